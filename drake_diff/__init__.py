@@ -1,0 +1,36 @@
+"""Trajectory optimization on Drake with gradients that are checked before they are used."""
+
+from drake_diff.certificate import Certificate as Certificate
+from drake_diff.certificate import certify_jacobian as certify_jacobian
+from drake_diff.certify import certify as certify
+from drake_diff.certify import certify_rollout as certify_rollout
+from drake_diff.contract import Contract as Contract
+from drake_diff.cost import QuadraticCost as QuadraticCost
+from drake_diff.exceptions import ArtifactError as ArtifactError
+from drake_diff.exceptions import CertificateError as CertificateError
+from drake_diff.exceptions import DrakeDiffError as DrakeDiffError
+from drake_diff.exceptions import GradientError as GradientError
+from drake_diff.exceptions import InputError as InputError
+from drake_diff.exceptions import MissingDependencyError as MissingDependencyError
+from drake_diff.exceptions import ModelError as ModelError
+from drake_diff.exceptions import ModelWarning as ModelWarning
+from drake_diff.exceptions import NonFiniteError as NonFiniteError
+from drake_diff.exceptions import ShapeError as ShapeError
+from drake_diff.exceptions import SimulationError as SimulationError
+from drake_diff.exceptions import UnknownNameError as UnknownNameError
+from drake_diff.model import Model as Model
+from drake_diff.model import load_model as load_model
+from drake_diff.model import model_from_diagram as model_from_diagram
+from drake_diff.parameters import list_parameters as list_parameters
+from drake_diff.problem import Bounds as Bounds
+from drake_diff.problem import Problem as Problem
+from drake_diff.rollout import Rollout as Rollout
+from drake_diff.rollout import rollout as rollout
+from drake_diff.rollout_gradient import RolloutGradient as RolloutGradient
+from drake_diff.rollout_gradient import differentiate_rollout as differentiate_rollout
+from drake_diff.solution import Solution as Solution
+from drake_diff.solution import Status as Status
+from drake_diff.solver import solve as solve
+from drake_diff.step import step as step
+from drake_diff.step_derivatives import StepDerivatives as StepDerivatives
+from drake_diff.step_derivatives import differentiate_step as differentiate_step

@@ -1,0 +1,266 @@
+"""Compare a derivative with differences, entry by entry: agree, disagree, discontinuous, undecided.
+
+For every entry the function is differenced at 13 step sizes, half a decade apart. With C(h) the central quotient
+and r = sqrt(10), Richardson's D(h) = C(h/r) + (C(h/r) - C(h)) / (r^2 - 1) has an error of order h^4. Where three
+neighbouring D lie close together is a plateau; their spread is its uncertainty. An entry
+
+    agrees            where it lies on a plateau that is resolved to 1e-4 of it; an iteratively solved step
+                      is allowed 100 times its solver's tolerance, relative to the entry and the row's largest;
+    disagrees         where there are such plateaus and it lies on none;
+    is discontinuous  where forward and backward quotients do not approach each other as h shrinks (a kink), or
+                      grow apart as 1/h (a jump), or where the derivative is another one 1e-9 beside the point;
+    is undecided      where the differences resolve nothing. Undecided does not pass.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drake_diff.arrays import Array, finite_array, frozen
+from drake_diff.exceptions import CertificateError, GradientError, ShapeError
+from drake_diff.finite_difference import Difference, Function, differences
+
+STEPS = tuple(10.0 ** (-k / 2) for k in range(4, 17))  # 1e-2 ... 1e-8
+RATIO_SQUARED = 10.0
+RELATIVE_TOLERANCE = 1e-6
+RESOLVED = 1e-4
+NEGLIGIBLE = 1e-6  # of the largest entry in the row: smaller ones need not be resolved, only consistent
+ROUNDING = 1e-15
+# The derivative of what an iterative solver leaves unsolved: measured up to 60 times its tolerance, by row.
+SOLVER_FACTOR = 100.0
+JITTER = 1e-9
+JITTER_CHANGE = 0.1
+VERDICTS = ("agree", "undecided", "disagree", "discontinuous")  # from good to bad
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One entry of the derivative: its own value, the differences' value, and what is left of doubt."""
+
+    row: str
+    column: str
+    derivative: float
+    difference: float
+    tolerance: float
+    verdict: str
+
+    def __str__(self) -> str:
+        return (
+            f"d {self.row} / d {self.column}: derivative {self.derivative:.9g}, differences {self.difference:.9g}, "
+            f"tolerance {self.tolerance:.2g}: {self.verdict}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """The comparison of one derivative (m, n) with differences; arrays (m, n), verdicts by index in VERDICTS."""
+
+    rows: tuple[str, ...]
+    columns: tuple[str, ...]
+    derivative: Array
+    difference: Array
+    tolerance: Array
+    codes: NDArray[np.int64]
+    method: str
+    subject: str
+
+    @property
+    def verdict(self) -> str:
+        """The worst verdict of all entries."""
+        return VERDICTS[int(np.max(self.codes))] if self.codes.size else "agree"
+
+    @cached_property
+    def entries(self) -> tuple[Entry, ...]:
+        """Every entry, row by row."""
+        return tuple(self.entry(i, j) for i in range(len(self.rows)) for j in range(len(self.columns)))
+
+    @property
+    def worst(self) -> Entry:
+        """The entry with the worst verdict; among equals, the one furthest beyond its tolerance."""
+        excess = np.abs(self.derivative - self.difference) / self.tolerance
+        rank = self.codes + excess / (1 + excess)
+        i, j = np.unravel_index(int(np.argmax(np.where(np.isnan(rank), np.inf, rank))), rank.shape)
+        return self.entry(int(i), int(j))
+
+    def entry(self, row: int, column: int) -> Entry:
+        """The entry at (`row`, `column`)."""
+        at = (row, column)
+        return Entry(
+            self.rows[row],
+            self.columns[column],
+            float(self.derivative[at]),
+            float(self.difference[at]),
+            float(self.tolerance[at]),
+            VERDICTS[self.codes[at]],
+        )
+
+    def count(self, verdict: str) -> int:
+        """How many entries have this verdict."""
+        return int((self.codes == VERDICTS.index(verdict)).sum())
+
+    def require(self) -> "Certificate":
+        """This certificate where every entry agrees; CertificateError, naming the worst entry, where not."""
+        if self.verdict != "agree":
+            raise CertificateError(f"{self.subject}: {self}")
+        return self
+
+    def __str__(self) -> str:
+        counts = ", ".join(f"{self.count(v)} {v}" for v in VERDICTS if self.count(v))
+        worst = f"; worst: {self.worst}" if self.codes.size else ""
+        return f"{self.verdict} ({counts} of {self.codes.size} entries, {self.method}){worst}"
+
+
+def certify_jacobian(
+    f: Function,
+    x: ArrayLike,
+    jacobian: ArrayLike | Callable[[Array], Array],
+    *,
+    rows: Sequence[str] | None = None,
+    columns: Sequence[str] | None = None,
+    solver_tolerance: float = 0.0,
+    method: str = "given",
+    subject: str = "the derivative",
+) -> Certificate:
+    """Certify `jacobian` (m, n), an array or a function of x, of any `f`: R^n -> R^m at `x` (n,).
+
+    `solver_tolerance` is how accurately `f` is solved, relative to max(1, |f|), where it is solved iteratively.
+    Given a function, the derivative is also taken 1e-9 beside `x`.
+    """
+    x = finite_array("x", x, ("n",))
+    scale = np.maximum(1.0, np.abs(x))
+    at_x = np.asarray(jacobian(x) if callable(jacobian) else jacobian, dtype=float)
+    beside = None
+    if callable(jacobian):
+        beside = np.asarray(jacobian(x + JITTER * scale * jitter_direction(len(x))), dtype=float)
+    return certify_displacement(
+        lambda d: np.asarray(f(x + scale * d), dtype=float),
+        at_x * scale,
+        beside=None if beside is None else beside * scale,
+        scale=scale,
+        rows=tuple(rows or (f"f[{i}]" for i in range(at_x.shape[0]))),
+        columns=tuple(columns or (f"x[{i}]" for i in range(len(x)))),
+        solver_tolerance=solver_tolerance,
+        method=method,
+        subject=subject,
+    )
+
+
+def jitter_direction(size: int) -> Array:
+    """(size,) entries between 0.5 and 1 of either sign, always the same ones."""
+    random = np.random.default_rng(0)
+    return random.uniform(0.5, 1.0, size) * random.choice([-1.0, 1.0], size)
+
+
+def certify_displacement(
+    f: Function,
+    derivative: Array,
+    *,
+    rows: tuple[str, ...],
+    columns: tuple[str, ...],
+    scale: Array,
+    beside: Array | None = None,
+    minus: Difference = np.subtract,
+    solver_tolerance: float = 0.0,
+    method: str = "given",
+    subject: str = "the derivative",
+) -> Certificate:
+    """Certify `derivative` (m, n) of `f`, a function of a scaled displacement (n,), at 0.
+
+    `beside` is the derivative at a point 1e-9 away; `scale` (n,) takes the scaling out of what is reported;
+    `minus` subtracts two values of `f`, on a tangent space if need be.
+    """
+    if derivative.shape != (len(rows), len(columns)):
+        raise ShapeError("derivative", got=derivative.shape, expected=(len(rows), len(columns)))
+    if not np.all(np.isfinite(derivative)):
+        raise GradientError(f"{subject} is not finite: {derivative}")
+    centre = f(np.zeros(len(columns)))
+    sweep = [differences(f, len(columns), h, at_zero=centre, minus=minus) for h in STEPS]
+    forward, backward = np.array([d.forward for d in sweep]), np.array([d.backward for d in sweep])
+    values = np.abs(minus(centre, np.zeros_like(centre))) if minus is np.subtract else np.ones(len(rows))
+    value_scale = np.maximum(1.0, values)
+    difference, tolerance, codes = _judge(derivative, (forward + backward) / 2, value_scale, solver_tolerance)
+    jumps = _not_smooth(forward, backward, derivative, value_scale, solver_tolerance)
+    if beside is not None:
+        jumps |= _jittery(derivative, beside)
+    codes[jumps] = VERDICTS.index("discontinuous")
+    return Certificate(
+        rows,
+        columns,
+        frozen(derivative / scale),
+        frozen(difference / scale),
+        frozen(tolerance / scale),
+        codes,
+        method,
+        subject,
+    )
+
+
+def _judge(
+    a: Array, central: Array, value_scale: Array, solver_tolerance: float
+) -> tuple[Array, Array, NDArray[np.int64]]:
+    """The differences' value, the tolerance and the verdict of every entry, kinks and jumps aside."""
+    richardson = central[1:] + (central[1:] - central[:-1]) / (RATIO_SQUARED - 1)
+    windows = np.array([richardson[s - 1 : s + 2] for s in range(1, len(richardson) - 1)])
+    middle = windows[:, 1]
+    rounding = ROUNDING * value_scale[None, :, None] / np.array(STEPS[2:-1])[:, None, None]
+    uncertainty = windows.max(axis=1) - windows.min(axis=1) + rounding
+    magnitude = np.maximum(np.abs(a), np.abs(middle))
+    row_size = np.abs(a).max(axis=1, keepdims=True, initial=0)
+    unsolved = SOLVER_FACTOR * solver_tolerance * (row_size + magnitude)
+    allowed = RELATIVE_TOLERANCE * magnitude + 3 * uncertainty + unsolved
+    resolved = uncertainty <= RESOLVED * magnitude + unsolved
+    vanishing = (magnitude <= NEGLIGIBLE * row_size) | (magnitude <= 3 * rounding)
+    agrees = (np.abs(a - middle) <= allowed) & (resolved | vanishing)
+    codes = np.where(
+        agrees.any(axis=0),
+        VERDICTS.index("agree"),
+        np.where(resolved.any(axis=0), VERDICTS.index("disagree"), VERDICTS.index("undecided")),
+    )
+    # Report the step that tells most: the best of the agreeing ones, else the least uncertain.
+    rank = np.where(agrees.any(axis=0)[None] & ~agrees, np.inf, uncertainty)
+    best = np.argmin(rank, axis=0)[None]
+    picked = [np.take_along_axis(values, best, axis=0)[0] for values in (middle, allowed)]
+    return picked[0], picked[1], codes
+
+
+def _not_smooth(
+    forward: Array, backward: Array, a: Array, value_scale: Array, solver_tolerance: float
+) -> NDArray[np.bool_]:
+    """Entries whose one-sided quotients do not approach each other as the step shrinks.
+
+    What an iterative solver leaves unsolved looks like a jump too, so a gap must also stand above that.
+    """
+    gap = np.abs(forward - backward)
+    found = _stays_apart(gap, a, 100 * ROUNDING * value_scale)
+    if solver_tolerance and found.any():
+        found &= _stays_apart(gap, a, solver_tolerance * value_scale)
+    return found
+
+
+def _stays_apart(gap: Array, a: Array, noise: Array) -> NDArray[np.bool_]:
+    """Entries whose gap, at the four smallest steps at which it stands above `noise`, does not shrink.
+
+    The gap of a smooth entry shrinks as h, that of a kink at the point stays, that of a jump grows as 1/h.
+    """
+    tells = gap * np.array(STEPS)[:, None, None] > noise[None, :, None]
+    significant = RESOLVED * np.maximum(np.abs(a), NEGLIGIBLE * np.abs(a).max(axis=1, keepdims=True, initial=0))
+    found = np.zeros(a.shape, dtype=bool)
+    for i, j in np.argwhere(tells[3:].any(axis=0)):
+        last = int(np.flatnonzero(tells[:, i, j])[-1])
+        steps, gaps = np.array(STEPS[last - 3 : last + 1]), gap[last - 3 : last + 1, i, j]
+        # Where a kink of this size would still tell at the next smaller step, and does not: it is not at the point.
+        ends_early = last + 1 < len(STEPS) and gaps[-1] * STEPS[last + 1] > 2 * noise[i]
+        if ends_early or gaps[-1] <= significant[i, j] or np.min(gaps) == 0:
+            continue
+        found[i, j] = np.polyfit(np.log(steps), np.log(gaps), 1)[0] < 0.5
+    return found
+
+
+def _jittery(a: Array, beside: Array) -> NDArray[np.bool_]:
+    """Entries that are another number right beside the point."""
+    size = np.abs(a) + np.abs(beside)
+    row_size = size.max(axis=1, keepdims=True) if size.size else size
+    return np.asarray((np.abs(a - beside) > JITTER_CHANGE * size) & (size > NEGLIGIBLE * row_size))

@@ -1,0 +1,146 @@
+"""Certify the derivative of a step, or of a whole rollout, before it is used."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_diff.arrays import Array, finite_array
+from drake_diff.certificate import JITTER, Certificate, certify_displacement, jitter_direction
+from drake_diff.contract import SAP_RELATIVE_TOLERANCE
+from drake_diff.model import Model
+from drake_diff.parameters import column_names, find_parameters, stacked_values
+from drake_diff.plant_elements import actuators
+from drake_diff.rollout import check_inputs, roll_states
+from drake_diff.rollout_gradient import Loss, RolloutGradient, differentiate_rollout, evaluate_loss
+from drake_diff.step import advance, check_point
+from drake_diff.step_derivatives import StepDerivatives, differentiate_step, step_of_displacement
+from drake_diff.tangent import TangentSpace, tangent_space
+
+LIMIT_REACH = 0.05  # [m or rad] a joint limit this near may hold the joint in one of the displaced steps
+
+
+def certify(
+    model: Model,
+    x: ArrayLike,
+    u: ArrayLike | None = None,
+    *,
+    parameters: Sequence[str] = (),
+    method: str = "auto",
+    derivatives: StepDerivatives | None = None,
+) -> Certificate:
+    """Compare the Jacobians of the step at (`x`, `u`) with differences of the double step, entry by entry.
+
+    Rows are the next state's, columns those of [x; u; parameters], both on the tangent space (a quaternion has
+    three entries). The derivative is `differentiate_step(..., method=method)`, or `derivatives` where given.
+    """
+    x, u = check_point(model, x, u)
+    found = find_parameters(model, tuple(parameters))
+    point = np.concatenate([x, u, stacked_values(found)])
+    space, free = tangent_space(model), len(point) - model.nx
+    scale = np.concatenate([_scale(space, x), np.maximum(1.0, np.abs(point[model.nx :]))])
+
+    def f(displacement: Array) -> Array:
+        moved = _move(space, model.nx, point, scale * displacement)
+        return np.asarray(step_of_displacement(model, moved, found)(np.zeros(len(point))))
+
+    def on_tangent(at: Array, d: StepDerivatives) -> Array:
+        full = np.hstack([d.A, d.B, d.C])
+        plus = np.block(
+            [
+                [space.derivative_of_plus(at[: model.nx]), np.zeros((model.nx, free))],
+                [np.zeros((free, space.size)), np.eye(free)],
+            ]
+        )
+        return np.asarray(space.derivative_of_minus(d.x_next) @ full @ plus * scale)
+
+    d = derivatives or differentiate_step(model, x, u, parameters=parameters, method=method)
+    beside = None
+    if derivatives is None and not found:
+        jittered = _move(space, model.nx, point, JITTER * scale * jitter_direction(len(scale)))
+        d_beside = differentiate_step(model, jittered[: model.nx], jittered[model.nx :], method=method)
+        beside = on_tangent(jittered, d_beside)
+    return certify_displacement(
+        f,
+        on_tangent(point, d),
+        rows=space.names,
+        columns=space.names + model.input_names + column_names(found),
+        scale=scale,
+        beside=beside,
+        minus=space.minus,
+        solver_tolerance=solver_tolerance(model, x, u),
+        method=d.method,
+        subject=f"the step of {model.name}",
+    )
+
+
+def certify_rollout(
+    model: Model,
+    x0: ArrayLike,
+    us: ArrayLike | None,
+    loss: Loss,
+    *,
+    num_steps: int | None = None,
+    method: str = "auto",
+) -> Certificate:
+    """Compare `differentiate_rollout`'s gradient by x0 and us with differences of whole rollouts, entry by entry.
+
+    One row, the loss; columns x0 (on the tangent space), then u[k] step by step. Costs 26 rollouts per column.
+    """
+    us = check_inputs(model, us, num_steps)
+    x0 = finite_array("x0", x0, (model.nx,))
+    space = tangent_space(model)
+    scale = np.concatenate([_scale(space, x0), np.maximum(1.0, np.abs(us.ravel()))])
+
+    def moved(displacement: Array) -> tuple[Array, Array]:
+        point = _move(space, model.nx, np.concatenate([x0, us.ravel()]), scale * displacement)
+        return point[: model.nx], point[model.nx :].reshape(us.shape)
+
+    def f(displacement: Array) -> Array:
+        x, inputs = moved(displacement)
+        return np.array([evaluate_loss(loss, roll_states(model, x, inputs), inputs)])
+
+    def on_tangent(displacement: Array) -> tuple[Array, RolloutGradient]:
+        x, inputs = moved(displacement)
+        g = differentiate_rollout(model, x, inputs, loss, method=method)
+        return np.concatenate([g.x0 @ space.derivative_of_plus(x), g.us.ravel()])[None] * scale, g
+
+    derivative, gradient = on_tangent(np.zeros(len(scale)))
+    inputs = tuple(f"{name}[{k}]" for k in range(len(us)) for name in model.input_names)
+    return certify_displacement(
+        f,
+        derivative,
+        rows=("loss",),
+        columns=tuple(f"{name}[0]" for name in space.names) + inputs,
+        scale=scale,
+        beside=on_tangent(JITTER * jitter_direction(len(scale)))[0],
+        solver_tolerance=max(solver_tolerance(model, x, u) for x, u in zip(gradient.xs[:-1], us, strict=True)),
+        method=" + ".join(gradient.methods),
+        subject=f"the rollout of {model.name}",
+    )
+
+
+def solver_tolerance(model: Model, x: Array, u: Array) -> float:
+    """How accurately the step at (`x`, `u`) is solved: SAP's tolerance where it has anything to solve."""
+    plant, context = model.plant, model.double.context
+    advance(model.double, x, u)
+    contacts = plant.get_contact_results_output_port().Eval(context)
+    touching = contacts.num_point_pair_contacts() + contacts.num_hydroelastic_contacts()
+    q = x[: model.nq]
+    reach = LIMIT_REACH + 2 * model.time_step * np.abs(x[model.nq :]).max(initial=0)
+    near_limit = np.any(q < plant.GetPositionLowerLimits() + reach) or np.any(
+        q > plant.GetPositionUpperLimits() - reach
+    )
+    pd = any(actuator.has_controller() for actuator in actuators(plant))
+    return SAP_RELATIVE_TOLERANCE if touching or near_limit or pd or plant.num_constraints() else 0.0
+
+
+def _scale(space: TangentSpace, x: Array) -> Array:
+    """(size,) how far a coordinate is moved relative to the step: its magnitude, at least 1; rotations 1."""
+    magnitude = np.maximum(1.0, np.abs(x))
+    magnitude[[i for q in space.quaternions for i in range(q, q + 4)]] = 1.0
+    return np.delete(magnitude, list(space.quaternions))
+
+
+def _move(space: TangentSpace, nx: int, point: Array, displacement: Array) -> Array:
+    return np.concatenate([space.plus(point[:nx], displacement[: space.size]), point[nx:] + displacement[space.size :]])

@@ -1,0 +1,98 @@
+"""The plant's equations of motion in continuous time, for collocation: a Drake System made from the discrete plant.
+
+    M(q) dv/dt = B u + forces(q, v) - C(q, v) v,    dq/dt = N(q) v,
+
+with Drake's own mass matrix, force elements (gravity, springs), joint damping and bias. Contact, joint limits,
+PD control and constraints are not in it: they exist only in the discrete step. With r(q, v, dv/dt, u) the residual
+by inverse dynamics, d(dv/dt) = -M^-1 dr at fixed dv/dt, so AutoDiffXd never factors a matrix.
+"""
+
+from typing import Any
+
+import numpy as np
+from pydrake.autodiffutils import AutoDiffXd, ExtractValue
+from pydrake.multibody.tree import MultibodyForces_
+from pydrake.systems.framework import BasicVector_, LeafSystem_
+from pydrake.systems.scalar_conversion import TemplateSystem
+
+from drake_diff.arrays import Array
+from drake_diff.exceptions import ModelError
+from drake_diff.model import Model, Twin
+from drake_diff.plant_elements import actuators
+
+
+class EquationsOfMotion:
+    """dx/dt = f(x, u) of a model, for floats and for AutoDiffXd.
+
+    Raises ModelError where the model has PD control or constraints, which have no continuous form here.
+    """
+
+    def __init__(self, model: Model):
+        if model.pd_targets or any(a.has_controller() for a in actuators(model.plant)):
+            raise ModelError("collocation: PD-controlled actuators have no continuous form; use method='shooting'")
+        if model.plant.num_constraints():
+            raise ModelError("collocation: the model's constraints have no continuous form; use method='shooting'")
+        self.model = model
+        self.actuation = model.plant.MakeActuationMatrix()
+
+    def __call__(self, x: Array, u: Array) -> Array:
+        """(nx,) dx/dt at `x` (nx,), `u` (nu,)."""
+        twin = self.model.double
+        self._set(twin, x)
+        acceleration, _ = self._acceleration(u)
+        return np.concatenate([self._q_dot(twin, x), acceleration])
+
+    def autodiff(self, x: Any, u: Any) -> Any:
+        """The same with AutoDiffXd in and out."""
+        self._set(self.model.double, ExtractValue(x).ravel())
+        acceleration, mass = self._acceleration(ExtractValue(u).ravel())
+        twin = self.model.autodiff
+        self._set(twin, x)
+        constant = np.array([AutoDiffXd(a) for a in acceleration])
+        residual = self._inverse_dynamics(twin, MultibodyForces_[AutoDiffXd], constant) - self.actuation @ u
+        return np.concatenate([self._q_dot(twin, x), acceleration - np.linalg.inv(mass) @ residual])
+
+    def _set(self, twin: Twin, x: Any) -> None:
+        twin.plant.SetPositionsAndVelocities(twin.context, x)
+
+    def _q_dot(self, twin: Twin, x: Any) -> Any:
+        v = x[self.model.nq :]
+        return np.asarray(twin.plant.MapVelocityToQDot(twin.context, v)).ravel()
+
+    def _acceleration(self, u: Array) -> tuple[Array, Array]:
+        twin = self.model.double
+        rest = self._inverse_dynamics(twin, MultibodyForces_[float], np.zeros(self.model.nv))
+        mass = twin.plant.CalcMassMatrix(twin.context)
+        return np.linalg.solve(mass, self.actuation @ u - rest), mass
+
+    def _inverse_dynamics(self, twin: Twin, forces_of: Any, acceleration: Any) -> Any:
+        forces = forces_of(twin.plant)
+        twin.plant.CalcForceElementsContribution(twin.context, forces)
+        return twin.plant.CalcInverseDynamics(twin.context, acceleration, forces)
+
+
+@TemplateSystem.define("ContinuousSystem_")
+def ContinuousSystem_(T):  # type: ignore[no-untyped-def]
+    class Impl(LeafSystem_[T]):  # type: ignore[misc]
+        """`EquationsOfMotion` as a Drake System with one input u and the state x = [q; v]."""
+
+        def _construct(self, equations, converter=None):  # type: ignore[no-untyped-def]
+            LeafSystem_[T].__init__(self, converter)
+            self.equations = equations
+            model = equations.model
+            self.DeclareVectorInputPort("u", BasicVector_[T](model.nu))
+            self.DeclareContinuousState(model.nq, model.nv, 0)
+
+        def _construct_copy(self, other, converter=None):  # type: ignore[no-untyped-def]
+            self._construct(other.equations, converter=converter)
+
+        def DoCalcTimeDerivatives(self, context, derivatives):  # type: ignore[no-untyped-def]
+            x = context.get_continuous_state_vector().CopyToVector()
+            u = self.get_input_port().Eval(context)
+            evaluate = self.equations if T is float else self.equations.autodiff
+            derivatives.SetFromVector(evaluate(x, u))
+
+    return Impl
+
+
+ContinuousSystem = ContinuousSystem_[None]

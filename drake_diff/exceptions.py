@@ -1,0 +1,82 @@
+"""Every error that drake_diff raises on purpose.
+
+DrakeDiffError
+├── InputError (ValueError)        what was passed in cannot be right: expected, got
+│   ├── ShapeError                 an array of the wrong shape
+│   ├── NonFiniteError             NaN or infinity where a number is needed
+│   └── UnknownNameError           a joint, parameter, solver, ... that does not exist; lists those that do
+├── ModelError                     a file or diagram that is no usable robot model
+├── GradientError                  a derivative that must not be used
+├── CertificateError               a certificate whose verdict is not "agree"
+├── SimulationError                Drake could not take a step
+├── MissingDependencyError         an optional engine or solver that is not there; says what to install
+└── ArtifactError                  a run directory or log that is missing, incomplete or damaged
+
+ModelWarning (UserWarning)         what was left out of a model that is used all the same
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+
+class DrakeDiffError(Exception):
+    """The root of the tree."""
+
+
+class InputError(DrakeDiffError, ValueError):
+    """Bad input, found before anything ran."""
+
+    def __init__(self, subject: str, *, got: Any, expected: str):
+        super().__init__(f"{subject}: expected {expected}, got {got}")
+        self.subject, self.got, self.expected = subject, got, expected
+
+
+class ShapeError(InputError):
+    """An array of the wrong shape."""
+
+    def __init__(self, subject: str, *, got: tuple[int, ...], expected: tuple[int | str, ...]):
+        shape = "(" + ", ".join(str(n) for n in expected) + ("," if len(expected) == 1 else "") + ")"
+        super().__init__(subject, got=f"shape {tuple(got)}", expected=f"shape {shape}")
+
+
+class NonFiniteError(InputError):
+    """NaN or infinity where a finite number is needed."""
+
+    def __init__(self, subject: str, *, index: tuple[int, ...], got: float):
+        super().__init__(f"{subject}{list(index)}", got=got, expected="a finite number")
+
+
+class UnknownNameError(InputError):
+    """A name that does not exist; the message lists those that do."""
+
+    def __init__(self, subject: str, *, got: object, known: Iterable[str]):
+        names = ", ".join(sorted(known)) or "(none)"
+        super().__init__(subject, got=repr(got), expected=f"one of {names}")
+
+
+class ModelError(DrakeDiffError):
+    """A file or diagram that is no usable robot model."""
+
+
+class GradientError(DrakeDiffError):
+    """A derivative that must not be used: it is not finite, or its value is not the simulator's."""
+
+
+class CertificateError(DrakeDiffError):
+    """A certificate whose verdict is not "agree"."""
+
+
+class SimulationError(DrakeDiffError):
+    """Drake could not take a step."""
+
+
+class MissingDependencyError(DrakeDiffError):
+    """An optional engine or solver that is not there."""
+
+
+class ArtifactError(DrakeDiffError):
+    """A run directory or log that is missing, incomplete or damaged."""
+
+
+class ModelWarning(UserWarning):
+    """Something of a model file was left out; the model is used all the same."""

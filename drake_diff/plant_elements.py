@@ -1,0 +1,89 @@
+"""The bodies, joints and actuators of a plant, found by index or by name; the plant in a diagram."""
+
+from typing import Any
+
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JointActuatorIndex, JointIndex, ModelInstanceIndex
+from pydrake.systems.framework import Diagram
+
+from drake_diff.exceptions import ModelError, UnknownNameError
+
+DiagramPath = tuple[int, ...]  # the position among the subsystems, level by level
+
+
+def instances(plant: Any) -> list[ModelInstanceIndex]:
+    """Every model instance, the world and Drake's default one included."""
+    return [ModelInstanceIndex(i) for i in range(plant.num_model_instances())]
+
+
+def instances_with_joints(plant: Any) -> list[ModelInstanceIndex]:
+    """The model instances that have positions."""
+    return [i for i in instances(plant) if plant.num_positions(i) > 0]
+
+
+def bodies(plant: Any) -> list[Any]:
+    """Every body but the world."""
+    found = [plant.get_body(index) for i in instances(plant) for index in plant.GetBodyIndices(i)]
+    return [body for body in found if body.index() != plant.world_body().index()]
+
+
+def joints(plant: Any) -> list[Any]:
+    """Every joint, in the order of its index."""
+    return [plant.get_joint(JointIndex(int(i))) for i in plant.GetJointIndices()]
+
+
+def actuators(plant: Any) -> list[Any]:
+    """Every actuator, in the order of the actuation input."""
+    return [plant.get_joint_actuator(JointActuatorIndex(int(i))) for i in plant.GetJointActuatorIndices()]
+
+
+def named(kind: str, elements: list[Any], name: str) -> Any:
+    """The one of `elements` called `name`; UnknownNameError lists those that exist."""
+    matches = [element for element in elements if element.name() == name]
+    if not matches:
+        raise UnknownNameError(kind, got=name, known=[element.name() for element in elements])
+    if len(matches) > 1:
+        raise ModelError(f"{len(matches)} elements of kind {kind} are called {name!r}: names must be unique")
+    return matches[0]
+
+
+def path_to_the_plant(diagram: Diagram) -> DiagramPath:
+    """Where in `diagram` its only MultibodyPlant is; ModelError where there is none or more than one."""
+    paths = _paths_to_plants(diagram, ())
+    if len(paths) != 1:
+        raise ModelError(f"the diagram: expected exactly one MultibodyPlant, got {len(paths)}")
+    return paths[0]
+
+
+def _paths_to_plants(diagram: Diagram, here: DiagramPath) -> list[DiagramPath]:
+    found: list[DiagramPath] = []
+    for i, system in enumerate(diagram.GetSystems()):
+        if isinstance(system, MultibodyPlant):
+            found.append((*here, i))
+        elif isinstance(system, Diagram):
+            found += _paths_to_plants(system, (*here, i))
+    return found
+
+
+def follow(diagram: Any, path: DiagramPath) -> Any:
+    """The subsystem at `path`; works on the diagram and on its scalar-converted twin."""
+    system = diagram
+    for i in path:
+        system = system.GetSystems()[i]
+    return system
+
+
+def is_driven(diagram: Diagram, path: DiagramPath, port: Any) -> bool:
+    """Whether something inside `diagram` feeds an input port of the subsystem at `path`, at any level."""
+    level, index = follow(diagram, path[:-1]), port.get_index()
+    system = follow(diagram, path)
+    for destination, destination_port in level.connection_map():
+        if destination is system and destination_port == index:
+            return True
+    if len(path) == 1:
+        return False  # exported by the outermost diagram at most: free
+    for i in range(level.num_input_ports()):
+        for exported_system, exported_port in level.GetInputPortLocators(level.get_input_port(i).get_index()):
+            if exported_system is system and exported_port == index:
+                return is_driven(diagram, path[:-1], level.get_input_port(i))
+    return False

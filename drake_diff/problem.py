@@ -1,0 +1,201 @@
+"""What is to be optimized; contains no solver."""
+
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
+from typing import Any
+
+import numpy as np
+
+from drake_diff.arrays import Array, array_with_gaps, finite_array, frozen, positive_int
+from drake_diff.cost import FinalCost, QuadraticCost, RunningCost
+from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
+from drake_diff.model import Model
+
+OPTIMIZABLE = ("controls", "initial_state")
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Limits of states (nx,) and inputs (nu,), infinite where there is none.
+
+    The model's own limits (positions, velocities, efforts) apply to a whole array that is None and to each
+    entry that is NaN.
+    """
+
+    x_lower: Any = None
+    x_upper: Any = None
+    u_lower: Any = None
+    u_upper: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Minimize sum_k h * running_cost(x_k, u_k) + final_cost(x_N) over `num_steps` steps of h = model.time_step.
+
+    (Collocation: the transcription's quadrature of the same rate.) `x0` (nx,) is the initial state; `x_goal`
+    (nx,) a hard final equality whose NaN entries are free. `bounds` hold at every state after the initial one
+    and for every input. `optimize` names what may change: "controls" and/or "initial_state", the latter where
+    `initial_state_mask` (nx,) is True, x0 being the first guess there. Controls that are not optimized are `us`
+    (N, nu), zero where not given.
+
+    Raises InputError, ShapeError, NonFiniteError or UnknownNameError, each with expected and got.
+    """
+
+    model: Model
+    _: KW_ONLY
+    x0: Any
+    num_steps: int
+    running_cost: RunningCost | None = None
+    final_cost: FinalCost | None = None
+    x_goal: Any = None
+    bounds: Any = None  # Bounds
+    optimize: Sequence[str] = ("controls",)
+    initial_state_mask: Any = None
+    us: Any = None
+
+    def __post_init__(self) -> None:
+        model = self.model
+        if not isinstance(model, Model):
+            raise InputError("model", got=type(model).__name__, expected="a Model")
+        self._set("x0", finite_array("x0", self.x0, (model.nx,)))
+        self._set("num_steps", positive_int("num_steps", self.num_steps))
+        self._set("optimize", _check_optimize(model, self.optimize))
+        self._set("bounds", _resolve_bounds(model, self.bounds or Bounds()))
+        self._set("initial_state_mask", self._check_mask())
+        self._set("us", self._check_us())
+        self._check_inside("x0", self.x0, "x")
+        if self.x_goal is not None:
+            self._set("x_goal", array_with_gaps("x_goal", self.x_goal, (model.nx,)))
+            self._check_goal()
+        self._check_costs()
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    @property
+    def optimizes_controls(self) -> bool:
+        return "controls" in self.optimize
+
+    @property
+    def goal(self) -> Array:
+        """(nx,) the hard final state; NaN where it is free."""
+        return np.full(self.model.nx, np.nan) if self.x_goal is None else np.asarray(self.x_goal)
+
+    def goal_error(self, x: Array) -> Array:
+        """(nx,) the distance of `x` from the goal, 0 where the goal is free."""
+        goal = self.goal
+        return np.where(np.isnan(goal), 0.0, x - np.where(np.isnan(goal), 0.0, goal))
+
+    def objective(self, xs: Array, inputs: Array) -> float:
+        """The objective of xs (N+1, nx) under inputs (N, nu) held over each step.
+
+        Inputs (N+1, nu) are at the knots, and the running cost is integrated by the trapezoid rule.
+        """
+        total = 0.0 if self.final_cost is None else float(self.final_cost(xs[-1]))
+        if self.running_cost is not None:
+            rates = [float(self.running_cost(x, u)) for x, u in zip(xs, inputs, strict=False)]
+            if len(inputs) == len(xs):
+                rates[0], rates[-1] = rates[0] / 2, rates[-1] / 2
+            total += self.model.time_step * sum(rates)
+        return total
+
+    def _check_mask(self) -> Array:
+        nx = self.model.nx
+        free = "initial_state" in self.optimize
+        if self.initial_state_mask is None:
+            return np.full(nx, free)
+        mask = np.asarray(self.initial_state_mask)
+        if mask.shape != (nx,):
+            raise ShapeError("initial_state_mask", got=mask.shape, expected=(nx,))
+        if mask.dtype != bool:
+            raise InputError("initial_state_mask", got=f"dtype {mask.dtype}", expected="booleans")
+        if free and not mask.any():
+            raise InputError("initial_state_mask", got="no True entry", expected="at least one free entry")
+        if not free:
+            raise InputError("initial_state_mask", got="a mask", expected='"initial_state" in optimize')
+        return mask
+
+    def _check_us(self) -> Array:
+        shape = (self.num_steps, self.model.nu)
+        if self.us is None:
+            return frozen(np.zeros(shape))
+        us = finite_array("us", self.us, shape)
+        if not self.optimizes_controls:
+            self._check_inside("us", us, "u")
+        return us
+
+    def _check_inside(self, subject: str, values: Any, kind: str) -> None:
+        lower, upper = getattr(self.bounds, f"{kind}_lower"), getattr(self.bounds, f"{kind}_upper")
+        names = self.model.state_names if kind == "x" else self.model.input_names
+        outside = np.argwhere(np.atleast_2d((values < lower) | (values > upper)))
+        if len(outside):
+            i = int(outside[0][-1])
+            got = float(np.atleast_2d(values)[tuple(outside[0])])
+            raise InputError(f"{subject}, {names[i]}", got=got, expected=f"within [{lower[i]:g}, {upper[i]:g}]")
+
+    def _check_goal(self) -> None:
+        goal = self.goal
+        if np.any(np.isinf(goal)):
+            raise InputError("x_goal", got=goal, expected="finite numbers, NaN where free")
+        inside = np.where(np.isnan(goal), np.clip(0.0, self.bounds.x_lower, self.bounds.x_upper), goal)
+        self._check_inside("x_goal", inside, "x")
+
+    def _check_costs(self) -> None:
+        if self.running_cost is None and self.final_cost is None and self.x_goal is None:
+            raise InputError("problem", got="no cost and no goal", expected="a cost, an x_goal, or both")
+        for name in ("running_cost", "final_cost"):
+            cost = getattr(self, name)
+            if cost is not None and not callable(cost):
+                raise InputError(name, got=type(cost).__name__, expected="a function or a QuadraticCost")
+            if isinstance(cost, QuadraticCost):
+                _check_sizes(name, cost, self.model)
+
+
+def _check_optimize(model: Model, optimize: Sequence[str]) -> tuple[str, ...]:
+    names = (optimize,) if isinstance(optimize, str) else tuple(optimize)
+    if not names:
+        raise InputError("optimize", got="nothing", expected="at least one of " + ", ".join(OPTIMIZABLE))
+    for name in names:
+        if name not in OPTIMIZABLE:
+            raise UnknownNameError("optimize", got=name, known=OPTIMIZABLE)
+    if "controls" in names and model.nu == 0:
+        raise InputError("optimize", got='"controls", but the model has no actuators', expected="an actuated model")
+    return names
+
+
+def _resolve_bounds(model: Model, bounds: Bounds) -> Bounds:
+    plant = model.plant
+    own = {
+        "x_lower": np.concatenate([plant.GetPositionLowerLimits(), plant.GetVelocityLowerLimits()]),
+        "x_upper": np.concatenate([plant.GetPositionUpperLimits(), plant.GetVelocityUpperLimits()]),
+        "u_lower": plant.GetEffortLowerLimits(),
+        "u_upper": plant.GetEffortUpperLimits(),
+    }
+    resolved = {}
+    for name, limits in own.items():
+        given = getattr(bounds, name)
+        if given is None:
+            resolved[name] = frozen(limits)
+        else:
+            checked = array_with_gaps(name, given, limits.shape)
+            resolved[name] = frozen(np.where(np.isnan(checked), limits, checked))
+    for kind, names in (("x", model.state_names), ("u", model.input_names)):
+        lower, upper = resolved[f"{kind}_lower"], resolved[f"{kind}_upper"]
+        crossed = np.flatnonzero(lower > upper)
+        if len(crossed):
+            i = int(crossed[0])
+            raise InputError(
+                f"bounds of {names[i]}", got=f"[{lower[i]:g}, {upper[i]:g}]", expected="lower at most upper"
+            )
+    return Bounds(**resolved)
+
+
+def _check_sizes(name: str, cost: QuadraticCost, model: Model) -> None:
+    for part, size in (("Q", model.nx), ("R", model.nu)):
+        weight = getattr(cost, part)
+        if weight is not None and weight.shape != (size, size):
+            raise ShapeError(f"{name}.{part}", got=weight.shape, expected=(size, size))
+    for part, size in (("x_ref", model.nx), ("u_ref", model.nu)):
+        reference = getattr(cost, part)
+        if reference is not None and reference.shape != (size,):
+            raise ShapeError(f"{name}.{part}", got=reference.shape, expected=(size,))

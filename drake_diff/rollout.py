@@ -1,0 +1,203 @@
+"""Many steps; energy, contact, penetration and constraint violation along them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_diff.arrays import Array, finite_array, frozen, positive_int
+from drake_diff.contact import ContactPoint, contacts_of_the_step, penetration
+from drake_diff.exceptions import InputError
+from drake_diff.model import Model
+from drake_diff.plant_elements import joints
+from drake_diff.step import advance, check_point
+from drake_diff.tangent import tangent_space
+
+Policy = Callable[[Array, float], ArrayLike]
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """N steps of the double plant and what was measured along them; arrays are read-only, SI units.
+
+    The energy balance of the discrete plant is `energy_error` = energy - energy[0] - work + dissipation: with
+    midpoint velocities work and dissipation are exact where M is constant, so that what remains is the error of
+    the time stepping, and what contact, joint limits and constraints took or gave.
+    """
+
+    times: Array  # (N+1,) [s]
+    xs: Array  # (N+1, nx)
+    us: Array  # (N, nu), as commanded
+    efforts: Array  # (N, nu), as applied: clipped at the effort limits, PD control included
+    kinetic_energy: Array  # (N+1,) [J]
+    potential_energy: Array  # (N+1,) [J], gravity and springs
+    work: Array  # (N+1,) [J], done by the actuators since the start
+    dissipation: Array  # (N+1,) [J], taken by joint damping since the start
+    penetration: Array  # (N+1,) [m], the largest overlap of two geometries
+    constraint_violation: Array  # (N+1,) beyond joint limits [m or rad], or of a quaternion's unit norm [1]
+    contacts: tuple[tuple[ContactPoint, ...], ...]  # N tuples: the contacts of each step
+
+    @property
+    def energy(self) -> Array:
+        """(N+1,) [J]: kinetic plus potential energy."""
+        return frozen(self.kinetic_energy + self.potential_energy)
+
+    @property
+    def energy_error(self) -> Array:
+        """(N+1,) [J]: energy that neither actuators nor damping account for."""
+        return frozen(self.energy - self.energy[0] - self.work + self.dissipation)
+
+    @property
+    def energy_drift(self) -> float:
+        """[J]: the lasting part of `energy_error`, its oscillation averaged out (see `drift`)."""
+        return drift(self.energy_error)
+
+    @property
+    def energy_oscillation(self) -> float:
+        """[J]: the largest distance of `energy_error` from its drift line."""
+        error = self.energy_error
+        line = self.energy_drift * np.linspace(-0.5, 0.5, len(error))
+        return float(np.abs(error - smooth_mean(error) - line).max())
+
+
+def rollout(
+    model: Model,
+    x0: ArrayLike,
+    us: ArrayLike | None = None,
+    *,
+    policy: Policy | None = None,
+    num_steps: int | None = None,
+) -> Rollout:
+    """Step from `x0` (nx,) under the inputs `us` (N, nu), or under `policy(x, t) -> u` for `num_steps` steps.
+
+    A model without actuators needs `num_steps` alone. Raises ShapeError, NonFiniteError, InputError, or
+    SimulationError where Drake cannot take a step.
+    """
+    if policy is None:
+        return _roll(model, x0, check_inputs(model, us, num_steps))
+    if us is not None:
+        raise InputError("rollout", got="us and policy", expected="one of them")
+    return _roll(model, x0, policy, positive_int("num_steps", num_steps))
+
+
+def check_inputs(model: Model, us: ArrayLike | None, num_steps: int | None = None) -> Array:
+    """`us` as a finite (N, nu) array; for a model without actuators `num_steps` alone will do."""
+    if us is None and model.nu == 0:
+        us = np.zeros((positive_int("num_steps", num_steps), 0))
+    checked = finite_array("us", us, ("N", model.nu))
+    if len(checked) == 0:
+        raise InputError("us", got="0 steps", expected="at least one step")
+    if num_steps is not None and num_steps != len(checked):
+        raise InputError("num_steps", got=num_steps, expected=f"{len(checked)}, the length of us")
+    return checked
+
+
+def roll_states(model: Model, x0: Array, us: Array) -> Array:
+    """(N+1, nx): the states alone, nothing measured; sizes are the caller's business."""
+    xs = np.empty((len(us) + 1, model.nx))
+    xs[0] = x0
+    for k, u in enumerate(us):
+        xs[k + 1] = advance(model.double, xs[k], u)
+    return xs
+
+
+def _roll(model: Model, x0: ArrayLike, inputs: Array | Policy, num_steps: int = 0) -> Rollout:
+    count = num_steps or len(inputs)  # type: ignore[arg-type]
+    h, meter = model.time_step, _Meter(model)
+    xs, us = np.empty((count + 1, model.nx)), np.empty((count, model.nu))
+    xs[0] = finite_array("x0", x0, (model.nx,))
+    for k in range(count):
+        u = inputs(xs[k].copy(), k * h) if callable(inputs) else inputs[k]
+        us[k] = check_point(model, xs[k], u)[1]
+        xs[k + 1] = advance(model.double, xs[k], us[k])
+        meter.measure_state()  # of the state before the step
+        meter.measure_step(xs[k], xs[k + 1])
+    model.plant.SetPositionsAndVelocities(model.double.context, xs[-1])
+    meter.measure_state()
+    return meter.result(xs, us)
+
+
+class _Meter:
+    """Reads energies, efforts, contacts and violations from the double context, state by state."""
+
+    def __init__(self, model: Model):
+        self.model, self.plant, self.context = model, model.plant, model.double.context
+        self.space = tangent_space(model)
+        self.damping = _damping(model)
+        self.actuation = self.plant.MakeActuationMatrix()
+        self.limits = self.plant.GetPositionLowerLimits(), self.plant.GetPositionUpperLimits()
+        self.states: list[tuple[float, float, float, float]] = []
+        self.steps: list[tuple[float, float]] = []
+        self.efforts: list[Array] = []
+        self.contacts: list[tuple[ContactPoint, ...]] = []
+
+    def measure_state(self) -> None:
+        kinetic = self.plant.CalcKineticEnergy(self.context)
+        potential = self.plant.CalcPotentialEnergy(self.context)
+        self.states.append((kinetic, potential, penetration(self.model), self._violation()))
+
+    def measure_step(self, x: Array, x_next: Array) -> None:
+        nq, h = self.model.nq, self.model.time_step
+        net = np.asarray(self.plant.get_net_actuation_output_port().Eval(self.context))
+        middle = (x[nq:] + x_next[nq:]) / 2
+        work = h * float(middle @ self.actuation @ net)
+        self.steps.append((work, h * float(middle @ (self.damping * x_next[nq:]))))
+        self.efforts.append(net)
+        self.contacts.append(contacts_of_the_step(self.model))
+
+    def _violation(self) -> float:
+        q = np.asarray(self.plant.GetPositions(self.context))
+        beyond = np.maximum(self.limits[0] - q, q - self.limits[1]).max(initial=0.0)
+        norms = [abs(np.linalg.norm(q[start : start + 4]) - 1) for start in self.space.quaternions]
+        return float(max([beyond, *norms]))
+
+    def result(self, xs: Array, us: Array) -> Rollout:
+        states, steps = np.array(self.states), np.vstack([np.zeros((1, 2)), np.array(self.steps)])
+        return Rollout(
+            times=frozen(self.model.time_step * np.arange(len(xs))),
+            xs=frozen(xs),
+            us=frozen(us),
+            efforts=frozen(np.array(self.efforts).reshape(us.shape)),
+            kinetic_energy=frozen(states[:, 0]),
+            potential_energy=frozen(states[:, 1]),
+            work=frozen(np.cumsum(steps[:, 0])),
+            dissipation=frozen(np.cumsum(steps[:, 1])),
+            penetration=frozen(states[:, 2]),
+            constraint_violation=frozen(states[:, 3]),
+            contacts=tuple(self.contacts),
+        )
+
+
+def _damping(model: Model) -> Array:
+    """(nv,) the joint damping coefficients."""
+    damping = np.zeros(model.nv)
+    for joint in joints(model.plant):
+        start = joint.velocity_start()
+        damping[start : start + joint.num_velocities()] = joint.GetDampingVector(model.double.context)
+    return damping
+
+
+def smooth_mean(series: Array) -> float:
+    """The mean of `series` (n,) under the weight exp(-1 / (s (1 - s))), s from 0 to 1 along it.
+
+    The weight vanishes with all its derivatives at both ends, so an oscillation of more than a few periods
+    contributes next to nothing (Das, Saiki, Sander and Yorke, "Quantitative quasiperiodicity", 2017).
+    """
+    s = (np.arange(len(series)) + 0.5) / len(series)
+    weight = np.exp(-1 / (s * (1 - s)))
+    return float(weight @ series / weight.sum())
+
+
+def drift(series: Array) -> float:
+    """How far `series` (n,) wanders from its start to its end, oscillation averaged out.
+
+    Twice the difference between the smooth means of its second and its first half: exactly the rise of a
+    straight line, next to nothing for an oscillation of many periods. Of fewer than four values, the last minus
+    the first.
+    """
+    if len(series) < 4:
+        return float(series[-1] - series[0])
+    half = len(series) // 2
+    rise = smooth_mean(series[-half:]) - smooth_mean(series[:half])
+    return rise * (len(series) - 1) / (len(series) - half)

@@ -1,0 +1,166 @@
+"""Single shooting: inputs and initial state are the variables, Drake's own steps the dynamics, our gradients exact."""
+
+from typing import Any
+
+import numpy as np
+from pydrake.autodiffutils import ExtractValue
+from pydrake.solvers import MathematicalProgram
+
+from drake_diff.arrays import Array
+from drake_diff.autodiff import chain, chain_rows
+from drake_diff.cost import differentiate_cost, differentiate_final_cost
+from drake_diff.nonlinear_program import Limits, NlpResult, Report, solve_program
+from drake_diff.problem import Problem
+from drake_diff.rollout import roll_states
+from drake_diff.rollout_gradient import accumulate, linearize
+from drake_diff.step_derivatives import StepDerivatives
+
+DEFAULT_SOLVER = "snopt"
+
+
+def solve_shooting(
+    problem: Problem, xs: Array, us: Array, *, solver: str, limits: Limits, report: Report | None
+) -> tuple[NlpResult, Array, Array]:
+    """Solve `problem` from the guess xs[0] (nx,), us (N, nu); gives (result, xs, us).
+
+    Raises GradientError or SimulationError where a step or its derivative is refused.
+    """
+    variables = ShootingVariables(problem)
+    program = _program(problem, variables)
+    guess = variables.pack(xs[0], us)
+    result = solve_program(program, guess, solver=solver, limits=limits, report=report)
+    x0, found = variables.unpack(result.z)
+    return result, roll_states(problem.model, x0, found), found
+
+
+class ShootingVariables:
+    """The vector z = [free entries of x0; us], and the rollout it stands for, linearized once for each z."""
+
+    def __init__(self, problem: Problem):
+        self.problem = problem
+        self.free = np.flatnonzero(problem.initial_state_mask)
+        self.shape = (problem.num_steps, problem.model.nu)
+        self.size = len(self.free) + (self.shape[0] * self.shape[1] if problem.optimizes_controls else 0)
+        self._at: bytes = b""
+        self._linearization: list[StepDerivatives] = []
+
+    def pack(self, x0: Array, us: Array) -> Array:
+        """z (size,) from x0 (nx,) and us (N, nu)."""
+        inputs = us.ravel() if self.problem.optimizes_controls else np.zeros(0)
+        return np.concatenate([x0[self.free], inputs])
+
+    def unpack(self, z: Array) -> tuple[Array, Array]:
+        """x0 (nx,) and us (N, nu) from z (size,)."""
+        x0 = np.array(self.problem.x0)
+        x0[self.free] = z[: len(self.free)]
+        if not self.problem.optimizes_controls:
+            return x0, np.array(self.problem.us)
+        return x0, z[len(self.free) :].reshape(self.shape)
+
+    def gradient(self, by_x0: Array, by_us: Array) -> Array:
+        """(size,) the gradient by z from those by x0 (nx,) and us (N, nu)."""
+        return self.pack(by_x0, by_us)
+
+    def linearization(self, z: Array) -> list[StepDerivatives]:
+        """The step derivatives along the rollout of z."""
+        if z.tobytes() != self._at:
+            x0, us = self.unpack(z)
+            self._linearization, self._at = linearize(self.problem.model, x0, us), z.tobytes()
+        return self._linearization
+
+    def states(self, z: Array) -> Array:
+        """(N+1, nx) the states of the rollout of z."""
+        x0, us = self.unpack(z)
+        if z.tobytes() == self._at:
+            return np.vstack([x0, [d.x_next for d in self._linearization]])
+        return roll_states(self.problem.model, x0, us)
+
+
+def _program(problem: Problem, variables: ShootingVariables) -> MathematicalProgram:
+    program = MathematicalProgram()
+    z = program.NewContinuousVariables(variables.size, "z")
+    b = problem.bounds
+    lower = variables.pack(b.x_lower, np.tile(b.u_lower, (problem.num_steps, 1)))
+    upper = variables.pack(b.x_upper, np.tile(b.u_upper, (problem.num_steps, 1)))
+    program.AddBoundingBoxConstraint(lower, upper, z).evaluator().set_description("initial state and inputs")
+    if problem.running_cost is not None or problem.final_cost is not None:
+        program.AddCost(RolloutCost(problem, variables), vars=z)
+    wanted = np.flatnonzero(~np.isnan(problem.goal))
+    if len(wanted):
+        goal = problem.goal[wanted]
+        rows = _StateRows(variables, [(problem.num_steps, int(i)) for i in wanted])
+        program.AddConstraint(rows, goal, goal, vars=z, description="goal")
+    bounded = [
+        (k, int(i))
+        for k in range(1, problem.num_steps + 1)
+        for i in np.flatnonzero(np.isfinite(b.x_lower) | np.isfinite(b.x_upper))
+    ]
+    if bounded:
+        columns = [i for _, i in bounded]
+        rows = _StateRows(variables, bounded)
+        program.AddConstraint(rows, b.x_lower[columns], b.x_upper[columns], vars=z, description="state bounds")
+    return program
+
+
+class RolloutCost:
+    """The objective as a function of z, floats or AutoDiffXd, by reverse accumulation."""
+
+    def __init__(self, problem: Problem, variables: ShootingVariables):
+        self.problem, self.variables = problem, variables
+
+    def __call__(self, z: Any) -> Any:
+        if z.dtype == float:
+            return self.value(z)
+        value, gradient, _ = self.differentiate(ExtractValue(z.reshape(-1, 1)).ravel())
+        return chain(value, gradient, z)
+
+    def value(self, z: Array) -> float:
+        """The objective at z."""
+        return self.problem.objective(self.variables.states(z), self.variables.unpack(z)[1])
+
+    def differentiate(self, z: Array) -> tuple[float, Array, Array]:
+        """(value, gradient by z, gradients by every state (N+1, nx)) at z."""
+        problem, (_, us) = self.problem, self.variables.unpack(z)
+        linearization = self.variables.linearization(z)
+        xs, h = self.variables.states(z), problem.model.time_step
+        by_xs, by_us, total = np.zeros_like(xs), np.zeros_like(us), 0.0
+        if problem.running_cost is not None:
+            for k, u in enumerate(us):
+                value, by_x, by_u = differentiate_cost(problem.running_cost, xs[k], u)
+                total += h * value
+                by_xs[k], by_us[k] = h * by_x, h * by_u
+        if problem.final_cost is not None:
+            value, by_xs[-1] = differentiate_final_cost(problem.final_cost, xs[-1])
+            total += value
+        states, inputs, _ = accumulate(linearization, by_xs, by_us)
+        return total, self.variables.gradient(states[0], inputs), states
+
+
+class _StateRows:
+    """Chosen entries (step, coordinate) of the states as a function of z, floats or AutoDiffXd."""
+
+    def __init__(self, variables: ShootingVariables, entries: list[tuple[int, int]]):
+        self.variables = variables
+        self.steps = np.array([k for k, _ in entries])
+        self.coordinates = np.array([i for _, i in entries])
+
+    def __call__(self, z: Any) -> Any:
+        if z.dtype == float:
+            return self.variables.states(z)[self.steps, self.coordinates]
+        at = ExtractValue(z.reshape(-1, 1)).ravel()
+        jacobian = state_sensitivities(self.variables, at)[self.steps, self.coordinates]
+        return chain_rows(self.variables.states(at)[self.steps, self.coordinates], jacobian, z)
+
+
+def state_sensitivities(variables: ShootingVariables, z: Array) -> Array:
+    """(N+1, nx, size): d x_k / d z, forward: S_(k+1) = A_k S_k + B_k d u_k / d z."""
+    linearization = variables.linearization(z)
+    nx, nu, free = variables.problem.model.nx, variables.shape[1], len(variables.free)
+    sensitivities = np.zeros((len(linearization) + 1, nx, variables.size))
+    sensitivities[0, variables.free, np.arange(free)] = 1.0
+    for k, d in enumerate(linearization):
+        sensitivities[k + 1] = d.A @ sensitivities[k]
+        if variables.problem.optimizes_controls:
+            start = free + k * nu
+            sensitivities[k + 1][:, start : start + nu] += d.B
+    return sensitivities

@@ -1,0 +1,237 @@
+"""`solve`: take a problem, a method and a guess; return a Solution whose status was measured, not believed."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from pydrake.autodiffutils import InitializeAutoDiff
+
+from drake_diff.arrays import Array, finite_array, frozen, positive_float, positive_int
+from drake_diff.autodiff import gradient_rows
+from drake_diff.certificate import Certificate, certify_jacobian
+from drake_diff.certify import certify
+from drake_diff.collocation import DEFAULT_SOLVER as COLLOCATION_SOLVER
+from drake_diff.collocation import solve_collocation
+from drake_diff.continuous import EquationsOfMotion
+from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
+from drake_diff.ilqr import check_problem, is_solvable, solve_ilqr
+from drake_diff.nonlinear_program import SOLVERS, Limits, NlpResult
+from drake_diff.problem import Problem
+from drake_diff.rollout import roll_states
+from drake_diff.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
+from drake_diff.shooting import RolloutCost, ShootingVariables, solve_shooting
+from drake_diff.solution import Solution, Status
+from drake_diff.verdict import ended, judged, refused, why_blind
+
+METHODS = ("auto", "collocation", "shooting", "ilqr")
+CERTIFIED_KNOTS = 5
+GUESS_NOISE = 1e-3  # of the largest input: breaks the symmetry of a guess that is a stationary point
+
+Progress = Callable[[str], None]
+Search = Callable[[Array, Array], tuple[NlpResult, Array, Array]]
+
+
+def solve(
+    problem: Problem,
+    *,
+    method: str = "auto",
+    initial_guess: Any = None,
+    solver: str | None = None,
+    max_iterations: int = 500,
+    time_limit: float | None = None,
+    tolerance: float = 1e-8,
+    seed: int = 0,
+    progress: bool | Progress = False,
+) -> Solution:
+    """Solve `problem`, check the gradients that were used, and measure the result again on Drake's plant.
+
+    `method`: "collocation" (smooth, in continuous time), "shooting" (through Drake's own steps, contact
+    included) or "auto". `initial_guess` is None (a straight line to the goal; near zero inputs), (xs, us) with
+    shapes (N+1, nx) and (N, nu), or a Solution. `solver` is "ipopt" or "snopt"; `time_limit` [s]; `tolerance` the
+    solver's on feasibility and optimality; `seed` that of the guess's noise. `progress` prints, or hands each
+    line to a function.
+
+    Raises InputError and its kin, or ModelError, before anything runs; how a solve ended is `Solution.status`.
+    """
+    if method not in METHODS:
+        raise UnknownNameError("method", got=method, known=METHODS)
+    if solver is not None and solver not in SOLVERS:
+        raise UnknownNameError("solver", got=solver, known=SOLVERS)
+    limits = Limits(
+        positive_int("max_iterations", max_iterations),
+        np.inf if time_limit is None else positive_float("time_limit [s]", time_limit),
+        positive_float("tolerance", tolerance),
+    )
+    reason = "asked for"
+    if method == "auto":
+        method, reason = choose_method(problem)
+    solver = solver or {"collocation": COLLOCATION_SOLVER, "shooting": SHOOTING_SOLVER}.get(method, "riccati")
+    xs, us = _guess(problem, method, initial_guess, seed)
+    options = {
+        "max_iterations": limits.max_iterations,
+        "time_limit": time_limit,
+        "tolerance": limits.tolerance,
+        "seed": seed,
+        "method_reason": reason,
+        "initial_guess": "default" if initial_guess is None else "given",
+    }
+    report = print if progress is True else (progress or None)
+    run = _Run(problem, method, solver, limits, options, report)
+    if method == "collocation":
+        return run.collocate(xs, us)
+    if method == "ilqr":
+        return run.sweep(us)
+    if initial_guess is None and is_solvable(problem):
+        us = run.improved_guess(us)
+    return run.shoot(xs, us)
+
+
+def choose_method(problem: Problem) -> tuple[str, str]:
+    """("collocation" or "shooting", why)."""
+    contract = problem.model.contract
+    if not problem.optimizes_controls:
+        return "shooting", "the controls are not optimized"
+    if contract.contact.collision_pairs:
+        return "shooting", "the model has geometries that can touch, which collocation leaves out"
+    if contract.constraints or any(actuator.kp is not None for actuator in contract.actuators):
+        return "shooting", "the model has constraints or PD control, which collocation leaves out"
+    return "collocation", "the model is smooth"
+
+
+def _guess(problem: Problem, method: str, given: Any, seed: int) -> tuple[Array, Array]:
+    model, count = problem.model, problem.num_steps
+    if isinstance(given, Solution):
+        given = (given.xs, given.us)
+    if given is not None:
+        if not (isinstance(given, (tuple, list)) and len(given) == 2):
+            raise InputError("initial_guess", got=type(given).__name__, expected="None, (xs, us) or a Solution")
+        xs = finite_array("initial_guess xs", given[0], (count + 1, model.nx))
+        return xs, finite_array("initial_guess us", given[1], (count, model.nu))
+    end = np.where(np.isnan(problem.goal), problem.x0, problem.goal)
+    xs = problem.x0 + np.linspace(0, 1, count + 1)[:, None] * (end - problem.x0)
+    us = np.array(problem.us)
+    if method == "shooting" and problem.optimizes_controls and not us.any():
+        limit = np.minimum(np.abs(problem.bounds.u_lower), np.abs(problem.bounds.u_upper))
+        size = np.where(np.isfinite(limit), limit, 1.0)
+        us = GUESS_NOISE * size * np.random.default_rng(seed).standard_normal(us.shape)
+    inside = np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
+    return xs, inside if problem.optimizes_controls else us
+
+
+class _Run:
+    """One solve: certify at the guess, solve, certify at the result, measure, judge."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        method: str,
+        solver: str,
+        limits: Limits,
+        options: dict[str, Any],
+        report: Progress | None,
+    ):
+        self.problem, self.method, self.solver = problem, method, solver
+        self.limits, self.options, self.report = limits, options, report
+        self.start = time.monotonic()
+        self.knots = np.unique(np.linspace(0, problem.num_steps - 1, CERTIFIED_KNOTS).astype(int))
+
+    def collocate(self, xs: Array, us: Array) -> Solution:
+        equations = EquationsOfMotion(self.problem.model)
+        before = self._certify_equations(equations, xs, us)
+        result, xs, us, u_final = solve_collocation(
+            self.problem, xs, us, solver=self.solver, limits=self.limits, report=self.report
+        )
+        after = self._certify_equations(equations, xs, us) if np.all(np.isfinite(xs)) else ()
+        draft = self._draft(xs, us, u_final=u_final, certificates=before + after)
+        return judged(draft, result)
+
+    def sweep(self, us: Array) -> Solution:
+        check_problem(self.problem)
+
+        def search(xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
+            return solve_ilqr(self.problem, us, limits=self.limits, report=self.report)
+
+        return self._through_steps(np.tile(self.problem.x0, (len(us) + 1, 1)), us, search)
+
+    def shoot(self, xs: Array, us: Array) -> Solution:
+        def search(xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
+            return solve_shooting(self.problem, xs, us, solver=self.solver, limits=self.limits, report=self.report)
+
+        return self._through_steps(xs, us, search)
+
+    def improved_guess(self, us: Array) -> Array:
+        """`us` after iLQR, which gets out of curved valleys of the cost that shooting crawls along."""
+        try:
+            result, _, improved = solve_ilqr(self.problem, us, limits=self.limits, report=self.report)
+        except (GradientError, SimulationError):
+            return us  # shooting meets the same refusal and says so in its status
+        self.options["initial_guess"] = f"default, then {result.message}"
+        return improved
+
+    def _through_steps(self, xs: Array, us: Array, search: Search) -> Solution:
+        """Certify, search, certify again, on Drake's own steps."""
+        variables = ShootingVariables(self.problem)
+        try:
+            xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us))
+        except (GradientError, SimulationError) as error:
+            return refused(self._draft(xs, us), error)
+        if blindness:
+            return ended(self._draft(xs, us, certificates=before), Status.NO_GRADIENT, blindness)
+        try:
+            result, xs, us = search(xs, us)
+            z = variables.pack(xs[0], us)
+            xs, us, after, blindness = self._look_at(variables, z)
+        except (GradientError, SimulationError) as error:
+            return refused(self._draft(xs, us, certificates=before), error)
+        norms = np.linalg.norm(RolloutCost(self.problem, variables).differentiate(z)[2], axis=1)
+        draft = self._draft(xs, us, certificates=before + after, gradient_norms=frozen(norms))
+        solution = judged(draft, result)
+        return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
+
+    def _draft(self, xs: Array, us: Array, **found: Any) -> Solution:
+        if found.get("u_final") is not None:
+            found["u_final"] = frozen(found["u_final"])
+        return Solution(
+            problem=self.problem,
+            method=self.method,
+            solver=self.solver,
+            status=Status.FAILED,
+            message="",
+            xs=frozen(xs),
+            us=frozen(us),
+            options=self.options,
+            wall_time=time.monotonic() - self.start,
+            **found,
+        )
+
+    def _look_at(self, variables: ShootingVariables, z: Array) -> tuple[Array, Array, tuple[Certificate, ...], str]:
+        """xs and us of z, certificates of some of its steps, and why the goal or cost is out of its reach."""
+        x0, us = variables.unpack(z)
+        xs = roll_states(self.problem.model, x0, us)
+        certificates = tuple(certify(self.problem.model, xs[k], us[k]) for k in self.knots)
+        return xs, us, certificates, why_blind(self.problem, variables, z)
+
+    def _certify_equations(self, equations: EquationsOfMotion, xs: Array, us: Array) -> tuple[Certificate, ...]:
+        model = self.problem.model
+        names = tuple(f"d({name})/dt" for name in model.state_names)
+
+        def f(z: Array) -> Array:
+            return equations(z[: model.nx], z[model.nx :])
+
+        def jacobian(z: Array) -> Array:
+            variables = InitializeAutoDiff(z).ravel()
+            return gradient_rows(equations.autodiff(variables[: model.nx], variables[model.nx :]), len(z))
+
+        return tuple(
+            certify_jacobian(
+                f,
+                np.concatenate([xs[k], us[k]]),
+                jacobian,
+                rows=names,
+                columns=model.state_names + model.input_names,
+                method="autodiff, continuous time",
+                subject=f"the equations of motion of {model.name}",
+            )
+            for k in self.knots
+        )

@@ -1,0 +1,43 @@
+"""One discrete step of Drake's double plant."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_diff.arrays import Array, finite_array
+from drake_diff.exceptions import SimulationError
+from drake_diff.model import Model, Twin
+
+
+def step(model: Model, x: ArrayLike, u: ArrayLike | None = None) -> Array:
+    """(nx,): the state one `model.time_step` after `x` (nx,) under the constant input `u` (nu,) [N or N m].
+
+    `u` may be left out where the model has no actuators. Raises ShapeError, NonFiniteError, or SimulationError
+    where Drake cannot take the step or its result is not finite.
+    """
+    return advance(model.double, *check_point(model, x, u))
+
+
+def check_point(model: Model, x: ArrayLike, u: ArrayLike | None) -> tuple[Array, Array]:
+    """`x` and `u` as finite arrays of the model's sizes."""
+    no_input = u is None and model.nu == 0
+    return finite_array("x", x, (model.nx,)), finite_array("u", [] if no_input else u, (model.nu,))
+
+
+def advance(twin: Twin, x: Any, u: Any) -> Any:
+    """(nx,): one step of the twin, floats or AutoDiffXd; sizes are the caller's business.
+
+    The context is left at (x, u), so that what Drake computed on the way (contacts, efforts) can be read.
+    """
+    plant, context = twin.plant, twin.context
+    plant.SetPositionsAndVelocities(context, x)
+    plant.get_actuation_input_port().FixValue(context, u)
+    try:
+        # value() is a view that the next step overwrites.
+        x_next = np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())
+    except RuntimeError as error:
+        raise SimulationError(f"Drake cannot take this step: {error}") from error
+    if x_next.dtype == float and not np.all(np.isfinite(x_next)):
+        raise SimulationError(f"the step leads to {x_next}, which is not finite, from x = {x}, u = {u}")
+    return x_next

@@ -1,0 +1,110 @@
+"""The status of a solve: what the solver says, cut down to what was measured again on Drake's plant."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from drake_diff.arrays import Array
+from drake_diff.contact import penetration
+from drake_diff.cost import differentiate_final_cost
+from drake_diff.exceptions import GradientError
+from drake_diff.nonlinear_program import NlpResult, Outcome
+from drake_diff.problem import Problem
+from drake_diff.shooting import ShootingVariables, state_sensitivities
+from drake_diff.solution import FEASIBILITY_TOLERANCE, INTEGRATION_TOLERANCE, Solution, Status
+
+NO_EFFECT = 1e-12
+
+
+def why_blind(problem: Problem, variables: ShootingVariables, z: Array) -> str:
+    """Which part of the goal, or the final cost, nothing in z has an effect on; empty where there is none."""
+    last = state_sensitivities(variables, z)[-1]
+    x_final = variables.states(z)[-1]
+    effect = np.abs(last).max(axis=1, initial=0.0)
+    wrong = np.abs(problem.goal_error(x_final)) > FEASIBILITY_TOLERANCE
+    deaf = np.flatnonzero(wrong & (effect < NO_EFFECT))
+    if len(deaf):
+        return f"no variable moves {problem.model.state_names[deaf[0]]}, whose goal is not reached"
+    if problem.final_cost is not None:
+        _, slope = differentiate_final_cost(problem.final_cost, x_final)
+        if np.abs(slope).max() > NO_EFFECT and np.abs(slope @ last).max(initial=0.0) < NO_EFFECT:
+            return "no variable changes the final cost, although the final state does"
+    return ""
+
+
+def refused(draft: Solution, error: Exception) -> Solution:
+    status = Status.NO_GRADIENT if isinstance(error, GradientError) else Status.DIVERGED
+    return ended(draft, status, str(error))
+
+
+def ended(draft: Solution, status: Status, detail: str, **fields: Any) -> Solution:
+    return replace(
+        draft, status=status, message=f"{status.sentence}: {detail}" if detail else status.sentence, **fields
+    )
+
+
+_STATUSES = {
+    Outcome.ITERATION_LIMIT: Status.ITERATION_LIMIT,
+    Outcome.TIME_LIMIT: Status.TIME_LIMIT,
+    Outcome.INFEASIBLE: Status.INFEASIBLE,
+    Outcome.UNBOUNDED: Status.DIVERGED,
+    Outcome.INTERRUPTED: Status.INTERRUPTED,
+    Outcome.DIVERGED: Status.DIVERGED,
+    Outcome.NO_GRADIENT: Status.NO_GRADIENT,
+    Outcome.FAILED: Status.FAILED,
+}
+
+
+def judged(draft: Solution, result: NlpResult) -> Solution:
+    """The draft with the status that the solver's outcome and our own measures allow."""
+    fields = {"iterations": result.iterations, "solver_message": result.message}
+    complaints = list(complaints_about(draft))
+    if result.outcome in _STATUSES:
+        detail = "; ".join([result.message, *complaints])
+        return ended(draft, _STATUSES[result.outcome], detail, **fields)
+    if result.outcome is Outcome.INACCURATE:
+        complaints.insert(0, f"the solver could not reach its tolerance ({result.message})")
+    if not np.all(np.isfinite(draft.xs)):
+        return ended(draft, Status.DIVERGED, "; ".join(complaints), **fields)
+    status = Status.CONVERGED_NOT_VERIFIED if complaints else Status.CONVERGED
+    return ended(draft, status, "; ".join(complaints), **fields)
+
+
+def complaints_about(solution: Solution) -> Iterator[str]:
+    """What does not hold of `solution` when measured again on Drake's plant, a clause each."""
+    for name, value in (
+        ("defect", solution.defect),
+        ("goal error", solution.goal_error),
+        ("bound violation", solution.bound_violation),
+        ("initial state error", solution.initial_state_error),
+    ):
+        if not value <= FEASIBILITY_TOLERANCE:
+            yield f"{name} {value:.3g} is above {FEASIBILITY_TOLERANCE:g}"
+    if not np.isfinite(solution.cost):
+        yield "the cost is not finite"
+    if solution.u_final is not None:
+        if not solution.integration_error <= INTEGRATION_TOLERANCE:
+            knot = int(np.argmax(solution.integration_errors))
+            yield (
+                f"an accurate integration from knot {knot} misses the next by {solution.integration_error:.3g}, "
+                f"tolerance {INTEGRATION_TOLERANCE:g}: take a smaller time step"
+            )
+        depth, knot = _deepest(solution)
+        if depth > 0:
+            yield f"geometries overlap by {depth:.3g} m at knot {knot}, and collocation leaves contact out"
+    for certificate in solution.certificates:
+        if certificate.verdict != "agree":
+            yield f"a gradient certificate says {certificate.verdict}: {certificate.worst}"
+            break
+
+
+def _deepest(solution: Solution) -> tuple[float, int]:
+    """The largest overlap of geometries at the knots, and the knot."""
+    model = solution.problem.model
+    depths = []
+    for x in solution.xs:
+        model.plant.SetPositionsAndVelocities(model.double.context, x)
+        depths.append(penetration(model))
+    return max(depths), int(np.argmax(depths))
