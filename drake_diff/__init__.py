@@ -6,6 +6,9 @@ from drake_diff.certify import certify as certify
 from drake_diff.certify import certify_rollout as certify_rollout
 from drake_diff.contract import Contract as Contract
 from drake_diff.cost import QuadraticCost as QuadraticCost
+from drake_diff.evidence import EvidenceRecord as EvidenceRecord
+from drake_diff.evidence import load_record as load_record
+from drake_diff.evidence import save as save
 from drake_diff.exceptions import ArtifactError as ArtifactError
 from drake_diff.exceptions import CertificateError as CertificateError
 from drake_diff.exceptions import DrakeDiffError as DrakeDiffError

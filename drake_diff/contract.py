@@ -79,8 +79,8 @@ class CollisionGeometry:
     shape: str
     friction: float | None
     stiffness: float | None  # [N/m]
-    dissipation: float | None  # Hunt-Crossley [s/m]
-    relaxation_time: float | None  # [s]
+    dissipation: float | None  # Hunt-Crossley [s/m]: similar and lagged contact
+    relaxation_time: float | None  # [s]: sap contact
     hydroelastic_modulus: float | None  # [Pa]
 
 
@@ -312,9 +312,16 @@ def _lines(c: Contract) -> list[str]:
     for g in c.geometries:
         lines.append(
             f"  collision  {g.name} of {g.body}: {g.shape}, friction {_or_default(g.friction)},"
-            f" stiffness {_or_default(g.stiffness)} N/m, dissipation {_or_default(g.dissipation)} s/m"
+            f" stiffness {_or_default(g.stiffness)} N/m, {_damping_of_contact(c.contact.approximation, g)}"
         )
     return lines + [f"  note       {note}" for note in c.notes]
+
+
+def _damping_of_contact(approximation: str, g: CollisionGeometry) -> str:
+    """What damps contact: sap knows only the relaxation time, similar and lagged only Hunt-Crossley's number."""
+    if approximation == "sap":
+        return f"relaxation time {_or_default(g.relaxation_time)} s"
+    return f"dissipation {_or_default(g.dissipation)} s/m"
 
 
 def _row(values: tuple[float, ...]) -> str:

@@ -101,6 +101,11 @@ class Solution:
         return total if np.isfinite(total) else float("inf")
 
     @property
+    def times(self) -> Array:
+        """(N+1,) [s] of the states."""
+        return self.problem.model.time_step * np.arange(len(self.xs))
+
+    @property
     def inputs_at_knots(self) -> Array:
         """The inputs at the knots: (N, nu) held ones, (N+1, nu) where they are linear in between."""
         return self.us if self.u_final is None else np.vstack([self.us, self.u_final])

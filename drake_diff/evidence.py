@@ -1,0 +1,410 @@
+"""The record of a run: what was asked, what came out, what was measured again, and with which versions.
+
+`EvidenceRecord` has nothing to do with RFC 4998, which uses the name for archive time stamps. A run directory is
+written so that record.json is complete last: a run that is killed leaves one that says "incomplete".
+"""
+
+import json
+import math
+import platform
+import subprocess
+import sys
+from datetime import UTC, datetime
+from hashlib import sha256
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from drake_diff.certificate import VERDICTS, Certificate
+from drake_diff.exceptions import ArtifactError
+from drake_diff.problem import Problem
+from drake_diff.solution import FEASIBILITY_TOLERANCE, INTEGRATION_TOLERANCE, Solution, Status
+from drake_diff.whole_file import write_whole
+
+SCHEMA_VERSION = "0.1.0"
+RECORD, TRACE, REPLAY = "record.json", "trace.mcap", "replay.html"
+PACKAGES = ("drake", "drake-diff", "numpy", "mcap", "protobuf", "foxglove-schemas-protobuf", "pydantic")
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+class Quantity(_Part):
+    """A number with its unit; `value` is None where there is no finite one, and `reason` says why."""
+
+    value: float | None
+    unit: str
+    reason: str | None = None
+
+
+class Check(_Part):
+    """Something measured on the plant after the solve. Without a bound it informs, and `passed` is None."""
+
+    name: str
+    definition: str
+    quantity: Quantity
+    bound: float | None = None
+    passed: bool | None = None
+
+
+class GradientEvidence(_Part):
+    """One certificate: what was compared, where the derivative came from, and the entry that is worst."""
+
+    subject: str
+    method: str
+    verdict: str
+    entries: int
+    counts: dict[str, int]
+    worst: str | None
+
+
+class Failure(_Part):
+    """Why a run is no success, under one of the five labels."""
+
+    label: Literal["perception_error", "state_error", "planning_error", "control_error", "evaluation_error"]
+    code: str
+    message: str
+
+
+class FileEvidence(_Part):
+    """A file of the run directory, or one the run was made from."""
+
+    path: str
+    bytes: int
+    sha256: str
+
+
+class Solver(_Part):
+    """What solved the problem, and how it says it ended."""
+
+    method: str
+    solver: str
+    status: str
+    message: str
+    solver_message: str
+    options: dict[str, Any]
+    iterations: int
+
+
+class Provenance(_Part):
+    """With what the run was made."""
+
+    python: str
+    platform: str
+    packages: dict[str, str]
+    git: dict[str, str | bool] | None
+    command: list[str]
+    model_file: FileEvidence | None
+
+
+class WallClock(_Part):
+    """What differs from run to run: everything else in the record is the same, byte for byte."""
+
+    written_utc: str
+    solve_s: float | None = None
+
+
+class EvidenceRecord(_Part):
+    """Everything a stranger needs to judge the run, except the motion itself, which is in trace.mcap."""
+
+    schema_version: str = SCHEMA_VERSION
+    name: str
+    state: Literal["incomplete", "complete"]
+    verdict: Literal["pass", "fail", "incomplete"]
+    sentence: str
+    problem: dict[str, Any]
+    contract: dict[str, Any]
+    solver: Solver | None = None
+    checks: list[Check] = []
+    gradients: list[GradientEvidence] = []
+    gradient_norms: list[float] = []
+    failures: list[Failure] = []
+    provenance: Provenance
+    wall_clock: WallClock
+    files: dict[str, FileEvidence] = {}
+
+    def as_row(self) -> dict[str, str]:
+        """The textbook's view of the record: section, tool, observation, action, metric, perturbation."""
+        positions = self.contract["positions"] + self.contract["velocities"]
+        metrics = [f"{c.name} {c.quantity.value} {c.quantity.unit}" for c in self.checks]
+        return {
+            "section": "differentiable physics",
+            "tool": f"drake {self.provenance.packages.get('drake', '?')}, {self.solver.method if self.solver else '-'}",
+            "observation": ", ".join(f"{x['name']} [{x['unit']}]" for x in positions),
+            "action": ", ".join(f"{x['name']} [{x['unit']}]" for x in self.contract["inputs"]),
+            "metric": "; ".join(metrics),
+            "perturbation": "none",
+        }
+
+    def to_json(self) -> str:
+        """The record as JSON with sorted keys; the same record gives the same bytes."""
+        return json.dumps(self.model_dump(mode="json"), sort_keys=True, indent=2, allow_nan=False) + "\n"
+
+
+def load_record(directory: str | Path) -> EvidenceRecord:
+    """The record in a run directory. ArtifactError where there is none or it does not hold to the schema."""
+    path = Path(directory) / RECORD
+    try:
+        return EvidenceRecord.model_validate_json(path.read_text())
+    except FileNotFoundError as error:
+        raise ArtifactError(f"{path}: no such record; expected a run directory that drake_diff wrote") from error
+    except (ValidationError, UnicodeDecodeError) as error:
+        raise ArtifactError(f"{path} is no record of schema {SCHEMA_VERSION}: {error}") from error
+
+
+def begin(directory: str | Path, problem: Problem) -> None:
+    """Mark `directory` as a run that is under way: whatever happens next, its record says "incomplete"."""
+    folder = Path(directory)
+    folder.mkdir(parents=True, exist_ok=True)
+    sentence = "the run has begun and not ended: it is under way, or it was killed"
+    record = _record(folder.name, problem, state="incomplete", verdict="incomplete", sentence=sentence)
+    write_whole(folder / RECORD, record.to_json().encode())
+
+
+def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
+    """Write the run directory of `solution`: record.json, trace.mcap and replay.html; gives the record.
+
+    Each file is written aside and moved into place, record.json last, so that at any moment the record is
+    complete only if everything it names is.
+    """
+    from drake_diff.meshcat_view import write_replay  # what a script that saves nothing need not load
+    from drake_diff.trace import write_trace
+
+    folder = Path(directory)
+    begin(folder, solution.problem)
+    complete = _record(
+        folder.name,
+        solution.problem,
+        state="complete",
+        verdict="pass" if solution.success else "fail",
+        sentence=solution.message,
+        solver=_solver(solution),
+        checks=_checks(solution),
+        gradients=[_gradient(c) for c in solution.certificates],
+        gradient_norms=[] if solution.gradient_norms is None else _finite_list(solution.gradient_norms),
+        failures=_failures(solution),
+        solve_s=solution.wall_time,
+    )
+    write_trace(folder / TRACE, solution, {RECORD: ("application/json", _reproducible(complete))})
+    motion = solution.replay
+    model = solution.problem.model
+    write_replay(
+        folder / REPLAY,
+        model,
+        solution.times,
+        solution.xs if motion is None else motion.xs,
+        contacts=() if motion is None else motion.contacts,
+        planned_xs=solution.xs if solution.u_final is not None and motion is not None else None,
+        title=f"{folder.name}: {solution.status.value}",
+    )
+    files = {name: file_evidence(folder / name, name) for name in (TRACE, REPLAY)}
+    complete = complete.model_copy(update={"files": files})
+    write_whole(folder / RECORD, complete.to_json().encode())
+    return complete
+
+
+def file_evidence(path: Path, name: str) -> FileEvidence:
+    """Size and hash of the file at `path`, under the name it has in the record."""
+    data = path.read_bytes()
+    return FileEvidence(path=name, bytes=len(data), sha256=sha256(data).hexdigest())
+
+
+def _record(name: str, problem: Problem, *, solve_s: float | None = None, **fields: Any) -> EvidenceRecord:
+    return EvidenceRecord(
+        name=name,
+        problem=_describe(problem),
+        contract=problem.model.contract.to_dict(),
+        provenance=_provenance(problem),
+        wall_clock=WallClock(written_utc=datetime.now(UTC).isoformat(timespec="seconds"), solve_s=solve_s),
+        **fields,
+    )
+
+
+def _reproducible(record: EvidenceRecord) -> bytes:
+    """The record without wall-clock facts and without the files' hashes, which could not hold their own."""
+    fields = record.model_dump(mode="json")
+    del fields["wall_clock"], fields["files"]
+    return (json.dumps(fields, sort_keys=True, indent=2, allow_nan=False) + "\n").encode()
+
+
+def _describe(problem: Problem) -> dict[str, Any]:
+    b = problem.bounds
+    return {
+        "num_steps": problem.num_steps,
+        "time_step_s": problem.model.time_step,
+        "horizon_s": problem.num_steps * problem.model.time_step,
+        "state_names": list(problem.model.state_names),
+        "input_names": list(problem.model.input_names),
+        "x0": _finite_list(problem.x0),
+        "x_goal": _finite_list(problem.goal),
+        "x_lower": _finite_list(b.x_lower),
+        "x_upper": _finite_list(b.x_upper),
+        "u_lower": _finite_list(b.u_lower),
+        "u_upper": _finite_list(b.u_upper),
+        "optimize": list(problem.optimize),
+        "running_cost": _name(problem.running_cost),
+        "final_cost": _name(problem.final_cost),
+        "initial_state_free": [bool(free) for free in problem.initial_state_mask],
+    }
+
+
+def _finite_list(values: Any) -> list[float | None]:
+    """Numbers for JSON; None where there is no bound or no goal (infinite, NaN)."""
+    return [float(v) if math.isfinite(v) else None for v in np.asarray(values).ravel()]
+
+
+def _name(cost: Any) -> Any:
+    if cost is None or not hasattr(cost, "Q"):
+        return None if cost is None else getattr(cost, "__qualname__", type(cost).__name__)
+    parts = {name: getattr(cost, name) for name in ("Q", "R", "x_ref", "u_ref")}
+    return {"QuadraticCost": {name: np.asarray(v).tolist() for name, v in parts.items() if v is not None}}
+
+
+def _solver(solution: Solution) -> Solver:
+    return Solver(
+        method=solution.method,
+        solver=solution.solver,
+        status=solution.status.value,
+        message=solution.message,
+        solver_message=solution.solver_message,
+        options=solution.options,
+        iterations=len(solution.iterations),
+    )
+
+
+def _checks(solution: Solution) -> list[Check]:
+    """Every measure of the solution and of its replay; those with a bound decide, the others inform."""
+    tolerance = FEASIBILITY_TOLERANCE
+    checks = [
+        _check("cost", "objective of the states and inputs as the problem defines it", solution.cost, "1"),
+        _check("defect", "largest distance from the dynamics over one step", solution.defect, "q, v", tolerance),
+        _check(
+            "goal error", "largest distance of the final state from the goal", solution.goal_error, "q, v", tolerance
+        ),
+        _check("bound violation", "largest excess over a bound", solution.bound_violation, "q, v, u", tolerance),
+        _check(
+            "initial state error",
+            "distance of the first state from x0",
+            solution.initial_state_error,
+            "q, v",
+            tolerance,
+        ),
+    ]
+    if solution.u_final is not None:
+        definition = "largest distance of a knot from an accurate integration from the knot before"
+        checks.append(
+            _check("integration error", definition, solution.integration_error, "q, v", INTEGRATION_TOLERANCE)
+        )
+    return checks + _replay_checks(solution)
+
+
+def _replay_checks(solution: Solution) -> list[Check]:
+    r = solution.replay
+    if r is None:
+        missing = "the discrete plant could not be stepped along these inputs"
+        return [
+            Check(
+                name="replay",
+                definition="open-loop replay on the discrete plant",
+                quantity=Quantity(value=None, unit="1", reason=missing),
+                passed=False,
+            )
+        ]
+    end = float(np.abs(r.xs[-1] - solution.xs[-1]).max())
+    scale = "in the open-loop replay on the discrete plant"
+    return [
+        _check("replay end error", f"largest distance of the final state {scale} from the plan's", end, "q, v"),
+        _check(
+            "energy drift", f"lasting energy that actuators and damping do not explain, {scale}", r.energy_drift, "J"
+        ),
+        _check(
+            "energy oscillation",
+            f"largest oscillation of that energy about its drift, {scale}",
+            r.energy_oscillation,
+            "J",
+        ),
+        _check("energy scale", f"range of kinetic plus potential energy {scale}", float(np.ptp(r.energy)), "J"),
+        _check("penetration", f"largest overlap of two geometries {scale}", float(r.penetration.max()), "m"),
+        _check(
+            "constraint violation",
+            f"largest excess over a joint limit or of a quaternion's norm {scale}",
+            float(r.constraint_violation.max()),
+            "q",
+        ),
+    ]
+
+
+def _check(name: str, definition: str, value: float, unit: str, bound: float | None = None) -> Check:
+    finite = math.isfinite(value)
+    quantity = Quantity(value=value if finite else None, unit=unit, reason=None if finite else "not finite")
+    passed = None if bound is None else bool(value <= bound)
+    return Check(name=name, definition=definition, quantity=quantity, bound=bound, passed=passed)
+
+
+def _gradient(certificate: Certificate) -> GradientEvidence:
+    return GradientEvidence(
+        subject=certificate.subject,
+        method=certificate.method,
+        verdict=certificate.verdict,
+        entries=int(certificate.codes.size),
+        counts={v: certificate.count(v) for v in VERDICTS},
+        worst=str(certificate.worst) if certificate.codes.size else None,
+    )
+
+
+_FAILURES: dict[Status, tuple[str, str]] = {
+    Status.CONVERGED_NOT_VERIFIED: ("planning_error", "not_verified"),
+    Status.ITERATION_LIMIT: ("planning_error", "solver_iteration_limit"),
+    Status.TIME_LIMIT: ("planning_error", "latency_budget_exceeded"),
+    Status.INFEASIBLE: ("planning_error", "solver_infeasible"),
+    Status.DIVERGED: ("state_error", "simulation_diverged"),
+    Status.NO_GRADIENT: ("planning_error", "gradient_vanishing"),
+    Status.INTERRUPTED: ("evaluation_error", "interrupted"),
+    Status.FAILED: ("planning_error", "solver_numerical"),
+}
+
+
+def _failures(solution: Solution) -> list[Failure]:
+    if solution.success:
+        return []
+    label, code = _FAILURES[solution.status]
+    failures = [Failure(label=label, code=code, message=solution.message)]  # type: ignore[arg-type]
+    bad = next((c for c in solution.certificates if c.verdict != "agree"), None)
+    if bad is not None:
+        failures.append(Failure(label="planning_error", code="gradient_mismatch", message=f"{bad.subject}: {bad}"))
+    return failures
+
+
+def _provenance(problem: Problem) -> Provenance:
+    source = problem.model.source
+    return Provenance(
+        python=platform.python_version(),
+        platform=f"{platform.system()} {platform.machine()}",
+        packages={name: found for name in PACKAGES if (found := _version(name))},
+        git=_git(),
+        command=[Path(sys.argv[0]).name, *sys.argv[1:]],
+        model_file=file_evidence(source, source.name) if source is not None else None,
+    )
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _git() -> dict[str, str | bool] | None:
+    """Commit and dirty flag of the working directory, None where it is no git checkout or there is no git."""
+    try:
+        run = [
+            subprocess.run(["git", *words], capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+            for words in (["rev-parse", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
+        ]
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return {"commit": run[0], "dirty": bool(run[1])}
