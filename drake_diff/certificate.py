@@ -184,7 +184,8 @@ def certify_displacement(
     difference, tolerance, codes = _judge(derivative, (forward + backward) / 2, value_scale, solver_tolerance)
     jumps = _not_smooth(forward, backward, derivative, value_scale, solver_tolerance)
     if beside is not None:
-        jumps |= _jittery(derivative, beside)
+        reach = np.maximum(np.abs(forward), np.abs(backward)).max(axis=0, initial=0)
+        jumps |= _jittery(derivative, beside, reach)
     codes[jumps] = VERDICTS.index("discontinuous")
     return Certificate(
         rows,
@@ -259,8 +260,11 @@ def _stays_apart(gap: Array, a: Array, noise: Array) -> NDArray[np.bool_]:
     return found
 
 
-def _jittery(a: Array, beside: Array) -> NDArray[np.bool_]:
-    """Entries that are another number right beside the point."""
-    size = np.abs(a) + np.abs(beside)
-    row_size = size.max(axis=1, keepdims=True) if size.size else size
-    return np.asarray((np.abs(a - beside) > JITTER_CHANGE * size) & (size > NEGLIGIBLE * row_size))
+def _jittery(a: Array, beside: Array, reach: Array) -> NDArray[np.bool_]:
+    """Entries that are another number right beside the point; `reach` is the largest quotient seen around it.
+
+    A smooth entry changes by about 1e-9 of its derivative's slope, and by 1e-2 of it over the widest quotient.
+    """
+    change, size = np.abs(a - beside), np.abs(a) + np.abs(beside)
+    row_size = size.max(axis=1, keepdims=True, initial=0)
+    return (change > JITTER_CHANGE * size) & (size > NEGLIGIBLE * row_size) & (change > RESOLVED * reach)

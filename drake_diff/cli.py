@@ -40,10 +40,9 @@ def run(
     problem = module.problem()
     options = dict(getattr(module, "solve_options", {}))
     directory = out or Path("artifacts") / script.stem
-    begin(directory, problem)
     console.print(f"[bold]{escape(script.name)}[/]: {escape(repr(problem.model))}, {problem.num_steps} steps")
     with _progress(console) as report:
-        solution = solve(problem, progress=report, **options)
+        solution = solve(problem, progress=report, on_start=lambda: begin(directory, problem), **options)
     record = save(solution, directory)
     _print_record(console, record, directory)
     raise typer.Exit(HOLDS if record.verdict == "pass" else CHECK_FAILED)

@@ -10,7 +10,6 @@ from drake_diff.arrays import Array
 from drake_diff.autodiff import chain
 from drake_diff.continuous import ContinuousSystem, EquationsOfMotion
 from drake_diff.cost import QuadraticCost, differentiate_cost, differentiate_final_cost
-from drake_diff.exceptions import InputError
 from drake_diff.nonlinear_program import Limits, NlpResult, Report, solve_program
 from drake_diff.problem import Problem
 
@@ -23,10 +22,8 @@ def solve_collocation(
     """Solve `problem` from the guess xs (N+1, nx), us (N, nu); gives (result, xs, us, u_final).
 
     N intervals of exactly model.time_step; inputs linear between knots; running cost by the trapezoid rule.
-    Raises ModelError where the model has no continuous form, InputError where the controls are not optimized.
+    Raises ModelError where the model has no continuous form.
     """
-    if not problem.optimizes_controls:
-        raise InputError("optimize", got=list(problem.optimize), expected='"controls" for method="collocation"')
     transcription = _Transcription(problem)
     guess = transcription.pack(xs, np.vstack([us, us[-1:]]))
     result = solve_program(transcription.program, guess, solver=solver, limits=limits, report=report)

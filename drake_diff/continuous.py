@@ -19,6 +19,7 @@ from drake_diff.arrays import Array
 from drake_diff.exceptions import ModelError
 from drake_diff.model import Model, Twin
 from drake_diff.plant_elements import actuators
+from drake_diff.step import set_state
 
 
 class EquationsOfMotion:
@@ -38,22 +39,19 @@ class EquationsOfMotion:
     def __call__(self, x: Array, u: Array) -> Array:
         """(nx,) dx/dt at `x` (nx,), `u` (nu,)."""
         twin = self.model.double
-        self._set(twin, x)
+        set_state(twin, x)
         acceleration, _ = self._acceleration(u)
         return np.concatenate([self._q_dot(twin, x), acceleration])
 
     def autodiff(self, x: Any, u: Any) -> Any:
         """The same with AutoDiffXd in and out."""
-        self._set(self.model.double, ExtractValue(x).ravel())
+        set_state(self.model.double, ExtractValue(x).ravel())
         acceleration, mass = self._acceleration(ExtractValue(u).ravel())
         twin = self.model.autodiff
-        self._set(twin, x)
+        set_state(twin, x)
         constant = np.array([AutoDiffXd(a) for a in acceleration])
         residual = self._inverse_dynamics(twin, MultibodyForces_[AutoDiffXd], constant) - self.actuation @ u
         return np.concatenate([self._q_dot(twin, x), acceleration - np.linalg.inv(mass) @ residual])
-
-    def _set(self, twin: Twin, x: Any) -> None:
-        twin.plant.SetPositionsAndVelocities(twin.context, x)
 
     def _q_dot(self, twin: Twin, x: Any) -> Any:
         v = x[self.model.nq :]

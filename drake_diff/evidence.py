@@ -196,7 +196,7 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
         folder / REPLAY,
         model,
         solution.times,
-        solution.xs if motion is None else motion.xs,
+        _drawable(solution) if motion is None else motion.xs,
         contacts=() if motion is None else motion.contacts,
         planned_xs=solution.xs if solution.u_final is not None and motion is not None else None,
         title=f"{folder.name}: {solution.status.value}",
@@ -205,6 +205,12 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
     complete = complete.model_copy(update={"files": files})
     write_whole(folder / RECORD, complete.to_json().encode())
     return complete
+
+
+def _drawable(solution: Solution) -> np.ndarray:
+    """The solver's states, those that are not finite at the problem's x0: a page cannot show nothing."""
+    finite = np.all(np.isfinite(solution.xs), axis=1)
+    return np.where(finite[:, None], solution.xs, solution.problem.x0)
 
 
 def file_evidence(path: Path, name: str) -> FileEvidence:

@@ -1,6 +1,8 @@
 """An MCAP file of protobuf channels: written whole, byte for byte the same for the same content, read with its CRCs."""
 
 import json
+import struct
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -19,6 +21,9 @@ from drake_diff.whole_file import write_whole
 
 CHUNK_SIZE = 64 * 1024  # what a damaged file can lose at most
 LIBRARY = "drake_diff"
+MAGIC = b"\x89MCAP0\r\n"
+FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, CRC of the summary
+DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of all before it
 
 
 @dataclass(frozen=True)
@@ -97,10 +102,30 @@ def read_mcap(path: str | Path) -> McapLog:
         raise ArtifactError(f"{path}: cannot be read: {error}") from error
     log = McapLog({}, {}, {}, {})
     try:
+        _check_crcs(data)
         _collect(data, log)
     except Exception as error:  # a damaged file makes the reader fail in many ways; none of them is ours
         raise ArtifactError(f"{path} is no whole MCAP file of this project: {type(error).__name__}: {error}") from error
     return log
+
+
+def _check_crcs(data: bytes) -> None:
+    """The checksums of the data section and of the summary; between them they cover every byte but the last magic.
+
+    The format allows a file without them, the reader does not check them, and ours always has them.
+    """
+    if len(data) < len(MAGIC) + FOOTER.size or not data.endswith(MAGIC):
+        raise McapError("it does not end as an MCAP file does: it was cut short")
+    footer = len(data) - len(MAGIC) - FOOTER.size
+    opcode, length, summary_start, _, summary_crc = FOOTER.unpack_from(data, footer)
+    data_end = summary_start - DATA_END.size
+    if (opcode, length) != (0x02, FOOTER.size - 9) or not 0 <= data_end <= footer:
+        raise McapError("its footer is damaged")
+    end_opcode, end_length, data_crc = DATA_END.unpack_from(data, data_end)
+    if (end_opcode, end_length) != (0x0F, DATA_END.size - 9) or zlib.crc32(data[:data_end]) != data_crc:
+        raise McapError("the checksum of its data does not match")
+    if zlib.crc32(data[summary_start : len(data) - len(MAGIC) - 4]) != summary_crc:
+        raise McapError("the checksum of its summary does not match")
 
 
 def _collect(data: bytes, log: McapLog) -> None:

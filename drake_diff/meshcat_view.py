@@ -29,6 +29,7 @@ from drake_diff.arrays import Array
 from drake_diff.contact import ContactPoint
 from drake_diff.model import Model
 from drake_diff.plant_elements import bodies
+from drake_diff.step import set_state
 from drake_diff.whole_file import write_whole
 
 # Drake tells of the port it listens on; nobody is meant to connect to it.
@@ -145,7 +146,7 @@ def _draw(meshcat: Meshcat, root: str, shapes: list[tuple[str, Any, RigidTransfo
 
 def _pose(meshcat: Meshcat, root: str, model: Model, x: Array, time: float | None) -> None:
     context = model.double.context
-    model.plant.SetPositionsAndVelocities(context, x)
+    set_state(model.double, x)
     for body in bodies(model.plant):
         pose = model.plant.EvalBodyPoseInWorld(context, body)
         meshcat.SetTransform(f"{root}/{_path(body)}", pose, time_in_recording=time)
@@ -171,7 +172,7 @@ def _look_at(meshcat: Meshcat, model: Model, xs: Array) -> None:
     """A camera in front of the motion's xz plane, far enough back to have all of it in view."""
     plant, context, points = model.plant, model.double.context, []
     for x in xs[:: max(1, len(xs) // 50)]:
-        plant.SetPositionsAndVelocities(context, x)
+        set_state(model.double, x)
         points += [plant.EvalBodyPoseInWorld(context, b) @ b.default_com() for b in bodies(plant)]
     low, high = np.min(points, axis=0), np.max(points, axis=0)
     centre, size = (low + high) / 2, max(0.5, float(np.linalg.norm(high - low)))

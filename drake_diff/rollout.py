@@ -11,7 +11,7 @@ from drake_diff.contact import ContactPoint, contacts_of_the_step, penetration
 from drake_diff.exceptions import InputError
 from drake_diff.model import Model
 from drake_diff.plant_elements import joints
-from drake_diff.step import advance, check_point
+from drake_diff.step import advance, check_point, set_state
 from drake_diff.tangent import tangent_space
 
 Policy = Callable[[Array, float], ArrayLike]
@@ -113,7 +113,7 @@ def _roll(model: Model, x0: ArrayLike, inputs: Array | Policy, num_steps: int = 
         xs[k + 1] = advance(model.double, xs[k], us[k])
         meter.measure_state()  # of the state before the step
         meter.measure_step(xs[k], xs[k + 1])
-    model.plant.SetPositionsAndVelocities(model.double.context, xs[-1])
+    set_state(model.double, xs[-1])
     meter.measure_state()
     return meter.result(xs, us)
 

@@ -187,6 +187,8 @@ class Solution:
     def _collocation_defect(self, k: int) -> float:
         h, f, u = self.problem.model.time_step, self._equations, self.inputs_at_knots
         x0, x1 = self.xs[k], self.xs[k + 1]
+        if not (np.all(np.isfinite(self.xs[k : k + 2])) and np.all(np.isfinite(u[k : k + 2]))):
+            return float("inf")
         f0, f1 = f(x0, u[k]), f(x1, u[k + 1])
         middle = (x0 + x1) / 2 + h / 8 * (f0 - f1)
         slope = 1.5 / h * (x1 - x0) - (f0 + f1) / 4
@@ -194,6 +196,8 @@ class Solution:
 
     def _integration_error(self, k: int) -> float:
         u = self.inputs_at_knots
+        if not (np.all(np.isfinite(self.xs[k : k + 2])) and np.all(np.isfinite(u[k : k + 2]))):
+            return float("inf")
         end = _integrate(self._equations, self.xs[k], u[k], u[k + 1], self.problem.model.time_step)
         return _largest(np.abs(self.xs[k + 1] - end))
 

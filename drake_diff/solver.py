@@ -43,6 +43,7 @@ def solve(
     tolerance: float = 1e-8,
     seed: int = 0,
     progress: bool | Progress = False,
+    on_start: Callable[[], None] | None = None,
 ) -> Solution:
     """Solve `problem`, check the gradients that were used, and measure the result again on Drake's plant.
 
@@ -50,7 +51,7 @@ def solve(
     included) or "auto". `initial_guess` is None (a straight line to the goal; near zero inputs), (xs, us) with
     shapes (N+1, nx) and (N, nu), or a Solution. `solver` is "ipopt" or "snopt"; `time_limit` [s]; `tolerance` the
     solver's on feasibility and optimality; `seed` that of the guess's noise. `progress` prints, or hands each
-    line to a function.
+    line to a function; `on_start` is called once, when all input has been checked and the work begins.
 
     Raises InputError and its kin, or ModelError, before anything runs; how a solve ended is `Solution.status`.
     """
@@ -77,6 +78,9 @@ def solve(
         "initial_guess": "default" if initial_guess is None else "given",
     }
     report = print if progress is True else (progress or None)
+    _check_method(problem, method)
+    if on_start is not None:
+        on_start()
     run = _Run(problem, method, solver, limits, options, report)
     if method == "collocation":
         return run.collocate(xs, us)
@@ -85,6 +89,16 @@ def solve(
     if initial_guess is None and is_solvable(problem):
         us = run.improved_guess(us)
     return run.shoot(xs, us)
+
+
+def _check_method(problem: Problem, method: str) -> None:
+    """Refuse a problem that `method` cannot take."""
+    if method == "ilqr":
+        check_problem(problem)
+    elif method == "collocation":
+        EquationsOfMotion(problem.model)
+        if not problem.optimizes_controls:
+            raise InputError("optimize", got=list(problem.optimize), expected='"controls" for method="collocation"')
 
 
 def choose_method(problem: Problem) -> tuple[str, str]:
@@ -147,8 +161,6 @@ class _Run:
         return judged(draft, result)
 
     def sweep(self, us: Array) -> Solution:
-        check_problem(self.problem)
-
         def search(xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
             return solve_ilqr(self.problem, us, limits=self.limits, report=self.report)
 

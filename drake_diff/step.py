@@ -25,13 +25,25 @@ def check_point(model: Model, x: ArrayLike, u: ArrayLike | None) -> tuple[Array,
     return finite_array("x", x, (model.nx,)), finite_array("u", [] if no_input else u, (model.nu,))
 
 
+def set_state(twin: Twin, x: Any) -> None:
+    """Put the state `x` (nx,), floats or AutoDiffXd, into the twin's context.
+
+    Raises SimulationError where a float is not finite: Drake would end the process with SystemExit.
+    """
+    if np.asarray(x).dtype == float and not np.all(np.isfinite(x)):
+        raise SimulationError(f"a state is not finite: {x}")
+    twin.plant.SetPositionsAndVelocities(twin.context, x)
+
+
 def advance(twin: Twin, x: Any, u: Any) -> Any:
     """(nx,): one step of the twin, floats or AutoDiffXd; sizes are the caller's business.
 
     The context is left at (x, u), so that what Drake computed on the way (contacts, efforts) can be read.
     """
     plant, context = twin.plant, twin.context
-    plant.SetPositionsAndVelocities(context, x)
+    set_state(twin, x)
+    if np.asarray(u).dtype == float and not np.all(np.isfinite(u)):
+        raise SimulationError(f"an input is not finite: {u}")
     plant.get_actuation_input_port().FixValue(context, u)
     try:
         # value() is a view that the next step overwrites.

@@ -19,6 +19,7 @@ from drake_diff.model import Model
 from drake_diff.plant_elements import actuators, bodies, joints
 from drake_diff.rollout import Rollout
 from drake_diff.solution import Solution
+from drake_diff.step import set_state
 
 ITERATION_PERIOD = 1_000_000  # [ns] of log time per solver iteration: wall time would make no two files alike
 ARROW_LENGTH_PER_NEWTON = 0.02  # [m/N]
@@ -171,7 +172,7 @@ def _transforms(model: Model, times: Array, xs: Array) -> Channel:
     named = [(b, f"{plant.GetModelInstanceName(b.model_instance())}::{b.name()}") for b in bodies(plant)]
     rows = []
     for t, x in zip(times, xs, strict=False):
-        plant.SetPositionsAndVelocities(context, x)
+        set_state(model.double, x)
         message = FrameTransforms()
         for body, name in named:
             transform = message.transforms.add(parent_frame_id="world", child_frame_id=name)

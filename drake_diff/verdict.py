@@ -14,6 +14,7 @@ from drake_diff.nonlinear_program import NlpResult, Outcome
 from drake_diff.problem import Problem
 from drake_diff.shooting import ShootingVariables, state_sensitivities
 from drake_diff.solution import FEASIBILITY_TOLERANCE, INTEGRATION_TOLERANCE, Solution, Status
+from drake_diff.step import set_state
 
 NO_EFFECT = 1e-12
 
@@ -105,6 +106,6 @@ def _deepest(solution: Solution) -> tuple[float, int]:
     model = solution.problem.model
     depths = []
     for x in solution.xs:
-        model.plant.SetPositionsAndVelocities(model.double.context, x)
+        set_state(model.double, x)
         depths.append(penetration(model))
     return max(depths), int(np.argmax(depths))

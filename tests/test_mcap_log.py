@@ -76,24 +76,16 @@ def test_a_cut_file_is_refused(tmp_path):
             read_mcap(path)
 
 
-def test_a_flipped_bit_in_a_message_is_refused_or_changes_nothing(tmp_path):
-    """Some bytes carry nothing (padding of the index): then what is read must be unchanged."""
+def test_any_flipped_bit_is_refused(tmp_path):
     path = tmp_path / "a.mcap"
-    write(path, states())
-    whole, good = path.read_bytes(), read_mcap(path)
-    seeded, refused = random.Random(0), 0
-    for _ in range(200):
+    write(path, states(), status="converged")
+    whole, seeded = path.read_bytes(), random.Random(0)
+    for _ in range(300):
         damaged = bytearray(whole)
-        at = seeded.randrange(len(damaged))
-        damaged[at] ^= 1 << seeded.randrange(8)
+        damaged[seeded.randrange(len(damaged))] ^= 1 << seeded.randrange(8)
         path.write_bytes(damaged)
-        try:
-            log = read_mcap(path)
-        except ArtifactError:
-            refused += 1
-            continue
-        assert log.messages["/state"] == good.messages["/state"], f"byte {at}"
-    assert refused >= 150  # most of the file is chunk data under a CRC
+        with pytest.raises(ArtifactError, match=r"a\.mcap"):
+            read_mcap(path)
 
 
 def test_a_file_that_is_no_mcap_or_missing_is_refused(tmp_path):

@@ -1,0 +1,148 @@
+"""The command: what it prints, its exit status, and what it leaves behind."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import drake_diff as dd
+
+ROOT = Path(__file__).parent.parent
+PENDULUM = f"""
+import numpy as np
+import drake_diff as dd
+
+def problem():
+    model = dd.load_model({str(ROOT / "models" / "pendulum.urdf")!r}, time_step=0.02)
+    return dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=NUM_STEPS,
+                      running_cost=dd.QuadraticCost(R=[[1.0]]), bounds=dd.Bounds(u_lower=[-LIMIT], u_upper=[LIMIT]))
+
+solve_options = OPTIONS
+"""
+
+
+def script(folder, *, num_steps=40, limit=30.0, options=None):
+    path = folder / "task.py"
+    text = PENDULUM.replace("NUM_STEPS", str(num_steps)).replace("LIMIT", str(limit))
+    path.write_text(text.replace("OPTIONS", repr(options or {"method": "shooting"})))
+    return path
+
+
+def drake_diff(*words, cwd):
+    command = [sys.executable, "-m", "drake_diff.cli", *map(str, words)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
+
+
+def test_a_run_that_holds_prints_its_checks_and_exits_with_0(tmp_path):
+    done = drake_diff("run", script(tmp_path), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "pass  converged" in done.stdout
+    assert re.search(r"goal error +\S+ +q, v +1e-05 +holds", done.stdout)
+    assert dd.load_record(tmp_path / "artifacts" / "task").verdict == "pass"
+
+
+def test_out_names_the_run_directory(tmp_path):
+    done = drake_diff("run", script(tmp_path), "--out", tmp_path / "elsewhere", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "elsewhere" / "record.json").is_file()
+    assert not (tmp_path / "artifacts").exists()
+
+
+def test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact(tmp_path):
+    """0.1 N m cannot lift 1 kg at 0.5 m, which weighs 4.9 N m, to the top within 0.8 s."""
+    done = drake_diff("run", script(tmp_path, limit=0.1), cwd=tmp_path)
+    assert done.returncode == 1, done.stderr
+    record = dd.load_record(tmp_path / "artifacts" / "task")
+    assert (record.state, record.verdict) == ("complete", "fail")
+    assert record.solver.status in done.stdout
+    assert {p.name for p in (tmp_path / "artifacts" / "task").iterdir()} == {
+        "record.json",
+        "replay.html",
+        "trace.mcap",
+    }
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (("num_steps=40", "num_steps=0"), "num_steps"),
+        (("x0=[0, 0]", "x0=[0, 0, 0]"), "expected shape (2,)"),
+        (("x0=[0, 0]", "x0=[0, float('nan')]"), "finite"),
+        (("u_lower=[-30.0]", "u_lower=[31.0]"), "lower at most upper"),
+        (("time_step=0.02", "time_step=-0.02"), "time_step"),
+        (("pendulum.urdf", "nothing.urdf"), "a file that exists"),
+        (("'shooting'", "'magic'"), "one of auto, collocation"),
+        (("def problem", "def another"), "problem()"),
+    ],
+)
+def test_bad_input_exits_with_2_a_named_error_and_no_artifact(tmp_path, edit, words):
+    path = script(tmp_path)
+    text = path.read_text()
+    assert edit[0] in text
+    path.write_text(text.replace(*edit))
+    done = drake_diff("run", path, cwd=tmp_path)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert "Error: " in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "artifacts").exists()
+
+
+def test_a_missing_script_exits_with_2(tmp_path):
+    done = drake_diff("run", tmp_path / "nothing.py", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "nothing.py" in done.stderr
+
+
+def test_a_bug_in_the_script_exits_with_4_and_its_traceback(tmp_path):
+    path = script(tmp_path)
+    path.write_text(path.read_text().replace("import numpy as np", "import numpy as np\n1 / 0"))
+    done = drake_diff("run", path, cwd=tmp_path)
+    assert done.returncode == 4
+    assert "ZeroDivisionError" in done.stderr
+
+
+def test_ctrl_c_ends_the_run_with_the_best_motion_so_far(tmp_path):
+    options = {"method": "shooting", "solver": "ipopt", "tolerance": 1e-14, "max_iterations": 100000}
+    running = start(script(tmp_path, num_steps=400, options=options), tmp_path)
+    record = tmp_path / "artifacts" / "task" / "record.json"
+    wait_until(record.exists)
+    time.sleep(2.0)
+    running.send_signal(signal.SIGINT)
+    assert running.wait(timeout=60) == 1
+    found = dd.load_record(record.parent)
+    assert found.state == "complete"
+    assert found.solver.status == "interrupted"
+    assert found.failures[0].code == "interrupted"
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.3, 1.0, 1.5])
+def test_a_killed_run_never_looks_finished(tmp_path, delay):
+    running = start(script(tmp_path, num_steps=60), tmp_path)
+    record = tmp_path / "artifacts" / "task" / "record.json"
+    wait_until(record.exists)
+    time.sleep(delay)
+    os.kill(running.pid, signal.SIGKILL)
+    running.wait(timeout=10)
+    found = dd.load_record(record.parent)
+    if found.state == "complete":  # it was faster than the kill: then everything it names must be there
+        assert all((record.parent / name).stat().st_size == file.bytes for name, file in found.files.items())
+    else:
+        assert found.verdict == "incomplete"
+
+
+def start(path, cwd):
+    command = [sys.executable, "-m", "drake_diff.cli", "run", str(path)]
+    return subprocess.Popen(command, cwd=cwd, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def wait_until(condition, timeout=60.0):
+    end = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)

@@ -1,0 +1,279 @@
+"""The run directory: complete, true, the same bytes for the same input, and honest when the run failed."""
+
+import dataclasses
+import json
+import math
+import subprocess
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+from drake_diff.evidence import begin
+from drake_diff.mcap_log import read_mcap
+from drake_diff.meshcat_view import write_replay
+from drake_diff.trace import read_trace
+
+MODELS = Path(__file__).parent.parent / "models"
+CHROMIUM = Path("/usr/bin/chromium")
+
+
+@pytest.fixture(scope="module")
+def swing_up():
+    """A pendulum swung up through its own steps in 0.8 s."""
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    problem = dd.Problem(
+        model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=40, running_cost=dd.QuadraticCost(R=[[1.0]])
+    )
+    solution = dd.solve(problem, method="shooting")
+    assert solution.success
+    return solution
+
+
+@pytest.fixture(scope="module")
+def collocated(swing_up):
+    return dd.solve(swing_up.problem, method="collocation")
+
+
+@pytest.fixture(scope="module")
+def thrown():
+    """A ball that falls on the ground and rolls."""
+    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.005)
+    x0 = model.default_state
+    x0[6], x0[10] = 0.15, 0.5
+    free = np.zeros(13, dtype=bool)
+    free[10] = True
+    problem = dd.Problem(
+        model,
+        x0=x0,
+        num_steps=60,
+        final_cost=lambda x: (x[4] - 0.3) ** 2,
+        optimize="initial_state",
+        initial_state_mask=free,
+    )
+    return dd.solve(problem)
+
+
+@pytest.fixture(scope="module")
+def run(swing_up, tmp_path_factory):
+    directory = tmp_path_factory.mktemp("runs") / "pendulum"
+    dd.save(swing_up, directory)
+    return directory
+
+
+def test_a_run_directory_holds_the_three_files_and_nothing_else(run):
+    assert sorted(p.name for p in run.iterdir()) == ["record.json", "replay.html", "trace.mcap"]
+
+
+def test_the_record_comes_back_as_it_was_saved(swing_up, tmp_path):
+    assert dd.save(swing_up, tmp_path / "run") == dd.load_record(tmp_path / "run")
+
+
+def test_the_record_says_what_the_solution_measures(run, swing_up):
+    record = dd.load_record(run)
+    values = {check.name: check.quantity.value for check in record.checks}
+    assert record.verdict == "pass"
+    assert record.state == "complete"
+    assert record.solver.status == "converged"
+    assert values["cost"] == swing_up.cost
+    assert values["goal error"] == swing_up.goal_error
+    assert values["defect"] == 0.0
+    assert record.problem["x_goal"] == [np.pi, 0.0]
+    assert len(record.gradient_norms) == 41
+    assert {g.verdict for g in record.gradients} == {"agree"}
+    assert record.failures == []
+
+
+def test_the_record_knows_contract_versions_and_model_file(run):
+    record = dd.load_record(run)
+    model_file = MODELS / "pendulum.urdf"
+    assert record.provenance.model_file.sha256 == sha256(model_file.read_bytes()).hexdigest()
+    assert record.provenance.packages["drake"]
+    assert record.contract["time_step"] == 0.02
+    assert [b["mass"] for b in record.contract["bodies"]] == [1.0]
+    assert record.contract["inputs"][0]["upper"] is None  # no limit: JSON knows no infinity
+
+
+def test_the_record_is_json_without_nan(run):
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    json.loads((run / "record.json").read_text(), parse_constant=refuse)
+
+
+def test_the_hashes_in_the_record_are_the_files(run):
+    files = dd.load_record(run).files
+    assert set(files) == {"trace.mcap", "replay.html"}
+    for name, file in files.items():
+        data = (run / name).read_bytes()
+        assert (file.bytes, file.sha256) == (len(data), sha256(data).hexdigest())
+
+
+def test_the_same_solve_gives_the_same_bytes_but_for_the_wall_clock(swing_up, run, tmp_path):
+    again = dd.solve(swing_up.problem, method="shooting")
+    record = dd.save(again, tmp_path / "pendulum")
+    first = dd.load_record(run)
+    assert (tmp_path / "pendulum" / "trace.mcap").read_bytes() == (run / "trace.mcap").read_bytes()
+    apart = {"wall_clock", "files"}
+    assert record.model_dump(exclude=apart) == first.model_dump(exclude=apart)
+
+
+def test_as_row_has_the_keys_of_the_textbook(run):
+    row = dd.load_record(run).as_row()
+    assert list(row) == ["section", "tool", "observation", "action", "metric", "perturbation"]
+    assert "hinge_q [rad]" in row["observation"]
+    assert "motor [N m]" in row["action"]
+
+
+def test_an_unfinished_run_says_so(swing_up, tmp_path):
+    begin(tmp_path / "run", swing_up.problem)
+    record = dd.load_record(tmp_path / "run")
+    assert (record.state, record.verdict) == ("incomplete", "incomplete")
+    assert "killed" in record.sentence
+
+
+def test_a_save_that_breaks_leaves_a_record_that_says_incomplete(swing_up, tmp_path, monkeypatch):
+    dd.save(swing_up, tmp_path / "run")
+
+    def broken(*args, **kwargs):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("drake_diff.meshcat_view.write_whole", broken)
+    with pytest.raises(OSError, match="disk full"):
+        dd.save(swing_up, tmp_path / "run")
+    assert dd.load_record(tmp_path / "run").state == "incomplete"
+    assert not list((tmp_path / "run").glob("*.partial"))
+
+
+def test_a_failed_solution_is_saved_with_a_labelled_failure(swing_up, tmp_path):
+    failed = dd.solve(swing_up.problem, method="shooting", max_iterations=2)
+    record = dd.save(failed, tmp_path / "run")
+    assert (record.state, record.verdict) == ("complete", "fail")
+    assert [(f.label, f.code) for f in record.failures] == [("planning_error", "solver_iteration_limit")]
+    assert any(check.passed is False for check in record.checks)
+
+
+def test_a_motion_that_is_not_finite_is_recorded_as_missing_not_as_zero(swing_up, tmp_path):
+    xs = np.array(swing_up.xs)
+    xs[0] = np.nan
+    record = dd.save(dataclasses.replace(swing_up, xs=xs, status=dd.Status.DIVERGED), tmp_path / "run")
+    checks = {check.name: check for check in record.checks}
+    assert checks["defect"].quantity.value is None
+    assert checks["defect"].passed is False
+    assert checks["replay"].passed is False
+
+
+def test_a_record_that_was_edited_out_of_its_schema_is_refused(run, tmp_path):
+    text = (run / "record.json").read_text()
+    for old, new in (('"verdict": "pass"', '"verdict": "great"'), ('"schema_version"', '"schema"'), ("{", "")):
+        (tmp_path / "record.json").write_text(text.replace(old, new))
+        with pytest.raises(dd.ArtifactError, match=r"record\.json"):
+            dd.load_record(tmp_path)
+
+
+def test_a_directory_without_a_record_is_refused(tmp_path):
+    with pytest.raises(dd.ArtifactError, match="no such record"):
+        dd.load_record(tmp_path)
+
+
+def test_the_trace_gives_back_states_and_inputs_bit_for_bit(run, swing_up):
+    trace = read_trace(run / "trace.mcap")
+    assert trace.xs.tobytes() == swing_up.replay.xs.tobytes()
+    assert trace.us.tobytes() == swing_up.us.tobytes()
+    assert trace.planned_xs.tobytes() == swing_up.xs.tobytes()
+    assert trace.times.tobytes() == swing_up.times.tobytes()
+    assert trace.diagnostics["energy_total"].tobytes() == swing_up.replay.energy.tobytes()
+    assert trace.diagnostics["work_actuators"].tobytes() == swing_up.replay.work.tobytes()
+
+
+def test_the_trace_replays_in_the_plant(run, swing_up):
+    trace = read_trace(run / "trace.mcap")
+    again = dd.rollout(swing_up.problem.model, trace.xs[0], trace.us)
+    assert again.xs.tobytes() == trace.xs.tobytes()
+
+
+def test_the_trace_carries_the_model_file_and_the_record(run):
+    attachments = read_trace(run / "trace.mcap").attachments
+    assert attachments["pendulum.urdf"] == (MODELS / "pendulum.urdf").read_bytes()
+    record = json.loads(attachments["record.json"])
+    assert record["verdict"] == "pass"
+    assert "wall_clock" not in record
+
+
+def test_the_trace_has_well_known_channels_with_units_in_simulated_time(run):
+    log = read_mcap(run / "trace.mcap")
+    states = log.messages["/joint_states"]
+    assert [t for t, _ in states[:3]] == [0, 20_000_000, 40_000_000]
+    assert states[5][1].joints[0].name == "hinge"
+    assert states[5][1].joints[0].position == pytest.approx(read_trace(run / "trace.mcap").xs[5, 0], abs=0)
+    assert log.channel_metadata["/state"]["units"]["q"] == {"hinge_q": "rad"}
+    assert log.channel_metadata["/diagnostics"]["units"]["energy_total"] == "J"
+    assert len(log.messages["/solver/iterations"]) > 3
+    assert {m.verdict for _, m in log.messages["/gradient/check"]} == {"agree"}
+
+
+def test_frame_transforms_put_the_bob_where_the_angle_says(run):
+    """The pole's frame turns by q about +y: its quaternion is (cos q/2, 0, sin q/2, 0)."""
+    log = read_mcap(run / "trace.mcap")
+    for (_, transforms), (_, state) in zip(log.messages["/tf"], log.messages["/state"], strict=True):
+        rotation = transforms.transforms[0].rotation
+        # Both quaternions of a rotation are right: compare up to sign.
+        cosine = rotation.w * math.cos(state.q[0] / 2) + rotation.y * math.sin(state.q[0] / 2)
+        assert abs(cosine) == pytest.approx(1, abs=1e-12)
+
+
+def test_contacts_are_in_the_trace_with_their_force(thrown, tmp_path):
+    """At rest the ground carries the ball: m g = 9.81 N, up."""
+    dd.save(thrown, tmp_path / "run")
+    log = read_mcap(tmp_path / "run" / "trace.mcap")
+    last = log.messages["/contacts"][-1][1]
+    assert {last.body_a[0], last.body_b[0]} == {"ground", "ball"}
+    assert abs(last.fz[0]) == pytest.approx(9.81, abs=0.2)  # still settling
+    assert len(log.messages["/scene/contacts"]) == len(log.messages["/contacts"])
+    diagnostics = read_trace(tmp_path / "run" / "trace.mcap").diagnostics
+    assert diagnostics["max_penetration"].max() == thrown.replay.penetration.max() > 0
+
+
+def test_collocation_keeps_plan_and_replay_apart(collocated, tmp_path):
+    dd.save(collocated, tmp_path / "run")
+    trace = read_trace(tmp_path / "run" / "trace.mcap")
+    assert len(trace.planned_us) == 41  # linear between knots
+    assert len(trace.us) == 40  # held over each step
+    assert np.abs(trace.planned_xs[-1] - [np.pi, 0]).max() < 1e-6
+    assert np.abs(trace.xs - trace.planned_xs).max() > 1e-3  # another integrator, open loop
+
+
+def test_the_replay_is_one_offline_page(run):
+    page = (run / "replay.html").read_text()
+    assert len(page) > 2_000_000  # the viewer is inside: a wheel without it shipped once
+    assert "<title>pendulum: converged</title>" in page
+    assert 'src="http' not in page
+
+
+def test_a_hostile_title_or_body_name_does_no_harm(tmp_path):
+    urdf = (MODELS / "pendulum.urdf").read_text().replace('"pole"', '"&lt;script&gt;alert(1)&lt;/script&gt;/../x"')
+    (tmp_path / "evil.urdf").write_text(urdf)
+    model = dd.load_model(tmp_path / "evil.urdf", time_step=0.01)
+    motion = dd.rollout(model, [0.1, 0], np.zeros((5, 1)))
+    write_replay(tmp_path / "a.html", model, motion.times, motion.xs, title="<script>alert(2)</script>")
+    page = (tmp_path / "a.html").read_text()
+    assert "<script>alert" not in page
+
+
+@pytest.mark.skipif(not CHROMIUM.exists(), reason="no browser installed (Debian's chromium)")
+def test_the_replay_shows_something_in_a_browser(run, tmp_path):
+    import matplotlib.image
+
+    picture = tmp_path / "shot.png"
+    flags = (
+        "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
+        "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader "
+        f"--enable-unsafe-swiftshader --window-size=600,400 --user-data-dir={tmp_path / 'profile'}"
+    )
+    command = [str(CHROMIUM), *flags.split(), f"--screenshot={picture}", (run / "replay.html").as_uri()]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    pixels = matplotlib.image.imread(picture)[:, :, :3]
+    reddish = (pixels[..., 0] > 0.5) & (pixels[..., 1] < 0.4) & (pixels[..., 2] < 0.4)
+    assert reddish.sum() > 20  # the pendulum's red bob
