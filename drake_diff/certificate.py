@@ -27,7 +27,8 @@ STEPS = tuple(10.0 ** (-k / 2) for k in range(4, 17))  # 1e-2 ... 1e-8
 RATIO_SQUARED = 10.0
 RELATIVE_TOLERANCE = 1e-6
 RESOLVED = 1e-4
-NEGLIGIBLE = 1e-6  # of the largest entry in the row: smaller ones need not be resolved, only consistent
+# Entries below this part of their row's largest, or below NOTHING, need not be resolved, only consistent.
+NEGLIGIBLE, NOTHING = 1e-6, 1e-9
 ROUNDING = 1e-15
 # The derivative of what an iterative solver leaves unsolved: measured up to 60 times its tolerance, by row.
 SOLVER_FACTOR = 100.0
@@ -213,7 +214,8 @@ def _judge(
     unsolved = SOLVER_FACTOR * solver_tolerance * (row_size + magnitude)
     allowed = RELATIVE_TOLERANCE * magnitude + 3 * uncertainty + unsolved
     resolved = uncertainty <= RESOLVED * magnitude + unsolved
-    vanishing = (magnitude <= NEGLIGIBLE * row_size) | (magnitude <= 3 * rounding)
+    best = uncertainty <= 10 * np.min(uncertainty, axis=0, initial=np.inf)
+    vanishing = (magnitude <= np.maximum(NEGLIGIBLE * row_size, NOTHING)) & best
     agrees = (np.abs(a - middle) <= allowed) & (resolved | vanishing)
     codes = np.where(
         agrees.any(axis=0),
@@ -234,15 +236,18 @@ def _not_smooth(
 
     What an iterative solver leaves unsolved looks like a jump too, so a gap must also stand above that.
     """
-    gap = np.abs(forward - backward)
-    found = _stays_apart(gap, a, 100 * ROUNDING * value_scale)
-    if solver_tolerance and found.any():
-        found &= _stays_apart(gap, a, solver_tolerance * value_scale)
+    found = np.zeros(a.shape, dtype=bool)
+    # A jump that is the same on both sides shows in no gap, but in quotients that grow without end.
+    for gap, steepest in ((np.abs(forward - backward), 0.5), (np.abs(forward + backward) / 2, -0.5)):
+        apart = _does_not_shrink(gap, a, 100 * ROUNDING * value_scale, steepest)
+        if solver_tolerance and apart.any():
+            apart &= _does_not_shrink(gap, a, solver_tolerance * value_scale, steepest)
+        found |= apart
     return found
 
 
-def _stays_apart(gap: Array, a: Array, noise: Array) -> NDArray[np.bool_]:
-    """Entries whose gap, at the four smallest steps at which it stands above `noise`, does not shrink.
+def _does_not_shrink(gap: Array, a: Array, noise: Array, steepest: float) -> NDArray[np.bool_]:
+    """Entries whose gap, over the four smallest steps at which it stands above `noise`, goes as h^`steepest` or less.
 
     The gap of a smooth entry shrinks as h, that of a kink at the point stays, that of a jump grows as 1/h.
     """
@@ -256,7 +261,7 @@ def _stays_apart(gap: Array, a: Array, noise: Array) -> NDArray[np.bool_]:
         ends_early = last + 1 < len(STEPS) and gaps[-1] * STEPS[last + 1] > 2 * noise[i]
         if ends_early or gaps[-1] <= significant[i, j] or np.min(gaps) == 0:
             continue
-        found[i, j] = np.polyfit(np.log(steps), np.log(gaps), 1)[0] < 0.5
+        found[i, j] = np.polyfit(np.log(steps), np.log(gaps), 1)[0] < steepest
     return found
 
 

@@ -9,7 +9,7 @@ from drake_diff.arrays import Array, finite_array
 from drake_diff.certificate import JITTER, Certificate, certify_displacement, jitter_direction
 from drake_diff.contract import SAP_RELATIVE_TOLERANCE
 from drake_diff.model import Model
-from drake_diff.parameters import column_names, find_parameters, stacked_values
+from drake_diff.parameters import column_names, difference_scale, find_parameters, stacked_values
 from drake_diff.plant_elements import actuators
 from drake_diff.rollout import check_inputs, roll_states
 from drake_diff.rollout_gradient import Loss, RolloutGradient, differentiate_rollout, evaluate_loss
@@ -38,7 +38,7 @@ def certify(
     found = find_parameters(model, tuple(parameters))
     point = np.concatenate([x, u, stacked_values(found)])
     space, free = tangent_space(model), len(point) - model.nx
-    scale = np.concatenate([_scale(space, x), np.maximum(1.0, np.abs(point[model.nx :]))])
+    scale = np.concatenate([_scale(space, x), np.maximum(1.0, np.abs(u)), difference_scale(found)])
 
     def f(displacement: Array) -> Array:
         moved = _move(space, model.nx, point, scale * displacement)

@@ -15,7 +15,7 @@ from pydrake.math import RigidTransform_, RotationMatrix_
 from pydrake.multibody.tree import FixedOffsetFrame, RigidBody, WeldJoint
 
 from drake_diff.arrays import Array, frozen
-from drake_diff.exceptions import UnknownNameError
+from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.model import Model, Twin
 from drake_diff.plant_elements import bodies, joints
 
@@ -32,6 +32,11 @@ class Parameter:
     unit: str
     value: Array
     derivative_source: str = "autodiff"
+
+    @property
+    def positive(self) -> bool:
+        """Whether Drake ends the process on a value below zero."""
+        return self.name.endswith((".mass", ".damping"))
 
 
 def list_parameters(model: Model) -> list[Parameter]:
@@ -54,6 +59,19 @@ def find_parameters(model: Model, names: Sequence[str]) -> tuple[Parameter, ...]
         if name not in known:
             raise UnknownNameError("parameter", got=name, known=known)
     return tuple(known[name] for name in names)
+
+
+def difference_scale(parameters: Sequence[Parameter]) -> Array:
+    """(np,) by how much differences move each entry, relative to their step: never to where Drake takes no value.
+
+    Raises InputError where a parameter sits at zero and cannot be moved to both sides.
+    """
+    scale = [np.zeros(0)]
+    for p in parameters:
+        if p.positive and not np.all(p.value > 0):
+            raise InputError(p.name, got=float(p.value[0]), expected="a value above 0, to difference on both sides")
+        scale.append(np.array(p.value) if p.positive else np.maximum(1.0, np.abs(p.value)))
+    return np.concatenate(scale)
 
 
 def column_names(parameters: Sequence[Parameter]) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from drake_diff.autodiff import gradient_rows
 from drake_diff.exceptions import GradientError, SimulationError, UnknownNameError
 from drake_diff.finite_difference import differences
 from drake_diff.model import Model
-from drake_diff.parameters import Parameter, column_names, find_parameters, set_parameters, stacked_values
+from drake_diff.parameters import Parameter, column_names, difference_scale, find_parameters, set_parameters, stacked_values
 from drake_diff.step import advance, check_point
 
 METHODS = ("auto", "autodiff", "finite_difference")
@@ -117,7 +117,7 @@ def check_derivatives(model: Model, jacobian: Array) -> None:
 
 def _finite_difference(model: Model, x: Array, u: Array, parameters: Sequence[Parameter], x_next: Array) -> Array:
     point = np.concatenate([x, u, stacked_values(parameters)])
-    scale = np.maximum(1.0, np.abs(point))
+    scale = np.concatenate([np.maximum(1.0, np.abs(x)), np.maximum(1.0, np.abs(u)), difference_scale(parameters)])
     f = step_of_displacement(model, point, parameters)
     return differences(lambda d: f(scale * d), len(point), DIFFERENCE_STEP, at_zero=x_next).central / scale
 

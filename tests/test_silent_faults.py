@@ -1,0 +1,177 @@
+"""What Drake differentiates wrongly without a word (DRAKE_FACTS), and the gate that catches each."""
+
+import numpy as np
+import pytest
+from conftest import MODELS, Plant, contact_properties
+from pydrake.geometry import AddCompliantHydroelasticProperties, Box, Cylinder, Sphere
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import FixedOffsetFrame, PdControllerGains, RevoluteJoint, SpatialInertia, UnitInertia
+
+import drake_diff as dd
+from drake_diff.plant_elements import actuators
+
+
+def pd_pendulum():
+    plant = Plant(0.01)
+    body = plant.plant.AddRigidBody("pole", SpatialInertia(1.0, [0, 0, -0.5], UnitInertia(0.25, 0.25, 0.0)))
+    joint = RevoluteJoint("hinge", plant.plant.world_frame(), body.body_frame(), [0, 1, 0])
+    actuator = plant.plant.AddJointActuator("motor", plant.plant.AddJoint(joint))
+    actuator.set_controller_gains(PdControllerGains(p=20.0, d=3.0))
+    return plant.model()
+
+
+def test_pd_gains_reach_the_autodiff_twin():
+    """(m l^2 + h d + h^2 p) w+ = m l^2 w + h (u - m g l sin q - p q), the target being q = 0 at rest."""
+    model, h, q, w, u = pd_pendulum(), 0.01, 0.7, -1.2, 0.3
+    inertia = 0.25 + h * 3.0 + h**2 * 20.0
+    w_next = (0.25 * w + h * (u - 9.81 * 0.5 * np.sin(q) - 20.0 * q)) / inertia
+    d = dd.differentiate_step(model, [q, w], [u], method="autodiff")
+    assert d.x_next[1] == pytest.approx(w_next, rel=1e-7)  # solved by SAP
+    assert d.A[1] == pytest.approx([-h * (4.905 * np.cos(q) + 20.0) / inertia, 0.25 / inertia], rel=1e-6)
+    assert d.B[1, 0] == pytest.approx(h / inertia, rel=1e-6)
+
+
+def test_dropped_pd_gains_are_caught_by_the_parity_gate():
+    model = pd_pendulum()
+    twin = actuators(model.autodiff.plant)[0]
+    twin.set_controller_gains(PdControllerGains(p=1e-12, d=0.0))  # as good as dropped
+    with pytest.raises(dd.GradientError, match="the AutoDiffXd step is not the double step: hinge_w"):
+        dd.differentiate_step(model, [0.7, -1.2], [0.3])
+
+
+def offset_pendulum():
+    """Two hinges, the second's frame on its parent being a FixedOffsetFrame whose pose is the identity."""
+    plant = Plant(0.01)
+    inertia = SpatialInertia.SolidSphereWithMass(1.0, 0.1)
+    upper = plant.plant.AddRigidBody("upper", inertia)
+    lower = plant.plant.AddRigidBody("lower", SpatialInertia(1.0, [0, 0, -0.3], UnitInertia(0.09, 0.09, 0.0)))
+    plant.plant.AddJoint(RevoluteJoint("first", plant.plant.world_frame(), upper.body_frame(), [0, 1, 0]))
+    frame = plant.plant.AddFrame(FixedOffsetFrame("offset", upper.body_frame(), RigidTransform()))
+    plant.plant.AddJoint(RevoluteJoint("second", frame, lower.body_frame(), [0, 1, 0]))
+    return plant.model()
+
+
+def certify_offset():
+    return dd.certify(offset_pendulum(), [0.3, 0.4, 0.5, 0.6], parameters=("second.offset",))
+
+
+def test_the_derivative_by_an_identity_offset_is_kept():
+    certify_offset().require()
+
+
+def test_the_derivative_that_drake_drops_at_an_identity_offset_is_caught(monkeypatch):
+    monkeypatch.setattr("drake_diff.parameters.IDENTITY_OFFSET", 0.0)
+    certificate = certify_offset()
+    assert certificate.verdict == "disagree"
+    assert certificate.worst.column.startswith("second.offset")
+    assert certificate.worst.derivative == 0.0
+    with pytest.raises(dd.CertificateError, match=r"second\.offset"):
+        certificate.require()
+
+
+def pair(upper, lower, *, hydroelastic, height):
+    """A free body of shape `upper` at `height` over a fixed one whose top is z = 0."""
+    plant = Plant(0.01, "sap", "hydroelastic_with_fallback" if hydroelastic else "point")
+    body = plant.plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    properties = [contact_properties(1e4, friction=0.5) for _ in range(2)]
+    if hydroelastic:
+        for p in properties:
+            AddCompliantHydroelasticProperties(0.02, 1e7, p)
+    plant.shape(body, upper, properties[0])
+    plant.shape(plant.plant.world_body(), lower, properties[1], RigidTransform([0, 0, -0.1]))
+    model = plant.model()
+    x = model.default_state
+    x[6], x[12] = height, -0.1
+    return model, x
+
+
+def refuses(model, x):
+    """Whether a derivative here is refused outright or not certified."""
+    try:
+        return dd.certify(model, x, method="autodiff").verdict != "agree"
+    except dd.GradientError:
+        return True  # AutoDiffXd gives NaN here in Drake 1.51
+
+
+def test_a_sphere_exactly_on_a_cylinders_axis_is_caught():
+    assert refuses(*pair(Sphere(0.1), Cylinder(0.2, 0.2), hydroelastic=False, height=0.0995))
+
+
+def test_the_same_sphere_beside_the_axis_is_certified():
+    model, x = pair(Sphere(0.1), Cylinder(0.2, 0.2), hydroelastic=False, height=0.0995)
+    x[4] = 0.013
+    dd.certify(model, x, method="autodiff").require()
+
+
+@pytest.mark.parametrize(
+    ("upper", "lower", "height"),
+    [
+        (Sphere(0.1), Cylinder(0.2, 0.2), 0.095),  # over an untilted cap
+        (Cylinder(0.1, 0.2), Cylinder(0.2, 0.2), 0.095),  # aligned caps
+        (Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), 0.0995),  # flat faces
+    ],
+)
+def test_aligned_hydroelastic_shapes_are_caught(upper, lower, height):
+    assert refuses(*pair(upper, lower, hydroelastic=True, height=height))
+
+
+def test_a_derivative_beyond_any_plausible_size_is_refused(load, monkeypatch):
+    monkeypatch.setattr("drake_diff.step_derivatives.MAGNITUDE_BOUND", 1e-3)
+    with pytest.raises(dd.GradientError, match="expected a finite number of at most"):
+        dd.differentiate_step(load("pendulum.urdf"), [0.1, 0.0], [0.0])
+
+
+def test_a_pair_that_autodiff_refuses_falls_back_to_differences_and_says_so():
+    model, x = pair(Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), hydroelastic=False, height=0.0995)
+    x[:4] = [0.9996, 0.02, -0.015, 0.01]
+    x[:4] /= np.linalg.norm(x[:4])
+    d = dd.differentiate_step(model, x)
+    assert d.method == "finite_difference"
+    assert "AutoDiffXd is refused" in d.reason
+    with pytest.raises(dd.SimulationError, match="Box"):
+        dd.differentiate_step(model, x, method="autodiff")
+
+
+def test_differences_and_autodiff_agree_where_both_work(load):
+    for name in ("acrobot.xml", "double_pendulum.urdf"):
+        model = load(name)
+        point = [0.4, -0.9, 1.3, -0.6], 0.2 * np.ones(model.nu)
+        a, b = (dd.differentiate_step(model, *point, method=m) for m in ("autodiff", "finite_difference"))
+        assert (a.method, b.method) == ("autodiff", "finite_difference")
+        assert a.A == pytest.approx(b.A, abs=1e-9)  # central differences with step 1e-5: rounding 1e-11
+        assert a.B == pytest.approx(b.B, abs=1e-9)
+
+
+def test_an_unknown_method_or_parameter_is_named(load):
+    model = load("pendulum.urdf")
+    with pytest.raises(dd.UnknownNameError, match="one of auto, autodiff, finite_difference, got 'magic'"):
+        dd.differentiate_step(model, [0, 0], [0], method="magic")
+    with pytest.raises(dd.UnknownNameError, match=r"pole\.mass"):
+        dd.differentiate_step(model, [0, 0], [0], parameters=("poel.mass",))
+
+
+def test_parameter_columns_have_their_closed_form(load):
+    """A03 with s = 1 / (1 + h b / I), I = m l^2: by damping, and by mass at fixed unit inertia and centre of mass."""
+    h, q, w, u, b, inertia = 0.01, 0.7, -1.2, 0.3, 0.1, 0.25
+    d = dd.differentiate_step(load("pendulum.urdf"), [q, w], [u], parameters=("hinge.damping", "pole.mass"))
+    s = 1 / (1 + h * b / inertia)
+    w_next = s * (w + h * (-(9.81 / 0.5) * np.sin(q) + u / inertia))
+    by_damping = -h / inertia * s * w_next
+    by_mass = s * (h * b / inertia * w_next - h * u / inertia)  # dI/dm = I at m = 1
+    assert d.parameters == ("hinge.damping", "pole.mass")
+    assert d.C[1] == pytest.approx([by_damping, by_mass], rel=1e-9)
+    assert d.C[0] == pytest.approx([h * by_damping, h * by_mass], rel=1e-9)
+
+
+def test_every_listed_parameter_is_certified_at_a_good_state():
+    model = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.005)
+    names = [p.name for p in dd.list_parameters(model)]
+    assert {"upper.mass", "lower.center_of_mass", "elbow.damping", "elbow.offset"} <= set(names)
+    names = [name for name in names if not name.endswith("damping")]  # zero: see the next test
+    dd.certify(model, [0.4, -0.9, 1.3, -0.6], [0.25, -0.15], parameters=names).require()
+
+
+def test_a_parameter_that_cannot_be_differenced_is_named_before_drake_ends_the_process(load):
+    model = load("double_pendulum.urdf")
+    with pytest.raises(dd.InputError, match=r"elbow\.damping: expected a value above 0"):
+        dd.certify(model, np.zeros(4), np.zeros(2), parameters=("elbow.damping",))

@@ -1,0 +1,247 @@
+"""One step against closed forms (ORACLES A01-A18); rtol 1e-12 smooth, 1e-7 for what SAP solves."""
+
+import math
+
+import numpy as np
+import pytest
+from conftest import Plant, contact_properties, random_state
+from scipy_free import newton
+
+import drake_diff as dd
+
+G = 9.81
+APPROXIMATIONS = ("sap", "similar", "lagged")
+
+
+@pytest.mark.parametrize(("h", "count"), [(0.01, 100), (0.004, 37)])
+def test_projectile_follows_symplectic_euler(load, h, count):
+    """A01: p_N = p0 + v0 N h - g h^2 N (N + 1) / 2."""
+    model = load("projectile.sdf", time_step=h)
+    p0, v0 = np.array([0.3, -1.0, 1.0]), np.array([2.0, 1.0, 5.0])
+    x0 = np.concatenate([[1, 0, 0, 0], p0, np.zeros(3), v0])
+    end = dd.rollout(model, x0, num_steps=count).xs[-1]
+    fall = np.array([0, 0, G]) * h**2 * count * (count + 1) / 2
+    assert end[4:7] == pytest.approx(p0 + v0 * count * h - fall, rel=1e-9)
+    assert end[10:] == pytest.approx(v0 - [0, 0, G * count * h], rel=1e-9)
+
+
+def test_projectile_error_is_first_order_with_coefficient_g_t_h_over_2(load):
+    for h in (0.02, 0.01, 0.005):
+        model = load("projectile.sdf", time_step=h)
+        end = dd.rollout(model, model.default_state, num_steps=round(1 / h)).xs[-1]
+        assert end[6] + G / 2 == pytest.approx(-G * h / 2, rel=1e-9)
+
+
+def test_projectile_by_gravity(load):
+    """A01: dz_N/dg = -h^2 N (N + 1) / 2 = -0.505; linear in g, so a difference is exact."""
+    ends = []
+    for g in (9.0, 10.0):
+        model = load("projectile.sdf", gravity=(0, 0, -g))
+        ends.append(dd.rollout(model, model.default_state, num_steps=100).xs[-1][6])
+    assert ends[1] - ends[0] == pytest.approx(-0.505, rel=1e-9)
+
+
+def pendulum_step(q, w, u, h, l=0.5, b=0.1, m=1.0):  # noqa: E741
+    """A03: joint damping implicit, gravity and input explicit."""
+    inertia = m * l**2
+    s = 1 / (1 + h * b / inertia)
+    w_next = s * (w + h * (-(G / l) * math.sin(q) + u / inertia))
+    A = [[1 - h**2 * s * (G / l) * math.cos(q), h * s], [-h * s * (G / l) * math.cos(q), s]]
+    return [q + h * w_next, w_next], A, [[h**2 * s / inertia], [h * s / inertia]], s
+
+
+@pytest.mark.parametrize("approximation", APPROXIMATIONS)
+@pytest.mark.parametrize(
+    ("h", "q", "w", "u"), [(0.01, 0.7, -1.2, 0.3), (0.003, -2.5, 4.0, -1.7), (0.05, 3.1, 0.0, 0.0)]
+)
+def test_pendulum_step_and_jacobian(load, approximation, h, q, w, u):
+    model = load("pendulum.urdf", time_step=h, contact_approximation=approximation)
+    x_next, A, B, s = pendulum_step(q, w, u, h)
+    assert dd.step(model, [q, w], [u]) == pytest.approx(x_next, rel=1e-12)
+    d = dd.differentiate_step(model, [q, w], [u])
+    assert d.A == pytest.approx(np.array(A), rel=1e-12)
+    assert d.B == pytest.approx(np.array(B), rel=1e-12)
+    assert np.linalg.det(d.A) == pytest.approx(s, rel=1e-12)
+
+
+def test_pendulum_digits_of_the_oracle(load):
+    d = dd.differentiate_step(load("pendulum.urdf"), [0.7, -1.2], [0.3])
+    assert d.x_next == pytest.approx([0.686908411253, -1.309158874737], abs=1e-12)
+    assert d.A[1] == pytest.approx([-0.1494641804235, 0.996015936255], rel=1e-12)
+    assert d.B.ravel() == pytest.approx([3.984063745020e-4, 3.984063745020e-2], rel=1e-12)
+
+
+def test_double_pendulum_step_jacobian_and_energy(load):
+    """A05 with its digits."""
+    model = load("double_pendulum.urdf", time_step=0.005)
+    x, u = [0.4, -0.9, 1.3, -0.6], [0.25, -0.15]
+    d = dd.differentiate_step(model, x, u)
+    expected = [0.40628355157782, -0.902092759011, 1.25671031556302, -0.41855180220094]
+    assert d.x_next == pytest.approx(expected, abs=1e-13)
+    lower = [
+        [-0.0604564179632879, -0.0182224978032518, 0.994554043826923, -0.00144431914674947],
+        [0.0215128929057214, -0.0149505999112984, 0.0380103812989330, 1.00359904677631],
+    ]
+    assert d.A[2:] == pytest.approx(np.array(lower), abs=1e-13)
+    inputs = [[0.00940727957631641, -0.02344166059779], [-0.02344166059779, 0.144127714073045]]
+    assert d.B[2:] == pytest.approx(np.array(inputs), abs=1e-13)
+    assert np.linalg.det(d.A) == pytest.approx(0.9981883894737102, rel=1e-12)
+    motion = dd.rollout(model, x, [u])
+    assert motion.kinetic_energy[0] == pytest.approx(0.6523114432910162, rel=1e-12)
+    assert motion.potential_energy[0] == pytest.approx(-10.18077388024687, rel=1e-12)
+
+
+@pytest.mark.parametrize(("x", "v", "u"), [(0.35, -0.4, 1.0), (-0.2, 2.0, -7.0)])
+def test_mass_spring_damper_step_and_jacobian(load, x, v, u):
+    """A07: spring explicit, damper implicit."""
+    h, m, k, c, rest = 0.01, 2.0, 50.0, 1.5, 0.1
+    s = 1 / (1 + h * c / m)
+    v_next = s * (v + h * (u - k * (x - rest)) / m)
+    d = dd.differentiate_step(load("mass_spring_damper.sdf", time_step=h), [x, v], [u])
+    assert d.x_next == pytest.approx([x + h * v_next, v_next], rel=1e-12)
+    assert d.A == pytest.approx(np.array([[1 - h**2 * s * k / m, h * s], [-h * s * k / m, s]]), rel=1e-12)
+    assert d.B.ravel() == pytest.approx([h**2 * s / m, h * s / m], rel=1e-12)
+
+
+ALL = ("pendulum.urdf", "cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "mass_spring_damper.sdf")
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_upper_half_of_the_jacobian_follows_from_the_lower(load, name):
+    """A09 (i), (ii) where dq/dt = v: A_top = [I 0] + h A_bottom, B_top = h B_bottom, det A = det dv+/dv."""
+    model, random = load(name), np.random.default_rng(1)
+    h, n = model.time_step, model.nv
+    for _ in range(5):
+        d = dd.differentiate_step(model, random_state(model, random), random.standard_normal(model.nu))
+        assert d.A[:n] == pytest.approx(np.eye(n, 2 * n) + h * d.A[n:], abs=1e-14)
+        assert d.B[:n] == pytest.approx(h * d.B[n:], abs=1e-14)
+        assert np.linalg.det(d.A) == pytest.approx(np.linalg.det(d.A[n:, n:]), rel=1e-12)
+
+
+def test_a_conservative_one_dof_step_preserves_area(write_urdf):
+    """A09 (iii)."""
+    model = write_urdf(mass=2.0)
+    assert np.linalg.det(dd.differentiate_step(model, [0.3, 1.0], [0.5]).A) == pytest.approx(1, abs=1e-14)
+
+
+def ball_on_ground(h, k, approximation, relaxation_time=None, mass=1.0):
+    """A12, A14: a ball on a vertical rail; both sides of stiffness 2k, so that the pair has k."""
+    plant = Plant(h, approximation)
+    plant.ball("ball", mass, 0.1, contact_properties(2 * k, relaxation_time=relaxation_time), "z")
+    plant.ground(contact_properties(2 * k, relaxation_time=relaxation_time and 0.0))
+    return plant.model()
+
+
+CONTACTS = [(0.003, -0.2), (0.003, 0.4), (0.0005, -1.0)]
+
+
+@pytest.mark.parametrize(("h", "k"), [(0.005, 5000.0), (0.002, 20000.0)])
+@pytest.mark.parametrize("approximation", ["lagged", "similar"])
+@pytest.mark.parametrize(("depth", "v"), CONTACTS)
+def test_point_contact_step_without_dissipation(h, k, approximation, depth, v):
+    """A12: v+ = (v - g h + h k x / m) / (1 + h^2 k / m) while that presses, else free fall."""
+    model = ball_on_ground(h, k, approximation)
+    pressed = (v - G * h + h * k * depth) / (1 + h**2 * k)
+    touches = k * depth - h * k * pressed > 0
+    d = dd.differentiate_step(model, [0.1 - depth, v])
+    assert d.x_next[1] == pytest.approx(pressed if touches else v - G * h, rel=1e-7)
+    expected = [-h * k / (1 + h**2 * k), 1 / (1 + h**2 * k)] if touches else [0, 1]
+    assert d.A[1] == pytest.approx(expected, rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.parametrize(("h", "k", "tau"), [(0.005, 5000.0, 0.02), (0.005, 5000.0, 0.0), (0.002, 8000.0, 0.007)])
+@pytest.mark.parametrize(("depth", "v"), CONTACTS)
+def test_sap_contact_step(h, k, tau, depth, v):
+    """A14: regularization R = 1 / (h k (h + tau)), bias x / (h + tau)."""
+    model = ball_on_ground(h, k, "sap", relaxation_time=tau)
+    bias, regularization = depth / (h + tau), 1 / (h * k * (h + tau))
+    pressed = (v - G * h + bias / regularization) / (1 + 1 / regularization)
+    touches = bias > pressed
+    d = dd.differentiate_step(model, [0.1 - depth, v])
+    assert d.x_next[1] == pytest.approx(pressed if touches else v - G * h, rel=1e-7)
+    slope = 1 / (1 + 1 / regularization)
+    expected = [-slope * h * k, slope] if touches else [0, 1]
+    assert d.A[1] == pytest.approx(expected, rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.parametrize("approximation", APPROXIMATIONS)
+@pytest.mark.parametrize(("k_ball", "k_ground"), [(1e4, 1e4), (2000.0, 6000.0)])
+def test_static_penetration_is_weight_over_stiffness(approximation, k_ball, k_ground):
+    """A15, after 8 s of settling; stiffnesses combine as springs in series."""
+    plant = Plant(0.01, approximation)
+    plant.ball("ball", 1.0, 0.1, contact_properties(k_ball, dissipation=20.0, relaxation_time=0.1), "z")
+    plant.ground(contact_properties(k_ground, dissipation=20.0, relaxation_time=0.1))
+    motion = dd.rollout(plant.model(), [0.1, 0.0], num_steps=800)
+    k = k_ball * k_ground / (k_ball + k_ground)
+    assert motion.penetration[-1] == pytest.approx(G / k, abs=1e-8)
+
+
+@pytest.mark.parametrize(("u", "v0"), [(0.0, 1.0), (2.0, 0.0), (4.9, 0.0), (6.0, 0.0), (-6.5, 0.3)])
+def test_lagged_friction_step(u, v0):
+    """A18: v = v0 + h u / m - mu g h v / sqrt(v^2 + eps^2), by Newton's method here."""
+    mu, h, k, eps = 0.5, 0.01, 1e4, 1e-4
+    plant = Plant(h, "lagged")
+    plant.ball("ball", 1.0, 0.1, contact_properties(2 * k, friction=mu), "z", "x")
+    plant.ground(contact_properties(2 * k, friction=mu))
+    plant.plant.AddJointActuator("push", plant.plant.GetJointByName("ball_x"))
+    plant.plant.set_stiction_tolerance(eps)
+    model = plant.model()
+    z = 0.1 - G / k
+    d = dd.differentiate_step(model, [z, 0, 0, v0], [u])
+
+    def residual(v):
+        return v - v0 - h * u + mu * G * h * v / math.sqrt(v**2 + eps**2)
+
+    def slope(v):
+        return 1 + mu * G * h * eps**2 / (v**2 + eps**2) ** 1.5
+
+    v = newton(residual, slope, v0 + h * u)
+    assert d.x_next[3] == pytest.approx(v, rel=1e-7, abs=1e-9)
+    assert d.B[3, 0] == pytest.approx(h / slope(v), rel=1e-6)
+    assert d.A[3, 3] == pytest.approx(1 / slope(v), rel=1e-6)
+    assert d.B[1, 0] == pytest.approx(h * d.B[3, 0], rel=1e-9)
+
+
+def test_results_do_not_depend_on_the_order_of_calls(load):
+    model, fresh = load("sliding_block.sdf"), load("sliding_block.sdf")
+    rest = model.default_state
+    rest[6] = 0.0495
+    fast = rest.copy()
+    fast[10] = 1.0
+    dd.differentiate_step(model, fast, parameters=("block.mass",))
+    dd.rollout(model, fast, num_steps=3)
+    dd.certify(model, fast)
+    assert np.array_equal(dd.step(model, rest), dd.step(fresh, rest))
+    assert np.array_equal(dd.differentiate_step(model, rest).A, dd.differentiate_step(fresh, rest).A)
+
+
+def test_the_step_is_a_copy(load):
+    model = load("pendulum.urdf")
+    first = dd.step(model, [0.1, 0.0], [0.0])
+    kept = first.copy()
+    dd.step(model, [2.0, 1.0], [0.0])
+    assert np.array_equal(first, kept)
+
+
+@pytest.mark.parametrize(
+    ("x", "u", "words"),
+    [
+        ([0.1], [0.0], r"x: expected shape \(2,\), got shape \(1,\)"),
+        ([0.1, 0.0], [0.0, 1.0], r"u: expected shape \(1,\), got shape \(2,\)"),
+        ([0.1, math.nan], [0.0], r"x\[1\]: expected a finite number, got nan"),
+        ([0.1, 0.0], [math.inf], r"u\[0\]: expected a finite number, got inf"),
+        ([0.1, 0.0], None, r"u: expected shape"),
+        (["a", 0.0], [0.0], "x: expected an array of numbers"),
+    ],
+)
+def test_bad_input_is_named(load, x, u, words):
+    with pytest.raises(dd.InputError, match=words):
+        dd.step(load("pendulum.urdf"), x, u)
+
+
+def test_a_state_that_is_not_finite_is_an_error_not_the_end_of_the_process(load):
+    """Drake itself raises SystemExit here."""
+    from drake_diff.step import advance
+
+    with pytest.raises(dd.SimulationError, match="not finite"):
+        advance(load("pendulum.urdf").double, np.array([np.nan, 0.0]), np.zeros(1))
