@@ -6,7 +6,6 @@ from drake_diff.certify import certify as certify
 from drake_diff.certify import certify_rollout as certify_rollout
 from drake_diff.contract import Contract as Contract
 from drake_diff.cost import QuadraticCost as QuadraticCost
-from drake_diff.evidence import EvidenceRecord as EvidenceRecord
 from drake_diff.evidence import load_record as load_record
 from drake_diff.evidence import save as save
 from drake_diff.exceptions import ArtifactError as ArtifactError
@@ -27,6 +26,7 @@ from drake_diff.model import model_from_diagram as model_from_diagram
 from drake_diff.parameters import list_parameters as list_parameters
 from drake_diff.problem import Bounds as Bounds
 from drake_diff.problem import Problem as Problem
+from drake_diff.record import EvidenceRecord as EvidenceRecord
 from drake_diff.rollout import Rollout as Rollout
 from drake_diff.rollout import rollout as rollout
 from drake_diff.rollout_gradient import RolloutGradient as RolloutGradient

@@ -25,7 +25,8 @@ def gradient_of(f: Callable[[Any], Any], z: Array) -> tuple[float, Array]:
         active = slice(start, min(start + DIRECTIONS, len(z)))
         variables = np.array([AutoDiffXd(entry) for entry in z])
         variables[active] = InitializeAutoDiff(z[active]).ravel()
-        result = np.asarray(f(variables)).ravel()
+        with np.errstate(all="ignore"):  # what is not finite is refused below, whole
+            result = np.asarray(f(variables)).ravel()
         if result.shape != (1,):
             raise InputError("loss", got=f"{len(result)} values", expected="one scalar")
         if not isinstance(result[0], AutoDiffXd):

@@ -7,10 +7,10 @@ from numpy.typing import ArrayLike
 
 from drake_diff.arrays import Array, finite_array
 from drake_diff.certificate import JITTER, Certificate, certify_displacement, jitter_direction
-from drake_diff.contract import SAP_RELATIVE_TOLERANCE
 from drake_diff.model import Model
 from drake_diff.parameters import column_names, difference_scale, find_parameters, stacked_values
 from drake_diff.plant_elements import actuators
+from drake_diff.read_contract import SAP_RELATIVE_TOLERANCE
 from drake_diff.rollout import check_inputs, roll_states
 from drake_diff.rollout_gradient import Loss, RolloutGradient, differentiate_rollout, evaluate_loss
 from drake_diff.step import advance, check_point

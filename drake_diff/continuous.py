@@ -82,7 +82,7 @@ def ContinuousSystem_(T):  # type: ignore[no-untyped-def]
             self.DeclareContinuousState(model.nq, model.nv, 0)
 
         def _construct_copy(self, other, converter=None):  # type: ignore[no-untyped-def]
-            self._construct(other.equations, converter=converter)
+            self._construct(other.equations, converter=converter)  # type: ignore[no-untyped-call]
 
         def DoCalcTimeDerivatives(self, context, derivatives):  # type: ignore[no-untyped-def]
             x = context.get_continuous_state_vector().CopyToVector()

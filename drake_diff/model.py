@@ -4,7 +4,7 @@ import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import AddContactMaterial, HalfSpace, ProximityProperties
@@ -14,6 +14,7 @@ from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_diff.arrays import finite_array, positive_float
+from drake_diff.contract import Contract
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, UnknownNameError
 from drake_diff.model_file import read_into
 from drake_diff.plant_elements import (
@@ -26,9 +27,6 @@ from drake_diff.plant_elements import (
     named,
     path_to_the_plant,
 )
-
-if TYPE_CHECKING:
-    from drake_diff.contract import Contract
 
 CONTACT_MODELS = ("point", "hydroelastic", "hydroelastic_with_fallback")
 CONTACT_APPROXIMATIONS = ("sap", "similar", "lagged")
@@ -108,9 +106,9 @@ class Model:
         return self._twin(diagram, plant)
 
     @cached_property
-    def contract(self) -> "Contract":
+    def contract(self) -> Contract:
         """What the model promises: names, units, limits, masses, contact, time step."""
-        from drake_diff.contract import read_contract  # contract reads a Model, so it stands below it
+        from drake_diff.read_contract import read_contract  # it reads a Model, so it stands below
 
         return read_contract(self)
 
@@ -175,8 +173,8 @@ def load_model(
     plant, _ = AddMultibodyPlant(config, builder)
     source = Path(path)
     notes = read_into(plant, source)
-    for note in notes:
-        warnings.warn(f"{source.name}: {note}", ModelWarning, stacklevel=2)
+    if notes:
+        warnings.warn("\n  ".join([f"{source.name}:", *notes]), ModelWarning, stacklevel=2)
     if weld_base is not None:
         plant.WeldFrames(plant.world_frame(), named("link", bodies(plant), weld_base).body_frame())
     if ground is not None:

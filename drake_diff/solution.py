@@ -103,7 +103,7 @@ class Solution:
     @property
     def times(self) -> Array:
         """(N+1,) [s] of the states."""
-        return self.problem.model.time_step * np.arange(len(self.xs))
+        return np.asarray(self.problem.model.time_step * np.arange(len(self.xs)), dtype=float)
 
     @property
     def inputs_at_knots(self) -> Array:

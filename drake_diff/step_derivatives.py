@@ -13,7 +13,14 @@ from drake_diff.autodiff import gradient_rows
 from drake_diff.exceptions import GradientError, SimulationError, UnknownNameError
 from drake_diff.finite_difference import differences
 from drake_diff.model import Model
-from drake_diff.parameters import Parameter, column_names, difference_scale, find_parameters, set_parameters, stacked_values
+from drake_diff.parameters import (
+    Parameter,
+    column_names,
+    difference_scale,
+    find_parameters,
+    set_parameters,
+    stacked_values,
+)
 from drake_diff.step import advance, check_point
 
 METHODS = ("auto", "autodiff", "finite_difference")

@@ -299,7 +299,7 @@ def _gradient_checks(solution: Solution) -> Channel:
 
 def _gradient_norms(solution: Solution, times: Array) -> Channel:
     kind = TYPES["GradientNorm"]
-    norms = [] if solution.gradient_norms is None else solution.gradient_norms
+    norms = np.zeros(0) if solution.gradient_norms is None else solution.gradient_norms
     rows = [
         (nanoseconds(t), kind.cls(step=k, norm=float(norm)))
         for k, (t, norm) in enumerate(zip(times, norms, strict=False))

@@ -62,6 +62,12 @@ def contact_properties(stiffness, dissipation=0.0, friction=0.0, relaxation_time
     return properties
 
 
+def add_slide(plant, name, parent, body, axis):
+    """A prismatic joint along a world axis."""
+    direction = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1]}[axis]
+    return plant.AddJoint(PrismaticJoint(name, parent, body.body_frame(), direction))
+
+
 class Plant:
     """A plant under construction, for what no file format says."""
 
@@ -81,17 +87,13 @@ class Plant:
         parent = self.plant.world_frame()
         for axis in axes[:-1]:
             link = self.plant.AddRigidBody(f"{name}_{axis}", SpatialInertia.Zero())
-            self.slide(f"{name}_{axis}", parent, link, axis)
+            add_slide(self.plant, f"{name}_{axis}", parent, link, axis)
             parent = link.body_frame()
         body = self.plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(mass, radius))
         if axes:
-            self.slide(f"{name}_{axes[-1]}", parent, body, axes[-1])
+            add_slide(self.plant, f"{name}_{axes[-1]}", parent, body, axes[-1])
         self.plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(radius), name, properties)
         return body
-
-    def slide(self, name, parent, body, axis):
-        direction = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1]}[axis]
-        self.plant.AddJoint(PrismaticJoint(name, parent, body.body_frame(), direction))
 
     def ground(self, properties):
         self.plant.RegisterCollisionGeometry(

@@ -24,9 +24,7 @@ CHROMIUM = Path("/usr/bin/chromium")
 def swing_up():
     """A pendulum swung up through its own steps in 0.8 s."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
-    problem = dd.Problem(
-        model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=40, running_cost=dd.QuadraticCost(R=[[1.0]])
-    )
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=40, running_cost=dd.QuadraticCost(R=[[1.0]]))
     solution = dd.solve(problem, method="shooting")
     assert solution.success
     return solution

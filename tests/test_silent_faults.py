@@ -138,8 +138,8 @@ def test_differences_and_autodiff_agree_where_both_work(load):
         point = [0.4, -0.9, 1.3, -0.6], 0.2 * np.ones(model.nu)
         a, b = (dd.differentiate_step(model, *point, method=m) for m in ("autodiff", "finite_difference"))
         assert (a.method, b.method) == ("autodiff", "finite_difference")
-        assert a.A == pytest.approx(b.A, abs=1e-9)  # central differences with step 1e-5: rounding 1e-11
-        assert a.B == pytest.approx(b.B, abs=1e-9)
+        assert pytest.approx(b.A, abs=1e-9) == a.A  # central differences with step 1e-5: rounding 1e-11
+        assert pytest.approx(b.B, abs=1e-9) == a.B
 
 
 def test_an_unknown_method_or_parameter_is_named(load):

@@ -59,8 +59,8 @@ def test_pendulum_step_and_jacobian(load, approximation, h, q, w, u):
     x_next, A, B, s = pendulum_step(q, w, u, h)
     assert dd.step(model, [q, w], [u]) == pytest.approx(x_next, rel=1e-12)
     d = dd.differentiate_step(model, [q, w], [u])
-    assert d.A == pytest.approx(np.array(A), rel=1e-12)
-    assert d.B == pytest.approx(np.array(B), rel=1e-12)
+    assert pytest.approx(np.array(A), rel=1e-12) == d.A
+    assert pytest.approx(np.array(B), rel=1e-12) == d.B
     assert np.linalg.det(d.A) == pytest.approx(s, rel=1e-12)
 
 
@@ -99,7 +99,7 @@ def test_mass_spring_damper_step_and_jacobian(load, x, v, u):
     v_next = s * (v + h * (u - k * (x - rest)) / m)
     d = dd.differentiate_step(load("mass_spring_damper.sdf", time_step=h), [x, v], [u])
     assert d.x_next == pytest.approx([x + h * v_next, v_next], rel=1e-12)
-    assert d.A == pytest.approx(np.array([[1 - h**2 * s * k / m, h * s], [-h * s * k / m, s]]), rel=1e-12)
+    assert pytest.approx(np.array([[1 - h**2 * s * k / m, h * s], [-h * s * k / m, s]]), rel=1e-12) == d.A
     assert d.B.ravel() == pytest.approx([h**2 * s / m, h * s / m], rel=1e-12)
 
 

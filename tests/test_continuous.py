@@ -1,0 +1,63 @@
+"""The equations of motion in continuous time, against a closed form and against Drake's own continuous plant."""
+
+import numpy as np
+import pytest
+from conftest import MODELS, random_state
+from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from test_silent_faults import pd_pendulum
+
+import drake_diff as dd
+from drake_diff.continuous import ContinuousSystem, EquationsOfMotion
+
+
+def test_kellys_cart_pole(load):
+    """A33."""
+    f = EquationsOfMotion(load("cart_pole.urdf"))
+    expected = [-0.3, 1.1, 3.172075726216, -17.491825696946]
+    assert f(np.array([0.1, 0.7, -0.3, 1.1]), np.array([2.0])) == pytest.approx(expected, abs=1e-11)
+
+
+@pytest.mark.parametrize(("q", "w", "u"), [(0.7, -1.2, 0.3), (-2.0, 3.0, -1.0)])
+def test_the_damped_pendulum(load, q, w, u):
+    f = EquationsOfMotion(load("pendulum.urdf"))
+    acceleration = (u - 0.1 * w - 9.81 * 0.5 * np.sin(q)) / 0.25
+    assert f(np.array([q, w]), np.array([u])) == pytest.approx([w, acceleration], rel=1e-12)
+
+
+NAMES = ("cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "mass_spring_damper.sdf", "projectile.sdf")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_values_and_derivatives_are_those_of_drakes_continuous_plant(load, name):
+    model, random = load(name), np.random.default_rng(0)
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModels(str(MODELS / name))
+    plant.Finalize()
+    twin = plant.ToAutoDiffXd()
+    context = twin.CreateDefaultContext()
+    f = EquationsOfMotion(model)
+    for _ in range(5):
+        x, u = random_state(model, random), random.standard_normal(model.nu)
+        z = InitializeAutoDiff(np.concatenate([x, u])).ravel()
+        twin.SetPositionsAndVelocities(context, z[: model.nx])
+        twin.get_actuation_input_port().FixValue(context, z[model.nx :])
+        drake = twin.EvalTimeDerivatives(context).CopyToVector()
+        ours = f.autodiff(z[: model.nx], z[model.nx :])
+        assert f(x, u) == pytest.approx(ExtractValue(drake).ravel(), rel=1e-11, abs=1e-11)
+        assert ExtractGradient(ours) == pytest.approx(ExtractGradient(drake), rel=1e-9, abs=1e-9)
+
+
+def test_it_is_a_drake_system_with_an_autodiff_twin(load):
+    system = ContinuousSystem(EquationsOfMotion(load("cart_pole.urdf")))
+    context = system.CreateDefaultContext()
+    context.SetContinuousState([0.1, 0.7, -0.3, 1.1])
+    system.get_input_port().FixValue(context, [2.0])
+    assert system.EvalTimeDerivatives(context).CopyToVector()[2] == pytest.approx(3.172075726216, abs=1e-11)
+    assert system.ToAutoDiffXd() is not None
+
+
+def test_pd_control_has_no_continuous_form():
+    with pytest.raises(dd.ModelError, match="PD-controlled"):
+        EquationsOfMotion(pd_pendulum())

@@ -1,0 +1,60 @@
+"""What is public, and that modules import only from those above them."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import drake_diff
+
+PACKAGE = Path(drake_diff.__file__).parent
+PUBLIC = """
+ArtifactError Bounds Certificate CertificateError Contract DrakeDiffError EvidenceRecord GradientError InputError
+MissingDependencyError Model ModelError ModelWarning NonFiniteError Problem QuadraticCost Rollout RolloutGradient
+ShapeError SimulationError Solution Status StepDerivatives UnknownNameError certify certify_jacobian certify_rollout
+differentiate_rollout differentiate_step list_parameters load_model load_record model_from_diagram rollout save solve
+step
+""".split()
+ORDER = """
+exceptions arrays autodiff whole_file plant_elements model_file contract model read_contract tangent parameters step
+finite_difference step_derivatives contact certificate rollout rollout_gradient certify continuous cost problem
+solution nonlinear_program collocation shooting ilqr verdict solver mcap_messages mcap_log trace meshcat_view record
+evidence cli
+""".split()
+
+
+def test_the_public_names_are_these():
+    modules = {path.stem for path in PACKAGE.glob("*.py")}
+    functions = {name for name in vars(drake_diff) if not name.startswith("_")}
+    assert sorted(functions - (modules - set(PUBLIC))) == sorted(PUBLIC)
+    for name in PUBLIC:
+        assert callable(getattr(drake_diff, name)), name  # no module hides a function of its name
+
+
+def test_every_public_name_is_documented():
+    for name in PUBLIC:
+        assert getattr(drake_diff, name).__doc__, name
+
+
+def test_every_module_has_its_place_and_imports_only_from_above():
+    modules = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__"}
+    assert modules == set(ORDER)
+    for name in ORDER:
+        tree = ast.parse((PACKAGE / f"{name}.py").read_text())
+        for node in tree.body:  # what functions import when called is not in the way of data
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("drake_diff."):
+                imported = node.module.removeprefix("drake_diff.")
+                assert ORDER.index(imported) < ORDER.index(name), f"{name} imports {imported}"
+
+
+def test_no_module_is_too_long_and_none_asserts():
+    for path in PACKAGE.glob("*.py"):
+        text = path.read_text()
+        assert len(text.splitlines()) <= 320, path.name
+        assert not any(isinstance(node, ast.Assert) for node in ast.walk(ast.parse(text))), path.name
+
+
+def test_importing_the_package_loads_neither_plots_nor_viewers_nor_logs():
+    code = "import sys, drake_diff; print([m for m in ('matplotlib', 'mcap', 'typer', 'mujoco') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,147 @@
+"""Rollouts: what is measured along them, in closed form where there is one (ORACLES A10, A15)."""
+
+import math
+
+import numpy as np
+import pytest
+from conftest import MODELS
+
+import drake_diff as dd
+from drake_diff.rollout import drift
+
+
+@pytest.fixture
+def oscillator(tmp_path):
+    """A10: the mass on its spring, without damper or rest length."""
+    text = (MODELS / "mass_spring_damper.sdf").read_text()
+    text = text.replace("<damping>1.5", "<damping>0").replace("<spring_reference>0.1", "<spring_reference>0")
+    (tmp_path / "oscillator.sdf").write_text(text)
+    return dd.load_model(tmp_path / "oscillator.sdf", time_step=0.01)
+
+
+def test_symplectic_euler_conserves_a_modified_energy(oscillator):
+    """A10: v^2 + w^2 x^2 - h w^2 x v is constant, w = 5."""
+    motion = dd.rollout(oscillator, [0.2, 0.0], np.zeros((5000, 1)))
+    x, v = motion.xs.T
+    modified = v**2 + 25 * x**2 - 0.01 * 25 * x * v
+    assert np.abs(modified / modified[0] - 1).max() < 1e-11
+
+
+def test_oscillating_energy_is_no_drift(oscillator):
+    """A10: the energy swings between E0 / (1 + h w / 2) and E0 / (1 - h w / 2) for ever, and drifts not at all."""
+    motion = dd.rollout(oscillator, [0.2, 0.0], np.zeros((5000, 1)))
+    relative = motion.energy / motion.energy[0] - 1
+    assert relative.min() == pytest.approx(-0.024390243902, abs=1e-4)  # the extreme falls between samples
+    assert relative.max() == pytest.approx(0.025641025641, abs=1e-4)
+    assert abs(motion.energy_drift) < 1e-9 * motion.energy[0]
+    assert motion.energy_oscillation == pytest.approx(0.025 * motion.energy[0], rel=0.01)
+
+
+@pytest.mark.parametrize("h", [0.02, 0.005])
+def test_the_oscillators_frequency_and_power_of_its_jacobian(oscillator, h):
+    """A10: A^N = (sin(N a) A - sin((N - 1) a) I) / sin a, cos a = 1 - h^2 w^2 / 2."""
+    model = dd.load_model(oscillator.source, time_step=h)
+    A = dd.differentiate_step(model, [0.2, 0.0], [0.0]).A
+    count, angle = 100, math.acos(1 - (5 * h) ** 2 / 2)
+    expected = (math.sin(count * angle) * A - math.sin((count - 1) * angle) * np.eye(2)) / math.sin(angle)
+    g = [dd.differentiate_rollout(model, [0.2, 0.0], np.zeros((count, 1)), lambda x, i=i: x[i]).x0 for i in (0, 1)]
+    assert np.array(g) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def test_a_straight_line_drifts_by_its_rise_and_the_line_under_an_oscillation_too():
+    n = np.arange(1001)
+    assert drift(0.003 * n) == pytest.approx(3.0, rel=1e-12)
+    assert drift(0.003 * n + np.sin(0.5 * n)) == pytest.approx(3.0, rel=1e-6)
+    assert abs(drift(np.sin(0.5 * n))) < 1e-6
+    assert drift(np.array([1.0, 1.5])) == 0.5
+
+
+def test_free_fall_drifts_as_symplectic_euler_must(load):
+    """A01: E_N - E_0 = -m g^2 h T / 2, a drift and no oscillation."""
+    model = load("projectile.sdf", time_step=0.01)
+    motion = dd.rollout(model, model.default_state, num_steps=100)
+    assert motion.energy_drift == pytest.approx(-0.5 * 9.81**2 * 0.01, rel=1e-9)
+    assert motion.energy_oscillation < 1e-12
+
+
+def test_work_and_dissipation_close_the_energy_balance(write_urdf, load):
+    """Constant mass: midpoint work is exact, so nothing is left."""
+    random = np.random.default_rng(0)
+    motion = dd.rollout(write_urdf(mass=2.0), [0.0, 1.0], random.standard_normal((50, 1)))
+    assert np.abs(motion.energy_error).max() < 1e-13
+    damped = dd.rollout(load("mass_spring_damper.sdf"), [0.1, 1.0], np.zeros((300, 1)))
+    assert damped.dissipation[-1] > 0.5 * damped.energy[0]
+    assert abs(damped.energy_error[-1]) < 0.02 * damped.energy[0]  # what the explicit spring does at h w = 0.05
+
+
+def test_a_policy_gives_what_its_inputs_give(load):
+    model = load("cart_pole.urdf")
+    closed = dd.rollout(model, [0, 0.3, 0, 0], policy=lambda x, t: [-2 * x[0] + np.sin(t)], num_steps=30)
+    assert closed.us[5, 0] == pytest.approx(-2 * closed.xs[5, 0] + math.sin(0.05), rel=1e-14)
+    assert np.array_equal(dd.rollout(model, [0, 0.3, 0, 0], closed.us).xs, closed.xs)
+
+
+def test_efforts_are_what_the_limits_leave(load):
+    motion = dd.rollout(load("cart_pole.urdf"), np.zeros(4), [[50.0], [-3.0]])
+    assert motion.us.ravel().tolist() == [50.0, -3.0]
+    assert motion.efforts.ravel().tolist() == [20.0, -3.0]
+
+
+def test_a_saturated_input_has_no_derivative(load):
+    d = dd.differentiate_step(load("cart_pole.urdf"), np.zeros(4), [50.0])
+    assert np.array_equal(d.B, np.zeros((4, 1)))
+
+
+def test_a_ball_comes_to_rest_on_the_ground_which_carries_it(load):
+    model = load("sphere_on_ground.sdf", time_step=0.005)
+    x0 = model.default_state
+    x0[6] = 0.12
+    motion = dd.rollout(model, x0, num_steps=600)
+    assert motion.penetration[0] == 0.0
+    assert motion.penetration[-1] == pytest.approx(9.81 / 1e4, rel=1e-6)
+    assert 9.81 / 1e4 < motion.penetration.max() < 0.01
+    contact = motion.contacts[-1][0]
+    assert {contact.body_a, contact.body_b} == {"ground", "ball"}
+    up = contact.force if contact.body_a == "ball" else -contact.force
+    assert up == pytest.approx([0, 0, 9.81], abs=1e-4)
+    assert contact.depth == pytest.approx(9.81 / 1e4, rel=1e-4)
+    assert motion.contacts[0] == ()
+
+
+def test_a_joint_beyond_its_limit_and_a_drifting_quaternion_show(load):
+    motion = dd.rollout(load("cart_pole.urdf"), [2.25, 0, 0, 0], [[0.0]])
+    assert motion.constraint_violation[0] == pytest.approx(0.25, abs=1e-14)
+    model = load("projectile.sdf")
+    x = model.default_state
+    x[7] = 10.0
+    spun = dd.rollout(model, x, num_steps=1)
+    assert spun.constraint_violation[1] == pytest.approx(math.hypot(1, 0.05) - 1, rel=1e-9)  # q+ = q + h w q / 2
+
+
+def test_times_are_those_of_the_plant(load):
+    motion = dd.rollout(load("pendulum.urdf", time_step=0.02), [0, 0], np.zeros((3, 1)))
+    assert motion.times == pytest.approx([0, 0.02, 0.04, 0.06], abs=1e-15)
+
+
+def test_arrays_of_a_rollout_are_read_only(load):
+    motion = dd.rollout(load("pendulum.urdf"), [0, 0], [[0.0]])
+    with pytest.raises(ValueError, match="read-only"):
+        motion.xs[0, 0] = 1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "words"),
+    [
+        (([0.0],), {"us": [[0.0]]}, "x0: expected shape"),
+        (([0.0, math.nan],), {"us": [[0.0]]}, "finite number"),
+        (([0.0, 0.0],), {"us": [0.0]}, r"us: expected shape \(N, 1\)"),
+        (([0.0, 0.0],), {"us": np.zeros((0, 1))}, "at least one step"),
+        (([0.0, 0.0],), {"us": [[0.0]], "policy": lambda x, t: [0.0]}, "one of them"),
+        (([0.0, 0.0],), {"policy": lambda x, t: [0.0], "num_steps": 0}, "num_steps"),
+        (([0.0, 0.0],), {"policy": lambda x, t: [0.0, 1.0], "num_steps": 1}, r"u: expected shape \(1,\)"),
+        (([0.0, 0.0],), {"us": [[0.0]], "num_steps": 3}, "num_steps"),
+    ],
+)
+def test_bad_input_is_named(load, arguments, options, words):
+    with pytest.raises(dd.InputError, match=words):
+        dd.rollout(load("pendulum.urdf"), *arguments, **options)
