@@ -1,0 +1,139 @@
+"""Problems and costs: what they mean, and what is refused before anything runs."""
+
+import math
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+from drake_diff.cost import differentiate_cost, final_cost_hessian, running_cost_hessian
+
+R = dd.QuadraticCost(R=[[1.0]])
+
+
+def cart_pole(load, **changes):
+    fields = {"x0": [0, 0, 0, 0], "x_goal": [1, np.pi, 0, 0], "num_steps": 10, "running_cost": R}
+    return dd.Problem(load("cart_pole.urdf"), **{**fields, **changes})
+
+
+def test_the_objective_is_a_rate_times_the_time_step_plus_the_final_cost(load):
+    model = load("pendulum.urdf", time_step=0.02)
+    problem = dd.Problem(
+        model, x0=[0, 0], num_steps=2, running_cost=lambda x, u: x[0] + 2 * u[0], final_cost=lambda x: 10 * x[1]
+    )
+    xs, us = np.array([[1.0, 0], [2.0, 0], [3.0, 4.0]]), np.array([[0.5], [1.5]])
+    assert problem.objective(xs, us) == pytest.approx(0.02 * (1 + 2 * 0.5 + 2 + 2 * 1.5) + 40, rel=1e-14)
+    knots = np.array([[0.5], [1.5], [2.5]])
+    trapezoid = 0.02 * ((1 + 1) / 2 + (2 + 3) + (3 + 5) / 2)
+    assert problem.objective(xs, knots) == pytest.approx(trapezoid + 40, rel=1e-14)
+
+
+def test_the_soft_pendulums_cost_without_input_is_the_oracles(load):
+    """B33 without input: hanging still costs (100 * 0.02 * 0.1 + 50) pi^2."""
+    problem = dd.Problem(
+        load("pendulum.urdf", time_step=0.02),
+        x0=[0, 0],
+        num_steps=100,
+        running_cost=dd.QuadraticCost(Q=np.diag([0.1, 0.01]), R=[[0.1]], x_ref=[np.pi, 0]),
+        final_cost=dd.QuadraticCost(Q=np.diag([50, 5]), x_ref=[np.pi, 0]),
+    )
+    motion = dd.rollout(problem.model, [0, 0], np.zeros((100, 1)))
+    assert problem.objective(motion.xs, motion.us) == pytest.approx(50.2 * np.pi**2, rel=1e-12)
+
+
+def test_a_quadratic_cost_has_no_half():
+    cost = dd.QuadraticCost(Q=[[2.0, 1.0], [1.0, 3.0]], R=[[4.0]], x_ref=[1, 0], u_ref=[0.5])
+    x, u = np.array([2.0, -1.0]), np.array([1.5])
+    assert cost(x, u) == pytest.approx(2 - 2 + 3 + 4, rel=1e-15)  # (1, -1) Q (1, -1)' = 2 - 2 + 3; 4 * 1^2
+    assert cost(x) == pytest.approx(3.0, rel=1e-15)
+    value, by_x, by_u = differentiate_cost(cost, x, u)
+    assert value == pytest.approx(7.0, rel=1e-15)
+    assert by_x == pytest.approx([2 * (2 - 1), 2 * (1 - 3)], rel=1e-15)
+    assert by_u == pytest.approx([8.0], rel=1e-15)
+    hessian = running_cost_hessian(cost, x, u)
+    assert hessian == pytest.approx(np.array([[4, 2, 0], [2, 6, 0], [0, 0, 8]]), abs=0)
+
+
+def test_a_function_is_differentiated_like_the_quadratic_cost_it_is():
+    Q = np.array([[2.0, 1.0], [1.0, 3.0]])
+    quadratic, function = dd.QuadraticCost(Q=Q, R=[[4.0]]), lambda x, u: x @ Q @ x + 4 * u[0] ** 2
+    x, u = np.array([0.3, -0.7]), np.array([0.2])
+    for a, b in zip(differentiate_cost(quadratic, x, u), differentiate_cost(function, x, u), strict=True):
+        assert a == pytest.approx(b, rel=1e-13)
+    assert running_cost_hessian(function, x, u) == pytest.approx(running_cost_hessian(quadratic, x, u), abs=1e-8)
+
+
+def test_a_hessian_of_a_concave_cost_is_cut_to_zero():
+    assert final_cost_hessian(lambda x: -(x[0] ** 2) + x[1] ** 2, np.zeros(2)) == pytest.approx(
+        np.diag([0.0, 2.0]), abs=1e-9
+    )
+
+
+def test_the_models_limits_apply_where_no_bound_is_given(load):
+    b = cart_pole(load).bounds
+    assert (b.x_lower[0], b.x_upper[0], b.u_lower[0], b.u_upper[0]) == (-2, 2, -20, 20)
+    assert np.isinf(b.x_upper[1])
+
+
+def test_nan_means_the_models_limit_and_inf_means_none(load):
+    b = cart_pole(load, bounds=dd.Bounds(x_upper=[math.nan, 4.0, math.nan, 1.0], u_upper=[math.inf])).bounds
+    assert b.x_upper.tolist() == [2.0, 4.0, math.inf, 1.0]
+    assert b.u_upper.tolist() == [math.inf]
+
+
+def test_a_nan_goal_is_free(load):
+    problem = cart_pole(load, x_goal=[math.nan, np.pi, math.nan, 0])
+    assert problem.goal_error(np.array([9.0, 3.0, 9.0, 0.5])) == pytest.approx([0, 3 - np.pi, 0, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"x0": [0, 0]}, r"x0: expected shape \(4,\), got shape \(2,\)"),
+        ({"x0": [0, 0, 0, math.nan]}, r"x0\[3\]: expected a finite number, got nan"),
+        ({"x0": [3.0, 0, 0, 0]}, r"x0, slide_x: expected within \[-2, 2\], got 3"),
+        ({"x_goal": [2.5, 0, 0, 0]}, r"x_goal, slide_x: expected within \[-2, 2\], got 2.5"),
+        ({"x_goal": [math.inf, 0, 0, 0]}, "x_goal: expected finite numbers"),
+        ({"x_goal": [0.0]}, "x_goal: expected shape"),
+        ({"num_steps": 0}, "num_steps: expected a whole number of at least 1, got 0"),
+        ({"num_steps": -3}, "num_steps"),
+        ({"num_steps": 2.5}, "num_steps"),
+        ({"num_steps": True}, "num_steps"),
+        ({"bounds": dd.Bounds(u_lower=[5.0], u_upper=[-5.0])}, r"bounds of force: expected lower at most upper"),
+        ({"bounds": dd.Bounds(u_lower=[30.0])}, r"bounds of force: .*got \[30, 20\]"),
+        ({"bounds": dd.Bounds(x_lower=[0.0])}, "x_lower: expected shape"),
+        ({"optimize": ()}, "optimize"),
+        ({"optimize": ("everything",)}, "optimize: expected one of controls, initial_state, got 'everything'"),
+        ({"optimize": "initial_state", "initial_state_mask": [True]}, "initial_state_mask: expected shape"),
+        ({"optimize": "initial_state", "initial_state_mask": [1, 0, 0, 0]}, "booleans"),
+        ({"optimize": "initial_state", "initial_state_mask": [False] * 4}, "at least one free entry"),
+        ({"initial_state_mask": [True] * 4}, '"initial_state" in optimize'),
+        ({"running_cost": 3.0}, "a function or a QuadraticCost, got float"),
+        ({"running_cost": dd.QuadraticCost(R=np.eye(2))}, r"running_cost.R: expected shape \(1, 1\)"),
+        ({"running_cost": dd.QuadraticCost(Q=np.eye(3))}, r"running_cost.Q: expected shape \(4, 4\)"),
+        ({"running_cost": None, "x_goal": None}, "a cost, an x_goal, or both"),
+        ({"us": np.zeros((3, 1))}, r"us: expected shape \(10, 1\)"),
+    ],
+)
+def test_bad_problems_are_named(load, changes, words):
+    with pytest.raises(dd.InputError, match=words):
+        cart_pole(load, **changes)
+
+
+def test_controls_without_actuators_are_refused(load):
+    with pytest.raises(dd.InputError, match="an actuated model"):
+        dd.Problem(load("projectile.sdf"), x0=np.eye(13)[0], num_steps=3, final_cost=lambda x: x[4])
+
+
+@pytest.mark.parametrize(
+    ("Q", "words"),
+    [
+        ([[1.0, 2.0], [0.0, 1.0]], "a symmetric matrix"),
+        ([[1.0, 0.0], [0.0, -1.0]], "a positive semidefinite matrix"),
+        ([[1.0, 0.0]], "a square matrix"),
+        ([[math.nan]], "a finite number"),
+    ],
+)
+def test_bad_weights_are_named(Q, words):
+    with pytest.raises(dd.InputError, match=words):
+        dd.QuadraticCost(Q=Q)

@@ -1,0 +1,424 @@
+"""The solvers against known optima, and a status that is measured, not believed."""
+
+import dataclasses
+import math
+import signal
+import sys
+import threading
+
+import numpy as np
+import pytest
+from test_silent_faults import pd_pendulum
+
+import drake_diff as dd
+from drake_diff.nonlinear_program import NlpResult, Outcome, _snopt_rows
+from drake_diff.solution import Status
+
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+
+
+def block_move(write_urdf, count, *, mass=1.0, distance=1.0, horizon=1.0):
+    model = write_urdf(mass=mass, time_step=horizon / count)
+    return dd.Problem(model, x0=[0, 0], x_goal=[distance, 0], num_steps=count, running_cost=EFFORT)
+
+
+@pytest.mark.parametrize("count", [2, 4, 10, 20])
+@pytest.mark.parametrize(("mass", "distance", "horizon"), [(1.0, 1.0, 1.0), (2.5, -0.4, 1.7)])
+def test_minimum_effort_block_move_by_collocation(write_urdf, count, mass, distance, horizon):
+    """B01: J = 12 m^2 d^2 / T^3 / (1 - 2/N^2 + 4/(3 N^3)), inputs linear, running cost by trapezoids."""
+    solution = dd.solve(block_move(write_urdf, count, mass=mass, distance=distance, horizon=horizon))
+    exact = 12 * mass**2 * distance**2 / horizon**3 / (1 - 2 / count**2 + 4 / (3 * count**3))
+    assert solution.method == "collocation"
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(exact, rel=1e-8)
+    assert solution.integration_error < 1e-9  # a cubic is exact here
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "snopt"])
+@pytest.mark.parametrize("count", [10, 100])
+def test_minimum_effort_block_move_by_shooting(write_urdf, solver, count):
+    """B01: symplectic Euler's optimum is 12 / (1 - 1/N^2)."""
+    solution = dd.solve(block_move(write_urdf, count), method="shooting", solver=solver)
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(12 / (1 - 1 / count**2), rel=1e-8)
+
+
+def swing_up(load, count, cost=EFFORT, **changes):
+    model = load("cart_pole.urdf", time_step=2 / count)
+    return dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=count, running_cost=cost, **changes)
+
+
+@pytest.mark.parametrize(("count", "cost"), [(20, 62.58516350539), (40, 59.79288912066)])
+@pytest.mark.parametrize("running_cost", [EFFORT, lambda x, u: u[0] ** 2])
+def test_cart_pole_swing_up_by_collocation(load, count, cost, running_cost):
+    """B02, Drake's own values."""
+    solution = dd.solve(swing_up(load, count, running_cost), method="collocation")
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(cost, rel=1e-8)
+
+
+def test_snopt_finds_the_same_swing_up(load):
+    solution = dd.solve(swing_up(load, 20), method="collocation", solver="snopt")
+    assert solution.cost == pytest.approx(62.58516350539, rel=1e-8)
+
+
+def pendulum(load, **problem):
+    fields = {"x0": [0, 0], "num_steps": 100, **problem}
+    return dd.Problem(load("pendulum.urdf", time_step=0.02), **fields)
+
+
+SOFT = {
+    "running_cost": dd.QuadraticCost(Q=np.diag([0.1, 0.01]), R=[[0.1]], x_ref=[np.pi, 0]),
+    "final_cost": dd.QuadraticCost(Q=np.diag([50, 5]), x_ref=[np.pi, 0]),
+}
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "snopt"])
+def test_pendulum_with_a_hard_goal_by_shooting(load, solver):
+    """B33: J = 8.826541704941, the first inputs to the digits that the solver's tolerance leaves."""
+    solution = dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]), method="shooting", solver=solver)
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(8.826541704941, rel=1e-10)
+    assert solution.us[:3, 0] == pytest.approx([-1.52719898, -1.74962353, -1.96009648], abs=2e-6)
+
+
+@pytest.mark.parametrize("method", ["shooting", "ilqr"])
+def test_pendulum_with_a_soft_goal(load, method):
+    """B33: J* = 1.88951695347."""
+    solution = dd.solve(pendulum(load, **SOFT), method=method)
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(1.88951695347, rel=1e-10)
+    assert solution.us[:4, 0] == pytest.approx([3.31679908, 3.64914248, 3.96280849, 4.25531903], abs=1e-5)
+
+
+def test_shooting_says_that_its_guess_was_improved(load):
+    solution = dd.solve(pendulum(load, **SOFT), method="shooting")
+    assert "iLQR: solved" in solution.options["initial_guess"]
+
+
+def test_active_input_bounds_give_the_same_optimum_by_ilqr_and_by_snopt(load):
+    problem = pendulum(load, **SOFT, bounds=dd.Bounds(u_lower=[-4.0], u_upper=[4.0]))
+    a, b = (dd.solve(problem, method=m) for m in ("ilqr", "shooting"))
+    assert a.success, a.message
+    assert b.success, b.message
+    assert np.abs(a.us).max() == 4.0
+    assert a.cost == pytest.approx(b.cost, rel=1e-8)
+
+
+def riccati(A, B, Q, R, Qf, count):
+    P = Qf
+    for _ in range(count):
+        K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+        P = Q + A.T @ P @ (A - B @ K)
+    return P
+
+
+@pytest.mark.parametrize(("h", "count", "Q", "R", "Qf"), [(0.1, 20, 1.0, 0.1, 10.0), (0.05, 33, 3.0, 0.7, 2.0)])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_lqr_is_solved_in_one_step_from_any_guess(write_urdf, h, count, Q, R, Qf, seed):
+    """A30: J* = x0' P0 x0; the running cost is a rate, so the weights are divided by h."""
+    model = write_urdf(time_step=h)
+    problem = dd.Problem(
+        model,
+        x0=[1, 0],
+        num_steps=count,
+        running_cost=dd.QuadraticCost(Q=Q / h * np.eye(2), R=[[R / h]]),
+        final_cost=dd.QuadraticCost(Q=Qf * np.eye(2)),
+    )
+    us = 10 * np.random.default_rng(seed).standard_normal((count, 1))
+    solution = dd.solve(problem, method="ilqr", initial_guess=(np.zeros((count + 1, 2)), us))
+    P = riccati(
+        np.array([[1, h], [0, 1]]), np.array([[h**2], [h]]), Q * np.eye(2), R * np.eye(1), Qf * np.eye(2), count
+    )
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(P[0, 0], rel=1e-12)
+    assert "after 1 steps" in solution.solver_message
+    if (h, count) == (0.1, 20):
+        assert solution.cost == pytest.approx(12.948481280713864, rel=1e-12)
+
+
+def test_initial_state_and_controls_are_optimized_together(write_urdf):
+    """min sum_k h u_k^2 / h + v_0^2 with x_0 fixed, x_N = 1: a least-norm problem, solved densely here."""
+    h, count = 0.1, 8
+    model = write_urdf(time_step=h)
+    problem = dd.Problem(
+        model,
+        x0=[0, 0],
+        num_steps=count,
+        x_goal=[1, math.nan],
+        running_cost=lambda x, u: u[0] ** 2 / h,
+        optimize=("controls", "initial_state"),
+        initial_state_mask=[False, True],
+        bounds=dd.Bounds(x_lower=[-9, -0.3], x_upper=[9, 9]),
+    )
+    solution = dd.solve(problem, method="shooting")
+    assert solution.success, solution.message
+    assert solution.xs[0, 0] == 0.0
+    # A free initial velocity costs nothing, so none is needed of the inputs.
+    assert solution.xs[0, 1] == pytest.approx(1 / (count * h), abs=1e-6)
+    assert np.abs(solution.us).max() < 1e-6
+
+
+def test_only_the_masked_entries_of_the_initial_state_move(load):
+    model = load("projectile.sdf")
+    x0 = model.default_state
+    x0[12] = 3.0
+    free = np.zeros(13, dtype=bool)
+    free[10] = True
+    problem = dd.Problem(
+        model,
+        x0=x0,
+        num_steps=50,
+        final_cost=lambda x: (x[4] - 2.0) ** 2,
+        optimize="initial_state",
+        initial_state_mask=free,
+    )
+    solution = dd.solve(problem)
+    assert solution.success, solution.message
+    assert solution.xs[0, 10] == pytest.approx(4.0, abs=1e-6)  # 2 m in 0.5 s
+    assert np.array_equal(solution.xs[0][~free], x0[~free])
+
+
+@pytest.fixture
+def solutions(load):
+    problem = pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0])
+    found = {m: dd.solve(problem, method=m) for m in ("collocation", "shooting")}
+    assert all(s.success for s in found.values())
+    return found
+
+
+@pytest.mark.parametrize("method", ["collocation", "shooting"])
+@pytest.mark.parametrize("knot", [1, 50, 100])
+def test_a_knot_moved_by_a_thousandth_shows_in_the_defect(solutions, method, knot):
+    xs = np.array(solutions[method].xs)
+    xs[knot, 0] += 1e-3
+    assert solutions[method].defect < 1e-8
+    assert dataclasses.replace(solutions[method], xs=xs).defect > 5e-4
+
+
+@pytest.mark.parametrize("method", ["collocation", "shooting"])
+def test_a_moved_start_goal_or_input_shows(solutions, method):
+    s = solutions[method]
+    start, end, us = np.array(s.xs), np.array(s.xs), np.array(s.us)
+    start[0, 0] += 1e-3
+    end[-1, 1] += 1e-3
+    us[30] += 0.1
+    assert dataclasses.replace(s, xs=start).initial_state_error == pytest.approx(1e-3)
+    assert dataclasses.replace(s, xs=end).goal_error == pytest.approx(1e-3, rel=1e-3)
+    assert dataclasses.replace(s, us=us).defect > 1e-4
+    assert dataclasses.replace(s, us=us).cost != s.cost
+    assert dataclasses.replace(s, us=us + 1e9).bound_violation == 0.0  # this pendulum has no limits
+
+
+def test_what_is_missing_is_infinite_not_zero(solutions):
+    for s in solutions.values():
+        broken = dataclasses.replace(s, xs=np.full_like(s.xs, np.nan))
+        for measure in ("cost", "defect", "goal_error", "bound_violation", "integration_error", "initial_state_error"):
+            assert getattr(broken, measure) == math.inf, measure
+        assert broken.replay is None
+
+
+def test_integration_error_shrinks_with_the_time_step(load):
+    errors = [dd.solve(swing_up(load, n), method="collocation").integration_error for n in (20, 40)]
+    assert errors[1] < errors[0] / 10  # fourth order or better
+
+
+def test_a_coarse_collocation_is_not_called_converged(load):
+    solution = dd.solve(swing_up(load, 8), method="collocation")
+    assert not solution.success
+    assert "an accurate integration from knot" in solution.message
+
+
+def test_too_small_a_force_ends_without_success_and_says_so(load):
+    bounds = dd.Bounds(u_lower=[-0.5], u_upper=[0.5])
+    for method in ("collocation", "shooting"):
+        solution = dd.solve(swing_up(load, 20, bounds=bounds), method=method, max_iterations=100)
+        assert solution.status in (Status.INFEASIBLE, Status.ITERATION_LIMIT), solution.message
+        assert not solution.success
+        assert len(solution.message) > 40
+        assert np.all(np.isfinite(solution.xs))
+
+
+@pytest.mark.parametrize(("method", "solver"), [("collocation", "ipopt"), ("shooting", "snopt"), ("shooting", "ipopt")])
+def test_limits_end_a_solve_and_are_named(load, method, solver):
+    problem = swing_up(load, 40)
+    short = dd.solve(problem, method=method, solver=solver, max_iterations=2)
+    assert short.status is Status.ITERATION_LIMIT
+    late = dd.solve(problem, method=method, solver=solver, time_limit=0.05)
+    assert late.status is Status.TIME_LIMIT
+    assert np.all(np.isfinite(late.xs))
+
+
+def test_a_goal_that_nothing_moves_is_no_gradient(write_urdf):
+    second = """<link name="other"><inertial><mass value="1"/>
+        <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+      <joint name="free" type="prismatic"><parent link="world"/><child link="other"/><axis xyz="1 0 0"/></joint>"""
+    model = write_urdf(gap=second)
+    goal = [math.nan, 1.0, math.nan, math.nan]
+    solution = dd.solve(dd.Problem(model, x0=np.zeros(4), num_steps=5, x_goal=goal), method="shooting")
+    assert solution.status is Status.NO_GRADIENT
+    assert "no variable moves free_x" in solution.message
+    soft = dd.Problem(model, x0=np.zeros(4), num_steps=5, running_cost=EFFORT, final_cost=lambda x: (x[1] - 1) ** 2)
+    assert dd.solve(soft, method="shooting").status is Status.NO_GRADIENT
+
+
+def test_a_solver_that_lies_is_not_believed(load, monkeypatch):
+    def liar(problem, xs, us, **options):
+        return NlpResult(us.ravel(), Outcome.SOLVED, "all is well", ()), xs, us
+
+    monkeypatch.setattr("drake_diff.solver.solve_shooting", liar)
+    solution = dd.solve(swing_up(load, 20), method="shooting")
+    assert solution.status is Status.CONVERGED_NOT_VERIFIED
+    assert "goal error" in solution.message
+
+
+def test_a_wrong_derivative_is_named_and_keeps_a_solve_from_success(load, monkeypatch):
+    module = sys.modules["drake_diff.certify"]
+    original = module.differentiate_step
+
+    def one_percent_off(*args, **options):
+        d = original(*args, **options)
+        return dataclasses.replace(d, A=d.A * np.array([[1, 1], [1.01, 1]]))
+
+    monkeypatch.setattr(module, "differentiate_step", one_percent_off)
+    solution = dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]), method="shooting")
+    assert solution.status is Status.CONVERGED_NOT_VERIFIED
+    assert "d hinge_w / d hinge_q" in solution.message
+
+
+def test_a_refused_derivative_ends_as_no_gradient(load, monkeypatch):
+    monkeypatch.setattr("drake_diff.step_derivatives.MAGNITUDE_BOUND", 1e-3)
+    solution = dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]), method="shooting")
+    assert solution.status is Status.NO_GRADIENT
+    assert "expected a finite number of at most" in solution.message
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "snopt"])
+def test_ctrl_c_keeps_the_motion_and_puts_the_handler_back(load, solver):
+    before = signal.getsignal(signal.SIGINT)
+    threading.Timer(0.6, signal.raise_signal, [signal.SIGINT]).start()
+    problem = swing_up(load, 400)
+    solution = dd.solve(problem, method="shooting", solver=solver, tolerance=1e-13)
+    assert solution.status is Status.INTERRUPTED
+    assert np.all(np.isfinite(solution.xs))
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize(
+    ("method", "solver"),
+    [("collocation", "ipopt"), ("collocation", "snopt"), ("shooting", "ipopt"), ("shooting", "snopt")],
+)
+def test_the_solvers_own_table_is_kept(load, method, solver):
+    rows = dd.solve(swing_up(load, 20), method=method, solver=solver).iterations
+    assert len(rows) > 5
+    assert all(math.isfinite(row.objective) and math.isfinite(row.primal_infeasibility) for row in rows)
+    assert [row.iteration for row in rows] == sorted({row.iteration for row in rows})
+    assert rows[-1].primal_infeasibility < 1e-5
+
+
+def test_snopts_blank_columns_are_read_where_they_stand():
+    text = """
+   Itns Major Minors    Step   nCon Feasible  Optimal  MeritFunction     L+U BSwap     nS condZHZ Penalty
+     38     0     38              1  7.1E+00  2.0E+00  4.9503550E+07     572                              _  r i
+     57     1     19 5.0E-02      2 (6.7E-09) 1.9E+01  4.6700506E+07     566           15 3.3E+00         _  rl
+"""
+    rows = list(_snopt_rows(text.splitlines()))
+    assert [(r.iteration, r.objective, r.primal_infeasibility) for r in rows] == [
+        (0, 4.9503550e7, 7.1),
+        (1, 4.6700506e7, 6.7e-9),
+    ]
+    assert math.isnan(rows[0].step)
+    assert rows[1].step == 0.05
+
+
+def test_progress_is_told_while_it_runs(load):
+    lines = []
+    dd.solve(swing_up(load, 100), method="shooting", progress=lines.append)
+    assert len(lines) > 2
+    assert "cost" in lines[0]
+
+
+def test_the_same_seed_gives_the_same_bits(load):
+    a, b = (dd.solve(swing_up(load, 20), method="shooting", seed=3) for _ in range(2))
+    assert a.xs.tobytes() == b.xs.tobytes()
+    assert a.iterations == b.iterations
+
+
+def test_a_solution_is_a_warm_start(load):
+    first = dd.solve(swing_up(load, 40), method="shooting", solver="snopt")
+    again = dd.solve(swing_up(load, 40), method="shooting", solver="snopt", initial_guess=first)
+    assert again.success, again.message
+    assert len(again.iterations) < len(first.iterations) / 2
+    assert again.cost == pytest.approx(first.cost, rel=1e-8)
+
+
+def test_auto_chooses_and_says_why(load):
+    assert dd.solve(swing_up(load, 20)).options["method_reason"] == "the model is smooth"
+    model = load("sphere_on_ground.sdf")
+    free = np.zeros(13, dtype=bool)
+    free[10] = True
+    problem = dd.Problem(
+        model,
+        x0=model.default_state + 0.3 * np.eye(13)[6],
+        num_steps=5,
+        final_cost=lambda x: (x[4] - 1) ** 2,
+        optimize="initial_state",
+        initial_state_mask=free,
+    )
+    assert dd.solve(problem).method == "shooting"
+
+
+def test_pd_control_is_left_to_shooting():
+    problem = dd.Problem(pd_pendulum(), x0=[0.5, 0], num_steps=20, running_cost=EFFORT, x_goal=[0.2, 0])
+    with pytest.raises(dd.ModelError, match="use method='shooting'"):
+        dd.solve(problem, method="collocation")
+    solution = dd.solve(problem)
+    assert solution.method == "shooting"
+    assert solution.success, solution.message
+
+
+def test_collocation_through_the_ground_is_not_verified(tmp_path):
+    """A ball on a vertical rail, pulled from above the ground to below it: collocation knows no ground."""
+    from conftest import Plant, contact_properties
+
+    plant = Plant(0.05)
+    plant.ball("ball", 1.0, 0.1, contact_properties(1e4), "z")
+    plant.ground(contact_properties(1e4))
+    plant.plant.AddJointActuator("pull", plant.plant.GetJointByName("ball_z"))
+    problem = dd.Problem(plant.model(), x0=[0.3, 0], num_steps=20, running_cost=EFFORT, x_goal=[-0.2, 0])
+    solution = dd.solve(problem, method="collocation")
+    assert solution.status is Status.CONVERGED_NOT_VERIFIED
+    assert "geometries overlap" in solution.message
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"method": "magic"}, "method: expected one of auto, collocation, ilqr, shooting, got 'magic'"),
+        ({"solver": "magic"}, "solver: expected one of ipopt, snopt, got 'magic'"),
+        ({"max_iterations": 0}, "max_iterations"),
+        ({"time_limit": -1.0}, "time_limit"),
+        ({"tolerance": 0.0}, "tolerance"),
+        ({"initial_guess": "good"}, r"initial_guess: expected None, \(xs, us\) or a Solution, got str"),
+        ({"initial_guess": (np.zeros((3, 4)), np.zeros((20, 1)))}, r"initial_guess xs: expected shape \(21, 4\)"),
+        ({"initial_guess": (np.zeros((21, 4)), np.full((20, 1), np.nan))}, "initial_guess us"),
+        ({"method": "ilqr"}, 'x_goal: expected none for method="ilqr"'),
+    ],
+)
+def test_bad_options_are_named_before_anything_runs(load, options, words):
+    started = []
+    with pytest.raises(dd.InputError, match=words):
+        dd.solve(swing_up(load, 20), on_start=lambda: started.append(1), **options)
+    assert not started
+
+
+def test_collocation_needs_controls_to_optimize(load):
+    problem = swing_up(load, 20, optimize="initial_state")
+    with pytest.raises(dd.InputError, match='"controls" for method="collocation"'):
+        dd.solve(problem, method="collocation")
+
+
+def test_every_status_has_a_sentence():
+    values = "converged converged_not_verified iteration_limit time_limit infeasible diverged no_gradient interrupted"
+    assert [s.value for s in Status] == [*values.split(), "failed"]
+    assert all(len(s.sentence) > 15 for s in Status)
