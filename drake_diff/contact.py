@@ -12,7 +12,10 @@ from drake_diff.model import Model
 
 @dataclass(frozen=True, eq=False)
 class ContactPoint:
-    """One point, or one hydroelastic patch at its centroid, where two bodies push each other; world frame."""
+    """One point, or one hydroelastic patch at its centroid, where two bodies push each other; world frame.
+
+    Where one of them is fixed to the world it is body b, so that the force is the one on what moves.
+    """
 
     body_a: str
     body_b: str
@@ -32,33 +35,39 @@ def contacts_of_the_step(model: Model) -> tuple[ContactPoint, ...]:
 
 
 def _from_point(model: Model, info: Any) -> ContactPoint:
-    pair = info.point_pair()
-    return ContactPoint(
-        body_a=model.plant.get_body(info.bodyA_index()).name(),
-        body_b=model.plant.get_body(info.bodyB_index()).name(),
+    return _contact(
+        model,
+        [model.plant.get_body(index) for index in (info.bodyA_index(), info.bodyB_index())],
         point=frozen(info.contact_point()),
-        normal=frozen(pair.nhat_BA_W),
-        force=frozen(-info.contact_force()),  # Drake's is on B
-        depth=float(pair.depth),
+        normal=np.asarray(info.point_pair().nhat_BA_W),
+        force=-np.asarray(info.contact_force()),  # Drake's is on B
+        depth=float(info.point_pair().depth),
         slip_speed=float(info.slip_speed()),
     )
+
+
+def _contact(model: Model, bodies: list[Any], *, normal: Array, force: Array, **rest: Any) -> ContactPoint:
+    """A contact whose force is that on the body which can move, where only one of the two can."""
+    a, b = bodies
+    if model.plant.IsAnchored(a):
+        a, b, normal, force = b, a, -normal, -force
+    return ContactPoint(body_a=a.name(), body_b=b.name(), normal=frozen(normal), force=frozen(force), **rest)
 
 
 def _from_patch(model: Model, info: Any) -> ContactPoint:
     surface = info.contact_surface()
     inspector = model.plant.get_geometry_query_input_port().Eval(model.double.context).inspector()
     bodies = [
-        model.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).name()
-        for geometry in (surface.id_M(), surface.id_N())
+        model.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)) for geometry in (surface.id_M(), surface.id_N())
     ]
     force = np.asarray(info.F_Ac_W().translational())
     size = float(np.linalg.norm(force))
-    return ContactPoint(
-        body_a=bodies[0],
-        body_b=bodies[1],
+    return _contact(
+        model,
+        bodies,
         point=frozen(surface.centroid()),
-        normal=frozen(force / size if size else np.zeros(3)),
-        force=frozen(force),
+        normal=force / size if size else np.zeros(3),
+        force=force,
         depth=0.0,
         slip_speed=0.0,
     )

@@ -37,6 +37,7 @@ logging.getLogger("drake").addFilter(lambda record: "Meshcat listening" not in r
 
 FRAMES_PER_SECOND = 64.0
 DRAWN = (Box, Capsule, Convex, Cylinder, Ellipsoid, Mesh, Sphere)
+TRAIL = Rgba(0.45, 0.5, 0.6, 1)
 GREY, RED = Rgba(0.6, 0.6, 0.62, 1), Rgba(0.85, 0.2, 0.1, 1)
 GHOST_OPACITY = 0.3
 REPETITIONS = 5
@@ -67,6 +68,7 @@ def write_replay(
     slots = max((len(c) for c in contacts), default=0)
     for slot in range(slots):
         _draw_arrow(meshcat, f"contacts/{slot}")
+    _draw_trails(meshcat, model, xs)
     meshcat.StartRecording(frames_per_second=FRAMES_PER_SECOND, set_visualizations_while_recording=False)
     for time, k in _frames(times):
         _pose(meshcat, "motion", model, xs[k], time)
@@ -144,6 +146,23 @@ def _draw(meshcat: Meshcat, root: str, shapes: list[tuple[str, Any, RigidTransfo
         meshcat.SetTransform(f"{root}/{path}/{i}", pose)
 
 
+def _draw_trails(meshcat: Meshcat, model: Model, xs: Array) -> None:
+    """A thin line along the way of every body's centre of mass."""
+    for name, points in _ways(model, xs).items():
+        meshcat.SetLine(f"trails/{name}", points.T, 1.0, TRAIL)
+
+
+def _ways(model: Model, xs: Array) -> dict[str, Array]:
+    """(N+1, 3) where the centre of mass of every body goes."""
+    ways: dict[str, list[Array]] = {_path(body): [] for body in bodies(model.plant)}
+    for x in xs:
+        set_state(model.double, x)
+        for body in bodies(model.plant):
+            pose = model.plant.EvalBodyPoseInWorld(model.double.context, body)
+            ways[_path(body)].append(pose @ body.default_com())
+    return {name: np.array(points) for name, points in ways.items()}
+
+
 def _pose(meshcat: Meshcat, root: str, model: Model, x: Array, time: float | None) -> None:
     context = model.double.context
     set_state(model.double, x)
@@ -170,10 +189,7 @@ def _place_arrows(meshcat: Meshcat, contacts: Sequence[ContactPoint], slots: int
 
 def _look_at(meshcat: Meshcat, model: Model, xs: Array) -> None:
     """A camera in front of the motion's xz plane, far enough back to have all of it in view."""
-    plant, context, points = model.plant, model.double.context, []
-    for x in xs[:: max(1, len(xs) // 50)]:
-        set_state(model.double, x)
-        points += [plant.EvalBodyPoseInWorld(context, b) @ b.default_com() for b in bodies(plant)]
+    points = np.concatenate(list(_ways(model, xs).values()))
     low, high = np.min(points, axis=0), np.max(points, axis=0)
     centre, size = (low + high) / 2, max(0.5, float(np.linalg.norm(high - low)))
     meshcat.SetCameraPose(centre + size * np.array([0.1, -1.0, 0.25]), centre)
