@@ -35,7 +35,9 @@ class Rollout:
     work: Array  # (N+1,) [J], done by the actuators since the start
     dissipation: Array  # (N+1,) [J], taken by joint damping since the start
     penetration: Array  # (N+1,) [m], the largest overlap of two geometries
-    constraint_violation: Array  # (N+1,) beyond joint limits [m or rad], or of a quaternion's unit norm [1]
+    # (N+1,) beyond joint limits [m or rad], or of a quaternion's unit norm [1]; inf for a plant with constraints
+    # (couplers, balls, welds, distances), whose violation pydrake does not tell.
+    constraint_violation: Array
     contacts: tuple[tuple[ContactPoint, ...], ...]  # N tuples: the contacts of each step
 
     @property
@@ -147,6 +149,8 @@ class _Meter:
         self.contacts.append(contacts_of_the_step(self.model))
 
     def _violation(self) -> float:
+        if self.plant.num_constraints():
+            return float("inf")  # pydrake does not tell where a coupler, ball, weld or distance should be
         q = np.asarray(self.plant.GetPositions(self.context))
         beyond = np.maximum(self.limits[0] - q, q - self.limits[1]).max(initial=0.0)
         norms = [abs(np.linalg.norm(q[start : start + 4]) - 1) for start in self.space.quaternions]

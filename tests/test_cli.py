@@ -20,7 +20,8 @@ import drake_diff as dd
 def problem():
     model = dd.load_model({str(ROOT / "models" / "pendulum.urdf")!r}, time_step=0.02)
     return dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=NUM_STEPS,
-                      running_cost=dd.QuadraticCost(R=[[1.0]]), bounds=dd.Bounds(u_lower=[-LIMIT], u_upper=[LIMIT]))
+                      running_cost=dd.QuadraticCost(R=[[1.0]]),
+                      bounds=dd.Bounds([-50, -99], [50, 99], [-LIMIT], [LIMIT]))
 
 solve_options = OPTIONS
 """
@@ -73,10 +74,15 @@ def test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact(tm
         (("num_steps=40", "num_steps=0"), "num_steps"),
         (("x0=[0, 0]", "x0=[0, 0, 0]"), "expected shape (2,)"),
         (("x0=[0, 0]", "x0=[0, float('nan')]"), "finite"),
-        (("u_lower=[-30.0]", "u_lower=[31.0]"), "lower at most upper"),
+        (("[-30.0]", "[31.0]"), "lower at most upper"),
         (("time_step=0.02", "time_step=-0.02"), "time_step"),
         (("pendulum.urdf", "nothing.urdf"), "a file that exists"),
         (("'shooting'", "'magic'"), "one of auto, collocation"),
+        (("{'method'", "{'solver': 'magic', 'method'"), "one of ipopt, snopt"),
+        (("pendulum.urdf", "../README.md"), ".urdf, .sdf"),
+        (("pendulum.urdf", "../tests/not_a_robot.urdf"), "no robot model"),
+        (("pendulum.urdf", "projectile.sdf"), "expected"),
+        (("x0=[0, 0]", "x0=[99, 0]"), "expected within [-50, 50]"),
         (("def problem", "def another"), "problem()"),
     ],
 )

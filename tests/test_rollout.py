@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from conftest import MODELS
+from conftest import MODELS, Plant, contact_properties
 
 import drake_diff as dd
+from drake_diff.continuous import EquationsOfMotion
 from drake_diff.rollout import drift
 
 
@@ -116,6 +117,17 @@ def test_a_joint_beyond_its_limit_and_a_drifting_quaternion_show(load):
     x[7] = 10.0
     spun = dd.rollout(model, x, num_steps=1)
     assert spun.constraint_violation[1] == pytest.approx(math.hypot(1, 0.05) - 1, rel=1e-9)  # q+ = q + h w q / 2
+
+
+def test_the_violation_of_a_plants_constraints_is_not_called_zero():
+    plant = Plant(0.01)
+    bodies = [plant.ball(name, 1.0, 0.1, contact_properties(1e4), "x", "z") for name in "ab"]
+    plant.plant.AddDistanceConstraint(bodies[0], [0, 0, 0], bodies[1], [0, 0, 0], 1.0)
+    model = plant.model()
+    motion = dd.rollout(model, [0, 0, 1, 0, 0, 0, 0, 0], num_steps=2)
+    assert np.all(np.isinf(motion.constraint_violation))
+    with pytest.raises(dd.ModelError, match="constraints have no continuous form"):
+        EquationsOfMotion(model)
 
 
 def test_times_are_those_of_the_plant(load):

@@ -159,6 +159,23 @@ def test_initial_state_and_controls_are_optimized_together(write_urdf):
     assert np.abs(solution.us).max() < 1e-6
 
 
+def test_collocation_too_takes_a_free_initial_state(write_urdf):
+    """With the initial velocity free, the block drifts to its goal and no force is needed."""
+    problem = dd.Problem(
+        write_urdf(time_step=0.1),
+        x0=[0, 0],
+        num_steps=10,
+        x_goal=[1, math.nan],
+        running_cost=EFFORT,
+        optimize=("controls", "initial_state"),
+        initial_state_mask=[False, True],
+    )
+    solution = dd.solve(problem, method="collocation")
+    assert solution.success, solution.message
+    assert solution.xs[0] == pytest.approx([0, 1], abs=1e-6)
+    assert solution.cost < 1e-12
+
+
 def test_only_the_masked_entries_of_the_initial_state_move(load):
     model = load("projectile.sdf")
     x0 = model.default_state

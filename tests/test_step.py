@@ -41,6 +41,25 @@ def test_projectile_by_gravity(load):
     assert ends[1] - ends[0] == pytest.approx(-0.505, rel=1e-9)
 
 
+def test_projectile_by_the_time_step(load):
+    """A01: dz_N/dh = v_0 N - g h N (N + 1); quadratic in h, so a central difference is exact."""
+    ends = []
+    for h in (0.0099, 0.0101):
+        model = load("projectile.sdf", time_step=h)
+        x0 = model.default_state
+        x0[12] = 5.0
+        ends.append(dd.rollout(model, x0, num_steps=100).xs[-1][6])
+    assert (ends[1] - ends[0]) / 0.0002 == pytest.approx(5.0 * 100 - 9.81 * 0.01 * 100 * 101, rel=1e-9)
+
+
+def test_double_pendulum_mass_matrix(load):
+    """A05."""
+    model = load("double_pendulum.urdf", time_step=0.005)
+    dd.step(model, [0.4, -0.9, 1.3, -0.6], [0.0, 0.0])
+    expected = [[0.89371745778245, 0.14535872889123], [0.14535872889123, 0.05833333333333]]
+    assert model.plant.CalcMassMatrix(model.double.context) == pytest.approx(np.array(expected), abs=1e-13)
+
+
 def pendulum_step(q, w, u, h, l=0.5, b=0.1, m=1.0):  # noqa: E741
     """A03: joint damping implicit, gravity and input explicit."""
     inertia = m * l**2
