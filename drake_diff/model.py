@@ -221,8 +221,8 @@ def _check_plant(model: Model) -> None:
         raise ModelError("the plant is continuous (time_step 0): build it with a time_step above 0")
     if plant.has_sampled_output_ports():
         raise ModelError(
-            "the plant has sampled output ports, so its update cannot be evaluated alone: build it from "
-            "MultibodyPlantConfig(use_sampled_output_ports=False)"
+            "the plant has sampled output ports, so its update cannot be evaluated alone: before Finalize call "
+            "plant.SetUseSampledOutputPorts(False), or set use_sampled_output_ports=False in its MultibodyPlantConfig"
         )
     if plant.num_velocities() == 0:
         raise ModelError("the model cannot move: it has no joints and no free body")

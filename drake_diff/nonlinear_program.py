@@ -179,7 +179,7 @@ def _explain_exception(watch: _Watch, error: Exception) -> tuple[Outcome, str]:
     text = f"{type(error).__name__}: {error}"
     for name, outcome in (("SimulationError", Outcome.DIVERGED), ("GradientError", Outcome.NO_GRADIENT)):
         if name in text:
-            return outcome, text[text.index(name) :].strip()
+            return outcome, text[text.rindex(name) :].strip()  # SNOPT's text holds the traceback first
     return Outcome.FAILED, text
 
 

@@ -1,5 +1,6 @@
 """Single shooting: inputs and initial state are the variables, Drake's own steps the dynamics, our gradients exact."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from pydrake.solvers import MathematicalProgram
 from drake_diff.arrays import Array
 from drake_diff.autodiff import chain, chain_rows
 from drake_diff.cost import differentiate_cost, differentiate_final_cost
+from drake_diff.exceptions import SimulationError
 from drake_diff.nonlinear_program import Limits, NlpResult, Report, solve_program
 from drake_diff.problem import Problem
 from drake_diff.rollout import roll_states
@@ -25,7 +27,8 @@ def solve_shooting(
 
     Raises GradientError or SimulationError where a step or its derivative is refused.
     """
-    variables = ShootingVariables(problem)
+    # IPOPT shortens a step whose end it cannot evaluate; SNOPT, in Drake, has no way to be told.
+    variables = ShootingVariables(problem, tolerate_failure=solver == "ipopt")
     program = _program(problem, variables)
     guess = variables.pack(xs[0], us)
     result = solve_program(program, guess, solver=solver, limits=limits, report=report)
@@ -36,8 +39,9 @@ def solve_shooting(
 class ShootingVariables:
     """The vector z = [free entries of x0; us], and the rollout it stands for, linearized once for each z."""
 
-    def __init__(self, problem: Problem):
+    def __init__(self, problem: Problem, *, tolerate_failure: bool = False):
         self.problem = problem
+        self.tolerate_failure = tolerate_failure
         self.free = np.flatnonzero(problem.initial_state_mask)
         self.shape = (problem.num_steps, problem.model.nu)
         self.size = len(self.free) + (self.shape[0] * self.shape[1] if problem.optimizes_controls else 0)
@@ -67,6 +71,15 @@ class ShootingVariables:
             x0, us = self.unpack(z)
             self._linearization, self._at = linearize(self.problem.model, x0, us), z.tobytes()
         return self._linearization
+
+    def attempt(self, evaluate: Callable[[], Any], failed: Any) -> Any:
+        """`evaluate()`, or `failed` (NaN) where the simulation fails and the solver can take that as a step too long."""
+        try:
+            return evaluate()
+        except SimulationError:
+            if self.tolerate_failure:
+                return failed
+            raise
 
     def states(self, z: Array) -> Array:
         """(N+1, nx) the states of the rollout of z."""
@@ -110,8 +123,10 @@ class RolloutCost:
 
     def __call__(self, z: Any) -> Any:
         if z.dtype == float:
-            return self.value(z)
-        value, gradient, _ = self.differentiate(ExtractValue(z.reshape(-1, 1)).ravel())
+            return self.variables.attempt(lambda: self.value(z), np.nan)
+        at = ExtractValue(z.reshape(-1, 1)).ravel()
+        missing = np.nan, np.full(len(at), np.nan), None
+        value, gradient, _ = self.variables.attempt(lambda: self.differentiate(at), missing)
         return chain(value, gradient, z)
 
     def value(self, z: Array) -> float:
@@ -145,11 +160,18 @@ class _StateRows:
         self.coordinates = np.array([i for _, i in entries])
 
     def __call__(self, z: Any) -> Any:
+        missing = np.full(len(self.steps), np.nan)
         if z.dtype == float:
-            return self.variables.states(z)[self.steps, self.coordinates]
+            return self.variables.attempt(lambda: self._values(z), missing)
         at = ExtractValue(z.reshape(-1, 1)).ravel()
-        jacobian = state_sensitivities(self.variables, at)[self.steps, self.coordinates]
-        return chain_rows(self.variables.states(at)[self.steps, self.coordinates], jacobian, z)
+        values, jacobian = self.variables.attempt(
+            lambda: (self._values(at), state_sensitivities(self.variables, at)[self.steps, self.coordinates]),
+            (missing, np.full((len(missing), len(at)), np.nan)),
+        )
+        return chain_rows(values, jacobian, z)
+
+    def _values(self, z: Array) -> Array:
+        return self.variables.states(z)[self.steps, self.coordinates]
 
 
 def state_sensitivities(variables: ShootingVariables, z: Array) -> Array:

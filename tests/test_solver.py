@@ -439,3 +439,24 @@ def test_every_status_has_a_sentence():
     values = "converged converged_not_verified iteration_limit time_limit infeasible diverged no_gradient interrupted"
     assert [s.value for s in Status] == [*values.split(), "failed"]
     assert all(len(s.sentence) > 15 for s in Status)
+
+
+def acrobot_swing_up(load):
+    """From hanging to upright in 4 s at 0.05 s: some inputs that a line search tries fling it beyond every number."""
+    bounds = dd.Bounds(u_lower=[-40.0], u_upper=[40.0])
+    model = load("acrobot.xml", time_step=0.05)
+    return dd.Problem(model, x0=np.zeros(4), x_goal=[np.pi, 0, 0, 0], num_steps=80, running_cost=EFFORT, bounds=bounds)
+
+
+def test_a_motion_that_leaves_every_finite_number_is_called_diverged(load):
+    """SNOPT, in Drake, cannot be told that a step was too long."""
+    solution = dd.solve(acrobot_swing_up(load), method="shooting", solver="snopt", max_iterations=50)
+    assert solution.status is Status.DIVERGED
+    assert "SimulationError: the step leads to" in solution.message
+    assert "Traceback" not in solution.message
+    assert np.all(np.isfinite(solution.xs))
+
+
+def test_ipopt_shortens_a_step_that_cannot_be_simulated(load):
+    solution = dd.solve(acrobot_swing_up(load), method="shooting", solver="ipopt", max_iterations=20)
+    assert solution.status is Status.ITERATION_LIMIT
