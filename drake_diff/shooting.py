@@ -73,7 +73,7 @@ class ShootingVariables:
         return self._linearization
 
     def attempt(self, evaluate: Callable[[], Any], failed: Any) -> Any:
-        """`evaluate()`, or `failed` (NaN) where the simulation fails and the solver can take that as a step too long."""
+        """`evaluate()`, or `failed` (NaN) where the simulation fails and the solver takes that for too long a step."""
         try:
             return evaluate()
         except SimulationError:
