@@ -358,7 +358,7 @@ def test_progress_is_told_while_it_runs(load):
 def test_the_same_seed_gives_the_same_bits(load):
     a, b = (dd.solve(swing_up(load, 20), method="shooting", seed=3) for _ in range(2))
     assert a.xs.tobytes() == b.xs.tobytes()
-    assert a.iterations == b.iterations
+    assert repr(a.iterations) == repr(b.iterations)  # a blank cell is NaN, which equals nothing
 
 
 def test_a_solution_is_a_warm_start(load):
