@@ -36,7 +36,7 @@ class Problem:
     (nx,) a hard final equality whose NaN entries are free. `bounds` hold at every state after the initial one
     and for every input. `optimize` names what may change: "controls" and/or "initial_state", the latter where
     `initial_state_mask` (nx,) is True, x0 being the first guess there. Controls that are not optimized are `us`
-    (N, nu), zero where not given.
+    (N, nu), zero where not given; controls that are optimized start from it.
 
     Raises InputError, ShapeError, NonFiniteError or UnknownNameError, each with expected and got.
     """

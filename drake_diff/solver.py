@@ -16,7 +16,7 @@ from drake_diff.collocation import solve_collocation
 from drake_diff.continuous import EquationsOfMotion
 from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.ilqr import check_problem, is_solvable, solve_ilqr
-from drake_diff.nonlinear_program import SOLVERS, Limits, NlpResult
+from drake_diff.nonlinear_program import SOLVERS, Limits, NlpResult, Outcome
 from drake_diff.problem import Problem
 from drake_diff.rollout import roll_states
 from drake_diff.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
@@ -59,6 +59,8 @@ def solve(
         raise UnknownNameError("method", got=method, known=METHODS)
     if solver is not None and solver not in SOLVERS:
         raise UnknownNameError("solver", got=solver, known=SOLVERS)
+    if solver is not None and method == "ilqr":
+        raise InputError("solver", got=repr(solver), expected='none for method="ilqr", which is its own')
     limits = Limits(
         positive_int("max_iterations", max_iterations),
         np.inf if time_limit is None else positive_float("time_limit [s]", time_limit),
@@ -86,9 +88,7 @@ def solve(
         return run.collocate(xs, us)
     if method == "ilqr":
         return run.sweep(us)
-    if initial_guess is None and is_solvable(problem):
-        us = run.improved_guess(us)
-    return run.shoot(xs, us)
+    return run.shoot(xs, us, improve=initial_guess is None and is_solvable(problem))
 
 
 def _check_method(problem: Problem, method: str) -> None:
@@ -166,20 +166,18 @@ class _Run:
 
         return self._through_steps(np.tile(self.problem.x0, (len(us) + 1, 1)), us, search)
 
-    def shoot(self, xs: Array, us: Array) -> Solution:
+    def shoot(self, xs: Array, us: Array, *, improve: bool) -> Solution:
+        """Shooting; `improve` the guess by iLQR, which gets out of curved valleys that shooting crawls along."""
+
         def search(xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
+            if improve:
+                result, xs, us = solve_ilqr(self.problem, us, limits=self.limits, report=self.report)
+                self.options["initial_guess"] = f"default, then {result.message}"
+                if result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
+                    return result, xs, us
             return solve_shooting(self.problem, xs, us, solver=self.solver, limits=self.limits, report=self.report)
 
         return self._through_steps(xs, us, search)
-
-    def improved_guess(self, us: Array) -> Array:
-        """`us` after iLQR, which gets out of curved valleys of the cost that shooting crawls along."""
-        try:
-            result, _, improved = solve_ilqr(self.problem, us, limits=self.limits, report=self.report)
-        except (GradientError, SimulationError):
-            return us  # shooting meets the same refusal and says so in its status
-        self.options["initial_guess"] = f"default, then {result.message}"
-        return improved
 
     def _through_steps(self, xs: Array, us: Array, search: Search) -> Solution:
         """Certify, search, certify again, on Drake's own steps."""

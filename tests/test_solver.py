@@ -321,6 +321,15 @@ def test_ctrl_c_keeps_the_motion_and_puts_the_handler_back(load, solver):
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_ctrl_c_while_the_guess_is_improved_ends_the_solve(load):
+    """1 000 steps: the improvement by iLQR alone takes many seconds."""
+    problem = pendulum(load, **SOFT, num_steps=1000)
+    threading.Timer(1.5, signal.raise_signal, [signal.SIGINT]).start()
+    solution = dd.solve(problem, method="shooting")
+    assert solution.status is Status.INTERRUPTED
+    assert "iLQR: interrupted" in solution.message
+
+
 @pytest.mark.parametrize(
     ("method", "solver"),
     [("collocation", "ipopt"), ("collocation", "snopt"), ("shooting", "ipopt"), ("shooting", "snopt")],
@@ -413,6 +422,7 @@ def test_collocation_through_the_ground_is_not_verified(tmp_path):
     [
         ({"method": "magic"}, "method: expected one of auto, collocation, ilqr, shooting, got 'magic'"),
         ({"solver": "magic"}, "solver: expected one of ipopt, snopt, got 'magic'"),
+        ({"method": "ilqr", "solver": "snopt"}, "solver: expected none for method"),
         ({"max_iterations": 0}, "max_iterations"),
         ({"time_limit": -1.0}, "time_limit"),
         ({"tolerance": 0.0}, "tolerance"),
