@@ -218,6 +218,7 @@ def _replay_checks(solution: Solution) -> list[Check]:
     scale = "in the open-loop replay on the discrete plant"
     return [
         _check("replay end error", f"largest distance of the final state {scale} from the plan's", end, "q, v"),
+        _check("half-step end error", "the same, in steps half as long", solution.half_step_error, "q, v"),
         _check(
             "energy drift", f"lasting energy that actuators and damping do not explain, {scale}", r.energy_drift, "J"
         ),

@@ -1,6 +1,7 @@
 """A robot file or a user's own Drake diagram becomes a finalized discrete plant and its AutoDiffXd twin."""
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -51,10 +52,18 @@ class Model:
     one thread.
     """
 
-    def __init__(self, diagram: Diagram, *, source: Path | None, notes: tuple[str, ...] = ()):
+    def __init__(
+        self,
+        diagram: Diagram,
+        *,
+        source: Path | None,
+        notes: tuple[str, ...] = (),
+        rebuild: "Callable[[float], Model] | None" = None,
+    ):
         self.diagram = diagram
         self.source = source
         self.notes = notes
+        self._rebuild = rebuild
         self.path = path_to_the_plant(diagram)
         self.plant: MultibodyPlant = follow(diagram, self.path)
         _check_plant(self)
@@ -82,6 +91,14 @@ class Model:
         """(nx,) the state that the file or diagram starts in."""
         context = self.plant.GetMyContextFromRoot(self.diagram.CreateDefaultContext())
         return np.asarray(self.plant.GetPositionsAndVelocities(context))
+
+    def at_time_step(self, time_step: float) -> "Model":
+        """The same model at another time step [s]. ModelError where it came from a diagram, which has but one."""
+        if self._rebuild is None:
+            raise ModelError("a model from a diagram keeps its time step: build the diagram again with another")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ModelWarning)  # said when the model was loaded first
+            return self._rebuild(positive_float("time_step [s]", time_step))
 
     @cached_property
     def double(self) -> Twin:
@@ -186,7 +203,19 @@ def load_model(
         diagram = builder.Build()
     except RuntimeError as error:
         raise ModelError(f"{source} cannot be finalized: {error}") from error
-    return Model(diagram, source=source, notes=notes)
+
+    def rebuild(other: float) -> Model:
+        return load_model(
+            path,
+            time_step=other,
+            contact_model=contact_model,
+            contact_approximation=contact_approximation,
+            weld_base=weld_base,
+            ground=ground,
+            gravity=gravity,
+        )
+
+    return Model(diagram, source=source, notes=notes, rebuild=rebuild)
 
 
 def model_from_diagram(diagram: Diagram) -> Model:

@@ -10,9 +10,9 @@ import numpy as np
 from drake_diff.arrays import Array
 from drake_diff.certificate import Certificate
 from drake_diff.continuous import EquationsOfMotion
-from drake_diff.exceptions import SimulationError
+from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.problem import Problem
-from drake_diff.rollout import Rollout, rollout
+from drake_diff.rollout import Rollout, roll_states, rollout
 from drake_diff.step import advance
 
 FEASIBILITY_TOLERANCE = 1e-5  # defect, goal and bounds, in the state's and input's own units
@@ -173,6 +173,21 @@ class Solution:
             return rollout(self.problem.model, self.xs[0], us)
         except (SimulationError, ValueError):
             return None  # not finite, or beyond what Drake can step: recorded as missing, never as zero
+
+    @cached_property
+    def half_step_error(self) -> float:
+        """How far from xs[-1] the same held inputs lead at half the time step: what a step size decided.
+
+        inf where the model cannot be built again (it came from a diagram) or stepped.
+        """
+        if self.replay is None:
+            return float("inf")
+        try:
+            finer = self.problem.model.at_time_step(self.problem.model.time_step / 2)
+            end = roll_states(finer, self.xs[0], np.repeat(self.replay.us, 2, axis=0))[-1]
+        except (ModelError, SimulationError):
+            return float("inf")
+        return _largest(np.abs(end - self.xs[-1]))
 
     @cached_property
     def _equations(self) -> EquationsOfMotion:

@@ -222,6 +222,18 @@ def test_a_diagram_of_ones_own_steps_as_the_file_does(load):
     assert dd.step(mine, x) == pytest.approx(dd.step(file, x), abs=1e-12)
 
 
+def test_the_same_model_at_another_time_step(load):
+    model = load("sphere_on_ground.sdf", contact_approximation="lagged", gravity=(0, 0, -1.0))
+    finer = model.at_time_step(0.002)
+    assert finer.time_step == 0.002
+    assert finer.contract.contact == model.contract.contact
+    assert finer.contract.gravity == (0, 0, -1.0)
+    with pytest.raises(dd.InputError, match="time_step"):
+        model.at_time_step(0.0)
+    with pytest.raises(dd.ModelError, match="keeps its time step"):
+        dd.model_from_diagram(diagram_with()).at_time_step(0.01)
+
+
 def robot(name):
     return next(f.locate() for f in files("example-robot-data") if str(f).endswith("/" + name))
 

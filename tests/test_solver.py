@@ -235,6 +235,17 @@ def test_what_is_missing_is_infinite_not_zero(solutions):
         assert broken.replay is None
 
 
+def test_half_the_time_step_leads_elsewhere_by_the_closed_form(write_urdf):
+    """A held force u on 1 kg: x_N = u h^2 N (N + 1) / 2, and at h/2 less by u h^2 N / 4."""
+    h, count, u = 0.1, 8, 0.7
+    problem = dd.Problem(write_urdf(time_step=h), x0=[0, 0], num_steps=count, final_cost=lambda x: (x[0] - 1) ** 2)
+    us = np.full((count, 1), u)
+    solution = dd.solve(problem, method="ilqr", initial_guess=(np.zeros((count + 1, 2)), us))
+    moved = dataclasses.replace(solution, us=us, xs=dd.rollout(problem.model, [0, 0], us).xs)
+    assert moved.xs[-1, 0] == pytest.approx(u * h**2 * count * (count + 1) / 2, rel=1e-12)
+    assert moved.half_step_error == pytest.approx(u * h**2 * count / 4, rel=1e-9)
+
+
 def test_integration_error_shrinks_with_the_time_step(load):
     errors = [dd.solve(swing_up(load, n), method="collocation").integration_error for n in (20, 40)]
     assert errors[1] < errors[0] / 10  # fourth order or better
