@@ -10,7 +10,7 @@ from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
 
 from drake_diff.arrays import Array, frozen
 from drake_diff.autodiff import gradient_rows
-from drake_diff.exceptions import GradientError, SimulationError, UnknownNameError
+from drake_diff.exceptions import GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.finite_difference import differences
 from drake_diff.model import Model
 from drake_diff.parameters import (
@@ -70,7 +70,7 @@ def differentiate_step(
         try:
             jacobian = _autodiff(model, x, u, found, x_next)
             return _split(model, x_next, jacobian, found, "autodiff", "asked for" if method != "auto" else "works")
-        except SimulationError as error:
+        except (ModelError, SimulationError) as error:
             if method == "autodiff":
                 raise
             reason = f"AutoDiffXd is refused: {error}"

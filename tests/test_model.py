@@ -11,7 +11,7 @@ from conftest import MODELS, Plant, add_slide, contact_properties
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.planning import RobotDiagramBuilder
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
 import drake_diff as dd
@@ -232,6 +232,23 @@ def test_the_same_model_at_another_time_step(load):
         model.at_time_step(0.0)
     with pytest.raises(dd.ModelError, match="keeps its time step"):
         dd.model_from_diagram(diagram_with()).at_time_step(0.01)
+
+
+def test_a_diagram_without_an_autodiff_form_is_differenced_and_says_so():
+    """A Python system that defines no scalar conversion stops Drake's conversion of the whole diagram."""
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.01, use_sampled_output_ports=False), builder)
+    body = plant.AddRigidBody("block", SpatialInertia.SolidSphereWithMass(2.0, 0.1))
+    plant.AddJointActuator("push", add_slide(plant, "slide", plant.world_frame(), body, "x"))
+    plant.Finalize()
+    builder.AddSystem(LeafSystem()).set_name("python_only")
+    model = dd.model_from_diagram(builder.Build())
+    d = dd.differentiate_step(model, [0.0, 0.0], [3.0])
+    assert d.method == "finite_difference"
+    assert "no AutoDiffXd twin" in d.reason
+    assert d.B[1, 0] == pytest.approx(0.01 / 2, rel=1e-9)
+    with pytest.raises(dd.ModelError, match="no AutoDiffXd twin"):
+        dd.differentiate_step(model, [0.0, 0.0], [3.0], method="autodiff")
 
 
 def robot(name):
