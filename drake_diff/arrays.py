@@ -38,6 +38,8 @@ def array_with_gaps(subject: str, values: Any, shape: Sequence[int | str]) -> Ar
 
 def _array(subject: str, values: Any, shape: Sequence[int | str]) -> Array:
     try:
+        if np.iscomplexobj(values):
+            raise TypeError("complex")
         array = frozen(values)
     except (TypeError, ValueError) as error:
         raise InputError(subject, got=repr(values)[:80], expected="an array of numbers") from error

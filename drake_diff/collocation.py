@@ -74,6 +74,9 @@ class _Transcription:
 
     def _add_bounds(self) -> None:
         b = self.problem.bounds
+        free = self.problem.initial_state_mask
+        if free.any():
+            self._add_box(b.x_lower[free], b.x_upper[free], self.states[0][free], "initial state bounds")
         for k, variables in enumerate(self.states[1:], start=1):
             self._add_box(b.x_lower, b.x_upper, variables, f"state bounds at knot {k}")
         for k, variables in enumerate(self.inputs):

@@ -203,7 +203,7 @@ def _explain(solver: str, result: Any) -> tuple[Outcome, str]:
     details = result.get_solver_details()
     if solver == "ipopt":
         words = details.ConvertStatusToString()
-        if words == "Stopped at acceptable point":
+        if words == "Stop at acceptable point":
             outcome = Outcome.INACCURATE
         return outcome, f"IPOPT: {words}"
     if details.info in _SNOPT_INACCURATE:
@@ -222,7 +222,7 @@ def _read_table(solver: str, print_file: Path) -> tuple[Iteration, ...]:
 
 
 _IPOPT_ROW = re.compile(
-    r"^\s*(?P<iter>\d+)r?\s+(?P<objective>\S+)\s+(?P<inf_pr>\S+)\s+(?P<inf_du>\S+)\s+\S+\s+\S+\s+\S+\s+\S+\s+"
+    r"^\s*(?P<iter>\d+)(?:r|\s)\s*(?P<objective>-?\d\S+)\s+(?P<inf_pr>\S+)\s+(?P<inf_du>\S+)\s+\S+\s+\S+\s+\S+\s+\S+\s+"
     r"(?P<alpha_pr>[\d.e+-]+)\w?\s+\d+"
 )
 

@@ -33,8 +33,8 @@ class Problem:
     """Minimize sum_k h * running_cost(x_k, u_k) + final_cost(x_N) over `num_steps` steps of h = model.time_step.
 
     (Collocation: the transcription's quadrature of the same rate.) `x0` (nx,) is the initial state; `x_goal`
-    (nx,) a hard final equality whose NaN entries are free. `bounds` hold at every state after the initial one
-    and for every input. `optimize` names what may change: "controls" and/or "initial_state", the latter where
+    (nx,) a hard final equality whose NaN entries are free. `bounds` hold at every state that is not
+    given and for every input. `optimize` names what may change: "controls" and/or "initial_state", the latter where
     `initial_state_mask` (nx,) is True, x0 being the first guess there. Controls that are not optimized are `us`
     (N, nu), zero where not given; controls that are optimized start from it.
 
@@ -60,6 +60,8 @@ class Problem:
         self._set("x0", finite_array("x0", self.x0, (model.nx,)))
         self._set("num_steps", positive_int("num_steps", self.num_steps))
         self._set("optimize", _check_optimize(model, self.optimize))
+        if not (self.bounds is None or isinstance(self.bounds, Bounds)):
+            raise InputError("bounds", got=type(self.bounds).__name__, expected="Bounds")
         self._set("bounds", _resolve_bounds(model, self.bounds or Bounds()))
         self._set("initial_state_mask", self._check_mask())
         self._set("us", self._check_us())
@@ -111,7 +113,7 @@ class Problem:
             raise InputError("initial_state_mask", got=f"dtype {mask.dtype}", expected="booleans")
         if free and not mask.any():
             raise InputError("initial_state_mask", got="no True entry", expected="at least one free entry")
-        if not free:
+        if not free and mask.any():
             raise InputError("initial_state_mask", got="a mask", expected='"initial_state" in optimize')
         return mask
 
@@ -141,7 +143,7 @@ class Problem:
         self._check_inside("x_goal", inside, "x")
 
     def _check_costs(self) -> None:
-        if self.running_cost is None and self.final_cost is None and self.x_goal is None:
+        if self.running_cost is None and self.final_cost is None and np.all(np.isnan(self.goal)):
             raise InputError("problem", got="no cost and no goal", expected="a cost, an x_goal, or both")
         for name in ("running_cost", "final_cost"):
             cost = getattr(self, name)
@@ -152,6 +154,8 @@ class Problem:
 
 
 def _check_optimize(model: Model, optimize: Sequence[str]) -> tuple[str, ...]:
+    if not isinstance(optimize, (str, tuple, list, set, frozenset)):
+        raise InputError("optimize", got=repr(optimize), expected="names out of " + ", ".join(OPTIMIZABLE))
     names = (optimize,) if isinstance(optimize, str) else tuple(optimize)
     if not names:
         raise InputError("optimize", got="nothing", expected="at least one of " + ", ".join(OPTIMIZABLE))
@@ -181,7 +185,7 @@ def _resolve_bounds(model: Model, bounds: Bounds) -> Bounds:
             resolved[name] = frozen(np.where(np.isnan(checked), limits, checked))
     for kind, names in (("x", model.state_names), ("u", model.input_names)):
         lower, upper = resolved[f"{kind}_lower"], resolved[f"{kind}_upper"]
-        crossed = np.flatnonzero(lower > upper)
+        crossed = np.flatnonzero((lower > upper) | (lower == np.inf) | (upper == -np.inf))
         if len(crossed):
             i = int(crossed[0])
             raise InputError(

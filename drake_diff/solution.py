@@ -117,6 +117,8 @@ class Solution:
         Discrete: |x_(k+1) - step(x_k, u_k)|. Collocation: h |dx/dt - f(x, u)| of the cubic through the knots at
         its midpoint, Drake's own defect times h.
         """
+        if self.us.shape != self.problem.us.shape or self.xs.shape != (len(self.us) + 1, self.problem.model.nx):
+            return np.full(max(self.problem.num_steps, 1), np.inf)
         measure = self._step_defect if self.u_final is None else self._collocation_defect
         return np.array([measure(k) for k in range(len(self.us))])
 
@@ -145,9 +147,11 @@ class Solution:
         """The largest excess over a bound of a state after the first, or of an input."""
         b = self.problem.bounds
         states, inputs = self.xs[1:], self.inputs_at_knots
+        free = self.problem.initial_state_mask
         if not (np.all(np.isfinite(states)) and np.all(np.isfinite(inputs))):
             return float("inf")
         excess = [b.x_lower - states, states - b.x_upper, b.u_lower - inputs, inputs - b.u_upper]
+        excess += [(b.x_lower - self.xs[0])[free], (self.xs[0] - b.x_upper)[free]]
         return float(max(np.max(e, initial=0.0) for e in excess))
 
     @cached_property

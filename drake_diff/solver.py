@@ -55,6 +55,12 @@ def solve(
 
     Raises InputError and its kin, or ModelError, before anything runs; how a solve ended is `Solution.status`.
     """
+    if not isinstance(problem, Problem):
+        raise InputError("problem", got=type(problem).__name__, expected="a Problem")
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InputError("seed", got=repr(seed), expected="a whole number of at least 0")
+    if not (isinstance(progress, bool) or callable(progress)):
+        raise InputError("progress", got=repr(progress), expected="True, False or a function")
     if method not in METHODS:
         raise UnknownNameError("method", got=method, known=METHODS)
     if solver is not None and solver not in SOLVERS:
@@ -127,7 +133,7 @@ def _guess(problem: Problem, method: str, given: Any, seed: int) -> tuple[Array,
     us = np.array(problem.us)
     if method == "shooting" and problem.optimizes_controls and not us.any():
         limit = np.minimum(np.abs(problem.bounds.u_lower), np.abs(problem.bounds.u_upper))
-        size = np.where(np.isfinite(limit), limit, 1.0)
+        size = np.where(np.isfinite(limit), np.minimum(limit, 100.0), 1.0)
         us = GUESS_NOISE * size * np.random.default_rng(seed).standard_normal(us.shape)
     inside = np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
     return xs, inside if problem.optimizes_controls else us

@@ -1,6 +1,8 @@
 """Problems and costs: what they mean, and what is refused before anything runs."""
 
+import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import pytest
 import drake_diff as dd
 from drake_diff.cost import differentiate_cost, final_cost_hessian, running_cost_hessian
 
+MODELS = Path(__file__).parent.parent / "models"
 R = dd.QuadraticCost(R=[[1.0]])
 
 
@@ -113,11 +116,74 @@ def test_a_nan_goal_is_free(load):
         ({"running_cost": dd.QuadraticCost(Q=np.eye(3))}, r"running_cost.Q: expected shape \(4, 4\)"),
         ({"running_cost": None, "x_goal": None}, "a cost, an x_goal, or both"),
         ({"us": np.zeros((3, 1))}, r"us: expected shape \(10, 1\)"),
+        ({"us": np.full((10, 1), math.nan)}, r"us\[0, 0\]: expected a finite number, got nan"),
+        (
+            {"optimize": "initial_state", "us": np.full((10, 1), 21.0)},
+            r"us, force: expected within \[-20, 20\], got 21",
+        ),
+        ({"x0": None}, r"x0: expected shape \(4,\), got shape \(\)"),
+        ({"x0": "rest"}, "x0: expected an array of numbers, got 'rest'"),
+        ({"x0": [0, 0, 0, math.inf]}, r"x0\[3\]: expected a finite number, got inf"),
+        ({"num_steps": 10.0}, "num_steps: expected a whole number of at least 1, got 10.0"),
+        ({"final_cost": dd.QuadraticCost(Q=np.eye(3))}, r"final_cost.Q: expected shape \(4, 4\), got shape \(3, 3\)"),
+        ({"final_cost": "small"}, "final_cost: expected a function or a QuadraticCost, got str"),
+        ({"running_cost": dd.QuadraticCost(x_ref=[1, 2])}, r"running_cost.x_ref: expected shape \(4,\)"),
+        ({"running_cost": dd.QuadraticCost(u_ref=[1, 2])}, r"running_cost.u_ref: expected shape \(1,\)"),
+        ({"bounds": dd.Bounds(u_upper=5.0)}, r"u_upper: expected shape \(1,\), got shape \(\)"),
+        (
+            {"bounds": dd.Bounds(x_lower=[0.5, math.nan, math.nan, math.nan])},
+            r"x0, slide_x: expected within \[0.5, 2\]",
+        ),
+        ({"optimize": "initial_state", "initial_state_mask": [0.0, 1.0, 0.0, 0.0]}, "got dtype float64"),
     ],
 )
 def test_bad_problems_are_named(load, changes, words):
-    with pytest.raises(dd.InputError, match=words):
+    with pytest.raises(dd.InputError, match=words) as error:
         cart_pole(load, **changes)
+    assert f": expected {error.value.expected}, got {error.value.got}" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"bounds": ([-1], [1])},
+        {"bounds": dd.Bounds(u_lower=[math.inf], u_upper=[math.inf])},
+        {"optimize": None},
+        {"optimize": 3},
+        {"x_goal": [math.nan] * 4, "running_cost": None},
+        {"x0": np.array([0.5 + 1j, 0, 0, 0])},
+    ],
+)
+def test_what_cannot_be_meant_is_refused_by_a_named_error(load, changes):
+    """A tuple for Bounds, an input of infinity at least, no names, a goal of gaps and no cost, a complex position."""
+    with pytest.raises(dd.InputError, match=r"expected .*got"):
+        cart_pole(load, **changes)
+
+
+def test_a_problem_can_be_changed_in_one_field(load):
+    """Like every frozen dataclass; what was resolved when it was made must not be in the way."""
+    problem = cart_pole(load)
+    longer = dataclasses.replace(problem, num_steps=20, us=None)
+    assert longer.num_steps == 20
+    assert longer.bounds.u_upper.tolist() == [20.0]
+
+
+def test_a_models_speed_limit_applies(tmp_path):
+    text = (MODELS / "cart_pole.urdf").read_text()
+    limited = text.replace('effort="20"/>', 'effort="20" velocity="3"/>')
+    assert limited != text
+    (tmp_path / "limited.urdf").write_text(limited)
+    model = dd.load_model(tmp_path / "limited.urdf", time_step=0.1)
+    bounds = dd.Problem(model, x0=np.zeros(4), num_steps=3, running_cost=R).bounds
+    assert bounds.x_upper.tolist() == [2.0, math.inf, 3.0, math.inf]
+    assert bounds.x_lower.tolist() == [-2.0, -math.inf, -3.0, -math.inf]
+
+
+def test_infinity_takes_the_models_limit_away_on_one_side_only(load):
+    bounds = cart_pole(load, bounds=dd.Bounds(u_upper=[math.inf], x_lower=[-math.inf, 0, math.nan, math.nan])).bounds
+    assert (bounds.u_lower[0], bounds.u_upper[0]) == (-20.0, math.inf)
+    assert (bounds.x_lower[0], bounds.x_upper[0]) == (-math.inf, 2.0)
+    assert bounds.x_lower[1] == 0.0
 
 
 def test_controls_without_actuators_are_refused(load):

@@ -1,0 +1,194 @@
+"""Collocation against closed forms and a dense solve of the same transcription, and what it refuses."""
+
+import math
+import signal
+
+import numpy as np
+import pytest
+from test_solution import MODELS, block
+
+import drake_diff as dd
+from drake_diff.nonlinear_program import NlpResult, Outcome
+from drake_diff.solution import Status
+
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+
+
+def move(count=10, *, model=None, **changes):
+    """Min. effort from rest at 0 to rest at 1 within 1 s."""
+    fields = {"x0": [0, 0], "x_goal": [1, 0], "running_cost": EFFORT, "num_steps": count}
+    return dd.Problem(model or block(time_step=1 / count), **{**fields, **changes})
+
+
+def swing_up(count=20, **changes):
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=2 / count)
+    fields = {"x0": np.zeros(4), "x_goal": [1, np.pi, 0, 0], "running_cost": EFFORT, "num_steps": count}
+    return dd.Problem(model, **{**fields, **changes})
+
+
+def collocate(problem, **options):
+    return dd.solve(problem, method="collocation", **options)
+
+
+@pytest.mark.parametrize("count", [2, 4, 10, 20])
+@pytest.mark.parametrize("solver", ["ipopt", "snopt"])
+def test_the_block_moves_by_the_transcriptions_own_optimum(count, solver):
+    """B01: J = 12 / (1 - 2/N^2 + 4/(3 N^3)): linear inputs, the running cost by trapezoids."""
+    solution = collocate(move(count), solver=solver)
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(12 / (1 - 2 / count**2 + 4 / (3 * count**3)), rel=1e-8)
+
+
+def test_the_blocks_motion_tends_to_the_calculus_of_variations():
+    """u = 6 - 12 t, x = 3 t^2 - 2 t^3; the inputs' error at N = 40 is O(1/N)."""
+    solution = collocate(move(40))
+    t = solution.times
+    assert solution.xs[:, 0] == pytest.approx(3 * t**2 - 2 * t**3, abs=1e-3)
+    assert solution.inputs_at_knots[:, 0] == pytest.approx(6 - 12 * t, abs=6 / 40 * 2)
+
+
+def dense_block(count, h, Q, R, Qf, target):
+    """xs, us (knots) of min trapezoid(x'Qx + R u^2) + (x_N - target)'Qf(x_N - target), by least squares."""
+    steps = np.zeros((count + 1, 2, count + 1))  # x_k = steps[k] @ u, exact for linear u
+    for k in range(count):
+        steps[k + 1] = [[1, h], [0, 1]] @ steps[k]
+        steps[k + 1, :, k] += [h**2 / 3, h / 2]
+        steps[k + 1, :, k + 1] += [h**2 / 6, h / 2]
+    weights = np.full(count + 1, h)
+    weights[[0, -1]] = h / 2
+    H = sum(w * S.T @ Q @ S for w, S in zip(weights, steps, strict=True)) + np.diag(weights * R)
+    H += steps[-1].T @ Qf @ steps[-1]
+    us = np.linalg.solve(H, steps[-1].T @ Qf @ target)
+    return steps @ us, us
+
+
+@pytest.mark.parametrize("as_functions", [False, True])
+def test_running_and_final_costs_give_the_dense_solves_optimum(as_functions):
+    count, h, Q, R, Qf, target = 8, 0.125, np.diag([2.0, 0.3]), 0.05, np.diag([7.0, 1.0]), np.array([1.0, 0.2])
+    running, final = dd.QuadraticCost(Q=Q, R=[[R]]), dd.QuadraticCost(Q=Qf, x_ref=target)
+    if as_functions:
+        running, final = lambda x, u: x @ Q @ x + R * u @ u, lambda x: (x - target) @ Qf @ (x - target)
+    solution = collocate(move(count, x_goal=None, running_cost=running, final_cost=final))
+    xs, us = dense_block(count, h, Q, R, Qf, target)
+    assert solution.success, solution.message
+    assert solution.xs == pytest.approx(xs, abs=1e-6)
+    assert solution.inputs_at_knots[:, 0] == pytest.approx(us, abs=1e-5)
+
+
+def test_every_knots_input_keeps_its_bound():
+    """|u| <= 5 cuts 6 - 12 t at both ends, where it is active: the first knot's and the last knot's too."""
+    solution = collocate(move(bounds=dd.Bounds(u_lower=[-5], u_upper=[5])))
+    assert solution.success, solution.message
+    knots = solution.inputs_at_knots[:, 0]
+    assert np.abs(knots).max() <= 5 + 1e-6
+    assert knots[[0, -1]] == pytest.approx([5, -5], abs=1e-5)
+    assert solution.cost > collocate(move()).cost
+
+
+def test_a_state_bound_is_kept_at_the_knots():
+    """v <= 1.2, where the free motion reaches 1.5."""
+    solution = collocate(move(bounds=dd.Bounds(x_upper=[9, 1.2])))
+    assert solution.success, solution.message
+    assert solution.xs[:, 1].max() == pytest.approx(1.2, abs=1e-6)
+
+
+def test_a_free_goal_entry_is_left_free():
+    """min of the effort to reach x = 1 at any speed in continuous time: 3 d^2 / T^3 with u = 3 (1 - t)."""
+    solution = collocate(move(40, x_goal=[1, math.nan]))
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(3, rel=2e-3)  # trapezoids at N = 40 are O(1/N^2)
+    assert solution.xs[-1, 1] == pytest.approx(1.5, rel=2e-3)
+
+
+def test_a_free_initial_velocity_keeps_its_bound():
+    """v_0 <= 0.3 although 1 would need no effort: shooting keeps this bound, and so must collocation."""
+    changes = {"optimize": ("controls", "initial_state"), "initial_state_mask": [False, True]}
+    problem = move(x_goal=[1, math.nan], bounds=dd.Bounds(x_upper=[9, 0.3], u_upper=[99]), **changes)
+    wide = move(x_goal=[1, math.nan], bounds=dd.Bounds(x_upper=[9, 2.0]), **changes)
+    assert collocate(wide).xs[0, 1] == pytest.approx(1.0, abs=1e-6)
+    solution = collocate(problem)
+    assert not solution.success or solution.xs[0, 1] <= 0.3 + 1e-6
+
+
+def test_the_masked_out_entries_of_the_initial_state_stay():
+    changes = {"optimize": ("controls", "initial_state"), "initial_state_mask": [False, True]}
+    solution = collocate(move(x0=[0.25, 0], x_goal=[1, math.nan], **changes))
+    assert solution.success, solution.message
+    assert solution.xs[0] == pytest.approx([0.25, 0.75], abs=1e-6)
+    assert solution.initial_state_error < 1e-9
+
+
+def test_a_coupled_model_is_refused():
+    model = block(blocks=2, actuated=1, couple=True)
+    problem = dd.Problem(model, x0=np.zeros(4), num_steps=5, running_cost=EFFORT, x_goal=[1, 0.5, 0, 0])
+    with pytest.raises(dd.ModelError, match=r"constraints have no continuous form; use method='shooting'"):
+        collocate(problem)
+
+
+def test_nothing_to_control_is_refused():
+    problem = move(optimize=("initial_state",))
+    with pytest.raises(dd.InputError, match=r'optimize: expected "controls" .* got \[\'initial_state\'\]'):
+        collocate(problem)
+
+
+def test_a_pushed_block_does_not_move_its_neighbour():
+    """Its goal is out of reach: no success, and the goal error is told."""
+    model = block(blocks=2, actuated=1)
+    problem = dd.Problem(model, x0=np.zeros(4), num_steps=5, running_cost=EFFORT, x_goal=[1, 1, 0, 0])
+    solution = collocate(problem, max_iterations=50)
+    assert not solution.success
+    assert solution.status in (Status.INFEASIBLE, Status.NO_GRADIENT, Status.ITERATION_LIMIT)
+    assert len(solution.message) > 40
+
+
+def test_a_collocation_solver_that_lies_is_not_believed(monkeypatch):
+    def liar(problem, xs, us, **options):
+        return NlpResult(us.ravel(), Outcome.SOLVED, "all is well", ()), xs, us, us[-1]
+
+    monkeypatch.setattr("drake_diff.solver.solve_collocation", liar)
+    solution = collocate(swing_up())
+    assert solution.status is Status.CONVERGED_NOT_VERIFIED
+    assert "defect" in solution.message
+    assert "is above 1e-05" in solution.message
+
+
+@pytest.mark.parametrize(("row", "column"), [(2, 1), (2, 3), (3, 1), (3, 3), (2, 4), (3, 4)])
+def test_a_derivative_that_is_one_percent_off_is_named(row, column, monkeypatch):
+    """Every entry of [A B] of the accelerations that is not zero by itself, the guess being a moving one."""
+    from drake_diff.continuous import EquationsOfMotion
+
+    honest = EquationsOfMotion.autodiff
+
+    def one_percent_off(self, x, u):
+        from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
+
+        result = honest(self, x, u)
+        jacobian = np.array(ExtractGradient(result.reshape(-1, 1)))
+        jacobian[row, column] *= 1.01
+        return InitializeAutoDiff(ExtractValue(result.reshape(-1, 1)), jacobian).ravel()
+
+    problem = swing_up()
+    guess = np.linspace(0, 1, 21)[:, None] * [0.5, 2.5, 1.0, 2.0], np.full((20, 1), 3.0)
+    monkeypatch.setattr(EquationsOfMotion, "autodiff", one_percent_off)
+    solution = collocate(problem, initial_guess=guess, max_iterations=3)
+    names = (*problem.model.state_names, *problem.model.input_names)
+    assert not solution.success
+    assert "disagree" in [certificate.verdict for certificate in solution.certificates]
+    assert f"d d({names[row]})/dt / d {names[column]}" in solution.message
+
+
+def test_ctrl_c_ends_it_with_a_motion(monkeypatch):
+    monkeypatch.setattr("drake_diff.nonlinear_program.REPORT_PERIOD", 0.0)
+    before = signal.getsignal(signal.SIGINT)
+    for solver in ("ipopt", "snopt"):
+        solution = collocate(swing_up(), solver=solver, progress=lambda line: signal.raise_signal(signal.SIGINT))
+        assert solution.status is Status.INTERRUPTED
+        assert np.all(np.isfinite(solution.xs))
+        assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_the_same_problem_gives_the_same_bits():
+    a, b = (collocate(swing_up()) for _ in range(2))
+    assert a.xs.tobytes() == b.xs.tobytes()
+    assert a.inputs_at_knots.tobytes() == b.inputs_at_knots.tobytes()
+    assert repr(a.iterations) == repr(b.iterations)

@@ -1,0 +1,220 @@
+"""A Solution measures itself: corrupt a motion in any one place and a measure grows; what is missing is infinite."""
+
+import dataclasses
+import functools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import PrismaticJoint, SpatialInertia
+from pydrake.systems.framework import DiagramBuilder
+
+import drake_diff as dd
+
+MODELS = Path(__file__).parent.parent / "models"
+METHODS = ("collocation", "shooting", "ilqr")
+N, H = 10, 0.1
+MOVED = 1e-3
+
+
+def block(*, mass=1.0, time_step=H, effort=math.inf, blocks=1, actuated=1, couple=False):
+    """Blocks side by side on rails, x_k along its rail; the first `actuated` of them are pushed."""
+    builder = DiagramBuilder()
+    config = MultibodyPlantConfig(
+        time_step=time_step, use_sampled_output_ports=False, discrete_contact_approximation="sap"
+    )
+    plant, _ = AddMultibodyPlant(config, builder)
+    rails = []
+    for i in range(blocks):
+        body = plant.AddRigidBody(f"block_{i}", SpatialInertia.SolidBoxWithMass(mass, 0.1, 0.1, 0.1))
+        rails.append(plant.AddJoint(PrismaticJoint(f"rail_{i}", plant.world_frame(), body.body_frame(), [1, 0, 0])))
+    for i in range(actuated):
+        plant.AddJointActuator(f"push_{i}", rails[i], effort)
+    if couple:
+        plant.AddCouplerConstraint(rails[0], rails[1], 2.0)
+    plant.Finalize()
+    return dd.model_from_diagram(builder.Build())
+
+
+@functools.cache
+def solved(method):
+    """A block moved by 1 m within bounds that are not active; iLQR takes no goal and no bound of a state."""
+    hard = {
+        "x_goal": [1, 0],
+        "running_cost": dd.QuadraticCost(R=[[1.0]]),
+        "bounds": dd.Bounds([-0.5, -3], [1.5, 3], [-20], [20]),
+    }
+    soft = {
+        "running_cost": dd.QuadraticCost(R=[[1.0]]),
+        "final_cost": dd.QuadraticCost(Q=100 * np.eye(2), x_ref=[1, 0]),
+        "bounds": dd.Bounds(u_lower=[-20], u_upper=[20]),
+    }
+    solution = dd.solve(
+        dd.Problem(block(), x0=[0, 0], num_steps=N, **(soft if method == "ilqr" else hard)), method=method
+    )
+    assert solution.success, solution.message
+    return solution
+
+
+def moved(solution, name, index, by):
+    """`solution` with one entry of one of its arrays changed."""
+    values = np.array(getattr(solution, name))
+    values[index] += by
+    return dataclasses.replace(solution, **{name: values})
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_an_untouched_solution_measures_as_exact(method):
+    s = solved(method)
+    assert s.defect < 1e-9  # a linear plant: rounding, and the solver's 1e-8 on collocation's defects times h
+    assert s.initial_state_error < 1e-9
+    assert s.bound_violation == 0.0
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("coordinate", [0, 1])
+@pytest.mark.parametrize("knot", [0, 1, N // 2, N - 1, N])
+def test_one_moved_knot_shows_in_its_own_intervals(method, coordinate, knot):
+    """A first position can hide from no interval here, nor can a velocity: both ends of an interval are measured."""
+    s = moved(solved(method), "xs", (knot, coordinate), MOVED)
+    touched = [k for k in (knot - 1, knot) if 0 <= k < N]
+    assert s.defect > MOVED / 2
+    assert int(np.argmax(s.defects)) in touched
+    assert np.delete(s.defects, touched).max() < 1e-9
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_moved_first_state_shows_in_the_initial_state_error(method):
+    assert moved(solved(method), "xs", (0, 1), MOVED).initial_state_error == pytest.approx(MOVED, rel=1e-6)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_motion_shifted_as_a_whole_shows_at_its_start(method):
+    """No interval of it is wrong: only where it starts."""
+    s = solved(method)
+    shifted = dataclasses.replace(s, xs=s.xs + np.array([MOVED, 0]))
+    assert shifted.defect < 1e-9
+    assert shifted.initial_state_error == pytest.approx(MOVED, rel=1e-6)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("index", [0, N // 2, N - 1])
+def test_one_moved_input_shows_in_the_defect(method, index):
+    """A held input moves the velocity of 1 kg by h du; a collocated one half of that in each of its intervals."""
+    assert moved(solved(method), "us", index, 0.01).defect >= 0.9 * H * 0.01 / 4
+
+
+def test_collocations_last_input_shows_in_the_defect():
+    assert moved(solved("collocation"), "u_final", 0, 0.01).defect >= 0.9 * H * 0.01 / 4
+
+
+@pytest.mark.parametrize("method", ["collocation", "shooting"])
+def test_a_missed_goal_is_measured_in_its_own_unit(method):
+    assert moved(solved(method), "xs", (N, 0), MOVED).goal_error == pytest.approx(MOVED, rel=1e-4)
+
+
+@pytest.mark.parametrize("method", ["collocation", "shooting"])
+@pytest.mark.parametrize(
+    ("name", "index", "to", "violation"),
+    [
+        ("xs", (3, 0), 1.75, 0.25),
+        ("xs", (3, 1), -3.5, 0.5),
+        ("xs", (N, 0), -0.6, 0.1),
+        ("us", (0, 0), 21.0, 1.0),
+        ("us", (N - 1, 0), -22.0, 2.0),
+    ],
+)
+def test_a_broken_bound_is_measured_by_its_excess(method, name, index, to, violation):
+    s = solved(method)
+    broken = moved(s, name, index, to - getattr(s, name)[index])
+    assert broken.bound_violation == pytest.approx(violation, rel=1e-12)
+
+
+def test_collocations_last_input_is_held_to_its_bound():
+    s = solved("collocation")
+    assert moved(s, "u_final", 0, 100 - s.u_final[0]).bound_violation == pytest.approx(80, rel=1e-12)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_cost_is_computed_from_the_motion(method):
+    """Inputs twice as large cost four times as much; the final cost of a motion left as it is stays."""
+    s = solved(method)
+    final = 0.0 if s.problem.final_cost is None else s.problem.final_cost(s.xs[-1])
+    fields = {"us": 2 * s.us} if s.u_final is None else {"us": 2 * s.us, "u_final": 2 * s.u_final}
+    assert dataclasses.replace(s, **fields).cost == pytest.approx(4 * (s.cost - final) + final, rel=1e-12)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("method", METHODS)
+def test_one_entry_of_a_state_that_is_no_number_makes_the_motion_infinitely_wrong(method, bad):
+    s = moved(solved(method), "xs", (4, 1), bad)
+    assert s.defect == s.bound_violation == s.integration_error == math.inf
+    assert s.half_step_error == math.inf
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize("method", METHODS)
+def test_one_input_that_is_no_number_makes_the_motion_infinitely_wrong(method, bad):
+    s = moved(solved(method), "us", (4, 0), bad)
+    assert s.defect == s.bound_violation == s.cost == s.integration_error == math.inf
+    assert s.replay is None
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_ends_that_are_no_numbers_are_infinitely_wrong(method):
+    s = solved(method)
+    assert moved(s, "xs", (0, 0), math.nan).initial_state_error == math.inf
+    if s.problem.x_goal is not None:
+        assert moved(s, "xs", (N, 0), math.nan).goal_error == math.inf
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("steps", [0, 1, N - 1])
+def test_a_motion_that_ends_too_early_is_infinitely_wrong(method, steps):
+    """Each of its intervals may be right: those that are missing are not."""
+    s = solved(method)
+    assert dataclasses.replace(s, xs=s.xs[: steps + 1], us=s.us[:steps]).defect == math.inf
+
+
+@pytest.mark.parametrize("method", ["shooting", "ilqr"])
+def test_the_replay_of_a_discrete_solution_is_the_solution(method):
+    s = solved(method)
+    assert np.array_equal(s.replay.xs, s.xs)
+
+
+def test_the_replay_of_a_collocated_solution_is_the_discrete_plants():
+    """Held mean inputs on 1 kg by symplectic Euler: v_k+1 = v_k + h (u_k + u_k+1) / 2, x_k+1 = x_k + h v_k+1."""
+    s = solved("collocation")
+    v = np.concatenate([[0], H * np.cumsum((s.inputs_at_knots[:-1, 0] + s.inputs_at_knots[1:, 0]) / 2)])
+    x = np.concatenate([[0], H * np.cumsum(v[1:])])
+    assert s.replay.xs == pytest.approx(np.column_stack([x, v]), abs=1e-12)
+    assert abs(s.replay.xs[-1, 0] - 1) > MOVED  # another integrator: it does not land where the cubic does
+
+
+def test_the_integration_error_of_a_cubic_motion_is_rounding():
+    assert solved("collocation").integration_error < 1e-9
+
+
+def test_the_integration_error_falls_by_the_fourth_order_of_hermite_simpson():
+    """Per interval it is O(h^5): halving h divides it by about 32 on a smooth motion, by 16 at the very least."""
+    errors = []
+    for count in (20, 40):
+        model = dd.load_model(MODELS / "cart_pole.urdf", time_step=2 / count)
+        problem = dd.Problem(
+            model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=count, running_cost=dd.QuadraticCost(R=[[1.0]])
+        )
+        errors.append(dd.solve(problem, method="collocation").integration_error)
+    assert 0 < errors[1] < errors[0] / 16
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_solutions_arrays_are_read_only(method):
+    with pytest.raises(ValueError, match="read-only"):
+        solved(method).xs[0, 0] = 1.0
+
+
+def test_only_converged_is_success():
+    s = solved("shooting")
+    assert [status for status in dd.Status if dataclasses.replace(s, status=status).success] == [dd.Status.CONVERGED]
