@@ -24,6 +24,10 @@ from drake_diff.model import Model as Model
 from drake_diff.model import load_model as load_model
 from drake_diff.model import model_from_diagram as model_from_diagram
 from drake_diff.parameters import list_parameters as list_parameters
+from drake_diff.policy import LQR as LQR
+from drake_diff.policy import PD as PD
+from drake_diff.policy import TVLQR as TVLQR
+from drake_diff.policy import ParametricPolicy as ParametricPolicy
 from drake_diff.problem import Bounds as Bounds
 from drake_diff.problem import Problem as Problem
 from drake_diff.record import EvidenceRecord as EvidenceRecord
@@ -31,6 +35,11 @@ from drake_diff.rollout import Rollout as Rollout
 from drake_diff.rollout import rollout as rollout
 from drake_diff.rollout_gradient import RolloutGradient as RolloutGradient
 from drake_diff.rollout_gradient import differentiate_rollout as differentiate_rollout
+from drake_diff.smoothing import Barrier as Barrier
+from drake_diff.smoothing import Gaussian as Gaussian
+from drake_diff.smoothing import Smoothed as Smoothed
+from drake_diff.smoothing import smooth as smooth
+from drake_diff.smoothing import smooth_step as smooth_step
 from drake_diff.solution import Solution as Solution
 from drake_diff.solution import Status as Status
 from drake_diff.solver import solve as solve

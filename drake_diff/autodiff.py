@@ -52,6 +52,14 @@ def gradient_rows(values: Any, width: int) -> Array:
     return np.asarray(gradient) if gradient.shape[1] else np.zeros((len(values), width))
 
 
+def plain(values: Any) -> Array:
+    """The values alone of an array of floats or AutoDiffXd, of any shape."""
+    array = np.asarray(values)
+    if array.dtype != object:
+        return array.astype(float)
+    return np.array([getattr(v, "value", lambda v=v: v)() for v in array.ravel()]).reshape(array.shape)
+
+
 def chain(value: float, gradient: Array, z: Any) -> AutoDiffXd:
     """The AutoDiffXd of a scalar of `z` (n,) whose value and gradient (n,) by z are known."""
     return AutoDiffXd(value, gradient @ ExtractGradient(z.reshape(-1, 1)))

@@ -21,15 +21,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_diff.arrays import Array, finite_array, frozen
 from drake_diff.exceptions import CertificateError, GradientError, ShapeError
-from drake_diff.finite_difference import Difference, Function, differences
+from drake_diff.finite_difference import ROUNDING, Difference, Function, differences, richardson
 
 STEPS = tuple(10.0 ** (-k / 2) for k in range(4, 17))  # 1e-2 ... 1e-8
-RATIO_SQUARED = 10.0
 RELATIVE_TOLERANCE = 1e-6
 RESOLVED = 1e-4
 # Entries below this part of their row's largest, or below NOTHING, need not be resolved, only consistent.
 NEGLIGIBLE, NOTHING = 1e-6, 1e-9
-ROUNDING = 1e-15
 # The derivative of what an iterative solver leaves unsolved: measured up to 60 times its tolerance, by row.
 SOLVER_FACTOR = 100.0
 JITTER = 1e-9
@@ -204,8 +202,8 @@ def _judge(
     a: Array, central: Array, value_scale: Array, solver_tolerance: float
 ) -> tuple[Array, Array, NDArray[np.int64]]:
     """The differences' value, the tolerance and the verdict of every entry, kinks and jumps aside."""
-    richardson = central[1:] + (central[1:] - central[:-1]) / (RATIO_SQUARED - 1)
-    windows = np.array([richardson[s - 1 : s + 2] for s in range(1, len(richardson) - 1)])
+    values = richardson(central)
+    windows = np.array([values[s - 1 : s + 2] for s in range(1, len(values) - 1)])
     middle = windows[:, 1]
     rounding = ROUNDING * value_scale[None, :, None] / np.array(STEPS[2:-1])[:, None, None]
     uncertainty = windows.max(axis=1) - windows.min(axis=1) + rounding

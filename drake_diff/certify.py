@@ -1,20 +1,18 @@
 """Certify the derivative of a step, or of a whole rollout, before it is used."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff.arrays import Array, finite_array
 from drake_diff.certificate import JITTER, Certificate, certify_displacement, jitter_direction
 from drake_diff.model import Model
-from drake_diff.parameters import column_names, difference_scale, find_parameters, stacked_values
+from drake_diff.parameters import Parameters, ParameterVector, applied, select
 from drake_diff.plant_elements import actuators
 from drake_diff.read_contract import SAP_RELATIVE_TOLERANCE
 from drake_diff.rollout import check_inputs, roll_states
 from drake_diff.rollout_gradient import Loss, RolloutGradient, differentiate_rollout, evaluate_loss
 from drake_diff.step import advance, check_point
-from drake_diff.step_derivatives import StepDerivatives, differentiate_step, step_of_displacement
+from drake_diff.step_derivatives import StepDerivatives, step_at, step_jacobians
 from drake_diff.tangent import TangentSpace, tangent_space
 
 LIMIT_REACH = 0.05  # [m or rad] a joint limit this near may hold the joint in one of the displaced steps
@@ -25,7 +23,7 @@ def certify(
     x: ArrayLike,
     u: ArrayLike | None = None,
     *,
-    parameters: Sequence[str] = (),
+    parameters: Parameters = (),
     method: str = "auto",
     derivatives: StepDerivatives | None = None,
 ) -> Certificate:
@@ -35,43 +33,53 @@ def certify(
     three entries). The derivative is `differentiate_step(..., method=method)`, or `derivatives` where given.
     """
     x, u = check_point(model, x, u)
-    found = find_parameters(model, tuple(parameters))
-    point = np.concatenate([x, u, stacked_values(found)])
-    space, free = tangent_space(model), len(point) - model.nx
-    scale = np.concatenate([_scale(space, x), np.maximum(1.0, np.abs(u)), difference_scale(found)])
+    vector = select(model, parameters)
+    with applied(vector) as set_model:
+        return _certify_step(set_model, vector, x, u, method, derivatives)
+
+
+def _certify_step(
+    model: Model, vector: ParameterVector, x: Array, u: Array, method: str, given: StepDerivatives | None
+) -> Certificate:
+    space, end = tangent_space(model), model.nx + model.nu
+    point = np.concatenate([x, u, vector.values])
+    scale = np.concatenate([_scale(space, x), np.maximum(1.0, np.abs(u)), vector.difference_scale()])
 
     def f(displacement: Array) -> Array:
         moved = _move(space, model.nx, point, scale * displacement)
-        return np.asarray(step_of_displacement(model, moved, found)(np.zeros(len(point))))
+        return step_at(model, vector, moved[: model.nx], moved[model.nx : end], moved[end:])
 
     def on_tangent(at: Array, d: StepDerivatives) -> Array:
-        full = np.hstack([d.A, d.B, d.C])
-        plus = np.block(
-            [
-                [space.derivative_of_plus(at[: model.nx]), np.zeros((model.nx, free))],
-                [np.zeros((free, space.size)), np.eye(free)],
-            ]
-        )
-        return np.asarray(space.derivative_of_minus(d.x_next) @ full @ plus * scale)
+        return np.asarray(_on_tangent(space, at[: model.nx], d) * scale)
 
-    d = derivatives or differentiate_step(model, x, u, parameters=parameters, method=method)
+    d = given or step_jacobians(model, vector, x, u, method)
     beside = None
-    if derivatives is None and not found:
+    if given is None and not vector.parameters:
         jittered = _move(space, model.nx, point, JITTER * scale * jitter_direction(len(scale)))
-        d_beside = differentiate_step(model, jittered[: model.nx], jittered[model.nx :], method=method)
+        d_beside = step_jacobians(model, vector, jittered[: model.nx], jittered[model.nx :], method)
         beside = on_tangent(jittered, d_beside)
     return certify_displacement(
         f,
         on_tangent(point, d),
         rows=space.names,
-        columns=space.names + model.input_names + column_names(found),
+        columns=space.names + model.input_names + vector.names,
         scale=scale,
         beside=beside,
         minus=space.minus,
         solver_tolerance=solver_tolerance(model, x, u),
-        method=d.method,
+        method=" + ".join(dict.fromkeys((d.method, *d.sources))),
         subject=f"the step of {model.name}",
     )
+
+
+def _on_tangent(space: TangentSpace, x: Array, d: StepDerivatives) -> Array:
+    """[A B C] from and to the tangent space."""
+    full = np.hstack([d.A, d.B, d.C])
+    free = full.shape[1] - space.nx
+    plus = np.zeros((full.shape[1], space.size + free))
+    plus[: space.nx, : space.size] = space.derivative_of_plus(x)
+    plus[space.nx :, space.size :] = np.eye(free)
+    return np.asarray(space.derivative_of_minus(d.x_next) @ full @ plus)
 
 
 def certify_rollout(
@@ -80,30 +88,37 @@ def certify_rollout(
     us: ArrayLike | None,
     loss: Loss,
     *,
+    parameters: Parameters = (),
     num_steps: int | None = None,
     method: str = "auto",
 ) -> Certificate:
-    """Compare `differentiate_rollout`'s gradient by x0 and us with differences of whole rollouts, entry by entry.
+    """Compare `differentiate_rollout`'s gradient by x0, us and parameters with differences of whole rollouts.
 
-    One row, the loss; columns x0 (on the tangent space), then u[k] step by step. Costs 26 rollouts per column.
+    One row, the loss; columns x0 (on the tangent space), then u[k] step by step, then the parameters. Costs 26
+    rollouts per column.
     """
     us = check_inputs(model, us, num_steps)
     x0 = finite_array("x0", x0, (model.nx,))
-    space = tangent_space(model)
-    scale = np.concatenate([_scale(space, x0), np.maximum(1.0, np.abs(us.ravel()))])
+    vector, space = select(model, parameters), tangent_space(model)
+    steps = np.maximum(1.0, np.abs(us.ravel()))
+    scale = np.concatenate([_scale(space, x0), steps, vector.difference_scale()])
+    end = model.nx + us.size
 
-    def moved(displacement: Array) -> tuple[Array, Array]:
-        point = _move(space, model.nx, np.concatenate([x0, us.ravel()]), scale * displacement)
-        return point[: model.nx], point[model.nx :].reshape(us.shape)
+    def moved(displacement: Array) -> tuple[Array, Array, ParameterVector]:
+        point = np.concatenate([x0, us.ravel(), vector.values])
+        point = _move(space, model.nx, point, scale * displacement)
+        return point[: model.nx], point[model.nx : end].reshape(us.shape), vector.at(point[end:])
 
     def f(displacement: Array) -> Array:
-        x, inputs = moved(displacement)
-        return np.array([evaluate_loss(loss, roll_states(model, x, inputs), inputs)])
+        x, inputs, values = moved(displacement)
+        with applied(values) as set_model:
+            return np.array([evaluate_loss(loss, roll_states(set_model, x, inputs), inputs)])
 
     def on_tangent(displacement: Array) -> tuple[Array, RolloutGradient]:
-        x, inputs = moved(displacement)
-        g = differentiate_rollout(model, x, inputs, loss, method=method)
-        return np.concatenate([g.x0 @ space.derivative_of_plus(x), g.us.ravel()])[None] * scale, g
+        x, inputs, values = moved(displacement)
+        g = differentiate_rollout(model, x, inputs, loss, parameters=values, method=method)
+        by_x0 = g.x0 @ space.derivative_of_plus(x)
+        return np.concatenate([by_x0, g.us.ravel(), g.parameters])[None] * scale, g
 
     derivative, gradient = on_tangent(np.zeros(len(scale)))
     inputs = tuple(f"{name}[{k}]" for k in range(len(us)) for name in model.input_names)
@@ -111,11 +126,11 @@ def certify_rollout(
         f,
         derivative,
         rows=("loss",),
-        columns=tuple(f"{name}[0]" for name in space.names) + inputs,
+        columns=tuple(f"{name}[0]" for name in space.names) + inputs + vector.names,
         scale=scale,
         beside=on_tangent(JITTER * jitter_direction(len(scale)))[0],
         solver_tolerance=max(solver_tolerance(model, x, u) for x, u in zip(gradient.xs[:-1], us, strict=True)),
-        method=" + ".join(gradient.methods),
+        method=" + ".join(dict.fromkeys((*gradient.methods, *gradient.parameter_sources))),
         subject=f"the rollout of {model.name}",
     )
 

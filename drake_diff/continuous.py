@@ -17,9 +17,10 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 
 from drake_diff.arrays import Array
 from drake_diff.exceptions import ModelError
-from drake_diff.model import Model, Twin
+from drake_diff.model import Model
 from drake_diff.plant_elements import actuators
 from drake_diff.step import set_state
+from drake_diff.twin import Twin
 
 
 class EquationsOfMotion:

@@ -10,6 +10,10 @@ from drake_diff.arrays import Array
 Function = Callable[[Array], Array]
 Difference = Callable[[Array, Array], Array]
 
+RATIO_SQUARED = 10.0  # of neighbouring steps of a sweep: half a decade
+SWEEP = tuple(10.0 ** (-k / 2) for k in range(4, 12))  # 1e-2 ... 3e-6
+ROUNDING = 1e-15
+
 
 @dataclass(frozen=True)
 class Differences:
@@ -38,3 +42,22 @@ def differences(
     forward = np.array([c[0] for c in columns]).reshape(size, rows).T
     backward = np.array([c[1] for c in columns]).reshape(size, rows).T
     return Differences(step, forward, backward)
+
+
+def richardson(central: Array) -> Array:
+    """(s - 1, m, n) of central quotients (s, m, n) half a decade apart: with an error of order h^4, not h^2."""
+    return central[1:] + (central[1:] - central[:-1]) / (RATIO_SQUARED - 1)
+
+
+def plateau(f: Function, size: int, *, at_zero: Array) -> Array:
+    """(m, n) the derivative of `f` at 0 where the quotients of a sweep of steps depend least on the step.
+
+    Every entry is judged on its own: no one step suits all, where a solver leaves small changes unsolved or large
+    ones change the contact. Of three neighbouring Richardson values that lie closest, the middle one.
+    """
+    central = np.array([differences(f, size, h, at_zero=at_zero).central for h in SWEEP])
+    values = richardson(central)
+    windows = np.array([values[s : s + 3] for s in range(len(values) - 2)])
+    rounding = ROUNDING * np.maximum(1.0, np.abs(at_zero))[None, :, None] / np.array(SWEEP[2:-1])[:, None, None]
+    best = np.argmin(windows.max(axis=1) - windows.min(axis=1) + rounding, axis=0)
+    return np.asarray(np.take_along_axis(windows[:, 1], best[None], axis=0)[0])

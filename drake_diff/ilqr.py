@@ -52,6 +52,10 @@ def _unkept(problem: Problem) -> Iterator[str]:
         yield 'optimize "initial_state"'
     if not problem.optimizes_controls:
         yield "fixed controls"
+    if problem.parameters.parameters:
+        yield "parameters"
+    if problem.trajectory_cost is not None:
+        yield "trajectory_cost"
 
 
 def solve_ilqr(problem: Problem, us: Array, *, limits: Limits, report: Report | None) -> tuple[NlpResult, Array, Array]:

@@ -2,12 +2,12 @@
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydrake.autodiffutils import AutoDiffXd
 from pydrake.geometry import AddContactMaterial, HalfSpace, ProximityProperties
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
@@ -27,20 +27,16 @@ from drake_diff.plant_elements import (
     is_driven,
     named,
     path_to_the_plant,
+    scene_graph_beside,
 )
+from drake_diff.twin import Twin
+
+if TYPE_CHECKING:
+    from drake_diff.parameters import Parameter
 
 CONTACT_MODELS = ("point", "hydroelastic", "hydroelastic_with_fallback")
 CONTACT_APPROXIMATIONS = ("sap", "similar", "lagged")
-
-
-@dataclass(frozen=True)
-class Twin:
-    """One scalar type of the model: its diagram, its plant, and one context that is kept and reused."""
-
-    diagram: Any
-    plant: Any
-    root_context: Any
-    context: Any  # the plant's, inside root_context
+OTHER_TIME_STEPS = 64  # how many rebuilt models are kept: a certificate by the time step needs 26
 
 
 class Model:
@@ -64,6 +60,7 @@ class Model:
         self.source = source
         self.notes = notes
         self._rebuild = rebuild
+        self._others: dict[float, Model] = {}  # the same model at other time steps
         self.path = path_to_the_plant(diagram)
         self.plant: MultibodyPlant = follow(diagram, self.path)
         _check_plant(self)
@@ -96,14 +93,28 @@ class Model:
         """The same model at another time step [s]. ModelError where it came from a diagram, which has but one."""
         if self._rebuild is None:
             raise ModelError("a model from a diagram keeps its time step: build the diagram again with another")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ModelWarning)  # said when the model was loaded first
-            return self._rebuild(positive_float("time_step [s]", time_step))
+        if time_step not in self._others:
+            if len(self._others) >= OTHER_TIME_STEPS:
+                self._others.pop(next(iter(self._others)))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ModelWarning)  # said when the model was loaded first
+                self._others[time_step] = self._rebuild(positive_float("time_step [s]", time_step))
+        return self._others[time_step]
+
+    @property
+    def can_rebuild(self) -> bool:
+        """Whether the model can be had at another time step: one from a file can."""
+        return self._rebuild is not None
+
+    @cached_property
+    def takes_forces(self) -> bool:
+        """Whether generalized forces can be added: nothing in the diagram feeds that port."""
+        return not is_driven(self.diagram, self.path, self.plant.get_applied_generalized_force_input_port())
 
     @cached_property
     def double(self) -> Twin:
         """The plant that everything is measured on."""
-        return self._twin(self.diagram, self.plant)
+        return self._twin(float, self.diagram, self.plant)
 
     @cached_property
     def autodiff(self) -> Twin:
@@ -120,7 +131,14 @@ class Model:
             if ours.has_controller():
                 gains = ours.get_controller_gains()
                 twin.set_controller_gains(PdControllerGains(p=gains.p, d=gains.d))
-        return self._twin(diagram, plant)
+        return self._twin(AutoDiffXd, diagram, plant)
+
+    @cached_property
+    def parameters(self) -> "tuple[Parameter, ...]":
+        """Every parameter of the model, sorted by name; `list_parameters` is the public way to them."""
+        from drake_diff.parameters import read_parameters  # it reads a Model, so it stands below
+
+        return read_parameters(self)
 
     @cached_property
     def contract(self) -> Contract:
@@ -129,12 +147,12 @@ class Model:
 
         return read_contract(self)
 
-    def _twin(self, diagram: Any, plant: Any) -> Twin:
-        root = diagram.CreateDefaultContext()
+    def _twin(self, scalar: Any, diagram: Any, plant: Any) -> Twin:
+        root, defaults = diagram.CreateDefaultContext(), diagram.CreateDefaultContext()
         context = plant.GetMyMutableContextFromRoot(root)
         for instance, target in self.pd_targets.items():
             plant.get_desired_state_input_port(instance).FixValue(context, target)
-        return Twin(diagram, plant, root, context)
+        return Twin(scalar, diagram, plant, scene_graph_beside(diagram, self.path), root, context, defaults)
 
     @cached_property
     def pd_targets(self) -> dict[Any, np.ndarray]:

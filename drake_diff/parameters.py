@@ -1,153 +1,248 @@
-"""Named physical parameters: how each is read from and set in a context of either scalar type.
+"""Named physical parameters as one flat vector: names, units, bounds, values, and where each derivative comes from.
 
-A name is `element.quantity`. Of a body: `pole.mass` [kg] (the unit inertia stays, so the inertia grows with the
-mass) and `pole.center_of_mass` [m] (three entries in the body's frame; the inertia about the body's origin
-stays). Of a joint: `hinge.damping` [N s/m or N m s/rad] and `hinge.offset` [m] (three entries: where the joint's
-frame sits on its parent). AutoDiffXd carries all of them.
+A name is `element.quantity`, with SI units and as many entries as stand in brackets:
+
+    pole.mass                        unit inertia and centre of mass stay, so the inertia grows with the mass
+    pole.center_of_mass[3]           in the body's frame; the unit inertia about the body's origin stays
+    pole.inertia[6]                  xx yy zz xy xz yz about the centre of mass, whatever mass and centre are
+    hinge.damping                    of joints with one degree of freedom
+    hinge.offset[3]                  where the joint's frame sits on its parent: link lengths
+    hinge.spring_stiffness, hinge.spring_rest_angle, slide.spring_stiffness, slide.spring_rest_length
+    motor.gear_ratio, motor.rotor_inertia, motor.kp, motor.kd
+    ball.friction, ball.stiffness, ball.dissipation, ball.relaxation_time, ball.hydroelastic_modulus, ball.radius
+                                     of all the body's collision geometries; ball/tip.friction is of one
+    model.time_step, model.gravity[3]
+
+An element whose name two model instances share is called `instance::name`. Static friction follows the dynamic
+one, which is all that a discrete plant uses.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from pydrake.math import RigidTransform_, RotationMatrix_
-from pydrake.multibody.tree import FixedOffsetFrame, RigidBody, WeldJoint
+from numpy.typing import NDArray
 
-from drake_diff.arrays import Array, frozen
+from drake_diff.arrays import Array, finite_array, frozen
+from drake_diff.contact_parameters import CONTACT_KINDS
 from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.model import Model, Twin
-from drake_diff.plant_elements import bodies, joints
+from drake_diff.inertia import room_of_inertia
+from drake_diff.model import Model
+from drake_diff.parameter_kinds import MECHANISM_KINDS, Kind
+from drake_diff.twin import Twin
 
-# Drake drops the derivative of a frame's pose whose value is exactly the identity. A translation of this
-# length [m] changes no number in the step and keeps the derivative.
-IDENTITY_OFFSET = 1e-300
+KINDS = (*MECHANISM_KINDS, *CONTACT_KINDS)
+TIME_STEP = "model.time_step"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Parameter:
-    """One named parameter: its unit, its value in the model, and where its derivative comes from."""
+    """One named parameter: its value in the model (n,), its unit and range, and what its derivative comes from."""
 
     name: str
     unit: str
     value: Array
-    derivative_source: str = "autodiff"
+    lower: float
+    upper: float
+    derivative_source: str  # "autodiff", "chain_rule" or "finite_difference"
+    kind: Kind = field(repr=False)
 
     @property
-    def positive(self) -> bool:
-        """Whether Drake ends the process on a value below zero."""
-        return self.name.endswith((".mass", ".damping"))
+    def label(self) -> str:
+        """The element's name."""
+        return self.name.rsplit(".", 1)[0]
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """A name for each entry."""
+        return (self.name,) if len(self.value) == 1 else tuple(f"{self.name}[{i}]" for i in range(len(self.value)))
 
 
 def list_parameters(model: Model) -> list[Parameter]:
     """Every parameter of `model`, sorted by name."""
+    return list(model.parameters)
+
+
+def read_parameters(model: Model) -> tuple[Parameter, ...]:
+    """Every parameter of `model`, sorted by name, read afresh."""
     found = []
-    for body in bodies(model.plant):
-        found += [_parameter(model, body, "mass"), _parameter(model, body, "center_of_mass")]
-    for joint in joints(model.plant):
-        if len(joint.default_damping_vector()) == 1:
-            found.append(_parameter(model, joint, "damping"))
-        if isinstance(joint.frame_on_parent(), FixedOffsetFrame) and not isinstance(joint, WeldJoint):
-            found.append(_parameter(model, joint, "offset"))
-    return sorted(found, key=lambda parameter: parameter.name)
+    for kind in KINDS:
+        for label, unit, value in kind.find(model):
+            lower = 0.0 if kind.positive else -np.inf
+            value = frozen(np.atleast_1d(value))
+            found.append(Parameter(f"{label}.{kind.quantity}", unit, value, lower, np.inf, kind.source, kind))
+    return tuple(sorted(found, key=lambda parameter: parameter.name))
 
 
-def find_parameters(model: Model, names: Sequence[str]) -> tuple[Parameter, ...]:
-    """The parameters called `names`, in that order; UnknownNameError lists those that exist."""
-    known = {parameter.name: parameter for parameter in list_parameters(model)}
+@dataclass(frozen=True, eq=False)
+class ParameterVector:
+    """Some parameters of a model, one after the other, and the values (np,) that they are set to."""
+
+    model: Model
+    parameters: tuple[Parameter, ...]
+    values: Array
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """A name for each entry: `pole.mass`, `pole.center_of_mass[0]`, ..."""
+        return tuple(name for p in self.parameters for name in p.columns)
+
+    @cached_property
+    def sources(self) -> tuple[str, ...]:
+        """Where the derivative by each entry comes from."""
+        return tuple(p.derivative_source for p in self.parameters for _ in p.value)
+
+    @cached_property
+    def slices(self) -> tuple[slice, ...]:
+        """Where each parameter stands in the vector."""
+        ends = np.cumsum([0, *(len(p.value) for p in self.parameters)])
+        return tuple(slice(int(a), int(b)) for a, b in pairwise(ends))
+
+    @cached_property
+    def differenced(self) -> NDArray[np.int64]:
+        """The indices of the entries whose derivative is a difference of the double step."""
+        return np.flatnonzero([source == "finite_difference" for source in self.sources])
+
+    def at(self, values: Any) -> "ParameterVector":
+        """The same parameters set to `values` (np,)."""
+        return replace(self, values=frozen(values))
+
+    def to_dict(self) -> dict[str, Array]:
+        """The values by parameter name."""
+        return {p.name: self.values[s] for p, s in zip(self.parameters, self.slices, strict=True)}
+
+    def time_step(self, values: Array) -> float:
+        """The time step [s] that goes with `values` (np,)."""
+        for p, s in zip(self.parameters, self.slices, strict=True):
+            if p.name == TIME_STEP:
+                return float(values[s][0])
+        return self.model.time_step
+
+    def write(self, twin: Twin, values: Any) -> None:
+        """Set every parameter in the twin: floats, or AutoDiffXd where the twin is of that type."""
+        for p, s in self._in_order:
+            # What Drake takes as plain numbers came into the AutoDiffXd twin with the double twin's context.
+            if twin.scalar is float or p.kind.source != "finite_difference":
+                p.kind.write(twin, p.label, values[s])
+            elif p.kind.on_plant:
+                p.kind.write(twin, p.label, self.values[s])
+
+    def restore(self, twin: Twin) -> None:
+        """Set the twin back to the model's own values."""
+        twin.reset()
+        for p, _ in self._in_order:
+            if p.kind.on_plant:
+                p.kind.write(twin, p.label, p.value)
+
+    @cached_property
+    def _in_order(self) -> list[tuple[Parameter, slice]]:
+        pairs = zip(self.parameters, self.slices, strict=True)
+        return sorted(pairs, key=lambda pair: KINDS.index(pair[0].kind))
+
+    def difference_scale(self, entries: Any = slice(None)) -> Array:
+        """By how much differences move each of the `entries`, relative to their step: never to where Drake takes none.
+
+        Raises InputError where a parameter cannot be moved to both sides.
+        """
+        scale = np.full(len(self.values), np.nan)
+        wanted = np.zeros(len(self.values), dtype=bool)
+        wanted[entries] = True
+        for p, s in self._pairs:
+            if wanted[s].any():
+                scale[s] = self._room(p, self.values[s])
+        return scale[entries]
+
+    @property
+    def _pairs(self) -> Iterator[tuple[Parameter, slice]]:
+        return zip(self.parameters, self.slices, strict=True)
+
+    @staticmethod
+    def _room(p: Parameter, value: Array) -> Array:
+        if p.kind.quantity == "inertia":
+            room = room_of_inertia(value)
+            if room <= 0:
+                expected = "one inside what is physically possible (a point or a rod is on its edge)"
+                raise InputError(p.name, got=value, expected=expected)
+            return np.full(6, room)
+        if p.kind.positive and not np.all(value > 0):
+            raise InputError(
+                p.name,
+                got=float(value[0]),
+                expected="a value above 0, to difference on both sides (give one by a mapping)",
+            )
+        return np.array(value) if p.kind.positive else np.maximum(1.0, np.abs(value))
+
+
+Parameters = Sequence[str] | Mapping[str, Any] | ParameterVector
+
+
+def select(model: Model, parameters: Parameters) -> ParameterVector:
+    """The parameters named, in that order; a mapping also gives values, else the model's own are taken.
+
+    Raises UnknownNameError, which lists those that exist, ShapeError, NonFiniteError, or InputError for a value out
+    of range.
+    """
+    if isinstance(parameters, ParameterVector):
+        return parameters
+    names = (parameters,) if isinstance(parameters, str) else tuple(parameters)
+    if not names:
+        return ParameterVector(model, (), frozen([]))
+    if len(set(names)) < len(names):
+        raise InputError("parameters", got=", ".join(names), expected="each name once")
+    known = {parameter.name: parameter for parameter in model.parameters}
     for name in names:
         if name not in known:
             raise UnknownNameError("parameter", got=name, known=known)
-    return tuple(known[name] for name in names)
+    found = tuple(known[name] for name in names)
+    _check_overlap(found)
+    given = parameters if isinstance(parameters, Mapping) else {}
+    values = [_check_value(p, given[p.name]) if p.name in given else p.value for p in found]
+    return ParameterVector(model, found, frozen(np.concatenate(values)))
 
 
-def difference_scale(parameters: Sequence[Parameter]) -> Array:
-    """(np,) by how much differences move each entry, relative to their step: never to where Drake takes no value.
+def _check_value(p: Parameter, given: Any) -> Array:
+    value = finite_array(p.name, np.atleast_1d(given), (len(p.value),))
+    if np.any(value < p.lower):
+        raise InputError(p.name, got=given, expected=f"at least {p.lower:g} {p.unit}")
+    if p.kind.quantity == "inertia" and room_of_inertia(value) < 0:
+        raise InputError(p.name, got=given, expected="an inertia that a distribution of mass can have")
+    return value
 
-    Raises InputError where a parameter sits at zero and cannot be moved to both sides.
-    """
-    scale = [np.zeros(0)]
+
+def _check_overlap(parameters: Sequence[Parameter]) -> None:
+    """A body's contact and that of one of its geometries are not independent."""
+    names = {p.name for p in parameters}
     for p in parameters:
-        if p.positive and not np.all(p.value > 0):
-            raise InputError(p.name, got=float(p.value[0]), expected="a value above 0, to difference on both sides")
-        scale.append(np.array(p.value) if p.positive else np.maximum(1.0, np.abs(p.value)))
-    return np.concatenate(scale)
+        whole = f"{p.label.split('/')[0]}.{p.kind.quantity}"
+        if "/" in p.label and whole in names:
+            raise InputError(
+                "parameters", got=f"{whole} and {p.name}", expected="one of them: the first sets the other"
+            )
 
 
-def column_names(parameters: Sequence[Parameter]) -> tuple[str, ...]:
-    """One name per entry of the stacked vector: a parameter of three entries gets [0], [1], [2]."""
-    return tuple(p.name if len(p.value) == 1 else f"{p.name}[{i}]" for p in parameters for i in range(len(p.value)))
+@contextmanager
+def applied(vector: ParameterVector) -> Iterator[Model]:
+    """The vector's model with the values set, or what stands in for it at another time step; undone at the end."""
+    if not vector.parameters:
+        yield vector.model
+        return
+    h = vector.time_step(vector.values)
+    model = vector.model if h == vector.model.time_step else vector.model.at_time_step(h)
+    try:
+        vector.write(model.double, vector.values)
+        yield model
+    finally:
+        vector.restore(model.double)
+        if "autodiff" in vars(model):  # made on the way, or before
+            vector.restore(model.autodiff)
 
 
-def stacked_values(parameters: Sequence[Parameter]) -> Array:
-    """(np,) the values of `parameters`, one after the other."""
-    return np.concatenate([np.zeros(0), *(p.value for p in parameters)])
-
-
-def set_parameters(twin: Twin, parameters: Sequence[Parameter], values: Any) -> None:
-    """Write the stacked `values` (np,), floats or AutoDiffXd as the twin's scalar type asks, into its context."""
-    start = 0
-    for parameter in parameters:
-        stop = start + len(parameter.value)
-        element, quantity = parameter.name.rsplit(".", 1)
-        _WRITE[quantity](twin, element, values[start:stop])
-        start = stop
-
-
-def _parameter(model: Model, element: Any, quantity: str) -> Parameter:
-    unit, read = _READ[quantity]
-    name, value = f"{element.name()}.{quantity}", np.atleast_1d(read(element, model))
-    if quantity == "damping" and element.type_name() == "prismatic":
-        unit = "N s/m"
-    return Parameter(name, unit, frozen(value))
-
-
-_READ: dict[str, tuple[str, Any]] = {
-    "mass": ("kg", lambda body, model: body.default_mass()),
-    "center_of_mass": ("m", lambda body, model: body.default_com()),
-    "damping": ("N m s/rad", lambda joint, model: joint.default_damping_vector()),
-    "offset": (
-        "m",
-        lambda joint, model: joint.frame_on_parent().GetFixedPoseInBodyFrame().translation(),
-    ),
-}
-
-
-def _write_mass(twin: Twin, body: str, value: Any) -> None:
-    _body(twin, body).SetMass(twin.context, value[0])
-
-
-def _write_center_of_mass(twin: Twin, body: str, value: Any) -> None:
-    _body(twin, body).SetCenterOfMassInBodyFrame(twin.context, value)
-
-
-def _write_damping(twin: Twin, joint: str, value: Any) -> None:
-    twin.plant.GetJointByName(joint).SetDampingVector(twin.context, value)
-
-
-def _write_offset(twin: Twin, joint: str, value: Any) -> None:
-    frame = twin.plant.GetJointByName(joint).frame_on_parent()
-    scalar = type(value[0]) if value.dtype == object else float
-    rotation = frame.GetFixedPoseInBodyFrame().rotation().matrix()
-    if rotation.dtype == object:
-        rotation = np.vectorize(lambda entry: entry.value())(rotation)
-    if _is_zero(value) and np.array_equal(rotation, np.eye(3)):
-        value = value + np.array([0.0, 0.0, IDENTITY_OFFSET])
-    pose = RigidTransform_[scalar](RotationMatrix_[scalar](rotation.astype(float).astype(scalar)), value)
-    frame.SetPoseInParentFrame(twin.context, pose)
-
-
-def _is_zero(value: Any) -> bool:
-    return all((v.value() if hasattr(v, "value") else v) == 0 for v in value)
-
-
-def _body(twin: Twin, name: str) -> RigidBody:
-    return twin.plant.GetBodyByName(name)
-
-
-_WRITE = {
-    "mass": _write_mass,
-    "center_of_mass": _write_center_of_mass,
-    "damping": _write_damping,
-    "offset": _write_offset,
-}
+def write_autodiff(vector: ParameterVector, model: Model, variables: Any) -> None:
+    """Set the AutoDiffXd twin of a model that the vector is applied to: `variables` (np,) AutoDiffXd."""
+    if vector.parameters:
+        model.autodiff.root_context.SetTimeStateAndParametersFrom(model.double.root_context)
+        vector.write(model.autodiff, variables)

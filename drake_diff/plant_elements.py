@@ -2,11 +2,15 @@
 
 from typing import Any
 
+from pydrake.autodiffutils import AutoDiffXd
+from pydrake.geometry import SceneGraph_
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JointActuatorIndex, JointIndex, ModelInstanceIndex
 from pydrake.systems.framework import Diagram
 
 from drake_diff.exceptions import ModelError, UnknownNameError
+
+_SCENE_GRAPHS = (SceneGraph_[float], SceneGraph_[AutoDiffXd])
 
 DiagramPath = tuple[int, ...]  # the position among the subsystems, level by level
 
@@ -35,6 +39,26 @@ def joints(plant: Any) -> list[Any]:
 def actuators(plant: Any) -> list[Any]:
     """Every actuator, in the order of the actuation input."""
     return [plant.get_joint_actuator(JointActuatorIndex(int(i))) for i in plant.GetJointActuatorIndices()]
+
+
+def labelled(elements: list[Any]) -> dict[str, Any]:
+    """The elements by name, or by "instance::name" where two model instances use the same."""
+    names = [element.name() for element in elements]
+    found = {}
+    for element, name in zip(elements, names, strict=True):
+        if names.count(name) > 1:
+            name = f"{element.GetParentPlant().GetModelInstanceName(element.model_instance())}::{name}"
+        found[name] = element
+    return found
+
+
+def scene_graph_beside(diagram: Any, path: DiagramPath) -> Any | None:
+    """The SceneGraph, of either scalar type, nearest to the plant at `path`; None where there is none."""
+    for depth in reversed(range(len(path))):
+        found = [s for s in follow(diagram, path[:depth]).GetSystems() if isinstance(s, _SCENE_GRAPHS)]
+        if found:
+            return found[0]
+    return None
 
 
 def named(kind: str, elements: list[Any], name: str) -> Any:

@@ -1,6 +1,6 @@
 """What is to be optimized; contains no solver."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
@@ -10,8 +10,11 @@ from drake_diff.arrays import Array, array_with_gaps, finite_array, frozen, posi
 from drake_diff.cost import FinalCost, QuadraticCost, RunningCost
 from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
 from drake_diff.model import Model
+from drake_diff.parameters import TIME_STEP, select
 
-OPTIMIZABLE = ("controls", "initial_state")
+OPTIMIZABLE = ("controls", "initial_state", "parameters")
+# A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
+SMALLEST_PART = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +41,12 @@ class Problem:
     `initial_state_mask` (nx,) is True, x0 being the first guess there. Controls that are not optimized are `us`
     (N, nu), zero where not given; controls that are optimized start from it.
 
+    `parameters` names some of the model's (see `list_parameters`), or maps names to values, which hold in all steps;
+    with "parameters" in `optimize` these are where the search starts, between `parameter_bounds` (a mapping from
+    names to (lower, upper)); what cannot be negative stays above 1e-3 of its start where no bound is given, and an
+    inertia stays one that a body can have. `trajectory_cost(xs, us)` adds a cost of the whole motion, such as its
+    distance from a measured one.
+
     Raises InputError, ShapeError, NonFiniteError or UnknownNameError, each with expected and got.
     """
 
@@ -52,6 +61,9 @@ class Problem:
     optimize: Sequence[str] = ("controls",)
     initial_state_mask: Any = None
     us: Any = None
+    parameters: Any = ()  # becomes a ParameterVector
+    parameter_bounds: Mapping[str, tuple[Any, Any]] | None = None
+    trajectory_cost: Callable[[Any, Any], Any] | None = None
 
     def __post_init__(self) -> None:
         model = self.model
@@ -60,6 +72,8 @@ class Problem:
         self._set("x0", finite_array("x0", self.x0, (model.nx,)))
         self._set("num_steps", positive_int("num_steps", self.num_steps))
         self._set("optimize", _check_optimize(model, self.optimize))
+        self._set("parameters", select(model, self.parameters))
+        self._check_parameters()
         if not (self.bounds is None or isinstance(self.bounds, Bounds)):
             raise InputError("bounds", got=type(self.bounds).__name__, expected="Bounds")
         self._set("bounds", _resolve_bounds(model, self.bounds or Bounds()))
@@ -77,6 +91,21 @@ class Problem:
     @property
     def optimizes_controls(self) -> bool:
         return "controls" in self.optimize
+
+    @property
+    def optimizes_parameters(self) -> bool:
+        return "parameters" in self.optimize
+
+    def bounds_of_parameters(self) -> tuple[Array, Array]:
+        """(lower (np,), upper (np,)) of the parameter vector, infinite where there is none."""
+        lower, upper = np.full(len(self.parameters.values), -np.inf), np.full(len(self.parameters.values), np.inf)
+        given = self.parameter_bounds or {}
+        for p, s in zip(self.parameters.parameters, self.parameters.slices, strict=True):
+            if p.kind.positive:
+                lower[s] = SMALLEST_PART * self.parameters.values[s]
+            if p.name in given:
+                lower[s], upper[s] = given[p.name]
+        return lower, upper
 
     @property
     def goal(self) -> Array:
@@ -99,7 +128,25 @@ class Problem:
             if len(inputs) == len(xs):
                 rates[0], rates[-1] = rates[0] / 2, rates[-1] / 2
             total += self.model.time_step * sum(rates)
+        if self.trajectory_cost is not None:
+            total += float(self.trajectory_cost(xs, inputs))
         return total
+
+    def _check_parameters(self) -> None:
+        vector, given = self.parameters, self.parameter_bounds or {}
+        if self.optimizes_parameters and not vector.parameters:
+            raise InputError("parameters", got="none", expected='at least one name, as "parameters" is in optimize')
+        if TIME_STEP in {p.name for p in vector.parameters}:
+            raise InputError("parameters", got=TIME_STEP, expected="others: the horizon is num_steps * model.time_step")
+        for name in given:
+            if name not in {p.name for p in vector.parameters}:
+                raise UnknownNameError("parameter_bounds", got=name, known=[p.name for p in vector.parameters])
+            if name.endswith(".inertia"):
+                raise InputError(f"parameter_bounds of {name}", got="bounds", expected="none: it stays possible anyway")
+        lower, upper = self.bounds_of_parameters()
+        for i in np.flatnonzero(~((lower <= vector.values) & (vector.values <= upper))):
+            expected = f"within [{lower[i]:g}, {upper[i]:g}]"
+            raise InputError(f"parameters, {vector.names[i]}", got=float(vector.values[i]), expected=expected)
 
     def _check_mask(self) -> Array:
         nx = self.model.nx
@@ -143,9 +190,10 @@ class Problem:
         self._check_inside("x_goal", inside, "x")
 
     def _check_costs(self) -> None:
-        if self.running_cost is None and self.final_cost is None and np.all(np.isnan(self.goal)):
+        costs = (self.running_cost, self.final_cost, self.trajectory_cost)
+        if all(cost is None for cost in costs) and np.all(np.isnan(self.goal)):
             raise InputError("problem", got="no cost and no goal", expected="a cost, an x_goal, or both")
-        for name in ("running_cost", "final_cost"):
+        for name in ("running_cost", "final_cost", "trajectory_cost"):
             cost = getattr(self, name)
             if cost is not None and not callable(cost):
                 raise InputError(name, got=type(cost).__name__, expected="a function or a QuadraticCost")

@@ -1,7 +1,8 @@
 """Many steps; energy, contact, penetration and constraint violation along them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,7 +11,7 @@ from drake_diff.arrays import Array, finite_array, frozen, positive_int
 from drake_diff.contact import ContactPoint, contacts_of_the_step, penetration
 from drake_diff.exceptions import InputError
 from drake_diff.model import Model
-from drake_diff.plant_elements import joints
+from drake_diff.parameters import applied, select
 from drake_diff.step import advance, check_point, set_state
 from drake_diff.tangent import tangent_space
 
@@ -70,17 +71,20 @@ def rollout(
     *,
     policy: Policy | None = None,
     num_steps: int | None = None,
+    parameters: Mapping[str, Any] | None = None,
 ) -> Rollout:
     """Step from `x0` (nx,) under the inputs `us` (N, nu), or under `policy(x, t) -> u` for `num_steps` steps.
 
-    A model without actuators needs `num_steps` alone. Raises ShapeError, NonFiniteError, InputError, or
+    A model without actuators needs `num_steps` alone. `parameters` maps names (see `list_parameters`) to values
+    that replace the model's own. Raises ShapeError, NonFiniteError, InputError, or
     SimulationError where Drake cannot take a step.
     """
-    if policy is None:
-        return _roll(model, x0, check_inputs(model, us, num_steps))
-    if us is not None:
+    if us is not None and policy is not None:
         raise InputError("rollout", got="us and policy", expected="one of them")
-    return _roll(model, x0, policy, positive_int("num_steps", num_steps))
+    inputs = check_inputs(model, us, num_steps) if policy is None else policy
+    count = len(inputs) if policy is None else positive_int("num_steps", num_steps)  # type: ignore[arg-type]
+    with applied(select(model, parameters or ())) as set_model:
+        return _roll(set_model, x0, inputs, count)
 
 
 def check_inputs(model: Model, us: ArrayLike | None, num_steps: int | None = None) -> Array:
@@ -104,8 +108,7 @@ def roll_states(model: Model, x0: Array, us: Array) -> Array:
     return xs
 
 
-def _roll(model: Model, x0: ArrayLike, inputs: Array | Policy, num_steps: int = 0) -> Rollout:
-    count = num_steps or len(inputs)  # type: ignore[arg-type]
+def _roll(model: Model, x0: ArrayLike, inputs: Array | Policy, count: int) -> Rollout:
     h, meter = model.time_step, _Meter(model)
     xs, us = np.empty((count + 1, model.nx)), np.empty((count, model.nu))
     xs[0] = finite_array("x0", x0, (model.nx,))
@@ -126,7 +129,7 @@ class _Meter:
     def __init__(self, model: Model):
         self.model, self.plant, self.context = model, model.plant, model.double.context
         self.space = tangent_space(model)
-        self.damping = _damping(model)
+        self.damping = model.double.damping()
         self.actuation = self.plant.MakeActuationMatrix()
         self.limits = self.plant.GetPositionLowerLimits(), self.plant.GetPositionUpperLimits()
         self.states: list[tuple[float, float, float, float]] = []
@@ -137,6 +140,7 @@ class _Meter:
     def measure_state(self) -> None:
         kinetic = self.plant.CalcKineticEnergy(self.context)
         potential = self.plant.CalcPotentialEnergy(self.context)
+        potential += sum(f.potential(self.plant, self.context) for f in self.model.double.added.values())
         self.states.append((kinetic, potential, penetration(self.model), self._violation()))
 
     def measure_step(self, x: Array, x_next: Array) -> None:
@@ -171,15 +175,6 @@ class _Meter:
             constraint_violation=frozen(states[:, 3]),
             contacts=tuple(self.contacts),
         )
-
-
-def _damping(model: Model) -> Array:
-    """(nv,) the joint damping coefficients."""
-    damping = np.zeros(model.nv)
-    for joint in joints(model.plant):
-        start = joint.velocity_start()
-        damping[start : start + joint.num_velocities()] = joint.GetDampingVector(model.double.context)
-    return damping
 
 
 def smooth_mean(series: Array) -> float:

@@ -6,24 +6,29 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from drake_diff.arrays import Array, finite_array, frozen
+from drake_diff.arrays import Array, finite_array, frozen, positive_int
 from drake_diff.autodiff import gradient_of
 from drake_diff.exceptions import InputError
 from drake_diff.model import Model
-from drake_diff.rollout import check_inputs
-from drake_diff.step_derivatives import StepDerivatives, differentiate_step
+from drake_diff.parameters import Parameters, ParameterVector, applied, select
+from drake_diff.policy import differentiate_policy
+from drake_diff.rollout import Policy, check_inputs
+from drake_diff.step_derivatives import StepDerivatives, step_jacobians
 
 Loss = Callable[..., Any]
+Feedback = tuple[Array, Array]  # a policy's derivatives (nu, nx) by the state and (nu, n) by its parameters
+EXPLODED, VANISHED = 1e6, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class RolloutGradient:
-    """loss and its gradient by x0 (nx,), us (N, nu) and parameters (np,).
+    """loss and its gradient by x0 (nx,), us (N, nu), parameters (np,) and the policy's parameters (n,).
 
     `state_gradient_norms` (N+1,) is |d loss / d x_k|, the later steps being functions of x_k: where it grows
     without bound going back the gradient explodes, where it dies out the early inputs cannot be learned.
+    Under a policy `us` is what it chose, and `state_gradient_norms` go through the closed loop.
     """
 
     loss: float
@@ -31,9 +36,37 @@ class RolloutGradient:
     us: Array
     parameters: Array
     parameter_names: tuple[str, ...]
+    parameter_sources: tuple[str, ...]  # where each column came from
+    policy: Array
     state_gradient_norms: Array
+    spectral_radii: Array  # (N,) the largest |eigenvalue| of each step's Jacobian by the state, policy included
     xs: Array  # (N+1, nx) the rollout itself
+    inputs: Array  # (N, nu) what was applied
     methods: tuple[str, ...]  # where the step Jacobians came from: one name, or more where a fallback was taken
+
+    @property
+    def growth_rate(self) -> float:
+        """By which factor |d loss / d x_k| grows per step back in time: its geometric mean, 1 for a neutral motion.
+
+        NaN where either end is zero: a gradient that does not depend on a state has no rate.
+        """
+        first, last = self.state_gradient_norms[0], self.state_gradient_norms[-1]
+        if first == 0 or last == 0:
+            return float("nan")
+        return float((first / last) ** (1 / (len(self.state_gradient_norms) - 1)))
+
+    @property
+    def explodes_at(self) -> int | None:
+        """The last step k at which |d loss / d x_k| is over 1e6 times the smallest after it that is not 0."""
+        norms = np.where(self.state_gradient_norms > 0, self.state_gradient_norms, np.inf)
+        smallest_after = np.minimum.accumulate(norms[::-1])[::-1]
+        return _last(self.state_gradient_norms > EXPLODED * smallest_after)
+
+    @property
+    def vanishes_at(self) -> int | None:
+        """The last step k at which |d loss / d x_k| is below 1e-6 of the largest after it; None if there is none."""
+        largest_after = np.maximum.accumulate(self.state_gradient_norms[::-1])[::-1]
+        return _last(self.state_gradient_norms < VANISHED * largest_after)
 
 
 def differentiate_rollout(
@@ -42,58 +75,114 @@ def differentiate_rollout(
     us: ArrayLike | None,
     loss: Loss,
     *,
-    parameters: Sequence[str] = (),
+    policy: Policy | None = None,
+    parameters: Parameters = (),
     num_steps: int | None = None,
     method: str = "auto",
 ) -> RolloutGradient:
-    """The gradient of `loss` along the rollout from `x0` (nx,) under `us` (N, nu).
+    """The gradient of `loss` along the rollout from `x0` (nx,) under `us` (N, nu), or under `policy` for `num_steps`.
 
     `loss(xs, us)`, or `loss(x_final)` where it takes one argument, is a scalar written with ordinary arithmetic
-    and NumPy functions, so that AutoDiffXd flows through it. Reverse accumulation through the step Jacobians:
-    with l_N = dloss/dx_N, l_k = dloss/dx_k + A_k' l_(k+1), the gradients are l_0 by x0,
-    dloss/du_k + B_k' l_(k+1) by u_k and sum_k C_k' l_(k+1) by the parameters.
+    and NumPy functions, so that AutoDiffXd flows through it; so is the policy (see `drake_diff.policy`).
+    `parameters` names what to differentiate by, or maps names to values. Reverse accumulation through the step
+    Jacobians: with l_N = dloss/dx_N, g_k = dloss/du_k + B_k' l_(k+1) and l_k = dloss/dx_k + A_k' l_(k+1) + K_k' g_k,
+    K and P the policy's derivatives by state and by its own parameters, the gradients are l_0 by x0, g_k by u_k,
+    sum_k C_k' l_(k+1) by the parameters and sum_k P_k' g_k by the policy's.
     """
-    us = check_inputs(model, us, num_steps)
     x0 = finite_array("x0", x0, (model.nx,))
-    linearization = linearize(model, x0, us, parameters=parameters, method=method)
+    if us is not None and policy is not None:
+        raise InputError("differentiate_rollout", got="us and policy", expected="one of them")
+    vector = select(model, parameters)
+    feedback: list[Feedback] = []
+    with applied(vector) as set_model:
+        if policy is None:
+            inputs = check_inputs(model, us, num_steps)
+            linearization = linearize(set_model, x0, inputs, vector=vector, method=method)
+        else:
+            steps = positive_int("num_steps", num_steps)
+            linearization, feedback, inputs = _close_the_loop(set_model, x0, policy, steps, vector, method)
     xs = np.vstack([x0, [d.x_next for d in linearization]])
-    value, by_xs, by_us = differentiate_loss(loss, xs, us)
-    state_gradients, input_gradients, parameter_gradient = accumulate(linearization, by_xs, by_us)
+    value, by_xs, by_us = differentiate_loss(loss, xs, inputs)
+    totals = accumulate(linearization, by_xs, by_us, feedback)
     return RolloutGradient(
         loss=value,
-        x0=frozen(state_gradients[0]),
-        us=frozen(input_gradients),
-        parameters=frozen(parameter_gradient),
+        x0=frozen(totals.states[0]),
+        us=frozen(totals.inputs),
+        parameters=frozen(totals.parameters),
         parameter_names=linearization[0].parameters,
-        state_gradient_norms=frozen(np.linalg.norm(state_gradients, axis=1)),
+        parameter_sources=linearization[0].sources,
+        policy=frozen(totals.policy),
+        state_gradient_norms=frozen(np.linalg.norm(totals.states, axis=1)),
+        spectral_radii=frozen(_spectral_radii(linearization, feedback)),
         xs=frozen(xs),
+        inputs=frozen(inputs),
         methods=tuple(sorted({d.method for d in linearization})),
     )
 
 
 def linearize(
-    model: Model, x0: Array, us: Array, *, parameters: Sequence[str] = (), method: str = "auto"
+    model: Model, x0: Array, us: Array, *, vector: ParameterVector | None = None, method: str = "auto"
 ) -> list[StepDerivatives]:
-    """The step derivatives along the rollout from `x0` (nx,) under `us` (N, nu)."""
+    """The step derivatives along the rollout from `x0` (nx,) under `us` (N, nu), `vector` being applied."""
     found: list[StepDerivatives] = []
-    x = x0
+    vector, x = vector or select(model, ()), x0
     for u in us:
-        found.append(differentiate_step(model, x, u, parameters=parameters, method=method))
+        found.append(step_jacobians(model, vector, x, u, method))
         x = found[-1].x_next
     return found
 
 
-def accumulate(linearization: Sequence[StepDerivatives], by_xs: Array, by_us: Array) -> tuple[Array, Array, Array]:
-    """From a loss's partial gradients by xs (N+1, nx) and us (N, nu) to its total ones, and by parameters (np,)."""
-    state = np.array(by_xs)
-    inputs = np.array(by_us)
+def _close_the_loop(
+    model: Model, x0: Array, policy: Policy, count: int, vector: ParameterVector, method: str
+) -> tuple[list[StepDerivatives], list[Feedback], Array]:
+    found: list[StepDerivatives] = []
+    feedback: list[Feedback] = []
+    x, inputs = x0, np.empty((count, model.nu))
+    for k in range(count):
+        inputs[k], *slopes = differentiate_policy(policy, x, k * model.time_step, model.nu)
+        feedback.append((slopes[0], slopes[1]))
+        found.append(step_jacobians(model, vector, x, inputs[k], method))
+        x = found[-1].x_next
+    return found, feedback, inputs
+
+
+@dataclass(frozen=True, eq=False)
+class Totals:
+    """A loss's total gradients: by states (N+1, nx), inputs (N, nu), parameters (np,), policy parameters (n,)."""
+
+    states: Array
+    inputs: Array
+    parameters: Array
+    policy: Array
+
+
+def accumulate(
+    linearization: Sequence[StepDerivatives], by_xs: Array, by_us: Array, feedback: Sequence[Feedback] = ()
+) -> Totals:
+    """From a loss's partial gradients by xs (N+1, nx) and us (N, nu) to its total ones."""
+    state, inputs = np.array(by_xs), np.array(by_us)
     parameters = np.zeros(linearization[0].C.shape[1])
+    policy = np.zeros(feedback[0][1].shape[1] if feedback else 0)
     for k in reversed(range(len(linearization))):
         d = linearization[k]
         inputs[k] += d.B.T @ state[k + 1]
         parameters += d.C.T @ state[k + 1]
         state[k] += d.A.T @ state[k + 1]
-    return state, inputs, parameters
+        if feedback:
+            by_x, by_parameters = feedback[k]
+            state[k] += by_x.T @ inputs[k]
+            policy += by_parameters.T @ inputs[k]
+    return Totals(state, inputs, parameters, policy)
+
+
+def _last(where: NDArray[np.bool_]) -> int | None:
+    found = np.flatnonzero(where)
+    return int(found[-1]) if len(found) else None
+
+
+def _spectral_radii(linearization: Sequence[StepDerivatives], feedback: Sequence[Feedback]) -> Array:
+    closed = [d.A + d.B @ by_x for d, (by_x, _) in zip(linearization, feedback, strict=True)] if feedback else None
+    return np.abs(np.linalg.eigvals(np.array(closed or [d.A for d in linearization]))).max(axis=1)
 
 
 def evaluate_loss(loss: Loss, xs: Array, us: Array) -> float:

@@ -1,4 +1,4 @@
-"""Single shooting: inputs and initial state are the variables, Drake's own steps the dynamics, our gradients exact."""
+"""Single shooting: inputs, initial state, parameters are the variables, Drake's own steps the dynamics."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,9 +12,11 @@ from drake_diff.autodiff import chain, chain_rows
 from drake_diff.cost import differentiate_cost, differentiate_final_cost
 from drake_diff.exceptions import SimulationError
 from drake_diff.nonlinear_program import Limits, NlpResult, Report, solve_program
+from drake_diff.parameter_coordinates import ParameterCoordinates
+from drake_diff.parameters import ParameterVector, applied
 from drake_diff.problem import Problem
 from drake_diff.rollout import roll_states
-from drake_diff.rollout_gradient import accumulate, linearize
+from drake_diff.rollout_gradient import Totals, accumulate, differentiate_loss, linearize
 from drake_diff.step_derivatives import StepDerivatives
 
 DEFAULT_SOLVER = "snopt"
@@ -32,26 +34,30 @@ def solve_shooting(
     program = _program(problem, variables)
     guess = variables.pack(xs[0], us)
     result = solve_program(program, guess, solver=solver, limits=limits, report=report)
-    x0, found = variables.unpack(result.z)
-    return result, roll_states(problem.model, x0, found), found
+    return result, variables.states(result.z), variables.unpack(result.z)[1]
 
 
 class ShootingVariables:
-    """The vector z = [free entries of x0; us], and the rollout it stands for, linearized once for each z."""
+    """z = [free entries of x0; us; parameters in their coordinates] and its rollout, linearized once for each z."""
 
     def __init__(self, problem: Problem, *, tolerate_failure: bool = False):
         self.problem = problem
         self.tolerate_failure = tolerate_failure
         self.free = np.flatnonzero(problem.initial_state_mask)
         self.shape = (problem.num_steps, problem.model.nu)
-        self.size = len(self.free) + (self.shape[0] * self.shape[1] if problem.optimizes_controls else 0)
+        self.coordinates = ParameterCoordinates(problem.parameters) if problem.optimizes_parameters else None
+        self.num_parameters = len(problem.parameters.values) if problem.optimizes_parameters else 0
+        self._end = len(self.free) + (self.shape[0] * self.shape[1] if problem.optimizes_controls else 0)
+        self.size = self._end + self.num_parameters
         self._at: bytes = b""
         self._linearization: list[StepDerivatives] = []
 
-    def pack(self, x0: Array, us: Array) -> Array:
-        """z (size,) from x0 (nx,) and us (N, nu)."""
+    def pack(self, x0: Array, us: Array, parameters: Array | None = None) -> Array:
+        """z (size,) from x0 (nx,), us (N, nu) and parameter values (np,), the problem's where None."""
         inputs = us.ravel() if self.problem.optimizes_controls else np.zeros(0)
-        return np.concatenate([x0[self.free], inputs])
+        values = self.problem.parameters.values if parameters is None else parameters
+        coordinates = np.zeros(0) if self.coordinates is None else self.coordinates.from_values(values)
+        return np.concatenate([x0[self.free], inputs, coordinates])
 
     def unpack(self, z: Array) -> tuple[Array, Array]:
         """x0 (nx,) and us (N, nu) from z (size,)."""
@@ -59,17 +65,31 @@ class ShootingVariables:
         x0[self.free] = z[: len(self.free)]
         if not self.problem.optimizes_controls:
             return x0, np.array(self.problem.us)
-        return x0, z[len(self.free) :].reshape(self.shape)
+        return x0, z[len(self.free) : self._end].reshape(self.shape)
 
-    def gradient(self, by_x0: Array, by_us: Array) -> Array:
-        """(size,) the gradient by z from those by x0 (nx,) and us (N, nu)."""
-        return self.pack(by_x0, by_us)
+    def parameters(self, z: Array) -> ParameterVector:
+        """The problem's parameters at z (size,)."""
+        if self.coordinates is None:
+            return self.problem.parameters
+        return self.problem.parameters.at(self.coordinates.to_values(z[self._end :]))
+
+    def gradient(self, z: Array, totals: Totals) -> Array:
+        """(size,) the gradient by z from those by x0 (nx,), us (N, nu) and parameters (np,)."""
+        inputs = totals.inputs.ravel() if self.problem.optimizes_controls else np.zeros(0)
+        return np.concatenate([totals.states[0][self.free], inputs, self.pull_back(z, totals.parameters)])
+
+    def pull_back(self, z: Array, by_parameters: Array) -> Array:
+        """(..., num_parameters) the derivative by the parameters' coordinates in z."""
+        if self.coordinates is None:
+            return np.zeros((*by_parameters.shape[:-1], 0))
+        return self.coordinates.pull_back(z[self._end :], by_parameters)
 
     def linearization(self, z: Array) -> list[StepDerivatives]:
         """The step derivatives along the rollout of z."""
         if z.tobytes() != self._at:
-            x0, us = self.unpack(z)
-            self._linearization, self._at = linearize(self.problem.model, x0, us), z.tobytes()
+            (x0, us), vector = self.unpack(z), self.parameters(z)
+            with applied(vector) as model:
+                self._linearization, self._at = linearize(model, x0, us, vector=vector), z.tobytes()
         return self._linearization
 
     def attempt(self, evaluate: Callable[[], Any], failed: Any) -> Any:
@@ -86,17 +106,19 @@ class ShootingVariables:
         x0, us = self.unpack(z)
         if z.tobytes() == self._at:
             return np.vstack([x0, [d.x_next for d in self._linearization]])
-        return roll_states(self.problem.model, x0, us)
+        with applied(self.parameters(z)) as model:
+            return roll_states(model, x0, us)
 
 
 def _program(problem: Problem, variables: ShootingVariables) -> MathematicalProgram:
     program = MathematicalProgram()
     z = program.NewContinuousVariables(variables.size, "z")
     b = problem.bounds
-    lower = variables.pack(b.x_lower, np.tile(b.u_lower, (problem.num_steps, 1)))
-    upper = variables.pack(b.x_upper, np.tile(b.u_upper, (problem.num_steps, 1)))
-    program.AddBoundingBoxConstraint(lower, upper, z).evaluator().set_description("initial state and inputs")
-    if problem.running_cost is not None or problem.final_cost is not None:
+    lowest, highest = problem.bounds_of_parameters()
+    lower = variables.pack(b.x_lower, np.tile(b.u_lower, (problem.num_steps, 1)), lowest)
+    upper = variables.pack(b.x_upper, np.tile(b.u_upper, (problem.num_steps, 1)), highest)
+    program.AddBoundingBoxConstraint(lower, upper, z).evaluator().set_description("variables")
+    if any(cost is not None for cost in (problem.running_cost, problem.final_cost, problem.trajectory_cost)):
         program.AddCost(RolloutCost(problem, variables), vars=z)
     wanted = np.flatnonzero(~np.isnan(problem.goal))
     if len(wanted):
@@ -147,8 +169,11 @@ class RolloutCost:
         if problem.final_cost is not None:
             value, by_xs[-1] = differentiate_final_cost(problem.final_cost, xs[-1])
             total += value
-        states, inputs, _ = accumulate(linearization, by_xs, by_us)
-        return total, self.variables.gradient(states[0], inputs), states
+        if problem.trajectory_cost is not None:
+            value, added_xs, added_us = differentiate_loss(problem.trajectory_cost, xs, us)
+            total, by_xs, by_us = total + value, by_xs + added_xs, by_us + added_us
+        totals = accumulate(linearization, by_xs, by_us)
+        return total, self.variables.gradient(z, totals), totals.states
 
 
 class _StateRows:
@@ -175,7 +200,7 @@ class _StateRows:
 
 
 def state_sensitivities(variables: ShootingVariables, z: Array) -> Array:
-    """(N+1, nx, size): d x_k / d z, forward: S_(k+1) = A_k S_k + B_k d u_k / d z."""
+    """(N+1, nx, size): d x_k / d z, forward: S_(k+1) = A_k S_k + B_k d u_k / d z + C_k d p / d z."""
     linearization = variables.linearization(z)
     nx, nu, free = variables.problem.model.nx, variables.shape[1], len(variables.free)
     sensitivities = np.zeros((len(linearization) + 1, nx, variables.size))
@@ -185,4 +210,5 @@ def state_sensitivities(variables: ShootingVariables, z: Array) -> Array:
         if variables.problem.optimizes_controls:
             start = free + k * nu
             sensitivities[k + 1][:, start : start + nu] += d.B
+        sensitivities[k + 1][:, variables.size - variables.num_parameters :] += variables.pull_back(z, d.C)
     return sensitivities

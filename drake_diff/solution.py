@@ -11,6 +11,8 @@ from drake_diff.arrays import Array
 from drake_diff.certificate import Certificate
 from drake_diff.continuous import EquationsOfMotion
 from drake_diff.exceptions import ModelError, SimulationError
+from drake_diff.model import Model
+from drake_diff.parameters import ParameterVector, applied, select
 from drake_diff.problem import Problem
 from drake_diff.rollout import Rollout, roll_states, rollout
 from drake_diff.step import advance
@@ -82,6 +84,7 @@ class Solution:
     xs: Array
     us: Array
     u_final: Array | None = None
+    parameters: Array | None = None  # (np,) the values of `problem.parameters`; the problem's own where None
     iterations: tuple[Iteration, ...] = ()
     certificates: tuple[Certificate, ...] = ()
     gradient_norms: Array | None = None  # (N+1,) |d cost / d x_k| at the solution, where the method has it
@@ -93,6 +96,11 @@ class Solution:
     def success(self) -> bool:
         """Whether the solver converged and everything measured again holds."""
         return self.status is Status.CONVERGED
+
+    @property
+    def vector(self) -> ParameterVector:
+        """The problem's parameters as they were found."""
+        return self.problem.parameters if self.parameters is None else self.problem.parameters.at(self.parameters)
 
     @cached_property
     def cost(self) -> float:
@@ -119,8 +127,10 @@ class Solution:
         """
         if self.us.shape != self.problem.us.shape or self.xs.shape != (len(self.us) + 1, self.problem.model.nx):
             return np.full(max(self.problem.num_steps, 1), np.inf)
-        measure = self._step_defect if self.u_final is None else self._collocation_defect
-        return np.array([measure(k) for k in range(len(self.us))])
+        if self.u_final is not None:
+            return np.array([self._collocation_defect(k) for k in range(len(self.us))])
+        with applied(self.vector) as model:
+            return np.array([self._step_defect(model, k) for k in range(len(self.us))])
 
     @property
     def defect(self) -> float:
@@ -144,13 +154,15 @@ class Solution:
 
     @cached_property
     def bound_violation(self) -> float:
-        """The largest excess over a bound of a state after the first, or of an input."""
+        """The largest excess over a bound of a state that is not given, an input, or a parameter."""
         b = self.problem.bounds
         states, inputs = self.xs[1:], self.inputs_at_knots
         free = self.problem.initial_state_mask
         if not (np.all(np.isfinite(states)) and np.all(np.isfinite(inputs))):
             return float("inf")
         excess = [b.x_lower - states, states - b.x_upper, b.u_lower - inputs, inputs - b.u_upper]
+        lowest, highest = self.problem.bounds_of_parameters()
+        excess += [lowest - self.vector.values, self.vector.values - highest]
         excess += [(b.x_lower - self.xs[0])[free], (self.xs[0] - b.x_upper)[free]]
         return float(max(np.max(e, initial=0.0) for e in excess))
 
@@ -174,7 +186,7 @@ class Solution:
         knots = self.inputs_at_knots
         us = self.us if self.u_final is None else (knots[:-1] + knots[1:]) / 2
         try:
-            return rollout(self.problem.model, self.xs[0], us)
+            return rollout(self.problem.model, self.xs[0], us, parameters=self.vector.to_dict())
         except (SimulationError, ValueError):
             return None  # not finite, or beyond what Drake can step: recorded as missing, never as zero
 
@@ -188,7 +200,8 @@ class Solution:
             return float("inf")
         try:
             finer = self.problem.model.at_time_step(self.problem.model.time_step / 2)
-            end = roll_states(finer, self.xs[0], np.repeat(self.replay.us, 2, axis=0))[-1]
+            with applied(select(finer, self.vector.to_dict())) as model:
+                end = roll_states(model, self.xs[0], np.repeat(self.replay.us, 2, axis=0))[-1]
         except (ModelError, SimulationError):
             return float("inf")
         return _largest(np.abs(end - self.xs[-1]))
@@ -197,9 +210,9 @@ class Solution:
     def _equations(self) -> EquationsOfMotion:
         return EquationsOfMotion(self.problem.model)
 
-    def _step_defect(self, k: int) -> float:
+    def _step_defect(self, model: Model, k: int) -> float:
         try:
-            return _largest(np.abs(self.xs[k + 1] - advance(self.problem.model.double, self.xs[k], self.us[k])))
+            return _largest(np.abs(self.xs[k + 1] - advance(model.double, self.xs[k], self.us[k])))
         except SimulationError:
             return float("inf")
 

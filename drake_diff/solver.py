@@ -18,7 +18,6 @@ from drake_diff.exceptions import GradientError, InputError, SimulationError, Un
 from drake_diff.ilqr import check_problem, is_solvable, solve_ilqr
 from drake_diff.nonlinear_program import SOLVERS, Limits, NlpResult, Outcome
 from drake_diff.problem import Problem
-from drake_diff.rollout import roll_states
 from drake_diff.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
 from drake_diff.shooting import RolloutCost, ShootingVariables, solve_shooting
 from drake_diff.solution import Solution, Status
@@ -103,6 +102,8 @@ def _check_method(problem: Problem, method: str) -> None:
         check_problem(problem)
     elif method == "collocation":
         EquationsOfMotion(problem.model)
+        if problem.parameters.parameters or problem.trajectory_cost is not None:
+            raise InputError("parameters, trajectory_cost", got="given", expected='method="shooting"')
         if not problem.optimizes_controls:
             raise InputError("optimize", got=list(problem.optimize), expected='"controls" for method="collocation"')
 
@@ -112,6 +113,8 @@ def choose_method(problem: Problem) -> tuple[str, str]:
     contract = problem.model.contract
     if not problem.optimizes_controls:
         return "shooting", "the controls are not optimized"
+    if problem.parameters.parameters or problem.trajectory_cost is not None:
+        return "shooting", "collocation takes neither parameters nor a cost of the whole trajectory"
     if contract.contact.collision_pairs:
         return "shooting", "the model has geometries that can touch, which collocation leaves out"
     if contract.constraints or any(actuator.kp is not None for actuator in contract.actuators):
@@ -196,12 +199,14 @@ class _Run:
             return ended(self._draft(xs, us, certificates=before), Status.NO_GRADIENT, blindness)
         try:
             result, xs, us = search(xs, us)
-            z = variables.pack(xs[0], us)
+            z = result.z if self.method == "shooting" and len(result.z) == variables.size else variables.pack(xs[0], us)
             xs, us, after, blindness = self._look_at(variables, z)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(xs, us, certificates=before), error)
         norms = np.linalg.norm(RolloutCost(self.problem, variables).differentiate(z)[2], axis=1)
-        draft = self._draft(xs, us, certificates=before + after, gradient_norms=frozen(norms))
+        values = variables.parameters(z).values
+        found = {"certificates": before + after, "gradient_norms": frozen(norms), "parameters": values}
+        draft = self._draft(xs, us, **found)
         solution = judged(draft, result)
         return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
 
@@ -223,9 +228,9 @@ class _Run:
 
     def _look_at(self, variables: ShootingVariables, z: Array) -> tuple[Array, Array, tuple[Certificate, ...], str]:
         """xs and us of z, certificates of some of its steps, and why the goal or cost is out of its reach."""
-        x0, us = variables.unpack(z)
-        xs = roll_states(self.problem.model, x0, us)
-        certificates = tuple(certify(self.problem.model, xs[k], us[k]) for k in self.knots)
+        us = variables.unpack(z)[1]
+        xs, parameters = variables.states(z), variables.parameters(z).to_dict()
+        certificates = tuple(certify(self.problem.model, xs[k], us[k], parameters=parameters) for k in self.knots)
         return xs, us, certificates, why_blind(self.problem, variables, z)
 
     def _certify_equations(self, equations: EquationsOfMotion, xs: Array, us: Array) -> tuple[Certificate, ...]:

@@ -1,5 +1,6 @@
 """One discrete step of Drake's double plant."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -7,16 +8,23 @@ from numpy.typing import ArrayLike
 
 from drake_diff.arrays import Array, finite_array
 from drake_diff.exceptions import SimulationError
-from drake_diff.model import Model, Twin
+from drake_diff.model import Model
+from drake_diff.parameters import applied, select
+from drake_diff.twin import Twin
 
 
-def step(model: Model, x: ArrayLike, u: ArrayLike | None = None) -> Array:
+def step(
+    model: Model, x: ArrayLike, u: ArrayLike | None = None, *, parameters: Mapping[str, Any] | None = None
+) -> Array:
     """(nx,): the state one `model.time_step` after `x` (nx,) under the constant input `u` (nu,) [N or N m].
 
-    `u` may be left out where the model has no actuators. Raises ShapeError, NonFiniteError, or SimulationError
+    `u` may be left out where the model has no actuators; `parameters` maps names (see `list_parameters`) to values
+    that replace the model's own for this step. Raises ShapeError, NonFiniteError, or SimulationError
     where Drake cannot take the step or its result is not finite.
     """
-    return advance(model.double, *check_point(model, x, u))
+    point = check_point(model, x, u)
+    with applied(select(model, parameters or ())) as set_model:
+        return advance(set_model.double, *point)
 
 
 def check_point(model: Model, x: ArrayLike, u: ArrayLike | None) -> tuple[Array, Array]:
@@ -45,6 +53,8 @@ def advance(twin: Twin, x: Any, u: Any) -> Any:
     if np.asarray(u).dtype == float and not np.all(np.isfinite(u)):
         raise SimulationError(f"an input is not finite: {u}")
     plant.get_actuation_input_port().FixValue(context, u)
+    if twin.added:
+        plant.get_applied_generalized_force_input_port().FixValue(context, twin.added_force())
     try:
         # value() is a view that the next step overwrites.
         x_next = np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())

@@ -1,103 +1,181 @@
 """The Jacobians of one discrete step, and the gates that each must pass before anyone sees it."""
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
 
 from drake_diff.arrays import Array, frozen
 from drake_diff.autodiff import gradient_rows
 from drake_diff.exceptions import GradientError, ModelError, SimulationError, UnknownNameError
-from drake_diff.finite_difference import differences
+from drake_diff.finite_difference import differences, plateau
+from drake_diff.implicit import NotSmoothError, implicit_jacobian
 from drake_diff.model import Model
-from drake_diff.parameters import (
-    Parameter,
-    column_names,
-    difference_scale,
-    find_parameters,
-    set_parameters,
-    stacked_values,
-)
+from drake_diff.parameters import Parameters, ParameterVector, applied, select, write_autodiff
 from drake_diff.step import advance, check_point
 
-METHODS = ("auto", "autodiff", "finite_difference")
+METHODS = ("auto", "autodiff", "implicit", "finite_difference")
 # The AutoDiffXd and the double step run the same algorithm, so they differ by rounding only.
 PARITY_TOLERANCE = 1e-9
 # Lagged contact reaches 4e4 where it is right; Drake's singular poses give 1e15 and more.
 MAGNITUDE_BOUND = 1e8
 # Cube root of the double step's rounding: where truncation and rounding of a central difference balance.
 DIFFERENCE_STEP = 1e-5
+# Two ways to the same smooth Jacobian differ by rounding, which the inverse of a mass matrix may magnify.
+SAME_JACOBIAN = 1e-10
+TIMED_CALLS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class StepDerivatives:
-    """x_next (nx,) = f(x, u, p) and A = df/dx (nx, nx), B = df/du (nx, nu), C = df/dp (nx, np)."""
+    """x_next (nx,) = f(x, u, p) and A = df/dx (nx, nx), B = df/du (nx, nu), C = df/dp (nx, np).
+
+    `method` is what A and B come from, `sources` (np,) what each column of C does.
+    """
 
     x_next: Array
     A: Array
     B: Array
     C: Array
     parameters: tuple[str, ...]
+    sources: tuple[str, ...]
     method: str
     reason: str
 
 
 def differentiate_step(
-    model: Model,
-    x: ArrayLike,
-    u: ArrayLike | None = None,
-    *,
-    parameters: Sequence[str] = (),
-    method: str = "auto",
+    model: Model, x: ArrayLike, u: ArrayLike | None = None, *, parameters: Parameters = (), method: str = "auto"
 ) -> StepDerivatives:
     """The Jacobians of `step(model, x, u)` in Drake's coordinates x = [q; v].
 
-    `method` is "autodiff" (AutoDiffXd through Drake's step), "finite_difference" (central differences of the
-    double step) or "auto": autodiff, or differences where Drake refuses AutoDiffXd, which `method` and
-    `reason` of the result then say. Raises GradientError where the AutoDiffXd step is not the double step, or
-    a derivative is not finite or beyond 1e8; SimulationError where Drake cannot take the step.
+    `parameters` names what C is by, at the model's own values, or maps the names to other values. `method` is
+    "autodiff" (AutoDiffXd through Drake's step), "implicit" (from the equation of a smooth step, about three times
+    faster; autodiff where contact or a constraint acts), "finite_difference" (central differences of the double
+    step) or "auto": implicit where it was measured to be equal to autodiff and faster on this model, else
+    autodiff, and differences where Drake refuses AutoDiffXd. `method` and `reason` of the result say what it was.
+    Raises GradientError where the AutoDiffXd step is not the double step, or a derivative is not finite or beyond
+    1e8; SimulationError where Drake cannot take the step.
     """
     if method not in METHODS:
         raise UnknownNameError("method", got=method, known=METHODS)
     x, u = check_point(model, x, u)
-    found = find_parameters(model, tuple(parameters))
+    vector = select(model, parameters)
+    with applied(vector) as set_model:
+        return step_jacobians(set_model, vector, x, u, method)
+
+
+def step_jacobians(model: Model, vector: ParameterVector, x: Array, u: Array, method: str) -> StepDerivatives:
+    """`differentiate_step` on a model that the vector is applied to; sizes are the caller's business."""
     x_next = advance(model.double, x, u)
-    reason = "asked for"
-    if method != "finite_difference":
-        try:
-            jacobian = _autodiff(model, x, u, found, x_next)
-            return _split(model, x_next, jacobian, found, "autodiff", "asked for" if method != "auto" else "works")
-        except (ModelError, SimulationError) as error:
-            if method == "autodiff":
-                raise
-            reason = f"AutoDiffXd is refused: {error}"
-    jacobian = _finite_difference(model, x, u, found, x_next)
-    return _split(model, x_next, jacobian, found, "finite_difference", reason)
-
-
-def _autodiff(model: Model, x: Array, u: Array, parameters: Sequence[Parameter], x_next: Array) -> Array:
-    point = np.concatenate([x, u, stacked_values(parameters)])
-    variables = InitializeAutoDiff(point).ravel()
-    end = model.nx + model.nu
-    twin = model.autodiff
-    try:
-        set_parameters(twin, parameters, variables[end:])
-        result = advance(twin, variables[: model.nx], variables[model.nx : end])
-    finally:
-        if parameters:
-            restore_parameters(model)
-    jacobian = gradient_rows(result, len(point))
-    check_parity(model, ExtractValue(result).ravel(), x_next)
+    jacobian, used, reason = _SOURCES[method](model, vector, x, u, x_next)
+    if len(vector.differenced) and used != "finite_difference":
+        jacobian[:, model.nx + model.nu + vector.differenced] = _parameter_differences(model, vector, x, u, x_next)
     check_derivatives(model, jacobian)
-    return jacobian
+    nx, end = model.nx, model.nx + model.nu
+    return StepDerivatives(
+        x_next=frozen(x_next),
+        A=frozen(jacobian[:, :nx]),
+        B=frozen(jacobian[:, nx:end]),
+        C=frozen(jacobian[:, end:]),
+        parameters=vector.names,
+        sources=vector.sources if used != "finite_difference" else ("finite_difference",) * len(vector.names),
+        method=used,
+        reason=reason,
+    )
 
 
-def restore_parameters(model: Model) -> None:
-    """Put the AutoDiffXd context's parameters back to the double context's."""
-    model.autodiff.root_context.SetTimeStateAndParametersFrom(model.double.root_context)
+Source = tuple[Array, str, str]  # the Jacobian (nx, nx + nu + np), the method and why it was taken
+
+
+def _by_autodiff(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
+    return _autodiff(model, vector, x, u, x_next), "autodiff", "asked for"
+
+
+def _by_finite_difference(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
+    return _finite_difference(model, vector, x, u, x_next), "finite_difference", "asked for"
+
+
+def _by_implicit(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
+    try:
+        return implicit_jacobian(model, vector, x, u, x_next), "implicit", "asked for"
+    except NotSmoothError as error:
+        return _autodiff(model, vector, x, u, x_next), "autodiff", f"not implicit: {error}"
+
+
+def _by_choice(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
+    """What is exact and fastest on this model, measured on the first smooth step that is met."""
+    why = "the first choice"
+    try:
+        if model not in _CHOICES or _CHOICES[model].use_implicit:
+            jacobian = implicit_jacobian(model, vector, x, u, x_next)
+            if model not in _CHOICES:
+                _CHOICES[model] = _compare(model, vector, x, u, x_next, jacobian)
+            if _CHOICES[model].use_implicit:
+                return jacobian, "implicit", _CHOICES[model].reason
+        why = _CHOICES[model].reason
+    except NotSmoothError as error:
+        why = f"not implicit: {error}"
+    except ModelError as error:
+        why = str(error)
+    try:
+        return _autodiff(model, vector, x, u, x_next), "autodiff", why
+    except (ModelError, SimulationError) as error:
+        jacobian = _finite_difference(model, vector, x, u, x_next)
+        return jacobian, "finite_difference", f"AutoDiffXd is refused: {error}"
+
+
+_SOURCES: dict[str, Callable[[Model, ParameterVector, Array, Array, Array], Source]] = {
+    "autodiff": _by_autodiff,
+    "finite_difference": _by_finite_difference,
+    "implicit": _by_implicit,
+    "auto": _by_choice,
+}
+
+
+@dataclass(frozen=True)
+class _Choice:
+    use_implicit: bool
+    reason: str
+
+
+_CHOICES: WeakKeyDictionary[Model, _Choice] = WeakKeyDictionary()
+
+
+def _compare(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array, jacobian: Array) -> _Choice:
+    """Implicit or autodiff from now on: the one is measured against the other at this smooth step."""
+    try:
+        other = _autodiff(model, vector, x, u, x_next)
+    except (ModelError, SimulationError) as error:
+        return _Choice(True, f"AutoDiffXd refuses the whole step: {error}")
+    gap = float(np.abs(jacobian - other).max())
+    if not gap <= SAME_JACOBIAN * max(1.0, float(np.abs(other).max())):
+        return _Choice(False, f"implicit differs from autodiff by {gap:.2g} on this model")
+
+    def seconds(f: Callable[..., Array]) -> float:
+        times = []
+        for _ in range(TIMED_CALLS):
+            start = time.perf_counter()
+            f(model, vector, x, u, x_next)
+            times.append(time.perf_counter() - start)
+        return min(times)
+
+    if seconds(implicit_jacobian) < seconds(_autodiff):
+        return _Choice(True, "equal to autodiff and faster, as measured on this model")
+    return _Choice(False, "faster than implicit, as measured on this model")
+
+
+def _autodiff(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array:
+    point = np.concatenate([x, u, vector.values])
+    variables = InitializeAutoDiff(point).ravel()
+    twin, end = model.autodiff, model.nx + model.nu
+    write_autodiff(vector, model, variables[end:])
+    result = advance(twin, variables[: model.nx], variables[model.nx : end])
+    check_parity(model, ExtractValue(result).ravel(), x_next)
+    return gradient_rows(result, len(point))
 
 
 def check_parity(model: Model, autodiff: Array, double: Array) -> None:
@@ -112,9 +190,11 @@ def check_parity(model: Model, autodiff: Array, double: Array) -> None:
 
 
 def check_derivatives(model: Model, jacobian: Array) -> None:
-    """Refuse a derivative that is not finite or implausibly large."""
-    size = np.where(np.isfinite(jacobian), np.abs(jacobian), np.inf)
-    if size.size and size.max() > MAGNITUDE_BOUND:
+    """Refuse a derivative by x or u that is not finite or implausibly large, and by a parameter that is not finite."""
+    bound = np.full(jacobian.shape[1], MAGNITUDE_BOUND)
+    bound[model.nx + model.nu :] = np.finfo(float).max  # its size is a matter of the parameter's unit
+    size = np.where(np.isfinite(jacobian), np.abs(jacobian), np.inf) / bound
+    if size.size and size.max() > 1:
         row, column = np.unravel_index(int(np.argmax(size)), size.shape)
         raise GradientError(
             f"the derivative of {model.state_names[row]} by variable {column} of [x; u; parameters] is "
@@ -122,38 +202,45 @@ def check_derivatives(model: Model, jacobian: Array) -> None:
         )
 
 
-def _finite_difference(model: Model, x: Array, u: Array, parameters: Sequence[Parameter], x_next: Array) -> Array:
-    point = np.concatenate([x, u, stacked_values(parameters)])
-    scale = np.concatenate([np.maximum(1.0, np.abs(x)), np.maximum(1.0, np.abs(u)), difference_scale(parameters)])
-    f = step_of_displacement(model, point, parameters)
-    return differences(lambda d: f(scale * d), len(point), DIFFERENCE_STEP, at_zero=x_next).central / scale
+def _finite_difference(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array:
+    point = np.concatenate([x, u])
+    scale = np.maximum(1.0, np.abs(point))
+
+    def f(d: Array) -> Array:
+        moved = point + scale * d
+        return np.asarray(advance(model.double, moved[: model.nx], moved[model.nx :]))
+
+    by_point = differences(f, len(point), DIFFERENCE_STEP, at_zero=x_next).central / scale
+    every = np.arange(len(vector.values))
+    return np.hstack([by_point, _parameter_differences(model, vector, x, u, x_next, every)])
 
 
-def step_of_displacement(model: Model, point: Array, parameters: Sequence[Parameter]) -> Any:
-    """The double step as a function of a displacement of the point [x; u; p]; it leaves no trace in the model."""
-    nominal, end = stacked_values(parameters), model.nx + model.nu
+def _parameter_differences(
+    model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array, wanted: NDArray[np.int64] | None = None
+) -> Array:
+    """(nx, n) the derivative of the double step by the `wanted` entries of the vector, else by the differenced ones."""
+    indices = vector.differenced if wanted is None else wanted
+    if not len(indices):
+        return np.zeros((model.nx, 0))
+    scale = vector.difference_scale(indices)
 
-    def f(displacement: Array) -> Array:
-        moved = point + displacement
-        try:
-            set_parameters(model.double, parameters, moved[end:])
-            return np.asarray(advance(model.double, moved[: model.nx], moved[model.nx : end]))
-        finally:
-            set_parameters(model.double, parameters, nominal)
+    def f(d: Array) -> Array:
+        values = np.array(vector.values)
+        values[indices] += scale * d
+        return step_at(model, vector, x, u, values)
 
-    return f
+    return plateau(f, len(indices), at_zero=x_next) / scale
 
 
-def _split(
-    model: Model, x_next: Array, jacobian: Array, parameters: Sequence[Parameter], method: str, reason: str
-) -> StepDerivatives:
-    nx, end = model.nx, model.nx + model.nu
-    return StepDerivatives(
-        x_next=frozen(x_next),
-        A=frozen(jacobian[:, :nx]),
-        B=frozen(jacobian[:, nx:end]),
-        C=frozen(jacobian[:, end:]),
-        parameters=column_names(parameters),
-        method=method,
-        reason=reason,
-    )
+def step_at(model: Model, vector: ParameterVector, x: Array, u: Array, values: Array) -> Array:
+    """(nx,) the double step with the vector's parameters at `values` (np,); the model keeps what was applied."""
+    if np.array_equal(values, vector.values):
+        return np.asarray(advance(model.double, x, u))
+    if vector.time_step(values) != model.time_step:
+        with applied(vector.at(values)) as other:
+            return np.asarray(advance(other.double, x, u))
+    try:
+        vector.write(model.double, values)
+        return np.asarray(advance(model.double, x, u))
+    finally:
+        vector.write(model.double, vector.values)

@@ -1,0 +1,443 @@
+"""The routes around contact that AutoDiffXd refuses: what they change, what they keep, and that they differentiate."""
+
+import re
+from itertools import combinations_with_replacement, product
+
+import numpy as np
+import pytest
+from conftest import Plant, contact_properties
+from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
+    AddCompliantHydroelasticPropertiesForHalfSpace,
+    AddRigidHydroelasticProperties,
+    Box,
+    Capsule,
+    CollisionFilterDeclaration,
+    Convex,
+    Cylinder,
+    Ellipsoid,
+    GeometrySet,
+    HalfSpace,
+    Mesh,
+    ProximityProperties,
+    Role,
+    Sphere,
+)
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.tree import SpatialInertia
+
+import drake_diff as dd
+from drake_diff.contact import contacts_of_the_step
+from drake_diff.contact_geometry import ROUTES, autodiff_supports, replace_collision_geometry
+
+MASS, SIZE = 2.0, (0.3, 0.2, 0.1)  # [kg], [m]
+BOX_STIFFNESS, GROUND_STIFFNESS = 2e4, 1e4  # [N/m]
+TETRAHEDRON = "v -.1 -.1 -.1\nv .1 -.1 -.1\nv 0 .1 -.1\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+SHAPES = ("Sphere", "Box", "Cylinder", "Capsule", "Ellipsoid", "HalfSpace", "Convex", "Mesh")
+TWINS = ("autodiff", "double")
+
+
+@pytest.fixture(scope="module")
+def shapes(tmp_path_factory):
+    """One of each shape that a plant can collide with, about 0.2 m across."""
+    path = tmp_path_factory.mktemp("mesh") / "tetrahedron.obj"
+    path.write_text(TETRAHEDRON)
+    solids = [Sphere(0.1), Box(0.2, 0.2, 0.2), Cylinder(0.1, 0.2), Capsule(0.1, 0.2), Ellipsoid(0.1, 0.12, 0.09)]
+    return dict(zip(SHAPES, [*solids, HalfSpace(), Convex(str(path), 1.0), Mesh(str(path), 1.0)], strict=True))
+
+
+def add_body(plant, shape, *, name="box", properties=None, pose=None):
+    body = plant.plant.AddRigidBody(name, SpatialInertia.SolidBoxWithMass(MASS, *SIZE))
+    plant.shape(body, shape, properties or contact_properties(BOX_STIFFNESS, 1.0, 0.4, 0.001), pose)
+    return body
+
+
+def replaced(plant, route="corner_spheres"):
+    return replace_collision_geometry(plant.plant, plant.scene_graph, route)
+
+
+def collision_names(plant):
+    inspector = plant.scene_graph.model_inspector()
+    return [inspector.GetName(g) for g in inspector.GetAllGeometryIds(Role.kProximity)]
+
+
+def geometry_id(plant, body, name):
+    return plant.scene_graph.model_inspector().GetGeometryIdByName(
+        plant.plant.GetBodyFrameIdOrThrow(body.index()), Role.kProximity, name
+    )
+
+
+def box_on_ground(route, contact_model="point"):
+    plant = Plant(0.005, contact_model=contact_model)
+    add_body(plant, Box(*SIZE))
+    plant.ground(contact_properties(GROUND_STIFFNESS, 1.0, 0.4, 0.001))
+    replaced(plant, route)
+    return plant.model()
+
+
+def sliding(model, tilt, height):
+    """The box at a generic pose, sliding and turning."""
+    x = model.default_state.copy()
+    x[:4] = RollPitchYaw(*tilt, 0.4).ToQuaternion().wxyz()
+    x[4:] = [0.1, -0.2, height, 0.1, 0.2, -0.1, 0.5, 0.3, -0.2]
+    return x
+
+
+def check_the_derivative(model, x, tolerance):
+    """Autodiff certifies and equals central differences of 4th order, relative to its largest entry."""
+    A = dd.differentiate_step(model, x, method="autodiff").A
+    dd.step(model, x)
+    assert contacts_of_the_step(model)
+    assert dd.certify(model, x, method="autodiff").verdict == "agree"
+    h = 1e-6 * np.eye(len(x))
+    near = np.array([dd.step(model, x + e) - dd.step(model, x - e) for e in h])
+    far = np.array([dd.step(model, x + 2 * e) - dd.step(model, x - 2 * e) for e in h])
+    differences = ((8 * near - far) / 12e-6).T
+    assert np.abs(A - differences).max() <= tolerance * np.abs(A).max()
+
+
+# What the step does with the box as it is, and with each route.
+
+
+def test_a_box_on_the_ground_is_refused_as_it_is():
+    model = box_on_ground("differences")
+    x = sliding(model, (0.02, -0.03), 0.052)
+    with pytest.raises(dd.SimulationError, match="Penetration queries between shapes"):
+        dd.differentiate_step(model, x, method="autodiff")
+    assert dd.differentiate_step(model, x).method == "finite_difference"
+
+
+def test_a_sliding_box_on_corner_spheres_is_differentiated_by_autodiff():
+    model = box_on_ground("corner_spheres")
+    x = sliding(model, (0.02, -0.03), 0.052)
+    check_the_derivative(model, x, 1e-7)  # measured 6e-10; SAP solves to a tolerance
+
+
+@pytest.mark.parametrize("contact_model", ["hydroelastic", "hydroelastic_with_fallback"])
+def test_a_sliding_hydroelastic_box_is_differentiated_by_autodiff(contact_model):
+    model = box_on_ground("hydroelastic", contact_model)
+    x = sliding(model, (0.3, -0.25), 0.09)
+    check_the_derivative(model, x, 1e-6)  # measured 1.4e-9
+
+
+def test_the_box_rests_on_four_springs():
+    """m g = 4 k depth, where each contact is two springs in series."""
+    model = box_on_ground("corner_spheres")
+    x = model.default_state.copy()
+    x[6] = SIZE[2] / 2 + 0.001
+    for _ in range(600):
+        x = dd.step(model, x)
+    k = BOX_STIFFNESS * GROUND_STIFFNESS / (BOX_STIFFNESS + GROUND_STIFFNESS)
+    assert len(contacts_of_the_step(model)) == 4
+    # 3 s of dissipation leave a speed of 1e-8 m/s, and the depth within 6e-7 of its limit
+    np.testing.assert_allclose(SIZE[2] / 2 - x[6], MASS * 9.81 / (4 * k), rtol=1e-5)
+
+
+# What is registered in place of what.
+
+
+def test_the_corner_spheres_touch_three_faces_of_a_turned_box_from_inside():
+    plant = Plant(0.005)
+    X_BG = RigidTransform(RollPitchYaw(0.3, -0.5, 0.9), [0.1, 0.2, -0.3])
+    body = add_body(plant, Box(*SIZE), pose=X_BG)
+    replaced(plant)
+    inspector = plant.scene_graph.model_inspector()
+    for i, signs in enumerate(product((-1, 1), repeat=3)):
+        sphere = geometry_id(plant, body, f"box_shape_corner_{i}")
+        assert inspector.GetShape(sphere).radius() == pytest.approx(0.005, rel=1e-12)  # 0.05 of the edge of 0.1 m
+        p_BS = X_BG @ (np.array(signs) * [0.145, 0.095, 0.045])
+        np.testing.assert_allclose(inspector.GetPoseInFrame(sphere).translation(), p_BS, atol=1e-15)
+
+
+def test_a_moving_capsule_becomes_its_two_ends():
+    plant = Plant(0.005)
+    body = add_body(plant, Capsule(0.1, 0.4), pose=RigidTransform([0, 0, 1.0]))
+    (note,) = replaced(plant)
+    assert "capsule" in note
+    inspector = plant.scene_graph.model_inspector()
+    for i, z in enumerate((0.8, 1.2)):
+        sphere = geometry_id(plant, body, f"box_shape_corner_{i}")
+        assert inspector.GetShape(sphere).radius() == 0.1
+        np.testing.assert_allclose(inspector.GetPoseInFrame(sphere).translation(), [0, 0, z], atol=1e-15)
+    assert len(collision_names(plant)) == 2
+
+
+def test_a_moving_cylinder_becomes_spheres_along_its_rims_approximately():
+    plant = Plant(0.005)
+    body = add_body(plant, Cylinder(0.2, 0.1))
+    (note,) = replaced(plant)
+    assert "approximate" in note
+    inspector = plant.scene_graph.model_inspector()
+    for i in range(16):
+        sphere = geometry_id(plant, body, f"box_shape_corner_{i}")
+        radius, p = inspector.GetShape(sphere).radius(), inspector.GetPoseInFrame(sphere).translation()
+        assert radius == pytest.approx(0.005, rel=1e-12)
+        assert np.hypot(*p[:2]) + radius == pytest.approx(0.2, rel=1e-12)
+        assert abs(p[2]) + radius == pytest.approx(0.05, rel=1e-12)
+    assert len(collision_names(plant)) == 16
+
+
+def test_many_geometries_on_one_body_are_each_replaced():
+    """The ids of plant.GetCollisionGeometriesForBody dangle as soon as a geometry is added to that body."""
+    plant = Plant(0.005)
+    body = add_body(plant, Sphere(0.1))
+    for i in range(40):
+        plant.plant.RegisterCollisionGeometry(
+            body, RigidTransform([i, 0, 0]), Capsule(0.1, 0.2), f"link_{i}", contact_properties(1e4 + i)
+        )
+    assert len(replaced(plant)) == 40
+    inspector = plant.scene_graph.model_inspector()
+    names = [f"link_{i}_corner_{end}" for i in range(40) for end in range(2)]
+    assert sorted(collision_names(plant)) == sorted(["box_shape", *names])
+    for i in range(40):
+        sphere = geometry_id(plant, body, f"link_{i}_corner_1")
+        np.testing.assert_allclose(inspector.GetPoseInFrame(sphere).translation(), [i, 0, 0.1], atol=1e-15)
+        properties = inspector.GetProximityProperties(sphere)
+        assert properties.GetProperty("material", "point_contact_stiffness") == 1e4 + i
+
+
+def test_the_material_is_carried_over():
+    plant = Plant(0.005)
+    properties = contact_properties(1234.0, 0.7, 0.35, 0.012)
+    properties.AddProperty("user", "label", 3.0)
+    body = add_body(plant, Box(*SIZE), properties=properties)
+    replaced(plant)
+    inspector = plant.scene_graph.model_inspector()
+    for i in range(8):
+        carried = inspector.GetProximityProperties(geometry_id(plant, body, f"box_shape_corner_{i}"))
+        friction = carried.GetProperty("material", "coulomb_friction")
+        assert (friction.static_friction(), friction.dynamic_friction()) == (0.35, 0.35)
+        assert carried.GetProperty("material", "point_contact_stiffness") == 1234.0
+        assert carried.GetProperty("material", "hunt_crossley_dissipation") == 0.7
+        assert carried.GetProperty("material", "relaxation_time") == 0.012
+        assert carried.GetProperty("user", "label") == 3.0
+
+
+def test_what_is_fixed_to_the_world_stays():
+    plant = Plant(0.005)
+    plant.shape(plant.plant.world_body(), Box(*SIZE), contact_properties(1e4))
+    shelf = add_body(plant, Box(*SIZE), name="shelf")
+    plant.plant.WeldFrames(plant.plant.world_frame(), shelf.body_frame())
+    lip = add_body(plant, Capsule(0.1, 0.2), name="lip")
+    plant.plant.WeldFrames(shelf.body_frame(), lip.body_frame())
+    assert replaced(plant) == ()
+    assert sorted(collision_names(plant)) == ["lip_shape", "shelf_shape", "world_shape"]
+
+
+def test_what_is_welded_to_a_moving_body_moves():
+    plant = Plant(0.005)
+    base, tool = add_body(plant, Sphere(0.1), name="base"), add_body(plant, Box(*SIZE), name="tool")
+    plant.plant.WeldFrames(base.body_frame(), tool.body_frame())
+    replaced(plant)
+    assert sorted(collision_names(plant)) == ["base_shape", *(f"tool_shape_corner_{i}" for i in range(8))]
+
+
+@pytest.mark.parametrize("kind", ["Ellipsoid", "Convex", "Mesh"])
+def test_what_stays_refused_is_said(shapes, kind):
+    plant = Plant(0.005)
+    add_body(plant, shapes[kind])
+    (note,) = replaced(plant)
+    assert kind in note
+    assert "refuses" in note
+    assert "hydroelastic or differences" in note
+    assert collision_names(plant) == ["box_shape"]
+
+
+def test_spheres_and_half_spaces_stay_and_nothing_is_said():
+    plant = Plant(0.005)
+    add_body(plant, Sphere(0.1))
+    plant.ground(contact_properties(1e4))
+    assert replaced(plant) == ()
+    assert sorted(collision_names(plant)) == ["box_shape", "ground"]
+
+
+def test_a_second_replacement_changes_nothing():
+    plant = Plant(0.005)
+    add_body(plant, Box(*SIZE))
+    replaced(plant)
+    before = collision_names(plant)
+    assert replaced(plant) == ()
+    assert collision_names(plant) == before
+
+
+def test_the_name_keeps_its_model_once():
+    plant = Plant(0.005)
+    crate = plant.plant.AddModelInstance("crate")
+    body = plant.plant.AddRigidBody("box", crate, SpatialInertia.SolidBoxWithMass(MASS, *SIZE))
+    plant.shape(body, Capsule(0.1, 0.2), contact_properties(1e4))
+    replaced(plant)
+    assert collision_names(plant) == ["crate::box_shape_corner_0", "crate::box_shape_corner_1"]
+
+
+def test_masses_and_what_is_drawn_stay():
+    plant = Plant(0.005)
+    body = add_body(plant, Box(*SIZE))
+    drawn = plant.plant.RegisterVisualGeometry(body, RigidTransform(), Box(*SIZE), "drawn", np.array([1, 0, 0, 1.0]))
+    before = body.default_spatial_inertia().CopyToFullMatrix6()
+    replaced(plant)
+    inspector = plant.scene_graph.model_inspector()
+    np.testing.assert_array_equal(body.default_spatial_inertia().CopyToFullMatrix6(), before)
+    assert inspector.GetAllGeometryIds(Role.kIllustration) == [drawn]
+    np.testing.assert_array_equal(inspector.GetShape(drawn).size(), SIZE)
+
+
+@pytest.mark.parametrize("excluded", [True, False])
+def test_a_collision_filter_of_the_original_holds_for_its_spheres(excluded):
+    plant = Plant(0.005)
+    box, can = add_body(plant, Box(*SIZE)), add_body(plant, Capsule(0.1, 0.2), name="can")
+    a, b = geometry_id(plant, box, "box_shape"), geometry_id(plant, can, "can_shape")
+    if excluded:
+        declaration = CollisionFilterDeclaration().ExcludeBetween(GeometrySet(a), GeometrySet(b))
+        plant.scene_graph.collision_filter_manager().Apply(declaration)
+    replaced(plant)
+    inspector = plant.scene_graph.model_inspector()
+    filtered = [
+        inspector.CollisionFiltered(
+            geometry_id(plant, box, f"box_shape_corner_{i}"), geometry_id(plant, can, f"can_shape_corner_{j}")
+        )
+        for i in range(8)
+        for j in range(2)
+    ]
+    assert filtered == [excluded] * 16
+
+
+# The hydroelastic route.
+
+
+def test_hydroelastic_properties_are_added_and_the_material_stays():
+    plant = Plant(0.005, contact_model="hydroelastic")
+    body = add_body(plant, Box(*SIZE), properties=contact_properties(1234.0, 0.7, 0.35))
+    plant.ground(contact_properties(1e4))
+    notes = replaced(plant, "hydroelastic")
+    assert [note.partition(" hydroelastic")[0] for note in notes] == [
+        "ground on world: became rigid",
+        "box_shape on box: became compliant",
+    ]
+    inspector = plant.scene_graph.model_inspector()
+    carried = inspector.GetProximityProperties(geometry_id(plant, body, "box_shape"))
+    assert carried.GetProperty("hydroelastic", "hydroelastic_modulus") == 1e7
+    assert carried.GetProperty("hydroelastic", "resolution_hint") == pytest.approx(0.05, rel=1e-12)  # half of 0.1 m
+    assert carried.GetProperty("material", "point_contact_stiffness") == 1234.0
+    assert carried.GetProperty("material", "coulomb_friction").dynamic_friction() == 0.35
+
+
+def test_hydroelastic_properties_of_its_own_stay():
+    plant = Plant(0.005, contact_model="hydroelastic")
+    properties = contact_properties(1e4)
+    AddCompliantHydroelasticProperties(0.02, 3e6, properties)
+    body = add_body(plant, Box(*SIZE), properties=properties)
+    (note,) = replaced(plant, "hydroelastic")
+    assert "keeps its own" in note
+    carried = plant.scene_graph.model_inspector().GetProximityProperties(geometry_id(plant, body, "box_shape"))
+    assert carried.GetProperty("hydroelastic", "hydroelastic_modulus") == 3e6
+    assert carried.GetProperty("hydroelastic", "resolution_hint") == 0.02
+
+
+def test_a_modulus_without_a_compliance_type_is_kept():
+    plant = Plant(0.005, contact_model="hydroelastic")
+    properties = contact_properties(1e4)
+    properties.AddProperty("hydroelastic", "hydroelastic_modulus", 3e6)
+    body = add_body(plant, Box(*SIZE), properties=properties)
+    (note,) = replaced(plant, "hydroelastic")
+    assert "modulus 3e+06 Pa" in note
+    carried = plant.scene_graph.model_inspector().GetProximityProperties(geometry_id(plant, body, "box_shape"))
+    assert carried.GetProperty("hydroelastic", "hydroelastic_modulus") == 3e6
+    assert carried.HasProperty("hydroelastic", "compliance_type")
+
+
+def test_hydroelastic_in_a_plant_with_point_contact_is_an_error():
+    plant = Plant(0.005)
+    add_body(plant, Box(*SIZE))
+    with pytest.raises(dd.InputError, match="contact_model: expected hydroelastic or hydroelastic_with_fallback"):
+        replaced(plant, "hydroelastic")
+
+
+# The other route, and errors.
+
+
+def test_differences_changes_nothing():
+    plant = Plant(0.005)
+    add_body(plant, Box(*SIZE))
+    assert replaced(plant, "differences") == (
+        "Pairs of geometries that AutoDiffXd refuses are differenced, by choice.",
+    )
+    assert collision_names(plant) == ["box_shape"]
+
+
+def test_an_unknown_route_lists_those_that_exist():
+    with pytest.raises(dd.UnknownNameError) as error:
+        replaced(Plant(0.005), "spheres")
+    assert all(route in str(error.value) for route in ROUTES)
+
+
+@pytest.mark.parametrize("route", ROUTES)
+def test_a_finalized_plant_is_an_error(route):
+    plant = Plant(0.005)
+    add_body(plant, Box(*SIZE))
+    plant.plant.Finalize()
+    with pytest.raises(dd.ModelError, match="is finalized"):
+        replaced(plant, route)
+
+
+def test_a_name_that_is_taken_is_an_error():
+    plant = Plant(0.005)
+    body = add_body(plant, Box(*SIZE))
+    plant.plant.RegisterCollisionGeometry(
+        body, RigidTransform(), Sphere(0.1), "box_shape_corner_0", contact_properties(1e4)
+    )
+    with pytest.raises(dd.ModelError, match="Drake refuses the route 'corner_spheres'"):
+        replaced(plant)
+
+
+# Which pairs Drake supports, measured again.
+
+
+def step_throws(a, b, contact_model, *, half_space="rigid", twin="autodiff"):
+    """Whether the step of two overlapping free bodies throws."""
+    plant = Plant(0.005, contact_model=contact_model)
+    for name, shape in (("a", a), ("b", b)):
+        properties = ProximityProperties() if contact_model == "point" else hydroelastic(shape, half_space)
+        add_body(plant, shape, name=name, properties=properties)
+    model = plant.model()
+    x = model.default_state.copy()
+    x[:7] = [*RollPitchYaw(0.3, 0.2, 0.1).ToQuaternion().wxyz(), 0.05, 0.03, 0.08]
+    try:
+        dd.differentiate_step(model, x, method="autodiff") if twin == "autodiff" else dd.step(model, x)
+    except dd.SimulationError as error:
+        if not re.search("are not supported|that is not allowed", str(error)):
+            raise  # something other than the pair
+        return True
+    assert contacts_of_the_step(model)  # so that silence means support, not a miss
+    return False
+
+
+def hydroelastic(shape, half_space):
+    properties = contact_properties(1e4, 1.0, 0.5, 0.001)
+    if not isinstance(shape, HalfSpace):
+        AddCompliantHydroelasticProperties(0.1, 1e7, properties)
+    elif half_space == "rigid":
+        AddRigidHydroelasticProperties(properties)
+    else:
+        AddCompliantHydroelasticPropertiesForHalfSpace(0.1, 1e7, properties)
+    return properties
+
+
+@pytest.mark.parametrize("contact_model", ["point", "hydroelastic", "hydroelastic_with_fallback"])
+@pytest.mark.parametrize(("a", "b"), list(combinations_with_replacement(SHAPES, 2)))
+def test_autodiff_throws_where_the_table_says_so_and_nowhere_else(shapes, a, b, contact_model):
+    supported = autodiff_supports(shapes[a], shapes[b], contact_model)
+    assert autodiff_supports(shapes[b], shapes[a], contact_model) == supported
+    assert step_throws(shapes[a], shapes[b], contact_model) is not supported
+    assert step_throws(shapes[b], shapes[a], contact_model) is not supported
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_a_compliant_half_space_meets_no_compliant_body(shapes, kind):
+    """Why the route hydroelastic makes half spaces rigid: not even the double step takes these."""
+    for twin in TWINS:
+        assert step_throws(shapes[kind], HalfSpace(), "hydroelastic", half_space="compliant", twin=twin)
+
+
+def test_an_unknown_contact_model_is_an_error(shapes):
+    with pytest.raises(dd.UnknownNameError, match="hydroelastic_with_fallback"):
+        autodiff_supports(shapes["Box"], shapes["Box"], "soft")

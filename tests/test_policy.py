@@ -1,0 +1,505 @@
+"""Feedback policies: LQR and TVLQR against closed forms, derivatives by state and parameters, and what is refused."""
+
+import math
+
+import numpy as np
+import pytest
+from conftest import Plant, add_slide
+from pydrake.multibody.tree import RevoluteJoint, SpatialInertia, UnitInertia
+from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
+
+import drake_diff as dd
+from drake_diff.policy import LQR, PD, TVLQR, ParametricPolicy, differentiate_policy, policy_parameters
+from drake_diff.tangent import tangent_space
+
+# A30: the discrete double integrator with h = 0.1, Q = I, R = 0.1.
+Q, R = np.eye(2), np.array([[0.1]])
+UPRIGHT = np.array([0.0, np.pi, 0.0, 0.0])  # of the cart-pole
+
+
+def network(x, t, p, hidden=16):
+    """A 4-16-1 network: W2 tanh(W1 x + b1) + b2, p = [W1; b1; W2; b2] (97,)."""
+    size = len(x)
+    w1, rest = p[: hidden * size].reshape(hidden, size), p[hidden * size :]
+    return rest[hidden : 2 * hidden].reshape(1, hidden) @ np.tanh(w1 @ x + rest[:hidden]) + rest[2 * hidden :]
+
+
+def closed_loop_gradient(model, policy, x0, num_steps, final_weight, input_weight):
+    """(xs, gradient by x0, gradient by the parameters) of w'x_N^2 + r sum u^2 by reverse accumulation.
+
+    l_k = dloss/dx_k + K' g_k + A' l_(k+1), g_k = dloss/du_k + B' l_(k+1), gradient sum_k P_k' g_k, with K, P the
+    derivatives of the policy by x and by its parameters.
+    """
+    xs, tape = [np.asarray(x0, dtype=float)], []
+    for k in range(num_steps):
+        u, by_x, by_p = differentiate_policy(policy, xs[-1], k * model.time_step, model.nu)
+        d = dd.differentiate_step(model, xs[-1], u)
+        tape.append((u, by_x, by_p, d))
+        xs.append(d.x_next)
+    by_state, by_parameters = 2 * final_weight * xs[-1], np.zeros(len(policy_parameters(policy)))
+    for u, by_x, by_p, d in reversed(tape):
+        g = 2 * input_weight * u + d.B.T @ by_state
+        by_parameters += by_p.T @ g
+        by_state = by_x.T @ g + d.A.T @ by_state
+    return np.array(xs), by_state, by_parameters
+
+
+def closed_loop_loss(model, policy, x0, num_steps, final_weight, input_weight):
+    motion = dd.rollout(model, x0, policy=policy, num_steps=num_steps)
+    return float(final_weight @ motion.xs[-1] ** 2 + input_weight * (motion.us**2).sum())
+
+
+def central_differences(f, p, size=1e-5):
+    moved = size * np.maximum(1.0, np.abs(p))
+    return np.array([(f(p + d) - f(p - d)) / (2 * d.sum()) for d in np.diag(moved)])
+
+
+def check_gradients(model, policy, x0, num_steps, final_weight, input_weight=0.01):
+    args = num_steps, np.asarray(final_weight), input_weight
+    xs, by_x0, by_parameters = closed_loop_gradient(model, policy, x0, *args)
+    assert np.array_equal(xs, dd.rollout(model, x0, policy=policy, num_steps=num_steps).xs)
+    others = central_differences(lambda z: closed_loop_loss(model, policy, z, *args), np.asarray(x0, dtype=float))
+    assert by_x0 == pytest.approx(others, rel=1e-6, abs=1e-6 * np.abs(others).max())
+    others = central_differences(
+        lambda p: closed_loop_loss(model, ParametricPolicy(policy, p), x0, *args), np.array(policy.parameters)
+    )
+    assert np.abs(others).max() > 1e-3
+    assert by_parameters == pytest.approx(others, rel=1e-6, abs=1e-6 * np.abs(others).max())
+
+
+def riccati(A, B, Q, R, P, num_steps):
+    """K_0 and P_0, by completing the square in [x; u] rather than by the textbook formula."""
+    for _ in range(num_steps):
+        AB = np.hstack([A, B])
+        H = AB.T @ P @ AB
+        nx = len(A)
+        H[:nx, :nx] += Q
+        H[nx:, nx:] += R
+        K = np.linalg.inv(H[nx:, nx:]) @ H[nx:, :nx]
+        P = H[:nx, :nx] - K.T @ H[nx:, nx:] @ K
+        P = (P + P.T) / 2  # without it the rounding grows
+    return K, P
+
+
+# --- LQR --------------------------------------------------------------------------------------------------------------
+
+
+def test_lqr_of_the_double_integrator_is_known(write_urdf):
+    """A30: the DARE's P and K."""
+    lqr = LQR(write_urdf(), [0, 0], [0], Q, R)
+    assert lqr.cost_to_go == pytest.approx(np.array([[12.82704933, 2.58530726], [2.58530726, 4.31618637]]), abs=1e-8)
+    assert lqr.gain == pytest.approx(np.array([[2.58530726, 3.31618637]]), abs=1e-8)
+    assert lqr([1.0, 2.0], 0.0) == pytest.approx([-2.58530726 - 2 * 3.31618637], abs=1e-7)
+    assert np.array_equal(lqr.parameters, lqr.gain.ravel())
+
+
+def test_lqr_gain_is_the_limit_of_the_riccati_recursion_and_drakes_own(load):
+    """Cart-pole upright, mass and time step other than the oracle's."""
+    model, weight = load("cart_pole.urdf", time_step=0.02), np.diag([1.0, 10.0, 0.1, 0.5])
+    lqr = LQR(model, UPRIGHT, [0.0], weight, 0.3 * np.eye(1))
+    d = dd.differentiate_step(model, UPRIGHT, [0.0])
+    K, P = riccati(d.A, d.B, weight, 0.3 * np.eye(1), weight, 3000)
+    assert lqr.gain == pytest.approx(K, rel=1e-8)
+    assert lqr.cost_to_go == pytest.approx(P, rel=1e-8)
+    assert np.array_equal(lqr.gain, DiscreteTimeLinearQuadraticRegulator(d.A, d.B, weight, 0.3 * np.eye(1))[0])
+
+
+def test_lqr_brings_the_cart_pole_back_upright(load):
+    model = load("cart_pole.urdf", time_step=0.02)
+    lqr = LQR(model, UPRIGHT, [0.0], np.diag([1.0, 10.0, 0.1, 0.1]), 0.1 * np.eye(1))
+    start = UPRIGHT + np.array([0, 0.1, 0, 0])
+    motion = dd.rollout(model, start, policy=lqr, num_steps=500)
+    assert motion.xs[-1] == pytest.approx(UPRIGHT, abs=1e-4)
+    fallen = dd.rollout(model, start, policy=lambda x, t: [0.0], num_steps=500)
+    assert np.abs(fallen.xs[:, 1] - np.pi).max() > 1.0
+
+
+def test_lqr_spends_its_cost_to_go(write_urdf):
+    """sum d'Qd + u'Ru along the closed loop is x0' P x0."""
+    model = write_urdf(mass=2.0)
+    lqr = LQR(model, [0.5, 0.0], [0.0], Q, R)  # anywhere at rest is a fixed point
+    motion = dd.rollout(model, [1.5, -0.3], policy=lqr, num_steps=400)
+    d = motion.xs - [0.5, 0.0]
+    assert (d**2).sum() + 0.1 * (motion.us**2).sum() == pytest.approx(d[0] @ lqr.cost_to_go @ d[0], rel=1e-10)
+
+
+def test_lqr_refuses_what_is_no_fixed_point(load, write_urdf):
+    with pytest.raises(dd.InputError, match="fixed point"):
+        LQR(load("pendulum.urdf"), [0.3, 0.0], [0.0], Q, R)
+    with pytest.raises(dd.InputError, match="fixed point"):
+        LQR(write_urdf(), [0.0, 1e-3], [0.0], Q, R)
+    held = LQR(load("pendulum.urdf"), [0.3, 0.0], [9.81 * 0.5 * math.sin(0.3)], Q, R)  # the torque that holds it
+    assert held([0.3, 0.0], 0.0) == pytest.approx([9.81 * 0.5 * math.sin(0.3)])
+
+
+def test_lqr_refuses_weights_it_cannot_use(write_urdf):
+    model = write_urdf()
+    for weights in [(Q, [[0.0]]), (Q, [[-1.0]]), (-Q, R), ([[1, 2], [0, 1]], R)]:
+        with pytest.raises(dd.InputError, match=r"positive|symmetric"):
+            LQR(model, [0, 0], [0], *weights)
+    with pytest.raises(dd.ShapeError):
+        LQR(model, [0, 0], [0], np.eye(3), R)
+    with pytest.raises(dd.ShapeError, match="x_ref"):
+        LQR(model, [0, 0, 0], [0], Q, R)
+    with pytest.raises(dd.InputError, match="Q that sees all of it"):  # where Drake ends the process
+        LQR(model, [0, 0], [0], np.zeros((2, 2)), R)
+
+
+def test_lqr_of_what_cannot_be_stabilized_is_an_error_not_the_end_of_the_process():
+    model = floating_arm()
+    with pytest.raises(dd.InputError, match="stabilize"):
+        LQR(model, model.default_state, [0.0], np.eye(14), np.eye(1))
+
+
+# --- TVLQR ------------------------------------------------------------------------------------------------------------
+
+
+def test_tvlqr_of_the_double_integrator_is_known(write_urdf):
+    """A30: N = 20, Qf = 10 I, x0 = (1, 0): P0, K0 and J*."""
+    model, count = write_urdf(), 20
+    tvlqr = TVLQR(model, np.zeros((count + 1, 2)), np.zeros((count, 1)), Q, R, 10 * Q)
+    assert tvlqr.gains.shape == (count, 1, 2)
+    assert tvlqr.cost_to_go.shape == (count + 1, 2, 2)
+    P0 = np.array([[12.94848128, 2.61821518], [2.61821518, 4.32509127]])
+    assert tvlqr.cost_to_go[0] == pytest.approx(P0, abs=1e-8)
+    assert tvlqr.gains[0] == pytest.approx(np.array([[2.61821518, 3.32509127]]), abs=1e-8)
+    assert np.array_equal(tvlqr.cost_to_go[-1], 10 * Q)
+    motion = dd.rollout(model, [1.0, 0.0], policy=tvlqr, num_steps=count)
+    cost = (motion.xs[:-1] ** 2).sum() + 0.1 * (motion.us**2).sum() + 10 * motion.xs[-1] @ motion.xs[-1]
+    assert cost == pytest.approx(12.948481280713864, rel=1e-12)
+
+
+def test_tvlqr_without_a_final_weight_ends_in_q(write_urdf):
+    model = write_urdf(mass=3.0)
+    tvlqr = TVLQR(model, np.zeros((8, 2)), np.zeros((7, 1)), 2 * Q, R)
+    K, P = riccati(np.array([[1, 0.1], [0, 1]]), np.array([[0.01], [0.1]]) / 3, 2 * Q, R, 2 * Q, 7)
+    assert tvlqr.gains[0] == pytest.approx(K, rel=1e-12)
+    assert tvlqr.cost_to_go[0] == pytest.approx(P, rel=1e-12)
+
+
+def test_tvlqr_follows_a_trajectory_that_open_loop_loses(load):
+    """The pendulum pushed over the top and around: a wrong start is forgotten; at step k its own gain acts."""
+    model, count = load("pendulum.urdf", time_step=0.02), 150
+    us = 5.0 * np.ones((count, 1))
+    xs = dd.rollout(model, [0.0, 0.0], us).xs
+    tvlqr = TVLQR(model, xs, us, np.diag([100.0, 1.0]), R)
+    start = xs[0] + [0.2, -0.3]
+    closed = dd.rollout(model, start, policy=tvlqr, num_steps=count)
+    assert np.abs(closed.xs[-1] - xs[-1]).max() < 1e-4
+    assert np.abs(dd.rollout(model, start, us).xs[-1] - xs[-1]).max() > 0.1
+    for k in (0, 7, count - 1):
+        assert tvlqr(start, k * 0.02) == pytest.approx(us[k] - tvlqr.gains[k] @ (start - xs[k]), rel=1e-14)
+    assert np.array_equal(tvlqr(start, 99.0), tvlqr(start, (count - 1) * 0.02))  # held after the end
+    assert np.array_equal(tvlqr(start, -1.0), tvlqr(start, 0.0))
+
+
+def floating_arm():
+    """A free ball with an actuated bob on a hinge; no gravity."""
+    plant = Plant(0.02, gravity=0.0)
+    ball = plant.plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(2.0, 0.3))
+    bob = plant.plant.AddRigidBody("bob", SpatialInertia(0.5, [0.0, 0.0, -0.4], UnitInertia(0.17, 0.17, 0.01)))
+    hinge = plant.plant.AddJoint(RevoluteJoint("hinge", ball.body_frame(), bob.body_frame(), [0, 1, 0]))
+    plant.plant.AddJointActuator("motor", hinge)
+    return plant.model()
+
+
+def test_tvlqr_of_a_floating_base_lives_in_the_tangent_space():
+    """Its gains are those of Jacobians from differences of plus, step and minus: 14 numbers for 15 coordinates."""
+    model, random, count = floating_arm(), np.random.default_rng(3), 6
+    space = tangent_space(model)
+    assert (model.nx, space.size) == (15, 14)
+    x0 = space.plus(model.default_state, 0.5 * random.standard_normal(14))
+    us = random.standard_normal((count, 1))
+    xs = dd.rollout(model, x0, us).xs
+    tvlqr = TVLQR(model, xs, us, np.eye(14), np.eye(1))
+    P = np.eye(14)
+    for k in reversed(range(count)):
+        A = tangent_differences(lambda d, k=k: space.minus(dd.step(model, space.plus(xs[k], d), us[k]), xs[k + 1]), 14)
+        B = tangent_differences(lambda e, k=k: space.minus(dd.step(model, xs[k], us[k] + e), xs[k + 1]), 1)
+        K, P = riccati(A, B, np.eye(14), np.eye(1), P, 1)
+        assert tvlqr.gains[k] == pytest.approx(K, abs=1e-7)
+        assert tvlqr.cost_to_go[k] == pytest.approx(P, abs=1e-6)
+    opposite = np.concatenate([-xs[2][:4], xs[2][4:]])  # the same orientation
+    assert tvlqr(opposite, 2 * 0.02) == pytest.approx(us[2], abs=1e-12)
+
+
+def tangent_differences(f, size):
+    return np.column_stack([(f(d) - f(-d)) / 2e-5 for d in 1e-5 * np.eye(size)])
+
+
+def test_tvlqr_refuses_arrays_that_do_not_fit(write_urdf):
+    model = write_urdf()
+    with pytest.raises(dd.ShapeError, match="xs"):
+        TVLQR(model, np.zeros((5, 2)), np.zeros((5, 1)), Q, R)
+    with pytest.raises(dd.ShapeError, match="us"):
+        TVLQR(model, np.zeros((6, 2)), np.zeros((5, 2)), Q, R)
+    with pytest.raises(dd.InputError, match="at least one step"):
+        TVLQR(model, np.zeros((1, 2)), np.zeros((0, 1)), Q, R)
+    with pytest.raises(dd.InputError, match="Qf"):
+        TVLQR(model, np.zeros((6, 2)), np.zeros((5, 1)), Q, R, -Q)
+
+
+# --- PD ---------------------------------------------------------------------------------------------------------------
+
+
+def test_one_closed_loop_step_of_the_pendulum_under_pd_has_its_closed_form(load):
+    """A03 with u = kp (q_ref - q) + kd (w_ref - w): A + B K, K = (-kp, -kd), and d x+ / d(kp, kd) = B (e_q, e_w)."""
+    model, x, ref = load("pendulum.urdf"), np.array([0.7, -1.2]), np.array([1.0, 0.2])
+    kp, kd, h, inertia = 3.0, 0.4, 0.01, 0.25
+    s = 1 / (1 + h * 0.1 / inertia)
+    u, by_x, by_p = differentiate_policy(PD(model, kp, kd, ref), x, 0.0, 1)
+    assert u == pytest.approx([kp * 0.3 + kd * 1.4], rel=1e-14)
+    d = dd.differentiate_step(model, x, u)
+    B = np.array([[h * h * s / inertia], [h * s / inertia]])
+    A = np.array([[1 - h * h * s * 19.62 * math.cos(0.7), h * s], [-h * s * 19.62 * math.cos(0.7), s]])
+    assert d.A + d.B @ by_x == pytest.approx(A + B @ [[-kp, -kd]], rel=1e-10)
+    assert d.B @ by_p == pytest.approx(B @ [[0.3, 1.4]], rel=1e-10)
+
+
+def test_pd_reads_each_actuators_own_joint():
+    """Two of three slides actuated, in another order: selection as the actuation matrix has it."""
+    plant = Plant(0.01)
+    parent, made = plant.plant.world_frame(), {}
+    for name in ("x", "y", "z"):
+        body = plant.plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+        made[name], parent = add_slide(plant.plant, name, parent, body, name), body.body_frame()
+    plant.plant.AddJointActuator("second", made["z"])
+    plant.plant.AddJointActuator("first", made["x"])
+    model = plant.model()
+    pd = PD(model, [10.0, 20.0], 0.5)
+    assert np.array_equal(pd.parameters, [10.0, 20.0, 0.5, 0.5])
+    x = np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])
+    selection = model.plant.MakeActuationMatrix().T
+    expected = -np.diag([10.0, 20.0]) @ selection @ x[:3] - 0.5 * selection @ x[3:]
+    assert pd(x, 0.0) == pytest.approx(expected, rel=1e-14)
+
+
+def test_pd_of_a_floating_robot_reads_the_joint_behind_the_quaternion():
+    """The joint is position 7 and velocity 6 of the 15 coordinates, so 7 and 14 of x."""
+    x = np.arange(15.0)
+    assert PD(floating_arm(), 3.0, 0.5)(x, 0.0) == pytest.approx([-3.0 * 7 - 0.5 * 14], rel=1e-14)
+
+
+def test_pd_holds_the_default_state_where_no_reference_is_given(load):
+    model = load("pendulum.urdf")
+    assert np.array_equal(PD(model, 1.0, 1.0).x_ref, model.default_state)
+
+
+def test_pd_refuses_gains_and_references_that_do_not_fit(load):
+    model = load("pendulum.urdf")
+    for bad in ({"kp": [1.0, 2.0]}, {"kd": [[1.0]]}, {"x_ref": [0.0]}):
+        with pytest.raises(dd.ShapeError):
+            PD(model, **{"kp": 1.0, "kd": 1.0} | bad)
+    with pytest.raises(dd.NonFiniteError):
+        PD(model, float("nan"), 1.0)
+    with pytest.raises(dd.InputError, match="actuators"):
+        PD(load("projectile.sdf"), 1.0, 1.0)
+
+
+# --- gradients through the closed loop --------------------------------------------------------------------------------
+
+
+def test_the_gradient_by_pd_gains_is_that_of_rollouts(load):
+    model = load("pendulum.urdf")
+    check_gradients(model, PD(model, 3.0, 0.4, [1.0, 0.0]), [0.1, 0.5], 30, [1.0, 0.3])
+
+
+def test_the_gradient_by_lqr_gains_is_that_of_rollouts(load):
+    model = load("cart_pole.urdf", time_step=0.02)
+    lqr = LQR(model, UPRIGHT, [0.0], np.eye(4), np.eye(1))
+    check_gradients(model, lqr, UPRIGHT + np.array([0.05, 0.05, 0.0, 0.1]), 30, [1.0, 1.0, 0.1, 0.1])
+
+
+def test_the_gradient_by_all_tvlqr_gains_is_that_of_rollouts(load):
+    model = load("pendulum.urdf")
+    us = 2.0 * np.ones((10, 1))
+    tvlqr = TVLQR(model, dd.rollout(model, [0.0, 0.0], us).xs, us, Q, R)
+    check_gradients(model, tvlqr, [0.3, -0.2], 10, [1.0, 0.3])
+
+
+def test_the_gradient_by_a_neural_networks_weights_is_that_of_rollouts(load):
+    model, random = load("cart_pole.urdf", time_step=0.02), np.random.default_rng(5)
+    policy = ParametricPolicy(network, 0.5 * random.standard_normal(97))
+    check_gradients(model, policy, [0.1, 0.4, -0.2, 0.3], 30, [1.0, 1.0, 0.1, 0.1])
+
+
+def test_the_gradient_by_gains_of_a_floating_robot_is_that_of_rollouts():
+    model, random = floating_arm(), np.random.default_rng(6)
+    x0 = tangent_space(model).plus(model.default_state, 0.3 * random.standard_normal(14))
+    tvlqr = TVLQR(model, np.tile(model.default_state, (6, 1)), np.zeros((5, 1)), np.eye(14), np.eye(1))
+    args = 5, np.linspace(1, 2, 15), 0.1
+    _, _, gradient = closed_loop_gradient(model, tvlqr, x0, *args)
+    others = central_differences(
+        lambda p: closed_loop_loss(model, ParametricPolicy(tvlqr, p), x0, *args), np.array(tvlqr.parameters), 1e-4
+    )
+    assert gradient == pytest.approx(others, rel=1e-5, abs=1e-6 * np.abs(others).max())
+
+
+# --- the derivative of a policy ---------------------------------------------------------------------------------------
+
+
+def test_the_derivative_of_a_plain_function_has_no_parameters():
+    x = np.array([0.3, -0.4])
+    u, by_x, by_p = differentiate_policy(lambda x, t: np.array([t * np.sin(x[0]) * x[1]]), x, 2.0, 1)
+    assert u == pytest.approx([-0.8 * math.sin(0.3)])
+    assert by_x == pytest.approx(np.array([[-0.8 * math.cos(0.3), 2 * math.sin(0.3)]]))
+    assert by_p.shape == (1, 0)
+
+
+def test_a_function_with_parameters_is_differentiated_by_both():
+    policy = ParametricPolicy(lambda x, t, p: np.array([p[0] * x[0] ** 2, np.exp(p[1] * t)]), [3.0, 0.5])
+    u, by_x, by_p = differentiate_policy(policy, np.array([0.2, 9.0]), 2.0, 2)
+    assert u == pytest.approx([0.12, math.e])
+    assert by_x == pytest.approx(np.array([[1.2, 0.0], [0.0, 0.0]]))
+    assert by_p == pytest.approx(np.array([[0.04, 0.0], [0.0, 2 * math.e]]))
+    assert np.array_equal(policy(np.array([0.2, 9.0]), 2.0, [1.0, 0.0]), [0.2**2, 1.0])
+
+
+@pytest.mark.parametrize(
+    "constant",
+    [
+        lambda x, t: [0.5, 2],
+        lambda x, t: np.full(2, math.sin(t)),
+        lambda x, t: np.maximum(np.minimum(x[:2], -1.0), -1.0),
+        lambda x, t: np.sign(x[:2] - 0.3),
+    ],
+)
+def test_a_constant_output_has_zero_derivatives(constant):
+    _, by_x, by_p = differentiate_policy(constant, np.array([0.1, 0.2, 0.3]), 1.0, 2)
+    assert np.array_equal(by_x, np.zeros((2, 3)))
+    assert by_p.shape == (2, 0)
+
+
+def test_a_constant_beside_what_depends_on_the_state():
+    _, by_x, _ = differentiate_policy(lambda x, t: np.array([0.5, 3 * x[1], 1]), np.array([0.1, 0.2]), 0.0, 3)
+    assert np.array_equal(by_x, [[0, 0], [0, 3], [0, 0]])
+
+
+def test_no_actuators_no_output():
+    u, by_x, by_p = differentiate_policy(ParametricPolicy(lambda x, t, p: np.zeros(0), [1.0]), np.zeros(3), 0.0, 0)
+    assert (u.shape, by_x.shape, by_p.shape) == ((0,), (0, 3), (0, 1))
+
+
+NUMPY = {
+    "tanh": np.tanh,
+    "sin": np.sin,
+    "cos": np.cos,
+    "tan": np.tan,
+    "arcsin": np.arcsin,
+    "arccos": np.arccos,
+    "arctan": np.arctan,
+    "arctan2": lambda x: np.arctan2(x, 2.0),
+    "sinh": np.sinh,
+    "cosh": np.cosh,
+    "exp": np.exp,
+    "log": np.log,
+    "sqrt": np.sqrt,
+    "square": np.square,
+    "power": lambda x: np.power(x, 3),
+    "abs": np.abs,
+    "maximum": lambda x: np.maximum(x, 0.4),
+    "minimum": lambda x: np.minimum(x, 0.4),
+    "clip": lambda x: np.clip(x, 0.35, 0.8),
+    "where": lambda x: np.where(x > 0.4, x, 0.1 * x),
+    "sum": lambda x: np.array([np.sum(x), np.mean(x)]),
+    "dot": lambda x: np.array([np.dot(x, x), x @ np.ones((2, 2)) @ x]),
+    "outer": lambda x: np.outer(x, x)[0],
+    "einsum": lambda x: np.einsum("ij,j->i", np.ones((2, 2)), x),
+    "concatenate": lambda x: np.concatenate([x[1:] ** 2, [2.0]]),
+    "norm": lambda x: np.array([np.linalg.norm(x), 1.0]),
+}
+
+
+@pytest.mark.parametrize("name", NUMPY)
+def test_these_numpy_functions_take_autodiffxd(name):
+    f, x = NUMPY[name], np.array([0.3, 0.6])
+    _, by_x, _ = differentiate_policy(lambda x, t: f(x), x, 0.0, 2)
+    differences = np.column_stack([(f(x + d) - f(x - d)) / 2e-6 for d in 1e-6 * np.eye(2)])
+    assert by_x == pytest.approx(differences, abs=1e-8)
+
+
+def into_floats(x, t):
+    u = np.zeros(1)
+    u[0] = x[0]
+    return u
+
+
+@pytest.mark.parametrize(
+    "policy",
+    [
+        lambda x, t: [float(x[0])],
+        lambda x, t: [math.tanh(x[0])],
+        lambda x, t: np.asarray(x[:1], dtype=float),
+        lambda x, t: np.expm1(x[:1]),
+        lambda x, t: np.hypot(x[:1], 1.0),
+        lambda x, t: np.interp(x[:1], [0, 1], [0, 1]),
+        lambda x, t: [x[0].value() if hasattr(x[0], "value") else x[0]],
+        into_floats,
+    ],
+)
+def test_lost_derivatives_are_refused(policy):
+    with pytest.raises(dd.GradientError, match="lost its derivatives"):
+        differentiate_policy(policy, np.array([0.3, 0.4]), 0.0, 1)
+
+
+def test_lost_derivatives_by_the_parameters_alone_are_refused():
+    function = lambda x, t, p: [getattr(p[0], "value", lambda: p[0])()]  # noqa: E731
+    with pytest.raises(dd.GradientError, match="lost its derivatives"):
+        differentiate_policy(ParametricPolicy(function, [1.0]), np.zeros(2), 0.0, 1)
+
+
+def test_a_random_policy_is_refused():
+    random = np.random.default_rng(7)
+    with pytest.raises(dd.GradientError, match="is it random"):
+        differentiate_policy(lambda x, t: x[:1] + random.standard_normal(1), np.zeros(2), 0.0, 1)
+
+
+def test_a_derivative_that_is_not_finite_is_refused():
+    with pytest.raises(dd.GradientError, match="not finite"):
+        differentiate_policy(lambda x, t: np.sqrt(x[:1]), np.zeros(2), 0.0, 1)
+
+
+def test_other_errors_of_the_policy_stay_what_they_are():
+    with pytest.raises(TypeError, match="NoneType"):
+        differentiate_policy(lambda x, t: None + x, np.zeros(2), 0.0, 1)
+
+
+def test_an_output_of_the_wrong_shape_is_refused():
+    for policy in (lambda x, t: -x, lambda x, t: x[0], lambda x, t: x[:1].reshape(1, 1)):
+        with pytest.raises(dd.ShapeError, match=r"policy\(x, t\)"):
+            differentiate_policy(policy, np.zeros(2), 0.0, 1)
+    with pytest.raises(dd.NonFiniteError):
+        differentiate_policy(lambda x, t: [np.nan], np.zeros(2), 0.0, 1)
+
+
+def test_parameters_must_be_a_flat_vector_of_numbers():
+    with pytest.raises(dd.ShapeError):
+        ParametricPolicy(network, np.zeros((2, 3)))
+    with pytest.raises(dd.NonFiniteError):
+        ParametricPolicy(network, [1.0, np.inf])
+    parameters = np.ones(3)
+    policy = ParametricPolicy(network, parameters)
+    parameters[0] = 5.0  # the policy keeps its own
+    assert np.array_equal(policy_parameters(policy), np.ones(3))
+
+
+def test_a_policy_cannot_change_the_state_it_is_given():
+    def meddling(x, t):
+        u = -x[:1]
+        x[0] = 7.0
+        return u
+
+    x = np.array([0.3, 0.4])
+    assert np.array_equal(differentiate_policy(meddling, x, 0.0, 1)[1], [[-1.0, 0.0]])
+    assert x[0] == 0.3
+
+
+def test_a_long_tvlqr_is_differentiated_by_the_gains_that_act(write_urdf):
+    """5000 steps: only two of the 10000 parameters carry derivatives at a time."""
+    model, count = write_urdf(), 5000
+    xs, us = np.zeros((count + 1, 2)), np.zeros((count, 1))
+    tvlqr = TVLQR(model, xs, us, Q, R)
+    _, by_x, by_p = differentiate_policy(ParametricPolicy(tvlqr, tvlqr.parameters), np.array([1.0, 2.0]), 400.0, 1)
+    assert by_x == pytest.approx(-tvlqr.gains[4000], rel=1e-14)
+    assert np.array_equal(np.flatnonzero(by_p), [8000, 8001])
+    assert np.array_equal(by_p[0, 8000:8002], [-1.0, -2.0])

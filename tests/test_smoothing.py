@@ -1,0 +1,496 @@
+"""Randomized smoothing against closed forms and quadrature (ORACLES C07, C11), within 5 standard errors."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from conftest import Plant, contact_properties
+
+import drake_diff as dd
+from drake_diff.smoothing import Barrier, Gaussian, smooth, smooth_step
+
+SUH = (9.81, 0.06, 0.02, 0.05)  # gravity, wall, height of the wall, sigma
+SAMPLES = 25000
+
+
+def within(estimate, truth, variance, errors=5.0):
+    """Whether all entries lie within so many standard errors of the truth."""
+    return bool(np.all(np.abs(np.asarray(estimate) - truth) <= errors * np.sqrt(variance) + 1e-15))
+
+
+def integral(f, breaks, panels=20, order=20):
+    """Gauss-Legendre between `breaks`; f takes an array."""
+    nodes, weights = np.polynomial.legendre.leggauss(order)
+    edges = np.concatenate([np.linspace(a, b, panels + 1)[:-1] for a, b in pairwise(breaks)])
+    edges = np.append(edges, breaks[-1])
+    half, middle = np.diff(edges)[:, None] / 2, (edges[1:] + edges[:-1])[:, None] / 2
+    return float(np.sum(f(middle + half * nodes) * half * weights))
+
+
+def ball(theta, g, d, height):
+    """C07: J = -x_f^2 and dJ/dtheta of a ball thrown at `theta` with 1 m/s at a wall at d."""
+    reach = np.sin(2 * theta) / g
+    at_the_wall = d * np.tan(theta) - g * d**2 / (2 * np.cos(theta) ** 2)
+    blocked = (reach >= d) & (at_the_wall < height)
+    return np.where(blocked, -(d**2), -(reach**2)), np.where(blocked, 0, -4 * reach * np.cos(2 * theta) / g)
+
+
+def ball_breaks(g, d, height):
+    """(where J jumps, where it has a kink)."""
+    a = g * d**2 / 2
+    root = math.sqrt(d**2 - 4 * a * (a + height))
+    jumps = [math.atan((d - root) / (2 * a)), math.atan((d + root) / (2 * a))]
+    kink = math.asin(g * d) / 2
+    return jumps, [kink, math.pi / 2 - kink]
+
+
+def exact_ball(theta, g, d, height, sigma):
+    """F, dF/dtheta, E[first], and the variances of one sample of first, zeroth and first - zeroth."""
+    jumps, kinks = ball_breaks(g, d, height)
+    low, high = theta - 10 * sigma, theta + 10 * sigma
+    breaks = [low, *sorted(b for b in jumps + kinks if low < b < high), high]
+
+    def mean(of):
+        def integrand(t):
+            w, (value, slope) = t - theta, ball(t, g, d, height)
+            zeroth = (value - ball(theta, g, d, height)[0]) * w / sigma**2
+            return of(value, slope, zeroth) * np.exp(-((w / sigma) ** 2) / 2) / (sigma * math.sqrt(2 * math.pi))
+
+        return integral(integrand, breaks)
+
+    first, zeroth = mean(lambda v, s, z: s), mean(lambda v, s, z: z)
+    return {
+        "value": mean(lambda v, s, z: v),
+        "value_variance": mean(lambda v, s, z: v**2) - mean(lambda v, s, z: v) ** 2,
+        "truth": zeroth,
+        "first": first,
+        "first_variance": mean(lambda v, s, z: s**2) - first**2,
+        "zeroth_variance": mean(lambda v, s, z: z**2) - zeroth**2,
+        "bias_variance": mean(lambda v, s, z: (s - z) ** 2) - (first - zeroth) ** 2,
+    }
+
+
+def smooth_ball(theta, g, d, height, sigma, **options):
+    return smooth(
+        lambda x: float(ball(x[0], g, d, height)[0]),
+        [theta],
+        lambda x: ball(x[0], g, d, height)[1],
+        noise=Gaussian(sigma),
+        samples=SAMPLES,
+        **options,
+    )
+
+
+@pytest.mark.parametrize(
+    ("theta", "value", "truth", "first", "bias"),
+    [
+        (0.3, -0.00307709811, -0.01115833969, -0.01115833969, 0),
+        (0.6, -0.00380439500, -0.00923031040, -0.00018531449, 0.00904499591),
+        (0.7, -0.00728360895, -0.05318651088, -0.00226092970, 0.05092558118),
+        (1.0, -0.00852432022, 0.01541917168, 0.01541591526, -3.2564e-6),
+    ],
+)
+def test_the_quadrature_gives_the_published_ball_with_wall(theta, value, truth, first, bias):
+    exact = exact_ball(theta, *SUH)
+    assert exact["value"] == pytest.approx(value, abs=1e-11)
+    assert exact["truth"] == pytest.approx(truth, abs=1e-11)
+    assert exact["first"] == pytest.approx(first, abs=1e-11)
+    assert exact["first"] - exact["truth"] == pytest.approx(bias, abs=1e-10)
+
+
+@pytest.mark.parametrize(
+    "case", [(0.6, *SUH), (0.7, *SUH), (0.5, 3.7, 0.09, 0.03, 0.08), (0.45, 20, 0.02, 0.005, 0.03)]
+)
+def test_the_bias_of_the_quadrature_is_what_the_jumps_make(case):
+    """Bias = -sum over the jumps b of [J(b+) - J(b-)] times the density of b."""
+    theta, g, d, height, sigma = case
+    bias = 0.0
+    for b in ball_breaks(g, d, height)[0]:
+        jump = ball(b + 1e-9, g, d, height)[0] - ball(b - 1e-9, g, d, height)[0]
+        bias -= jump * math.exp(-(((b - theta) / sigma) ** 2) / 2) / (sigma * math.sqrt(2 * math.pi))
+    exact = exact_ball(*case)
+    assert exact["first"] - exact["truth"] == pytest.approx(bias, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("case", "biased"),
+    [
+        ((0.3, *SUH), False),
+        ((0.6, *SUH), True),
+        ((0.7, *SUH), True),
+        ((1.0, *SUH), False),  # a bias of 3e-6 that no such number of samples shows
+        ((0.5, 3.7, 0.09, 0.03, 0.08), True),
+        ((0.45, 20, 0.02, 0.005, 0.03), True),
+    ],
+)
+def test_ball_with_wall(case, biased):
+    found, exact = smooth_ball(*case, seed=3), exact_ball(*case)
+    assert within(found.value, exact["value"], found.value_variance)
+    assert within(found.zeroth, exact["truth"], found.zeroth_variance)
+    assert within(found.first, exact["first"], found.first_variance)
+    assert within(found.bias, exact["first"] - exact["truth"], found.bias_error**2)
+    assert found.biased.tolist() == [[biased]]
+    allowed = 3 * found.bias_error if biased else 0
+    assert np.all(np.abs(found.jacobian - exact["truth"]) <= allowed + 5 * np.sqrt(found.zeroth_variance))
+
+
+def test_the_reported_variances_are_those_of_one_sample_divided_by_their_number():
+    """C07: 7.7544e-6 and 5.60554e-3; the estimates of the variances scatter by about 1 % themselves."""
+    found, exact = smooth_ball(0.7, *SUH), exact_ball(0.7, *SUH)
+    assert exact["first_variance"] == pytest.approx(7.7544e-6, rel=1e-4)
+    assert exact["zeroth_variance"] == pytest.approx(5.60554e-3, rel=1e-5)
+    assert SAMPLES * found.first_variance.item() == pytest.approx(7.7544e-6, rel=0.05)
+    assert SAMPLES * found.zeroth_variance.item() == pytest.approx(5.60554e-3, rel=0.05)
+    assert SAMPLES * found.value_variance.item() == pytest.approx(exact["value_variance"], rel=0.05)
+    assert SAMPLES * found.bias_error.item() ** 2 == pytest.approx(exact["bias_variance"], rel=0.05)
+
+
+def heaviside(theta, sigma, **options):
+    return smooth(lambda x: float(x[0] > 0), [theta], lambda x: [0.0], noise=Gaussian(sigma), **options)
+
+
+@pytest.mark.parametrize(("theta", "sigma"), [(0.0, 0.05), (0.02, 0.05), (-0.3, 0.4), (7.0, 11.0)])
+def test_heaviside_is_biased_and_the_blend_follows_zeroth_order(theta, sigma):
+    """C07: first order is 0 always, the truth is the normal density of theta, F its distribution function."""
+    truth = math.exp(-((theta / sigma) ** 2) / 2) / (sigma * math.sqrt(2 * math.pi))
+    found = heaviside(theta, sigma, samples=5000)
+    assert not found.first.any()
+    assert not found.first_variance.any()
+    assert within(found.value, (1 + math.erf(theta / sigma / math.sqrt(2))) / 2, found.value_variance)
+    assert within(found.zeroth, truth, found.zeroth_variance)
+    assert found.biased.all()
+    assert found.weight * np.abs(found.bias) == pytest.approx(3 * found.bias_error, rel=1e-12)
+    assert np.abs(found.jacobian - found.zeroth) == pytest.approx(3 * found.bias_error, rel=1e-12)
+    assert heaviside(theta, sigma, samples=5000, method="first").jacobian == 0
+
+
+def test_what_the_blend_keeps_of_the_bias_shrinks_with_more_samples():
+    few, many = heaviside(0.02, 0.05, samples=500), heaviside(0.02, 0.05, samples=30000)
+    assert few.biased.all()
+    assert many.weight < few.weight / 5  # 7.7 but for chance
+
+
+def test_first_order_of_a_linear_function_is_exact():
+    A, x = np.array([[1.0, -2.0, 0.5], [0.0, 3.0, 4.0]]), np.array([0.3, 1.0, -2.0])
+    found = smooth(lambda z: A @ z, x, lambda z: A, noise=Gaussian([0.1, 0.2, 0.5]), samples=2000)
+    assert np.array_equal(found.first, A)
+    assert not found.first_variance.any()
+    assert within(found.zeroth, A, found.zeroth_variance)
+    assert within(found.value, A @ x, found.value_variance)
+    assert np.array_equal(found.jacobian, A)
+    assert np.all(found.weight == 1)
+    assert not found.variance.any()
+    assert not found.biased.any()
+
+
+def test_quadratic_function():
+    """f = x^2: F = x^2 + sigma^2, dF/dx = 2 x; one sample of zeroth order varies by 8 x^2 + 15 sigma^2."""
+    x, sigma, count = 0.7, 0.3, 30000
+    found = smooth(lambda z: z[0] ** 2, [x], lambda z: 2 * z, noise=Gaussian(sigma), samples=count)
+    assert within(found.value, x**2 + sigma**2, found.value_variance)
+    assert within(found.first, 2 * x, found.first_variance)
+    assert within(found.zeroth, 2 * x, found.zeroth_variance)
+    assert within(found.jacobian, 2 * x, found.variance)
+    assert count * found.first_variance == pytest.approx(4 * sigma**2, rel=0.05)
+    assert count * found.zeroth_variance == pytest.approx(8 * x**2 + 15 * sigma**2, rel=0.05)
+    assert not found.biased.any()
+    both = found.first_variance + found.zeroth_variance
+    assert found.weight == pytest.approx(found.zeroth_variance / both, rel=1e-12)
+
+
+def test_the_variance_of_the_blend_is_that_of_many_blends():
+    """Both orders use the same samples: without their covariance the variance would be 30 % too small here."""
+    sigma, x = 0.5, 0.2
+    runs = [
+        smooth(lambda z: z[0] ** 2, [x], lambda z: 2 * z, noise=Gaussian(sigma), samples=100, seed=seed)
+        for seed in range(400)
+    ]
+    blends = np.array([run.jacobian.item() for run in runs])
+    reported = np.mean([run.variance.item() for run in runs])
+    naive = np.mean([(1 / (1 / run.first_variance + 1 / run.zeroth_variance)).item() for run in runs])
+    assert reported == pytest.approx(blends.var(ddof=1), rel=0.2)
+    assert naive < 0.75 * reported
+
+
+def test_vector_function_of_which_one_entry_jumps():
+    """Rows sin x0 + x1, x0 x1 and sign(x1): only d sign / d x1 is biased, by minus 2 normal densities."""
+    x, sigma = np.array([0.4, 0.1]), np.array([0.2, 0.3])
+
+    def f(z):
+        return np.array([math.sin(z[0]) + z[1], z[0] * z[1], np.sign(z[1])])
+
+    def jacobian(z):
+        return [[math.cos(z[0]), 1.0], [z[1], z[0]], [0.0, 0.0]]
+
+    found = smooth(f, x, jacobian, noise=Gaussian(sigma), samples=20000)
+    density = 2 * math.exp(-((x[1] / sigma[1]) ** 2) / 2) / (sigma[1] * math.sqrt(2 * math.pi))
+    truth = np.array([[math.cos(x[0]) * math.exp(-(sigma[0] ** 2) / 2), 1.0], [x[1], x[0]], [0.0, density]])
+    assert found.jacobian.shape == found.variance.shape == found.weight.shape == (3, 2)
+    assert within(found.zeroth, truth, found.zeroth_variance)
+    assert found.biased.tolist() == [[False, False], [False, False], [False, True]]
+    smooth_rows = [0, 1]
+    assert within(found.jacobian[smooth_rows], truth[smooth_rows], found.variance[smooth_rows])
+    assert str(found).splitlines() == [
+        "blend of first and zeroth order, 3 x 2, 20000 samples of Gaussian(sigma = 0.2 to 0.3), seed 0",
+        f"standard errors up to {np.sqrt(found.variance.max()):.2g}; first order is biased in 1 of 6 entries, "
+        f"its weight is {found.weight.min():.2g} to 1",
+    ]
+
+
+def test_a_wrong_derivative_is_seen():
+    """The Jacobian of f is off by a factor of 1.1."""
+    found = smooth(lambda z: 2 * z[0], [1.0], lambda z: [2.2], noise=Gaussian(0.1), samples=20000)
+    assert found.biased.all()
+    assert smooth(lambda z: 2.0, [1.0], lambda z: [2.2], noise=Gaussian(0.1), samples=2).weight == 0
+
+
+@pytest.mark.parametrize(("u", "c"), [(0.1, 0.04), (-0.3, 0.04), (0.0, 2.0), (5.0, 30.0)])
+def test_barrier_noise_makes_the_log_barrier(u, c):
+    """C11, first by quadrature in w = sqrt(c) tan t, which makes the density cos(t) / 2; then sampled."""
+    root, edge = math.sqrt(c), math.atan(-u / math.sqrt(c))
+    step, value = (1 + u / math.sqrt(u**2 + c)) / 2, (u + math.sqrt(u**2 + c)) / 2
+    assert integral(lambda t: np.cos(t) / 2, [edge, math.pi / 2]) == pytest.approx(step, rel=1e-14)
+    assert integral(lambda t: (u + root * np.tan(t)) * np.cos(t) / 2, [edge, math.pi / 2]) == pytest.approx(value)
+    if (u, c) == (0.1, 0.04):
+        assert step == pytest.approx(0.7236067977499789, rel=1e-15)
+
+    def zeroth(t):
+        w = root * np.tan(t)
+        return (np.maximum(u + w, 0) - max(u, 0)) * Barrier(c).score(w) * np.cos(t) / 2
+
+    assert integral(zeroth, [-math.pi / 2, edge, math.pi / 2]) == pytest.approx(step, rel=1e-12)
+    found = smooth(lambda z: max(z[0], 0.0), [u], lambda z: [float(z[0] > 0)], noise=Barrier(c), samples=20000)
+    assert within(found.first, step, found.first_variance)
+    assert within(found.zeroth, step, found.zeroth_variance)
+    assert within(found.jacobian, step, found.variance)
+    assert not found.biased.any()
+    assert 20000 * found.first_variance == pytest.approx(step * (1 - step), rel=0.05)
+
+
+def test_barrier_noise_shows_the_bias_of_a_jump():
+    found = smooth(lambda z: float(z[0] > 0), [0.1], lambda z: [0.0], noise=Barrier(0.04), samples=5000)
+    assert within(found.zeroth, 0.5 * 0.04 * (0.1**2 + 0.04) ** -1.5, found.zeroth_variance)
+    assert found.biased.all()
+
+
+@pytest.mark.parametrize("c", [0.04, 3.0])
+def test_barrier_samples_have_their_distribution(c):
+    w = Barrier(c).sample(np.random.default_rng(0), (200000, 1))
+    for at in math.sqrt(c) * np.array([-10.0, -1.0, 0.0, 0.5, 3.0]):
+        share = (1 + at / math.sqrt(at**2 + c)) / 2
+        assert np.mean(w <= at) == pytest.approx(share, abs=5 * math.sqrt(share * (1 - share) / len(w)))
+
+
+@pytest.mark.parametrize(
+    ("noise", "log_density"),
+    [
+        (Gaussian(0.3), lambda w: -(w**2) / (2 * 0.3**2)),
+        (Barrier(0.3), lambda w: -1.5 * np.log(w**2 + 0.3)),
+    ],
+)
+def test_the_score_is_minus_the_slope_of_the_log_density(noise, log_density):
+    w, h = np.array([-2.0, -0.1, 0.0, 0.4, 1.7]), 1e-5
+    assert noise.score(w) == pytest.approx(-(log_density(w + h) - log_density(w - h)) / (2 * h), abs=1e-8)
+
+
+@pytest.mark.parametrize("noise", [Gaussian([0.2, 0.0]), Barrier([0.2, 0.0])])
+def test_a_coordinate_without_noise_has_first_order_only(noise):
+    assert noise.score([0.1, 0.0])[1] == 0
+    found = smooth(lambda z: z[0] * z[1], [0.5, 2.0], lambda z: [z[1], z[0]], noise=noise, samples=500)
+    assert np.array_equal(found.zeroth[:, 1], found.first[:, 1])
+    assert np.array_equal(found.zeroth_variance[:, 1], found.first_variance[:, 1])
+    assert (found.weight[0, 1], found.bias[0, 1], found.bias_error[0, 1], found.biased[0, 1]) == (1, 0, 0, False)
+    assert found.first[0, 0] == 2
+    assert found.first_variance[0, 0] == 0
+    assert found.zeroth[0, 0] != 2
+
+
+def test_zeroth_order_needs_no_derivative():
+    both = smooth(np.sum, [1.0, 2.0], lambda z: [1.0, 1.0], noise=Gaussian(0.1), samples=100, method="zeroth")
+    found = smooth(np.sum, [1.0, 2.0], noise=Gaussian(0.1), samples=100, method="zeroth")
+    assert found.jacobian.tobytes() == found.zeroth.tobytes() == both.jacobian.tobytes()
+    assert found.variance.tobytes() == found.zeroth_variance.tobytes() == both.variance.tobytes()
+    assert (found.first, found.first_variance, found.bias, found.bias_error, found.biased) == (None,) * 5
+    assert not found.weight.any()
+    assert str(found).endswith("no derivative to compare with")
+    assert str(both).startswith("zeroth order, 1 x 2, 100 samples of Gaussian(sigma = 0.1), seed 0\n")
+
+
+def test_the_same_seed_gives_the_same_bytes_and_arrays_are_read_only():
+    runs = [smooth_ball_quick(seed) for seed in (5, 5, 6)]
+    fields = [name for name, value in vars(runs[0]).items() if isinstance(value, np.ndarray)]
+    assert len(fields) == 12
+    for name in fields:
+        assert getattr(runs[0], name).tobytes() == getattr(runs[1], name).tobytes(), name
+        assert not getattr(runs[0], name).flags.writeable, name
+    assert runs[0].zeroth != runs[2].zeroth
+    assert [run.seed for run in runs] == [5, 5, 6]
+
+
+def smooth_ball_quick(seed):
+    return smooth(lambda z: z[0] ** 3, [1.0], lambda z: 3 * z**2, noise=Barrier(0.01), samples=50, seed=seed)
+
+
+def test_a_function_may_overwrite_its_argument():
+    def f(z):
+        z *= 2
+        return z
+
+    found = smooth(f, [1.0], lambda z: [[z[0]]], noise=Gaussian(0.1), samples=3000)
+    assert within(found.value, 2, found.value_variance)
+    assert within(found.first, 1, found.first_variance)
+
+
+def test_a_large_constant_costs_no_digits_of_the_variance():
+    found = smooth(lambda z: 1e8 + z[0], [0.0], lambda z: [1.0], noise=Gaussian(0.1), samples=5000)
+    assert 5000 * found.value_variance == pytest.approx(0.01, rel=0.1)
+    assert within(found.zeroth, 1, found.zeroth_variance)
+
+
+def one(z):
+    return [1.0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"method": "second"}, "expected one of blend, first, zeroth"),
+        ({"samples": 1}, "at least 2"),
+        ({"samples": 0}, "samples"),
+        ({"samples": 2.5}, "samples"),
+        ({"seed": -1}, "seed"),
+        ({"seed": None}, "seed"),
+        ({"noise": 0.1}, "a Gaussian or a Barrier"),
+        ({"noise": Gaussian([0.1, 0.1])}, r"the numbers of Gaussian: expected shape \(1,\), got shape \(2,\)"),
+        ({"noise": Barrier([0.1, 0.1])}, "the numbers of Barrier"),
+        ({"x": 1.0}, "x: expected shape"),
+        ({"x": [np.nan]}, "x"),
+        ({"x": [], "f": np.sum}, "at least one of each"),
+        ({"f": lambda z: []}, "at least one of each"),
+        ({"f": lambda z: [[1.0]]}, r"f\(x\): expected shape"),
+        ({"f": lambda z: None}, r"f\(x\)"),
+        ({"f": lambda z: [[1.0], [1.0, 2.0]]}, r"f\(x\): expected an array of numbers"),
+        ({"f": lambda z: [1.0] * (1 + (z[0] != 0))}, r"f\(x\): expected shape \(1,\), got shape \(2,\)"),
+        ({"jacobian": None}, "jacobian: expected a function"),
+        ({"jacobian": None, "method": "first"}, "jacobian: expected a function"),
+        ({"jacobian": lambda z: [1.0, 2.0]}, r"jacobian\(x\): expected shape \(1, 1\), got shape \(1, 2\)"),
+        ({"f": lambda z: [1.0, 2.0], "jacobian": lambda z: [1.0, 2.0]}, r"expected shape \(2, 1\)"),
+    ],
+)
+def test_bad_input_is_refused(changes, message):
+    arguments = {"f": lambda z: z[0], "x": [0.0], "jacobian": one, "noise": Gaussian(0.1), "samples": 10} | changes
+    with pytest.raises(dd.InputError, match=message):
+        smooth(arguments.pop("f"), arguments.pop("x"), arguments.pop("jacobian"), **arguments)
+
+
+def test_an_unknown_method_has_its_own_error():
+    with pytest.raises(dd.UnknownNameError):
+        smooth(np.sum, [0.0], one, noise=Gaussian(1.0), method="")
+
+
+def test_zeroth_order_needs_a_derivative_where_noise_does_not_move():
+    with pytest.raises(dd.InputError, match="jacobian"):
+        smooth(np.sum, [0.0, 0.0], noise=Gaussian([0.1, 0.0]), method="zeroth")
+
+
+@pytest.mark.parametrize("kind", [Gaussian, Barrier])
+@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf, True, "1", None, [], [0.0, 0.0], [0.1, -0.1], [np.nan]])
+def test_noise_of_no_size_is_refused(kind, scale):
+    with pytest.raises(dd.InputError, match=f"{kind.__name__}.(sigma|c)"):
+        kind(scale)
+
+
+@pytest.mark.parametrize(
+    ("f", "jacobian", "message"),
+    [
+        (lambda z: np.nan, one, r"f\(\[0.0\]\) is \[nan\]"),
+        (lambda z: np.inf if z[0] else 0.0, one, r"f\(\[.*\]\) is \[inf\]"),
+        (lambda z: z[0], lambda z: [np.nan], r"jacobian\(\[.*\]\) is \[\[nan\]\]"),
+        (lambda z: 1e200 * z[0], one, "too large"),
+    ],
+)
+def test_what_is_not_finite_is_refused(f, jacobian, message):
+    with pytest.raises(dd.GradientError, match=message):
+        smooth(f, [0.0], jacobian, noise=Gaussian(0.1), samples=10)
+
+
+def test_little_noise_leaves_the_derivatives_of_a_smooth_step(load):
+    model, x, u = load("pendulum.urdf"), np.array([0.7, -1.2]), np.array([0.4])
+    found, step = smooth_step(model, x, u, noise=Gaussian(1e-4), samples=300), dd.differentiate_step(model, x, u)
+    AB = np.hstack([step.A, step.B])
+    assert found.first == pytest.approx(AB, abs=1e-5)
+    assert found.jacobian == pytest.approx(AB, abs=1e-5)
+    assert within(found.zeroth, AB, found.zeroth_variance)
+    assert found.value == pytest.approx(step.x_next, abs=5e-5)
+    assert not found.biased.any()
+
+
+def test_zeroth_order_of_a_step(load):
+    model, x = load("pendulum.urdf"), [0.7, -1.2]
+    found = smooth_step(model, x, [0.4], noise=Gaussian(1e-4), method="zeroth")
+    assert found.first is None
+    fixed = smooth_step(model, x, [0.4], noise=Gaussian([1e-4, 1e-4, 0]), method="zeroth")
+    assert np.array_equal(fixed.jacobian[:, 2], fixed.first[:, 2])
+    assert fixed.jacobian[:, 2] == pytest.approx(dd.differentiate_step(model, x, [0.4]).B[:, 0], rel=1e-6)
+
+
+H, K, TAU, RADIUS = 0.01, 1e4, 0.002, 0.1  # of the pair; see models/sphere_on_ground.sdf
+CONTACT = 1 / (1 + H * K * (H + TAU))  # a step in contact leaves this share of the free velocity of 1 kg
+
+
+@pytest.fixture
+def ball_over_ground():
+    """The ball of sphere_on_ground.sdf on a vertical slide: x = [z, v]."""
+    plant, properties = Plant(H), contact_properties(2 * K, 1.0, 0.5, TAU / 2)
+    plant.ball("ball", 1.0, RADIUS, properties, "z")
+    plant.ground(properties)
+    return plant.model()
+
+
+def test_smoothing_a_touching_ball_lies_between_the_two_sides(ball_over_ground):
+    """With v = g h the step has a kink at touchdown but no jump: half of each side, and first order is right."""
+    v = 9.81 * H
+    above = dd.differentiate_step(ball_over_ground, [RADIUS + 1e-6, v]).A
+    below = dd.differentiate_step(ball_over_ground, [RADIUS - 1e-6, v]).A
+    assert (above[1, 0], below[1, 0]) == pytest.approx((0, -H * K * CONTACT), abs=1e-9)
+    found = smooth_step(ball_over_ground, [RADIUS, v], noise=Gaussian([1e-3, 0]), samples=1000)
+    for estimate in (found.first, found.jacobian):
+        assert np.all(np.minimum(above, below) < estimate)
+        assert np.all(estimate < np.maximum(above, below))
+    middle = (above + below) / 2
+    assert within(found.first, middle, found.first_variance)
+    assert within(found.zeroth, middle, found.zeroth_variance)
+    assert not found.biased.any()
+
+
+def test_a_landing_balls_jump_is_seen_as_bias(ball_over_ground):
+    """At v = -1 the next velocity jumps at touchdown by 1 - CONTACT of itself: first order does not see it."""
+    sigma, free = 1e-3, -1 - 9.81 * H
+    density = 1 / (sigma * math.sqrt(2 * math.pi))
+    truth = -H * K * CONTACT / 2 + free * (1 - CONTACT) * density
+    found = smooth_step(ball_over_ground, [RADIUS, -1.0], noise=Gaussian([sigma, 0]), samples=1000)
+    assert within(found.first[1, 0], -H * K * CONTACT / 2, found.first_variance[1, 0])
+    assert within(found.zeroth[1, 0], truth, found.zeroth_variance[1, 0])
+    assert found.biased.tolist() == [[True, False], [True, False]]
+    assert found.weight[1, 0] < 0.2
+    error = abs(found.jacobian[1, 0] - truth)
+    assert error < 3 * found.bias_error[1, 0] + 5 * math.sqrt(found.zeroth_variance[1, 0])
+    assert error < abs(found.first[1, 0] - truth) / 2
+
+
+def test_steps_that_cannot_be_smoothed_are_refused(load):
+    model = load("sphere_on_ground.sdf")
+    with pytest.raises(dd.InputError, match=r"the quaternion \(ball_qw, ball_qx, ball_qy, ball_qz\)"):
+        smooth_step(model, model.default_state, noise=Gaussian(0.1))
+    model = load("pendulum.urdf")
+    with pytest.raises(dd.ShapeError, match="x"):
+        smooth_step(model, [0.0], [0.0], noise=Gaussian(0.1))
+    with pytest.raises(dd.ShapeError, match="u"):
+        smooth_step(model, [0.0, 0.0], noise=Gaussian(0.1))
+    with pytest.raises(dd.ShapeError, match="the numbers of Gaussian"):
+        smooth_step(model, [0.0, 0.0], [0.0], noise=Gaussian([0.1, 0.1]))
+    with pytest.raises(dd.UnknownNameError):
+        smooth_step(model, [0.0, 0.0], [0.0], noise=Gaussian(0.1), method="third")
+    with pytest.raises(dd.InputError, match="a Gaussian or a Barrier"):
+        smooth_step(model, [0.0, 0.0], [0.0], noise=None, method="zeroth")
