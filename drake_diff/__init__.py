@@ -1,9 +1,14 @@
 """Trajectory optimization on Drake with gradients that are checked before they are used."""
 
+from drake_diff.audit import Finding as Finding
+from drake_diff.audit import audit as audit
 from drake_diff.certificate import Certificate as Certificate
 from drake_diff.certificate import certify_jacobian as certify_jacobian
+from drake_diff.certification import certify_model as certify_model
+from drake_diff.certify import RolloutCertificate as RolloutCertificate
 from drake_diff.certify import certify as certify
 from drake_diff.certify import certify_rollout as certify_rollout
+from drake_diff.contact import contact_modes as contact_modes
 from drake_diff.contract import Contract as Contract
 from drake_diff.cost import QuadraticCost as QuadraticCost
 from drake_diff.evidence import load_record as load_record
@@ -30,6 +35,7 @@ from drake_diff.policy import TVLQR as TVLQR
 from drake_diff.policy import ParametricPolicy as ParametricPolicy
 from drake_diff.problem import Bounds as Bounds
 from drake_diff.problem import Problem as Problem
+from drake_diff.record import CertificationRecord as CertificationRecord
 from drake_diff.record import EvidenceRecord as EvidenceRecord
 from drake_diff.rollout import Rollout as Rollout
 from drake_diff.rollout import rollout as rollout

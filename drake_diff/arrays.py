@@ -24,9 +24,8 @@ def finite_array(subject: str, values: Any, shape: Sequence[int | str]) -> Array
     Raises ShapeError, NonFiniteError, or InputError where `values` holds no numbers.
     """
     array = _array(subject, values, shape)
-    bad = np.argwhere(~np.isfinite(array))
-    if len(bad):
-        index = tuple(int(i) for i in bad[0])
+    if not np.isfinite(array).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise NonFiniteError(subject, index=index, got=float(array[index]))
     return array
 

@@ -9,7 +9,8 @@ neighbouring D lie close together is a plateau; their spread is its uncertainty.
     disagrees         where there are such plateaus and it lies on none;
     is discontinuous  where forward and backward quotients do not approach each other as h shrinks (a kink), or
                       grow apart as 1/h (a jump), or where the derivative is another one 1e-9 beside the point;
-    is undecided      where the differences resolve nothing. Undecided does not pass.
+    is undecided      where the differences resolve nothing. Undecided does not pass;
+    is not converged  where it agrees, but a rollout's gradient is another one at a finer time step (`refinement`).
 """
 
 from collections.abc import Callable, Sequence
@@ -22,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from drake_diff.arrays import Array, finite_array, frozen
 from drake_diff.exceptions import CertificateError, GradientError, ShapeError
 from drake_diff.finite_difference import ROUNDING, Difference, Function, differences, richardson
+from drake_diff.mode_changes import ModeChange
 
 STEPS = tuple(10.0 ** (-k / 2) for k in range(4, 17))  # 1e-2 ... 1e-8
 RELATIVE_TOLERANCE = 1e-6
@@ -32,7 +34,7 @@ NEGLIGIBLE, NOTHING = 1e-6, 1e-9
 SOLVER_FACTOR = 100.0
 JITTER = 1e-9
 JITTER_CHANGE = 0.1
-VERDICTS = ("agree", "undecided", "disagree", "discontinuous")  # from good to bad
+VERDICTS = ("agree", "undecided", "not_converged", "disagree", "discontinuous")  # from good to bad
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ class Certificate:
     codes: NDArray[np.int64]
     method: str
     subject: str
+    mode_changes: tuple[ModeChange, ...] = ()  # of contact, within 1e-4 of the point
 
     @property
     def verdict(self) -> str:
@@ -109,7 +112,9 @@ class Certificate:
     def __str__(self) -> str:
         counts = ", ".join(f"{self.count(v)} {v}" for v in VERDICTS if self.count(v))
         worst = f"; worst: {self.worst}" if self.codes.size else ""
-        return f"{self.verdict} ({counts} of {self.codes.size} entries, {self.method}){worst}"
+        changes = f"; contact changes nearby: {self.mode_changes[0]}" if self.mode_changes else ""
+        more = f" and {len(self.mode_changes) - 1} more" if len(self.mode_changes) > 1 else ""
+        return f"{self.verdict} ({counts} of {self.codes.size} entries, {self.method}){worst}{changes}{more}"
 
 
 def certify_jacobian(

@@ -1,19 +1,35 @@
 """Certify the derivative of a step, or of a whole rollout, before it is used."""
 
+from dataclasses import dataclass, field, replace
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff.arrays import Array, finite_array
-from drake_diff.certificate import JITTER, Certificate, certify_displacement, jitter_direction
+from drake_diff.certificate import JITTER, VERDICTS, Certificate, certify_displacement, jitter_direction
+from drake_diff.mode_changes import ModeChange, find_mode_changes
 from drake_diff.model import Model
 from drake_diff.parameters import Parameters, ParameterVector, applied, select
 from drake_diff.plant_elements import actuators
 from drake_diff.read_contract import SAP_RELATIVE_TOLERANCE
+from drake_diff.refinement import Refinement, refined, stiffened
 from drake_diff.rollout import check_inputs, roll_states
 from drake_diff.rollout_gradient import Loss, RolloutGradient, differentiate_rollout, evaluate_loss
 from drake_diff.step import advance, check_point
 from drake_diff.step_derivatives import StepDerivatives, step_at, step_jacobians
 from drake_diff.tangent import TangentSpace, tangent_space
+
+
+@dataclass(frozen=True, eq=False)
+class RolloutCertificate(Certificate):
+    """The certificate of a rollout's gradient, the gradient, and whether it converges with the time step."""
+
+    gradient: RolloutGradient = field(kw_only=True)
+    refinements: tuple[Refinement, ...] = ()
+
+    def __str__(self) -> str:
+        return "; ".join([super().__str__(), *map(str, self.refinements)])
+
 
 LIMIT_REACH = 0.05  # [m or rad] a joint limit this near may hold the joint in one of the displaced steps
 
@@ -58,11 +74,17 @@ def _certify_step(
         jittered = _move(space, model.nx, point, JITTER * scale * jitter_direction(len(scale)))
         d_beside = step_jacobians(model, vector, jittered[: model.nx], jittered[model.nx :], method)
         beside = on_tangent(jittered, d_beside)
-    return certify_displacement(
+    derivative, by_point = on_tangent(point, d), space.names + model.input_names
+    changes: tuple[ModeChange, ...] = ()
+    if model.contract.contact.collision_pairs:
+        changes = find_mode_changes(
+            model, f, derivative, rows=space.names, columns=by_point, scale=scale, minus=space.minus
+        )
+    certificate = certify_displacement(
         f,
-        on_tangent(point, d),
+        derivative,
         rows=space.names,
-        columns=space.names + model.input_names + vector.names,
+        columns=by_point + vector.names,
         scale=scale,
         beside=beside,
         minus=space.minus,
@@ -70,6 +92,7 @@ def _certify_step(
         method=" + ".join(dict.fromkeys((d.method, *d.sources))),
         subject=f"the step of {model.name}",
     )
+    return replace(certificate, mode_changes=changes)
 
 
 def _on_tangent(space: TangentSpace, x: Array, d: StepDerivatives) -> Array:
@@ -90,12 +113,16 @@ def certify_rollout(
     *,
     parameters: Parameters = (),
     num_steps: int | None = None,
+    refine: bool = False,
+    refine_stiffness: bool = False,
     method: str = "auto",
-) -> Certificate:
+) -> RolloutCertificate:
     """Compare `differentiate_rollout`'s gradient by x0, us and parameters with differences of whole rollouts.
 
     One row, the loss; columns x0 (on the tangent space), then u[k] step by step, then the parameters. Costs 26
-    rollouts per column.
+    rollouts per column. `refine` takes the gradient again at h/2 and h/4, `refine_stiffness` at 4 and 16 times
+    the contact stiffness (see `drake_diff.refinement`): entries that agree with differences and do not converge
+    are `not_converged`.
     """
     us = check_inputs(model, us, num_steps)
     x0 = finite_array("x0", x0, (model.nx,))
@@ -122,17 +149,33 @@ def certify_rollout(
 
     derivative, gradient = on_tangent(np.zeros(len(scale)))
     inputs = tuple(f"{name}[{k}]" for k in range(len(us)) for name in model.input_names)
-    return certify_displacement(
+    columns = tuple(f"{name}[0]" for name in space.names) + inputs + vector.names
+    refinements = []
+    for wanted, by in ((refine, refined), (refine_stiffness, stiffened)):
+        if wanted:
+            refinements.append(by(model, x0, us, loss, vector, columns, method))
+    certificate = certify_displacement(
         f,
         derivative,
         rows=("loss",),
-        columns=tuple(f"{name}[0]" for name in space.names) + inputs + vector.names,
+        columns=columns,
         scale=scale,
         beside=on_tangent(JITTER * jitter_direction(len(scale)))[0],
         solver_tolerance=max(solver_tolerance(model, x, u) for x, u in zip(gradient.xs[:-1], us, strict=True)),
         method=" + ".join(dict.fromkeys((*gradient.methods, *gradient.parameter_sources))),
         subject=f"the rollout of {model.name}",
     )
+    return _with_refinements(certificate, gradient, tuple(refinements))
+
+
+def _with_refinements(
+    certificate: Certificate, gradient: RolloutGradient, refinements: tuple[Refinement, ...]
+) -> RolloutCertificate:
+    codes = np.array(certificate.codes)
+    for found in refinements:
+        codes[0] = np.where(found.converged, codes[0], np.maximum(codes[0], VERDICTS.index("not_converged")))
+    parts = {name: getattr(certificate, name) for name in Certificate.__dataclass_fields__} | {"codes": codes}
+    return RolloutCertificate(**parts, gradient=gradient, refinements=refinements)
 
 
 def solver_tolerance(model: Model, x: Array, u: Array) -> float:

@@ -48,6 +48,93 @@ def run(
     raise typer.Exit(HOLDS if record.verdict == "pass" else CHECK_FAILED)
 
 
+ModelFile = Annotated[Path, typer.Argument(help="A URDF, SDF, MJCF (.xml) or .dmd.yaml file.")]
+TimeStep = Annotated[float, typer.Option(help="[s]")]
+ContactModel = Annotated[str, typer.Option(help="point, hydroelastic or hydroelastic_with_fallback")]
+Approximation = Annotated[str, typer.Option(help="sap, similar or lagged")]
+Geometry = Annotated[str | None, typer.Option(help="Around refused pairs: corner_spheres, hydroelastic, differences")]
+WeldBase = Annotated[str | None, typer.Option(help="A link to fix to the world.")]
+Ground = Annotated[float | None, typer.Option(help="Friction [1] of a ground to add.")]
+
+
+@app.command()
+def audit(
+    model: ModelFile,
+    time_step: TimeStep = 0.01,
+    contact_model: ContactModel = "point",
+    contact_approximation: Approximation = "sap",
+    contact_geometry: Geometry = None,
+    weld_base: WeldBase = None,
+    ground: Ground = None,
+) -> None:
+    """List what of MODEL cannot be differentiated or will be differentiated wrongly, and what to change.
+
+    Exit status 1 where a finding is an error.
+    """
+    from drake_diff.audit import audit as audit_model
+    from drake_diff.model import load_model
+
+    loaded = load_model(
+        model,
+        time_step=time_step,
+        contact_model=contact_model,
+        contact_approximation=contact_approximation,
+        contact_geometry=contact_geometry,
+        weld_base=weld_base,
+        ground=ground,
+    )
+    console = Console(soft_wrap=True, highlight=False)
+    findings = audit_model(loaded)
+    for finding in findings:
+        colour = {"error": "red", "warning": "yellow"}.get(finding.severity, "dim")
+        console.print(f"[{colour} bold]{finding.severity}[/] {escape(finding.subject)}: {escape(finding.message)}")
+        console.print(f"    [dim]remedy:[/] {escape(finding.remedy)}")
+    counts = [sum(f.severity == severity for f in findings) for severity in ("error", "warning", "info")]
+    console.print(f"{escape(loaded.name)}: {counts[0]} errors, {counts[1]} warnings, {counts[2]} notes")
+    raise typer.Exit(CHECK_FAILED if counts[0] else HOLDS)
+
+
+@app.command()
+def certify(
+    model: ModelFile,
+    states: Annotated[int, typer.Option(help="How many states to sample; every other one in contact.")] = 20,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same states.")] = 0,
+    parameter: Annotated[list[str] | None, typer.Option(help="Also certify the derivative by this one.")] = None,
+    method: Annotated[str, typer.Option(help="auto, autodiff, implicit or finite_difference")] = "auto",
+    out: Annotated[Path | None, typer.Option(help="Directory; artifacts/certify_<model> where not given.")] = None,
+    time_step: TimeStep = 0.01,
+    contact_model: ContactModel = "point",
+    contact_approximation: Approximation = "sap",
+    contact_geometry: Geometry = None,
+    weld_base: WeldBase = None,
+    ground: Ground = None,
+) -> None:
+    """Compare the step's derivatives of MODEL with differences, entry by entry, at sampled states.
+
+    Writes certification.json. Exit status 0 only where every certificate agrees.
+    """
+    from drake_diff.certification import RECORD, certify_model
+    from drake_diff.model import load_model
+
+    loaded = load_model(
+        model,
+        time_step=time_step,
+        contact_model=contact_model,
+        contact_approximation=contact_approximation,
+        contact_geometry=contact_geometry,
+        weld_base=weld_base,
+        ground=ground,
+    )
+    console = Console(soft_wrap=True, highlight=False)
+    console.print(f"[bold]{escape(model.name)}[/]: {escape(repr(loaded))}, contact {loaded.contract.contact.model}")
+    directory = out or Path("artifacts") / f"certify_{model.stem}"
+    names = tuple(parameter or ())
+    record = certify_model(loaded, states=states, seed=seed, parameters=names, method=method, directory=directory)
+    _print_certification(console, record)
+    console.print(f"wrote {escape(str(directory / RECORD))}")
+    raise typer.Exit(HOLDS if record.verdict == "pass" else CHECK_FAILED)
+
+
 def main() -> None:
     """The entry point: every error of ours becomes a sentence and an exit status."""
     from drake_diff.exceptions import DrakeDiffError, MissingDependencyError
@@ -93,6 +180,34 @@ def _progress(console: Console) -> Iterator[Callable[[str], None]]:
         return
     with console.status("solving") as status:
         yield lambda line: status.update(escape(line))
+
+
+def _print_certification(console: Console, record: Any) -> None:
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for name in ("state", "motion", "contacts", "entries", "largest", "from", "verdict"):
+        table.add_column(name, justify="right" if name in ("state", "entries", "largest") else "left")
+    for i, state in enumerate(record.states):
+        modes = list(state.contact_modes.values())
+        contacts = ", ".join(f"{modes.count(mode)} {mode}" for mode in sorted(set(modes)))
+        gradient, largest = state.gradient, state.largest
+        colour = "green" if state.verdict == "agree" else "red"
+        table.add_row(
+            str(i),
+            state.kind,
+            contacts,
+            str(gradient.entries) if gradient else "",
+            "" if largest is None else f"{largest:.4g}",
+            gradient.method if gradient else "",
+            f"[{colour}]{state.verdict}[/]" + (f", {len(state.mode_changes)} near" if state.mode_changes else ""),
+        )
+    console.print(table)
+    for i, state in enumerate(record.states):
+        if state.verdict != "agree":
+            console.print(f"state {i}: {escape(state.refusal or state.gradient.worst)}")
+            for change in state.mode_changes[:3]:
+                console.print(f"    {escape(change)}")
+    colour = "green" if record.verdict == "pass" else "red"
+    console.print(f"[{colour} bold]{record.verdict}[/]  {escape(record.sentence)}, {record.wall_clock.solve_s:.1f} s")
 
 
 def _print_record(console: Console, record: Any, directory: Path) -> None:

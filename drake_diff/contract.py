@@ -70,6 +70,7 @@ class Contact:
 
     model: str
     approximation: str
+    geometry: str  # "as modelled", or the route that was taken around pairs that AutoDiffXd refuses
     collision_pairs: int
     solver_relative_tolerance: float
     sap_near_rigid_threshold: float
@@ -121,7 +122,8 @@ def _lines(c: Contract) -> list[str]:
         f"{c.name}: time step {c.time_step:g} s, {c.integrator}",
         f"  source     {c.source or 'a diagram'}; scalar types {', '.join(c.scalar_types)}",
         f"  frame      {c.frame}; gravity {_row(c.gravity)} m/s^2",
-        f"  contact    {c.contact.model}, {c.contact.approximation}, {c.contact.collision_pairs} pairs,"
+        f"  contact    {c.contact.model}, {c.contact.approximation}, geometry {c.contact.geometry},"
+        f" {c.contact.collision_pairs} pairs,"
         f" solver tolerance {c.contact.solver_relative_tolerance:g} (relative)",
     ]
     for kind, coordinates in (("q", c.positions), ("v", c.velocities), ("u", c.inputs)):

@@ -5,29 +5,22 @@ A run directory is written so that record.json is complete last: a run that is k
 
 import json
 import math
-import platform
-import subprocess
-import sys
 from datetime import UTC, datetime
-from hashlib import sha256
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
-from drake_diff.certificate import VERDICTS, Certificate
 from drake_diff.exceptions import ArtifactError
 from drake_diff.problem import Problem
+from drake_diff.provenance import file_evidence, gradient_evidence, provenance_of
 from drake_diff.record import (
     SCHEMA_VERSION,
     Check,
     EvidenceRecord,
     Failure,
-    FileEvidence,
-    GradientEvidence,
-    Provenance,
+    ParameterEvidence,
     Quantity,
     Solver,
     WallClock,
@@ -36,7 +29,6 @@ from drake_diff.solution import FEASIBILITY_TOLERANCE, INTEGRATION_TOLERANCE, So
 from drake_diff.whole_file import write_whole
 
 RECORD, TRACE, REPLAY = "record.json", "trace.mcap", "replay.html"
-PACKAGES = ("drake", "drake-diff", "numpy", "mcap", "protobuf", "foxglove-schemas-protobuf", "pydantic")
 
 
 def load_record(directory: str | Path) -> EvidenceRecord:
@@ -78,7 +70,8 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
         sentence=solution.message,
         solver=_solver(solution),
         checks=_checks(solution),
-        gradients=[_gradient(c) for c in solution.certificates],
+        parameters=_parameters(solution),
+        gradients=[gradient_evidence(c) for c in solution.certificates],
         gradient_norms=[] if solution.gradient_norms is None else _finite_list(solution.gradient_norms),
         failures=_failures(solution),
         solve_s=solution.wall_time,
@@ -107,18 +100,12 @@ def _drawable(solution: Solution) -> np.ndarray:
     return np.where(finite[:, None], solution.xs, solution.problem.x0)
 
 
-def file_evidence(path: Path, name: str) -> FileEvidence:
-    """Size and hash of the file at `path`, under the name it has in the record."""
-    data = path.read_bytes()
-    return FileEvidence(path=name, bytes=len(data), sha256=sha256(data).hexdigest())
-
-
 def _record(name: str, problem: Problem, *, solve_s: float | None = None, **fields: Any) -> EvidenceRecord:
     return EvidenceRecord(
         name=name,
         problem=_describe(problem),
         contract=problem.model.contract.to_dict(),
-        provenance=_provenance(problem),
+        provenance=provenance_of(problem.model),
         wall_clock=WallClock(written_utc=datetime.now(UTC).isoformat(timespec="seconds"), solve_s=solve_s),
         **fields,
     )
@@ -148,8 +135,28 @@ def _describe(problem: Problem) -> dict[str, Any]:
         "optimize": list(problem.optimize),
         "running_cost": _name(problem.running_cost),
         "final_cost": _name(problem.final_cost),
+        "trajectory_cost": _name(problem.trajectory_cost),
         "initial_state_free": [bool(free) for free in problem.initial_state_mask],
     }
+
+
+def _parameters(solution: Solution) -> list[ParameterEvidence]:
+    problem, found = solution.problem, solution.vector
+    lower, upper = problem.bounds_of_parameters()
+    units = [p.unit for p in found.parameters for _ in p.value]
+    return [
+        ParameterEvidence(
+            name=name,
+            unit=units[i],
+            derivative_source=found.sources[i],
+            start=float(problem.parameters.values[i]),
+            value=float(found.values[i]),
+            optimized=problem.optimizes_parameters,
+            lower=_finite_list(lower)[i],
+            upper=_finite_list(upper)[i],
+        )
+        for i, name in enumerate(found.names)
+    ]
 
 
 def _finite_list(values: Any) -> list[float | None]:
@@ -246,17 +253,6 @@ def _check(name: str, definition: str, value: float, unit: str, bound: float | N
     return Check(name=name, definition=definition, quantity=quantity, bound=bound, passed=passed)
 
 
-def _gradient(certificate: Certificate) -> GradientEvidence:
-    return GradientEvidence(
-        subject=certificate.subject,
-        method=certificate.method,
-        verdict=certificate.verdict,
-        entries=int(certificate.codes.size),
-        counts={v: certificate.count(v) for v in VERDICTS},
-        worst=str(certificate.worst) if certificate.codes.size else None,
-    )
-
-
 _FAILURES: dict[Status, tuple[str, str]] = {
     Status.CONVERGED_NOT_VERIFIED: ("planning_error", "not_verified"),
     Status.ITERATION_LIMIT: ("planning_error", "solver_iteration_limit"),
@@ -278,34 +274,3 @@ def _failures(solution: Solution) -> list[Failure]:
     if bad is not None:
         failures.append(Failure(label="planning_error", code="gradient_mismatch", message=f"{bad.subject}: {bad}"))
     return failures
-
-
-def _provenance(problem: Problem) -> Provenance:
-    source = problem.model.source
-    return Provenance(
-        python=platform.python_version(),
-        platform=f"{platform.system()} {platform.machine()}",
-        packages={name: found for name in PACKAGES if (found := _version(name))},
-        git=_git(),
-        command=[Path(sys.argv[0]).name, *sys.argv[1:]],
-        model_file=file_evidence(source, source.name) if source is not None else None,
-    )
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
-
-
-def _git() -> dict[str, str | bool] | None:
-    """Commit and dirty flag of the working directory, None where it is no git checkout or there is no git."""
-    try:
-        run = [
-            subprocess.run(["git", *words], capture_output=True, text=True, timeout=10, check=True).stdout.strip()
-            for words in (["rev-parse", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
-        ]
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return {"commit": run[0], "dirty": bool(run[1])}

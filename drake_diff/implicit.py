@@ -11,7 +11,7 @@ damping D and the PD controllers are implicit. With the inputs clipped at their 
 
 so dv' = -(dr/dv')^-1 dr with dr/dv' = M / h + D + B (kd + h kp) B' for the inputs that are not clipped, and
 q' = q + h N(q) v'. Only r is differentiated by AutoDiffXd, at Drake's own v', which costs a third of a whole step.
-r(v') = 0 is checked first, in both scalar types: where it does not hold, something else acts.
+r(v') = 0 is checked: where it does not hold, something else acts, or the AutoDiffXd plant is not the double one.
 """
 
 from dataclasses import dataclass
@@ -20,11 +20,11 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.autodiffutils import AutoDiffXd, InitializeAutoDiff
+from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 from pydrake.multibody.tree import MultibodyForces_
 
 from drake_diff.arrays import Array
-from drake_diff.autodiff import gradient_rows, plain
+from drake_diff.autodiff import gradient_rows
 from drake_diff.exceptions import GradientError
 from drake_diff.model import Model
 from drake_diff.parameters import ParameterVector, write_autodiff
@@ -38,27 +38,6 @@ RESIDUAL_TOLERANCE = 1e-9
 
 class NotSmoothError(GradientError):
     """The step is not the one that the implicit form describes."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Inputs:
-    """What the actuators do to the generalized forces: each drives one velocity."""
-
-    velocity: Array  # (nu,) the index of the velocity, and of ...
-    position: Array  # ... the position
-    limit: Array
-    kp: Array
-    kd: Array
-    reference: Array  # (nu, 2)
-
-    def effort(self, q: Any, v_next: Array, u: Any, h: float) -> tuple[Any, NDArray[np.bool_]]:
-        """(nu,) the net effort, and whether it is free of its limit."""
-        q_next = q[self.position] + h * v_next[self.velocity]
-        wanted = (
-            u - self.kp * (q_next - self.reference[:, 0]) - self.kd * (v_next[self.velocity] - self.reference[:, 1])
-        )
-        free = np.abs(plain(wanted)) < self.limit
-        return np.where(free, wanted, np.clip(plain(wanted), -self.limit, self.limit)), free
 
 
 def why_not_implicit(model: Model) -> str:
@@ -78,66 +57,74 @@ def why_not_implicit(model: Model) -> str:
 def implicit_jacobian(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array:
     """(nx, nx + nu + np) the derivative of the step by [x; u; parameters]; differenced parameters have zeros.
 
-    `model` has the vector applied. Raises NotSmoothError where something else than smooth forces acts.
+    The vector is applied to `model`, whose double twin stands at the step from (x, u) to `x_next`, as
+    `step.advance` leaves it. Raises NotSmoothError where something else than smooth forces acts.
     """
-    form = _form_of(model)
+    form, twin, nq, nx, h = _form_of(model), model.double, model.nq, model.nx, model.time_step
     if form.excluded:
         raise NotSmoothError(form.excluded)
-    inputs, v_next = form.inputs(), x_next[model.nq :]
-    set_state(model.double, x)
-    residual, free, size = _residual(model.double, inputs, x, v_next, u, model)
-    _check_vanishes(residual, size)
-    end = model.nx + model.nu
-    variables = InitializeAutoDiff(np.concatenate([x, u, vector.values])).ravel()
-    write_autodiff(vector, model, variables[end:])
-    twin = model.autodiff
-    set_state(twin, variables[: model.nx])
-    residual, _, _ = _residual(twin, inputs, variables[: model.nx], v_next, variables[model.nx : end], model)
-    _check_vanishes(plain(residual), size)
-    by_point = gradient_rows(residual, len(variables))
-    acceleration_part = model.plant.CalcMassMatrix(model.double.context) / model.time_step
-    by_point[:, model.nq : model.nx] -= acceleration_part  # through (v' - v) / h
-    pd = np.zeros(model.nv)
-    np.add.at(pd, inputs.velocity, np.where(free, inputs.kd + model.time_step * inputs.kp, 0.0))
-    by_next = acceleration_part + np.diag(model.double.damping() + pd)
+    if form.can_touch and _touches(twin):
+        raise NotSmoothError("geometries touch")
+    v_next = x_next[nq:]
+    change, damping = v_next - x[nq:], twin.damping()
+    kp, kd = form.gains()
+    effort = u - kp * (x[form.position] + h * v_next[form.velocity] - form.reference[0])
+    effort -= kd * (v_next[form.velocity] - form.reference[1])
+    free = np.abs(effort) < form.limit
+    applied = form.actuation @ np.clip(effort, -form.limit, form.limit)
+
+    variables = InitializeAutoDiff(np.concatenate([x, vector.values])).ravel()
+    write_autodiff(vector, model, variables[nx:])
+    set_state(model.autodiff, variables[:nx])
+    needed = _needed(model.autodiff, np.array([AutoDiffXd(a) for a in change / h])).reshape(-1, 1)
+    _check_vanishes(ExtractValue(needed).ravel(), damping * change - applied)
+    rows = gradient_rows(needed, len(variables))
+    if vector.parameters:
+        rows = rows + gradient_rows(model.autodiff.damping() * change, len(variables))
+    pressed = form.actuation * free  # (nv, nu) what an input that is not at its limit does
+    by_point = np.concatenate([rows[:, :nx], -pressed, rows[:, nx:]], axis=1)
+    by_next = model.plant.CalcMassMatrix(twin.context) / h
+    by_next[form.diagonal] += damping
+    by_point[:, nq:nx] -= by_next  # through (v' - v) / h and D (v' - v)
+    if form.pd:
+        by_point[:, form.position] += pressed * kp
+        by_next += (pressed * (kd + h * kp)) @ form.actuation.T
     velocities = -np.linalg.solve(by_next, by_point)
-    return np.vstack([_positions(model, twin, v_next, velocities, len(variables)), velocities])
+    return np.concatenate([_positions(model, v_next, velocities, len(vector.values)), velocities])
 
 
-def _positions(model: Model, twin: Twin, v_next: Array, velocities: Array, width: int) -> Array:
-    """(nq, width) the derivative of q' = q + h N(q) v'."""
-    own = np.eye(model.nq, width)
-    if model.nq == model.nv:
-        return own + model.time_step * velocities
-    qdot = twin.plant.MapVelocityToQDot(twin.context, np.array([AutoDiffXd(v) for v in v_next]))
-    n = np.array([model.plant.MapVelocityToQDot(model.double.context, e) for e in np.eye(model.nv)]).T
-    return own + model.time_step * (gradient_rows(np.asarray(qdot), width) + n @ velocities)
+def _touches(twin: Twin) -> bool:
+    contacts = twin.plant.get_contact_results_output_port().Eval(twin.context)
+    return bool(contacts.num_point_pair_contacts() or contacts.num_hydroelastic_contacts())
 
 
-def _residual(
-    twin: Twin, inputs: _Inputs, x: Any, v_next: Array, u: Any, model: Model
-) -> tuple[Any, NDArray[np.bool_], float]:
-    """(nv,) r, the inputs that are free of their limits, and the size of the forces in it, in the twin's state."""
-    plant, context = twin.plant, twin.context
-    forces = MultibodyForces_[twin.scalar](plant)
-    plant.CalcForceElementsContribution(context, forces)
+def _needed(twin: Twin, acceleration: Any) -> Any:
+    """(nv,) M a + bias less gravity, springs, damping and added forces, in the twin's state."""
+    forces = MultibodyForces_[twin.scalar](twin.plant)
+    twin.plant.CalcForceElementsContribution(twin.context, forces)
     if twin.added:
         forces.mutable_generalized_forces()[:] = forces.generalized_forces() + twin.added_force()
-    v = plain(x[model.nq :])
-    acceleration = ((v_next - v) / model.time_step).astype(twin.scalar)
-    efforts, free = inputs.effort(x[: model.nq], v_next, u, model.time_step)
-    applied = np.zeros(model.nv).astype(twin.scalar)
-    np.add.at(applied, inputs.velocity, efforts)
-    needed = plant.CalcInverseDynamics(context, acceleration, forces)
-    residual = needed + twin.damping() * (v_next - x[model.nq :]) - applied
-    size = float(max(np.abs(plain(needed)).max(), np.abs(plain(applied)).max(initial=0.0), 1.0))
-    return residual, free, size
+    return twin.plant.CalcInverseDynamics(twin.context, acceleration, forces)
 
 
-def _check_vanishes(residual: Array, size: float) -> None:
-    worst = float(np.abs(residual).max())
-    if not worst <= RESIDUAL_TOLERANCE * size:
+def _check_vanishes(needed: Array, rest: Array) -> None:
+    worst = float(np.abs(needed + rest).max())
+    if not worst <= RESIDUAL_TOLERANCE * max(float(np.abs(needed).max()), float(np.abs(rest).max()), 1.0):
         raise NotSmoothError(f"contact, a joint limit or a constraint acts: {worst:.3g} N or N m are not accounted for")
+
+
+def _positions(model: Model, v_next: Array, velocities: Array, num_parameters: int) -> Array:
+    """(nq, nx + nu + np) the derivative of q' = q + h N(q) v'; the AutoDiffXd twin stands at the step's state."""
+    if model.nq == model.nv:
+        moved = model.time_step * velocities
+        moved[_form_of(model).diagonal] += 1.0
+        return np.asarray(moved)
+    own = np.eye(model.nq, velocities.shape[1])
+    twin = model.autodiff
+    q_dot = np.asarray(twin.plant.MapVelocityToQDot(twin.context, np.array([AutoDiffXd(v) for v in v_next])))
+    own[:, : model.nx] += model.time_step * gradient_rows(q_dot, model.nx + num_parameters)[:, : model.nx]
+    n = np.array([model.plant.MapVelocityToQDot(model.double.context, e) for e in np.eye(model.nv)]).T
+    return np.asarray(own + model.time_step * n @ velocities)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,16 +133,21 @@ class _Form:
 
     excluded: str  # why the form describes no step of the model; empty where it may
     actuators: list[Any]
-    velocity: Array
-    position: Array
+    velocity: NDArray[np.int64]  # (nu,) the index in v of the joint that an input drives, and in q
+    position: NDArray[np.int64]
+    actuation: Array  # (nv, nu)
     limit: Array
-    reference: Array
+    reference: Array  # (2, nu) the positions and velocities that PD control holds
+    diagonal: tuple[NDArray[np.int64], NDArray[np.int64]]  # of (nv, nv)
+    pd: bool
+    can_touch: bool
 
-    def inputs(self) -> _Inputs:
+    def gains(self) -> tuple[Array, Array]:
+        """kp (nu,) and kd (nu,), zero where there is no controller; they may change as parameters do."""
+        if not self.pd:
+            return np.zeros(len(self.actuators)), np.zeros(len(self.actuators))
         gains = [a.get_controller_gains() if a.has_controller() else None for a in self.actuators]
-        kp = np.array([g.p if g else 0.0 for g in gains])
-        kd = np.array([g.d if g else 0.0 for g in gains])
-        return _Inputs(self.velocity, self.position, self.limit, kp, kd, self.reference)
+        return np.array([g.p if g else 0.0 for g in gains]), np.array([g.d if g else 0.0 for g in gains])
 
 
 _FORMS: WeakKeyDictionary[Model, _Form] = WeakKeyDictionary()
@@ -164,23 +156,29 @@ _FORMS: WeakKeyDictionary[Model, _Form] = WeakKeyDictionary()
 def _form_of(model: Model) -> _Form:
     if model not in _FORMS:
         found = actuators(model.plant)
+        velocity = np.array([a.joint().velocity_start() for a in found], dtype=int)
+        actuation = np.zeros((model.nv, len(found)))
+        actuation[velocity, np.arange(len(found))] = 1.0
         _FORMS[model] = _Form(
             excluded=why_not_implicit(model),
             actuators=found,
-            velocity=np.array([a.joint().velocity_start() for a in found], dtype=int),
+            velocity=velocity,
             position=np.array([a.joint().position_start() for a in found], dtype=int),
+            actuation=actuation,
             limit=np.array([a.effort_limit() for a in found], dtype=float),
             reference=_references(model, found),
+            diagonal=np.diag_indices(model.nv),
+            pd=any(a.has_controller() for a in found),
+            can_touch=model.contract.contact.collision_pairs > 0,
         )
     return _FORMS[model]
 
 
 def _references(model: Model, found: list[Any]) -> Array:
-    """(nu, 2) the position and velocity that PD control holds; zero where there is none."""
-    references = np.zeros((len(found), 2))
+    references = np.zeros((2, len(found)))
     for instance, target in model.pd_targets.items():
         driven = [i for i, a in enumerate(found) if a.model_instance() == instance]
-        references[driven] = np.asarray(target).reshape(2, len(driven)).T
+        references[:, driven] = np.asarray(target).reshape(2, len(driven))
     return references
 
 

@@ -15,6 +15,7 @@ from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_diff.arrays import finite_array, positive_float
+from drake_diff.contact_geometry import ROUTES, replace_collision_geometry
 from drake_diff.contract import Contract
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, UnknownNameError
 from drake_diff.model_file import read_into
@@ -54,11 +55,13 @@ class Model:
         *,
         source: Path | None,
         notes: tuple[str, ...] = (),
+        contact_geometry: str | None = None,
         rebuild: "Callable[[float], Model] | None" = None,
     ):
         self.diagram = diagram
         self.source = source
         self.notes = notes
+        self.contact_geometry = contact_geometry  # the route around refused pairs that the user chose
         self._rebuild = rebuild
         self._others: dict[float, Model] = {}  # the same model at other time steps
         self.path = path_to_the_plant(diagram)
@@ -180,6 +183,7 @@ def load_model(
     time_step: float,
     contact_model: str = "point",
     contact_approximation: str = "sap",
+    contact_geometry: str | None = None,
     weld_base: str | None = None,
     ground: float | None = None,
     gravity: tuple[float, float, float] | None = None,
@@ -187,9 +191,13 @@ def load_model(
     """The robot in a URDF, SDF, MJCF (.xml) or .dmd.yaml file as a discrete model.
 
     `time_step` [s]; `contact_model` is one of point, hydroelastic, hydroelastic_with_fallback;
-    `contact_approximation` one of sap, similar, lagged (sap's Jacobians are the tamest by far). `weld_base`
-    names a link to fix to the world, `ground` is the friction [1] of a half space z <= 0 to add, `gravity`
-    [m/s^2] replaces Drake's (0, 0, -9.81).
+    `contact_approximation` one of sap, similar, lagged (sap's Jacobians are the tamest by far).
+    `contact_geometry` is what to do about pairs of shapes that AutoDiffXd refuses (a box on the ground in point
+    contact): "corner_spheres" puts spheres in the place of boxes, cylinders and capsules that move, "hydroelastic"
+    makes all geometries compliant (with a hydroelastic `contact_model`), "differences" says that differences are
+    wanted; without it they are taken too, and `audit` calls the pair an error. `weld_base` names a link to fix to
+    the world, `ground` is the friction [1] of a half space z <= 0 to add, `gravity` [m/s^2] replaces Drake's
+    (0, 0, -9.81).
 
     Raises InputError (missing file, unknown kind, bad option) or ModelError (Drake cannot read it); what Drake
     or we left out of the file (meshes of a format that Drake cannot use, ...) is a ModelWarning and stays in
@@ -198,6 +206,8 @@ def load_model(
     time_step = positive_float("time_step [s]", time_step)
     _check_choice("contact_model", contact_model, CONTACT_MODELS)
     _check_choice("contact_approximation", contact_approximation, CONTACT_APPROXIMATIONS)
+    if contact_geometry is not None:
+        _check_choice("contact_geometry", contact_geometry, ROUTES)
     config = MultibodyPlantConfig(
         time_step=time_step,
         contact_model=contact_model,
@@ -205,7 +215,7 @@ def load_model(
         use_sampled_output_ports=False,  # sampled ports turn the update into one that cannot be evaluated alone
     )
     builder = DiagramBuilder()
-    plant, _ = AddMultibodyPlant(config, builder)
+    plant, scene_graph = AddMultibodyPlant(config, builder)
     source = Path(path)
     notes = read_into(plant, source)
     if notes:
@@ -214,6 +224,8 @@ def load_model(
         plant.WeldFrames(plant.world_frame(), named("link", bodies(plant), weld_base).body_frame())
     if ground is not None:
         _add_ground(plant, ground)
+    if contact_geometry is not None:
+        notes += replace_collision_geometry(plant, scene_graph, contact_geometry)
     if gravity is not None:
         plant.mutable_gravity_field().set_gravity_vector(finite_array("gravity", gravity, (3,)))
     try:
@@ -228,12 +240,13 @@ def load_model(
             time_step=other,
             contact_model=contact_model,
             contact_approximation=contact_approximation,
+            contact_geometry=contact_geometry,
             weld_base=weld_base,
             ground=ground,
             gravity=gravity,
         )
 
-    return Model(diagram, source=source, notes=notes, rebuild=rebuild)
+    return Model(diagram, source=source, notes=notes, contact_geometry=contact_geometry, rebuild=rebuild)
 
 
 def model_from_diagram(diagram: Diagram) -> Model:

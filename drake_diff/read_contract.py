@@ -159,6 +159,7 @@ def _read_contact(model: Model) -> Contact:
             model.plant.get_contact_model().name, "hydroelastic_with_fallback"
         ),
         approximation=model.plant.get_discrete_contact_approximation().name.removeprefix("k").lower(),
+        geometry=model.contact_geometry or "as modelled",
         collision_pairs=len(inspector.GetCollisionCandidates()) if inspector is not None else 0,
         solver_relative_tolerance=SAP_RELATIVE_TOLERANCE,
         sap_near_rigid_threshold=float(model.plant.get_sap_near_rigid_threshold()),

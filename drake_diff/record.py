@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-SCHEMA_VERSION = "0.1.0"
+SCHEMA_VERSION = "0.2.0"
 
 
 class _Part(BaseModel):
@@ -42,6 +42,19 @@ class GradientEvidence(_Part):
     entries: int
     counts: dict[str, int]
     worst: str | None
+
+
+class ParameterEvidence(_Part):
+    """One entry of the parameter vector: where it started, what was found, where its derivative came from."""
+
+    name: str
+    unit: str
+    derivative_source: str
+    start: float
+    value: float
+    optimized: bool
+    lower: float | None
+    upper: float | None
 
 
 class Failure(_Part):
@@ -101,6 +114,7 @@ class EvidenceRecord(_Part):
     problem: dict[str, Any]
     contract: dict[str, Any]
     solver: Solver | None = None
+    parameters: list[ParameterEvidence] = []
     checks: list[Check] = []
     gradients: list[GradientEvidence] = []
     gradient_norms: list[float] = []
@@ -121,6 +135,43 @@ class EvidenceRecord(_Part):
             "metric": "; ".join(metrics),
             "perturbation": "none",
         }
+
+    def to_json(self) -> str:
+        """The record as JSON with sorted keys; the same record gives the same bytes."""
+        return json.dumps(self.model_dump(mode="json"), sort_keys=True, indent=2, allow_nan=False) + "\n"
+
+
+class StateEvidence(_Part):
+    """The certificate of one sampled state of a model."""
+
+    kind: Literal["free", "contact"]
+    x: list[float]
+    u: list[float]
+    gradient: GradientEvidence | None
+    refusal: str | None = None  # why there is no certificate
+    largest: float | None = None  # the largest entry of the derivative
+    contact_modes: dict[str, str] = {}  # of the pairs that push each other
+    mode_changes: list[str] = []  # within 1e-4 of the state
+
+    @property
+    def verdict(self) -> str:
+        """The certificate's, or "refused"."""
+        return self.gradient.verdict if self.gradient else "refused"
+
+
+class CertificationRecord(_Part):
+    """Certificates of a model at sampled states."""
+
+    schema_version: str = SCHEMA_VERSION
+    name: str
+    verdict: Literal["pass", "fail", "incomplete"]
+    sentence: str
+    seed: int
+    parameters: list[str]
+    contract: dict[str, Any]
+    states: list[StateEvidence]
+    provenance: Provenance
+    wall_clock: WallClock
 
     def to_json(self) -> str:
         """The record as JSON with sorted keys; the same record gives the same bytes."""

@@ -106,7 +106,7 @@ def test_a_nan_goal_is_free(load):
         ({"bounds": dd.Bounds(u_lower=[30.0])}, r"bounds of force: .*got \[30, 20\]"),
         ({"bounds": dd.Bounds(x_lower=[0.0])}, "x_lower: expected shape"),
         ({"optimize": ()}, "optimize"),
-        ({"optimize": ("everything",)}, "optimize: expected one of controls, initial_state, got 'everything'"),
+        ({"optimize": ("everything",)}, "controls, initial_state, parameters, got 'everything'"),
         ({"optimize": "initial_state", "initial_state_mask": [True]}, "initial_state_mask: expected shape"),
         ({"optimize": "initial_state", "initial_state_mask": [1, 0, 0, 0]}, "booleans"),
         ({"optimize": "initial_state", "initial_state_mask": [False] * 4}, "at least one free entry"),

@@ -9,19 +9,20 @@ import drake_diff
 
 PACKAGE = Path(drake_diff.__file__).parent
 PUBLIC = """
-ArtifactError Barrier Bounds Certificate CertificateError Contract DrakeDiffError EvidenceRecord Gaussian
-GradientError InputError LQR MissingDependencyError Model ModelError ModelWarning NonFiniteError PD ParametricPolicy
-Problem QuadraticCost Rollout RolloutGradient ShapeError SimulationError Smoothed Solution Status StepDerivatives
-TVLQR UnknownNameError certify certify_jacobian certify_rollout differentiate_rollout differentiate_step
-list_parameters load_model load_record model_from_diagram rollout save smooth smooth_step solve step
+ArtifactError Barrier Bounds Certificate CertificateError CertificationRecord Contract DrakeDiffError EvidenceRecord
+Finding Gaussian GradientError InputError LQR MissingDependencyError Model ModelError ModelWarning NonFiniteError PD
+ParametricPolicy Problem QuadraticCost Rollout RolloutCertificate RolloutGradient ShapeError SimulationError Smoothed
+Solution Status StepDerivatives TVLQR UnknownNameError audit certify certify_jacobian certify_model certify_rollout
+contact_modes differentiate_rollout differentiate_step list_parameters load_model load_record model_from_diagram
+rollout save smooth smooth_step solve step
 """.split()
 ORDER = """
 exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin
 model read_contract tangent inertia parameter_kinds contact_parameters parameters parameter_coordinates step
-finite_difference implicit step_derivatives smoothing policy contact certificate rollout rollout_gradient certify
-continuous cost problem
+finite_difference implicit step_derivatives smoothing policy contact mode_changes certificate
+rollout rollout_gradient refinement certify continuous cost problem
 solution nonlinear_program collocation shooting ilqr verdict solver mcap_messages mcap_log trace meshcat_view record
-evidence cli
+provenance evidence sampling certification audit cli
 """.split()
 
 

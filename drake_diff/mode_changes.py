@@ -1,0 +1,87 @@
+"""Where the contact mode of a step changes beside the point at which it is differentiated."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_diff.arrays import Array
+from drake_diff.contact import SEPARATED, Pair, active_modes
+from drake_diff.model import Model
+
+# How far, in scaled coordinates, the neighbourhood reaches.
+NEIGHBOURHOOD = 1e-4
+# A row is touched where its change departs from the derivative's by this part of the larger one.
+TOUCHED = 1e-2
+
+
+@dataclass(frozen=True)
+class ModeChange:
+    """One pair's mode here and where one column is displaced, and the rows that the derivative misses there."""
+
+    pair: Pair
+    before: str
+    after: str
+    column: str
+    displacement: float  # in the column's own unit
+    rows: tuple[str, ...]
+
+    def __str__(self) -> str:
+        touched = f", which touches d({', '.join(self.rows)})/d{self.column}" if self.rows else ""
+        return (
+            f"{self.pair[0]} and {self.pair[1]}: {self.before} here, {self.after} where {self.column} "
+            f"is {self.displacement:+.3g}{touched}"
+        )
+
+
+def find_mode_changes(
+    model: Model,
+    f: Callable[[Array], Array],
+    derivative: Array,
+    *,
+    rows: tuple[str, ...],
+    columns: tuple[str, ...],
+    scale: Array,
+    minus: Callable[[Array, Array], Array],
+) -> tuple[ModeChange, ...]:
+    """Displace each of the `columns` by 1e-4 of its scale to both sides and compare the modes of the step `f`.
+
+    `f` takes a scaled displacement (n,) and leaves the double twin at the step; `derivative` (m, n) is by it.
+    """
+    centre = f(np.zeros(derivative.shape[1]))
+    here = active_modes(model)
+    return tuple(
+        change
+        for j in range(len(columns))
+        for sign in (1.0, -1.0)
+        for change in _along(model, f, derivative, rows, columns, scale, minus, centre, here, j, sign)
+    )
+
+
+def _along(
+    model: Model,
+    f: Callable[[Array], Array],
+    derivative: Array,
+    rows: tuple[str, ...],
+    columns: tuple[str, ...],
+    scale: Array,
+    minus: Callable[[Array, Array], Array],
+    centre: Array,
+    here: dict[Pair, str],
+    j: int,
+    sign: float,
+) -> Iterator[ModeChange]:
+    step = sign * NEIGHBOURHOOD * np.eye(derivative.shape[1])[j]
+    change = minus(f(step), centre)
+    there = active_modes(model)
+    differ = sorted(pair for pair in here.keys() | there.keys() if here.get(pair) != there.get(pair))
+    if not differ:
+        return
+    predicted = derivative @ step
+    size = np.maximum(np.abs(predicted), np.abs(change))
+    missed = np.abs(change - predicted) > TOUCHED * np.maximum(size, 1e-6 * size.max(initial=0.0))
+    touched = tuple(name for name, miss in zip(rows, missed, strict=True) if miss)
+    for pair in differ:
+        yield ModeChange(
+            pair, here.get(pair, SEPARATED), there.get(pair, SEPARATED), columns[j], float(step[j] * scale[j]), touched
+        )
