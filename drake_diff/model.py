@@ -64,6 +64,7 @@ class Model:
         self.contact_geometry = contact_geometry  # the route around refused pairs that the user chose
         self._rebuild = rebuild
         self._others: dict[float, Model] = {}  # the same model at other time steps
+        self.has_other_parameters = False  # in its contexts, for the time being: see `parameters.applied`
         self.path = path_to_the_plant(diagram)
         self.plant: MultibodyPlant = follow(diagram, self.path)
         _check_plant(self)

@@ -234,8 +234,10 @@ def applied(vector: ParameterVector) -> Iterator[Model]:
     model = vector.model if h == vector.model.time_step else vector.model.at_time_step(h)
     try:
         vector.write(model.double, vector.values)
+        model.has_other_parameters = True
         yield model
     finally:
+        model.has_other_parameters = False
         vector.restore(model.double)
         if "autodiff" in vars(model):  # made on the way, or before
             vector.restore(model.autodiff)
@@ -243,6 +245,6 @@ def applied(vector: ParameterVector) -> Iterator[Model]:
 
 def write_autodiff(vector: ParameterVector, model: Model, variables: Any) -> None:
     """Set the AutoDiffXd twin of a model that the vector is applied to: `variables` (np,) AutoDiffXd."""
-    if vector.parameters:
+    if model.has_other_parameters:
         model.autodiff.root_context.SetTimeStateAndParametersFrom(model.double.root_context)
         vector.write(model.autodiff, variables)

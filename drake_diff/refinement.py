@@ -5,7 +5,7 @@ discrete motion can be 10 to 400 times that of the motion it stands for. So the 
 and h/4 (at k, 4 k and 16 k, a compliant contact being off by 1/sqrt(k)). Its error being of first order in h, two
 changes d1 and d2 of it have |d2| about |d1| / 2, and its limit is g3 + d2. An entry has
 
-    converged   where |d2| <= 0.75 |d1|, or both are negligible, and the first value is within 10 % of the limit.
+    converged   where |d2| <= 0.75 |d1| and the first value is within 10 % of the limit, or both are below 1 %.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from drake_diff.arrays import Array, frozen
 from drake_diff.exceptions import InputError
 from drake_diff.model import Model
-from drake_diff.parameters import TIME_STEP, ParameterVector
+from drake_diff.parameters import TIME_STEP, ParameterVector, applied, select
 from drake_diff.rollout_gradient import Loss, RolloutGradient, differentiate_rollout, takes_one_argument
 from drake_diff.tangent import tangent_space
 
@@ -25,7 +25,8 @@ REFINEMENTS = (1, 2, 4)
 STIFFENING = (1, 4, 16)
 CONTRACTION = 0.75
 TRUSTED = 0.1  # how far from its limit a gradient may be, relative to it
-NEGLIGIBLE = 1e-3  # changes and entries below this part of the largest are not judged
+STILL = 1e-2  # changes below this part tell no rate
+NEGLIGIBLE = 1e-3  # entries below this part of the largest are judged by its measure
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,14 +86,16 @@ def stiffened(
     Raises InputError where it states none.
     """
     stiffness = _stated_stiffness(model)
+    named = sorted(stiffness.keys() & vector.to_dict().keys())
+    if named:
+        raise InputError("parameters", got=named[0], expected="others, as refine_stiffness=True changes it")
     if not stiffness:
         raise InputError("refine_stiffness", got="a model that states no point stiffness", expected="one that does")
     values = []
     for factor in STIFFENING:
-        stiffer = {**{name: factor * k for name, k in stiffness.items()}, **vector.to_dict()}
-        gradient = differentiate_rollout(model, x0, us, loss, parameters=stiffer, method=method)
-        own = [gradient.parameter_names.index(name) for name in vector.names]
-        values.append(_flat(model, x0, gradient, us.shape, 1, own))
+        with applied(select(model, {name: factor * k for name, k in stiffness.items()})) as stiffer:
+            gradient = differentiate_rollout(stiffer, x0, us, loss, parameters=vector.to_dict(), method=method)
+        values.append(_flat(model, x0, gradient, us.shape, 1))
     return _judge("stiffness, times", tuple(map(float, STIFFENING)), columns, np.array(values), model, us)
 
 
@@ -109,13 +112,11 @@ def _coarse(loss: Loss, m: int) -> Loss:
     return lambda xs, us: loss(xs[::m], us[::m])
 
 
-def _flat(
-    model: Model, x0: Array, g: RolloutGradient, shape: tuple[int, ...], m: int, own: Sequence[int] | None = None
-) -> Array:
+def _flat(model: Model, x0: Array, g: RolloutGradient, shape: tuple[int, ...], m: int) -> Array:
     """[by x0 on the tangent space; by each held input; by parameters]."""
     by_x0 = g.x0 @ tangent_space(model).derivative_of_plus(x0)
     by_us = g.us.reshape(shape[0], m, shape[1]).sum(axis=1).ravel()
-    return np.concatenate([by_x0, by_us, g.parameters if own is None else g.parameters[list(own)]])
+    return np.concatenate([by_x0, by_us, g.parameters])
 
 
 def _judge(
@@ -132,7 +133,7 @@ def _judge(
         typical = np.sqrt((by_input**2).mean(axis=0))
         scale[inputs] = np.maximum(by_input, typical).ravel()
     contracts = np.abs(second) <= CONTRACTION * np.abs(first)
-    still = np.maximum(np.abs(first), np.abs(second)) <= NEGLIGIBLE * scale
+    still = np.maximum(np.abs(first), np.abs(second)) <= STILL * scale
     near = np.abs(values[0] - limit) <= TRUSTED * scale
     converged = ((contracts & near) | still) & np.all(np.isfinite(values), axis=0)
     return Refinement(by, levels, tuple(columns), frozen(values), frozen(limit), converged)

@@ -1,0 +1,118 @@
+"""Contact modes from Drake's own forces, and where they change beside a step."""
+
+import numpy as np
+import pytest
+from conftest import Plant, contact_properties
+from pydrake.geometry import AddCompliantHydroelasticProperties, AddRigidHydroelasticProperties, Box
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import SpatialInertia
+
+import drake_diff as dd
+
+G, K, MU, H = 9.81, 1e4, 0.5, 0.01
+REST = 0.1 - G / K  # [m] of a ball of 1 kg on a ground, both of stiffness 2 K
+PAIR = ("ball/ball", "world/ground")
+
+
+def pushed_ball(approximation, mu=MU):
+    """A ball on slides along x and z over the ground, pushed along x."""
+    plant = Plant(H, approximation)
+    plant.ball("ball", 1.0, 0.1, contact_properties(2 * K, 0.0, mu, 0.0), "x", "z")
+    plant.ground(contact_properties(2 * K, 0.0, mu, 0.0))
+    plant.plant.AddJointActuator("push", plant.plant.GetJointByName("ball_x"))
+    return plant.model()
+
+
+@pytest.mark.parametrize("approximation", ["sap", "similar", "lagged"])
+@pytest.mark.parametrize("mu", [0.3, 0.5])
+def test_a_push_below_the_friction_limit_sticks_and_one_above_slides(approximation, mu):
+    """A18: the limit is mu m g."""
+    model, x = pushed_ball(approximation, mu), [0.0, REST, 0.0, 0.0]
+    assert dd.contact_modes(model, x, [0.5 * mu * G]) == {PAIR: "sticking"}
+    assert dd.contact_modes(model, x, [-0.5 * mu * G]) == {PAIR: "sticking"}
+    assert dd.contact_modes(model, x, [1.3 * mu * G]) == {PAIR: "sliding"}
+
+
+@pytest.mark.parametrize("approximation", ["sap", "similar", "lagged"])
+def test_a_ball_in_the_air_is_separated_and_so_is_one_that_leaves(approximation):
+    model = pushed_ball(approximation)
+    assert dd.contact_modes(model, [0.0, 0.2, 0.0, 0.0], [0.0]) == {PAIR: "separated"}
+    # Overlapping by 1e-5 m and leaving at 1 m/s, it is out within the step.
+    assert dd.contact_modes(model, [0.0, 0.1 - 1e-5, 0.0, 1.0], [0.0]) == {PAIR: "separated"}
+
+
+def test_without_friction_every_contact_slides():
+    assert dd.contact_modes(pushed_ball("sap", 0.0), [0.0, REST, 0.0, 0.0], [0.0]) == {PAIR: "sliding"}
+
+
+def test_every_candidate_pair_is_listed():
+    plant = Plant(H)
+    for i, name in enumerate("abc"):
+        plant.ball(name, 1.0, 0.1, contact_properties(2 * K, 0.0, MU, 0.0), "xyz"[i])
+    model = plant.model()
+    modes = dd.contact_modes(model, [0.0] * 3 + [0.0] * 3)  # all three at the origin
+    assert list(modes) == [("a/a", "b/b"), ("a/a", "c/c"), ("b/b", "c/c")]
+    far = dd.contact_modes(model, [1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
+    assert set(far.values()) == {"separated"}
+
+
+def test_a_model_without_geometry_has_no_modes(load):
+    assert dd.contact_modes(load("pendulum.urdf"), [0.1, 0.0], [0.0]) == {}
+
+
+@pytest.mark.parametrize(("push", "mode"), [(0.0, "sticking"), (3.0 * MU * G, "sliding")])
+def test_a_hydroelastic_patch_has_a_mode_too(push, mode):
+    plant = Plant(H, "sap", "hydroelastic")
+    body = plant.plant.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(1.0, 0.2, 0.2, 0.2))
+    soft, hard = contact_properties(K, 0.0, MU, 0.0), contact_properties(K, 0.0, MU, 0.0)
+    AddCompliantHydroelasticProperties(0.1, 1e6, soft)
+    AddRigidHydroelasticProperties(0.1, hard)
+    plant.shape(body, Box(0.2, 0.2, 0.2), soft)
+    plant.ground(hard)
+    plant.plant.mutable_gravity_field().set_gravity_vector([push, 0, -G])  # pushed by tilting gravity
+    model = plant.model()
+    x = model.default_state
+    x[6] = 0.1 - 1e-5
+    for _ in range(40):
+        x = dd.step(model, x)
+    assert dd.contact_modes(model, x) == {("box/box_shape", "world/ground"): mode}
+
+
+def test_a_change_of_mode_beside_the_step_is_named_with_the_entries_it_touches():
+    """The ball hangs 5e-5 m over the ground at the end of the step's start: 1e-4 m lower it touches."""
+    model = pushed_ball("lagged")
+    certificate = dd.certify(model, [0.0, 0.1 + 5e-5, 0.0, 0.0], [0.0])
+    changes = certificate.mode_changes
+    assert [(c.pair, c.before, c.after, c.column) for c in changes] == [(PAIR, "separated", "sticking", "ball_z_x")]
+    assert changes[0].displacement == -1e-4
+    assert set(changes[0].rows) == {"ball_z_x", "ball_z_v"}
+    assert "contact changes nearby" in str(certificate)
+    assert "touches d(ball_z_x, ball_z_v)/dball_z_x" in str(changes[0])
+
+
+def test_at_the_edge_of_friction_the_push_changes_the_mode():
+    """sap: at 0.3 N short of mu m g no change within 1e-4 N, at the limit one."""
+    model, x = pushed_ball("sap"), [0.0, REST, 0.0, 0.0]
+    limit = next(u for u in np.arange(4.0, 6.0, 1e-4) if dd.contact_modes(model, x, [u])[PAIR] == "sliding")
+    assert limit == pytest.approx(MU * G, rel=0.02)  # sap's regularization
+    columns = {c.column for c in dd.certify(model, x, [limit]).mode_changes}
+    assert "push" in columns
+    assert not dd.certify(model, x, [limit - 0.3]).mode_changes
+
+
+def test_no_change_is_reported_where_there_is_none():
+    assert dd.certify(pushed_ball("sap"), [0.0, REST, 0.5, 0.0], [0.0]).mode_changes == ()
+    assert dd.certify(pushed_ball("sap"), [0.0, 0.3, 0.5, 0.0], [0.0]).mode_changes == ()
+
+
+def test_ground_by_name_where_it_was_registered_by_hand():
+    plant = Plant(H)
+    body = plant.plant.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(1.0, 0.2, 0.2, 0.2))
+    plant.plant.RegisterCollisionGeometry(
+        body, RigidTransform(), Box(0.2, 0.2, 0.2), "skin", contact_properties(K, 0.0, MU, 0.0)
+    )
+    plant.ground(contact_properties(K, 0.0, MU, 0.0))
+    model = plant.model()
+    x = model.default_state
+    x[6] = 0.0999
+    assert dd.contact_modes(model, x) == {("box/skin", "world/ground"): "sticking"}

@@ -1,0 +1,204 @@
+"""Gradients that equal differences and are wrong about the physics, and those that are right: h, h/2, h/4."""
+
+import numpy as np
+import pytest
+from conftest import Plant, contact_properties
+
+import drake_diff as dd
+
+BALL = """<sdf version="1.9"><model name="bouncer"><link name="ball"><inertial><mass>{mass}</mass>
+<inertia><ixx>1</ixx><iyy>1</iyy><izz>1</izz></inertia></inertial><collision name="skin">
+<geometry><sphere><radius>0.1</radius></sphere></geometry>
+<drake:proximity_properties xmlns:drake="http://drake.mit.edu">
+<drake:point_contact_stiffness>{stiffness}</drake:point_contact_stiffness>
+<drake:hunt_crossley_dissipation>0</drake:hunt_crossley_dissipation></drake:proximity_properties></collision></link>
+<link name="floor"><collision name="top"><geometry><plane><normal>0 0 1</normal></plane></geometry>
+<drake:proximity_properties xmlns:drake="http://drake.mit.edu">
+<drake:point_contact_stiffness>{stiffness}</drake:point_contact_stiffness>
+<drake:hunt_crossley_dissipation>0</drake:hunt_crossley_dissipation></drake:proximity_properties></collision></link>
+<joint name="weld" type="fixed"><parent>world</parent><child>floor</child></joint>
+<joint name="slide" type="prismatic"><parent>world</parent><child>ball</child><axis><xyz>0 0 1</xyz><limit><effort>0</effort></limit></axis>
+</joint>
+</model></sdf>"""
+
+
+@pytest.fixture
+def bouncer(tmp_path):
+    """A ball on a vertical slide over a floor, without gravity and without dissipation: C01 in its own direction."""
+
+    def make(stiffness, time_step, mass=1.0):
+        path = tmp_path / "bouncer.sdf"
+        path.write_text(BALL.format(stiffness=2 * stiffness, mass=mass))  # two in series: half of each
+        return dd.load_model(path, time_step=time_step, contact_approximation="lagged", gravity=(0, 0, 0))
+
+    return make
+
+
+def height(x):
+    return x[0]
+
+
+@pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e5])
+def test_through_a_bounce_the_gradient_does_not_converge_and_is_called_that(bouncer, stiffness):
+    """C01: a rigid ball ends at 2 r - y0 - v0 T, so d y / d y0 = -1 and d y / d v0 = -T."""
+    model = bouncer(stiffness, 1 / 480)
+    certificate = dd.certify_rollout(model, [1.003, -2.0], None, height, num_steps=480, refine=True)
+    assert certificate.verdict == "not_converged", str(certificate)
+    assert certificate.entries[0].verdict == "not_converged"
+    assert "not converged: do not optimize with this" in str(certificate)
+    with pytest.raises(dd.CertificateError, match="not converged: do not optimize with this"):
+        certificate.require()
+
+
+def test_without_the_second_layer_the_same_gradient_agrees(bouncer):
+    certificate = dd.certify_rollout(bouncer(1e4, 1 / 480), [1.003, -2.0], None, height, num_steps=480)
+    assert certificate.verdict == "agree"  # with differences, which are as wrong
+    assert abs(certificate.entries[0].derivative + 1) > 1
+
+
+@pytest.mark.parametrize(("stiffness", "mass"), [(400.0, 1.0), (250.0, 0.8)])
+def test_where_the_step_resolves_the_contact_the_limit_is_the_compliant_closed_form(bouncer, stiffness, mass):
+    """A spring of half a period pi / w, w^2 = k / m, returns the ball: d y / d y0 = -1, d y / d v0 = -(T - pi / w)."""
+    h, count = 2e-4, 1000
+    model, omega = bouncer(stiffness, h, mass), np.sqrt(stiffness / mass)
+    certificate = dd.certify_rollout(model, [0.12003, -1.0], None, height, num_steps=count, refine=True)
+    assert certificate.verdict == "agree", str(certificate)
+    refinement = certificate.refinements[0]
+    assert refinement.levels == (h, h / 2, h / 4)
+    # h w = 0.004: touchdown falls anywhere in a step, so the limit has an error of that order times the steps' phase.
+    assert refinement.limit == pytest.approx([-1.0, -(h * count - np.pi / omega)], rel=0.05)
+
+
+def test_stiffening_a_bounce_does_not_converge_at_a_fixed_step(bouncer):
+    certificate = dd.certify_rollout(
+        bouncer(1e3, 1 / 480), [1.003, -2.0], None, height, num_steps=480, refine_stiffness=True
+    )
+    assert certificate.refinements[0].by == "stiffness, times"
+    assert certificate.refinements[0].levels == (1.0, 4.0, 16.0)
+    assert certificate.verdict == "not_converged"
+
+
+def test_stiffening_needs_a_stated_stiffness(load):
+    with pytest.raises(dd.InputError, match="states no point stiffness"):
+        dd.certify_rollout(load("pendulum.urdf"), [0.1, 0], [[0.0]], height, refine_stiffness=True)
+
+
+@pytest.mark.parametrize(("h", "count"), [(0.01, 100), (0.02, 37)])
+def test_the_gradient_of_a_projectile_is_the_same_at_every_step_size(load, h, count):
+    """A01: d z / d v0 = T for every h."""
+    model = load("projectile.sdf", time_step=h)
+    x0 = model.default_state
+    x0[6], x0[10:] = 1.0, [2.0, 1.0, 5.0]
+    certificate = dd.certify_rollout(model, x0, None, lambda x: x[6], num_steps=count, refine=True).require()
+    j = certificate.columns.index("ball_vz[0]") if "ball_vz[0]" in certificate.columns else -1
+    assert certificate.refinements[0].values[:, j] == pytest.approx([h * count] * 3, rel=1e-9)
+
+
+@pytest.mark.parametrize("h", [0.01, 0.005])
+def test_the_gradient_of_a_spring_tends_to_the_continuous_one(load, h):
+    """x(T) of m x'' + c x' + k x = 0 by x(0): e^(-a T) (cos w T + a / w sin w T), a = c / 2 m; and by v(0)."""
+    model, count = load("mass_spring_damper.sdf", time_step=h), round(0.5 / h)
+    x0 = [0.35, -0.4]
+    certificate = dd.certify_rollout(model, x0, np.zeros((count, 1)), height, refine=True).require()
+    m, c, k = 2.0, 1.5, 50.0
+    a, w, T = c / (2 * m), np.sqrt(k / m - (c / (2 * m)) ** 2), 0.5
+    by_x = np.exp(-a * T) * (np.cos(w * T) + a / w * np.sin(w * T))
+    by_v = np.exp(-a * T) * np.sin(w * T) / w
+    # What extrapolation leaves is of second order: h^2 times w^2.
+    assert certificate.refinements[0].limit[:2] == pytest.approx([by_x, by_v], abs=(10 * h) ** 2)
+
+
+def test_inputs_and_parameters_are_refined_too(load):
+    us = np.full((30, 1), 0.1)
+    certificate = dd.certify_rollout(
+        load("pendulum.urdf"), [0.5, 0], us, lambda xs, us: (xs[:, 0] ** 2).sum() + (us**2).sum(),
+        refine=True, parameters=("pole.mass", "hinge.damping"),
+    ).require()  # fmt: skip
+    assert certificate.columns[-2:] == ("pole.mass", "hinge.damping")
+    assert certificate.refinements[0].values.shape == (3, 2 + 30 + 2)
+    assert certificate.refinements[0].converged.all()
+
+
+def test_a_model_with_one_time_step_cannot_be_refined():
+    plant = Plant(0.01)
+    plant.ball("ball", 1.0, 0.1, contact_properties(1e4), "z")
+    with pytest.raises(dd.ModelError, match="build the diagram again"):
+        dd.certify_rollout(plant.model(), [1.0, 0.0], None, height, num_steps=3, refine=True)
+
+
+def test_the_time_step_is_not_refined_and_a_parameter_at_once(load):
+    with pytest.raises(dd.InputError, match="refine=True changes the time step"):
+        dd.certify_rollout(
+            load("pendulum.urdf"), [0.1, 0], [[0.0]], height, refine=True, parameters=("model.time_step",)
+        )
+
+
+def two_balls(h, stiffness, masses=(1.0, 1.0)):
+    """C12: the first runs into the second, which rests, along x."""
+    plant = Plant(h, "lagged", gravity=0.0)
+    for name, mass in zip(("left", "right"), masses, strict=True):
+        plant.ball(name, mass, 0.1, contact_properties(2 * stiffness), "x")
+    return plant.model()
+
+
+@pytest.mark.parametrize("stiffness", [1e3, 1e5])
+def test_momentum_holds_of_a_gradient_that_is_wrong(stiffness):
+    """C12 and A28: rigid balls swap velocities, so d x2(T) / d (x1, x2, v1, v2) = (1, 0, 1, 0).
+
+    A discrete, compliant contact keeps the sums, by position 1 and by velocity T, and can be far from each part.
+    """
+    h, count = 1 / 100, 100
+    model = two_balls(h, stiffness)
+    x0 = [0.0, 0.52, 1.0, 0.0]
+    left, right = (dd.differentiate_rollout(model, x0, None, lambda x, i=i: x[i], num_steps=count).x0 for i in (0, 1))
+    assert (left + right)[:2] == pytest.approx([1.0, 1.0], rel=1e-6)  # SAP's tolerance
+    assert (left + right)[2:] == pytest.approx([1.0, 1.0], rel=1e-6)
+    assert np.abs(right - [1, 0, 1, 0]).max() > 0.05
+
+
+def test_two_balls_resolved_tend_to_the_rigid_gradient():
+    """The compliant closed form: d x2(T) / d (x1, x2, v1, v2) = (1, 0, T - tau, tau), tau = pi / w / 2 ... of the swap.
+
+    With w^2 = 2 k / m the balls touch for pi / w, in which their centre of mass runs on: x2(T) = x2 + v (T - t1 - pi/w)
+    + v pi / (2 w), t1 = (x2 - x1 - 2 r) / v: by x1 +1, by x2 0, by v1 T - pi / (2 w), by v2 pi / (2 w).
+    """
+    h, count, k = 1e-4, 5000, 500.0
+    x0 = [0.0, 0.25, 1.0, 0.0]
+    gradient = dd.differentiate_rollout(two_balls(h, k), x0, None, lambda x: x[1], num_steps=count)
+    half = np.pi / np.sqrt(2 * k) / 2
+    # h w = 0.003, over the 1000 steps in contact.
+    assert gradient.x0 == pytest.approx([1.0, 0.0, h * count - half, half], abs=0.05)
+
+
+def test_horizon_diagnostics_of_a_growing_motion(load):
+    """An inverted pendulum: |dx_N / dx_k| grows by the spectral radius of its step."""
+    model = load("pendulum.urdf", time_step=0.01)
+    gradient = dd.differentiate_rollout(model, [np.pi, 0], np.zeros((600, 1)), lambda x: x[0])
+    A = dd.differentiate_step(model, [np.pi, 0], [0]).A
+    radius = np.abs(np.linalg.eigvals(A)).max()
+    assert gradient.spectral_radii == pytest.approx(np.full(600, radius), rel=1e-9)
+    assert gradient.growth_rate == pytest.approx(radius, rel=1e-2)  # the ends are no eigenvectors
+    first = gradient.explodes_at
+    norms = gradient.state_gradient_norms
+    assert norms[first] > 1e6 * norms[first:].min()
+    assert norms[first + 1] <= 1e6 * norms[first + 1 :].min()
+    assert gradient.vanishes_at is None
+
+
+def test_horizon_diagnostics_of_a_vanishing_gradient():
+    """A20: a ball that friction has stopped does not know how fast it was."""
+    plant = Plant(0.01, "lagged")
+    plant.ball("ball", 1.0, 0.1, contact_properties(2e4, 10.0, 0.5), "x", "z")
+    plant.ground(contact_properties(2e4, 10.0, 0.5))
+    x0 = [0.0, 0.1 - 9.81 / 1e4, 1.0, 0.0]
+    gradient = dd.differentiate_rollout(plant.model(), x0, None, lambda x: x[2], num_steps=60)
+    assert gradient.vanishes_at is not None
+    assert gradient.explodes_at is None
+
+
+def test_a_neutral_motion_neither_grows_nor_vanishes(load):
+    gradient = dd.differentiate_rollout(load("projectile.sdf"), load("projectile.sdf").default_state, None,
+                                        lambda x: x[6], num_steps=10)  # fmt: skip
+    assert gradient.growth_rate == pytest.approx(1.0, abs=1e-3)
+    assert gradient.explodes_at is None
+    assert gradient.vanishes_at is None
