@@ -1,7 +1,7 @@
 """Trajectory optimization on Drake with gradients that are checked before they are used."""
 
-from drake_diff.audit import Finding as Finding
 from drake_diff.audit import audit as audit
+from drake_diff.audit_place import Finding as Finding
 from drake_diff.certificate import Certificate as Certificate
 from drake_diff.certificate import certify_jacobian as certify_jacobian
 from drake_diff.certification import certify_model as certify_model

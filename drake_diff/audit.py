@@ -1,18 +1,14 @@
 """Before anything runs: what in a model cannot be differentiated, or will be differentiated wrongly, and what to do."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, Literal
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.geometry import Box, Cylinder, HalfSpace, ProximityProperties, Sphere, VolumeMesh
-from pydrake.multibody.plant import ContactModel, DiscreteContactApproximation
 from pydrake.multibody.tree import FixedOffsetFrame, MultibodyForces, WeldJoint
 
 from drake_diff.arrays import Array
-from drake_diff.contact_geometry import MEETS_A_SPHERE, autodiff_supports
+from drake_diff.audit_contact import CONTACT_CHECKS
+from drake_diff.audit_place import SEVERITIES, Finding, Findings, Place, short
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError
 from drake_diff.model import Model
 from drake_diff.parameter_kinds import IDENTITY_OFFSET
@@ -20,49 +16,8 @@ from drake_diff.plant_elements import actuators, instances, is_driven, joints
 from drake_diff.step import advance, check_point, set_state
 from drake_diff.step_derivatives import StepDerivatives, differentiate_step
 
-Severity = Literal["error", "warning", "info"]
-SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
-
-PARALLEL = 1e-6  # [rad] between face normals
-NEARLY_PARALLEL = 1e-2  # [rad]: jumps were measured up to 1e-3 and beyond
-IN_PLANE = 1e-6  # [m] from a plane of symmetry
-ROUND = ("Sphere", "Ellipsoid", "Capsule")
-REACH = 1e-3  # [m] faces nearer than this count as touching
-ON_AXIS = 1e-9  # [m] from a sphere's centre to a cylinder's axis
 AT_LIMIT = 1e-6  # [m or rad] from a joint's limit
-TOUCH = 1e-9  # [m] of signed distance, where Drake computes it exactly
-ROUGH_TOUCH = 1e-6  # [m] where it iterates (measured: 1e-7 off for an ellipsoid)
 HUGE = 1e3  # of an entry of A or B: sap's reach 14, lagged contact's 4e4
-BY_CHOICE = "differenced, by choice"  # in the note of the route "differences"
-
-_PROPERTIES = {  # name: (group, unit, the tag in <drake:proximity_properties>)
-    "coulomb_friction": ("material", "", "drake:mu_dynamic"),
-    "point_contact_stiffness": ("material", " N/m", "drake:point_contact_stiffness"),
-    "hunt_crossley_dissipation": ("material", " s/m", "drake:hunt_crossley_dissipation"),
-    "relaxation_time": ("material", " s", "drake:relaxation_time"),
-    "hydroelastic_modulus": ("hydroelastic", " Pa", "drake:hydroelastic_modulus"),
-}
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something to know before differentiating a model: `message` says what, `remedy` what to change.
-
-    "error": it throws, or the derivative is wrong, here; "warning": it may be, or a number was not chosen;
-    "info": it is taken care of, or a limit to know. `code` is stable, for tests and records.
-    """
-
-    severity: Severity
-    code: str
-    subject: str
-    message: str
-    remedy: str
-
-    def __str__(self) -> str:
-        return f"{self.severity} {self.code} ({self.subject}): {self.message}\n  -> {self.remedy}"
-
-
-Findings = Iterator[Finding]
 
 
 def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) -> list[Finding]:
@@ -74,221 +29,19 @@ def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) 
     point = check_point(
         model, model.default_state if x is None else x, np.zeros(model.nu) if u is None and model.nu else u
     )
-    place = _Place(model, *point)
+    place = Place(model, *point)
     checks = _CHECKS if place.has_poses else _CHECKS_WITHOUT_POSES
     found = [finding for check in checks for finding in check(place)]
     return sorted(found, key=lambda f: (SEVERITIES.index(f.severity), f.subject, f.code))
 
 
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """A model at x, u: what several checks ask for, computed once."""
-
-    model: Model
-    x: Array
-    u: Array
-
-    @cached_property
-    def has_poses(self) -> bool:
-        """Whether Drake can place the bodies: not with a quaternion of zeros."""
-        plant, context = self.model.plant, self.model.double.context
-        set_state(self.model.double, self.x)
-        try:
-            plant.EvalBodyPoseInWorld(context, plant.world_body())
-        except RuntimeError:
-            return False
-        return True
-
-    @cached_property
-    def step_error(self) -> SimulationError | None:
-        """Why the double step fails here."""
-        try:
-            advance(self.model.double, self.x, self.u)
-        except SimulationError as error:
-            return error
-        return None
-
-    @cached_property
-    def by_autodiff(self) -> StepDerivatives | DrakeDiffError:
-        """The Jacobians by AutoDiffXd through the whole step, or why there are none."""
-        try:
-            return differentiate_step(self.model, self.x, self.u, method="autodiff")
-        except (GradientError, ModelError, SimulationError) as error:
-            return error
-
-    @cached_property
-    def query(self) -> Any:
-        """Drake's QueryObject; it sees the state that the double context has when it is asked."""
-        return self.model.plant.get_geometry_query_input_port().Eval(self.model.double.context)
-
-    @cached_property
-    def geometries(self) -> "dict[Any, _Geometry]":
-        """Those that can collide, by id, at x."""
-        set_state(self.model.double, self.x)
-        ids = {g for pair in self.candidates for g in pair}
-        return {g: _geometry(self, g) for g in sorted(ids, key=lambda g: g.get_value())}
-
-    @cached_property
-    def candidates(self) -> list[tuple[Any, Any]]:
-        """The ids of the geometries that can collide."""
-        port = self.model.plant.get_geometry_query_input_port()
-        if self.model.double.scene_graph is None or not port.HasValue(self.model.double.context):
-            return []
-        return sorted(self.query.inspector().GetCollisionCandidates(), key=lambda p: [g.get_value() for g in p])
-
-    @cached_property
-    def pairs(self) -> "list[_Pair]":
-        contact = self.model.plant.get_contact_model()
-        return [_Pair(self.geometries[a], self.geometries[b], contact) for a, b in self.candidates]
-
-
-@dataclass(frozen=True, eq=False)
-class _Geometry:
-    """A collision geometry at x. `own` is what the file or the user gave it, `all` what Drake uses."""
-
-    id: Any
-    label: str
-    body: str
-    shape: Any
-    pose: Any  # X_WG
-    box: Any  # its oriented box in its own frame; None for a half space
-    compliance: Literal["none", "rigid", "compliant"]
-    own: ProximityProperties
-    all: ProximityProperties
-
-    @property
-    def kind(self) -> str:
-        return type(self.shape).__name__
-
-    def axis(self, i: int) -> Array:
-        """(3,) the unit vector of its frame in the world."""
-        return np.asarray(self.pose.rotation().matrix())[:, i]
-
-    def extent(self, direction: Array) -> tuple[float, float]:
-        """Where its box begins and ends [m] along a direction in the world."""
-        if self.box is None:
-            middle, along = float(direction @ self.pose.translation()), float(direction @ self.axis(2))
-            infinite = abs(along) < 1 - PARALLEL
-            return (-np.inf if infinite or along > 0 else middle), (np.inf if infinite or along < 0 else middle)
-        pose = self.pose @ self.box.pose()
-        middle = float(direction @ pose.translation())
-        half = float(np.abs(direction @ pose.rotation().matrix()) @ self.box.half_width())
-        return middle - half, middle + half
-
-
-def _geometry(place: _Place, id_: Any) -> _Geometry:
-    inspector, own = place.query.inspector(), place.model.double.scene_graph.model_inspector()
-    body = place.model.plant.GetBodyFromFrameId(inspector.GetFrameId(id_))
-    shape, body_name = inspector.GetShape(id_), body.name() if body is not None else "?"
-    return _Geometry(
-        id=id_,
-        label=f"{body_name}/{inspector.GetName(id_).split('::')[-1]} ({type(shape).__name__})",
-        body=body_name,
-        shape=shape,
-        pose=place.query.GetPoseInWorld(id_),
-        box=inspector.GetObbInGeometryFrame(id_),
-        compliance=_compliance(place, id_, shape),
-        own=own.GetProximityProperties(id_),
-        all=inspector.GetProximityProperties(id_),
-    )
-
-
-def _compliance(place: _Place, id_: Any, shape: Any) -> Literal["none", "rigid", "compliant"]:
-    """How hydroelastic contact sees a geometry. Python cannot read Drake's compliance_type, so by its mesh."""
-    scene_graph = place.model.double.scene_graph
-    if not isinstance(shape, HalfSpace):
-        mesh = place.query.inspector().maybe_get_hydroelastic_mesh(id_)
-        return "none" if mesh is None else "compliant" if isinstance(mesh, VolumeMesh) else "rigid"
-    own = scene_graph.model_inspector().GetProximityProperties(id_)
-    if own.HasProperty("hydroelastic", "compliance_type"):
-        return "compliant" if own.HasProperty("hydroelastic", "slab_thickness") else "rigid"
-    default = scene_graph.get_config().default_proximity_properties.compliance_type
-    return "none" if default == "undefined" else "compliant" if default == "compliant" else "rigid"
-
-
-@dataclass(frozen=True, eq=False)
-class _Pair:
-    """Two geometries that can collide."""
-
-    a: _Geometry
-    b: _Geometry
-    model: Any
-
-    @property
-    def label(self) -> str:
-        return f"{self.a.label} - {self.b.label}"
-
-    @property
-    def bodies(self) -> tuple[str, str]:
-        return self.a.body, self.b.body
-
-    @property
-    def contact(self) -> Literal["point", "hydroelastic", "none"]:
-        """What Drake computes between them; "none" is what it throws at."""
-        both = {self.a.compliance, self.b.compliance}
-        soft_half_space = both == {"compliant"} and "HalfSpace" in (self.a.kind, self.b.kind)
-        hydroelastic = "none" not in both and both != {"rigid"} and not soft_half_space
-        if self.model == ContactModel.kPoint:
-            return "point"
-        if hydroelastic:
-            return "hydroelastic"
-        return "none" if self.model == ContactModel.kHydroelastic else "point"
-
-    @property
-    def refused(self) -> bool:
-        return self.contact == "none" or not autodiff_supports(self.a.shape, self.b.shape, self.contact)
-
-    def of_kinds(self, a: type, b: type) -> tuple[_Geometry, _Geometry] | None:
-        """The two in the order of the shapes that are asked for."""
-        for one, other in ((self.a, self.b), (self.b, self.a)):
-            if isinstance(one.shape, a) and isinstance(other.shape, b):
-                return one, other
-        return None
-
-
-def _no_step(place: _Place) -> Findings:
+def _no_step(place: Place) -> Findings:
     if place.step_error is not None:
         remedy = "choose x and u that `step` can take; where contact is named, see the finding pair_refused"
-        yield Finding("error", "no_step", "step", f"the double step fails here: {_short(place.step_error)}", remedy)
+        yield Finding("error", "no_step", "step", f"the double step fails here: {short(place.step_error)}", remedy)
 
 
-def _pair_refused(place: _Place) -> Findings:
-    by_choice = any(BY_CHOICE in note for note in place.model.notes)
-    groups: dict[tuple[str, str], list[_Pair]] = {}
-    for pair in place.pairs:
-        if pair.refused:
-            groups.setdefault(pair.bodies, []).append(pair)
-    remedy = (
-        'load_model(..., contact_geometry="corner_spheres") puts spheres in place of boxes, cylinders and capsules, '
-        '"hydroelastic" gives every geometry a mesh, "differences" differences the step by choice; or filter the pair '
-        "(CollisionFilterDeclaration, or <drake:collision_filter_group> in the file) where it never touches"
-    )
-    if by_choice:
-        remedy = "nothing to do: it is differenced by choice, which needs method auto or finite_difference"
-    for bodies, pairs in groups.items():
-        yield Finding(
-            "info" if by_choice else "error", "pair_refused", " - ".join(bodies), _refusal(place, pairs), remedy
-        )
-
-
-def _refusal(place: _Place, pairs: list[_Pair]) -> str:
-    sides = (dict.fromkeys(p.a.label for p in pairs), dict.fromkeys(p.b.label for p in pairs))
-    names = " against ".join(", ".join(side) for side in sides)
-    if any(pair.contact == "none" for pair in pairs):
-        why = "hydroelastic contact alone needs properties on both, one of them not rigid; the double step throws too"
-    else:
-        why = "AutoDiffXd has no point contact between these shapes, and throws as soon as their bounding boxes meet"
-    if any("HalfSpace" in (p.a.kind, p.b.kind) for p in pairs):
-        why += ", and that of a tilted half space is infinite: it throws without touching"
-    error = place.by_autodiff
-    if not isinstance(error, SimulationError):
-        return f"{names}: {why}. The AutoDiffXd step does not throw at x."
-    if any(p.a.kind.lower() in str(error).lower() and p.b.kind.lower() in str(error).lower() for p in pairs):
-        return f"{names}: {why}. The AutoDiffXd step throws at x over such shapes: {_short(error)}."
-    return f"{names}: {why}. At x the AutoDiffXd step throws over another pair: {_short(error)}."
-
-
-def _pd_gains(place: _Place) -> Findings:
+def _pd_gains(place: Place) -> Findings:
     plant = place.model.plant
     for instance in instances(plant):
         with_gains = [a for a in actuators(plant) if a.model_instance() == instance and a.has_controller()]
@@ -304,7 +57,7 @@ def _pd_gains(place: _Place) -> Findings:
         yield Finding("info", "pd_gains", ", ".join(a.name() for a in with_gains), message, remedy)
 
 
-def _identity_frame(place: _Place) -> Findings:
+def _identity_frame(place: Place) -> Findings:
     found = []
     for joint in joints(place.model.plant):
         frame = joint.frame_on_parent()
@@ -319,84 +72,7 @@ def _identity_frame(place: _Place) -> Findings:
         yield Finding("info", "identity_frame", ", ".join(found), message, remedy)
 
 
-def _aligned_faces(place: _Place) -> Findings:
-    remedy = (
-        "put spheres in place of one of them (corner_spheres), or start tilted by 0.03 rad and more and `certify` the "
-        "poses in contact: near the aligned pose too (measured: up to 1e-3 rad, cylinder on cylinder up to 0.04) the "
-        "meshes' edges make the step jump"
-    )
-    for pair in place.pairs:
-        if pair.contact != "hydroelastic":
-            continue
-        angle, gap = _alignment(pair)
-        if angle is None:
-            continue
-        text = f"faces {angle:.2g} rad from parallel at x, {gap:.3g} m apart: "
-        if angle <= PARALLEL and gap <= REACH:
-            text += "the hydroelastic step jumps there, and AutoDiffXd gives a finite, plausible, wrong number"
-            yield Finding("error", "aligned_faces", pair.label, text, remedy)
-        elif angle <= NEARLY_PARALLEL:
-            text += "where they meet like this the hydroelastic step jumps"
-            yield Finding("warning", "aligned_faces", pair.label, text, remedy)
-        else:
-            text += "tilted now; where they come to lie flat the hydroelastic step jumps"
-            yield Finding("info", "aligned_faces", pair.label, text, remedy)
-
-
-def _alignment(pair: _Pair) -> tuple[float | None, float]:
-    """The angle [rad] between the two nearest face normals, and the gap [m] along them; None without flat faces.
-
-    Drake's mesh of a round shape is one too, where it lies in a plane of symmetry of a box's or a cylinder's mesh.
-    """
-    for one, other in ((pair.a, pair.b), (pair.b, pair.a)):
-        if one.kind in ROUND and other.kind in ("Box", "Cylinder") and not _in_symmetry_plane(one, other):
-            return None, np.inf
-    faces = [(n, m) for n in _normals(pair.a, pair.b) for m in _normals(pair.b, pair.a)]
-    if not faces:
-        return None, np.inf
-    angle = min(float(np.linalg.norm(np.cross(n, m))) for n, m in faces)
-    return angle, max(_gap(pair, n) for both in faces for n in both)
-
-
-def _normals(geometry: _Geometry, other: _Geometry) -> list[Array]:
-    """The normals of its flat faces, or of the planes that its mesh lines up with."""
-    if geometry.kind == "Box" or (geometry.kind in ("Sphere", "Ellipsoid") and other.kind in ("Box", "Cylinder")):
-        return [geometry.axis(i) for i in range(3)]
-    meshed_capsule = geometry.kind == "Capsule" and other.kind in ("Box", "Cylinder")
-    return [geometry.axis(2)] if geometry.kind in ("Cylinder", "HalfSpace") or meshed_capsule else []
-
-
-def _in_symmetry_plane(round_: _Geometry, flat: _Geometry) -> bool:
-    """Whether a round shape's centre is in a plane x = 0 or y = 0 (of a box: or z = 0) of the flat one's frame."""
-    offset = flat.pose.inverse() @ round_.pose.translation()
-    planes = 3 if flat.kind == "Box" else 2
-    return bool(np.min(np.abs(offset[:planes])) <= IN_PLANE)
-
-
-def _gap(pair: _Pair, direction: Array) -> float:
-    """How far [m] the two boxes are apart along a direction; negative where they overlap."""
-    (low_a, high_a), (low_b, high_b) = pair.a.extent(direction), pair.b.extent(direction)
-    return max(low_a - high_b, low_b - high_a)
-
-
-def _cylinder_axis(place: _Place) -> Findings:
-    for pair in place.pairs:
-        both = pair.of_kinds(Sphere, Cylinder)
-        if both is None or pair.contact != "point":
-            continue
-        offset = both[0].pose.translation() - both[1].pose.translation()
-        distance = float(np.linalg.norm(np.cross(both[1].axis(2), offset)))
-        message = f"the sphere's centre is {distance:.3g} m from the cylinder's axis"
-        remedy = "move the sphere off the axis by 1e-6 m or more, or put a box in place of the cylinder"
-        if distance < ON_AXIS:
-            message += ": where they touch AutoDiffXd is singular on it (NaN, or a plausible wrong number)"
-            yield Finding("error", "cylinder_axis", pair.label, message, remedy)
-        else:
-            message += ": exactly on it AutoDiffXd would be singular"
-            yield Finding("info", "cylinder_axis", pair.label, message, remedy)
-
-
-def _saturated_effort(place: _Place) -> Findings:
+def _saturated_effort(place: Place) -> Findings:
     remedy = "stay inside the limit (Bounds of a Problem do), or raise it in the file"
     for note in place.model.notes:
         if "zero effort limit" in note:
@@ -415,7 +91,7 @@ def _saturated_effort(place: _Place) -> Findings:
             yield Finding("warning", "saturated_effort", actuator.name(), message, remedy)
 
 
-def _net_effort(place: _Place) -> Array:
+def _net_effort(place: Place) -> Array:
     """(nu,) what the actuators apply [N or N m]: u with PD control, clamped; u alone where no step can be taken."""
     if place.step_error is not None:
         return place.u
@@ -423,7 +99,7 @@ def _net_effort(place: _Place) -> Array:
     return np.array(place.model.plant.get_net_actuation_output_port().Eval(place.model.double.context))
 
 
-def _effort_to_hold(place: _Place) -> Array:
+def _effort_to_hold(place: Place) -> Array:
     """(nu,) the effort [N or N m] nearest to what no acceleration at rest takes."""
     plant, twin = place.model.plant, place.model.double
     set_state(twin, np.concatenate([place.x[: place.model.nq], np.zeros(place.model.nv)]))
@@ -433,7 +109,7 @@ def _effort_to_hold(place: _Place) -> Array:
     return np.asarray(np.linalg.lstsq(plant.MakeActuationMatrix(), needed, rcond=None)[0])
 
 
-def _jacobian(place: _Place) -> Findings:
+def _jacobian(place: Place) -> Findings:
     if place.step_error is not None:
         return
     result = place.by_autodiff
@@ -442,7 +118,7 @@ def _jacobian(place: _Place) -> Findings:
         yield Finding("error", "autodiff_refused", "diagram", str(result), remedy)
     elif isinstance(result, SimulationError) and not any(pair.refused for pair in place.pairs):
         remedy = "leave out what it names, or accept differences (method finite_difference)"
-        yield Finding("error", "autodiff_refused", "step", f"the AutoDiffXd step throws: {_short(result)}", remedy)
+        yield Finding("error", "autodiff_refused", "step", f"the AutoDiffXd step throws: {short(result)}", remedy)
     if isinstance(result, ModelError | SimulationError):
         result = _by_differences(place)
     if isinstance(result, DrakeDiffError):
@@ -452,7 +128,7 @@ def _jacobian(place: _Place) -> Findings:
         yield from _huge(place.model, result)
 
 
-def _by_differences(place: _Place) -> StepDerivatives | DrakeDiffError:
+def _by_differences(place: Place) -> StepDerivatives | DrakeDiffError:
     try:
         return differentiate_step(place.model, place.x, place.u, method="finite_difference")
     except (GradientError, SimulationError) as error:
@@ -473,46 +149,7 @@ def _huge(model: Model, d: StepDerivatives) -> Findings:
         yield Finding("warning", "huge_jacobian", entry, message, remedy)
 
 
-def _default_decides(place: _Place) -> Findings:
-    groups: dict[tuple[str, ...], list[_Geometry]] = {}
-    for geometry in place.geometries.values():
-        pairs = [pair for pair in place.pairs if geometry in (pair.a, pair.b)]
-        missing = tuple(
-            name
-            for name in _needed(place, geometry, {pair.contact for pair in pairs})
-            if not geometry.own.HasProperty(_PROPERTIES[name][0], name)
-        )
-        if missing:
-            groups.setdefault(missing, []).append(geometry)
-    for missing, geometries in groups.items():
-        values = ", ".join(f"{name} {_value(geometries[0], name)}" for name in missing)
-        message = f"not given, so the scene graph's default decides: {values}"
-        if "relaxation_time" in missing and _value(geometries[0], "relaxation_time") == "0.1 s":
-            message += " (with which a ball hardly bounces)"
-        tags = ", ".join(_PROPERTIES[name][2] for name in missing)
-        remedy = f"give them in <drake:proximity_properties> ({tags}) or in the geometry's ProximityProperties"
-        yield Finding("warning", "default_decides", ", ".join(g.label for g in geometries), message, remedy)
-
-
-def _needed(place: _Place, geometry: _Geometry, contacts: set[str]) -> list[str]:
-    """The properties that the step reads from a geometry."""
-    sap = place.model.plant.get_discrete_contact_approximation() == DiscreteContactApproximation.kSap
-    names = ["coulomb_friction", "relaxation_time" if sap else "hunt_crossley_dissipation"]
-    names += ["point_contact_stiffness"] if "point" in contacts else []
-    soft = geometry.compliance == "compliant"
-    return names + (["hydroelastic_modulus"] if "hydroelastic" in contacts and soft else [])
-
-
-def _value(geometry: _Geometry, name: str) -> str:
-    """The number that Drake uses, with its unit."""
-    group, unit, _ = _PROPERTIES[name]
-    if not geometry.all.HasProperty(group, name):
-        return "(Drake's own)"
-    value = geometry.all.GetProperty(group, name)
-    return f"{value.dynamic_friction() if name == 'coulomb_friction' else value:g}{unit}"
-
-
-def _mechanism(place: _Place) -> Findings:
+def _mechanism(place: Place) -> Findings:
     plant, context = place.model.plant, place.model.double.context
     if plant.num_constraints():
         message = f"constraints in every step ({plant.num_constraints()}), which the implicit method does not know"
@@ -527,7 +164,7 @@ def _mechanism(place: _Place) -> Findings:
         yield Finding("info", "locked_joint", ", ".join(locked), message + "derivative is refused", remedy)
 
 
-def _joint_limit(place: _Place) -> Findings:
+def _joint_limit(place: Place) -> Findings:
     plant, names = place.model.plant, place.model.position_names
     limits = zip(plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits(), strict=True)
     for name, q, (low, high) in zip(names, place.x[: place.model.nq], limits, strict=True):
@@ -537,43 +174,11 @@ def _joint_limit(place: _Place) -> Findings:
             yield Finding("warning", "joint_limit", name, message, remedy)
 
 
-def _touching(place: _Place) -> Findings:
-    set_state(place.model.double, place.x)
-    unmeasured = []
-    for pair in place.pairs:
-        try:
-            distance = place.query.ComputeSignedDistancePairClosestPoints(pair.a.id, pair.b.id).distance
-        except RuntimeError:  # no such distance between these shapes
-            unmeasured.append(pair.label)
-            continue
-        if abs(distance) < _touch_tolerance(pair):
-            message = f"exactly at touch (signed distance {distance:.2g} m): the derivative is that of one side"
-            remedy = "start a little apart or a little in contact, or take `smooth_step`"
-            yield Finding("warning", "touching", pair.label, message, remedy)
-    if unmeasured:
-        message = "Drake computes no distance between these, so whether they are exactly at touch is not known"
-        remedy = "compare x with x moved by 1e-6 m yourself, or put spheres in place of one (corner_spheres)"
-        yield Finding("info", "not_measured", ", ".join(unmeasured), message, remedy)
-
-
-def _touch_tolerance(pair: _Pair) -> float:
-    exact = {pair.a.kind, pair.b.kind} <= MEETS_A_SPHERE and pair.of_kinds(Sphere, object) is not None
-    return TOUCH if exact or pair.of_kinds(Box, Box) else ROUGH_TOUCH
-
-
-def _short(error: DrakeDiffError) -> str:
-    return str(error).removeprefix("Drake cannot take this step: ").split(". ")[0].rstrip(".")
-
-
-_CHECKS_WITHOUT_POSES: tuple[Callable[[_Place], Findings], ...] = (_no_step, _pd_gains, _identity_frame, _joint_limit)
-_CHECKS: tuple[Callable[[_Place], Findings], ...] = (
+_CHECKS_WITHOUT_POSES: tuple[Callable[[Place], Findings], ...] = (_no_step, _pd_gains, _identity_frame, _joint_limit)
+_CHECKS: tuple[Callable[[Place], Findings], ...] = (
     *_CHECKS_WITHOUT_POSES,
-    _pair_refused,
-    _aligned_faces,
-    _cylinder_axis,
+    *CONTACT_CHECKS,
     _saturated_effort,
     _jacobian,
-    _default_decides,
     _mechanism,
-    _touching,
 )

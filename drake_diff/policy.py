@@ -165,6 +165,11 @@ def policy_parameters(policy: Any) -> Array:
     return finite_array("policy.parameters", getattr(policy, "parameters", ()), ("n",))
 
 
+def active_parameters(policy: Any, t: float) -> slice:
+    """Which of the policy's parameters act at time t [s]: all, but where it has a method `active(t)` that says."""
+    return policy.active(t) if hasattr(policy, "active") else slice(0, len(policy_parameters(policy)))
+
+
 def differentiate_policy(policy: Any, x: Array, t: float, nu: int) -> tuple[Array, Array, Array]:
     """(u (nu,), du/dx (nu, nx), du/dparameters (nu, n)) of `policy` at state `x` (nx,) and time `t` [s].
 
@@ -174,7 +179,7 @@ def differentiate_policy(policy: Any, x: Array, t: float, nu: int) -> tuple[Arra
     """
     parameters = policy_parameters(policy)
     u = _evaluate(policy, x, t, parameters, nu)
-    active = policy.active(t) if hasattr(policy, "active") else slice(0, len(parameters))
+    active = active_parameters(policy, t)
     variables = InitializeAutoDiff(np.concatenate([x, parameters[active]])).ravel()
     moved = parameters.astype(object)
     moved[active] = variables[len(x) :]

@@ -13,12 +13,13 @@ from drake_diff.autodiff import gradient_of
 from drake_diff.exceptions import InputError
 from drake_diff.model import Model
 from drake_diff.parameters import Parameters, ParameterVector, applied, select
-from drake_diff.policy import differentiate_policy
+from drake_diff.policy import active_parameters, differentiate_policy, policy_parameters
 from drake_diff.rollout import Policy, check_inputs
 from drake_diff.step_derivatives import StepDerivatives, step_jacobians
 
 Loss = Callable[..., Any]
-Feedback = tuple[Array, Array]  # a policy's derivatives (nu, nx) by the state and (nu, n) by its parameters
+# A policy's derivatives (nu, nx) by the state and (nu, n) by those of its parameters that act, and which they are.
+Feedback = tuple[Array, Array, slice]
 EXPLODED, VANISHED = 1e6, 1e-6
 
 
@@ -103,7 +104,7 @@ def differentiate_rollout(
             linearization, feedback, inputs = _close_the_loop(set_model, x0, policy, steps, vector, method)
     xs = np.vstack([x0, [d.x_next for d in linearization]])
     value, by_xs, by_us = differentiate_loss(loss, xs, inputs)
-    totals = accumulate(linearization, by_xs, by_us, feedback)
+    totals = accumulate(linearization, by_xs, by_us, feedback, len(policy_parameters(policy)))
     return RolloutGradient(
         loss=value,
         x0=frozen(totals.states[0]),
@@ -139,8 +140,10 @@ def _close_the_loop(
     feedback: list[Feedback] = []
     x, inputs = x0, np.empty((count, model.nu))
     for k in range(count):
-        inputs[k], *slopes = differentiate_policy(policy, x, k * model.time_step, model.nu)
-        feedback.append((slopes[0], slopes[1]))
+        t = k * model.time_step
+        inputs[k], by_x, by_parameters = differentiate_policy(policy, x, t, model.nu)
+        active = active_parameters(policy, t)
+        feedback.append((by_x, by_parameters[:, active].copy(), active))
         found.append(step_jacobians(model, vector, x, inputs[k], method))
         x = found[-1].x_next
     return found, feedback, inputs
@@ -157,21 +160,25 @@ class Totals:
 
 
 def accumulate(
-    linearization: Sequence[StepDerivatives], by_xs: Array, by_us: Array, feedback: Sequence[Feedback] = ()
+    linearization: Sequence[StepDerivatives],
+    by_xs: Array,
+    by_us: Array,
+    feedback: Sequence[Feedback] = (),
+    num_policy_parameters: int = 0,
 ) -> Totals:
     """From a loss's partial gradients by xs (N+1, nx) and us (N, nu) to its total ones."""
     state, inputs = np.array(by_xs), np.array(by_us)
     parameters = np.zeros(linearization[0].C.shape[1])
-    policy = np.zeros(feedback[0][1].shape[1] if feedback else 0)
+    policy = np.zeros(num_policy_parameters)
     for k in reversed(range(len(linearization))):
         d = linearization[k]
         inputs[k] += d.B.T @ state[k + 1]
         parameters += d.C.T @ state[k + 1]
         state[k] += d.A.T @ state[k + 1]
         if feedback:
-            by_x, by_parameters = feedback[k]
+            by_x, by_parameters, active = feedback[k]
             state[k] += by_x.T @ inputs[k]
-            policy += by_parameters.T @ inputs[k]
+            policy[active] += by_parameters.T @ inputs[k]
     return Totals(state, inputs, parameters, policy)
 
 
@@ -181,7 +188,7 @@ def _last(where: NDArray[np.bool_]) -> int | None:
 
 
 def _spectral_radii(linearization: Sequence[StepDerivatives], feedback: Sequence[Feedback]) -> Array:
-    closed = [d.A + d.B @ by_x for d, (by_x, _) in zip(linearization, feedback, strict=True)] if feedback else None
+    closed = [d.A + d.B @ by_x for d, (by_x, _, _) in zip(linearization, feedback, strict=True)] if feedback else None
     return np.abs(np.linalg.eigvals(np.array(closed or [d.A for d in linearization]))).max(axis=1)
 
 

@@ -22,7 +22,7 @@ model read_contract tangent inertia parameter_kinds contact_parameters parameter
 finite_difference implicit step_derivatives smoothing policy contact mode_changes certificate
 rollout rollout_gradient refinement certify continuous cost problem
 solution nonlinear_program collocation shooting ilqr verdict solver mcap_messages mcap_log trace meshcat_view record
-provenance evidence sampling certification audit cli
+provenance evidence sampling certification audit_place audit_contact audit cli
 """.split()
 
 

@@ -17,7 +17,8 @@ BALL = """<sdf version="1.9"><model name="bouncer"><link name="ball"><inertial><
 <drake:point_contact_stiffness>{stiffness}</drake:point_contact_stiffness>
 <drake:hunt_crossley_dissipation>0</drake:hunt_crossley_dissipation></drake:proximity_properties></collision></link>
 <joint name="weld" type="fixed"><parent>world</parent><child>floor</child></joint>
-<joint name="slide" type="prismatic"><parent>world</parent><child>ball</child><axis><xyz>0 0 1</xyz><limit><effort>0</effort></limit></axis>
+<joint name="slide" type="prismatic"><parent>world</parent><child>ball</child>
+<axis><xyz>0 0 1</xyz><limit><effort>0</effort></limit></axis>
 </joint>
 </model></sdf>"""
 

@@ -1,0 +1,566 @@
+"""The audit names what cannot be differentiated, or will be differentiated wrongly, before anything runs."""
+
+import time
+import warnings
+from importlib.metadata import files
+
+import numpy as np
+import pytest
+from conftest import MODELS, Plant, add_slide, contact_properties
+from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
+    AddRigidHydroelasticProperties,
+    Box,
+    Capsule,
+    Cylinder,
+    Ellipsoid,
+    HalfSpace,
+    ProximityProperties,
+    SceneGraphConfig,
+    Sphere,
+)
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, PdControllerGains, RevoluteJoint, SpatialInertia, UnitInertia
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource
+
+import drake_diff as dd
+from drake_diff.audit import SEVERITIES, Finding, audit
+from drake_diff.plant_elements import actuators, joints
+
+
+def codes(findings, *severities):
+    return {f.code for f in findings if not severities or f.severity in severities}
+
+
+def only(findings, code):
+    """The one finding with that code."""
+    found = [f for f in findings if f.code == code]
+    assert len(found) == 1, [str(f) for f in findings]
+    return found[0]
+
+
+def given(hydroelastic=None):
+    """Contact properties with nothing left to defaults."""
+    properties = contact_properties(1e4, 1.0, 0.5, 0.01)
+    if hydroelastic == "compliant":
+        AddCompliantHydroelasticProperties(0.02, 1e7, properties)
+    if hydroelastic == "rigid":
+        AddRigidHydroelasticProperties(0.02, properties)
+    return properties
+
+
+def pair(upper, lower, height, *, compliance=(None, None), contact_model="point", tilt=(0, 0, 0), ground=(0, 0, 0)):
+    """A free body of shape `upper` at `height`, turned by `tilt` (roll, pitch, yaw); `lower` fixed, its top z = 0."""
+    plant = Plant(0.01, "sap", contact_model)
+    body = plant.plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    below = 0.0 if isinstance(lower, HalfSpace) else -0.1
+    plant.shape(body, upper, given(compliance[0]))
+    pose = RigidTransform(RollPitchYaw(*ground), [0, 0, below])
+    plant.shape(plant.plant.world_body(), lower, given(compliance[1]), pose)
+    model = plant.model()
+    x = model.default_state
+    x[:4] = RollPitchYaw(*tilt).ToQuaternion().wxyz()
+    x[6], x[12] = height, -0.1
+    return model, x
+
+
+def block(limit=np.inf, gains=None, start=0.0):
+    """1 kg on a vertical actuated rail; the weight is 9.81 N."""
+    plant = Plant(0.01)
+    body = plant.plant.AddRigidBody("block", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    joint = add_slide(plant.plant, "lift", plant.plant.world_frame(), body, "z")
+    joint.set_default_positions([start])
+    actuator = plant.plant.AddJointActuator("motor", joint, limit)
+    if gains:
+        actuator.set_controller_gains(PdControllerGains(p=gains[0], d=gains[1]))
+    return plant
+
+
+@pytest.mark.parametrize("name", sorted(p.name for p in MODELS.iterdir()))
+def test_the_models_of_this_repository_are_clean(load, name):
+    model = load(name)
+    findings = audit(model)
+    assert codes(findings) <= {"identity_frame"}
+    assert codes(findings, "error", "warning") == set()
+
+
+@pytest.mark.filterwarnings("ignore::drake_diff.ModelWarning")
+def test_findings_are_sorted_worst_first_and_readable():
+    model = dd.load_model(robot("panda.urdf"), time_step=0.005, weld_base="panda_link0", ground=0.5)
+    findings = audit(model)
+    assert {f.severity for f in findings} == set(SEVERITIES)
+    order = [(SEVERITIES.index(f.severity), f.subject, f.code) for f in findings]
+    assert order == sorted(order)
+    for f in findings:
+        assert all(isinstance(text, str) and text for text in (f.code, f.subject, f.message, f.remedy))
+    line = str(Finding("info", "a_code", "a thing", "is so", "do this"))
+    assert line == "info a_code (a thing): is so\n  -> do this"
+
+
+def test_a_bad_point_is_refused(load):
+    model = load("pendulum.urdf")
+    with pytest.raises(dd.ShapeError, match=r"x: expected shape \(2,\)"):
+        audit(model, [0.0])
+    with pytest.raises(dd.ShapeError, match=r"u: expected shape \(1,\)"):
+        audit(model, [0.0, 0.0], [1.0, 2.0])
+    with pytest.raises(dd.NonFiniteError, match=r"x\[1\]"):
+        audit(model, [0.0, np.nan])
+
+
+def test_a_plant_without_a_scene_graph_is_audited():
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(MultibodyPlant(0.01))
+    plant.SetUseSampledOutputPorts(False)
+    plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    plant.Finalize()
+    assert audit(dd.model_from_diagram(builder.Build())) == []
+
+
+def test_the_audit_leaves_the_model_as_it_was(load):
+    model = load("sphere_on_ground.sdf")
+    x = np.array(model.default_state)
+    x[6], x[10], x[12] = 0.0985, 0.7, -0.3
+    before = dd.step(model, x)
+    audit(model)
+    assert np.array_equal(dd.step(model, x), before)
+
+
+# 1. Pairs that AutoDiffXd refuses
+
+
+def test_a_box_above_a_tilted_half_space_is_refused_without_touching():
+    """20 cm of air below the box; the half space's bounding box is infinite as soon as it is tilted."""
+    model, x = pair(Box(0.2, 0.2, 0.2), HalfSpace(), 0.3, ground=(0.2, 0, 0))
+    found = only(audit(model, x), "pair_refused")
+    assert (found.severity, found.subject) == ("error", "body - world")
+    assert "body/body_shape (Box)" in found.message
+    assert "(HalfSpace)" in found.message
+    assert "throws without touching" in found.message
+    assert "The AutoDiffXd step throws at x over such shapes: Penetration queries" in found.message
+    for route in ("corner_spheres", "hydroelastic", "differences", "CollisionFilterDeclaration"):
+        assert route in found.remedy
+    with pytest.raises(dd.SimulationError, match="Penetration queries"):
+        dd.differentiate_step(model, x, method="autodiff")
+
+
+def test_a_refused_pair_that_is_far_away_does_not_throw_yet():
+    model, x = pair(Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), 1.0)
+    found = only(audit(model, x), "pair_refused")
+    assert found.severity == "error"
+    assert "The AutoDiffXd step does not throw at x." in found.message
+    assert "half space" not in found.message
+    assert dd.differentiate_step(model, x, method="autodiff").method == "autodiff"
+
+
+def test_pairs_that_autodiff_takes_are_not_refused():
+    for lower in (Box(1, 1, 0.2), HalfSpace(), Capsule(0.1, 0.3), Sphere(0.1)):
+        assert codes(audit(*pair(Sphere(0.1), lower, 0.4)), "error", "warning") == set()
+
+
+def test_refused_pairs_are_grouped_by_bodies_and_other_throws_are_told_apart():
+    plant = Plant(0.01)
+    for i, height in enumerate((0.0, 0.05, 2.0)):
+        body = plant.plant.AddRigidBody(f"body{i}", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+        for k in range(2):
+            pose = RigidTransform([0.3 * k, 0, height])
+            shape = Cylinder(0.1, 0.2) if i == 2 else Box(0.2, 0.2, 0.2)
+            plant.plant.RegisterCollisionGeometry(body, pose, shape, f"part{k}", given())
+    model = plant.model()
+    refused = {f.subject: f.message for f in audit(model) if f.code == "pair_refused"}
+    assert set(refused) == {"body0 - body1", "body0 - body2", "body1 - body2"}
+    boxes = "body0/part0 (Box), body0/part1 (Box) against body1/part0 (Box), body1/part1 (Box): "
+    assert refused["body0 - body1"].startswith(boxes)
+    assert (
+        "throws at x over such shapes: Penetration queries between shapes 'Box' and 'Box'" in refused["body0 - body1"]
+    )
+    assert "throws over another pair" in refused["body0 - body2"]
+
+
+def test_pairs_differenced_by_choice_are_only_told():
+    model, x = pair(Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), 0.0995)
+    model.contact_geometry = "differences"  # as load_model leaves it
+    findings = audit(model, x)
+    found = only(findings, "pair_refused")
+    assert found.severity == "info"
+    assert "by choice" in found.remedy
+    assert "autodiff_refused" not in codes(findings)
+
+
+def test_hydroelastic_contact_alone_without_properties_is_refused():
+    for compliance, height in ((("compliant", None), 0.0995), (("rigid", "rigid"), 1.0)):
+        model, x = pair(Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), height, compliance=compliance, contact_model="hydroelastic")
+        found = only(audit(model, x), "pair_refused")
+        assert found.severity == "error"
+        assert "the double step throws too" in found.message
+    model, x = pair(Sphere(0.1), Box(1, 1, 0.2), 0.095, compliance=("rigid", "rigid"), contact_model="hydroelastic")
+    step = only(audit(model, x), "no_step")
+    assert step.severity == "error"
+    assert "two rigid objects" in step.message
+    with pytest.raises(dd.SimulationError, match="two rigid objects"):
+        dd.step(model, x)
+
+
+def test_with_fallback_a_pair_without_properties_is_judged_as_point_contact():
+    fallback = {"contact_model": "hydroelastic_with_fallback"}
+    for compliance in ((None, None), ("compliant", None), ("rigid", "rigid")):
+        model, x = pair(Ellipsoid(0.1, 0.1, 0.1), Box(1, 1, 0.2), 0.095, compliance=compliance, **fallback)
+        assert only(audit(model, x), "pair_refused").severity == "error"
+        with pytest.raises(dd.SimulationError):
+            dd.differentiate_step(model, x, method="autodiff")
+    model, x = pair(Ellipsoid(0.1, 0.1, 0.1), Box(1, 1, 0.2), 0.095, compliance=("compliant",) * 2, **fallback)
+    assert "pair_refused" not in codes(audit(model, x))
+    assert dd.differentiate_step(model, x, method="autodiff").method == "autodiff"
+
+
+def test_a_pair_that_the_table_takes_but_drake_refuses_is_still_found(monkeypatch):
+    monkeypatch.setattr("drake_diff.audit_place.autodiff_supports", lambda *_: True)
+    found = only(audit(*pair(Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), 0.0995)), "autodiff_refused")
+    assert (found.severity, found.subject) == ("error", "step")
+    assert "Penetration queries between shapes 'Box' and 'Box'" in found.message
+
+
+# 2. and 3. What drake_diff takes care of
+
+
+def test_pd_gains_and_their_target_are_told():
+    found = only(audit(block(gains=(20.0, 3.0), start=0.25).model()), "pd_gains")
+    assert (found.severity, found.subject) == ("info", "motor")
+    assert "drops these PD gains; drake_diff puts them back" in found.message
+    assert "(0.25, 0)" in found.message
+
+
+def test_pd_gains_whose_target_the_diagram_feeds_are_told():
+    plant = block(gains=(20.0, 3.0))
+    plant.plant.Finalize()
+    instance = actuators(plant.plant)[0].model_instance()
+    source = plant.builder.AddSystem(ConstantVectorSource([0.1, 0.0]))
+    plant.builder.Connect(source.get_output_port(), plant.plant.get_desired_state_input_port(instance))
+    found = only(audit(dd.model_from_diagram(plant.builder.Build())), "pd_gains")
+    assert "your diagram feeds the desired state port" in found.message
+
+
+def test_an_identity_frame_is_told_and_another_is_not():
+    plant = Plant(0.01)
+    inertia = SpatialInertia(1.0, [0, 0, -0.3], UnitInertia(0.09, 0.09, 0.0))
+    parent = plant.plant.world_frame()
+    for name, z in (("first", 0.0), ("second", 0.4)):
+        body = plant.plant.AddRigidBody(name, inertia)
+        frame = plant.plant.AddFrame(FixedOffsetFrame(f"{name}_offset", parent, RigidTransform([0, 0, z])))
+        plant.plant.AddJoint(RevoluteJoint(name, frame, body.body_frame(), [0, 1, 0]))
+        parent = body.body_frame()
+    found = only(audit(plant.model()), "identity_frame")
+    assert (found.severity, found.subject) == ("info", "first")
+    assert "1e-300 m" in found.message
+
+
+# 4. Aligned faces
+
+
+HYDROELASTIC = {"compliance": ("compliant", "compliant"), "contact_model": "hydroelastic_with_fallback"}
+
+
+@pytest.mark.parametrize(
+    ("upper", "lower", "height"),
+    [
+        (Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), 0.0995),
+        (Cylinder(0.1, 0.2), Cylinder(0.2, 0.2), 0.095),
+        (Cylinder(0.1, 0.2), Box(1, 1, 0.2), 0.095),
+        (Sphere(0.1), Cylinder(0.2, 0.2), 0.095),  # over an untilted cap
+    ],
+)
+def test_aligned_faces_in_reach_are_an_error(upper, lower, height):
+    model, x = pair(upper, lower, height, **HYDROELASTIC)
+    found = only(audit(model, x), "aligned_faces")
+    assert found.severity == "error"
+    assert "0 rad from parallel at x" in found.message
+    assert "wrong number" in found.message
+    x[6] = 0.4
+    far = only(audit(model, x), "aligned_faces")
+    assert far.severity == "warning"
+    assert "0.3 m apart" in far.message
+
+
+def test_a_box_flat_on_a_rigid_half_space_is_aligned_by_its_bottom():
+    compliance = {"compliance": ("compliant", "rigid"), "contact_model": "hydroelastic_with_fallback"}
+    found = only(audit(*pair(Box(0.2, 0.2, 0.2), HalfSpace(), 0.0995, **compliance)), "aligned_faces")
+    assert found.severity == "error"
+    assert "-0.0005 m apart" in found.message
+    found = only(audit(*pair(Box(0.2, 0.2, 0.2), HalfSpace(), -0.2, **compliance)), "aligned_faces")
+    assert "-0.3 m apart" in found.message  # below the surface it is still inside
+    found = only(audit(*pair(Box(0.2, 0.2, 0.2), HalfSpace(), 0.3, **compliance)), "aligned_faces")
+    assert "0.2 m apart" in found.message
+    assert found.severity == "warning"
+
+
+def test_tilted_faces_are_only_told():
+    found = only(
+        audit(*pair(Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), 0.0995, tilt=(0.03, -0.02, 0.5), **HYDROELASTIC)),
+        "aligned_faces",
+    )
+    assert found.severity == "info"
+    assert "0.036 rad from parallel" in found.message
+    assert "tilted now" in found.message
+
+
+def test_nearly_aligned_faces_are_a_warning():
+    """Measured: a box at 1e-3 rad on a rigid half space is not certified."""
+    compliance = {"compliance": ("compliant", "rigid"), "contact_model": "hydroelastic_with_fallback"}
+    model, x = pair(Box(0.2, 0.2, 0.2), HalfSpace(), 0.0965, tilt=(1e-3, 0, 0.4), **compliance)
+    found = only(audit(model, x), "aligned_faces")
+    assert found.severity == "warning"
+    assert "0.001 rad from parallel" in found.message
+    assert dd.certify(model, x, method="autodiff").verdict != "agree"
+
+
+@pytest.mark.parametrize("lower", [Cylinder(0.2, 0.2), Box(1, 1, 0.2)])
+def test_a_sphere_over_a_flat_mesh_is_aligned_only_in_its_planes_of_symmetry(lower):
+    """The meshes' edges lie on each other there: certify says the same."""
+    model, x = pair(Sphere(0.1), lower, 0.095, **HYDROELASTIC)
+    assert only(audit(model, x), "aligned_faces").severity == "error"
+    assert dd.certify(model, x, method="autodiff").verdict == "discontinuous"
+    x[4:6] = 0.0131, 0.0072
+    assert codes(audit(model, x), "error", "warning") == set()
+    dd.certify(model, x, method="autodiff").require()
+
+
+def test_a_round_shape_has_nothing_to_align_with_on_a_half_space():
+    compliance = {"compliance": ("compliant", "rigid"), "contact_model": "hydroelastic_with_fallback"}
+    for shape in (Sphere(0.1), Ellipsoid(0.1, 0.09, 0.1), Capsule(0.1, 0.1)):
+        model, x = pair(shape, HalfSpace(), 0.145 if isinstance(shape, Capsule) else 0.095, **compliance)
+        assert "aligned_faces" not in codes(audit(model, x))
+        dd.certify(model, x, method="autodiff").require()
+
+
+def test_point_contact_has_no_aligned_faces():
+    assert "aligned_faces" not in codes(audit(*pair(Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), 0.0995)))
+
+
+# 5. A sphere on a cylinder's axis
+
+
+@pytest.mark.parametrize("height", [0.0995, 0.3])
+def test_a_sphere_on_a_cylinders_axis_is_an_error(height):
+    found = only(audit(*pair(Sphere(0.1), Cylinder(0.2, 0.2), height)), "cylinder_axis")
+    assert found.severity == "error"
+    assert "AutoDiffXd is singular" in found.message
+
+
+def test_a_sphere_beside_the_axis_is_only_told():
+    model, x = pair(Sphere(0.1), Cylinder(0.2, 0.2), 0.0995)
+    x[4] = 0.013
+    found = only(audit(model, x), "cylinder_axis")
+    assert found.severity == "info"
+    assert "0.013 m from the cylinder's axis" in found.message
+
+
+# 6. Efforts at their limits
+
+
+def test_an_effort_at_its_limit_is_an_error():
+    model = block(limit=20.0).model()
+    assert "saturated_effort" not in codes(audit(model, u=[19.99]))
+    for u in (20.0, -25.0):
+        found = only(audit(model, u=[u]), "saturated_effort")
+        assert (found.severity, found.subject) == ("error", "motor")
+        assert f"limit 20 (u is {u:g}): there the derivative by u is exactly 0" in found.message
+    assert np.all(dd.differentiate_step(model, model.default_state, [-25.0]).B == 0)
+
+
+def test_pd_control_that_saturates_is_an_error_even_at_zero_input():
+    model = block(limit=20.0, gains=(1000.0, 1.0)).model()
+    found = only(audit(model, [0.1, 0.0]), "saturated_effort")
+    assert found.severity == "error"
+    assert "(u is 0)" in found.message
+    assert np.all(dd.differentiate_step(model, [0.1, 0.0], [0.0], method="autodiff").B == 0)
+
+
+def test_a_limit_below_the_effort_that_holds_the_pose_is_a_warning():
+    found = only(audit(block(limit=9.0).model(), [0.0, 3.0]), "saturated_effort")
+    assert found.severity == "warning"
+    assert "to hold x at rest takes 9.81 (without contact), beyond the limit 9" in found.message
+    assert "saturated_effort" not in codes(audit(block(limit=10.0).model()))
+
+
+@pytest.mark.filterwarnings("ignore::drake_diff.ModelWarning")
+def test_an_actuator_that_drake_leaves_out_for_a_limit_of_zero_is_an_error(write_urdf):
+    model = write_urdf(limit=0)
+    assert model.nu == 0
+    found = only(audit(model), "saturated_effort")
+    assert found.severity == "error"
+    assert "zero effort limit" in found.message
+    assert "slide" in found.message
+
+
+# 7. The Jacobian at x
+
+
+def test_a_huge_entry_is_named(write_urdf):
+    """B = h / m = 0.1 / 1e-6."""
+    found = only(audit(write_urdf(mass=1e-6)), "huge_jacobian")
+    assert found.severity == "warning"
+    assert found.subject == "d slide_v / d push"
+    assert "1e+05" in found.message
+    assert "huge_jacobian" not in codes(audit(write_urdf(mass=1e-3)))
+
+
+def test_a_refused_gradient_is_an_error():
+    model = block(gains=(20.0, 3.0)).model()
+    actuators(model.autodiff.plant)[0].set_controller_gains(PdControllerGains(p=1e-12, d=0.0))
+    found = only(audit(model, [0.1, 0.0]), "gradient_refused")
+    assert found.severity == "error"
+    assert "the AutoDiffXd step is not the double step: lift" in found.message
+
+
+def test_a_gradient_beyond_any_plausible_size_is_an_error(load, monkeypatch):
+    monkeypatch.setattr("drake_diff.step_derivatives.MAGNITUDE_BOUND", 1e-3)
+    found = only(audit(load("pendulum.urdf")), "gradient_refused")
+    assert "expected a finite number of at most" in found.message
+
+
+def test_a_diagram_without_an_autodiff_form_is_an_error():
+    plant = block()
+    plant.plant.Finalize()
+    plant.builder.AddSystem(LeafSystem()).set_name("python_only")
+    found = only(audit(dd.model_from_diagram(plant.builder.Build())), "autodiff_refused")
+    assert (found.severity, found.subject) == ("error", "diagram")
+    assert "no AutoDiffXd twin" in found.message
+
+
+def test_a_state_that_drake_cannot_place_is_an_error():
+    model, x = pair(Sphere(0.1), Cylinder(0.2, 0.2), 0.3)
+    x[:4] = 0
+    found = only(audit(model, x), "no_step")
+    assert found.severity == "error"
+    assert "quaternion" in found.message
+
+
+# 8. Numbers that nobody chose
+
+
+def ball_over_ground(properties, **options):
+    plant = Plant(0.01, **options)
+    plant.ball("ball", 1.0, 0.1, properties, "z")
+    plant.ground(given())
+    model = plant.model()
+    return audit(model, [0.3, 0.0])
+
+
+def test_contact_numbers_that_are_not_given_are_named_with_the_value_that_decides():
+    found = only(ball_over_ground(ProximityProperties()), "default_decides")
+    assert (found.severity, found.subject) == ("warning", "ball/ball (Sphere)")
+    numbers = "coulomb_friction 0.5, relaxation_time 0.1 s, point_contact_stiffness 1e+06 N/m"
+    assert numbers in found.message
+    assert "hardly bounces" in found.message
+    for tag in ("drake:mu_dynamic", "drake:relaxation_time", "drake:point_contact_stiffness"):
+        assert tag in found.remedy
+
+
+@pytest.mark.parametrize("approximation", ["similar", "lagged"])
+def test_similar_and_lagged_contact_ask_for_the_dissipation_instead(approximation):
+    found = only(ball_over_ground(ProximityProperties(), approximation=approximation), "default_decides")
+    assert "hunt_crossley_dissipation 50 s/m" in found.message
+    assert "relaxation_time" not in found.message
+
+
+def test_only_what_is_missing_is_named():
+    assert "default_decides" not in codes(ball_over_ground(given()))
+    found = only(ball_over_ground(contact_properties(1e4, 1.0, 0.5)), "default_decides")
+    assert "decides: relaxation_time 0.1 s (" in found.message
+    assert "friction" not in found.message
+
+
+def test_what_collides_with_nothing_needs_no_numbers():
+    plant = Plant(0.01)
+    plant.ball("ball", 1.0, 0.1, ProximityProperties(), "z")
+    assert codes(audit(plant.model())) == set()
+
+
+def test_a_modulus_from_the_scene_graphs_config_is_named():
+    plant = Plant(0.01, contact_model="hydroelastic")
+    config = SceneGraphConfig()
+    config.default_proximity_properties.compliance_type = "compliant"
+    plant.scene_graph.set_config(config)
+    plant.ball("ball", 1.0, 0.1, given(), "z")
+    plant.shape(plant.plant.world_body(), Box(1, 1, 0.2), given("rigid"))
+    found = only(audit(plant.model(), [1.0, 0.0]), "default_decides")
+    assert found.subject == "ball/ball (Sphere)"
+    assert "decides: hydroelastic_modulus 1e+07 Pa" in found.message
+
+
+# 9. and 10. Constraints, limits, touch
+
+
+def test_constraints_and_locked_joints_are_told():
+    plant = Plant(0.01, gravity=0.0)
+    for name in ("a", "b"):
+        body = plant.plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+        add_slide(plant.plant, name, plant.plant.world_frame(), body, "x")
+    plant.plant.AddCouplerConstraint(*(plant.plant.GetJointByName(n) for n in "ab"), 2.0, 0.0)
+    model = plant.model()
+    joints(model.plant)[1].Lock(model.double.context)
+    findings = audit(model)
+    assert codes(findings, "error", "warning") == set()
+    assert "(1)" in only(findings, "constraints").message
+    locked = only(findings, "locked_joint")
+    assert (locked.severity, locked.subject) == ("info", "b")
+
+
+def test_a_position_at_its_limit_is_a_warning(load):
+    model = load("cart_pole.urdf")
+    for q in (2.0, 2.0 - 1e-7, 2.5, -2.0):
+        found = only(audit(model, [q, 0, 0, 0]), "joint_limit")
+        assert (found.severity, found.subject) == ("warning", "slide_x")
+        assert "[-2, 2]" in found.message
+    assert "joint_limit" not in codes(audit(model, [1.99, 0, 0, 0]))
+
+
+@pytest.mark.parametrize("lower", [HalfSpace(), Box(1, 1, 0.2), Sphere(0.1)])
+def test_a_pair_exactly_at_touch_is_a_warning(lower):
+    model, x = pair(Sphere(0.1), lower, 0.1)
+    found = only(audit(model, x), "touching")
+    assert found.severity == "warning"
+    assert "one side" in found.message
+    for height in (0.1 - 1e-6, 0.1 + 1e-6):
+        x[6] = height
+        assert "touching" not in codes(audit(model, x))
+
+
+def test_a_pair_without_a_distance_is_named_as_not_measured():
+    findings = audit(*pair(Box(0.2, 0.2, 0.2), HalfSpace(), 0.1))
+    assert "touching" not in codes(findings)
+    found = only(findings, "not_measured")
+    assert found.severity == "info"
+    assert "body/body_shape (Box)" in found.subject
+
+
+# Real robots
+
+
+def robot(name):
+    return next(f.locate() for f in files("example-robot-data") if str(f).endswith("/" + name))
+
+
+@pytest.mark.parametrize(
+    ("name", "base", "refused"),
+    [
+        (
+            "panda.urdf",
+            "panda_link0",
+            {"panda_leftfinger - panda_rightfinger", "panda_leftfinger - world", "panda_rightfinger - world"},
+        ),
+        ("ur5_robot.urdf", None, {"ee_link - world"}),
+        ("solo12.urdf", None, set()),
+    ],
+)
+def test_a_real_robot_is_audited_quickly_and_its_boxes_are_named(name, base, refused):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dd.ModelWarning)
+        model = dd.load_model(robot(name), time_step=0.005, weld_base=base, ground=0.5)
+    start = time.perf_counter()
+    findings = audit(model)
+    assert time.perf_counter() - start < 2.0
+    assert {f.subject for f in findings if f.code == "pair_refused"} == refused
+    assert all("(Box)" in f.message for f in findings if f.code == "pair_refused")
+    assert codes(findings, "error") == ({"pair_refused"} if refused else set())
