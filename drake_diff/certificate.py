@@ -189,7 +189,7 @@ def certify_displacement(
     jumps = _not_smooth(forward, backward, derivative, value_scale, solver_tolerance)
     if beside is not None:
         reach = np.maximum(np.abs(forward), np.abs(backward)).max(axis=0, initial=0)
-        jumps |= _jittery(derivative, beside, reach)
+        jumps |= _jittery(derivative, beside, reach, solver_tolerance)
     codes[jumps] = VERDICTS.index("discontinuous")
     return Certificate(
         rows,
@@ -268,11 +268,13 @@ def _does_not_shrink(gap: Array, a: Array, noise: Array, steepest: float) -> NDA
     return found
 
 
-def _jittery(a: Array, beside: Array, reach: Array) -> NDArray[np.bool_]:
+def _jittery(a: Array, beside: Array, reach: Array, solver_tolerance: float) -> NDArray[np.bool_]:
     """Entries that are another number right beside the point; `reach` is the largest quotient seen around it.
 
-    A smooth entry changes by about 1e-9 of its derivative's slope, and by 1e-2 of it over the widest quotient.
+    A smooth entry changes by about 1e-9 of its derivative's slope, and by 1e-2 of it over the widest quotient; what
+    an iterative solver leaves unsolved changes from point to point.
     """
     change, size = np.abs(a - beside), np.abs(a) + np.abs(beside)
     row_size = size.max(axis=1, keepdims=True, initial=0)
-    return (change > JITTER_CHANGE * size) & (size > NEGLIGIBLE * row_size) & (change > RESOLVED * reach)
+    told = change > np.maximum(RESOLVED * reach, SOLVER_FACTOR * solver_tolerance * row_size)
+    return told & (change > JITTER_CHANGE * size) & (size > NEGLIGIBLE * row_size)
