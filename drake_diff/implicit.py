@@ -102,9 +102,8 @@ def _needed(twin: Twin, acceleration: Any) -> Any:
     """(nv,) M a + bias less gravity, springs, damping and added forces, in the twin's state."""
     forces = MultibodyForces_[twin.scalar](twin.plant)
     twin.plant.CalcForceElementsContribution(twin.context, forces)
-    if twin.added:
-        forces.mutable_generalized_forces()[:] = forces.generalized_forces() + twin.added_force()
-    return twin.plant.CalcInverseDynamics(twin.context, acceleration, forces)
+    needed = twin.plant.CalcInverseDynamics(twin.context, acceleration, forces)
+    return needed - twin.added_force() if twin.added else needed  # `forces` of AutoDiffXd are a copy: not writable
 
 
 def _check_vanishes(needed: Array, rest: Array) -> None:
@@ -115,7 +114,7 @@ def _check_vanishes(needed: Array, rest: Array) -> None:
 
 def _positions(model: Model, v_next: Array, velocities: Array, num_parameters: int) -> Array:
     """(nq, nx + nu + np) the derivative of q' = q + h N(q) v'; the AutoDiffXd twin stands at the step's state."""
-    if model.nq == model.nv:
+    if model.plant.IsVelocityEqualToQDot():
         moved = model.time_step * velocities
         moved[_form_of(model).diagonal] += 1.0
         return np.asarray(moved)

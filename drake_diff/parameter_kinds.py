@@ -64,6 +64,12 @@ def _central_inertia(body: Any) -> list[float]:
     return [*about_com.get_moments(), *about_com.get_products()]
 
 
+def _find_inertia(model: Model) -> Found:
+    for label, body in labelled(bodies(model.plant)).items():
+        if body.default_mass() > 0:  # a frame without mass has none: setting it would end the process
+            yield label, "kg m^2", _central_inertia(body)
+
+
 def _write_mass(twin: Twin, label: str, value: Values) -> None:
     twin.body(label).SetMass(twin.context, value[0])
 
@@ -215,7 +221,7 @@ MECHANISM_KINDS = (
     Kind("gravity", "chain_rule", _find_gravity, _write_gravity, on_plant=True),
     Kind("mass", "autodiff", _find_of_bodies("kg", lambda b: b.default_mass()), _write_mass, positive=True),
     Kind("center_of_mass", "autodiff", _find_of_bodies("m", lambda b: b.default_com()), _write_center_of_mass),
-    Kind("inertia", "autodiff", _find_of_bodies("kg m^2", _central_inertia), _write_inertia),
+    Kind("inertia", "autodiff", _find_inertia, _write_inertia),
     Kind("damping", "autodiff", _find_damping, _write_damping, positive=True),
     Kind("offset", "autodiff", _find_offset, _write_offset),
     Kind(

@@ -217,8 +217,8 @@ def _check_overlap(parameters: Sequence[Parameter]) -> None:
     """A body's contact and that of one of its geometries are not independent."""
     names = {p.name for p in parameters}
     for p in parameters:
-        whole = f"{p.label.split('/')[0]}.{p.kind.quantity}"
-        if "/" in p.label and whole in names:
+        whole = f"{p.label.rsplit('/', 1)[0]}.{p.kind.quantity}"
+        if p.kind in CONTACT_KINDS and "/" in p.label and whole in names:
             raise InputError(
                 "parameters", got=f"{whole} and {p.name}", expected="one of them: the first sets the other"
             )

@@ -58,7 +58,7 @@ def advance(twin: Twin, x: Any, u: Any) -> Any:
     try:
         # value() is a view that the next step overwrites.
         x_next = np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())
-    except RuntimeError as error:
+    except (RuntimeError, SystemExit) as error:  # SystemExit: a condition in Drake, such as a stiffness above 0
         raise SimulationError(f"Drake cannot take this step: {error}") from error
     if x_next.dtype == float and not np.all(np.isfinite(x_next)):
         raise SimulationError(f"the step leads to {x_next}, which is not finite, from x = {x}, u = {u}")

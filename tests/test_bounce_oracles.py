@@ -138,7 +138,7 @@ def test_the_rigid_optimum_has_c05s_digits():
 
 
 def test_the_rigid_optimum_costs_nearly_as_much_in_the_simulator():
-    """Stiff balls in small steps: h w = 0.05, and pi / w = 16 ms of contact, in which ball 2 loses v pi / (2 w) of way."""
+    """Stiff balls in small steps: h w = 0.05; in pi / w = 16 ms of contact ball 2 loses v pi / (2 w) of way."""
     h, k = 2.5e-4, 2e4
     plant = Plant(h, "lagged", gravity=0.0)
     for name in ("one", "two"):

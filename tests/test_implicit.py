@@ -1,0 +1,432 @@
+"""The implicit step Jacobian is that of AutoDiffXd wherever a step is smooth, and is handed over wherever it is not."""
+
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import MODELS, Plant, add_slide, contact_properties, random_state
+from pydrake.common.value import Value
+from pydrake.geometry import Box
+from pydrake.math import RigidTransform
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import ExternallyAppliedSpatialForce
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    PdControllerGains,
+    PrismaticSpring,
+    QuaternionFloatingJoint,
+    RevoluteJoint,
+    RevoluteSpring,
+    RotationalInertia,
+    RpyFloatingJoint,
+    SpatialInertia,
+    UniversalJoint,
+)
+from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
+from test_model import robot
+
+import drake_diff as dd
+
+NAMES = sorted(path.name for path in MODELS.iterdir())
+SAME = 1e-10  # two exact derivatives of one smooth step differ by rounding
+
+
+def exact_parameters(model):
+    """All whose derivative is no difference."""
+    return tuple(p.name for p in dd.list_parameters(model) if p.derivative_source != "finite_difference")
+
+
+def agree(a, b):
+    """Whether two StepDerivatives are the same to rounding, and lead to the same state to the bit."""
+    assert np.array_equal(a.x_next, b.x_next)
+    for name in ("A", "B", "C"):
+        ours, theirs = getattr(a, name), getattr(b, name)
+        tolerance = SAME * max(1.0, np.abs(theirs).max(initial=0.0))
+        assert np.abs(ours - theirs).max(initial=0.0) <= tolerance, name
+
+
+def same_by_both(model, x, u=(), parameters=None, expected="implicit"):
+    """The implicit derivatives at (x, u), which autodiff and the automatic choice confirm."""
+    parameters = exact_parameters(model) if parameters is None else parameters
+    found = {
+        method: dd.differentiate_step(model, x, u, parameters=parameters, method=method)
+        for method in ("implicit", "autodiff", "auto", "auto")
+    }
+    assert found["implicit"].method == expected, found["implicit"].reason
+    assert found["autodiff"].method == "autodiff"
+    agree(found["implicit"], found["autodiff"])
+    agree(found["auto"], found["autodiff"])
+    return found["implicit"]
+
+
+def in_the_air(model, x):
+    """Free bodies a metre up, off whatever there is."""
+    if model.state_names[0].endswith("_qw"):
+        x[6] = 1.0
+    return x
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("seed", range(3))
+def test_every_model_of_this_repository(load, name, seed):
+    model, random = load(name), np.random.default_rng(seed)
+    x = in_the_air(model, random_state(model, random, 0.7))
+    d = same_by_both(model, x, random.standard_normal(model.nu))
+    assert d.reason == "asked for"
+    assert d.C.shape[1] >= 10
+
+
+@pytest.mark.parametrize("approximation", ["sap", "similar", "lagged"])
+def test_every_contact_approximation(load, approximation):
+    model = load("double_pendulum.urdf", contact_approximation=approximation, time_step=0.05)
+    same_by_both(model, [0.4, -0.9, 1.3, -0.6], [0.25, -0.15])
+
+
+@pytest.mark.parametrize(
+    ("name", "base"),
+    [("panda.urdf", "panda_link0"), ("ur5_robot.urdf", None), ("solo12.urdf", None), ("solo12.urdf", "base_link")],
+)
+def test_real_robots(tmp_path, name, base):
+    """Panda without the coupling of its fingers, which is a constraint, and without their boxes, which touch."""
+    text = Path(robot(name)).read_text()
+    path = tmp_path / name
+    path.write_text(re.sub(r"(?s)<mimic.*?/>|<(collision|visual).*?</\1>", "", text))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dd.ModelWarning)
+        model = dd.load_model(path, time_step=0.005, weld_base=base)
+    lower, upper = model.plant.GetPositionLowerLimits(), model.plant.GetPositionUpperLimits()
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        x = random_state(model, random, 0.4)
+        limited = np.isfinite(lower) & np.isfinite(upper)
+        low, high = lower[limited], upper[limited]
+        x[: model.nq][limited] = (low + high) / 2 + 0.05 * (high - low) * random.standard_normal(len(low))
+        same_by_both(model, x, 0.3 * random.standard_normal(model.nu))
+
+
+def test_a_real_robot_with_coupled_fingers_is_handed_over():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dd.ModelWarning)
+        model = dd.load_model(robot("panda.urdf"), time_step=0.005, weld_base="panda_link0")
+    d = dd.differentiate_step(model, model.default_state, np.zeros(model.nu))
+    assert d.method != "implicit"
+    assert dd.step(model, model.default_state, np.zeros(model.nu)) == pytest.approx(d.x_next, abs=0)
+
+
+def floating(joint_type, seed):
+    """A free body with a sprung arm on it, so that the base is pushed around."""
+    made, random = Plant(0.01), np.random.default_rng(seed)
+    plant = made.plant
+    inertia = RotationalInertia(0.2, 0.3, 0.25, 0.01, -0.02, 0.015)
+    base = plant.AddRigidBody("base", SpatialInertia.MakeFromCentralInertia(2.0, np.array([0.1, 0, 0.05]), inertia))
+    arm = plant.AddRigidBody("arm", SpatialInertia.MakeFromCentralInertia(0.7, np.array([0, 0, -0.3]), inertia))
+    if joint_type is not None:
+        plant.AddJoint(joint_type("free", plant.world_frame(), base.body_frame()))
+    pose = RigidTransform(random.standard_normal(3))
+    frame = plant.AddFrame(FixedOffsetFrame("mount", base.body_frame(), pose))
+    hinge = plant.AddJoint(RevoluteJoint("hinge", frame, arm.body_frame(), [0.0, 0.6, 0.8], 0.3))
+    plant.AddForceElement(RevoluteSpring(hinge, 0.4, 5.0))
+    plant.AddJointActuator("motor", hinge)
+    return made.model()
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("joint_type", [None, QuaternionFloatingJoint, RpyFloatingJoint, UniversalJoint])
+def test_floating_bases_and_joints_of_many_degrees(joint_type, seed):
+    model, random = floating(joint_type, seed), np.random.default_rng(seed)
+    same_by_both(model, random_state(model, random, 0.5), random.standard_normal(1))
+
+
+def test_a_choice_made_at_rest_holds_in_motion():
+    """Of roll, pitch and yaw there are as many as angular velocities, but their rates are not these."""
+    model = floating(RpyFloatingJoint, 0)
+    rest = np.zeros(model.nx)
+    dd.differentiate_step(model, rest, [0.0])
+    same_by_both(model, random_state(model, np.random.default_rng(0), 0.5), [0.3])
+
+
+def test_a_quaternion_that_is_not_of_unit_norm():
+    """Drake's coordinates are taken as they are; A has a column for each."""
+    model, random = floating(None, 0), np.random.default_rng(0)
+    x = random_state(model, random)
+    x[:4] *= 1.1
+    same_by_both(model, x, [0.2])
+
+
+def springs_and_motors(*, limit=np.inf, kp=(0.0, 0.0, 0.0), gear=1.0, damping=0.2):
+    """A sprung cart, a sprung pole on it and a pole on that, all driven, PD-controlled where a gain is given."""
+    made = Plant(0.01)
+    plant = made.plant
+    cart = plant.AddRigidBody("cart", SpatialInertia.SolidSphereWithMass(1.5, 0.1))
+    joints = [add_slide(plant, "rail", plant.world_frame(), cart, "x")]
+    plant.AddForceElement(PrismaticSpring(joints[0], 0.2, 30.0))
+    parent = cart
+    for i in range(2):
+        inertia = SpatialInertia.SolidCapsuleWithMass(0.8, 0.05, 0.4, [0, 0, 1]).Shift([0, 0, 0.3])
+        pole = plant.AddRigidBody(f"pole{i}", inertia)
+        frame = plant.AddFrame(FixedOffsetFrame(f"m{i}", parent.body_frame(), RigidTransform([0, 0, -0.6 * i])))
+        joints.append(plant.AddJoint(RevoluteJoint(f"hinge{i}", frame, pole.body_frame(), [0, 1, 0])))
+        plant.AddForceElement(RevoluteSpring(joints[-1], 0.3 * i, 4.0 + i))
+        parent = pole
+    for i, joint in enumerate(joints):
+        joint.set_default_damping_vector([damping * (i + 1)])
+        joint.set_default_positions([0.1 * i])
+        motor = plant.AddJointActuator(f"motor{i}", joint, limit)
+        motor.set_default_gear_ratio(gear)
+        motor.set_default_rotor_inertia(0.01)
+        if kp[i]:
+            motor.set_controller_gains(PdControllerGains(p=kp[i], d=0.1 * kp[i]))
+    return made.model()
+
+
+POINT = [0.3, 0.5, -0.4, 0.2, -0.7, 1.1], [0.4, -0.3, 0.2]
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.2, 50.0])
+@pytest.mark.parametrize("gear", [1.0, -12.0])
+def test_springs_damping_and_reflected_inertia(damping, gear):
+    same_by_both(springs_and_motors(damping=damping, gear=gear), *POINT)
+
+
+@pytest.mark.parametrize("kp", [(20.0, 5.0, 8.0), (0.0, 30.0, 0.0), (3000.0, 900.0, 400.0)])
+def test_pd_control_of_some_or_all_joints(kp):
+    d = same_by_both(springs_and_motors(kp=kp), *POINT)
+    assert not np.allclose(d.A, dd.differentiate_step(springs_and_motors(), *POINT).A, atol=1e-3)
+
+
+@pytest.mark.parametrize("kp", [(0.0, 0.0, 0.0), (20.0, 5.0, 8.0), (0.0, 300.0, 200.0)])
+@pytest.mark.parametrize("u", [[30.0, -0.3, -0.2], [0.4, 900.0, -900.0], [-30.0, -900.0, 900.0]])
+def test_efforts_at_their_limits(kp, u):
+    """A saturated input has no effect, and its controller adds neither stiffness nor damping."""
+    model = springs_and_motors(limit=3.0, kp=kp)
+    d = same_by_both(model, POINT[0], u)
+    saturated = np.abs(dd.rollout(model, POINT[0], [u]).efforts[0]) >= 3.0 - 1e-9
+    assert saturated.any()
+    assert np.all(np.abs(d.B).max(axis=0)[saturated] == 0)
+    assert np.all(np.abs(d.B).max(axis=0)[~saturated] > 0)
+
+
+def limited_pendulum(lower=-1.0, upper=1.0):
+    made = Plant(0.01)
+    inertia = SpatialInertia.SolidCapsuleWithMass(1.0, 0.05, 0.4, [0, 0, 1]).Shift([0, 0, 0.3])
+    pole = made.plant.AddRigidBody("pole", inertia)
+    hinge = made.plant.AddJoint(RevoluteJoint("hinge", made.plant.world_frame(), pole.body_frame(), [0, 1, 0]))
+    hinge.set_position_limits([lower], [upper])
+    made.plant.AddJointActuator("motor", hinge)
+    return made.model()
+
+
+@pytest.mark.parametrize("q", [0.0, 0.5, -0.6])
+def test_a_joint_far_from_its_limits(q):
+    same_by_both(limited_pendulum(), [q, 0.3], [0.1])
+
+
+@pytest.mark.parametrize(("q", "w"), [(1.01, 0.0), (0.999, 3.0), (-1.02, -1.0)])
+def test_a_joint_at_its_limit_is_handed_over(q, w):
+    model = limited_pendulum()
+    d = same_by_both(model, [q, w], [0.1], expected="autodiff")
+    assert d.reason.startswith("not implicit: ")
+    assert "joint limit" in d.reason
+    free = dd.differentiate_step(limited_pendulum(-9, 9), [q, w], [0.1])
+    assert not np.allclose(d.A, free.A, atol=1e-3)  # the limit does act here
+
+
+def test_a_chosen_model_is_implicit_in_the_air_and_handed_over_on_the_ground(load):
+    model = load("sphere_on_ground.sdf")
+    x = model.default_state
+    x[12] = -0.1
+    for height, expected in ((0.5, "implicit"), (0.0985, "autodiff"), (0.5, "implicit"), (0.0985, "autodiff")):
+        x[6] = height
+        d = same_by_both(model, x, (), expected=expected)
+        assert d.reason.startswith("asked for" if expected == "implicit" else "not implicit: ")
+
+
+def test_contact_is_handed_over_even_where_it_carries_almost_nothing(load):
+    """A frictionless graze: the force is far below the weight, its derivative is not."""
+    model = load("sphere_on_ground.sdf", contact_approximation="lagged")
+    x = model.default_state
+    x[6] = 0.1 - 1e-7
+    d = same_by_both(model, x, (), expected="autodiff")
+    assert abs(d.A[12, 6]) > 1  # -h k / m / (1 + h^2 k / m), not 0
+
+
+def constrained(kind):
+    made = Plant(0.01)
+    plant = made.plant
+    bodies = [plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(1.0, 0.1)) for name in ("one", "two")]
+    rails = [add_slide(plant, b.name(), plant.world_frame(), b, "x") for b in bodies]
+    if kind == "coupler":
+        plant.AddCouplerConstraint(rails[0], rails[1], 2.0)
+    elif kind == "distance":
+        plant.AddDistanceConstraint(bodies[0], [0, 0, 0], bodies[1], [0, 0.5, 0], 0.6)
+    elif kind == "ball":
+        plant.AddBallConstraint(bodies[0], [0, 0, 0], bodies[1], [0.3, 0, 0])
+    elif kind == "weld":
+        plant.AddWeldConstraint(bodies[0], RigidTransform(), bodies[1], RigidTransform([0.3, 0, 0]))
+    plant.AddJointActuator("push", rails[0])
+    return made.model()
+
+
+@pytest.mark.parametrize("kind", ["coupler", "distance", "ball", "weld"])
+def test_constraints_are_handed_over(kind):
+    model = constrained(kind)
+    d = same_by_both(model, [0.3, 0.05, 0.2, -0.1], [0.4], parameters=("one.mass",), expected="autodiff")
+    assert d.reason == "not implicit: constraints act at every step"
+    assert "constraints" in dd.differentiate_step(model, [0.3, 0.05, 0.2, -0.1], [0.4]).reason
+
+
+def test_a_locked_joint_is_handed_over():
+    model = springs_and_motors()
+    for twin in (model.double, model.autodiff):
+        twin.plant.GetJointByName("hinge1").Lock(twin.context)
+    x = np.array(POINT[0])
+    x[5] = 0.0
+    d = dd.differentiate_step(model, x, POINT[1], method="implicit")
+    assert (d.method, d.reason) == ("autodiff", "not implicit: a joint is locked")
+    agree(d, dd.differentiate_step(model, x, POINT[1], method="autodiff"))
+    assert d.x_next[5] == 0
+
+
+@pytest.mark.parametrize("port", ["generalized", "spatial"])
+def test_a_diagram_that_applies_forces_is_handed_over(port):
+    made = Plant(0.01)
+    body = made.plant.AddRigidBody("block", SpatialInertia.SolidSphereWithMass(2.0, 0.1))
+    made.plant.AddJointActuator("push", add_slide(made.plant, "slide", made.plant.world_frame(), body, "x"))
+    made.plant.Finalize()
+    if port == "generalized":
+        source = made.builder.AddSystem(ConstantVectorSource([7.0]))
+        made.builder.Connect(source.get_output_port(), made.plant.get_applied_generalized_force_input_port())
+    else:
+        force = ExternallyAppliedSpatialForce()
+        force.body_index, force.F_Bq_W = body.index(), SpatialForce([0, 0, 0], [7.0, 0, 0])
+        source = made.builder.AddSystem(ConstantValueSource(Value[list[ExternallyAppliedSpatialForce]]([force])))
+        made.builder.Connect(source.get_output_port(), made.plant.get_applied_spatial_force_input_port())
+    model = dd.model_from_diagram(made.builder.Build())
+    assert dd.step(model, [0.0, 1.0], [3.0])[1] == pytest.approx(1 + 0.01 * 10.0 / 2, rel=1e-12)
+    # Drake cannot convert a constant spatial force to AutoDiffXd, and says so when the step is taken.
+    d = dd.differentiate_step(model, [0.0, 1.0], [3.0], method="implicit" if port == "generalized" else "auto")
+    assert d.method == ("autodiff" if port == "generalized" else "finite_difference")
+    assert ("the diagram feeds applied" in d.reason) == (port == "generalized")
+    assert d.B[1, 0] == pytest.approx(0.01 / 2, rel=1e-9)
+    by_mass = dd.differentiate_step(model, [0.0, 1.0], [3.0], parameters=("block.mass",))
+    assert by_mass.C[1, 0] == pytest.approx(-0.01 * 10.0 / 4, rel=1e-9)
+    names = {p.name for p in dd.list_parameters(model)}
+    assert ("model.gravity" in names) == (port == "spatial")  # a fed port takes no force of ours
+
+
+def test_pd_targets_that_the_diagram_feeds_are_handed_over():
+    made = Plant(0.01)
+    body = made.plant.AddRigidBody("block", SpatialInertia.SolidSphereWithMass(2.0, 0.1))
+    slide = add_slide(made.plant, "slide", made.plant.world_frame(), body, "x")
+    made.plant.AddJointActuator("push", slide).set_controller_gains(PdControllerGains(p=50.0, d=5.0))
+    made.plant.Finalize()
+    source = made.builder.AddSystem(ConstantVectorSource([0.4, 0.0]))
+    port = made.plant.get_desired_state_input_port(slide.model_instance())
+    made.builder.Connect(source.get_output_port(), port)
+    model = dd.model_from_diagram(made.builder.Build())
+    d = same_by_both(model, [0.1, 1.0], [3.0], expected="autodiff")
+    assert d.reason == "not implicit: the diagram feeds PD targets"
+    h, m = 0.01, 2.0  # m v+ = m v + h (u - p (q + h v+ - 0.4) - d v+)
+    v = (m + h * (3.0 - 50.0 * (0.1 - 0.4))) / (m + h * 5 + h**2 * 50)
+    assert d.x_next[1] == pytest.approx(v, rel=1e-7)  # solved by SAP
+
+
+def box_over(ground):
+    """A tilted box above the ground, its bounding volume in what is below it, itself not."""
+    made = Plant(0.01)
+    body = made.plant.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(1.3, 0.3, 0.2, 0.1))
+    made.shape(body, Box(0.3, 0.2, 0.1), contact_properties(1e4, friction=0.5))
+    if ground == "box":
+        pose = RigidTransform([0.24, 0.19, 0.0])  # a corner beside a corner
+        world = made.plant.world_body()
+        made.shape(world, Box(0.2, 0.2, 0.2), contact_properties(1e4, friction=0.5), pose)
+    else:
+        made.ground(contact_properties(1e4, friction=0.5))
+    model = made.model()
+    x = model.default_state
+    x[:4] = np.array([0.9, 0.1, 0.05, 0.4]) / np.linalg.norm([0.9, 0.1, 0.05, 0.4])
+    x[6] = 0.0 if ground == "box" else 0.13
+    x[7:] = 0.4, -0.3, 0.2, 0.1, -0.2, 0.05
+    return model, x
+
+
+@pytest.mark.parametrize("ground", ["half space", "box"])
+def test_a_box_in_the_air_that_autodiff_refuses_on_a_broad_phase_hit(ground):
+    model, x = box_over(ground)
+    assert dd.rollout(model, x, num_steps=1).contacts == ((),)
+    try:
+        dd.differentiate_step(model, x, method="autodiff")
+        refused = False
+    except (dd.SimulationError, dd.ModelError):
+        refused = True
+    names = exact_parameters(model)
+    d = dd.differentiate_step(model, x, parameters=names, method="implicit")
+    by_differences = dd.differentiate_step(model, x, parameters=names, method="finite_difference")
+    chosen = dd.differentiate_step(model, x, parameters=names)
+    assert d.method == "implicit"
+    if refused:
+        assert chosen.method == "implicit"
+        assert "AutoDiffXd refuses the whole step" in chosen.reason
+    for other in (by_differences, chosen):
+        assert pytest.approx(other.A, abs=1e-8) == d.A  # central differences with step 1e-5
+        assert pytest.approx(other.C, abs=1e-8) == d.C
+    dd.certify(model, x, parameters=names, method="implicit").require()
+    assert refused or ground == "half space"  # which 1.51 refuses and 1.58 does not
+
+
+def test_the_automatic_choice_says_what_it_took_and_why(load):
+    model = load("double_pendulum.urdf")
+    point = [0.4, -0.9, 1.3, -0.6], [0.25, -0.15]
+    d = dd.differentiate_step(model, *point)
+    assert d.method in ("implicit", "autodiff")
+    assert "as measured on this model" in d.reason
+    assert ("equal to autodiff and faster" in d.reason) == (d.method == "implicit")
+    again = dd.differentiate_step(model, [0.1, 0.2, 0.3, 0.4], [0.0, 1.0])
+    assert (again.method, again.reason) == (d.method, d.reason)  # once and for all
+
+
+def test_a_choice_made_without_parameters_holds_with_them(load):
+    """Gravity and springs act as forces of ours beside Drake's own."""
+    model = load("mass_spring_damper.sdf")
+    dd.differentiate_step(model, [0.3, -0.4], [1.0])
+    names = ("slide.spring_stiffness", "slide.spring_rest_length", "model.gravity")
+    same_by_both(model, [0.35, -0.4], [1.0], parameters=names)
+    values = {"slide.spring_stiffness": 80.0, "slide.spring_rest_length": -0.2, "model.gravity": [3.0, 0.0, -9.0]}
+    d = same_by_both(model, [0.35, -0.4], [1.0], parameters=values)
+    s = 1 / (1 + 0.01 * 1.5 / 2)
+    by_stiffness, by_rest = -s * 0.01 * (0.35 + 0.2) / 2, s * 0.01 * 80.0 / 2
+    assert d.C[1] == pytest.approx([by_stiffness, by_rest, s * 0.01, 0, 0], rel=1e-9, abs=1e-14)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_values_given_by_mapping_are_differentiated_where_they_are(seed):
+    model, random = springs_and_motors(kp=(0.0, 20.0, 0.0), gear=3.0), np.random.default_rng(seed)
+    values = {}
+    for p in dd.list_parameters(model):
+        factor = random.uniform(0.8, 1.25)  # one for all its entries: an inertia stays possible
+        values[p.name] = factor * p.value if np.any(p.value) else p.value + 0.1 * (p.name[-4:] != "rtia")
+    given = dd.differentiate_step(model, *POINT, parameters=values, method="implicit")
+    assert given.method == "implicit"
+    by_autodiff = dd.differentiate_step(model, *POINT, parameters=values, method="autodiff")
+    agree(given, by_autodiff)  # the differenced ones by the same differences
+    own = dd.differentiate_step(model, *POINT, method="implicit")
+    assert not np.allclose(own.x_next, given.x_next)
+    agree(own, dd.differentiate_step(model, *POINT, method="autodiff"))
+
+
+def test_rollouts_by_both_methods_are_the_same(load):
+    model = load("acrobot.xml")
+    us = 0.3 * np.random.default_rng(0).standard_normal((60, model.nu))
+    names = exact_parameters(model)
+    a, b = (
+        dd.differentiate_rollout(
+            model, [0.4, -0.9, 1.3, -0.6], us, lambda x: (x**2).sum(), parameters=names, method=method
+        )
+        for method in ("implicit", "autodiff")
+    )
+    assert (a.methods, b.methods) == (("implicit",), ("autodiff",))
+    for name in ("x0", "us", "parameters"):
+        # 60 steps, whose rounding the motion magnifies as it does the gradient itself
+        assert getattr(a, name) == pytest.approx(getattr(b, name), rel=1e-8, abs=1e-8)
