@@ -66,3 +66,26 @@ def test_the_sphere_rolls_to_where_it_is_sent():
     assert solution.success, solution.message
     assert solution.xs[-1][module.X] == pytest.approx(1.0, abs=1e-5)
     assert 0 < solution.replay.penetration.max() < 0.02
+
+
+def test_the_network_learns_to_balance():
+    module = example("neural_network_policy")
+    random = np.random.default_rng(1)
+    model = dd.load_model(module.MODEL, time_step=module.TIME_STEP)
+    untrained, starts, unseen = (
+        module.first_parameters(random), module.initial_states(random, 4), module.initial_states(random, 10)
+    )  # fmt: skip
+    trained = module.train(model, untrained, starts)
+    assert module.survivors(model, trained, unseen) > module.survivors(model, untrained, unseen)
+    before, after = (module.loss_and_gradient(model, p, starts, 60)[0] for p in (untrained, trained))
+    assert after < 0.1 * before
+
+
+def test_the_hidden_parameters_are_found():
+    """The motion has no noise, so the only limit is the solver's tolerance."""
+    module = example("hidden_parameters")
+    model, x0, us = module.sliding()
+    solution = dd.solve(
+        module.problem(model, x0, us, {"ball.friction": 0.25}, {"ball.friction": 0.5}), method="shooting"
+    )
+    assert solution.vector.to_dict()["ball.friction"][0] == pytest.approx(0.25, rel=1e-4)

@@ -382,7 +382,7 @@ def test_the_automatic_choice_says_what_it_took_and_why(load):
     d = dd.differentiate_step(model, *point)
     assert d.method in ("implicit", "autodiff")
     assert "as measured on this model" in d.reason
-    assert ("equal to autodiff and faster" in d.reason) == (d.method == "implicit")
+    assert ("equal to autodiff" in d.reason) == (d.method == "implicit")
     again = dd.differentiate_step(model, [0.1, 0.2, 0.3, 0.4], [0.0, 1.0])
     assert (again.method, again.reason) == (d.method, d.reason)  # once and for all
 

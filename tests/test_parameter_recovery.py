@@ -127,6 +127,7 @@ def test_a_hidden_friction(approximation):
     all_recovered(outcomes, certified=False)
 
 
+@pytest.mark.slow
 def test_a_hidden_link_length(load):
     """The elbow's place on the upper rod; along the hinges, axis y, it has no effect and stays where it started."""
     model, outcomes = load("double_pendulum.urdf", time_step=0.01), {}
@@ -156,6 +157,7 @@ def pushed_ball(approximation):
     return made.model()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("approximation", ["lagged", "sap", "similar"])
 def test_a_hidden_mass_through_contact(approximation):
     """Known only by how it is pushed, and thrown off where the push ends."""
