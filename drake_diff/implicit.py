@@ -137,7 +137,7 @@ class _Form:
     actuation: Array  # (nv, nu)
     limit: Array
     reference: Array  # (2, nu) the positions and velocities that PD control holds
-    diagonal: tuple[NDArray[np.int64], NDArray[np.int64]]  # of (nv, nv)
+    diagonal: tuple[Any, ...]  # the indices of that of (nv, nv)
     pd: bool
     can_touch: bool
 
