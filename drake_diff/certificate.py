@@ -6,7 +6,7 @@ neighbouring D lie close together is a plateau; their spread is its uncertainty.
 
     agrees            where it lies on a plateau that is resolved to 1e-4 of it; an iteratively solved step
                       is allowed 100 times its solver's tolerance, relative to the entry and the row's largest;
-    disagrees         where there are such plateaus and it lies on none;
+    disagrees         where there are such plateaus and it lies on none, by more than ten times that allowance;
     is discontinuous  where forward and backward quotients do not approach each other as h shrinks (a kink), or
                       grow apart as 1/h (a jump), or where the derivative is another one 1e-9 beside the point;
     is undecided      where the differences resolve nothing. Undecided does not pass;
@@ -32,6 +32,7 @@ RESOLVED = 1e-4
 NEGLIGIBLE, NOTHING = 1e-6, 1e-9
 # The derivative of what an iterative solver leaves unsolved: measured up to 60 times its tolerance, by row.
 SOLVER_FACTOR = 100.0
+DOUBTFUL = 10.0  # up to so many times that, a gap may still be the solver's: undecided, which does not pass
 JITTER = 1e-9
 JITTER_CHANGE = 0.1
 VERDICTS = ("agree", "undecided", "not_converged", "disagree", "discontinuous")  # from good to bad
@@ -219,12 +220,11 @@ def _judge(
     resolved = uncertainty <= RESOLVED * magnitude + unsolved
     best = uncertainty <= 10 * np.min(uncertainty, axis=0, initial=np.inf)
     vanishing = (magnitude <= np.maximum(NEGLIGIBLE * row_size, NOTHING)) & best
-    agrees = (np.abs(a - middle) <= allowed) & (resolved | vanishing)
-    codes = np.where(
-        agrees.any(axis=0),
-        VERDICTS.index("agree"),
-        np.where(resolved.any(axis=0), VERDICTS.index("disagree"), VERDICTS.index("undecided")),
-    )
+    gap = np.abs(a - middle)
+    agrees = (gap <= allowed) & (resolved | vanishing)
+    contradicts = resolved.any(axis=0) & ~(resolved & (gap <= allowed + DOUBTFUL * unsolved)).any(axis=0)
+    codes = np.where(contradicts, VERDICTS.index("disagree"), VERDICTS.index("undecided"))
+    codes[agrees.any(axis=0)] = VERDICTS.index("agree")
     # Report the step that tells most: the best of the agreeing ones, else the least uncertain.
     rank = np.where(agrees.any(axis=0)[None] & ~agrees, np.inf, uncertainty)
     best = np.argmin(rank, axis=0)[None]

@@ -227,6 +227,9 @@ def _print_record(console: Console, record: Any, directory: Path) -> None:
             {True: "holds", False: "[red]does not hold[/]", None: ""}[check.passed],
         )
     console.print(table)
+    for p in record.parameters:
+        moved = f", from {p.start:.6g}" if p.optimized else ""
+        console.print(f"{escape(p.name)} = {p.value:.9g} {p.unit}{moved}, derivative from {p.derivative_source}")
     verdicts = [gradient.verdict for gradient in record.gradients]
     console.print(
         f"gradients: {verdicts.count('agree')} of {len(verdicts)} certificates agree; "

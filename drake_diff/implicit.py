@@ -10,7 +10,8 @@ damping D and the PD controllers are implicit. With the inputs clipped at their 
     input_i = clip(u_i - kp_i (q_i + h v'_i - q_ref_i) - kd_i (v'_i - v_ref_i)),
 
 so dv' = -(dr/dv')^-1 dr with dr/dv' = M / h + D + B (kd + h kp) B' for the inputs that are not clipped, and
-q' = q + h N(q) v'. Only r is differentiated by AutoDiffXd, at Drake's own v', which costs about 0.4 of a whole step.
+q' = q + h N(q) v'. Only r is differentiated, at Drake's own v': of a tree of hinges and slides by its own formulas
+(`tree_dynamics`), for many steps in one call; else, and by parameters, by AutoDiffXd.
 r(v') = 0 is checked: where it does not hold, something else acts, or the AutoDiffXd plant is not the double one.
 """
 
@@ -29,11 +30,16 @@ from drake_diff.exceptions import GradientError
 from drake_diff.model import Model
 from drake_diff.parameters import ParameterVector, write_autodiff
 from drake_diff.plant_elements import actuators, is_driven, joints
-from drake_diff.step import set_state
+from drake_diff.step import advance, set_state
+from drake_diff.tree_dynamics import TreeDynamics, tree_of
 from drake_diff.twin import Twin
 
 # Rounding of the forces that balance, relative to the largest of them. What a solver leaves is larger.
 RESIDUAL_TOLERANCE = 1e-9
+# `tree_dynamics` and AutoDiffXd differ by rounding.
+SAME_TREE = 1e-11
+# From so many joints on NumPy's calls for one state cost less than AutoDiffXd's arithmetic.
+TREE_JOINTS = 5
 
 
 class NotSmoothError(GradientError):
@@ -60,24 +66,71 @@ def implicit_jacobian(model: Model, vector: ParameterVector, x: Array, u: Array,
     The vector is applied to `model`, whose double twin stands at the step from (x, u) to `x_next`, as
     `step.advance` leaves it. Raises NotSmoothError where something else than smooth forces acts.
     """
-    form, twin, nq, nx, h = _form_of(model), model.double, model.nq, model.nx, model.time_step
+    form = _form_of(model)
     if form.excluded:
         raise NotSmoothError(form.excluded)
-    if form.can_touch and _touches(twin):
+    if form.can_touch and _touches(model.double):
         raise NotSmoothError("geometries touch")
+    if form.tree is not None and model.nv >= TREE_JOINTS and not model.has_other_parameters:
+        jacobians, missing = _by_tree(model, form, form.tree, x[None], u[None], x_next[None])
+        _check_vanishes(missing[0])
+        return np.asarray(jacobians[0])
+    return _by_autodiff(model, form, vector, x, u, x_next)
+
+
+def implicit_jacobians(model: Model, xs: Array, us: Array) -> tuple[Array, list[Array | None]] | None:
+    """Step from xs (nx,) under us (N, nu): the states (N+1, nx), and (nx, nx + nu) of each step, None if not smooth.
+
+    None altogether where there is no tree or parameters are set: then the steps are differentiated one by one.
+    """
+    form = _form_of(model)
+    if form.excluded or form.tree is None or model.has_other_parameters:
+        return None
+    states, touching = np.empty((len(us) + 1, model.nx)), np.zeros(len(us), dtype=bool)
+    states[0] = xs
+    for k, u in enumerate(us):
+        states[k + 1] = advance(model.double, states[k], u)
+        touching[k] = form.can_touch and _touches(model.double)
+    jacobians, missing = _by_tree(model, form, form.tree, states[:-1], us, states[1:])
+    smooth = ~touching & (missing <= RESIDUAL_TOLERANCE)
+    return states, [jacobian if good else None for jacobian, good in zip(jacobians, smooth, strict=True)]
+
+
+def _by_tree(
+    model: Model, form: "_Form", tree: TreeDynamics, xs: Array, us: Array, x_nexts: Array
+) -> tuple[Array, Array]:
+    """(N, nx, nx + nu) the derivatives of N steps, and (N,) the force that is not accounted for, as a part."""
+    n, h, damping = model.nv, model.time_step, tree.damping
+    q, v, v_next = xs[:, :n], xs[:, n:], x_nexts[:, n:]
+    effort, free, (kp, kd) = form.effort(q, v_next, us, h)
+    d = tree(tree.place(model, q), q, v, (v_next - v) / h)
+    rest = damping * (v_next - v) - np.clip(effort, -form.limit, form.limit) @ form.actuation.T
+    diagonal = np.arange(n)
+    by_next = d.mass / h
+    by_next[:, diagonal, diagonal] += damping
+    pressed = form.actuation * free[:, None, :]
+    by_point = np.concatenate([d.by_q, d.by_v - by_next, -pressed], axis=2)
+    if form.pd:
+        by_point[:, :, form.position] += pressed * kp
+        by_next = by_next + (pressed * (kd + h * kp)) @ form.actuation.T
+    velocities = -np.linalg.solve(by_next, by_point)
+    positions = h * velocities
+    positions[:, diagonal, diagonal] += 1.0
+    return np.concatenate([positions, velocities], axis=1), _missing(d.tau, rest)
+
+
+def _by_autodiff(model: Model, form: "_Form", vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array:
+    twin, nq, nx, h = model.double, model.nq, model.nx, model.time_step
     v_next = x_next[nq:]
     change, damping = v_next - x[nq:], twin.damping()
-    kp, kd = form.gains()
-    effort = u - kp * (x[form.position] + h * v_next[form.velocity] - form.reference[0])
-    effort -= kd * (v_next[form.velocity] - form.reference[1])
-    free = np.abs(effort) < form.limit
+    effort, free, (kp, kd) = form.effort(x[:nq], v_next, u, h)
     applied = form.actuation @ np.clip(effort, -form.limit, form.limit)
 
     variables = InitializeAutoDiff(np.concatenate([x, vector.values])).ravel()
     write_autodiff(vector, model, variables[nx:])
     set_state(model.autodiff, variables[:nx])
     needed = _needed(model.autodiff, np.array([AutoDiffXd(a) for a in change / h])).reshape(-1, 1)
-    _check_vanishes(ExtractValue(needed).ravel(), damping * change - applied)
+    _check_vanishes(_missing(ExtractValue(needed).ravel(), damping * change - applied))
     rows = gradient_rows(needed, len(variables))
     if vector.parameters:
         rows = rows + gradient_rows(model.autodiff.damping() * change, len(variables))
@@ -106,10 +159,17 @@ def _needed(twin: Twin, acceleration: Any) -> Any:
     return needed - twin.added_force() if twin.added else needed  # `forces` of AutoDiffXd are a copy: not writable
 
 
-def _check_vanishes(needed: Array, rest: Array) -> None:
-    worst = float(np.abs(needed + rest).max())
-    if not worst <= RESIDUAL_TOLERANCE * max(float(np.abs(needed).max()), float(np.abs(rest).max()), 1.0):
-        raise NotSmoothError(f"contact, a joint limit or a constraint acts: {worst:.3g} N or N m are not accounted for")
+def _missing(needed: Array, rest: Array) -> Array:
+    """(...,) the largest force (..., nv) that is not accounted for, relative to the largest of those that are."""
+    size = np.maximum(np.maximum(np.abs(needed).max(axis=-1), np.abs(rest).max(axis=-1)), 1.0)
+    return np.asarray(np.abs(needed + rest).max(axis=-1) / size)
+
+
+def _check_vanishes(missing: Array) -> None:
+    if not missing <= RESIDUAL_TOLERANCE:
+        raise NotSmoothError(
+            f"contact, a joint limit or a constraint acts: {float(missing):.3g} of the forces are not accounted for"
+        )
 
 
 def _positions(model: Model, v_next: Array, velocities: Array, num_parameters: int) -> Array:
@@ -140,6 +200,16 @@ class _Form:
     diagonal: tuple[Any, ...]  # the indices of that of (nv, nv)
     pd: bool
     can_touch: bool
+    tree: TreeDynamics | None
+
+    def effort(self, q: Array, v_next: Array, u: Array, h: float) -> tuple[Array, NDArray[np.bool_], Any]:
+        """(..., nu) what the inputs are before they are clipped, whether they are free of their limits, and kp, kd."""
+        kp, kd = self.gains()
+        effort = u
+        if self.pd:
+            moved = q[..., self.position] + h * v_next[..., self.velocity] - self.reference[0]
+            effort = u - kp * moved - kd * (v_next[..., self.velocity] - self.reference[1])
+        return effort, np.abs(effort) < self.limit, (kp, kd)
 
     def gains(self) -> tuple[Array, Array]:
         """kp (nu,) and kd (nu,), zero where there is no controller; they may change as parameters do."""
@@ -169,8 +239,31 @@ def _form_of(model: Model) -> _Form:
             diagonal=np.diag_indices(model.nv),
             pd=any(a.has_controller() for a in found),
             can_touch=model.contract.contact.collision_pairs > 0,
+            tree=_checked_tree(model),
         )
     return _FORMS[model]
+
+
+def _checked_tree(model: Model) -> TreeDynamics | None:
+    """The model's tree, where it has one that gives at two states what AutoDiffXd through Drake gives."""
+    tree = tree_of(model)
+    if isinstance(tree, str):
+        return None
+    random, here = np.random.default_rng(0), model.plant.GetPositionsAndVelocities(model.double.context)
+    states = random.standard_normal((2, model.nx))
+    same = all(_is_same(model, tree, x, random.standard_normal(model.nv)) for x in states)
+    set_state(model.double, here)
+    return tree if same else None
+
+
+def _is_same(model: Model, tree: TreeDynamics, x: Array, a: Array) -> bool:
+    n = model.nv
+    set_state(model.autodiff, InitializeAutoDiff(x).ravel())
+    exact = _needed(model.autodiff, np.array([AutoDiffXd(entry) for entry in a])).reshape(-1, 1)
+    ours = tree(tree.place(model, x[None, :n]), x[None, :n], x[None, n:], a[None])
+    found = np.column_stack([ours.tau[0], ours.by_q[0], ours.by_v[0]])
+    wanted = np.column_stack([ExtractValue(exact).ravel(), gradient_rows(exact, 2 * n)])
+    return bool(np.all(np.abs(found - wanted) <= SAME_TREE * max(1.0, float(np.abs(wanted).max()))))
 
 
 def _references(model: Model, found: list[Any]) -> Array:

@@ -15,7 +15,7 @@ from drake_diff.model import Model
 from drake_diff.parameters import Parameters, ParameterVector, applied, select
 from drake_diff.policy import active_parameters, differentiate_policy, policy_parameters
 from drake_diff.rollout import Policy, check_inputs
-from drake_diff.step_derivatives import StepDerivatives, step_jacobians
+from drake_diff.step_derivatives import StepDerivatives, smooth_steps, step_jacobians
 
 Loss = Callable[..., Any]
 # A policy's derivatives (nu, nx) by the state and (nu, n) by those of its parameters that act, and which they are.
@@ -126,8 +126,11 @@ def linearize(
 ) -> list[StepDerivatives]:
     """The step derivatives along the rollout from `x0` (nx,) under `us` (N, nu), `vector` being applied."""
     found: list[StepDerivatives] = []
-    vector, x = vector or select(model, ()), x0
-    for u in us:
+    vector = vector or select(model, ())
+    if method in ("auto", "implicit") and not vector.parameters:
+        found = smooth_steps(model, x0, us, method)
+    x = found[-1].x_next if found else x0
+    for u in us[len(found) :]:
         found.append(step_jacobians(model, vector, x, u, method))
         x = found[-1].x_next
     return found

@@ -19,7 +19,7 @@ rollout save smooth smooth_step solve step
 ORDER = """
 exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin
 model read_contract tangent inertia parameter_kinds contact_parameters parameters parameter_coordinates step
-finite_difference implicit step_derivatives smoothing policy contact mode_changes certificate
+finite_difference tree_dynamics implicit step_derivatives smoothing policy contact mode_changes certificate
 rollout rollout_gradient refinement certify continuous cost problem
 solution nonlinear_program collocation shooting ilqr verdict solver mcap_messages mcap_log trace meshcat_view record
 provenance evidence sampling certification audit_place audit_contact audit cli

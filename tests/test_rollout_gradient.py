@@ -23,7 +23,7 @@ def test_the_double_integrators_gradient_and_norms_have_their_closed_form(write_
     assert g.state_gradient_norms == pytest.approx(
         [math.hypot(1, (count - k) * h) for k in range(count + 1)], rel=1e-12
     )
-    assert g.methods == ("autodiff",)
+    assert g.methods == ("implicit",)
 
 
 def test_a_loss_of_the_whole_motion_is_differentiated_too(write_urdf):
