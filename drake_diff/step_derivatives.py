@@ -54,12 +54,16 @@ def differentiate_step(
     """The Jacobians of `step(model, x, u)` in Drake's coordinates x = [q; v].
 
     `parameters` names what C is by, at the model's own values, or maps the names to other values. `method` is
-    "autodiff" (AutoDiffXd through Drake's step), "implicit" (from the equation of a smooth step, two to
-    three times as fast; autodiff where contact or a constraint acts), "finite_difference" (central differences of the double
-    step) or "auto": implicit where it was measured to be equal to autodiff and not much slower on this model, else
-    autodiff, and differences where Drake refuses AutoDiffXd. `method` and `reason` of the result say what it was.
-    Raises GradientError where the AutoDiffXd step is not the double step, or a derivative is not finite or beyond
-    1e8; SimulationError where Drake cannot take the step.
+
+    - "autodiff": AutoDiffXd through Drake's step;
+    - "implicit": from the equation of a smooth step, two to three times as fast from five joints on; autodiff where
+      contact or a constraint acts;
+    - "finite_difference": central differences of the double step;
+    - "auto": implicit where it was measured to be equal to autodiff and not much slower on this model, else autodiff,
+      and differences where Drake refuses AutoDiffXd.
+
+    `method` and `reason` of the result say what it was. Raises GradientError where the AutoDiffXd step is not the
+    double step, or a derivative is not finite or beyond 1e8; SimulationError where Drake cannot take the step.
     """
     if method not in METHODS:
         raise UnknownNameError("method", got=method, known=METHODS)
