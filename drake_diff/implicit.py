@@ -223,25 +223,29 @@ _FORMS: WeakKeyDictionary[Model, _Form] = WeakKeyDictionary()
 
 
 def _form_of(model: Model) -> _Form:
-    if model not in _FORMS:
-        found = actuators(model.plant)
-        velocity = np.array([a.joint().velocity_start() for a in found], dtype=int)
-        actuation = np.zeros((model.nv, len(found)))
-        actuation[velocity, np.arange(len(found))] = 1.0
-        _FORMS[model] = _Form(
-            excluded=why_not_implicit(model),
-            actuators=found,
-            velocity=velocity,
-            position=np.array([a.joint().position_start() for a in found], dtype=int),
-            actuation=actuation,
-            limit=np.array([a.effort_limit() for a in found], dtype=float),
-            reference=_references(model, found),
-            diagonal=np.diag_indices(model.nv),
-            pd=any(a.has_controller() for a in found),
-            can_touch=model.contract.contact.collision_pairs > 0,
-            tree=_checked_tree(model),
-        )
-    return _FORMS[model]
+    """Read once, from the model's own parameters: while it has others, no tree is made and nothing is kept."""
+    if model in _FORMS:
+        return _FORMS[model]
+    found = actuators(model.plant)
+    velocity = np.array([a.joint().velocity_start() for a in found], dtype=int)
+    actuation = np.zeros((model.nv, len(found)))
+    actuation[velocity, np.arange(len(found))] = 1.0
+    form = _Form(
+        excluded=why_not_implicit(model),
+        actuators=found,
+        velocity=velocity,
+        position=np.array([a.joint().position_start() for a in found], dtype=int),
+        actuation=actuation,
+        limit=np.array([a.effort_limit() for a in found], dtype=float),
+        reference=_references(model, found),
+        diagonal=np.diag_indices(model.nv),
+        pd=any(a.has_controller() for a in found),
+        can_touch=model.contract.contact.collision_pairs > 0,
+        tree=None if model.has_other_parameters else _checked_tree(model),
+    )
+    if not model.has_other_parameters:
+        _FORMS[model] = form
+    return form
 
 
 def _checked_tree(model: Model) -> TreeDynamics | None:

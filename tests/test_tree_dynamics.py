@@ -22,6 +22,7 @@ from test_silent_faults import pd_pendulum
 
 import drake_diff as dd
 from drake_diff.implicit import _form_of, implicit_jacobians
+from drake_diff.parameters import applied, select
 from drake_diff.rollout_gradient import linearize
 from drake_diff.tree_dynamics import TreeDynamics, tree_of
 
@@ -234,3 +235,15 @@ def test_a_clipped_input_has_no_derivative(write_urdf):
     model = write_urdf(mass=1.5, limit=2.0)
     found = linearize(model, np.zeros(2), np.array([[1.9], [2.1], [-3.0]]), method="implicit")
     assert [d.B[1, 0] for d in found] == pytest.approx([0.1 / 1.5, 0.0, 0.0], abs=1e-15)
+
+
+@pytest.mark.parametrize("name", ["model.gravity", "hinge.damping"])
+def test_a_tree_is_not_made_of_another_models_parameters(load, name):
+    """The first step ever is taken with other parameters, the second with the model's own."""
+    model, value = load("pendulum.urdf"), {"model.gravity": [0, 0, -1.0], "hinge.damping": 3.0}[name]
+    x0, us = np.array([0.7, -1.2]), np.zeros((5, 1))
+    for parameters in ({name: value}, {}):
+        with applied(select(model, parameters)) as set_model:
+            ours, drakes = (linearize(set_model, x0, us, method=method) for method in ("implicit", "autodiff"))
+        for a, b in zip(ours, drakes, strict=True):
+            assert pytest.approx(b.A, abs=1e-10) == a.A
