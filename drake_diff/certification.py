@@ -17,6 +17,7 @@ from drake_diff.provenance import gradient_evidence, provenance_of
 from drake_diff.record import CertificationRecord, StateEvidence, WallClock
 from drake_diff.sampling import SampledState, sample_states
 from drake_diff.step import advance
+from drake_diff.step_derivatives import check_method
 from drake_diff.whole_file import write_whole
 
 RECORD = "certification.json"
@@ -37,6 +38,7 @@ def certify_model(
     it is written there as certification.json, which says "incomplete" until the last state is done.
     """
     start = time.monotonic()
+    check_method(method)
     positive_int("states", states)
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise InputError("seed", got=repr(seed), expected="a whole number of at least 0")

@@ -16,7 +16,7 @@ from drake_diff.refinement import Refinement, refined, stiffened
 from drake_diff.rollout import check_inputs, roll_states
 from drake_diff.rollout_gradient import Loss, RolloutGradient, differentiate_rollout, evaluate_loss
 from drake_diff.step import advance, check_point
-from drake_diff.step_derivatives import StepDerivatives, step_at, step_jacobians
+from drake_diff.step_derivatives import StepDerivatives, check_method, step_at, step_jacobians
 from drake_diff.tangent import TangentSpace, tangent_space
 
 
@@ -48,6 +48,7 @@ def certify(
     Rows are the next state's, columns those of [x; u; parameters], both on the tangent space (a quaternion has
     three entries). The derivative is `differentiate_step(..., method=method)`, or `derivatives` where given.
     """
+    check_method(method)
     x, u = check_point(model, x, u)
     vector = select(model, parameters)
     with applied(vector) as set_model:
@@ -124,6 +125,7 @@ def certify_rollout(
     the contact stiffness (see `drake_diff.refinement`): entries that agree with differences and do not converge
     are `not_converged`.
     """
+    check_method(method)
     us = check_inputs(model, us, num_steps)
     x0 = finite_array("x0", x0, (model.nx,))
     vector, space = select(model, parameters), tangent_space(model)

@@ -15,7 +15,7 @@ from drake_diff.model import Model
 from drake_diff.parameters import Parameters, ParameterVector, applied, select
 from drake_diff.policy import active_parameters, differentiate_policy, policy_parameters
 from drake_diff.rollout import Policy, check_inputs
-from drake_diff.step_derivatives import StepDerivatives, smooth_steps, step_jacobians
+from drake_diff.step_derivatives import StepDerivatives, check_method, smooth_steps, step_jacobians
 
 Loss = Callable[..., Any]
 # A policy's derivatives (nu, nx) by the state and (nu, n) by those of its parameters that act, and which they are.
@@ -90,6 +90,7 @@ def differentiate_rollout(
     K and P the policy's derivatives by state and by its own parameters, the gradients are l_0 by x0, g_k by u_k,
     sum_k C_k' l_(k+1) by the parameters and sum_k P_k' g_k by the policy's.
     """
+    check_method(method)
     x0 = finite_array("x0", x0, (model.nx,))
     if us is not None and policy is not None:
         raise InputError("differentiate_rollout", got="us and policy", expected="one of them")

@@ -65,12 +65,17 @@ def differentiate_step(
     `method` and `reason` of the result say what it was. Raises GradientError where the AutoDiffXd step is not the
     double step, or a derivative is not finite or beyond 1e8; SimulationError where Drake cannot take the step.
     """
-    if method not in METHODS:
-        raise UnknownNameError("method", got=method, known=METHODS)
+    check_method(method)
     x, u = check_point(model, x, u)
     vector = select(model, parameters)
     with applied(vector) as set_model:
         return step_jacobians(set_model, vector, x, u, method)
+
+
+def check_method(method: str) -> None:
+    """Refuse what is no source of a step's derivative, naming those that are."""
+    if method not in METHODS:
+        raise UnknownNameError("method", got=method, known=METHODS)
 
 
 def step_jacobians(model: Model, vector: ParameterVector, x: Array, u: Array, method: str) -> StepDerivatives:

@@ -87,7 +87,12 @@ def test_a_refused_derivative_is_told_and_fails(load, monkeypatch):
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [({"states": 0}, "states"), ({"seed": -1}, "seed"), ({"parameters": ("nix",)}, "parameter: expected one of")],
+    [
+        ({"states": 0}, "states"),
+        ({"seed": -1}, "seed"),
+        ({"parameters": ("nix",)}, "parameter: expected one of"),
+        ({"method": "magic"}, "method: expected one of"),
+    ],
 )
 def test_bad_options_are_named_and_leave_no_file(load, tmp_path, options, words):
     with pytest.raises(dd.InputError, match=words):
