@@ -1,6 +1,6 @@
 """Where the contact mode of a step changes beside the point at which it is differentiated."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,40 +48,23 @@ def find_mode_changes(
 
     `f` takes a scaled displacement (n,) and leaves the double twin at the step; `derivative` (m, n) is by it.
     """
-    centre = f(np.zeros(derivative.shape[1]))
+    size = derivative.shape[1]
+    centre = f(np.zeros(size))
     here = active_modes(model)
-    return tuple(
-        change
-        for j in range(len(columns))
-        for sign in (1.0, -1.0)
-        for change in _along(model, f, derivative, rows, columns, scale, minus, centre, here, j, sign)
-    )
+    found = []
+    for j, column in enumerate(columns):
+        for reach in (NEIGHBOURHOOD, -NEIGHBOURHOOD):
+            step = reach * np.eye(size)[j]
+            change = minus(f(step), centre)
+            there = active_modes(model)
+            touched = _touched(rows, change, derivative @ step)
+            for pair in sorted(pair for pair in here.keys() | there.keys() if here.get(pair) != there.get(pair)):
+                before, after = here.get(pair, SEPARATED), there.get(pair, SEPARATED)
+                found.append(ModeChange(pair, before, after, column, float(reach * scale[j]), touched))
+    return tuple(found)
 
 
-def _along(
-    model: Model,
-    f: Callable[[Array], Array],
-    derivative: Array,
-    rows: tuple[str, ...],
-    columns: tuple[str, ...],
-    scale: Array,
-    minus: Callable[[Array, Array], Array],
-    centre: Array,
-    here: dict[Pair, str],
-    j: int,
-    sign: float,
-) -> Iterator[ModeChange]:
-    step = sign * NEIGHBOURHOOD * np.eye(derivative.shape[1])[j]
-    change = minus(f(step), centre)
-    there = active_modes(model)
-    differ = sorted(pair for pair in here.keys() | there.keys() if here.get(pair) != there.get(pair))
-    if not differ:
-        return
-    predicted = derivative @ step
+def _touched(rows: tuple[str, ...], change: Array, predicted: Array) -> tuple[str, ...]:
     size = np.maximum(np.abs(predicted), np.abs(change))
     missed = np.abs(change - predicted) > TOUCHED * np.maximum(size, 1e-6 * size.max(initial=0.0))
-    touched = tuple(name for name, miss in zip(rows, missed, strict=True) if miss)
-    for pair in differ:
-        yield ModeChange(
-            pair, here.get(pair, SEPARATED), there.get(pair, SEPARATED), columns[j], float(step[j] * scale[j]), touched
-        )
+    return tuple(name for name, miss in zip(rows, missed, strict=True) if miss)
