@@ -68,6 +68,7 @@ def test_the_sphere_rolls_to_where_it_is_sent():
     assert 0 < solution.replay.penetration.max() < 0.02
 
 
+@pytest.mark.slow
 def test_the_network_learns_to_balance():
     module = example("neural_network_policy")
     random = np.random.default_rng(1)
