@@ -1,35 +1,38 @@
-"""Iterative LQR on Drake's own steps: a Riccati sweep back, a rollout with feedback forward.
+"""Multiple-shooting iLQR on Drake's own steps: a Riccati sweep back, a rollout with feedback forward.
 
-Li and Todorov, "Iterative linear quadratic regulator design for nonlinear biological movement systems", 2004.
-Its feedback follows curved valleys of the cost in which quasi-Newton shooting crawls. No hard goal and no state
-bounds; inputs that meet a bound are clipped and, where the cost pushes outwards, taken out of the sweep.
+Li and Todorov, "Iterative linear quadratic regulator design for nonlinear biological movement systems", 2004, and
+the feasibility-driven form of Mastalli et al., "Crocoddyl", 2020: the guess need not be a rollout, and a step of size a
+leaves 1 - a of each gap between step(x_k, u_k) and x_(k+1). A hard goal and state bounds are augmented Lagrangians,
+and the dynamics' second derivatives, which iLQR leaves out, are learned on the way (`secant`).
 """
 
 import math
 import threading
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from drake_diff.arrays import Array
-from drake_diff.cost import (
-    differentiate_cost,
-    differentiate_final_cost,
-    final_cost_hessian,
-    running_cost_hessian,
-)
+from drake_diff.augmented_lagrangian import GROWTH, LARGEST_PENALTY, StateConstraints
 from drake_diff.exceptions import InputError, SimulationError
+from drake_diff.expansion import Motion, expand, jacobians_along
 from drake_diff.nonlinear_program import Limits, NlpResult, Outcome, Report, interrupt_flag
 from drake_diff.problem import Problem
-from drake_diff.rollout import roll_states
-from drake_diff.rollout_gradient import linearize
-from drake_diff.solution import Iteration
+from drake_diff.riccati import LinearQuadratic, Policy, slope_along, solve_riccati
+from drake_diff.secant import DynamicsCurvature
+from drake_diff.solution import FEASIBILITY_TOLERANCE, Iteration
 from drake_diff.step import advance
+from drake_diff.tangent import tangent_space
 
 SMALLEST_REGULARIZATION, LARGEST_REGULARIZATION = 1e-8, 1e8
 SUFFICIENT_DECREASE = 1e-4
+STEP_SIZES = tuple(0.5 ** np.arange(12))
+# Of the cost: a promise below this is lost in the rounding of the cost's sum.
+ROUNDING = 1e-13
+# Of what the next update of the multipliers changes in the augmented cost: what a minimization before it may leave.
+LEFT_OVER = 3e-2
 
 
 def check_problem(problem: Problem) -> None:
@@ -38,18 +41,13 @@ def check_problem(problem: Problem) -> None:
         raise InputError(subject, got="given", expected='none for method="ilqr"; method="shooting" takes it')
 
 
-def is_solvable(problem: Problem) -> bool:
-    """Whether `problem` has nothing that iLQR here cannot keep."""
-    return not list(_unkept(problem))
+def is_unconstrained(problem: Problem) -> bool:
+    """Whether iLQR can solve `problem` in one minimization: costs and input bounds alone, from the given x0."""
+    hard = StateConstraints(problem).any or problem.initial_state_mask.any()
+    return not hard and not list(_unkept(problem))
 
 
 def _unkept(problem: Problem) -> Iterator[str]:
-    if problem.x_goal is not None:
-        yield "x_goal"
-    if np.isfinite(problem.bounds.x_lower).any() or np.isfinite(problem.bounds.x_upper).any():
-        yield "state bounds"
-    if problem.initial_state_mask.any():
-        yield 'optimize "initial_state"'
     if not problem.optimizes_controls:
         yield "fixed controls"
     if problem.parameters.parameters:
@@ -58,149 +56,195 @@ def _unkept(problem: Problem) -> Iterator[str]:
         yield "trajectory_cost"
 
 
-def solve_ilqr(problem: Problem, us: Array, *, limits: Limits, report: Report | None) -> tuple[NlpResult, Array, Array]:
-    """Solve `problem` from the inputs `us` (N, nu); gives (result, xs, us), result.z being us flat."""
-    search = _Search(problem, us, limits, report)
+def solve_ilqr(
+    problem: Problem, xs: Array, us: Array, *, limits: Limits, report: Report | None
+) -> tuple[NlpResult, Array, Array]:
+    """Solve `problem` from xs (N+1, nx), us (N, nu), a rollout or not; gives (result, xs, us), result.z being us flat.
+
+    Raises GradientError where a derivative is refused, SimulationError where a step from the guess is.
+    """
+    search = _Search(problem, xs, us, limits, report)
     with interrupt_flag() as interrupted:
         outcome = search.run(interrupted)
     message = f"iLQR: {outcome.value} after {len(search.rows) - 1} steps"
-    return NlpResult(search.us.ravel(), outcome, message, tuple(search.rows)), search.xs, search.us
+    motion = search.motion
+    return NlpResult(motion.us.ravel(), outcome, message, tuple(search.rows)), motion.xs, motion.us
 
 
-@dataclass(frozen=True, eq=False)
-class _Sweep:
-    feedforward: list[Array]
-    feedback: list[Array]
-    expected: float  # the decrease that the quadratic model promises, as a positive number
-    gradient: float  # the largest |dJ/du| of an input that is free to move
+def _best_policy(models: Iterable[LinearQuadratic], regularization: float) -> Policy | None:
+    """The policy of the first of the models whose Hessians allow one."""
+    for model in models:
+        policy = solve_riccati(model, regularization)
+        if policy is not None and policy.expected >= 0:
+            return policy
+    return None
+
+
+def _promise(models: Iterable[LinearQuadratic]) -> float:
+    """The largest decrease that any of the models promises, regularized as little as it allows."""
+    policies = (solve_riccati(m, 0.0) or solve_riccati(m, SMALLEST_REGULARIZATION) for m in models)
+    return max((abs(policy.expected) for policy in policies if policy is not None), default=math.inf)
 
 
 class _Search:
-    def __init__(self, problem: Problem, us: Array, limits: Limits, report: Report | None):
+    def __init__(self, problem: Problem, xs: Array, us: Array, limits: Limits, report: Report | None):
         self.problem, self.limits, self.report = problem, limits, report
-        self.us = np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
-        self.xs = roll_states(problem.model, problem.x0, self.us)
-        self.cost = problem.objective(self.xs, self.us)
-        self.regularization = 0.0
-        self.rows = [Iteration(0, self.cost, 0.0, math.nan, math.nan)]
+        self.constraints = StateConstraints(problem)
         self.start = time.monotonic()
+        self.motion = self._take_in(xs, us)
+        self.expanded, self.curvature = self.motion, DynamicsCurvature()
+        self.cost = problem.objective(self.motion.xs, self.motion.us)
+        self.constraints.choose_penalty(self.motion.xs, self.cost, float(np.sum(self.motion.gaps**2)))
+        self.jacobians: Array | None = None
+        self.gap_weight = 0.0
+        self.regularization = 0.0
+        self.rows = [Iteration(0, self.cost, self._infeasibility(), math.nan, math.nan)]
 
     def run(self, interrupted: threading.Event) -> Outcome:
-        for iteration in range(1, self.limits.max_iterations + 1):
-            model = _QuadraticModel(self.problem, self.xs, self.us)
-            outcome = self._step(model, iteration)
+        """Minimize once, or, where there are constraints, again and again for better multipliers."""
+        final = not self.constraints.any
+        while True:
+            outcome = self._minimize(final, interrupted)
+            if outcome not in (Outcome.SOLVED, Outcome.INACCURATE) or not self.constraints.any:
+                return outcome
+            residual = self.constraints.residual(self.motion.xs)
+            reached = residual <= self.limits.tolerance
+            exhausted = self.constraints.penalty >= LARGEST_PENALTY
+            if final and reached:
+                return outcome
+            if final and exhausted:
+                stands = self.constraints.violation(self.motion.xs) > FEASIBILITY_TOLERANCE
+                return Outcome.INFEASIBLE if stands else Outcome.INACCURATE
+            self.constraints.update(self.motion.xs)
+            final = reached or exhausted
+            if not final:
+                self.constraints.penalty *= GROWTH
+
+    def _minimize(self, final: bool, interrupted: threading.Event) -> Outcome:
+        """Take steps until little is left to gain: rounding if `final`, else a part of what the multipliers would."""
+        while True:
+            model = self._expand()
+            outcome = self._step(model, final)
             if outcome is not None:
                 return outcome
             if interrupted.is_set():
                 return Outcome.INTERRUPTED
             if time.monotonic() - self.start > self.limits.time_limit:
                 return Outcome.TIME_LIMIT
-        return Outcome.ITERATION_LIMIT
 
-    def _step(self, model: "_QuadraticModel", iteration: int) -> Outcome | None:
-        """Take one step that lowers the cost; an outcome where there is none left to take."""
+    def _expand(self) -> LinearQuadratic:
+        new, old = self.motion, self.expanded
+        if new is not old or self.jacobians is None:
+            self.jacobians = jacobians_along(self.problem, new)
+        model = expand(self.problem, new, self.jacobians, self.constraints)
+        self.curvature.update(model, np.hstack([new.xs[:-1] - old.xs[:-1], new.us - old.us]))
+        self.expanded = new
+        return model
+
+    def _step(self, model: LinearQuadratic, final: bool) -> Outcome | None:
+        """Take one step that lowers the merit; an outcome where there is none left to take."""
+        merit = self._merit()
+        scale = 1 + abs(merit)
+        left_over = self.limits.tolerance**2 * scale
+        if not final:
+            left_over = max(left_over, LEFT_OVER * self.constraints.unrest(self.motion.xs))
+        curved = replace(model, hessians=model.hessians + self.curvature.M)
+        promise = _promise((curved, model)) if self.motion.is_rollout else math.inf
+        if promise <= left_over:
+            return Outcome.SOLVED
+        if len(self.rows) > self.limits.max_iterations:
+            return Outcome.ITERATION_LIMIT
         while self.regularization <= LARGEST_REGULARIZATION:
-            sweep = model.sweep(self.regularization)
-            if sweep is not None:
-                if sweep.expected <= self.limits.tolerance**2 * (1 + abs(self.cost)):
-                    return Outcome.SOLVED
-                for size in 0.5 ** np.arange(12):
-                    if self._try(sweep, float(size), iteration):
-                        self.regularization = self._relaxed()
-                        return None
-                if sweep.expected <= 1e-13 * (1 + abs(self.cost)):
-                    return Outcome.SOLVED  # what is left to gain is less than the cost's rounding
+            policy = _best_policy((curved, model), self.regularization)
+            if policy is not None and self._search_along(model, policy):
+                self.regularization = self._relaxed()
+                return None
+            if promise <= ROUNDING * scale:
+                return Outcome.SOLVED  # what is left to gain is less than the cost's rounding
             self.regularization = max(8 * self.regularization, SMALLEST_REGULARIZATION)
+        self.regularization = 0.0
         return Outcome.INACCURATE
 
     def _relaxed(self) -> float:
         smaller = self.regularization / 8
         return smaller if smaller > SMALLEST_REGULARIZATION else 0.0
 
-    def _try(self, sweep: _Sweep, size: float, iteration: int) -> bool:
-        try:
-            xs, us, cost = self._roll_with_feedback(sweep, size)
-        except SimulationError:
-            return False  # too long a step: a shorter one is tried next
-        if not cost <= self.cost - SUFFICIENT_DECREASE * size * sweep.expected:
-            return False
-        self.xs, self.us, self.cost = xs, us, cost
-        self.rows.append(Iteration(iteration, cost, 0.0, sweep.gradient, size))
+    def _search_along(self, model: LinearQuadratic, policy: Policy) -> bool:
+        """Take the largest of `STEP_SIZES` that lowers the merit enough, if there is one."""
+        slope, distance = policy.slope, self.motion.distance
+        if distance:
+            slope, curvature = slope_along(model, policy)
+            self.gap_weight = max(self.gap_weight, 2 * (slope + max(curvature, 0) / 2) / distance)
+            slope -= self.gap_weight * distance
+        merit = self._merit()
+        for size in STEP_SIZES:
+            try:
+                motion = self._roll(policy, size)
+            except SimulationError:
+                continue  # too long a step: a shorter one is tried next
+            with np.errstate(over="ignore", invalid="ignore"):  # a merit that is not finite is no decrease
+                cost = self.problem.objective(motion.xs, motion.us)
+                found = self._merit_of(motion, cost)
+            if found <= merit + SUFFICIENT_DECREASE * size * slope:
+                self.motion, self.cost = motion, cost
+                self._record(policy.gradient, size)
+                return True
+        return False
+
+    def _roll(self, policy: Policy, size: float) -> Motion:
+        """Step from x_0 with feedback, each gap shrunk to 1 - `size` of itself."""
+        twin, old = self.problem.model.double, self.motion
+        xs, us = np.empty_like(old.xs), np.empty_like(old.us)
+        gaps = (1 - size) * old.gaps
+        xs[0] = self._inside_start(old.xs[0] + size * policy.start)
+        for k in range(len(us)):
+            du = size * policy.feedforward[k] + policy.feedback[k] @ (xs[k] - old.xs[k])
+            us[k] = self._inside(old.us[k] + du)
+            xs[k + 1] = advance(twin, xs[k], us[k]) - gaps[k]
+        return Motion(xs, us, gaps)
+
+    def _take_in(self, xs: Array, us: Array) -> Motion:
+        """The guess, its inputs taken inside their bounds and its first state the problem's, and its gaps."""
+        free = self.problem.initial_state_mask
+        xs, us = np.array(xs), self._inside(us)
+        xs[0] = self._inside_start(np.where(free, xs[0], self.problem.x0))
+        gaps = np.empty_like(xs[1:])
+        quaternions = tangent_space(self.problem.model).quaternions
+        for k, u in enumerate(us):
+            x_next = advance(self.problem.model.double, xs[k], u)
+            for part in (slice(start, start + 4) for start in quaternions):
+                if x_next[part] @ xs[k + 1, part] < 0:  # the same rotation, further off
+                    xs[k + 1, part] *= -1
+            gaps[k] = x_next - xs[k + 1]
+        return Motion(xs, us, gaps)
+
+    def _inside(self, us: Array) -> Array:
+        """`us` (..., nu) within its bounds, and on a bound where rounding alone parts it from one."""
+        bounds = self.problem.bounds
+        us = np.clip(us, bounds.u_lower, bounds.u_upper)
+        for bound in (bounds.u_lower, bounds.u_upper):
+            us = np.where(np.abs(us - bound) <= 1e-14 * np.abs(us), bound, us)
+        return us
+
+    def _inside_start(self, x: Array) -> Array:
+        bounds = self.problem.bounds
+        return np.where(self.problem.initial_state_mask, np.clip(x, bounds.x_lower, bounds.x_upper), x)
+
+    def _merit(self) -> float:
+        return self._merit_of(self.motion, self.cost)
+
+    def _merit_of(self, motion: Motion, cost: float) -> float:
+        """Cost, augmented by the constraints, plus the weighted sum of all gaps."""
+        return cost + self.constraints.value(motion.xs) + self.gap_weight * motion.distance
+
+    def _infeasibility(self) -> float:
+        return max(float(np.abs(self.motion.gaps).max(initial=0.0)), self.constraints.violation(self.motion.xs))
+
+    def _record(self, gradient: float, size: float) -> None:
+        number, violation = len(self.rows), self._infeasibility()
+        self.rows.append(Iteration(number, self.cost, violation, gradient, size))
         if self.report:
-            self.report(f"iteration {iteration:4d}  cost {cost:12.6g}  gradient {sweep.gradient:9.2e}  step {size:.3g}")
-        return True
-
-    def _roll_with_feedback(self, sweep: _Sweep, size: float) -> tuple[Array, Array, float]:
-        bounds, xs, us = self.problem.bounds, [np.array(self.problem.x0)], []
-        for k, u in enumerate(self.us):
-            wanted = u + size * sweep.feedforward[k] + sweep.feedback[k] @ (xs[-1] - self.xs[k])
-            us.append(np.clip(wanted, bounds.u_lower, bounds.u_upper))
-            xs.append(advance(self.problem.model.double, xs[-1], us[-1]))
-        states, inputs = np.array(xs), np.array(us)
-        return states, inputs, self.problem.objective(states, inputs)
-
-
-class _QuadraticModel:
-    """Dynamics to first and cost to second order along a motion."""
-
-    def __init__(self, problem: Problem, xs: Array, us: Array):
-        self.problem, self.us = problem, us
-        self.steps = linearize(problem.model, xs[0], us)
-        h, nx, nu = problem.model.time_step, problem.model.nx, problem.model.nu
-        self.hessians = np.zeros((len(us), nx + nu, nx + nu))
-        self.gradients = np.zeros((len(us), nx + nu))
-        if problem.running_cost is not None:
-            for k, u in enumerate(us):
-                _, by_x, by_u = differentiate_cost(problem.running_cost, xs[k], u)
-                self.gradients[k] = h * np.concatenate([by_x, by_u])
-                self.hessians[k] = h * running_cost_hessian(problem.running_cost, xs[k], u)
-        self.final_gradient, self.final_hessian = np.zeros(nx), np.zeros((nx, nx))
-        if problem.final_cost is not None:
-            self.final_gradient = differentiate_final_cost(problem.final_cost, xs[-1])[1]
-            self.final_hessian = final_cost_hessian(problem.final_cost, xs[-1])
-
-    def sweep(self, regularization: float) -> _Sweep | None:
-        """The Riccati recursion; None where the inputs' Hessian is not positive definite."""
-        nx = self.problem.model.nx
-        slope, curvature = self.final_gradient, self.final_hessian
-        feedforward, feedback, expected, largest = [], [], 0.0, 0.0
-        for k in reversed(range(len(self.us))):
-            d = self.steps[k]
-            dynamics = np.hstack([d.A, d.B])
-            q = self.gradients[k] + dynamics.T @ slope
-            Q = self.hessians[k] + dynamics.T @ curvature @ dynamics
-            free = self._free(k, q[nx:])
-            gains = _gains(Q, q, nx, free, regularization)
-            if gains is None:
-                return None
-            step, gain = gains
-            expected -= float(step @ q[nx:]) + 0.5 * float(step @ Q[nx:, nx:] @ step)
-            largest = max(largest, float(np.abs(q[nx:][free]).max(initial=0.0)))
-            slope = q[:nx] + gain.T @ (Q[nx:, nx:] @ step + q[nx:]) + Q[:nx, nx:] @ step
-            curvature = Q[:nx, :nx] + gain.T @ Q[nx:, nx:] @ gain + gain.T @ Q[nx:, :nx] + Q[:nx, nx:] @ gain
-            curvature = (curvature + curvature.T) / 2
-            feedforward.append(step)
-            feedback.append(gain)
-        return _Sweep(feedforward[::-1], feedback[::-1], expected, largest)
-
-    def _free(self, k: int, gradient: Array) -> Array:
-        """Which inputs may move: not those at a bound that the cost pushes against."""
-        bounds, u = self.problem.bounds, self.us[k]
-        return ~(((u <= bounds.u_lower) & (gradient > 0)) | ((u >= bounds.u_upper) & (gradient < 0)))
-
-
-def _gains(Q: Array, q: Array, nx: int, free: Array, regularization: float) -> tuple[Array, Array] | None:
-    """(step (nu,), gain (nu, nx)) that minimize the quadratic model over the free inputs."""
-    nu = len(q) - nx
-    step, gain = np.zeros(nu), np.zeros((nu, nx))
-    if not free.any():
-        return step, gain
-    inputs = nx + np.flatnonzero(free)
-    hessian = Q[np.ix_(inputs, inputs)] + regularization * np.eye(len(inputs))
-    try:
-        np.linalg.cholesky(hessian)
-    except np.linalg.LinAlgError:
-        return None
-    solved = -np.linalg.solve(hessian, np.column_stack([q[inputs], Q[inputs, :nx]]))
-    step[free], gain[free] = solved[:, 0], solved[:, 1:]
-    return step, gain
+            self.report(
+                f"iteration {number:4d}  cost {self.cost:12.6g}  violation {violation:9.2e}  gradient {gradient:9.2e}  "
+                f"step {size:.3g}"
+            )

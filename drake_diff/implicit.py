@@ -78,22 +78,27 @@ def implicit_jacobian(model: Model, vector: ParameterVector, x: Array, u: Array,
     return _by_autodiff(model, form, vector, x, u, x_next)
 
 
-def implicit_jacobians(model: Model, xs: Array, us: Array) -> tuple[Array, list[Array | None]] | None:
-    """Step from xs (nx,) under us (N, nu): the states (N+1, nx), and (nx, nx + nu) of each step, None if not smooth.
+def implicit_jacobians(
+    model: Model, x0: Array, us: Array, xs: Array | None = None
+) -> tuple[Array, list[Array | None]] | None:
+    """Steps from x0 (nx,) under us (N, nu), or from each of xs (N, nx): their ends (N, nx), and (nx, nx + nu) each.
 
-    None altogether where there is no tree or parameters are set: then the steps are differentiated one by one.
+    A step that is not smooth has None; None altogether where there is no tree, or parameters are set: then the steps
+    are differentiated one by one.
     """
     form = _form_of(model)
     if form.excluded or form.tree is None or model.has_other_parameters:
         return None
-    states, touching = np.empty((len(us) + 1, model.nx)), np.zeros(len(us), dtype=bool)
-    states[0] = xs
+    starts, ends = np.empty((len(us), model.nx)), np.empty((len(us), model.nx))
+    touching = np.zeros(len(us), dtype=bool)
+    x = x0
     for k, u in enumerate(us):
-        states[k + 1] = advance(model.double, states[k], u)
+        starts[k] = x if xs is None else xs[k]
+        x = ends[k] = advance(model.double, starts[k], u)
         touching[k] = form.can_touch and _touches(model.double)
-    jacobians, missing = _by_tree(model, form, form.tree, states[:-1], us, states[1:])
+    jacobians, missing = _by_tree(model, form, form.tree, starts, us, ends)
     smooth = ~touching & (missing <= RESIDUAL_TOLERANCE)
-    return states, [jacobian if good else None for jacobian, good in zip(jacobians, smooth, strict=True)]
+    return ends, [jacobian if good else None for jacobian, good in zip(jacobians, smooth, strict=True)]
 
 
 def _by_tree(

@@ -123,17 +123,25 @@ def differentiate_rollout(
 
 
 def linearize(
-    model: Model, x0: Array, us: Array, *, vector: ParameterVector | None = None, method: str = "auto"
+    model: Model,
+    x0: Array,
+    us: Array,
+    *,
+    vector: ParameterVector | None = None,
+    method: str = "auto",
+    xs: Array | None = None,
 ) -> list[StepDerivatives]:
-    """The step derivatives along the rollout from `x0` (nx,) under `us` (N, nu), `vector` being applied."""
+    """The step derivatives along the rollout from `x0` (nx,) under `us` (N, nu), `vector` being applied.
+
+    Given xs (N, nx), those of the steps from each of them.
+    """
     found: list[StepDerivatives] = []
     vector = vector or select(model, ())
     if method in ("auto", "implicit") and not vector.parameters:
-        found = smooth_steps(model, x0, us, method)
-    x = found[-1].x_next if found else x0
-    for u in us[len(found) :]:
-        found.append(step_jacobians(model, vector, x, u, method))
-        x = found[-1].x_next
+        found = smooth_steps(model, x0, us, method, xs)
+    for k in range(len(found), len(us)):
+        x = (found[-1].x_next if found else x0) if xs is None else xs[k]
+        found.append(step_jacobians(model, vector, x, us[k], method))
     return found
 
 

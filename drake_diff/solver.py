@@ -15,7 +15,7 @@ from drake_diff.collocation import DEFAULT_SOLVER as COLLOCATION_SOLVER
 from drake_diff.collocation import solve_collocation
 from drake_diff.continuous import EquationsOfMotion
 from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
-from drake_diff.ilqr import check_problem, is_solvable, solve_ilqr
+from drake_diff.ilqr import check_problem, is_unconstrained, solve_ilqr
 from drake_diff.nonlinear_program import SOLVERS, Limits, NlpResult, Outcome
 from drake_diff.problem import Problem
 from drake_diff.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
@@ -46,11 +46,12 @@ def solve(
 ) -> Solution:
     """Solve `problem`, check the gradients that were used, and measure the result again on Drake's plant.
 
-    `method`: "collocation" (smooth, in continuous time), "shooting" (through Drake's own steps, contact
-    included) or "auto". `initial_guess` is None (a straight line to the goal; near zero inputs), (xs, us) with
-    shapes (N+1, nx) and (N, nu), or a Solution. `solver` is "ipopt" or "snopt"; `time_limit` [s]; `tolerance` the
-    solver's on feasibility and optimality; `seed` that of the guess's noise. `progress` prints, or hands each
-    line to a function; `on_start` is called once, when all input has been checked and the work begins.
+    `method`: "collocation" (smooth, in continuous time), "shooting" (through Drake's own steps, contact included),
+    "ilqr" (the same by Riccati sweeps, from any xs and us) or "auto". `initial_guess` is None (a straight line to
+    the goal; near zero inputs), (xs, us) with shapes (N+1, nx) and (N, nu), or a Solution. `solver` is "ipopt" or
+    "snopt"; `time_limit` [s]; `tolerance` the solver's on feasibility and optimality; `seed` that of the guess's
+    noise. `progress` prints, or hands each line to a function; `on_start` is called once, when all input has been
+    checked and the work begins.
 
     Raises InputError and its kin, or ModelError, before anything runs; how a solve ended is `Solution.status`.
     """
@@ -92,8 +93,8 @@ def solve(
     if method == "collocation":
         return run.collocate(xs, us)
     if method == "ilqr":
-        return run.sweep(us)
-    return run.shoot(xs, us, improve=initial_guess is None and is_solvable(problem))
+        return run.sweep(xs, us, given=initial_guess is not None)
+    return run.shoot(xs, us, improve=initial_guess is None and is_unconstrained(problem))
 
 
 def _check_method(problem: Problem, method: str) -> None:
@@ -169,18 +170,20 @@ class _Run:
         draft = self._draft(xs, us, u_final=u_final, certificates=before + after)
         return judged(draft, result)
 
-    def sweep(self, us: Array) -> Solution:
-        def search(xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
-            return solve_ilqr(self.problem, us, limits=self.limits, report=self.report)
+    def sweep(self, xs: Array, us: Array, *, given: bool) -> Solution:
+        """iLQR; from the states of a `given` guess, which need not be a rollout, else from the rollout of `us`."""
 
-        return self._through_steps(np.tile(self.problem.x0, (len(us) + 1, 1)), us, search)
+        def search(rolled: Array, us: Array) -> tuple[NlpResult, Array, Array]:
+            return solve_ilqr(self.problem, xs if given else rolled, us, limits=self.limits, report=self.report)
+
+        return self._through_steps(xs, us, search)
 
     def shoot(self, xs: Array, us: Array, *, improve: bool) -> Solution:
         """Shooting; `improve` the guess by iLQR, which gets out of curved valleys that shooting crawls along."""
 
         def search(xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
             if improve:
-                result, xs, us = solve_ilqr(self.problem, us, limits=self.limits, report=self.report)
+                result, xs, us = solve_ilqr(self.problem, xs, us, limits=self.limits, report=self.report)
                 self.options["initial_guess"] = f"default, then {result.message}"
                 if result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
                     return result, xs, us

@@ -98,31 +98,31 @@ def step_jacobians(model: Model, vector: ParameterVector, x: Array, u: Array, me
     )
 
 
-def smooth_steps(model: Model, x0: Array, us: Array, method: str) -> list[StepDerivatives]:
-    """The derivatives of the steps from `x0` under `us` (N, nu), all in one call; none where they cannot be.
+def smooth_steps(model: Model, x0: Array, us: Array, method: str, xs: Array | None = None) -> list[StepDerivatives]:
+    """The derivatives of the steps from `x0` under `us` (N, nu), or from each of xs (N, nx), all in one call.
 
-    A step that is not smooth is differentiated on its own. What `method` "auto" takes is settled by the first.
+    Empty where they cannot be. A step that is not smooth is differentiated on its own. What `method` "auto" takes is
+    settled by the first.
     """
+    vector, nx = select(model, ()), model.nx
     if method == "auto" and model not in _CHOICES:
-        step_jacobians(model, select(model, ()), x0, us[0], method)
+        step_jacobians(model, vector, x0, us[0], method)
     if method == "auto" and not (model in _CHOICES and _CHOICES[model].use_implicit):
         return []
-    at_once = implicit_jacobians(model, x0, us)
+    at_once = implicit_jacobians(model, x0, us, xs)
     if at_once is None:
         return []
-    states, jacobians = at_once
-    check_derivatives(model, np.concatenate([j for j in jacobians if j is not None] or [np.zeros((0, model.nx))]))
+    ends, jacobians = at_once
+    check_derivatives(model, np.concatenate([j for j in jacobians if j is not None] or [np.zeros((0, nx))]))
     reason = "asked for" if method == "implicit" else _CHOICES[model].reason
-    vector, nx = select(model, ()), model.nx
+    starts = np.vstack([x0, ends[:-1]]) if xs is None else xs
+    none = frozen(np.zeros((nx, 0)))
     return [
-        step_jacobians(model, vector, states[k], us[k], method)
-        if jacobian is None
-        else StepDerivatives(
-            frozen(states[k + 1]), frozen(jacobian[:, :nx]), frozen(jacobian[:, nx:]), frozen(np.zeros((nx, 0))),
-            (), (), "implicit", reason,
-        )
-        for k, jacobian in enumerate(jacobians)
-    ]  # fmt: skip
+        step_jacobians(model, vector, starts[k], us[k], method)
+        if j is None
+        else StepDerivatives(frozen(ends[k]), frozen(j[:, :nx]), frozen(j[:, nx:]), none, (), (), "implicit", reason)
+        for k, j in enumerate(jacobians)
+    ]
 
 
 Source = tuple[Array, str, str]  # the Jacobian (nx, nx + nu + np), the method and why it was taken

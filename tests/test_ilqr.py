@@ -1,13 +1,25 @@
 """iLQR against the Riccati recursion, its own quadratic case, and against what its optimum must satisfy."""
 
+import itertools
 import signal
+import time
 
 import numpy as np
 import pytest
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import RevoluteJoint, SpatialInertia
+from pydrake.systems.framework import DiagramBuilder
 from test_solution import MODELS, block
 
 import drake_diff as dd
+from drake_diff.augmented_lagrangian import StateConstraints
+from drake_diff.expansion import Motion, expand, jacobians_along
+from drake_diff.ilqr import _Search
+from drake_diff.nonlinear_program import Limits
+from drake_diff.riccati import minimize_in_box, solve_riccati
 from drake_diff.solution import Status
+
+EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 SOFT = {
     "running_cost": dd.QuadraticCost(Q=np.diag([0.1, 0.01]), R=[[0.1]], x_ref=[np.pi, 0]),
@@ -46,11 +58,14 @@ OTHERS = [
 
 @pytest.mark.parametrize("case", OTHERS)
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_one_step_from_any_guess_is_the_riccati_recursions_optimum(case, seed):
+@pytest.mark.parametrize("infeasible", [False, True])
+def test_one_step_from_any_guess_is_the_riccati_recursions_optimum(case, seed, infeasible):
     """1e-12 relative: a sum of a few hundred rounded terms."""
     problem = lqr(*case, x0=(1.0, -0.5))
-    us = 10 * np.random.default_rng(seed).standard_normal((case[1], 1))
-    solution = dd.solve(problem, method="ilqr", initial_guess=(np.zeros((case[1] + 1, 2)), us))
+    random = np.random.default_rng(seed)
+    us = 10 * random.standard_normal((case[1], 1))
+    xs = 10 * random.standard_normal((case[1] + 1, 2)) if infeasible else dd.rollout(problem.model, problem.x0, us).xs
+    solution = dd.solve(problem, method="ilqr", initial_guess=(xs, us))
     P, gains = riccati(*case)
     x0 = np.array([1.0, -0.5])
     assert solution.success, solution.message
@@ -157,10 +172,9 @@ def test_a_function_is_optimized_like_the_quadratic_cost_it_is():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"x_goal": [np.pi, 0]}, 'x_goal: expected none for method="ilqr"; method="shooting" takes it, got given'),
-        ({"bounds": dd.Bounds(x_upper=[4, np.inf])}, 'state bounds: expected none for method="ilqr"'),
-        ({"optimize": ("controls", "initial_state")}, 'optimize "initial_state": expected none'),
-        ({"optimize": ("initial_state",)}, 'optimize "initial_state": expected none'),
+        ({"optimize": ("initial_state",)}, 'fixed controls: expected none for method="ilqr"; method="shooting" takes'),
+        ({"parameters": ["hinge.damping"]}, "parameters: expected none"),
+        ({"trajectory_cost": lambda xs, us: xs[3, 0] ** 2}, "trajectory_cost: expected none"),
     ],
 )
 def test_what_ilqr_cannot_keep_is_refused(changes, words):
@@ -196,3 +210,316 @@ def test_a_guess_outside_the_bounds_is_taken_inside():
     solution = dd.solve(problem, method="ilqr", initial_guess=(np.zeros((6, 2)), np.full((5, 1), 9.0)))
     assert solution.success, solution.message
     assert solution.us.tolist() == [[1.0]] * 5
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_two_blocks_too_are_solved_in_one_step_from_an_infeasible_guess(seed):
+    """4 states and 2 inputs whose costs are coupled, against the normal equations of the stacked problem."""
+    random, h, count = np.random.default_rng(seed), 0.1, 12
+    root = random.standard_normal((6, 6))
+    weight = root @ root.T
+    Q, R, x0 = weight[:4, :4], weight[4:, 4:] + np.eye(2), random.standard_normal(4)
+    problem = dd.Problem(
+        block(time_step=h, blocks=2, actuated=2),
+        x0=x0,
+        num_steps=count,
+        running_cost=dd.QuadraticCost(Q=Q / h, R=R / h),
+        final_cost=dd.QuadraticCost(Q=Q),
+    )
+    guess = 10 * random.standard_normal((count + 1, 4)), 10 * random.standard_normal((count, 2))
+    solution = dd.solve(problem, method="ilqr", initial_guess=guess)
+    A, B = np.kron([[1, h], [0, 1]], np.eye(2)), np.kron([[h**2], [h]], np.eye(2))
+    P = Q
+    for _ in range(count):
+        P = Q + A.T @ P @ (A - B @ np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A))
+    assert solution.success, solution.message
+    assert len(solution.iterations) == 2
+    assert solution.iterations[0].primal_infeasibility > 1
+    assert solution.iterations[1].primal_infeasibility == 0
+    assert solution.cost == pytest.approx(x0 @ P @ x0, rel=1e-12)
+
+
+def test_a_step_of_size_a_leaves_the_rest_of_each_gap():
+    """A swing-up from a straight line: the largest gap shrinks by 1 - size, and is exactly 0 after a full step."""
+    xs = np.linspace(0, 1, 101)[:, None] * np.array([np.pi, 0])
+    solution = dd.solve(pendulum(), method="ilqr", initial_guess=(xs, np.full((100, 1), 8.0)))
+    rows = solution.iterations
+    assert rows[0].primal_infeasibility > 0.1
+    for before, after in itertools.pairwise(rows):
+        assert after.primal_infeasibility == pytest.approx((1 - after.step) * before.primal_infeasibility, rel=1e-12)
+    assert solution.success, solution.message
+    assert solution.defect < 1e-12
+    assert np.abs(pendulum_gradient(solution.us)).max() < 1e-6
+
+
+@pytest.mark.parametrize("size", [0.25, 1.0])
+def test_a_roll_keeps_the_rest_of_the_gaps(size):
+    """The defects of the moved motion, measured by Drake's steps, against 1 - size of those before."""
+    problem, random = pendulum(), np.random.default_rng(0)
+    guess = random.standard_normal((101, 2)), random.standard_normal((100, 1))
+    search = _Search(problem, *guess, Limits(1, np.inf, 1e-8), None)
+    moved = search._roll(solve_riccati(search._expand(), 1e3), size)
+    steps = [dd.step(problem.model, x, u) for x, u in zip(moved.xs, moved.us, strict=False)]
+    assert np.array(steps) - moved.xs[1:] == pytest.approx((1 - size) * search.motion.gaps, abs=1e-12)
+
+
+def test_a_hard_goal_of_the_pendulum():
+    """B33: J = 8.826541704941, to 1e-8 of it since the goal is met to 1e-8."""
+    solution = dd.solve(pendulum(x_goal=[np.pi, 0], running_cost=EFFORT, final_cost=None), method="ilqr")
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(8.826541704941, rel=1e-8)
+    assert solution.goal_error < 1e-8
+    assert solution.us[:3, 0] == pytest.approx([-1.52719898, -1.74962353, -1.96009648], abs=2e-6)
+
+
+def test_the_pendulum_of_drake_ddp():
+    """B35: 0.225845385916, by an independent program; few steps, as the dynamics' curvature is learned on the way."""
+    problem = dd.Problem(
+        dd.load_model(MODELS / "pendulum.urdf", time_step=0.01),
+        x0=[0, 0],
+        num_steps=199,
+        running_cost=dd.QuadraticCost(Q=np.diag([0, 0.01]), R=[[0.01]]),
+        final_cost=dd.QuadraticCost(Q=100 * np.eye(2), x_ref=[np.pi, 0]),
+    )
+    solution = dd.solve(problem, method="ilqr")
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(0.225845385916, abs=1e-12)
+    assert len(solution.iterations) < 40  # 199 without
+
+
+def test_the_pendulum_of_irs_lqr(tmp_path):
+    """B37: dw / dt = u - sin q, h = 0.05; 1856.154405579479 at u = 0.1 and 349.490454199 at the optimum."""
+    text = (MODELS / "pendulum.urdf").read_text()
+    length, mass = 9.81, 9.81**-2  # so that g / l = m l^2 = 1
+    for old, new in (("0 0 -0.5", f"0 0 {-length}"), ('mass value="1"', f'mass value="{mass}"'), ("0.1", "0")):
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path / "pendulum.urdf"
+    path.write_text(text)
+    model = dd.load_model(path, time_step=0.05)
+    target = dd.QuadraticCost(Q=np.eye(2), x_ref=[np.pi, 0])
+    weights = dd.QuadraticCost(Q=np.eye(2) / 0.05, R=[[1 / 0.05]], x_ref=[np.pi, 0])
+    problem = dd.Problem(model, x0=[0, 0], num_steps=200, running_cost=weights, final_cost=target)
+    us = np.full((200, 1), 0.1)
+    solution = dd.solve(problem, method="ilqr", initial_guess=(dd.rollout(model, [0, 0], us).xs, us))
+    assert solution.iterations[0].objective == pytest.approx(1856.154405579479, rel=1e-12)
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(349.490454199, rel=1e-10)
+
+
+@pytest.mark.parametrize(("count", "mass", "distance"), [(10, 1.0, 1.0), (100, 1.0, 1.0), (25, 2.5, -0.3)])
+def test_a_block_is_moved_with_the_least_effort(count, mass, distance):
+    """B01: 12 m^2 d^2 / T^3 / (1 - 1 / N^2) by symplectic Euler; a multiplier's rounding, and the goal's 1e-8."""
+    model = block(mass=mass, time_step=1 / count)
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[distance, 0], num_steps=count, running_cost=EFFORT)
+    solution = dd.solve(problem, method="ilqr")
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(12 * mass**2 * distance**2 / (1 - 1 / count**2), rel=1e-8)
+    assert solution.goal_error < 1e-8
+
+
+def move(count=20, goal=(1, 0), **bounds):
+    model = block(time_step=1 / count)
+    fields = {"x0": [0, 0], "num_steps": count, "running_cost": EFFORT, "bounds": dd.Bounds(**bounds)}
+    return dd.Problem(model, x_goal=goal, **fields)
+
+
+def test_a_velocity_limit_is_met_and_pays():
+    """u_k - u_(k+1) is a constant plus the multiplier of v_(k+1) <= 1.2, which is 0 where v is below.
+
+    IPOPT, whose bounds give by 1e-8, finds the cost.
+    """
+    problem = move(x_upper=[np.inf, 1.2])
+    solution = dd.solve(problem, method="ilqr")
+    assert solution.success, solution.message
+    assert solution.bound_violation < 1e-8
+    slack = 1.2 - solution.xs[1:-1, 1]
+    assert (slack < 1e-7).sum() > 3
+    falls = -np.diff(solution.us[:, 0])
+    apart = falls[slack > 1e-3]
+    assert np.ptp(apart) < 1e-6
+    assert falls.min() > apart.max() - 1e-6 or falls.max() < apart.min() + 1e-6
+    shooting = dd.solve(problem, method="shooting", solver="ipopt")
+    assert shooting.success, shooting.message
+    assert solution.cost == pytest.approx(shooting.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("bounds", [{"u_lower": [-5.0], "u_upper": [5.0]}, {"u_lower": [-4.5], "x_upper": [2, 1.4]}])
+def test_input_bounds_with_a_goal_give_the_optimum_of_ipopt(bounds):
+    problem = move(**bounds)
+    a = dd.solve(problem, method="ilqr")
+    b = dd.solve(problem, method="shooting", solver="ipopt")
+    assert a.success, a.message
+    assert a.us.min() == bounds["u_lower"][0]
+    assert a.cost == pytest.approx(b.cost, rel=1e-6)
+
+
+def test_cart_pole_swing_up_from_rest():
+    """The optimum of examples/cart_pole_swing_up.py at 50 steps: 58.6088 by SNOPT and IPOPT."""
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04)
+    problem = dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=50, running_cost=EFFORT)
+    solution = dd.solve(problem, method="ilqr")
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(58.6088133284, rel=1e-8)
+    line = np.linspace(0, 1, 51)[:, None] * problem.x_goal
+    from_a_line = dd.solve(problem, method="ilqr", initial_guess=(line, np.zeros((50, 1))))
+    assert from_a_line.success, from_a_line.message
+    assert from_a_line.cost == pytest.approx(58.6088133284, rel=1e-8)
+    again = dd.solve(problem, method="ilqr", initial_guess=solution)
+    assert again.success, again.message
+    assert len(again.iterations) < 12  # a good guess is not left
+
+
+def craft():
+    """A hull floating without gravity, turned by three reaction wheels."""
+    builder = DiagramBuilder()
+    config = MultibodyPlantConfig(time_step=0.05, use_sampled_output_ports=False, discrete_contact_approximation="sap")
+    plant, _ = AddMultibodyPlant(config, builder)
+    plant.mutable_gravity_field().set_gravity_vector([0, 0, 0])
+    hull = plant.AddRigidBody("hull", SpatialInertia.SolidBoxWithMass(10, 0.3, 0.4, 0.5))
+    for i, axis in enumerate(np.eye(3)):
+        wheel = plant.AddRigidBody(f"wheel_{i}", SpatialInertia.SolidSphereWithMass(1, 0.2))
+        joint = plant.AddJoint(RevoluteJoint(f"axle_{i}", hull.body_frame(), wheel.body_frame(), axis))
+        plant.AddJointActuator(f"motor_{i}", joint)
+    plant.Finalize()
+    return dd.model_from_diagram(builder.Build())
+
+
+def tilted(model, angle=1.5):
+    x0 = np.array(model.default_state)
+    x0[:4] = [np.cos(angle / 2), *(np.sin(angle / 2) * np.array([1, 2, 3]) / np.sqrt(14))]
+    return x0
+
+
+def test_a_floating_body_is_turned_upright_and_stopped():
+    """The quaternion's vector part and the rates are the goal; its norm grows, so that its scalar part is free."""
+    model = craft()
+    goal = np.full(model.nx, np.nan)
+    goal[[1, 2, 3, *range(model.nq, model.nq + 3)]] = 0
+    cost = dd.QuadraticCost(R=np.eye(3))
+    problem = dd.Problem(model, x0=tilted(model), x_goal=goal, num_steps=40, running_cost=cost)
+    solution = dd.solve(problem, method="ilqr")
+    assert solution.success, solution.message
+    shooting = dd.solve(problem, method="shooting", solver="ipopt")
+    assert solution.cost == pytest.approx(shooting.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("target", [[1, 0, 0, 0], [0, 1, 0, 0]])
+def test_a_floating_bodys_optimum_has_no_slope(target):
+    """By reverse accumulation in Drake's coordinates; without the quaternion's norm, which grows, 1e-3 is left."""
+    model = craft()
+    x0, x_ref, Q = tilted(model), np.array(model.default_state), np.zeros((model.nx, model.nx))
+    x_ref[:4], Q[:4, :4] = target, np.eye(4)
+    running = dd.QuadraticCost(Q=Q, R=0.01 * np.eye(3), x_ref=x_ref)
+    problem = dd.Problem(model, x0=x0, num_steps=30, running_cost=running, final_cost=dd.QuadraticCost(Q, x_ref=x_ref))
+    solution = dd.solve(problem, method="ilqr")
+    assert solution.success, solution.message
+
+    def loss(xs, us):
+        return 0.05 * sum(running(x, u) for x, u in zip(xs, us, strict=False)) + problem.final_cost(xs[-1])
+
+    assert np.abs(dd.differentiate_rollout(model, x0, solution.us, loss).us).max() < 1e-7
+
+
+def test_a_guess_with_the_other_sign_of_a_quaternion_is_the_same_guess():
+    model = craft()
+    x0, x_ref, Q = tilted(model), np.array(model.default_state), np.zeros((model.nx, model.nx))
+    Q[:4, :4] = np.eye(4)
+    cost = dd.QuadraticCost(Q=Q, R=0.01 * np.eye(3), x_ref=x_ref)
+    problem = dd.Problem(model, x0=x0, num_steps=10, running_cost=cost)
+    xs, us = np.tile(x0, (11, 1)), np.zeros((10, 3))
+    flipped = np.array(xs)
+    flipped[1::2, :4] *= -1
+    a, b = (dd.solve(problem, method="ilqr", initial_guess=(guess, us)) for guess in (xs, flipped))
+    assert a.success, a.message
+    assert a.us.tobytes() == b.us.tobytes()
+
+
+def test_a_free_initial_velocity_drifts_to_the_goal():
+    """No force is needed at v_0 = 1; where v_0 <= 0.7, v = 0.7 + sum of h u."""
+    fields = {"optimize": ("controls", "initial_state"), "initial_state_mask": [False, True]}
+    problem = dd.Problem(block(), x0=[0, 0], num_steps=10, x_goal=[1, np.nan], running_cost=EFFORT, **fields)
+    solution = dd.solve(problem, method="ilqr")
+    assert solution.success, solution.message
+    assert solution.xs[0] == pytest.approx([0, 1], abs=1e-7)
+    assert solution.cost < 1e-12
+    slow = dd.Problem(
+        block(),
+        x0=[0, 0],
+        num_steps=10,
+        final_cost=dd.QuadraticCost(Q=np.diag([100, 0]), x_ref=[1, 0]),
+        running_cost=EFFORT,
+        bounds=dd.Bounds(x_upper=[np.inf, 0.7]),
+        **fields,
+    )
+    a, b = dd.solve(slow, method="ilqr"), dd.solve(slow, method="shooting", solver="ipopt")
+    assert a.success, a.message
+    assert a.xs[0, 1] == pytest.approx(0.7, abs=1e-12)
+    assert a.cost == pytest.approx(b.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "bounds", [{"x_upper": [np.inf, 0.8]}, {"u_lower": [-3.0], "u_upper": [3.0]}, {"x_upper": [np.inf, 0.99]}]
+)
+def test_a_goal_out_of_reach_is_infeasible(bounds):
+    """1 m in 1 s from rest to rest takes more than 1 m/s, and 4 N."""
+    solution = dd.solve(move(**bounds), method="ilqr")
+    assert solution.status is Status.INFEASIBLE, solution.message
+    assert solution.iterations[-1].primal_infeasibility > 1e-3
+    assert "after" in solution.message
+
+
+def test_a_goal_alone_needs_no_cost():
+    problem = dd.Problem(block(), x0=[0, 0], num_steps=30, x_goal=[1, 0])
+    solution = dd.solve(problem, method="ilqr")
+    assert solution.success, solution.message
+
+
+@pytest.mark.slow
+def test_swing_ups_from_random_inputs_reach_the_goal_or_say_that_they_do_not():
+    """20 guesses, normal inputs of size 1 under |u| <= 2.5; shooting's optimum is 10.98372."""
+    problem = pendulum(
+        x_goal=[np.pi, 0],
+        running_cost=EFFORT,
+        final_cost=None,
+        bounds=dd.Bounds(u_lower=[-2.5], u_upper=[2.5]),
+    )
+    reached = 0
+    for seed in range(20):
+        us = np.random.default_rng(seed).standard_normal((100, 1))
+        guess = dd.rollout(problem.model, problem.x0, us).xs, us
+        solution = dd.solve(problem, method="ilqr", initial_guess=guess)
+        end = dd.rollout(problem.model, problem.x0, solution.us).xs[-1]
+        arrived = np.abs(end - [np.pi, 0]).max() < 1e-5 and np.abs(solution.us).max() <= 2.5
+        assert arrived or not solution.success
+        reached += solution.success
+        assert not solution.success or solution.cost == pytest.approx(10.98372, abs=1e-5)
+    assert reached >= 18
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_box_newton_step_satisfies_the_conditions_of_an_optimum(seed):
+    random = np.random.default_rng(seed)
+    root = random.standard_normal((5, 5))
+    hessian, gradient = root @ root.T + 0.1 * np.eye(5), 3 * random.standard_normal(5)
+    lower, upper = -random.random(5), random.random(5)
+    d, free = minimize_in_box(hessian, gradient, lower, upper)
+    slope = gradient + hessian @ d
+    assert np.abs(slope[free]).max(initial=0.0) < 1e-10
+    assert np.all((slope[d == lower] >= 0) | free[d == lower])
+    assert np.all((slope[d == upper] <= 0) | free[d == upper])
+    assert np.all((lower <= d) & (d <= upper))
+
+
+def test_a_sweep_takes_less_than_five_milliseconds():
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
+    problem = dd.Problem(model, x0=np.zeros(4), num_steps=100, running_cost=EFFORT, x_goal=[1, np.pi, 0, 0])
+    motion = Motion(np.zeros((101, 4)), np.zeros((100, 1)), np.zeros((100, 4)))
+    around = expand(problem, motion, jacobians_along(problem, motion), StateConstraints(problem))
+
+    def seconds():
+        start = time.perf_counter()
+        solve_riccati(around, 0.0)
+        return time.perf_counter() - start
+
+    assert min(seconds() for _ in range(10)) < 5e-3

@@ -21,7 +21,8 @@ exceptions arrays autodiff whole_file plant_elements model_file contact_geometry
 model read_contract tangent inertia parameter_kinds contact_parameters parameters parameter_coordinates step
 finite_difference tree_dynamics implicit step_derivatives smoothing policy contact mode_changes certificate
 rollout rollout_gradient refinement certify continuous cost problem
-solution nonlinear_program collocation shooting ilqr verdict solver mcap_messages mcap_log trace meshcat_view record
+solution nonlinear_program collocation shooting riccati secant augmented_lagrangian
+expansion ilqr verdict solver mcap_messages mcap_log trace meshcat_view record
 provenance evidence sampling certification audit_place audit_contact audit cli
 """.split()
 

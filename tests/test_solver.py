@@ -365,7 +365,6 @@ def test_collocation_through_the_ground_is_not_verified(tmp_path):
         ({"initial_guess": "good"}, r"initial_guess: expected None, \(xs, us\) or a Solution, got str"),
         ({"initial_guess": (np.zeros((3, 4)), np.zeros((20, 1)))}, r"initial_guess xs: expected shape \(21, 4\)"),
         ({"initial_guess": (np.zeros((21, 4)), np.full((20, 1), np.nan))}, "initial_guess us"),
-        ({"method": "ilqr"}, 'x_goal: expected none for method="ilqr"'),
         ({"method": None}, "method: expected one of .*, got None"),
         ({"max_iterations": 2.5}, "max_iterations: expected a whole number of at least 1, got 2.5"),
         ({"time_limit": math.nan}, r"time_limit \[s\]: expected a finite number above 0, got nan"),

@@ -220,6 +220,17 @@ def test_in_a_rollout_through_a_joint_limit_the_steps_at_it_are_autodiffs():
         assert pytest.approx(b.A, abs=1e-8 * np.abs(b.A).max()) == a.A
 
 
+def test_states_that_are_no_rollout_are_each_their_own(load):
+    model, random = load("acrobot.xml"), np.random.default_rng(2)
+    xs, us = random.standard_normal((6, 4)), random.standard_normal((6, 1))
+    for method in ("implicit", "autodiff"):
+        found = linearize(model, xs[0], us, method=method, xs=xs)
+        for d, x, u in zip(found, xs, us, strict=True):
+            alone = dd.differentiate_step(model, x, u, method="autodiff")
+            assert pytest.approx(alone.A, abs=1e-10) == d.A
+            assert np.array_equal(d.x_next, alone.x_next)
+
+
 def test_pd_control_and_clipped_inputs_in_one_call_too():
     model = pd_pendulum()
     x0, us = np.array([0.7, -1.2]), np.linspace(-1, 1, 15)[:, None]

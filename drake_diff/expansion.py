@@ -1,0 +1,95 @@
+"""The linear-quadratic problem around a motion: Drake's step Jacobians and the cost's derivatives.
+
+All in Drake's own coordinates, quaternions included: the discrete step lets a quaternion's norm grow, so that the norm
+is a state that inputs move, and on the rotations' tangent space the gradient would be wrong by what is left out.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_diff.arrays import Array
+from drake_diff.augmented_lagrangian import StateConstraints
+from drake_diff.cost import (
+    QuadraticCost,
+    differentiate_cost,
+    differentiate_final_cost,
+    final_cost_hessian,
+    running_cost_hessian,
+)
+from drake_diff.problem import Problem
+from drake_diff.riccati import LinearQuadratic
+from drake_diff.rollout_gradient import linearize
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """xs (N+1, nx) and us (N, nu), a rollout where the gaps (N, nx), step(x_k, u_k) - x_(k+1), are zero."""
+
+    xs: Array
+    us: Array
+    gaps: Array
+
+    @property
+    def is_rollout(self) -> bool:
+        return not self.gaps.any()
+
+    @property
+    def distance(self) -> float:
+        """The sum of all |gaps|."""
+        return float(np.abs(self.gaps).sum())
+
+
+def jacobians_along(problem: Problem, motion: Motion) -> Array:
+    """(N, nx, nx + nu): [A_k, B_k]; raises GradientError or SimulationError where one, or a step, is refused."""
+    steps = linearize(problem.model, motion.xs[0], motion.us, xs=motion.xs[:-1])
+    return np.concatenate([[d.A for d in steps], [d.B for d in steps]], axis=2)
+
+
+def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: StateConstraints) -> LinearQuadratic:
+    """`problem` around `motion`, the constraints being part of its cost."""
+    model, xs, us = problem.model, motion.xs, motion.us
+    gradients, hessians = _expand_running_cost(problem, xs, us)
+    final_gradient, final_hessian = _expand_final_cost(problem, xs[-1])
+    if constraints.any:
+        gradient, curvature = constraints.differentiate(xs)
+        diagonal = np.arange(model.nx)
+        gradients[:, : model.nx] += gradient[:-1]
+        hessians[:, diagonal, diagonal] += curvature[:-1]
+        final_gradient = final_gradient + gradient[-1]
+        final_hessian = final_hessian + np.diag(curvature[-1])
+    bounds, free = problem.bounds, problem.initial_state_mask
+    return LinearQuadratic(
+        F=jacobians,
+        gaps=motion.gaps,
+        gradients=gradients,
+        hessians=hessians,
+        final_gradient=final_gradient,
+        final_hessian=final_hessian,
+        lower=bounds.u_lower - us,
+        upper=bounds.u_upper - us,
+        start_lower=np.where(free, bounds.x_lower - xs[0], 0.0),
+        start_upper=np.where(free, bounds.x_upper - xs[0], 0.0),
+    )
+
+
+def _expand_running_cost(problem: Problem, xs: Array, us: Array) -> tuple[Array, Array]:
+    """(gradients (N, nx + nu), Hessians (N, nx + nu, nx + nu)) of h times the running cost."""
+    h, (nx, nu), cost = problem.model.time_step, (xs.shape[1], us.shape[1]), problem.running_cost
+    gradients, hessians = np.zeros((len(us), nx + nu)), np.zeros((len(us), nx + nu, nx + nu))
+    if isinstance(cost, QuadraticCost):
+        x_ref = np.zeros(nx) if cost.x_ref is None else cost.x_ref
+        u_ref = np.zeros(nu) if cost.u_ref is None else cost.u_ref
+        hessians[:] = h * running_cost_hessian(cost, xs[0], us[0])
+        gradients = (np.hstack([xs[:-1], us]) - np.concatenate([x_ref, u_ref])) @ hessians[0]
+    elif cost is not None:
+        for k, u in enumerate(us):
+            gradients[k] = h * np.concatenate(differentiate_cost(cost, xs[k], u)[1:])
+            hessians[k] = h * running_cost_hessian(cost, xs[k], u)
+    return gradients, hessians
+
+
+def _expand_final_cost(problem: Problem, x: Array) -> tuple[Array, Array]:
+    if problem.final_cost is None:
+        return np.zeros(len(x)), np.zeros((len(x), len(x)))
+    return differentiate_final_cost(problem.final_cost, x)[1], final_cost_hessian(problem.final_cost, x)

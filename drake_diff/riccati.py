@@ -1,0 +1,167 @@
+"""The linear-quadratic problem around a motion, with gaps and boxes, and the Riccati recursion that solves it.
+
+Minimize sum_k g_k' z_k + z_k' H_k z_k / 2 + (the same of dx_N), z_k = [dx_k; du_k], where
+dx_(k+1) = F_k z_k + f_k and lower_k <= du_k <= upper_k. The gaps f_k are those of Mastalli et al., "Crocoddyl", 2020,
+the boxes those of Tassa, Mansard and Todorov, "Control-limited differential dynamic programming", 2014.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_diff.arrays import Array
+
+BOX_ITERATIONS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class LinearQuadratic:
+    """N steps of n states and m inputs; dx_0 lies in [start_lower, start_upper], which is 0 where it is given."""
+
+    F: Array  # (N, n, n + m)
+    gaps: Array  # (N, n)
+    gradients: Array  # (N, n + m)
+    hessians: Array  # (N, n + m, n + m)
+    final_gradient: Array  # (n,)
+    final_hessian: Array  # (n, n)
+    lower: Array  # (N, m)
+    upper: Array  # (N, m)
+    start_lower: Array  # (n,)
+    start_upper: Array  # (n,)
+
+    @property
+    def num_states(self) -> int:
+        return len(self.final_gradient)
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """du_k = feedforward_k + feedback_k dx_k from dx_0 = start; what it promises where all gaps are 0.
+
+    `slope` and `curvature` are those of the quadratic model along the step: it changes the cost by
+    a slope + a^2 curvature / 2 at the step size a. `gradient` is the largest |d cost / d u| of an input, or
+    |d cost / d x_0|, that no bound holds.
+    """
+
+    start: Array  # (n,)
+    feedforward: Array  # (N, m)
+    feedback: Array  # (N, m, n)
+    slope: float
+    curvature: float
+    gradient: float
+
+    @property
+    def expected(self) -> float:
+        """The decrease that a full step promises, as a positive number."""
+        return -(self.slope + self.curvature / 2)
+
+
+def solve_riccati(problem: LinearQuadratic, regularization: float) -> Policy | None:
+    """The best policy, `regularization` added to the inputs' Hessian; None where that is not positive definite."""
+    n, (count, m) = problem.num_states, problem.lower.shape
+    s, P = problem.final_gradient, problem.final_hessian
+    feedforward, feedback = np.zeros((count, m)), np.zeros((count, m, n))
+    slope = curvature = gradient = 0.0
+    ridge = regularization * np.eye(m)
+    try:
+        for k in range(count - 1, -1, -1):
+            F = problem.F[k]
+            PF = P @ F
+            q = problem.gradients[k] + F.T @ s + PF.T @ problem.gaps[k]
+            Q = problem.hessians[k] + F.T @ PF
+            q_u, Q_uu, Q_ux = q[n:], Q[n:, n:], Q[n:, :n]
+            d, K, left = _best_input(Q_uu + ridge, q_u, Q_ux, problem.lower[k], problem.upper[k])
+            Qd = Q_uu @ d
+            slope += float(q_u @ d)
+            curvature += float(d @ Qd)
+            gradient = max(gradient, left)
+            s = q[:n] + K.T @ (Qd + q_u) + Q_ux.T @ d
+            KQ = K.T @ Q_ux
+            P = Q[:n, :n] + K.T @ Q_uu @ K + KQ + KQ.T
+            P = (P + P.T) / 2
+            feedforward[k], feedback[k] = d, K
+        start, left = _best_start(problem, P, s, regularization)
+    except np.linalg.LinAlgError:
+        return None
+    slope += float(s @ start)
+    curvature += float(start @ P @ start)
+    return Policy(start, feedforward, feedback, slope, curvature, max(gradient, left))
+
+
+def _best_input(hessian: Array, q_u: Array, Q_ux: Array, lower: Array, upper: Array) -> tuple[Array, Array, float]:
+    """(step (m,), feedback (m, n), largest |q_u| of an input that no bound holds)."""
+    gains = _gains(hessian, q_u, Q_ux)
+    d, K = gains[:, 0], gains[:, 1:]
+    if (d >= lower).all() and (d <= upper).all():
+        return d, K, float(np.abs(q_u).max(initial=0.0))
+    d, free = minimize_in_box(hessian, q_u, lower, upper)
+    K = np.zeros_like(Q_ux)
+    K[free] = _gains(hessian[np.ix_(free, free)], q_u[free], Q_ux[free])[:, 1:]
+    return d, K, float(np.abs(q_u[free]).max(initial=0.0))
+
+
+def _best_start(problem: LinearQuadratic, P: Array, s: Array, regularization: float) -> tuple[Array, float]:
+    """(dx_0 (n,), largest |s| of an entry that no bound holds)."""
+    start = np.zeros(len(s))
+    moves = np.flatnonzero(problem.start_lower < problem.start_upper)
+    if not len(moves):
+        return start, 0.0
+    hessian = P[np.ix_(moves, moves)] + regularization * np.eye(len(moves))
+    lower, upper = problem.start_lower[moves], problem.start_upper[moves]
+    start[moves], free = minimize_in_box(hessian, s[moves], lower, upper)
+    return start, float(np.abs(s[moves[free]]).max(initial=0.0))
+
+
+def _gains(hessian: Array, q_u: Array, Q_ux: Array) -> Array:
+    """(m, 1 + n): -hessian^-1 [q_u, Q_ux]; raises LinAlgError where the Hessian is not positive definite."""
+    if len(hessian) == 1:
+        if not hessian[0, 0] > 0:
+            raise np.linalg.LinAlgError
+        return np.concatenate([q_u[:, None], Q_ux], axis=1) / -hessian[0, 0]
+    np.linalg.cholesky(hessian)
+    return -np.linalg.solve(hessian, np.concatenate([q_u[:, None], Q_ux], axis=1))
+
+
+def minimize_in_box(hessian: Array, gradient: Array, lower: Array, upper: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """(d, free): argmin of gradient' d + d' hessian d / 2 within [lower, upper], by projected Newton steps.
+
+    `free` is where d is not held by a bound. Raises LinAlgError where the Hessian is not positive definite.
+    """
+    np.linalg.cholesky(hessian)
+    d = np.clip(np.zeros_like(gradient), lower, upper)
+    free = np.ones(len(d), dtype=bool)
+    for _ in range(BOX_ITERATIONS):
+        slope = gradient + hessian @ d
+        free = ~(((d <= lower) & (slope > 0)) | ((d >= upper) & (slope < 0)))
+        if not free.any():
+            break
+        step = np.zeros_like(d)
+        step[free] = -np.linalg.solve(hessian[np.ix_(free, free)], slope[free])
+        moved = _shorten(hessian, gradient, d, step, lower, upper)
+        if np.array_equal(moved, d):
+            break
+        d = moved
+    return d, free
+
+
+def _shorten(hessian: Array, gradient: Array, d: Array, step: Array, lower: Array, upper: Array) -> Array:
+    """The projected step, halved until it lowers the value; `d` where none does."""
+    value = gradient @ d + d @ hessian @ d / 2
+    for size in 0.5 ** np.arange(20):
+        moved = np.clip(d + size * step, lower, upper)
+        if gradient @ moved + moved @ hessian @ moved / 2 < value:
+            return moved
+    return d
+
+
+def slope_along(problem: LinearQuadratic, policy: Policy) -> tuple[float, float]:
+    """(slope, curvature) of the cost along the full linear step, which closes the gaps."""
+    dx, slope, curvature = policy.start, 0.0, 0.0
+    for k in range(len(problem.F)):
+        z = np.concatenate([dx, policy.feedforward[k] + policy.feedback[k] @ dx])
+        slope += float(problem.gradients[k] @ z)
+        curvature += float(z @ problem.hessians[k] @ z)
+        dx = problem.F[k] @ z + problem.gaps[k]
+    slope += float(problem.final_gradient @ dx)
+    return slope, curvature + float(dx @ problem.final_hessian @ dx)
