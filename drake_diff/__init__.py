@@ -11,6 +11,8 @@ from drake_diff.certify import certify_rollout as certify_rollout
 from drake_diff.contact import contact_modes as contact_modes
 from drake_diff.contract import Contract as Contract
 from drake_diff.cost import QuadraticCost as QuadraticCost
+from drake_diff.dynamics import Dynamics as Dynamics
+from drake_diff.dynamics import plant_dynamics as plant_dynamics
 from drake_diff.evidence import load_record as load_record
 from drake_diff.evidence import save as save
 from drake_diff.exceptions import ArtifactError as ArtifactError
@@ -52,3 +54,6 @@ from drake_diff.solver import solve as solve
 from drake_diff.step import step as step
 from drake_diff.step_derivatives import StepDerivatives as StepDerivatives
 from drake_diff.step_derivatives import differentiate_step as differentiate_step
+from drake_diff.transcribed import Transcribed as Transcribed
+from drake_diff.transcribed import violation_between_nodes as violation_between_nodes
+from drake_diff.transcription import transcribe_and_solve as transcribe_and_solve

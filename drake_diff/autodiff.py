@@ -66,7 +66,11 @@ def chain(value: float, gradient: Array, z: Any) -> AutoDiffXd:
 
 
 def chain_rows(values: Array, jacobian: Array, z: Any) -> Any:
-    """(m,) AutoDiffXd of a function of `z` (n,) whose values (m,) and Jacobian (m, n) by z are known."""
-    return InitializeAutoDiff(
-        value=values.reshape(-1, 1), gradient=jacobian @ ExtractGradient(z.reshape(-1, 1))
-    ).ravel()
+    """(m,) AutoDiffXd of a function of `z` (n,) whose values (m,) and Jacobian (m, n) by z are known.
+
+    Solvers seed z with the identity, and the product with it is left out: for it BLAS starts threads, which on a busy
+    machine costs more than all the rest.
+    """
+    seed = ExtractGradient(z.reshape(-1, 1))
+    gradient = jacobian if np.array_equal(seed, np.eye(len(z))) else jacobian @ seed
+    return InitializeAutoDiff(value=values.reshape(-1, 1), gradient=gradient).ravel()

@@ -253,6 +253,11 @@ def _form_of(model: Model) -> _Form:
     return form
 
 
+def tree_for(model: Model) -> TreeDynamics | None:
+    """The model's tree of hinges and slides, None where it is none or differs from AutoDiffXd through Drake."""
+    return _form_of(model).tree
+
+
 def _checked_tree(model: Model) -> TreeDynamics | None:
     """The model's tree, where it has one that gives at two states what AutoDiffXd through Drake gives."""
     tree = tree_of(model)

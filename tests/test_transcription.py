@@ -1,0 +1,660 @@
+"""Hermite-Simpson and trapezoid against closed forms, published optima, and their own exact discrete optima.
+
+B01, B02, ... are the oracles of ORACLES.md: every number here was known before this code.
+"""
+
+import dataclasses
+import itertools
+import math
+import time
+
+import numpy as np
+import pytest
+from conftest import random_state
+from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.multibody.tree import QuaternionFloatingJoint
+from test_implicit import floating
+from test_solution import MODELS, block
+
+import drake_diff as dd
+from drake_diff.continuous import EquationsOfMotion
+from drake_diff.dynamics import Dynamics, plant_dynamics
+from drake_diff.nonlinear_program import Limits, Outcome
+from drake_diff.transcribed import violation_between_nodes
+from drake_diff.transcription import transcribe_and_solve
+from drake_diff.transcription_program import TranscribedProgram
+
+SCHEMES = ("trapezoid", "hermite_simpson")
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+
+
+def effort(x, u):
+    return u[0] ** 2
+
+
+def half_effort(x, u):
+    return 0.5 * u[0] ** 2
+
+
+def push(x, u):
+    return np.array([x[1], u[0]])
+
+
+BLOCK = Dynamics(push, 2, 1)
+
+
+def solved(dynamics, **options):
+    motion = transcribe_and_solve(dynamics, **options)
+    assert motion.outcome in (Outcome.SOLVED, Outcome.INACCURATE), motion.message
+    assert motion.defect < 1e-8
+    return motion
+
+
+def move(count=10, dynamics=BLOCK, **changes):
+    return solved(
+        dynamics, count=count, **{"x0": [0, 0], "x_goal": [1, 0], "horizon": 1.0, "running_cost": effort} | changes
+    )
+
+
+# ------------------------------------------------------------------------------ exact discrete optima
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "snopt"])
+@pytest.mark.parametrize("count", [2, 5, 10, 20])
+def test_b01_the_blocks_move_has_each_schemes_own_optimum(count, solver):
+    by_trapezoid = move(count, scheme="trapezoid", solver=solver)
+    assert 12 / by_trapezoid.cost == pytest.approx(1 - 4 / count**2 + 3 / count**3, rel=1e-9)
+    by_simpson = move(count, solver=solver)
+    assert by_simpson.cost == pytest.approx(12, rel=1e-9)
+    t = by_simpson.times
+    assert by_simpson.us[:, 0] == pytest.approx(6 - 12 * t, abs=1e-6)
+    assert by_simpson.xs[:, 0] == pytest.approx(3 * t**2 - 2 * t**3, abs=1e-8)
+
+
+def test_b01_drakes_own_scheme_stands_in_between():
+    """12 / J = 1 - 2/N^2 + 4/(3 N^3): Drake's midpoint input is the mean, its cost by trapezoids."""
+    problem = dd.Problem(block(), x0=[0, 0], x_goal=[1, 0], running_cost=EFFORT, num_steps=10)
+    drake = dd.solve(problem, method="collocation")
+    assert 12 / drake.cost == pytest.approx(1 - 2 / 10**2 + 4 / (3 * 10**3), rel=1e-8)
+    assert move(10).cost < drake.cost < move(10, scheme="trapezoid").cost
+    assert move(10, plant_dynamics(block())).cost == pytest.approx(12, rel=1e-9)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_quadratic_cost_and_a_function_are_the_same(scheme):
+    a, b = move(scheme=scheme), move(scheme=scheme, running_cost=EFFORT)
+    assert a.cost == pytest.approx(b.cost, rel=1e-12)
+    assert a.us == pytest.approx(b.us, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "count", "optimum"),
+    [("trapezoid", 25, 60.03551947), ("hermite_simpson", 25, 58.80542547), ("hermite_simpson", 50, 58.80764217)],
+)
+def test_b02_the_cart_pole_from_its_file_swings_up(scheme, count, optimum):
+    dynamics = plant_dynamics(dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04))
+    motion = move(count, dynamics, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], horizon=2.0, scheme=scheme)
+    assert motion.cost == pytest.approx(optimum, rel=1e-7)
+    if count == 50:  # the largest input is between two nodes
+        xs, us = motion.at(np.linspace(0, 2, 2001))
+        assert np.abs(us).max() == pytest.approx(13.98, abs=0.01)
+        assert [xs[:, 0].min(), xs[:, 0].max()] == pytest.approx([0, 1.1795], abs=1e-3)
+    assert dynamics.bounds.u_upper == pytest.approx([20])
+
+
+# ------------------------------------------------------------------------------ pendulums
+
+
+@pytest.mark.parametrize(
+    ("scheme", "count", "optimum"),
+    [
+        ("trapezoid", 20, 8.876255),
+        ("trapezoid", 40, 8.821279),
+        ("trapezoid", 80, 8.807238),
+        ("hermite_simpson", 20, 8.8024872),
+        ("hermite_simpson", 40, 8.8024843),
+    ],
+)
+def test_b04_the_simple_pendulum_with_a_free_final_time(scheme, count, optimum):
+    pendulum = Dynamics(
+        lambda x, u: np.array([x[1], -0.1 * x[1] - np.sin(x[0]) + u[0]]), 2, 1, u_lower=[-5], u_upper=[5]
+    )
+    motion = move(count, pendulum, x_goal=[np.pi, 0], horizon=(0.5, 2.5), scheme=scheme)
+    assert motion.cost == pytest.approx(optimum, rel=1e-7)
+    assert motion.horizon == pytest.approx(2.5, abs=1e-6)
+    if scheme == "hermite_simpson":
+        assert np.abs(motion.us).max() == pytest.approx(2.968, abs=5e-3)
+
+
+def heavy_pendulum(damping, **bounds):
+    return Dynamics(lambda x, u: np.array([x[1], -9.81 * np.sin(x[0]) - damping * x[1] + u[0]]), 2, 1, **bounds)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "errors", "orders"),
+    [
+        ("hermite_simpson", (1.12727e-3, 6.99377e-5, 4.36113e-6), (3.8, 4.2)),
+        ("trapezoid", (0.58681, 0.16957, 0.045002), (1.75, 2.05)),
+    ],
+)
+def test_b26_and_b39_the_cost_converges_at_the_schemes_order(scheme, errors, orders):
+    """B26 gives the trapezoid's orders as 1.8 -> 1.96: its first is 1.791."""
+    found = [
+        move(n, heavy_pendulum(0.1), x_goal=[np.pi, 0], horizon=2.0, scheme=scheme).cost - 72.126618030
+        for n in (20, 40, 80)
+    ]
+    assert np.abs(found) == pytest.approx(errors, rel=1e-4)
+    for coarse, fine in itertools.pairwise(found):
+        assert orders[0] < math.log2(coarse / fine) < orders[1]
+
+
+def test_b26_the_inputs_of_the_least_effort():
+    motion = move(80, heavy_pendulum(0.1), x_goal=[np.pi, 0], horizon=2.0)
+    assert [motion.us.min(), motion.us.max()] == pytest.approx([-2.4700, 10.8685], abs=4e-3)
+
+
+def test_b26_minimum_time():
+    pendulum = heavy_pendulum(0.0, u_lower=[-5], u_upper=[5])
+    motion = move(50, pendulum, x_goal=[np.pi, 0], horizon=(0.5, 6), running_cost=1.0)
+    assert motion.horizon == pytest.approx(2.38569, rel=2e-4)  # nodes miss the switches: order 1 to 2
+    assert motion.horizon == pytest.approx(motion.cost, rel=1e-12)
+
+
+# ------------------------------------------------------------------------------ minimum time
+
+
+@pytest.mark.parametrize(("scheme", "count"), [("hermite_simpson", 10), ("hermite_simpson", 20)])
+def test_b06_the_double_integrator_in_minimum_time(scheme, count):
+    """A node lies on the switch, so that the motion is exact there."""
+    motion = move(count, x0=[-1, 0], x_goal=[0, 0], horizon=(0.1, 10), running_cost=1.0, bounds=unit_inputs())
+    assert motion.horizon == pytest.approx(2, rel=1e-7)
+    half = count // 2
+    assert motion.us[:half, 0] == pytest.approx(1, abs=1e-5)
+    assert motion.us[half + 1 :, 0] == pytest.approx(-1, abs=1e-5)
+
+
+def unit_inputs(most=1.0):
+    return dd.Bounds(u_lower=[-most], u_upper=[most])
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_b06_an_odd_number_of_intervals_is_slightly_slower(scheme):
+    motion = move(
+        9, x0=[-1, 0], x_goal=[0, 0], horizon=(0.1, 10), running_cost=1.0, bounds=unit_inputs(), scheme=scheme
+    )
+    assert 2 < motion.horizon < 2.03
+
+
+@pytest.mark.parametrize(("distance", "most"), [(9.0, 0.5), (0.04, 3.0)])
+def test_b06_any_distance(distance, most):
+    motion = move(20, x_goal=[distance, 0], horizon=(0.01, 30), running_cost=1.0, bounds=unit_inputs(most))
+    assert motion.horizon == pytest.approx(2 * math.sqrt(distance / most), rel=1e-6)
+
+
+@pytest.mark.parametrize(("count", "rel"), [(10, 3e-7), (20, 2e-8)])
+def test_b09_the_brachistochrone(count, rel):
+    def slide(x, u):
+        return np.array([x[2] * np.sin(u[0]), x[2] * np.cos(u[0]), 9.8 * np.cos(u[0])])
+
+    dynamics = Dynamics(slide, 3, 1, x_lower=[0, 0, 0], u_lower=[0], u_upper=[np.pi])
+    guess = np.linspace([0, 0, 0], [2, 2, 6], count + 1), np.full((count + 1, 1), 0.8), 1.0
+    ends = {"x0": np.zeros(3), "x_goal": [2, 2, np.nan]}
+    motion = move(count, dynamics, horizon=(0.1, 5), running_cost=1.0, guess=guess, **ends)
+    assert motion.horizon == pytest.approx(0.824759143156625, rel=rel)
+
+
+# ------------------------------------------------------------------------------ linear and chains
+
+
+@pytest.mark.parametrize(("scheme", "count", "rel"), [("hermite_simpson", 40, 2e-8), ("trapezoid", 80, 2e-4)])
+def test_b07_the_scalar_problem(scheme, count, rel):
+    dynamics = Dynamics(lambda x, u: u, 1, 1)
+    cost = dd.QuadraticCost(Q=[[0.5]], R=[[0.5]])
+    motion = move(count, dynamics, x0=[1], x_goal=[0.5], horizon=2.0, running_cost=cost, scheme=scheme)
+    assert motion.cost == pytest.approx(0.510461418068826, rel=rel)
+
+
+@pytest.mark.parametrize(("order", "optimum", "rel"), [(2, 12, 1e-9), (3, 720, 1e-5), (4, 100800, 5e-5)])
+def test_b31_chains_of_integrators(order, optimum, rel):
+    dynamics = Dynamics(lambda x, u: [*x[1:], u[0]], order, 1)
+    motion = move(20, dynamics, x0=np.zeros(order), x_goal=[1] + [0] * (order - 1))
+    assert motion.cost == pytest.approx(optimum, rel=rel)
+
+
+def test_b31_a_free_final_velocity():
+    assert move(x_goal=[1, np.nan], running_cost=half_effort).cost == pytest.approx(1.5, rel=1e-9)
+
+
+def test_a_free_initial_velocity():
+    """From any speed to any speed, the block needs no effort at all."""
+    motion = move(x0=[0, np.nan], x_goal=[1, np.nan])
+    assert motion.cost == pytest.approx(0, abs=1e-8)
+    assert motion.xs[0, 1] == pytest.approx(1, abs=1e-6)
+
+
+def test_a_final_cost():
+    """min 1/2 int u^2 + c/2 (x(1) - 1)^2 from rest: x(1) = c / (c + 3), J = 3 c / (2 (c + 3))."""
+    motion = move(x_goal=None, running_cost=half_effort, final_cost=lambda x: 5 * (x[0] - 1) ** 2)
+    assert motion.cost == pytest.approx(30 / 26, rel=1e-8)
+    assert motion.xs[-1, 0] == pytest.approx(10 / 13, rel=1e-6)
+    quadratic = dd.QuadraticCost(Q=[[5, 0], [0, 0]], x_ref=[1, 0])
+    assert move(x_goal=None, running_cost=half_effort, final_cost=quadratic).cost == pytest.approx(30 / 26, rel=1e-8)
+
+
+# ------------------------------------------------------------------------------ bounds
+
+
+def bryson_denham(count, scheme="hermite_simpson"):
+    bounds = dd.Bounds(x_upper=[1 / 9, np.inf])
+    return move(count, x0=[0, 1], x_goal=[0, -1], running_cost=half_effort, bounds=bounds, scheme=scheme)
+
+
+def test_b14_bryson_and_denham():
+    """Where nodes lie at the arcs' ends, 1/3 and 2/3, Hermite-Simpson is exact and the bound holds in between."""
+    motion = bryson_denham(15)
+    assert motion.cost == pytest.approx(4, rel=1e-7)
+    assert motion.us[0, 0] == pytest.approx(-6, abs=1e-4)
+    assert violation_between_nodes(motion).state < 1e-7
+    assert bryson_denham(100, "trapezoid").cost == pytest.approx(4.0035267, rel=1e-7)
+
+
+def test_b14_a_cost_below_the_optimum_goes_with_an_excess_between_the_nodes():
+    motion = bryson_denham(10)
+    excess = violation_between_nodes(motion)
+    assert motion.cost < 4 - 1e-4
+    assert excess.state == pytest.approx(1.01e-4, rel=0.02)
+    assert excess.input == 0
+    assert "x0 by 0.000101 at 0." in excess.where
+    dense = motion.at(np.linspace(0, 1, 5001))[0][:, 0].max() - 1 / 9
+    assert excess.state <= dense + 1e-9 <= 1.1 * excess.state
+    assert (motion.nodes[:, 0] <= 1 / 9 + 1e-8).all()
+
+
+def van_der_pol(**bounds):
+    return Dynamics(lambda x, u: np.array([(1 - x[1] ** 2) * x[0] - x[1] + u[0], x[0]]), 2, 1, **bounds)
+
+
+def state_and_effort(x, u):
+    return x[0] ** 2 + x[1] ** 2 + u[0] ** 2
+
+
+def test_b16_van_der_pols_oscillator():
+    dynamics = van_der_pol(u_lower=[-1], u_upper=[1], x_lower=[-0.25, -np.inf])
+    motion = move(100, dynamics, x0=[0, 1], x_goal=None, horizon=10.0, running_cost=state_and_effort)
+    assert motion.cost == pytest.approx(3.6152, rel=3e-5)
+    assert motion.xs[:, 0].min() == pytest.approx(-0.25, abs=1e-6)
+
+
+def test_b16_propts_variant():
+    dynamics = van_der_pol(u_lower=[-0.3], u_upper=[1])
+    motion = move(50, dynamics, x0=[0, 1], x_goal=None, horizon=5.0, running_cost=state_and_effort)
+    assert motion.cost == pytest.approx(2.86726, rel=5e-6)
+
+
+def test_b18_rayleighs_oscillator():
+    dynamics = Dynamics(
+        lambda x, u: np.array([x[1], -x[0] + x[1] * (1.4 - 0.14 * x[1] ** 2) + 4 * u[0]]),
+        2,
+        1,
+        u_lower=[-10],
+        u_upper=[10],
+    )
+    options = {"x0": [-5, -5], "x_goal": None, "horizon": 4.5, "running_cost": lambda x, u: u[0] ** 2 + x[0] ** 2}
+    assert move(120, dynamics, **options).cost == pytest.approx(29.74893, rel=2e-5)
+
+
+def test_b29_friction_with_a_push_of_both_signs():
+    motion = move(10, Dynamics(lambda x, u: np.array([x[1], u[0] - 4.0]), 2, 1))
+    assert motion.cost == pytest.approx(28, rel=1e-8)
+    assert motion.us[:, 0] == pytest.approx(10 - 12 * motion.times, abs=1e-5)
+
+
+def test_b29_friction_with_a_push_only():
+    dynamics = Dynamics(lambda x, u: np.array([x[1], u[0] - 4.0]), 2, 1, u_lower=[0])
+    motion = move(20, dynamics)  # a node lies at 3/4
+    assert motion.cost == pytest.approx(28.4444444444, rel=1e-8)
+    assert motion.us[0, 0] == pytest.approx(0.75 * 14.2222222, rel=1e-4)
+    assert motion.us[16:, 0] == pytest.approx(0, abs=1e-4)
+
+
+# ------------------------------------------------------------------------------ many states and scales
+
+
+def test_b28_the_planar_quadrotors_side_step():
+    m, r, inertia, hover = 0.486, 0.25, 0.00383, 0.486 * 9.81 / 2
+
+    def fly(x, u):
+        push = (u[0] + u[1]) / m
+        return np.array(
+            [x[3], x[4], x[5], -push * np.sin(x[2]), push * np.cos(x[2]) - 9.81, r * (u[0] - u[1]) / inertia]
+        )
+
+    count, goal = 40, np.array([1.0, 0, 0, 0, 0, 0])
+    guess = np.linspace(np.zeros(6), goal, count + 1), np.full((count + 1, 2), hover)
+    motion = move(
+        count,
+        Dynamics(fly, 6, 2, u_lower=[0, 0], u_upper=[12, 12]),
+        x0=np.zeros(6),
+        x_goal=goal,
+        horizon=1.5,
+        running_cost=lambda x, u: (u[0] - hover) ** 2 + (u[1] - hover) ** 2,
+        guess=guess,
+    )
+    assert motion.cost == pytest.approx(0.01673444, rel=1e-5)
+    assert [motion.us.min(), motion.us.max()] == pytest.approx([2.2453, 2.6248], abs=2e-3)
+
+
+HYPERSENSITIVE = 1.330806904943
+
+
+def hypersensitive(horizon, count, **options):
+    return move(
+        count,
+        Dynamics(lambda x, u: -(x**3) + u, 1, 1),
+        x0=[1.5],
+        x_goal=[1],
+        horizon=horizon,
+        running_cost=lambda x, u: 0.5 * (x[0] ** 2 + u[0] ** 2),
+        refine=True,
+        limits=Limits(1000, math.inf, 1e-7),
+        **options,
+    )
+
+
+def test_b12_the_hypersensitive_problem_over_50_seconds():
+    """exp(-50) from the optimum of an infinite horizon; the refinement finds both ends."""
+    motion = hypersensitive(50.0, 25, error_tolerance=1e-5)
+    assert motion.cost == pytest.approx(HYPERSENSITIVE, rel=1e-4)
+    assert np.abs(motion.at(np.linspace(20, 30, 100))[0]).max() < 1e-3
+    lengths = np.diff(motion.times)
+    assert lengths[0] < lengths.max() / 4
+    assert lengths[-1] < lengths.max() / 4
+
+
+@pytest.mark.slow
+def test_b12_the_hypersensitive_problem_over_10000_seconds():
+    motion = hypersensitive(1e4, 50, error_tolerance=1e-5, solver="snopt", max_count=2000)
+    assert motion.cost == pytest.approx(HYPERSENSITIVE, rel=1e-4)
+    assert np.abs(motion.at(np.linspace(100, 9900, 1000))[0]).max() < 1e-3
+
+
+# ------------------------------------------------------------------------------ measures, refinement
+
+
+def test_refinement_ends_below_its_tolerance():
+    motion = move(
+        8, heavy_pendulum(0.1), x_goal=[np.pi, 0], horizon=2.0, refine=True, error_tolerance=1e-8, max_count=400
+    )
+    counts, errors = zip(*motion.refinements, strict=True)
+    assert list(counts) == sorted(counts)
+    assert len(counts) > 1
+    assert errors[-1] <= 1e-8 < errors[-2]
+    assert motion.cost == pytest.approx(72.126618030, abs=2e-5)
+
+
+def test_refinement_says_when_it_gives_up():
+    motion = move(
+        10, heavy_pendulum(0.1), x_goal=[np.pi, 0], horizon=2.0, refine=True, scheme="trapezoid", max_count=50
+    )
+    assert len(motion.xs) <= 51
+    assert "raise max_count" in motion.message
+
+
+def test_the_cost_alone_can_ask_for_a_finer_mesh():
+    """x' = u: the trapezoid's states are exact, its cost is not."""
+    dynamics, options = Dynamics(lambda x, u: u, 1, 1), {"x0": [1], "x_goal": [0.5], "horizon": 2.0}
+    cost = dd.QuadraticCost(Q=[[0.5]], R=[[0.5]])
+    motion = move(10, dynamics, running_cost=cost, scheme="trapezoid", refine=True, error_tolerance=1e-6, **options)
+    assert len(motion.refinements) > 1
+    assert motion.errors.max() < 1e-12
+    assert motion.cost == pytest.approx(0.510461418068826, abs=1e-4)
+
+
+def test_errors_are_the_distance_from_an_accurate_integration():
+    """A knot that is moved by 0.01 m is 0.01 m off, and so is the next."""
+    motion = move()
+    assert motion.errors.max() < 1e-12
+    nodes = np.array(motion.nodes)
+    nodes[6, 0] += 0.01  # knot 3
+    worse = dataclasses.replace(motion, nodes=nodes)
+    assert worse.errors[[2, 3]] == pytest.approx([0.01, 0.01], rel=1e-9)
+    assert worse.defect == pytest.approx(0.01, rel=1e-9)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_the_motion_between_knots_goes_through_them(scheme):
+    motion = move(7, heavy_pendulum(0.1), x_goal=[np.pi, 0], horizon=2.0, scheme=scheme)
+    xs, us = motion.at(motion.times)
+    assert xs == pytest.approx(motion.xs, abs=1e-8)
+    assert us == pytest.approx(motion.us, abs=1e-8)
+    if scheme == "hermite_simpson":
+        xs, us = motion.at((motion.times[1:] + motion.times[:-1]) / 2)
+        assert xs == pytest.approx(motion.xs_mid, abs=1e-8)
+        assert us == pytest.approx(motion.us_mid, abs=1e-8)
+    else:
+        assert motion.xs_mid is None
+        assert motion.us_mid is None
+
+
+def test_a_result_is_a_guess_for_another_mesh_and_scheme():
+    options = {"x_goal": [np.pi, 0], "horizon": 2.0}
+    coarse = move(20, heavy_pendulum(0.1), **options, scheme="trapezoid")
+    cold = move(40, heavy_pendulum(0.1), **options)
+    warm = move(40, heavy_pendulum(0.1), **options, guess=coarse)
+    assert warm.cost == pytest.approx(cold.cost, rel=1e-9)
+    again = move(40, heavy_pendulum(0.1), **options, guess=warm)
+    assert again.cost == pytest.approx(cold.cost, rel=1e-9)
+
+
+def test_the_same_problem_gives_the_same_bits():
+    a, b = (move(20, heavy_pendulum(0.1), x_goal=[np.pi, 0], horizon=(1, 2)) for _ in range(2))
+    assert a.nodes.tobytes() == b.nodes.tobytes()
+    assert a.horizon == b.horizon
+
+
+def test_limits_are_kept():
+    options = {"x0": [0, 0], "x_goal": [np.pi, 0], "count": 20, "horizon": 2.0, "running_cost": effort}
+    motion = transcribe_and_solve(heavy_pendulum(0.1), **options, limits=Limits(3, math.inf, 1e-9))
+    assert motion.outcome is Outcome.ITERATION_LIMIT
+    assert not motion.success
+    motion = transcribe_and_solve(heavy_pendulum(0.1), **options, limits=Limits(500, 1e-3, 1e-9), refine=True)
+    assert motion.outcome is Outcome.TIME_LIMIT
+
+
+def test_what_cannot_be_is_infeasible():
+    motion = transcribe_and_solve(BLOCK, x0=[0, 0], x_goal=[1, 0], count=5, horizon=1.0, bounds=unit_inputs(3.9))
+    assert motion.outcome is not Outcome.SOLVED
+
+
+# ------------------------------------------------------------------------------ derivatives
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("horizon", [2.0, (1.0, 3.0)])
+def test_the_programs_jacobians_are_differences_of_its_values_and_keep_their_pattern(scheme, horizon):
+    pendulum = heavy_pendulum(0.1)
+    options = {"x0": [0, 0], "x_goal": [np.pi, 0], "count": 40, "horizon": horizon, "running_cost": effort}
+    motion = transcribe_and_solve(pendulum, **options, scheme=scheme, limits=Limits(3, 9.0, 1e-9))
+    program = TranscribedProgram(motion.task, motion.mesh).program
+    bindings = [*program.generic_constraints(), *program.generic_costs()]
+    assert len(program.generic_constraints()) > 1
+    rng = np.random.default_rng(0)
+    for binding in bindings:
+        evaluator, z = binding.evaluator(), rng.uniform(0.5, 2, len(binding.variables()))
+        exact = ExtractGradient(evaluator.Eval(InitializeAutoDiff(z)).reshape(-1, 1))
+        steps = 1e-6 * np.eye(len(z))
+        rough = np.array([(evaluator.Eval(z + e) - evaluator.Eval(z - e)) / 2e-6 for e in steps]).T
+        assert exact == pytest.approx(rough, abs=2e-7)
+        pattern = evaluator.gradient_sparsity_pattern()
+        if pattern is not None:
+            outside = np.ones(exact.shape, dtype=bool)
+            outside[tuple(np.array(pattern).T)] = False
+            assert not exact[outside].any()
+            assert len(pattern) < 0.5 * exact.size
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "snopt"])
+def test_every_knot_is_evaluated_and_linearized_once_an_iterate(solver):
+    valued, linearized = [], []
+
+    class Counting:
+        def values(self, knots):
+            valued.extend(k.tobytes() for k in knots)
+            return np.column_stack([knots[:, 1], knots[:, 2]])
+
+        def linearize(self, knots):
+            linearized.extend(k.tobytes() for k in knots)
+            rates = np.column_stack([knots[:, 1], knots[:, 2]])
+            return rates, np.tile([[0.0, 1, 0], [0, 0, 1]], (len(knots), 1, 1))
+
+    options = {"x0": [0, 0], "x_goal": [1, 0], "count": 40, "horizon": 1.0, "running_cost": effort, "solver": solver}
+    motion = transcribe_and_solve(Dynamics(Counting(), 2, 1), **options)
+    assert motion.success
+    assert len(linearized) <= 1.1 * 81 * (len(motion.iterations) + 1)
+    assert len(valued) <= 1.5 * 81 * (len(motion.iterations) + 1)  # a line search tries more than one
+    assert len(linearized) <= 1.05 * len(set(linearized)) + 81
+
+
+@pytest.mark.parametrize("name", ["cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "floating"])
+def test_a_plants_derivatives_are_those_of_its_equations_of_motion(load, name):
+    model = floating(QuaternionFloatingJoint, 0) if name == "floating" else load(name)
+    dynamics, equations, random = plant_dynamics(model), EquationsOfMotion(model), np.random.default_rng(0)
+    for _ in range(3):
+        x, u = random_state(model, random), random.standard_normal(model.nu)
+        z = InitializeAutoDiff(np.concatenate([x, u])).ravel()
+        expected = equations.autodiff(z[: model.nx], z[model.nx :]).reshape(-1, 1)
+        f, A, B = dynamics.derivatives(x, u)
+        assert f == pytest.approx(ExtractValue(expected).ravel(), rel=1e-12, abs=1e-12)
+        assert np.hstack([A, B]) == pytest.approx(ExtractGradient(expected), rel=1e-10, abs=1e-10)
+        assert dynamics(x, u) == pytest.approx(f, rel=1e-12, abs=1e-12)
+
+
+def test_kellys_acceleration_from_the_file(load):
+    """A33."""
+    dynamics = plant_dynamics(load("cart_pole.urdf"))
+    assert dynamics([0.1, 0.7, -0.3, 1.1], [2.0])[2:] == pytest.approx([3.172075726216, -17.491825696946], abs=1e-11)
+    assert dynamics.input_names == ("force",)
+
+
+FORMS = {
+    "columns": lambda x, u: np.array([x[1] * u[0], np.sin(x[0]) - u[1]]),
+    "a list": lambda x, u: [x[1] * u[0], np.sin(x[0]) - u[1]],
+    "matrix products": lambda x, u: np.array([[0, 1.0], [2, 3]]) @ x + u,
+    "knot by knot": lambda x, u: np.array([u @ u, x[0] * np.sum(x)]),
+    "with constants": lambda x, u: np.array([x[1] * u[0], 9.81]),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_dynamics_of_many_knots_are_those_of_each(form):
+    f, rng = FORMS[form], np.random.default_rng(0)
+    dynamics, knots = Dynamics(f, 2, 2), rng.standard_normal((5, 4))
+    values, rows = dynamics.linearize(knots)
+    assert dynamics.values(knots) == pytest.approx(values, abs=1e-14)
+    for k, knot in enumerate(knots):
+        assert values[k] == pytest.approx(f(knot[:2], knot[2:]), abs=1e-14)
+        steps = 1e-6 * np.eye(4)
+        rough = [(np.array(f(*np.split(knot + e, 2))) - np.array(f(*np.split(knot - e, 2)))) / 2e-6 for e in steps]
+        assert rows[k] == pytest.approx(np.array(rough).T, abs=1e-8)
+    assert dynamics._at.takes_columns == (form in ("columns", "a list", "matrix products"))
+
+
+# ------------------------------------------------------------------------------ bad input
+
+
+@pytest.mark.parametrize(
+    ("f", "message"),
+    [
+        (3, "dynamics: expected a function of x and u"),
+        (lambda x: x, "dynamics: expected a function .* got TypeError"),
+        (lambda x, u: np.array([x[1]]), r"dynamics: its result: expected shape \(2,\), got shape \(1,\)"),
+        (lambda x, u: np.array([x[1], u[3]]), "got IndexError"),
+        (lambda x, u: np.array([x[1], math.sin(x[0])]), "got TypeError"),
+        (lambda x, u: np.array([x[1], float(x[0])]), "got TypeError"),
+    ],
+)
+def test_a_function_that_is_no_dynamics_is_refused(f, message):
+    with pytest.raises(dd.InputError, match=message):
+        Dynamics(f, 2, 1)
+
+
+def test_dynamics_without_derivatives_are_refused():
+    with pytest.raises(dd.GradientError, match="dynamics lost its derivatives"):
+        Dynamics(lambda x, u: np.array([1.0, 2.0]), 2, 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"nx": 0}, "nx: expected a whole number"),
+        ({"nu": 1.5}, "nu: expected a whole number"),
+        ({"x_lower": [0]}, r"x_lower: expected shape \(2,\)"),
+        ({"u_lower": [2], "u_upper": [1]}, r"bounds of u0: expected lower at most upper, got \[2, 1\]"),
+        ({"state_names": ["a"]}, "state_names: expected 2 names"),
+    ],
+)
+def test_bad_dynamics_are_named(options, message):
+    sizes = {"nx": 2, "nu": 1} | options
+    with pytest.raises(dd.InputError, match=message):
+        Dynamics(push, **sizes)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"dynamics": push}, "dynamics: expected Dynamics or plant_dynamics"),
+        ({"x0": [0]}, r"x0: expected shape \(2,\)"),
+        ({"x0": [0, np.inf]}, "x0: expected finite numbers, NaN where free"),
+        ({"x_goal": [1, 0, 0]}, r"x_goal: expected shape \(2,\)"),
+        ({"x_goal": [3, 0], "bounds": dd.Bounds(x_upper=[2, 9])}, r"x_goal, x0: expected within \[-inf, 2\], got 3"),
+        ({"count": 0}, "count: expected a whole number"),
+        ({"horizon": 0}, r"horizon \[s\]: expected a finite number above 0"),
+        ({"horizon": (2, 1)}, "horizon: expected lower at most upper"),
+        ({"horizon": (1, np.inf)}, r"horizon \[s\]: expected a finite number above 0"),
+        ({"horizon": (1, 2, 3)}, "horizon: expected a number of seconds"),
+        ({"scheme": "radau"}, "scheme: expected one of hermite_simpson, trapezoid, got 'radau'"),
+        ({"solver": "knitro"}, "solver: expected one of"),
+        ({"bounds": (0, 1)}, "bounds: expected Bounds"),
+        ({"guess": 3}, "guess: expected"),
+        ({"guess": (np.zeros((3, 2)), np.zeros((3, 1)))}, r"guess xs: expected shape \(6, 2\)"),
+        ({"running_cost": "effort"}, "running_cost: expected an array of numbers"),
+        ({"running_cost": np.nan}, "running_cost"),
+        ({"running_cost": lambda x, u: x}, "running_cost: its result"),
+        ({"running_cost": dd.QuadraticCost(R=np.eye(2))}, r"running_cost.R: expected shape \(1, 1\)"),
+        ({"final_cost": dd.QuadraticCost(Q=np.eye(3))}, r"final_cost.Q: expected shape \(2, 2\)"),
+        ({"final_cost": 3}, "final_cost: expected a function"),
+        ({"running_cost": None, "x_goal": None}, "problem: expected a cost, an x_goal, or both"),
+        ({"refine": True, "error_tolerance": 0}, "error_tolerance: expected a finite number above 0"),
+        ({"max_count": 0}, "max_count: expected a whole number"),
+    ],
+)
+def test_bad_input_is_named_before_anything_runs(options, message):
+    given = {"dynamics": BLOCK, "x0": [0, 0], "x_goal": [1, 0], "count": 5, "horizon": 1.0, "running_cost": effort}
+    given |= options
+    with pytest.raises(dd.InputError, match=message):
+        transcribe_and_solve(given.pop("dynamics"), **given)
+
+
+def test_a_running_cost_without_derivatives_is_refused():
+    with pytest.raises(dd.GradientError, match="running_cost lost its derivatives"):
+        move(running_cost=lambda x, u: 1.0)
+
+
+# ------------------------------------------------------------------------------ times, printed
+
+
+def test_the_time_of_kellys_cart_pole(capsys):
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04)
+    problem = dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], running_cost=EFFORT, num_steps=50)
+    options = {"x0": np.zeros(4), "x_goal": [1, np.pi, 0, 0], "horizon": 2.0, "running_cost": EFFORT}
+    start = time.perf_counter()
+    drake = dd.solve(problem, method="collocation")
+    middle = time.perf_counter()
+    ours = move(50, plant_dynamics(model), limits=Limits(500, math.inf, 1e-8), **options)
+    end = time.perf_counter()
+    with capsys.disabled():
+        print(
+            f"\n50 intervals: Hermite-Simpson {end - middle:.2f} s (J {ours.cost:.6f}), dd.solve "
+            f"{middle - start:.2f} s (J {drake.cost:.6f}), ratio {(end - middle) / (middle - start):.2f}"
+        )
+    assert abs(ours.cost - 58.8077) < 1e-3 < abs(drake.cost - 58.8077)
