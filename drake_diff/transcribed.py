@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_diff.arrays import Array
 from drake_diff.nonlinear_program import Outcome
-from drake_diff.solution import Iteration
+from drake_diff.solution import FEASIBILITY_TOLERANCE, Iteration
 from drake_diff.transcription_program import OptimalControl
 from drake_diff.transcription_scheme import interval_defects, node_weights, per_interval
 
@@ -43,8 +43,22 @@ class Transcribed:
 
     @property
     def success(self) -> bool:
-        """Whether the solver says that it solved it; what it is worth say `defect`, `errors` and the bounds."""
-        return self.outcome is Outcome.SOLVED
+        """Whether the solver says that it solved it, and its equations, ends and bounds hold when measured again.
+
+        What lies between the nodes say `errors` and `violation_between_nodes`.
+        """
+        return self.outcome is Outcome.SOLVED and self.infeasibility <= FEASIBILITY_TOLERANCE
+
+    @property
+    def infeasibility(self) -> float:
+        """The largest defect, distance from a given end, or excess over a bound at a node; inf where not finite."""
+        task, nx, b = self.task, self.task.dynamics.nx, self.task.bounds
+        xs, us = self.nodes[:, :nx], self.nodes[:, nx:]
+        ends = np.concatenate([np.abs(xs[0] - task.x0), np.abs(xs[-1] - task.x_goal)])
+        inner = xs[1:] if np.all(np.isfinite(task.x0)) else xs
+        excess = [b.x_lower - inner, inner - b.x_upper, b.u_lower - us, us - b.u_upper]
+        worst = [float(np.max(e, initial=0.0)) for e in (ends[~np.isnan(ends)], *excess)]
+        return max(self.defect, *worst) if np.all(np.isfinite(self.nodes)) else float("inf")
 
     @property
     def times(self) -> Array:

@@ -658,3 +658,33 @@ def test_the_time_of_kellys_cart_pole(capsys):
             f"{middle - start:.2f} s (J {drake.cost:.6f}), ratio {(end - middle) / (middle - start):.2f}"
         )
     assert abs(ours.cost - 58.8077) < 1e-3 < abs(drake.cost - 58.8077)
+
+
+@pytest.mark.parametrize("row", [0, 4, -1])
+@pytest.mark.parametrize("column", [0, 1])
+def test_a_moved_node_is_no_success(row, column):
+    """Block move B01: whatever the solver says, the motion is measured."""
+    block = dd.Dynamics(lambda x, u: [x[1], u[0]], 2, 1)
+    found = dd.transcribe_and_solve(
+        block, x0=[0, 0], x_goal=[1, 0], count=5, horizon=1.0, running_cost=lambda x, u: u[0] ** 2
+    )
+    assert found.success
+    assert found.infeasibility < 1e-8
+    nodes = np.array(found.nodes)
+    nodes[row, column] += 1e-3
+    moved = dataclasses.replace(found, nodes=nodes)
+    assert not moved.success
+    assert moved.infeasibility >= 1e-4
+    nodes[row, column] = np.nan
+    assert dataclasses.replace(found, nodes=nodes).infeasibility == np.inf
+
+
+def test_an_input_beyond_its_bound_is_no_success():
+    block = dd.Dynamics(lambda x, u: [x[1], u[0]], 2, 1, u_lower=[-10], u_upper=[10])
+    found = dd.transcribe_and_solve(
+        block, x0=[0, 0], x_goal=[1, 0], count=5, horizon=1.0, running_cost=lambda x, u: u[0] ** 2
+    )
+    assert found.success
+    tight = dd.Bounds(*(np.array(b) for b in ([-9, -9], [9, 9], [-5.0], [5.0])))
+    task = dataclasses.replace(found.task, bounds=tight)
+    assert dataclasses.replace(found, task=task).infeasibility == pytest.approx(1.0, abs=1e-6)  # |u| is 6 at the ends
