@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.multibody.tree import FixedOffsetFrame, MultibodyForces, WeldJoint
+from pydrake.multibody.tree import FixedOffsetFrame, WeldJoint
 
 from drake_diff.arrays import Array
 from drake_diff.audit_contact import CONTACT_CHECKS
@@ -103,9 +103,7 @@ def _effort_to_hold(place: Place) -> Array:
     """(nu,) the effort [N or N m] nearest to what no acceleration at rest takes."""
     plant, twin = place.model.plant, place.model.double
     set_state(twin, np.concatenate([place.x[: place.model.nq], np.zeros(place.model.nv)]))
-    forces = MultibodyForces(plant)
-    plant.CalcForceElementsContribution(twin.context, forces)
-    needed = plant.CalcInverseDynamics(twin.context, np.zeros(place.model.nv), forces)
+    needed = twin.inverse_dynamics(np.zeros(place.model.nv))
     return np.asarray(np.linalg.lstsq(plant.MakeActuationMatrix(), needed, rcond=None)[0])
 
 

@@ -155,7 +155,7 @@ def certify_rollout(
     refinements = []
     for wanted, by in ((refine, refined), (refine_stiffness, stiffened)):
         if wanted:
-            refinements.append(by(model, x0, us, loss, vector, columns, method))
+            refinements.append(by(model, x0, us, loss, vector, columns, method, gradient))
     certificate = certify_displacement(
         f,
         derivative,
@@ -182,10 +182,9 @@ def _with_refinements(
 
 def solver_tolerance(model: Model, x: Array, u: Array) -> float:
     """How accurately the step at (`x`, `u`) is solved: SAP's tolerance where it has anything to solve."""
-    plant, context = model.plant, model.double.context
+    plant = model.plant
     advance(model.double, x, u)
-    contacts = plant.get_contact_results_output_port().Eval(context)
-    touching = contacts.num_point_pair_contacts() + contacts.num_hydroelastic_contacts()
+    touching = model.double.touches()
     q = x[: model.nq]
     reach = LIMIT_REACH + 2 * model.time_step * np.abs(x[model.nq :]).max(initial=0)
     near_limit = np.any(q < plant.GetPositionLowerLimits() + reach) or np.any(

@@ -89,7 +89,7 @@ def contact_modes(model: Model, x: ArrayLike, u: ArrayLike | None = None) -> dic
     above the stiction tolerance (of similar and lagged). Raises what `step` raises.
     """
     advance(model.double, *check_point(model, x, u))
-    active, inspector = active_modes(model), _inspector(model)
+    active, inspector = active_modes(model), model.double.inspector
     if inspector is None:
         return {}
     pairs = [_pair(model, inspector, *ids) for ids in inspector.GetCollisionCandidates()]
@@ -99,7 +99,7 @@ def contact_modes(model: Model, x: ArrayLike, u: ArrayLike | None = None) -> dic
 def active_modes(model: Model) -> dict[Pair, str]:
     """The modes of the pairs that push each other in the step that `step.advance` took last on the double twin."""
     results = model.plant.get_contact_results_output_port().Eval(model.double.context)
-    inspector = _inspector(model)
+    inspector = model.double.inspector
     found: dict[Pair, str] = {}
     if inspector is None:
         return found
@@ -141,11 +141,6 @@ def _pair(model: Model, inspector: Any, a: Any, b: Any) -> Pair:
         names.append(f"{body.name()}/{inspector.GetName(geometry).split('::')[-1]}")
     first, second = sorted(names)
     return first, second
-
-
-def _inspector(model: Model) -> Any:
-    port = model.plant.get_geometry_query_input_port()
-    return port.Eval(model.double.context).inspector() if port.HasValue(model.double.context) else None
 
 
 def penetration(model: Model) -> float:

@@ -26,7 +26,7 @@ _ROUND = (Sphere, Cylinder, Capsule)
 
 def _geometries(twin: Twin) -> dict[str, list[Any]]:
     """Collision geometries by the label of a body, and one by one."""
-    inspector, plant = _inspector(twin), twin.plant
+    inspector, plant = twin.inspector, twin.plant
     if inspector is None or twin.scene_graph is None:
         return {}
     found: dict[str, list[Any]] = {}
@@ -39,19 +39,10 @@ def _geometries(twin: Twin) -> dict[str, list[Any]]:
     return found
 
 
-def _inspector(twin: Twin) -> SceneGraphInspector | None:
-    port = twin.plant.get_geometry_query_input_port()
-    return port.Eval(twin.context).inspector() if port.HasValue(twin.context) else None
-
-
-def _needed_inspector(twin: Twin) -> SceneGraphInspector:
-    return twin.plant.get_geometry_query_input_port().Eval(twin.context).inspector()
-
-
 def _find(quantity: str, unit: str, read: Callable[[SceneGraphInspector, Any], float | None]) -> Kind:
     def find(model: Model) -> Found:
         for label, ids in _geometries(model.double).items():
-            values = {read(_needed_inspector(model.double), i) for i in ids}
+            values = {read(model.double.inspector, i) for i in ids}
             value = values.pop()
             if value is not None and not values:  # of geometries that differ each has its own value
                 yield label, unit, value
@@ -82,7 +73,7 @@ def _write_property(quantity: str) -> Callable[[Twin, str, Values], None]:
     group, name, _ = _PROPERTIES[quantity]
 
     def write(twin: Twin, label: str, value: Values) -> None:
-        new, inspector = float(value[0]), _needed_inspector(twin)
+        new, inspector = float(value[0]), twin.inspector
         root = twin.scene_graph.GetMyMutableContextFromRoot(twin.root_context)
         for geometry in _geometries(twin)[label]:
             properties = ProximityProperties(inspector.GetProximityProperties(geometry))
@@ -93,7 +84,7 @@ def _write_property(quantity: str) -> Callable[[Twin, str, Values], None]:
 
 
 def _write_radius(twin: Twin, label: str, value: Values) -> None:
-    radius, inspector = float(value[0]), _needed_inspector(twin)
+    radius, inspector = float(value[0]), twin.inspector
     root = twin.scene_graph.GetMyMutableContextFromRoot(twin.root_context)
     for geometry in _geometries(twin)[label]:
         shape = inspector.GetShape(geometry)

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractValue
-from pydrake.multibody.tree import MultibodyForces_
 from pydrake.systems.framework import BasicVector_, LeafSystem_
 from pydrake.systems.scalar_conversion import TemplateSystem
 
@@ -41,33 +40,30 @@ class EquationsOfMotion:
         """(nx,) dx/dt at `x` (nx,), `u` (nu,)."""
         twin = self.model.double
         set_state(twin, x)
-        acceleration, _ = self._acceleration(u)
-        return np.concatenate([self._q_dot(twin, x), acceleration])
+        acceleration, _ = self.acceleration(u)
+        return np.concatenate([self.q_dot(twin, x), acceleration])
 
     def autodiff(self, x: Any, u: Any) -> Any:
         """The same with AutoDiffXd in and out."""
         set_state(self.model.double, ExtractValue(x).ravel())
-        acceleration, mass = self._acceleration(ExtractValue(u).ravel())
+        acceleration, mass = self.acceleration(ExtractValue(u).ravel())
         twin = self.model.autodiff
         set_state(twin, x)
         constant = np.array([AutoDiffXd(a) for a in acceleration])
-        residual = self._inverse_dynamics(twin, MultibodyForces_[AutoDiffXd], constant) - self.actuation @ u
-        return np.concatenate([self._q_dot(twin, x), acceleration - np.linalg.inv(mass) @ residual])
+        residual = twin.inverse_dynamics(constant) - self.actuation @ u
+        return np.concatenate([self.q_dot(twin, x), acceleration - np.linalg.inv(mass) @ residual])
 
-    def _q_dot(self, twin: Twin, x: Any) -> Any:
+    def q_dot(self, twin: Twin, x: Any) -> Any:
+        """(nq,) N(q) v of x (nx,), whose positions are the twin's."""
         v = x[self.model.nq :]
         return np.asarray(twin.plant.MapVelocityToQDot(twin.context, v)).ravel()
 
-    def _acceleration(self, u: Array) -> tuple[Array, Array]:
+    def acceleration(self, u: Array) -> tuple[Array, Array]:
+        """(dv/dt (nv,), M (nv, nv)) under u (nu,) in the double context's state."""
         twin = self.model.double
-        rest = self._inverse_dynamics(twin, MultibodyForces_[float], np.zeros(self.model.nv))
+        rest = twin.inverse_dynamics(np.zeros(self.model.nv))
         mass = twin.plant.CalcMassMatrix(twin.context)
         return np.linalg.solve(mass, self.actuation @ u - rest), mass
-
-    def _inverse_dynamics(self, twin: Twin, forces_of: Any, acceleration: Any) -> Any:
-        forces = forces_of(twin.plant)
-        twin.plant.CalcForceElementsContribution(twin.context, forces)
-        return twin.plant.CalcInverseDynamics(twin.context, acceleration, forces)
 
 
 @TemplateSystem.define("ContinuousSystem_")

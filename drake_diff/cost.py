@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_diff.arrays import Array, finite_array
 from drake_diff.autodiff import gradient_of
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import InputError, ShapeError
 from drake_diff.finite_difference import differences
 
 RunningCost = Callable[[Any, Any], Any]  # (x, u) -> scalar
@@ -36,6 +36,13 @@ class QuadraticCost:
             if getattr(self, name) is not None:
                 size = "n" if weight is None else len(weight)
                 object.__setattr__(self, name, finite_array(name, getattr(self, name), (size,)))
+
+    def check_sizes(self, name: str, nx: int, nu: int) -> None:
+        """Raise ShapeError where a part has not the size of the states (nx,) or inputs (nu,); `name` is the cost's."""
+        for part, size in (("Q", nx), ("R", nu), ("x_ref", nx), ("u_ref", nu)):
+            value = getattr(self, part)
+            if value is not None and len(value) != size:
+                raise ShapeError(f"{name}.{part}", got=value.shape, expected=(size,) * value.ndim)
 
     def __call__(self, x: Any, u: Any = None) -> Any:
         """The cost of x (nx,) and u (nu,): floats or AutoDiffXd."""

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
-from pydrake.multibody.tree import MultibodyForces_
 
 from drake_diff.arrays import Array, array_with_gaps, finite_array, frozen, positive_int
 from drake_diff.autodiff import gradient_rows
@@ -230,17 +229,17 @@ class _PlantKnots:
     def _linearize(self, x: Array, u: Array) -> tuple[Array, Array]:
         equations, model, twin = self.equations, self.model, self.model.autodiff
         set_state(model.double, x)
-        acceleration, mass = equations._acceleration(u)
-        q_dot = equations._q_dot(model.double, x)
+        acceleration, mass = equations.acceleration(u)
+        q_dot = equations.q_dot(model.double, x)
         variables = InitializeAutoDiff(x).ravel()
         set_state(twin, variables)
         constant = np.array([AutoDiffXd(a) for a in acceleration])
-        residual = equations._inverse_dynamics(twin, MultibodyForces_[AutoDiffXd], constant)
+        residual = twin.inverse_dynamics(constant)
         rows = np.zeros((model.nx, model.nx + model.nu))
         if self.plain_rates:
             rows[: model.nq, model.nq : model.nx] = np.eye(model.nq)
         else:
-            rows[: model.nq, : model.nx] = gradient_rows(equations._q_dot(twin, variables), model.nx)
+            rows[: model.nq, : model.nx] = gradient_rows(equations.q_dot(twin, variables), model.nx)
         by_knot = np.concatenate([gradient_rows(residual, model.nx), -equations.actuation], axis=1)
         rows[model.nq :] = -np.linalg.solve(mass, by_knot)
         return np.concatenate([q_dot, acceleration]), rows

@@ -22,7 +22,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
-from pydrake.multibody.tree import MultibodyForces_
 
 from drake_diff.arrays import Array
 from drake_diff.autodiff import gradient_rows
@@ -32,7 +31,6 @@ from drake_diff.parameters import ParameterVector, write_autodiff
 from drake_diff.plant_elements import actuators, is_driven, joints
 from drake_diff.step import advance, set_state
 from drake_diff.tree_dynamics import TreeDynamics, tree_of
-from drake_diff.twin import Twin
 
 # Rounding of the forces that balance, relative to the largest of them. What a solver leaves is larger.
 RESIDUAL_TOLERANCE = 1e-9
@@ -69,7 +67,7 @@ def implicit_jacobian(model: Model, vector: ParameterVector, x: Array, u: Array,
     form = _form_of(model)
     if form.excluded:
         raise NotSmoothError(form.excluded)
-    if form.can_touch and _touches(model.double):
+    if form.can_touch and model.double.touches():
         raise NotSmoothError("geometries touch")
     if form.tree is not None and model.nv >= TREE_JOINTS and not model.has_other_parameters:
         jacobians, missing = _by_tree(model, form, form.tree, x[None], u[None], x_next[None])
@@ -95,7 +93,7 @@ def implicit_jacobians(
     for k, u in enumerate(us):
         starts[k] = x if xs is None else xs[k]
         x = ends[k] = advance(model.double, starts[k], u)
-        touching[k] = form.can_touch and _touches(model.double)
+        touching[k] = form.can_touch and model.double.touches()
     jacobians, missing = _by_tree(model, form, form.tree, starts, us, ends)
     smooth = ~touching & (missing <= RESIDUAL_TOLERANCE)
     return ends, [jacobian if good else None for jacobian, good in zip(jacobians, smooth, strict=True)]
@@ -134,7 +132,7 @@ def _by_autodiff(model: Model, form: "_Form", vector: ParameterVector, x: Array,
     variables = InitializeAutoDiff(np.concatenate([x, vector.values])).ravel()
     write_autodiff(vector, model, variables[nx:])
     set_state(model.autodiff, variables[:nx])
-    needed = _needed(model.autodiff, np.array([AutoDiffXd(a) for a in change / h])).reshape(-1, 1)
+    needed = model.autodiff.inverse_dynamics(np.array([AutoDiffXd(a) for a in change / h])).reshape(-1, 1)
     _check_vanishes(_missing(ExtractValue(needed).ravel(), damping * change - applied))
     rows = gradient_rows(needed, len(variables))
     if vector.parameters:
@@ -149,19 +147,6 @@ def _by_autodiff(model: Model, form: "_Form", vector: ParameterVector, x: Array,
         by_next += (pressed * (kd + h * kp)) @ form.actuation.T
     velocities = -np.linalg.solve(by_next, by_point)
     return np.concatenate([_positions(model, v_next, velocities, len(vector.values)), velocities])
-
-
-def _touches(twin: Twin) -> bool:
-    contacts = twin.plant.get_contact_results_output_port().Eval(twin.context)
-    return bool(contacts.num_point_pair_contacts() or contacts.num_hydroelastic_contacts())
-
-
-def _needed(twin: Twin, acceleration: Any) -> Any:
-    """(nv,) M a + bias less gravity, springs, damping and added forces, in the twin's state."""
-    forces = MultibodyForces_[twin.scalar](twin.plant)
-    twin.plant.CalcForceElementsContribution(twin.context, forces)
-    needed = twin.plant.CalcInverseDynamics(twin.context, acceleration, forces)
-    return needed - twin.added_force() if twin.added else needed  # `forces` of AutoDiffXd are a copy: not writable
 
 
 def _missing(needed: Array, rest: Array) -> Array:
@@ -273,7 +258,7 @@ def _checked_tree(model: Model) -> TreeDynamics | None:
 def _is_same(model: Model, tree: TreeDynamics, x: Array, a: Array) -> bool:
     n = model.nv
     set_state(model.autodiff, InitializeAutoDiff(x).ravel())
-    exact = _needed(model.autodiff, np.array([AutoDiffXd(entry) for entry in a])).reshape(-1, 1)
+    exact = model.autodiff.inverse_dynamics(np.array([AutoDiffXd(entry) for entry in a])).reshape(-1, 1)
     ours = tree(tree.place(model, x[None, :n]), x[None, :n], x[None, n:], a[None])
     found = np.column_stack([ours.tau[0], ours.by_q[0], ours.by_v[0]])
     wanted = np.column_stack([ExtractValue(exact).ravel(), gradient_rows(exact, 2 * n)])

@@ -15,7 +15,7 @@ from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_diff.arrays import finite_array, positive_float
-from drake_diff.contact_geometry import ROUTES, replace_collision_geometry
+from drake_diff.contact_geometry import CONTACT_MODELS, ROUTES, replace_collision_geometry
 from drake_diff.contract import Contract
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, UnknownNameError
 from drake_diff.model_file import read_into
@@ -35,7 +35,6 @@ from drake_diff.twin import Twin
 if TYPE_CHECKING:
     from drake_diff.parameters import Parameter
 
-CONTACT_MODELS = ("point", "hydroelastic", "hydroelastic_with_fallback")
 CONTACT_APPROXIMATIONS = ("sap", "similar", "lagged")
 OTHER_TIME_STEPS = 64  # how many rebuilt models are kept: a certificate by the time step needs 26
 

@@ -113,11 +113,11 @@ class ParameterVector:
 
     def to_dict(self) -> dict[str, Array]:
         """The values by parameter name."""
-        return {p.name: self.values[s] for p, s in zip(self.parameters, self.slices, strict=True)}
+        return {p.name: self.values[s] for p, s in self._pairs}
 
     def time_step(self, values: Array) -> float:
         """The time step [s] that goes with `values` (np,)."""
-        for p, s in zip(self.parameters, self.slices, strict=True):
+        for p, s in self._pairs:
             if p.name == TIME_STEP:
                 return float(values[s][0])
         return self.model.time_step
@@ -140,8 +140,7 @@ class ParameterVector:
 
     @cached_property
     def _in_order(self) -> list[tuple[Parameter, slice]]:
-        pairs = zip(self.parameters, self.slices, strict=True)
-        return sorted(pairs, key=lambda pair: KINDS.index(pair[0].kind))
+        return sorted(self._pairs, key=lambda pair: KINDS.index(pair[0].kind))
 
     def difference_scale(self, entries: Any = slice(None)) -> Array:
         """By how much differences move each of the `entries`, relative to their step: never to where Drake takes none.

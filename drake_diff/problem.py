@@ -198,7 +198,7 @@ class Problem:
             if cost is not None and not callable(cost):
                 raise InputError(name, got=type(cost).__name__, expected="a function or a QuadraticCost")
             if isinstance(cost, QuadraticCost):
-                _check_sizes(name, cost, self.model)
+                cost.check_sizes(name, self.model.nx, self.model.nu)
 
 
 def _check_optimize(model: Model, optimize: Sequence[str]) -> tuple[str, ...]:
@@ -240,14 +240,3 @@ def _resolve_bounds(model: Model, bounds: Bounds) -> Bounds:
                 f"bounds of {names[i]}", got=f"[{lower[i]:g}, {upper[i]:g}]", expected="lower at most upper"
             )
     return Bounds(**resolved)
-
-
-def _check_sizes(name: str, cost: QuadraticCost, model: Model) -> None:
-    for part, size in (("Q", model.nx), ("R", model.nu)):
-        weight = getattr(cost, part)
-        if weight is not None and weight.shape != (size, size):
-            raise ShapeError(f"{name}.{part}", got=weight.shape, expected=(size, size))
-    for part, size in (("x_ref", model.nx), ("u_ref", model.nu)):
-        reference = getattr(cost, part)
-        if reference is not None and reference.shape != (size,):
-            raise ShapeError(f"{name}.{part}", got=reference.shape, expected=(size,))

@@ -116,16 +116,8 @@ def _read_actuator(actuator: Any) -> Actuator:
     )
 
 
-def inspector_of(model: Model) -> SceneGraphInspector | None:
-    """The inspector of the scene graph the plant is connected to, with the context's properties, or None."""
-    port = model.plant.get_geometry_query_input_port()
-    if not port.HasValue(model.double.context):
-        return None
-    return port.Eval(model.double.context).inspector()
-
-
 def _read_geometries(model: Model) -> tuple[CollisionGeometry, ...]:
-    inspector = inspector_of(model)
+    inspector = model.double.inspector
     if inspector is None:
         return ()
     ids = inspector.GetAllGeometryIds(Role.kProximity)
@@ -153,7 +145,7 @@ def _property(properties: ProximityProperties, group: str, name: str) -> Any:
 
 
 def _read_contact(model: Model) -> Contact:
-    inspector = inspector_of(model)
+    inspector = model.double.inspector
     return Contact(
         model={"kPoint": "point", "kHydroelastic": "hydroelastic"}.get(
             model.plant.get_contact_model().name, "hydroelastic_with_fallback"

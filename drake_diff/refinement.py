@@ -60,17 +60,25 @@ class Refinement:
 
 
 def refined(
-    model: Model, x0: Array, us: Array, loss: Loss, vector: ParameterVector, columns: Sequence[str], method: str
+    model: Model,
+    x0: Array,
+    us: Array,
+    loss: Loss,
+    vector: ParameterVector,
+    columns: Sequence[str],
+    method: str,
+    first: RolloutGradient,
 ) -> Refinement:
     """The gradient at h, h/2 and h/4 under the same inputs, the loss seeing the states at the same times.
 
-    Raises InputError where the time step is itself a parameter, ModelError where the model has but one.
+    `first` is the gradient at h. Raises InputError where the time step is itself a parameter, ModelError where the
+    model has but one.
     """
     if TIME_STEP in {p.name for p in vector.parameters}:
         raise InputError("parameters", got=TIME_STEP, expected="others, as refine=True changes the time step")
-    values = []
-    for m in REFINEMENTS:
-        finer = model if m == 1 else model.at_time_step(model.time_step / m)
+    values = [_flat(model, x0, first, us.shape, 1)]
+    for m in REFINEMENTS[1:]:
+        finer = model.at_time_step(model.time_step / m)
         gradient = differentiate_rollout(
             finer, x0, np.repeat(us, m, axis=0), _coarse(loss, m), parameters=vector.to_dict(), method=method
         )
@@ -79,11 +87,18 @@ def refined(
 
 
 def stiffened(
-    model: Model, x0: Array, us: Array, loss: Loss, vector: ParameterVector, columns: Sequence[str], method: str
+    model: Model,
+    x0: Array,
+    us: Array,
+    loss: Loss,
+    vector: ParameterVector,
+    columns: Sequence[str],
+    method: str,
+    first: RolloutGradient,
 ) -> Refinement:
     """The gradient at k, 4 k and 16 k of every stiffness that the model states, at the model's own time step.
 
-    Raises InputError where it states none.
+    `first` is the gradient at k. Raises InputError where it states none.
     """
     stiffness = _stated_stiffness(model)
     named = sorted(stiffness.keys() & vector.to_dict().keys())
@@ -91,8 +106,8 @@ def stiffened(
         raise InputError("parameters", got=named[0], expected="others, as refine_stiffness=True changes it")
     if not stiffness:
         raise InputError("refine_stiffness", got="a model that states no point stiffness", expected="one that does")
-    values = []
-    for factor in STIFFENING:
+    values = [_flat(model, x0, first, us.shape, 1)]
+    for factor in STIFFENING[1:]:
         with applied(select(model, {name: factor * k for name, k in stiffness.items()})) as stiffer:
             gradient = differentiate_rollout(stiffer, x0, us, loss, parameters=vector.to_dict(), method=method)
         values.append(_flat(model, x0, gradient, us.shape, 1))

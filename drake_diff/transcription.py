@@ -19,7 +19,7 @@ from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.nonlinear_program import Limits, Outcome, solve_program
 from drake_diff.problem import Bounds
 from drake_diff.transcribed import Transcribed
-from drake_diff.transcription_program import OptimalControl, RunningRate, TranscribedProgram, check_sizes
+from drake_diff.transcription_program import OptimalControl, RunningRate, TranscribedProgram
 from drake_diff.transcription_scheme import SCHEMES, node_fractions
 
 DEFAULT_LIMITS = Limits(max_iterations=3000, time_limit=np.inf, tolerance=1e-9)
@@ -110,7 +110,7 @@ def _check_task(
     if not (bounds is None or isinstance(bounds, Bounds)):
         raise InputError("bounds", got=type(bounds).__name__, expected="Bounds")
     if isinstance(final, QuadraticCost):
-        check_sizes("final_cost", final, dynamics)
+        final.check_sizes("final_cost", dynamics.nx, dynamics.nu)
     elif final is not None:
         Pointwise("final_cost", lambda x, u: final(x), dynamics.nx, (), dynamics.probe())  # raises where it is none
     limits = dynamics.limits(bounds)

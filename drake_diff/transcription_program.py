@@ -16,7 +16,6 @@ from drake_diff.arrays import Array, finite_array
 from drake_diff.autodiff import chain, chain_rows
 from drake_diff.cost import FinalCost, QuadraticCost, differentiate_cost, differentiate_final_cost
 from drake_diff.dynamics import Dynamics, Pointwise
-from drake_diff.exceptions import ShapeError
 from drake_diff.problem import Bounds
 from drake_diff.transcription_scheme import Scheme, interval_defects, node_weights, per_interval
 
@@ -34,7 +33,7 @@ class RunningRate:
         if cost is None or np.isscalar(cost):
             self.constant = float(finite_array("running_cost", 0.0 if cost is None else cost, ()))
         elif self.quadratic:
-            check_sizes("running_cost", cost, dynamics)
+            cost.check_sizes("running_cost", dynamics.nx, dynamics.nu)
         else:
             self._at = Pointwise("running_cost", cost, self.nx, (), dynamics.probe())
 
@@ -55,14 +54,6 @@ class RunningRate:
             return np.array([v for v, _, _ in found]), np.array([np.concatenate(g) for _, *g in found])
         values, rows = self._at.linearize(knots)
         return values[:, 0], rows[:, 0]
-
-
-def check_sizes(subject: str, cost: QuadraticCost, dynamics: Dynamics) -> None:
-    """Raise ShapeError where a part of `cost` has not the size of the dynamics."""
-    for part, size in (("Q", dynamics.nx), ("x_ref", dynamics.nx), ("R", dynamics.nu), ("u_ref", dynamics.nu)):
-        value = getattr(cost, part)
-        if value is not None and len(value) != size:
-            raise ShapeError(f"{subject}.{part}", got=value.shape, expected=(size,) * value.ndim)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from pydrake.multibody.tree import MultibodyForces_
 
 from drake_diff.added_forces import AddedForce
 from drake_diff.plant_elements import actuators, bodies, joints, labelled
@@ -55,6 +56,24 @@ class Twin:
         for velocities, joint in self._moving_joints:
             found[velocities] = joint.GetDampingVector(self.context)
         return found
+
+    @property
+    def inspector(self) -> Any:
+        """The scene graph's inspector, with the context's own properties; None where there is no scene graph."""
+        port = self.plant.get_geometry_query_input_port()
+        return port.Eval(self.context).inspector() if port.HasValue(self.context) else None
+
+    def touches(self) -> bool:
+        """Whether the step from the context's state has any contact."""
+        contacts = self.plant.get_contact_results_output_port().Eval(self.context)
+        return bool(contacts.num_point_pair_contacts() or contacts.num_hydroelastic_contacts())
+
+    def inverse_dynamics(self, acceleration: Any) -> Any:
+        """(nv,) M a + bias less gravity, springs, damping and added forces, at the context's state."""
+        forces = MultibodyForces_[self.scalar](self.plant)
+        self.plant.CalcForceElementsContribution(self.context, forces)
+        needed = self.plant.CalcInverseDynamics(self.context, acceleration, forces)
+        return needed - self.added_force() if self.added else needed  # AutoDiffXd's `forces` are a copy: not writable
 
     def added_force(self) -> Any:
         """(nv,) the generalized force that parameters add in the state of the context."""
