@@ -2,12 +2,14 @@
 
 from drake_diff.audit import audit as audit
 from drake_diff.audit_place import Finding as Finding
+from drake_diff.bounds import Bounds as Bounds
 from drake_diff.certificate import Certificate as Certificate
 from drake_diff.certificate import certify_jacobian as certify_jacobian
 from drake_diff.certification import certify_model as certify_model
 from drake_diff.certify import RolloutCertificate as RolloutCertificate
 from drake_diff.certify import certify as certify
 from drake_diff.certify import certify_rollout as certify_rollout
+from drake_diff.constraint import Constraint as Constraint
 from drake_diff.contact import contact_modes as contact_modes
 from drake_diff.contract import Contract as Contract
 from drake_diff.cost import QuadraticCost as QuadraticCost
@@ -35,7 +37,6 @@ from drake_diff.policy import LQR as LQR
 from drake_diff.policy import PD as PD
 from drake_diff.policy import TVLQR as TVLQR
 from drake_diff.policy import ParametricPolicy as ParametricPolicy
-from drake_diff.problem import Bounds as Bounds
 from drake_diff.problem import Problem as Problem
 from drake_diff.record import CertificationRecord as CertificationRecord
 from drake_diff.record import EvidenceRecord as EvidenceRecord

@@ -122,9 +122,9 @@ class _RunningCost:
 
     def __call__(self, z: Any) -> Any:
         if z.dtype == float:
-            return self.weight * float(self.cost(z[: self.nx], z[self.nx :]))  # type: ignore[misc]
+            return self.weight * float(self.cost(z[: self.nx], z[self.nx :]))
         at = ExtractValue(z).ravel()
-        value, by_x, by_u = differentiate_cost(self.cost, at[: self.nx], at[self.nx :])  # type: ignore[arg-type]
+        value, by_x, by_u = differentiate_cost(self.cost, at[: self.nx], at[self.nx :])
         return chain(self.weight * value, self.weight * np.concatenate([by_x, by_u]), z)
 
 

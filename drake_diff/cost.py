@@ -54,6 +54,16 @@ class QuadraticCost:
         return total
 
 
+@dataclass(frozen=True)
+class ConstantCost:
+    """A running cost of `rate` [per s], so that the objective is `rate` times the horizon."""
+
+    rate: float
+
+    def __call__(self, x: Any, u: Any) -> Any:
+        return self.rate + 0.0 * x[0]
+
+
 def _form(weight: Any, z: Any, reference: Any) -> Any:
     d = z if reference is None else z - reference
     return d @ (weight @ d)

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 
-from drake_diff.arrays import Array, array_with_gaps, finite_array, frozen, positive_int
+from drake_diff.arrays import Array, finite_array, frozen, positive_int
 from drake_diff.autodiff import gradient_rows
+from drake_diff.bounds import Bounds, plant_limits, resolve_bounds
 from drake_diff.continuous import EquationsOfMotion
 from drake_diff.exceptions import GradientError, InputError, ShapeError
 from drake_diff.implicit import tree_for
 from drake_diff.model import Model
-from drake_diff.problem import Bounds
 from drake_diff.step import set_state
 from drake_diff.tree_dynamics import TreeDynamics
 
@@ -146,17 +146,7 @@ class Dynamics:
 
     def limits(self, given: Bounds | None) -> Bounds:
         """`given` with this dynamics' own bounds where it has none, checked."""
-        found = {}
-        for name, own in vars(self.bounds).items():
-            value = getattr(given, name, None)
-            checked = own if value is None else array_with_gaps(name, value, own.shape)
-            found[name] = frozen(np.where(np.isnan(checked), own, checked))
-        for kind, names in (("x", self.state_names), ("u", self.input_names)):
-            lower, upper = found[f"{kind}_lower"], found[f"{kind}_upper"]
-            for i in np.flatnonzero((lower > upper) | (lower == np.inf) | (upper == -np.inf))[:1]:
-                got = f"[{lower[i]:g}, {upper[i]:g}]"
-                raise InputError(f"bounds of {names[i]}", got=got, expected="lower at most upper")
-        return Bounds(**found)
+        return resolve_bounds(given, vars(self.bounds), self.state_names, self.input_names)
 
     def _knot(self, x: Any, u: Any) -> Array:
         return np.concatenate([finite_array("x", x, (self.nx,)), finite_array("u", u, (self.nu,))])[None]
@@ -167,15 +157,11 @@ def plant_dynamics(model: Model) -> Dynamics:
 
     Raises ModelError where the model has no continuous form (PD control, constraints).
     """
-    plant = model.plant
     return Dynamics(
         _PlantKnots(model),
         model.nx,
         model.nu,
-        x_lower=np.concatenate([plant.GetPositionLowerLimits(), plant.GetVelocityLowerLimits()]),
-        x_upper=np.concatenate([plant.GetPositionUpperLimits(), plant.GetVelocityUpperLimits()]),
-        u_lower=plant.GetEffortLowerLimits(),
-        u_upper=plant.GetEffortUpperLimits(),
+        **plant_limits(model.plant),
         state_names=model.state_names,
         input_names=model.input_names,
     )

@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff.arrays import Array, array_with_gaps, finite_array, frozen, positive_int
-from drake_diff.cost import FinalCost, QuadraticCost, RunningCost
+from drake_diff.arrays import Array, array_with_gaps, finite_array, frozen, positive_float, positive_int
+from drake_diff.bounds import Bounds, plant_limits, resolve_bounds
+from drake_diff.constraint import Constraint
+from drake_diff.cost import ConstantCost, FinalCost, QuadraticCost
 from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
 from drake_diff.model import Model
 from drake_diff.parameters import TIME_STEP, select
@@ -18,28 +20,16 @@ SMALLEST_PART = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Bounds:
-    """Limits of states (nx,) and inputs (nu,), infinite where there is none.
-
-    The model's own limits (positions, velocities, efforts) apply to a whole array that is None and to each
-    entry that is NaN.
-    """
-
-    x_lower: Any = None
-    x_upper: Any = None
-    u_lower: Any = None
-    u_upper: Any = None
-
-
-@dataclass(frozen=True, eq=False)
 class Problem:
     """Minimize sum_k h * running_cost(x_k, u_k) + final_cost(x_N) over `num_steps` steps of h = model.time_step.
 
     (Collocation: the transcription's quadrature of the same rate.) `x0` (nx,) is the initial state; `x_goal`
-    (nx,) a hard final equality whose NaN entries are free. `bounds` hold at every state that is not
-    given and for every input. `optimize` names what may change: "controls" and/or "initial_state", the latter where
-    `initial_state_mask` (nx,) is True, x0 being the first guess there. Controls that are not optimized are `us`
-    (N, nu), zero where not given; controls that are optimized start from it.
+    (nx,) a hard final equality whose NaN entries are free, and so are `waypoints`, a mapping from knots to states.
+    `bounds` hold at every state that is not given and for every input, `constraints` at their knots. With
+    `horizon` = (lower, upper) [s] the final time is free between them, `num_steps` intervals of equal length
+    (collocation); a `running_cost` of 1.0 is then the time itself. `optimize` names what may change: "controls" and/or
+    "initial_state", the latter where `initial_state_mask` (nx,) is True, x0 being the first guess there. Controls that
+    are not optimized are `us` (N, nu), zero where not given; controls that are optimized start from it.
 
     `parameters` names some of the model's (see `list_parameters`), or maps names to values, which hold in all steps;
     with "parameters" in `optimize` these are where the search starts, between `parameter_bounds` (a mapping from
@@ -54,9 +44,12 @@ class Problem:
     _: KW_ONLY
     x0: Any
     num_steps: int
-    running_cost: RunningCost | None = None
+    running_cost: Any = None  # becomes a RunningCost
     final_cost: FinalCost | None = None
     x_goal: Any = None
+    waypoints: Any = None  # becomes a dict
+    constraints: Any = ()  # becomes a tuple of Constraints
+    horizon: Any = None
     bounds: Any = None  # Bounds
     optimize: Sequence[str] = ("controls",)
     initial_state_mask: Any = None
@@ -76,13 +69,16 @@ class Problem:
         self._check_parameters()
         if not (self.bounds is None or isinstance(self.bounds, Bounds)):
             raise InputError("bounds", got=type(self.bounds).__name__, expected="Bounds")
-        self._set("bounds", _resolve_bounds(model, self.bounds or Bounds()))
+        limits = plant_limits(model.plant)
+        self._set("bounds", resolve_bounds(self.bounds, limits, model.state_names, model.input_names))
         self._set("initial_state_mask", self._check_mask())
         self._set("us", self._check_us())
         self._check_inside("x0", self.x0, "x")
         if self.x_goal is not None:
-            self._set("x_goal", array_with_gaps("x_goal", self.x_goal, (model.nx,)))
-            self._check_goal()
+            self._set("x_goal", self._check_waypoint("x_goal", self.x_goal))
+        self._set("waypoints", self._check_waypoints())
+        self._set("constraints", self._check_constraints())
+        self._set("horizon", self._check_horizon())
         self._check_costs()
 
     def _set(self, name: str, value: Any) -> None:
@@ -111,6 +107,34 @@ class Problem:
     def goal(self) -> Array:
         """(nx,) the hard final state; NaN where it is free."""
         return np.full(self.model.nx, np.nan) if self.x_goal is None else np.asarray(self.x_goal)
+
+    @property
+    def initial_state_is_given(self) -> bool:
+        return not self.initial_state_mask.any()
+
+    def state_limits(self) -> tuple[Array, Array]:
+        """(lower (N+1, nx), upper (N+1, nx)): the bounds of each state, x0, waypoints and goal where they are given."""
+        sides = [np.tile(side, (self.num_steps + 1, 1)) for side in (self.bounds.x_lower, self.bounds.x_upper)]
+        start = np.where(self.initial_state_mask, np.nan, self.x0)
+        for knot, wanted in {0: start, **self.waypoints, self.num_steps: self.goal}.items():
+            for side in sides:
+                side[knot] = np.where(np.isnan(wanted), side[knot], wanted)
+        return sides[0], sides[1]
+
+    def constraint_excess(self, xs: Array, us: Array) -> dict[str, tuple[float, int]]:
+        """The largest excess over its bounds of each constraint and the knot it is at, at xs (N+1, nx) under us.
+
+        us is (N, nu), or (N+1, nu) at the knots; waypoints are constraints here too.
+        """
+        found: dict[str, tuple[float, int]] = {}
+        for c in self.constraints:
+            knots = c.at_knots(self.num_steps, self.initial_state_is_given)
+            worst = max((c.excess(xs[k], us[min(k, len(us) - 1)]), k) for k in knots)
+            found[c.label] = max(worst, found.get(c.label, worst))
+        for k, wanted in self.waypoints.items():
+            distance = np.abs(xs[k] - wanted)[~np.isnan(wanted)]
+            found[f"waypoint at knot {k}"] = (float(np.max(distance, initial=0.0)), k)
+        return found
 
     def goal_error(self, x: Array) -> Array:
         """(nx,) the distance of `x` from the goal, 0 where the goal is free."""
@@ -182,14 +206,44 @@ class Problem:
             got = float(np.atleast_2d(values)[tuple(outside[0])])
             raise InputError(f"{subject}, {names[i]}", got=got, expected=f"within [{lower[i]:g}, {upper[i]:g}]")
 
-    def _check_goal(self) -> None:
-        goal = self.goal
-        if np.any(np.isinf(goal)):
-            raise InputError("x_goal", got=goal, expected="finite numbers, NaN where free")
-        inside = np.where(np.isnan(goal), np.clip(0.0, self.bounds.x_lower, self.bounds.x_upper), goal)
-        self._check_inside("x_goal", inside, "x")
+    def _check_waypoint(self, subject: str, given: Any) -> Array:
+        waypoint = array_with_gaps(subject, given, (self.model.nx,))
+        if np.any(np.isinf(waypoint)):
+            raise InputError(subject, got=waypoint, expected="finite numbers, NaN where free")
+        inside = np.clip(0.0, self.bounds.x_lower, self.bounds.x_upper)
+        self._check_inside(subject, np.where(np.isnan(waypoint), inside, waypoint), "x")
+        return waypoint
+
+    def _check_waypoints(self) -> dict[int, Array]:
+        found = {}
+        for knot, given in (self.waypoints or {}).items():
+            if isinstance(knot, bool) or not isinstance(knot, (int, np.integer)) or not 0 < knot < self.num_steps:
+                expected = f"whole numbers from 1 to {self.num_steps - 1} (the last state's is x_goal)"
+                raise InputError("knots of waypoints", got=repr(knot), expected=expected)
+            found[int(knot)] = self._check_waypoint(f"waypoint at knot {knot}", given)
+        return dict(sorted(found.items()))
+
+    def _check_constraints(self) -> tuple[Constraint, ...]:
+        given = (self.constraints,) if isinstance(self.constraints, Constraint) else tuple(self.constraints)
+        for constraint in given:
+            if not isinstance(constraint, Constraint):
+                raise InputError("constraints", got=type(constraint).__name__, expected="Constraints")
+            constraint.at_knots(self.num_steps, self.initial_state_is_given)
+        return tuple(constraint.resolved(self.x0, np.zeros(self.model.nu)) for constraint in given)
+
+    def _check_horizon(self) -> tuple[float, float] | None:
+        if self.horizon is None:
+            return None
+        if not (isinstance(self.horizon, (tuple, list)) and len(self.horizon) == 2):
+            raise InputError("horizon", got=repr(self.horizon), expected="(lower, upper) in seconds")
+        lower, upper = (positive_float("horizon [s]", value) for value in self.horizon)
+        if lower > upper:
+            raise InputError("horizon", got=repr(self.horizon), expected="lower at most upper")
+        return lower, upper
 
     def _check_costs(self) -> None:
+        if isinstance(self.running_cost, (int, float)) and self.horizon is not None:
+            self._set("running_cost", ConstantCost(positive_float("running_cost", self.running_cost)))
         costs = (self.running_cost, self.final_cost, self.trajectory_cost)
         if all(cost is None for cost in costs) and np.all(np.isnan(self.goal)):
             raise InputError("problem", got="no cost and no goal", expected="a cost, an x_goal, or both")
@@ -213,30 +267,3 @@ def _check_optimize(model: Model, optimize: Sequence[str]) -> tuple[str, ...]:
     if "controls" in names and model.nu == 0:
         raise InputError("optimize", got='"controls", but the model has no actuators', expected="an actuated model")
     return names
-
-
-def _resolve_bounds(model: Model, bounds: Bounds) -> Bounds:
-    plant = model.plant
-    own = {
-        "x_lower": np.concatenate([plant.GetPositionLowerLimits(), plant.GetVelocityLowerLimits()]),
-        "x_upper": np.concatenate([plant.GetPositionUpperLimits(), plant.GetVelocityUpperLimits()]),
-        "u_lower": plant.GetEffortLowerLimits(),
-        "u_upper": plant.GetEffortUpperLimits(),
-    }
-    resolved = {}
-    for name, limits in own.items():
-        given = getattr(bounds, name)
-        if given is None:
-            resolved[name] = frozen(limits)
-        else:
-            checked = array_with_gaps(name, given, limits.shape)
-            resolved[name] = frozen(np.where(np.isnan(checked), limits, checked))
-    for kind, names in (("x", model.state_names), ("u", model.input_names)):
-        lower, upper = resolved[f"{kind}_lower"], resolved[f"{kind}_upper"]
-        crossed = np.flatnonzero((lower > upper) | (lower == np.inf) | (upper == -np.inf))
-        if len(crossed):
-            i = int(crossed[0])
-            raise InputError(
-                f"bounds of {names[i]}", got=f"[{lower[i]:g}, {upper[i]:g}]", expected="lower at most upper"
-            )
-    return Bounds(**resolved)

@@ -99,6 +99,8 @@ def solve(
 
 def _check_method(problem: Problem, method: str) -> None:
     """Refuse a problem that `method` cannot take."""
+    if problem.constraints or problem.waypoints or problem.horizon is not None:
+        raise InputError("constraints, waypoints, horizon", got="given", expected="none")
     if method == "ilqr":
         check_problem(problem)
     elif method == "collocation":

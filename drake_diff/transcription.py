@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from drake_diff.arrays import Array, array_with_gaps, finite_array, frozen, positive_float, positive_int
+from drake_diff.bounds import Bounds
 from drake_diff.cost import FinalCost, QuadraticCost
 from drake_diff.dynamics import Dynamics, Pointwise
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.nonlinear_program import Limits, Outcome, solve_program
-from drake_diff.problem import Bounds
 from drake_diff.transcribed import Transcribed
 from drake_diff.transcription_program import OptimalControl, RunningRate, TranscribedProgram
 from drake_diff.transcription_scheme import SCHEMES, node_fractions

@@ -14,9 +14,9 @@ from pydrake.solvers import MathematicalProgram
 
 from drake_diff.arrays import Array, finite_array
 from drake_diff.autodiff import chain, chain_rows
+from drake_diff.bounds import Bounds
 from drake_diff.cost import FinalCost, QuadraticCost, differentiate_cost, differentiate_final_cost
 from drake_diff.dynamics import Dynamics, Pointwise
-from drake_diff.problem import Bounds
 from drake_diff.transcription_scheme import Scheme, interval_defects, node_weights, per_interval
 
 # Variables of one constraint: several intervals share one, which saves calls, while AutoDiffXd stays small.
