@@ -153,3 +153,17 @@ def penetration(model: Model) -> float:
     except RuntimeError as error:
         raise SimulationError(f"Drake cannot measure how deep the geometries overlap: {error}") from error
     return float(max((pair.depth for pair in pairs), default=0.0))
+
+
+def thinnest_geometry(model: Model) -> tuple[float, str]:
+    """(thickness [m], name) of the thinnest geometry that may collide; (inf, "nothing") where none has a size."""
+    port = model.plant.get_geometry_query_input_port()
+    found = (float("inf"), "nothing")
+    if not port.HasValue(model.double.context):
+        return found
+    inspector = port.Eval(model.double.context).inspector()
+    for geometry in {g for pair in inspector.GetCollisionCandidates() for g in pair}:
+        box = inspector.GetObbInGeometryFrame(geometry)
+        if box is not None:  # a half space has none
+            found = min(found, (2 * float(np.min(box.half_width())), str(inspector.GetName(geometry))))
+    return found

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from drake_diff.exceptions import ArtifactError
+from drake_diff.nonlinear_program import FEASIBILITY_TOLERANCE
 from drake_diff.problem import Problem
 from drake_diff.provenance import file_evidence, gradient_evidence, provenance_of
 from drake_diff.record import (
@@ -25,7 +26,7 @@ from drake_diff.record import (
     Solver,
     WallClock,
 )
-from drake_diff.solution import FEASIBILITY_TOLERANCE, INTEGRATION_TOLERANCE, Solution, Status
+from drake_diff.solution import INTEGRATION_TOLERANCE, Solution, Status
 from drake_diff.whole_file import write_whole
 
 RECORD, TRACE, REPLAY = "record.json", "trace.mcap", "replay.html"

@@ -18,11 +18,18 @@ from drake_diff.arrays import Array
 from drake_diff.augmented_lagrangian import GROWTH, LARGEST_PENALTY, StateConstraints
 from drake_diff.exceptions import InputError, SimulationError
 from drake_diff.expansion import Motion, expand, jacobians_along
-from drake_diff.nonlinear_program import Limits, NlpResult, Outcome, Report, interrupt_flag
+from drake_diff.nonlinear_program import (
+    FEASIBILITY_TOLERANCE,
+    Iteration,
+    Limits,
+    NlpResult,
+    Outcome,
+    Report,
+    interrupt_flag,
+)
 from drake_diff.problem import Problem
 from drake_diff.riccati import LinearQuadratic, Policy, slope_along, solve_riccati
 from drake_diff.secant import DynamicsCurvature
-from drake_diff.solution import FEASIBILITY_TOLERANCE, Iteration
 from drake_diff.step import advance
 from drake_diff.tangent import tangent_space
 

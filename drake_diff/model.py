@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from drake_diff.parameters import Parameter
 
 CONTACT_APPROXIMATIONS = ("sap", "similar", "lagged")
-OTHER_TIME_STEPS = 64  # how many rebuilt models are kept: a certificate by the time step needs 26
+OTHERS_KEPT = 64  # how many rebuilt models are kept: a certificate by the time step needs 26
 
 
 class Model:
@@ -55,14 +55,14 @@ class Model:
         source: Path | None,
         notes: tuple[str, ...] = (),
         contact_geometry: str | None = None,
-        rebuild: "Callable[[float], Model] | None" = None,
+        rebuild: "Callable[..., Model] | None" = None,
     ):
         self.diagram = diagram
         self.source = source
         self.notes = notes
         self.contact_geometry = contact_geometry  # the route around refused pairs that the user chose
         self._rebuild = rebuild
-        self._others: dict[float, Model] = {}  # the same model at other time steps
+        self._others: dict[tuple[str, Any], Model] = {}  # the same model with one thing changed
         self.has_other_parameters = False  # in its contexts, for the time being: see `parameters.applied`
         self.path = path_to_the_plant(diagram)
         self.plant: MultibodyPlant = follow(diagram, self.path)
@@ -94,19 +94,28 @@ class Model:
 
     def at_time_step(self, time_step: float) -> "Model":
         """The same model at another time step [s]. ModelError where it came from a diagram, which has but one."""
+        return self._other(time_step=positive_float("time_step [s]", time_step))
+
+    def with_contact(self, approximation: str) -> "Model":
+        """The same model with another contact approximation (sap, similar, lagged). ModelError like `at_time_step`."""
+        _check_choice("contact_approximation", approximation, CONTACT_APPROXIMATIONS)
+        return self._other(contact_approximation=approximation)
+
+    def _other(self, **change: Any) -> "Model":
         if self._rebuild is None:
             raise ModelError("a model from a diagram keeps its time step: build the diagram again with another")
-        if time_step not in self._others:
-            if len(self._others) >= OTHER_TIME_STEPS:
+        key = next(iter(change.items()))
+        if key not in self._others:
+            if len(self._others) >= OTHERS_KEPT:
                 self._others.pop(next(iter(self._others)))
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", ModelWarning)  # said when the model was loaded first
-                self._others[time_step] = self._rebuild(positive_float("time_step [s]", time_step))
-        return self._others[time_step]
+                self._others[key] = self._rebuild(**change)
+        return self._others[key]
 
     @property
     def can_rebuild(self) -> bool:
-        """Whether the model can be had at another time step: one from a file can."""
+        """Whether the model can be had at another time step or contact approximation: one from a file can."""
         return self._rebuild is not None
 
     @cached_property
@@ -234,17 +243,18 @@ def load_model(
     except RuntimeError as error:
         raise ModelError(f"{source} cannot be finalized: {error}") from error
 
-    def rebuild(other: float) -> Model:
-        return load_model(
-            path,
-            time_step=other,
-            contact_model=contact_model,
-            contact_approximation=contact_approximation,
-            contact_geometry=contact_geometry,
-            weld_base=weld_base,
-            ground=ground,
-            gravity=gravity,
-        )
+    options: dict[str, Any] = {
+        "time_step": time_step,
+        "contact_model": contact_model,
+        "contact_approximation": contact_approximation,
+        "contact_geometry": contact_geometry,
+        "weld_base": weld_base,
+        "ground": ground,
+        "gravity": gravity,
+    }
+
+    def rebuild(**changes: Any) -> Model:
+        return load_model(path, **{**options, **changes})
 
     return Model(diagram, source=source, notes=notes, contact_geometry=contact_geometry, rebuild=rebuild)
 

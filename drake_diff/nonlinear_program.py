@@ -25,11 +25,22 @@ from pydrake.solvers import (
 
 from drake_diff.arrays import Array
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, UnknownNameError
-from drake_diff.solution import Iteration
 
+FEASIBILITY_TOLERANCE = 1e-5  # defect, goal and bounds, in the state's and input's own units
 SOLVERS = ("ipopt", "snopt")
 REPORT_PERIOD = 0.2  # [s] between two progress reports: each costs an evaluation of every constraint
 Report = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One row of the solver's own table; NaN where it prints no such number."""
+
+    iteration: int
+    objective: float
+    primal_infeasibility: float
+    dual_infeasibility: float
+    step: float
 
 
 class Outcome(enum.Enum):

@@ -9,15 +9,17 @@ import numpy as np
 
 from drake_diff.arrays import Array
 from drake_diff.certificate import Certificate
-from drake_diff.continuous import EquationsOfMotion
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model import Model
+from drake_diff.nonlinear_program import Iteration
 from drake_diff.parameters import ParameterVector, applied, select
 from drake_diff.problem import Problem
-from drake_diff.rollout import Rollout, roll_states, rollout
+from drake_diff.replay import Plan, Replay, held, replay_open_loop, replays
+from drake_diff.rollout import Rollout, roll_states
 from drake_diff.step import advance
+from drake_diff.transcribed import Collocated
+from drake_diff.transcription import transcribed_from
 
-FEASIBILITY_TOLERANCE = 1e-5  # defect, goal and bounds, in the state's and input's own units
 # Between two knots the transcription is a cubic; further than this [state units] from an accurate integration
 # its motion is not the model's.
 INTEGRATION_TOLERANCE = 1e-2
@@ -56,24 +58,15 @@ _SENTENCES = {
 }
 
 
-@dataclass(frozen=True)
-class Iteration:
-    """One row of the solver's own table; NaN where it prints no such number."""
-
-    iteration: int
-    objective: float
-    primal_infeasibility: float
-    dual_infeasibility: float
-    step: float
-
-
 @dataclass(frozen=True, eq=False)
 class Solution:
     """A motion xs (N+1, nx) under us (N, nu), how it was found, and what it measures on Drake's double plant.
 
-    The inputs of a discrete method are held over each step. Those of collocation are linear between knots, `us`
-    holding knots 0 ... N-1 and `u_final` (nu,) the last one. `cost`, `defect`, `bound_violation` and the rest
-    are computed from xs and us each time a Solution is made, never taken from the solver.
+    The inputs of a discrete method (`scheme` "step") are held over each step. Those of a collocation scheme are at
+    the knots, `u_final` (nu,) at the last one, and linear in between, or, of hermite_simpson, the parabola through
+    `us_mid` (N, nu) at the midpoints. `horizon` [s] is num_steps * time_step, or what a free one came to.
+    `cost`, `defect`, `bound_violation`, `replays` and the rest are computed from xs and us each time a Solution is
+    made, never taken from the solver.
     """
 
     problem: Problem
@@ -83,7 +76,10 @@ class Solution:
     message: str
     xs: Array
     us: Array
+    scheme: str = "step"
+    us_mid: Array | None = None
     u_final: Array | None = None
+    free_horizon: float | None = None  # [s] where the problem leaves it free
     parameters: Array | None = None  # (np,) the values of `problem.parameters`; the problem's own where None
     iterations: tuple[Iteration, ...] = ()
     certificates: tuple[Certificate, ...] = ()
@@ -102,33 +98,52 @@ class Solution:
         """The problem's parameters as they were found."""
         return self.problem.parameters if self.parameters is None else self.problem.parameters.at(self.parameters)
 
+    @property
+    def horizon(self) -> float:
+        """[s] from the first state to the last."""
+        whole = self.problem.num_steps * self.problem.model.time_step
+        return whole if self.free_horizon is None else self.free_horizon
+
+    @property
+    def time_step(self) -> float:
+        """[s] from one state to the next."""
+        return self.horizon / self.problem.num_steps
+
     @cached_property
     def cost(self) -> float:
         """The objective of xs and us, as `Problem` defines it; inf where it is not finite."""
-        total = self.problem.objective(self.xs, self.inputs_at_knots)
+        if not self._is_whole:
+            return float("inf")
+        total = self.problem.objective(self.xs, self.us) if self.transcribed is None else self.transcribed.cost
         return total if np.isfinite(total) else float("inf")
 
     @property
     def times(self) -> Array:
         """(N+1,) [s] of the states."""
-        return np.asarray(self.problem.model.time_step * np.arange(len(self.xs)), dtype=float)
+        return np.asarray(self.time_step * np.arange(len(self.xs)), dtype=float)
 
     @property
     def inputs_at_knots(self) -> Array:
-        """The inputs at the knots: (N, nu) held ones, (N+1, nu) where they are linear in between."""
+        """The inputs at the knots: (N, nu) held ones, (N+1, nu) those of collocation."""
         return self.us if self.u_final is None else np.vstack([self.us, self.u_final])
+
+    @cached_property
+    def transcribed(self) -> Collocated | None:
+        """The motion of a collocation scheme, from xs, us, us_mid and u_final; None where they are no such motion."""
+        if self.scheme == "step" or not self._is_whole:
+            return None
+        return transcribed_from(self.problem, self.scheme, self.xs, self.inputs_at_knots, self.us_mid, self.horizon)
 
     @cached_property
     def defects(self) -> Array:
         """(N,) how far each interval is from the dynamics, as a state change, in the worst coordinate's unit.
 
-        Discrete: |x_(k+1) - step(x_k, u_k)|. Collocation: h |dx/dt - f(x, u)| of the cubic through the knots at
-        its midpoint, Drake's own defect times h.
+        Discrete: |x_(k+1) - step(x_k, u_k)|. Collocation: the scheme's own equations.
         """
-        if self.us.shape != self.problem.us.shape or self.xs.shape != (len(self.us) + 1, self.problem.model.nx):
-            return np.full(max(self.problem.num_steps, 1), np.inf)
-        if self.u_final is not None:
-            return np.array([self._collocation_defect(k) for k in range(len(self.us))])
+        if not self._is_whole:
+            return np.full(self.problem.num_steps, np.inf)
+        if self.transcribed is not None:
+            return np.nan_to_num(self.transcribed.defects, nan=np.inf)
         with applied(self.vector) as model:
             return np.array([self._step_defect(model, k) for k in range(len(self.us))])
 
@@ -143,9 +158,7 @@ class Solution:
 
         Of a discrete method the step is the dynamics, and this is its defect.
         """
-        if self.u_final is None:
-            return self.defects
-        return np.array([self._integration_error(k) for k in range(len(self.us))])
+        return self.defects if self.transcribed is None else self.transcribed.errors
 
     @property
     def integration_error(self) -> float:
@@ -155,16 +168,39 @@ class Solution:
     @cached_property
     def bound_violation(self) -> float:
         """The largest excess over a bound of a state that is not given, an input, or a parameter."""
-        b = self.problem.bounds
-        states, inputs = self.xs[1:], self.inputs_at_knots
+        return max((excess for excess, _ in self.bound_excess.values()), default=0.0)
+
+    @cached_property
+    def bound_excess(self) -> dict[str, tuple[float, int]]:
+        """The largest excess over a bound and its knot, by the state's, input's or parameter's name, where above 0.
+
+        States that are given have none; collocation's midpoints count to the knot before them.
+        """
+        b, names = self.problem.bounds, self.problem.model.input_names
         free = self.problem.initial_state_mask
-        if not (np.all(np.isfinite(states)) and np.all(np.isfinite(inputs))):
-            return float("inf")
-        excess = [b.x_lower - states, states - b.x_upper, b.u_lower - inputs, inputs - b.u_upper]
-        lowest, highest = self.problem.bounds_of_parameters()
-        excess += [lowest - self.vector.values, self.vector.values - highest]
-        excess += [(b.x_lower - self.xs[0])[free], (self.xs[0] - b.x_upper)[free]]
-        return float(max(np.max(e, initial=0.0) for e in excess))
+        given = np.zeros(self.xs.shape, dtype=bool)
+        given[0] = ~free
+        inside = np.clip(0.0, b.x_lower, b.x_upper)
+        sides = [(self.problem.model.state_names, np.where(given, inside, self.xs), b.x_lower, b.x_upper)]
+        sides += [(names, us, b.u_lower, b.u_upper) for us in (self.inputs_at_knots, self.us_mid) if us is not None]
+        sides.append((self.vector.names, self.vector.values[None], *self.problem.bounds_of_parameters()))
+        found: dict[str, tuple[float, int]] = {}
+        for labels, values, lower, upper in sides:
+            excess = np.where(np.isfinite(values), np.maximum(lower - values, values - upper), np.inf)
+            for i in np.flatnonzero(excess.max(axis=0, initial=0.0) > 0):
+                k = int(np.argmax(excess[:, i]))
+                found[labels[i]] = max((float(excess[k, i]), k), found.get(labels[i], (0.0, 0)))
+        return found
+
+    @cached_property
+    def constraint_excess(self) -> dict[str, tuple[float, int]]:
+        """The largest excess and its knot of each of the problem's constraints and waypoints."""
+        return self.problem.constraint_excess(self.xs, self.inputs_at_knots)
+
+    @property
+    def constraint_violation(self) -> float:
+        """The largest excess over a bound of a constraint, or distance from a waypoint, in its own unit."""
+        return max((excess for excess, _ in self.constraint_excess.values()), default=0.0)
 
     @cached_property
     def goal_error(self) -> float:
@@ -177,18 +213,25 @@ class Solution:
         fixed = ~self.problem.initial_state_mask
         return _largest(np.abs(self.xs[0] - self.problem.x0)[fixed])
 
+    @property
+    def plan(self) -> Plan:
+        """What is replayed: states, and inputs held over each step, or their means over the parts of an interval."""
+        continuous = self.transcribed is not None
+        sample = held(self.xs, self.us) if self.transcribed is None else self.transcribed.sample
+        return Plan(self.problem, self.vector, self.time_step, sample, continuous)
+
     @cached_property
     def replay(self) -> Rollout | None:
-        """The discrete plant's own open-loop motion from xs[0] under us; None where it cannot be taken.
+        """The discrete plant's own open-loop motion from xs[0]; None where it cannot be taken.
 
-        An input that is linear between knots is held at its mean over each step.
+        An input that changes between knots is held at its mean over each step.
         """
-        knots = self.inputs_at_knots
-        us = self.us if self.u_final is None else (knots[:-1] + knots[1:]) / 2
-        try:
-            return rollout(self.problem.model, self.xs[0], us, parameters=self.vector.to_dict())
-        except (SimulationError, ValueError):
-            return None  # not finite, or beyond what Drake can step: recorded as missing, never as zero
+        return replay_open_loop(self.plan)
+
+    @cached_property
+    def replays(self) -> tuple[Replay, ...]:
+        """The plan in every variant of the plant (step, half step, other contact), open loop and under TVLQR."""
+        return replays(self.plan)
 
     @cached_property
     def half_step_error(self) -> float:
@@ -199,16 +242,20 @@ class Solution:
         if self.replay is None:
             return float("inf")
         try:
-            finer = self.problem.model.at_time_step(self.problem.model.time_step / 2)
+            finer = self.problem.model.at_time_step(self.time_step / 2)
             with applied(select(finer, self.vector.to_dict())) as model:
                 end = roll_states(model, self.xs[0], np.repeat(self.replay.us, 2, axis=0))[-1]
         except (ModelError, SimulationError):
             return float("inf")
         return _largest(np.abs(end - self.xs[-1]))
 
-    @cached_property
-    def _equations(self) -> EquationsOfMotion:
-        return EquationsOfMotion(self.problem.model)
+    @property
+    def _is_whole(self) -> bool:
+        """Whether xs and the inputs have the problem's shapes, and all of collocation's are numbers."""
+        if self.us.shape != self.problem.us.shape or self.xs.shape != (len(self.us) + 1, self.problem.model.nx):
+            return False
+        parts = [part for part in (self.xs, self.inputs_at_knots, self.us_mid) if part is not None]
+        return self.scheme == "step" or all(bool(np.all(np.isfinite(part))) for part in parts)
 
     def _step_defect(self, model: Model, k: int) -> float:
         try:
@@ -216,48 +263,8 @@ class Solution:
         except SimulationError:
             return float("inf")
 
-    def _collocation_defect(self, k: int) -> float:
-        h, f, u = self.problem.model.time_step, self._equations, self.inputs_at_knots
-        x0, x1 = self.xs[k], self.xs[k + 1]
-        if not (np.all(np.isfinite(self.xs[k : k + 2])) and np.all(np.isfinite(u[k : k + 2]))):
-            return float("inf")
-        f0, f1 = f(x0, u[k]), f(x1, u[k + 1])
-        middle = (x0 + x1) / 2 + h / 8 * (f0 - f1)
-        slope = 1.5 / h * (x1 - x0) - (f0 + f1) / 4
-        return _largest(h * np.abs(slope - f(middle, (u[k] + u[k + 1]) / 2)))
-
-    def _integration_error(self, k: int) -> float:
-        u = self.inputs_at_knots
-        if not (np.all(np.isfinite(self.xs[k : k + 2])) and np.all(np.isfinite(u[k : k + 2]))):
-            return float("inf")
-        end = _integrate(self._equations, self.xs[k], u[k], u[k + 1], self.problem.model.time_step)
-        return _largest(np.abs(self.xs[k + 1] - end))
-
 
 def _largest(values: Array) -> float:
     """The largest value; inf where one is not a number, 0 where there is none."""
     values = np.asarray(values, dtype=float)
     return float("inf") if np.any(np.isnan(values)) else float(np.max(values, initial=0.0))
-
-
-def _integrate(f: EquationsOfMotion, x: Array, u0: Array, u1: Array, h: float) -> Array:
-    """(nx,): the classical Runge-Kutta method over `h` with u linear, halved until it moves by less than 1e-9."""
-    coarse = _runge_kutta(f, x, u0, u1, h, 2)
-    for substeps in (4, 8, 16, 32, 64):
-        fine = _runge_kutta(f, x, u0, u1, h, substeps)
-        if _largest(np.abs(fine - coarse)) < 1e-9:
-            break
-        coarse = fine
-    return fine
-
-
-def _runge_kutta(f: EquationsOfMotion, x: Array, u0: Array, u1: Array, h: float, substeps: int) -> Array:
-    dt = h / substeps
-    for i in range(substeps):
-        start, middle, end = (u0 + (u1 - u0) * s / substeps for s in (i, i + 0.5, i + 1))
-        k1 = f(x, start)
-        k2 = f(x + dt / 2 * k1, middle)
-        k3 = f(x + dt / 2 * k2, middle)
-        k4 = f(x + dt * k3, end)
-        x = x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    return x

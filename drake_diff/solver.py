@@ -14,6 +14,7 @@ from drake_diff.certify import certify
 from drake_diff.collocation import DEFAULT_SOLVER as COLLOCATION_SOLVER
 from drake_diff.collocation import solve_collocation
 from drake_diff.continuous import EquationsOfMotion
+from drake_diff.dynamics import Dynamics, plant_dynamics
 from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.ilqr import check_problem, is_unconstrained, solve_ilqr
 from drake_diff.nonlinear_program import SOLVERS, Limits, NlpResult, Outcome
@@ -21,6 +22,8 @@ from drake_diff.problem import Problem
 from drake_diff.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
 from drake_diff.shooting import RolloutCost, ShootingVariables, solve_shooting
 from drake_diff.solution import Solution, Status
+from drake_diff.transcription import transcribe_problem
+from drake_diff.transcription_scheme import SCHEMES
 from drake_diff.verdict import ended, judged, refused, why_blind
 
 METHODS = ("auto", "collocation", "shooting", "ilqr")
@@ -36,6 +39,7 @@ def solve(
     *,
     method: str = "auto",
     initial_guess: Any = None,
+    scheme: str | None = None,
     solver: str | None = None,
     max_iterations: int = 500,
     time_limit: float | None = None,
@@ -75,6 +79,7 @@ def solve(
     reason = "asked for"
     if method == "auto":
         method, reason = choose_method(problem)
+    scheme = _choose_scheme(method, scheme, solver, asked=reason == "asked for")
     solver = solver or {"collocation": COLLOCATION_SOLVER, "shooting": SHOOTING_SOLVER}.get(method, "riccati")
     xs, us = _guess(problem, method, initial_guess, seed)
     options = {
@@ -89,7 +94,7 @@ def solve(
     _check_method(problem, method)
     if on_start is not None:
         on_start()
-    run = _Run(problem, method, solver, limits, options, report)
+    run = _Run(problem, method, scheme, solver, limits, options, report)
     if method == "collocation":
         return run.collocate(xs, us)
     if method == "ilqr":
@@ -99,8 +104,8 @@ def solve(
 
 def _check_method(problem: Problem, method: str) -> None:
     """Refuse a problem that `method` cannot take."""
-    if problem.constraints or problem.waypoints or problem.horizon is not None:
-        raise InputError("constraints, waypoints, horizon", got="given", expected="none")
+    if problem.horizon is not None and method != "collocation":
+        raise InputError("horizon", got="given", expected='none for discrete steps: method="collocation" takes it')
     if method == "ilqr":
         check_problem(problem)
     elif method == "collocation":
@@ -109,6 +114,21 @@ def _check_method(problem: Problem, method: str) -> None:
             raise InputError("parameters, trajectory_cost", got="given", expected='method="shooting"')
         if not problem.optimizes_controls:
             raise InputError("optimize", got=list(problem.optimize), expected='"controls" for method="collocation"')
+
+
+def _choose_scheme(method: str, scheme: str | None, solver: str | None, *, asked: bool) -> str:
+    """The collocation scheme, "step" of the discrete methods; InputError where `solver` does not go with it."""
+    if method != "collocation":
+        if scheme is not None:
+            raise InputError("scheme", got=repr(scheme), expected=f'none for method="{method}"')
+        return "step"
+    if scheme is None:
+        scheme = "drake" if asked or solver == "snopt" else "hermite_simpson"
+    if scheme not in SCHEMES:
+        raise UnknownNameError("scheme", got=scheme, known=SCHEMES)
+    if solver == "snopt" and scheme != "drake":
+        raise InputError("solver", got='"snopt"', expected=f'"ipopt" for scheme="{scheme}"')
+    return scheme
 
 
 def choose_method(problem: Problem) -> tuple[str, str]:
@@ -152,25 +172,37 @@ class _Run:
         self,
         problem: Problem,
         method: str,
+        scheme: str,
         solver: str,
         limits: Limits,
         options: dict[str, Any],
         report: Progress | None,
     ):
-        self.problem, self.method, self.solver = problem, method, solver
+        self.problem, self.method, self.scheme, self.solver = problem, method, scheme, solver
         self.limits, self.options, self.report = limits, options, report
         self.start = time.monotonic()
         self.knots = np.unique(np.linspace(0, problem.num_steps - 1, CERTIFIED_KNOTS).astype(int))
 
     def collocate(self, xs: Array, us: Array) -> Solution:
-        equations = EquationsOfMotion(self.problem.model)
-        before = self._certify_equations(equations, xs, us)
+        dynamics = plant_dynamics(self.problem.model)
+        before = self._certify_dynamics(dynamics, xs, us)
+        result, found = self._drake(xs, us) if self.scheme == "drake" else self._transcribe(xs, us)
+        finite = bool(np.all(np.isfinite(found["xs"])))
+        after = self._certify_dynamics(dynamics, found["xs"], found["us"]) if finite else ()
+        return judged(self._draft(**found, certificates=before + after), result)
+
+    def _drake(self, xs: Array, us: Array) -> tuple[NlpResult, dict[str, Any]]:
         result, xs, us, u_final = solve_collocation(
             self.problem, xs, us, solver=self.solver, limits=self.limits, report=self.report
         )
-        after = self._certify_equations(equations, xs, us) if np.all(np.isfinite(xs)) else ()
-        draft = self._draft(xs, us, u_final=u_final, certificates=before + after)
-        return judged(draft, result)
+        return result, {"xs": xs, "us": us, "u_final": u_final}
+
+    def _transcribe(self, xs: Array, us: Array) -> tuple[NlpResult, dict[str, Any]]:
+        knots = np.vstack([us, us[-1:]])
+        motion = transcribe_problem(self.problem, self.scheme, (xs, knots), limits=self.limits, report=self.report)
+        result = NlpResult(motion.nodes.ravel(), motion.outcome, motion.message, motion.iterations)
+        found = {"xs": motion.xs, "us": motion.us[:-1], "u_final": motion.us[-1], "us_mid": motion.us_mid}
+        return result, found | {"free_horizon": motion.horizon if self.problem.horizon else None}
 
     def sweep(self, xs: Array, us: Array, *, given: bool) -> Solution:
         """iLQR; from the states of a `given` guess, which need not be a rollout, else from the rollout of `us`."""
@@ -216,11 +248,11 @@ class _Run:
         return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
 
     def _draft(self, xs: Array, us: Array, **found: Any) -> Solution:
-        if found.get("u_final") is not None:
-            found["u_final"] = frozen(found["u_final"])
+        found |= {name: frozen(found[name]) for name in ("u_final", "us_mid") if found.get(name) is not None}
         return Solution(
             problem=self.problem,
             method=self.method,
+            scheme=self.scheme,
             solver=self.solver,
             status=Status.FAILED,
             message="",
@@ -238,14 +270,18 @@ class _Run:
         certificates = tuple(certify(self.problem.model, xs[k], us[k], parameters=parameters) for k in self.knots)
         return xs, us, certificates, why_blind(self.problem, variables, z)
 
-    def _certify_equations(self, equations: EquationsOfMotion, xs: Array, us: Array) -> tuple[Certificate, ...]:
-        model = self.problem.model
+    def _certify_dynamics(self, dynamics: Dynamics, xs: Array, us: Array) -> tuple[Certificate, ...]:
+        """Certificates, at some knots, of the derivative that collocation uses against the equations' differences."""
+        model, equations = self.problem.model, EquationsOfMotion(self.problem.model)
+        own = self.scheme != "drake"
         names = tuple(f"d({name})/dt" for name in model.state_names)
 
         def f(z: Array) -> Array:
             return equations(z[: model.nx], z[model.nx :])
 
         def jacobian(z: Array) -> Array:
+            if own:
+                return np.asarray(dynamics.linearize(z[None])[1][0])
             variables = InitializeAutoDiff(z).ravel()
             return gradient_rows(equations.autodiff(variables[: model.nx], variables[model.nx :]), len(z))
 
@@ -256,7 +292,7 @@ class _Run:
                 jacobian,
                 rows=names,
                 columns=model.state_names + model.input_names,
-                method="autodiff, continuous time",
+                method="continuous time" if own else "autodiff, continuous time",
                 subject=f"the equations of motion of {model.name}",
             )
             for k in self.knots

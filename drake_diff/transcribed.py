@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff.arrays import Array
-from drake_diff.nonlinear_program import Outcome
-from drake_diff.solution import FEASIBILITY_TOLERANCE, Iteration
+from drake_diff.nonlinear_program import FEASIBILITY_TOLERANCE, Iteration, Outcome
 from drake_diff.transcription_program import OptimalControl
 from drake_diff.transcription_scheme import interval_defects, node_weights, per_interval
 
@@ -26,28 +25,16 @@ class Excess:
 
 
 @dataclass(frozen=True, eq=False)
-class Transcribed:
+class Collocated:
     """A motion at N+1 knots: xs (N+1, nx), us (N+1, nu), at the midpoints xs_mid, us_mid (N, ...) or None; T [s].
 
-    Between knots x' and u are the scheme's polynomials. `refinements` are (intervals, largest error) of each round.
+    Between knots x' and u are the scheme's polynomials.
     """
 
     task: OptimalControl
     mesh: Array  # (N+1,) fractions of the horizon
     nodes: Array  # (K, nx + nu): knots, and midpoints between them
     horizon: float
-    outcome: Outcome
-    message: str
-    iterations: tuple[Iteration, ...]
-    refinements: tuple[tuple[int, float], ...] = ()
-
-    @property
-    def success(self) -> bool:
-        """Whether the solver says that it solved it, and its equations, ends and bounds hold when measured again.
-
-        What lies between the nodes say `errors` and `violation_between_nodes`.
-        """
-        return self.outcome is Outcome.SOLVED and self.infeasibility <= FEASIBILITY_TOLERANCE
 
     @property
     def infeasibility(self) -> float:
@@ -80,6 +67,14 @@ class Transcribed:
     @property
     def us_mid(self) -> Array | None:
         return None if self.task.scheme.nodes == 1 else self.nodes[1::2, self.task.dynamics.nx :]
+
+    def sample(self, parts: int) -> tuple[Array, Array]:
+        """xs (m N + 1, nx) at the m-th parts of each interval, and the mean inputs us (m N, nu) over each part."""
+        k, tau = np.repeat(np.arange(len(self.mesh) - 1), parts), np.tile(np.arange(parts) / parts, len(self.mesh) - 1)
+        xs = np.vstack([self._between(k, tau)[0], self.xs[-1]])
+        weights = self.task.scheme.integrated(tau + 1 / parts) - self.task.scheme.integrated(tau)
+        us = per_interval(self.nodes[:, self.task.dynamics.nx :], self.task.scheme)[k]
+        return xs, parts * np.einsum("sj,sju->su", weights, us)
 
     @cached_property
     def cost(self) -> float:
@@ -157,12 +152,30 @@ class Transcribed:
         return z
 
 
+@dataclass(frozen=True, eq=False)
+class Transcribed(Collocated):
+    """What a solver found, and how it ended; `refinements` are (intervals, largest error) of each round."""
+
+    outcome: Outcome
+    message: str
+    iterations: tuple[Iteration, ...]
+    refinements: tuple[tuple[int, float], ...] = ()
+
+    @property
+    def success(self) -> bool:
+        """Whether the solver says that it solved it, and its equations, ends and bounds hold when measured again.
+
+        What lies between the nodes say `errors` and `violation_between_nodes`.
+        """
+        return self.outcome is Outcome.SOLVED and self.infeasibility <= FEASIBILITY_TOLERANCE
+
+
 def _finite(values: Array) -> Array:
     """With inf for what is no number."""
     return np.asarray(np.nan_to_num(values, nan=np.inf, posinf=np.inf))
 
 
-def violation_between_nodes(motion: Transcribed) -> Excess:
+def violation_between_nodes(motion: Collocated) -> Excess:
     """The largest excess over the bounds at 19 points within each interval, where the solver enforces nothing.
 
     A cost below the optimum of the problem with its bounds goes together with an excess here.

@@ -15,10 +15,11 @@ import numpy as np
 from drake_diff.arrays import Array, array_with_gaps, finite_array, frozen, positive_float, positive_int
 from drake_diff.bounds import Bounds
 from drake_diff.cost import FinalCost, QuadraticCost
-from drake_diff.dynamics import Dynamics, Pointwise
+from drake_diff.dynamics import Dynamics, Pointwise, plant_dynamics
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.nonlinear_program import Limits, Outcome, solve_program
-from drake_diff.transcribed import Transcribed
+from drake_diff.problem import Problem
+from drake_diff.transcribed import Collocated, Transcribed
 from drake_diff.transcription_program import OptimalControl, RunningRate, TranscribedProgram
 from drake_diff.transcription_scheme import SCHEMES, node_fractions
 
@@ -76,6 +77,47 @@ def transcribe_and_solve(
         motion = _solve(task, mesh, nodes, motion.horizon, solver, limits, report)
         rounds.append((len(mesh) - 1, float(np.max(_worst(motion)))))
     return dataclasses.replace(motion, refinements=tuple(rounds))
+
+
+def optimal_control(problem: Problem, scheme: str) -> OptimalControl:
+    """What `problem` asks of a collocation scheme; ModelError where its model has no continuous form."""
+    whole = problem.num_steps * problem.model.time_step
+    return _check_task(
+        plant_dynamics(problem.model),
+        np.where(problem.initial_state_mask, np.nan, problem.x0),
+        problem.goal,
+        problem.horizon or whole,
+        problem.running_cost,
+        problem.final_cost,
+        problem.bounds,
+        scheme,
+    )
+
+
+def transcribe_problem(
+    problem: Problem, scheme: str, guess: Any, *, limits: Limits, report: Callable[[str], None] | None
+) -> Transcribed:
+    """Solve `problem` on its own `num_steps` equal intervals from `guess`: (xs (N+1, nx), us (N+1, nu))."""
+    task, mesh = optimal_control(problem, scheme), np.linspace(0, 1, problem.num_steps + 1)
+    nodes, _ = _first_nodes(task, mesh, guess)
+    time = float(np.clip(problem.num_steps * problem.model.time_step, *task.horizon))
+    return _solve(task, mesh, nodes, time, "ipopt", limits, report)
+
+
+def transcribed_from(
+    problem: Problem, scheme: str, xs: Array, us: Array, us_mid: Array | None, horizon: float
+) -> Collocated:
+    """The motion with knots xs (N+1, nx), us (N+1, nu) and midpoint inputs (N, nu), linear in between where None."""
+    task, mesh = optimal_control(problem, scheme), np.linspace(0, 1, len(xs))
+    knots = np.hstack([xs, us])
+    if task.scheme.nodes == 1:
+        return Collocated(task, mesh, knots, horizon)
+    rates, h = task.dynamics.values(knots), horizon / (len(xs) - 1)
+    x_mid = (xs[:-1] + xs[1:]) / 2 + h / 8 * (rates[:-1] - rates[1:])
+    u_mid = (us[:-1] + us[1:]) / 2 if us_mid is None else us_mid
+    nodes = np.empty((2 * len(xs) - 1, knots.shape[1]))
+    nodes[::2], nodes[1::2] = knots, np.hstack([x_mid, u_mid])
+    return Collocated(task, mesh, nodes, horizon)
 
 
 def _solve(

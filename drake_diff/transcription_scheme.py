@@ -1,12 +1,14 @@
-"""Two collocation schemes as tableaus: trapezoid, and Hermite-Simpson with a free input at the midpoint.
+"""Collocation schemes as tableaus: trapezoid, Hermite-Simpson with a free input at the midpoint, and Drake's.
 
-Over an interval of length h with nodes 0 ... s (ends and, for Hermite-Simpson, the middle) both ask for
+Over an interval of length h with nodes 0 ... s (ends and, for Hermite-Simpson, the middle) they ask for
 
     sum_j states[i, j] x_j - h sum_j slopes[i, j] f(x_j, u_j) = 0,    cost = h sum_j weights[j] L(x_j, u_j),
 
 and their motion between nodes is x' the polynomial through f_j, u the polynomial through u_j (Betts, "Practical
 Methods for Optimal Control", ch. 4; Kelly, SIAM Review 59(4), 2017). Hermite-Simpson is in separated form: midpoint
-states are variables, so that bounds hold there too. Order: 2 and 4.
+states are variables, so that bounds hold there too. Order: 2 and 4. "drake" is what Drake's DirectCollocation
+transcribes: Hermite-Simpson with the mean of its neighbours for the midpoint's input, and the cost by the trapezoid
+rule, which makes the optimum of order 2.
 """
 
 from dataclasses import dataclass
@@ -25,6 +27,7 @@ class Scheme:
     states: Array
     slopes: Array
     basis: Array
+    input_is_linear: bool = False
 
     @property
     def nodes(self) -> int:
@@ -34,7 +37,7 @@ class Scheme:
     @cached_property
     def weights(self) -> Array:
         """(s+1,) the quadrature of an interval of length 1."""
-        return self.integrated(np.ones(1))[0]
+        return np.array([0.5, 0, 0.5]) if self.input_is_linear else self.integrated(np.ones(1))[0]
 
     def at(self, tau: Array) -> Array:
         """(S, s+1) the weight of each node's value at `tau` (S,) within an interval."""
@@ -46,14 +49,15 @@ class Scheme:
         return np.asarray(tau[:, None] ** powers / powers @ self.basis.T)
 
 
+_SIMPSON = (
+    np.array([[-1.0, 0, 1], [-0.5, 1, -0.5]]),
+    np.array([[1.0, 4, 1], [0.75, 0, -0.75]]) / 6,
+    np.array([[1.0, -3, 2], [0, 4, -4], [0, -1, 2]]),
+)
 SCHEMES = {
+    "hermite_simpson": Scheme(4, *_SIMPSON),
     "trapezoid": Scheme(2, np.array([[-1.0, 1]]), np.array([[0.5, 0.5]]), np.array([[1.0, -1], [0, 1]])),
-    "hermite_simpson": Scheme(
-        4,
-        np.array([[-1.0, 0, 1], [-0.5, 1, -0.5]]),
-        np.array([[1.0, 4, 1], [0.75, 0, -0.75]]) / 6,
-        np.array([[1.0, -3, 2], [0, 4, -4], [0, -1, 2]]),
-    ),
+    "drake": Scheme(2, *_SIMPSON, input_is_linear=True),
 }
 
 

@@ -10,10 +10,11 @@ from drake_diff.arrays import Array
 from drake_diff.contact import penetration
 from drake_diff.cost import differentiate_final_cost
 from drake_diff.exceptions import GradientError
-from drake_diff.nonlinear_program import NlpResult, Outcome
+from drake_diff.nonlinear_program import FEASIBILITY_TOLERANCE, NlpResult, Outcome
 from drake_diff.problem import Problem
+from drake_diff.replay import broken_variants
 from drake_diff.shooting import ShootingVariables, state_sensitivities
-from drake_diff.solution import FEASIBILITY_TOLERANCE, INTEGRATION_TOLERANCE, Solution, Status
+from drake_diff.solution import INTEGRATION_TOLERANCE, Solution, Status
 from drake_diff.step import set_state
 
 NO_EFFECT = 1e-12
@@ -69,23 +70,18 @@ def judged(draft: Solution, result: NlpResult) -> Solution:
         complaints.insert(0, f"the solver could not reach its tolerance ({result.message})")
     if not np.all(np.isfinite(draft.xs)):
         return ended(draft, Status.DIVERGED, "; ".join(complaints), **fields)
+    if not complaints:
+        complaints += broken_variants(draft.plan, draft.replays)
     status = Status.CONVERGED_NOT_VERIFIED if complaints else Status.CONVERGED
     return ended(draft, status, "; ".join(complaints), **fields)
 
 
 def complaints_about(solution: Solution) -> Iterator[str]:
-    """What does not hold of `solution` when measured again on Drake's plant, a clause each."""
-    for name, value in (
-        ("defect", solution.defect),
-        ("goal error", solution.goal_error),
-        ("bound violation", solution.bound_violation),
-        ("initial state error", solution.initial_state_error),
-    ):
-        if not value <= FEASIBILITY_TOLERANCE:
-            yield f"{name} {value:.3g} is above {FEASIBILITY_TOLERANCE:g}"
+    """What does not hold of `solution` when measured again on Drake's plant, a clause each, replays apart."""
+    yield from _infeasibilities(solution)
     if not np.isfinite(solution.cost):
         yield "the cost is not finite"
-    if solution.u_final is not None:
+    if solution.transcribed is not None:
         if not solution.integration_error <= INTEGRATION_TOLERANCE:
             knot = int(np.argmax(solution.integration_errors))
             yield (
@@ -99,6 +95,31 @@ def complaints_about(solution: Solution) -> Iterator[str]:
         if certificate.verdict != "agree":
             yield f"a gradient certificate says {certificate.verdict}: {certificate.worst}"
             break
+
+
+def _infeasibilities(solution: Solution) -> Iterator[str]:
+    """Equations, ends, bounds and constraints that do not hold, with the knots at which they do not."""
+    names, above = solution.problem.model.state_names, f"above {FEASIBILITY_TOLERANCE:g}"
+    if not solution.defect <= FEASIBILITY_TOLERANCE:
+        where = _spans(np.flatnonzero(~(solution.defects <= FEASIBILITY_TOLERANCE)))
+        yield f"defect {solution.defect:.3g} is {above}: the motion is not the model's after knots {where}"
+    if not solution.goal_error <= FEASIBILITY_TOLERANCE:
+        worst = int(np.argmax(np.nan_to_num(np.abs(solution.problem.goal_error(solution.xs[-1])), nan=np.inf)))
+        yield f"goal error {solution.goal_error:.3g} is {above}: {names[worst]} does not reach its goal"
+    for name, (excess, knot) in solution.bound_excess.items():
+        if not excess <= FEASIBILITY_TOLERANCE:
+            yield f"bound violation {excess:.3g} is {above}: {name} at knot {knot}"
+    for name, (excess, knot) in solution.constraint_excess.items():
+        if not excess <= FEASIBILITY_TOLERANCE:
+            yield f"constraint violation {excess:.3g} is {above}: {name} at knot {knot}"
+    if not solution.initial_state_error <= FEASIBILITY_TOLERANCE:
+        yield f"initial state error {solution.initial_state_error:.3g} is {above}"
+
+
+def _spans(knots: Any) -> str:
+    """Whole numbers as ranges: "0-11, 14"."""
+    runs = np.split(knots, np.flatnonzero(np.diff(knots) > 1) + 1)
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs if len(run))
 
 
 def _deepest(solution: Solution) -> tuple[float, int]:

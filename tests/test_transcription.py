@@ -612,7 +612,7 @@ def test_bad_dynamics_are_named(options, message):
         ({"horizon": (2, 1)}, "horizon: expected lower at most upper"),
         ({"horizon": (1, np.inf)}, r"horizon \[s\]: expected a finite number above 0"),
         ({"horizon": (1, 2, 3)}, "horizon: expected a number of seconds"),
-        ({"scheme": "radau"}, "scheme: expected one of hermite_simpson, trapezoid, got 'radau'"),
+        ({"scheme": "radau"}, "scheme: expected one of drake, hermite_simpson, trapezoid, got 'radau'"),
         ({"solver": "knitro"}, "solver: expected one of"),
         ({"bounds": (0, 1)}, "bounds: expected Bounds"),
         ({"guess": 3}, "guess: expected"),
