@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from drake_diff.constraint import Constraint
 from drake_diff.exceptions import ArtifactError
 from drake_diff.nonlinear_program import FEASIBILITY_TOLERANCE
 from drake_diff.problem import Problem
@@ -23,9 +24,11 @@ from drake_diff.record import (
     Failure,
     ParameterEvidence,
     Quantity,
+    ReplayEvidence,
     Solver,
     WallClock,
 )
+from drake_diff.replay import Replay
 from drake_diff.solution import INTEGRATION_TOLERANCE, Solution, Status
 from drake_diff.whole_file import write_whole
 
@@ -74,6 +77,7 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
         parameters=_parameters(solution),
         gradients=[gradient_evidence(c) for c in solution.certificates],
         gradient_norms=[] if solution.gradient_norms is None else _finite_list(solution.gradient_norms),
+        replays=[_replay_evidence(r) for r in solution.replays],
         failures=_failures(solution),
         solve_s=solution.wall_time,
     )
@@ -86,7 +90,7 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
         solution.times,
         _drawable(solution) if motion is None else motion.xs,
         contacts=() if motion is None else motion.contacts,
-        planned_xs=solution.xs if solution.u_final is not None and motion is not None else None,
+        planned_xs=solution.xs if solution.transcribed is not None and motion is not None else None,
         title=f"{folder.name}: {solution.status.value}",
     )
     files = {name: file_evidence(folder / name, name) for name in (TRACE, REPLAY)}
@@ -129,6 +133,9 @@ def _describe(problem: Problem) -> dict[str, Any]:
         "input_names": list(problem.model.input_names),
         "x0": _finite_list(problem.x0),
         "x_goal": _finite_list(problem.goal),
+        "waypoints": {str(k): _finite_list(x) for k, x in problem.waypoints.items()},
+        "constraints": [_constraint(problem, c) for c in problem.constraints],
+        "free_horizon_s": None if problem.horizon is None else list(problem.horizon),
         "x_lower": _finite_list(b.x_lower),
         "x_upper": _finite_list(b.x_upper),
         "u_lower": _finite_list(b.u_lower),
@@ -139,6 +146,11 @@ def _describe(problem: Problem) -> dict[str, Any]:
         "trajectory_cost": _name(problem.trajectory_cost),
         "initial_state_free": [bool(free) for free in problem.initial_state_mask],
     }
+
+
+def _constraint(problem: Problem, c: Constraint) -> dict[str, Any]:
+    knots = c.at_knots(problem.num_steps, problem.initial_state_is_given)
+    return {"name": c.label, "lower": _finite_list(c.lower), "upper": _finite_list(c.upper), "knots": list(knots)}
 
 
 def _parameters(solution: Solution) -> list[ParameterEvidence]:
@@ -201,8 +213,16 @@ def _checks(solution: Solution) -> list[Check]:
             "q, v",
             tolerance,
         ),
+        _check(
+            "constraint violation",
+            "largest excess over a bound of a constraint, or distance from a waypoint",
+            solution.constraint_violation,
+            "the constraint's",
+            tolerance,
+        ),
+        _check("horizon", "time from the first state to the last", solution.horizon, "s"),
     ]
-    if solution.u_final is not None:
+    if solution.transcribed is not None:
         definition = "largest distance of a knot from an accurate integration from the knot before"
         checks.append(
             _check("integration error", definition, solution.integration_error, "q, v", INTEGRATION_TOLERANCE)
@@ -239,12 +259,28 @@ def _replay_checks(solution: Solution) -> list[Check]:
         _check("energy scale", f"range of kinetic plus potential energy {scale}", float(np.ptp(r.energy)), "J"),
         _check("penetration", f"largest overlap of two geometries {scale}", float(np.max(r.penetration)), "m"),
         _check(
-            "constraint violation",
+            "joint limit violation",
             f"largest excess over a joint limit or of a quaternion's norm {scale}",
             float(np.max(r.constraint_violation)),
             "q",
         ),
     ]
+
+
+def _replay_evidence(r: Replay) -> ReplayEvidence:
+    goal, bound, energy, depth = _finite_list([r.goal_error, r.bound_violation, r.energy_error, r.penetration])
+    return ReplayEvidence(
+        variant=r.variant,
+        control=r.control,
+        time_step_s=r.time_step,
+        contact_approximation=r.approximation,
+        goal_error=goal,
+        bound_violation=bound,
+        energy_error_J=energy,
+        penetration_m=depth,
+        holds=r.holds,
+        failures=list(r.failures),
+    )
 
 
 def _check(name: str, definition: str, value: float, unit: str, bound: float | None = None) -> Check:

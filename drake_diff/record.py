@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-SCHEMA_VERSION = "0.2.0"
+SCHEMA_VERSION = "0.3.0"
 
 
 class _Part(BaseModel):
@@ -55,6 +55,21 @@ class ParameterEvidence(_Part):
     optimized: bool
     lower: float | None
     upper: float | None
+
+
+class ReplayEvidence(_Part):
+    """One replay of the plan on the plant; a measure is None where the motion could not be taken."""
+
+    variant: str
+    control: str
+    time_step_s: float
+    contact_approximation: str
+    goal_error: float | None  # the largest, in the state's units
+    bound_violation: float | None  # the same
+    energy_error_J: float | None
+    penetration_m: float | None
+    holds: bool
+    failures: list[str]
 
 
 class Failure(_Part):
@@ -118,6 +133,7 @@ class EvidenceRecord(_Part):
     checks: list[Check] = []
     gradients: list[GradientEvidence] = []
     gradient_norms: list[float] = []
+    replays: list[ReplayEvidence] = []
     failures: list[Failure] = []
     provenance: Provenance
     wall_clock: WallClock

@@ -1,0 +1,157 @@
+"""Replays of a plan: closed forms for what they measure, and plans that must not pass."""
+
+import math
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+from drake_diff.parameters import select
+from drake_diff.replay import STATE_TOLERANCE, Plan, broken_variants, held, replay_open_loop, replays
+from drake_diff.solution import Status
+
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+H, COUNT = 0.05, 20
+
+
+def block(write_urdf, *, time_step=H, count=COUNT, **fields):
+    given = {"x0": [0, 0], "num_steps": count, "running_cost": EFFORT, **fields}
+    return dd.Problem(write_urdf(time_step=time_step), **given)
+
+
+def plan_of(problem, us):
+    """The plan that the plant's own steps make of `us`."""
+    us = np.asarray(us, dtype=float)
+    xs = dd.rollout(problem.model, problem.x0, us).xs if problem.model.nu else None
+    return Plan(problem, select(problem.model, ()), problem.model.time_step, held(xs, us), continuous=False)
+
+
+def by_name(found, variant, control):
+    return next(r for r in found if (r.variant, r.control) == (variant, control))
+
+
+def test_half_the_step_leads_a_block_elsewhere_by_the_closed_form(write_urdf):
+    """Symplectic Euler under a constant force: x_N = u h^2 N (N + 1) / 2, so h to h/2 differs by u h T / 4."""
+    problem = block(write_urdf, x_goal=[math.nan, math.nan], final_cost=lambda x: x[0])
+    found = replays(plan_of(problem, np.full((COUNT, 1), 2.0)))
+    ends = [by_name(found, f"in steps of {h:g} s", "open loop").motion.xs[-1, 0] for h in (H, H / 2)]
+    assert ends[0] - ends[1] == pytest.approx(2.0 * H * (H * COUNT) / 4, rel=1e-9)
+    assert {r.variant for r in found} == {"in steps of 0.05 s", "in steps of 0.025 s"}  # nothing can touch
+
+
+def test_feedback_holds_what_open_loop_loses(load):
+    """Balancing upright: what half the step changes grows by exp(4.4 t) open loop, and decays under TVLQR."""
+    model = load("pendulum.urdf", time_step=0.02)
+    balance = dd.LQR(model, [np.pi, 0], [0], Q=np.eye(2), R=[[1.0]])
+    us = dd.rollout(model, [np.pi - 0.5, 0], policy=balance, num_steps=150).us
+    problem = dd.Problem(model, x0=[np.pi - 0.5, 0], num_steps=150, x_goal=[np.pi, 0])
+    plan = plan_of(problem, us)
+    found = replays(plan)
+    assert by_name(found, "in steps of 0.01 s", "open loop").goal_error > 0.1
+    assert by_name(found, "in steps of 0.01 s", "TVLQR").goal_error < 1e-3
+    assert not list(broken_variants(plan, found))
+
+
+def test_the_plants_own_step_gives_the_plan_back(write_urdf):
+    plan = plan_of(block(write_urdf, final_cost=lambda x: x[0]), np.linspace(-1, 1, COUNT)[:, None])
+    for control in ("open loop", "TVLQR"):
+        motion = by_name(replays(plan), f"in steps of {H:g} s", control).motion
+        np.testing.assert_allclose(motion.xs, plan.sample(1)[0], rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("fields", "clause"),
+    [
+        ({"x_goal": [0.9, math.nan]}, "slide_x ends 0.15 from its goal, tolerance 0.0525"),
+        ({"x_goal": [math.nan, 0.0]}, "slide_v ends"),
+        ({"bounds": dd.Bounds(x_upper=[0.5, math.inf])}, "slide_x is 0.55 beyond its bound at 1 s"),
+        ({"constraints": dd.Constraint(lambda x: x[1], upper=1, name="slow")}, "slow is broken by 1 at knot 20"),
+        ({"waypoints": {10: [0.1, math.nan]}}, "waypoint at knot 10 is broken"),
+    ],
+)
+def test_a_plan_that_misses_what_is_asked_is_told(write_urdf, fields, clause):
+    """u = 2 for 1 s: x ends at 1.05 (symplectic), v at 2, x_10 = 0.275."""
+    problem = block(write_urdf, **{"final_cost": lambda x: x[0], **fields})
+    plan = plan_of(problem, np.full((COUNT, 1), 2.0))
+    found = by_name(replays(plan), f"in steps of {H:g} s", "open loop")
+    assert any(clause in failure for failure in found.failures), found.failures
+    assert len(list(broken_variants(plan, replays(plan)))) == 2
+
+
+def test_the_tolerance_is_five_percent_of_the_range(write_urdf):
+    us = np.full((COUNT, 1), 2.0)
+    for factor, holds in ((0.9, True), (1.1, False)):
+        goal = 1.05 * (1 - factor * STATE_TOLERANCE)
+        plan = plan_of(block(write_urdf, x_goal=[goal, math.nan]), us)
+        assert by_name(replays(plan), f"in steps of {H:g} s", "open loop").holds is holds
+
+
+def test_energy_out_of_nothing_is_told(load):
+    """Semi-implicit Euler of an oscillator is unstable beyond h w = 2: the swing grows without a motor's work."""
+    model = load("pendulum.urdf", time_step=0.55)  # w = sqrt(g / l) = 4.4: h w = 2.4
+    problem = dd.Problem(model, x0=[0.02, 0], num_steps=12, final_cost=lambda x: x[0])
+    plan = plan_of(problem, np.zeros((12, 1)))
+    found = by_name(replays(plan), "in steps of 0.55 s", "open loop")
+    assert any("J of energy come from nowhere" in failure for failure in found.failures), found
+
+
+def test_a_deep_overlap_is_told_and_another_approximation_is_tried(tmp_path):
+    """A ball of 1 kg and radius 0.1 m on a ground of 100 N/m: it sinks m g / k = 0.098 m, a quarter is 0.05 m."""
+    path = tmp_path / "ball.sdf"
+    path.write_text(BALL)
+    model = dd.load_model(path, time_step=0.002, ground=0.5)
+    problem = dd.Problem(model, x0=[0.1, 0], num_steps=300, final_cost=lambda x: x[0], optimize="initial_state")
+    us = np.zeros((300, 0))
+    xs = dd.rollout(model, [0.1, 0], num_steps=300).xs
+    found = replays(Plan(problem, select(model, ()), 0.002, held(xs, us), continuous=False))
+    assert [r.variant for r in found] == ["in steps of 0.002 s", "in steps of 0.001 s", "with lagged contact"]
+    assert found[2].approximation == "lagged"
+    for replay in found:
+        assert "limit 0.05 m (a quarter of " in replay.failures[0]
+        assert 0.09 < replay.penetration < 0.2  # near the static depth, and less than twice that, the undamped swing
+
+
+BALL = """<sdf version="1.9"><model name="ball"><link name="ball"><inertial><mass>1</mass></inertial>
+<collision name="ball"><geometry><sphere><radius>0.1</radius></sphere></geometry>
+<drake:proximity_properties><drake:point_contact_stiffness>100</drake:point_contact_stiffness>
+</drake:proximity_properties></collision></link>
+<joint name="z" type="prismatic"><parent>world</parent><child>ball</child><axis><xyz>0 0 1</xyz>
+<limit><effort>0</effort></limit></axis></joint>
+</model></sdf>""".replace("<sdf ", '<sdf xmlns:drake="drake" ')
+
+
+def test_inputs_that_cannot_be_stepped_are_missing_not_zero(write_urdf):
+    problem = block(write_urdf, final_cost=lambda x: x[0])
+    us = np.full((COUNT, 1), np.nan)
+    plan = Plan(problem, select(problem.model, ()), H, held(np.zeros((COUNT + 1, 2)), us), continuous=False)
+    assert replay_open_loop(plan) is None
+    for replay in replays(plan):
+        assert replay.motion is None
+        assert replay.goal_error == replay.penetration == math.inf
+        assert not replay.holds
+
+
+def test_a_collocated_plan_is_replayed_in_finer_steps_until_two_hold(write_urdf):
+    """B01 in 4 intervals: at h = 0.25 the simulator ends h T / 2 times the mean slope elsewhere, at h/16 within 5 %."""
+    problem = block(write_urdf, time_step=0.25, count=4, x_goal=[1, 0])
+    solution = dd.solve(problem, method="collocation", scheme="hermite_simpson")
+    assert solution.success, solution.message
+    variants = list(dict.fromkeys(r.variant for r in solution.replays))
+    assert variants[:2] == ["in steps of 0.25 s", "in steps of 0.125 s"]
+    assert not solution.replays[0].holds
+    assert all(any(r.holds for r in solution.replays if r.variant == v) for v in variants[-2:])
+
+
+def test_a_solve_whose_replay_fails_is_no_success(load):
+    """A discrete swing-up in steps of 0.1 s is right at 0.1 s alone."""
+    problem = dd.Problem(
+        load("cart_pole.urdf", time_step=0.1),
+        x0=np.zeros(4),
+        x_goal=[1, np.pi, 0, 0],
+        num_steps=20,
+        running_cost=EFFORT,
+    )
+    solution = dd.solve(problem, method="ilqr")
+    assert solution.defect == 0
+    assert solution.status is Status.CONVERGED_NOT_VERIFIED
+    assert "replayed in steps of 0.05 s it does not hold: open loop, " in solution.message
