@@ -106,7 +106,9 @@ def test_a_deep_overlap_is_told_and_another_approximation_is_tried(tmp_path):
     found = replays(Plan(problem, select(model, ()), 0.002, held(xs, us), continuous=False))
     assert [r.variant for r in found] == ["in steps of 0.002 s", "in steps of 0.001 s", "with lagged contact"]
     assert found[2].approximation == "lagged"
-    for replay in found:
+    assert 0.02 < found[2].penetration < 0.05  # Hunt-Crossley dissipation, which sap leaves out, sinks slower
+    assert found[2].holds
+    for replay in found[:2]:
         assert "limit 0.05 m (a quarter of " in replay.failures[0]
         assert 0.09 < replay.penetration < 0.2  # near the static depth, and less than twice that, the undamped swing
 
