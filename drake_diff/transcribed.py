@@ -9,7 +9,7 @@ import numpy as np
 from drake_diff.arrays import Array
 from drake_diff.nonlinear_program import Outcome
 from drake_diff.solution import FEASIBILITY_TOLERANCE, Iteration
-from drake_diff.transcription_program import OptimalControl
+from drake_diff.optimal_control import OptimalControl
 from drake_diff.transcription_scheme import interval_defects, node_weights, per_interval
 
 SUBSTEPS = 10  # of the Runge-Kutta method that measures an interval
@@ -39,6 +39,7 @@ class Transcribed:
     outcome: Outcome
     message: str
     iterations: tuple[Iteration, ...]
+    derivatives: str  # where the solver's came from, and why there is no Hessian where there is none
     refinements: tuple[tuple[int, float], ...] = ()
 
     @property
@@ -51,14 +52,15 @@ class Transcribed:
 
     @property
     def infeasibility(self) -> float:
-        """The largest defect, distance from a given end, or excess over a bound at a node; inf where not finite."""
-        task, nx, b = self.task, self.task.dynamics.nx, self.task.bounds
-        xs, us = self.nodes[:, :nx], self.nodes[:, nx:]
-        ends = np.concatenate([np.abs(xs[0] - task.x0), np.abs(xs[-1] - task.x_goal)])
-        inner = xs[1:] if np.all(np.isfinite(task.x0)) else xs
-        excess = [b.x_lower - inner, inner - b.x_upper, b.u_lower - us, us - b.u_upper]
-        worst = [float(np.max(e, initial=0.0)) for e in (ends[~np.isnan(ends)], *excess)]
-        return max(self.defect, *worst) if np.all(np.isfinite(self.nodes)) else float("inf")
+        """The largest defect, excess over a bound or constraint, or distance from an end or waypoint at a node.
+
+        inf where something is not finite.
+        """
+        if not np.all(np.isfinite(self.nodes)):
+            return float("inf")
+        lower, upper = self.task.node_limits(self.mesh)
+        beyond = float(np.max(np.maximum(lower - self.nodes, self.nodes - upper), initial=0.0))
+        return max(self.defect, beyond, *self.task.path_excess(self.nodes, self.mesh).values())
 
     @property
     def times(self) -> Array:
@@ -85,7 +87,7 @@ class Transcribed:
     def cost(self) -> float:
         """The scheme's own quadrature of the running cost, and the final cost."""
         weights = self.horizon * node_weights(self.mesh, self.task.scheme)
-        return float(weights @ self.task.rate.values(self.nodes)) + self.task.final(self.xs[-1])
+        return float(weights @ self.task.rate.values(self.nodes)) + float(self.task.final(self.xs[-1]))
 
     @cached_property
     def defects(self) -> Array:

@@ -7,19 +7,20 @@ too coarse for the best input, only a finer one tells.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from drake_diff.arrays import Array, array_with_gaps, finite_array, frozen, positive_float, positive_int
 from drake_diff.bounds import Bounds
+from drake_diff.constraint import Constraint
 from drake_diff.cost import FinalCost, QuadraticCost
 from drake_diff.dynamics import Dynamics, Pointwise
 from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.nonlinear_program import Limits, Outcome, solve_program
+from drake_diff.nonlinear_program import Limits, Outcome
+from drake_diff.optimal_control import OptimalControl, PathConstraint, RunningRate
 from drake_diff.transcribed import Transcribed
-from drake_diff.transcription_program import OptimalControl, RunningRate, TranscribedProgram
 from drake_diff.transcription_scheme import SCHEMES, node_fractions
 
 DEFAULT_LIMITS = Limits(max_iterations=3000, time_limit=np.inf, tolerance=1e-9)
@@ -37,9 +38,10 @@ def transcribe_and_solve(
     running_cost: Any = None,
     final_cost: FinalCost | None = None,
     bounds: Bounds | None = None,
+    constraints: Any = (),
+    waypoints: Mapping[int, Any] | None = None,
     scheme: str = "hermite_simpson",
     guess: Any = None,
-    solver: str = "ipopt",
     limits: Limits = DEFAULT_LIMITS,
     report: Callable[[str], None] | None = None,
     refine: bool = False,
@@ -54,17 +56,30 @@ def transcribe_and_solve(
     `violation_between_nodes`. `scheme` is "hermite_simpson" (order 4) or "trapezoid" (order 2). `guess` is (xs, us) or
     (xs, us, horizon) with shapes (count+1, nx), (count+1, nu), or a `Transcribed`; else a straight line at zero input.
 
+    `constraints` are `Constraint`s, kept at their knots, where those are None at the midpoints too, and one of u also
+    at knot `count`. `waypoints` maps knots 1 ... count-1 to states (nx,), NaN where free. Knots are those of the first
+    mesh, whose places the refined ones keep.
+
+    The solver is the IPOPT that CasADi carries: with exact Hessians where everything can be written as an expression,
+    else with a limited-memory one; `derivatives` of the result says which and why.
+
     `refine` splits intervals whose `errors` or `cost_errors` are above `error_tolerance` and solves again from there,
     up to `max_count` intervals; `limits` hold for each round.
 
     Raises InputError and its kin before anything runs; how a solve ended is `outcome` and `message`.
     """
-    task = _check_task(dynamics, x0, x_goal, horizon, running_cost, final_cost, bounds, scheme)
     mesh = np.linspace(0, 1, positive_int("count", count) + 1)
+    task = _check_task(dynamics, x0, x_goal, horizon, running_cost, final_cost, bounds, scheme)
+    task = dataclasses.replace(
+        task, waypoints=_check_waypoints(task, mesh, waypoints), paths=_check_constraints(task, mesh, constraints)
+    )
     error_tolerance = positive_float("error_tolerance", error_tolerance)
     max_count = positive_int("max_count", max_count)
     nodes, time = _first_nodes(task, mesh, guess)
-    motion = _solve(task, mesh, nodes, time, solver, limits, report)
+    from drake_diff.knot_functions import knot_functions  # CasADi takes a while to load
+
+    functions = knot_functions(task)
+    motion = _solve(task, mesh, functions, nodes, time, limits, report)
     rounds = [(len(mesh) - 1, float(np.max(_worst(motion))))] if refine else []
     while rounds and motion.outcome in FOUND and rounds[-1][1] > error_tolerance:
         mesh = _split(motion, error_tolerance)
@@ -73,18 +88,24 @@ def transcribe_and_solve(
             motion = dataclasses.replace(motion, message=motion.message + told)
             break
         nodes = np.hstack(motion.at(motion.horizon * node_fractions(mesh, task.scheme)))
-        motion = _solve(task, mesh, nodes, motion.horizon, solver, limits, report)
+        motion = _solve(task, mesh, functions, nodes, motion.horizon, limits, report)
         rounds.append((len(mesh) - 1, float(np.max(_worst(motion)))))
     return dataclasses.replace(motion, refinements=tuple(rounds))
 
 
 def _solve(
-    task: OptimalControl, mesh: Array, nodes: Array, time: float, solver: str, limits: Limits, report: Any
+    task: OptimalControl, mesh: Array, functions: Any, nodes: Array, time: float, limits: Limits, report: Any
 ) -> Transcribed:
-    program = TranscribedProgram(task, mesh)
-    result = solve_program(program.program, program.pack(nodes, time), solver=solver, limits=limits, report=report)
+    from drake_diff.ipopt import solve_ipopt
+    from drake_diff.transcription_program import TranscribedProgram
+
+    program = TranscribedProgram(task, mesh, functions)
+    result = solve_ipopt(program, program.pack(nodes, time), limits, report)
     found, horizon = program.unpack(result.z)
-    return Transcribed(task, frozen(mesh), frozen(found), horizon, result.outcome, result.message, result.iterations)
+    why = functions.why_not
+    told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
+    found = frozen(found)
+    return Transcribed(task, frozen(mesh), found, horizon, result.outcome, result.message, result.iterations, told)
 
 
 def _worst(motion: Transcribed) -> Array:
@@ -132,6 +153,32 @@ def _check_end(dynamics: Dynamics, subject: str, values: Any, limits: Bounds | N
             expected = f"within [{limits.x_lower[i]:g}, {limits.x_upper[i]:g}]"
             raise InputError(f"{subject}, {dynamics.state_names[i]}", got=float(end[i]), expected=expected)
     return end
+
+
+def _check_waypoints(
+    task: OptimalControl, mesh: Array, given: Mapping[int, Any] | None
+) -> tuple[tuple[float, Array], ...]:
+    """The waypoints by their fraction of the horizon."""
+    found, last = [], len(mesh) - 1
+    for knot, wanted in (given or {}).items():
+        if isinstance(knot, bool) or not isinstance(knot, (int, np.integer)) or not 0 < knot < last:
+            expected = f"whole numbers from 1 to {last - 1} (the last state's is x_goal)"
+            raise InputError("knots of waypoints", got=repr(knot), expected=expected)
+        found.append((float(mesh[knot]), _check_end(task.dynamics, f"waypoint at knot {knot}", wanted, task.bounds)))
+    return tuple(sorted(found, key=lambda at: at[0]))
+
+
+def _check_constraints(task: OptimalControl, mesh: Array, given: Any) -> tuple[PathConstraint, ...]:
+    constraints = (given,) if isinstance(given, Constraint) else tuple(given)
+    first_is_given, found = bool(np.all(np.isfinite(task.x0))), []
+    x, u = np.split(task.dynamics.probe()[0], [task.dynamics.nx])
+    for c in constraints:
+        if not isinstance(c, Constraint):
+            raise InputError("constraints", got=type(c).__name__, expected="Constraints")
+        knots = c.at_knots(len(mesh) - 1 + int(c.takes_input), first_is_given)
+        fractions = None if c.knots is None else mesh[list(knots)]
+        found.append(PathConstraint(c.resolved(x, u), fractions, knots[0]))
+    return tuple(found)
 
 
 def _check_horizon(horizon: Any) -> tuple[float, float]:

@@ -59,12 +59,11 @@ def move(count=10, dynamics=BLOCK, **changes):
 # ------------------------------------------------------------------------------ exact discrete optima
 
 
-@pytest.mark.parametrize("solver", ["ipopt", "snopt"])
 @pytest.mark.parametrize("count", [2, 5, 10, 20])
-def test_b01_the_blocks_move_has_each_schemes_own_optimum(count, solver):
-    by_trapezoid = move(count, scheme="trapezoid", solver=solver)
+def test_b01_the_blocks_move_has_each_schemes_own_optimum(count):
+    by_trapezoid = move(count, scheme="trapezoid")
     assert 12 / by_trapezoid.cost == pytest.approx(1 - 4 / count**2 + 3 / count**3, rel=1e-9)
-    by_simpson = move(count, solver=solver)
+    by_simpson = move(count)
     assert by_simpson.cost == pytest.approx(12, rel=1e-9)
     t = by_simpson.times
     assert by_simpson.us[:, 0] == pytest.approx(6 - 12 * t, abs=1e-6)
@@ -373,7 +372,7 @@ def test_b12_the_hypersensitive_problem_over_50_seconds():
 
 @pytest.mark.slow
 def test_b12_the_hypersensitive_problem_over_10000_seconds():
-    motion = hypersensitive(1e4, 50, error_tolerance=1e-5, solver="snopt", max_count=2000)
+    motion = hypersensitive(1e4, 50, error_tolerance=1e-5, max_count=2000)
     assert motion.cost == pytest.approx(HYPERSENSITIVE, rel=1e-4)
     assert np.abs(motion.at(np.linspace(100, 9900, 1000))[0]).max() < 1e-3
 
@@ -493,8 +492,7 @@ def test_the_programs_jacobians_are_differences_of_its_values_and_keep_their_pat
             assert len(pattern) < 0.5 * exact.size
 
 
-@pytest.mark.parametrize("solver", ["ipopt", "snopt"])
-def test_every_knot_is_evaluated_and_linearized_once_an_iterate(solver):
+def test_every_knot_is_evaluated_and_linearized_once_an_iterate():
     valued, linearized = [], []
 
     class Counting:
@@ -507,7 +505,7 @@ def test_every_knot_is_evaluated_and_linearized_once_an_iterate(solver):
             rates = np.column_stack([knots[:, 1], knots[:, 2]])
             return rates, np.tile([[0.0, 1, 0], [0, 0, 1]], (len(knots), 1, 1))
 
-    options = {"x0": [0, 0], "x_goal": [1, 0], "count": 40, "horizon": 1.0, "running_cost": effort, "solver": solver}
+    options = {"x0": [0, 0], "x_goal": [1, 0], "count": 40, "horizon": 1.0, "running_cost": effort}
     motion = transcribe_and_solve(Dynamics(Counting(), 2, 1), **options)
     assert motion.success
     assert len(linearized) <= 1.1 * 81 * (len(motion.iterations) + 1)
@@ -613,7 +611,6 @@ def test_bad_dynamics_are_named(options, message):
         ({"horizon": (1, np.inf)}, r"horizon \[s\]: expected a finite number above 0"),
         ({"horizon": (1, 2, 3)}, "horizon: expected a number of seconds"),
         ({"scheme": "radau"}, "scheme: expected one of hermite_simpson, trapezoid, got 'radau'"),
-        ({"solver": "knitro"}, "solver: expected one of"),
         ({"bounds": (0, 1)}, "bounds: expected Bounds"),
         ({"guess": 3}, "guess: expected"),
         ({"guess": (np.zeros((3, 2)), np.zeros((3, 1)))}, r"guess xs: expected shape \(6, 2\)"),

@@ -1,0 +1,164 @@
+"""The equations of motion of a tree of hinges and slides as a CasADi function of a knot [q, v, u].
+
+    M(q) dv/dt = B u - C(q, v) v + gravity + springs - D v
+
+Bias by the recursive Newton-Euler algorithm, mass matrix by the composite-rigid-body algorithm (Featherstone, "Rigid
+Body Dynamics Algorithms", 2008, ch. 5 and 6), each body in a frame at its joint whose z axis is the joint's, so that
+most products are with zeros and ones and vanish. What is not in the tree shows in the comparison with Drake.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from drake_diff.arrays import Array
+from drake_diff.continuous import EquationsOfMotion
+from drake_diff.implicit import tree_for
+from drake_diff.model import Model
+from drake_diff.step import set_state
+from drake_diff.symbolic import agrees
+from drake_diff.tree_dynamics import TreeDynamics, tree_of
+
+SAME_PLANT = 1e-9  # of the largest rate: what a badly conditioned mass matrix may leave
+ROUNDED = 1e-15  # of the frames' entries (sines of pi): zeros that would keep products alive
+Z = ca.DM([0, 0, 1])
+
+
+def symbolic_plant(model: Model) -> Any | str:
+    """x' of a knot [q, v, u] as an SX function, or why there is none; compared with Drake's plant at two states."""
+    tree = tree_for(model)
+    if tree is None:
+        found = tree_of(model)
+        return found if isinstance(found, str) else "its tree differs from Drake's inverse dynamics"
+    equations, random, n = EquationsOfMotion(model), np.random.default_rng(1), model.nv
+    knot = ca.SX.sym("knot", model.nx + model.nu)
+    q, v, u = knot[:n], knot[n : 2 * n], knot[2 * n :]
+    function = ca.Function("plant", [knot], [ca.vertcat(v, _acceleration(tree, model, q, v, equations.actuation @ u))])
+    here = model.plant.GetPositionsAndVelocities(model.double.context)
+    probe = random.standard_normal((2, model.nx + model.nu))
+    wanted = np.array([equations(row[: model.nx], row[model.nx :]) for row in probe])
+    set_state(model.double, here)
+    return function if agrees(function, probe, wanted, SAME_PLANT) else "its symbolic form differs from Drake's plant"
+
+
+@dataclass(frozen=True, eq=False)
+class _Link:
+    """A body in the frame at its joint: `rotation` and `offset` in the parent's at q = 0, mass, moment and inertia."""
+
+    parent: int  # -1: the world
+    rotation: Any
+    offset: Any
+    mass: float
+    moment: Any
+    inertia: Any
+
+
+def _links(tree: TreeDynamics, model: Model) -> list[_Link]:
+    """The bodies in the order of the joints."""
+    poses = tree.place(model, np.zeros((1, len(tree.mass))))[0]
+    turns = [_with_z(axis) for axis in tree.axis]
+    frames = [(p[:, :3] @ t, p[:, :3] @ o + p[:, 3]) for p, t, o in zip(poses, turns, tree.origin, strict=True)]
+    links = []
+    for k, turn in enumerate(turns):
+        above = [j for j in np.flatnonzero(tree.ancestors[k]) if j != k]
+        parent = max(above, key=lambda j: tree.ancestors[j].sum(), default=-1)
+        R, p = frames[parent] if above else (np.eye(3), np.zeros(3))
+        m, origin = tree.mass[k], tree.origin[k]
+        moment = tree.moment[k] - m * origin
+        h, o = _hat(tree.moment[k]), _hat(origin)
+        inertia = tree.inertia[k] + o @ h + h @ o - m * o @ o
+        parts = (R.T @ frames[k][0], R.T @ (frames[k][1] - p), turn.T @ moment, turn.T @ inertia @ turn)
+        rotation, offset, moment, inertia = (ca.DM(np.where(np.abs(a) < ROUNDED, 0.0, a)) for a in parts)
+        links.append(_Link(int(parent), rotation, offset, float(m), moment, inertia))
+    return links
+
+
+def _acceleration(tree: TreeDynamics, model: Model, q: Any, v: Any, force: Any) -> Any:
+    """dv/dt (n,) under generalized forces (n,)."""
+    links, n = _links(tree, model), len(tree.mass)
+    frames = [_frame(link, tree.hinge[k], q[k]) for k, link in enumerate(links)]
+    order = sorted(range(n), key=lambda k: tree.ancestors[k].sum())  # parents first
+    bias = _bias(links, frames, tree.hinge, order, v, tree.gravity)
+    mass = _mass(links, frames, tree.hinge, order) + ca.diag(tree.reflected)
+    rest = force - bias - ca.DM(tree.stiffness) * (q - ca.DM(tree.rest)) - ca.DM(tree.damping) * v
+    return ca.ldl_solve(rest, *ca.ldl(mass))
+
+
+def _frame(link: _Link, hinge: bool, q: Any) -> tuple[Any, Any]:
+    """Rotation and origin of the body's frame in its parent's, at the joint's position q."""
+    if not hinge:
+        return link.rotation, link.offset + link.rotation[:, 2] * q
+    c, s = ca.cos(q), ca.sin(q)
+    turned = ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
+    return link.rotation @ turned, link.offset
+
+
+def _bias(links: list[_Link], frames: list[Any], hinge: Any, order: list[int], v: Any, gravity: Array) -> Any:
+    """(n,) the joints' forces without acceleration: the motion outwards, the bodies' forces inwards."""
+    n, zero = len(links), ca.DM.zeros(3)
+    motions: dict[int, Any] = {-1: (zero, zero, ca.DM(-gravity))}
+    forces: dict[int, Any] = {}
+    for k in order:
+        link, (R, p) = links[k], frames[k]
+        w, dw, a = motions[link.parent]
+        a = R.T @ (a + ca.cross(dw, p) + ca.cross(w, ca.cross(w, p)))
+        w, dw, spin = R.T @ w, R.T @ dw, Z * v[k]
+        if hinge[k]:
+            dw = dw + ca.cross(w, spin)
+            w = w + spin
+        else:
+            a = a + 2 * ca.cross(w, spin)
+        motions[k] = w, dw, a
+        force = link.mass * a + ca.cross(dw, link.moment) + ca.cross(w, ca.cross(w, link.moment))
+        moment = link.inertia @ dw + ca.cross(w, link.inertia @ w) + ca.cross(link.moment, a)
+        forces[k] = force, moment
+    bias = ca.SX.zeros(n)
+    for k in reversed(order):
+        force, moment = forces[k]
+        bias[k] = moment[2] if hinge[k] else force[2]
+        if links[k].parent >= 0:
+            force, moment = _to_parent(force, moment, *frames[k])
+            f, m = forces[links[k].parent]
+            forces[links[k].parent] = f + force, m + moment
+    return bias
+
+
+def _mass(links: list[_Link], frames: list[Any], hinge: Any, order: list[int]) -> Any:
+    """(n, n): column k are the forces that the bodies which joint k carries need for its acceleration alone."""
+    carried = [(link.mass, link.moment, link.inertia) for link in links]
+    mass = ca.SX.zeros(len(links), len(links))
+    for k in reversed(order):
+        m, h, inertia = carried[k]
+        force, moment = (ca.cross(Z, h), inertia @ Z) if hinge[k] else (m * Z, ca.cross(h, Z))
+        j = k
+        while j >= 0:
+            mass[j, k] = mass[k, j] = moment[2] if hinge[j] else force[2]
+            force, moment = _to_parent(force, moment, *frames[j])
+            j = links[j].parent
+        parent, (R, p) = links[k].parent, frames[k]
+        if parent >= 0:
+            turned, P = R @ h, ca.skew(p)
+            H = ca.skew(turned)
+            about = R @ inertia @ R.T - P @ H - H @ P - m * P @ P
+            M, moments, inertias = carried[parent]
+            carried[parent] = M + m, moments + turned + m * p, inertias + about
+    return mass
+
+
+def _to_parent(force: Any, moment: Any, R: Any, p: Any) -> tuple[Any, Any]:
+    turned = R @ force
+    return turned, R @ moment + ca.cross(p, turned)
+
+
+def _with_z(axis: Array) -> Array:
+    """(3, 3): a rotation whose third column is the unit vector `axis` (3,); a permutation where it can be."""
+    first = np.eye(3)[(int(np.argmax(np.abs(axis))) + 1) % 3]
+    first = first - (first @ axis) * axis
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, np.cross(axis, first), axis])
+
+
+def _hat(w: Array) -> Array:
+    return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
