@@ -20,7 +20,8 @@ OUTCOMES = {
     "Infeasible_Problem_Detected": Outcome.INFEASIBLE,
     "Diverging_Iterates": Outcome.UNBOUNDED,
 }
-QUIET = {
+OPTIONS = {
+    "ipopt.mu_strategy": "adaptive",  # the monotone one ends minimum times of a pendulum as infeasible
     "print_time": False,
     "show_eval_warnings": False,
     "calc_lam_p": False,
@@ -38,7 +39,7 @@ def solve_ipopt(program: TranscribedProgram, guess: Array, limits: Limits, repor
     """
     with interrupt_flag() as interrupted:
         watch = _Watch(program, limits, interrupted, report)
-        options = QUIET | program.derivatives() | _options(program, limits) | {"iteration_callback": watch}
+        options = OPTIONS | program.derivatives() | _options(program, limits) | {"iteration_callback": watch}
         solver = ca.nlpsol("solver", "ipopt", program.nlp, options)
         lower, upper = program.sides
         found = solver(x0=guess, lbx=program.lower, ubx=program.upper, lbg=lower, ubg=upper)
@@ -115,11 +116,14 @@ class _Watch(ca.Callback):  # type: ignore[misc]
     def _violation(self, x: Array, g: Array) -> float:
         p = self.program
         lower, upper = p.sides
-        return max(float(np.max(np.maximum(a - v, v - b), initial=0.0)) for v, a, b in ((x, p.lower, p.upper), (g, lower, upper)))
+        return max(
+            float(np.max(np.maximum(a - v, v - b), initial=0.0))
+            for v, a, b in ((x, p.lower, p.upper), (g, lower, upper))
+        )
 
 
 def _options(program: TranscribedProgram, limits: Limits) -> dict[str, Any]:
-    found = {
+    found: dict[str, Any] = {
         "ipopt.tol": limits.tolerance,
         "ipopt.constr_viol_tol": limits.tolerance,
         "ipopt.max_iter": limits.max_iterations,

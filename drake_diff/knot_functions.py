@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from drake_diff.arrays import Array
+from drake_diff.arrays import Array, Indices
 from drake_diff.constraint import Constraint
 from drake_diff.cost import differentiate_final_cost
 from drake_diff.dynamics import Dynamics, PlantKnots, Pointwise
@@ -43,7 +43,7 @@ class Symbolic:
         return ca.vec(self._hessian.map(knots.shape[1])(knots, weights).nz[:])
 
     @property
-    def hessian_at(self) -> tuple[Array, Array]:
+    def hessian_at(self) -> tuple[Indices, Indices]:
         return _places(self._hessian.sparsity_out(0))
 
     @cached_property
@@ -141,8 +141,8 @@ class _Callback(ca.Callback):  # type: ignore[misc]
 KnotFunction = Symbolic | Called
 
 
-def _places(sparsity: Any) -> tuple[Array, Array]:
-    return np.array(sparsity.row(), dtype=int), np.array(sparsity.get_col(), dtype=int)
+def _places(sparsity: Any) -> tuple[Indices, Indices]:
+    return np.array(sparsity.row(), dtype=np.intp), np.array(sparsity.get_col(), dtype=np.intp)
 
 
 @dataclass(frozen=True, eq=False)

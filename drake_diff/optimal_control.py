@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff.arrays import Array, finite_array
+from drake_diff.arrays import Array, Indices, finite_array
 from drake_diff.bounds import Bounds
 from drake_diff.constraint import Constraint
 from drake_diff.cost import FinalCost, QuadraticCost, differentiate_cost
@@ -58,14 +58,14 @@ class PathConstraint:
     fractions: Array | None
     first: int
 
-    def nodes(self, mesh: Array, scheme: Scheme) -> Array:
+    def nodes(self, mesh: Array, scheme: Scheme) -> Indices:
         """The numbers of its nodes on `mesh` (N+1,), which holds the fractions."""
         if self.fractions is not None:
             return nodes_at(self.fractions, mesh, scheme)
         return np.arange(self.first, scheme.nodes * (len(mesh) - 1) + 1)
 
 
-def nodes_at(fractions: Array, mesh: Array, scheme: Scheme) -> Array:
+def nodes_at(fractions: Array, mesh: Array, scheme: Scheme) -> Indices:
     """The numbers of the nodes at `fractions` of the horizon that knots of `mesh` lie at."""
     return scheme.nodes * np.argmin(np.abs(mesh[None] - np.asarray(fractions)[:, None]), axis=1)
 
@@ -105,7 +105,8 @@ class OptimalControl:
 
     def path_excess(self, nodes: Array, mesh: Array) -> dict[str, float]:
         """The largest excess over its bounds of each path constraint at `nodes` (K, nx + nu); inf where no number."""
-        nx, found = self.dynamics.nx, {}
+        nx = self.dynamics.nx
+        found: dict[str, float] = {}
         for path in self.paths:
             c = path.constraint
             worst = max(c.excess(k[:nx], k[nx:]) for k in nodes[path.nodes(mesh, self.scheme)])

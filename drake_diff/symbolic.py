@@ -46,6 +46,10 @@ def _binary(operation: Callable[[Any, Any], Any]) -> Callable[[Symbol, Any], Any
     return apply
 
 
+def _turned(operation: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    return lambda a, b: operation(b, a)
+
+
 def _unary(name: str) -> Callable[[Symbol], Symbol]:
     return lambda self: Symbol(getattr(self.sx, name)())
 
@@ -55,12 +59,14 @@ def _compare(self: Symbol, other: Any) -> bool:
 
 
 for _name in ("add", "sub", "mul", "truediv", "pow"):
-    _f = getattr(operator, _name)
-    setattr(Symbol, f"__{_name}__", _binary(_f))
-    setattr(Symbol, f"__r{_name}__", _binary(lambda a, b, f=_f: f(b, a)))
+    setattr(Symbol, f"__{_name}__", _binary(getattr(operator, _name)))
+    setattr(Symbol, f"__r{_name}__", _binary(_turned(getattr(operator, _name))))
 for _name in ("lt", "le", "gt", "ge", "eq", "ne"):
     setattr(Symbol, f"__{_name}__", _compare)
-for _name in "sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh arccosh arctanh exp log log10 sqrt fabs".split():
+for _name in (
+    *("sin", "cos", "tan", "arcsin", "arccos", "arctan", "sinh", "cosh", "tanh", "arcsinh", "arccosh", "arctanh"),
+    *("exp", "log", "log10", "sqrt", "fabs"),
+):
     setattr(Symbol, _name, _unary(_name))
 setattr(Symbol, "arctan2", _binary(ca.atan2))  # noqa: B010  (mypy: the class has none)
 

@@ -33,10 +33,10 @@ def symbolic_plant(model: Model) -> Any | str:
         found = tree_of(model)
         return found if isinstance(found, str) else "its tree differs from Drake's inverse dynamics"
     equations, random, n = EquationsOfMotion(model), np.random.default_rng(1), model.nv
+    here = model.plant.GetPositionsAndVelocities(model.double.context)
     knot = ca.SX.sym("knot", model.nx + model.nu)
     q, v, u = knot[:n], knot[n : 2 * n], knot[2 * n :]
     function = ca.Function("plant", [knot], [ca.vertcat(v, _acceleration(tree, model, q, v, equations.actuation @ u))])
-    here = model.plant.GetPositionsAndVelocities(model.double.context)
     probe = random.standard_normal((2, model.nx + model.nu))
     wanted = np.array([equations(row[: model.nx], row[model.nx :]) for row in probe])
     set_state(model.double, here)

@@ -8,8 +8,8 @@ import numpy as np
 
 from drake_diff.arrays import Array
 from drake_diff.nonlinear_program import Outcome
-from drake_diff.solution import FEASIBILITY_TOLERANCE, Iteration
 from drake_diff.optimal_control import OptimalControl
+from drake_diff.solution import FEASIBILITY_TOLERANCE, Iteration
 from drake_diff.transcription_scheme import interval_defects, node_weights, per_interval
 
 SUBSTEPS = 10  # of the Runge-Kutta method that measures an interval

@@ -169,7 +169,7 @@ def _check_waypoints(
 
 
 def _check_constraints(task: OptimalControl, mesh: Array, given: Any) -> tuple[PathConstraint, ...]:
-    constraints = (given,) if isinstance(given, Constraint) else tuple(given)
+    constraints = given if isinstance(given, (tuple, list)) else (given,)
     first_is_given, found = bool(np.all(np.isfinite(task.x0))), []
     x, u = np.split(task.dynamics.probe()[0], [task.dynamics.nx])
     for c in constraints:

@@ -8,20 +8,16 @@ with constant sparse S and D from the scheme's states and slopes, so that the He
 for a free final time T. Path constraints add rows to g and terms to the blocks of their nodes.
 """
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from drake_diff.arrays import Array
+from drake_diff.arrays import Array, Indices
 from drake_diff.knot_functions import KnotFunction, KnotFunctions
 from drake_diff.optimal_control import OptimalControl
 from drake_diff.transcription_scheme import node_weights
-
-Indices = NDArray[np.intp]
 
 
 class TranscribedProgram:
@@ -161,7 +157,7 @@ class TranscribedProgram:
         f, rate, total = self.functions.dynamics, self.functions.rate, _Sum((self.z.numel(), self.z.numel()))
         nu = ca.mtimes(self._D.T, multipliers[: self.num_defects])
         weights = ca.DM(self.weights).T
-        terms = [
+        terms: list[tuple[Any, Indices, Any]] = [
             (f, self.every, -self.time * ca.reshape(nu, self.nx, self.every.size)),
             (rate, self.every, sigma * self.time * weights),
         ]
@@ -204,7 +200,9 @@ class _Sum:
     """A sparse matrix whose entries are sums: matrix[row, column] += coefficient * source[index]."""
 
     def __init__(self, shape: tuple[int, int]):
-        self.shape, self.places, self.parts = shape, [], []
+        self.shape = shape
+        self.places: list[Indices] = []
+        self.parts: list[tuple[Array, Any, Indices]] = []
 
     def add(self, rows: Any, columns: Any, coefficients: Any, source: Any, index: Any) -> None:
         """Add entries, one for each of `index`; the others are broadcast to it and it to them."""

@@ -61,6 +61,7 @@ def test_no_module_is_too_long_and_none_asserts():
 
 
 def test_importing_the_package_loads_neither_plots_nor_viewers_nor_logs():
-    code = "import sys, drake_diff; print([m for m in ('matplotlib', 'mcap', 'typer', 'mujoco', 'casadi') if m in sys.modules])"
+    late = ("matplotlib", "mcap", "typer", "mujoco", "casadi")
+    code = f"import sys, drake_diff; print([m for m in {late} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
