@@ -97,17 +97,10 @@ def model_named(name):
     return dd.load_model(MODELS / name, time_step=0.01)
 
 
-PLANTS = [
-    "pendulum.urdf",
-    "cart_pole.urdf",
-    "acrobot.xml",
-    "double_pendulum.urdf",
-    "mass_spring_damper.sdf",
-    "ur5_robot.urdf",
-]
+PLANTS = ["pendulum.urdf", "cart_pole.urdf", "acrobot.xml", "double_pendulum.urdf", "mass_spring_damper.sdf"]
 
 
-@pytest.mark.parametrize("name", [*PLANTS, "tree0", "tree1", "tree2"])
+@pytest.mark.parametrize("name", [*PLANTS, "ur5_robot.urdf", "tree0", "tree1", "tree2"])
 def test_a_plants_expression_and_its_derivative_are_drakes(name):
     """1e-9 of the largest entry: the trees' mass matrices have condition numbers up to 1e5."""
     model, random = model_named(name), np.random.default_rng(5)

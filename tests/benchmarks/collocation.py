@@ -104,13 +104,8 @@ def kelly_by_hand(count: int = 50) -> Row:
         lower[at, :4] = upper[at, :4] = end
     guess = np.hstack([np.linspace(np.zeros(4), [1, np.pi, 0, 0], 2 * count + 1), np.zeros((2 * count + 1, 1))])
     found = solver(x0=guess.ravel(), lbx=lower.ravel(), ubx=upper.ravel(), lbg=0, ubg=0)
-    stats = solver.stats()
-    return (
-        time.perf_counter() - start,
-        "solved" if stats["success"] else "failed",
-        float(found["f"]),
-        stats["iter_count"],
-    )
+    seconds, stats = time.perf_counter() - start, solver.stats()
+    return seconds, "solved" if stats["success"] else "failed", float(found["f"]), stats["iter_count"]
 
 
 def measured(run: Callable[[], Row]) -> Row:
