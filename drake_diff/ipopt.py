@@ -31,15 +31,20 @@ OPTIONS = {
 }
 
 
-def solve_ipopt(program: TranscribedProgram, guess: Array, limits: Limits, report: Report | None) -> NlpResult:
-    """Solve `program` from `guess` (n,): with its exact Hessian, or IPOPT's limited-memory one where it has none.
+NOT_FINITE = "IPOPT: Invalid Number Detected"
+
+
+def solve_ipopt(
+    program: TranscribedProgram, guess: Array, limits: Limits, report: Report | None, *, exact: bool
+) -> NlpResult:
+    """Solve `program` from `guess` (n,), with its `exact` Hessian or IPOPT's limited-memory one.
 
     `report` gets a line of progress a few times a second. Ctrl-C ends the solve with the best iterate so far.
     An error that a function of the user's raised is raised again, but that of a simulation or gradient is told.
     """
     with interrupt_flag() as interrupted:
         watch = _Watch(program, limits, interrupted, report)
-        options = OPTIONS | program.derivatives() | _options(program, limits) | {"iteration_callback": watch}
+        options = OPTIONS | program.derivatives(exact) | _options(exact, limits) | {"iteration_callback": watch}
         solver = ca.nlpsol("solver", "ipopt", program.nlp, options)
         lower, upper = program.sides
         found = solver(x0=guess, lbx=program.lower, ubx=program.upper, lbg=lower, ubg=upper)
@@ -122,13 +127,13 @@ class _Watch(ca.Callback):  # type: ignore[misc]
         )
 
 
-def _options(program: TranscribedProgram, limits: Limits) -> dict[str, Any]:
+def _options(exact: bool, limits: Limits) -> dict[str, Any]:
     found: dict[str, Any] = {
         "ipopt.tol": limits.tolerance,
         "ipopt.constr_viol_tol": limits.tolerance,
         "ipopt.max_iter": limits.max_iterations,
     }
-    if not program.is_exact:
+    if not exact:
         found |= {"ipopt.hessian_approximation": "limited-memory", "pass_nonlinear_variables": False}
     return found
 

@@ -18,7 +18,7 @@ from drake_diff.cost import differentiate_final_cost
 from drake_diff.dynamics import Dynamics, PlantKnots, Pointwise
 from drake_diff.optimal_control import OptimalControl
 from drake_diff.symbolic import trace
-from drake_diff.symbolic_tree import symbolic_plant
+from drake_diff.symbolic_tree import PlantFunctions, symbolic_plant
 
 Values = Callable[[Array], Array]  # knots (K, nx + nu) -> (K, m)
 Linearize = Callable[[Array], tuple[Array, Array]]  # -> (K, m), (K, m, nx + nu)
@@ -29,8 +29,10 @@ class Symbolic:
 
     why_not = ""
 
-    def __init__(self, function: Any):
+    def __init__(self, function: Any, jacobian: Any = None, hessian: Any = None):
         self.function, self.rows, self.width = function, function.size1_out(0), function.size1_in(0)
+        if jacobian is not None:
+            self._jacobian, self._hessian = jacobian, hessian
         self.jacobian_at = _places(self._jacobian.sparsity_out(0))
 
     def values(self, knots: Any) -> Any:
@@ -213,12 +215,13 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
 
 def _dynamics(dynamics: Dynamics) -> KnotFunction:
     form, probe = dynamics.form, dynamics.probe()
+    found: Any = "an object with derivatives of its own"
     if isinstance(form, PlantKnots):
         found = symbolic_plant(form.model)
     elif isinstance(form, Pointwise):
         found = trace(form.f, dynamics.nx, probe, form.values(probe))
-    else:
-        found = "an object with derivatives of its own"
+    if isinstance(found, PlantFunctions):
+        return Symbolic(found.function, found.jacobian, found.hessian)
     if not isinstance(found, str):
         return Symbolic(found)
     return Called(found, dynamics.values, dynamics.linearize, dynamics.nx, dynamics.nx + dynamics.nu)

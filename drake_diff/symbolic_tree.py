@@ -1,10 +1,14 @@
-"""The equations of motion of a tree of hinges and slides as a CasADi function of a knot [q, v, u].
+"""The equations of motion of a tree of hinges and slides as CasADi functions of a knot z = [q, v, u].
 
-    M(q) dv/dt = B u - C(q, v) v + gravity + springs - D v
+    r(q, v, a) = M(q) a + C(q, v) v - gravity - springs + D v,    r(q, v, dv/dt) = B u
 
-Bias by the recursive Newton-Euler algorithm, mass matrix by the composite-rigid-body algorithm (Featherstone, "Rigid
-Body Dynamics Algorithms", 2008, ch. 5 and 6), each body in a frame at its joint whose z axis is the joint's, so that
-most products are with zeros and ones and vanish. What is not in the tree shows in the comparison with Drake.
+r by the recursive Newton-Euler algorithm, M by the composite-rigid-body algorithm (Featherstone, "Rigid Body Dynamics
+Algorithms", 2008, ch. 5 and 6), each body in a frame at its joint whose z axis is the joint's, so that most products
+are with zeros and ones and vanish. Derivatives of dv/dt = a(z) come from those of r, which is half as long:
+
+    a_z = -M^-1 (r_z - B_z),    d^2 (w' a) = -(H_zz + H_za a_z + (H_za a_z)'),    H = d^2 (mu' r), mu = M^-1 w fixed
+
+What is not in the tree shows in the comparison with Drake.
 """
 
 from dataclasses import dataclass
@@ -26,21 +30,57 @@ ROUNDED = 1e-15  # of the frames' entries (sines of pi): zeros that would keep p
 Z = ca.DM([0, 0, 1])
 
 
-def symbolic_plant(model: Model) -> Any | str:
-    """x' of a knot [q, v, u] as an SX function, or why there is none; compared with Drake's plant at two states."""
+@dataclass(frozen=True, eq=False)
+class PlantFunctions:
+    """x' of a knot (nx,), its Jacobian, and of a knot and weights (nx,) the upper triangle of d^2 (weights' x')."""
+
+    function: Any
+    jacobian: Any
+    hessian: Any
+
+
+def symbolic_plant(model: Model) -> PlantFunctions | str:
+    """The equations of motion as SX functions, or why there are none; compared with Drake's plant at two states."""
     tree = tree_for(model)
     if tree is None:
         found = tree_of(model)
         return found if isinstance(found, str) else "its tree differs from Drake's inverse dynamics"
-    equations, random, n = EquationsOfMotion(model), np.random.default_rng(1), model.nv
+    equations, random = EquationsOfMotion(model), np.random.default_rng(1)
     here = model.plant.GetPositionsAndVelocities(model.double.context)
-    knot = ca.SX.sym("knot", model.nx + model.nu)
-    q, v, u = knot[:n], knot[n : 2 * n], knot[2 * n :]
-    function = ca.Function("plant", [knot], [ca.vertcat(v, _acceleration(tree, model, q, v, equations.actuation @ u))])
+    functions = _functions(tree, model, ca.DM(equations.actuation))
     probe = random.standard_normal((2, model.nx + model.nu))
     wanted = np.array([equations(row[: model.nx], row[model.nx :]) for row in probe])
     set_state(model.double, here)
-    return function if agrees(function, probe, wanted, SAME_PLANT) else "its symbolic form differs from Drake's plant"
+    same = agrees(functions.function, probe, wanted, SAME_PLANT)
+    return functions if same else "its symbolic form differs from Drake's plant"
+
+
+def _functions(tree: TreeDynamics, model: Model, actuation: Any) -> PlantFunctions:
+    n, width = model.nv, model.nx + model.nu
+    knot, weights, mu, a = (ca.SX.sym(s, k) for s, k in (("knot", width), ("w", 2 * n), ("mu", n), ("a", n)))
+    q, v, u = knot[:n], knot[n : 2 * n], knot[2 * n :]
+    links, order = _links(tree, model), sorted(range(n), key=lambda k: tree.ancestors[k].sum())  # parents first
+    frames = [_frame(link, tree.hinge[k], q[k]) for k, link in enumerate(links)]
+    factors = ca.ldl(_mass(links, frames, tree.hinge, order) + ca.diag(tree.reflected))
+
+    def residual(a: Any) -> Any:
+        motion = _inverse_dynamics(links, frames, tree.hinge, order, v, a, tree.gravity) + ca.DM(tree.reflected) * a
+        return motion + ca.DM(tree.stiffness) * (q - ca.DM(tree.rest)) + ca.DM(tree.damping) * v
+
+    solved = ca.ldl_solve(actuation @ u - residual(ca.SX.zeros(n)), *factors)
+    r, qva = residual(a), ca.vertcat(q, v, a)
+    slopes = ca.Function("slopes", [knot, a], [ca.jacobian(r, knot)])
+    curves = ca.Function("curves", [knot, a, mu], [ca.hessian(ca.dot(mu, r), qva)[0]])
+    by_knot = -ca.ldl_solve(slopes(knot, solved) - ca.horzcat(ca.SX(n, 2 * n), actuation), *factors)
+    H = -curves(knot, solved, ca.ldl_solve(weights[n:], *factors))
+    S = ca.vertcat(H[: 2 * n, 2 * n :] @ by_knot, ca.SX(model.nu, width))
+    hessian = ca.diagcat(H[: 2 * n, : 2 * n], ca.SX(model.nu, model.nu)) + S + S.T
+    identity = ca.horzcat(ca.SX(n, n), ca.SX.eye(n), ca.SX(n, model.nu))
+    return PlantFunctions(
+        ca.Function("plant", [knot], [ca.vertcat(v, solved)]),
+        ca.Function("jacobian", [knot], [ca.vertcat(identity, by_knot)]),
+        ca.Function("hessian", [knot, weights], [ca.triu(hessian)]),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,17 +115,6 @@ def _links(tree: TreeDynamics, model: Model) -> list[_Link]:
     return links
 
 
-def _acceleration(tree: TreeDynamics, model: Model, q: Any, v: Any, force: Any) -> Any:
-    """dv/dt (n,) under generalized forces (n,)."""
-    links, n = _links(tree, model), len(tree.mass)
-    frames = [_frame(link, tree.hinge[k], q[k]) for k, link in enumerate(links)]
-    order = sorted(range(n), key=lambda k: tree.ancestors[k].sum())  # parents first
-    bias = _bias(links, frames, tree.hinge, order, v, tree.gravity)
-    mass = _mass(links, frames, tree.hinge, order) + ca.diag(tree.reflected)
-    rest = force - bias - ca.DM(tree.stiffness) * (q - ca.DM(tree.rest)) - ca.DM(tree.damping) * v
-    return ca.ldl_solve(rest, *ca.ldl(mass))
-
-
 def _frame(link: _Link, hinge: bool, q: Any) -> tuple[Any, Any]:
     """Rotation and origin of the body's frame in its parent's, at the joint's position q."""
     if not hinge:
@@ -95,8 +124,10 @@ def _frame(link: _Link, hinge: bool, q: Any) -> tuple[Any, Any]:
     return link.rotation @ turned, link.offset
 
 
-def _bias(links: list[_Link], frames: list[Any], hinge: Any, order: list[int], v: Any, gravity: Array) -> Any:
-    """(n,) the joints' forces without acceleration: the motion outwards, the bodies' forces inwards."""
+def _inverse_dynamics(
+    links: list[_Link], frames: list[Any], hinge: Any, order: list[int], v: Any, acceleration: Any, gravity: Array
+) -> Any:
+    """(n,) the joints' forces of the bodies' inertia and weight: motion outwards, forces inwards."""
     n, zero = len(links), ca.DM.zeros(3)
     motions: dict[int, Any] = {-1: (zero, zero, ca.DM(-gravity))}
     forces: dict[int, Any] = {}
@@ -104,25 +135,25 @@ def _bias(links: list[_Link], frames: list[Any], hinge: Any, order: list[int], v
         link, (R, p) = links[k], frames[k]
         w, dw, a = motions[link.parent]
         a = R.T @ (a + ca.cross(dw, p) + ca.cross(w, ca.cross(w, p)))
-        w, dw, spin = R.T @ w, R.T @ dw, Z * v[k]
+        w, dw, spin, push = R.T @ w, R.T @ dw, Z * v[k], Z * acceleration[k]
         if hinge[k]:
-            dw = dw + ca.cross(w, spin)
+            dw = dw + ca.cross(w, spin) + push
             w = w + spin
         else:
-            a = a + 2 * ca.cross(w, spin)
+            a = a + 2 * ca.cross(w, spin) + push
         motions[k] = w, dw, a
         force = link.mass * a + ca.cross(dw, link.moment) + ca.cross(w, ca.cross(w, link.moment))
         moment = link.inertia @ dw + ca.cross(w, link.inertia @ w) + ca.cross(link.moment, a)
         forces[k] = force, moment
-    bias = ca.SX.zeros(n)
+    tau = ca.SX.zeros(n)
     for k in reversed(order):
         force, moment = forces[k]
-        bias[k] = moment[2] if hinge[k] else force[2]
+        tau[k] = moment[2] if hinge[k] else force[2]
         if links[k].parent >= 0:
             force, moment = _to_parent(force, moment, *frames[k])
             f, m = forces[links[k].parent]
             forces[links[k].parent] = f + force, m + moment
-    return bias
+    return tau
 
 
 def _mass(links: list[_Link], frames: list[Any], hinge: Any, order: list[int]) -> Any:

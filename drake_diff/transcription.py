@@ -96,14 +96,18 @@ def transcribe_and_solve(
 def _solve(
     task: OptimalControl, mesh: Array, functions: Any, nodes: Array, time: float, limits: Limits, report: Any
 ) -> Transcribed:
-    from drake_diff.ipopt import solve_ipopt
+    from drake_diff.ipopt import NOT_FINITE, solve_ipopt
     from drake_diff.transcription_program import TranscribedProgram
 
     program = TranscribedProgram(task, mesh, functions)
-    result = solve_ipopt(program, program.pack(nodes, time), limits, report)
-    found, horizon = program.unpack(result.z)
-    why = functions.why_not
+    guess, why = program.pack(nodes, time), functions.why_not
     told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
+    result = solve_ipopt(program, guess, limits, report, exact=not why)
+    if not why and result.message == NOT_FINITE:
+        again = solve_ipopt(program, guess, limits, report, exact=False)
+        if again.message != NOT_FINITE:  # then it was the Hessian
+            told, result = "symbolic, limited-memory Hessian: the exact one is not finite at an iterate", again
+    found, horizon = program.unpack(result.z)
     found = frozen(found)
     return Transcribed(task, frozen(mesh), found, horizon, result.outcome, result.message, result.iterations, told)
 

@@ -37,11 +37,6 @@ class TranscribedProgram:
         self.paths = [(p.nodes(mesh, task.scheme), p.constraint) for p in task.paths]
         self._set_links()
 
-    @property
-    def is_exact(self) -> bool:
-        """Whether there is a Hessian."""
-        return not self.functions.why_not
-
     def pack(self, nodes: Array, horizon: float) -> Array:
         """The decision variables of `nodes` (K, nx + nu) and `horizon` [s]."""
         return np.append(nodes.ravel(), [horizon] * self.free)
@@ -70,15 +65,15 @@ class TranscribedProgram:
         g += [ca.vec(f.values(self.knots[:, at.tolist()])) for f, at in self._path_functions]
         return {"x": self.z, "f": f, "g": ca.vertcat(*g)}
 
-    def derivatives(self) -> dict[str, Any]:
-        """CasADi Functions by the names of nlpsol's options; without "hess_lag" where there is no Hessian."""
+    def derivatives(self, exact: bool) -> dict[str, Any]:
+        """CasADi Functions by the names of nlpsol's options, "hess_lag" only where `exact`."""
         p, sigma = ca.MX.sym("p", 0), ca.MX.sym("sigma")
         multipliers = ca.MX.sym("multipliers", self.nlp["g"].numel())
         found = {
             "grad_f": ca.Function("grad_f", [self.z, p], [self.nlp["f"], self._gradient()]),
             "jac_g": ca.Function("jac_g", [self.z, p], [self.nlp["g"], self._jacobian()]),
         }
-        if self.is_exact:
+        if exact:
             hessian = self._hessian(sigma, multipliers)
             found["hess_lag"] = ca.Function("hess_lag", [self.z, p, sigma, multipliers], [hessian])
         return found

@@ -21,7 +21,7 @@ from drake_diff import symbolic_tree
 from drake_diff.continuous import EquationsOfMotion
 from drake_diff.dynamics import Dynamics, plant_dynamics
 from drake_diff.symbolic import trace
-from drake_diff.symbolic_tree import symbolic_plant
+from drake_diff.symbolic_tree import PlantFunctions, symbolic_plant
 
 EXACT = "symbolic, exact Hessian"
 FORMS = {
@@ -104,10 +104,11 @@ PLANTS = ["pendulum.urdf", "cart_pole.urdf", "acrobot.xml", "double_pendulum.urd
 def test_a_plants_expression_and_its_derivative_are_drakes(name):
     """1e-9 of the largest entry: the trees' mass matrices have condition numbers up to 1e5."""
     model, random = model_named(name), np.random.default_rng(5)
-    function, equations = symbolic_plant(model), EquationsOfMotion(model)
-    assert isinstance(function, ca.Function), function
-    knot = ca.SX.sym("knot", function.size1_in(0))
-    jacobian = ca.Function("jacobian", [knot], [ca.densify(ca.jacobian(function(knot), knot))])
+    plant, equations = symbolic_plant(model), EquationsOfMotion(model)
+    assert isinstance(plant, PlantFunctions), plant
+    function, jacobian = plant.function, plant.jacobian
+    knot, weights = ca.SX.sym("knot", model.nx + model.nu), random.standard_normal(model.nx)
+    by_casadi = ca.Function("hessian", [knot], [ca.triu(ca.hessian(ca.dot(ca.DM(weights), function(knot)), knot)[0])])
     for _ in range(3):
         at = np.concatenate([random_state(model, random), random.standard_normal(model.nu)])
         z = InitializeAutoDiff(at).ravel()
@@ -115,6 +116,8 @@ def test_a_plants_expression_and_its_derivative_are_drakes(name):
         value, rows = ExtractValue(exact).ravel(), ExtractGradient(exact)
         assert function(at).full().ravel() == pytest.approx(value, abs=1e-9 * max(1, np.abs(value).max()))
         assert jacobian(at).full() == pytest.approx(rows, abs=1e-9 * max(1, np.abs(rows).max()))
+        curves = by_casadi(at).full()
+        assert plant.hessian(at, weights).full() == pytest.approx(curves, abs=1e-9 * max(1, np.abs(curves).max()))
 
 
 @pytest.mark.parametrize("left_out", ["damping", "stiffness", "reflected", "mass", "gravity"])
@@ -198,6 +201,16 @@ def test_a_floating_body_goes_the_other_way():
     assert "quaternion_floating" in motion.derivatives
     assert motion.success, motion.message
     assert motion.cost == pytest.approx(0, abs=1e-8)
+
+
+def test_a_hessian_that_is_not_finite_is_left_and_that_is_told():
+    """|v|^1.5 has a first derivative at rest and no second."""
+    drag = Dynamics(lambda x, u: [x[1], u[0] - 0.1 * abs(x[1]) ** 1.5], 2, 1)
+    motion = move(10, drag)
+    assert motion.success
+    assert motion.derivatives == "symbolic, limited-memory Hessian: the exact one is not finite at an iterate"
+    assert 12 < motion.cost < 13
+    assert motion.xs[-1] == pytest.approx([1, 0], abs=1e-9)
 
 
 def test_the_block_is_exact_in_one_step():
