@@ -11,7 +11,7 @@ are with zeros and ones and vanish. Derivatives of dv/dt = a(z) come from those 
 What is not in the tree shows in the comparison with Drake.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -85,22 +85,25 @@ def _functions(tree: TreeDynamics, model: Model, actuation: Any) -> PlantFunctio
 
 @dataclass(frozen=True, eq=False)
 class _Link:
-    """A body in the frame at its joint: `rotation` and `offset` in the parent's at q = 0, mass, moment and inertia."""
+    """A body in the frame at its joint: `rotation` and `offset` in the parent's at q = 0, and what it weighs."""
 
     parent: int  # -1: the world
     rotation: Any
     offset: Any
-    mass: float
-    moment: Any
-    inertia: Any
+    weight: tuple[Any, Any, Any]  # mass, mass times centre of mass, inertia about the joint's origin
 
 
 def _links(tree: TreeDynamics, model: Model) -> list[_Link]:
-    """The bodies in the order of the joints."""
+    """The bodies in the order of the joints.
+
+    What of a hinged body turns on its axis without being seen to, diag(Iyy, Iyy, 0) with the mass and its moment along
+    the axis, is put on the parent, where it is fixed (Gautier and Khalil, "Direct calculation of minimum set of inertial
+    parameters of serial robots", 1990): less to compute, and the same motion.
+    """
     poses = tree.place(model, np.zeros((1, len(tree.mass))))[0]
     turns = [_with_z(axis) for axis in tree.axis]
     frames = [(p[:, :3] @ t, p[:, :3] @ o + p[:, 3]) for p, t, o in zip(poses, turns, tree.origin, strict=True)]
-    links = []
+    links: list[_Link] = []
     for k, turn in enumerate(turns):
         above = [j for j in np.flatnonzero(tree.ancestors[k]) if j != k]
         parent = max(above, key=lambda j: tree.ancestors[j].sum(), default=-1)
@@ -111,8 +114,30 @@ def _links(tree: TreeDynamics, model: Model) -> list[_Link]:
         inertia = tree.inertia[k] + o @ h + h @ o - m * o @ o
         parts = (R.T @ frames[k][0], R.T @ (frames[k][1] - p), turn.T @ moment, turn.T @ inertia @ turn)
         rotation, offset, moment, inertia = (ca.DM(np.where(np.abs(a) < ROUNDED, 0.0, a)) for a in parts)
-        links.append(_Link(int(parent), rotation, offset, float(m), moment, inertia))
+        links.append(_Link(int(parent), rotation, offset, (ca.DM(m), moment, inertia)))
+    for k in sorted(np.flatnonzero(tree.hinge), key=lambda k: -tree.ancestors[k].sum()):
+        link, (m, h, inertia) = links[k], links[k].weight
+        unseen = m, h[2] * Z, inertia[1, 1] * ca.diag(ca.DM([1, 1, 0]))
+        own = inertia - unseen[2]
+        own[1, 1] = 0  # not a rounding error
+        links[k] = replace(link, weight=(0.0, ca.DM([h[0], h[1], 0]), own))
+        if link.parent >= 0:
+            parent = links[link.parent]
+            moved = _moved(unseen, link.rotation, link.offset)
+            links[link.parent] = replace(parent, weight=_sum(parent.weight, moved))
     return links
+
+
+def _moved(weight: Any, R: Any, p: Any) -> Any:
+    """The weight of a body in the frame that its own lies in at R, p."""
+    m, h, inertia = weight
+    turned, P = R @ h, ca.skew(p)
+    H = ca.skew(turned)
+    return m, turned + m * p, R @ inertia @ R.T - P @ H - H @ P - m * P @ P
+
+
+def _sum(a: Any, b: Any) -> Any:
+    return tuple(x + y for x, y in zip(a, b, strict=True))
 
 
 def _frame(link: _Link, hinge: bool, q: Any) -> tuple[Any, Any]:
@@ -142,8 +167,9 @@ def _inverse_dynamics(
         else:
             a = a + 2 * ca.cross(w, spin) + push
         motions[k] = w, dw, a
-        force = link.mass * a + ca.cross(dw, link.moment) + ca.cross(w, ca.cross(w, link.moment))
-        moment = link.inertia @ dw + ca.cross(w, link.inertia @ w) + ca.cross(link.moment, a)
+        m, h, inertia = link.weight
+        force = m * a + ca.cross(dw, h) + ca.cross(w, ca.cross(w, h))
+        moment = inertia @ dw + ca.cross(w, inertia @ w) + ca.cross(h, a)
         forces[k] = force, moment
     tau = ca.SX.zeros(n)
     for k in reversed(order):
@@ -158,7 +184,7 @@ def _inverse_dynamics(
 
 def _mass(links: list[_Link], frames: list[Any], hinge: Any, order: list[int]) -> Any:
     """(n, n): column k are the forces that the bodies which joint k carries need for its acceleration alone."""
-    carried = [(link.mass, link.moment, link.inertia) for link in links]
+    carried = [link.weight for link in links]
     mass = ca.SX.zeros(len(links), len(links))
     for k in reversed(order):
         m, h, inertia = carried[k]
@@ -168,13 +194,9 @@ def _mass(links: list[_Link], frames: list[Any], hinge: Any, order: list[int]) -
             mass[j, k] = mass[k, j] = moment[2] if hinge[j] else force[2]
             force, moment = _to_parent(force, moment, *frames[j])
             j = links[j].parent
-        parent, (R, p) = links[k].parent, frames[k]
+        parent = links[k].parent
         if parent >= 0:
-            turned, P = R @ h, ca.skew(p)
-            H = ca.skew(turned)
-            about = R @ inertia @ R.T - P @ H - H @ P - m * P @ P
-            M, moments, inertias = carried[parent]
-            carried[parent] = M + m, moments + turned + m * p, inertias + about
+            carried[parent] = _sum(carried[parent], _moved(carried[k], *frames[k]))
     return mass
 
 
