@@ -69,7 +69,8 @@ def _functions(tree: TreeDynamics, model: Model, actuation: Any) -> PlantFunctio
 
     solved = ca.ldl_solve(actuation @ u - residual(ca.SX.zeros(n)), *factors)
     r, qva = residual(a), ca.vertcat(q, v, a)
-    slopes = ca.Function("slopes", [knot, a], [ca.jacobian(r, knot)])
+    rows = [ca.gradient(r[i], knot).T for i in range(n)]  # backwards: a fifth shorter than CasADi's own choice
+    slopes = ca.Function("slopes", [knot, a], [ca.vertcat(*rows)])
     curves = ca.Function("curves", [knot, a, mu], [ca.hessian(ca.dot(mu, r), qva)[0]])
     by_knot = -ca.ldl_solve(slopes(knot, solved) - ca.horzcat(ca.SX(n, 2 * n), actuation), *factors)
     H = -curves(knot, solved, ca.ldl_solve(weights[n:], *factors))
@@ -94,12 +95,7 @@ class _Link:
 
 
 def _links(tree: TreeDynamics, model: Model) -> list[_Link]:
-    """The bodies in the order of the joints.
-
-    What of a hinged body turns on its axis without being seen to, diag(Iyy, Iyy, 0) with the mass and its moment along
-    the axis, is put on the parent, where it is fixed (Gautier and Khalil, "Direct calculation of minimum set of inertial
-    parameters of serial robots", 1990): less to compute, and the same motion.
-    """
+    """The bodies in the order of the joints."""
     poses = tree.place(model, np.zeros((1, len(tree.mass))))[0]
     turns = [_with_z(axis) for axis in tree.axis]
     frames = [(p[:, :3] @ t, p[:, :3] @ o + p[:, 3]) for p, t, o in zip(poses, turns, tree.origin, strict=True)]
@@ -115,16 +111,26 @@ def _links(tree: TreeDynamics, model: Model) -> list[_Link]:
         parts = (R.T @ frames[k][0], R.T @ (frames[k][1] - p), turn.T @ moment, turn.T @ inertia @ turn)
         rotation, offset, moment, inertia = (ca.DM(np.where(np.abs(a) < ROUNDED, 0.0, a)) for a in parts)
         links.append(_Link(int(parent), rotation, offset, (ca.DM(m), moment, inertia)))
-    for k in sorted(np.flatnonzero(tree.hinge), key=lambda k: -tree.ancestors[k].sum()):
+    return _regrouped(links, tree)
+
+
+def _regrouped(links: list[_Link], tree: TreeDynamics) -> list[_Link]:
+    """The same motion with less to compute.
+
+    What of a hinged body nobody sees turn on its axis, diag(Iyy, Iyy, 0) with the mass and its moment along the axis,
+    is put on the parent (Gautier and Khalil, "Direct calculation of minimum set of inertial parameters of serial
+    robots", IEEE Transactions on Robotics and Automation 6(3), 1990).
+    """
+    links = list(links)
+    for k in sorted(np.flatnonzero(tree.hinge).tolist(), key=lambda k: -int(tree.ancestors[k].sum())):
         link, (m, h, inertia) = links[k], links[k].weight
         unseen = m, h[2] * Z, inertia[1, 1] * ca.diag(ca.DM([1, 1, 0]))
         own = inertia - unseen[2]
-        own[1, 1] = 0  # not a rounding error
         links[k] = replace(link, weight=(0.0, ca.DM([h[0], h[1], 0]), own))
         if link.parent >= 0:
             parent = links[link.parent]
-            moved = _moved(unseen, link.rotation, link.offset)
-            links[link.parent] = replace(parent, weight=_sum(parent.weight, moved))
+            weight = _sum(parent.weight, _moved(unseen, link.rotation, link.offset))
+            links[link.parent] = replace(parent, weight=weight)
     return links
 
 

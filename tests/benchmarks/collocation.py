@@ -3,8 +3,9 @@
     python tests/benchmarks/collocation.py
 
 All start from a straight line at zero input, with the same limits and tolerance, side by side in one run. Seconds are
-of processor time, in which other work on the machine does not count; what takes less than one is the median of five. Drake's scheme is another one (midpoint input the mean, cost by the
-trapezoid rule), so that its optimum differs a little. "limit" is 60 s or 3000 iterations.
+of processor time, in which other work on the machine does not count; what takes less than one is the median of five.
+Drake's scheme is another one (midpoint input the mean, cost by the trapezoid rule), so that its optimum differs a
+little. "limit" is 60 s on the wall or 3000 iterations.
 """
 
 import statistics
