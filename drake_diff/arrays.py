@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from drake_diff.exceptions import InputError, NonFiniteError, ShapeError
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 
 def frozen(values: ArrayLike) -> Array:

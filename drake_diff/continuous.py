@@ -10,11 +10,12 @@ by inverse dynamics, d(dv/dt) = -M^-1 dr at fixed dv/dt, so AutoDiffXd never fac
 from typing import Any
 
 import numpy as np
-from pydrake.autodiffutils import AutoDiffXd, ExtractValue
+from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 from pydrake.systems.framework import BasicVector_, LeafSystem_
 from pydrake.systems.scalar_conversion import TemplateSystem
 
 from drake_diff.arrays import Array
+from drake_diff.autodiff import gradient_rows
 from drake_diff.exceptions import ModelError
 from drake_diff.model import Model
 from drake_diff.plant_elements import actuators
@@ -52,6 +53,11 @@ class EquationsOfMotion:
         constant = np.array([AutoDiffXd(a) for a in acceleration])
         residual = twin.inverse_dynamics(constant) - self.actuation @ u
         return np.concatenate([self.q_dot(twin, x), acceleration - np.linalg.inv(mass) @ residual])
+
+    def jacobian(self, knot: Array) -> Array:
+        """(nx, nx + nu) at `knot` = [x; u], by AutoDiffXd."""
+        variables, nx = InitializeAutoDiff(knot).ravel(), self.model.nx
+        return gradient_rows(self.autodiff(variables[:nx], variables[nx:]), len(knot))
 
     def q_dot(self, twin: Twin, x: Any) -> Any:
         """(nq,) N(q) v of x (nx,), whose positions are the twin's."""

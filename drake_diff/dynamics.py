@@ -120,6 +120,11 @@ class Dynamics:
         own = hasattr(f, "linearize")
         self._at = f if own else Pointwise("dynamics", f, self.nx, (self.nx,), self.probe())
 
+    @property
+    def form(self) -> Any:
+        """What computes it: a `Pointwise`, a `PlantKnots`, or the caller's own object."""
+        return self._at
+
     def __call__(self, x: Any, u: Any) -> Array:
         """(nx,) the rates at `x` (nx,), `u` (nu,)."""
         return np.asarray(self.values(self._knot(x, u))[0])
@@ -158,7 +163,7 @@ def plant_dynamics(model: Model) -> Dynamics:
     Raises ModelError where the model has no continuous form (PD control, constraints).
     """
     return Dynamics(
-        _PlantKnots(model),
+        PlantKnots(model),
         model.nx,
         model.nu,
         **plant_limits(model.plant),
@@ -167,7 +172,7 @@ def plant_dynamics(model: Model) -> Dynamics:
     )
 
 
-class _PlantKnots:
+class PlantKnots:
     """`EquationsOfMotion` at many knots: with r the residual by inverse dynamics at the solved acceleration a,
 
     da = -M^-1 dr and dr/du = -B, so that AutoDiffXd takes one inverse dynamics by x alone; a tree of hinges and slides

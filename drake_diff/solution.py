@@ -17,8 +17,7 @@ from drake_diff.problem import Problem
 from drake_diff.replay import Plan, Replay, held, replay_open_loop, replays
 from drake_diff.rollout import Rollout, roll_states
 from drake_diff.step import advance
-from drake_diff.transcribed import Collocated
-from drake_diff.transcription import transcribed_from
+from drake_diff.transcribed import Collocated, collocated
 
 # Between two knots the transcription is a cubic; further than this [state units] from an accurate integration
 # its motion is not the model's.
@@ -132,7 +131,7 @@ class Solution:
         """The motion of a collocation scheme, from xs, us, us_mid and u_final; None where they are no such motion."""
         if self.scheme == "step" or not self._is_whole:
             return None
-        return transcribed_from(self.problem, self.scheme, self.xs, self.inputs_at_knots, self.us_mid, self.horizon)
+        return collocated(self.problem, self.scheme, self.xs, self.inputs_at_knots, self.us_mid, self.horizon)
 
     @cached_property
     def defects(self) -> Array:

@@ -5,16 +5,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from pydrake.autodiffutils import InitializeAutoDiff
 
 from drake_diff.arrays import Array, finite_array, frozen, positive_float, positive_int
-from drake_diff.autodiff import gradient_rows
 from drake_diff.certificate import Certificate, certify_jacobian
 from drake_diff.certify import certify
 from drake_diff.collocation import DEFAULT_SOLVER as COLLOCATION_SOLVER
 from drake_diff.collocation import solve_collocation
 from drake_diff.continuous import EquationsOfMotion
-from drake_diff.dynamics import Dynamics, plant_dynamics
 from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.ilqr import check_problem, is_unconstrained, solve_ilqr
 from drake_diff.nonlinear_program import SOLVERS, Limits, NlpResult, Outcome
@@ -22,7 +19,7 @@ from drake_diff.problem import Problem
 from drake_diff.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
 from drake_diff.shooting import RolloutCost, ShootingVariables, solve_shooting
 from drake_diff.solution import Solution, Status
-from drake_diff.transcription import transcribe_problem
+from drake_diff.transcription import ProblemTranscription
 from drake_diff.transcription_scheme import SCHEMES
 from drake_diff.verdict import ended, judged, refused, why_blind
 
@@ -184,25 +181,34 @@ class _Run:
         self.knots = np.unique(np.linspace(0, problem.num_steps - 1, CERTIFIED_KNOTS).astype(int))
 
     def collocate(self, xs: Array, us: Array) -> Solution:
-        dynamics = plant_dynamics(self.problem.model)
-        before = self._certify_dynamics(dynamics, xs, us)
-        result, found = self._drake(xs, us) if self.scheme == "drake" else self._transcribe(xs, us)
-        finite = bool(np.all(np.isfinite(found["xs"])))
-        after = self._certify_dynamics(dynamics, found["xs"], found["us"]) if finite else ()
-        return judged(self._draft(**found, certificates=before + after), result)
+        """In CasADi; SNOPT, which that does not carry, in Drake's own DirectCollocation."""
+        if self.solver == "snopt":
+            equations = EquationsOfMotion(self.problem.model)
+            before = self._certify_equations(equations.jacobian, xs, us)
+            result, found = self._solve_drakes(xs, us)
+            return self._collocated(result, found, before, equations.jacobian)
+        transcription = ProblemTranscription(self.problem, self.scheme)
+        before = self._certify_equations(transcription.jacobian, xs, us)
+        motion = transcription.solve(xs, np.vstack([us, us[-1:]]), limits=self.limits, report=self.report)
+        self.options["derivatives"] = motion.derivatives
+        found = {"xs": motion.xs, "us": motion.us[:-1], "u_final": motion.us[-1]}
+        found |= {"us_mid": None if self.scheme == "drake" else motion.us_mid}
+        found |= {"free_horizon": motion.horizon if self.problem.horizon else None}
+        result = NlpResult(motion.nodes.ravel(), motion.outcome, motion.message, motion.iterations)
+        return self._collocated(result, found, before, transcription.jacobian)
 
-    def _drake(self, xs: Array, us: Array) -> tuple[NlpResult, dict[str, Any]]:
+    def _solve_drakes(self, xs: Array, us: Array) -> tuple[NlpResult, dict[str, Any]]:
         result, xs, us, u_final = solve_collocation(
             self.problem, xs, us, solver=self.solver, limits=self.limits, report=self.report
         )
         return result, {"xs": xs, "us": us, "u_final": u_final}
 
-    def _transcribe(self, xs: Array, us: Array) -> tuple[NlpResult, dict[str, Any]]:
-        knots = np.vstack([us, us[-1:]])
-        motion = transcribe_problem(self.problem, self.scheme, (xs, knots), limits=self.limits, report=self.report)
-        result = NlpResult(motion.nodes.ravel(), motion.outcome, motion.message, motion.iterations)
-        found = {"xs": motion.xs, "us": motion.us[:-1], "u_final": motion.us[-1], "us_mid": motion.us_mid}
-        return result, found | {"free_horizon": motion.horizon if self.problem.horizon else None}
+    def _collocated(
+        self, result: NlpResult, found: dict[str, Any], before: tuple[Certificate, ...], jacobian: Any
+    ) -> Solution:
+        finite = bool(np.all(np.isfinite(found["xs"])))
+        after = self._certify_equations(jacobian, found["xs"], found["us"]) if finite else ()
+        return judged(self._draft(**found, certificates=before + after), result)
 
     def sweep(self, xs: Array, us: Array, *, given: bool) -> Solution:
         """iLQR; from the states of a `given` guess, which need not be a rollout, else from the rollout of `us`."""
@@ -270,29 +276,21 @@ class _Run:
         certificates = tuple(certify(self.problem.model, xs[k], us[k], parameters=parameters) for k in self.knots)
         return xs, us, certificates, why_blind(self.problem, variables, z)
 
-    def _certify_dynamics(self, dynamics: Dynamics, xs: Array, us: Array) -> tuple[Certificate, ...]:
-        """Certificates, at some knots, of the derivative that collocation uses against the equations' differences."""
+    def _certify_equations(self, jacobian: Any, xs: Array, us: Array) -> tuple[Certificate, ...]:
+        """Certificates, at some knots, of the Jacobian that the solver gets against Drake's own equations."""
         model, equations = self.problem.model, EquationsOfMotion(self.problem.model)
-        own = self.scheme != "drake"
-        names = tuple(f"d({name})/dt" for name in model.state_names)
 
         def f(z: Array) -> Array:
             return equations(z[: model.nx], z[model.nx :])
-
-        def jacobian(z: Array) -> Array:
-            if own:
-                return np.asarray(dynamics.linearize(z[None])[1][0])
-            variables = InitializeAutoDiff(z).ravel()
-            return gradient_rows(equations.autodiff(variables[: model.nx], variables[model.nx :]), len(z))
 
         return tuple(
             certify_jacobian(
                 f,
                 np.concatenate([xs[k], us[k]]),
                 jacobian,
-                rows=names,
+                rows=tuple(f"d({name})/dt" for name in model.state_names),
                 columns=model.state_names + model.input_names,
-                method="continuous time" if own else "autodiff, continuous time",
+                method="continuous time",
                 subject=f"the equations of motion of {model.name}",
             )
             for k in self.knots

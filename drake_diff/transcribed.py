@@ -8,7 +8,8 @@ import numpy as np
 
 from drake_diff.arrays import Array
 from drake_diff.nonlinear_program import FEASIBILITY_TOLERANCE, Iteration, Outcome
-from drake_diff.transcription_program import OptimalControl
+from drake_diff.optimal_control import OptimalControl, task_of
+from drake_diff.problem import Problem
 from drake_diff.transcription_scheme import interval_defects, node_weights, per_interval
 
 SUBSTEPS = 10  # of the Runge-Kutta method that measures an interval
@@ -38,14 +39,15 @@ class Collocated:
 
     @property
     def infeasibility(self) -> float:
-        """The largest defect, distance from a given end, or excess over a bound at a node; inf where not finite."""
-        task, nx, b = self.task, self.task.dynamics.nx, self.task.bounds
-        xs, us = self.nodes[:, :nx], self.nodes[:, nx:]
-        ends = np.concatenate([np.abs(xs[0] - task.x0), np.abs(xs[-1] - task.x_goal)])
-        inner = xs[1:] if np.all(np.isfinite(task.x0)) else xs
-        excess = [b.x_lower - inner, inner - b.x_upper, b.u_lower - us, us - b.u_upper]
-        worst = [float(np.max(e, initial=0.0)) for e in (ends[~np.isnan(ends)], *excess)]
-        return max(self.defect, *worst) if np.all(np.isfinite(self.nodes)) else float("inf")
+        """The largest defect, excess over a bound or constraint, or distance from an end or waypoint at a node.
+
+        inf where something is not finite.
+        """
+        if not np.all(np.isfinite(self.nodes)):
+            return float("inf")
+        lower, upper = self.task.node_limits(self.mesh)
+        beyond = float(np.max(np.maximum(lower - self.nodes, self.nodes - upper), initial=0.0))
+        return max(self.defect, beyond, *self.task.path_excess(self.nodes, self.mesh).values())
 
     @property
     def times(self) -> Array:
@@ -80,7 +82,7 @@ class Collocated:
     def cost(self) -> float:
         """The scheme's own quadrature of the running cost, and the final cost."""
         weights = self.horizon * node_weights(self.mesh, self.task.scheme)
-        return float(weights @ self.task.rate.values(self.nodes)) + self.task.final(self.xs[-1])
+        return float(weights @ self.task.rate.values(self.nodes)) + float(self.task.final(self.xs[-1]))
 
     @cached_property
     def defects(self) -> Array:
@@ -159,6 +161,7 @@ class Transcribed(Collocated):
     outcome: Outcome
     message: str
     iterations: tuple[Iteration, ...]
+    derivatives: str  # where the solver's came from, and why there is no Hessian where there is none
     refinements: tuple[tuple[int, float], ...] = ()
 
     @property
@@ -192,3 +195,17 @@ def violation_between_nodes(motion: Collocated) -> Excess:
     time = motion.times[k[at]] + tau[at] * motion._lengths[k[at]]
     where = f"{name} by {both[at, column]:.3g} at {time:.4g} s" if both[at, column] > 0 else "nowhere"
     return Excess(float(np.max(by_state)), float(np.max(by_input)), where)
+
+
+def collocated(problem: Problem, scheme: str, xs: Array, us: Array, us_mid: Array | None, horizon: float) -> Collocated:
+    """The motion with knots xs (N+1, nx), us (N+1, nu) and midpoint inputs (N, nu), linear in between where None."""
+    task, mesh = task_of(problem, scheme), np.linspace(0, 1, len(xs))
+    knots = np.hstack([xs, us])
+    if task.scheme.nodes == 1:
+        return Collocated(task, mesh, knots, horizon)
+    rates, h = task.dynamics.values(knots), horizon / (len(xs) - 1)
+    x_mid = (xs[:-1] + xs[1:]) / 2 + h / 8 * (rates[:-1] - rates[1:])
+    u_mid = (us[:-1] + us[1:]) / 2 if us_mid is None else us_mid
+    nodes = np.empty((2 * len(xs) - 1, knots.shape[1]))
+    nodes[::2], nodes[1::2] = knots, np.hstack([x_mid, u_mid])
+    return Collocated(task, mesh, nodes, horizon)

@@ -7,21 +7,21 @@ too coarse for the best input, only a finer one tells.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from drake_diff.arrays import Array, array_with_gaps, finite_array, frozen, positive_float, positive_int
+from drake_diff.arrays import Array, finite_array, frozen, positive_float, positive_int
 from drake_diff.bounds import Bounds
-from drake_diff.cost import FinalCost, QuadraticCost
-from drake_diff.dynamics import Dynamics, Pointwise, plant_dynamics
-from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.nonlinear_program import Limits, Outcome, solve_program
+from drake_diff.cost import FinalCost
+from drake_diff.dynamics import Dynamics
+from drake_diff.exceptions import InputError
+from drake_diff.nonlinear_program import Limits, Outcome
+from drake_diff.optimal_control import OptimalControl, checked_task, task_of
 from drake_diff.problem import Problem
-from drake_diff.transcribed import Collocated, Transcribed
-from drake_diff.transcription_program import OptimalControl, RunningRate, TranscribedProgram
-from drake_diff.transcription_scheme import SCHEMES, node_fractions
+from drake_diff.transcribed import Transcribed
+from drake_diff.transcription_scheme import node_fractions
 
 DEFAULT_LIMITS = Limits(max_iterations=3000, time_limit=np.inf, tolerance=1e-9)
 MOST_PIECES = 4  # of one interval in one round of refinement
@@ -38,9 +38,10 @@ def transcribe_and_solve(
     running_cost: Any = None,
     final_cost: FinalCost | None = None,
     bounds: Bounds | None = None,
+    constraints: Any = (),
+    waypoints: Mapping[int, Any] | None = None,
     scheme: str = "hermite_simpson",
     guess: Any = None,
-    solver: str = "ipopt",
     limits: Limits = DEFAULT_LIMITS,
     report: Callable[[str], None] | None = None,
     refine: bool = False,
@@ -55,17 +56,37 @@ def transcribe_and_solve(
     `violation_between_nodes`. `scheme` is "hermite_simpson" (order 4) or "trapezoid" (order 2). `guess` is (xs, us) or
     (xs, us, horizon) with shapes (count+1, nx), (count+1, nu), or a `Transcribed`; else a straight line at zero input.
 
+    `constraints` are `Constraint`s, kept at their knots, where those are None at the midpoints too, and one of u also
+    at knot `count`. `waypoints` maps knots 1 ... count-1 to states (nx,), NaN where free. Knots are those of the first
+    mesh, whose places the refined ones keep.
+
+    The solver is the IPOPT that CasADi carries: with exact Hessians where everything can be written as an expression,
+    else with a limited-memory one; `derivatives` of the result says which and why.
+
     `refine` splits intervals whose `errors` or `cost_errors` are above `error_tolerance` and solves again from there,
     up to `max_count` intervals; `limits` hold for each round.
 
     Raises InputError and its kin before anything runs; how a solve ended is `outcome` and `message`.
     """
-    task = _check_task(dynamics, x0, x_goal, horizon, running_cost, final_cost, bounds, scheme)
     mesh = np.linspace(0, 1, positive_int("count", count) + 1)
+    task = checked_task(
+        dynamics,
+        mesh,
+        x0=x0,
+        x_goal=x_goal,
+        waypoints=waypoints,
+        horizon=horizon,
+        running_cost=running_cost,
+        final_cost=final_cost,
+        bounds=bounds,
+        constraints=constraints,
+        scheme=scheme,
+    )
     error_tolerance = positive_float("error_tolerance", error_tolerance)
     max_count = positive_int("max_count", max_count)
-    nodes, time = _first_nodes(task, mesh, guess)
-    motion = _solve(task, mesh, nodes, time, solver, limits, report)
+    nodes, time = first_nodes(task, mesh, guess)
+    functions = knot_functions_of(task)
+    motion = solve_on_mesh(task, mesh, functions, nodes, time, limits, report)
     rounds = [(len(mesh) - 1, float(np.max(_worst(motion))))] if refine else []
     while rounds and motion.outcome in FOUND and rounds[-1][1] > error_tolerance:
         mesh = _split(motion, error_tolerance)
@@ -74,59 +95,53 @@ def transcribe_and_solve(
             motion = dataclasses.replace(motion, message=motion.message + told)
             break
         nodes = np.hstack(motion.at(motion.horizon * node_fractions(mesh, task.scheme)))
-        motion = _solve(task, mesh, nodes, motion.horizon, solver, limits, report)
+        motion = solve_on_mesh(task, mesh, functions, nodes, motion.horizon, limits, report)
         rounds.append((len(mesh) - 1, float(np.max(_worst(motion)))))
     return dataclasses.replace(motion, refinements=tuple(rounds))
 
 
-def optimal_control(problem: Problem, scheme: str) -> OptimalControl:
-    """What `problem` asks of a collocation scheme; ModelError where its model has no continuous form."""
-    whole = problem.num_steps * problem.model.time_step
-    return _check_task(
-        plant_dynamics(problem.model),
-        np.where(problem.initial_state_mask, np.nan, problem.x0),
-        problem.goal,
-        problem.horizon or whole,
-        problem.running_cost,
-        problem.final_cost,
-        problem.bounds,
-        scheme,
-    )
+class ProblemTranscription:
+    """A `Problem` in a scheme, on its own `num_steps` equal intervals."""
+
+    def __init__(self, problem: Problem, scheme: str):
+        self.task, self.mesh = task_of(problem, scheme), np.linspace(0, 1, problem.num_steps + 1)
+        self.functions = knot_functions_of(self.task)
+        self.horizon = float(np.clip(problem.num_steps * problem.model.time_step, *self.task.horizon))
+
+    def jacobian(self, knot: Array) -> Array:
+        """(nx, nx + nu) of the rates at `knot` (nx + nu,), as the solver gets it."""
+        return np.asarray(self.functions.dynamics.jacobian_of(knot))
+
+    def solve(self, xs: Array, us: Array, *, limits: Limits, report: Callable[[str], None] | None) -> Transcribed:
+        """From the guess xs (N+1, nx), us (N+1, nu)."""
+        nodes, _ = first_nodes(self.task, self.mesh, (xs, us))
+        return solve_on_mesh(self.task, self.mesh, self.functions, nodes, self.horizon, limits, report)
 
 
-def transcribe_problem(
-    problem: Problem, scheme: str, guess: Any, *, limits: Limits, report: Callable[[str], None] | None
+def knot_functions_of(task: OptimalControl) -> Any:
+    """The task's functions as CasADi's, which is loaded when it is first needed."""
+    from drake_diff.knot_functions import knot_functions
+
+    return knot_functions(task)
+
+
+def solve_on_mesh(
+    task: OptimalControl, mesh: Array, functions: Any, nodes: Array, time: float, limits: Limits, report: Any
 ) -> Transcribed:
-    """Solve `problem` on its own `num_steps` equal intervals from `guess`: (xs (N+1, nx), us (N+1, nu))."""
-    task, mesh = optimal_control(problem, scheme), np.linspace(0, 1, problem.num_steps + 1)
-    nodes, _ = _first_nodes(task, mesh, guess)
-    time = float(np.clip(problem.num_steps * problem.model.time_step, *task.horizon))
-    return _solve(task, mesh, nodes, time, "ipopt", limits, report)
+    from drake_diff.ipopt import NOT_FINITE, solve_ipopt
+    from drake_diff.transcription_program import TranscribedProgram
 
-
-def transcribed_from(
-    problem: Problem, scheme: str, xs: Array, us: Array, us_mid: Array | None, horizon: float
-) -> Collocated:
-    """The motion with knots xs (N+1, nx), us (N+1, nu) and midpoint inputs (N, nu), linear in between where None."""
-    task, mesh = optimal_control(problem, scheme), np.linspace(0, 1, len(xs))
-    knots = np.hstack([xs, us])
-    if task.scheme.nodes == 1:
-        return Collocated(task, mesh, knots, horizon)
-    rates, h = task.dynamics.values(knots), horizon / (len(xs) - 1)
-    x_mid = (xs[:-1] + xs[1:]) / 2 + h / 8 * (rates[:-1] - rates[1:])
-    u_mid = (us[:-1] + us[1:]) / 2 if us_mid is None else us_mid
-    nodes = np.empty((2 * len(xs) - 1, knots.shape[1]))
-    nodes[::2], nodes[1::2] = knots, np.hstack([x_mid, u_mid])
-    return Collocated(task, mesh, nodes, horizon)
-
-
-def _solve(
-    task: OptimalControl, mesh: Array, nodes: Array, time: float, solver: str, limits: Limits, report: Any
-) -> Transcribed:
-    program = TranscribedProgram(task, mesh)
-    result = solve_program(program.program, program.pack(nodes, time), solver=solver, limits=limits, report=report)
+    program = TranscribedProgram(task, mesh, functions)
+    guess, why = program.pack(nodes, time), functions.why_not
+    told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
+    result = solve_ipopt(program, guess, limits, report, exact=not why)
+    if not why and result.message == NOT_FINITE:
+        again = solve_ipopt(program, guess, limits, report, exact=False)
+        if again.message != NOT_FINITE:  # then it was the Hessian
+            told, result = "symbolic, limited-memory Hessian: the exact one is not finite at an iterate", again
     found, horizon = program.unpack(result.z)
-    return Transcribed(task, frozen(mesh), frozen(found), horizon, result.outcome, result.message, result.iterations)
+    found = frozen(found)
+    return Transcribed(task, frozen(mesh), found, horizon, result.outcome, result.message, result.iterations, told)
 
 
 def _worst(motion: Transcribed) -> Array:
@@ -142,52 +157,7 @@ def _split(motion: Transcribed, tolerance: float) -> Array:
     return np.append(np.concatenate([a + (b - a) * np.arange(n) / n for a, b, n in ends]), 1.0)
 
 
-def _check_task(
-    dynamics: Dynamics, x0: Any, x_goal: Any, horizon: Any, running: Any, final: Any, bounds: Any, scheme: str
-) -> OptimalControl:
-    if not isinstance(dynamics, Dynamics):
-        raise InputError("dynamics", got=type(dynamics).__name__, expected="Dynamics or plant_dynamics(model)")
-    if scheme not in SCHEMES:
-        raise UnknownNameError("scheme", got=scheme, known=SCHEMES)
-    if not (bounds is None or isinstance(bounds, Bounds)):
-        raise InputError("bounds", got=type(bounds).__name__, expected="Bounds")
-    if isinstance(final, QuadraticCost):
-        final.check_sizes("final_cost", dynamics.nx, dynamics.nu)
-    elif final is not None:
-        Pointwise("final_cost", lambda x, u: final(x), dynamics.nx, (), dynamics.probe())  # raises where it is none
-    limits = dynamics.limits(bounds)
-    free = np.full(dynamics.nx, np.nan)
-    start = _check_end(dynamics, "x0", x0, None)
-    goal = free if x_goal is None else _check_end(dynamics, "x_goal", x_goal, limits)
-    if running is None and final is None and np.all(np.isnan(goal)):
-        raise InputError("problem", got="no cost and no goal", expected="a cost, an x_goal, or both")
-    rate = RunningRate(running, dynamics)
-    return OptimalControl(dynamics, start, goal, _check_horizon(horizon), rate, final, limits, SCHEMES[scheme])
-
-
-def _check_end(dynamics: Dynamics, subject: str, values: Any, limits: Bounds | None) -> Array:
-    end = array_with_gaps(subject, values, (dynamics.nx,))
-    if np.any(np.isinf(end)):
-        raise InputError(subject, got=end, expected="finite numbers, NaN where free")
-    if limits is not None:
-        for i in np.flatnonzero((end < limits.x_lower) | (end > limits.x_upper))[:1]:
-            expected = f"within [{limits.x_lower[i]:g}, {limits.x_upper[i]:g}]"
-            raise InputError(f"{subject}, {dynamics.state_names[i]}", got=float(end[i]), expected=expected)
-    return end
-
-
-def _check_horizon(horizon: Any) -> tuple[float, float]:
-    if not isinstance(horizon, (tuple, list)):
-        horizon = (horizon, horizon)
-    if len(horizon) != 2:
-        raise InputError("horizon", got=repr(horizon), expected="a number of seconds, or (lower, upper)")
-    lower, upper = (positive_float("horizon [s]", value) for value in horizon)
-    if lower > upper:
-        raise InputError("horizon", got=repr(horizon), expected="lower at most upper")
-    return lower, upper
-
-
-def _first_nodes(task: OptimalControl, mesh: Array, guess: Any) -> tuple[Array, float]:
+def first_nodes(task: OptimalControl, mesh: Array, guess: Any) -> tuple[Array, float]:
     """Nodes (K, nx + nu) within the input's bounds, and a horizon, from a guess at the knots."""
     f, where = task.dynamics, node_fractions(mesh, task.scheme)
     if isinstance(guess, Transcribed):

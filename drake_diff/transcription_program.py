@@ -1,256 +1,244 @@
-"""Optimal control by collocation as a sparse program for IPOPT and SNOPT.
+"""Optimal control by collocation as a sparse program for IPOPT: its functions and their exact derivatives.
 
-The variables are the nodes (knots and midpoints), row by row, and a free final time. Constraints span a few
-neighbouring intervals and have those intervals' variables alone, with the pattern of their Jacobian.
+With the rates F and their Jacobians J at all nodes, each computed once, the rest is linear in them:
+
+    g = S z - T D F,    dg = S - T D J,    d^2 (lambda' g) = -T sum_k d^2 (nu_k' f),    nu = D' lambda
+
+with constant sparse S and D from the scheme's states and slopes, so that the Hessian has one block a node, and a column
+for a free final time T. Path constraints add rows to g and terms to the blocks of their nodes.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
+import casadi as ca
 import numpy as np
-from pydrake.autodiffutils import ExtractValue
-from pydrake.solvers import MathematicalProgram
 
-from drake_diff.arrays import Array, finite_array
-from drake_diff.autodiff import chain, chain_rows
-from drake_diff.bounds import Bounds
-from drake_diff.cost import FinalCost, QuadraticCost, differentiate_cost, differentiate_final_cost
-from drake_diff.dynamics import Dynamics, Pointwise
-from drake_diff.transcription_scheme import Scheme, interval_defects, node_weights, per_interval
-
-# Variables of one constraint: several intervals share one, which saves calls, while AutoDiffXd stays small.
-CHUNK = 64
-
-
-class RunningRate:
-    """A running cost at many knots: a number [per s], a QuadraticCost, or a function (x, u) -> scalar."""
-
-    def __init__(self, cost: Any, dynamics: Dynamics):
-        self.cost, self.nx, self.width = cost, dynamics.nx, dynamics.nx + dynamics.nu
-        self.quadratic = isinstance(cost, QuadraticCost)
-        self.constant = None
-        if cost is None or np.isscalar(cost):
-            self.constant = float(finite_array("running_cost", 0.0 if cost is None else cost, ()))
-        elif self.quadratic:
-            cost.check_sizes("running_cost", dynamics.nx, dynamics.nu)
-        else:
-            self._at = Pointwise("running_cost", cost, self.nx, (), dynamics.probe())
-
-    def values(self, knots: Array) -> Array:
-        """(K,) at `knots` (K, nx + nu)."""
-        if self.constant is not None:
-            return np.full(len(knots), self.constant)
-        if self.quadratic:
-            return np.array([float(self.cost(k[: self.nx], k[self.nx :])) for k in knots])
-        return self._at.values(knots)[:, 0]
-
-    def linearize(self, knots: Array) -> tuple[Array, Array]:
-        """(K,) and the gradients (K, nx + nu)."""
-        if self.constant is not None:
-            return self.values(knots), np.zeros(knots.shape)
-        if self.quadratic:
-            found = [differentiate_cost(self.cost, k[: self.nx], k[self.nx :]) for k in knots]
-            return np.array([v for v, _, _ in found]), np.array([np.concatenate(g) for _, *g in found])
-        values, rows = self._at.linearize(knots)
-        return values[:, 0], rows[:, 0]
-
-
-@dataclass(frozen=True, eq=False)
-class OptimalControl:
-    """What is transcribed, checked: NaN in `x0` and `x_goal` (nx,) is free; `horizon` (lower, upper) [s]."""
-
-    dynamics: Dynamics
-    x0: Array
-    x_goal: Array
-    horizon: tuple[float, float]
-    rate: RunningRate
-    final_cost: FinalCost | None
-    bounds: Bounds
-    scheme: Scheme
-
-    @property
-    def time_is_free(self) -> bool:
-        return self.horizon[0] < self.horizon[1]
-
-    def final(self, x: Array) -> float:
-        """The final cost at `x` (nx,)."""
-        return 0.0 if self.final_cost is None else float(self.final_cost(x))
-
-
-class KnotCache:
-    """The dynamics at knots, each evaluated once however many constraints and calls ask for it."""
-
-    def __init__(self, dynamics: Dynamics, capacity: int):
-        self.dynamics, self.capacity = dynamics, capacity
-        self._values: dict[bytes, Array] = {}
-        self._rows: dict[bytes, Array] = {}
-
-    def values(self, knots: Array) -> Array:
-        """(K, nx) the rates at `knots` (K, nx + nu)."""
-        return self._look_up(knots, self._values, self._evaluate)[0]
-
-    def linearize(self, knots: Array) -> tuple[Array, Array]:
-        """(K, nx) the rates and (K, nx, nx + nu) their Jacobians."""
-        values, keys = self._look_up(knots, self._rows, self._linearize)
-        return values, np.array([self._rows[key] for key in keys])
-
-    def _look_up(self, knots: Array, known: dict[bytes, Array], find: Callable[..., None]) -> tuple[Array, list[bytes]]:
-        keys = [knot.tobytes() for knot in knots]
-        if len(self._values) + len(keys) > self.capacity:
-            self._values.clear()
-            self._rows.clear()
-        missing = [i for i, key in enumerate(keys) if key not in known]
-        if missing:
-            find(knots[missing], [keys[i] for i in missing])
-        return np.array([self._values[key] for key in keys]), keys
-
-    def _evaluate(self, knots: Array, keys: list[bytes]) -> None:
-        self._values.update(zip(keys, self.dynamics.values(knots), strict=True))
-
-    def _linearize(self, knots: Array, keys: list[bytes]) -> None:
-        values, rows = self.dynamics.linearize(knots)
-        self._values.update(zip(keys, values, strict=True))
-        self._rows.update(zip(keys, rows, strict=True))
+from drake_diff.arrays import Array, Indices
+from drake_diff.knot_functions import KnotFunction, KnotFunctions
+from drake_diff.optimal_control import OptimalControl
+from drake_diff.transcription_scheme import node_weights
 
 
 class TranscribedProgram:
     """The program of an `OptimalControl` on a mesh (N+1,) of fractions of the horizon: z = [nodes row by row, T]."""
 
-    def __init__(self, task: OptimalControl, mesh: Array):
-        self.task, self.mesh = task, mesh
-        self.width = task.dynamics.nx + task.dynamics.nu
-        self.num_nodes = task.scheme.nodes * (len(mesh) - 1) + 1
-        self.cache = KnotCache(task.dynamics, 10 * self.num_nodes)
-        self.program = MathematicalProgram()
-        self.nodes = self.program.NewContinuousVariables(self.num_nodes, self.width, "node")
-        self.time = self.program.NewContinuousVariables(int(task.time_is_free), "horizon")
-        self._add_bounds()
-        self._add_dynamics()
-        self._add_costs()
+    def __init__(self, task: OptimalControl, mesh: Array, functions: KnotFunctions):
+        self.task, self.mesh, self.functions = task, mesh, functions
+        self.nx, self.width = task.dynamics.nx, task.dynamics.nx + task.dynamics.nu
+        self.weights = node_weights(mesh, task.scheme)
+        self.every = np.arange(len(self.weights))
+        self.free = int(task.time_is_free)
+        nodes = zip(task.node_limits(mesh), task.horizon, strict=True)
+        self.lower, self.upper = (np.append(side.ravel(), [time] * self.free) for side, time in nodes)
+        self.z = ca.MX.sym("z", len(self.lower))
+        self.knots = ca.reshape(self.z[: self.every.size * self.width], self.width, self.every.size)
+        self.time = self.z[-1] if self.free else ca.MX(task.horizon[0])
+        self.paths = [(p.nodes(mesh, task.scheme), p.constraint) for p in task.paths]
+        self._set_links()
+        self._linear = self._linear_inputs() if task.scheme.input_is_linear else None
 
     def pack(self, nodes: Array, horizon: float) -> Array:
         """The decision variables of `nodes` (K, nx + nu) and `horizon` [s]."""
-        z = np.zeros(self.program.num_vars())
-        self.program.SetDecisionVariableValueInVector(self.nodes, nodes, z)
-        self.program.SetDecisionVariableValueInVector(self.time, np.full(len(self.time), horizon), z)
-        return z
+        return np.append(nodes.ravel(), [horizon] * self.free)
 
     def unpack(self, z: Array) -> tuple[Array, float]:
         """The nodes (K, nx + nu) and the horizon [s] of the decision variables."""
-        found = z[self.program.FindDecisionVariableIndices(self.nodes.ravel())]
-        times = z[self.program.FindDecisionVariableIndices(self.time)]
-        return found.reshape(self.nodes.shape), float(times[0]) if len(times) else self.task.horizon[0]
+        nodes = z[: self.every.size * self.width].reshape(-1, self.width)
+        return nodes, float(z[-1]) if self.free else self.task.horizon[0]
 
-    def _add_bounds(self) -> None:
-        task, b, nx = self.task, self.task.bounds, self.task.dynamics.nx
-        lower = np.tile(np.concatenate([b.x_lower, b.u_lower]), (self.num_nodes, 1))
-        upper = np.tile(np.concatenate([b.x_upper, b.u_upper]), (self.num_nodes, 1))
-        for node, wanted in ((0, task.x0), (-1, task.x_goal)):
-            for side in (lower, upper):
-                side[node, :nx] = np.where(np.isnan(wanted), side[node, :nx], wanted)
-        self.program.AddBoundingBoxConstraint(lower.ravel(), upper.ravel(), self.nodes.ravel())
-        if task.time_is_free:
-            self.program.AddBoundingBoxConstraint(*task.horizon, self.time)
+    @cached_property
+    def sides(self) -> tuple[Array, Array]:
+        """(lower, upper) of g: 0 for the defects, then each path constraint's own, node by node."""
+        lower, upper = [np.zeros(self.num_defects)], [np.zeros(self.num_defects)]
+        for at, constraint in self.paths:
+            lower.append(np.tile(constraint.lower, len(at)))
+            upper.append(np.tile(constraint.upper, len(at)))
+        if self._linear is not None:
+            lower.append(np.zeros(self._linear.shape[0]))
+            upper.append(np.zeros(self._linear.shape[0]))
+        return np.concatenate(lower), np.concatenate(upper)
 
-    def _add_dynamics(self) -> None:
-        scheme, count = self.task.scheme, len(self.mesh) - 1
-        size = max(1, CHUNK // (scheme.nodes * self.width))
-        for start in range(0, count, size):
-            chunk = _Defects(self, slice(start, min(start + size, count)))
-            zero = np.zeros(chunk.num_rows)
-            nodes = self.nodes[scheme.nodes * start : scheme.nodes * chunk.intervals.stop + 1]
-            variables = np.concatenate([nodes.ravel(), self.time])
-            name = f"dynamics, intervals {start} to {chunk.intervals.stop - 1}"
-            binding = self.program.AddConstraint(chunk, zero, zero, vars=variables, description=name)
-            binding.evaluator().SetGradientSparsityPattern(chunk.pattern())
+    @cached_property
+    def nlp(self) -> dict[str, Any]:
+        """x, f and g as CasADi's nlpsol takes them."""
+        f = self.time * ca.dot(self._costs, ca.DM(self.weights).T)
+        if self.functions.final is not None:
+            f += self.functions.final.values(self.knots[:, -1])
+        g = [ca.mtimes(self._S, self.z) - self.time * ca.mtimes(self._D, ca.vec(self._rates))]
+        g += [ca.vec(f.values(self.knots[:, at.tolist()])) for f, at in self._path_functions]
+        if self._linear is not None:
+            g.append(ca.mtimes(self._linear, self.z))
+        return {"x": self.z, "f": f, "g": ca.vertcat(*g)}
 
-    def _add_costs(self) -> None:
-        task, weights = self.task, node_weights(self.mesh, self.task.scheme)
-        if task.rate.cost is not None:
-            size = max(1, CHUNK // self.width)
-            for start in range(0, self.num_nodes, size):
-                part = slice(start, start + size)
-                variables = np.concatenate([self.nodes[part].ravel(), self.time])
-                self.program.AddCost(_RunningCost(task, weights[part]), vars=variables)
-        if task.final_cost is not None:
-            self.program.AddCost(_FinalCost(task), vars=self.nodes[-1, : task.dynamics.nx])
+    def derivatives(self, exact: bool) -> dict[str, Any]:
+        """CasADi Functions by the names of nlpsol's options, "hess_lag" only where `exact`."""
+        p, sigma = ca.MX.sym("p", 0), ca.MX.sym("sigma")
+        multipliers = ca.MX.sym("multipliers", self.nlp["g"].numel())
+        found = {
+            "grad_f": ca.Function("grad_f", [self.z, p], [self.nlp["f"], self._gradient()]),
+            "jac_g": ca.Function("jac_g", [self.z, p], [self.nlp["g"], self._jacobian()]),
+        }
+        if exact:
+            hessian = self._hessian(sigma, multipliers)
+            found["hess_lag"] = ca.Function("hess_lag", [self.z, p, sigma, multipliers], [hessian])
+        return found
+
+    def _set_links(self) -> None:
+        """Which node enters which defect (nx rows), by its state and by its rate, and the matrices S and D of that."""
+        scheme, lengths = self.task.scheme, np.diff(self.mesh)
+        groups, nodes = scheme.states.shape
+        k, i, j = (a.ravel() for a in np.indices((len(lengths), groups, nodes)))
+        self.defect, self.node = k * groups + i, k * scheme.nodes + j
+        self.state, self.slope = scheme.states[i, j], lengths[k] * scheme.slopes[i, j]
+        self.num_defects = len(lengths) * groups * self.nx
+        each = np.arange(self.nx)
+        rows, self.rate_index = (a[:, None] * self.nx + each for a in (self.defect, self.node))
+        self.link_rows, columns = rows, self.node[:, None] * self.width + each
+        self._S = _sparse(rows, columns, self.state[:, None], (self.num_defects, self.z.numel()))
+        self._D = _sparse(rows, self.rate_index, self.slope[:, None], (self.num_defects, self.every.size * self.nx))
+        self.link_columns = columns
+
+    def _linear_inputs(self) -> Any:
+        """The matrix of 2 u_mid - u_0 - u_1, for all intervals and inputs."""
+        middle = np.arange(1, self.every.size, 2)[:, None] * self.width + np.arange(self.nx, self.width)
+        rows = np.arange(middle.size).reshape(middle.shape)
+        columns = np.stack([middle, middle - self.width, middle + self.width])
+        values = np.array([2.0, -1, -1])[:, None, None]
+        return _sparse(rows, columns, values, (middle.size, self.z.numel()))
+
+    @cached_property
+    def _rates(self) -> Any:
+        return self.functions.dynamics.values(self.knots)
+
+    @cached_property
+    def _rows(self) -> Any:
+        return self.functions.dynamics.jacobian(self.knots)
+
+    @cached_property
+    def _costs(self) -> Any:
+        return self.functions.rate.values(self.knots)
+
+    @cached_property
+    def _cost_rows(self) -> Any:
+        return self.functions.rate.jacobian(self.knots)
+
+    @property
+    def _path_functions(self) -> list[tuple[KnotFunction, Indices]]:
+        return [(f, at) for f, (at, _) in zip(self.functions.paths, self.paths, strict=True)]
+
+    def _gradient(self) -> Any:
+        total, last = _Sum((self.z.numel(), 1)), self.every[-1:]
+        b = _Blocks(self.functions.rate.jacobian_at, self.every)
+        total.add(b.column(self.width), 0, self.weights[b.node], self.time * self._cost_rows, b.index)
+        if self.free:
+            total.add(self.z.numel() - 1, 0, self.weights, ca.vec(self._costs), self.every)
+        if self.functions.final is not None:
+            b = _Blocks(self.functions.final.jacobian_at, last)
+            total.add(b.column(self.width), 0, 1.0, self.functions.final.jacobian(self.knots[:, -1]), b.index)
+        return ca.densify(total.matrix())
+
+    def _jacobian(self) -> Any:
+        f, total = self.functions.dynamics, _Sum((self.nlp["g"].numel(), self.z.numel()))
+        total.add(self.link_rows, self.link_columns, self.state[:, None], ca.DM(1), 0)
+        rows, columns = f.jacobian_at
+        index = self.node[:, None] * len(rows) + np.arange(len(rows))
+        at = self.defect[:, None] * self.nx + rows, self.node[:, None] * self.width + columns
+        total.add(*at, -self.slope[:, None], self.time * self._rows, index)
+        if self.free:
+            source = ca.vec(self._rates)
+            total.add(self.link_rows, self.z.numel() - 1, -self.slope[:, None], source, self.rate_index)
+        first = self.num_defects
+        for path, nodes in self._path_functions:
+            b = _Blocks(path.jacobian_at, nodes)
+            total.add(
+                first + b.place * path.rows + b.rows,
+                b.column(self.width),
+                1.0,
+                path.jacobian(self.knots[:, nodes.tolist()]),
+                b.index,
+            )
+            first += path.rows * len(nodes)
+        if self._linear is not None:
+            rows, columns = (np.array(a) for a in self._linear.sparsity().get_triplet())
+            total.add(first + rows, columns, np.array(self._linear.nonzeros()), ca.DM(1), 0)
+        return total.matrix()
+
+    def _hessian(self, sigma: Any, multipliers: Any) -> Any:
+        """The upper triangle of d^2 (sigma f + multipliers' g) / dz^2."""
+        f, rate, total = self.functions.dynamics, self.functions.rate, _Sum((self.z.numel(), self.z.numel()))
+        nu = ca.mtimes(self._D.T, multipliers[: self.num_defects])
+        weights = ca.DM(self.weights).T
+        terms: list[tuple[Any, Indices, Any]] = [
+            (f, self.every, -self.time * ca.reshape(nu, self.nx, self.every.size)),
+            (rate, self.every, sigma * self.time * weights),
+        ]
+        if self.functions.final is not None:
+            terms.append((self.functions.final, self.every[-1:], sigma))
+        first = self.num_defects
+        for path, nodes in self._path_functions:
+            last = first + path.rows * len(nodes)
+            terms.append((path, nodes, ca.reshape(multipliers[first:last], path.rows, len(nodes))))
+            first = last
+        for function, nodes, seeds in terms:
+            b = _Blocks(function.hessian_at, nodes)
+            source = function.hessian(self.knots[:, nodes.tolist()], seeds)
+            total.add(b.node * self.width + b.rows, b.column(self.width), 1.0, source, b.index)
+        if self.free:
+            b = _Blocks(f.jacobian_at, self.every)
+            source = self._rows * nu[(b.node * self.nx + b.rows).ravel().tolist()]
+            total.add(b.column(self.width), self.z.numel() - 1, -1.0, source, b.index)
+            b = _Blocks(rate.jacobian_at, self.every)
+            source = sigma * self._cost_rows
+            total.add(b.column(self.width), self.z.numel() - 1, self.weights[b.node], source, b.index)
+        return total.matrix()
 
 
-class _Defects:
-    """The defects of some intervals as a function of their nodes and a free T, floats or AutoDiffXd."""
+class _Blocks:
+    """The nonzeros at `at` (rows, columns) of one block a node, as arrays (nodes, nonzeros)."""
 
-    def __init__(self, whole: TranscribedProgram, intervals: slice):
-        self.task, self.cache, self.intervals = whole.task, whole.cache, intervals
-        self.lengths = np.diff(whole.mesh)[intervals]
-        self.nodes = self.task.scheme.nodes * len(self.lengths) + 1
-        self.width = whole.width
-        self.num_rows = self.task.scheme.states.shape[0] * len(self.lengths) * self.task.dynamics.nx
-        self.num_variables = self.nodes * self.width + int(self.task.time_is_free)
+    def __init__(self, at: tuple[Indices, Indices], nodes: Indices):
+        self.rows, self.columns = (np.tile(a, (len(nodes), 1)) for a in at)
+        self.place = np.repeat(np.arange(len(nodes))[:, None], len(at[0]), axis=1)
+        self.node = np.repeat(nodes[:, None], len(at[0]), axis=1)
+        self.index = np.arange(self.rows.size).reshape(self.rows.shape)
 
-    def __call__(self, z: Any) -> Any:
-        plain = z if z.dtype == float else ExtractValue(z.reshape(-1, 1)).ravel()
-        knots = np.ascontiguousarray(plain[: self.nodes * self.width].reshape(self.nodes, self.width))
-        horizon = float(plain[-1]) if self.task.time_is_free else self.task.horizon[0]
-        if z.dtype == float:
-            return self._defects(knots, self.cache.values(knots), horizon).ravel()
-        fs, rows = self.cache.linearize(knots)
-        return chain_rows(self._defects(knots, fs, horizon).ravel(), self._jacobian(fs, rows, horizon), z)
-
-    def _defects(self, knots: Array, fs: Array, horizon: float) -> Array:
-        scheme, nx = self.task.scheme, self.task.dynamics.nx
-        xs, fs = per_interval(knots[:, :nx], scheme), per_interval(fs, scheme)
-        return interval_defects(scheme, horizon * self.lengths, xs, fs)
-
-    def _jacobian(self, fs: Array, rows: Array, horizon: float) -> Array:
-        """(num_rows, num_variables): states[i, j] [I, 0] - h slopes[i, j] [A_j, B_j], and by T."""
-        scheme, nx, s = self.task.scheme, self.task.dynamics.nx, self.task.scheme.nodes
-        identity, groups = np.eye(nx, self.width), len(scheme.states)
-        jacobian = np.zeros((len(self.lengths), groups, nx, self.num_variables))
-        for k, h in enumerate(horizon * self.lengths):
-            for j in range(s + 1):
-                columns = slice((s * k + j) * self.width, (s * k + j + 1) * self.width)
-                for i in range(groups):
-                    block = scheme.states[i, j] * identity - h * scheme.slopes[i, j] * rows[s * k + j]
-                    jacobian[k, i, :, columns] = block
-        if self.task.time_is_free:
-            jacobian[..., -1] = -self.lengths[:, None, None] * (scheme.slopes @ per_interval(fs, scheme))
-        return jacobian.reshape(self.num_rows, self.num_variables)
-
-    def pattern(self) -> list[tuple[int, int]]:
-        """The (row, column) that may not be zero: where rates and Jacobians with nothing in common leave something."""
-        fs = np.sqrt(2.0 + np.arange(self.nodes * self.task.dynamics.nx)).reshape(self.nodes, -1)
-        where = self._jacobian(fs, np.full((*fs.shape, self.width), np.pi), 1.0)
-        return [(int(row), int(column)) for row, column in np.argwhere(where != 0)]
+    def column(self, width: int) -> Indices:
+        """The decision variables of the columns."""
+        return self.node * width + self.columns
 
 
-class _RunningCost:
-    """T sum_k weights_k L(x_k, u_k) of some nodes, floats or AutoDiffXd."""
+class _Sum:
+    """A sparse matrix whose entries are sums: matrix[row, column] += coefficient * source[index]."""
 
-    def __init__(self, task: OptimalControl, weights: Array):
-        self.task, self.weights = task, weights
+    def __init__(self, shape: tuple[int, int]):
+        self.shape = shape
+        self.places: list[Indices] = []
+        self.parts: list[tuple[Array, Any, Indices]] = []
 
-    def __call__(self, z: Any) -> Any:
-        plain = z if z.dtype == float else ExtractValue(z.reshape(-1, 1)).ravel()
-        free = int(self.task.time_is_free)
-        knots = plain[: len(plain) - free].reshape(len(self.weights), -1)
-        horizon = float(plain[-1]) if free else self.task.horizon[0]
-        if z.dtype == float:
-            return horizon * float(self.weights @ self.task.rate.values(knots))
-        values, gradients = self.task.rate.linearize(knots)
-        total = float(self.weights @ values)
-        by_nodes = horizon * (self.weights[:, None] * gradients).ravel()
-        return chain(horizon * total, np.concatenate([by_nodes, np.full(free, total)]), z)
+    def add(self, rows: Any, columns: Any, coefficients: Any, source: Any, index: Any) -> None:
+        """Add entries, one for each of `index`; the others are broadcast to it and it to them."""
+        rows, columns, coefficients, index = (
+            a.ravel() for a in np.broadcast_arrays(rows, columns, coefficients, index)
+        )
+        self.places.append(columns * self.shape[0] + rows)
+        self.parts.append((coefficients, source, index))
+
+    def matrix(self) -> Any:
+        """An MX of the places that were added to."""
+        places, targets = np.unique(np.concatenate(self.places), return_inverse=True)
+        nonzeros, start = 0, 0
+        for coefficients, source, index in self.parts:
+            rows = targets[start : start + len(index)]
+            gather = _sparse(rows, index, coefficients, (len(places), source.numel()))
+            nonzeros, start = nonzeros + ca.mtimes(gather, source), start + len(index)
+        columns, rows = np.divmod(places, self.shape[0])
+        starts = np.searchsorted(columns, np.arange(self.shape[1] + 1))
+        return ca.MX(ca.Sparsity(*self.shape, starts.tolist(), rows.tolist()), nonzeros)
 
 
-class _FinalCost:
-    """The final cost of the last state, floats or AutoDiffXd."""
-
-    def __init__(self, task: OptimalControl):
-        self.task = task
-
-    def __call__(self, x: Any) -> Any:
-        if x.dtype == float:
-            return self.task.final(x)
-        value, gradient = differentiate_final_cost(self.task.final_cost, ExtractValue(x).ravel())  # type: ignore[arg-type]
-        return chain(value, gradient, x)
+def _sparse(rows: Any, columns: Any, values: Any, shape: tuple[int, int]) -> Any:
+    """A DM of `shape` with `values` other than 0 at (rows, columns)."""
+    rows, columns, values = (a.ravel() for a in np.broadcast_arrays(rows, columns, values))
+    kept = values != 0
+    return ca.DM.triplet(rows[kept].tolist(), columns[kept].tolist(), ca.DM(values[kept]), *shape)

@@ -1,5 +1,6 @@
 """Collocation against closed forms and a dense solve of the same transcription, and what it refuses."""
 
+import dataclasses
 import math
 import signal
 
@@ -146,7 +147,7 @@ def test_a_collocation_solver_that_lies_is_not_believed(monkeypatch):
         return NlpResult(us.ravel(), Outcome.SOLVED, "all is well", ()), xs, us, us[-1]
 
     monkeypatch.setattr("drake_diff.solver.solve_collocation", liar)
-    solution = collocate(swing_up())
+    solution = collocate(swing_up(), solver="snopt")
     assert solution.status is Status.CONVERGED_NOT_VERIFIED
     assert "defect" in solution.message
     assert "is above 1e-05" in solution.message
@@ -170,15 +171,41 @@ def test_a_derivative_that_is_one_percent_off_is_named(row, column, monkeypatch)
     problem = swing_up()
     guess = np.linspace(0, 1, 21)[:, None] * [0.5, 2.5, 1.0, 2.0], np.full((20, 1), 3.0)
     monkeypatch.setattr(EquationsOfMotion, "autodiff", one_percent_off)
-    solution = collocate(problem, initial_guess=guess, max_iterations=3)
+    solution = collocate(problem, solver="snopt", initial_guess=guess, max_iterations=3)
     names = (*problem.model.state_names, *problem.model.input_names)
     assert not solution.success
     assert "disagree" in [certificate.verdict for certificate in solution.certificates]
     assert f"d d({names[row]})/dt / d {names[column]}" in solution.message
 
 
+@pytest.mark.parametrize(("row", "column"), [(2, 1), (3, 3), (3, 4)])
+def test_an_expressions_derivative_that_is_one_percent_off_is_named(row, column, monkeypatch):
+    """The same of the expressions that CasADi gets."""
+    import casadi as ca
+
+    from drake_diff import knot_functions
+
+    honest = knot_functions.symbolic_plant
+
+    def one_percent_off(model):
+        found = honest(model)
+        knot, factor = ca.SX.sym("knot", found.function.size1_in(0)), np.ones((4, 5))
+        factor[row, column] = 1.01
+        wrong = ca.Function("wrong", [knot], [found.jacobian(knot) * ca.DM(factor)])
+        return dataclasses.replace(found, jacobian=wrong)
+
+    guess = np.linspace(0, 1, 21)[:, None] * [0.5, 2.5, 1.0, 2.0], np.full((20, 1), 3.0)
+    monkeypatch.setattr(knot_functions, "symbolic_plant", one_percent_off)
+    problem = swing_up()
+    solution = collocate(problem, initial_guess=guess, max_iterations=3)
+    names = (*problem.model.state_names, *problem.model.input_names)
+    assert not solution.success
+    assert f"d d({names[row]})/dt / d {names[column]}" in solution.message
+
+
 def test_ctrl_c_ends_it_with_a_motion(monkeypatch):
-    monkeypatch.setattr("drake_diff.nonlinear_program.REPORT_PERIOD", 0.0)
+    for module in ("nonlinear_program", "ipopt"):
+        monkeypatch.setattr(f"drake_diff.{module}.REPORT_PERIOD", 0.0)
     before = signal.getsignal(signal.SIGINT)
     for solver in ("ipopt", "snopt"):
         solution = collocate(swing_up(), solver=solver, progress=lambda line: signal.raise_signal(signal.SIGINT))

@@ -1,0 +1,235 @@
+"""Functions of a knot [x, u] within a CasADi program, at all their knots in one call: symbolic, or called back.
+
+Both give `values` (m, K), the nonzeros of the K Jacobians by the knot, and, where symbolic, those of the Hessians of
+weights (m, K) times values. `jacobian_at` and `hessian_at` are (rows, columns) of the nonzeros of one knot.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from drake_diff.arrays import Array, Indices
+from drake_diff.constraint import Constraint
+from drake_diff.cost import differentiate_final_cost
+from drake_diff.dynamics import Dynamics, PlantKnots, Pointwise
+from drake_diff.optimal_control import OptimalControl
+from drake_diff.symbolic import trace
+from drake_diff.symbolic_tree import PlantFunctions, symbolic_plant
+
+Values = Callable[[Array], Array]  # knots (K, nx + nu) -> (K, m)
+Linearize = Callable[[Array], tuple[Array, Array]]  # -> (K, m), (K, m, nx + nu)
+
+
+class Symbolic:
+    """A function of which CasADi has the expression; `why_not` of a second derivative is none."""
+
+    why_not = ""
+
+    def __init__(self, function: Any, jacobian: Any = None, hessian: Any = None):
+        self.function, self.rows, self.width = function, function.size1_out(0), function.size1_in(0)
+        if jacobian is not None:
+            self._jacobian, self._hessian = jacobian, hessian
+        self.jacobian_at = _places(self._jacobian.sparsity_out(0))
+
+    def values(self, knots: Any) -> Any:
+        return self.function.map(knots.shape[1])(knots)
+
+    def jacobian(self, knots: Any) -> Any:
+        return ca.vec(self._jacobian.map(knots.shape[1])(knots).nz[:])
+
+    def jacobian_of(self, knot: Array) -> Array:
+        """(m, nx + nu) at one `knot` (nx + nu,)."""
+        return np.asarray(self._jacobian(knot).full())
+
+    def hessian(self, knots: Any, weights: Any) -> Any:
+        return ca.vec(self._hessian.map(knots.shape[1])(knots, weights).nz[:])
+
+    @property
+    def hessian_at(self) -> tuple[Indices, Indices]:
+        return _places(self._hessian.sparsity_out(0))
+
+    @cached_property
+    def _jacobian(self) -> Any:
+        knot = ca.SX.sym("knot", self.width)
+        return ca.Function("jacobian", [knot], [ca.jacobian(self.function(knot), knot)])
+
+    @cached_property
+    def _hessian(self) -> Any:
+        """The upper triangle."""
+        knot, weights = ca.SX.sym("knot", self.width), ca.SX.sym("weights", self.rows)
+        hessian, _ = ca.hessian(ca.dot(weights, self.function(knot)), knot)
+        return ca.Function("hessian", [knot, weights], [ca.triu(hessian)])
+
+
+class Called:
+    """A function that is called back, with dense Jacobians; the first error of a call is kept, and fails the call."""
+
+    def __init__(self, why_not: str, values: Values, linearize: Linearize, rows: int, width: int):
+        self.why_not, self.rows, self.width = why_not, rows, width
+        self.evaluate, self.linearize = values, linearize
+        self.error: Exception | None = None
+        self.jacobian_at = _places(ca.Sparsity.dense(rows, width))
+        self._kept: list[Any] = []  # CasADi holds no reference to its callbacks
+
+    def values(self, knots: Any) -> Any:
+        self._kept.append(_Callback(self, knots.shape[1], self.rows, self.evaluate))
+        return self._kept[-1](knots)
+
+    def jacobian(self, knots: Any) -> Any:
+        def rows(at: Array) -> Array:
+            return self.linearize(at)[1].transpose(0, 2, 1)
+
+        self._kept.append(_Callback(self, knots.shape[1], self.rows * self.width, rows))
+        return ca.vec(self._kept[-1](knots))
+
+    def jacobian_of(self, knot: Array) -> Array:
+        """(m, nx + nu) at one `knot` (nx + nu,)."""
+        return np.asarray(self.linearize(knot[None])[1][0])
+
+
+class _Callback(ca.Callback):  # type: ignore[misc]
+    """(nx + nu, K) -> (rows, K); the last result is kept, since a solver asks twice for its first iterate's."""
+
+    def __init__(self, owner: Called, count: int, rows: int, at_knots: Values):
+        ca.Callback.__init__(self)
+        self.owner, self.count, self.rows, self.at_knots = owner, count, rows, at_knots
+        self.last: tuple[bytes, Array] | None = None
+        self.construct("called", {})
+
+    def get_n_in(self) -> int:
+        return 1
+
+    def get_n_out(self) -> int:
+        return 1
+
+    def get_sparsity_in(self, i: int) -> Any:
+        return ca.Sparsity.dense(self.owner.width, self.count)
+
+    def get_sparsity_out(self, i: int) -> Any:
+        return ca.Sparsity.dense(self.rows, self.count)
+
+    def has_jacobian(self) -> bool:
+        return self.rows == self.owner.rows
+
+    def has_jac_sparsity(self, i: int, j: int) -> bool:
+        return self.has_jacobian()
+
+    def get_jac_sparsity(self, i: int, j: int, symmetric: bool) -> Any:
+        return ca.Sparsity(self._jacobian_sparsity)
+
+    def get_jacobian(self, name: str, inputs: Any, outputs: Any, options: Any) -> Any:
+        """nlpsol asks for it as it makes itself ready; the program has its own."""
+        knots, values = ca.MX.sym("knots", self.owner.width, self.count), ca.MX.sym("values", self.rows, self.count)
+        jacobian = ca.MX(self._jacobian_sparsity, self.owner.jacobian(knots))
+        return ca.Function(name, [knots, values], [jacobian], inputs, outputs, options)
+
+    @cached_property
+    def _jacobian_sparsity(self) -> Any:
+        block = ca.Sparsity.dense(self.rows, self.owner.width)
+        return ca.diagcat(*[block] * self.count)
+
+    def has_eval_buffer(self) -> bool:
+        return True
+
+    def eval_buffer(self, arguments: Any, results: Any) -> int:
+        knots = np.array(np.frombuffer(arguments[0], float)).reshape(self.count, self.owner.width)
+        key = knots.tobytes()
+        try:
+            if self.last is None or self.last[0] != key:
+                self.last = key, np.array(self.at_knots(knots)).ravel()
+        except Exception as error:  # must not go through C++; the solve raises or tells it
+            self.owner.error = self.owner.error or error
+            return 1
+        np.frombuffer(results[0], float)[:] = self.last[1]
+        return 0
+
+
+KnotFunction = Symbolic | Called
+
+
+def _places(sparsity: Any) -> tuple[Indices, Indices]:
+    return np.array(sparsity.row(), dtype=np.intp), np.array(sparsity.get_col(), dtype=np.intp)
+
+
+@dataclass(frozen=True, eq=False)
+class KnotFunctions:
+    """Those of a task; the final cost is one of the last knot, `paths` are in the order of the task's."""
+
+    dynamics: KnotFunction
+    rate: KnotFunction
+    final: KnotFunction | None
+    paths: tuple[KnotFunction, ...]
+
+    @property
+    def why_not(self) -> str:
+        """Which of them has no second derivative and why, "" where all have."""
+        named = [("dynamics", self.dynamics), ("running_cost", self.rate), ("final_cost", self.final)]
+        named += [(f"constraint {i}", path) for i, path in enumerate(self.paths)]
+        return next((f"{name}: {f.why_not}" for name, f in named if f is not None and f.why_not), "")
+
+    @property
+    def error(self) -> Exception | None:
+        """The first error that one of them raised."""
+        called = [f for f in (self.dynamics, self.rate, self.final, *self.paths) if isinstance(f, Called)]
+        return next((f.error for f in called if f.error is not None), None)
+
+
+def knot_functions(task: OptimalControl) -> KnotFunctions:
+    """The functions of `task`, each symbolic if it can be."""
+    nx, width, probe = task.dynamics.nx, task.dynamics.nx + task.dynamics.nu, task.dynamics.probe()
+
+    def choose(function: Any, values: Values, linearize: Linearize, rows: int) -> KnotFunction:
+        with np.errstate(all="ignore"):
+            found = trace(function, nx, probe, values(probe))
+        return Called(found, values, linearize, rows, width) if isinstance(found, str) else Symbolic(found)
+
+    def rate_values(knots: Array) -> Array:
+        return task.rate.values(knots)[:, None]
+
+    def rate_rows(knots: Array) -> tuple[Array, Array]:
+        values, gradients = task.rate.linearize(knots)
+        return values[:, None], gradients[:, None]
+
+    def final_values(knots: Array) -> Array:
+        return np.array([[float(task.final(knot[:nx]))] for knot in knots])
+
+    def final_rows(knots: Array) -> tuple[Array, Array]:
+        found = [differentiate_final_cost(task.final, knot[:nx]) for knot in knots]
+        rows = np.zeros((len(knots), 1, width))
+        rows[:, 0, :nx] = [gradient for _, gradient in found]
+        return np.array([[value] for value, _ in found]), rows
+
+    def path(c: Constraint) -> KnotFunction:
+        def values(knots: Array) -> Array:
+            return np.array([c(knot[:nx], knot[nx:]) for knot in knots])
+
+        def linearize(knots: Array) -> tuple[Array, Array]:
+            found = [c.differentiate(knot[:nx], knot[nx:]) for knot in knots]
+            return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
+
+        return choose(c.function if c.takes_input else lambda x, u: c.function(x), values, linearize, len(c.lower))
+
+    return KnotFunctions(
+        _dynamics(task.dynamics),
+        choose(task.rate, rate_values, rate_rows, 1),
+        choose(lambda x, u: task.final(x), final_values, final_rows, 1) if task.final_cost is not None else None,
+        tuple(path(p.constraint) for p in task.paths),
+    )
+
+
+def _dynamics(dynamics: Dynamics) -> KnotFunction:
+    form, probe = dynamics.form, dynamics.probe()
+    found: Any = "an object with derivatives of its own"
+    if isinstance(form, PlantKnots):
+        found = symbolic_plant(form.model)
+    elif isinstance(form, Pointwise):
+        found = trace(form.f, dynamics.nx, probe, form.values(probe))
+    if isinstance(found, PlantFunctions):
+        return Symbolic(found.function, found.jacobian, found.hessian)
+    if not isinstance(found, str):
+        return Symbolic(found)
+    return Called(found, dynamics.values, dynamics.linearize, dynamics.nx, dynamics.nx + dynamics.nu)

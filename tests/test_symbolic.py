@@ -1,0 +1,222 @@
+"""Expressions of functions and of plants against plain calls and Drake, and what must not become one."""
+
+import dataclasses
+import math
+
+import casadi as ca
+import numpy as np
+import pydrake.math
+import pytest
+from conftest import random_state
+from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.multibody.tree import QuaternionFloatingJoint
+from test_implicit import floating
+from test_model import robot
+from test_solution import MODELS
+from test_transcription import BLOCK, move, own_derivatives, solved
+from test_tree_dynamics import random_tree
+
+import drake_diff as dd
+from drake_diff import symbolic_tree
+from drake_diff.continuous import EquationsOfMotion
+from drake_diff.dynamics import Dynamics, plant_dynamics
+from drake_diff.symbolic import trace
+from drake_diff.symbolic_tree import PlantFunctions, symbolic_plant
+
+EXACT = "symbolic, exact Hessian"
+FORMS = {
+    "ordinary": lambda x, u: np.array([-(x[1] ** 2) / u[0] + 3, 2.0 - x[0] * np.float64(2.0) ** x[1]]),
+    "a list": lambda x, u: [+x[1], 9.81],
+    "sines": lambda x, u: np.sin(x) + np.cos(x) * np.tan(u[0]),
+    "roots": lambda x, u: np.array([np.sqrt(x[0]), np.exp(x[1]) + np.log(x[0]) - np.log10(u[0])]),
+    "arcs": lambda x, u: np.arcsin(0.1 * x) + np.arccos(0.1 * x) * np.arctan(u[0]),
+    "hyperbolas": lambda x, u: np.sinh(x) + np.cosh(x) * np.tanh(u[0]),
+    "two arguments": lambda x, u: np.array([np.arctan2(x[0], x[1]), np.power(x[1], 3) + np.square(u[0])]),
+    "matrices": lambda x, u: np.array([[0, 1.0], [2, 3]]) @ x + np.ones(2) * u[0],
+    "products": lambda x, u: np.array([x @ x, np.dot(x, x) * np.sum(x)]),
+    "a length": lambda x, u: x / np.linalg.norm(x) + abs(u[0]) - np.abs(x),
+    "joined": lambda x, u: np.concatenate([x[1:], u]),
+    "assigned": lambda x, u: assigned(x, u),
+}
+
+
+def assigned(x, u):
+    result = np.zeros(2, dtype=object)
+    result[0], result[1] = x[1], u[0] * x[0]
+    return result
+
+
+def traced(f, nx=2, nu=1):
+    probe = np.random.default_rng(3).uniform(0.5, 1.5, (3, nx + nu))
+    return trace(f, nx, probe, np.array([np.asarray(f(k[:nx], k[nx:]), dtype=float) for k in probe])), probe
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_function_in_ordinary_arithmetic_has_an_expression(form):
+    f = FORMS[form]
+    function, probe = traced(f)
+    assert isinstance(function, ca.Function)
+    for knot in probe + 0.1:
+        wanted = np.asarray(f(knot[:2], knot[2:]), dtype=float)
+        assert function(knot).full().ravel() == pytest.approx(wanted, rel=1e-13)
+
+
+REFUSED = {
+    "a branch": lambda x, u: [x[1], u[0] if x[0] > 0 else 0.0],
+    "equality": lambda x, u: [x[1], u[0] if x[0] == 1 else 0.0],
+    "truth": lambda x, u: [x[1], u[0] if x[0] else 0.0],
+    "the larger": lambda x, u: [x[1], np.maximum(x[0], u[0])],
+    "a built-in": lambda x, u: [x[1], max(x[0], u[0])],
+    "a choice": lambda x, u: [x[1], np.where(x[0] > 0, u[0], 0)],
+    "math": lambda x, u: [x[1], math.sin(u[0])],
+    "float()": lambda x, u: [x[1], float(u[0])],
+    "assigned to floats": lambda x, u: np.concatenate([x[:1], np.asarray(u, dtype=float)]),
+    "Drake": lambda x, u: [x[1], pydrake.math.sin(u[0])],
+}
+
+
+@pytest.mark.parametrize("form", REFUSED)
+def test_a_function_that_does_more_has_none_and_it_says_why(form):
+    why, _ = traced(REFUSED[form])
+    assert isinstance(why, str)
+    assert "TypeError" in why
+
+
+def test_an_expression_with_other_values_is_refused():
+    why, _ = traced(lambda x, u: [x[1], 2 * u[0] if x.dtype == object else u[0]])
+    assert why == "its symbolic form gives other values"
+    why, _ = traced(lambda x, u: [x[1]] if x.dtype == object else [x[1], u[0]])
+    assert why == "its symbolic form gives other values"
+
+
+def model_named(name):
+    if name.startswith("tree"):
+        return random_tree(int(name[-1]))
+    if name.endswith("robot.urdf"):
+        return dd.load_model(robot(name), time_step=0.01)
+    return dd.load_model(MODELS / name, time_step=0.01)
+
+
+PLANTS = ["pendulum.urdf", "cart_pole.urdf", "acrobot.xml", "double_pendulum.urdf", "mass_spring_damper.sdf"]
+
+
+@pytest.mark.parametrize("name", [*PLANTS, "ur5_robot.urdf", "tree0", "tree1", "tree2"])
+def test_a_plants_expression_and_its_derivative_are_drakes(name):
+    """1e-9 of the largest entry: the trees' mass matrices have condition numbers up to 1e5."""
+    model, random = model_named(name), np.random.default_rng(5)
+    plant, equations = symbolic_plant(model), EquationsOfMotion(model)
+    assert isinstance(plant, PlantFunctions), plant
+    function, jacobian = plant.function, plant.jacobian
+    knot, weights = ca.SX.sym("knot", model.nx + model.nu), random.standard_normal(model.nx)
+    by_casadi = ca.Function("hessian", [knot], [ca.triu(ca.hessian(ca.dot(ca.DM(weights), function(knot)), knot)[0])])
+    for _ in range(3):
+        at = np.concatenate([random_state(model, random), random.standard_normal(model.nu)])
+        z = InitializeAutoDiff(at).ravel()
+        exact = equations.autodiff(z[: model.nx], z[model.nx :]).reshape(-1, 1)
+        value, rows = ExtractValue(exact).ravel(), ExtractGradient(exact)
+        assert function(at).full().ravel() == pytest.approx(value, abs=1e-9 * max(1, np.abs(value).max()))
+        assert jacobian(at).full() == pytest.approx(rows, abs=1e-9 * max(1, np.abs(rows).max()))
+        curves = by_casadi(at).full()
+        assert plant.hessian(at, weights).full() == pytest.approx(curves, abs=1e-9 * max(1, np.abs(curves).max()))
+
+
+@pytest.mark.parametrize("left_out", ["damping", "stiffness", "reflected", "mass", "gravity"])
+def test_a_plants_expression_that_leaves_something_out_is_refused(monkeypatch, left_out):
+    model = random_tree(0)
+    tree = symbolic_tree.tree_for(model)
+    assert np.abs(getattr(tree, left_out)).max() > 0
+    without = dataclasses.replace(tree, **{left_out: 0.9 * getattr(tree, left_out)})
+    monkeypatch.setattr(symbolic_tree, "tree_for", lambda model: without)
+    assert symbolic_plant(model) == "its symbolic form differs from Drake's plant"
+
+
+def test_a_model_that_is_no_tree_of_hinges_and_slides_has_none():
+    why = symbolic_plant(floating(QuaternionFloatingJoint, 0))
+    assert isinstance(why, str)
+    assert "quaternion_floating" in why
+
+
+def test_the_context_is_left_as_it_was():
+    model = model_named("acrobot.xml")
+    model.plant.SetPositionsAndVelocities(model.double.context, [0.1, 0.2, 0.3, 0.4])
+    symbolic_plant(model)
+    assert list(model.plant.GetPositionsAndVelocities(model.double.context)) == [0.1, 0.2, 0.3, 0.4]
+
+
+# ------------------------------------------------------------------------------ two routes, one result
+
+
+def test_a_branch_goes_the_other_way_and_says_so():
+    motion = move(10, Dynamics(lambda x, u: [x[1], u[0] if u[0] > -1e9 else 0.0 * u[0]], 2, 1))
+    assert motion.derivatives.startswith("first derivatives, limited-memory Hessian: dynamics: TypeError")
+    assert motion.cost == pytest.approx(12, rel=1e-9)
+    motion = move(10, running_cost=lambda x, u: u[0] ** 2 if u[0] > -1e9 else 0.0 * u[0])
+    assert "limited-memory Hessian: running_cost: TypeError" in motion.derivatives
+    assert motion.cost == pytest.approx(12, rel=1e-9)
+    assert move(10).derivatives == EXACT
+
+
+def test_functions_of_every_kind_may_go_the_other_way():
+    def same(value):
+        return value if value > -1e9 else 0.0 * value
+
+    motion = move(10, x_goal=None, final_cost=lambda x: same(10 * (x[0] - 1) ** 2))
+    assert "final_cost: TypeError" in motion.derivatives
+    assert motion.cost == pytest.approx(30 / 13, rel=1e-8)  # 3 c / (3 + c), twice test_a_final_cost's
+    limit = dd.Constraint(lambda x: same(x[1]), upper=1.25)
+    motion = move(10, constraints=limit)
+    assert "constraint 0: TypeError" in motion.derivatives
+    assert motion.cost == pytest.approx(8 * 1.25**2 / 0.9, rel=1e-7)
+
+
+@pytest.mark.parametrize("scheme", ["trapezoid", "hermite_simpson"])
+def test_both_routes_find_the_same_swing_up(scheme):
+    """The same program by expressions, and by batched calls with approximate Hessians."""
+    plant = plant_dynamics(dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04))
+    called = Dynamics(own_derivatives(plant), 4, 1)
+    task = {
+        "x0": np.zeros(4),
+        "x_goal": [1, np.pi, 0, 0],
+        "count": 25,
+        "horizon": (1.5, 2.0),
+        "running_cost": dd.QuadraticCost(R=[[1.0]]),
+        "scheme": scheme,
+    }
+    a, b = solved(plant, **task), solved(called, **task, bounds=plant.bounds)
+    assert a.derivatives == EXACT
+    assert b.derivatives.endswith("dynamics: an object with derivatives of its own")
+    assert a.cost == pytest.approx(b.cost, rel=1e-8)
+    assert a.nodes == pytest.approx(b.nodes, abs=1e-4)  # where two approximations of one flat optimum end
+    assert len(a.iterations) < len(b.iterations)
+
+
+def test_a_floating_body_goes_the_other_way():
+    """A body of 1 kg without gravity's help: to hover is the cheapest, and its quaternion stays one."""
+    model = floating(QuaternionFloatingJoint, 0)
+    dynamics = plant_dynamics(model)
+    x = model.default_state
+    motion = dd.transcribe_and_solve(
+        dynamics, x0=x, count=3, horizon=0.1, running_cost=dd.QuadraticCost(R=np.eye(model.nu))
+    )
+    assert "quaternion_floating" in motion.derivatives
+    assert motion.success, motion.message
+    assert motion.cost == pytest.approx(0, abs=1e-8)
+
+
+def test_a_hessian_that_is_not_finite_is_left_and_that_is_told():
+    """|v|^1.5 has a first derivative at rest and no second."""
+    drag = Dynamics(lambda x, u: [x[1], u[0] - 0.1 * abs(x[1]) ** 1.5], 2, 1)
+    motion = move(10, drag)
+    assert motion.success
+    assert motion.derivatives == "symbolic, limited-memory Hessian: the exact one is not finite at an iterate"
+    assert 12 < motion.cost < 13
+    assert motion.xs[-1] == pytest.approx([1, 0], abs=1e-9)
+
+
+def test_the_block_is_exact_in_one_step():
+    """A quadratic program: an exact Hessian needs one step, IPOPT's table has the start and it."""
+    motion = dd.transcribe_and_solve(
+        BLOCK, x0=[0, 0], x_goal=[1, 0], count=10, horizon=1.0, running_cost=lambda x, u: u[0] ** 2
+    )
+    assert len(motion.iterations) == 2
+    assert motion.iterations[-1].objective == pytest.approx(12, rel=1e-9)
