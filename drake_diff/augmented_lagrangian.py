@@ -8,6 +8,7 @@ p J'J of the rows that push is kept (Gauss-Newton), which no constraint can make
 
 from collections.abc import Callable
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -52,7 +53,7 @@ class AugmentedLagrangian:
 
     def violation(self, xs: Array, us: Array) -> float:
         """The largest excess over a bound, or distance from the goal, in the row's own unit."""
-        return float(self._excess(xs, us).max(initial=0.0))
+        return float(np.max(self._excess(xs, us), initial=0.0))
 
     def residual(self, xs: Array, us: Array) -> float:
         """The largest change of a multiplier by `update`, over the penalty: 0 at a KKT point."""
@@ -95,7 +96,7 @@ class AugmentedLagrangian:
     @cached_property
     def _slices(self) -> list[slice]:
         ends = np.cumsum([len(self.lower) - sum(g.size for g in self.groups), *(g.size for g in self.groups)])
-        return [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
     def _choose_scales(self, xs: Array, us: Array) -> None:
         for group, rows in zip(self.groups, self._slices, strict=True):

@@ -19,8 +19,9 @@ from drake_diff.exceptions import GradientError, InputError, SimulationError, Un
 from drake_diff.ilqr import check_problem, is_unconstrained, solve_ilqr
 from drake_diff.nonlinear_program import SOLVERS, Limits, NlpResult, Outcome
 from drake_diff.problem import Problem
-from drake_diff.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
-from drake_diff.shooting import RolloutCost, ShootingVariables, solve_shooting
+from drake_diff.shooting import RolloutCost, ShootingVariables
+from drake_diff.shooting_program import DEFAULT_SOLVER as SHOOTING_SOLVER
+from drake_diff.shooting_program import solve_shooting
 from drake_diff.solution import Solution, Status
 from drake_diff.transcription import transcribe_problem
 from drake_diff.transcription_scheme import SCHEMES
@@ -45,6 +46,7 @@ def solve(
     time_limit: float | None = None,
     tolerance: float = 1e-8,
     seed: int = 0,
+    segments: int = 1,
     progress: bool | Progress = False,
     on_start: Callable[[], None] | None = None,
 ) -> Solution:
@@ -54,8 +56,9 @@ def solve(
     "ilqr" (the same by Riccati sweeps, from any xs and us) or "auto". `initial_guess` is None (a straight line to
     the goal; near zero inputs), (xs, us) with shapes (N+1, nx) and (N, nu), or a Solution. `solver` is "ipopt" or
     "snopt"; `time_limit` [s]; `tolerance` the solver's on feasibility and optimality; `seed` that of the guess's
-    noise. `progress` prints, or hands each line to a function; `on_start` is called once, when all input has been
-    checked and the work begins.
+    noise. With `segments` > 1 shooting is multiple: the states that the segments start from are variables too, first
+    those of the guess. `progress` prints, or hands each line to a function; `on_start` is called once, when all input
+    has been checked and the work begins.
 
     Raises InputError and its kin, or ModelError, before anything runs; how a solve ended is `Solution.status`.
     """
@@ -87,11 +90,13 @@ def solve(
         "time_limit": time_limit,
         "tolerance": limits.tolerance,
         "seed": seed,
+        "segments": segments,
         "method_reason": reason,
         "initial_guess": "default" if initial_guess is None else "given",
     }
     report = print if progress is True else (progress or None)
     _check_method(problem, method)
+    _check_segments(problem, method, positive_int("segments", segments))
     if on_start is not None:
         on_start()
     run = _Run(problem, method, scheme, solver, limits, options, report)
@@ -99,6 +104,8 @@ def solve(
         return run.collocate(xs, us)
     if method == "ilqr":
         return run.sweep(xs, us, given=initial_guess is not None)
+    if segments > 1:
+        return run.shoot_segments(xs, us, segments)
     return run.shoot(xs, us, improve=initial_guess is None and is_unconstrained(problem))
 
 
@@ -129,6 +136,15 @@ def _choose_scheme(method: str, scheme: str | None, solver: str | None, *, asked
     if solver == "snopt" and scheme != "drake":
         raise InputError("solver", got='"snopt"', expected=f'"ipopt" for scheme="{scheme}"')
     return scheme
+
+
+def _check_segments(problem: Problem, method: str, segments: int) -> None:
+    if segments > 1 and method != "shooting":
+        raise InputError("segments", got=segments, expected=f'1 for method="{method}"')
+    if segments > problem.num_steps:
+        raise InputError("segments", got=segments, expected=f"at most num_steps, {problem.num_steps}")
+    if segments > 1 and problem.trajectory_cost is not None:
+        raise InputError("segments", got=segments, expected="1 with a trajectory_cost, which is of the whole motion")
 
 
 def choose_method(problem: Problem) -> tuple[str, str]:
@@ -225,9 +241,19 @@ class _Run:
 
         return self._through_steps(xs, us, search)
 
-    def _through_steps(self, xs: Array, us: Array, search: Search) -> Solution:
-        """Certify, search, certify again, on Drake's own steps."""
-        variables = ShootingVariables(self.problem)
+    def shoot_segments(self, xs: Array, us: Array, segments: int) -> Solution:
+        """Multiple shooting, from the states of the guess; looked at around its own states, which defects part."""
+
+        def search(xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
+            return solve_shooting(
+                self.problem, xs, us, solver=self.solver, limits=self.limits, report=self.report, segments=segments
+            )
+
+        return self._through_steps(xs, us, search, segmented=True)
+
+    def _through_steps(self, xs: Array, us: Array, search: Search, *, segmented: bool = False) -> Solution:
+        """Certify, search, certify again, on Drake's own steps; at rollouts, or at the states as they are."""
+        variables = ShootingVariables(self.problem, around=xs if segmented else None)
         try:
             xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us))
         except (GradientError, SimulationError) as error:
@@ -236,6 +262,7 @@ class _Run:
             return ended(self._draft(xs, us, certificates=before), Status.NO_GRADIENT, blindness)
         try:
             result, xs, us = search(xs, us)
+            variables = ShootingVariables(self.problem, around=xs if segmented else None)
             z = result.z if self.method == "shooting" and len(result.z) == variables.size else variables.pack(xs[0], us)
             xs, us, after, blindness = self._look_at(variables, z)
         except (GradientError, SimulationError) as error:

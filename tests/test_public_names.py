@@ -22,9 +22,9 @@ exceptions arrays autodiff whole_file plant_elements model_file contact_geometry
 read_contract tangent inertia parameter_kinds contact_parameters parameters parameter_coordinates step
 finite_difference tree_dynamics implicit step_derivatives smoothing policy contact mode_changes certificate rollout
 rollout_gradient refinement certify continuous cost bounds constraint problem replay dynamics nonlinear_program
-transcription_scheme transcription_program transcribed transcription solution collocation shooting riccati secant
-augmented_lagrangian expansion ilqr verdict solver mcap_messages mcap_log trace meshcat_view record provenance
-evidence sampling certification audit_place audit_contact audit cli
+transcription_scheme transcription_program transcribed transcription solution collocation shooting shooting_program
+riccati secant augmented_lagrangian expansion ilqr verdict solver mcap_messages mcap_log trace meshcat_view record
+provenance evidence sampling certification audit_place audit_contact audit cli
 """.split()
 
 
