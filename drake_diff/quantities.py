@@ -110,7 +110,7 @@ def contact_force(model: Model, body: str) -> OfStateAndInput:
         twin, (x, u) = _at(model, x, u)
         advance(twin, x, u)
         results = twin.plant.get_contact_results_output_port().Eval(twin.context)
-        total = np.zeros(3).astype(twin.scalar)
+        total = np.array([twin.scalar(0.0)] * 3)
         for i in range(results.num_point_pair_contacts()):
             info = results.point_pair_contact_info(i)
             total = total + _on(index, info.bodyB_index(), info.bodyA_index()) * info.contact_force()

@@ -44,6 +44,12 @@ def solve_shooting(
     return whole, motion.states(result.z), motion.whole.unpack(whole.z)[1]
 
 
+def roll_segments(problem: Problem, xs: Array, us: Array, segments: int) -> Array:
+    """(N+1, nx): the rollouts under us (N, nu) of all segments, each from its own first state in xs (N+1, nx)."""
+    motion = SegmentedMotion(problem, segments)
+    return motion.states(motion.pack(xs, us))
+
+
 class SegmentedMotion:
     """z = [that of the whole motion's ShootingVariables; the states that segments 1, 2, ... start from]."""
 

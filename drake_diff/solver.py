@@ -21,7 +21,7 @@ from drake_diff.nonlinear_program import SOLVERS, Limits, NlpResult, Outcome
 from drake_diff.problem import Problem
 from drake_diff.shooting import RolloutCost, ShootingVariables
 from drake_diff.shooting_program import DEFAULT_SOLVER as SHOOTING_SOLVER
-from drake_diff.shooting_program import solve_shooting
+from drake_diff.shooting_program import roll_segments, solve_shooting
 from drake_diff.solution import Solution, Status
 from drake_diff.transcription import transcribe_problem
 from drake_diff.transcription_scheme import SCHEMES
@@ -242,7 +242,11 @@ class _Run:
         return self._through_steps(xs, us, search)
 
     def shoot_segments(self, xs: Array, us: Array, segments: int) -> Solution:
-        """Multiple shooting, from the states of the guess; looked at around its own states, which defects part."""
+        """Multiple shooting, looked at around the segments' own states, which defects part."""
+        try:
+            xs = roll_segments(self.problem, xs, us, segments)
+        except SimulationError as error:
+            return refused(self._draft(xs, us), error)
 
         def search(xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
             return solve_shooting(
