@@ -7,8 +7,10 @@ or AutoDiffXd, to use in costs and constraints:
     Problem(..., final_cost=lambda x: 100 * np.sum((hand(x) - target) ** 2))
     Problem(..., constraints=Constraint(lambda x: hand(x)[2], lower=0.1))
 
-Quantities are those of the model's own parameters: a cost or constraint made of them does not follow parameters that
-are optimized. A frame is named "frame", "instance::frame" where two model instances have one, or by its body.
+Quantities are those of the model's own parameters and have no derivative by any. Where others are applied that they
+depend on (joint offsets; masses and centres of mass; for contact forces all), they are refused, and so is a Problem
+that has such parameters and uses them. A frame is named "frame", "instance::frame" where two model instances have one,
+or by its body.
 """
 
 from collections.abc import Callable
@@ -27,6 +29,8 @@ from drake_diff.plant_elements import bodies, labelled
 from drake_diff.step import advance, set_state
 from drake_diff.twin import Twin
 
+PLACE = frozenset({"offset"})  # the parameters that frames depend on
+BALANCE = PLACE | {"mass", "center_of_mass"}
 ORIGIN = (0.0, 0.0, 0.0)
 ROTATION_TOLERANCE = 1e-9  # of R' R = I: a goal written down with fewer digits would be another rotation
 
@@ -42,6 +46,7 @@ def frame_position(model: Model, frame: str, point: ArrayLike = ORIGIN, relative
     here, base, p = _frame_index(model, frame), _frame_index(model, relative_to), finite_array("point", point, (3,))
 
     def position(x: Any) -> Any:
+        _refuse_other(model, PLACE)
         twin, _ = _at(model, x)
         pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
         return pose.translation() + pose.rotation().matrix() @ p
@@ -59,6 +64,7 @@ def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_t
     here, base, goal = _frame_index(model, frame), _frame_index(model, relative_to), _check_rotation(R_goal)
 
     def error(x: Any) -> Any:
+        _refuse_other(model, PLACE)
         twin, _ = _at(model, x)
         pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
         return 2 * _quaternion(pose.rotation().matrix() @ goal.T)[1:]
@@ -74,6 +80,7 @@ def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfSta
     here, p = _frame_index(model, frame), finite_array("point", point, (3,))
 
     def velocity(x: Any) -> Any:
+        _refuse_other(model, PLACE)
         twin, _ = _at(model, x)
         world, moving = twin.plant.world_frame(), twin.plant.get_frame(here)
         arm = moving.CalcPose(twin.context, world).rotation().matrix() @ p
@@ -88,6 +95,7 @@ def center_of_mass(model: Model) -> OfState:
         raise ModelError("the bodies have no mass, and so no centre of mass")
 
     def center(x: Any) -> Any:
+        _refuse_other(model, BALANCE)
         twin, _ = _at(model, x)
         return np.array(twin.plant.CalcCenterOfMassPositionInWorld(twin.context))
 
@@ -107,6 +115,7 @@ def contact_force(model: Model, body: str) -> OfStateAndInput:
     index = known[body].index()
 
     def force(x: Any, u: Any) -> Any:
+        _refuse_other(model, model.other_quantities)
         twin, (x, u) = _at(model, x, u)
         advance(twin, x, u)
         results = twin.plant.get_contact_results_output_port().Eval(twin.context)
@@ -129,6 +138,11 @@ def contact_force(model: Model, body: str) -> OfStateAndInput:
 def _on(index: Any, pushed: Any, pushing: Any) -> float:
     """The sign of a contact's force on the body of that index; 0 where it is another's."""
     return float(pushed == index) - float(pushing == index)
+
+
+def _refuse_other(model: Model, depends_on: frozenset[str]) -> None:
+    for quantity in sorted(model.other_quantities & depends_on):
+        raise InputError("parameters of a model whose task quantities are used", got=quantity, expected="others")
 
 
 def _at(model: Model, x: Any, *inputs: Any) -> tuple[Twin, list[Any]]:

@@ -1,5 +1,7 @@
 """Waypoints and constraints by iLQR and by shooting, single and multiple, against closed forms."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from test_ilqr import A30, lqr
@@ -8,6 +10,7 @@ from test_solution import MODELS, block
 import drake_diff as dd
 from drake_diff.augmented_lagrangian import AugmentedLagrangian
 from drake_diff.solution import Status
+from drake_diff.verdict import complaints_about
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 METHODS = {
@@ -162,7 +165,7 @@ def test_contradictory_constraints_are_infeasible(method):
     ]
     solution = dd.solve(move(10, constraints=apart), **METHODS[method])
     assert solution.status is Status.INFEASIBLE, solution.message
-    assert "is off by" in solution.message
+    assert "constraint violation" in solution.message
 
 
 def test_a_constraint_that_never_acts_leaves_one_full_step():
@@ -213,6 +216,19 @@ def test_the_augmented_lagrangians_derivatives_are_differences(free):
     ours = np.concatenate([gradients[:, :2].ravel(), gradients[:-1, 2]])
     assert ours == pytest.approx(np.array(slopes), rel=1e-6, abs=1e-6)
     assert np.all(np.linalg.eigvalsh(hessians) > -1e-9)
+
+
+@pytest.mark.parametrize("knot", [3, 10, 20])
+def test_a_motion_that_breaks_a_constraint_is_told(knot):
+    """Of v <= 1.2 with one velocity set to 1.3, and of a waypoint moved by a thousandth."""
+    problem = move(constraints=dd.Constraint(lambda x: x[1], upper=1.2, name="speed"), waypoints={10: [0.5, np.nan]})
+    solution = solved(problem, "ilqr")
+    assert not list(complaints_about(solution))
+    xs = np.array(solution.xs)
+    xs[knot, 1], xs[10, 0] = 1.3, xs[10, 0] + 1e-3
+    complaints = list(complaints_about(dataclasses.replace(solution, xs=xs)))
+    assert f"constraint violation 0.1 is above 1e-05: speed at knot {knot}" in complaints
+    assert "constraint violation 0.001 is above 1e-05: waypoint at knot 10 at knot 10" in complaints
 
 
 @pytest.mark.parametrize("method", ["ilqr", "shooting"])
