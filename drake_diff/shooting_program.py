@@ -14,12 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.solvers import MathematicalProgram
 
-from drake_diff.arrays import Array
+from drake_diff.arrays import Array, positive_int
+from drake_diff.exceptions import InputError
 from drake_diff.nonlinear_program import Limits, NlpResult, Report, solve_program
 from drake_diff.problem import Problem
 from drake_diff.shooting import RolloutCost, ShootingVariables, defect, limits_of_constraints, limits_of_states
 
 DEFAULT_SOLVER = "snopt"
+
+
+def check_segments(problem: Problem, method: str, segments: int) -> None:
+    """Refuse a number of segments that is none, or that the method or the problem does not allow."""
+    if positive_int("segments", segments) > 1 and method != "shooting":
+        raise InputError("segments", got=segments, expected=f'1 for method="{method}"')
+    if segments > problem.num_steps:
+        raise InputError("segments", got=segments, expected=f"at most num_steps, {problem.num_steps}")
+    if segments > 1 and problem.trajectory_cost is not None:
+        raise InputError("segments", got=segments, expected="1 with a trajectory_cost, which is of the whole motion")
 
 
 def solve_shooting(

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from drake_diff.nonlinear_program import SOLVERS, Limits, NlpResult, Outcome
 from drake_diff.problem import Problem
 from drake_diff.shooting import RolloutCost, ShootingVariables
 from drake_diff.shooting_program import DEFAULT_SOLVER as SHOOTING_SOLVER
-from drake_diff.shooting_program import roll_segments, solve_shooting
+from drake_diff.shooting_program import check_segments, roll_segments, solve_shooting
 from drake_diff.solution import Solution, Status
 from drake_diff.transcription import transcribe_problem
 from drake_diff.transcription_scheme import SCHEMES
@@ -96,7 +97,7 @@ def solve(
     }
     report = print if progress is True else (progress or None)
     _check_method(problem, method)
-    _check_segments(problem, method, positive_int("segments", segments))
+    check_segments(problem, method, segments)
     if on_start is not None:
         on_start()
     run = _Run(problem, method, scheme, solver, limits, options, report)
@@ -136,15 +137,6 @@ def _choose_scheme(method: str, scheme: str | None, solver: str | None, *, asked
     if solver == "snopt" and scheme != "drake":
         raise InputError("solver", got='"snopt"', expected=f'"ipopt" for scheme="{scheme}"')
     return scheme
-
-
-def _check_segments(problem: Problem, method: str, segments: int) -> None:
-    if segments > 1 and method != "shooting":
-        raise InputError("segments", got=segments, expected=f'1 for method="{method}"')
-    if segments > problem.num_steps:
-        raise InputError("segments", got=segments, expected=f"at most num_steps, {problem.num_steps}")
-    if segments > 1 and problem.trajectory_cost is not None:
-        raise InputError("segments", got=segments, expected="1 with a trajectory_cost, which is of the whole motion")
 
 
 def choose_method(problem: Problem) -> tuple[str, str]:
@@ -248,12 +240,13 @@ class _Run:
         except SimulationError as error:
             return refused(self._draft(xs, us), error)
 
-        def search(xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
-            return solve_shooting(
-                self.problem, xs, us, solver=self.solver, limits=self.limits, report=self.report, segments=segments
-            )
-
-        return self._through_steps(xs, us, search, segmented=True)
+        fixed: dict[str, Any] = {
+            "solver": self.solver,
+            "limits": self.limits,
+            "report": self.report,
+            "segments": segments,
+        }
+        return self._through_steps(xs, us, partial(solve_shooting, self.problem, **fixed), segmented=True)
 
     def _through_steps(self, xs: Array, us: Array, search: Search, *, segmented: bool = False) -> Solution:
         """Certify, search, certify again, on Drake's own steps; at rollouts, or at the states as they are."""
