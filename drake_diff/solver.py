@@ -239,14 +239,8 @@ class _Run:
             xs = roll_segments(self.problem, xs, us, segments)
         except SimulationError as error:
             return refused(self._draft(xs, us), error)
-
-        fixed: dict[str, Any] = {
-            "solver": self.solver,
-            "limits": self.limits,
-            "report": self.report,
-            "segments": segments,
-        }
-        return self._through_steps(xs, us, partial(solve_shooting, self.problem, **fixed), segmented=True)
+        search = partial(solve_shooting, solver=self.solver, limits=self.limits, report=self.report, segments=segments)
+        return self._through_steps(xs, us, partial(search, self.problem), segmented=True)
 
     def _through_steps(self, xs: Array, us: Array, search: Search, *, segmented: bool = False) -> Solution:
         """Certify, search, certify again, on Drake's own steps; at rollouts, or at the states as they are."""
