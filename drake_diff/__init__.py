@@ -38,6 +38,11 @@ from drake_diff.policy import PD as PD
 from drake_diff.policy import TVLQR as TVLQR
 from drake_diff.policy import ParametricPolicy as ParametricPolicy
 from drake_diff.problem import Problem as Problem
+from drake_diff.quantities import center_of_mass as center_of_mass
+from drake_diff.quantities import contact_force as contact_force
+from drake_diff.quantities import frame_position as frame_position
+from drake_diff.quantities import frame_rotation_error as frame_rotation_error
+from drake_diff.quantities import frame_velocity as frame_velocity
 from drake_diff.record import CertificationRecord as CertificationRecord
 from drake_diff.record import EvidenceRecord as EvidenceRecord
 from drake_diff.rollout import Rollout as Rollout

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_diff.arrays import Array
-from drake_diff.augmented_lagrangian import StateConstraints
+from drake_diff.augmented_lagrangian import AugmentedLagrangian
 from drake_diff.cost import (
     QuadraticCost,
     differentiate_cost,
@@ -31,6 +31,11 @@ class Motion:
     gaps: Array
 
     @property
+    def point(self) -> tuple[Array, Array]:
+        """xs and us."""
+        return self.xs, self.us
+
+    @property
     def is_rollout(self) -> bool:
         return not self.gaps.any()
 
@@ -46,18 +51,17 @@ def jacobians_along(problem: Problem, motion: Motion) -> Array:
     return np.concatenate([[d.A for d in steps], [d.B for d in steps]], axis=2)
 
 
-def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: StateConstraints) -> LinearQuadratic:
+def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: AugmentedLagrangian) -> LinearQuadratic:
     """`problem` around `motion`, the constraints being part of its cost."""
     model, xs, us = problem.model, motion.xs, motion.us
     gradients, hessians = _expand_running_cost(problem, xs, us)
     final_gradient, final_hessian = _expand_final_cost(problem, xs[-1])
     if constraints.any:
-        gradient, curvature = constraints.differentiate(xs)
-        diagonal = np.arange(model.nx)
-        gradients[:, : model.nx] += gradient[:-1]
-        hessians[:, diagonal, diagonal] += curvature[:-1]
-        final_gradient = final_gradient + gradient[-1]
-        final_hessian = final_hessian + np.diag(curvature[-1])
+        gradient, curvature = constraints.differentiate(xs, us)
+        gradients += gradient[:-1]
+        hessians += curvature[:-1]
+        final_gradient = final_gradient + gradient[-1, : model.nx]
+        final_hessian = final_hessian + curvature[-1, : model.nx, : model.nx]
     bounds, free = problem.bounds, problem.initial_state_mask
     return LinearQuadratic(
         F=jacobians,

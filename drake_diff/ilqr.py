@@ -2,8 +2,8 @@
 
 Li and Todorov, "Iterative linear quadratic regulator design for nonlinear biological movement systems", 2004, and
 the feasibility-driven form of Mastalli et al., "Crocoddyl", 2020: the guess need not be a rollout, and a step of size a
-leaves 1 - a of each gap between step(x_k, u_k) and x_(k+1). A hard goal and state bounds are augmented Lagrangians,
-and the dynamics' second derivatives, which iLQR leaves out, are learned on the way (`secant`).
+leaves 1 - a of each gap between step(x_k, u_k) and x_(k+1). A hard goal, waypoints, state bounds and constraints are
+augmented Lagrangians, and the dynamics' second derivatives, which iLQR leaves out, are learned on the way (`secant`).
 """
 
 import math
@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from drake_diff.arrays import Array
-from drake_diff.augmented_lagrangian import GROWTH, LARGEST_PENALTY, StateConstraints
+from drake_diff.augmented_lagrangian import GROWTH, LARGEST_PENALTY, AugmentedLagrangian
 from drake_diff.exceptions import InputError, SimulationError
 from drake_diff.expansion import Motion, expand, jacobians_along
 from drake_diff.nonlinear_program import (
@@ -50,7 +50,7 @@ def check_problem(problem: Problem) -> None:
 
 def is_unconstrained(problem: Problem) -> bool:
     """Whether iLQR can solve `problem` in one minimization: costs and input bounds alone, from the given x0."""
-    hard = StateConstraints(problem).any or problem.initial_state_mask.any()
+    hard = AugmentedLagrangian(problem).any or problem.initial_state_mask.any()
     return not hard and not list(_unkept(problem))
 
 
@@ -96,12 +96,12 @@ def _promise(models: Iterable[LinearQuadratic]) -> float:
 class _Search:
     def __init__(self, problem: Problem, xs: Array, us: Array, limits: Limits, report: Report | None):
         self.problem, self.limits, self.report = problem, limits, report
-        self.constraints = StateConstraints(problem)
+        self.constraints = AugmentedLagrangian(problem)
         self.start = time.monotonic()
         self.motion = self._take_in(xs, us)
         self.expanded, self.curvature = self.motion, DynamicsCurvature()
         self.cost = problem.objective(self.motion.xs, self.motion.us)
-        self.constraints.choose_penalty(self.motion.xs, self.cost, float(np.sum(self.motion.gaps**2)))
+        self.constraints.start(*self.motion.point, self.cost, float(np.sum(self.motion.gaps**2)))
         self.jacobians: Array | None = None
         self.gap_weight = 0.0
         self.regularization = 0.0
@@ -114,15 +114,14 @@ class _Search:
             outcome = self._minimize(final, interrupted)
             if outcome not in (Outcome.SOLVED, Outcome.INACCURATE) or not self.constraints.any:
                 return outcome
-            residual = self.constraints.residual(self.motion.xs)
-            reached = residual <= self.limits.tolerance
+            stands = self.constraints.violation(*self.motion.point) > FEASIBILITY_TOLERANCE
+            reached = not stands and self.constraints.residual(*self.motion.point) <= self.limits.tolerance
             exhausted = self.constraints.penalty >= LARGEST_PENALTY
             if final and reached:
                 return outcome
             if final and exhausted:
-                stands = self.constraints.violation(self.motion.xs) > FEASIBILITY_TOLERANCE
                 return Outcome.INFEASIBLE if stands else Outcome.INACCURATE
-            self.constraints.update(self.motion.xs)
+            self.constraints.update(*self.motion.point)
             final = reached or exhausted
             if not final:
                 self.constraints.penalty *= GROWTH
@@ -154,7 +153,7 @@ class _Search:
         scale = 1 + abs(merit)
         left_over = self.limits.tolerance**2 * scale
         if not final:
-            left_over = max(left_over, LEFT_OVER * self.constraints.unrest(self.motion.xs))
+            left_over = max(left_over, LEFT_OVER * self.constraints.unrest(*self.motion.point))
         curved = replace(model, hessians=model.hessians + self.curvature.M)
         promise = _promise((curved, model)) if self.motion.is_rollout else math.inf
         if promise <= left_over:
@@ -187,11 +186,11 @@ class _Search:
         for size in STEP_SIZES:
             try:
                 motion = self._roll(policy, size)
+                with np.errstate(all="ignore"):  # a merit that is not finite is no decrease
+                    cost = self.problem.objective(motion.xs, motion.us)
+                    found = self._merit_of(motion, cost)
             except SimulationError:
                 continue  # too long a step: a shorter one is tried next
-            with np.errstate(over="ignore", invalid="ignore"):  # a merit that is not finite is no decrease
-                cost = self.problem.objective(motion.xs, motion.us)
-                found = self._merit_of(motion, cost)
             if found <= merit + SUFFICIENT_DECREASE * size * slope:
                 self.motion, self.cost = motion, cost
                 self._record(policy.gradient, size)
@@ -242,10 +241,10 @@ class _Search:
 
     def _merit_of(self, motion: Motion, cost: float) -> float:
         """Cost, augmented by the constraints, plus the weighted sum of all gaps."""
-        return cost + self.constraints.value(motion.xs) + self.gap_weight * motion.distance
+        return cost + self.constraints.value(*motion.point) + self.gap_weight * motion.distance
 
     def _infeasibility(self) -> float:
-        return max(float(np.abs(self.motion.gaps).max(initial=0.0)), self.constraints.violation(self.motion.xs))
+        return max(float(np.abs(self.motion.gaps).max(initial=0.0)), self.constraints.violation(*self.motion.point))
 
     def _record(self, gradient: float, size: float) -> None:
         number, violation = len(self.rows), self._infeasibility()

@@ -63,7 +63,8 @@ class Model:
         self.contact_geometry = contact_geometry  # the route around refused pairs that the user chose
         self._rebuild = rebuild
         self._others: dict[tuple[str, Any], Model] = {}  # the same model with one thing changed
-        self.has_other_parameters = False  # in its contexts, for the time being: see `parameters.applied`
+        # What parameters in its contexts are, for the time being, not the model's own: see `parameters.applied`.
+        self.other_quantities: frozenset[str] = frozenset()
         self.path = path_to_the_plant(diagram)
         self.plant: MultibodyPlant = follow(diagram, self.path)
         _check_plant(self)
@@ -77,6 +78,11 @@ class Model:
         self.velocity_names: tuple[str, ...] = tuple(self.plant.GetVelocityNames(add_model_instance_prefix=prefix))
         self.state_names = self.position_names + self.velocity_names
         self.input_names = tuple(actuator.name() for actuator in actuators(self.plant))
+
+    @property
+    def has_other_parameters(self) -> bool:
+        """Whether parameters are applied that are not the model's own."""
+        return bool(self.other_quantities)
 
     @property
     def name(self) -> str:

@@ -233,10 +233,10 @@ def applied(vector: ParameterVector) -> Iterator[Model]:
     model = vector.model if h == vector.model.time_step else vector.model.at_time_step(h)
     try:
         vector.write(model.double, vector.values)
-        model.has_other_parameters = True
+        model.other_quantities = frozenset(p.kind.quantity for p in vector.parameters)
         yield model
     finally:
-        model.has_other_parameters = False
+        model.other_quantities = frozenset()
         vector.restore(model.double)
         if "autodiff" in vars(model):  # made on the way, or before
             vector.restore(model.autodiff)

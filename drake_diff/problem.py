@@ -12,7 +12,7 @@ from drake_diff.constraint import Constraint
 from drake_diff.cost import ConstantCost, FinalCost, QuadraticCost
 from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
 from drake_diff.model import Model
-from drake_diff.parameters import TIME_STEP, select
+from drake_diff.parameters import TIME_STEP, applied, select
 
 OPTIMIZABLE = ("controls", "initial_state", "parameters")
 # A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
@@ -80,6 +80,7 @@ class Problem:
         self._set("constraints", self._check_constraints())
         self._set("horizon", self._check_horizon())
         self._check_costs()
+        self._check_quantities()
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -253,6 +254,21 @@ class Problem:
                 raise InputError(name, got=type(cost).__name__, expected="a function or a QuadraticCost")
             if isinstance(cost, QuadraticCost):
                 cost.check_sizes(name, self.model.nx, self.model.nu)
+
+    def _check_quantities(self) -> None:
+        """Call each function once with the parameters applied: what depends on the model's own refuses them."""
+        if not self.parameters.parameters:
+            return
+        x, u = self.x0, np.zeros(self.model.nu)
+        with applied(self.parameters), np.errstate(all="ignore"):
+            for constraint in self.constraints:
+                constraint(x, u)
+            if self.running_cost is not None:
+                self.running_cost(x, u)
+            if self.final_cost is not None:
+                self.final_cost(x)
+            if self.trajectory_cost is not None:
+                self.trajectory_cost(np.tile(x, (self.num_steps + 1, 1)), self.us)
 
 
 def _check_optimize(model: Model, optimize: Sequence[str]) -> tuple[str, ...]:

@@ -230,9 +230,10 @@ def _broken_constraints(plan: Plan, xs: Array, us: Array) -> Iterator[str]:
     """Of the constraints and waypoints, by a replay's states xs (N+1, nx) and us (N, nu) at the plan's knots."""
     problem, ranges = plan.problem, {}
     planned_xs, planned_us = plan.sample(1)
-    for c in problem.constraints:
-        knots = c.at_knots(problem.num_steps, problem.initial_state_is_given)
-        values = np.array([c(planned_xs[k], planned_us[min(k, len(us) - 1)]) for k in knots])
+    for c in problem.constraints:  # its range is that along the whole plan: at a single knot it has none
+        with np.errstate(all="ignore"):
+            values = np.array([c(x, u) for x, u in zip(planned_xs, [*planned_us, planned_us[-1]], strict=True)])
+        values = values[np.isfinite(values).all(axis=1)]
         ranges[c.label] = max(float(np.ptp(values, axis=0).max()), SMALLEST_RANGE)
     for name, (excess, knot) in problem.constraint_excess(xs, us).items():
         tolerance = STATE_TOLERANCE * ranges.get(name, float(np.max(plan.scale)))

@@ -1,17 +1,16 @@
-"""Single shooting: inputs, initial state, parameters are the variables, Drake's own steps the dynamics."""
+"""A motion, or a segment of one, as a function of the variables that it is shot from, through Drake's own steps."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from pydrake.autodiffutils import ExtractValue
-from pydrake.solvers import MathematicalProgram
 
 from drake_diff.arrays import Array
 from drake_diff.autodiff import chain, chain_rows
 from drake_diff.cost import differentiate_cost, differentiate_final_cost
 from drake_diff.exceptions import SimulationError
-from drake_diff.nonlinear_program import Limits, NlpResult, Report, solve_program
 from drake_diff.parameter_coordinates import ParameterCoordinates
 from drake_diff.parameters import ParameterVector, applied
 from drake_diff.problem import Problem
@@ -19,62 +18,64 @@ from drake_diff.rollout import roll_states
 from drake_diff.rollout_gradient import Totals, accumulate, differentiate_loss, linearize
 from drake_diff.step_derivatives import StepDerivatives
 
-DEFAULT_SOLVER = "snopt"
-
-
-def solve_shooting(
-    problem: Problem, xs: Array, us: Array, *, solver: str, limits: Limits, report: Report | None
-) -> tuple[NlpResult, Array, Array]:
-    """Solve `problem` from the guess xs[0] (nx,), us (N, nu); gives (result, xs, us).
-
-    Raises GradientError or SimulationError where a step or its derivative is refused.
-    """
-    # IPOPT shortens a step whose end it cannot evaluate; SNOPT, in Drake, has no way to be told.
-    variables = ShootingVariables(problem, tolerate_failure=solver == "ipopt")
-    program = _program(problem, variables)
-    guess = variables.pack(xs[0], us)
-    result = solve_program(program, guess, solver=solver, limits=limits, report=report)
-    return result, variables.states(result.z), variables.unpack(result.z)[1]
-
 
 class ShootingVariables:
-    """z = [free entries of x0; us; parameters in their coordinates] and its rollout, linearized once for each z."""
+    """z = [free entries of the first state; us; parameters in their coordinates] and its rollout of n steps.
 
-    def __init__(self, problem: Problem, *, tolerate_failure: bool = False):
-        self.problem = problem
-        self.tolerate_failure = tolerate_failure
-        self.free = np.flatnonzero(problem.initial_state_mask)
-        self.shape = (problem.num_steps, problem.model.nu)
+    `steps` are those of a segment, all where None; the first state of a later segment is free in every entry. Given
+    `around` (n+1, nx), the states are these instead of a rollout, and the steps are linearized around them. That is
+    done once for each z.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        steps: range | None = None,
+        around: Array | None = None,
+        tolerate_failure: bool = False,
+    ):
+        self.problem, self.around, self.tolerate_failure = problem, around, tolerate_failure
+        self.steps = range(problem.num_steps) if steps is None else steps
+        begins, nx = self.steps.start == 0, problem.model.nx
+        self.free = np.flatnonzero(problem.initial_state_mask) if begins else np.arange(nx)
+        self.shape = (len(self.steps), problem.model.nu)
         self.coordinates = ParameterCoordinates(problem.parameters) if problem.optimizes_parameters else None
         self.num_parameters = len(problem.parameters.values) if problem.optimizes_parameters else 0
-        self._end = len(self.free) + (self.shape[0] * self.shape[1] if problem.optimizes_controls else 0)
-        self.size = self._end + self.num_parameters
-        self._at: bytes = b""
+        num_inputs = self.shape[0] * self.shape[1] if problem.optimizes_controls else 0
+        self.inputs = slice(len(self.free), len(self.free) + num_inputs)  # where in z they are
+        self.size = self.inputs.stop + self.num_parameters
+        self._at: bytes | None = None
         self._linearization: list[StepDerivatives] = []
 
+    @property
+    def is_last(self) -> bool:
+        """Whether the motion ends with these steps."""
+        return self.steps.stop == self.problem.num_steps
+
     def pack(self, x0: Array, us: Array, parameters: Array | None = None) -> Array:
-        """z (size,) from x0 (nx,), us (N, nu) and parameter values (np,), the problem's where None."""
+        """z (size,) from the first state x0 (nx,), us (n, nu) and parameter values (np,), the problem's where None."""
         inputs = us.ravel() if self.problem.optimizes_controls else np.zeros(0)
         values = self.problem.parameters.values if parameters is None else parameters
         coordinates = np.zeros(0) if self.coordinates is None else self.coordinates.from_values(values)
         return np.concatenate([x0[self.free], inputs, coordinates])
 
     def unpack(self, z: Array) -> tuple[Array, Array]:
-        """x0 (nx,) and us (N, nu) from z (size,)."""
+        """x0 (nx,) and us (n, nu) from z (size,)."""
         x0 = np.array(self.problem.x0)
         x0[self.free] = z[: len(self.free)]
         if not self.problem.optimizes_controls:
-            return x0, np.array(self.problem.us)
-        return x0, z[len(self.free) : self._end].reshape(self.shape)
+            return x0, np.array(self.problem.us[self.steps.start : self.steps.stop])
+        return x0, z[self.inputs].reshape(self.shape)
 
     def parameters(self, z: Array) -> ParameterVector:
         """The problem's parameters at z (size,)."""
         if self.coordinates is None:
             return self.problem.parameters
-        return self.problem.parameters.at(self.coordinates.to_values(z[self._end :]))
+        return self.problem.parameters.at(self.coordinates.to_values(z[self.inputs.stop :]))
 
     def gradient(self, z: Array, totals: Totals) -> Array:
-        """(size,) the gradient by z from those by x0 (nx,), us (N, nu) and parameters (np,)."""
+        """(size,) the gradient by z from those by x0 (nx,), us (n, nu) and parameters (np,)."""
         inputs = totals.inputs.ravel() if self.problem.optimizes_controls else np.zeros(0)
         return np.concatenate([totals.states[0][self.free], inputs, self.pull_back(z, totals.parameters)])
 
@@ -82,14 +83,16 @@ class ShootingVariables:
         """(..., num_parameters) the derivative by the parameters' coordinates in z."""
         if self.coordinates is None:
             return np.zeros((*by_parameters.shape[:-1], 0))
-        return self.coordinates.pull_back(z[self._end :], by_parameters)
+        return self.coordinates.pull_back(z[self.inputs.stop :], by_parameters)
 
     def linearization(self, z: Array) -> list[StepDerivatives]:
-        """The step derivatives along the rollout of z."""
+        """The step derivatives along the states of z."""
         if z.tobytes() != self._at:
             (x0, us), vector = self.unpack(z), self.parameters(z)
             with applied(vector) as model:
-                self._linearization, self._at = linearize(model, x0, us, vector=vector), z.tobytes()
+                given = None if self.around is None else self.around[:-1]
+                self._linearization = linearize(model, x0, us, vector=vector, xs=given)
+            self._at = z.tobytes()
         return self._linearization
 
     def attempt(self, evaluate: Callable[[], Any], failed: Any) -> Any:
@@ -102,7 +105,9 @@ class ShootingVariables:
             raise
 
     def states(self, z: Array) -> Array:
-        """(N+1, nx) the states of the rollout of z."""
+        """(n+1, nx) the states of the rollout of z, or those given."""
+        if self.around is not None:
+            return self.around
         x0, us = self.unpack(z)
         if z.tobytes() == self._at:
             return np.vstack([x0, [d.x_next for d in self._linearization]])
@@ -110,38 +115,33 @@ class ShootingVariables:
             return roll_states(model, x0, us)
 
 
-def _program(problem: Problem, variables: ShootingVariables) -> MathematicalProgram:
-    program = MathematicalProgram()
-    z = program.NewContinuousVariables(variables.size, "z")
-    b = problem.bounds
-    lowest, highest = problem.bounds_of_parameters()
-    lower = variables.pack(b.x_lower, np.tile(b.u_lower, (problem.num_steps, 1)), lowest)
-    upper = variables.pack(b.x_upper, np.tile(b.u_upper, (problem.num_steps, 1)), highest)
-    program.AddBoundingBoxConstraint(lower, upper, z).evaluator().set_description("variables")
-    if any(cost is not None for cost in (problem.running_cost, problem.final_cost, problem.trajectory_cost)):
-        program.AddCost(RolloutCost(problem, variables), vars=z)
-    wanted = np.flatnonzero(~np.isnan(problem.goal))
-    if len(wanted):
-        goal = problem.goal[wanted]
-        rows = _StateRows(variables, [(problem.num_steps, int(i)) for i in wanted])
-        program.AddConstraint(rows, goal, goal, vars=z, description="goal")
-    bounded = [
-        (k, int(i))
-        for k in range(1, problem.num_steps + 1)
-        for i in np.flatnonzero(np.isfinite(b.x_lower) | np.isfinite(b.x_upper))
-    ]
-    if bounded:
-        columns = [i for _, i in bounded]
-        rows = _StateRows(variables, bounded)
-        program.AddConstraint(rows, b.x_lower[columns], b.x_upper[columns], vars=z, description="state bounds")
-    return program
+def state_sensitivities(variables: ShootingVariables, z: Array) -> Array:
+    """(n+1, nx, size): d x_k / d z, forward: S_(k+1) = A_k S_k + B_k d u_k / d z + C_k d p / d z."""
+    linearization = variables.linearization(z)
+    nx, nu, free = variables.problem.model.nx, variables.shape[1], len(variables.free)
+    sensitivities = np.zeros((len(linearization) + 1, nx, variables.size))
+    sensitivities[0, variables.free, np.arange(free)] = 1.0
+    for k, d in enumerate(linearization):
+        sensitivities[k + 1] = d.A @ sensitivities[k]
+        if variables.problem.optimizes_controls:
+            start = variables.inputs.start + k * nu
+            sensitivities[k + 1][:, start : start + nu] += d.B
+        sensitivities[k + 1][:, variables.inputs.stop :] += variables.pull_back(z, d.C)
+    return sensitivities
 
 
 class RolloutCost:
-    """The objective as a function of z, floats or AutoDiffXd, by reverse accumulation."""
+    """What the steps of z add to the objective, as a function of floats or AutoDiffXd, by reverse accumulation."""
 
     def __init__(self, problem: Problem, variables: ShootingVariables):
-        self.problem, self.variables = problem, variables
+        self.variables, self.time_step, self.running = variables, problem.model.time_step, problem.running_cost
+        self.final = problem.final_cost if variables.is_last else None
+        self.trajectory = problem.trajectory_cost
+
+    @property
+    def any(self) -> bool:
+        """Whether there is a cost here."""
+        return any(cost is not None for cost in (self.running, self.final, self.trajectory))
 
     def __call__(self, z: Any) -> Any:
         if z.dtype == float:
@@ -152,63 +152,106 @@ class RolloutCost:
         return chain(value, gradient, z)
 
     def value(self, z: Array) -> float:
-        """The objective at z."""
-        return self.problem.objective(self.variables.states(z), self.variables.unpack(z)[1])
+        """The cost at z."""
+        xs, us = self.variables.states(z), self.variables.unpack(z)[1]
+        total = 0.0 if self.final is None else float(self.final(xs[-1]))
+        if self.running is not None:
+            total += self.time_step * sum(float(self.running(x, u)) for x, u in zip(xs, us, strict=False))
+        return total + (0.0 if self.trajectory is None else float(self.trajectory(xs, us)))
 
     def differentiate(self, z: Array) -> tuple[float, Array, Array]:
-        """(value, gradient by z, gradients by every state (N+1, nx)) at z."""
-        problem, (_, us) = self.problem, self.variables.unpack(z)
+        """(value, gradient by z, gradients by every state (n+1, nx)) at z."""
         linearization = self.variables.linearization(z)
-        xs, h = self.variables.states(z), problem.model.time_step
+        xs, us, h = self.variables.states(z), self.variables.unpack(z)[1], self.time_step
         by_xs, by_us, total = np.zeros_like(xs), np.zeros_like(us), 0.0
-        if problem.running_cost is not None:
+        if self.running is not None:
             for k, u in enumerate(us):
-                value, by_x, by_u = differentiate_cost(problem.running_cost, xs[k], u)
+                value, by_x, by_u = differentiate_cost(self.running, xs[k], u)
                 total += h * value
                 by_xs[k], by_us[k] = h * by_x, h * by_u
-        if problem.final_cost is not None:
-            value, by_xs[-1] = differentiate_final_cost(problem.final_cost, xs[-1])
+        if self.final is not None:
+            value, by_xs[-1] = differentiate_final_cost(self.final, xs[-1])
             total += value
-        if problem.trajectory_cost is not None:
-            value, added_xs, added_us = differentiate_loss(problem.trajectory_cost, xs, us)
+        if self.trajectory is not None:
+            value, added_xs, added_us = differentiate_loss(self.trajectory, xs, us)
             total, by_xs, by_us = total + value, by_xs + added_xs, by_us + added_us
         totals = accumulate(linearization, by_xs, by_us)
         return total, self.variables.gradient(z, totals), totals.states
 
 
-class _StateRows:
-    """Chosen entries (step, coordinate) of the states as a function of z, floats or AutoDiffXd."""
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """lower <= values(z) <= upper, m rows of a segment's z, or of more variables after it; floats or AutoDiffXd."""
 
-    def __init__(self, variables: ShootingVariables, entries: list[tuple[int, int]]):
-        self.variables = variables
-        self.steps = np.array([k for k, _ in entries])
-        self.coordinates = np.array([i for _, i in entries])
+    variables: ShootingVariables
+    lower: Array
+    upper: Array
+    values: Callable[[Array], Array]
+    jacobian: Callable[[Array], Array]
 
     def __call__(self, z: Any) -> Any:
-        missing = np.full(len(self.steps), np.nan)
+        missing = np.full(len(self.lower), np.nan)
         if z.dtype == float:
-            return self.variables.attempt(lambda: self._values(z), missing)
+            return self.variables.attempt(lambda: self.values(z), missing)
         at = ExtractValue(z.reshape(-1, 1)).ravel()
         values, jacobian = self.variables.attempt(
-            lambda: (self._values(at), state_sensitivities(self.variables, at)[self.steps, self.coordinates]),
-            (missing, np.full((len(missing), len(at)), np.nan)),
+            lambda: (self.values(at), self.jacobian(at)), (missing, np.full((len(missing), len(at)), np.nan))
         )
         return chain_rows(values, jacobian, z)
 
-    def _values(self, z: Array) -> Array:
-        return self.variables.states(z)[self.steps, self.coordinates]
+
+def limits_of_states(problem: Problem, variables: ShootingVariables) -> Rows:
+    """Bounds, waypoints and goal at the knots after the first, but not where the next segment begins."""
+    first, last = variables.steps.start, variables.steps.stop
+    lower, upper = (side[first : last + variables.is_last] for side in problem.state_limits())
+    steps, entries = np.nonzero(np.isfinite(lower) | np.isfinite(upper))
+    steps, entries = steps[steps > 0], entries[steps > 0]
+
+    def values(z: Array) -> Array:
+        return variables.states(z)[steps, entries]
+
+    def jacobian(z: Array) -> Array:
+        return state_sensitivities(variables, z)[steps, entries]
+
+    return Rows(variables, lower[steps, entries], upper[steps, entries], values, jacobian)
 
 
-def state_sensitivities(variables: ShootingVariables, z: Array) -> Array:
-    """(N+1, nx, size): d x_k / d z, forward: S_(k+1) = A_k S_k + B_k d u_k / d z + C_k d p / d z."""
-    linearization = variables.linearization(z)
-    nx, nu, free = variables.problem.model.nx, variables.shape[1], len(variables.free)
-    sensitivities = np.zeros((len(linearization) + 1, nx, variables.size))
-    sensitivities[0, variables.free, np.arange(free)] = 1.0
-    for k, d in enumerate(linearization):
-        sensitivities[k + 1] = d.A @ sensitivities[k]
-        if variables.problem.optimizes_controls:
-            start = free + k * nu
-            sensitivities[k + 1][:, start : start + nu] += d.B
-        sensitivities[k + 1][:, variables.size - variables.num_parameters :] += variables.pull_back(z, d.C)
-    return sensitivities
+def limits_of_constraints(problem: Problem, variables: ShootingVariables) -> Rows:
+    """The problem's constraints at the knots from the first on, but not where the next segment begins."""
+    first, nx, nu = variables.steps.start, problem.model.nx, problem.model.nu
+    knots = range(first, variables.steps.stop + variables.is_last)
+    given = problem.initial_state_is_given
+    here = [(k - first, c) for c in problem.constraints for k in c.at_knots(problem.num_steps, given) if k in knots]
+
+    def values(z: Array) -> Array:
+        xs, us = variables.states(z), variables.unpack(z)[1]
+        with np.errstate(all="ignore"):  # solvers know what to do with what is not finite
+            return np.concatenate([c(xs[k], us[min(k, len(us) - 1)]) for k, c in here])
+
+    def jacobian(z: Array) -> Array:
+        xs, us, sensitivities = variables.states(z), variables.unpack(z)[1], state_sensitivities(variables, z)
+        found = []
+        for k, c in here:
+            by_xu = c.differentiate(xs[k], us[min(k, len(us) - 1)])[1]
+            found.append(by_xu[:, :nx] @ sensitivities[k])
+            if k < len(us) and problem.optimizes_controls:
+                start = variables.inputs.start + k * nu
+                found[-1][:, start : start + nu] += by_xu[:, nx:]
+        return np.concatenate(found)
+
+    none = [np.zeros(0)]
+    lower, upper = (np.concatenate([getattr(c, side) for _, c in here] or none) for side in ("lower", "upper"))
+    return Rows(variables, lower, upper, values, jacobian)
+
+
+def defect(variables: ShootingVariables) -> Rows:
+    """0 = where a segment ends less where the next begins, by [z; the state that it begins from]."""
+    size, nx = variables.size, variables.problem.model.nx
+
+    def values(z: Array) -> Array:
+        return variables.states(z[:size])[-1] - z[size:]
+
+    def jacobian(z: Array) -> Array:
+        return np.hstack([state_sensitivities(variables, z[:size])[-1], -np.eye(nx)])
+
+    return Rows(variables, np.zeros(nx), np.zeros(nx), values, jacobian)

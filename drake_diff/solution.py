@@ -105,8 +105,9 @@ class Solution:
 
     @property
     def time_step(self) -> float:
-        """[s] from one state to the next."""
-        return self.horizon / self.problem.num_steps
+        """[s] from one state to the next: the model's own, to the last bit, where the horizon is not free."""
+        own = self.problem.model.time_step
+        return own if self.free_horizon is None else self.free_horizon / self.problem.num_steps
 
     @cached_property
     def cost(self) -> float:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,9 @@ from drake_diff.exceptions import GradientError, InputError, SimulationError, Un
 from drake_diff.ilqr import check_problem, is_unconstrained, solve_ilqr
 from drake_diff.nonlinear_program import SOLVERS, Limits, NlpResult, Outcome
 from drake_diff.problem import Problem
-from drake_diff.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
-from drake_diff.shooting import RolloutCost, ShootingVariables, solve_shooting
+from drake_diff.shooting import RolloutCost, ShootingVariables
+from drake_diff.shooting_program import DEFAULT_SOLVER as SHOOTING_SOLVER
+from drake_diff.shooting_program import check_segments, roll_segments, solve_shooting
 from drake_diff.solution import Solution, Status
 from drake_diff.transcription import ProblemTranscription
 from drake_diff.transcription_scheme import SCHEMES
@@ -42,6 +44,7 @@ def solve(
     time_limit: float | None = None,
     tolerance: float = 1e-8,
     seed: int = 0,
+    segments: int = 1,
     progress: bool | Progress = False,
     on_start: Callable[[], None] | None = None,
 ) -> Solution:
@@ -51,8 +54,9 @@ def solve(
     "ilqr" (the same by Riccati sweeps, from any xs and us) or "auto". `initial_guess` is None (a straight line to
     the goal; near zero inputs), (xs, us) with shapes (N+1, nx) and (N, nu), or a Solution. `solver` is "ipopt" or
     "snopt"; `time_limit` [s]; `tolerance` the solver's on feasibility and optimality; `seed` that of the guess's
-    noise. `progress` prints, or hands each line to a function; `on_start` is called once, when all input has been
-    checked and the work begins.
+    noise. With `segments` > 1 shooting is multiple: the states that the segments start from are variables too, first
+    those of the guess. `progress` prints, or hands each line to a function; `on_start` is called once, when all input
+    has been checked and the work begins.
 
     Raises InputError and its kin, or ModelError, before anything runs; how a solve ended is `Solution.status`.
     """
@@ -84,11 +88,13 @@ def solve(
         "time_limit": time_limit,
         "tolerance": limits.tolerance,
         "seed": seed,
+        "segments": segments,
         "method_reason": reason,
         "initial_guess": "default" if initial_guess is None else "given",
     }
     report = print if progress is True else (progress or None)
     _check_method(problem, method)
+    check_segments(problem, method, segments)
     if on_start is not None:
         on_start()
     run = _Run(problem, method, scheme, solver, limits, options, report)
@@ -96,6 +102,8 @@ def solve(
         return run.collocate(xs, us)
     if method == "ilqr":
         return run.sweep(xs, us, given=initial_guess is not None)
+    if segments > 1:
+        return run.shoot_segments(xs, us, segments)
     return run.shoot(xs, us, improve=initial_guess is None and is_unconstrained(problem))
 
 
@@ -231,9 +239,18 @@ class _Run:
 
         return self._through_steps(xs, us, search)
 
-    def _through_steps(self, xs: Array, us: Array, search: Search) -> Solution:
-        """Certify, search, certify again, on Drake's own steps."""
-        variables = ShootingVariables(self.problem)
+    def shoot_segments(self, xs: Array, us: Array, segments: int) -> Solution:
+        """Multiple shooting, looked at around the segments' own states, which defects part."""
+        try:
+            xs = roll_segments(self.problem, xs, us, segments)
+        except SimulationError as error:
+            return refused(self._draft(xs, us), error)
+        search = partial(solve_shooting, solver=self.solver, limits=self.limits, report=self.report, segments=segments)
+        return self._through_steps(xs, us, partial(search, self.problem), segmented=True)
+
+    def _through_steps(self, xs: Array, us: Array, search: Search, *, segmented: bool = False) -> Solution:
+        """Certify, search, certify again, on Drake's own steps; at rollouts, or at the states as they are."""
+        variables = ShootingVariables(self.problem, around=xs if segmented else None)
         try:
             xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us))
         except (GradientError, SimulationError) as error:
@@ -242,6 +259,7 @@ class _Run:
             return ended(self._draft(xs, us, certificates=before), Status.NO_GRADIENT, blindness)
         try:
             result, xs, us = search(xs, us)
+            variables = ShootingVariables(self.problem, around=xs if segmented else None)
             z = result.z if self.method == "shooting" and len(result.z) == variables.size else variables.pack(xs[0], us)
             xs, us, after, blindness = self._look_at(variables, z)
         except (GradientError, SimulationError) as error:

@@ -12,7 +12,7 @@ from pydrake.systems.framework import DiagramBuilder
 from test_solution import MODELS, block
 
 import drake_diff as dd
-from drake_diff.augmented_lagrangian import StateConstraints
+from drake_diff.augmented_lagrangian import AugmentedLagrangian
 from drake_diff.expansion import Motion, expand, jacobians_along
 from drake_diff.ilqr import _Search
 from drake_diff.nonlinear_program import Limits
@@ -515,7 +515,7 @@ def test_a_sweep_takes_less_than_five_milliseconds():
     model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
     problem = dd.Problem(model, x0=np.zeros(4), num_steps=100, running_cost=EFFORT, x_goal=[1, np.pi, 0, 0])
     motion = Motion(np.zeros((101, 4)), np.zeros((100, 1)), np.zeros((100, 4)))
-    around = expand(problem, motion, jacobians_along(problem, motion), StateConstraints(problem))
+    around = expand(problem, motion, jacobians_along(problem, motion), AugmentedLagrangian(problem))
 
     def seconds():
         start = time.perf_counter()

@@ -1,0 +1,272 @@
+"""Task quantities against closed forms, against Drake's own Jacobians, and against differences."""
+
+from importlib.metadata import files
+
+import numpy as np
+import pytest
+from conftest import Plant, add_slide, contact_properties, random_state
+from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
+    AddRigidHydroelasticProperties,
+    Box,
+    CollisionFilterDeclaration,
+    GeometrySet,
+    HalfSpace,
+    Sphere,
+)
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.tree import FixedOffsetFrame, JacobianWrtVariable, SpatialInertia
+from test_ilqr import craft
+
+import drake_diff as dd
+
+
+def asset(name):
+    return next(f.locate() for f in files("example-robot-data") if str(f).endswith("/" + name))
+
+
+def ur5():
+    with pytest.warns(dd.ModelWarning):  # meshes skipped
+        return dd.load_model(asset("ur5_robot.urdf"), time_step=0.02)
+
+
+def differentiate(function, x, u=None):
+    """(values, Jacobian by x, or by x and u)."""
+    z = InitializeAutoDiff(x if u is None else np.concatenate([x, u])).ravel()
+    result = function(z) if u is None else function(z[: len(x)], z[len(x) :])
+    return ExtractValue(result).ravel(), ExtractGradient(result)
+
+
+def differences(function, x, step=1e-6):
+    return np.array([(function(x + d) - function(x - d)) / (2 * step) for d in step * np.eye(len(x))]).T
+
+
+def test_a_pendulums_tip(load):
+    """q about +y from hanging: p = l (-sin q, 0, -cos q), v = l w (-cos q, 0, sin q); centre of mass the same."""
+    model, x = load("pendulum.urdf"), np.array([0.7, -1.2])
+    tip, speed, center = (
+        dd.frame_position(model, "pole", [0, 0, -0.5]),
+        dd.frame_velocity(model, "pole", [0, 0, -0.5]),
+        dd.center_of_mass(model),
+    )
+    place, along = np.array([-np.sin(0.7), 0, -np.cos(0.7)]), np.array([-np.cos(0.7), 0, np.sin(0.7)])
+    assert tip(x) == pytest.approx(0.5 * place, abs=1e-15)
+    assert center(x) == pytest.approx(0.5 * place, abs=1e-15)
+    assert speed(x) == pytest.approx(-1.2 * 0.5 * along, abs=1e-15)
+    assert differentiate(tip, x)[1][:, 0] == pytest.approx(0.5 * along, abs=1e-15)
+    assert differentiate(speed, x)[1] == pytest.approx(np.array([0.6 * place, 0.5 * along]).T, abs=1e-15)
+
+
+def test_a_double_pendulums_tip_in_the_world_and_in_its_upper_rod(load):
+    """Rods of 0.8 and 0.5 m; the centre of mass weighs 1 kg at 0.4 m and 0.7 kg at 0.25 m of them."""
+    model, x = load("double_pendulum.urdf"), np.array([0.4, -0.9, 1.3, -0.6])
+
+    def rod(angle, length):
+        return length * np.array([-np.sin(angle), 0, -np.cos(angle)])
+
+    upper, lower = rod(0.4, 0.8), rod(-0.5, 0.5)
+    assert dd.frame_position(model, "lower", [0, 0, -0.5])(x) == pytest.approx(upper + lower, abs=1e-15)
+    inside = dd.frame_position(model, "lower", [0, 0, -0.5], relative_to="upper")(x)
+    assert inside == pytest.approx(rod(-0.9, 0.5) + np.array([0, 0, -0.8]), abs=1e-15)
+    center = (upper / 2 + 0.7 * (upper + lower / 2)) / 1.7
+    assert dd.center_of_mass(model)(x) == pytest.approx(center, abs=1e-15)
+    turned = RollPitchYaw(0, 0.4, 0).ToRotationMatrix().matrix()
+    assert dd.frame_rotation_error(model, "upper", turned)(x) == pytest.approx(np.zeros(3), abs=1e-15)
+    error = dd.frame_rotation_error(model, "lower", np.eye(3), relative_to="upper")(x)
+    assert error == pytest.approx([0, 2 * np.sin(-0.45), 0], abs=1e-15)
+
+
+def test_a_cart_poles_velocity_is_the_carts_and_the_poles(load):
+    model, x = load("cart_pole.urdf"), np.array([0.3, 0.5, -0.7, 1.1])
+    tip, speed = (f(model, "pole", [0, 0, -0.5]) for f in (dd.frame_position, dd.frame_velocity))
+    rate = differences(tip, x)[:, :2] @ x[2:]
+    assert speed(x) == pytest.approx(rate, abs=1e-9)  # differences of 1e-6
+    assert dd.frame_velocity(model, "cart")(x) == pytest.approx([-0.7, 0, 0], abs=1e-15)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_gradients_on_a_ur5_are_drakes_own_jacobians(seed):
+    model, p = ur5(), np.array([0.1, -0.2, 0.05])
+    x = random_state(model, np.random.default_rng(seed))
+    plant, context = model.plant, model.double.context
+    plant.SetPositionsAndVelocities(context, x)
+    hand, world = plant.GetFrameByName("tool0"), plant.world_frame()
+    wrt = JacobianWrtVariable.kQDot
+    jacobian = plant.CalcJacobianTranslationalVelocity(context, wrt, hand, p, world, world)
+    by_x = differentiate(dd.frame_position(model, "tool0", p), x)[1]
+    assert by_x[:, : model.nq] == pytest.approx(jacobian, abs=1e-13)
+    assert not by_x[:, model.nq :].any()
+    velocity, by_x = differentiate(dd.frame_velocity(model, "tool0", p), x)
+    assert velocity == pytest.approx(jacobian @ x[model.nq :], abs=1e-13)
+    assert by_x[:, model.nq :] == pytest.approx(jacobian, abs=1e-13)
+    assert by_x == pytest.approx(differences(dd.frame_velocity(model, "tool0", p), x), abs=1e-8)
+    jacobian = plant.CalcJacobianCenterOfMassTranslationalVelocity(context, wrt, world, world)
+    assert differentiate(dd.center_of_mass(model), x)[1][:, : model.nq] == pytest.approx(jacobian, abs=1e-13)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.0, 2.0, 3.0, 3.14, np.pi - 1e-7])
+def test_a_rotation_error_is_two_sines_of_half_the_angle_up_to_half_a_turn(angle):
+    """A free body turned by `angle` from a goal about random axes; gradients against differences, value by angle."""
+    model = craft()
+    for seed in range(4):
+        random = np.random.default_rng(seed)
+        axis = random.standard_normal(3)
+        axis /= np.linalg.norm(axis)
+        goal = RollPitchYaw(random.standard_normal(3)).ToRotationMatrix()
+        turn = RotationMatrix(np.asarray(_rodrigues(angle * axis)))
+        x = random_state(model, random)
+        x[:4] = turn.multiply(goal).ToQuaternion().wxyz()
+        error = dd.frame_rotation_error(model, model.plant.get_body(_last_body(model)).name(), goal.matrix())
+        values, by_x = differentiate(error, x)
+        assert error(x) == pytest.approx(2 * np.sin(angle / 2) * axis, abs=1e-7 if angle > 3.1415 else 1e-13)
+        assert values == pytest.approx(error(x), abs=1e-13)
+        if angle < 3.14159:
+            assert by_x == pytest.approx(differences(error, x), abs=1e-8)
+
+
+def _rodrigues(r):
+    angle = np.linalg.norm(r)
+    K = np.array([[0, -r[2], r[1]], [r[2], 0, -r[0]], [-r[1], r[0], 0]])
+    return np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * K @ K
+
+
+def _last_body(model):
+    return max(model.plant.GetFloatingBaseBodies())
+
+
+def test_a_rotation_that_is_small_is_the_rotation_vector_itself():
+    model = craft()
+    name, x = model.plant.get_body(_last_body(model)).name(), model.default_state
+    r = np.array([1e-6, -2e-6, 3e-6])
+    x[:4] = RotationMatrix(_rodrigues(r)).ToQuaternion().wxyz()
+    assert dd.frame_rotation_error(model, name, np.eye(3))(x) == pytest.approx(r, abs=1e-16)
+
+
+def two_arms():
+    """Two instances with a body and a frame of the same names."""
+    plant = Plant(0.01)
+    for name in ("left", "right"):
+        instance = plant.plant.AddModelInstance(name)
+        arm = plant.plant.AddRigidBody("arm", instance, SpatialInertia.SolidSphereWithMass(1, 0.1))
+        add_slide(plant.plant, f"{name}_rail", plant.plant.world_frame(), arm, "x" if name == "left" else "z")
+        plant.plant.AddFrame(FixedOffsetFrame("hand", arm.body_frame(), RigidTransform([0, 0, 0.3]), instance))
+    return plant.model()
+
+
+def test_frames_of_two_instances_are_told_apart():
+    model, x = two_arms(), np.array([1.0, 2.0, 3.0, 4.0])
+    assert dd.frame_position(model, "left::hand", [0.1, 0, 0])(x) == pytest.approx([1.1, 0, 0.3], abs=1e-15)
+    assert dd.frame_position(model, "right::arm")(x) == pytest.approx([0, 0, 2], abs=1e-15)
+    between = dd.frame_position(model, "left::hand", relative_to="right::hand")
+    assert between(x) == pytest.approx([1, 0, -2], abs=1e-15)
+    with pytest.raises(dd.UnknownNameError, match="left::arm, left::hand, right::arm, right::hand, world"):
+        dd.frame_position(model, "hand")
+
+
+def box_on_the_ground(kind="spheres", *, pusher=False):
+    """A box of 2 kg on the ground, by four corner spheres or by hydroelastic contact."""
+    plant = Plant(0.01, contact_model="point" if kind == "spheres" else "hydroelastic")
+    ground, skin = contact_properties(2e4), contact_properties(2e4)
+    if kind == "hydroelastic":
+        AddRigidHydroelasticProperties(ground)
+        AddCompliantHydroelasticProperties(0.05, 1e6, skin)
+    plant.plant.RegisterCollisionGeometry(plant.plant.world_body(), RigidTransform(), HalfSpace(), "ground", ground)
+    box = plant.plant.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(2, 0.2, 0.2, 0.2))
+    rail = add_slide(plant.plant, "rail", plant.plant.world_frame(), box, "z")
+    if pusher:
+        plant.plant.AddJointActuator("press", rail)
+    if kind == "spheres":
+        for i, (a, b) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
+            pose = RigidTransform([0.09 * a, 0.09 * b, -0.09])
+            plant.plant.RegisterCollisionGeometry(box, pose, Sphere(0.01), f"corner_{i}", skin)
+        body = GeometrySet(plant.plant.GetCollisionGeometriesForBody(box))
+        plant.scene_graph.collision_filter_manager().Apply(CollisionFilterDeclaration().ExcludeWithin(body))
+    else:
+        plant.plant.RegisterCollisionGeometry(box, RigidTransform(), Box(0.2, 0.2, 0.2), "skin", skin)
+    return plant.model()
+
+
+@pytest.mark.parametrize("kind", ["spheres", "hydroelastic"])
+def test_a_box_at_rest_presses_with_its_weight(kind):
+    """m g = 19.62 N; SAP stops at 1e-6 of it."""
+    model, x = box_on_the_ground(kind), np.array([0.0995, 0.0])
+    for _ in range(300):
+        x = dd.step(model, x)
+    assert dd.contact_force(model, "box")(x, np.zeros(0)) == pytest.approx([0, 0, 2 * 9.81], abs=1e-4)
+    x[0] = 0.3
+    assert not dd.contact_force(model, "box")(x, np.zeros(0)).any()
+
+
+@pytest.mark.parametrize("kind", ["spheres", "hydroelastic"])
+def test_a_contact_force_is_the_change_of_momentum_and_differentiates(kind):
+    """F h = m (v+ - v) - (u - m g) h; derivatives against differences of it, 1e-7 of 1e4 N/m."""
+    model = box_on_the_ground(kind, pusher=True)
+    force, x, u = dd.contact_force(model, "box"), np.array([0.0981, -0.05]), np.array([-3.0])
+    change = 2 * (dd.step(model, x, u)[1] - x[1]) / 0.01
+    assert force(x, u)[2] == pytest.approx(change + 3.0 + 2 * 9.81, rel=1e-6)
+    assert force(x, u)[2] > 20
+    values, by_xu = differentiate(force, x, u)
+    assert values == pytest.approx(force(x, u), rel=1e-9)
+    z = np.concatenate([x, u])
+    assert by_xu == pytest.approx(differences(lambda z: force(z[:2], z[2:]), z, 1e-7), rel=1e-5, abs=1e-4)
+
+
+def test_two_balls_push_each_other_with_opposite_forces():
+    """An overlap d of 1 mm at rest; SAP is implicit: F = k d / (1 + h k (h + tau) / m), tau = 0.2 s, m = 0.5 kg."""
+    plant = Plant(0.01)
+    for name, axis in (("a", "x"), ("b", "x")):
+        plant.ball(name, 1.0, 0.1, contact_properties(1e4), axis)
+    model, x = plant.model(), np.array([0.0, 0.199, 0.0, 0.0])
+    on_a, on_b = (dd.contact_force(model, name)(x, np.zeros(0)) for name in "ab")
+    assert on_a == pytest.approx([-5000 * 0.001 / (1 + 0.01 * 5000 * 0.21 / 0.5), 0, 0], rel=1e-6)
+    assert on_a == pytest.approx(-on_b, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda m: dd.frame_position(m, "hand"), r"frame: expected one of .*pole, world, got 'hand'"),
+        (lambda m: dd.frame_position(m, "pole", relative_to="cart"), "got 'cart'"),
+        (lambda m: dd.frame_velocity(m, "hand"), "got 'hand'"),
+        (lambda m: dd.frame_rotation_error(m, "hand", np.eye(3)), "got 'hand'"),
+        (lambda m: dd.contact_force(m, "world"), "body: expected one of pole, got 'world'"),
+        (lambda m: dd.frame_position(m, "pole", [0, 0]), "shape"),
+        (lambda m: dd.frame_rotation_error(m, "pole", 1.01 * np.eye(3)), "a rotation matrix"),
+        (lambda m: dd.frame_rotation_error(m, "pole", np.diag([1, 1, -1])), "a rotation matrix"),
+        (lambda m: dd.frame_position(m, "pole")([0.0]), r"shape \(2,\)"),
+    ],
+)
+def test_what_does_not_exist_or_fit_is_named(load, make, words):
+    with pytest.raises(dd.InputError, match=words):
+        make(load("pendulum.urdf"))
+
+
+@pytest.mark.parametrize("part", ["running_cost", "final_cost", "trajectory_cost", "constraints"])
+def test_a_place_beside_an_offset_is_refused(load, part):
+    """It would be that of the model's own link length, and its gradient by the length would be missing."""
+    model = load("double_pendulum.urdf")
+    tip = dd.frame_position(model, "lower", [0, 0, -0.5])
+    functions = {
+        "running_cost": lambda x, u: tip(x)[2],
+        "final_cost": lambda x: tip(x)[2],
+        "trajectory_cost": lambda xs, us: tip(xs[-1])[2],
+        "constraints": dd.Constraint(lambda x: tip(x)[2], upper=0.1),
+    }
+    fields = {"x0": np.zeros(4), "num_steps": 5, "x_goal": [1, 0, 0, 0], part: functions[part]}
+    both = {"optimize": ("controls", "parameters")}
+    dd.Problem(model, **fields)
+    dd.Problem(model, **fields, parameters=["lower.mass"], **both)
+    with pytest.raises(dd.InputError, match="task quantities are used: expected others, got offset"):
+        dd.Problem(model, **fields, parameters=["lower.mass", "elbow.offset"], **both)
+    assert tip(np.zeros(4))[2] == -1.3  # and works again
+
+
+def test_a_centre_of_mass_beside_a_mass_and_a_contact_force_beside_anything_are_refused():
+    model = box_on_the_ground(pusher=True)
+    center, force = dd.center_of_mass(model), dd.contact_force(model, "box")
+    fields = {"x0": [0.2, 0], "num_steps": 5, "optimize": ("controls", "parameters")}
+    with pytest.raises(dd.InputError, match="got mass"):
+        dd.Problem(model, **fields, final_cost=lambda x: center(x)[2], parameters=["box.mass"])
+    with pytest.raises(dd.InputError, match="got damping"):
+        dd.Problem(model, **fields, running_cost=lambda x, u: force(x, u)[2], parameters=["rail.damping"])
