@@ -168,6 +168,8 @@ class _Search:
                 return None
             if promise <= ROUNDING * scale:
                 return Outcome.SOLVED  # what is left to gain is less than the cost's rounding
+            if self.motion.is_rollout and policy is not None and policy.expected <= ROUNDING * scale:
+                break  # no step that can be told from none: the cost has a kink or a jump here, as contact makes them
             self.regularization = max(8 * self.regularization, SMALLEST_REGULARIZATION)
         self.regularization = 0.0
         return Outcome.INACCURATE

@@ -13,6 +13,7 @@ from drake_diff.certificate import Certificate, certify_jacobian
 from drake_diff.certify import certify
 from drake_diff.collocation import DEFAULT_SOLVER as COLLOCATION_SOLVER
 from drake_diff.collocation import solve_collocation
+from drake_diff.continuation import check_schedule, solve_continuation
 from drake_diff.continuous import EquationsOfMotion
 from drake_diff.dynamics import Dynamics, plant_dynamics
 from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
@@ -21,6 +22,7 @@ from drake_diff.nonlinear_program import SOLVERS, Limits, NlpResult, Outcome
 from drake_diff.problem import Problem
 from drake_diff.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
 from drake_diff.shooting import RolloutCost, ShootingVariables, solve_shooting
+from drake_diff.soft_contact import SoftContact
 from drake_diff.solution import Solution, Status
 from drake_diff.transcription import transcribe_problem
 from drake_diff.transcription_scheme import SCHEMES
@@ -45,6 +47,7 @@ def solve(
     time_limit: float | None = None,
     tolerance: float = 1e-8,
     seed: int = 0,
+    continuation: Any = None,
     progress: bool | Progress = False,
     on_start: Callable[[], None] | None = None,
 ) -> Solution:
@@ -54,7 +57,9 @@ def solve(
     "ilqr" (the same by Riccati sweeps, from any xs and us) or "auto". `initial_guess` is None (a straight line to
     the goal; near zero inputs), (xs, us) with shapes (N+1, nx) and (N, nu), or a Solution. `solver` is "ipopt" or
     "snopt"; `time_limit` [s]; `tolerance` the solver's on feasibility and optimality; `seed` that of the guess's
-    noise. `progress` prints, or hands each line to a function; `on_start` is called once, when all input has been
+    noise. `continuation` finds contact that the guess does not make, by stages of a force at a distance before the
+    true plant: "auto" (see `continuation.default_schedule`) or SoftContacts, with "ilqr"; `Solution.options` has the
+    stages' log. `progress` prints, or hands each line to a function; `on_start` is called once, when all input has been
     checked and the work begins.
 
     Raises InputError and its kin, or ModelError, before anything runs; how a solve ended is `Solution.status`.
@@ -77,6 +82,8 @@ def solve(
         positive_float("tolerance", tolerance),
     )
     reason = "asked for"
+    if continuation is not None and method == "auto":
+        method, reason = "ilqr", "a continuation is asked for"
     if method == "auto":
         method, reason = choose_method(problem)
     scheme = _choose_scheme(method, scheme, solver, asked=reason == "asked for")
@@ -92,13 +99,16 @@ def solve(
     }
     report = print if progress is True else (progress or None)
     _check_method(problem, method)
+    if continuation is not None and method != "ilqr":
+        raise InputError("continuation", got="given", expected=f'none for method="{method}"; method="ilqr" takes it')
+    stages = () if continuation is None else check_schedule(problem, continuation)
     if on_start is not None:
         on_start()
     run = _Run(problem, method, scheme, solver, limits, options, report)
     if method == "collocation":
         return run.collocate(xs, us)
     if method == "ilqr":
-        return run.sweep(xs, us, given=initial_guess is not None)
+        return run.sweep(xs, us, given=initial_guess is not None, stages=stages)
     return run.shoot(xs, us, improve=initial_guess is None and is_unconstrained(problem))
 
 
@@ -204,13 +214,21 @@ class _Run:
         found = {"xs": motion.xs, "us": motion.us[:-1], "u_final": motion.us[-1], "us_mid": motion.us_mid}
         return result, found | {"free_horizon": motion.horizon if self.problem.horizon else None}
 
-    def sweep(self, xs: Array, us: Array, *, given: bool) -> Solution:
-        """iLQR; from the states of a `given` guess, which need not be a rollout, else from the rollout of `us`."""
+    def sweep(self, xs: Array, us: Array, *, given: bool, stages: tuple[SoftContact, ...]) -> Solution:
+        """iLQR; from the states of a `given` guess, which need not be a rollout, else from the rollout of `us`.
+
+        With `stages`, which take the inputs of the guess alone, it need not have a gradient.
+        """
 
         def search(rolled: Array, us: Array) -> tuple[NlpResult, Array, Array]:
+            if stages:
+                limits, report = self.limits, self.report
+                result, xs_found, us, logs = solve_continuation(self.problem, us, stages, limits=limits, report=report)
+                self.options["continuation"] = [log.to_dict() for log in logs]
+                return result, xs_found, us
             return solve_ilqr(self.problem, xs if given else rolled, us, limits=self.limits, report=self.report)
 
-        return self._through_steps(xs, us, search)
+        return self._through_steps(xs, us, search, may_be_blind=bool(stages))
 
     def shoot(self, xs: Array, us: Array, *, improve: bool) -> Solution:
         """Shooting; `improve` the guess by iLQR, which gets out of curved valleys that shooting crawls along."""
@@ -225,14 +243,14 @@ class _Run:
 
         return self._through_steps(xs, us, search)
 
-    def _through_steps(self, xs: Array, us: Array, search: Search) -> Solution:
+    def _through_steps(self, xs: Array, us: Array, search: Search, *, may_be_blind: bool = False) -> Solution:
         """Certify, search, certify again, on Drake's own steps."""
         variables = ShootingVariables(self.problem)
         try:
             xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us))
         except (GradientError, SimulationError) as error:
             return refused(self._draft(xs, us), error)
-        if blindness:
+        if blindness and not may_be_blind:
             return ended(self._draft(xs, us, certificates=before), Status.NO_GRADIENT, blindness)
         try:
             result, xs, us = search(xs, us)
