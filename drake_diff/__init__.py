@@ -54,6 +54,8 @@ from drake_diff.smoothing import Gaussian as Gaussian
 from drake_diff.smoothing import Smoothed as Smoothed
 from drake_diff.smoothing import smooth as smooth
 from drake_diff.smoothing import smooth_step as smooth_step
+from drake_diff.soft_contact import SoftContact as SoftContact
+from drake_diff.soft_contact import softened as softened
 from drake_diff.solution import Solution as Solution
 from drake_diff.solution import Status as Status
 from drake_diff.solver import solve as solve

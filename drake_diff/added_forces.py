@@ -1,4 +1,4 @@
-"""Generalized forces that a parameter adds to a step, where Drake has no parameter of its own for it."""
+"""Generalized forces that are added to a step: those of a parameter that Drake has not, and those of a model."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol

@@ -167,6 +167,8 @@ class _Search:
                 return None
             if promise <= ROUNDING * scale:
                 return Outcome.SOLVED  # what is left to gain is less than the cost's rounding
+            if self.motion.is_rollout and policy is not None and policy.expected <= ROUNDING * scale:
+                break  # no step that can be told from none: the cost has a kink or a jump here, as contact makes them
             self.regularization = max(8 * self.regularization, SMALLEST_REGULARIZATION)
         self.regularization = 0.0
         return Outcome.INACCURATE
@@ -250,7 +252,4 @@ class _Search:
         number, violation = len(self.rows), self._infeasibility()
         self.rows.append(Iteration(number, self.cost, violation, gradient, size))
         if self.report:
-            self.report(
-                f"iteration {number:4d}  cost {self.cost:12.6g}  violation {violation:9.2e}  gradient {gradient:9.2e}  "
-                f"step {size:.3g}"
-            )
+            self.report.row(self.rows[-1])

@@ -105,12 +105,10 @@ class _Watch(ca.Callback):  # type: ignore[misc]
             self.stopped_by = Outcome.INTERRUPTED
         elif now - self.start > self.limits.time_limit:
             self.stopped_by = Outcome.TIME_LIMIT
-        if self.report and (now - self.last_report > REPORT_PERIOD or self.stopped_by):
-            self.last_report = now
-            self.report(
-                f"iteration {self.iterates:5d}  cost {f[0]:12.6g}  violation {violation:9.2e}  "
-                f"{now - self.start:6.1f} s"
-            )
+        if self.report:
+            due = now - self.last_report > REPORT_PERIOD or self.stopped_by is not None
+            self.last_report = now if due else self.last_report
+            self.report.row(Iteration(self.iterates, float(f[0]), violation, math.nan, math.nan), printed=due)
         self.iterates += 1
 
     def best_of(self, guess: Array) -> Array:

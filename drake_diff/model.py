@@ -14,6 +14,7 @@ from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, Multibod
 from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
+from drake_diff.added_forces import AddedForce
 from drake_diff.arrays import finite_array, positive_float
 from drake_diff.contact_geometry import CONTACT_MODELS, ROUTES, replace_collision_geometry
 from drake_diff.contract import Contract
@@ -56,8 +57,10 @@ class Model:
         notes: tuple[str, ...] = (),
         contact_geometry: str | None = None,
         rebuild: "Callable[..., Model] | None" = None,
+        forces: tuple[AddedForce, ...] = (),
     ):
         self.diagram = diagram
+        self.forces = forces  # what acts beside the forces of the plant itself
         self.source = source
         self.notes = notes
         self.contact_geometry = contact_geometry  # the route around refused pairs that the user chose
@@ -100,14 +103,15 @@ class Model:
 
     def at_time_step(self, time_step: float) -> "Model":
         """The same model at another time step [s]. ModelError where it came from a diagram, which has but one."""
-        return self._other(time_step=positive_float("time_step [s]", time_step))
+        return self.changed(time_step=positive_float("time_step [s]", time_step))
 
     def with_contact(self, approximation: str) -> "Model":
         """The same model with another contact approximation (sap, similar, lagged). ModelError like `at_time_step`."""
         _check_choice("contact_approximation", approximation, CONTACT_APPROXIMATIONS)
-        return self._other(contact_approximation=approximation)
+        return self.changed(contact_approximation=approximation)
 
-    def _other(self, **change: Any) -> "Model":
+    def changed(self, **change: Any) -> "Model":
+        """The same model with one option of `load_model` changed. ModelError where it came from a diagram."""
         if self._rebuild is None:
             raise ModelError("a model from a diagram keeps its time step: build the diagram again with another")
         key = next(iter(change.items()))
@@ -170,7 +174,9 @@ class Model:
         context = plant.GetMyMutableContextFromRoot(root)
         for instance, target in self.pd_targets.items():
             plant.get_desired_state_input_port(instance).FixValue(context, target)
-        return Twin(scalar, diagram, plant, scene_graph_beside(diagram, self.path), root, context, defaults)
+        return Twin(
+            scalar, diagram, plant, scene_graph_beside(diagram, self.path), root, context, defaults, self.forces
+        )
 
     @cached_property
     def pd_targets(self) -> dict[Any, np.ndarray]:

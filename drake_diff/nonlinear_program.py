@@ -29,7 +29,6 @@ from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, Unknow
 FEASIBILITY_TOLERANCE = 1e-5  # defect, goal and bounds, in the state's and input's own units
 SOLVERS = ("ipopt", "snopt")
 REPORT_PERIOD = 0.2  # [s] between two progress reports: each costs an evaluation of every constraint
-Report = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -41,6 +40,34 @@ class Iteration:
     primal_infeasibility: float
     dual_infeasibility: float
     step: float
+
+    def __str__(self) -> str:
+        columns = [f"iteration {self.iteration:5d}", f"cost {self.objective:12.6g}"]
+        columns.append(f"violation {self.primal_infeasibility:9.2e}")
+        if not math.isnan(self.dual_infeasibility):
+            columns.append(f"gradient {self.dual_infeasibility:9.2e}")
+        if not math.isnan(self.step):
+            columns.append(f"step {self.step:.3g}")
+        return "  ".join(columns)
+
+
+class Report:
+    """Where the progress of a solve goes: a `line` for people, an Iteration for `callback`."""
+
+    def __init__(self, line: Callable[[str], None] | None = None, callback: Callable[[Iteration], None] | None = None):
+        self.line, self.callback = line, callback
+
+    def row(self, row: Iteration, *, printed: bool = True) -> None:
+        """Hand on `row`, and print it."""
+        if self.callback is not None:
+            self.callback(row)
+        if printed:
+            self.say(str(row))
+
+    def say(self, text: str) -> None:
+        """Print a line of progress."""
+        if self.line is not None:
+            self.line(text)
 
 
 class Outcome(enum.Enum):
@@ -140,7 +167,8 @@ class _Watch:
         if merit < self.best_merit:
             self.best, self.best_merit = z, merit
         if self.report:
-            self.report(
+            self.report.row(Iteration(self.evaluations, cost, violation, math.nan, math.nan), printed=False)
+            self.report.say(
                 f"evaluation {self.evaluations:5d}  cost {cost:12.6g}  violation {violation:9.2e}  {elapsed:6.1f} s"
             )
 

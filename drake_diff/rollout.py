@@ -140,7 +140,7 @@ class _Meter:
     def measure_state(self) -> None:
         kinetic = self.plant.CalcKineticEnergy(self.context)
         potential = self.plant.CalcPotentialEnergy(self.context)
-        potential += sum(f.potential(self.plant, self.context) for f in self.model.double.added.values())
+        potential += sum(f.potential(self.plant, self.context) for f in self.model.double.forces)
         self.states.append((kinetic, potential, penetration(self.model), self._violation()))
 
     def measure_step(self, x: Array, x_next: Array) -> None:

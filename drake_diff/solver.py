@@ -1,36 +1,31 @@
-"""`solve`: take a problem, a method and a guess; return a Solution whose status was measured, not believed."""
+"""`solve`: check what is asked, choose a method or a chain of them, and run it."""
 
+import dataclasses
 import time
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from drake_diff.arrays import Array, finite_array, frozen, positive_float, positive_int
-from drake_diff.certificate import Certificate, certify_jacobian
-from drake_diff.certify import certify
+from drake_diff.arrays import Array, finite_array, positive_float, positive_int
 from drake_diff.collocation import DEFAULT_SOLVER as COLLOCATION_SOLVER
-from drake_diff.collocation import solve_collocation
+from drake_diff.continuation import check_schedule
 from drake_diff.continuous import EquationsOfMotion
-from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
-from drake_diff.ilqr import check_problem, is_unconstrained, solve_ilqr
-from drake_diff.nonlinear_program import SOLVERS, Limits, NlpResult, Outcome
+from drake_diff.exceptions import DrakeDiffError, InputError, UnknownNameError
+from drake_diff.ilqr import check_problem, is_unconstrained
+from drake_diff.nonlinear_program import SOLVERS, Iteration, Limits, Report
 from drake_diff.problem import Problem
-from drake_diff.shooting import RolloutCost, ShootingVariables
+from drake_diff.run import Run
 from drake_diff.shooting_program import DEFAULT_SOLVER as SHOOTING_SOLVER
-from drake_diff.shooting_program import check_segments, roll_segments, solve_shooting
+from drake_diff.shooting_program import check_segments
 from drake_diff.solution import Solution, Status
-from drake_diff.transcription import ProblemTranscription
 from drake_diff.transcription_scheme import SCHEMES
-from drake_diff.verdict import ended, judged, refused, why_blind
 
 METHODS = ("auto", "collocation", "shooting", "ilqr")
-CERTIFIED_KNOTS = 5
 GUESS_NOISE = 1e-3  # of the largest input: breaks the symmetry of a guess that is a stationary point
 
 Progress = Callable[[str], None]
-Search = Callable[[Array, Array], tuple[NlpResult, Array, Array]]
 
 
 def solve(
@@ -45,7 +40,9 @@ def solve(
     tolerance: float = 1e-8,
     seed: int = 0,
     segments: int = 1,
+    continuation: Any = None,
     progress: bool | Progress = False,
+    callback: Callable[[Iteration], None] | None = None,
     on_start: Callable[[], None] | None = None,
 ) -> Solution:
     """Solve `problem`, check the gradients that were used, and measure the result again on Drake's plant.
@@ -55,8 +52,15 @@ def solve(
     the goal; near zero inputs), (xs, us) with shapes (N+1, nx) and (N, nu), or a Solution. `solver` is "ipopt" or
     "snopt"; `time_limit` [s]; `tolerance` the solver's on feasibility and optimality; `seed` that of the guess's
     noise. With `segments` > 1 shooting is multiple: the states that the segments start from are variables too, first
-    those of the guess. `progress` prints, or hands each line to a function; `on_start` is called once, when all input
-    has been checked and the work begins.
+    those of the guess. `continuation` finds contact that the guess does not make, by stages of a force at a distance
+    before the true plant: "auto" (see `continuation.default_schedule`) or SoftContacts, with "ilqr"; `Solution.options`
+    has the stages' log. `progress` prints, or hands each line to a function; `callback` gets an Iteration for each of
+    the solver's (SNOPT, and IPOPT by shooting: a few times a second), and what it raises ends the solve; `on_start` is
+    called once, when all input has been checked and the work begins.
+
+    "auto" chains methods until one is verified: collocation where the model is smooth, else, or where that fails, iLQR
+    (with a continuation where the guess touches nothing that matters), whose result the next one starts from.
+    `Solution.options["chain"]` says what was tried, how it ended, and why it was chosen.
 
     Raises InputError and its kin, or ModelError, before anything runs; how a solve ended is `Solution.status`.
     """
@@ -64,6 +68,8 @@ def solve(
         raise InputError("problem", got=type(problem).__name__, expected="a Problem")
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise InputError("seed", got=repr(seed), expected="a whole number of at least 0")
+    if not (callback is None or callable(callback)):
+        raise InputError("callback", got=repr(callback), expected="None or a function of an Iteration")
     if not (isinstance(progress, bool) or callable(progress)):
         raise InputError("progress", got=repr(progress), expected="True, False or a function")
     if method not in METHODS:
@@ -77,34 +83,124 @@ def solve(
         np.inf if time_limit is None else positive_float("time_limit [s]", time_limit),
         positive_float("tolerance", tolerance),
     )
-    reason = "asked for"
-    if method == "auto":
-        method, reason = choose_method(problem)
-    scheme = _choose_scheme(method, scheme, solver, asked=reason == "asked for")
-    solver = solver or {"collocation": COLLOCATION_SOLVER, "shooting": SHOOTING_SOLVER}.get(method, "riccati")
-    xs, us = _guess(problem, method, initial_guess, seed)
-    options = {
-        "max_iterations": limits.max_iterations,
-        "time_limit": time_limit,
-        "tolerance": limits.tolerance,
-        "seed": seed,
-        "segments": segments,
-        "method_reason": reason,
-        "initial_guess": "default" if initial_guess is None else "given",
-    }
-    report = print if progress is True else (progress or None)
-    _check_method(problem, method)
-    check_segments(problem, method, segments)
-    if on_start is not None:
-        on_start()
-    run = _Run(problem, method, scheme, solver, limits, options, report)
+    report = Report(print if progress is True else (progress or None), callback)
+    task = _Task(problem, limits, seed, report, on_start)
+    if method == "auto" and continuation is None and segments == 1:
+        return _solve_in_chain(task, initial_guess, solver)
+    reason = "asked for" if method != "auto" else "a continuation is asked for"
+    method = "ilqr" if method == "auto" and continuation is not None else method
+    options = {"scheme": scheme, "solver": solver, "segments": segments, "continuation": continuation}
+    return task.prepare(Attempt(method, reason, **options), initial_guess)()
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One method, and why it is taken."""
+
+    method: str
+    reason: str
+    scheme: str | None = None
+    solver: str | None = None
+    segments: int = 1
+    continuation: Any = None
+
+
+class _Task:
+    """What all attempts at a problem share."""
+
+    def __init__(
+        self, problem: Problem, limits: Limits, seed: int, report: Report, on_start: Callable[[], None] | None
+    ):
+        self.problem, self.limits, self.seed, self.report, self.on_start = problem, limits, seed, report, on_start
+        self.start = time.monotonic()
+
+    def prepare(self, attempt: Attempt, given: Any) -> Callable[[], Solution]:
+        """Check that `attempt` can be made from the guess `given`; what is returned makes it."""
+        problem, method = self.problem, attempt.method
+        scheme = _choose_scheme(attempt)
+        solver = {"collocation": COLLOCATION_SOLVER, "shooting": SHOOTING_SOLVER}.get(method, "riccati")
+        xs, us = _guess(problem, method, given, self.seed)
+        _check_method(problem, method)
+        check_segments(problem, method, attempt.segments)
+        if attempt.continuation is not None and method != "ilqr":
+            expected = f'none for method="{method}"; method="ilqr" takes it'
+            raise InputError("continuation", got="given", expected=expected)
+        stages = () if attempt.continuation is None else check_schedule(problem, attempt.continuation)
+        left = self.limits.time_limit - (time.monotonic() - self.start)
+        options = {
+            "max_iterations": self.limits.max_iterations,
+            "time_limit": None if np.isinf(self.limits.time_limit) else self.limits.time_limit,
+            "tolerance": self.limits.tolerance,
+            "seed": self.seed,
+            "segments": attempt.segments,
+            "method_reason": attempt.reason,
+            "initial_guess": "default" if given is None else "given",
+        }
+        limits = dataclasses.replace(self.limits, time_limit=max(left, 0.0))
+        run = Run(problem, method, scheme, attempt.solver or solver, limits, options, self.report)
+
+        def make() -> Solution:
+            if self.on_start is not None:
+                self.on_start()
+                self.on_start = None
+            if method == "collocation":
+                return run.collocate(xs, us)
+            if method == "ilqr":
+                return run.sweep(xs, us, given=given is not None, stages=stages)
+            if attempt.segments > 1:
+                return run.shoot_segments(xs, us, attempt.segments)
+            return run.shoot(xs, us, improve=given is None and is_unconstrained(problem))
+
+        return make
+
+
+ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
+# The order in which a chain that ends without a verified motion prefers what it has.
+PREFERENCE = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED, Status.INTERRUPTED, Status.TIME_LIMIT)
+
+
+def _solve_in_chain(task: _Task, given: Any, solver: str | None) -> Solution:
+    """Attempt after attempt until one is verified; the best of them, with what was tried in its options."""
+    found: list[Solution] = []
+    chain: list[dict[str, str]] = []
+    for attempt, guess in _attempts(task.problem, given, solver, found):
+        try:
+            make = task.prepare(attempt, guess)
+        except DrakeDiffError as error:
+            if not found:
+                raise
+            chain.append({"method": attempt.method, "reason": attempt.reason, "ended": f"not possible: {error}"})
+            continue
+        found.append(make())
+        last = found[-1]
+        task.report.say(f"{attempt.method} ({attempt.reason}): {last.status.value}")
+        chain.append({"method": attempt.method, "reason": attempt.reason, "ended": last.status.value})
+        if last.status in ENDED:
+            break
+    best = min(found, key=_preference)
+    return dataclasses.replace(best, options=best.options | {"chain": chain})
+
+
+def _preference(solution: Solution) -> tuple[int, float]:
+    rank = PREFERENCE.index(solution.status) if solution.status in PREFERENCE else len(PREFERENCE)
+    return rank, solution.defect + solution.goal_error
+
+
+def _attempts(problem: Problem, given: Any, solver: str | None, found: list[Solution]) -> Iterator[tuple[Attempt, Any]]:
+    """What to try next and from which guess, by what the attempts before, in `found`, came to."""
+    method, reason = choose_method(problem)
+    scheme = "hermite_simpson" if method == "collocation" and solver != "snopt" else None
+    yield Attempt(method, reason, scheme=scheme, solver=None if method == "ilqr" else solver), given
+    if found[-1].status is Status.NO_GRADIENT and method == "ilqr":
+        yield Attempt("ilqr", "the guess has no gradient", continuation="auto"), given
+    if method == "shooting":
+        return
     if method == "collocation":
-        return run.collocate(xs, us)
-    if method == "ilqr":
-        return run.sweep(xs, us, given=initial_guess is not None)
-    if segments > 1:
-        return run.shoot_segments(xs, us, segments)
-    return run.shoot(xs, us, improve=initial_guess is None and is_unconstrained(problem))
+        yield Attempt("ilqr", "collocation was not verified: a guess for it"), given
+    if np.all(np.isfinite(found[-1].xs)):
+        begun = found[-1].xs, found[-1].us
+        next_method = "collocation" if method == "collocation" else "shooting"
+        yield Attempt(next_method, "from the motion that iLQR found", scheme=scheme, solver=solver), begun
 
 
 def _check_method(problem: Problem, method: str) -> None:
@@ -121,32 +217,35 @@ def _check_method(problem: Problem, method: str) -> None:
             raise InputError("optimize", got=list(problem.optimize), expected='"controls" for method="collocation"')
 
 
-def _choose_scheme(method: str, scheme: str | None, solver: str | None, *, asked: bool) -> str:
-    """The collocation scheme, "step" of the discrete methods; InputError where `solver` does not go with it."""
-    if method != "collocation":
+def _choose_scheme(attempt: Attempt) -> str:
+    """The collocation scheme, "step" of the discrete methods; InputError where the solver does not go with it."""
+    scheme = attempt.scheme
+    if attempt.method != "collocation":
         if scheme is not None:
-            raise InputError("scheme", got=repr(scheme), expected=f'none for method="{method}"')
+            raise InputError("scheme", got=repr(scheme), expected=f'none for method="{attempt.method}"')
         return "step"
     if scheme is None:
-        scheme = "drake" if asked or solver == "snopt" else "hermite_simpson"
+        scheme = "drake"
     if scheme not in SCHEMES:
         raise UnknownNameError("scheme", got=scheme, known=SCHEMES)
-    if solver == "snopt" and scheme != "drake":
+    if attempt.solver == "snopt" and scheme != "drake":
         raise InputError("solver", got='"snopt"', expected=f'"ipopt" for scheme="{scheme}"')
     return scheme
 
 
 def choose_method(problem: Problem) -> tuple[str, str]:
-    """("collocation" or "shooting", why)."""
+    """(method, why)."""
     contract = problem.model.contract
+    if problem.horizon is not None:
+        return "collocation", "the horizon is free"
     if not problem.optimizes_controls:
         return "shooting", "the controls are not optimized"
     if problem.parameters.parameters or problem.trajectory_cost is not None:
-        return "shooting", "collocation takes neither parameters nor a cost of the whole trajectory"
+        return "shooting", "collocation and iLQR take neither parameters nor a cost of the whole trajectory"
     if contract.contact.collision_pairs:
-        return "shooting", "the model has geometries that can touch, which collocation leaves out"
+        return "ilqr", "the model has geometries that can touch, which collocation leaves out"
     if contract.constraints or any(actuator.kp is not None for actuator in contract.actuators):
-        return "shooting", "the model has constraints or PD control, which collocation leaves out"
+        return "ilqr", "the model has constraints or PD control, which collocation leaves out"
     return "collocation", "the model is smooth"
 
 
@@ -168,148 +267,3 @@ def _guess(problem: Problem, method: str, given: Any, seed: int) -> tuple[Array,
         us = GUESS_NOISE * size * np.random.default_rng(seed).standard_normal(us.shape)
     inside = np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
     return xs, inside if problem.optimizes_controls else us
-
-
-class _Run:
-    """One solve: certify at the guess, solve, certify at the result, measure, judge."""
-
-    def __init__(
-        self,
-        problem: Problem,
-        method: str,
-        scheme: str,
-        solver: str,
-        limits: Limits,
-        options: dict[str, Any],
-        report: Progress | None,
-    ):
-        self.problem, self.method, self.scheme, self.solver = problem, method, scheme, solver
-        self.limits, self.options, self.report = limits, options, report
-        self.start = time.monotonic()
-        self.knots = np.unique(np.linspace(0, problem.num_steps - 1, CERTIFIED_KNOTS).astype(int))
-
-    def collocate(self, xs: Array, us: Array) -> Solution:
-        """In CasADi; SNOPT, which that does not carry, in Drake's own DirectCollocation."""
-        if self.solver == "snopt":
-            equations = EquationsOfMotion(self.problem.model)
-            before = self._certify_equations(equations.jacobian, xs, us)
-            result, found = self._solve_drakes(xs, us)
-            return self._collocated(result, found, before, equations.jacobian)
-        transcription = ProblemTranscription(self.problem, self.scheme)
-        before = self._certify_equations(transcription.jacobian, xs, us)
-        motion = transcription.solve(xs, np.vstack([us, us[-1:]]), limits=self.limits, report=self.report)
-        self.options["derivatives"] = motion.derivatives
-        found = {"xs": motion.xs, "us": motion.us[:-1], "u_final": motion.us[-1]}
-        found |= {"us_mid": None if self.scheme == "drake" else motion.us_mid}
-        found |= {"free_horizon": motion.horizon if self.problem.horizon else None}
-        result = NlpResult(motion.nodes.ravel(), motion.outcome, motion.message, motion.iterations)
-        return self._collocated(result, found, before, transcription.jacobian)
-
-    def _solve_drakes(self, xs: Array, us: Array) -> tuple[NlpResult, dict[str, Any]]:
-        result, xs, us, u_final = solve_collocation(
-            self.problem, xs, us, solver=self.solver, limits=self.limits, report=self.report
-        )
-        return result, {"xs": xs, "us": us, "u_final": u_final}
-
-    def _collocated(
-        self, result: NlpResult, found: dict[str, Any], before: tuple[Certificate, ...], jacobian: Any
-    ) -> Solution:
-        finite = bool(np.all(np.isfinite(found["xs"])))
-        after = self._certify_equations(jacobian, found["xs"], found["us"]) if finite else ()
-        return judged(self._draft(**found, certificates=before + after), result)
-
-    def sweep(self, xs: Array, us: Array, *, given: bool) -> Solution:
-        """iLQR; from the states of a `given` guess, which need not be a rollout, else from the rollout of `us`."""
-
-        def search(rolled: Array, us: Array) -> tuple[NlpResult, Array, Array]:
-            return solve_ilqr(self.problem, xs if given else rolled, us, limits=self.limits, report=self.report)
-
-        return self._through_steps(xs, us, search)
-
-    def shoot(self, xs: Array, us: Array, *, improve: bool) -> Solution:
-        """Shooting; `improve` the guess by iLQR, which gets out of curved valleys that shooting crawls along."""
-
-        def search(xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
-            if improve:
-                result, xs, us = solve_ilqr(self.problem, xs, us, limits=self.limits, report=self.report)
-                self.options["initial_guess"] = f"default, then {result.message}"
-                if result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
-                    return result, xs, us
-            return solve_shooting(self.problem, xs, us, solver=self.solver, limits=self.limits, report=self.report)
-
-        return self._through_steps(xs, us, search)
-
-    def shoot_segments(self, xs: Array, us: Array, segments: int) -> Solution:
-        """Multiple shooting, looked at around the segments' own states, which defects part."""
-        try:
-            xs = roll_segments(self.problem, xs, us, segments)
-        except SimulationError as error:
-            return refused(self._draft(xs, us), error)
-        search = partial(solve_shooting, solver=self.solver, limits=self.limits, report=self.report, segments=segments)
-        return self._through_steps(xs, us, partial(search, self.problem), segmented=True)
-
-    def _through_steps(self, xs: Array, us: Array, search: Search, *, segmented: bool = False) -> Solution:
-        """Certify, search, certify again, on Drake's own steps; at rollouts, or at the states as they are."""
-        variables = ShootingVariables(self.problem, around=xs if segmented else None)
-        try:
-            xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us))
-        except (GradientError, SimulationError) as error:
-            return refused(self._draft(xs, us), error)
-        if blindness:
-            return ended(self._draft(xs, us, certificates=before), Status.NO_GRADIENT, blindness)
-        try:
-            result, xs, us = search(xs, us)
-            variables = ShootingVariables(self.problem, around=xs if segmented else None)
-            z = result.z if self.method == "shooting" and len(result.z) == variables.size else variables.pack(xs[0], us)
-            xs, us, after, blindness = self._look_at(variables, z)
-        except (GradientError, SimulationError) as error:
-            return refused(self._draft(xs, us, certificates=before), error)
-        norms = np.linalg.norm(RolloutCost(self.problem, variables).differentiate(z)[2], axis=1)
-        values = variables.parameters(z).values
-        found = {"certificates": before + after, "gradient_norms": frozen(norms), "parameters": values}
-        draft = self._draft(xs, us, **found)
-        solution = judged(draft, result)
-        return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
-
-    def _draft(self, xs: Array, us: Array, **found: Any) -> Solution:
-        found |= {name: frozen(found[name]) for name in ("u_final", "us_mid") if found.get(name) is not None}
-        return Solution(
-            problem=self.problem,
-            method=self.method,
-            scheme=self.scheme,
-            solver=self.solver,
-            status=Status.FAILED,
-            message="",
-            xs=frozen(xs),
-            us=frozen(us),
-            options=self.options,
-            wall_time=time.monotonic() - self.start,
-            **found,
-        )
-
-    def _look_at(self, variables: ShootingVariables, z: Array) -> tuple[Array, Array, tuple[Certificate, ...], str]:
-        """xs and us of z, certificates of some of its steps, and why the goal or cost is out of its reach."""
-        us = variables.unpack(z)[1]
-        xs, parameters = variables.states(z), variables.parameters(z).to_dict()
-        certificates = tuple(certify(self.problem.model, xs[k], us[k], parameters=parameters) for k in self.knots)
-        return xs, us, certificates, why_blind(self.problem, variables, z)
-
-    def _certify_equations(self, jacobian: Any, xs: Array, us: Array) -> tuple[Certificate, ...]:
-        """Certificates, at some knots, of the Jacobian that the solver gets against Drake's own equations."""
-        model, equations = self.problem.model, EquationsOfMotion(self.problem.model)
-
-        def f(z: Array) -> Array:
-            return equations(z[: model.nx], z[model.nx :])
-
-        return tuple(
-            certify_jacobian(
-                f,
-                np.concatenate([xs[k], us[k]]),
-                jacobian,
-                rows=tuple(f"d({name})/dt" for name in model.state_names),
-                columns=model.state_names + model.input_names,
-                method="continuous time",
-                subject=f"the equations of motion of {model.name}",
-            )
-            for k in self.knots
-        )

@@ -53,7 +53,7 @@ def advance(twin: Twin, x: Any, u: Any) -> Any:
     if np.asarray(u).dtype == float and not np.all(np.isfinite(u)):
         raise SimulationError(f"an input is not finite: {u}")
     plant.get_actuation_input_port().FixValue(context, u)
-    if twin.added:
+    if twin.forces:
         plant.get_applied_generalized_force_input_port().FixValue(context, twin.added_force())
     try:
         # value() is a view that the next step overwrites.

@@ -17,7 +17,7 @@ from drake_diff.bounds import Bounds
 from drake_diff.cost import FinalCost
 from drake_diff.dynamics import Dynamics
 from drake_diff.exceptions import InputError
-from drake_diff.nonlinear_program import Limits, Outcome
+from drake_diff.nonlinear_program import Limits, Outcome, Report
 from drake_diff.optimal_control import OptimalControl, checked_task, task_of
 from drake_diff.problem import Problem
 from drake_diff.transcribed import Transcribed
@@ -85,8 +85,8 @@ def transcribe_and_solve(
     error_tolerance = positive_float("error_tolerance", error_tolerance)
     max_count = positive_int("max_count", max_count)
     nodes, time = first_nodes(task, mesh, guess)
-    functions = knot_functions_of(task)
-    motion = solve_on_mesh(task, mesh, functions, nodes, time, limits, report)
+    functions, lines = knot_functions_of(task), Report(report)
+    motion = solve_on_mesh(task, mesh, functions, nodes, time, limits, lines)
     rounds = [(len(mesh) - 1, float(np.max(_worst(motion))))] if refine else []
     while rounds and motion.outcome in FOUND and rounds[-1][1] > error_tolerance:
         mesh = _split(motion, error_tolerance)
@@ -95,7 +95,7 @@ def transcribe_and_solve(
             motion = dataclasses.replace(motion, message=motion.message + told)
             break
         nodes = np.hstack(motion.at(motion.horizon * node_fractions(mesh, task.scheme)))
-        motion = solve_on_mesh(task, mesh, functions, nodes, motion.horizon, limits, report)
+        motion = solve_on_mesh(task, mesh, functions, nodes, motion.horizon, limits, lines)
         rounds.append((len(mesh) - 1, float(np.max(_worst(motion)))))
     return dataclasses.replace(motion, refinements=tuple(rounds))
 
@@ -112,7 +112,7 @@ class ProblemTranscription:
         """(nx, nx + nu) of the rates at `knot` (nx + nu,), as the solver gets it."""
         return np.asarray(self.functions.dynamics.jacobian_of(knot))
 
-    def solve(self, xs: Array, us: Array, *, limits: Limits, report: Callable[[str], None] | None) -> Transcribed:
+    def solve(self, xs: Array, us: Array, *, limits: Limits, report: Report | None) -> Transcribed:
         """From the guess xs (N+1, nx), us (N+1, nu)."""
         nodes, _ = first_nodes(self.task, self.mesh, (xs, us))
         return solve_on_mesh(self.task, self.mesh, self.functions, nodes, self.horizon, limits, report)
@@ -126,7 +126,7 @@ def knot_functions_of(task: OptimalControl) -> Any:
 
 
 def solve_on_mesh(
-    task: OptimalControl, mesh: Array, functions: Any, nodes: Array, time: float, limits: Limits, report: Any
+    task: OptimalControl, mesh: Array, functions: Any, nodes: Array, time: float, limits: Limits, report: Report | None
 ) -> Transcribed:
     from drake_diff.ipopt import NOT_FINITE, solve_ipopt
     from drake_diff.transcription_program import TranscribedProgram

@@ -175,6 +175,8 @@ def _cross_of_force(force: Array) -> Array:
 def tree_of(model: Model) -> TreeDynamics | str:
     """The tree of a model, or what in the model is none."""
     plant = model.plant
+    if model.forces:
+        return "forces are added to Drake's"
     moving = sorted((j for j in joints(plant) if j.num_velocities()), key=lambda j: j.velocity_start())
     for joint in moving:
         if joint.type_name() not in ("revolute", "prismatic"):

@@ -22,6 +22,7 @@ class Twin:
     root_context: Any
     context: Any  # the plant's, inside root_context
     defaults: Any  # a root context that nobody touches
+    own: tuple[AddedForce, ...] = ()  # the model's own beside Drake's, which no parameter changes
     added: dict[str, AddedForce] = field(default_factory=dict)  # by parameters that Drake has not
 
     def body(self, label: str) -> Any:
@@ -73,11 +74,16 @@ class Twin:
         forces = MultibodyForces_[self.scalar](self.plant)
         self.plant.CalcForceElementsContribution(self.context, forces)
         needed = self.plant.CalcInverseDynamics(self.context, acceleration, forces)
-        return needed - self.added_force() if self.added else needed  # AutoDiffXd's `forces` are a copy: not writable
+        return needed - self.added_force() if self.forces else needed  # AutoDiffXd's `forces` are a copy: not writable
+
+    @property
+    def forces(self) -> tuple[AddedForce, ...]:
+        """All that acts beside Drake's own forces."""
+        return (*self.own, *self.added.values())
 
     def added_force(self) -> Any:
-        """(nv,) the generalized force that parameters add in the state of the context."""
-        return sum(force.force(self.plant, self.context) for force in self.added.values())
+        """(nv,) the generalized force of `forces` in the state of the context."""
+        return sum(force.force(self.plant, self.context) for force in self.forces)
 
     def reset(self) -> None:
         """Put every parameter of the context back to the model's own."""

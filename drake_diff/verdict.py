@@ -9,11 +9,12 @@ import numpy as np
 from drake_diff.arrays import Array
 from drake_diff.contact import penetration
 from drake_diff.cost import differentiate_final_cost
-from drake_diff.exceptions import GradientError
+from drake_diff.exceptions import GradientError, ModelError
 from drake_diff.nonlinear_program import FEASIBILITY_TOLERANCE, NlpResult, Outcome
 from drake_diff.problem import Problem
 from drake_diff.replay import broken_variants
 from drake_diff.shooting import ShootingVariables, state_sensitivities
+from drake_diff.soft_contact import distances
 from drake_diff.solution import INTEGRATION_TOLERANCE, Solution, Status
 from drake_diff.step import set_state
 
@@ -28,12 +29,35 @@ def why_blind(problem: Problem, variables: ShootingVariables, z: Array) -> str:
     wrong = np.abs(problem.goal_error(x_final)) > FEASIBILITY_TOLERANCE
     deaf = np.flatnonzero(wrong & (effect < NO_EFFECT))
     if len(deaf):
-        return f"no variable moves {problem.model.state_names[deaf[0]]}, whose goal is not reached"
+        name = problem.model.state_names[deaf[0]]
+        return f"no variable moves {name}, whose goal is not reached{_what_is_apart(problem, variables.states(z))}"
     if problem.final_cost is not None:
         _, slope = differentiate_final_cost(problem.final_cost, x_final)
         if np.abs(slope).max() > NO_EFFECT and np.abs(slope @ last).max(initial=0.0) < NO_EFFECT:
-            return "no variable changes the final cost, although the final state does"
+            apart = _what_is_apart(problem, variables.states(z))
+            return f"no variable changes the final cost, although the final state does{apart}"
     return ""
+
+
+def _what_is_apart(problem: Problem, xs: Array) -> str:
+    """Which bodies that may collide never touch along xs (N+1, nx), and what to do; empty where there are none."""
+    model, nearest = problem.model, dict[tuple[str, str], tuple[float, int]]()
+    try:
+        for k, x in enumerate(xs):
+            set_state(model.double, x)
+            for pair, distance in distances(model.double).items():
+                nearest[pair] = min((distance, k), nearest.get(pair, (np.inf, k)))
+    except ModelError:  # Drake knows no distance of some pair
+        return ""
+    apart = {pair: found for pair, found in nearest.items() if found[0] > 0}
+    if not apart:
+        return ""
+    told = "; ".join(
+        f"{a} and {b} stay {d:.3g} m apart or more, nearest at knot {k}" for (a, b), (d, k) in apart.items()
+    )
+    head = "nothing touches" if len(apart) == len(nearest) else "some bodies never touch"
+    advice = '; use method="ilqr" and continuation="auto"' if problem.optimizes_controls else ""
+    return f": at knots 0-{len(xs) - 1} {head} ({told}){advice}"
 
 
 def refused(draft: Solution, error: Exception) -> Solution:

@@ -68,6 +68,15 @@ def test_the_sphere_rolls_to_where_it_is_sent():
     assert 0 < solution.replay.penetration.max() < 0.02
 
 
+def test_the_ball_is_pushed_from_a_guess_that_never_touches_it():
+    """The goal is hard: 1e-8 of the solver, 1e-5 the package's measure, here on the true plant's own rollout."""
+    module = example("push_without_touching")
+    solution = dd.solve(module.problem(), **module.solve_options)
+    assert solution.success, solution.message
+    assert solution.replay.xs[-1][module.BALL] == pytest.approx(module.GOAL, abs=1e-7)
+    assert not solution.replay.contacts[0]
+
+
 @pytest.mark.slow
 def test_the_network_learns_to_balance():
     module = example("neural_network_policy")

@@ -14,6 +14,7 @@ from test_silent_faults import pd_pendulum
 import drake_diff as dd
 from drake_diff.nonlinear_program import NlpResult, Outcome
 from drake_diff.rollout_gradient import linearize
+from drake_diff.run import Run
 from drake_diff.solution import Status
 
 MODELS = Path(__file__).parent.parent / "models"
@@ -232,7 +233,7 @@ def test_a_solver_that_lies_is_not_believed(load, monkeypatch):
     def liar(problem, xs, us, **options):
         return NlpResult(us.ravel(), Outcome.SOLVED, "all is well", ()), xs, us
 
-    monkeypatch.setattr("drake_diff.solver.solve_shooting", liar)
+    monkeypatch.setattr("drake_diff.run.solve_shooting", liar)
     solution = dd.solve(swing_up(load, 20), method="shooting")
     assert solution.status is Status.CONVERGED_NOT_VERIFIED
     assert "goal error" in solution.message
@@ -330,12 +331,12 @@ def test_auto_chooses_and_says_why(load):
     assert dd.solve(problem).method == "shooting"
 
 
-def test_pd_control_is_left_to_shooting():
+def test_pd_control_is_left_to_the_discrete_methods():
     problem = dd.Problem(pd_pendulum(), x0=[0.5, 0], num_steps=20, running_cost=EFFORT, x_goal=[0.2, 0])
     with pytest.raises(dd.ModelError, match="use method='shooting'"):
         dd.solve(problem, method="collocation")
     solution = dd.solve(problem)
-    assert solution.method == "shooting"
+    assert solution.method == "ilqr"
     assert solution.success, solution.message
 
 
@@ -397,6 +398,43 @@ def test_collocation_needs_controls_to_optimize(load):
     problem = swing_up(load, 20, optimize="initial_state")
     with pytest.raises(dd.InputError, match='"controls" for method="collocation"'):
         dd.solve(problem, method="collocation")
+
+
+def test_auto_goes_on_from_what_a_failed_attempt_left(load, monkeypatch):
+    """Collocation is made to fail once: iLQR finds a motion, and collocation starts from that."""
+    honest = Run.collocate
+    calls = []
+
+    def fail_once(self, xs, us):
+        calls.append((xs, us))
+        solution = honest(self, xs, us)
+        return dataclasses.replace(solution, status=Status.INFEASIBLE) if len(calls) == 1 else solution
+
+    monkeypatch.setattr(Run, "collocate", fail_once)
+    solution = dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]))
+    assert solution.success, solution.message
+    assert [link["method"] for link in solution.options["chain"]] == ["collocation", "ilqr"]
+    assert solution.options["chain"][1]["reason"] == "collocation was not verified: a guess for it"
+    assert solution.options["chain"][0]["ended"] == "infeasible"
+
+
+def test_the_callback_sees_every_iteration_and_may_end_the_solve(load):
+    class Enough(Exception):  # noqa: N818
+        pass
+
+    def stop_at_three(row):
+        if row.iteration == 3:
+            raise Enough
+
+    for method in ("ilqr", "collocation"):
+        rows = []
+        solution = dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]), method=method, callback=rows.append)
+        assert [row.iteration for row in rows] == list(range(rows[0].iteration, len(rows) + rows[0].iteration))
+        assert rows[-1].objective == pytest.approx(solution.cost, rel=1e-6)
+        with pytest.raises(Enough):
+            dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]), method=method, callback=stop_at_three)
+    with pytest.raises(dd.InputError, match="callback"):
+        dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]), callback=3)
 
 
 def test_every_status_has_a_sentence():

@@ -1,0 +1,58 @@
+"""Push a ball to where it should be, from a guess that never touches it.
+
+The motor moves the pusher alone. At zero input nothing touches, and no input has any effect on the ball: every
+gradient to the goal is zero, and shooting and iLQR end as `no_gradient`. A continuation solves the problem first with
+a force at a distance between the two, of a shorter reach in each stage, and in the last one on the true plant.
+
+    drake-diff run examples/push_without_touching.py    writes artifacts/push_without_touching
+    python examples/push_without_touching.py            prints the stages, and what the true plant does
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+import drake_diff as dd
+
+MODEL = Path(__file__).parent.parent / "models" / "two_spheres.sdf"
+TIME_STEP, NUM_STEPS, GAP, DIAMETER, GOAL = 0.02, 50, 0.05, 0.2, 0.6
+PUSHER, BALL = 0, 1  # in Drake's state: both positions, both velocities
+
+solve_options = {"method": "ilqr", "continuation": "auto", "max_iterations": 100}
+
+
+def problem() -> dd.Problem:
+    """The ball, at rest 0.05 m from the pusher, is to pass x = 0.6 m after 1 s; least effort."""
+    goal = np.full(4, np.nan)
+    goal[BALL] = GOAL
+    return dd.Problem(
+        dd.load_model(MODEL, time_step=TIME_STEP),
+        x0=[0, DIAMETER + GAP, 0, 0],
+        num_steps=NUM_STEPS,
+        running_cost=dd.QuadraticCost(Q=np.zeros((4, 4)), R=[[1e-3]]),
+        x_goal=goal,
+    )
+
+
+def main() -> None:
+    task = problem()
+    blind = dd.solve(task, method="ilqr")
+    print(f"without a continuation: {blind.status.value}\n  {blind.message}\nwith one:")
+    solution = dd.solve(task, **solve_options)
+    for stage in solution.options["continuation"]:
+        contact = "the true plant"
+        if stage["distance"] is not None:
+            contact = f"{stage['distance']:.4f} m, {stage['stiffness']:7.1f} N/m"
+        print(
+            f"  stage {stage['number']}  {contact:22s}  {stage['status']:16s} {stage['iterations']:3d} steps  "
+            f"cost {stage['cost']:.6f}  goal error {stage['goal_error']:.1e}"
+        )
+    print(f"{solution.status.value}: {solution.message}")
+    end = solution.replay.xs[-1]
+    touches = [k for k, contacts in enumerate(solution.replay.contacts) if contacts]
+    print(f"the true plant under these inputs: the ball is at x = {end[BALL]:.9f} m; it is touched in {len(touches)}")
+    print(f"of {NUM_STEPS} steps, first at t = {touches[0] * TIME_STEP:.2f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,231 @@
+"""Through contact from a guess that does not touch: the stages, and what the true plant does in the end."""
+
+import math
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+from drake_diff.continuation import default_schedule
+from drake_diff.goal_restoration import restore_goal
+from drake_diff.solution import Status
+
+ROOT = Path(__file__).parent.parent
+FREE = math.nan
+
+
+@pytest.fixture
+def two_spheres(tmp_path):
+    """Both spheres with masses and a damping of our own."""
+
+    def build(*, pusher=1.0, ball=0.5, damping=0.5, time_step=0.02):
+        text = (ROOT / "models" / "two_spheres.sdf").read_text()
+        for old, new in (("<mass>1<", pusher), ("<mass>0.5<", ball), ("<damping>0.5<", damping)):
+            assert text.count(old) == 1
+            text = text.replace(old, f"{old.split('>')[0]}>{new}<")
+        path = tmp_path / "two_spheres.sdf"
+        path.write_text(text)
+        return dd.load_model(path, time_step=time_step)
+
+    return build
+
+
+def push(model, *, gap, goal, num_steps=50, **more):
+    given = {"x_goal": [FREE, goal, FREE, FREE]} | more
+    effort = dd.QuadraticCost(Q=np.zeros((4, 4)), R=[[1e-3]])
+    return dd.Problem(model, x0=[0, 0.2 + gap, 0, 0], num_steps=num_steps, running_cost=effort, **given)
+
+
+def test_a_push_from_a_distance_arrives_and_keeps_momentum(two_spheres):
+    """Without damping the momentum of both is what the motor gave: sum of h u, all on Drake's own plant.
+
+    SAP solves its impulses to 1e-6 of the largest, but applies each to both bodies alike: the balance is rounding.
+    """
+    problem = push(two_spheres(damping=0), gap=0.4, goal=1.0)
+    solution = dd.solve(problem, continuation="auto", max_iterations=100)
+    assert solution.success, solution.message
+    end = solution.replay.xs[-1]
+    assert end[1] == pytest.approx(1.0, abs=1e-8)
+    assert 1.0 * end[2] + 0.5 * end[3] == pytest.approx(0.02 * solution.us.sum(), rel=1e-10)
+    assert solution.replay.penetration[0] == 0 < solution.replay.penetration.max()
+    assert solution.method == "ilqr"
+
+
+def test_auto_finds_contact_that_its_guess_does_not_make(two_spheres):
+    solution = dd.solve(push(two_spheres(damping=0), gap=0.4, goal=1.0), max_iterations=100)
+    assert solution.success, solution.message
+    assert [link["ended"] for link in solution.options["chain"]] == ["no_gradient", "converged"]
+    assert solution.options["chain"][1]["reason"] == "the guess has no gradient"
+
+
+def test_before_touching_the_push_is_the_closed_form_of_least_effort(two_spheres):
+    """The pusher alone is a double integrator: whatever it is to do at touching, least effort is linear in time."""
+    solution = dd.solve(push(two_spheres(damping=0), gap=0.4, goal=1.0), continuation="auto", max_iterations=100)
+    first = next(k for k, contacts in enumerate(solution.replay.contacts) if contacts)
+    bend = np.diff(solution.us[:first, 0], 2)
+    assert first > 10
+    assert np.abs(bend).max() < 1e-4 * np.abs(solution.us).max()  # the gradient is met to 1e-8 of the cost's scale
+
+
+def test_the_stages_are_logged_and_the_last_is_the_true_plant(two_spheres):
+    lines = []
+    problem = push(two_spheres(damping=0), gap=0.4, goal=0.8)
+    given = [dd.SoftContact(0.15, 100.0), dd.SoftContact(0.05, 150.0)]
+    solution = dd.solve(problem, method="ilqr", continuation=given, max_iterations=100, progress=lines.append)
+    logs = solution.options["continuation"]
+    assert [log["number"] for log in logs] == [1, 2, 3]
+    assert [log["distance"] for log in logs] == [0.15, 0.05, None]
+    assert [log["stiffness"] for log in logs] == [100.0, 150.0, None]
+    assert logs[-1]["iterations"] == len(solution.iterations) - 1
+    assert logs[-1]["cost"] == pytest.approx(solution.cost, rel=1e-12)
+    assert logs[-1]["goal_error"] == pytest.approx(solution.goal_error, abs=1e-15)
+    assert sum(line.startswith("stage ") for line in lines) == 3
+    assert solution.defect == 0  # measured on the true plant
+
+
+def test_a_soft_final_cost_is_reached_too(two_spheres):
+    problem = push(two_spheres(damping=0), gap=0.4, goal=1.0, x_goal=None, final_cost=lambda x: 10 * (x[1] - 1.0) ** 2)
+    assert dd.solve(problem, method="ilqr").status is Status.NO_GRADIENT
+    solution = dd.solve(problem, continuation="auto", max_iterations=100)
+    assert abs(solution.replay.xs[-1][1] - 1.0) < 1e-3  # effort 1e-3 against 10: the miss is of their ratio
+
+
+def test_the_default_schedule_is_read_off_the_model(two_spheres):
+    """L = 0.45, h = 0.02, N = 50: L/3 and L/9, as L/27 < 4 L / 50; the reduced mass of 1 and 0.5 is 1/3."""
+    stages = default_schedule(push(two_spheres(), gap=0.45, goal=1.0))
+    assert [s.distance for s in stages] == pytest.approx([0.15, 0.05], rel=1e-12)
+    nudge = 10 * 2 / 3 * 0.45 / 1.0**2 / (0.15 * math.log1p(math.exp(-3)))
+    assert stages[0].stiffness == pytest.approx(min(nudge, 0.4 / 3 / 0.02**2), rel=1e-9)
+    assert stages[1].stiffness == pytest.approx(0.4 / 3 / 0.02**2, rel=1e-9)
+
+
+def test_blindness_names_what_stays_apart(two_spheres):
+    """The pusher moves towards the ball from 0.3 m and is 0.12 m away at the last knot: h^2 u N (N + 1) / 2 = 0.18."""
+    us = np.full((20, 1), 0.18 / (0.02**2 * 20 * 21 / 2))
+    problem = push(two_spheres(), gap=0.3, goal=1.0, num_steps=20)
+    xs = np.tile(problem.x0, (21, 1))
+    solution = dd.solve(problem, method="ilqr", initial_guess=(xs, us))
+    assert solution.status is Status.NO_GRADIENT
+    assert "at knots 0-20 nothing touches (pusher and ball stay 0.12 m apart or more, nearest at knot 20)" in (
+        solution.message
+    )
+    assert 'continuation="auto"' in solution.message
+
+
+def test_a_stage_that_is_refused_is_told_and_the_schedule_goes_on(two_spheres):
+    """h^2 k / m = 1e9: the first stage throws the ball out of every number."""
+    problem = push(two_spheres(damping=0), gap=0.4, goal=1.0)
+    given = [dd.SoftContact(1.0, 1e12), *default_schedule(problem)]
+    solution = dd.solve(problem, continuation=given, max_iterations=100)
+    first, *rest = solution.options["continuation"]
+    assert first["status"] != "solved"
+    assert len(rest) == len(given)
+    assert solution.goal_error < 1e-5
+
+
+def test_the_time_limit_is_that_of_all_stages(two_spheres):
+    solution = dd.solve(push(two_spheres(), gap=0.4, goal=1.0), continuation="auto", time_limit=0.05)
+    assert solution.status is Status.TIME_LIMIT
+    assert "in stage 1" in solution.message
+    assert len(solution.options["continuation"]) == 1
+    assert solution.defect == 0
+
+
+def test_ctrl_c_ends_all_stages(two_spheres):
+    before = signal.getsignal(signal.SIGINT)
+    problem = push(two_spheres(), gap=0.4, goal=1.0)
+
+    def interrupt_in_the_first_stage(line):
+        if line.startswith("iteration     1"):
+            signal.raise_signal(signal.SIGINT)
+
+    solution = dd.solve(problem, continuation="auto", progress=interrupt_in_the_first_stage)
+    assert solution.status is Status.INTERRUPTED
+    assert len(solution.options["continuation"]) == 1
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize("wrong", ["soft", 0.1, [], [0.1], (dd.SoftContact(0.1, 1.0), None)])
+def test_a_schedule_that_is_none_is_refused(two_spheres, wrong):
+    with pytest.raises(dd.InputError, match="continuation"):
+        dd.solve(push(two_spheres(), gap=0.4, goal=1.0), continuation=wrong)
+
+
+def test_only_ilqr_takes_a_continuation(two_spheres, load):
+    with pytest.raises(dd.InputError, match='method="ilqr" takes it'):
+        dd.solve(push(two_spheres(), gap=0.4, goal=1.0), method="shooting", continuation="auto")
+    pendulum = load("pendulum.urdf")
+    with pytest.raises(dd.InputError, match="may collide"):
+        dd.solve(dd.Problem(pendulum, x0=[0, 0], num_steps=5, x_goal=[1, 0]), continuation="auto")
+
+
+def test_a_goal_is_reached_where_a_jump_of_contact_holds_up_the_search(two_spheres):
+    """With damping the least effort makes contact exactly at a knot; the search stops there, and says so."""
+    problem = push(two_spheres(), gap=0.4, goal=1.2)
+    solution = dd.solve(problem, continuation="auto", max_iterations=40)
+    assert not solution.success
+    assert "pusher and ball just touching at knot" in solution.message
+    assert "towards the goal" in solution.message
+    assert solution.replay.xs[-1][1] == pytest.approx(1.2, abs=1e-8)
+
+
+def test_restoration_leaves_a_goal_that_nothing_moves(two_spheres):
+    problem = push(two_spheres(), gap=0.4, goal=1.2, num_steps=10)
+    us = np.zeros((10, 1))
+    _, found, done = restore_goal(problem, np.tile(problem.x0, (11, 1)), us, 1e-8)
+    assert found is us
+    assert done == ""
+
+
+@pytest.mark.slow
+def test_a_box_is_pushed_to_its_goal(load):
+    """The pusher starts 0.15 m away from the box; its goal is a place in the plane, the yaw being free."""
+    goal = np.full(10, FREE)
+    goal[:2] = [0.4, 0.1]
+    problem = dd.Problem(
+        load("box_push.sdf", time_step=0.02),
+        x0=[0, 0, 0, -0.35, -0.05, 0, 0, 0, 0, 0],
+        num_steps=60,
+        running_cost=dd.QuadraticCost(Q=np.zeros((10, 10)), R=1e-3 * np.eye(2)),
+        x_goal=goal,
+    )
+    assert dd.solve(problem, method="ilqr").status is Status.NO_GRADIENT
+    solution = dd.solve(problem, continuation="auto", max_iterations=60)
+    replay = solution.replay
+    assert replay.xs[-1][:2] == pytest.approx([0.4, 0.1], abs=1e-5)
+    assert not replay.contacts[0]
+    assert any(replay.contacts)
+
+
+@pytest.mark.slow
+def test_a_hopper_jumps_to_an_apex(load):
+    """From standing: contact is held, then broken. In flight the momentum upwards changes by -m g h in each step."""
+    stand = 0.3 + 1.201 * 9.81 / 1e4
+    goal = np.full(8, FREE)
+    goal[[0, 1, 5]] = [0.2, 0.6, 0.0]
+    posture = dd.QuadraticCost(
+        Q=np.diag([0, 0, 10.0, 10, 0, 0, 0, 0]),
+        x_ref=[0, 0, 0, 0.3, 0, 0, 0, 0],
+        R=1e-3 * np.eye(2),
+        u_ref=[0, 9.81],
+    )
+    problem = dd.Problem(
+        load("hopper.sdf", time_step=0.01),
+        x0=[0, 0.35, 0, stand, 0, 0, 0, 0],
+        num_steps=60,
+        us=np.tile([0, 9.81], (60, 1)),
+        running_cost=posture,
+        x_goal=goal,
+    )
+    solution = dd.solve(problem, continuation="auto", max_iterations=100)
+    assert solution.goal_error < 1e-5
+    replay = solution.replay
+    assert replay.xs[-1][[0, 1, 5]] == pytest.approx([0.2, 0.6, 0.0], abs=1e-5)
+    assert replay.contacts[0]
+    assert not replay.contacts[-1]
+    landed = max(k for k, contacts in enumerate(replay.contacts) if contacts) + 1
+    momentum = 1.201 * replay.xs[:, 5] - 0.2 * replay.xs[:, 7]  # z lifts body, hip and foot, the leg lowers the foot
+    assert len(momentum) - landed > 3
+    assert np.diff(momentum[landed:]) == pytest.approx(-1.201 * 9.81 * 0.01, rel=1e-9)  # rounding of velocities near 1

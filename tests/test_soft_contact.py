@@ -1,0 +1,99 @@
+"""The force at a distance: its law, its balance of momentum and energy, and its derivative."""
+
+import math
+
+import numpy as np
+import pytest
+from conftest import Plant, contact_properties
+
+import drake_diff as dd
+from drake_diff.soft_contact import distances
+from drake_diff.step import set_state
+
+SOFT = dd.SoftContact(0.05, 200.0)
+
+
+@pytest.mark.parametrize("phi", [-3.0, -0.05, 0.0, 0.02, 0.4])
+def test_the_force_is_the_slope_of_the_energy(phi):
+    """At touching it is sigma k log 2; the differences are central, so off by d^2 c'' / 6 < 1e-6."""
+    d = 1e-5
+    slope = (SOFT.energy(phi - d) - SOFT.energy(phi + d)) / (2 * d)
+    assert slope == pytest.approx(SOFT.normal_force(phi), rel=1e-6)
+    assert SOFT.normal_force(0.0) == pytest.approx(0.05 * 200 * math.log(2), rel=1e-14)
+
+
+def test_the_limits_are_a_spring_and_nothing():
+    """exp(-60) is below the rounding of 1; the energy at touching is sigma^2 k pi^2 / 12."""
+    assert SOFT.normal_force(-3.0) == pytest.approx(200 * 3.0, rel=1e-14)
+    assert SOFT.normal_force(3.0) == pytest.approx(0.05 * 200 * math.exp(-60), rel=1e-14)
+    assert SOFT.normal_force(1e4) == 0.0
+    assert SOFT.energy(0.0) == pytest.approx(0.05**2 * 200 * math.pi**2 / 12, rel=1e-13)
+
+
+def test_one_step_of_two_spheres_is_the_closed_form(load):
+    """Semi-implicit Euler: m v' = m v + h (u - c), (m + h d) v' = m v + h c, in the state before the step."""
+    soft, h = dd.softened(load("two_spheres.sdf", time_step=0.02), SOFT), 0.02
+    c = 0.05 * 200 * math.log1p(math.exp(-0.1 / 0.05))
+    v = np.array([0.5 + h * (3 - c) / 1, (0.5 * 0.2 + h * c) / (0.5 + h * 0.5)])
+    wanted = np.concatenate([np.array([0, 0.3]) + h * v, v])
+    assert dd.step(soft, [0, 0.3, 0.5, 0.2], [3.0]) == pytest.approx(wanted, rel=1e-12)
+
+
+def test_energy_is_kept_and_momentum_exchanged_at_a_distance():
+    """Two equal balls swap their velocities. The symplectic error is of the order (h omega)^2 = h^2 2 k / m = 1e-4."""
+    plant = Plant(0.001)
+    for name in ("a", "b"):
+        plant.ball(name, 1.0, 0.1, contact_properties(1e4), "x")
+    soft = dd.softened(plant.model(), dd.SoftContact(0.05, 50.0))
+    r = dd.rollout(soft, [0, 1.2, 0.5, 0], num_steps=4000)
+    assert r.xs[-1][2:] == pytest.approx([0, 0.5], abs=1e-4)
+    assert r.xs[:, 2:].sum(axis=1) == pytest.approx(np.full(4001, 0.5), rel=1e-12)
+    assert not any(r.contacts)  # Drake's own contact never acts
+    assert np.abs(r.energy_error).max() < 1e-3 * 0.125
+
+
+@pytest.mark.parametrize("x", [[0, 0.5, 1, 0.2], [0, 0.25, 1, 0.2], [0, 0.19, 1, 0.2]])
+def test_steps_are_certified_apart_and_touching(load, x):
+    soft = dd.softened(load("two_spheres.sdf", time_step=0.02), SOFT)
+    dd.certify(soft, x, [1.0]).require()
+    dd.certify(soft.at_time_step(0.01), x, [1.0]).require()
+
+
+def test_steps_are_certified_where_normals_and_arms_turn(load):
+    """A sphere beside a turning box; eight spheres of a tumbling block above the ground."""
+    box = dd.softened(load("box_push.sdf"), SOFT)
+    dd.certify(box, [0, 0, 0.3, -0.25, -0.1, 0.1, 0.2, 0.3, 0.4, 0.5], [1, 2]).require()
+    block = dd.softened(load("sliding_block.sdf"), SOFT)
+    q = np.array([0.9, 0.1, 0.2, 0.3])
+    dd.certify(block, [*(q / np.linalg.norm(q)), 0, 0, 0.3, 0.1, 0.2, 0.3, 0.4, 0.5, -0.6]).require()
+
+
+def test_a_force_without_its_derivative_is_refused(load, monkeypatch):
+    """The same law, cut off from AutoDiffXd: the certificate must see it."""
+    soft = dd.softened(load("two_spheres.sdf", time_step=0.02), SOFT)
+    honest = dd.SoftContact.normal_force
+    monkeypatch.setattr(dd.SoftContact, "normal_force", lambda s, phi: honest(s, getattr(phi, "value", lambda: phi)()))
+    assert dd.certify(soft, [0, 0.3, 1, 0.2], [1.0]).verdict == "disagree"
+
+
+def test_the_model_itself_stays_as_it_is(load):
+    model = load("two_spheres.sdf", time_step=0.02)
+    before = dd.step(model, [0, 0.3, 1, 0], [1.0])
+    dd.step(dd.softened(model, SOFT), [0, 0.3, 1, 0], [1.0])
+    assert np.array_equal(dd.step(model, [0, 0.3, 1, 0], [1.0]), before)
+
+
+def test_distances_are_those_between_the_surfaces(load):
+    twin = load("two_spheres.sdf").double
+    set_state(twin, [0.1, 0.7, 0, 0])
+    assert distances(twin) == {("pusher", "ball"): pytest.approx(0.4, abs=1e-14)}
+
+
+def test_what_cannot_be_softened_is_refused(load):
+    with pytest.raises(dd.InputError, match="at least one pair"):
+        dd.softened(load("pendulum.urdf"), SOFT)
+    with pytest.raises(dd.InputError, match="a SoftContact"):
+        dd.softened(load("two_spheres.sdf"), 0.1)
+    for wrong in ((0.0, 1.0), (0.1, -1.0), (math.nan, 1.0)):
+        with pytest.raises(dd.InputError, match="above 0"):
+            dd.SoftContact(*wrong)
