@@ -1,0 +1,108 @@
+"""What users ask `solve` for, by collocation: minimum time, waypoints, path constraints, each against a closed form."""
+
+import math
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+from drake_diff.solution import Status
+
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+SCHEMES = ("hermite_simpson", "trapezoid", "drake")
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_minimum_time_is_bang_bang(write_urdf, scheme):
+    """B06: from rest, distance D = 1, |u| <= 1, m = 1: T = 2 sqrt(D) = 2, u = +1 then -1; a node lies at the switch."""
+    problem = dd.Problem(
+        write_urdf(time_step=0.1),
+        x0=[-1, 0],
+        x_goal=[0, 0],
+        num_steps=20,
+        running_cost=1.0,
+        horizon=(0.5, 8.0),
+        bounds=dd.Bounds(u_lower=[-1], u_upper=[1]),
+    )
+    solution = dd.solve(problem, method="collocation", scheme=scheme)
+    # The input jumps at the middle, where trapezoid and drake have to be linear: O(h) over one interval.
+    assert solution.horizon == pytest.approx(2.0, abs=1e-5 if scheme == "hermite_simpson" else 0.02), solution.message
+    assert solution.cost == pytest.approx(solution.horizon, rel=1e-12)
+    assert solution.times[-1] == pytest.approx(solution.horizon, rel=1e-12)
+    assert solution.us[:9, 0] == pytest.approx(np.ones(9), abs=1e-4)
+    assert solution.us[12:, 0] == pytest.approx(-np.ones(8), abs=1e-4)
+
+
+def test_auto_takes_collocation_where_the_horizon_is_free(load):
+    """More time never costs more: the free horizon's optimum is no dearer than that of its upper end."""
+    model = load("pendulum.urdf", time_step=0.02)
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=60, running_cost=EFFORT, horizon=(0.5, 2.0))
+    solution = dd.solve(problem)
+    assert solution.method == "collocation"
+    assert solution.options["method_reason"] == "the horizon is free"
+    assert solution.success, solution.message
+    assert 0.5 <= solution.horizon <= 2.0 + 1e-6  # IPOPT keeps a bound to its tolerance
+    fixed = dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=60, running_cost=EFFORT, horizon=(2.0, 2.0))
+    assert solution.cost <= dd.solve(fixed).cost + 1e-6
+
+
+@pytest.mark.parametrize("method", ["shooting", "ilqr"])
+def test_discrete_methods_refuse_a_free_horizon(load, method):
+    problem = dd.Problem(load("pendulum.urdf"), x0=[0, 0], x_goal=[1, 0], num_steps=10, horizon=(1, 2))
+    with pytest.raises(dd.InputError, match='horizon: expected none for discrete steps: method="collocation" takes it'):
+        dd.solve(problem, method=method)
+
+
+def test_a_waypoint_is_passed_at_the_cost_of_the_closed_form(write_urdf):
+    """Rest to rest over 1 m in 1 s through x(1/2) = a, v free: min int u^2 = 12 + 192 (a - 1/2)^2.
+
+    The cubic alone passes 1/2. A unit force-multiplier at the middle adds to x(1/2) the compliance 1/192, that of a
+    beam clamped at both ends.
+    """
+    problem = dd.Problem(
+        write_urdf(time_step=0.05),
+        x0=[0, 0],
+        x_goal=[1, 0],
+        num_steps=20,
+        running_cost=EFFORT,
+        waypoints={10: [0.6, math.nan]},
+    )
+    solution = dd.solve(problem, method="collocation", scheme="hermite_simpson")
+    assert solution.success, solution.message
+    assert solution.xs[10, 0] == pytest.approx(0.6, abs=1e-8)
+    assert solution.cost == pytest.approx(12 + 192 * 0.01, rel=1e-8)
+    assert solution.constraint_excess["waypoint at knot 10"][0] < 1e-8
+
+
+@pytest.mark.parametrize("as_bound", [True, False])
+def test_a_speed_limit_costs_what_the_closed_form_says(write_urdf, as_bound):
+    """Rest to rest, 1 m in 1 s, v <= w: u = 2 w / s (1 - t / s) over s = 3/2 (1 - 1/w), then 0: J = 8 w^2 / (3 s).
+
+    The way is w (1 - 2 s / 3) = 1. With w = 9/8, s = 1/6 lies on a knot of 30.
+    """
+    w, s = 9 / 8, 1 / 6
+    limit = {"bounds": dd.Bounds(x_upper=[math.inf, w])} if as_bound else {}
+    if not as_bound:
+        limit = {"constraints": dd.Constraint(lambda x: x[1], upper=w, name="speed")}
+    problem = dd.Problem(
+        write_urdf(time_step=1 / 30), x0=[0, 0], x_goal=[1, 0], num_steps=30, running_cost=EFFORT, **limit
+    )
+    solution = dd.solve(problem, method="collocation", scheme="hermite_simpson")
+    assert solution.status in (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED), solution.message
+    assert solution.cost == pytest.approx(8 * w**2 / (3 * s), rel=1e-6)
+    assert solution.xs[:, 1].max() <= w + 1e-8
+
+
+def test_a_broken_constraint_is_named_with_its_knot(write_urdf):
+    problem = dd.Problem(
+        write_urdf(time_step=0.1),
+        x0=[0, 0],
+        x_goal=[1, 0],
+        num_steps=10,
+        running_cost=EFFORT,
+        constraints=dd.Constraint(lambda x: x[1], upper=0.5, name="too slow"),
+    )
+    solution = dd.solve(problem, method="collocation")
+    assert not solution.success
+    assert solution.status is Status.INFEASIBLE
+    assert "too slow" in solution.message or "defect" in solution.message
