@@ -227,6 +227,10 @@ def _print_record(console: Console, record: Any, directory: Path) -> None:
             {True: "holds", False: "[red]does not hold[/]", None: ""}[check.passed],
         )
     console.print(table)
+    for replay in record.replays:
+        told = "holds" if replay.holds else "[red]does not hold[/]: " + escape(replay.failures[0])
+        goal = "-" if replay.goal_error is None else f"{replay.goal_error:.3g}"
+        console.print(f"replayed {replay.variant}, {replay.control}: goal error {goal}, {told}", highlight=False)
     for p in record.parameters:
         moved = f", from {p.start:.6g}" if p.optimized else ""
         console.print(f"{escape(p.name)} = {p.value:.9g} {p.unit}{moved}, derivative from {p.derivative_source}")

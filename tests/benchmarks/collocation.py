@@ -125,6 +125,7 @@ def main() -> None:
             problem = every[name]
             rows: dict[str, Callable[[], Row]] = {
                 "ours, Hermite-Simpson": lambda p=problem: ours(p, "hermite_simpson"),
+                "ours, Drake's scheme": lambda p=problem: ours(p, "drake"),
                 "ours, trapezoid": lambda p=problem: ours(p, "trapezoid"),
                 "Drake, IPOPT": lambda p=problem: drakes(p, "ipopt"),
                 "Drake, SNOPT": lambda p=problem: drakes(p, "snopt"),
