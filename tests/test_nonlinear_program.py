@@ -9,7 +9,7 @@ import pytest
 from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver
 
 import drake_diff as dd
-from drake_diff.nonlinear_program import Limits, Outcome, _ipopt_rows, _snopt_rows, solve_program
+from drake_diff.nonlinear_program import Limits, Outcome, Report, _ipopt_rows, _snopt_rows, solve_program
 
 SOLVERS = ("ipopt", "snopt")
 UNLIMITED = Limits(max_iterations=500, time_limit=math.inf, tolerance=1e-8)
@@ -38,7 +38,7 @@ def flat_bowl(z):
 
 
 def run(p, *, solver, guess=(0.0, 0.0), limits=UNLIMITED, report=None):
-    return solve_program(p, np.array(guess), solver=solver, limits=limits, report=report)
+    return solve_program(p, np.array(guess), solver=solver, limits=limits, report=Report(report))
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
