@@ -103,6 +103,7 @@ class Attempt:
     solver: str | None = None
     segments: int = 1
     continuation: Any = None
+    max_iterations: int | None = None
 
 
 class _Task:
@@ -127,8 +128,11 @@ class _Task:
             raise InputError("continuation", got="given", expected=expected)
         stages = () if attempt.continuation is None else check_schedule(problem, attempt.continuation)
         left = self.limits.time_limit - (time.monotonic() - self.start)
+        most = self.limits.max_iterations if attempt.max_iterations is None else attempt.max_iterations
+        most = min(most, self.limits.max_iterations)
+        limits = dataclasses.replace(self.limits, time_limit=max(left, 0.0), max_iterations=most)
         options = {
-            "max_iterations": self.limits.max_iterations,
+            "max_iterations": limits.max_iterations,
             "time_limit": None if np.isinf(self.limits.time_limit) else self.limits.time_limit,
             "tolerance": self.limits.tolerance,
             "seed": self.seed,
@@ -136,7 +140,6 @@ class _Task:
             "method_reason": attempt.reason,
             "initial_guess": "default" if given is None else "given",
         }
-        limits = dataclasses.replace(self.limits, time_limit=max(left, 0.0))
         run = Run(problem, method, scheme, attempt.solver or solver, limits, options, self.report)
 
         def make() -> Solution:
@@ -154,6 +157,7 @@ class _Task:
         return make
 
 
+GUESS_ITERATIONS = 100  # of an attempt that is to find a guess for the next one
 ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
 # The order in which a chain that ends without a verified motion prefers what it has.
 PREFERENCE = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED, Status.INTERRUPTED, Status.TIME_LIMIT)
@@ -196,7 +200,8 @@ def _attempts(problem: Problem, given: Any, solver: str | None, found: list[Solu
     if method == "shooting":
         return
     if method == "collocation":
-        yield Attempt("ilqr", "collocation was not verified: a guess for it"), given
+        reason = "collocation was not verified: a guess for it"
+        yield Attempt("ilqr", reason, max_iterations=GUESS_ITERATIONS), given
     if np.all(np.isfinite(found[-1].xs)):
         begun = found[-1].xs, found[-1].us
         next_method = "collocation" if method == "collocation" else "shooting"
