@@ -27,7 +27,7 @@ nonlinear_program transcription_scheme optimal_control transcribed symbolic symb
 transcription_program ipopt transcription solution collocation shooting shooting_program riccati secant
 augmented_lagrangian expansion ilqr goal_restoration continuation verdict run solver mcap_messages mcap_read
 mcap_log mcap_recover trace_read trace_motion trace_solve trace meshcat_view record provenance evidence sampling
-certification audit_place audit_contact audit cli
+certification audit_place audit_contact audit ros2_bag cli_mcap cli
 """.split()
 
 
