@@ -74,8 +74,7 @@ def _transforms(types: dict[str, Any], time: int, message: Any, _: dict[str, Any
     stamped = types["geometry_msgs/msg/TransformStamped"]
     return types["tf2_msgs/msg/TFMessage"](
         transforms=[
-            stamped(_header(types, time, t.parent_frame_id), t.child_frame_id, pose(t))
-            for t in message.transforms
+            stamped(_header(types, time, t.parent_frame_id), t.child_frame_id, pose(t)) for t in message.transforms
         ]
     )
 
