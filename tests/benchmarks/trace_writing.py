@@ -1,6 +1,6 @@
 """A trace of 10,000 steps of a 30-joint plant: written by `write_trace`, and by a plain `mcap` loop.
 
-    OPENBLAS_NUM_THREADS=1 python tests/benchmarks/mcap.py [STEPS]
+    OPENBLAS_NUM_THREADS=1 python tests/benchmarks/trace_writing.py [STEPS]
 
 Three plain loops, each with the `mcap` package's defaults (chunks of 1 MiB, no checksum of the data):
   stored   the very messages of the trace, already made: what our chunks, checksums and merging in time cost
