@@ -29,6 +29,7 @@ from drake_diff.exceptions import NonFiniteError as NonFiniteError
 from drake_diff.exceptions import ShapeError as ShapeError
 from drake_diff.exceptions import SimulationError as SimulationError
 from drake_diff.exceptions import UnknownNameError as UnknownNameError
+from drake_diff.mcap_read import read_mcap as read_mcap
 from drake_diff.model import Model as Model
 from drake_diff.model import load_model as load_model
 from drake_diff.model import model_from_diagram as model_from_diagram
@@ -62,6 +63,7 @@ from drake_diff.solver import solve as solve
 from drake_diff.step import step as step
 from drake_diff.step_derivatives import StepDerivatives as StepDerivatives
 from drake_diff.step_derivatives import differentiate_step as differentiate_step
+from drake_diff.trace_read import read_trace as read_trace
 from drake_diff.transcribed import Transcribed as Transcribed
 from drake_diff.transcribed import violation_between_nodes as violation_between_nodes
 from drake_diff.transcription import transcribe_and_solve as transcribe_and_solve

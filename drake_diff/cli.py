@@ -14,9 +14,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from drake_diff.cli_mcap import add_commands
+
 HOLDS, CHECK_FAILED, USAGE, MISSING, INTERNAL = range(5)
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
+add_commands(app)
 
 
 @app.callback()

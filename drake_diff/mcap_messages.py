@@ -8,7 +8,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
 NUMBER, NUMBERS = ("double", False), ("double", True)
-WHOLE, TEXT, TEXTS = ("int64", False), ("string", False), ("string", True)
+WHOLE, FLAG, TEXT, TEXTS = ("int64", False), ("bool", False), ("string", False), ("string", True)
 
 # message: {field: (type, unit)}; field numbers are the order, so new fields go last.
 MESSAGES: dict[str, dict[str, tuple[tuple[str, bool], str]]] = {
@@ -53,10 +53,41 @@ MESSAGES: dict[str, dict[str, tuple[tuple[str, bool], str]]] = {
         "verdict": (TEXT, ""),
         "entries": (WHOLE, "1"),
         "agreeing": (WHOLE, "1"),
-        "worst": (TEXT, ""),
+        "cosine": (NUMBER, "1"),  # of the angle between derivative and differences, all entries in one vector
+        "worst_row": (TEXT, ""),
+        "worst_column": (TEXT, ""),
+        "worst_derivative": (NUMBER, "unit of the row per unit of the column"),
+        "worst_difference": (NUMBER, "unit of the row per unit of the column"),
+        "worst_tolerance": (NUMBER, "unit of the row per unit of the column"),
+        "mode_changes": (TEXTS, ""),
     },
     "GradientNorm": {"step": (WHOLE, "1"), "norm": (NUMBER, "1 per state unit")},
-    "Event": {"level": (TEXT, ""), "label": (TEXT, ""), "message": (TEXT, "")},
+    "Plan": {
+        "scheme": (TEXT, ""),
+        "num_steps": (WHOLE, "1"),
+        "horizon": (NUMBER, "s"),
+        "horizon_is_free": (FLAG, "1"),
+        "parameters": (NUMBERS, "see names"),
+    },
+    "Replay": {
+        "variant": (TEXT, ""),
+        "control": (TEXT, ""),
+        "approximation": (TEXT, ""),
+        "time_step": (NUMBER, "s"),
+        "goal_error": (NUMBER, "the state's"),
+        "bound_violation": (NUMBER, "the state's"),
+        "energy_error": (NUMBER, "J"),
+        "penetration": (NUMBER, "m"),
+        "holds": (FLAG, "1"),
+        "failures": (TEXTS, ""),
+    },
+    "Event": {
+        "time": (NUMBER, "s"),
+        "kind": (TEXT, ""),
+        "failure_label": (TEXT, ""),
+        "code": (TEXT, ""),
+        "message": (TEXT, ""),
+    },
 }
 
 

@@ -1,16 +1,24 @@
 """The MCAP file: what goes in comes out bit for bit, and damage is noticed."""
 
 import math
+import mmap
+import os
 import random
+import signal
+import struct
+import time
+import tracemalloc
+import warnings
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drake_diff.exceptions import ArtifactError
-from drake_diff.mcap_log import Channel, read_mcap, write_mcap
+from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
+from drake_diff.mcap_log import CHUNK_SIZE, Channel, read_mcap, write_mcap
 from drake_diff.mcap_messages import MESSAGES, TYPES
+from drake_diff.mcap_recover import recover_mcap
 
 STATE = TYPES["State"].cls
 
@@ -100,3 +108,188 @@ def test_every_message_has_a_unit_for_every_number():
         for field, ((kind, _), unit) in fields.items():
             assert (kind == "string") == (unit == ""), f"{name}.{field}"
     assert math.isclose(TYPES["GradientNorm"].cls(step=3, norm=0.1).norm, 0.1)
+
+
+DOUBLES = st.floats(allow_nan=True, allow_infinity=True)
+NAMES = st.text(st.characters(codec="utf-8"), max_size=20)
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_any_log_comes_back_names_numbers_and_bytes(tmp_path_factory, data):
+    path = tmp_path_factory.mktemp("mcap") / "a.mcap"
+    topics = data.draw(st.lists(NAMES, max_size=4, unique=True))
+    metadata = data.draw(st.dictionaries(NAMES, NAMES, max_size=3))
+    attachments = data.draw(st.dictionaries(NAMES, st.tuples(NAMES, st.binary(max_size=50)), max_size=3))
+    names = data.draw(st.lists(NAMES, max_size=3))
+    rows, channels = {}, []
+    for topic in topics:
+        count, nq = data.draw(st.integers(0, 5)), data.draw(st.integers(1, 4))
+        number = st.lists(DOUBLES, min_size=nq, max_size=nq)
+        rows[topic] = data.draw(st.lists(st.tuples(DOUBLES, number, number), min_size=count, max_size=count))
+        messages = [(k, STATE(time=t, q=q, v=v)) for k, (t, q, v) in enumerate(rows[topic])]
+        channels.append(Channel(topic, STATE, messages, {"names": {"q": names}}))
+    write_mcap(path, channels, metadata, attachments)
+    log = read_mcap(path)
+    assert log.metadata == {"run": metadata}
+    assert log.attachments == {name: content for name, (_, content) in attachments.items()}
+    assert list(log.messages) == topics
+    for topic in topics:
+        found = log.arrays(topic)
+        assert log.channel_metadata[topic] == {"names": {"q": names}}
+        for i, field in enumerate(("time", "q", "v")):
+            assert found[field].tobytes() == np.array([row[i] for row in rows[topic]], dtype=float).tobytes()
+
+
+def test_arrays_of_lists_of_different_lengths_texts_and_flags(tmp_path):
+    contacts, replay = TYPES["Contacts"].cls, TYPES["Replay"].cls
+    channels = [
+        Channel("/contacts", contacts, [(0, contacts(body_a=["a"], depth=[1.0])), (1, contacts(depth=[2.0, 3.0]))]),
+        Channel("/replays", replay, [(0, replay(variant="x", holds=True, failures=["y", "z"]))]),
+    ]
+    write_mcap(tmp_path / "a.mcap", channels, {}, {})
+    log = read_mcap(tmp_path / "a.mcap")
+    found = log.arrays("/contacts")
+    assert [depth.tolist() for depth in found["depth"]] == [[1.0], [2.0, 3.0]]
+    assert found["body_a"] == [["a"], []]
+    found = log.arrays("/replays")
+    assert (found["variant"], found["failures"], found["holds"].tolist()) == (["x"], [["y", "z"]], [True])
+    with pytest.raises(UnknownNameError, match="one of /contacts, /replays"):
+        log.arrays("/contact")
+
+
+def test_an_empty_channel_gives_arrays_as_wide_as_its_names(tmp_path):
+    write_mcap(tmp_path / "a.mcap", [Channel("/state", STATE, [], {"names": {"q": ["a", "b"]}})], {}, {})
+    assert read_mcap(tmp_path / "a.mcap").arrays("/state")["q"].shape == (0, 2)
+
+
+def test_channels_are_merged_in_time_and_a_time_that_decreases_is_refused(tmp_path):
+    from mcap.reader import make_reader
+
+    channels = [Channel(f"/{i}", STATE, [(t, STATE()) for t in range(i, 30, 3)]) for i in range(3)]
+    write_mcap(tmp_path / "a.mcap", channels, {}, {})
+    with (tmp_path / "a.mcap").open("rb") as file:
+        times = [m.log_time for _, _, m in make_reader(file).iter_messages(log_time_order=False)]
+    assert times == list(range(30))
+    with pytest.raises(InputError, match="time of message 1 of /state: expected at least 5, got 4"):
+        write_mcap(tmp_path / "b.mcap", [Channel("/state", STATE, [(5, STATE()), (4, STATE())])], {}, {})
+    assert not list(tmp_path.glob("b.*"))
+
+
+def test_a_schema_that_does_not_decode_is_refused(tmp_path):
+    from mcap.writer import Writer
+
+    for encoding, schema in (("protobuf", b"no schema"), ("ros2msg", b"float64 x")):
+        with (tmp_path / "a.mcap").open("wb") as file:
+            writer = Writer(file, enable_data_crcs=True)
+            writer.start()
+            writer.register_channel("/a", encoding, writer.register_schema("a", encoding, schema))
+            writer.finish()
+        with pytest.raises(ArtifactError, match=r"a\.mcap is no whole MCAP file"):
+            read_mcap(tmp_path / "a.mcap")
+
+
+def test_an_attachment_whose_checksum_is_wrong_is_refused_though_every_other_holds(tmp_path):
+    import zlib
+
+    path = tmp_path / "a.mcap"
+    write(path, states(3))
+    data = bytearray(path.read_bytes())
+    data[data.index(b"<robot/>")] ^= 1
+    (start,) = struct.unpack_from("<Q", data, len(data) - 8 - 20)  # of the summary; before it the data's checksum
+    struct.pack_into("<I", data, start - 4, zlib.crc32(data[: start - 13]))
+    path.write_bytes(data)
+    with pytest.raises(ArtifactError, match="the checksum of an attachment"):
+        read_mcap(path)
+
+
+def test_a_long_log_is_streamed_not_gathered(tmp_path):
+    """40,000 messages are over 10 MB as Python objects; a few chunks and their indexes are far less."""
+    messages = ((k, STATE(time=k, q=[k] * 10)) for k in range(40_000))
+    tracemalloc.start()
+    write(tmp_path / "a.mcap", messages)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4e6
+
+
+def test_recover_gives_back_a_whole_file_whole(tmp_path):
+    write(tmp_path / "a.mcap", states(5000), status="converged")
+    done = recover_mcap(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    assert (done.messages, done.attachments, done.stopped_at) == (5000, 1, "")
+    whole, copy = read_mcap(tmp_path / "a.mcap"), read_mcap(tmp_path / "b.mcap")
+    assert copy.arrays("/state")["q"].tobytes() == whole.arrays("/state")["q"].tobytes()
+    assert copy.attachments == whole.attachments
+    assert copy.channel_metadata == whole.channel_metadata
+    recovered = {"from": "a.mcap", "messages": "5000", "stopped_at": "the end"}
+    assert copy.metadata == {**whole.metadata, "recovered": recovered}
+
+
+def test_recover_copies_what_is_before_the_damage_and_nothing_that_is_damaged(tmp_path):
+    path = tmp_path / "a.mcap"
+    write(path, states(5000))
+    whole, seeded = path.read_bytes(), random.Random(1)
+    rows = read_mcap(path).arrays("/state")["q"]
+    counts = []
+    for trial in range(30):
+        damaged = bytearray(whole)
+        damaged[seeded.randrange(8, len(damaged))] ^= 1 << seeded.randrange(8)
+        path.write_bytes(damaged if trial % 2 else whole[: seeded.randrange(8, len(whole))])
+        done = recover_mcap(path, tmp_path / f"{trial}.mcap")
+        log = read_mcap(tmp_path / f"{trial}.mcap")
+        found = log.arrays("/state")["q"] if done.messages else rows[:0]
+        assert len(found) == done.messages == int(log.metadata["recovered"]["messages"])
+        assert found.tobytes() == rows[: len(found)].tobytes()
+        counts.append(done.messages)
+    assert len(set(counts)) > 3  # damage at the end costs less than at the start
+
+
+def test_recover_refuses_what_is_no_mcap_and_what_exists(tmp_path):
+    (tmp_path / "a.mcap").write_text("not an mcap file")
+    with pytest.raises(ArtifactError, match=r"a\.mcap is no MCAP file"):
+        recover_mcap(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    with pytest.raises(InputError, match="OUT: expected a file that does not exist"):
+        recover_mcap(tmp_path / "a.mcap", tmp_path / "a.mcap")
+
+
+def test_a_process_killed_while_it_writes_loses_no_more_than_the_chunk_in_progress(tmp_path):
+    size = 9 + 22 + len(STATE(time=1.0, q=[1.0] * 30, v=[1.0] * 30).SerializeToString())  # of a message's record
+    seeded, lost = random.Random(2), []
+    for trial in range(20):
+        path, partial = tmp_path / f"{trial}.mcap", tmp_path / f"{trial}.mcap.partial"
+        written = _write_until_killed(path, after=seeded.randrange(1, 3000))
+        assert not path.exists()
+        done = recover_mcap(partial, tmp_path / f"{trial}.saved.mcap")
+        log = read_mcap(tmp_path / f"{trial}.saved.mcap")
+        times = log.arrays("/state")["time"] if done.messages else np.zeros(0)
+        assert times.tolist() == list(range(len(times)))
+        lost.append((written - len(times)) * size)
+    assert max(lost) <= CHUNK_SIZE + 1000  # schemas are in the first chunk, and the last message overflows it
+    assert len(set(lost)) > 5  # they did not all end at the same place
+
+
+def _write_until_killed(path, *, after):
+    """How many messages the writer had taken when SIGKILL ended its process, soon after the `after`-th."""
+    count = mmap.mmap(-1, 8)
+
+    def forever():
+        k = 0
+        while True:
+            yield k, STATE(time=k, q=[k] * 30, v=[k] * 30)
+            k += 1
+            count[:8] = struct.pack("<q", k)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # fork beside threads: the child only writes
+        child = os.fork()
+    if child == 0:
+        try:
+            write(path, forever())
+        finally:
+            os._exit(1)
+    deadline = time.monotonic() + 60
+    while struct.unpack("<q", count[:8])[0] < after and time.monotonic() < deadline:
+        time.sleep(1e-4)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return struct.unpack("<q", count[:8])[0]

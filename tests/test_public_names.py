@@ -15,8 +15,8 @@ ModelWarning NonFiniteError PD ParametricPolicy Problem QuadraticCost Rollout Ro
 ShapeError SimulationError Smoothed SoftContact Solution Status StepDerivatives TVLQR Transcribed UnknownNameError
 audit center_of_mass certify certify_jacobian certify_model certify_rollout contact_force contact_modes
 differentiate_rollout differentiate_step frame_position frame_rotation_error frame_velocity list_parameters load_model
-load_record model_from_diagram plant_dynamics rollout save smooth smooth_step softened solve step
-transcribe_and_solve violation_between_nodes
+load_record model_from_diagram plant_dynamics read_mcap read_trace rollout save smooth smooth_step softened
+solve step transcribe_and_solve violation_between_nodes
 """.split()
 ORDER = """
 exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin model
@@ -25,8 +25,9 @@ finite_difference tree_dynamics implicit step_derivatives smoothing policy conta
 rollout rollout_gradient refinement certify continuous cost bounds constraint problem replay dynamics
 nonlinear_program transcription_scheme optimal_control transcribed symbolic symbolic_tree knot_functions
 transcription_program ipopt transcription solution collocation shooting shooting_program riccati secant
-augmented_lagrangian expansion ilqr goal_restoration continuation verdict run solver mcap_messages mcap_log trace
-meshcat_view record provenance evidence sampling certification audit_place audit_contact audit cli
+augmented_lagrangian expansion ilqr goal_restoration continuation verdict run solver mcap_messages mcap_read
+mcap_log mcap_recover trace_read trace_motion trace_solve trace meshcat_view record provenance evidence sampling
+certification audit_place audit_contact audit ros2_bag cli_mcap cli
 """.split()
 
 

@@ -1,0 +1,123 @@
+"""The exported bag: read back by another library than the one that wrote it, number for number."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+from drake_diff.ros2_bag import export_ros2
+from drake_diff.solution import Solution
+from drake_diff.trace import write_trace
+
+pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
+MODELS = Path(__file__).parent.parent / "models"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A cart-pole pushed for 10 steps; the pole is not driven."""
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
+    problem = dd.Problem(model, x0=[0, 0.3, 0, 0], num_steps=10, final_cost=lambda x: x[0] ** 2)
+    motion = dd.rollout(model, [0, 0.3, 0, 0], np.linspace(0.1, 1, 10)[:, None])
+    solution = Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", motion.xs, motion.us)
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    folder.mkdir()
+    write_trace(folder / "trace.mcap", solution, {})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bag(run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bags") / "bag"
+    export_ros2(run, folder)
+    return folder
+
+
+def messages(bag, topic):
+    """Time [ns] and message, by the `mcap` project's ROS 2 decoder, every checksum checked."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    with (bag / "bag.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        return [(m.message.log_time, m.decoded_message) for m in reader.iter_decoded_messages(topics=[topic])]
+
+
+def test_joint_states_are_the_trace_s_bit_for_bit(run, bag):
+    trace, found = dd.read_trace(run / "trace.mcap"), messages(bag, "/joint_states")
+    assert [t for t, _ in found] == [20_000_000 * k for k in range(11)]
+    assert [list(m.name) for _, m in found] == [["slide", "hinge"]] * 11
+    xs = np.array([[*m.position, *m.velocity] for _, m in found])
+    assert xs.tobytes() == trace.xs.tobytes()
+    efforts = np.array([m.effort for _, m in found[:-1]])
+    assert efforts[:, 0].tobytes() == trace.us[:, 0].tobytes()
+    assert np.isnan(efforts[:, 1]).all()  # nothing drives the hinge
+    assert list(found[-1][1].effort) == []  # no step begins at the last state
+    assert (found[3][1].header.stamp.sec, found[3][1].header.stamp.nanosec) == (0, 60_000_000)
+
+
+def test_frames_inputs_and_diagnostics_are_the_trace_s(run, bag):
+    log = dd.read_mcap(run / "trace.mcap")
+    for (_, ours), (_, theirs) in zip(log.messages["/tf"], messages(bag, "/tf"), strict=True):
+        for a, b in zip(ours.transforms, theirs.transforms, strict=True):
+            assert (b.header.frame_id, b.child_frame_id) == ("world", a.child_frame_id)
+            for part, axes in (("translation", "xyz"), ("rotation", "wxyz")):
+                for axis in axes:
+                    assert getattr(getattr(a, part), axis) == getattr(getattr(b.transform, part), axis)
+    inputs = messages(bag, "/input")
+    assert [list(m.data) for _, m in inputs] == log.arrays("/input")["u"].tolist()
+    assert inputs[0][1].layout.dim[0].label == "force"
+    energies = log.arrays("/diagnostics")["energy_total"]
+    for energy, (_, m) in zip(energies, messages(bag, "/diagnostics"), strict=True):
+        assert float({v.key: v.value for v in m.status[0].values}["energy_total [J]"]) == energy
+
+
+def test_rosbags_reads_the_whole_bag_with_its_metadata(bag):
+    from rosbags.rosbag2 import Reader
+
+    with Reader(bag) as reader:
+        assert {c.topic: (c.msgtype, c.msgcount) for c in reader.connections} == {
+            "/joint_states": ("sensor_msgs/msg/JointState", 11),
+            "/planned/joint_states": ("sensor_msgs/msg/JointState", 11),
+            "/tf": ("tf2_msgs/msg/TFMessage", 11),
+            "/input": ("std_msgs/msg/Float64MultiArray", 10),
+            "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", 11),
+        }
+        assert len(list(reader.messages())) == 54
+
+
+def test_metadata_are_those_of_a_version_that_humble_reads(bag):
+    from ruamel.yaml import YAML
+
+    found = YAML(typ="safe").load(bag / "metadata.yaml")["rosbag2_bagfile_information"]
+    assert (found["version"], found["storage_identifier"], found["message_count"]) == (8, "mcap", 54)
+    assert found["relative_file_paths"] == ["bag.mcap"]
+    assert found["duration"]["nanoseconds"] == 200_000_000
+    formats = {t["topic_metadata"]["serialization_format"] for t in found["topics_with_message_count"]}
+    assert formats == {"cdr"}
+
+
+def test_the_same_trace_gives_the_same_bag(run, bag, tmp_path):
+    export_ros2(run, tmp_path / "bag")
+    assert (tmp_path / "bag" / "bag.mcap").read_bytes() == (bag / "bag.mcap").read_bytes()
+
+
+def test_what_exists_is_not_written_over_and_what_is_no_run_is_refused(run, bag, tmp_path):
+    with pytest.raises(dd.InputError, match="OUT: expected a directory that does not exist"):
+        export_ros2(run, bag)
+    with pytest.raises(dd.ArtifactError, match=r"trace\.mcap"):
+        export_ros2(tmp_path, tmp_path / "bag")
+    damaged = bytearray((run / "trace.mcap").read_bytes())
+    damaged[1000] ^= 1
+    (tmp_path / "trace.mcap").write_bytes(damaged)
+    with pytest.raises(dd.ArtifactError, match="checksum"):
+        export_ros2(tmp_path, tmp_path / "bag")
+    assert not (tmp_path / "bag").exists()
+
+
+def test_without_rosbags_it_says_what_to_install(run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    with pytest.raises(dd.MissingDependencyError, match=r"pip install 'drake-diff\[ros2\]'"):
+        export_ros2(run, tmp_path / "bag")
