@@ -6,6 +6,7 @@ from drake_diff.bounds import Bounds as Bounds
 from drake_diff.certificate import Certificate as Certificate
 from drake_diff.certificate import certify_jacobian as certify_jacobian
 from drake_diff.certification import certify_model as certify_model
+from drake_diff.certification_record import CertificationRecord as CertificationRecord
 from drake_diff.certify import RolloutCertificate as RolloutCertificate
 from drake_diff.certify import certify as certify
 from drake_diff.certify import certify_rollout as certify_rollout
@@ -15,7 +16,6 @@ from drake_diff.contract import Contract as Contract
 from drake_diff.cost import QuadraticCost as QuadraticCost
 from drake_diff.dynamics import Dynamics as Dynamics
 from drake_diff.dynamics import plant_dynamics as plant_dynamics
-from drake_diff.evidence import load_record as load_record
 from drake_diff.evidence import save as save
 from drake_diff.exceptions import ArtifactError as ArtifactError
 from drake_diff.exceptions import CertificateError as CertificateError
@@ -44,8 +44,8 @@ from drake_diff.quantities import contact_force as contact_force
 from drake_diff.quantities import frame_position as frame_position
 from drake_diff.quantities import frame_rotation_error as frame_rotation_error
 from drake_diff.quantities import frame_velocity as frame_velocity
-from drake_diff.record import CertificationRecord as CertificationRecord
 from drake_diff.record import EvidenceRecord as EvidenceRecord
+from drake_diff.record_file import load_record as load_record
 from drake_diff.rollout import Rollout as Rollout
 from drake_diff.rollout import rollout as rollout
 from drake_diff.rollout_gradient import RolloutGradient as RolloutGradient
@@ -67,3 +67,5 @@ from drake_diff.trace_read import read_trace as read_trace
 from drake_diff.transcribed import Transcribed as Transcribed
 from drake_diff.transcribed import violation_between_nodes as violation_between_nodes
 from drake_diff.transcription import transcribe_and_solve as transcribe_and_solve
+from drake_diff.verification import Verification as Verification
+from drake_diff.verify import verify as verify

@@ -8,13 +8,14 @@ from typing import Literal
 import numpy as np
 
 from drake_diff.arrays import positive_int
+from drake_diff.certification_record import CertificationRecord, StateEvidence
 from drake_diff.certify import certify
 from drake_diff.contact import active_modes
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model import Model
 from drake_diff.parameters import Parameters, select
-from drake_diff.provenance import gradient_evidence, provenance_of
-from drake_diff.record import CertificationRecord, StateEvidence, WallClock
+from drake_diff.provenance import gradient_evidence, model_input, provenance_of
+from drake_diff.record_parts import WallClock
 from drake_diff.sampling import SampledState, sample_states
 from drake_diff.step import advance
 from drake_diff.step_derivatives import check_method
@@ -53,9 +54,10 @@ def certify_model(
             sentence=sentence,
             seed=int(seed),
             parameters=names,
+            model=model_input(model),
             contract=model.contract.to_dict(),
             states=found,
-            provenance=provenance_of(model),
+            provenance=provenance_of(),
             wall_clock=WallClock(written_utc=now, solve_s=time.monotonic() - start),
         )
         if directory is not None:

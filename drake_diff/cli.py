@@ -14,12 +14,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from drake_diff.cli_mcap import add_commands
+from drake_diff import cli_mcap, cli_runs
+from drake_diff.cli_runs import plain
 
 HOLDS, CHECK_FAILED, USAGE, MISSING, INTERNAL = range(5)
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
-add_commands(app)
+cli_mcap.add_commands(app)
+cli_runs.add_commands(app)
 
 
 @app.callback()
@@ -35,7 +37,7 @@ def run(
     out: Annotated[Path | None, typer.Option(help="Run directory; artifacts/<script> where not given.")] = None,
 ) -> None:
     """Solve the problem that SCRIPT defines, measure the solution again, and write the run directory."""
-    from drake_diff.evidence import begin, save
+    from drake_diff.evidence import begin, save, save_failure
     from drake_diff.solver import solve
 
     console = Console(soft_wrap=True, highlight=False)
@@ -44,8 +46,19 @@ def run(
     options = dict(getattr(module, "solve_options", {}))
     directory = out or Path("artifacts") / script.stem
     console.print(f"[bold]{escape(script.name)}[/]: {escape(repr(problem.model))}, {problem.num_steps} steps")
-    with _progress(console) as report:
-        solution = solve(problem, progress=report, on_start=lambda: begin(directory, problem), **options)
+    begun: list[Path] = []
+
+    def on_start() -> None:
+        begin(directory, problem)
+        begun.append(directory)
+
+    try:
+        with _progress(console) as report:
+            solution = solve(problem, progress=report, on_start=on_start, **options)
+    except Exception as error:
+        if begun:
+            save_failure(error, directory, problem)
+        raise
     record = save(solution, directory)
     _print_record(console, record, directory)
     raise typer.Exit(HOLDS if record.verdict == "pass" else CHECK_FAILED)
@@ -218,17 +231,12 @@ def _print_record(console: Console, record: Any, directory: Path) -> None:
     solver = record.solver
     console.print(f"[{colour} bold]{record.verdict}[/]  {solver.status}: {escape(record.sentence)}")
     table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in ("measured again", "value", "unit", "bound", ""):
-        table.add_column(name, justify="right" if name in ("value", "bound") else "left")
-    for check in record.checks:
-        value, bound = check.quantity.value, check.bound
-        table.add_row(
-            check.name,
-            "-" if value is None else f"{value:.6g}",
-            check.quantity.unit,
-            "" if bound is None else f"{bound:g}",
-            {True: "holds", False: "[red]does not hold[/]", None: ""}[check.passed],
-        )
+    for name in ("measured again", "value", "unit", "tolerance", ""):
+        table.add_column(name, justify="right" if name in ("value", "tolerance") else "left")
+    for metric in record.metrics:
+        tolerance = "" if metric.tolerance is None else f"{metric.tolerance:g}"
+        shown = {"pass": "holds", "info": ""}.get(metric.verdict, "[red]does not hold[/]")
+        table.add_row(metric.name, plain(metric.value), metric.unit, tolerance, shown)
     console.print(table)
     for replay in record.replays:
         told = "holds" if replay.holds else "[red]does not hold[/]: " + escape(replay.failures[0])
@@ -237,7 +245,7 @@ def _print_record(console: Console, record: Any, directory: Path) -> None:
     for p in record.parameters:
         moved = f", from {p.start:.6g}" if p.optimized else ""
         console.print(f"{escape(p.name)} = {p.value:.9g} {p.unit}{moved}, derivative from {p.derivative_source}")
-    verdicts = [gradient.verdict for gradient in record.gradients]
+    verdicts = [certificate.verdict for certificate in record.gradient.certificates]
     console.print(
         f"gradients: {verdicts.count('agree')} of {len(verdicts)} certificates agree; "
         f"{solver.method} with {solver.solver}, {solver.iterations} iterations, {record.wall_clock.solve_s:.1f} s",

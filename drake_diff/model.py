@@ -64,6 +64,7 @@ class Model:
         self.source = source
         self.notes = notes
         self.contact_geometry = contact_geometry  # the route around refused pairs that the user chose
+        self.options: dict[str, Any] | None = None  # what `load_model` was called with, None of a user's diagram
         self._rebuild = rebuild
         self._others: dict[tuple[str, Any], Model] = {}  # the same model with one thing changed
         # What parameters in its contexts are, for the time being, not the model's own: see `parameters.applied`.
@@ -268,7 +269,9 @@ def load_model(
     def rebuild(**changes: Any) -> Model:
         return load_model(path, **{**options, **changes})
 
-    return Model(diagram, source=source, notes=notes, contact_geometry=contact_geometry, rebuild=rebuild)
+    model = Model(diagram, source=source, notes=notes, contact_geometry=contact_geometry, rebuild=rebuild)
+    model.options = options
+    return model
 
 
 def model_from_diagram(diagram: Diagram) -> Model:

@@ -12,6 +12,7 @@ from drake_diff.exceptions import ModelError, UnknownNameError
 
 _SCENE_GRAPHS = (SceneGraph_[float], SceneGraph_[AutoDiffXd])
 
+FLOATING = ("quaternion_floating", "rpy_floating")  # the types of joints that hold nothing
 DiagramPath = tuple[int, ...]  # the position among the subsystems, level by level
 
 

@@ -1,28 +1,34 @@
-"""With what a record was made: packages, commit, command, model file; and what it says of a file or a certificate."""
+"""With what a record was made: packages, commit, command, model file; and what it says of a certificate."""
 
 import platform
 import subprocess
 import sys
-from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import numpy as np
+
 from drake_diff.certificate import VERDICTS, Certificate
 from drake_diff.model import Model
-from drake_diff.record import FileEvidence, GradientEvidence, Provenance
+from drake_diff.named_files import file_evidence, named_files
+from drake_diff.record_parts import Certified, ModelInput, Provenance
 
-PACKAGES = ("drake", "drake-diff", "numpy", "mcap", "protobuf", "foxglove-schemas-protobuf", "pydantic")
+PACKAGES = (
+    "drake",
+    "drake-diff",
+    "numpy",
+    "casadi",
+    "mcap",
+    "mcap-protobuf-support",
+    "protobuf",
+    "foxglove-schemas-protobuf",
+    "pydantic",
+)
 
 
-def file_evidence(path: Path, name: str) -> FileEvidence:
-    """Size and hash of the file at `path`, under the name it has in the record."""
-    data = path.read_bytes()
-    return FileEvidence(path=name, bytes=len(data), sha256=sha256(data).hexdigest())
-
-
-def gradient_evidence(certificate: Certificate) -> GradientEvidence:
+def gradient_evidence(certificate: Certificate) -> Certified:
     """A certificate as it stands in a record."""
-    return GradientEvidence(
+    return Certified(
         subject=certificate.subject,
         method=certificate.method,
         verdict=certificate.verdict,
@@ -32,17 +38,29 @@ def gradient_evidence(certificate: Certificate) -> GradientEvidence:
     )
 
 
-def provenance_of(model: Model) -> Provenance:
-    """With which versions, from which commit, model file and command something is made."""
-    source = model.source
+def model_input(model: Model) -> ModelInput:
+    """The model file with what it names, and the options it was loaded with."""
+    source, options = model.source, model.options
+    if source is None or options is None:
+        return ModelInput(file=None, options=None)
+    plain = {key: v if v is None or isinstance(v, str) else np.asarray(v).tolist() for key, v in options.items()}
+    return ModelInput(file=file_evidence(source, source.name), named=named_files(source), options=plain)
+
+
+def provenance_of() -> Provenance:
+    """With which versions, from which commit and by which command something is made."""
     return Provenance(
         python=platform.python_version(),
         platform=f"{platform.system()} {platform.machine()}",
         packages={name: found for name in PACKAGES if (found := _version(name))},
         git=_git(),
-        command=[Path(sys.argv[0]).name, *sys.argv[1:]],
-        model_file=file_evidence(source, source.name) if source is not None else None,
+        command=[_text(word) for word in (Path(sys.argv[0]).name, *sys.argv[1:])],
     )
+
+
+def _text(word: str) -> str:
+    """Without the bytes of a file name that are no text."""
+    return word.encode("utf-8", "replace").decode()
 
 
 def _version(package: str) -> str | None:

@@ -4,47 +4,60 @@
 """
 
 import json
+from hashlib import sha256
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import Field, model_validator
 
-SCHEMA_VERSION = "0.3.0"
+from drake_diff.record_parts import (
+    Certified,
+    Event,
+    Failure,
+    FileEvidence,
+    FiniteTable,
+    Metric,
+    ModelInput,
+    Part,
+    Provenance,
+    Quantity,
+    WallClock,
+)
 
-
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
-
-
-class Quantity(_Part):
-    """A number with its unit; `value` is None where there is no finite one, and `reason` says why."""
-
-    value: float | None
-    unit: str
-    reason: str | None = None
-
-
-class Check(_Part):
-    """Something measured on the plant after the solve. Without a bound it informs, and `passed` is None."""
-
-    name: str
-    definition: str
-    quantity: Quantity
-    bound: float | None = None
-    passed: bool | None = None
+SCHEMA_VERSION = "1.0.0"
+APART = ("wall_clock", "files", "record_sha256")  # of what is the same, byte for byte, in every run
 
 
-class GradientEvidence(_Part):
-    """One certificate: what was compared, where the derivative came from, and the entry that is worst."""
+class Claim(Part):
+    """What the run says is true, and what it does not say."""
 
-    subject: str
+    statement: str
+    limitations: list[str]
+
+
+class Inputs(Part):
+    """What the run started from, besides `problem`, which holds the initial state."""
+
+    model: ModelInput
+    initial_guess: str
+    initial_guess_sha256: str | None  # of the bytes of xs (N+1, nx), then us (N, nu), as doubles
+    seed: int | None
+    random_generator: str = "numpy.random.default_rng"
+
+
+class Solver(Part):
+    """What solved the problem, and how it says it ended."""
+
     method: str
-    verdict: str
-    entries: int
-    counts: dict[str, int]
-    worst: str | None
+    solver: str
+    scheme: str
+    status: str
+    message: str
+    solver_message: str
+    options: FiniteTable
+    iterations: int
 
 
-class ParameterEvidence(_Part):
+class ParameterEvidence(Part):
     """One entry of the parameter vector: where it started, what was found, where its derivative came from."""
 
     name: str
@@ -57,7 +70,67 @@ class ParameterEvidence(_Part):
     upper: float | None
 
 
-class ReplayEvidence(_Part):
+class GradientColumn(Part):
+    """One of the variables that the motion is differentiated by, and where that column of derivatives comes from."""
+
+    name: str
+    unit: str
+    source: str
+
+
+class GradientEvidence(Part):
+    """What is differentiated, from where, and how far it agrees with differences."""
+
+    differentiated: list[str]
+    columns: list[GradientColumn]
+    smoothing: str
+    regularization: str
+    solver_tolerance: Quantity
+    horizon: Quantity
+    norm_definition: str
+    norms: list[float | None] = Field(default_factory=list)  # by knot; null where one is not finite
+    certificates: list[Certified] = Field(default_factory=list)
+
+
+class ObservedVariable(Part):
+    """One variable of the state as it is observed."""
+
+    name: str
+    unit: str
+    frame: str
+    uncertainty: Quantity
+
+
+class Observation(Part):
+    """What is observed, in which frame, and when."""
+
+    variables: list[ObservedVariable]
+    clock: str
+    start_s: float
+    period_s: float
+    count: int
+
+
+class Command(Part):
+    """One commanded input; null is no limit."""
+
+    name: str
+    unit: str
+    lower: float | None
+    upper: float | None
+
+
+class ActionInterface(Part):
+    """How the inputs reach the plant."""
+
+    command_type: str
+    commands: list[Command]
+    update_rate: Quantity
+    latency_budget: Quantity
+    safety_fallback: str
+
+
+class ReplayEvidence(Part):
     """One replay of the plan on the plant; a measure is None where the motion could not be taken."""
 
     variant: str
@@ -72,123 +145,81 @@ class ReplayEvidence(_Part):
     failures: list[str]
 
 
-class Failure(_Part):
-    """Why a run is no success, under one of the five labels."""
+class EvidenceRecord(Part):
+    """Everything a stranger needs to judge the run; the motion is in plan.npz and trace.mcap.
 
-    label: Literal["perception_error", "state_error", "planning_error", "control_error", "evaluation_error"]
-    code: str
-    message: str
-
-
-class FileEvidence(_Part):
-    """A file of the run directory, or one the run was made from."""
-
-    path: str
-    bytes: int
-    sha256: str
-
-
-class Solver(_Part):
-    """What solved the problem, and how it says it ended."""
-
-    method: str
-    solver: str
-    status: str
-    message: str
-    solver_message: str
-    options: dict[str, Any]
-    iterations: int
-
-
-class Provenance(_Part):
-    """With what the run was made."""
-
-    python: str
-    platform: str
-    packages: dict[str, str]
-    git: dict[str, str | bool] | None
-    command: list[str]
-    model_file: FileEvidence | None
-
-
-class WallClock(_Part):
-    """What differs from run to run: everything else in the record is the same, byte for byte."""
-
-    written_utc: str
-    solve_s: float | None = None
-
-
-class EvidenceRecord(_Part):
-    """Everything a stranger needs to judge the run, except the motion itself, which is in trace.mcap."""
+    `files` are all others of the run directory. `record_sha256` is that of this record's canonical JSON (sorted keys,
+    indented by 2) with `record_sha256` empty.
+    """
 
     schema_version: str = SCHEMA_VERSION
     name: str
     state: Literal["incomplete", "complete"]
     verdict: Literal["pass", "fail", "incomplete"]
     sentence: str
-    problem: dict[str, Any]
-    contract: dict[str, Any]
+    claim: Claim
+    inputs: Inputs
+    problem: FiniteTable
+    contract: FiniteTable
+    units: dict[str, str]  # of the numbers in `problem` and `contract`, by their key
     solver: Solver | None = None
-    parameters: list[ParameterEvidence] = []
-    checks: list[Check] = []
-    gradients: list[GradientEvidence] = []
-    gradient_norms: list[float] = []
-    replays: list[ReplayEvidence] = []
-    failures: list[Failure] = []
+    parameters: list[ParameterEvidence] = Field(default_factory=list)
+    metrics: list[Metric] = Field(default_factory=list)
+    invariants: list[Metric] = Field(default_factory=list)
+    gradient: GradientEvidence | None = None
+    observation: Observation
+    action: ActionInterface
+    events: list[Event] = Field(default_factory=list)
+    replays: list[ReplayEvidence] = Field(default_factory=list)
+    failures: list[Failure] = Field(default_factory=list)
     provenance: Provenance
     wall_clock: WallClock
-    files: dict[str, FileEvidence] = {}
+    files: dict[str, FileEvidence] = Field(default_factory=dict)
+    record_sha256: str = ""
+
+    @model_validator(mode="after")
+    def _passes_only_what_holds(self) -> "EvidenceRecord":
+        if (self.state == "incomplete") != (self.verdict == "incomplete"):
+            raise ValueError(f'a record that is {self.state} with the verdict "{self.verdict}"')
+        if self.verdict == "pass":
+            broken = [m.name for m in (*self.metrics, *self.invariants) if m.verdict in ("fail", "undecided")]
+            broken += [failure.code for failure in self.failures]
+            if self.solver is None or self.solver.status != "converged":
+                broken.append(f"solver status {self.solver.status if self.solver else 'missing'}")
+            if broken:
+                raise ValueError(f'a verdict "pass" with {", ".join(broken)}')
+        return self
 
     def as_row(self) -> dict[str, str]:
         """The textbook's view of the record: section, tool, observation, action, metric, perturbation."""
-        positions = self.contract["positions"] + self.contract["velocities"]
-        metrics = [f"{c.name} {c.quantity.value} {c.quantity.unit}" for c in self.checks]
         return {
             "section": "differentiable physics",
             "tool": f"drake {self.provenance.packages.get('drake', '?')}, {self.solver.method if self.solver else '-'}",
-            "observation": ", ".join(f"{x['name']} [{x['unit']}]" for x in positions),
-            "action": ", ".join(f"{x['name']} [{x['unit']}]" for x in self.contract["inputs"]),
-            "metric": "; ".join(metrics),
-            "perturbation": "none",
+            "observation": ", ".join(f"{x.name} [{x.unit}]" for x in self.observation.variables),
+            "action": ", ".join(f"{x.name} [{x.unit}]" for x in self.action.commands),
+            "metric": "; ".join(f"{m.name} {m.value} {m.unit}" for m in self.metrics),
+            "perturbation": "; ".join(dict.fromkeys(f"replayed {r.variant}" for r in self.replays)) or "none",
         }
 
     def to_json(self) -> str:
-        """The record as JSON with sorted keys; the same record gives the same bytes."""
-        return json.dumps(self.model_dump(mode="json"), sort_keys=True, indent=2, allow_nan=False) + "\n"
+        """The record as canonical JSON: the same record gives the same bytes."""
+        return canonical(self.model_dump(mode="json"))
+
+    def sealed(self) -> "EvidenceRecord":
+        """This record with its own hash."""
+        return self.model_copy(update={"record_sha256": own_sha256(self.model_dump(mode="json"))})
 
 
-class StateEvidence(_Part):
-    """The certificate of one sampled state of a model."""
-
-    kind: Literal["free", "contact"]
-    x: list[float]
-    u: list[float]
-    gradient: GradientEvidence | None
-    refusal: str | None = None  # why there is no certificate
-    largest: float | None = None  # the largest entry of the derivative
-    contact_modes: dict[str, str] = {}  # of the pairs that push each other
-    mode_changes: list[str] = []  # within 1e-4 of the state
-
-    @property
-    def verdict(self) -> str:
-        """The certificate's, or "refused"."""
-        return self.gradient.verdict if self.gradient else "refused"
+def canonical(fields: dict[str, Any]) -> str:
+    """JSON with sorted keys: the same fields give the same text."""
+    return json.dumps(fields, sort_keys=True, indent=2, allow_nan=False) + "\n"
 
 
-class CertificationRecord(_Part):
-    """Certificates of a model at sampled states."""
+def own_sha256(fields: dict[str, Any]) -> str:
+    """The hash that belongs into `record_sha256` of a record with these fields."""
+    return sha256(canonical({**fields, "record_sha256": ""}).encode()).hexdigest()
 
-    schema_version: str = SCHEMA_VERSION
-    name: str
-    verdict: Literal["pass", "fail", "incomplete"]
-    sentence: str
-    seed: int
-    parameters: list[str]
-    contract: dict[str, Any]
-    states: list[StateEvidence]
-    provenance: Provenance
-    wall_clock: WallClock
 
-    def to_json(self) -> str:
-        """The record as JSON with sorted keys; the same record gives the same bytes."""
-        return json.dumps(self.model_dump(mode="json"), sort_keys=True, indent=2, allow_nan=False) + "\n"
+def reproducible(fields: dict[str, Any]) -> str:
+    """The canonical JSON of a record's fields without wall-clock facts and hashes: what trace.mcap carries."""
+    return canonical({key: value for key, value in fields.items() if key not in APART})

@@ -4,6 +4,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -139,6 +140,7 @@ class _Task:
             "segments": attempt.segments,
             "method_reason": attempt.reason,
             "initial_guess": "default" if given is None else "given",
+            "initial_guess_sha256": sha256(xs.tobytes() + us.tobytes()).hexdigest(),
         }
         run = Run(problem, method, scheme, attempt.solver or solver, limits, options, self.report)
 

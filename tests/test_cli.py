@@ -43,7 +43,7 @@ def test_a_run_that_holds_prints_its_checks_and_exits_with_0(tmp_path):
     done = drake_diff("run", script(tmp_path), cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "pass  converged" in done.stdout
-    assert re.search(r"goal error +\S+ +q, v +1e-05 +holds", done.stdout)
+    assert re.search(r"goal error +\S+ +rad or rad/s +1e-05 +holds", done.stdout)
     assert dd.load_record(tmp_path / "artifacts" / "task").verdict == "pass"
 
 
@@ -62,6 +62,8 @@ def test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact(tm
     assert (record.state, record.verdict) == ("complete", "fail")
     assert record.solver.status in done.stdout
     assert {p.name for p in (tmp_path / "artifacts" / "task").iterdir()} == {
+        "plan.npz",
+        "record.schema.json",
         "record.json",
         "replay.html",
         "trace.mcap",

@@ -61,8 +61,9 @@ def run(swing_up, tmp_path_factory):
     return directory
 
 
-def test_a_run_directory_holds_the_three_files_and_nothing_else(run):
-    assert sorted(p.name for p in run.iterdir()) == ["record.json", "replay.html", "trace.mcap"]
+def test_a_run_directory_holds_these_files_and_nothing_else(run):
+    names = ["plan.npz", "record.json", "record.schema.json", "replay.html", "trace.mcap"]
+    assert sorted(p.name for p in run.iterdir()) == names
 
 
 def test_the_record_comes_back_as_it_was_saved(swing_up, tmp_path):
@@ -71,7 +72,7 @@ def test_the_record_comes_back_as_it_was_saved(swing_up, tmp_path):
 
 def test_the_record_says_what_the_solution_measures(run, swing_up):
     record = dd.load_record(run)
-    values = {check.name: check.quantity.value for check in record.checks}
+    values = {metric.name: metric.value for metric in record.metrics}
     assert record.verdict == "pass"
     assert record.state == "complete"
     assert record.solver.status == "converged"
@@ -79,15 +80,15 @@ def test_the_record_says_what_the_solution_measures(run, swing_up):
     assert values["goal error"] == swing_up.goal_error
     assert values["defect"] == 0.0
     assert record.problem["x_goal"] == [np.pi, 0.0]
-    assert len(record.gradient_norms) == 41
-    assert {g.verdict for g in record.gradients} == {"agree"}
+    assert len(record.gradient.norms) == 41
+    assert {c.verdict for c in record.gradient.certificates} == {"agree"}
     assert record.failures == []
 
 
 def test_the_record_knows_contract_versions_and_model_file(run):
     record = dd.load_record(run)
     model_file = MODELS / "pendulum.urdf"
-    assert record.provenance.model_file.sha256 == sha256(model_file.read_bytes()).hexdigest()
+    assert record.inputs.model.file.sha256 == sha256(model_file.read_bytes()).hexdigest()
     assert record.provenance.packages["drake"]
     assert record.contract["time_step"] == 0.02
     assert [b["mass"] for b in record.contract["bodies"]] == [1.0]
@@ -103,7 +104,7 @@ def test_the_record_is_json_without_nan(run):
 
 def test_the_hashes_in_the_record_are_the_files(run):
     files = dd.load_record(run).files
-    assert set(files) == {"trace.mcap", "replay.html"}
+    assert set(files) == {"plan.npz", "record.schema.json", "trace.mcap", "replay.html"}
     for name, file in files.items():
         data = (run / name).read_bytes()
         assert (file.bytes, file.sha256) == (len(data), sha256(data).hexdigest())
@@ -114,7 +115,8 @@ def test_the_same_solve_gives_the_same_bytes_but_for_the_wall_clock(swing_up, ru
     record = dd.save(again, tmp_path / "pendulum")
     first = dd.load_record(run)
     assert (tmp_path / "pendulum" / "trace.mcap").read_bytes() == (run / "trace.mcap").read_bytes()
-    apart = {"wall_clock", "files"}
+    assert (tmp_path / "pendulum" / "plan.npz").read_bytes() == (run / "plan.npz").read_bytes()
+    apart = {"wall_clock", "files", "record_sha256"}
     assert record.model_dump(exclude=apart) == first.model_dump(exclude=apart)
 
 
@@ -150,17 +152,17 @@ def test_a_failed_solution_is_saved_with_a_labelled_failure(swing_up, tmp_path):
     record = dd.save(failed, tmp_path / "run")
     assert (record.state, record.verdict) == ("complete", "fail")
     assert [(f.label, f.code) for f in record.failures] == [("planning_error", "solver_iteration_limit")]
-    assert any(check.passed is False for check in record.checks)
+    assert any(metric.verdict == "fail" for metric in record.metrics)
 
 
 def test_a_motion_that_is_not_finite_is_recorded_as_missing_not_as_zero(swing_up, tmp_path):
     xs = np.array(swing_up.xs)
     xs[0] = np.nan
     record = dd.save(dataclasses.replace(swing_up, xs=xs, status=dd.Status.DIVERGED), tmp_path / "run")
-    checks = {check.name: check for check in record.checks}
-    assert checks["defect"].quantity.value is None
-    assert checks["defect"].passed is False
-    assert checks["replay"].passed is False
+    metrics = {metric.name: metric for metric in record.metrics}
+    assert (metrics["defect"].value, metrics["defect"].verdict) == (None, "fail")
+    assert metrics["penetration"].value is None
+    assert "could not be stepped" in metrics["penetration"].reason
 
 
 def test_a_record_that_was_edited_out_of_its_schema_is_refused(run, tmp_path):

@@ -13,10 +13,10 @@ ArtifactError Barrier Bounds Certificate CertificateError CertificationRecord Co
 Dynamics EvidenceRecord Finding Gaussian GradientError InputError LQR MissingDependencyError Model ModelError
 ModelWarning NonFiniteError PD ParametricPolicy Problem QuadraticCost Rollout RolloutCertificate RolloutGradient
 ShapeError SimulationError Smoothed SoftContact Solution Status StepDerivatives TVLQR Transcribed UnknownNameError
-audit center_of_mass certify certify_jacobian certify_model certify_rollout contact_force contact_modes
+Verification audit center_of_mass certify certify_jacobian certify_model certify_rollout contact_force contact_modes
 differentiate_rollout differentiate_step frame_position frame_rotation_error frame_velocity list_parameters load_model
 load_record model_from_diagram plant_dynamics read_mcap read_trace rollout save smooth smooth_step softened
-solve step transcribe_and_solve violation_between_nodes
+solve step transcribe_and_solve verify violation_between_nodes
 """.split()
 ORDER = """
 exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin model
@@ -26,8 +26,10 @@ rollout rollout_gradient refinement certify continuous cost bounds constraint pr
 nonlinear_program transcription_scheme optimal_control transcribed symbolic symbolic_tree knot_functions
 transcription_program ipopt transcription solution collocation shooting shooting_program riccati secant
 augmented_lagrangian expansion ilqr goal_restoration continuation verdict run solver mcap_messages mcap_read
-mcap_log mcap_recover trace_read trace_motion trace_solve trace meshcat_view record provenance evidence sampling
-certification audit_place audit_contact audit ros2_bag cli_mcap cli
+mcap_log mcap_recover trace_read trace_motion trace_solve trace meshcat_view
+record_parts record record_schema record_file certification_record named_files provenance problem_record plan_file
+record_sections metrics invariants failures events evidence rerun verification verify runs sampling
+certification audit_place audit_contact audit ros2_bag cli_mcap cli_runs cli
 """.split()
 
 

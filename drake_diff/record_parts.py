@@ -1,0 +1,158 @@
+"""What records are made of: numbers with units and verdicts, files, failures, events. None is NaN or infinite."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, model_validator
+
+Label = Literal["perception_error", "state_error", "planning_error", "control_error", "evaluation_error"]
+Table = dict[str, JsonValue]
+
+
+def _finite(table: Any) -> Any:
+    """`table` as it is; ValueError where a number in it is none that JSON has."""
+    if isinstance(table, float) and table - table != 0:
+        raise ValueError("expected finite numbers, null where there is none")
+    for item in table.values() if isinstance(table, dict) else table if isinstance(table, list) else ():
+        _finite(item)
+    return table
+
+
+FiniteTable = Annotated[Table, AfterValidator(_finite)]
+
+
+class Part(BaseModel):
+    """The rules of every part: no field that the schema does not have, no NaN, no infinity."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+class Quantity(Part):
+    """A number with its unit; `value` is null where there is no finite one, and `reason` says why."""
+
+    value: float | None
+    unit: str
+    reason: str | None = None
+
+    @model_validator(mode="after")
+    def _has_a_reason(self) -> "Quantity":
+        if self.value is None and not self.reason:
+            raise ValueError("a value of null: expected a reason")
+        return self
+
+
+class Metric(Part):
+    """Something measured on the plant after the solve; with a tolerance it decides, without one it informs.
+
+    `verdict` is "pass" only where `value` keeps `tolerance`, and "info" where there is none; a value of null (there is
+    no finite one, and `reason` says why) passes nothing. `t_s` is where along the motion it is at its worst.
+    """
+
+    name: str
+    definition: str
+    unit: str
+    value: float | None
+    reason: str | None = None
+    tolerance: float | None = None
+    direction: Literal["at_most", "at_least", "info"] = "info"
+    verdict: Literal["pass", "fail", "undecided", "info"] = "info"
+    t_s: float | None = None
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> "Metric":
+        if self.value is None and not self.reason:
+            raise ValueError(f"metric {self.name}: a value of null: expected a reason")
+        if (self.tolerance is None) != (self.direction == "info") or (self.tolerance is None) != (
+            self.verdict == "info"
+        ):
+            raise ValueError(f'metric {self.name}: expected a tolerance, or "info" as direction and verdict')
+        if self.verdict == "pass" and not self.keeps(self.value):
+            raise ValueError(f'metric {self.name}: "pass", but {self.value} does not keep {self.tolerance}')
+        if self.verdict == "fail" and self.keeps(self.value):
+            raise ValueError(f'metric {self.name}: "fail", but {self.value} keeps {self.tolerance}')
+        return self
+
+    def keeps(self, value: float | None) -> bool:
+        """Whether `value` keeps the tolerance; no value keeps none."""
+        if value is None or self.tolerance is None:
+            return False
+        return value <= self.tolerance if self.direction == "at_most" else value >= self.tolerance
+
+
+class FileEvidence(Part):
+    """A file of the run directory, or one the run was made from; `reason` says why it has no size and hash."""
+
+    path: str
+    bytes: int | None
+    sha256: str | None
+    reason: str | None = None
+
+
+class Failure(Part):
+    """Why a run is no success: a case under one of the five labels, and what found it."""
+
+    label: Label
+    code: str
+    message: str
+    t_s: float | None = None  # along the motion, where the failure is at one time
+    detected_by: str
+    evidence: str | None = None  # the section of the record that shows it
+
+
+class Event(Part):
+    """Something that happened; `t_s` [s] is simulated time, null for what happens before or after the motion.
+
+    No solver here reports a "recovery" yet; observations and actions, step by step, are in trace.mcap.
+    """
+
+    t_s: float | None
+    kind: Literal[
+        "solver_started",
+        "solver_ended",
+        "contact_made",
+        "contact_broken",
+        "saturation_begins",
+        "saturation_ends",
+        "recovery",
+        "failure",
+    ]
+    message: str
+
+
+class Certified(Part):
+    """One certificate: what was compared, where the derivative came from, and the entry that is worst."""
+
+    subject: str
+    method: str
+    verdict: str
+    entries: int
+    counts: dict[str, int]
+    worst: str | None
+
+
+class Provenance(Part):
+    """With what the run was made."""
+
+    python: str
+    platform: str
+    packages: dict[str, str]
+    git: dict[str, str | bool] | None
+    command: list[str]
+
+
+class ModelInput(Part):
+    """What the model was made from, and how; no `file` and no `options` where it is a user's own diagram.
+
+    `named` are the files that the model file names (meshes, included models), by the name that they have in it. Those
+    whose name is neither that of a mesh nor of a robot file are not read.
+    """
+
+    file: FileEvidence | None
+    named: list[FileEvidence] = Field(default_factory=list)
+    options: FiniteTable | None
+
+
+class WallClock(Part):
+    """What differs from run to run: everything else in the record is the same, byte for byte."""
+
+    written_utc: str
+    solve_s: float | None = None

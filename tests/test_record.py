@@ -1,0 +1,337 @@
+"""The record's fields: what they refuse, that they come back as they were, and that they say what is true."""
+
+import dataclasses
+import math
+import subprocess
+import sys
+import types
+import typing
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pydantic import BaseModel, JsonValue, ValidationError
+
+import drake_diff as dd
+from drake_diff.invariants import invariants_of
+from drake_diff.named_files import named_files
+from drake_diff.problem_record import describe_problem, rebuild_problem
+from drake_diff.record import EvidenceRecord, canonical, own_sha256
+from drake_diff.record_file import parse_record
+from drake_diff.record_parts import Metric
+from drake_diff.record_schema import generated_schema, published_schema
+
+MODELS = Path(__file__).parent.parent / "models"
+NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**60), 2**60) | NUMBERS | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=5,
+)
+PLAIN = {str: st.text(max_size=12), int: st.integers(-(2**60), 2**60), float: NUMBERS, bool: st.booleans()}
+
+
+def values_of(annotation):
+    """A strategy for a field of a record."""
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if annotation is JsonValue:
+        return JSON
+    if annotation in PLAIN:
+        return PLAIN[annotation]
+    if annotation is type(None):
+        return st.none()
+    if origin is typing.Annotated:
+        return values_of(arguments[0])
+    if origin is typing.Literal:
+        return st.sampled_from(arguments)
+    if origin is list:
+        return st.lists(values_of(arguments[0]), max_size=2)
+    if origin is dict:
+        return st.dictionaries(values_of(arguments[0]), values_of(arguments[1]), max_size=2)
+    if origin in (typing.Union, types.UnionType):
+        return st.one_of([values_of(a) for a in arguments])
+    assert issubclass(annotation, BaseModel), annotation
+    return records_of(annotation)
+
+
+def records_of(model):
+    """A strategy for a part of a record, without those that its validators refuse."""
+    fields = {name: values_of(field.annotation) for name, field in model.model_fields.items()}
+    if model is Metric:
+        return metrics()
+    if "reason" in fields and "value" in fields:
+        fields["reason"] = st.text(min_size=1, max_size=12)
+    if model is EvidenceRecord:
+        fields |= {"schema_version": st.just("1.0.0"), "state": st.just("complete"), "verdict": st.just("fail")}
+    return st.builds(model, **fields)
+
+
+@st.composite
+def metrics(draw):
+    text = st.text(max_size=12)
+    value, tolerance = draw(st.none() | NUMBERS), draw(st.none() | NUMBERS)
+    direction = "info" if tolerance is None else draw(st.sampled_from(["at_most", "at_least"]))
+    verdict = "info"
+    if tolerance is not None:
+        holds = value is not None and (value <= tolerance if direction == "at_most" else value >= tolerance)
+        verdict = draw(st.sampled_from(["undecided", "pass" if holds else "fail"]))
+    return Metric(
+        name=draw(text),
+        definition=draw(text),
+        unit=draw(text),
+        value=value,
+        reason=draw(st.text(min_size=1, max_size=5)),
+        tolerance=tolerance,
+        direction=direction,
+        verdict=verdict,
+        t_s=draw(st.none() | NUMBERS),
+    )
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(records_of(EvidenceRecord))
+def test_any_record_comes_back_as_it_was(record):
+    import json
+
+    sealed = record.sealed()
+    fields = json.loads(sealed.to_json())
+    assert canonical(fields) == sealed.to_json()
+    assert own_sha256(fields) == sealed.record_sha256
+    assert parse_record(Path("record.json"), fields) == sealed
+    assert list(sealed.as_row()) == ["section", "tool", "observation", "action", "metric", "perturbation"]
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory):
+    """That of a pendulum that swings up, and passes."""
+    return dd.save(dd.solve(pendulum(), method="shooting"), tmp_path_factory.mktemp("run") / "pendulum")
+
+
+def pendulum(**changes):
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    options = {"x0": [0, 0], "x_goal": [np.pi, 0], "num_steps": 40, "running_cost": dd.QuadraticCost(R=[[1.0]])}
+    return dd.Problem(model, **{**options, **changes})
+
+
+def test_the_published_schema_is_what_pydantic_generates():
+    assert published_schema() == generated_schema()
+
+
+def test_the_schema_is_in_the_run_and_printed_by_the_command(record):
+    assert record.files["record.schema.json"].sha256 == sha256(published_schema()).hexdigest()
+    command = [sys.executable, "-m", "drake_diff.cli", "schema"]
+    assert subprocess.run(command, capture_output=True, check=True).stdout == published_schema()
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_number_that_json_does_not_have_is_refused_anywhere(record, bad):
+    fields = record.model_dump()
+    for place in (fields["metrics"][0], fields["problem"], fields["inputs"]["model"]["options"], fields["wall_clock"]):
+        key = "solve_s" if "solve_s" in place else "value"
+        kept, place[key] = place.get(key), bad
+        with pytest.raises(ValidationError, match="finite"):
+            EvidenceRecord.model_validate(fields)
+        place[key] = kept
+        if kept is None:
+            del place[key]
+
+
+def test_a_pass_with_a_failure_a_failed_metric_or_another_status_is_refused(record):
+    fields = record.model_dump()
+    failure = {"label": "state_error", "code": "c", "message": "m", "detected_by": "d"}
+    failed = {**fields["metrics"][1], "value": 1.0, "verdict": "fail"}
+    undecided = {**fields["metrics"][1], "value": None, "reason": "r", "verdict": "undecided"}
+    changes = [
+        {"failures": [failure]},
+        {"metrics": [failed]},
+        {"metrics": [undecided]},
+        {"invariants": [failed]},
+        {"solver": None},
+        {"solver": {**fields["solver"], "status": "diverged"}},
+        {"state": "incomplete"},
+        {"unknown": 1},
+    ]
+    for change in changes:
+        with pytest.raises(ValidationError):
+            EvidenceRecord.model_validate({**fields, **change})
+    assert EvidenceRecord.model_validate(fields) == record
+
+
+def test_a_metric_whose_verdict_is_not_that_of_its_value_is_refused():
+    given = {"name": "n", "definition": "d", "unit": "m", "direction": "at_most", "tolerance": 1.0}
+    assert Metric(**given, value=1.0, verdict="pass").keeps(1.0)
+    for value, verdict in ((1.5, "pass"), (0.5, "fail"), (0.5, "info"), (None, "pass")):
+        with pytest.raises(ValidationError):
+            Metric(**given, value=value, verdict=verdict)
+    with pytest.raises(ValidationError, match="reason"):
+        Metric(name="n", definition="d", unit="m", value=None)
+
+
+def test_another_major_version_is_refused_by_name_and_a_later_minor_one_is_read(record):
+    fields = record.model_dump(mode="json")
+    for version in ("0.3.0", "2.0.0", None):
+        with pytest.raises(dd.ArtifactError, match=r"schema_version .*; this drake_diff reads 1\.x\.y"):
+            parse_record(Path("record.json"), {**fields, "schema_version": version})
+    later = {**fields, "schema_version": "1.7.0", "weather": "fine"}
+    later["metrics"] = [{**later["metrics"][0], "colour": "blue"}, *later["metrics"][1:]]
+    assert parse_record(Path("record.json"), later).metrics == record.metrics
+    with pytest.raises(dd.ArtifactError, match="weather"):
+        parse_record(Path("record.json"), {**fields, "weather": "fine"})
+    with pytest.raises(dd.ArtifactError, match="verdict"):
+        parse_record(Path("record.json"), {**later, "verdict": "great"})
+
+
+def test_every_number_of_a_contract_and_a_problem_has_a_unit(record):
+    def keys(value):
+        if isinstance(value, dict):
+            for key, item in value.items():
+                if isinstance(item, (int, float)) and not isinstance(item, bool):
+                    yield key
+                yield from keys(item)
+        elif isinstance(value, list):
+            for item in value:
+                yield from keys(item)
+
+    units = {name.strip() for names in record.units for name in names.split(",")}
+    assert {*keys(record.contract), *keys(record.problem)} <= units
+
+
+def test_the_record_says_how_the_plant_is_observed_and_commanded(record):
+    assert [(v.name, v.unit) for v in record.observation.variables] == [("hinge_q", "rad"), ("hinge_w", "rad/s")]
+    assert {v.frame for v in record.observation.variables} == {"axes of hinge, world to pole"}
+    assert all(v.uncertainty.value == 0 and "exact" in v.uncertainty.reason for v in record.observation.variables)
+    assert (record.observation.period_s, record.observation.count) == (0.02, 41)
+    assert record.action.update_rate.value == pytest.approx(50, rel=1e-15)  # 1 / 0.02 s
+    assert record.action.latency_budget.value is None
+    assert record.action.safety_fallback.startswith("none")
+    assert {c.source for c in record.gradient.columns} == {c.method for c in record.gradient.certificates}
+    assert record.gradient.horizon.value == pytest.approx(0.8, rel=1e-15)
+    assert record.inputs.seed == 0
+    assert len(record.inputs.initial_guess_sha256) == 64
+
+
+def test_inputs_at_their_bounds_begin_and_end_in_the_events(tmp_path):
+    """+-5 N m do not lift the pole in one go: the input is at a bound for a while and leaves it."""
+    bounds = dd.Bounds([-50, -99], [50, 99], [-5], [5])
+    solution = dd.solve(pendulum(bounds=bounds, num_steps=60, running_cost=dd.QuadraticCost(R=[[1e-3]])))
+    record = dd.save(solution, tmp_path / "run")
+    at_bound = np.flatnonzero(np.abs(solution.replay.us[:, 0]) >= 5 * (1 - 1e-3))
+    begins = [e.t_s for e in record.events if e.kind == "saturation_begins"]
+    assert len(at_bound) > 0
+    assert begins[0] == solution.replay.times[at_bound[0]]
+    assert record.events[0].kind == "solver_started"
+
+
+@pytest.fixture(scope="module")
+def dropped():
+    """A ball that falls on the ground and slides."""
+    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.005)
+    x0 = model.default_state
+    x0[6], x0[10] = 0.15, 0.5
+    free = np.zeros(13, dtype=bool)
+    free[10] = True
+    final = dd.QuadraticCost(Q=np.diag([0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0, 0, 0]))
+    return dd.solve(
+        dd.Problem(model, x0=x0, num_steps=60, final_cost=final, optimize="initial_state", initial_state_mask=free)
+    )
+
+
+def test_momentum_energy_and_the_friction_cone_of_a_falling_ball(dropped, tmp_path):
+    """In flight momentum changes by m g t to rounding; semi-implicit Euler loses m g^2 h t / 2 of energy."""
+    found = {m.name: m for m in invariants_of(dropped)}
+    assert found["linear momentum error"].value < 1e-12  # N s: rounding of 1 kg * 1 m/s over some 20 steps
+    assert found["angular momentum error"].value < 1e-12
+    touches = next(k for k, contacts in enumerate(dropped.replay.contacts) if contacts)
+    lost = 9.81**2 * 0.005 * (touches * 0.005) / 2  # J, of 1 kg
+    assert abs(found["free-motion energy drift"].value) == pytest.approx(lost, rel=1e-6)
+    assert found["friction-cone excess"].value < 1e-6  # N: SAP keeps the cone
+    assert found["penetration"].value == dropped.replay.penetration.max() > 0
+    record = dd.save(dropped, tmp_path / "ball")
+    assert {v.frame for v in record.observation.variables} == {record.contract["frame"]}
+    assert dd.verify(tmp_path / "ball").require().holds
+    made = [e for e in record.events if e.kind == "contact_made"]
+    assert made[0].t_s == dropped.replay.times[touches]
+    assert {"ball", "ground"} <= set(made[0].message.split())
+
+
+def with_replay(solution, **changes):
+    """`solution` with another replay in the place of its own."""
+    other = dataclasses.replace(solution)
+    vars(other)["replay"] = dataclasses.replace(solution.replay, **changes)
+    return other
+
+
+def test_a_force_outside_the_friction_cone_and_momentum_from_nowhere_are_seen(dropped):
+    """mu = 0.5 on both: of 2 N along the ground under 1 N of push, 1.5 N are more than friction can give."""
+    contacts = list(dropped.replay.contacts)
+    k = next(k for k, found in enumerate(contacts) if found)
+    forced = dataclasses.replace(contacts[k][0], normal=np.array([0, 0, 1.0]), force=np.array([2.0, 0, 1.0]))
+    contacts[k] = (forced,)
+    found = {m.name: m for m in invariants_of(with_replay(dropped, contacts=tuple(contacts)))}
+    assert found["friction-cone excess"].value == pytest.approx(1.5, rel=1e-12)
+    assert found["friction-cone excess"].t_s == dropped.replay.times[k]
+    xs = np.array(dropped.replay.xs)
+    xs[5, 10] += 0.25  # m/s of v_x, of 1 kg
+    found = {m.name: m for m in invariants_of(with_replay(dropped, xs=xs))}
+    assert found["linear momentum error"].value == pytest.approx(0.25, rel=1e-9)
+    unknown = dataclasses.replace(forced, body_b="nobody")
+    contacts[k] = (unknown,)
+    found = {m.name: m for m in invariants_of(with_replay(dropped, contacts=tuple(contacts)))}
+    assert found["friction-cone excess"].value is None
+    assert "is not one number" in found["friction-cone excess"].reason
+
+
+def test_momentum_of_what_is_held_to_the_world_is_none_with_a_reason(record):
+    found = {m.name: m for m in record.invariants}
+    assert found["linear momentum error"].value is None
+    assert "hinge holds" in found["linear momentum error"].reason
+    assert found["friction-cone excess"].reason == "nothing touches"
+
+
+def test_a_problem_comes_back_from_its_record(record):
+    problem = pendulum(waypoints={20: [np.nan, 1.0]}, bounds=dd.Bounds([-9, -99], [9, 99], [-30], [30]))
+    described = describe_problem(problem)
+    again = rebuild_problem(record.model_copy(update={"problem": described}), problem.model, np.zeros((40, 1)))
+    assert describe_problem(again) == described
+
+
+def test_a_mesh_name_that_leads_elsewhere_is_not_read(tmp_path):
+    (tmp_path / "mesh.obj").write_text("v 0 0 0\n")
+    names = ("../../etc/passwd", "/etc/passwd", "mesh.obj", "gone.obj", "package://nowhere/a.stl", "x" * 5000 + ".obj")
+    visuals = "".join(f'<visual><geometry><mesh filename="{n}"/></geometry></visual>' for n in names)
+    (tmp_path / "m.urdf").write_text(f'<robot name="m"><link name="l">{visuals}</link></robot>')
+    found = {file.path: file for file in named_files(tmp_path / "m.urdf")}
+    assert set(found) == set(names)
+    assert found["mesh.obj"].sha256 == sha256(b"v 0 0 0\n").hexdigest()
+    for name in set(names) - {"mesh.obj"}:
+        assert (found[name].bytes, found[name].sha256) == (None, None)
+    assert "not read" in found["../../etc/passwd"].reason
+    assert found["gone.obj"].reason == "no such file"
+
+
+def test_a_model_file_that_python_cannot_parse_is_told_not_refused(tmp_path):
+    (tmp_path / "m.xml").write_text("<mujoco><a></mujoco>")
+    found = named_files(tmp_path / "m.xml")
+    assert [file.path for file in found] == ["m.xml"]
+    assert "cannot be listed" in found[0].reason
+
+
+def test_meshes_of_packages_folders_and_included_models_are_found(tmp_path):
+    folder = tmp_path / "robot" / "meshes"
+    folder.mkdir(parents=True)
+    (folder / "a.obj").write_text("a")
+    (tmp_path / "robot" / "arm.sdf").write_text("<sdf/>")
+    for name, text in (
+        ("m.urdf", '<robot><mesh filename="package://robot/meshes/a.obj"/><plugin filename="lib.so"/></robot>'),
+        ("m.sdf", "<sdf><mesh><uri>meshes/a.obj</uri></mesh></sdf>"),
+        ("m.xml", '<mujoco><compiler meshdir="meshes"/><asset><mesh file="a.obj"/></asset></mujoco>'),
+        ("n.sdf", f"<sdf><mesh><uri>{(folder / 'a.obj').as_uri()}</uri></mesh></sdf>"),
+        ("m.dmd.yaml", "directives:\n- add_model:\n    name: a\n    file: package://robot/arm.sdf\n"),
+    ):
+        (tmp_path / "robot" / name).write_text(text)
+        found = named_files(tmp_path / "robot" / name)
+        assert [file.reason for file in found] == [None], name
+        assert found[0].bytes in (1, 6)

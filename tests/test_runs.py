@@ -1,0 +1,179 @@
+"""Runs side by side, and the commands verify, list and compare-runs: what they print and their exit status."""
+
+import dataclasses
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+from drake_diff.cli_runs import plain
+from drake_diff.evidence import begin, save_failure, seal
+from drake_diff.runs import compare_runs, list_runs
+
+ROOT = Path(__file__).parent.parent
+MODELS = ROOT / "models"
+
+
+def solve(**changes):
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    options = {"x0": [0, 0], "x_goal": [1.0, 0], "num_steps": 20, "running_cost": dd.QuadraticCost(R=[[1.0]])}
+    return dd.solve(dd.Problem(model, **{**options, **changes}), method="shooting")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """A run, the same with another goal, one that failed, one that did not end, one that is none."""
+    folder = tmp_path_factory.mktemp("runs")
+    solution = solve()
+    dd.save(solution, folder / "a")
+    dd.save(solve(x_goal=[0.5, 0]), folder / "b")
+    save_failure(ZeroDivisionError("[red]no[/]\x1b[31m"), folder / "failed", solution.problem)
+    begin(folder / "open", solution.problem)
+    (folder / "odd").mkdir()
+    (folder / "odd" / "record.json").write_text("{}")
+    (folder / "empty").mkdir()
+    return folder
+
+
+def drake_diff(*words, cwd):
+    command = [sys.executable, "-m", "drake_diff.cli", *map(str, words)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, env=environment)
+
+
+def test_a_line_for_each_run_with_what_its_record_says(runs):
+    lines = {line.name: line for line in list_runs(runs)}
+    assert {name: line.verdict for name, line in lines.items()} == {
+        "a": "pass",
+        "b": "pass",
+        "failed": "fail",
+        "odd": "unreadable",
+        "open": "incomplete",
+    }
+    assert lines["a"].cost == dd.load_record(runs / "a").metrics[0].value
+    assert (lines["a"].status, lines["a"].model) == ("converged", "pendulum")
+    with pytest.raises(dd.ArtifactError, match="no directory"):
+        list_runs(runs / "nowhere")
+
+
+def test_two_runs_differ_in_what_was_changed_and_what_that_changed(runs):
+    found = compare_runs(runs / "a", runs / "b")
+    configuration = {d.key: (d.a, d.b) for d in found.configuration}
+    assert configuration.pop("problem.x_goal[0]") == (1.0, 0.5)
+    assert set(configuration) == {"inputs.initial_guess_sha256"}  # a straight line to the goal
+    assert found.versions == ()
+    assert "cost [1]" in {d.key for d in found.metrics}
+    assert found.comparable
+
+
+def test_the_same_run_twice_differs_in_nothing(runs, tmp_path):
+    dd.save(solve(), tmp_path / "a")
+    found = compare_runs(runs / "a", tmp_path / "a")
+    assert (found.configuration, found.versions, found.metrics, found.refused) == ((), (), (), ())
+
+
+def test_metrics_that_are_defined_otherwise_are_not_compared(runs, tmp_path):
+    directory = Path(shutil.copytree(runs / "b", tmp_path / "b"))
+    record = dd.load_record(directory)
+    cost = record.metrics[0].model_copy(update={"unit": "J"})
+    packages = {**record.provenance.packages, "drake": "0.1"}
+    provenance = record.provenance.model_copy(update={"packages": packages})
+    seal(directory, record.model_copy(update={"metrics": [cost, *record.metrics[1:-1]], "provenance": provenance}))
+    found = compare_runs(runs / "a", directory)
+    assert not found.comparable
+    assert found.refused[0] == "cost: its unit differs: '1' and 'J'"
+    assert "joint limit violation: only the first run has it" in found.refused
+    assert not any(d.key.startswith("cost") for d in found.metrics)
+    assert [d.key for d in found.versions] == ["provenance.packages.drake"]
+    done = drake_diff("compare-runs", runs / "a", directory, cwd=tmp_path)
+    assert done.returncode == 1
+    assert "not compared: cost" in done.stdout
+
+
+def test_the_record_of_an_error_has_a_label_and_the_message(runs):
+    record = dd.load_record(runs / "failed")
+    assert (record.state, record.verdict) == ("complete", "fail")
+    failure = record.failures[0]
+    assert (failure.label, failure.code) == ("evaluation_error", "exception")
+    assert failure.message.startswith("ZeroDivisionError")
+    assert dd.verify(runs / "failed").verdict == "undecided"
+
+
+def test_text_of_a_record_changes_nothing_on_a_terminal():
+    assert plain("[red]no[/]\x1b[31m\u202e\n").plain == "[red]no[/]\ufffd[31m\ufffd\ufffd"
+
+
+def test_the_commands_print_and_exit_as_they_should(runs, tmp_path):
+    done = drake_diff("verify", runs / "a", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "numbers are the recorded ones; the run's verdict: pass" in done.stdout
+    copy = Path(shutil.copytree(runs / "a", tmp_path / "copy"))
+    (copy / "trace.mcap").write_bytes(b"")
+    done = drake_diff("verify", copy, cwd=tmp_path)
+    assert done.returncode == 1
+    assert "trace.mcap: its 0 bytes are not those that record.json describes" in done.stdout
+    assert drake_diff("verify", runs / "open", cwd=tmp_path).returncode == 1
+    assert drake_diff("verify", runs / "nowhere", cwd=tmp_path).returncode == 2
+    done = drake_diff("list", runs, cwd=tmp_path)
+    assert done.returncode == 0
+    assert [line.split()[:2] for line in done.stdout.splitlines()[1:]] == [
+        ["a", "pass"],
+        ["b", "pass"],
+        ["failed", "fail"],
+        ["odd", "unreadable"],
+        ["open", "incomplete"],
+    ]
+    assert "\x1b" not in done.stdout
+    done = drake_diff("compare-runs", runs / "a", runs / "b", cwd=tmp_path)
+    assert done.returncode == 0
+    assert "problem.x_goal[0]" in done.stdout
+
+
+def test_an_exception_in_the_solve_leaves_a_labelled_record_and_exits_with_4(tmp_path):
+    (tmp_path / "task.py").write_text(
+        f"""
+import numpy as np
+import drake_diff as dd
+
+calls = []
+
+def cost(x):
+    calls.append(x)
+    if len(calls) > 5:
+        raise ZeroDivisionError("late")
+    return x[0] ** 2
+
+def problem():
+    model = dd.load_model({str(MODELS / "pendulum.urdf")!r}, time_step=0.02)
+    return dd.Problem(model, x0=[0.1, 0], num_steps=20, final_cost=cost)
+
+solve_options = {{"method": "shooting"}}
+"""
+    )
+    done = drake_diff("run", tmp_path / "task.py", "--out", tmp_path / "run", cwd=tmp_path)
+    assert done.returncode == 4, done.stdout
+    record = dd.load_record(tmp_path / "run")
+    assert (record.verdict, record.failures[0].code) == ("fail", "exception")
+    assert "late" in record.sentence
+
+
+def test_a_second_run_in_a_directory_leaves_nothing_of_the_first(runs, tmp_path):
+    directory = Path(shutil.copytree(runs / "a", tmp_path / "a"))
+    (directory / "trace.mcap.partial").write_bytes(b"half")
+    begin(directory, solve().problem)
+    assert [p.name for p in directory.iterdir()] == ["record.json"]
+
+
+def test_a_motion_that_is_not_finite_is_saved_and_verified(tmp_path):
+    solution = solve()
+    xs = np.array(solution.xs)
+    xs[5] = np.nan
+    broken = dataclasses.replace(solution, xs=xs, status=dd.Status.DIVERGED)
+    assert dd.save(broken, tmp_path / "run").verdict == "fail"
+    found = dd.verify(tmp_path / "run")
+    assert found.complaints == ()

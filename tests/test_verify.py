@@ -1,0 +1,364 @@
+"""`verify`: whatever is changed in a run directory is found, a lie in a whole one too, and nothing else is refused."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+import drake_diff.evidence as evidence
+from drake_diff.evidence import begin, seal
+from drake_diff.record import EvidenceRecord
+
+ROOT = Path(__file__).parent.parent
+MODELS = ROOT / "models"
+FILES = ("plan.npz", "record.json", "record.schema.json", "replay.html", "trace.mcap")
+EVIL = """<robot name="&lt;script&gt;alert(1)&lt;/script&gt;"><link name="[red]a[/]"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+<visual><geometry><mesh filename="{mesh}"/></geometry></visual></link>
+<joint name="j" type="continuous"><parent link="world"/><child link="[red]a[/]"/><axis xyz="0 1 0"/></joint>
+<transmission><type>transmission_interface/SimpleTransmission</type>
+<joint name="j"><hardwareInterface>EffortJointInterface</hardwareInterface></joint><actuator name="m"/></transmission>
+</robot>"""
+
+
+def swing_up(model=None, **changes):
+    """A pendulum on its way up in 0.4 s."""
+    model = model or dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    options = {"x0": [0, 0], "x_goal": [1.0, 0], "num_steps": 20, "running_cost": dd.QuadraticCost(R=[[1.0]])}
+    return dd.solve(dd.Problem(model, **{**options, **changes}), method="shooting")
+
+
+@pytest.fixture(scope="module")
+def solution():
+    return swing_up()
+
+
+@pytest.fixture(scope="module")
+def run(solution, tmp_path_factory):
+    directory = tmp_path_factory.mktemp("runs") / "pendulum"
+    dd.save(solution, directory)
+    return directory
+
+
+@pytest.fixture(scope="module")
+def other_run(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("runs") / "other"
+    dd.save(swing_up(x_goal=[0.5, 0]), directory)
+    return directory
+
+
+@pytest.fixture
+def copy(run, tmp_path):
+    return Path(shutil.copytree(run, tmp_path / "copy"))
+
+
+def test_a_run_holds_and_every_number_comes_out_again_to_the_last_bit(run):
+    found = dd.verify(run).require()
+    assert found.verdict == "holds"
+    assert len(found.comparisons) > 30
+    assert all(c.recorded == c.again for c in found.comparisons)
+
+
+def test_the_reference_run_of_this_repository_holds():
+    """On other versions of Drake and NumPy too: `notes` says which it was recorded with."""
+    found = dd.verify(ROOT / "artifacts" / "pendulum_swing_up")
+    assert found.complaints == ()
+    assert found.holds
+    assert found.record.verdict == "pass"
+
+
+def corruptions(count):
+    """(how, file, seed), seeded."""
+    rng = random.Random(0)
+    kinds = ("flip", "flip", "flip", "cut", "grow", "swap", "delete", "extra", "number", "text")
+    for seed in range(count):
+        how = kinds[seed % len(kinds)]
+        yield how, "record.json" if how in ("number", "text") else rng.choice(FILES), seed
+
+
+def corrupt(directory, other, how, name, seed):
+    rng, path = random.Random(seed), directory / name
+    data = bytearray(path.read_bytes())
+    if how == "flip":
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    elif how == "cut":
+        del data[rng.randrange(len(data)) :]
+    elif how == "grow":
+        data += b"\n" if seed % 2 else b"\0"
+    elif how == "swap":
+        data = bytearray((other / name).read_bytes())
+        if data == path.read_bytes():  # the schema is the same in every run
+            data = bytearray((other / "plan.npz").read_bytes())
+    elif how == "number":
+        data = edited(data, rng, lambda v: isinstance(v, float), lambda v: v + 1e-9 * max(abs(v), 1.0))
+    elif how == "text":
+        data = edited(data, rng, lambda v: isinstance(v, str), lambda v: v + " ")
+    if how == "delete":
+        path.unlink()
+    elif how == "extra":
+        (directory / f"{name}.more").write_bytes(data)
+    else:
+        assert data != path.read_bytes()
+        path.write_bytes(data)
+
+
+def edited(data, rng, wanted, change):
+    """The record with one of its values changed, written as drake_diff writes it."""
+    fields = json.loads(data)
+    places = []
+
+    def walk(part):
+        for key, value in part.items() if isinstance(part, dict) else enumerate(part):
+            if wanted(value):
+                places.append((part, key))
+            elif isinstance(value, (dict, list)):
+                walk(value)
+
+    walk(fields)
+    part, key = rng.choice(places)
+    part[key] = change(part[key])
+    return bytearray((json.dumps(fields, sort_keys=True, indent=2) + "\n").encode())
+
+
+def test_200_corruptions_are_found_and_the_message_names_the_file(run, other_run, tmp_path):
+    missed = []
+    for how, name, seed in corruptions(200):
+        directory = Path(shutil.copytree(run, tmp_path / str(seed)))
+        corrupt(directory, other_run, how, name, seed)
+        found = dd.verify(directory)
+        if found.verdict != "broken" or not any(name in complaint for complaint in found.complaints):
+            missed.append((how, name, seed, str(found)))
+        shutil.rmtree(directory)
+    assert missed == []
+
+
+def test_any_flipped_bit_of_a_wall_clock_or_of_the_hash_itself_is_found(run, copy):
+    text = (run / "record.json").read_bytes()
+    for key in (b'"written_utc": "', b'"record_sha256": "', b'"solve_s": '):
+        at = text.index(key) + len(key)
+        for offset in range(3):
+            changed = bytearray(text)
+            changed[at + offset] ^= 1
+            (copy / "record.json").write_bytes(changed)
+            assert dd.verify(copy).verdict == "broken"
+    (copy / "record.json").write_bytes(text.replace(b"\n", b"\r\n"))
+    assert "its bytes are not those" in str(dd.verify(copy))
+
+
+def test_a_number_edited_and_hashed_again_is_not_what_the_trace_carries(run, copy):
+    record = dd.load_record(copy)
+    lie = record.metrics[8].model_copy(update={"value": 1e-7})
+    changed = record.model_copy(update={"metrics": [*record.metrics[:8], lie, *record.metrics[9:]]})
+    seal(copy, changed)
+    found = dd.verify(copy)
+    assert found.verdict == "broken"
+    assert any("trace.mcap: the record that it carries" in problem for problem in found.complaints)
+    assert any("half-step end error: recorded 1e-07" in problem for problem in found.complaints)
+
+
+def lying(section, change):
+    """A `_complete` that makes a whole, consistent artifact out of a record with a lie in it."""
+    honest = evidence._complete
+
+    def complete(name, solution):
+        record = honest(name, solution)
+        fields = record.model_dump()
+        change(fields[section])
+        return EvidenceRecord.model_validate(fields)
+
+    return complete
+
+
+def set_value(index, key, value):
+    def change(part):
+        part[index][key] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("section", "change", "words"),
+    [
+        ("metrics", set_value(0, "value", 0.1), "cost: recorded 0.1"),
+        ("metrics", set_value(2, "value", 9e-6), "goal error: recorded 9e-06"),
+        ("metrics", set_value(2, "tolerance", 1.0), "the tolerance of goal error"),
+        ("metrics", set_value(8, "value", 0.0), "half-step end error: recorded 0"),
+        ("metrics", set_value(3, "definition", "another"), "bound violation (defined otherwise"),
+        ("invariants", set_value(0, "value", 0.0), "invariant free-motion energy drift: recorded 0"),
+        ("replays", set_value(2, "goal_error", 0.0), "replay in steps of 0.01 s, open loop: goal_error"),
+        ("replays", lambda part: part.pop(), "number of replays"),
+        ("contract", lambda part: part["bodies"][0].update(mass=2.0), "contract, bodies[0].mass: recorded 2.0"),
+        ("inputs", lambda part: part["model"]["options"].update(time_step=0.01), "contract, time_step"),
+    ],
+)
+def test_a_whole_artifact_that_lies_is_found_by_running_it_again(
+    solution, tmp_path, monkeypatch, section, change, words
+):
+    monkeypatch.setattr(evidence, "_complete", lying(section, change))
+    dd.save(solution, tmp_path / "run")
+    found = dd.verify(tmp_path / "run")
+    assert found.verdict == "broken"
+    assert any(words in complaint for complaint in found.complaints), found.complaints
+
+
+def test_a_plan_of_another_run_is_found_although_all_hashes_are_right(run, other_run, copy):
+    shutil.copy(other_run / "plan.npz", copy / "plan.npz")
+    seal(copy, dd.load_record(copy))
+    found = dd.verify(copy)
+    assert any("/planned/state is not what plan.npz has" in problem for problem in found.complaints)
+    assert any("goal error" in problem for problem in found.complaints)
+
+
+def test_links_and_files_outside_are_not_followed(run, copy, tmp_path):
+    (copy / "plan.npz").unlink()
+    (copy / "plan.npz").symlink_to(run / "plan.npz")
+    assert any("plan.npz: a link" in problem for problem in dd.verify(copy).complaints)
+    record = dd.load_record(run)
+    files = {**record.files, "../../secret": record.files["plan.npz"]}
+    (copy / "record.json").write_text(record.model_copy(update={"files": files}).sealed().to_json())
+    assert any("../../secret: missing" in problem for problem in dd.verify(copy).complaints)
+
+
+def test_an_incomplete_run_is_undecided_and_a_failed_one_is_true(solution, tmp_path):
+    begin(tmp_path / "a", solution.problem)
+    assert dd.verify(tmp_path / "a").verdict == "undecided"
+    record = dd.save(dd.solve(solution.problem, method="shooting", max_iterations=1), tmp_path / "b")
+    assert record.verdict == "fail"
+    assert dd.verify(tmp_path / "b").holds
+
+
+@pytest.mark.parametrize("key", ["num_steps", "x0", "constraints", "running_cost", "optimize"])
+def test_a_record_whose_problem_is_none_is_broken_not_an_accident(run, copy, key):
+    record = dd.load_record(run)
+    for problem in ({**record.problem, key: "?"}, {k: v for k, v in record.problem.items() if k != key}):
+        seal(copy, record.model_copy(update={"problem": problem}))
+        assert dd.verify(copy).verdict == "broken"
+
+
+def test_no_directory_is_an_error_and_no_record_is_broken(tmp_path):
+    with pytest.raises(dd.ArtifactError, match="run directory"):
+        dd.verify(tmp_path / "nothing")
+    assert dd.verify(tmp_path).verdict == "broken"
+    with pytest.raises(dd.ArtifactError, match=r"record\.json"):
+        dd.verify(tmp_path).require()
+
+
+def test_a_model_from_a_diagram_cannot_be_run_again(solution, tmp_path):
+    model = dd.model_from_diagram(dd.load_model(MODELS / "pendulum.urdf", time_step=0.02).diagram)
+    dd.save(swing_up(model), tmp_path / "run")
+    found = dd.verify(tmp_path / "run")
+    assert found.verdict == "undecided"
+    assert "not re-run: the model is a user's own diagram" in str(found)
+
+
+def test_a_users_constraint_is_undecided_and_a_users_cost_is_told(tmp_path):
+    def slow(x):
+        return x[1]
+
+    dd.save(swing_up(constraints=dd.Constraint(slow, upper=20.0)), tmp_path / "a")
+    found = dd.verify(tmp_path / "a")
+    assert (found.verdict, found.complaints) == ("undecided", ())
+    assert "slow is a user's function" in str(found)
+    dd.save(swing_up(final_cost=lambda x: x[0] ** 2), tmp_path / "b")
+    found = dd.verify(tmp_path / "b")
+    assert found.holds
+    assert any("final_cost" in line for line in found.not_rerun)
+    assert "cost" not in {c.name for c in found.comparisons}
+
+
+def test_collocation_and_found_parameters_are_run_again(tmp_path):
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    cost = dd.QuadraticCost(R=[[1.0]])
+    for scheme in ("hermite_simpson", "drake"):
+        problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=cost, horizon=(0.3, 0.5))
+        dd.save(dd.solve(problem, method="collocation", scheme=scheme), tmp_path / scheme)
+        assert dd.verify(tmp_path / scheme).require().holds
+    problem = dd.Problem(
+        model,
+        x0=[1, 0],
+        num_steps=20,
+        final_cost=dd.QuadraticCost(Q=np.eye(2)),
+        optimize="parameters",
+        parameters={"pole.mass": 0.9, "pole.center_of_mass": [0, 0, -0.4]},
+        parameter_bounds={"pole.mass": (0.5, 1.5)},
+    )
+    dd.save(dd.solve(problem), tmp_path / "parameters")
+    assert dd.verify(tmp_path / "parameters").require().holds
+
+
+def test_a_mesh_is_hashed_and_a_changed_one_is_not_run(tmp_path):
+    (tmp_path / "tetra.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    (tmp_path / "m.urdf").write_text(EVIL.format(mesh="tetra.obj"))
+    record = dd.save(swing_up(dd.load_model(tmp_path / "m.urdf", time_step=0.02)), tmp_path / "run")
+    assert [f.path for f in record.inputs.model.named] == ["tetra.obj"]
+    assert dd.verify(tmp_path / "run").require().holds
+    with (tmp_path / "tetra.obj").open("a") as file:
+        file.write("\n")
+    assert "names tetra.obj, which is not what it was" in str(dd.verify(tmp_path / "run"))
+    (tmp_path / "m.urdf").unlink()
+    assert dd.verify(tmp_path / "run").verdict == "undecided"
+
+
+def test_a_script_for_a_name_and_a_mesh_that_leads_elsewhere_do_no_harm(tmp_path):
+    model_file, secret = tmp_path / "a" / "b" / "evil.urdf", tmp_path / "etc" / "passwd"
+    model_file.parent.mkdir(parents=True)
+    secret.parent.mkdir()
+    secret.write_text("root:x:0:0:secret")
+    model_file.write_text(EVIL.format(mesh="../../etc/passwd"))
+    record = dd.save(swing_up(dd.load_model(model_file, time_step=0.02)), tmp_path / "run")
+    assert record.contract["name"] == "<script>alert(1)</script>"
+    assert record.inputs.model.named[0].sha256 is None
+    assert dd.verify(tmp_path / "run").holds
+    assert "<script>alert" not in (tmp_path / "run" / "replay.html").read_text()
+    written = [path.read_bytes() for path in (tmp_path / "run").iterdir()]
+    hashed = (secret.read_bytes(), sha256(secret.read_bytes()).hexdigest().encode())
+    assert not any(word in data for word in hashed for data in written)
+
+
+SCRIPT = f"""
+import sys
+sys.path.insert(0, {str(ROOT)!r})
+from examples.cart_pole_swing_up import problem as cart_pole
+
+def problem():
+    return cart_pole(num_steps=50)
+"""
+
+
+@pytest.mark.slow
+def test_a_run_killed_at_20_random_moments_is_never_a_false_success(tmp_path):
+    rng = random.Random(1)
+    (tmp_path / "task.py").write_text(SCRIPT)
+    command = [sys.executable, "-m", "drake_diff.cli", "run", str(tmp_path / "task.py")]
+    command += ["--out", str(tmp_path / "run")]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}
+    start = time.monotonic()
+    assert subprocess.run(command, **quiet, check=False).returncode == 0
+    whole, seen = time.monotonic() - start, []
+    for _ in range(20):
+        shutil.rmtree(tmp_path / "run", ignore_errors=True)
+        running = subprocess.Popen(command, **quiet)
+        time.sleep(rng.uniform(0.3, 1.05) * whole)
+        running.send_signal(signal.SIGKILL)
+        running.wait(timeout=10)
+        if not (tmp_path / "run" / "record.json").exists():
+            seen.append("nothing")
+            continue
+        record = dd.load_record(tmp_path / "run")
+        if record.state == "incomplete":
+            assert dd.verify(tmp_path / "run").verdict != "holds"
+        else:
+            dd.verify(tmp_path / "run").require()
+        seen.append(record.state)
+    assert "incomplete" in seen, seen
