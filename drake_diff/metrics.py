@@ -12,6 +12,7 @@ from drake_diff.record import ReplayEvidence
 from drake_diff.record_parts import Metric
 from drake_diff.replay import Replay
 from drake_diff.solution import INTEGRATION_TOLERANCE, Solution
+from drake_diff.transcribed import violation_between_nodes
 
 ON_THE_PLANT = "in the open-loop replay on the discrete plant"
 NO_REPLAY = "the discrete plant could not be stepped along these inputs"
@@ -82,6 +83,10 @@ def metrics_of(solution: Solution) -> list[Metric]:
     if solution.transcribed is not None:
         definition = "largest distance of a knot from an accurate integration from the knot before"
         found.append(measured("integration error", definition, solution.integration_error, x, INTEGRATION_TOLERANCE))
+        between = violation_between_nodes(solution.transcribed)
+        for name, value, unit in (("state", between.state, x), ("input", between.input, units_of(solution, "inputs"))):
+            definition = f"largest excess of the {name} over its bounds between the nodes, where no solver keeps them"
+            found.append(measured(f"{name} excess between nodes", definition, value, unit))
     return found + _metrics_of_the_replay(solution)
 
 

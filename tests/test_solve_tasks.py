@@ -106,3 +106,20 @@ def test_a_broken_constraint_is_named_with_its_knot(write_urdf):
     assert not solution.success
     assert solution.status is Status.INFEASIBLE
     assert "too slow" in solution.message or "defect" in solution.message
+
+
+def test_what_a_bound_is_exceeded_by_between_the_nodes_is_in_the_record(write_urdf, tmp_path):
+    """B14, Bryson and Denham: x <= 1/9, (0, 1) to (0, -1) in 1 s. With nodes beside the arcs' ends the excess is 1e-4."""
+    problem = dd.Problem(
+        write_urdf(time_step=0.1),
+        x0=[0, 1],
+        x_goal=[0, -1],
+        num_steps=10,
+        running_cost=dd.QuadraticCost(R=[[0.5]]),
+        bounds=dd.Bounds(x_upper=[1 / 9, math.inf]),
+    )
+    solution = dd.solve(problem, method="collocation", scheme="hermite_simpson")
+    assert solution.cost < 4 - 1e-4  # below the optimum of the problem that keeps its bound everywhere
+    metrics = {m.name: m for m in dd.save(solution, tmp_path / "run").metrics}
+    assert metrics["state excess between nodes"].value == pytest.approx(1.01e-4, rel=0.02)
+    assert metrics["input excess between nodes"].value == 0
