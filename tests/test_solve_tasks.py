@@ -109,7 +109,7 @@ def test_a_broken_constraint_is_named_with_its_knot(write_urdf):
 
 
 def test_what_a_bound_is_exceeded_by_between_the_nodes_is_in_the_record(write_urdf, tmp_path):
-    """B14, Bryson and Denham: x <= 1/9, (0, 1) to (0, -1) in 1 s. With nodes beside the arcs' ends the excess is 1e-4."""
+    """B14, Bryson and Denham: x <= 1/9, (0, 1) to (0, -1) in 1 s, nodes beside the ends of its arcs."""
     problem = dd.Problem(
         write_urdf(time_step=0.1),
         x0=[0, 1],
