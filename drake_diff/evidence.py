@@ -32,7 +32,7 @@ from drake_diff.replay import Replay
 from drake_diff.solution import INTEGRATION_TOLERANCE, Solution, Status
 from drake_diff.whole_file import write_whole
 
-RECORD, TRACE, REPLAY = "record.json", "trace.mcap", "replay.html"
+RECORD, TRACE, REPLAY, REPORT = "record.json", "trace.mcap", "replay.html", "report.html"
 
 
 def load_record(directory: str | Path) -> EvidenceRecord:
@@ -56,12 +56,13 @@ def begin(directory: str | Path, problem: Problem) -> None:
 
 
 def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
-    """Write the run directory of `solution`: record.json, trace.mcap and replay.html; gives the record.
+    """Write the run directory of `solution`: record.json, trace.mcap, replay.html and report.html; gives it.
 
     Each file is written aside and moved into place, record.json last, so that at any moment the record is
     complete only if everything it names is.
     """
     from drake_diff.meshcat_view import write_replay  # what a script that saves nothing need not load
+    from drake_diff.report import write_report
     from drake_diff.trace import write_trace
 
     folder = Path(directory)
@@ -93,7 +94,8 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
         planned_xs=solution.xs if solution.transcribed is not None and motion is not None else None,
         title=f"{folder.name}: {solution.status.value}",
     )
-    files = {name: file_evidence(folder / name, name) for name in (TRACE, REPLAY)}
+    write_report(folder / REPORT, solution, complete.model_dump(mode="json"), folder / REPLAY)
+    files = {name: file_evidence(folder / name, name) for name in (TRACE, REPLAY, REPORT)}
     complete = complete.model_copy(update={"files": files})
     write_whole(folder / RECORD, complete.to_json().encode())
     return complete
