@@ -14,6 +14,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from drake_diff.cli_view import view
+
 HOLDS, CHECK_FAILED, USAGE, MISSING, INTERNAL = range(5)
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
@@ -133,6 +135,9 @@ def certify(
     _print_certification(console, record)
     console.print(f"wrote {escape(str(directory / RECORD))}")
     raise typer.Exit(HOLDS if record.verdict == "pass" else CHECK_FAILED)
+
+
+app.command()(view)
 
 
 def main() -> None:

@@ -30,7 +30,9 @@ def write_report(path: Path, solution: Solution, record: Mapping[str, Any], repl
     body = "\n".join(_sections(solution, record, view))
     scripts = "".join(f"<script>{_asset(name)}</script>\n" for name in ("uPlot.iife.min.js", "report.js"))
     style = _asset("uPlot.min.css") + _asset("report.css")
-    head = f'<meta charset="utf-8">\n{content_policy(view, scripts)}\n<meta name="viewport" content="width=device-width">'
+    head = (
+        f'<meta charset="utf-8">\n{content_policy(view, scripts)}\n<meta name="viewport" content="width=device-width">'
+    )
     title = f"<title>{_text(record['name'])}: {_text(record['verdict'])}</title>"
     page = f"{head}\n{title}\n<style>{style}</style>\n</head><body>\n{body}\n{data}{scripts}</body></html>\n"
     write_whole(path, ('<!doctype html>\n<html lang="en"><head>\n' + page).encode())
@@ -72,11 +74,12 @@ def _header(solution: Solution, record: Mapping[str, Any]) -> str:
 
 def _view(solution: Solution, view: str) -> str:
     """The replay, with what is to be seen in it, and the slider that the plots follow."""
+    end = float(solution.times[-1])
     return (
         '<section id="motion"><h2>Motion</h2>'
         f'<iframe id="view" title="the motion in 3D" srcdoc="{html.escape(view)}"></iframe>'
         '<div class="controls"><button id="play" type="button" aria-label="play or pause">▶</button>'
-        f'<input id="time" type="range" aria-label="time" min="0" max="{float(solution.times[-1])!r}" step="any" value="0">'
+        f'<input id="time" type="range" aria-label="time" min="0" max="{end!r}" step="any" value="0">'
         '<output id="now" for="time">0 s</output></div>'
         f'<p class="note">{_text(_caption(solution))}</p>'
         '<img id="still" alt="the motion at the time of the slider"></section>'

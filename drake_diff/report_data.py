@@ -85,7 +85,10 @@ def _input_plots(solution: Solution, motion: Rollout | None) -> list[Plot]:
         if motion is not None:
             applied = motion.us[:, i]
             same = held and np.array_equal(applied, knots[:, i])
-            lines = [_line(c.name, _as_long(applied, solution), held=True), *([] if same else [planned | {"dashed": True}])]
+            lines = [
+                _line(c.name, _as_long(applied, solution), held=True),
+                *([] if same else [planned | {"dashed": True}]),
+            ]
         limits = _numbers([bounds.u_lower[i], bounds.u_upper[i]])
         plots.append(_plot(f"input {c.name}", c.unit, solution.times, lines, limits=limits))
     return plots
@@ -135,7 +138,10 @@ def _gradient_plots(solution: Solution) -> list[Plot]:
     norms = solution.gradient_norms
     if norms is None:
         return []
-    return [_plot("gradient norm |d cost / d x_k|", "cost / x", solution.times, [_line("norm", norms)], log=True)]
+    zero = not np.any(norms > 0)
+    note = "0 at every knot: the cost does not depend on the states" if zero else "0 is not on a log scale"
+    lines = [_line("norm", norms)]
+    return [_plot("gradient norm |d cost / d x_k|", "cost / x", solution.times, lines, log=not zero, note=note)]
 
 
 def _iteration_plots(solution: Solution) -> list[Plot]:

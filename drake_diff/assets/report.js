@@ -49,10 +49,15 @@
 
   const shorten = (v) => v === null || v === undefined ? "–" : Math.abs(v) >= 1e5 || (v && Math.abs(v) < 1e-3)
     ? v.toExponential(1) : String(Number(v.toPrecision(4)));
+  function decades(low, high) {  // whole powers of ten, sixteen of them at most
+    if (!(high > 0)) return [1e-3, 1];
+    const top = Math.ceil(Math.log10(high) + 1e-9), bottom = Math.floor(Math.log10(Math.max(low, high * 1e-16)));
+    return [10 ** Math.min(bottom, top - 1), 10 ** top];
+  }
   function range(plot) {
     return (u, low, high) => {
-      if (plot.log) return low > 0 ? uPlot.rangeLog(low, high, 10, true) : [1e-3, 1];
-      if (low === null) return [0, 1];
+      if (plot.log) return decades(low, high);
+      if (low === null || (low === 0 && high === 0)) return [0, 1];
       const span = Math.max(high - low, Math.abs(high) * 1e-3, 1e-12);
       for (const limit of plot.limits)  // a limit far away says nothing of the motion
         if (limit !== null && limit - high < 2 * span && low - limit < 2 * span) {
@@ -127,7 +132,7 @@
     box.className = "map";
     title.textContent = number + ": " + c.subject + " – " + c.verdict;
     const m = c.rows.length, n = c.columns.length;
-    const picture = svg("svg", { viewBox: `0 0 ${n} ${m}`, role: "img", "aria-label": title.textContent });
+    const picture = svg("svg", { viewBox: `0 0 ${n} ${m}`, role: "img", preserveAspectRatio: "xMinYMin", "aria-label": title.textContent });
     const say = (k) => {
       const i = Math.floor(k / n), j = k % n;
       told.textContent = `d ${c.rows[i]} / d ${c.columns[j]}: derivative ${c.derivative[k]}, differences ` +
@@ -140,6 +145,7 @@
       if (code) picture.append(svg("text", { x: x + 0.5, y: y + 0.5, class: "sign", "pointer-events": "none" }, SIGNS[code]));
     });
     told.textContent = `${m} rows: ${c.rows.join(", ")}. ${n} columns: ${c.columns.join(", ")}.`;
+    picture.style.maxWidth = 28 * n + "px";
     box.append(title, picture, told);
     return box;
   }
