@@ -197,7 +197,7 @@ def _look_at(meshcat: Meshcat, scene: Scene) -> None:
     """A camera far enough back to have all of the motion in view, and a grid to see it by."""
     low, high = scene.box
     centre = (low + high) / 2
-    meshcat.SetCameraPose(centre + 0.62 * scene.size / np.tan(FIELD_OF_VIEW / 2) * _direction(high - low), centre)
+    meshcat.SetCameraPose(centre + 0.52 * scene.size / np.tan(FIELD_OF_VIEW / 2) * _direction(high - low), centre)
     for decoration in ("/Axes", "/Grid"):
         meshcat.SetProperty(decoration, "visible", False)
     meshcat.SetProperty("/Background/<object>", "top_color", TOP)

@@ -51,14 +51,17 @@ def _script_json(name: str, value: Any) -> str:
 
 def _sections(solution: Solution, record: Mapping[str, Any], view: str) -> Iterable[str]:
     yield _header(solution, record)
-    yield _view(solution, view)
-    yield _section("What does not hold", _failures(record))
+    failures = _section("What does not hold", _failures(record))
+    yield "" if solution.success else failures  # first of all, where there is something
+    plots = '<section><h2>Plots</h2><div id="plots" class="plots"></div></section>'
+    yield f'<div class="stage">{_view(solution, view)}{plots}</div>'
+    yield failures if solution.success else ""
     yield _section("Measured again on the plant", _measures(record))
-    yield '<section><h2>Plots</h2><div id="plots" class="plots"></div></section>'
     yield _section("Replays in variants of the plant", _replays(solution))
     yield _section("Certificates of the gradients", _certificates(solution))
     yield _section("Contract", _contract(record["contract"]))
     yield _section("Provenance", _provenance(record))
+    yield _slider(float(solution.times[-1]))
 
 
 def _header(solution: Solution, record: Mapping[str, Any]) -> str:
@@ -73,16 +76,21 @@ def _header(solution: Solution, record: Mapping[str, Any]) -> str:
 
 
 def _view(solution: Solution, view: str) -> str:
-    """The replay, with what is to be seen in it, and the slider that the plots follow."""
-    end = float(solution.times[-1])
+    """The replay, with what is to be seen in it."""
     return (
         '<section id="motion"><h2>Motion</h2>'
         f'<iframe id="view" title="the motion in 3D" srcdoc="{html.escape(view)}"></iframe>'
-        '<div class="controls"><button id="play" type="button" aria-label="play or pause">▶</button>'
-        f'<input id="time" type="range" aria-label="time" min="0" max="{end!r}" step="any" value="0">'
-        '<output id="now" for="time">0 s</output></div>'
         f'<p class="note">{_text(_caption(solution))}</p>'
         '<img id="still" alt="the motion at the time of the slider"></section>'
+    )
+
+
+def _slider(end: float) -> str:
+    """The time that the view and the plots follow; it stays in sight."""
+    return (
+        '<div class="controls bar"><button id="play" type="button" aria-label="play or pause">▶</button>'
+        f'<input id="time" type="range" aria-label="time" min="0" max="{end!r}" step="any" value="0">'
+        '<output id="now" for="time">0 s</output></div>'
     )
 
 
