@@ -14,11 +14,11 @@ def view(run: Annotated[Path, typer.Argument(help="A run directory.")]) -> None:
     from drake_diff.view import serve
 
     console = Console(soft_wrap=True, highlight=False)
-    meshcat, notes = serve(run)
-    for note in notes:
-        console.print(f"[yellow]{escape(note)}[/]")
-    console.print(f"{escape(str(run))} is at {meshcat.web_url()} (Ctrl-C ends it)")
     try:
+        meshcat, notes = serve(run)
+        for note in notes:
+            console.print(f"[yellow]{escape(note)}[/]")
+        console.print(f"{escape(str(run))} is at {meshcat.web_url()} (Ctrl-C ends it)")
         threading.Event().wait()
     except KeyboardInterrupt:
         console.print("ended")

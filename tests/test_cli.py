@@ -64,6 +64,7 @@ def test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact(tm
     assert {p.name for p in (tmp_path / "artifacts" / "task").iterdir()} == {
         "record.json",
         "replay.html",
+        "report.html",
         "trace.mcap",
     }
 

@@ -4,6 +4,9 @@ import base64
 import dataclasses
 import json
 import shutil
+import signal
+import subprocess
+import sys
 import urllib.request
 from io import BytesIO
 from pathlib import Path
@@ -96,7 +99,7 @@ def runs(swing_up, thrown, collocated, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
-    from selenium import webdriver
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed (the test extra has it)")
     from selenium.webdriver.chrome.service import Service
 
     options = webdriver.ChromeOptions()
@@ -323,6 +326,16 @@ def test_the_live_view_is_at_loopback_only(runs):
     assert meshcat.web_url().startswith("http://127.0.0.1:")
     with urllib.request.urlopen(meshcat.web_url(), timeout=10) as page:
         assert b"meshcat" in page.read()
+
+
+def test_the_command_prints_the_address_and_ends_by_ctrl_c(runs):
+    command = [sys.executable, "-m", "drake_diff.cli", "view", str(runs / "swing_up")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        line = process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        rest = process.stdout.read()
+    assert "http://127.0.0.1:" in line
+    assert (rest, process.returncode) == ("ended\n", 0)
 
 
 def test_a_run_without_motion_cannot_be_viewed(runs):
