@@ -16,6 +16,7 @@ from rich.table import Table
 
 from drake_diff import cli_mcap, cli_runs
 from drake_diff.cli_runs import plain
+from drake_diff.cli_view import view
 
 HOLDS, CHECK_FAILED, USAGE, MISSING, INTERNAL = range(5)
 
@@ -149,6 +150,9 @@ def certify(
     _print_certification(console, record)
     console.print(f"wrote {escape(str(directory / RECORD))}")
     raise typer.Exit(HOLDS if record.verdict == "pass" else CHECK_FAILED)
+
+
+app.command()(view)
 
 
 def main() -> None:

@@ -34,8 +34,8 @@ from drake_diff.record_sections import (
 from drake_diff.solution import Solution
 from drake_diff.whole_file import write_whole
 
-TRACE, REPLAY = "trace.mcap", "replay.html"
-FILES = (SCHEMA_FILE, PLAN, TRACE, REPLAY)  # what `save` writes besides the record
+TRACE, REPLAY, REPORT = "trace.mcap", "replay.html", "report.html"
+FILES = (SCHEMA_FILE, PLAN, TRACE, REPLAY, REPORT)  # what `save` writes besides the record
 
 
 def begin(directory: str | Path, problem: Problem) -> None:
@@ -54,12 +54,13 @@ def begin(directory: str | Path, problem: Problem) -> None:
 
 
 def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
-    """Write the run directory of `solution`: record.json, plan.npz, trace.mcap, replay.html and the schema.
+    """Write the run directory of `solution`: record.json, plan.npz, trace.mcap, replay.html, report.html, the schema.
 
     Gives the record. Each file is written aside and moved into place, record.json last, so that at any moment the
     record is complete only if everything it names is.
     """
     from drake_diff.meshcat_view import write_replay  # what a script that saves nothing need not load
+    from drake_diff.report import write_report
     from drake_diff.trace import write_trace
 
     folder = Path(directory)
@@ -83,6 +84,7 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
         planned_xs=solution.xs if solution.transcribed is not None and motion is not None else None,
         title=f"{folder.name}: {solution.status.value}",
     )
+    write_report(folder / REPORT, solution, complete.model_dump(mode="json"), folder / REPLAY)
     return seal(folder, complete)
 
 

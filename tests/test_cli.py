@@ -66,6 +66,7 @@ def test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact(tm
         "record.schema.json",
         "record.json",
         "replay.html",
+        "report.html",
         "trace.mcap",
     }
 

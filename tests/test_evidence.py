@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import subprocess
 from hashlib import sha256
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from drake_diff.meshcat_view import write_replay
 from drake_diff.trace import read_trace
 
 MODELS = Path(__file__).parent.parent / "models"
-CHROMIUM = Path("/usr/bin/chromium")
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +60,7 @@ def run(swing_up, tmp_path_factory):
 
 
 def test_a_run_directory_holds_these_files_and_nothing_else(run):
-    names = ["plan.npz", "record.json", "record.schema.json", "replay.html", "trace.mcap"]
+    names = ["plan.npz", "record.json", "record.schema.json", "replay.html", "report.html", "trace.mcap"]
     assert sorted(p.name for p in run.iterdir()) == names
 
 
@@ -104,7 +102,7 @@ def test_the_record_is_json_without_nan(run):
 
 def test_the_hashes_in_the_record_are_the_files(run):
     files = dd.load_record(run).files
-    assert set(files) == {"plan.npz", "record.schema.json", "trace.mcap", "replay.html"}
+    assert set(files) == {"plan.npz", "record.schema.json", "trace.mcap", "replay.html", "report.html"}
     for name, file in files.items():
         data = (run / name).read_bytes()
         assert (file.bytes, file.sha256) == (len(data), sha256(data).hexdigest())
@@ -260,20 +258,3 @@ def test_a_hostile_title_or_body_name_does_no_harm(tmp_path):
     write_replay(tmp_path / "a.html", model, motion.times, motion.xs, title="<script>alert(2)</script>")
     page = (tmp_path / "a.html").read_text()
     assert "<script>alert" not in page
-
-
-@pytest.mark.skipif(not CHROMIUM.exists(), reason="no browser installed (Debian's chromium)")
-def test_the_replay_shows_something_in_a_browser(run, tmp_path):
-    import matplotlib.image
-
-    picture = tmp_path / "shot.png"
-    flags = (
-        "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
-        "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader "
-        f"--enable-unsafe-swiftshader --window-size=600,400 --user-data-dir={tmp_path / 'profile'}"
-    )
-    command = [str(CHROMIUM), *flags.split(), f"--screenshot={picture}", (run / "replay.html").as_uri()]
-    subprocess.run(command, check=True, capture_output=True, timeout=120)
-    pixels = matplotlib.image.imread(picture)[:, :, :3]
-    reddish = (pixels[..., 0] > 0.5) & (pixels[..., 1] < 0.4) & (pixels[..., 2] < 0.4)
-    assert reddish.sum() > 20  # the pendulum's red bob

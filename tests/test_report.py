@@ -1,0 +1,345 @@
+"""What people look at: replay.html, report.html and the live view, in a real browser where there is one."""
+
+import base64
+import dataclasses
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import urllib.request
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+from drake_diff.meshcat_scene import ARROW_PART, scene_of
+from drake_diff.meshcat_view import frames_of
+from drake_diff.report_data import report_data
+from drake_diff.view import scene_of_run, serve
+
+MODELS = Path(__file__).parent.parent / "models"
+HOSTILE = "<script>alert(1)</script>"
+CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+browsing = pytest.mark.skipif(
+    not (CHROMIUM and DRIVER), reason="no browser installed (apt-get install chromium chromium-driver)"
+)
+FLAGS = (
+    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
+    "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader"
+)
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    bounds = dd.Bounds(u_lower=[-30], u_upper=[30])
+    cost = dd.QuadraticCost(R=[[1.0]])
+    return dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=40, running_cost=cost, bounds=bounds)
+
+
+@pytest.fixture(scope="module")
+def swing_up(pendulum):
+    return dd.solve(pendulum, method="shooting")
+
+
+@pytest.fixture(scope="module")
+def thrown():
+    """A ball that falls on the ground and rolls: contact, and no actuator."""
+    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.005)
+    x0 = model.default_state
+    x0[6], x0[10] = 0.15, 0.5
+    free = np.zeros(13, dtype=bool)
+    free[10] = True
+    cost = {"final_cost": lambda x: (x[4] - 0.3) ** 2, "optimize": "initial_state", "initial_state_mask": free}
+    return dd.solve(dd.Problem(model, x0=x0, num_steps=60, **cost))
+
+
+@pytest.fixture(scope="module")
+def collocated(pendulum):
+    return dd.solve(pendulum, method="collocation")
+
+
+@pytest.fixture(scope="module")
+def hostile(tmp_path_factory):
+    """A run whose body, and whose directory, are named to break out of a page."""
+    folder = tmp_path_factory.mktemp("hostile")
+    escaped = HOSTILE.replace("<", "&lt;").replace(">", "&gt;")
+    urdf = (
+        (MODELS / "pendulum.urdf").read_text().replace('"pole"', f'"{escaped}"').replace('"pendulum"', f'"{escaped}"')
+    )
+    (folder / "evil.urdf").write_text(urdf)
+    model = dd.load_model(folder / "evil.urdf", time_step=0.02)
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=dd.QuadraticCost(R=[[1.0]]))
+    run = folder / "<img src=x onerror=alert(1)>"
+    dd.save(dd.solve(problem, method="shooting"), run)
+    return run
+
+
+@pytest.fixture(scope="module")
+def runs(swing_up, thrown, collocated, tmp_path_factory):
+    """A directory of each kind of run, the failed ones too."""
+    folder = tmp_path_factory.mktemp("runs")
+    xs = np.array(swing_up.xs)
+    xs[5:] = np.nan
+    found = {
+        "swing_up": swing_up,
+        "thrown": thrown,
+        "collocated": collocated,
+        "limited": dd.solve(swing_up.problem, method="shooting", max_iterations=2),
+        "not_finite": dataclasses.replace(swing_up, xs=xs, status=dd.Status.DIVERGED),
+        "no_replay": dataclasses.replace(swing_up, xs=np.full((41, 2), np.nan), status=dd.Status.DIVERGED),
+    }
+    for name, solution in found.items():
+        dd.save(solution, folder / name)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed (the test extra has it)")
+    from selenium.webdriver.chrome.service import Service
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in [*FLAGS.split(), f"--user-data-dir={tmp_path_factory.mktemp('profile')}"]:
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=Service(DRIVER))
+    driver.execute_cdp_cmd("Network.enable", {})
+    offline = {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
+    driver.execute_cdp_cmd("Network.emulateNetworkConditions", offline)
+    yield driver
+    driver.quit()
+
+
+def open_page(browser, page, *, size=(1440, 900), scheme="light"):
+    """Load `page` from the disk and wait until its animation is there; nothing may have gone wrong."""
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    screen = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": size[0] < 600}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+    browser.get_log("browser")
+    browser.get(page.as_uri())
+    ready = (
+        "document.documentElement.dataset.ready === 'yes'" if page.name == "report.html" else "viewer.animator.duration"
+    )
+    WebDriverWait(browser, 30).until(lambda b: b.execute_script(f"return Boolean({ready})"))
+
+
+def errors(browser):
+    """What the console complains of; SwiftShader's remarks on its own speed are none of ours."""
+    return [entry["message"] for entry in browser.get_log("browser") if "GPU stall" not in entry["message"]]
+
+
+def move_slider(browser, part):
+    browser.execute_script(
+        "const s = document.getElementById('time');s.value = arguments[0] * s.max; s.dispatchEvent(new Event('input'))",
+        part,
+    )
+    browser.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
+
+
+def view_of(browser):
+    """The 3D view's pixels, as it was last drawn."""
+    import matplotlib.image
+
+    url = browser.execute_script(
+        "const v = (document.getElementById('view') || {contentWindow: window}).contentWindow.viewer;"
+        "v.render(); return v.renderer.domElement.toDataURL('image/png')"
+    )
+    return matplotlib.image.imread(BytesIO(base64.b64decode(url.split(",")[1])))[..., :3]
+
+
+def cursors(browser):
+    return browser.execute_script(
+        "return [...document.querySelectorAll('.u-cursor-x')].map(c => c.getBoundingClientRect().left)"
+    )
+
+
+@browsing
+@pytest.mark.parametrize(("size", "scheme"), [((1440, 900), "light"), ((390, 844), "dark")], ids=["laptop", "phone"])
+@pytest.mark.parametrize("name", ["swing_up", "thrown", "collocated", "limited", "not_finite", "no_replay"])
+def test_a_report_opens_without_a_network_and_without_an_error(runs, browser, tmp_path, name, size, scheme):
+    open_page(browser, runs / name / "report.html", size=size, scheme=scheme)
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= size[0]
+    background = browser.execute_script("return getComputedStyle(document.body).backgroundColor")
+    assert (sum(int(c) for c in background[4:-1].split(",")) < 200) == (scheme == "dark")
+    assert len(np.unique(view_of(browser).reshape(-1, 3), axis=0)) > 50  # not blank
+    browser.save_screenshot(str(tmp_path / f"{name}.png"))
+    assert errors(browser) == []
+
+
+@browsing
+@pytest.mark.parametrize("name", ["swing_up", "thrown"])
+def test_the_slider_moves_the_view_and_the_cursors_together(runs, browser, tmp_path, name):
+    open_page(browser, runs / name / "report.html")
+    seen = {}
+    for part in (0.1, 0.7):
+        move_slider(browser, part)
+        seen[part] = view_of(browser), np.array(cursors(browser))
+        browser.save_screenshot(str(tmp_path / f"{part}.png"))
+    assert (np.abs(seen[0.7][0] - seen[0.1][0]).max(axis=2) > 0.2).sum() > 100  # pixels: the robot is elsewhere
+    data = browser.execute_script("return JSON.parse(document.getElementById('data').textContent)")
+    timed = np.array([plot["axis"] == "time" for plot in data["plots"]])
+    assert timed.sum() >= 5
+    assert np.all((seen[0.7][1] - seen[0.1][1])[timed] > 50)  # pixels, of plots that are 400 wide
+    assert errors(browser) == []
+
+
+@browsing
+def test_the_replay_page_is_posed_before_play_and_moves(runs, browser, tmp_path):
+    open_page(browser, runs / "swing_up" / "replay.html")
+    browser.execute_script("viewer.animator.play(); viewer.animator.pause(); viewer.animator.seek(0)")
+    start = view_of(browser)
+    reddish = (start[..., 0] > 0.5) & (start[..., 1] < 0.4) & (start[..., 2] < 0.4)
+    assert reddish.sum() > 20  # the pendulum's red bob
+    browser.execute_script("viewer.animator.seek(0.6)")
+    assert (np.abs(view_of(browser) - start).max(axis=2) > 0.2).sum() > 100
+    browser.save_screenshot(str(tmp_path / "replay.png"))
+    assert errors(browser) == []
+
+
+@browsing
+def test_an_arrow_is_as_long_as_its_force(runs, browser, thrown):
+    """At the end the ball rests: the force is its weight, 9.81 N, and the arrow's length that over the reference."""
+    open_page(browser, runs / "thrown" / "replay.html")
+    browser.execute_script("viewer.animator.play(); viewer.animator.pause(); viewer.animator.seek(0.2999)")
+    find = "viewer.scene_tree.find(['drake', 'contacts', '0', 'shaft']).object.scale.z"
+    scene = scene_of(thrown.problem.model, thrown.times, thrown.replay.xs, contacts=thrown.replay.contacts)
+    force = np.linalg.norm(thrown.replay.contacts[-1][0].force)
+    expected = force / scene.reference_force * ARROW_PART * scene.size
+    assert browser.execute_script(f"return {find}") == pytest.approx(expected, rel=1e-2)  # between two frames
+
+
+@browsing
+def test_hostile_names_do_no_harm_in_a_browser(hostile, browser):
+    for page in ("report.html", "replay.html"):
+        open_page(browser, hostile / page)  # an alert would make every command after it fail
+        assert errors(browser) == []
+    open_page(browser, hostile / "report.html")
+    assert HOSTILE in browser.execute_script("return document.body.innerText")
+
+
+@browsing
+def test_a_script_that_was_put_into_the_page_is_not_run(runs, browser, tmp_path):
+    """The policy has to refuse something, or it says nothing."""
+    text = (runs / "swing_up" / "report.html").read_text()
+    evil = "</header><script>document.title = 'evil'</script>"
+    (tmp_path / "report.html").write_text(text.replace("</header>", evil, 1))
+    open_page(browser, tmp_path / "report.html")
+    assert browser.title == "swing_up: pass"
+    assert any("Content Security Policy" in message for message in errors(browser))
+
+
+def test_hostile_names_are_text_in_the_report(hostile):
+    page = (hostile / "report.html").read_text()
+    assert HOSTILE not in page
+    assert "<img src=x" not in page
+
+
+def test_the_page_asks_nothing_of_the_network(runs):
+    page = (runs / "swing_up" / "report.html").read_text()
+    assert "default-src 'none'" in page
+    assert 'src="http' not in page
+    assert 'href="http' not in page
+
+
+def test_the_report_is_the_same_bytes_but_for_the_wall_clock(swing_up, tmp_path):
+    pages = []
+    for i in range(2):
+        dd.save(dataclasses.replace(swing_up, wall_time=float(i)), tmp_path / str(i) / "run")
+        page = (tmp_path / str(i) / "run" / "report.html").read_text()
+        at = page.index('<p id="wall-clock"')
+        pages.append(page[:at] + page[page.index("</p>", at) :])
+    assert pages[0] == pages[1]
+
+
+def test_the_record_is_in_the_page_for_machines(runs):
+    page = (runs / "swing_up" / "report.html").read_text()
+    start = page.index(">", page.index('id="record"')) + 1
+    embedded = json.loads(page[start : page.index("</script>", start)])
+    whole = json.loads((runs / "swing_up" / "record.json").read_text())
+    assert embedded == {
+        key: value for key, value in whole.items() if key not in ("wall_clock", "files", "record_sha256")
+    }
+
+
+def test_a_failed_run_says_so_on_top(runs):
+    page = (runs / "limited" / "report.html").read_text()
+    body = page[page.index("<body>") :]
+    assert '<p class="pill fail">fail</p>' in body
+    assert "solver_iteration_limit" in body
+    assert "iteration limit came first" in body
+
+
+def test_a_run_without_a_replay_does_not_claim_one(runs):
+    page = (runs / "no_replay" / "report.html").read_text()
+    assert "The solver&#x27;s states, not a replay" in page
+
+
+def test_plots_hold_what_was_measured(swing_up):
+    plots = {plot["title"]: plot for plot in report_data(swing_up)["plots"]}
+    assert plots["positions"]["series"][0]["y"] == pytest.approx(swing_up.replay.xs[:, 0], abs=1e-7)  # eight digits
+    assert plots["input motor"]["limits"] == [-30.0, 30.0]
+    assert plots["energy"]["series"][2]["y"] == pytest.approx(swing_up.replay.energy, rel=1e-7, abs=1e-9)
+    assert len(plots["cost per iteration"]["x"]) == len(swing_up.iterations)
+
+
+def test_frames_are_evenly_apart_and_hold_both_ends():
+    for steps, end in ((1, 0.02), (40, 0.8), (1000, 1.0)):
+        frames = frames_of(np.linspace(0, end, steps + 1))
+        assert (frames[0], frames[-1]) == ((0.0, 0), (end, steps))
+        assert np.ptp(np.diff([t for t, _ in frames])) < 1e-12 * end + 1e-15  # rounding
+
+
+def test_the_trail_is_that_of_the_frame_that_was_asked_for(swing_up):
+    """The bob's centre of mass is 0.5 m from the hinge and swings from below to above: 1 m of height."""
+    model, times, xs = swing_up.problem.model, swing_up.times, swing_up.replay.xs
+    assert np.ptp(scene_of(model, times, xs).trail[:, 2]) == pytest.approx(1.0, abs=1e-3)  # it ends 1e-8 from upright
+    assert np.ptp(scene_of(model, times, xs, frame="world").trail) == 0.0
+    with pytest.raises(dd.UnknownNameError, match="frame"):
+        scene_of(model, times, xs, frame="elbow")
+
+
+def test_a_run_is_shown_from_its_directory_alone(hostile, tmp_path):
+    """The model's source is gone; what is shown comes out of the trace."""
+    run = tmp_path / "run"
+    shutil.copytree(hostile, run)
+    source = hostile.parent / "evil.urdf"
+    text = source.read_text()
+    source.unlink()
+    try:
+        scene, notes = scene_of_run(run)
+    finally:
+        source.write_text(text)
+    assert notes == ()
+    assert len(scene.shapes) > 0
+    assert np.ptp(scene.trail, axis=0).max() > 0.1  # [m] it moves
+
+
+def test_the_live_view_is_at_loopback_only(runs):
+    meshcat, notes = serve(runs / "thrown")
+    assert notes == ()
+    assert meshcat.web_url().startswith("http://127.0.0.1:")
+    with urllib.request.urlopen(meshcat.web_url(), timeout=10) as page:
+        assert b"meshcat" in page.read()
+
+
+def test_the_command_prints_the_address_and_ends_by_ctrl_c(runs):
+    command = [sys.executable, "-m", "drake_diff.cli", "view", str(runs / "swing_up")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        line = process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        rest = process.stdout.read()
+    assert "http://127.0.0.1:" in line
+    assert (rest, process.returncode) == ("ended\n", 0)
+
+
+def test_a_run_without_motion_cannot_be_viewed(runs):
+    with pytest.raises(dd.ArtifactError, match="no motion"):
+        scene_of_run(runs / "no_replay")
