@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff.arrays import Array
+from drake_diff.contact_sequence import PATIENCE, solve_through_jumps
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.goal_restoration import restore_goal
 from drake_diff.ilqr import solve_ilqr
@@ -125,7 +126,7 @@ def solve_continuation(
                 return NlpResult(us.ravel(), outcome, message, ()), xs, us, tuple(logs)
         left = limits.time_limit - (time.monotonic() - start)
         xs = roll_states(problem.model, x0, us)
-        result, xs, us = solve_ilqr(problem, xs, us, limits=replace(limits, time_limit=left), report=report)
+        result, xs, us = solve_through_jumps(problem, xs, us, limits=replace(limits, time_limit=left), report=report)
         _add(logs, _log(problem, len(logs) + 1, None, result, xs), report)
     if result.outcome in (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.INFEASIBLE):
         xs, us, done = restore_goal(problem, xs, us, limits.tolerance)
@@ -163,7 +164,7 @@ def _take_stage(
     """The first state and the inputs that a stage finds, those given where it is refused."""
     try:
         xs = roll_states(soft.model, x0, us)
-        result, xs, found = solve_ilqr(soft, xs, us, limits=limits, report=report)
+        result, xs, found = solve_ilqr(soft, xs, us, limits=limits, report=report, patience=PATIENCE)
     except (GradientError, SimulationError) as error:
         log = StageLog(number, contact.distance, contact.stiffness, f"refused: {error}", 0, None, None, None)
         return x0, us, log, Outcome.NO_GRADIENT

@@ -36,6 +36,7 @@ from drake_diff.tangent import tangent_space
 SMALLEST_REGULARIZATION, LARGEST_REGULARIZATION = 1e-8, 1e8
 SUFFICIENT_DECREASE = 1e-4
 STEP_SIZES = tuple(0.5 ** np.arange(12))
+SHORT = 1 / 32
 # Of the cost: a promise below this is lost in the rounding of the cost's sum.
 ROUNDING = 1e-13
 # Of what the next update of the multipliers changes in the augmented cost: what a minimization before it may leave.
@@ -64,13 +65,23 @@ def _unkept(problem: Problem) -> Iterator[str]:
 
 
 def solve_ilqr(
-    problem: Problem, xs: Array, us: Array, *, limits: Limits, report: Report | None
+    problem: Problem,
+    xs: Array,
+    us: Array,
+    *,
+    limits: Limits,
+    report: Report | None,
+    patience: float = math.inf,
+    least_penalty: float = 0.0,
 ) -> tuple[NlpResult, Array, Array]:
     """Solve `problem` from xs (N+1, nx), us (N, nu), a rollout or not; gives (result, xs, us), result.z being us flat.
 
+    After `patience` steps in a row that are shorter than SHORT the search ends as inaccurate: it crawls along a jump.
+    `least_penalty` is what constraints weigh from the start.
     Raises GradientError where a derivative is refused, SimulationError where a step from the guess is.
     """
-    search = _Search(problem, xs, us, limits, report)
+    search = _Search(problem, xs, us, limits, report, patience)
+    search.constraints.penalty = max(search.constraints.penalty, least_penalty)
     with interrupt_flag() as interrupted:
         outcome = search.run(interrupted)
     message = f"iLQR: {outcome.value} after {len(search.rows) - 1} steps"
@@ -94,8 +105,8 @@ def _promise(models: Iterable[LinearQuadratic]) -> float:
 
 
 class _Search:
-    def __init__(self, problem: Problem, xs: Array, us: Array, limits: Limits, report: Report | None):
-        self.problem, self.limits, self.report = problem, limits, report
+    def __init__(self, problem: Problem, xs: Array, us: Array, limits: Limits, report: Report | None, patience: float):
+        self.problem, self.limits, self.report, self.patience = problem, limits, report, patience
         self.constraints = AugmentedLagrangian(problem)
         self.start = time.monotonic()
         self.motion = self._take_in(xs, us)
@@ -105,6 +116,7 @@ class _Search:
         self.jacobians: Array | None = None
         self.gap_weight = 0.0
         self.regularization = 0.0
+        self.stalled = False
         self.rows = [Iteration(0, self.cost, self._infeasibility(), math.nan, math.nan)]
 
     def run(self, interrupted: threading.Event) -> Outcome:
@@ -112,7 +124,7 @@ class _Search:
         final = not self.constraints.any
         while True:
             outcome = self._minimize(final, interrupted)
-            if outcome not in (Outcome.SOLVED, Outcome.INACCURATE) or not self.constraints.any:
+            if outcome not in (Outcome.SOLVED, Outcome.INACCURATE) or not self.constraints.any or self.stalled:
                 return outcome
             stands = self.constraints.violation(*self.motion.point) > FEASIBILITY_TOLERANCE
             reached = not stands and self.constraints.residual(*self.motion.point) <= self.limits.tolerance
@@ -133,10 +145,17 @@ class _Search:
             outcome = self._step(model, final)
             if outcome is not None:
                 return outcome
+            if self._crawls():
+                self.stalled = True
+                return Outcome.INACCURATE
             if interrupted.is_set():
                 return Outcome.INTERRUPTED
             if time.monotonic() - self.start > self.limits.time_limit:
                 return Outcome.TIME_LIMIT
+
+    def _crawls(self) -> bool:
+        steps = [row.step for row in self.rows[1:]]
+        return len(steps) >= self.patience and max(steps[-int(self.patience) :]) < SHORT
 
     def _expand(self) -> LinearQuadratic:
         new, old = self.motion, self.expanded

@@ -96,12 +96,16 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class NlpResult:
-    """The final, or the best, values of the decision variables (n,), and how they were reached."""
+    """The final, or the best, values of the decision variables (n,), and how they were reached.
+
+    `note` says what a claim of a minimum is limited to, if it is.
+    """
 
     z: Array
     outcome: Outcome
     message: str
     iterations: tuple[Iteration, ...]
+    note: str = ""
 
 
 class _Stop(Exception):  # noqa: N818  (a signal, not an error)
