@@ -28,7 +28,7 @@ from drake_diff.step import set_state
 
 MARGIN = 1e-5  # [m] that a held pair keeps from just touching: differences of 1e-6 then see no jump
 PRESSING = 1.01  # margins: nearer than that to just touching, a row is what holds the motion
-PATIENCE, MORE_PATIENCE = 3, 30  # short steps in a row are a stall; and where nothing new can be held
+PATIENCE, MORE_PATIENCE = 3, 10  # short steps in a row are a stall; and where nothing new can be held
 HOLDING = 1e6  # the least penalty of held rows: a search that may cross them sees the jump again
 MOST_SEQUENCES = 30  # that are tried: beyond them the result claims its own sequence alone
 
@@ -117,6 +117,7 @@ class _Sequences:
         self.problem, self.limits, self.report = problem, limits, report
         self.start, self.rows = time.monotonic(), list[Iteration]()
         self.costs = dict[tuple[Hold, ...], float]()  # of each sequence's minimum; infinite where none was found
+        self.ended = False  # by Ctrl-C or the clock
 
     def run(self, xs: Array, us: Array, interrupted: threading.Event) -> Found:
         """Let the search go free until it stalls, then from sequence to cheaper sequence."""
@@ -140,18 +141,19 @@ class _Sequences:
             hold = left.pop()
             cost = self.problem.objective(*best[1:])
             other = self._beyond(hold, *best[1:])
+            if self.ended:
+                left.append(hold)
+                break
             new = self.problem.objective(*other[1:]) if isinstance(other, tuple) else other
             if isinstance(other, tuple) and new < cost:
                 best, told, left = other, [], self._pressing(other[1])
             else:
-                told.append(
-                    f"{hold}: " + (f"beyond, {new:.6g}" if np.isfinite(new) else "beyond, no minimum was found")
-                )
-        told += [f"{hold}: beyond, not tried" for hold in left]
+                told.append(f"{hold} (beyond: {f'cost {new:.6g}' if np.isfinite(new) else 'no minimum found'})")
+        told += [f"{hold} (beyond: not tried)" for hold in left]
         if not told:
             return best
         cost = self.problem.objective(*best[1:])
-        note = f"a minimum for its own sequence of contacts, cost {cost:.6g}, held at " + "; ".join(told)
+        note = f"a minimum for its own sequence of contacts, cost {cost:.6g}, held by " + "; ".join(told)
         return replace(best[0], note=note), *best[1:]
 
     def _beyond(self, hold: Hold, xs: Array, us: Array) -> "Found | float":
@@ -191,6 +193,7 @@ class _Sequences:
         result, xs, us = solve_ilqr(
             held, xs, us, limits=limits, report=self.report, patience=patience, least_penalty=penalty
         )
+        self.ended = result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT)
         first = len(self.rows) - 1 if self.rows else 0
         self.rows += [replace(r, iteration=first + r.iteration) for r in result.iterations[bool(self.rows) :]]
         self.costs[holds] = self.problem.objective(xs, us) if result.outcome is Outcome.SOLVED else np.inf

@@ -32,7 +32,7 @@ FASTEST = 4.0
 # h^2 k / m of the stiffest stage: at 4 the explicit force is unstable; where it is weak, true contact, which jumps,
 # does the work, and the stage is as rough as the true plant.
 LARGEST_STIFFNESS = 0.4
-JUST_TOUCHING = 1e-7  # [m]; what rests on something presses further into it
+JUST_TOUCHING = 2e-5  # [m], beyond the margin of `contact_sequence`; what rests on something presses further into it
 NUDGE = 10.0  # how many gaps the force at x0 alone would move what it acts on, were it to last
 
 
@@ -112,6 +112,10 @@ def solve_continuation(
     Raises GradientError or SimulationError where the true plant refuses.
     """
     start, logs, x0 = time.monotonic(), list[StageLog](), np.array(problem.x0)
+
+    def is_over() -> bool:
+        return interrupted.is_set() or time.monotonic() - start > limits.time_limit
+
     with interrupt_flag() as interrupted:
         for contact in stages:
             left = limits.time_limit - (time.monotonic() - start)
@@ -128,14 +132,14 @@ def solve_continuation(
         xs = roll_states(problem.model, x0, us)
         result, xs, us = solve_through_jumps(problem, xs, us, limits=replace(limits, time_limit=left), report=report)
         _add(logs, _log(problem, len(logs) + 1, None, result, xs), report)
-    if result.outcome in (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.INFEASIBLE):
-        xs, us, done = restore_goal(problem, xs, us, limits.tolerance)
-        message, outcome = result.message + _where_it_jumps(problem, xs) + done, result.outcome
-        if outcome is Outcome.INFEASIBLE and np.abs(problem.goal_error(xs[-1])).max() <= limits.tolerance:
-            outcome = Outcome.INACCURATE  # state bounds are measured again by the verdict
-        result = replace(result, z=us.ravel(), outcome=outcome, message=message)
-        if done and report:
-            report.say(done.removeprefix("; "))
+        if result.outcome in (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.INFEASIBLE):
+            xs, us, done = restore_goal(problem, xs, us, limits.tolerance, is_over)
+            message, outcome = result.message + _where_it_jumps(problem, xs) + done, result.outcome
+            if outcome is Outcome.INFEASIBLE and np.abs(problem.goal_error(xs[-1])).max() <= limits.tolerance:
+                outcome = Outcome.INACCURATE  # state bounds are measured again by the verdict
+            result = replace(result, z=us.ravel(), outcome=outcome, message=message)
+            if done and report:
+                report.say(done.removeprefix("; "))
     return result, xs, us, tuple(logs)
 
 

@@ -36,7 +36,7 @@ from drake_diff.tangent import tangent_space
 SMALLEST_REGULARIZATION, LARGEST_REGULARIZATION = 1e-8, 1e8
 SUFFICIENT_DECREASE = 1e-4
 STEP_SIZES = tuple(0.5 ** np.arange(12))
-SHORT = 1 / 32
+CUT_BACK, SHORT = 1 / 8, 1 / 32  # two such steps: the model reaches too far; several: a search crawls
 # Of the cost: a promise below this is lost in the rounding of the cost's sum.
 ROUNDING = 1e-13
 # Of what the next update of the multipliers changes in the augmented cost: what a minimization before it may leave.
@@ -76,7 +76,8 @@ def solve_ilqr(
 ) -> tuple[NlpResult, Array, Array]:
     """Solve `problem` from xs (N+1, nx), us (N, nu), a rollout or not; gives (result, xs, us), result.z being us flat.
 
-    After `patience` steps in a row that are shorter than SHORT the search ends as inaccurate: it crawls along a jump.
+    After `patience` steps in a row that are shorter than SHORT the search ends as inaccurate: it crawls along a jump;
+    before that it regularizes where steps are short, as the model reaches too far.
     `least_penalty` is what constraints weigh from the start.
     Raises GradientError where a derivative is refused, SimulationError where a step from the guess is.
     """
@@ -105,7 +106,9 @@ def _promise(models: Iterable[LinearQuadratic]) -> float:
 
 
 class _Search:
-    def __init__(self, problem: Problem, xs: Array, us: Array, limits: Limits, report: Report | None, patience: float):
+    def __init__(
+        self, problem: Problem, xs: Array, us: Array, limits: Limits, report: Report | None, patience: float = math.inf
+    ):
         self.problem, self.limits, self.report, self.patience = problem, limits, report, patience
         self.constraints = AugmentedLagrangian(problem)
         self.start = time.monotonic()
@@ -182,15 +185,21 @@ class _Search:
         while self.regularization <= LARGEST_REGULARIZATION:
             policy = _best_policy((curved, model), self.regularization)
             if policy is not None and self._search_along(model, policy):
-                self.regularization = self._relaxed()
+                self.regularization = self._tightened() if self._is_cut_back() else self._relaxed()
                 return None
             if promise <= ROUNDING * scale:
                 return Outcome.SOLVED  # what is left to gain is less than the cost's rounding
             if self.motion.is_rollout and policy is not None and policy.expected <= ROUNDING * scale:
                 break  # no step that can be told from none: the cost has a kink or a jump here, as contact makes them
-            self.regularization = max(8 * self.regularization, SMALLEST_REGULARIZATION)
+            self.regularization = self._tightened()
         self.regularization = 0.0
         return Outcome.INACCURATE
+
+    def _is_cut_back(self) -> bool:
+        return math.isfinite(self.patience) and all(row.step <= CUT_BACK for row in self.rows[-2:])
+
+    def _tightened(self) -> float:
+        return max(8 * self.regularization, SMALLEST_REGULARIZATION)
 
     def _relaxed(self) -> float:
         smaller = self.regularization / 8

@@ -183,14 +183,28 @@ class _Watch:
         )
 
 
+class _Flag(threading.Event):
+    """A handler of Ctrl-C that notes it."""
+
+    def __call__(self, *_: Any) -> None:
+        self.set()
+
+
 @contextmanager
 def interrupt_flag() -> Iterator[threading.Event]:
-    """An event that Ctrl-C sets, where this is the main thread; the former handler is put back."""
-    flag = threading.Event()
+    """An event that Ctrl-C sets, where this is the main thread; the former handler is put back.
+
+    Within another such block it is that block's event: one Ctrl-C ends all.
+    """
+    flag = _Flag()
     if threading.current_thread() is not threading.main_thread():
         yield flag
         return
-    former = signal.signal(signal.SIGINT, lambda *_: flag.set())
+    former = signal.getsignal(signal.SIGINT)
+    if isinstance(former, _Flag):
+        yield former
+        return
+    signal.signal(signal.SIGINT, flag)
     try:
         yield flag
     finally:

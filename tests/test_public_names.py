@@ -25,8 +25,8 @@ finite_difference tree_dynamics implicit step_derivatives smoothing policy conta
 rollout rollout_gradient refinement certify continuous cost bounds constraint problem replay dynamics
 nonlinear_program transcription_scheme optimal_control transcribed symbolic symbolic_tree knot_functions
 transcription_program ipopt transcription solution collocation shooting shooting_program riccati secant
-augmented_lagrangian expansion ilqr contact_sequence goal_restoration continuation verdict run solver mcap_messages mcap_log trace
-meshcat_view record provenance evidence sampling certification audit_place audit_contact audit cli
+augmented_lagrangian expansion ilqr contact_sequence goal_restoration continuation verdict run solver mcap_messages
+mcap_log trace meshcat_view record provenance evidence sampling certification audit_place audit_contact audit cli
 """.split()
 
 
