@@ -30,6 +30,7 @@ MARGIN = 1e-5  # [m] that a held pair keeps from just touching: differences of 1
 PRESSING = 1.01  # margins: nearer than that to just touching, a row is what holds the motion
 PATIENCE, MORE_PATIENCE = 3, 10  # short steps in a row are a stall; and where nothing new can be held
 HOLDING = 1e6  # the least penalty of held rows: a search that may cross them sees the jump again
+BEYOND_ITERATIONS = 50  # for the minimum beyond a row, which the note then says was not found
 MOST_SEQUENCES = 30  # that are tried: beyond them the result claims its own sequence alone
 
 Found = tuple[NlpResult, Array, Array]  # as from `solve_ilqr`
@@ -164,7 +165,7 @@ class _Sequences:
         if holds in self.costs:
             return self.costs[holds]
         try:
-            other = self._minimize(beyond, us, holds, PATIENCE)
+            other = self._minimize(beyond, us, holds, PATIENCE, BEYOND_ITERATIONS)
         except (GradientError, SimulationError) as error:
             self._say(f"refused: {error}")
             self.costs[holds] = np.inf
@@ -180,10 +181,10 @@ class _Sequences:
         over = time.monotonic() - self.start > self.limits.time_limit or len(self.rows) > self.limits.max_iterations
         return over or interrupted.is_set()
 
-    def _minimize(self, xs: Array, us: Array, holds: tuple[Hold, ...], patience: int) -> Found:
-        """One search under `holds`, within what is left of the limits."""
+    def _minimize(self, xs: Array, us: Array, holds: tuple[Hold, ...], patience: int, most: float = np.inf) -> Found:
+        """One search under `holds`, of `most` iterations, within what is left of the limits."""
         left = self.limits.time_limit - (time.monotonic() - self.start)
-        more = max(self.limits.max_iterations - max(len(self.rows) - 1, 0), 1)
+        more = int(min(most, max(self.limits.max_iterations - max(len(self.rows) - 1, 0), 1)))
         limits = replace(self.limits, time_limit=left, max_iterations=more)
         rows = [hold.constraint(self.problem.model) for hold in holds]
         held = replace(self.problem, constraints=(*self.problem.constraints, *rows))

@@ -131,7 +131,7 @@ def solve_continuation(
         left = limits.time_limit - (time.monotonic() - start)
         xs = roll_states(problem.model, x0, us)
         result, xs, us = solve_through_jumps(problem, xs, us, limits=replace(limits, time_limit=left), report=report)
-        _add(logs, _log(problem, len(logs) + 1, None, result, xs), report)
+        _add(logs, _log(problem, len(logs) + 1, None, result, xs, us), report)
         if result.outcome in (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.INFEASIBLE):
             xs, us, done = restore_goal(problem, xs, us, limits.tolerance, is_over)
             message, outcome = result.message + _where_it_jumps(problem, xs) + done, result.outcome
@@ -172,12 +172,14 @@ def _take_stage(
     except (GradientError, SimulationError) as error:
         log = StageLog(number, contact.distance, contact.stiffness, f"refused: {error}", 0, None, None, None)
         return x0, us, log, Outcome.NO_GRADIENT
-    return xs[0], found, _log(soft, number, contact, result, xs), result.outcome
+    return xs[0], found, _log(soft, number, contact, result, xs, found), result.outcome
 
 
-def _log(problem: Problem, number: int, contact: SoftContact | None, result: NlpResult, xs: Array) -> StageLog:
+def _log(
+    problem: Problem, number: int, contact: SoftContact | None, result: NlpResult, xs: Array, us: Array
+) -> StageLog:
     last = result.iterations[-1]
-    numbers = last.objective, float(np.abs(problem.goal_error(xs[-1])).max()), last.dual_infeasibility
+    numbers = problem.objective(xs, us), float(np.abs(problem.goal_error(xs[-1])).max()), last.dual_infeasibility
     cost, error, gradient = (value if math.isfinite(value) else None for value in numbers)
     distance, stiffness = (None, None) if contact is None else (contact.distance, contact.stiffness)
     return StageLog(number, distance, stiffness, result.outcome.value, last.iteration, cost, error, gradient)

@@ -96,16 +96,13 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class NlpResult:
-    """The final, or the best, values of the decision variables (n,), and how they were reached.
-
-    `note` says what a claim of a minimum is limited to, if it is.
-    """
+    """The final, or the best, values of the decision variables (n,), how they were reached, and a claim's limits."""
 
     z: Array
     outcome: Outcome
     message: str
     iterations: tuple[Iteration, ...]
-    note: str = ""
+    note: str = ""  # what a claim of a minimum is limited to, if it is
 
 
 class _Stop(Exception):  # noqa: N818  (a signal, not an error)
@@ -192,10 +189,7 @@ class _Flag(threading.Event):
 
 @contextmanager
 def interrupt_flag() -> Iterator[threading.Event]:
-    """An event that Ctrl-C sets, where this is the main thread; the former handler is put back.
-
-    Within another such block it is that block's event: one Ctrl-C ends all.
-    """
+    """An event that Ctrl-C sets, in the main thread, until the block ends; that of a block around it, if any."""
     flag = _Flag()
     if threading.current_thread() is not threading.main_thread():
         yield flag
