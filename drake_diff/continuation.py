@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff.arrays import Array
+from drake_diff.contact_sequence import PATIENCE, solve_through_jumps
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.goal_restoration import restore_goal
 from drake_diff.ilqr import solve_ilqr
@@ -31,7 +32,7 @@ FASTEST = 4.0
 # h^2 k / m of the stiffest stage: at 4 the explicit force is unstable; where it is weak, true contact, which jumps,
 # does the work, and the stage is as rough as the true plant.
 LARGEST_STIFFNESS = 0.4
-JUST_TOUCHING = 1e-7  # [m]; what rests on something presses further into it
+JUST_TOUCHING = 2e-5  # [m], beyond the margin of `contact_sequence`; what rests on something presses further into it
 NUDGE = 10.0  # how many gaps the force at x0 alone would move what it acts on, were it to last
 
 
@@ -111,6 +112,10 @@ def solve_continuation(
     Raises GradientError or SimulationError where the true plant refuses.
     """
     start, logs, x0 = time.monotonic(), list[StageLog](), np.array(problem.x0)
+
+    def is_over() -> bool:
+        return interrupted.is_set() or time.monotonic() - start > limits.time_limit
+
     with interrupt_flag() as interrupted:
         for contact in stages:
             left = limits.time_limit - (time.monotonic() - start)
@@ -125,16 +130,16 @@ def solve_continuation(
                 return NlpResult(us.ravel(), outcome, message, ()), xs, us, tuple(logs)
         left = limits.time_limit - (time.monotonic() - start)
         xs = roll_states(problem.model, x0, us)
-        result, xs, us = solve_ilqr(problem, xs, us, limits=replace(limits, time_limit=left), report=report)
-        _add(logs, _log(problem, len(logs) + 1, None, result, xs), report)
-    if result.outcome in (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.INFEASIBLE):
-        xs, us, done = restore_goal(problem, xs, us, limits.tolerance)
-        message, outcome = result.message + _where_it_jumps(problem, xs) + done, result.outcome
-        if outcome is Outcome.INFEASIBLE and np.abs(problem.goal_error(xs[-1])).max() <= limits.tolerance:
-            outcome = Outcome.INACCURATE  # state bounds are measured again by the verdict
-        result = replace(result, z=us.ravel(), outcome=outcome, message=message)
-        if done and report:
-            report.say(done.removeprefix("; "))
+        result, xs, us = solve_through_jumps(problem, xs, us, limits=replace(limits, time_limit=left), report=report)
+        _add(logs, _log(problem, len(logs) + 1, None, result, xs, us), report)
+        if result.outcome in (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.INFEASIBLE):
+            xs, us, done = restore_goal(problem, xs, us, limits.tolerance, is_over)
+            message, outcome = result.message + _where_it_jumps(problem, xs) + done, result.outcome
+            if outcome is Outcome.INFEASIBLE and np.abs(problem.goal_error(xs[-1])).max() <= limits.tolerance:
+                outcome = Outcome.INACCURATE  # state bounds are measured again by the verdict
+            result = replace(result, z=us.ravel(), outcome=outcome, message=message)
+            if done and report:
+                report.say(done.removeprefix("; "))
     return result, xs, us, tuple(logs)
 
 
@@ -163,16 +168,18 @@ def _take_stage(
     """The first state and the inputs that a stage finds, those given where it is refused."""
     try:
         xs = roll_states(soft.model, x0, us)
-        result, xs, found = solve_ilqr(soft, xs, us, limits=limits, report=report)
+        result, xs, found = solve_ilqr(soft, xs, us, limits=limits, report=report, patience=PATIENCE)
     except (GradientError, SimulationError) as error:
         log = StageLog(number, contact.distance, contact.stiffness, f"refused: {error}", 0, None, None, None)
         return x0, us, log, Outcome.NO_GRADIENT
-    return xs[0], found, _log(soft, number, contact, result, xs), result.outcome
+    return xs[0], found, _log(soft, number, contact, result, xs, found), result.outcome
 
 
-def _log(problem: Problem, number: int, contact: SoftContact | None, result: NlpResult, xs: Array) -> StageLog:
+def _log(
+    problem: Problem, number: int, contact: SoftContact | None, result: NlpResult, xs: Array, us: Array
+) -> StageLog:
     last = result.iterations[-1]
-    numbers = last.objective, float(np.abs(problem.goal_error(xs[-1])).max()), last.dual_infeasibility
+    numbers = problem.objective(xs, us), float(np.abs(problem.goal_error(xs[-1])).max()), last.dual_infeasibility
     cost, error, gradient = (value if math.isfinite(value) else None for value in numbers)
     distance, stiffness = (None, None) if contact is None else (contact.distance, contact.stiffness)
     return StageLog(number, distance, stiffness, result.outcome.value, last.iteration, cost, error, gradient)

@@ -36,6 +36,7 @@ from drake_diff.tangent import tangent_space
 SMALLEST_REGULARIZATION, LARGEST_REGULARIZATION = 1e-8, 1e8
 SUFFICIENT_DECREASE = 1e-4
 STEP_SIZES = tuple(0.5 ** np.arange(12))
+CUT_BACK, SHORT = 1 / 8, 1 / 32  # two such steps: the model reaches too far; several: a search crawls
 # Of the cost: a promise below this is lost in the rounding of the cost's sum.
 ROUNDING = 1e-13
 # Of what the next update of the multipliers changes in the augmented cost: what a minimization before it may leave.
@@ -64,13 +65,24 @@ def _unkept(problem: Problem) -> Iterator[str]:
 
 
 def solve_ilqr(
-    problem: Problem, xs: Array, us: Array, *, limits: Limits, report: Report | None
+    problem: Problem,
+    xs: Array,
+    us: Array,
+    *,
+    limits: Limits,
+    report: Report | None,
+    patience: float = math.inf,
+    least_penalty: float = 0.0,
 ) -> tuple[NlpResult, Array, Array]:
     """Solve `problem` from xs (N+1, nx), us (N, nu), a rollout or not; gives (result, xs, us), result.z being us flat.
 
+    After `patience` steps in a row that are shorter than SHORT the search ends as inaccurate: it crawls along a jump;
+    before that it regularizes where steps are short, as the model reaches too far.
+    `least_penalty` is what constraints weigh from the start.
     Raises GradientError where a derivative is refused, SimulationError where a step from the guess is.
     """
-    search = _Search(problem, xs, us, limits, report)
+    search = _Search(problem, xs, us, limits, report, patience)
+    search.constraints.penalty = max(search.constraints.penalty, least_penalty)
     with interrupt_flag() as interrupted:
         outcome = search.run(interrupted)
     message = f"iLQR: {outcome.value} after {len(search.rows) - 1} steps"
@@ -94,8 +106,10 @@ def _promise(models: Iterable[LinearQuadratic]) -> float:
 
 
 class _Search:
-    def __init__(self, problem: Problem, xs: Array, us: Array, limits: Limits, report: Report | None):
-        self.problem, self.limits, self.report = problem, limits, report
+    def __init__(
+        self, problem: Problem, xs: Array, us: Array, limits: Limits, report: Report | None, patience: float = math.inf
+    ):
+        self.problem, self.limits, self.report, self.patience = problem, limits, report, patience
         self.constraints = AugmentedLagrangian(problem)
         self.start = time.monotonic()
         self.motion = self._take_in(xs, us)
@@ -105,6 +119,7 @@ class _Search:
         self.jacobians: Array | None = None
         self.gap_weight = 0.0
         self.regularization = 0.0
+        self.stalled = False
         self.rows = [Iteration(0, self.cost, self._infeasibility(), math.nan, math.nan)]
 
     def run(self, interrupted: threading.Event) -> Outcome:
@@ -112,7 +127,7 @@ class _Search:
         final = not self.constraints.any
         while True:
             outcome = self._minimize(final, interrupted)
-            if outcome not in (Outcome.SOLVED, Outcome.INACCURATE) or not self.constraints.any:
+            if outcome not in (Outcome.SOLVED, Outcome.INACCURATE) or not self.constraints.any or self.stalled:
                 return outcome
             stands = self.constraints.violation(*self.motion.point) > FEASIBILITY_TOLERANCE
             reached = not stands and self.constraints.residual(*self.motion.point) <= self.limits.tolerance
@@ -133,10 +148,17 @@ class _Search:
             outcome = self._step(model, final)
             if outcome is not None:
                 return outcome
+            if self._crawls():
+                self.stalled = True
+                return Outcome.INACCURATE
             if interrupted.is_set():
                 return Outcome.INTERRUPTED
             if time.monotonic() - self.start > self.limits.time_limit:
                 return Outcome.TIME_LIMIT
+
+    def _crawls(self) -> bool:
+        steps = [row.step for row in self.rows[1:]]
+        return len(steps) >= self.patience and max(steps[-int(self.patience) :]) < SHORT
 
     def _expand(self) -> LinearQuadratic:
         new, old = self.motion, self.expanded
@@ -163,15 +185,21 @@ class _Search:
         while self.regularization <= LARGEST_REGULARIZATION:
             policy = _best_policy((curved, model), self.regularization)
             if policy is not None and self._search_along(model, policy):
-                self.regularization = self._relaxed()
+                self.regularization = self._tightened() if self._is_cut_back() else self._relaxed()
                 return None
             if promise <= ROUNDING * scale:
                 return Outcome.SOLVED  # what is left to gain is less than the cost's rounding
             if self.motion.is_rollout and policy is not None and policy.expected <= ROUNDING * scale:
                 break  # no step that can be told from none: the cost has a kink or a jump here, as contact makes them
-            self.regularization = max(8 * self.regularization, SMALLEST_REGULARIZATION)
+            self.regularization = self._tightened()
         self.regularization = 0.0
         return Outcome.INACCURATE
+
+    def _is_cut_back(self) -> bool:
+        return math.isfinite(self.patience) and all(row.step <= CUT_BACK for row in self.rows[-2:])
+
+    def _tightened(self) -> float:
+        return max(8 * self.regularization, SMALLEST_REGULARIZATION)
 
     def _relaxed(self) -> float:
         smaller = self.regularization / 8

@@ -187,18 +187,22 @@ def _ball(body: Any) -> Drawn:
 def _shapes_on(inspector: Any, frame: Any, path: str) -> list[Drawn]:
     """Of a frame's geometries those meant to be seen, or those that touch where there are none."""
     for role in (Role.kIllustration, Role.kProximity):
-        found = [_drawn(inspector, geometry, role, path) for geometry in inspector.GetGeometries(frame, role)]
-        found = [drawn for drawn in found if isinstance(drawn.shape, DRAWN)]
+        drawn = (_drawn(inspector, geometry, role, path) for geometry in inspector.GetGeometries(frame, role))
+        found = [d for d in drawn if d is not None and isinstance(d.shape, DRAWN)]
         if found:
             return found
     return []
 
 
-def _drawn(inspector: Any, geometry: Any, role: Role, path: str) -> Drawn:
+def _drawn(inspector: Any, geometry: Any, role: Role, path: str) -> Drawn | None:
+    """A geometry as it is drawn; None where its file is no mesh that can be read, which the model's notes tell."""
     colour, pose = GREY, inspector.GetPoseInFrame(geometry)
     if role == Role.kIllustration:
         colour = inspector.GetIllustrationProperties(geometry).GetPropertyOrDefault("phong", "diffuse", GREY)
-    box = inspector.GetObbInGeometryFrame(geometry)
+    try:
+        box = inspector.GetObbInGeometryFrame(geometry)
+    except RuntimeError:  # a mesh is read when it is first asked for
+        return None
     centre = pose.translation() if box is None else pose @ box.pose().translation()
     radius = 0.0 if box is None else float(np.linalg.norm(box.half_width()))
     return Drawn(path, inspector.GetShape(geometry), pose, colour, np.asarray(centre), radius)

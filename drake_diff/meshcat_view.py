@@ -34,7 +34,6 @@ logging.getLogger("drake").addFilter(lambda record: "Meshcat listening" not in r
 
 FRAMES_PER_SECOND = 64.0
 REPETITIONS = 5
-UNREADABLE = 50  # of the scene's size: the ball in the place of a mesh that cannot be read
 RED, TRAIL, GHOST = Rgba(0.85, 0.2, 0.1, 1), Rgba(0.93, 0.55, 0.1, 1), Rgba(0.15, 0.4, 0.95, 0.3)
 LINES = Rgba(0.72, 0.75, 0.79, 1)
 WORLD = "world"
@@ -116,13 +115,10 @@ def _draw_shape(meshcat: Meshcat, path: str, drawn: Drawn, colour: Rgba, scene: 
     if isinstance(shape, HalfSpace):
         side = 20 * scene.size
         shape, pose = Box(side, side, 0.01), pose @ RigidTransform([0.0, 0.0, -0.005])
-    try:
-        if isinstance(shape, Mesh) and colour == GHOST:
-            meshcat.SetTriangleMesh(path, *_hull(shape), colour)  # a mesh has colours of its own, its hull has none
-        else:
-            meshcat.SetObject(path, shape, colour)
-    except RuntimeError:  # a file that is no mesh: a ball says where it would be
-        meshcat.SetObject(path, Sphere(scene.size / UNREADABLE), colour)
+    if isinstance(shape, Mesh) and colour == GHOST:
+        meshcat.SetTriangleMesh(path, *_hull(shape), colour)  # a mesh has colours of its own, its hull has none
+    else:
+        meshcat.SetObject(path, shape, colour)
     meshcat.SetTransform(path, pose)
 
 

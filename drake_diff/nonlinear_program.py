@@ -96,12 +96,13 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class NlpResult:
-    """The final, or the best, values of the decision variables (n,), and how they were reached."""
+    """The final, or the best, values of the decision variables (n,), how they were reached, and a claim's limits."""
 
     z: Array
     outcome: Outcome
     message: str
     iterations: tuple[Iteration, ...]
+    note: str = ""  # what a claim of a minimum is limited to, if it is
 
 
 class _Stop(Exception):  # noqa: N818  (a signal, not an error)
@@ -179,14 +180,25 @@ class _Watch:
         )
 
 
+class _Flag(threading.Event):
+    """A handler of Ctrl-C that notes it."""
+
+    def __call__(self, *_: Any) -> None:
+        self.set()
+
+
 @contextmanager
 def interrupt_flag() -> Iterator[threading.Event]:
-    """An event that Ctrl-C sets, where this is the main thread; the former handler is put back."""
-    flag = threading.Event()
+    """An event that Ctrl-C sets, in the main thread, until the block ends; that of a block around it, if any."""
+    flag = _Flag()
     if threading.current_thread() is not threading.main_thread():
         yield flag
         return
-    former = signal.signal(signal.SIGINT, lambda *_: flag.set())
+    former = signal.getsignal(signal.SIGINT)
+    if isinstance(former, _Flag):
+        yield former
+        return
+    signal.signal(signal.SIGINT, flag)
     try:
         yield flag
     finally:

@@ -11,6 +11,7 @@ from drake_diff.arrays import Array, frozen
 from drake_diff.certificate import Certificate, certify_jacobian
 from drake_diff.certify import certify
 from drake_diff.collocation import solve_collocation
+from drake_diff.contact_sequence import solve_through_jumps
 from drake_diff.continuation import solve_continuation
 from drake_diff.continuous import EquationsOfMotion
 from drake_diff.exceptions import GradientError, SimulationError
@@ -91,7 +92,8 @@ class Run:
                 result, xs_found, us, logs = solve_continuation(self.problem, us, stages, limits=limits, report=report)
                 self.options["continuation"] = [log.to_dict() for log in logs]
                 return result, xs_found, us
-            return solve_ilqr(self.problem, xs if given else rolled, us, limits=self.limits, report=self.report)
+            solve_method = solve_through_jumps if self.problem.model.contract.contact.collision_pairs else solve_ilqr
+            return solve_method(self.problem, xs if given else rolled, us, limits=self.limits, report=self.report)
 
         return self._through_steps(xs, us, search, may_be_blind=bool(stages))
 
@@ -138,6 +140,8 @@ class Run:
         norms = np.linalg.norm(RolloutCost(self.problem, variables).differentiate(z)[2], axis=1)
         values = variables.parameters(z).values
         found = {"certificates": before + after, "gradient_norms": frozen(norms), "parameters": values}
+        if result.note:
+            self.options["contact_sequence"] = result.note
         draft = self._draft(xs, us, **found)
         solution = judged(draft, result)
         return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution

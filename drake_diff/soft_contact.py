@@ -16,7 +16,7 @@ import numpy as np
 from pydrake.math import exp, log
 from pydrake.multibody.tree import JacobianWrtVariable
 
-from drake_diff.arrays import positive_float
+from drake_diff.arrays import Array, positive_float
 from drake_diff.exceptions import InputError, ModelError
 from drake_diff.model import Model
 from drake_diff.twin import Twin
@@ -101,6 +101,30 @@ def distances(twin: Twin) -> dict[tuple[str, str], float]:
     for pair, (a, b) in _pairs(twin.plant, twin.context):
         names = (a.name(), b.name())
         found[names] = min(float(pair.distance), found.get(names, np.inf))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Separation:
+    """Two bodies that may collide: their signed `distance` [m], its `gradient` (nq,), and the least motion (nq,) that
+    adds a metre to it, in the metric of the mass matrix (zero where nothing moves them apart)."""
+
+    bodies: tuple[str, str]
+    distance: float
+    gradient: Array
+    opening: Array
+
+
+def separations(twin: Twin) -> list[Separation]:
+    """Every pair of geometries that may collide, always in the same order, in the context's state."""
+    plant, context, found = twin.plant, twin.context, []
+    mass = plant.CalcMassMatrix(context)
+    to_v = np.array([plant.MapQDotToVelocity(context, e) for e in np.eye(plant.num_positions())]).T
+    for pair, (a, b) in _pairs(plant, context):
+        rate = _distance_rate(plant, context, pair, (a, b))
+        v = np.linalg.solve(mass, rate)
+        opening = plant.MapVelocityToQDot(context, v / max(rate @ v, np.finfo(float).tiny))
+        found.append(Separation((a.name(), b.name()), float(pair.distance), rate @ to_v, opening))
     return found
 
 

@@ -97,7 +97,7 @@ def judged(draft: Solution, result: NlpResult) -> Solution:
     if not complaints:
         complaints += broken_variants(draft.plan, draft.replays)
     status = Status.CONVERGED_NOT_VERIFIED if complaints else Status.CONVERGED
-    return ended(draft, status, "; ".join(complaints), **fields)
+    return ended(draft, status, "; ".join([*complaints, *[result.note] * bool(result.note)]), **fields)
 
 
 def complaints_about(solution: Solution) -> Iterator[str]:

@@ -15,14 +15,14 @@ import numpy as np
 import drake_diff as dd
 
 MODEL = Path(__file__).parent.parent / "models" / "two_spheres.sdf"
-TIME_STEP, NUM_STEPS, GAP, DIAMETER, GOAL = 0.02, 50, 0.05, 0.2, 0.6
+TIME_STEP, NUM_STEPS, GAP, DIAMETER, GOAL = 0.02, 50, 0.3, 0.2, 1.0
 PUSHER, BALL = 0, 1  # in Drake's state: both positions, both velocities
 
 solve_options = {"method": "ilqr", "continuation": "auto", "max_iterations": 100}
 
 
 def problem() -> dd.Problem:
-    """The ball, at rest 0.05 m from the pusher, is to pass x = 0.6 m after 1 s; least effort."""
+    """The ball, at rest 0.3 m from the pusher, is to pass x = 1 m after 1 s; least effort."""
     goal = np.full(4, np.nan)
     goal[BALL] = GOAL
     return dd.Problem(

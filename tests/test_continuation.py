@@ -89,6 +89,7 @@ def test_a_soft_final_cost_is_reached_too(two_spheres):
     problem = push(two_spheres(damping=0), gap=0.4, goal=1.0, x_goal=None, final_cost=lambda x: 10 * (x[1] - 1.0) ** 2)
     assert dd.solve(problem, method="ilqr").status is Status.NO_GRADIENT
     solution = dd.solve(problem, continuation="auto", max_iterations=100)
+    assert solution.success, solution.message
     assert abs(solution.replay.xs[-1][1] - 1.0) < 1e-3  # effort 1e-3 against 10: the miss is of their ratio
 
 
@@ -122,7 +123,7 @@ def test_a_stage_that_is_refused_is_told_and_the_schedule_goes_on(two_spheres):
     first, *rest = solution.options["continuation"]
     assert first["status"] != "solved"
     assert len(rest) == len(given)
-    assert solution.goal_error < 1e-5
+    assert solution.success, solution.message
 
 
 def test_the_time_limit_is_that_of_all_stages(two_spheres):
@@ -161,16 +162,6 @@ def test_only_ilqr_takes_a_continuation(two_spheres, load):
         dd.solve(dd.Problem(pendulum, x0=[0, 0], num_steps=5, x_goal=[1, 0]), continuation="auto")
 
 
-def test_a_goal_is_reached_where_a_jump_of_contact_holds_up_the_search(two_spheres):
-    """With damping the least effort makes contact exactly at a knot; the search stops there, and says so."""
-    problem = push(two_spheres(), gap=0.4, goal=1.2)
-    solution = dd.solve(problem, continuation="auto", max_iterations=40)
-    assert not solution.success
-    assert "pusher and ball just touching at knot" in solution.message
-    assert "towards the goal" in solution.message
-    assert solution.replay.xs[-1][1] == pytest.approx(1.2, abs=1e-8)
-
-
 def test_restoration_leaves_a_goal_that_nothing_moves(two_spheres):
     problem = push(two_spheres(), gap=0.4, goal=1.2, num_steps=10)
     us = np.zeros((10, 1))
@@ -180,10 +171,11 @@ def test_restoration_leaves_a_goal_that_nothing_moves(two_spheres):
 
 
 @pytest.mark.slow
-def test_a_box_is_pushed_to_its_goal(load):
-    """The pusher starts 0.15 m away from the box; its goal is a place in the plane, the yaw being free."""
+@pytest.mark.parametrize("wanted", [[0.4, 0.1], [0.4, 0.1, 0.3]])
+def test_a_box_is_pushed_to_its_goal(load, wanted):
+    """The pusher starts 0.15 m away from the box; its goal is a place in the plane, with the yaw free or given."""
     goal = np.full(10, FREE)
-    goal[:2] = [0.4, 0.1]
+    goal[: len(wanted)] = wanted
     problem = dd.Problem(
         load("box_push.sdf", time_step=0.02),
         x0=[0, 0, 0, -0.35, -0.05, 0, 0, 0, 0, 0],
@@ -191,10 +183,11 @@ def test_a_box_is_pushed_to_its_goal(load):
         running_cost=dd.QuadraticCost(Q=np.zeros((10, 10)), R=1e-3 * np.eye(2)),
         x_goal=goal,
     )
-    assert dd.solve(problem, method="ilqr").status is Status.NO_GRADIENT
-    solution = dd.solve(problem, continuation="auto", max_iterations=60)
+    solution = dd.solve(problem)
+    assert solution.success, solution.message
+    assert solution.options["chain"][0]["ended"] == "no_gradient"
     replay = solution.replay
-    assert replay.xs[-1][:2] == pytest.approx([0.4, 0.1], abs=1e-5)
+    assert replay.xs[-1][: len(wanted)] == pytest.approx(wanted, abs=1e-7)
     assert not replay.contacts[0]
     assert any(replay.contacts)
 
@@ -220,9 +213,9 @@ def test_a_hopper_jumps_to_an_apex(load):
         x_goal=goal,
     )
     solution = dd.solve(problem, continuation="auto", max_iterations=100)
-    assert solution.goal_error < 1e-5
+    assert solution.success, solution.message
     replay = solution.replay
-    assert replay.xs[-1][[0, 1, 5]] == pytest.approx([0.2, 0.6, 0.0], abs=1e-5)
+    assert replay.xs[-1][[0, 1, 5]] == pytest.approx([0.2, 0.6, 0.0], abs=1e-7)
     assert replay.contacts[0]
     assert not replay.contacts[-1]
     landed = max(k for k, contacts in enumerate(replay.contacts) if contacts) + 1

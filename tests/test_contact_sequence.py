@@ -1,0 +1,166 @@
+"""Minimization across the jumps that contact makes: what is held, on which side, and what is claimed."""
+
+import signal
+
+import numpy as np
+import pytest
+from test_continuation import push, two_spheres  # noqa: F401  (a fixture)
+
+import drake_diff as dd
+from drake_diff.contact_sequence import MARGIN, beginnings
+from drake_diff.goal_restoration import restore_goal
+from drake_diff.shooting import ShootingVariables, state_sensitivities
+from drake_diff.soft_contact import separations
+from drake_diff.solution import Status
+from drake_diff.step import set_state
+
+
+def separation(model, x):
+    set_state(model.double, x)
+    return separations(model.double)[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "x"),
+    [
+        ("two_spheres.sdf", [0.1, 0.5, 0, 0]),
+        ("box_push.sdf", [0.1, 0.05, 0.3, -0.3, -0.02, 0, 0, 0, 0, 0]),
+        ("box_push.sdf", [0, 0, 0, -0.19, 0.02, 0, 0, 0, 0, 0]),
+        ("hopper.sdf", [0.1, 0.4, 0.02, 0.3, 0, 0, 0, 0]),
+    ],
+)
+def test_a_distance_has_its_slope_and_opens_by_the_least_motion(load, name, x):
+    """Central differences with steps of 1e-6 are right to 1e-9 here; the opening adds its length to first order."""
+    model, x, d = load(name), np.array(x, dtype=float), 1e-6
+    found = separation(model, x)
+    for i, slope in enumerate(found.gradient):
+        e = d * np.eye(model.nx)[i]
+        assert slope == pytest.approx(
+            (separation(model, x + e).distance - separation(model, x - e).distance) / (2 * d), abs=1e-8
+        )
+    assert found.gradient @ found.opening == pytest.approx(1.0, rel=1e-12)
+    assert (found.distance < 0) == (x[3] == -0.19)
+    mass = model.double.plant.CalcMassMatrix(model.double.context)
+    assert mass @ found.opening == pytest.approx(
+        found.gradient / (found.gradient @ np.linalg.solve(mass, found.gradient))
+    )
+
+
+def test_beginnings_are_where_a_distance_turns_negative(two_spheres):  # noqa: F811
+    """Gaps 0.1, -0.01, 0.02, 0.01, -0.02, -0.03: touches begin at knots 1 and 4; nothing acts on the last state."""
+    gaps = np.array([0.1, -0.01, 0.02, 0.01, -0.02, 0.05, -0.03])
+    problem = push(two_spheres(), gap=0.1, goal=1.0, num_steps=6)
+    xs = np.stack([0 * gaps, 0.2 + gaps, 0 * gaps, 0 * gaps], axis=1)
+    found = beginnings(problem, xs)
+    assert [(h.knot, h.apart) for h in found] == [(1, False), (3, True), (4, False)]  # knot 0 is given
+    assert str(found[1]) == "pusher and ball apart at knot 3"
+    for hold in found:
+        moved = hold.moved_beyond(problem.model, xs[hold.knot])
+        assert separation(problem.model, moved).distance == pytest.approx(-MARGIN if hold.apart else MARGIN, rel=1e-9)
+        centre = [1.0, 0.5] @ moved[:2] - [1.0, 0.5] @ xs[hold.knot][:2]  # the masses' centre stays
+        assert centre == pytest.approx(0, abs=1e-15)
+        rows = hold.constraint(problem.model).differentiate(xs[hold.knot], np.zeros(1))
+        assert rows[0] == pytest.approx([gaps[hold.knot]], abs=1e-12)
+        assert rows[1] == pytest.approx(np.array([[-1.0, 1, 0, 0, 0]]), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("gap", "goal", "fields"),
+    [
+        (0.15, 0.7, {"damping": 1.0, "ball": 1.2}),
+        (0.3, 1.0, {}),
+        (0.4, 1.2, {"damping": 0.5}),
+        (0.55, 1.1, {"damping": 0.2, "pusher": 1.7, "time_step": 0.025}),
+    ],
+)
+def test_pushes_converge(two_spheres, gap, goal, fields):  # noqa: F811
+    model = two_spheres(**fields)
+    problem = push(model, gap=gap, goal=goal, num_steps=round(1 / model.time_step))
+    solution = dd.solve(problem)
+    assert solution.success, solution.message
+    assert solution.replay.xs[-1][1] == pytest.approx(goal, abs=1e-7)
+
+
+@pytest.fixture
+def elastic(two_spheres, monkeypatch, tmp_path):  # noqa: F811
+    """Spheres that rebound: steps of 0.02 s do not resolve it, and every touch is a large jump."""
+
+    def build(**fields):
+        two_spheres(**fields)
+        path = tmp_path / "two_spheres.sdf"
+        text = path.read_text()
+        for old, new in (("dissipation>50<", "dissipation>1<"), ("time>0.1<", "time>0.001<")):
+            assert text.count(old) == 2
+            text = text.replace(old, new)
+        path.write_text(text)
+        return dd.load_model(path, time_step=0.02)
+
+    return build
+
+
+def at_a_jump(elastic):
+    return push(elastic(damping=1.06, pusher=1.74, ball=0.586), gap=0.18, goal=0.93)
+
+
+def test_a_minimum_at_a_jump_meets_the_conditions_of_one_on_its_side(elastic):
+    """Least effort: u is a combination of the slopes of goal and held distance by u, the latter's sign as its side.
+
+    The slopes are the product of Drake's step Jacobians; the search ends at 1e-8 of the cost's scale.
+    """
+    problem = at_a_jump(elastic)
+    solution = dd.solve(problem, method="ilqr", continuation="auto")
+    assert solution.success, solution.message
+    note = solution.options["contact_sequence"]
+    assert note in solution.message
+    assert "a minimum for its own sequence of contacts" in note
+    distance = [x[1] - x[0] - 0.2 for x in solution.xs]
+    (knot,) = (k for k, d in enumerate(distance) if abs(abs(d) - MARGIN) < 1e-7)
+    apart = distance[knot] > 0
+    assert f"held by pusher and ball {'apart' if apart else 'touching'} at knot {knot} (beyond: " in note
+    variables = ShootingVariables(problem)
+    by_u = state_sensitivities(variables, variables.pack(solution.xs[0], solution.us))
+    slopes = np.stack([by_u[-1][1], by_u[knot][1] - by_u[knot][0]], axis=1)
+    u = solution.us.ravel()
+    multipliers = np.linalg.lstsq(slopes, u)[0]
+    assert np.abs(slopes @ multipliers - u).max() < 1e-5 * np.abs(u).max()
+    assert multipliers[1] > 0 if apart else multipliers[1] < 0
+    alone = slopes[:, :1]
+    assert np.abs(alone @ np.linalg.lstsq(alone, u)[0] - u).max() > 1e-2 * np.abs(u).max()  # the row does hold it
+
+
+def test_ctrl_c_ends_the_search_under_holds(elastic):
+    problem, lines = at_a_jump(elastic), []
+
+    def interrupt(line):
+        lines.append(line)
+        if line.startswith("held:"):
+            signal.raise_signal(signal.SIGINT)
+
+    assert dd.solve(problem, method="ilqr", continuation="auto", progress=interrupt).status is Status.INTERRUPTED
+    assert sum(line.startswith("held:") for line in lines) == 1
+
+
+@pytest.mark.parametrize("goal", [0.3, -1.0])
+def test_a_goal_that_no_contact_reaches_is_no_success(two_spheres, goal):  # noqa: F811
+    """The ball at 0.6 m can only be pushed away from the pusher."""
+    solution = dd.solve(push(two_spheres(), gap=0.4, goal=goal), method="ilqr", continuation="auto", max_iterations=60)
+    assert not solution.success
+    assert solution.goal_error > 0.25
+
+
+def test_restoration_keeps_bounds_and_looks_at_the_clock(two_spheres):  # noqa: F811
+    """The ball needs more than 1 m/s on its way to 1.2 m: no step towards the goal may take it there."""
+    model = two_spheres(damping=0)
+    us = np.full((50, 1), 2.0)
+    bounds = dd.Bounds(x_upper=[np.inf, np.inf, np.inf, 1.4])
+    free, bounded = (push(model, gap=0.2, goal=1.8, bounds=b) for b in (None, bounds))
+    xs = dd.rollout(model, free.x0, us).xs
+    assert xs[:, 3].max() < 1.4
+    moved, found, done = restore_goal(free, xs, us, 1e-8)
+    assert moved[-1, 1] == pytest.approx(1.8, abs=1e-8)
+    assert moved[:, 3].max() > 1.5
+    assert "Newton step" in done
+    kept, _, _ = restore_goal(bounded, xs, us, 1e-8)
+    assert kept[:, 3].max() < 1.4 + 1e-5
+    assert restore_goal(free, xs, us, 1e-8, lambda: True)[1] is us
+    assert found is not us
