@@ -1,6 +1,7 @@
 """What is public, and that modules import only from those above them."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -55,6 +56,12 @@ def test_every_module_has_its_place_and_imports_only_from_above():
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("drake_diff."):
                 imported = node.module.removeprefix("drake_diff.")
                 assert ORDER.index(imported) < ORDER.index(name), f"{name} imports {imported}"
+
+
+def test_the_readme_lists_the_modules_in_their_order():
+    text = (PACKAGE.parent / "README.md").read_text()
+    listed = [line for line in text[text.index("## How to change it") :].splitlines() if line.startswith("| ")]
+    assert [name for line in listed for name in re.findall(r"`(\w+)`", line)] == ORDER
 
 
 def test_no_module_is_too_long_and_none_asserts():
