@@ -181,7 +181,7 @@ def tree_of(model: Model) -> TreeDynamics | str:
     for joint in moving:
         if joint.type_name() not in ("revolute", "prismatic"):
             return f"{joint.name()} is of type {joint.type_name()}"
-    springs = _springs(plant)
+    springs = springs_of(plant)
     if isinstance(springs, str):
         return springs
     carriers = {j.child_body().index(): j for j in joints(plant)}
@@ -225,7 +225,7 @@ def _axis(joint: Any) -> Array:
     return np.asarray(joint.revolute_axis() if joint.type_name() == "revolute" else joint.translation_axis())
 
 
-def _springs(plant: Any) -> dict[Any, tuple[float, float]] | str:
+def springs_of(plant: Any) -> dict[Any, tuple[float, float]] | str:
     """Stiffness and rest position by joint, or which force element is none of gravity and these springs."""
     found: dict[Any, tuple[float, float]] = {}
     for i in range(plant.num_force_elements()):

@@ -1,0 +1,287 @@
+"""Five models by hand: mass matrix, bias and their derivatives on paper, each readable beside its file in models/.
+
+Every `residual_by_motion` is d(M(q) a + bias(q, v)) / dq at fixed a and v, every `bias_by_velocity` is d bias / dv.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import cos, sin
+
+import numpy as np
+
+from drake_diff.arrays import Array
+from drake_diff.engines.description import joint_contract
+from drake_diff.engines.engine import JointContract
+from drake_diff.engines.euler import Coordinates, euler_acceleration
+
+X, Y, Z, ORIGIN, NO_INERTIA = np.eye(3)[0], np.eye(3)[1], np.eye(3)[2], np.zeros(3), np.zeros((3, 3))
+Limits = tuple[float, float]
+FREE = (-np.inf, np.inf)
+
+
+@dataclass(frozen=True)
+class ClosedForm(ABC):
+    """Joints of one degree of freedom, unless said otherwise; q (nv,), v (nv,), u (nu,)."""
+
+    gravity: float = 9.81  # [m/s^2], downwards
+    joint_names: tuple[str, ...] = ()
+    input_names: tuple[str, ...] = ()
+    joint_damping: tuple[float, ...] = ()
+    effort_limits: tuple[float, ...] = ()
+    contact_law: str = "none"
+    limits: Mapping[str, Limits] = field(default_factory=dict)
+
+    @property
+    def coordinates(self) -> Coordinates:
+        return Coordinates((), tuple((i, i) for i in range(len(self.joint_names))))
+
+    @property
+    def gravity_vector(self) -> Array:
+        """(3,) [m/s^2]."""
+        return -self.gravity * Z
+
+    @property
+    def actuation(self) -> Array:
+        """B (nv, nu): input i drives joint i."""
+        return np.eye(self.coordinates.nv, len(self.input_names))
+
+    @property
+    def damping(self) -> Array:
+        """(nv,), implicit in the step."""
+        return np.array(self.joint_damping) if self.joint_damping else np.zeros(self.coordinates.nv)
+
+    @abstractmethod
+    def mass_matrix(self, q: Array) -> Array:
+        """M (nv, nv)."""
+
+    @abstractmethod
+    def bias(self, q: Array, v: Array) -> Array:
+        """(nv,)."""
+
+    def residual_by_motion(self, q: Array, v: Array, a: Array) -> Array:
+        """(nv, nv); 0 unless said otherwise."""
+        return np.zeros((len(v), len(v)))
+
+    def bias_by_velocity(self, q: Array, v: Array) -> Array:
+        """(nv, nv); 0 unless said otherwise."""
+        return np.zeros((len(v), len(v)))
+
+    @abstractmethod
+    def potential_energy(self, q: Array) -> float:
+        """[J]."""
+
+    def contact_depth(self, q: Array) -> float:
+        """[m]."""
+        return 0.0
+
+    @abstractmethod
+    def joints(self) -> tuple[JointContract, ...]:
+        """What the contract says of the joints."""
+
+    def acceleration(self, h: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
+        """(v' - v) / h (nv,) of the step, and its derivative by motion, v and u (nv, 2 nv + nu)."""
+        M, D, limit = self.mass_matrix(q), self.damping, np.array(self.effort_limits)
+        effort = np.clip(u, -limit, limit)
+        a = euler_acceleration(M, D, h, v, self.actuation @ effort - self.bias(q, v))
+        inside = self.actuation * (np.abs(u) <= limit)
+        residual = [self.residual_by_motion(q, v, a), self.bias_by_velocity(q, v) + np.diag(D), -inside]
+        return a, -np.linalg.solve(M + h * np.diag(D), np.hstack(residual))
+
+    def _joint(
+        self, index: int, kind: str, axis: Array, anchor: Array, mass: float, com: Array, inertia: Array,
+        *, stiffness: float = 0.0, rest: float = 0.0,
+    ) -> JointContract:  # fmt: skip
+        name = self.joint_names[index]
+        lower, upper = self.limits.get(name, FREE)
+        damping = 0.0 if kind == "quaternion_floating" else float(self.damping[index])
+        return joint_contract(
+            name=name, kind=kind, axis=axis, anchor=anchor, carried=[(mass, com, inertia)], damping=damping,
+            armature=0.0, stiffness=stiffness, rest=rest, lower=lower, upper=upper,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Projectile(ClosedForm):
+    """A free ball: q = (quaternion, position), v = (angular, linear velocity)."""
+
+    joint_names: tuple[str, ...] = ("ball",)
+    mass: float = 1.0
+    inertia: float = 0.001
+
+    @property
+    def coordinates(self) -> Coordinates:
+        return Coordinates(((0, 0),), ())
+
+    def mass_matrix(self, q: Array) -> Array:
+        return np.diag([self.inertia] * 3 + [self.mass] * 3)
+
+    def bias(self, q: Array, v: Array) -> Array:
+        return np.array([0, 0, 0, 0, 0, self.mass * self.gravity])
+
+    def potential_energy(self, q: Array) -> float:
+        return float(self.mass * self.gravity * q[6])
+
+    def joints(self) -> tuple[JointContract, ...]:
+        inertia = self.inertia * np.eye(3)
+        return (self._joint(0, "quaternion_floating", ORIGIN, ORIGIN, self.mass, ORIGIN, inertia),)
+
+
+@dataclass(frozen=True)
+class MassSpringDamper(ClosedForm):
+    """A block on a horizontal rail: m a = u - k (q - rest) - c v'."""
+
+    joint_names: tuple[str, ...] = ("slide",)
+    input_names: tuple[str, ...] = ("slide",)
+    joint_damping: tuple[float, ...] = (1.5,)
+    effort_limits: tuple[float, ...] = (1000.0,)
+    mass: float = 2.0
+    stiffness: float = 50.0
+    rest: float = 0.1
+    inertia: float = 0.0033
+
+    def mass_matrix(self, q: Array) -> Array:
+        return np.array([[self.mass]])
+
+    def bias(self, q: Array, v: Array) -> Array:
+        return self.stiffness * (q - self.rest)
+
+    def residual_by_motion(self, q: Array, v: Array, a: Array) -> Array:
+        return np.array([[self.stiffness]])
+
+    def potential_energy(self, q: Array) -> float:
+        return float(self.stiffness * (q[0] - self.rest) ** 2 / 2)
+
+    def joints(self) -> tuple[JointContract, ...]:
+        inertia = self.inertia * np.eye(3)
+        spring = {"stiffness": self.stiffness, "rest": self.rest}
+        return (self._joint(0, "prismatic", X, ORIGIN, self.mass, ORIGIN, inertia, **spring),)
+
+
+@dataclass(frozen=True)
+class Pendulum(ClosedForm):
+    """A point mass below a hinge about +y: m l^2 a = u - m g l sin q - b v'."""
+
+    joint_names: tuple[str, ...] = ("hinge",)
+    input_names: tuple[str, ...] = ("motor",)
+    joint_damping: tuple[float, ...] = (0.1,)
+    effort_limits: tuple[float, ...] = (np.inf,)
+    mass: float = 1.0
+    length: float = 0.5
+
+    def mass_matrix(self, q: Array) -> Array:
+        return np.array([[self.mass * self.length**2]])
+
+    def bias(self, q: Array, v: Array) -> Array:
+        return np.array([self.mass * self.gravity * self.length * sin(q[0])])
+
+    def residual_by_motion(self, q: Array, v: Array, a: Array) -> Array:
+        return np.array([[self.mass * self.gravity * self.length * cos(q[0])]])
+
+    def potential_energy(self, q: Array) -> float:
+        return -self.mass * self.gravity * self.length * cos(q[0])
+
+    def joints(self) -> tuple[JointContract, ...]:
+        return (self._joint(0, "revolute", Y, ORIGIN, self.mass, -self.length * Z, NO_INERTIA),)
+
+
+@dataclass(frozen=True)
+class DoublePendulum(ClosedForm):
+    """Two uniform thin rods below hinges about +y; the second angle is relative to the first."""
+
+    joint_names: tuple[str, ...] = ("shoulder", "elbow")
+    input_names: tuple[str, ...] = ("shoulder_motor", "elbow_motor")
+    effort_limits: tuple[float, ...] = (np.inf, np.inf)
+    masses: tuple[float, float] = (1.0, 0.7)
+    lengths: tuple[float, float] = (0.8, 0.5)
+
+    @property
+    def _moments(self) -> tuple[float, float, float]:
+        (m1, m2), (l1, l2) = self.masses, self.lengths
+        return m1 * l1**2 / 3 + m2 * l1**2, m2 * l2**2 / 3, m2 * l1 * l2 / 2
+
+    @property
+    def _weights(self) -> tuple[float, float]:
+        (m1, m2), (l1, l2) = self.masses, self.lengths
+        return (m1 / 2 + m2) * self.gravity * l1, m2 * self.gravity * l2 / 2
+
+    def mass_matrix(self, q: Array) -> Array:
+        (a, b, c), c2 = self._moments, cos(q[1])
+        return np.array([[a + b + 2 * c * c2, b + c * c2], [b + c * c2, b]])
+
+    def bias(self, q: Array, v: Array) -> Array:
+        (_, _, c), (g1, g2), s2 = self._moments, self._weights, sin(q[1])
+        lower = g2 * sin(q[0] + q[1])
+        upper = g1 * sin(q[0]) + lower
+        return np.array([upper - c * s2 * (2 * v[0] + v[1]) * v[1], lower + c * s2 * v[0] ** 2])
+
+    def residual_by_motion(self, q: Array, v: Array, a: Array) -> Array:
+        (_, _, c), (g1, g2), s2, c2 = self._moments, self._weights, sin(q[1]), cos(q[1])
+        lower = g2 * cos(q[0] + q[1])
+        by_elbow = -c * s2 * (2 * a[0] + a[1]) - c * c2 * (2 * v[0] + v[1]) * v[1]
+        return np.array(
+            [[g1 * cos(q[0]) + lower, by_elbow + lower], [lower, lower - c * s2 * a[0] + c * c2 * v[0] ** 2]]
+        )
+
+    def bias_by_velocity(self, q: Array, v: Array) -> Array:
+        cs = self._moments[2] * sin(q[1])
+        return np.array([[-2 * cs * v[1], -2 * cs * (v[0] + v[1])], [2 * cs * v[0], 0]])
+
+    def potential_energy(self, q: Array) -> float:
+        g1, g2 = self._weights
+        return -g1 * cos(q[0]) - g2 * cos(q[0] + q[1])
+
+    def joints(self) -> tuple[JointContract, ...]:
+        (m1, m2), (l1, l2) = self.masses, self.lengths
+        across = np.diag([1.0, 1.0, 0.0]) / 12
+        return (
+            self._joint(0, "revolute", Y, ORIGIN, m1, -l1 / 2 * Z, m1 * l1**2 * across),
+            self._joint(1, "revolute", Y, -l1 * Z, m2, -(l1 + l2 / 2) * Z, m2 * l2**2 * across),
+        )
+
+
+@dataclass(frozen=True)
+class CartPole(ClosedForm):
+    """Kelly's: a cart on a rail along x, a point bob on a massless pole from a hinge about -y; the cart is pushed."""
+
+    joint_names: tuple[str, ...] = ("slide", "hinge")
+    input_names: tuple[str, ...] = ("force",)
+    effort_limits: tuple[float, ...] = (20.0,)
+    limits: Mapping[str, Limits] = field(default_factory=lambda: {"slide": (-2.0, 2.0)})
+    cart: float = 1.0
+    bob: float = 0.3
+    length: float = 0.5
+
+    def mass_matrix(self, q: Array) -> Array:
+        ml = self.bob * self.length
+        return np.array([[self.cart + self.bob, ml * cos(q[1])], [ml * cos(q[1]), ml * self.length]])
+
+    def bias(self, q: Array, v: Array) -> Array:
+        return self.bob * self.length * sin(q[1]) * np.array([-(v[1] ** 2), self.gravity])
+
+    def residual_by_motion(self, q: Array, v: Array, a: Array) -> Array:
+        s, c = sin(q[1]), cos(q[1])
+        by_hinge = np.array([-s * a[1] - c * v[1] ** 2, -s * a[0] + c * self.gravity])
+        return np.column_stack([np.zeros(2), self.bob * self.length * by_hinge])
+
+    def bias_by_velocity(self, q: Array, v: Array) -> Array:
+        return np.array([[0, -2 * self.bob * self.length * sin(q[1]) * v[1]], [0, 0]])
+
+    def potential_energy(self, q: Array) -> float:
+        return -self.bob * self.gravity * self.length * cos(q[1])
+
+    def joints(self) -> tuple[JointContract, ...]:
+        return (
+            self._joint(0, "prismatic", X, ORIGIN, self.cart, ORIGIN, NO_INERTIA),
+            self._joint(1, "revolute", -Y, ORIGIN, self.bob, -self.length * Z, NO_INERTIA),
+        )
+
+
+# The hand calculation of the file of that name in models/.
+BY_MODEL: dict[str, ClosedForm] = {
+    "projectile": Projectile(),
+    "mass_spring_damper": MassSpringDamper(),
+    "pendulum": Pendulum(),
+    "double_pendulum": DoublePendulum(),
+    "cart_pole": CartPole(),
+}

@@ -1,0 +1,109 @@
+"""Drake's discrete step where nothing touches, written out: semi-implicit Euler with implicit joint damping.
+
+    (M(q) + h D) a = B u - bias(q, v) - D v,   v' = v + h a,   q' = q + h N(q) v'
+
+N is the identity but for a free body, where v = (w, v_o) in world and the quaternion moves by h/2 (0, w) * q.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_diff.arrays import Array
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Which entries of q and v belong together: free bodies, and joints of one degree of freedom."""
+
+    free: tuple[tuple[int, int], ...]  # (start in q, start in v)
+    single: tuple[tuple[int, int], ...]  # (index in q, index in v)
+
+    @property
+    def nq(self) -> int:
+        return 7 * len(self.free) + len(self.single)
+
+    @property
+    def nv(self) -> int:
+        return 6 * len(self.free) + len(self.single)
+
+    def rate(self, q: Array) -> Array:
+        """N (nq, nv) with dq/dt = N v."""
+        N = np.zeros((self.nq, self.nv))
+        for i, j in self.single:
+            N[i, j] = 1.0
+        for i, j in self.free:
+            N[i : i + 4, j : j + 3] = 0.5 * _times_from_left(q[i : i + 4])
+            N[i + 4 : i + 7, j + 3 : j + 6] = np.eye(3)
+        return N
+
+    def rate_by_position(self, v: Array) -> Array:
+        """(nq, nq) the derivative of N(q) v by q, which does not depend on q."""
+        derivative = np.zeros((self.nq, self.nq))
+        for i, j in self.free:
+            derivative[i : i + 4, i : i + 4] = 0.5 * _left_product(v[j : j + 3])
+        return derivative
+
+    def motion(self, q: Array) -> Array:
+        """W (nv, nq): the small motion, in the sense of v, that a change of q is; W N = 1, and W q = 0 for a norm."""
+        W = np.zeros((self.nv, self.nq))
+        for j, i in ((j, i) for i, j in self.single):
+            W[j, i] = 1.0
+        for i, j in self.free:
+            quaternion = q[i : i + 4]
+            W[j : j + 3, i : i + 4] = 2 * _times_from_left(quaternion).T / (quaternion @ quaternion)
+            W[j + 3 : j + 6, i + 4 : i + 7] = np.eye(3)
+        return W
+
+
+def euler_acceleration(M: Array, D: Array, h: float, v: Array, force: Array) -> Array:
+    """(nv,) (v' - v) / h of the step, with `force` (nv,) = B u - bias and joint damping D (nv,)."""
+    return np.asarray(np.linalg.solve(M + h * np.diag(D), force - D * v))
+
+
+def euler_step(coordinates: Coordinates, h: float, x: Array, acceleration: Array) -> Array:
+    """(nx,) the state that the acceleration leads to."""
+    q, v = x[: coordinates.nq], x[coordinates.nq :]
+    v_next = v + h * acceleration
+    return np.concatenate([q + h * coordinates.rate(q) @ v_next, v_next])
+
+
+def euler_jacobian(coordinates: Coordinates, h: float, x: Array, x_next: Array, by: Array) -> Array:
+    """(nx, nx + nu) of `euler_step`, from `by` (nv, 2 nv + nu): the acceleration by small motion, by v and by u."""
+    nq, nv = coordinates.nq, coordinates.nv
+    q, v_next = x[:nq], x_next[nq:]
+    lower = h * np.hstack([by[:, :nv] @ coordinates.motion(q), by[:, nv:]])
+    lower[:, nq : nq + nv] += np.eye(nv)
+    upper = h * coordinates.rate(q) @ lower
+    upper[:, :nq] += np.eye(nq) + h * coordinates.rate_by_position(v_next)
+    return np.vstack([upper, lower])
+
+
+def skew(w: Array) -> Array:
+    """(3, 3) with skew(w) x = w x x."""
+    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+
+
+def rotation(quaternion: Array) -> Array:
+    """(3, 3) of a quaternion (w, x, y, z) of any norm."""
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _times_from_left(q: Array) -> Array:
+    """(4, 3): w -> (0, w) * q."""
+    s, x, y, z = q
+    return np.array([[-x, -y, -z], [s, z, -y], [-z, s, x], [y, -x, s]])
+
+
+def _left_product(w: Array) -> Array:
+    """(4, 4): q -> (0, w) * q."""
+    product = np.zeros((4, 4))
+    product[0, 1:], product[1:, 0], product[1:, 1:] = -w, w, skew(w)
+    return product

@@ -1,0 +1,28 @@
+"""Engines by name, imported only when asked for."""
+
+from importlib import import_module
+from typing import Any
+
+from drake_diff.engines.engine import Engine
+from drake_diff.exceptions import UnknownNameError
+
+ENGINES = {
+    "numpy": ("numpy_engine", "NumpyEngine"),
+    "drake": ("drake_engine", "DrakeEngine"),
+    "mujoco": ("mujoco_engine", "MujocoEngine"),
+    "pinocchio": ("pinocchio_engine", "PinocchioEngine"),
+}
+
+
+def load_engine(name: str, model: Any, **options: Any) -> Engine:
+    """The engine `name` (numpy, drake, mujoco, pinocchio) on `model`, a Model or for numpy also a ClosedForm.
+
+    Options: contact and method of drake, path (an MJCF of your own) of mujoco, time_step [s] of a ClosedForm. Raises
+    MissingDependencyError, with what to install, where the engine is not there, and ModelError, naming the element,
+    where it cannot have the model.
+    """
+    if name not in ENGINES:
+        raise UnknownNameError("engine", got=name, known=ENGINES)
+    module, kind = ENGINES[name]
+    engine: Engine = getattr(import_module(f"drake_diff.engines.{module}"), kind)(model, **options)
+    return engine
