@@ -1,0 +1,516 @@
+"""One model in every engine: hand calculations, then Drake against Pinocchio and MuJoCo, then contact at rest."""
+
+import subprocess
+import sys
+import warnings
+from importlib.metadata import files
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from conftest import Plant, contact_properties, random_state
+from pydrake.geometry import Convex
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    QuaternionFloatingJoint,
+    RevoluteJoint,
+    SpatialInertia,
+    UniversalJoint,
+)
+from test_silent_faults import pd_pendulum
+
+import drake_diff as dd
+from drake_diff.engines.closed_form import BY_MODEL, CartPole, DoublePendulum, MassSpringDamper, Pendulum, Projectile
+from drake_diff.engines.closed_form_contact import SlidingBlock, SphereOnGround
+from drake_diff.engines.numpy_engine import NumpyEngine
+from drake_diff.tangent import tangent_space
+
+HAND = ["pendulum.urdf", "double_pendulum.urdf", "cart_pole.urdf", "mass_spring_damper.sdf", "projectile.sdf"]
+HERE = [*HAND, "acrobot.xml"]
+ROBOTS = ["panda.urdf", "ur5_robot.urdf", "solo12.urdf", "double_pendulum_continuous.urdf"]
+WELDED = {"double_pendulum_continuous.urdf": "base_link"}
+MIMIC = '<mimic joint="panda_finger_joint1"/>'
+G = 9.81
+
+
+def needs(engine):
+    """Skip, saying what is missing, where the engine is not installed."""
+    module = {"mujoco": "mujoco", "pinocchio": "pinocchio"}.get(engine)
+    if module and find_spec(module) is None:
+        pytest.skip(f"{engine} is not installed: pip install 'drake-diff[engines]'")
+
+
+def engine_of(name, model, **options):
+    needs(name)
+    return dd.load_engine(name, model, **options)
+
+
+def robot(name, tmp_path):
+    """A robot of example-robot-data, but for what no other engine has: that one finger mimics the other, which is a
+    coupler in Drake, and that continuous joints have limits 0 and 0, which Drake keeps."""
+    path = next(f.locate() for f in files("example-robot-data") if str(f).endswith("/" + name))
+    lines = path.read_text().splitlines()
+    copy = tmp_path / name
+    copy.write_text("\n".join(line for line in lines if line.strip() not in ('lower="0"', 'upper="0"', MIMIC)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dd.ModelWarning)  # meshes of visuals are skipped
+        return dd.load_model(copy, time_step=0.001, weld_base=WELDED.get(name))
+
+
+def free_state(model, random):
+    """A random state inside the limits, free bodies high up."""
+    x = random_state(model, random)
+    lower, upper = model.plant.GetPositionLowerLimits(), model.plant.GetPositionUpperLimits()
+    for i in np.flatnonzero(np.isfinite(lower) & np.isfinite(upper)):
+        x[i] = random.uniform(0.75 * lower[i] + 0.25 * upper[i], 0.25 * lower[i] + 0.75 * upper[i])
+    if model.nq > model.nv:
+        x[6] += 5.0
+    return x
+
+
+def on_tangent(model, A, x, x_next):
+    space = tangent_space(model)
+    return space.derivative_of_minus(x_next) @ A @ space.derivative_of_plus(x)
+
+
+# ---- hand calculations -------------------------------------------------------------------------------------------
+
+
+def test_pendulum_a03():
+    engine = NumpyEngine(Pendulum(), time_step=0.01)
+    x_next = engine.step([0.7, -1.2], [0.3])
+    A, B, _ = engine.differentiate_step([0.7, -1.2], [0.3])
+    # The oracle's digits; the formulas of ORACLES A03 below to rounding.
+    np.testing.assert_allclose(x_next, [0.686908411253, -1.309158874737], rtol=0, atol=6e-13)
+    h, gl, s = 0.01, G / 0.5, 1 / (1 + 0.01 * 0.1 / 0.25)
+    c = np.cos(0.7)
+    np.testing.assert_allclose(A, [[1 - h * h * s * gl * c, h * s], [-h * s * gl * c, s]], rtol=1e-14)
+    np.testing.assert_allclose(B.ravel(), [h * h * s / 0.25, h * s / 0.25], rtol=1e-14)
+
+
+def test_double_pendulum_a05():
+    engine = NumpyEngine(DoublePendulum(), time_step=0.005)
+    x, u = [0.4, -0.9, 1.3, -0.6], [0.25, -0.15]
+    M = [[0.89371745778245, 0.14535872889123], [0.14535872889123, 0.05833333333333]]
+    np.testing.assert_allclose(engine.mass_matrix(x[:2]), M, rtol=0, atol=6e-15)  # the oracle's 14 decimals
+    x_next = [0.40628355157782, -0.902092759011, 1.25671031556302, -0.41855180220094]
+    np.testing.assert_allclose(engine.step(x, u), x_next, rtol=0, atol=1e-12)  # its 12
+    A, B, _ = engine.differentiate_step(x, u)
+    lower = [
+        [-0.0604564179632879, -0.0182224978032518, 0.994554043826923, -0.00144431914674947],
+        [0.0215128929057214, -0.0149505999112984, 0.0380103812989330, 1.00359904677631],
+    ]
+    np.testing.assert_allclose(A[2:], lower, rtol=1e-13)  # 15 digits of numbers near 1
+    by_u = [[0.00940727957631641, -0.02344166059779], [-0.02344166059779, 0.144127714073045]]
+    np.testing.assert_allclose(B[2:], by_u, rtol=1e-12)
+    assert engine.energy(x) == pytest.approx(0.6523114432910162 - 10.18077388024687, rel=1e-14)
+
+
+def test_mass_spring_damper_a07():
+    engine = NumpyEngine(MassSpringDamper(), time_step=0.01)
+    np.testing.assert_allclose(engine.step([0.35, -0.4], [1]), [0.34545905707196, -0.45409429280397], rtol=1e-13)
+    A, B, _ = engine.differentiate_step([0.35, -0.4], [1])
+    expected = [[0.997518610421836, 0.00992555831265509], [-0.248138957816377, 0.992555831265509]]
+    np.testing.assert_allclose(A, expected, rtol=1e-14)
+    np.testing.assert_allclose(B.ravel(), [4.96277915632754e-5, 4.96277915632754e-3], rtol=1e-14)
+
+
+def test_projectile_a01():
+    engine = NumpyEngine(Projectile(), time_step=0.01)
+    x = np.array([1.0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 2, 1, 5])
+    total = np.eye(13)
+    for _ in range(100):
+        total = engine.differentiate_step(x, []).A @ total
+        x = engine.step(x, [])
+    np.testing.assert_allclose(x[4:7], [2, 1, 1.04595], rtol=1e-12)
+    np.testing.assert_allclose(total[4:7, 10:13], np.eye(3), atol=1e-12)
+
+
+def test_cart_pole_a33():
+    engine = NumpyEngine(CartPole(), time_step=1e-3)
+    x = np.array([0.1, 0.7, -0.3, 1.1])
+    acceleration = (engine.step(x, [2])[2:] - x[2:]) / 1e-3
+    np.testing.assert_allclose(acceleration, [3.172075726216, -17.491825696946], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("x", "v", "v_next"), [(0.003, -0.2, -0.154711111111), (0.003, 0.4, 0.378622222222),
+                                                (0.0005, -1, -0.921377777778)])  # fmt: skip
+def test_sphere_on_ground_a12(x, v, v_next):
+    engine = NumpyEngine(SphereOnGround(stiffness=5000), time_step=0.005)
+    state = [0.1 - x, v]
+    assert engine.step(state, [])[1] == pytest.approx(v_next, rel=1e-11)  # the oracle's 12 decimals
+    np.testing.assert_allclose(engine.differentiate_step(state, []).A[1], [-22.2222222222222, 0.888888888888889],
+                               rtol=1e-13)  # fmt: skip
+    assert engine.contact_depth(state) == pytest.approx(x, rel=1e-13)
+
+
+def test_sphere_on_ground_a14_holds_and_lets_go():
+    engine = NumpyEngine(SphereOnGround(stiffness=5000, relaxation_time=0.02), time_step=0.005)
+    assert engine.step([0.097, -0.2], [])[1] == pytest.approx(-0.107107692308, rel=1e-11)
+    assert engine.step([0.097, 0.4], [])[1] == pytest.approx(0.35095, rel=1e-13)
+    np.testing.assert_allclose(engine.differentiate_step([0.097, 0.4], []).A[1], [0, 1], atol=1e-15)
+
+
+@pytest.mark.parametrize(("u", "v0", "v", "by_v0", "by_u"), [
+    (0, 1, 0.9509500002712, 0.99999999943, None), (2, 0, 4.453632360759e-5, None, 2.66732351568e-5),
+    (4.9, 0, 6.055159639138e-4, None, 3.20313813328e-3), (6, 0, 0.01095204452046, None, 9.996268039878e-3),
+])  # fmt: skip
+def test_sliding_block_a18(u, v0, v, by_v0, by_u):
+    engine = NumpyEngine(SlidingBlock(), time_step=0.01)
+    assert engine.step([0, v0], [u])[1] == pytest.approx(v, rel=1e-11)  # the oracle's digits
+    A, B, _ = engine.differentiate_step([0, v0], [u])
+    if by_v0:
+        assert A[1, 1] == pytest.approx(by_v0, rel=1e-11)
+    else:
+        assert B[1, 0] == pytest.approx(by_u, rel=1e-10)
+
+
+def test_a_block_stops_a20_and_slides_down_a21():
+    flat = NumpyEngine(SlidingBlock(), time_step=0.01)
+    x, total = np.array([0.0, 1.0]), np.eye(2)
+    for _ in range(200):
+        total = flat.differentiate_step(x, [0]).A @ total
+        x = flat.step(x, [0])
+    assert x[0] == pytest.approx(0.0969954306, rel=1e-5)  # Drake's, whose normal force is not quite at rest
+    assert total[0, 1] == pytest.approx(0.2000252, rel=1e-5)
+    slope = NumpyEngine(SlidingBlock(friction=0.1, slope=np.deg2rad(15)), time_step=0.005)
+    x = np.array([0.0, 0.5])
+    for _ in range(200):
+        x = slope.step(x, [0])
+    np.testing.assert_allclose(x, [1.2996994024252, 2.0914415968662], rtol=1e-8)  # less friction by (s / v)^2 / 2
+
+
+@pytest.mark.parametrize("form", [*BY_MODEL.values(), SphereOnGround(relaxation_time=0.01), SlidingBlock()])
+def test_hand_jacobians_are_those_of_the_hand_steps(form):
+    engine, random = NumpyEngine(form, time_step=0.01), np.random.default_rng(1)
+    nx, nu = engine.nq + engine.nv, len(form.input_names)
+    point = np.concatenate([random.standard_normal(nx), random.standard_normal(nu)])
+    if isinstance(form, SphereOnGround):
+        point = np.array([0.098, -0.3])
+    A, B, _ = engine.differentiate_step(point[:nx], point[nx:])
+    for i, column in enumerate(np.hstack([A, B]).T):
+        e = 1e-6 * np.eye(nx + nu)[i]
+        ends = [engine.step(p[:nx], p[nx:]) for p in (point + e, point - e)]
+        np.testing.assert_allclose(column, (ends[0] - ends[1]) / 2e-6, atol=1e-8)  # rounding 1e-10, truncation less
+
+
+# ---- free motion, engine against engine ---------------------------------------------------------------------------
+
+
+def assert_free_steps_agree(model, name, step, jacobian, *, states=5):
+    """One step and its Jacobian (on the tangent space) to these tolerances, relative to the largest entry."""
+    drake, other, random = dd.load_engine("drake", model), engine_of(name, model), np.random.default_rng(2)
+    for _ in range(states):
+        x, u = free_state(model, random), random.standard_normal(model.nu)
+        a, b = drake.step(x, u), other.step(x, u)
+        np.testing.assert_allclose(b, a, rtol=0, atol=step * max(1, abs(a).max()))
+        one, two = drake.differentiate_step(x, u), other.differentiate_step(x, u)
+        A, A2 = on_tangent(model, one.A, x, a), on_tangent(model, two.A, x, b)
+        np.testing.assert_allclose(A2, A, rtol=0, atol=jacobian * max(1, abs(A).max()))
+        np.testing.assert_allclose(two.B, one.B, rtol=0, atol=jacobian * max(1, abs(one.B).max(initial=0)))
+        np.testing.assert_allclose(other.energy(x), drake.energy(x), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("file", HAND)
+def test_the_hand_calculation_is_drake(load, file):
+    assert_free_steps_agree(load(file), "numpy", 1e-13, 1e-12)  # a few roundings
+
+
+@pytest.mark.parametrize("file", HERE)
+def test_pinocchio_is_drake(load, file):
+    assert_free_steps_agree(load(file), "pinocchio", 1e-12, 1e-12)
+
+
+@pytest.mark.parametrize("file", [f for f in HERE if f != "projectile.sdf"])
+def test_mujoco_is_drake_where_no_body_is_free(load, file):
+    # 1e-10: the Jacobian is of differences; the step is good to 1e-14, and to 1e-12 on inertias of 2e-15 for 0.
+    assert_free_steps_agree(load(file), "mujoco", 1e-12, 1e-10)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_pinocchio_is_drake_on_robots(tmp_path, name):
+    assert_free_steps_agree(robot(name, tmp_path), "pinocchio", 1e-12, 1e-12, states=2)
+
+
+@pytest.mark.parametrize("name", ["ur5_robot.urdf", "double_pendulum_continuous.urdf"])
+def test_mujoco_is_drake_on_fixed_robots(tmp_path, name):
+    assert_free_steps_agree(robot(name, tmp_path), "mujoco", 1e-12, 1e-10, states=2)
+
+
+@pytest.mark.parametrize("name", ["panda.urdf", "solo12.urdf", "projectile.sdf"])
+def test_mujoco_differs_on_free_bodies_by_the_quaternions_exponential_alone(load, tmp_path, name):
+    model = load(name) if name == "projectile.sdf" else robot(name, tmp_path)
+    drake, mujoco, random = dd.load_engine("drake", model), engine_of("mujoco", model), np.random.default_rng(3)
+    from drake_diff.engines.mujoco_engine import exponential_gap
+
+    space = tangent_space(model)
+
+    def with_gap(x, u):
+        a = np.array(drake.step(x, u))
+        a[:4] = a[:4] / np.linalg.norm(a[:4]) + exponential_gap(x, a, model.time_step, 0, model.nq)
+        return a
+
+    for _ in range(3):
+        x, u = free_state(model, random), random.standard_normal(model.nu)
+        a, b = with_gap(x, u), mujoco.step(x, u)
+        assert np.abs(b[:4] - drake.step(x, u)[:4]).max() > 1e-8  # there is something to explain
+        np.testing.assert_allclose(b, a, rtol=0, atol=1e-12 * abs(a).max())
+        one, two = drake.differentiate_step(x, u), mujoco.differentiate_step(x, u)
+        A, A2 = on_tangent(model, one.A, x, drake.step(x, u)), on_tangent(model, two.A, x, b)
+        # The turn's own rows, by differences of Drake's step and the gap: good to 1e-9.
+        for i in range(len(A)):
+            e = 1e-6 * np.eye(len(A))[i]
+            ends = [space.minus(with_gap(space.plus(x, d), u), b)[:3] for d in (e, -e)]
+            np.testing.assert_allclose(A2[:3, i], (ends[0] - ends[1]) / 2e-6, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["pinocchio", "mujoco"])
+def test_a_swapped_quaternion_or_velocity_frame_is_found(load, monkeypatch, name):
+    plant = Plant(0.01)
+    inertia = SpatialInertia.SolidBoxWithMass(1.0, 0.1, 0.2, 0.3)
+    plant.plant.AddRigidBody("box", inertia)
+    model = plant.model()
+    drake, other = dd.load_engine("drake", model), engine_of(name, model)
+    assert [line.quantity for line in dd.match_contracts(drake, other) if line.verdict == "different"] == (
+        ["integrator"] if name == "mujoco" else []
+    )
+    module = sys.modules[f"drake_diff.engines.{name}_engine"]
+    real = module.rotation
+    wrong = {"quaternion order": lambda q: real(np.roll(q, 1)), "velocity frame": lambda q: np.eye(3)}
+    for swapped in wrong.values():
+        monkeypatch.setattr(module, "rotation", swapped)
+        found = [line.quantity for line in dd.match_contracts(drake, other) if line.verdict == "different"]
+        assert set(found) & {"M(q)", "bias(q, v)"}
+
+
+# ---- Drake's own variants, contact, refusals -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("contact", ["sap", "similar", "lagged"])
+@pytest.mark.parametrize("method", ["autodiff", "implicit", "finite_difference"])
+def test_drake_is_the_hand_calculation_in_every_variant(load, contact, method):
+    drake = dd.load_engine("drake", load("pendulum.urdf"), contact=contact, method=method)
+    hand = NumpyEngine(Pendulum(), time_step=0.01)
+    one, two = (engine.differentiate_step([0.7, -1.2], [0.3]) for engine in (drake, hand))
+    assert one.method == method
+    assert contact in drake.name
+    np.testing.assert_allclose(one.A, two.A, rtol=0, atol=1e-9)  # differences: rounding over a step of 1e-5
+
+
+@pytest.mark.parametrize(("contact", "relaxation"), [("lagged", 0.0), ("similar", 0.0), ("sap", 0.0), ("sap", 0.02)])
+def test_the_hand_calculation_of_landing_is_drake(contact, relaxation):
+    plant = Plant(0.005, contact)
+    plant.ball("ball", 1.0, 0.1, contact_properties(1e4, relaxation_time=relaxation / 2), "z")
+    plant.ground(contact_properties(1e4, relaxation_time=relaxation / 2))
+    drake = dd.load_engine("drake", plant.model())
+    hand = NumpyEngine(SphereOnGround(stiffness=5000, relaxation_time=relaxation), time_step=0.005)
+    for x in ([0.097, -0.2], [0.0995, -1.0], [0.2, 0.1]):
+        np.testing.assert_allclose(hand.step(x, []), drake.step(x, []), rtol=1e-7, atol=1e-9)  # SAP stops at 1e-6
+        np.testing.assert_allclose(hand.differentiate_step(x, []).A, drake.differentiate_step(x, []).A, rtol=1e-6,
+                                   atol=1e-8)  # fmt: skip
+        assert hand.contact_depth(x) == pytest.approx(drake.contact_depth(x), abs=1e-15)
+
+
+@pytest.mark.parametrize("file", ["sphere_on_ground.sdf", "sliding_block.sdf"])
+def test_mujoco_rests_as_deep_as_drake_a15(load, file):
+    model = load(file, time_step=0.005)
+    mujoco, x = engine_of("mujoco", model), model.default_state
+    weight, points, radius = {"sphere_on_ground.sdf": (1, 1, 0.1), "sliding_block.sdf": (2, 4, 0.05)}[file]
+    x[6] = radius
+    for _ in range(1000):
+        x = mujoco.step(x, [])
+    assert mujoco.status == "ok"
+    assert mujoco.contact_depth(x) == pytest.approx(weight * G / points / 1e4, rel=1e-9)  # settled for 5 s
+    assert dd.load_engine("drake", model).contact_depth(x) == pytest.approx(mujoco.contact_depth(x), rel=1e-9)
+
+
+def block_on_rails(time_step=0.01, friction=0.5, gravity=(0, 0, -G)):
+    """A ball on an x and a z rail, which slides like a block, and its state where it rests."""
+    plant = Plant(time_step, "lagged")
+    plant.ball("ball", 1.0, 0.1, contact_properties(2e4, 10, friction), "x", "z")
+    plant.ground(contact_properties(2e4, 10, friction))
+    plant.plant.mutable_gravity_field().set_gravity_vector(gravity)
+    return plant.model(), np.array([0, 0.1 + gravity[2] / 1e4, 0, 0])
+
+
+def test_mujoco_slides_to_a_stop_a20_and_its_jacobians_are_its_steps():
+    (model, (_, rest, _, _)), h, N = block_on_rails(), 0.01, 60
+    mujoco = engine_of("mujoco", model)
+
+    def end(v0):
+        x = np.array([0, rest, v0, 0])
+        for _ in range(N):
+            x = mujoco.step(x, [])
+        return x[0]
+
+    x, total = np.array([0, rest, 1, 0]), np.eye(4)
+    for _ in range(N):
+        total = mujoco.differentiate_step(x, []).A @ total
+        x = mujoco.step(x, [])
+    n = np.floor(1 / (0.5 * G * h))
+    hard = h * (n - 0.5 * G * h * n * (n + 1) / 2)  # symplectic Euler with hard Coulomb friction
+    assert x[0] == pytest.approx(hard, rel=0.01)  # the cone's normal force moves the ball up and down as it slides
+    assert total[0, 2] == pytest.approx((end(1 + 1e-5) - end(1 - 1e-5)) / 2e-5, rel=1e-6)
+
+
+def test_mujoco_creeps_on_an_incline_by_its_own_law():
+    slope, k = np.deg2rad(20), 1e4
+    model, x = block_on_rails(0.005, gravity=G * np.array([np.sin(slope), 0, -np.cos(slope)]))
+    mujoco = engine_of("mujoco", model)
+    for _ in range(400):
+        x = mujoco.step(x, [])
+    d, inverse_mass, ratio = 0.9, 2 / 3, 100  # that of a body on two of three rails, as MuJoCo averages
+    b = 2 * np.sqrt((1 - d) * k * inverse_mass) / d
+    creep = (1 - d) / d * inverse_mass / ratio * G * np.sin(slope) / b  # R f = b v
+    assert x[2] == pytest.approx(creep, rel=1e-4)  # R f = a + b v, and a is not quite 0
+    assert mujoco.contact_depth(x) == pytest.approx(G * np.cos(slope) / k, rel=1e-6)
+
+
+def test_mujoco_rolls_down_an_incline_a25():
+    slope, k, h, N = np.deg2rad(20), 1e5, 0.002, 500
+    plant = Plant(h, "lagged")
+    plant.ball("ball", 1.0, 0.1, contact_properties(2e5, 10, 0.6))
+    plant.ground(contact_properties(2e5, 10, 0.6))
+    plant.plant.mutable_gravity_field().set_gravity_vector(G * np.array([np.sin(slope), 0, -np.cos(slope)]))
+    model = plant.model()
+    mujoco, x = engine_of("mujoco", model), model.default_state
+    x[6] = 0.1 - G * np.cos(slope) / k
+    for _ in range(N):
+        x = mujoco.step(x, [])
+    r_e = 0.1 - G * np.cos(slope) / (2 * k)  # the contact point is half way down the overlap
+    assert x[10] == pytest.approx(G * np.sin(slope) * h * N / (1 + 0.4 * (0.1 / r_e) ** 2), rel=1e-5)
+
+
+def test_a_free_bodys_jacobian_in_contact_is_that_of_mujocos_own_step(load):
+    model, random = load("sphere_on_ground.sdf", time_step=0.005), np.random.default_rng(5)
+    engine, x, space = engine_of("mujoco", model), model.default_state, tangent_space(model)
+    x[:4] = random_state(model, random)[:4]
+    x[6:] = [0.099, 0.3, 1, -0.5, 0.4, 0.2, -0.1]
+    x_next = engine.step(x, [])
+    A = on_tangent(model, engine.differentiate_step(x, []).A, x, x_next)
+    for i, column in enumerate(A.T):
+        e = 1e-6 * np.eye(12)[i]
+        ends = [space.minus(engine.step(space.plus(x, d), []), x_next) for d in (e, -e)]
+        np.testing.assert_allclose(column, (ends[0] - ends[1]) / 2e-6, atol=1e-8)  # two differences, each good to 1e-9
+
+
+def test_pinocchio_falls_through_the_ground_and_says_so(load):
+    model = load("sphere_on_ground.sdf")
+    pinocchio, x = engine_of("pinocchio", model), model.default_state
+    x[6] = 0.05
+    assert pinocchio.step(x, [])[12] == pytest.approx(-G * 0.01)
+    assert pinocchio.contact_depth(x) == 0
+    lines = {line.quantity: line for line in dd.match_contracts(dd.load_engine("drake", model), pinocchio)}
+    assert lines["contact law"].verdict == "different"
+    assert "no contact" in lines["contact law"].detail
+
+
+def test_effort_limits_cut_and_the_derivative_is_zero_there(load):
+    model = load("cart_pole.urdf")
+    x, u = [0.1, 0.4, 0.2, -0.3], [25.0]
+    drake = dd.load_engine("drake", model)
+    for name in ("numpy", "pinocchio", "mujoco"):
+        engine = engine_of(name, model)
+        np.testing.assert_allclose(engine.step(x, u), drake.step(x, u), atol=1e-12)
+        assert np.abs(engine.differentiate_step(x, u).B).max() == 0
+
+
+@pytest.mark.parametrize("name", ["numpy", "drake", "pinocchio", "mujoco"])
+def test_bad_input_is_named(load, name):
+    engine = engine_of(name, load("pendulum.urdf"))
+    with pytest.raises(dd.ShapeError, match="x"):
+        engine.step([0.0], [0.0])
+    with pytest.raises(dd.NonFiniteError, match="u"):
+        engine.differentiate_step([0.0, 0.0], [np.nan])
+
+
+def test_what_mujoco_cannot_step_is_an_error(load, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a MUJOCO_LOG.TXT where it is
+    engine = engine_of("mujoco", load("pendulum.urdf"))
+    with pytest.raises(dd.SimulationError, match="MuJoCo"):
+        engine.step([0.0, 1e300], [0.0])
+
+
+def test_what_no_other_engine_has_is_named(load, tmp_path):
+    with pytest.raises(dd.UnknownNameError, match="mujoco"):
+        dd.load_engine("bullet", load("pendulum.urdf"))
+    with pytest.raises(dd.UnknownNameError, match="cart_pole"):
+        dd.load_engine("numpy", load("acrobot.xml"))
+    path = next(f.locate() for f in files("example-robot-data") if str(f).endswith("/panda.urdf"))
+    with pytest.warns(dd.ModelWarning):
+        panda = dd.load_model(path, time_step=0.001)
+    with pytest.raises(dd.ModelError, match="1 constraints"):
+        engine_of("pinocchio", panda)
+
+
+def test_a_free_body_by_frames_of_its_own_is_drakes_in_pinocchio_and_refused_by_mujoco():
+    plant = Plant(0.01)
+    body = plant.plant.AddRigidBody("body", SpatialInertia.SolidBoxWithMass(1.0, 0.1, 0.2, 0.3))
+    poses = [RigidTransform(RollPitchYaw(0.3, 0.2, k), [0.1, k, 0.2]) for k in (0.4, 0.5)]
+    owners = (plant.plant.world_frame(), body.body_frame())
+    frames = [
+        plant.plant.AddFrame(FixedOffsetFrame(f"at_{i}", *pair))
+        for i, pair in enumerate(zip(owners, poses, strict=True))
+    ]
+    plant.plant.AddJoint(QuaternionFloatingJoint("free", *frames))
+    model = plant.model()
+    assert_free_steps_agree(model, "pinocchio", 1e-12, 1e-12)
+    assert not any(
+        line.verdict == "different"
+        for line in dd.match_contracts(dd.load_engine("drake", model), dd.load_engine("pinocchio", model))
+    )
+    with pytest.raises(dd.ModelError, match="free"):
+        engine_of("mujoco", model)
+
+
+def test_geometry_that_mujoco_is_not_given_is_named(tmp_path):
+    (tmp_path / "t.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    plant = Plant(0.01)
+    body = plant.plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    plant.shape(body, Convex(str(tmp_path / "t.obj")), contact_properties(1e4))
+    plant.ground(contact_properties(1e4))
+    model = plant.model()
+    lines = dd.match_contracts(dd.load_engine("drake", model), engine_of("mujoco", model))
+    detail = next(line.detail for line in lines if line.quantity == "contact pairs" and line.verdict == "different")
+    assert "body_shape" in detail
+
+
+def refused(kind):
+    plant = Plant(0.01)
+    body = plant.plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    world = plant.plant.world_frame()
+    if kind == "universal":
+        plant.plant.AddJoint(UniversalJoint("odd", world, body.body_frame()))
+    elif kind == "PD gains":
+        return pd_pendulum()
+    elif kind == "locked":
+        joint = plant.plant.AddJoint(RevoluteJoint("odd", world, body.body_frame(), [0, 1, 0]))
+        plant.plant.Finalize()
+        diagram = plant.builder.Build()
+        model = dd.model_from_diagram(diagram)
+        joint.Lock(model.double.context)
+        return model
+    elif kind == "damped":
+        plant.plant.AddJoint(QuaternionFloatingJoint("odd", world, body.body_frame(), 0.1, 0.2))
+    elif kind == "gravity is off":
+        plant.plant.set_gravity_enabled(plant.plant.GetModelInstanceByName("DefaultModelInstance"), False)
+    return plant.model()
+
+
+@pytest.mark.parametrize("kind", ["universal", "PD gains", "locked", "damped", "gravity is off"])
+@pytest.mark.parametrize("name", ["pinocchio", "mujoco"])
+def test_a_model_that_other_engines_would_simulate_otherwise_is_refused(name, kind):
+    model = refused(kind)
+    with pytest.raises(dd.ModelError, match=kind):
+        engine_of(name, model)
+
+
+@pytest.mark.parametrize(("name", "module"), [("mujoco", "mujoco"), ("pinocchio", "pinocchio")])
+def test_a_missing_engine_is_named_with_its_extra(name, module):
+    code = f"""import sys; sys.modules[{module!r}] = None
+import drake_diff as dd
+try: dd.load_engine({name!r}, None)
+except dd.MissingDependencyError as error: print(error)"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "pip install 'drake-diff[engines]'" in done.stdout
