@@ -1,0 +1,228 @@
+"""The same model is found to be the same in every engine, and each single change is found and named."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from conftest import MODELS
+from test_engines import engine_of
+
+import drake_diff as dd
+from drake_diff.engines.closed_form import CartPole, DoublePendulum, MassSpringDamper, Pendulum
+from drake_diff.engines.description import describe
+from drake_diff.engines.mjcf import mjcf
+from drake_diff.engines.numpy_engine import NumpyEngine
+
+ENGINES = ["drake", "mujoco", "pinocchio"]
+LINK = """<link name="{name}"><inertial><origin xyz="0.02 0.01 -0.25"/><mass value="{mass}"/>
+  <inertia ixx="0.02" iyy="0.03" izz="0.015" ixy="{ixy}" ixz="0.002" iyz="-0.001"/></inertial></link>"""
+JOINT = """<joint name="{name}" type="revolute"><origin xyz="0 0.1 -0.5" rpy="{rpy}"/><parent link="{parent}"/>
+  <child link="{child}"/><axis xyz="0 0.6 0.8"/><dynamics damping="{damping}"/>
+  <limit lower="-2.5" upper="{upper}" effort="{effort}"/></joint>
+<transmission><type>transmission_interface/SimpleTransmission</type>
+  <joint name="{name}"><hardwareInterface>EffortJointInterface</hardwareInterface></joint>
+  <actuator name="{name}_motor"><drake:rotor_inertia value="{rotor}"/><drake:gear_ratio value="{gear}"/></actuator>
+</transmission>"""
+PLAIN = {
+    "mass": 1.3, "ixy": 0.003, "rpy": "0.3 0.2 0.1", "damping": 0.2, "upper": 2.5, "effort": 30,
+    "rotor": 1e-4, "gear": 20, "order": ("left", "right"),
+}  # fmt: skip
+
+
+def arms(tmp_path, *, time_step=0.002, gravity=None, **changes):
+    """Two arms of two links each, on the world; `changes` are made to the left arm's second joint and link."""
+    values = {**PLAIN, **changes}
+    text = []
+    for side in values["order"]:
+        for number, parent in ((1, "world"), (2, f"{side}_1")):
+            at = values if (side, number) == ("left", 2) else PLAIN
+            text.append(LINK.format(name=f"{side}_{number}", **at))
+            text.append(JOINT.format(name=f"{side}_joint_{number}", parent=parent, child=f"{side}_{number}", **at))
+    path = tmp_path / f"arms_{abs(hash(str(changes)))}.urdf"
+    path.write_text('<robot name="arms" xmlns:drake="http://drake.mit.edu">' + "\n".join(text) + "</robot>")
+    return dd.load_model(path, time_step=time_step, gravity=gravity)
+
+
+def different(a, b):
+    return {line.quantity: line.detail for line in dd.match_contracts(a, b) if line.verdict == "different"}
+
+
+FOLLOWS = {"M(q)", "bias(q, v)"}
+# What is changed: the quantities that must be named, those that may be, and words that must be in the first's detail.
+CHANGES = {
+    "mass + 1 %": ({"mass": 1.3 * 1.01}, {"mass", *FOLLOWS}, set(), ["left_joint_2", "1.3", "1.313"]),
+    "inertia product": ({"ixy": 0.0031}, {"inertia", "M(q)"}, {"bias(q, v)"}, ["left_joint_2"]),
+    "frame rotated": ({"rpy": "0.3 0.2 0.11"}, {"frames", *FOLLOWS}, {"center of mass", "inertia"}, ["left_joint_2"]),
+    "damping dropped": ({"damping": 0.0}, {"damping"}, set(), ["left_joint_2", "0.2"]),
+    "joint order": ({"order": ("right", "left")}, {"joint order and names", "actuator mapping"}, FOLLOWS,
+                    ["left_joint_1, left_joint_2, right_joint_1"]),
+    "time step": ({"time_step": 0.001}, {"time step"}, set(), ["0.002", "0.001"]),
+    "gravity sign": ({"gravity": (0, 0, 9.81)}, {"gravity", "bias(q, v)"}, set(), ["-9.81)", "9.81)"]),
+    "armature": ({"rotor": 1.1e-4}, {"armature", "M(q)"}, set(), ["left_joint_2", "0.04", "0.044"]),
+    "gear": ({"gear": 22}, {"armature", "M(q)"}, set(), ["left_joint_2", "0.04", "0.0484"]),
+    "limit": ({"upper": 2.4}, {"position limits"}, set(), ["left_joint_2", "2.5", "2.4"]),
+    "effort limit": ({"effort": 29}, {"effort limits"}, set(), ["30", "29"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ENGINES)
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_change_is_found_and_named(tmp_path, name, change):
+    changes, must, may, words = CHANGES[change]
+    reference = dd.load_engine("drake", arms(tmp_path))
+    own = different(reference, engine_of(name, arms(tmp_path)))
+    assert own.keys() <= {"limit law", "solver tolerance"}  # what no other engine can have as Drake has it
+    found = different(reference, engine_of(name, arms(tmp_path, **changes)))
+    assert must <= found.keys() - own.keys() <= must | may
+    first = next(quantity for quantity in found if quantity in must)
+    assert all(word in found[first] for word in words), found[first]
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_the_same_model_is_the_same_in_every_engine(tmp_path, name):
+    lines = dd.match_contracts(dd.load_engine("drake", arms(tmp_path)), engine_of(name, arms(tmp_path)))
+    assert len({line.quantity for line in lines}) == len(lines) == 23
+    assert all(str(line).startswith(line.verdict) for line in lines)
+    assert {line.quantity for line in lines if line.verdict == "mapped"} == set()
+
+
+HAND = {
+    "mass + 1 %": ("pendulum.urdf", Pendulum(mass=1.01), {"mass", *FOLLOWS}),
+    "frame": ("double_pendulum.urdf", DoublePendulum(lengths=(0.81, 0.5)),
+              {"frames", "center of mass", "inertia", *FOLLOWS}),
+    "gravity sign": ("pendulum.urdf", Pendulum(gravity=-9.81), {"gravity", "bias(q, v)"}),
+    "damping dropped": ("pendulum.urdf", Pendulum(joint_damping=(0.0,)), {"damping"}),
+    "spring": ("mass_spring_damper.sdf", MassSpringDamper(rest=0.11), {"springs", "bias(q, v)"}),
+    "inertia": ("mass_spring_damper.sdf", MassSpringDamper(inertia=0.004), {"inertia"}),
+    "limit": ("cart_pole.urdf", CartPole(limits={"slide": (-2, 2.1)}), {"position limits"}),
+    "effort limit": ("cart_pole.urdf", CartPole(effort_limits=(19.0,)), {"effort limits"}),
+    "actuator name": ("pendulum.urdf", Pendulum(input_names=("drive",)), {"actuator mapping"}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change", HAND)
+def test_a_change_of_a_hand_calculation_is_found_and_named(load, change):
+    file, form, quantities = HAND[change]
+    drake = dd.load_engine("drake", load(file))
+    own = different(drake, dd.load_engine("numpy", load(file)))
+    assert own.keys() <= {"limit law", "solver tolerance"}
+    assert different(drake, NumpyEngine(form, time_step=0.01)).keys() - own.keys() == quantities
+
+
+def test_another_time_step_of_a_hand_calculation_is_found(load):
+    drake = dd.load_engine("drake", load("pendulum.urdf"))
+    assert different(drake, NumpyEngine(Pendulum(), time_step=0.005)).keys() == {"time step"}
+
+
+def test_other_names_of_joints_are_found(load):
+    drake = dd.load_engine("drake", load("double_pendulum.urdf"))
+    swapped = replace(DoublePendulum(), joint_names=("elbow", "shoulder"))
+    assert "joint order and names" in different(drake, NumpyEngine(swapped, time_step=0.01))
+    assert "no joint has the same name" in different(drake, NumpyEngine(Pendulum(), time_step=0.01))["mass"]
+
+
+def test_other_joint_types_are_not_compared_further(load):
+    drake = dd.load_engine("drake", load("pendulum.urdf"))
+    found = different(drake, NumpyEngine(MassSpringDamper(joint_names=("hinge",)), time_step=0.01))
+    assert "not comparable" in found["M(q)"]
+    assert "revolute" in found["joint types"]
+
+
+def test_a_stiffness_that_is_each_engines_own_default_is_not_called_equal(load):
+    drake = dd.load_engine("drake", load("sphere_on_ground.sdf"))
+
+    def without_stiffness(**changes):
+        contacts = tuple(replace(pair, stiffness=None) for pair in drake.contract.contacts)
+        contract = replace(drake.contract, contacts=contacts, **changes)
+        return SimpleNamespace(contract=contract, mass_matrix=drake.mass_matrix, bias=drake.bias)
+
+    assert different(without_stiffness(), without_stiffness()) == {}
+    assert "None and None" in different(without_stiffness(), without_stiffness(contact_law="other"))["contact pairs"]
+    assert "10000" in different(drake, without_stiffness())["contact pairs"]
+
+
+def own_mjcf(tmp_path, model, *edits):
+    text = mjcf(describe(model), model.time_step)
+    for old, new in edits:
+        assert old in text
+        text = text.replace(old, new, 1)
+    path = tmp_path / "own.xml"
+    path.write_text(text)
+    return engine_of("mujoco", model, path=path)
+
+
+def test_a_users_own_mjcf_is_mapped_by_name_and_its_gear_is_found(tmp_path):
+    model = arms(tmp_path)
+    drake = dd.load_engine("drake", model)
+    found = different(
+        drake, own_mjcf(tmp_path, model, ('joint="left_joint_2" gear="1"', 'joint="left_joint_2" gear="2"'))
+    )
+    assert {"actuator mapping"} == found.keys() - {"limit law", "solver tolerance", "effort limits"}
+    assert "'left_joint_2': 2.0" in found["actuator mapping"]
+    with pytest.raises(dd.InputError, match="left_joint_2"):
+        own_mjcf(
+            tmp_path,
+            model,
+            ('<joint name="left_joint_2"', '<joint name="other"'),
+            ('joint="left_joint_2"', 'joint="other"'),
+        )
+
+
+@pytest.mark.parametrize(("old", "new", "said"), [
+    ("Euler", "implicitfast", None), ("Euler", "implicit", "IMPLICIT, joint damping implicit"),
+    ("Euler", "RK4", "RK4, joint damping explicit"),
+    ('warmstart="disable"', 'eulerdamp="disable"', "EULER, joint damping explicit"),
+])  # fmt: skip
+def test_the_integrators_step_is_drakes_exactly_where_the_contract_says_so(tmp_path, old, new, said):
+    model = arms(tmp_path)
+    drake, mujoco = dd.load_engine("drake", model), own_mjcf(tmp_path, model, (old, new))
+    found = different(drake, mujoco)
+    assert (said is None and "integrator" not in found) or said in found["integrator"]
+    x, u = np.linspace(-0.5, 0.6, 8), np.linspace(-1, 1, 4)
+    gap = np.abs(mujoco.step(x, u) - drake.step(x, u)).max()
+    assert gap < 1e-13 if said is None else gap > 1e-7
+
+
+@pytest.mark.parametrize(("old", "new", "said"), [
+    ('armature=', 'frictionloss="0.1" armature=', "friction loss"), ("<option ", '<option density="1.2" ', "a fluid"),
+    ('warmstart=', 'gravity="disable" warmstart=', "disabled parts"),
+    ("<contact", '<equality><joint joint1="left_joint_1"/></equality><contact', "equality constraints"),
+])  # fmt: skip
+def test_an_mjcf_with_what_the_contract_does_not_know_is_refused(tmp_path, old, new, said):
+    with pytest.raises(dd.ModelError, match=said):
+        own_mjcf(tmp_path, arms(tmp_path), (old, new))
+
+
+def test_an_mjcf_that_mujoco_does_not_read_is_refused(tmp_path):
+    with pytest.raises(dd.ModelError, match="own"):
+        own_mjcf(tmp_path, arms(tmp_path), ("<option", "<opinion"))
+
+
+def test_another_order_inside_mujoco_is_mapped(tmp_path):
+    needed = arms(tmp_path)
+    turned = arms(tmp_path, order=("right", "left"))
+    engine_of("mujoco", needed)
+    path = tmp_path / "turned.xml"
+    path.write_text(mjcf(describe(turned), turned.time_step))
+    engine, drake = dd.load_engine("mujoco", needed, path=path), dd.load_engine("drake", needed)
+    lines = {line.quantity: line for line in dd.match_contracts(drake, engine)}
+    assert lines["joint order and names"].verdict == "mapped"
+    assert lines["M(q)"].verdict == lines["bias(q, v)"].verdict == lines["actuator mapping"].verdict == "equal"
+    x, u = np.linspace(-0.5, 0.6, 8), np.linspace(-1, 1, 4)
+    np.testing.assert_allclose(engine.step(x, u), drake.step(x, u), atol=1e-13)
+    np.testing.assert_allclose(engine.differentiate_step(x, u).B, drake.differentiate_step(x, u).B, atol=1e-10)
+
+
+def test_other_friction_and_stiffness_are_found(tmp_path):
+    needed = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01)
+    for old, new, word in (
+        ("mu_dynamic>0.5", "mu_dynamic>0.4", "0.444"),
+        ("stiffness>20000", "stiffness>10000", "6666"),
+    ):
+        path = tmp_path / "ball.sdf"
+        path.write_text((MODELS / "sphere_on_ground.sdf").read_text().replace(old, new, 1))
+        found = different(dd.load_engine("drake", needed), engine_of("mujoco", dd.load_model(path, time_step=0.01)))
+        assert word in found["contact pairs"]
+    same = different(dd.load_engine("drake", needed), engine_of("mujoco", needed))
+    assert same.keys() == {"contact law", "solver tolerance", "integrator"}
