@@ -86,7 +86,7 @@ class ClosedForm(ABC):
         a = euler_acceleration(M, D, h, v, self.actuation @ effort - self.bias(q, v))
         inside = self.actuation * (np.abs(u) <= limit)
         residual = [self.residual_by_motion(q, v, a), self.bias_by_velocity(q, v) + np.diag(D), -inside]
-        return a, -np.linalg.solve(M + h * np.diag(D), np.hstack(residual))
+        return a, np.asarray(-np.linalg.solve(M + h * np.diag(D), np.hstack(residual)), dtype=float)
 
     def _joint(
         self, index: int, kind: str, axis: Array, anchor: Array, mass: float, com: Array, inertia: Array,

@@ -227,7 +227,7 @@ class MujocoEngine:
         Q = np.zeros((self.nv, self.nv))
         Q[self.dofs, np.arange(self.nv)] = 1.0
         for i, j in self.coordinates.free:
-            Q[np.ix_(self.dofs[j : j + 3], range(j, j + 3))] = rotation(q[i : i + 4]).T
+            Q[np.ix_(self.dofs[j : j + 3], np.arange(j, j + 3))] = rotation(q[i : i + 4]).T
         return Q
 
     def _tangent_map(self, x: Array) -> Array:
@@ -236,7 +236,7 @@ class MujocoEngine:
         T = _diagonal(self._turn(q), self._turn(q))
         for i, j in self.coordinates.free:
             by_turn = rotation(q[i : i + 4]).T @ skew(v[j : j + 3])
-            T[np.ix_(self.nv + self.dofs[j : j + 3], range(j, j + 3))] = by_turn
+            T[np.ix_(self.nv + self.dofs[j : j + 3], np.arange(j, j + 3))] = by_turn
         return T
 
     def _point(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
