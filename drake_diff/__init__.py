@@ -30,6 +30,7 @@ from drake_diff.exceptions import MissingDependencyError as MissingDependencyErr
 from drake_diff.exceptions import ModelError as ModelError
 from drake_diff.exceptions import ModelWarning as ModelWarning
 from drake_diff.exceptions import NonFiniteError as NonFiniteError
+from drake_diff.exceptions import NotOfferedError as NotOfferedError
 from drake_diff.exceptions import ShapeError as ShapeError
 from drake_diff.exceptions import SimulationError as SimulationError
 from drake_diff.exceptions import UnknownNameError as UnknownNameError

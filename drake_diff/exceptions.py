@@ -10,6 +10,7 @@ DrakeDiffError
 ├── CertificateError               a certificate whose verdict is not "agree"
 ├── SimulationError                Drake could not take a step
 ├── MissingDependencyError         an optional engine or solver that is not there; says what to install
+├── NotOfferedError                something that an engine does not compute
 └── ArtifactError                  a run directory or log that is missing, incomplete or damaged
 
 ModelWarning (UserWarning)         what was left out of a model that is used all the same
@@ -72,6 +73,10 @@ class SimulationError(DrakeDiffError):
 
 class MissingDependencyError(DrakeDiffError):
     """An optional engine or solver that is not there."""
+
+
+class NotOfferedError(DrakeDiffError):
+    """Something that an engine does not compute: a gradient, a mass matrix, an energy."""
 
 
 class ArtifactError(DrakeDiffError):

@@ -226,3 +226,32 @@ def test_other_friction_and_stiffness_are_found(tmp_path):
         assert word in found["contact pairs"]
     same = different(dd.load_engine("drake", needed), engine_of("mujoco", needed))
     assert same.keys() == {"contact law", "solver tolerance", "integrator"}
+
+
+class Other:
+    """An engine that says what another one says, but for what is given."""
+
+    def __init__(self, engine, mass_matrix=None, **contract):
+        self.contract = replace(engine.contract, **contract)
+        self.mass_matrix, self.bias = mass_matrix or engine.mass_matrix, engine.bias
+
+
+def test_what_an_engine_does_not_compute_is_not_called_equal(load):
+    def none(q):
+        raise dd.NotOfferedError("no mass matrix here")
+
+    drake = engine_of("drake", load("pendulum.urdf"))
+    lines = {line.quantity: line for line in dd.match_contracts(drake, Other(drake, none))}
+    assert lines["M(q)"].verdict == "different"
+    assert "no mass matrix here" in lines["M(q)"].detail
+    assert lines["bias(q, v)"].verdict == "equal"
+
+
+@pytest.mark.parametrize(("precision", "verdict"), [("float64", "different"), ("float32", "equal")])
+def test_single_precision_is_allowed_its_rounding_and_no_more(load, precision, verdict):
+    drake = engine_of("drake", load("pendulum.urdf"))
+    joint = drake.contract.joints[0]
+    for factor, expected in ((1 + 1e-7, verdict), (1 + 1e-4, "different")):
+        other = Other(drake, precision=precision, joints=(replace(joint, mass=joint.mass * factor),))
+        lines = {line.quantity: line.verdict for line in dd.match_contracts(drake, other)}
+        assert lines["mass"] == expected

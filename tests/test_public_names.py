@@ -12,13 +12,13 @@ PACKAGE = Path(drake_diff.__file__).parent
 PUBLIC = """
 ArtifactError Barrier Bounds Certificate CertificateError CertificationRecord Constraint Contract ContractLine
 DrakeDiffError Dynamics Engine EvidenceRecord Finding Gaussian GradientError InputError LQR MissingDependencyError
-Model ModelError ModelWarning NonFiniteError PD ParametricPolicy Problem QuadraticCost Rollout RolloutCertificate
-RolloutGradient ShapeError SimulationError Smoothed SoftContact Solution Status StepDerivatives TVLQR Transcribed
-UnknownNameError Verification audit center_of_mass certify certify_jacobian certify_model certify_rollout
-contact_force contact_modes differentiate_rollout differentiate_step frame_position frame_rotation_error
-frame_velocity list_parameters load_engine load_model load_record match_contracts model_from_diagram plant_dynamics
-read_mcap read_trace rollout save smooth smooth_step softened solve step transcribe_and_solve verify
-violation_between_nodes
+Model ModelError ModelWarning NonFiniteError NotOfferedError PD ParametricPolicy Problem QuadraticCost Rollout
+RolloutCertificate RolloutGradient ShapeError SimulationError Smoothed SoftContact Solution Status StepDerivatives
+TVLQR Transcribed UnknownNameError Verification audit center_of_mass certify certify_jacobian certify_model
+certify_rollout contact_force contact_modes differentiate_rollout differentiate_step frame_position
+frame_rotation_error frame_velocity list_parameters load_engine load_model load_record match_contracts
+model_from_diagram plant_dynamics read_mcap read_trace rollout save smooth smooth_step softened solve step
+transcribe_and_solve verify violation_between_nodes
 """.split()
 ORDER = """
 exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin model

@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 from numpy.typing import ArrayLike
 
 from drake_diff.arrays import Array
+
+Precision = Literal["float64", "float32"]
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,7 @@ class EngineContract:
     solver_tolerance: float | None  # relative; None where nothing is solved iteratively
     limit_law: str
     reset: str
+    precision: Precision = "float64"  # of the engine's arithmetic
     # By quantity of the match: why this engine cannot have what Drake has.
     reasons: Mapping[str, str] = field(default_factory=dict)
 
@@ -74,7 +77,8 @@ class StepJacobian(NamedTuple):
 class Engine(Protocol):
     """One model in one simulator. `x = [q; v]` and `u` are Drake's: order, quaternion (w, x, y, z), v in world.
 
-    Everything depends on the arguments alone, not on the calls before.
+    Everything depends on the arguments alone, not on the calls before. What an engine does not compute raises
+    NotOfferedError, with the reason.
     """
 
     @property
