@@ -16,10 +16,13 @@ from drake_diff.contract import Contract as Contract
 from drake_diff.cost import QuadraticCost as QuadraticCost
 from drake_diff.dynamics import Dynamics as Dynamics
 from drake_diff.dynamics import plant_dynamics as plant_dynamics
+from drake_diff.engines.comparison import Comparison as Comparison
+from drake_diff.engines.comparison import compare as compare
 from drake_diff.engines.contract_match import ContractLine as ContractLine
 from drake_diff.engines.contract_match import match_contracts as match_contracts
 from drake_diff.engines.engine import Engine as Engine
 from drake_diff.engines.load import load_engine as load_engine
+from drake_diff.engines.recording import Recording as Recording
 from drake_diff.evidence import save as save
 from drake_diff.exceptions import ArtifactError as ArtifactError
 from drake_diff.exceptions import CertificateError as CertificateError

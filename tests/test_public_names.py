@@ -10,15 +10,15 @@ import drake_diff
 
 PACKAGE = Path(drake_diff.__file__).parent
 PUBLIC = """
-ArtifactError Barrier Bounds Certificate CertificateError CertificationRecord Constraint Contract ContractLine
-DrakeDiffError Dynamics Engine EvidenceRecord Finding Gaussian GradientError InputError LQR MissingDependencyError
-Model ModelError ModelWarning NonFiniteError NotOfferedError PD ParametricPolicy Problem QuadraticCost Rollout
-RolloutCertificate RolloutGradient ShapeError SimulationError Smoothed SoftContact Solution Status StepDerivatives
-TVLQR Transcribed UnknownNameError Verification audit center_of_mass certify certify_jacobian certify_model
-certify_rollout contact_force contact_modes differentiate_rollout differentiate_step frame_position
-frame_rotation_error frame_velocity list_parameters load_engine load_model load_record match_contracts
-model_from_diagram plant_dynamics read_mcap read_trace rollout save smooth smooth_step softened solve step
-transcribe_and_solve verify violation_between_nodes
+ArtifactError Barrier Bounds Certificate CertificateError CertificationRecord Comparison Constraint Contract
+ContractLine DrakeDiffError Dynamics Engine EvidenceRecord Finding Gaussian GradientError InputError LQR
+MissingDependencyError Model ModelError ModelWarning NonFiniteError NotOfferedError PD ParametricPolicy Problem
+QuadraticCost Recording Rollout RolloutCertificate RolloutGradient ShapeError SimulationError Smoothed SoftContact
+Solution Status StepDerivatives TVLQR Transcribed UnknownNameError Verification audit center_of_mass certify
+certify_jacobian certify_model certify_rollout compare contact_force contact_modes differentiate_rollout
+differentiate_step frame_position frame_rotation_error frame_velocity list_parameters load_engine load_model
+load_record match_contracts model_from_diagram plant_dynamics read_mcap read_trace rollout save smooth smooth_step
+softened solve step transcribe_and_solve verify violation_between_nodes
 """.split()
 ORDER = """
 exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin model
@@ -33,8 +33,8 @@ report record_parts record record_schema record_file certification_record named_
 plan_file record_sections metrics invariants failures events evidence rerun verification verify runs view sampling
 certification audit_place audit_contact audit engines.engine engines.euler engines.description engines.closed_form
 engines.closed_form_contact engines.numpy_engine engines.drake_engine engines.pinocchio_engine engines.mjcf
-engines.mujoco_contract engines.mujoco_engine engines.contract_match engines.load ros2_bag cli_mcap cli_runs cli_view
-cli
+engines.mujoco_contract engines.mujoco_engine engines.contract_match engines.load engines.attribution engines.motion
+engines.jacobians engines.recording engines.comparison ros2_bag cli_mcap cli_runs cli_view cli
 """.split()
 
 

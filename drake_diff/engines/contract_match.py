@@ -21,11 +21,15 @@ RANDOM_STATES = 5
 
 @dataclass(frozen=True)
 class ContractLine:
-    """One thing that two engines must share: "equal", "mapped" (and how), or "different" (and why)."""
+    """One thing that two engines must share: "equal", "mapped" (and how), or "different" (and why).
+
+    `reason` is why an engine cannot have it, where it is the engine's doing; it stands in the detail too.
+    """
 
     quantity: str
     verdict: Verdict
     detail: str
+    reason: str = ""
 
     def __str__(self) -> str:
         return f"{self.verdict:9} {self.quantity}: {self.detail}"
@@ -85,8 +89,8 @@ def _values(values: tuple[Any, ...]) -> str:
 
 
 def _difference(one: EngineContract, two: EngineContract, quantity: str, what: str) -> ContractLine:
-    reason = one.reasons.get(quantity) or two.reasons.get(quantity)
-    return ContractLine(quantity, "different", f"{what}; {reason}" if reason else what)
+    reason = one.reasons.get(quantity) or two.reasons.get(quantity) or ""
+    return ContractLine(quantity, "different", f"{what}; {reason}" if reason else what, reason)
 
 
 def _text(one: EngineContract, two: EngineContract, quantity: str, a: str, b: str) -> ContractLine:
@@ -119,13 +123,14 @@ def _joint_line(
 ) -> ContractLine:
     """By name, so that another order is named once and not in every line."""
     others = {j.name: j for j in two.joints}
-    wrong = []
+    wrong, named = [], []
     for joint in one.joints:
         if joint.name in others:
             line = _numbers(one, two, quantity, read(joint), read(others[joint.name]))
-            wrong += [f"{joint.name}: {line.detail}"] if line.verdict == "different" else []
+            wrong += [line] if line.verdict == "different" else []
+            named += [f"{joint.name}: {line.detail}"] if line.verdict == "different" else []
     if wrong:
-        return ContractLine(quantity, "different", "; ".join(wrong))
+        return ContractLine(quantity, "different", "; ".join(named), wrong[0].reason)
     common = [j.name for j in one.joints if j.name in others]
     if not common:
         return ContractLine(quantity, "different", "no joint has the same name in both")
@@ -190,8 +195,8 @@ def _term(
         try:
             x, y = of_one(*state), of_two(*state)
         except NotOfferedError as error:
-            return ContractLine(quantity, "different", f"not comparable: {error}")
-        gap = np.abs(x - y) / max(float(np.abs(x).max()), NOTHING[precision])
+            return ContractLine(quantity, "different", f"not comparable: {error}", str(error))
+        gap = np.abs(x - y) / max(float(np.abs(x).max()), NOTHING[precision] / SAME_NUMBER[precision])
         where = np.unravel_index(int(np.argmax(gap)), gap.shape)
         if not gap[where] <= worst:
             entry = f"entry {[int(i) for i in where]}, {one.engine}: {x[where]:.10g}; {two.engine}: {y[where]:.10g}"

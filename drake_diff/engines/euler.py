@@ -79,6 +79,13 @@ def euler_jacobian(coordinates: Coordinates, h: float, x: Array, x_next: Array, 
     return np.vstack([upper, lower])
 
 
+def exponential_turn(quaternion: Array, angle: Array) -> Array:
+    """(4,) exp(angle / 2) * q: the quaternion (w, x, y, z) turned by the vector `angle` (3,) [rad] in world."""
+    half = float(np.linalg.norm(angle)) / 2
+    vector = np.sinc(half / np.pi) * angle / 2
+    return np.asarray(np.cos(half) * quaternion + _times_from_left(quaternion) @ vector)
+
+
 def skew(w: Array) -> Array:
     """(3, 3) with skew(w) x = w x x."""
     return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])

@@ -4,7 +4,8 @@ from importlib import import_module
 from typing import Any
 
 from drake_diff.engines.engine import Engine
-from drake_diff.exceptions import UnknownNameError
+from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.model import Model
 
 ENGINES = {
     "numpy": ("numpy_engine", "NumpyEngine"),
@@ -12,6 +13,14 @@ ENGINES = {
     "mujoco": ("mujoco_engine", "MujocoEngine"),
     "pinocchio": ("pinocchio_engine", "PinocchioEngine"),
 }
+
+
+def load_spec(spec: str, model: Model) -> Engine:
+    """The engine of a name, or Drake's "drake:CONTACT" or "drake:CONTACT:METHOD", as in drake:lagged:implicit."""
+    name, *chosen = spec.split(":")
+    if chosen and (name != "drake" or len(chosen) > 2):
+        raise InputError("engine", got=spec, expected="a name, drake:CONTACT or drake:CONTACT:METHOD")
+    return load_engine(name, model, **dict(zip(("contact", "method"), chosen, strict=False)))
 
 
 def load_engine(name: str, model: Any, **options: Any) -> Engine:

@@ -7,7 +7,7 @@ from drake_diff.arrays import Array, finite_array, frozen, positive_float
 from drake_diff.engines.closed_form import BY_MODEL, ClosedForm
 from drake_diff.engines.engine import EngineContract, StepJacobian
 from drake_diff.engines.euler import euler_jacobian, euler_step
-from drake_diff.exceptions import UnknownNameError
+from drake_diff.exceptions import ModelError
 from drake_diff.model import Model
 
 DRAKES_STEP = "semi-implicit Euler, joint damping implicit, q' = q + h N(q) v'"
@@ -23,7 +23,8 @@ class NumpyEngine:
     def __init__(self, model: Model | ClosedForm, *, time_step: float | None = None):
         if isinstance(model, Model):
             if model.name not in BY_MODEL:
-                raise UnknownNameError("a model with a hand calculation", got=model.name, known=BY_MODEL)
+                known = ", ".join(sorted(BY_MODEL))
+                raise ModelError(f"there is no hand calculation of the model {model.name!r}; expected one of {known}")
             self.form, self.time_step = BY_MODEL[model.name], model.time_step
         else:
             self.form, self.time_step = model, positive_float("time_step [s]", time_step)
