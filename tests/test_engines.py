@@ -435,7 +435,7 @@ def test_what_mujoco_cannot_step_is_an_error(load, tmp_path, monkeypatch):
 def test_what_no_other_engine_has_is_named(load, tmp_path):
     with pytest.raises(dd.UnknownNameError, match="mujoco"):
         dd.load_engine("bullet", load("pendulum.urdf"))
-    with pytest.raises(dd.UnknownNameError, match="cart_pole"):
+    with pytest.raises(dd.ModelError, match="cart_pole"):
         dd.load_engine("numpy", load("acrobot.xml"))
     path = next(f.locate() for f in files("example-robot-data") if str(f).endswith("/panda.urdf"))
     with pytest.warns(dd.ModelWarning):
