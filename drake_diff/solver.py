@@ -184,7 +184,7 @@ def _solve_in_chain(task: _Task, given: Any, solver: str | None) -> Solution:
         if last.status in ENDED:
             break
     best = min(found, key=_preference)
-    return dataclasses.replace(best, options=best.options | {"chain": chain})
+    return best.told(options=best.options | {"chain": chain})
 
 
 def _preference(solution: Solution) -> tuple[int, float]:
