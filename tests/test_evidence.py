@@ -12,6 +12,7 @@ import pytest
 import drake_diff as dd
 from drake_diff.evidence import begin
 from drake_diff.mcap_log import read_mcap
+from drake_diff.meshcat_scene import scene_of
 from drake_diff.meshcat_view import write_replay
 from drake_diff.trace import read_trace
 
@@ -255,6 +256,6 @@ def test_a_hostile_title_or_body_name_does_no_harm(tmp_path):
     (tmp_path / "evil.urdf").write_text(urdf)
     model = dd.load_model(tmp_path / "evil.urdf", time_step=0.01)
     motion = dd.rollout(model, [0.1, 0], np.zeros((5, 1)))
-    write_replay(tmp_path / "a.html", model, motion.times, motion.xs, title="<script>alert(2)</script>")
+    write_replay(tmp_path / "a.html", scene_of(model, motion.times, motion.xs), title="<script>alert(2)</script>")
     page = (tmp_path / "a.html").read_text()
     assert "<script>alert" not in page
