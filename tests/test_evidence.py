@@ -11,10 +11,10 @@ import pytest
 
 import drake_diff as dd
 from drake_diff.evidence import begin
-from drake_diff.mcap_log import read_mcap
+from drake_diff.mcap_read import read_mcap
 from drake_diff.meshcat_scene import scene_of
 from drake_diff.meshcat_view import write_replay
-from drake_diff.trace import read_trace
+from drake_diff.trace_read import read_trace
 
 MODELS = Path(__file__).parent.parent / "models"
 
