@@ -69,11 +69,8 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
     complete = _complete(folder.name, solution)
     write_whole(folder / SCHEMA_FILE, published_schema())
     write_plan(folder / PLAN, solution)
-    write_trace(
-        folder / TRACE,
-        solution,
-        {RECORD: ("application/json", reproducible(complete.model_dump(mode="json")).encode())},
-    )
+    fields = complete.model_dump(mode="json")
+    write_trace(folder / TRACE, solution, {RECORD: ("application/json", reproducible(fields).encode())})
     motion = solution.replay
     scene = scene_of(
         solution.problem.model,
@@ -83,7 +80,7 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
         planned_xs=solution.xs if solution.transcribed is not None and motion is not None else None,
     )
     write_replay(folder / REPLAY, scene, title=f"{folder.name}: {solution.status.value}")
-    write_report(folder / REPORT, solution, complete.model_dump(mode="json"), folder / REPLAY)
+    write_report(folder / REPORT, solution, fields, folder / REPLAY)
     return seal(folder, complete)
 
 
