@@ -35,25 +35,6 @@ def collocated(swing_up):
 
 
 @pytest.fixture(scope="module")
-def thrown():
-    """A ball that falls on the ground and rolls."""
-    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.005)
-    x0 = model.default_state
-    x0[6], x0[10] = 0.15, 0.5
-    free = np.zeros(13, dtype=bool)
-    free[10] = True
-    problem = dd.Problem(
-        model,
-        x0=x0,
-        num_steps=60,
-        final_cost=lambda x: (x[4] - 0.3) ** 2,
-        optimize="initial_state",
-        initial_state_mask=free,
-    )
-    return dd.solve(problem)
-
-
-@pytest.fixture(scope="module")
 def run(swing_up, tmp_path_factory):
     directory = tmp_path_factory.mktemp("runs") / "pendulum"
     dd.save(swing_up, directory)
