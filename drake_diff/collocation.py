@@ -10,7 +10,8 @@ from drake_diff.arrays import Array
 from drake_diff.autodiff import chain
 from drake_diff.continuous import ContinuousSystem, EquationsOfMotion
 from drake_diff.cost import QuadraticCost, differentiate_cost, differentiate_final_cost
-from drake_diff.nonlinear_program import Limits, NlpResult, Report, solve_program
+from drake_diff.mathematical_program import solve_program
+from drake_diff.nonlinear_program import Limits, NlpResult, Report
 from drake_diff.problem import Problem
 
 DEFAULT_SOLVER = "ipopt"

@@ -59,7 +59,8 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
     Gives the record. Each file is written aside and moved into place, record.json last, so that at any moment the
     record is complete only if everything it names is.
     """
-    from drake_diff.meshcat_view import write_replay  # what a script that saves nothing need not load
+    from drake_diff.meshcat_scene import scene_of  # what a script that saves nothing need not load
+    from drake_diff.meshcat_view import write_replay
     from drake_diff.report import write_report
     from drake_diff.trace import write_trace
 
@@ -68,23 +69,18 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
     complete = _complete(folder.name, solution)
     write_whole(folder / SCHEMA_FILE, published_schema())
     write_plan(folder / PLAN, solution)
-    write_trace(
-        folder / TRACE,
-        solution,
-        {RECORD: ("application/json", reproducible(complete.model_dump(mode="json")).encode())},
-    )
+    fields = complete.model_dump(mode="json")
+    write_trace(folder / TRACE, solution, {RECORD: ("application/json", reproducible(fields).encode())})
     motion = solution.replay
-    model = solution.problem.model
-    write_replay(
-        folder / REPLAY,
-        model,
+    scene = scene_of(
+        solution.problem.model,
         solution.times,
         _drawable(solution) if motion is None else motion.xs,
         contacts=() if motion is None else motion.contacts,
         planned_xs=solution.xs if solution.transcribed is not None and motion is not None else None,
-        title=f"{folder.name}: {solution.status.value}",
     )
-    write_report(folder / REPORT, solution, complete.model_dump(mode="json"), folder / REPLAY)
+    write_replay(folder / REPLAY, scene, title=f"{folder.name}: {solution.status.value}")
+    write_report(folder / REPORT, solution, fields, folder / REPLAY)
     return seal(folder, complete)
 
 

@@ -1,7 +1,6 @@
 """Run a transcribed program with the IPOPT that CasADi carries: progress, limits, interrupts, the best iterate."""
 
 import math
-import time
 from typing import Any
 
 import casadi as ca
@@ -9,7 +8,7 @@ import numpy as np
 
 from drake_diff.arrays import Array
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
-from drake_diff.nonlinear_program import REPORT_PERIOD, Iteration, Limits, NlpResult, Outcome, Report, interrupt_flag
+from drake_diff.nonlinear_program import Iteration, Limits, NlpResult, Outcome, Report, Watch, interrupt_flag
 from drake_diff.transcription_program import TranscribedProgram
 
 OUTCOMES = {
@@ -42,13 +41,14 @@ def solve_ipopt(
     An error that a function of the user's raised is raised again, but that of a simulation or gradient is told.
     """
     with interrupt_flag() as interrupted:
-        watch = _Watch(program, limits, interrupted, report)
-        options = OPTIONS | program.derivatives(exact) | _options(exact, limits) | {"iteration_callback": watch}
+        watch = Watch(limits, interrupted)
+        callback = _Callback(program, watch, report)
+        options = OPTIONS | program.derivatives(exact) | _options(exact, limits) | {"iteration_callback": callback}
         solver = ca.nlpsol("solver", "ipopt", program.nlp, options)
         lower, upper = program.sides
         found = solver(x0=guess, lbx=program.lower, ubx=program.upper, lbg=lower, ubg=upper)
         stats = solver.stats()
-    table, error = _rows(stats.get("iterations", {})), watch.error or program.functions.error
+    table, error = _rows(stats.get("iterations", {})), callback.error or program.functions.error
     if error is not None:
         return NlpResult(watch.best_of(guess), _explain_error(error), f"{type(error).__name__}: {error}", table)
     if watch.stopped_by is not None:
@@ -58,21 +58,17 @@ def solve_ipopt(
     return NlpResult(np.asarray(found["x"]).ravel(), outcome, f"IPOPT: {words.replace('_', ' ')}", table)
 
 
-class _Watch(ca.Callback):  # type: ignore[misc]
+class _Callback(ca.Callback):  # type: ignore[misc]
     """Called by the solver at every iterate: reports, keeps the best, says when to stop."""
 
-    def __init__(self, program: TranscribedProgram, limits: Limits, interrupted: Any, report: Report | None):
+    def __init__(self, program: TranscribedProgram, watch: Watch, report: Report | None):
         ca.Callback.__init__(self)
-        self.program, self.limits, self.interrupted, self.report = program, limits, interrupted, report
+        self.program, self.watch, self.report = program, watch, report
         self.sizes = {"x": program.z.numel(), "f": 1, "g": program.nlp["g"].numel(), "lam_x": program.z.numel()}
         self.sizes |= {"lam_g": self.sizes["g"], "lam_p": 0}
-        self.start = self.last_report = time.monotonic()
         self.iterates = 0
-        self.best: Array | None = None
-        self.best_merit = math.inf
-        self.stopped_by: Outcome | None = None
         self.error: Exception | None = None
-        self.construct("watch", {})
+        self.construct("callback", {})
 
     def get_n_in(self) -> int:
         return ca.nlpsol_n_out()
@@ -91,29 +87,17 @@ class _Watch(ca.Callback):  # type: ignore[misc]
             self._look(*(np.frombuffer(a, float) for a in arguments[:3]))
         except Exception as error:  # of `report`; must not go through C++, the solve raises it
             self.error = error
-        stop = self.stopped_by is not None or self.error is not None or self.program.functions.error is not None
+        stop = self.watch.stopped_by is not None or self.error is not None or self.program.functions.error is not None
         np.frombuffer(results[0], float)[:] = float(stop)
         return 0
 
     def _look(self, x: Array, f: Array, g: Array) -> None:
-        now = time.monotonic()
         violation = self._violation(x, g)
-        merit = float(f[0]) + 1e6 * max(0.0, violation - self.limits.tolerance)
-        if self.best is None or merit < self.best_merit:
-            self.best, self.best_merit = np.array(x), merit
-        if self.interrupted.is_set():
-            self.stopped_by = Outcome.INTERRUPTED
-        elif now - self.start > self.limits.time_limit:
-            self.stopped_by = Outcome.TIME_LIMIT
+        self.watch.offer(x, float(f[0]), violation)
+        due = self.watch.look_up()
         if self.report:
-            due = now - self.last_report > REPORT_PERIOD or self.stopped_by is not None
-            self.last_report = now if due else self.last_report
             self.report.row(Iteration(self.iterates, float(f[0]), violation, math.nan, math.nan), printed=due)
         self.iterates += 1
-
-    def best_of(self, guess: Array) -> Array:
-        """The best iterate, the guess where there was none."""
-        return guess if self.best is None else self.best
 
     def _violation(self, x: Array, g: Array) -> float:
         p = self.program

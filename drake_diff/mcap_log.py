@@ -12,8 +12,6 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from drake_diff.exceptions import InputError
-from drake_diff.mcap_read import McapLog as McapLog
-from drake_diff.mcap_read import read_mcap as read_mcap
 from drake_diff.whole_file import whole_file
 
 CHUNK_SIZE = 64 * 1024  # what is lost at most where a process is killed or a file damaged

@@ -3,7 +3,6 @@
 import html
 import logging
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from drake_diff.arrays import Array
-from drake_diff.contact import ContactPoint
-from drake_diff.meshcat_scene import ARROW_PART, Drawn, Poses, Push, Scene, scene_of
-from drake_diff.model import Model
+from drake_diff.meshcat_scene import ARROW_PART, Drawn, Poses, Push, Scene
 from drake_diff.page import content_policy
 from drake_diff.whole_file import write_whole
 
@@ -43,25 +40,13 @@ THICKNESS = 0.003  # of the scene's size: the radius of the trail and of an arro
 FIELD_OF_VIEW = np.deg2rad(75.0)  # Meshcat's camera, from top to bottom
 
 
-def write_replay(
-    path: Path,
-    model: Model,
-    times: Array,
-    xs: Array,
-    *,
-    contacts: Sequence[Sequence[ContactPoint]] = (),
-    planned_xs: Array | None = None,
-    frame: str | None = None,
-    title: str = "",
-) -> None:
-    """Write the motion `xs` (N+1, nx) at `times` (N+1,) [s] as one page that opens without a network.
+def write_replay(path: Path, scene: Scene, *, title: str = "") -> None:
+    """Write `scene` as one page that opens without a network, plays the motion a few times, and can scrub and pause it.
 
-    `contacts` holds the contacts of each step (N tuples): arrows as long as the forces are large, see
-    `Scene.reference_force`. `planned_xs` (N+1, nx) is a translucent ghost. The origin of `frame` leaves a line; without
-    it, the centre of mass that moves most. The page plays the motion a few times; its controls scrub and pause it.
+    Contact forces are arrows, see `Scene.reference_force`; the plan is a translucent ghost, and the trail a line.
     """
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
-    draw(meshcat, scene_of(model, times, xs, contacts=contacts, planned_xs=planned_xs, frame=frame))
+    draw(meshcat, scene)
     name = f"<title>{html.escape(title)}</title>"
     page = re.sub(r"<title>.*?</title>", lambda _: name, meshcat.StaticHtml(), count=1)
     page = page.replace("<head>", f"<head>\n  {content_policy(page)}", 1)

@@ -1,33 +1,20 @@
-"""Run a MathematicalProgram with SNOPT or IPOPT: progress, limits, interrupts, the best iterate, the solver's table."""
+"""What is common to all solves, whoever does them: limits, progress, interrupts, the best iterate, how they end."""
 
 import enum
 import math
-import re
 import signal
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.solvers import (
-    CommonSolverOption,
-    IpoptSolver,
-    MathematicalProgram,
-    SnoptSolver,
-    SolutionResult,
-    SolverOptions,
-)
 
 from drake_diff.arrays import Array
-from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, UnknownNameError
 
 FEASIBILITY_TOLERANCE = 1e-5  # defect, goal and bounds, in the state's and input's own units
-SOLVERS = ("ipopt", "snopt")
 REPORT_PERIOD = 0.2  # [s] between two progress reports: each costs an evaluation of every constraint
 
 
@@ -105,79 +92,41 @@ class NlpResult:
     note: str = ""  # what a claim of a minimum is limited to, if it is
 
 
-class _Stop(Exception):  # noqa: N818  (a signal, not an error)
-    """Raised in the callback to end a solve."""
+class Watch:
+    """What is kept of a solve while it runs: the best iterate, and whether Ctrl-C or the clock ends it."""
 
-
-def solve_program(
-    program: MathematicalProgram, guess: Array, *, solver: str, limits: Limits, report: Report | None = None
-) -> NlpResult:
-    """Solve `program` from `guess` (n,) with "ipopt" or "snopt".
-
-    `report` gets a line of progress a few times a second. Ctrl-C ends the solve with the best iterate so far.
-    """
-    if solver not in SOLVERS:
-        raise UnknownNameError("solver", got=solver, known=SOLVERS)
-    engine = IpoptSolver() if solver == "ipopt" else SnoptSolver()
-    if not (engine.available() and engine.enabled()):
-        raise MissingDependencyError(f"the solver {solver} is not in this Drake: take another one, or Drake's wheel")
-    with tempfile.TemporaryDirectory() as folder, interrupt_flag() as interrupted:
-        print_file = Path(folder) / "log"
-        watch = _Watch(program, limits, interrupted, report)
-        program.AddVisualizationCallback(watch, program.decision_variables())
-        try:
-            result = engine.Solve(program, guess, _options(solver, limits, print_file))
-        except (DrakeDiffError, RuntimeError, _Stop) as error:
-            outcome, message = _explain_exception(watch, error)
-            return NlpResult(watch.best, outcome, message, _read_table(solver, print_file))
-        outcome, message = _explain(solver, result)
-        z = result.GetSolution(program.decision_variables())
-        return NlpResult(np.asarray(z), outcome, message, _read_table(solver, print_file))
-
-
-class _Watch:
-    """Called by the solver at every evaluation: reports, keeps the best iterate, raises to stop."""
-
-    def __init__(self, program: MathematicalProgram, limits: Limits, interrupted: Any, report: Report | None):
-        self.program, self.limits, self.interrupted, self.report = program, limits, interrupted, report
+    def __init__(self, limits: Limits, interrupted: threading.Event):
+        self.limits, self.interrupted = limits, interrupted
         self.start = self.last_report = time.monotonic()
-        self.evaluations = 0
-        self.best = np.zeros(program.num_vars())
+        self.best: Array | None = None
         self.best_merit = math.inf
         self.stopped_by: Outcome | None = None
 
-    def __call__(self, z: Array) -> None:
-        self.evaluations += 1
+    @property
+    def elapsed(self) -> float:
+        """[s] since the start."""
+        return time.monotonic() - self.start
+
+    def look_up(self) -> bool:
+        """Note what ends the solve, if anything does; whether a report is due."""
         now = time.monotonic()
-        if self.evaluations == 1:
-            self.best = np.array(z)
         if self.interrupted.is_set():
             self.stopped_by = Outcome.INTERRUPTED
         elif now - self.start > self.limits.time_limit:
             self.stopped_by = Outcome.TIME_LIMIT
-        if now - self.last_report > REPORT_PERIOD or self.stopped_by:
-            self.last_report = now
-            self._look(np.array(z), now - self.start)
-        if self.stopped_by:
-            raise _Stop
+        due = now - self.last_report > REPORT_PERIOD or self.stopped_by is not None
+        self.last_report = now if due else self.last_report
+        return due
 
-    def _look(self, z: Array, elapsed: float) -> None:
-        cost = sum(float(self.program.EvalBinding(binding, z)[0]) for binding in self.program.GetAllCosts())
-        violation = max((self._violation(b, z) for b in self.program.GetAllConstraints()), default=0.0)
+    def offer(self, z: Array, cost: float, violation: float) -> None:
+        """Keep a copy of `z` (n,) if it is the best so far by cost + 1e6 * (violation beyond the tolerance)."""
         merit = cost + 1e6 * max(0.0, violation - self.limits.tolerance)
-        if merit < self.best_merit:
-            self.best, self.best_merit = z, merit
-        if self.report:
-            self.report.row(Iteration(self.evaluations, cost, violation, math.nan, math.nan), printed=False)
-            self.report.say(
-                f"evaluation {self.evaluations:5d}  cost {cost:12.6g}  violation {violation:9.2e}  {elapsed:6.1f} s"
-            )
+        if self.best is None or merit < self.best_merit:
+            self.best, self.best_merit = np.array(z), merit
 
-    def _violation(self, binding: Any, z: Array) -> float:
-        constraint, values = binding.evaluator(), self.program.EvalBinding(binding, z)
-        return float(
-            np.max(np.maximum(constraint.lower_bound() - values, values - constraint.upper_bound()), initial=0)
-        )
+    def best_of(self, guess: Array) -> Array:
+        """The best iterate, the guess where there was none."""
+        return guess if self.best is None else self.best
 
 
 class _Flag(threading.Event):
@@ -203,115 +152,3 @@ def interrupt_flag() -> Iterator[threading.Event]:
         yield flag
     finally:
         signal.signal(signal.SIGINT, former)
-
-
-def _options(solver: str, limits: Limits, print_file: Path) -> SolverOptions:
-    options = SolverOptions()
-    options.SetOption(CommonSolverOption.kPrintFileName, str(print_file))
-    if solver == "ipopt":
-        name = IpoptSolver.id()
-        options.SetOption(name, "tol", limits.tolerance)
-        options.SetOption(name, "constr_viol_tol", limits.tolerance)
-        options.SetOption(name, "max_iter", limits.max_iterations)
-        options.SetOption(name, "file_print_level", 5)  # else the file holds no table
-    else:
-        name = SnoptSolver.id()
-        options.SetOption(name, "Major feasibility tolerance", limits.tolerance)
-        options.SetOption(name, "Major optimality tolerance", limits.tolerance)
-        options.SetOption(name, "Major iterations limit", limits.max_iterations)
-        options.SetOption(name, "Iterations limit", 1000 * limits.max_iterations)
-    return options
-
-
-def _explain_exception(watch: _Watch, error: Exception) -> tuple[Outcome, str]:
-    """IPOPT hands our exceptions on, SNOPT wraps them in a RuntimeError: flags and names tell, not types."""
-    if watch.stopped_by is not None:
-        return watch.stopped_by, f"stopped: {watch.stopped_by.value}"
-    text = f"{type(error).__name__}: {error}"
-    for name, outcome in (("SimulationError", Outcome.DIVERGED), ("GradientError", Outcome.NO_GRADIENT)):
-        if name in text:
-            return outcome, text[text.rindex(name) :].strip()  # SNOPT's text holds the traceback first
-    return Outcome.FAILED, text
-
-
-_RESULTS = {
-    SolutionResult.kSolutionFound: Outcome.SOLVED,
-    SolutionResult.kIterationLimit: Outcome.ITERATION_LIMIT,
-    SolutionResult.kInfeasibleConstraints: Outcome.INFEASIBLE,
-    SolutionResult.kInfeasibleOrUnbounded: Outcome.INFEASIBLE,
-    SolutionResult.kUnbounded: Outcome.UNBOUNDED,
-}
-_SNOPT_INACCURATE = (
-    3,
-    41,
-)  # feasible or not better: "requested accuracy could not be achieved", "numerical difficulties"
-_SNOPT_INFEASIBLE = (11, 12, 13, 14, 15, 16)
-
-
-def _explain(solver: str, result: Any) -> tuple[Outcome, str]:
-    """The outcome and the solver's own words for it."""
-    outcome = _RESULTS.get(result.get_solution_result(), Outcome.FAILED)
-    details = result.get_solver_details()
-    if solver == "ipopt":
-        words = details.ConvertStatusToString()
-        if words == "Stop at acceptable point":
-            outcome = Outcome.INACCURATE
-        return outcome, f"IPOPT: {words}"
-    if details.info in _SNOPT_INACCURATE:
-        outcome = Outcome.INACCURATE
-    elif details.info in _SNOPT_INFEASIBLE:
-        outcome = Outcome.INFEASIBLE
-    return outcome, f"SNOPT info {details.info}: {result.get_solution_result().name}"
-
-
-def _read_table(solver: str, print_file: Path) -> tuple[Iteration, ...]:
-    if not print_file.is_file():
-        return ()
-    lines = print_file.read_text(errors="replace").splitlines()
-    rows = _ipopt_rows(lines) if solver == "ipopt" else _snopt_rows(lines)
-    return tuple(rows)
-
-
-_IPOPT_ROW = re.compile(
-    r"^\s*(?P<iter>\d+)(?:r|\s)\s*(?P<objective>-?\d\S+)\s+(?P<inf_pr>\S+)\s+(?P<inf_du>\S+)\s+\S+\s+\S+\s+\S+\s+\S+\s+"
-    r"(?P<alpha_pr>[\d.e+-]+)\w?\s+\d+"
-)
-
-
-def _ipopt_rows(lines: list[str]) -> Iterator[Iteration]:
-    for match in filter(None, map(_IPOPT_ROW.match, lines)):
-        yield Iteration(
-            int(match["iter"]),
-            _number(match["objective"]),
-            _number(match["inf_pr"]),
-            _number(match["inf_du"]),
-            _number(match["alpha_pr"]),
-        )
-
-
-def _snopt_rows(lines: list[str]) -> Iterator[Iteration]:
-    """Columns are read where their header stands: the first row leaves some of them blank."""
-    ends: dict[str, tuple[int, int]] = {}
-    for line in lines:
-        if "Itns" in line and "Major" in line and "Feasible" in line:
-            previous = 0
-            for match in re.finditer(r"\S+", line):
-                ends[match.group()] = (previous, match.end())
-                previous = match.end()
-        elif ends and re.match(r"^\s+\d+\s+\d+\s", line):
-            objective = next((n for n in ("MeritFunction", "Objective") if n in ends), "")
-            cell = {name: line[a:b].strip(" ()") for name, (a, b) in ends.items()}
-            yield Iteration(
-                int(cell["Major"]),
-                _number(cell.get(objective, "")),
-                _number(cell["Feasible"]),
-                _number(cell["Optimal"]),
-                _number(cell["Step"]),
-            )
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan

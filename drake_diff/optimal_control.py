@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff.arrays import Array, Indices, array_with_gaps, finite_array, positive_float
-from drake_diff.bounds import Bounds
+from drake_diff.arrays import Array, Indices, finite_array
+from drake_diff.bounds import Bounds, checked_horizon, checked_state, checked_waypoints
 from drake_diff.constraint import Constraint
 from drake_diff.cost import FinalCost, QuadraticCost, differentiate_cost
 from drake_diff.dynamics import Dynamics, Pointwise, plant_dynamics
@@ -165,39 +165,17 @@ def checked_task(
         )  # raises where it is none
     limits = dynamics.limits(bounds)
     free = np.full(dynamics.nx, np.nan)
-    start = _check_end(dynamics, "x0", x0, None)
-    goal = free if x_goal is None else _check_end(dynamics, "x_goal", x_goal, limits)
+    start = checked_state("x0", x0, None, dynamics.state_names)
+    goal = free if x_goal is None else checked_state("x_goal", x_goal, limits, dynamics.state_names)
     if running_cost is None and final_cost is None and np.all(np.isnan(goal)):
         raise InputError("problem", got="no cost and no goal", expected="a cost, an x_goal, or both")
     rate = RunningRate(running_cost, dynamics)
-    time = _check_horizon(horizon)
+    pair = horizon if isinstance(horizon, (tuple, list)) else (horizon, horizon)
+    time = checked_horizon(pair, "a number of seconds, or (lower, upper)")
     task = OptimalControl(dynamics, start, goal, time, rate, final_cost, limits, SCHEMES[scheme])
     paths = _check_constraints(task, mesh, constraints)
-    return replace(task, waypoints=_check_waypoints(task, mesh, waypoints), paths=paths)
-
-
-def _check_end(dynamics: Dynamics, subject: str, values: Any, limits: Bounds | None) -> Array:
-    end = array_with_gaps(subject, values, (dynamics.nx,))
-    if np.any(np.isinf(end)):
-        raise InputError(subject, got=end, expected="finite numbers, NaN where free")
-    if limits is not None:
-        for i in np.flatnonzero((end < limits.x_lower) | (end > limits.x_upper))[:1]:
-            expected = f"within [{limits.x_lower[i]:g}, {limits.x_upper[i]:g}]"
-            raise InputError(f"{subject}, {dynamics.state_names[i]}", got=float(end[i]), expected=expected)
-    return end
-
-
-def _check_waypoints(
-    task: OptimalControl, mesh: Array, given: Mapping[int, Any] | None
-) -> tuple[tuple[float, Array], ...]:
-    """The waypoints by their fraction of the horizon."""
-    found, last = [], len(mesh) - 1
-    for knot, wanted in (given or {}).items():
-        if isinstance(knot, bool) or not isinstance(knot, (int, np.integer)) or not 0 < knot < last:
-            expected = f"whole numbers from 1 to {last - 1} (the last state's is x_goal)"
-            raise InputError("knots of waypoints", got=repr(knot), expected=expected)
-        found.append((float(mesh[knot]), _check_end(task.dynamics, f"waypoint at knot {knot}", wanted, task.bounds)))
-    return tuple(sorted(found, key=lambda at: at[0]))
+    given = checked_waypoints(waypoints, len(mesh) - 1, limits, dynamics.state_names)
+    return replace(task, waypoints=tuple((float(mesh[knot]), state) for knot, state in given.items()), paths=paths)
 
 
 def _check_constraints(task: OptimalControl, mesh: Array, given: Any) -> tuple[PathConstraint, ...]:
@@ -211,14 +189,3 @@ def _check_constraints(task: OptimalControl, mesh: Array, given: Any) -> tuple[P
         fractions = None if c.knots is None else mesh[list(knots)]
         found.append(PathConstraint(c.resolved(x, u), fractions, knots[0]))
     return tuple(found)
-
-
-def _check_horizon(horizon: Any) -> tuple[float, float]:
-    if not isinstance(horizon, (tuple, list)):
-        horizon = (horizon, horizon)
-    if len(horizon) != 2:
-        raise InputError("horizon", got=repr(horizon), expected="a number of seconds, or (lower, upper)")
-    lower, upper = (positive_float("horizon [s]", value) for value in horizon)
-    if lower > upper:
-        raise InputError("horizon", got=repr(horizon), expected="lower at most upper")
-    return lower, upper

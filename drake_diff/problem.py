@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff.arrays import Array, array_with_gaps, finite_array, frozen, positive_float, positive_int
-from drake_diff.bounds import Bounds, plant_limits, resolve_bounds
+from drake_diff.arrays import Array, finite_array, frozen, positive_float, positive_int
+from drake_diff.bounds import Bounds, checked_horizon, checked_state, checked_waypoints, plant_limits, resolve_bounds
 from drake_diff.constraint import Constraint
 from drake_diff.cost import ConstantCost, FinalCost, QuadraticCost
 from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
@@ -69,16 +69,17 @@ class Problem:
         self._check_parameters()
         if not (self.bounds is None or isinstance(self.bounds, Bounds)):
             raise InputError("bounds", got=type(self.bounds).__name__, expected="Bounds")
-        limits = plant_limits(model.plant)
-        self._set("bounds", resolve_bounds(self.bounds, limits, model.state_names, model.input_names))
+        bounds = resolve_bounds(self.bounds, plant_limits(model.plant), model.state_names, model.input_names)
+        self._set("bounds", bounds)
         self._set("initial_state_mask", self._check_mask())
         self._set("us", self._check_us())
         self._check_inside("x0", self.x0, "x")
         if self.x_goal is not None:
-            self._set("x_goal", self._check_waypoint("x_goal", self.x_goal))
-        self._set("waypoints", self._check_waypoints())
+            self._set("x_goal", checked_state("x_goal", self.x_goal, bounds, model.state_names))
+        self._set("waypoints", checked_waypoints(self.waypoints, self.num_steps, bounds, model.state_names))
         self._set("constraints", self._check_constraints())
-        self._set("horizon", self._check_horizon())
+        if self.horizon is not None:
+            self._set("horizon", checked_horizon(self.horizon, "(lower, upper) in seconds"))
         self._check_costs()
         self._check_quantities()
 
@@ -207,23 +208,6 @@ class Problem:
             got = float(np.atleast_2d(values)[tuple(outside[0])])
             raise InputError(f"{subject}, {names[i]}", got=got, expected=f"within [{lower[i]:g}, {upper[i]:g}]")
 
-    def _check_waypoint(self, subject: str, given: Any) -> Array:
-        waypoint = array_with_gaps(subject, given, (self.model.nx,))
-        if np.any(np.isinf(waypoint)):
-            raise InputError(subject, got=waypoint, expected="finite numbers, NaN where free")
-        inside = np.clip(0.0, self.bounds.x_lower, self.bounds.x_upper)
-        self._check_inside(subject, np.where(np.isnan(waypoint), inside, waypoint), "x")
-        return waypoint
-
-    def _check_waypoints(self) -> dict[int, Array]:
-        found = {}
-        for knot, given in (self.waypoints or {}).items():
-            if isinstance(knot, bool) or not isinstance(knot, (int, np.integer)) or not 0 < knot < self.num_steps:
-                expected = f"whole numbers from 1 to {self.num_steps - 1} (the last state's is x_goal)"
-                raise InputError("knots of waypoints", got=repr(knot), expected=expected)
-            found[int(knot)] = self._check_waypoint(f"waypoint at knot {knot}", given)
-        return dict(sorted(found.items()))
-
     def _check_constraints(self) -> tuple[Constraint, ...]:
         given = (self.constraints,) if isinstance(self.constraints, Constraint) else tuple(self.constraints)
         for constraint in given:
@@ -231,16 +215,6 @@ class Problem:
                 raise InputError("constraints", got=type(constraint).__name__, expected="Constraints")
             constraint.at_knots(self.num_steps, self.initial_state_is_given)
         return tuple(constraint.resolved(self.x0, np.zeros(self.model.nu)) for constraint in given)
-
-    def _check_horizon(self) -> tuple[float, float] | None:
-        if self.horizon is None:
-            return None
-        if not (isinstance(self.horizon, (tuple, list)) and len(self.horizon) == 2):
-            raise InputError("horizon", got=repr(self.horizon), expected="(lower, upper) in seconds")
-        lower, upper = (positive_float("horizon [s]", value) for value in self.horizon)
-        if lower > upper:
-            raise InputError("horizon", got=repr(self.horizon), expected="lower at most upper")
-        return lower, upper
 
     def _check_costs(self) -> None:
         if isinstance(self.running_cost, (int, float)) and self.horizon is not None:

@@ -81,6 +81,15 @@ class Plan:
             ranges[kind] = np.maximum(ranges[kind], least)
         return np.asarray(ranges)
 
+    @cached_property
+    def open_loop(self) -> Rollout | None:
+        """The plant's own motion under the inputs at the plan's own step; None where it cannot be taken."""
+        try:
+            xs, us = self.sample(1)
+            return rollout(self.model_at(1), xs[0], us, parameters=self.vector.to_dict())
+        except (SimulationError, ModelError, ValueError):
+            return None  # not finite, or beyond what Drake can step: recorded as missing, never as zero
+
     def model_at(self, parts: int) -> Model:
         """The model at the m-th part of an interval."""
         model, h = self.problem.model, self.time_step / parts
@@ -96,15 +105,6 @@ def held(xs: Array, us: Array) -> Callable[[int], tuple[Array, Array]]:
         return between, np.repeat(us, parts, axis=0)
 
     return sample
-
-
-def replay_open_loop(plan: Plan) -> Rollout | None:
-    """The plant's own motion under the plan's inputs at its own step; None where it cannot be taken."""
-    try:
-        xs, us = plan.sample(1)
-        return rollout(plan.model_at(1), xs[0], us, parameters=plan.vector.to_dict())
-    except (SimulationError, ModelError, ValueError):
-        return None  # not finite, or beyond what Drake can step: recorded as missing, never as zero
 
 
 def replays(plan: Plan) -> tuple[Replay, ...]:
@@ -125,7 +125,8 @@ def replays(plan: Plan) -> tuple[Replay, ...]:
 
 def _replay_step(plan: Plan, parts: int) -> list[Replay]:
     name = f"in steps of {plan.time_step / parts:.4g} s"
-    return _replay_in(plan, name, lambda: plan.model_at(parts), parts)
+    known = plan.open_loop if parts == 1 else None
+    return _replay_in(plan, name, lambda: plan.model_at(parts), parts, known)
 
 
 def _holds(found: Sequence[Replay]) -> bool:
@@ -143,13 +144,15 @@ def broken_variants(plan: Plan, found: Sequence[Replay]) -> Iterator[str]:
             yield f"replayed {variant} it does not hold: " + "; ".join(f"{r.control}, {r.failures[0]}" for r in tried)
 
 
-def _replay_in(plan: Plan, variant: str, make: Callable[[], Model], parts: int) -> list[Replay]:
-    """Both replays in one variant of the plant; open loop alone where there is nothing to control."""
-    controls = ["open loop", "TVLQR"] if plan.problem.model.nu else ["open loop"]
+def _replay_in(
+    plan: Plan, variant: str, make: Callable[[], Model], parts: int, known: Rollout | None = None
+) -> list[Replay]:
+    """Both replays in one variant of the plant; open loop, whose motion may be `known`, alone without inputs."""
+    controls = {"open loop": known, "TVLQR": None} if plan.problem.model.nu else {"open loop": known}
     try:
         model = make()
         with applied(select(model, plan.vector.to_dict())) as set_model:
-            return [_replay(plan, variant, control, set_model, parts) for control in controls]
+            return [_replay(plan, variant, control, set_model, parts, motion) for control, motion in controls.items()]
     except (ModelError, InputError) as error:
         return [_missing(plan, variant, control, str(error)) for control in controls]
 
@@ -171,13 +174,9 @@ def _weights(plan: Plan, us: Array) -> tuple[Array, Array, Array]:
     return Q, EFFORT_WEIGHT * np.diag(1 / effort**2), FINAL_WEIGHT * Q
 
 
-def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int) -> Replay:
-    xs, us = plan.sample(parts)
+def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, known: Rollout | None) -> Replay:
     try:
-        if control == "open loop":
-            motion = rollout(model, xs[0], us)
-        else:
-            motion = rollout(model, xs[0], policy=_track(plan, model, xs, us), num_steps=len(us))
+        motion = _roll(plan, control, model, parts) if known is None else known
     except (SimulationError, ModelError, GradientError, ValueError) as error:
         return _missing(plan, variant, control, str(error))
     bounds = plan.problem.bounds
@@ -194,6 +193,13 @@ def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int) ->
         penetration=float(np.max(motion.penetration)),
         failures=tuple(_failures(plan, model, motion, parts)),
     )
+
+
+def _roll(plan: Plan, control: str, model: Model, parts: int) -> Rollout:
+    xs, us = plan.sample(parts)
+    if control == "open loop":
+        return rollout(model, xs[0], us)
+    return rollout(model, xs[0], policy=_track(plan, model, xs, us), num_steps=len(us))
 
 
 def _missing(plan: Plan, variant: str, control: str, why: str) -> Replay:

@@ -16,7 +16,8 @@ from pydrake.solvers import MathematicalProgram
 
 from drake_diff.arrays import Array, positive_int
 from drake_diff.exceptions import InputError
-from drake_diff.nonlinear_program import Limits, NlpResult, Report, solve_program
+from drake_diff.mathematical_program import solve_program
+from drake_diff.nonlinear_program import Limits, NlpResult, Report
 from drake_diff.problem import Problem
 from drake_diff.shooting import RolloutCost, ShootingVariables, defect, limits_of_constraints, limits_of_states
 

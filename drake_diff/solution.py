@@ -1,5 +1,6 @@
 """What every solver returns, and measures that do not take its word."""
 
+import copy
 import enum
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -9,12 +10,12 @@ import numpy as np
 
 from drake_diff.arrays import Array
 from drake_diff.certificate import Certificate
-from drake_diff.exceptions import ModelError, SimulationError
+from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
 from drake_diff.model import Model
 from drake_diff.nonlinear_program import Iteration
 from drake_diff.parameters import ParameterVector, applied, select
 from drake_diff.problem import Problem
-from drake_diff.replay import Plan, Replay, held, replay_open_loop, replays
+from drake_diff.replay import Plan, Replay, held, replays
 from drake_diff.rollout import Rollout, roll_states
 from drake_diff.step import advance
 from drake_diff.transcribed import Collocated, collocated
@@ -22,6 +23,7 @@ from drake_diff.transcribed import Collocated, collocated
 # Between two knots the transcription is a cubic; further than this [state units] from an accurate integration
 # its motion is not the model's.
 INTEGRATION_TOLERANCE = 1e-2
+TOLD = ("status", "message", "iterations", "solver_message", "options")  # fields that no measure depends on
 
 
 class Status(enum.Enum):
@@ -64,8 +66,8 @@ class Solution:
     The inputs of a discrete method (`scheme` "step") are held over each step. Those of a collocation scheme are at
     the knots, `u_final` (nu,) at the last one, and linear in between, or, of hermite_simpson, the parabola through
     `us_mid` (N, nu) at the midpoints. `horizon` [s] is num_steps * time_step, or what a free one came to.
-    `cost`, `defect`, `bound_violation`, `replays` and the rest are computed from xs and us each time a Solution is
-    made, never taken from the solver.
+    `cost`, `defect`, `bound_violation`, `replays` and the rest are computed from xs and us, once, when they are first
+    asked for, and never taken from the solver.
     """
 
     problem: Problem
@@ -86,6 +88,15 @@ class Solution:
     options: dict[str, Any] = field(default_factory=dict)
     solver_message: str = ""
     wall_time: float = 0.0  # [s]
+
+    def told(self, **fields: Any) -> "Solution":
+        """The same motion with other `fields` out of TOLD: its measures stay. UnknownNameError of others."""
+        for name in fields:
+            if name not in TOLD:
+                raise UnknownNameError("field to be told", got=name, known=TOLD)
+        found = copy.copy(self)
+        vars(found).update(fields)
+        return found
 
     @property
     def success(self) -> bool:
@@ -213,7 +224,7 @@ class Solution:
         fixed = ~self.problem.initial_state_mask
         return _largest(np.abs(self.xs[0] - self.problem.x0)[fixed])
 
-    @property
+    @cached_property
     def plan(self) -> Plan:
         """What is replayed: states, and inputs held over each step, or their means over the parts of an interval."""
         continuous = self.transcribed is not None
@@ -226,7 +237,7 @@ class Solution:
 
         An input that changes between knots is held at its mean over each step.
         """
-        return replay_open_loop(self.plan)
+        return self.plan.open_loop
 
     @cached_property
     def replays(self) -> tuple[Replay, ...]:

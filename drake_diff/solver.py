@@ -15,7 +15,8 @@ from drake_diff.continuation import check_schedule
 from drake_diff.continuous import EquationsOfMotion
 from drake_diff.exceptions import DrakeDiffError, InputError, UnknownNameError
 from drake_diff.ilqr import check_problem, is_unconstrained
-from drake_diff.nonlinear_program import SOLVERS, Iteration, Limits, Report
+from drake_diff.mathematical_program import SOLVERS
+from drake_diff.nonlinear_program import Iteration, Limits, Report
 from drake_diff.problem import Problem
 from drake_diff.run import Run
 from drake_diff.shooting_program import DEFAULT_SOLVER as SHOOTING_SOLVER
@@ -184,7 +185,7 @@ def _solve_in_chain(task: _Task, given: Any, solver: str | None) -> Solution:
         if last.status in ENDED:
             break
     best = min(found, key=_preference)
-    return dataclasses.replace(best, options=best.options | {"chain": chain})
+    return best.told(options=best.options | {"chain": chain})
 
 
 def _preference(solution: Solution) -> tuple[int, float]:

@@ -8,8 +8,6 @@ from drake_diff.mcap_log import write_mcap
 from drake_diff.parameters import applied
 from drake_diff.solution import Solution
 from drake_diff.trace_motion import Shown, motion_channels
-from drake_diff.trace_read import Trace as Trace
-from drake_diff.trace_read import read_trace as read_trace
 from drake_diff.trace_solve import event_channel, plan_channels, solver_channels
 
 CONFIGURATION = "configuration.json"

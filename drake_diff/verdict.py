@@ -1,7 +1,6 @@
 """The status of a solve: what the solver says, cut down to what was measured again on Drake's plant."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -66,9 +65,8 @@ def refused(draft: Solution, error: Exception) -> Solution:
 
 
 def ended(draft: Solution, status: Status, detail: str, **fields: Any) -> Solution:
-    return replace(
-        draft, status=status, message=f"{status.sentence}: {detail}" if detail else status.sentence, **fields
-    )
+    message = f"{status.sentence}: {detail}" if detail else status.sentence
+    return draft.told(status=status, message=message, **fields)
 
 
 _STATUSES = {

@@ -20,6 +20,7 @@ from drake_diff.record import EvidenceRecord, canonical, own_sha256, reproducibl
 from drake_diff.record_file import RECORD, parse_record, read_fields
 from drake_diff.rerun import rebuilt, resolve
 from drake_diff.solution import Solution
+from drake_diff.trace_read import read_trace
 from drake_diff.verification import (
     Comparison,
     Verification,
@@ -84,8 +85,6 @@ def _damage_of_files(folder: Path, record: EvidenceRecord) -> Iterator[str]:
 
 
 def _run_again(folder: Path, record: EvidenceRecord, fields: dict[str, Any]) -> Verification:
-    from drake_diff.trace import read_trace  # what a script that verifies nothing need not load
-
     costs, constraints = unknown_functions(record)
     notes = tuple(_other_versions(record))
     try:

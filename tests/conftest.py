@@ -37,6 +37,18 @@ def write_urdf(tmp_path):
     return write
 
 
+@pytest.fixture(scope="session")
+def thrown():
+    """A ball that falls on the ground and rolls: contact, and no actuator."""
+    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.005)
+    x0 = model.default_state
+    x0[6], x0[10] = 0.15, 0.5  # m high, m/s along x, which is free
+    along, free = np.eye(13)[4], np.arange(13) == 10
+    final = dd.QuadraticCost(Q=np.diag(along), x_ref=0.3 * along)
+    changes = {"optimize": "initial_state", "initial_state_mask": free}
+    return dd.solve(dd.Problem(model, x0=x0, num_steps=60, final_cost=final, **changes))
+
+
 BLOCK = """<robot name="block">
   <link name="block"><inertial><mass value="{mass}"/>
     <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>

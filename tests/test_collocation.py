@@ -204,8 +204,7 @@ def test_an_expressions_derivative_that_is_one_percent_off_is_named(row, column,
 
 
 def test_ctrl_c_ends_it_with_a_motion(monkeypatch):
-    for module in ("nonlinear_program", "ipopt"):
-        monkeypatch.setattr(f"drake_diff.{module}.REPORT_PERIOD", 0.0)
+    monkeypatch.setattr("drake_diff.nonlinear_program.REPORT_PERIOD", 0.0)
     before = signal.getsignal(signal.SIGINT)
     for solver in ("ipopt", "snopt"):
         solution = collocate(swing_up(), solver=solver, progress=lambda line: signal.raise_signal(signal.SIGINT))

@@ -170,16 +170,8 @@ def test_contradictory_constraints_are_infeasible(method):
 
 def test_a_constraint_that_never_acts_leaves_one_full_step():
     """A30: J* = 12.948481280713864 in one step, as without it."""
-    h, count, Q, R, Qf = A30
-    problem = dd.Problem(
-        block(time_step=h),
-        x0=[1, 0],
-        num_steps=count,
-        running_cost=dd.QuadraticCost(Q=Q / h, R=[[R / h]]),
-        final_cost=dd.QuadraticCost(Q=Qf),
-        constraints=dd.Constraint(lambda x, u: u[0] + x[0], upper=1e6),
-    )
-    solution = dd.solve(problem, method="ilqr")
+    never = dd.Constraint(lambda x, u: u[0] + x[0], upper=1e6)
+    solution = dd.solve(lqr(*A30, constraints=never), method="ilqr")
     assert solution.success, solution.message
     assert len(solution.iterations) == 2
     assert solution.cost == pytest.approx(12.948481280713864, rel=1e-12)

@@ -11,9 +11,10 @@ import pytest
 
 import drake_diff as dd
 from drake_diff.evidence import begin
-from drake_diff.mcap_log import read_mcap
+from drake_diff.mcap_read import read_mcap
+from drake_diff.meshcat_scene import scene_of
 from drake_diff.meshcat_view import write_replay
-from drake_diff.trace import read_trace
+from drake_diff.trace_read import read_trace
 
 MODELS = Path(__file__).parent.parent / "models"
 
@@ -31,25 +32,6 @@ def swing_up():
 @pytest.fixture(scope="module")
 def collocated(swing_up):
     return dd.solve(swing_up.problem, method="collocation")
-
-
-@pytest.fixture(scope="module")
-def thrown():
-    """A ball that falls on the ground and rolls."""
-    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.005)
-    x0 = model.default_state
-    x0[6], x0[10] = 0.15, 0.5
-    free = np.zeros(13, dtype=bool)
-    free[10] = True
-    problem = dd.Problem(
-        model,
-        x0=x0,
-        num_steps=60,
-        final_cost=lambda x: (x[4] - 0.3) ** 2,
-        optimize="initial_state",
-        initial_state_mask=free,
-    )
-    return dd.solve(problem)
 
 
 @pytest.fixture(scope="module")
@@ -255,6 +237,6 @@ def test_a_hostile_title_or_body_name_does_no_harm(tmp_path):
     (tmp_path / "evil.urdf").write_text(urdf)
     model = dd.load_model(tmp_path / "evil.urdf", time_step=0.01)
     motion = dd.rollout(model, [0.1, 0], np.zeros((5, 1)))
-    write_replay(tmp_path / "a.html", model, motion.times, motion.xs, title="<script>alert(2)</script>")
+    write_replay(tmp_path / "a.html", scene_of(model, motion.times, motion.xs), title="<script>alert(2)</script>")
     page = (tmp_path / "a.html").read_text()
     assert "<script>alert" not in page

@@ -27,15 +27,10 @@ SOFT = {
 }
 
 
-def lqr(h, count, Q, R, Qf, x0=(1, 0)):
+def lqr(h, count, Q, R, Qf, **fields):
     """The running cost is a rate: weights divided by h give sums without h."""
-    return dd.Problem(
-        block(time_step=h),
-        x0=x0,
-        num_steps=count,
-        running_cost=dd.QuadraticCost(Q=np.array(Q) / h, R=[[R / h]]),
-        final_cost=dd.QuadraticCost(Q=Qf),
-    )
+    costs = {"running_cost": dd.QuadraticCost(Q=Q / h, R=[[R / h]]), "final_cost": dd.QuadraticCost(Q=Qf)}
+    return dd.Problem(block(time_step=h), **{"x0": [1, 0], "num_steps": count, **costs, **fields})
 
 
 def riccati(h, count, Q, R, Qf):
@@ -156,15 +151,9 @@ def test_the_cost_falls_from_row_to_row():
 
 def test_a_function_is_optimized_like_the_quadratic_cost_it_is():
     """A30 again; second derivatives by differences of 1e-5 cost digits, so it may take more than one step."""
-    h, count, Q, R, Qf = A30
-    problem = dd.Problem(
-        block(time_step=h),
-        x0=[1, 0],
-        num_steps=count,
-        running_cost=lambda x, u: (x @ Q @ x + R * u[0] ** 2) / h,
-        final_cost=lambda x: x @ Qf @ x,
-    )
-    solution = dd.solve(problem, method="ilqr")
+    h, _, Q, R, Qf = A30
+    running = {"running_cost": lambda x, u: (x @ Q @ x + R * u[0] ** 2) / h}
+    solution = dd.solve(lqr(*A30, **running, final_cost=lambda x: x @ Qf @ x), method="ilqr")
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(12.948481280713864, rel=1e-12)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
-from test_ilqr import A30
+from test_ilqr import A30, lqr
 from test_solution import MODELS, block
 
 import drake_diff as dd
@@ -39,14 +39,8 @@ def test_a_pendulum_swings_up_with_the_oracles_cost(solver, segments):
 @pytest.mark.parametrize("segments", [1, 3, 20])
 def test_lqr_has_the_riccati_recursions_cost_from_states_that_are_no_rollout(solver, segments):
     """A30; the cost is flat at its minimum, but for the defects, which are met to 1e-8."""
-    h, count, Q, R, Qf = A30
-    problem = dd.Problem(
-        block(time_step=h),
-        x0=[1, 0],
-        num_steps=count,
-        running_cost=dd.QuadraticCost(Q=Q / h, R=[[R / h]]),
-        final_cost=dd.QuadraticCost(Q=Qf),
-    )
+    problem = lqr(*A30)
+    count = problem.num_steps
     random = np.random.default_rng(0)
     guess = random.standard_normal((count + 1, 2)), random.standard_normal((count, 1))
     solution = shoot(problem, solver=solver, segments=segments, initial_guess=guess)

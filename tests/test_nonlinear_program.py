@@ -9,7 +9,8 @@ import pytest
 from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver
 
 import drake_diff as dd
-from drake_diff.nonlinear_program import Limits, Outcome, Report, _ipopt_rows, _snopt_rows, solve_program
+from drake_diff.mathematical_program import _ipopt_rows, _snopt_rows, solve_program
+from drake_diff.nonlinear_program import Limits, Outcome, Report, Watch
 
 SOLVERS = ("ipopt", "snopt")
 UNLIMITED = Limits(max_iterations=500, time_limit=math.inf, tolerance=1e-8)
@@ -225,3 +226,32 @@ def test_a_solver_that_this_drake_lacks_is_named(solver, engine, monkeypatch):
     monkeypatch.setattr(engine, "available", lambda self: False)
     with pytest.raises(dd.MissingDependencyError, match=f"the solver {solver} is not in this Drake"):
         run(program(bowl), solver=solver)
+
+
+def watch(time_limit=math.inf):
+    return Watch(Limits(500, time_limit, 1e-8), threading.Event())
+
+
+def test_the_best_iterate_is_feasible_first_and_cheap_second():
+    """By cost + 1e6 * (violation - 1e-8): 5, then 1 + 1e6 (1e-3 - 1e-8), then 4, then 4.5."""
+    seen, z = watch(), np.zeros(1)
+    for i, (cost, violation) in enumerate([(5.0, 0.0), (1.0, 1e-3), (4.0, 1e-8), (4.5, 0.0)]):
+        z[0] = i
+        seen.offer(z, cost, violation)
+    assert seen.best_of(np.array([9.0])).tolist() == [2.0]  # a copy: z itself went on
+    seen.offer(np.array([7.0]), math.nan, 0.0)
+    assert seen.best_of(np.array([9.0])).tolist() == [2.0]
+
+
+def test_without_an_iterate_the_guess_is_the_best():
+    assert watch().best_of(np.array([9.0])).tolist() == [9.0]
+
+
+def test_the_clock_and_ctrl_c_end_a_solve_and_the_end_is_reported(monkeypatch):
+    going, late, interrupted = watch(), watch(time_limit=0.0), watch()
+    interrupted.interrupted.set()
+    assert [w.look_up() for w in (going, late, interrupted)] == [False, True, True]
+    assert [w.stopped_by for w in (going, late, interrupted)] == [None, Outcome.TIME_LIMIT, Outcome.INTERRUPTED]
+    monkeypatch.setattr("drake_diff.nonlinear_program.REPORT_PERIOD", 0.0)
+    assert going.look_up()
+    assert going.stopped_by is None

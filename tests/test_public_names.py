@@ -26,16 +26,16 @@ soft_contact read_contract tangent inertia parameter_kinds contact_parameters pa
 finite_difference tree_dynamics implicit step_derivatives smoothing policy contact quantities mode_changes certificate
 rollout rollout_gradient refinement certify continuous cost bounds constraint problem replay dynamics
 nonlinear_program transcription_scheme optimal_control transcribed symbolic symbolic_tree knot_functions
-transcription_program ipopt transcription solution collocation shooting shooting_program riccati secant
-augmented_lagrangian expansion ilqr contact_sequence goal_restoration continuation verdict run solver mcap_messages
-mcap_read mcap_log mcap_recover trace_read trace_motion trace_solve trace page html_parts meshcat_scene meshcat_view
-report_data report record_parts record record_schema record_file certification_record named_files provenance
-problem_record plan_file record_sections metrics invariants failures events evidence rerun verification verify runs
-view sampling certification audit_place audit_contact audit engines.engine engines.euler engines.description
-engines.closed_form engines.closed_form_contact engines.numpy_engine engines.drake_engine engines.pinocchio_engine
-engines.mjcf engines.mujoco_contract engines.mujoco_engine engines.contract_match engines.load engines.attribution
-engines.motion engines.jacobians engines.recording engines.comparison engines.comparison_words ros2_bag cli_mcap
-cli_runs cli_view cli
+transcription_program ipopt transcription solution mathematical_program collocation shooting shooting_program riccati
+secant augmented_lagrangian expansion ilqr contact_sequence goal_restoration continuation verdict run solver
+mcap_messages mcap_read mcap_log mcap_recover trace_read trace_motion trace_solve trace page html_parts meshcat_scene
+meshcat_view report_data report record_parts record record_schema record_file certification_record named_files
+provenance problem_record plan_file record_sections metrics invariants failures events evidence rerun verification
+verify runs view sampling certification audit_place audit_contact audit engines.engine engines.euler
+engines.description engines.closed_form engines.closed_form_contact engines.numpy_engine engines.drake_engine
+engines.pinocchio_engine engines.mjcf engines.mujoco_contract engines.mujoco_engine engines.contract_match
+engines.load engines.attribution engines.motion engines.jacobians engines.recording engines.comparison
+engines.comparison_words ros2_bag cli_mcap cli_runs cli_view cli
 """.split()
 
 

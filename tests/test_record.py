@@ -225,35 +225,21 @@ def test_inputs_at_their_bounds_begin_and_end_in_the_events(tmp_path):
     assert record.events[0].kind == "solver_started"
 
 
-@pytest.fixture(scope="module")
-def dropped():
-    """A ball that falls on the ground and slides."""
-    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.005)
-    x0 = model.default_state
-    x0[6], x0[10] = 0.15, 0.5
-    free = np.zeros(13, dtype=bool)
-    free[10] = True
-    final = dd.QuadraticCost(Q=np.diag([0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0, 0, 0]))
-    return dd.solve(
-        dd.Problem(model, x0=x0, num_steps=60, final_cost=final, optimize="initial_state", initial_state_mask=free)
-    )
-
-
-def test_momentum_energy_and_the_friction_cone_of_a_falling_ball(dropped, tmp_path):
+def test_momentum_energy_and_the_friction_cone_of_a_falling_ball(thrown, tmp_path):
     """In flight momentum changes by m g t to rounding; semi-implicit Euler loses m g^2 h t / 2 of energy."""
-    found = {m.name: m for m in invariants_of(dropped)}
+    found = {m.name: m for m in invariants_of(thrown)}
     assert found["linear momentum error"].value < 1e-12  # N s: rounding of 1 kg * 1 m/s over some 20 steps
     assert found["angular momentum error"].value < 1e-12
-    touches = next(k for k, contacts in enumerate(dropped.replay.contacts) if contacts)
+    touches = next(k for k, contacts in enumerate(thrown.replay.contacts) if contacts)
     lost = 9.81**2 * 0.005 * (touches * 0.005) / 2  # J, of 1 kg
     assert abs(found["free-motion energy drift"].value) == pytest.approx(lost, rel=1e-6)
     assert found["friction-cone excess"].value < 1e-6  # N: SAP keeps the cone
-    assert found["penetration"].value == dropped.replay.penetration.max() > 0
-    record = dd.save(dropped, tmp_path / "ball")
+    assert found["penetration"].value == thrown.replay.penetration.max() > 0
+    record = dd.save(thrown, tmp_path / "ball")
     assert {v.frame for v in record.observation.variables} == {record.contract["frame"]}
     assert dd.verify(tmp_path / "ball").require().holds
     made = [e for e in record.events if e.kind == "contact_made"]
-    assert made[0].t_s == dropped.replay.times[touches]
+    assert made[0].t_s == thrown.replay.times[touches]
     assert {"ball", "ground"} <= set(made[0].message.split())
 
 
@@ -264,22 +250,22 @@ def with_replay(solution, **changes):
     return other
 
 
-def test_a_force_outside_the_friction_cone_and_momentum_from_nowhere_are_seen(dropped):
+def test_a_force_outside_the_friction_cone_and_momentum_from_nowhere_are_seen(thrown):
     """mu = 0.5 on both: of 2 N along the ground under 1 N of push, 1.5 N are more than friction can give."""
-    contacts = list(dropped.replay.contacts)
+    contacts = list(thrown.replay.contacts)
     k = next(k for k, found in enumerate(contacts) if found)
     forced = dataclasses.replace(contacts[k][0], normal=np.array([0, 0, 1.0]), force=np.array([2.0, 0, 1.0]))
     contacts[k] = (forced,)
-    found = {m.name: m for m in invariants_of(with_replay(dropped, contacts=tuple(contacts)))}
+    found = {m.name: m for m in invariants_of(with_replay(thrown, contacts=tuple(contacts)))}
     assert found["friction-cone excess"].value == pytest.approx(1.5, rel=1e-12)
-    assert found["friction-cone excess"].t_s == dropped.replay.times[k]
-    xs = np.array(dropped.replay.xs)
+    assert found["friction-cone excess"].t_s == thrown.replay.times[k]
+    xs = np.array(thrown.replay.xs)
     xs[5, 10] += 0.25  # m/s of v_x, of 1 kg
-    found = {m.name: m for m in invariants_of(with_replay(dropped, xs=xs))}
+    found = {m.name: m for m in invariants_of(with_replay(thrown, xs=xs))}
     assert found["linear momentum error"].value == pytest.approx(0.25, rel=1e-9)
     unknown = dataclasses.replace(forced, body_b="nobody")
     contacts[k] = (unknown,)
-    found = {m.name: m for m in invariants_of(with_replay(dropped, contacts=tuple(contacts)))}
+    found = {m.name: m for m in invariants_of(with_replay(thrown, contacts=tuple(contacts)))}
     assert found["friction-cone excess"].value is None
     assert "is not one number" in found["friction-cone excess"].reason
 

@@ -7,7 +7,7 @@ import pytest
 
 import drake_diff as dd
 from drake_diff.parameters import select
-from drake_diff.replay import STATE_TOLERANCE, Plan, broken_variants, held, replay_open_loop, replays
+from drake_diff.replay import STATE_TOLERANCE, Plan, broken_variants, held, replays
 from drake_diff.solution import Status
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
@@ -126,7 +126,7 @@ def test_inputs_that_cannot_be_stepped_are_missing_not_zero(write_urdf):
     problem = block(write_urdf, final_cost=lambda x: x[0])
     us = np.full((COUNT, 1), np.nan)
     plan = Plan(problem, select(problem.model, ()), H, held(np.zeros((COUNT + 1, 2)), us), continuous=False)
-    assert replay_open_loop(plan) is None
+    assert plan.open_loop is None
     for replay in replays(plan):
         assert replay.motion is None
         assert replay.goal_error == replay.penetration == math.inf
@@ -157,3 +157,9 @@ def test_a_solve_whose_replay_fails_is_no_success(load):
     assert solution.defect == 0
     assert solution.status is Status.CONVERGED_NOT_VERIFIED
     assert "replayed in steps of 0.05 s it does not hold: open loop, " in solution.message
+
+
+def test_the_open_loop_motion_is_taken_once(write_urdf):
+    """The replay at the plan's own step is the plan's open-loop motion."""
+    plan = plan_of(block(write_urdf, x_goal=[1, 0]), np.full((COUNT, 1), 2.0))
+    assert by_name(replays(plan), f"in steps of {H:g} s", "open loop").motion is plan.open_loop

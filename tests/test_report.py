@@ -46,18 +46,6 @@ def swing_up(pendulum):
 
 
 @pytest.fixture(scope="module")
-def thrown():
-    """A ball that falls on the ground and rolls: contact, and no actuator."""
-    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.005)
-    x0 = model.default_state
-    x0[6], x0[10] = 0.15, 0.5
-    free = np.zeros(13, dtype=bool)
-    free[10] = True
-    cost = {"final_cost": lambda x: (x[4] - 0.3) ** 2, "optimize": "initial_state", "initial_state_mask": free}
-    return dd.solve(dd.Problem(model, x0=x0, num_steps=60, **cost))
-
-
-@pytest.fixture(scope="module")
 def collocated(pendulum):
     return dd.solve(pendulum, method="collocation")
 

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from test_ilqr import A30
+from test_ilqr import A30, lqr
 from test_solution import MODELS, block
 
 import drake_diff as dd
@@ -80,14 +80,8 @@ def test_the_block_moves_by_symplectic_eulers_optimum(solver, count):
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_lqr_by_shooting_has_the_riccati_recursions_cost(solver):
     """A30, from a given guess, so that iLQR does not help; 1e-12 since the cost is flat at its minimum."""
-    h, count, Q, R, Qf = A30
-    problem = dd.Problem(
-        block(time_step=h),
-        x0=[1, 0],
-        num_steps=count,
-        running_cost=dd.QuadraticCost(Q=Q / h, R=[[R / h]]),
-        final_cost=dd.QuadraticCost(Q=Qf),
-    )
+    problem = lqr(*A30)
+    count = problem.num_steps
     us = 10 * np.random.default_rng(5).standard_normal((count, 1))
     solution = shoot(problem, solver=solver, initial_guess=(np.zeros((count + 1, 2)), us))
     assert solution.success, solution.message

@@ -214,3 +214,26 @@ def test_a_solutions_arrays_are_read_only(method):
 def test_only_converged_is_success():
     s = solved("shooting")
     assert [status for status in dd.Status if dataclasses.replace(s, status=status).success] == [dd.Status.CONVERGED]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_another_status_leaves_the_measures_as_they_were_taken(method):
+    """The status is told of the motion: nothing of the motion is measured again."""
+    s = dataclasses.replace(solved(method))
+    measured = {name: getattr(s, name) for name in ("cost", "defects", "plan", "replay", "replays", "transcribed")}
+    told = s.told(status=dd.Status.INFEASIBLE, message="m", options={"chain": []}, iterations=(), solver_message="w")
+    assert (told.status, told.message, told.options) == (dd.Status.INFEASIBLE, "m", {"chain": []})
+    assert (told.iterations, told.solver_message) == ((), "w")
+    assert all(getattr(told, name) is value for name, value in measured.items())
+    assert s.status is dd.Status.CONVERGED
+
+
+@pytest.mark.parametrize("name", ["xs", "us", "problem", "certificates", "cost"])
+def test_what_a_measure_may_depend_on_is_not_told(name):
+    with pytest.raises(dd.InputError, match=f"expected one of iterations, .*, got '{name}'"):
+        solved("ilqr").told(**{name: None})
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_the_verdict_measured_is_not_measured_again(method):
+    assert {"cost", "defects", "plan", "replays"} <= vars(solved.__wrapped__(method)).keys()

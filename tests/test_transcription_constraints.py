@@ -10,7 +10,6 @@ import pytest
 from test_transcription import BLOCK, effort, heavy_pendulum, move, own_derivatives, unit_inputs
 
 import drake_diff as dd
-from drake_diff import ipopt
 from drake_diff.dynamics import Dynamics
 from drake_diff.nonlinear_program import Limits, Outcome
 
@@ -165,7 +164,7 @@ def test_a_node_moved_off_its_waypoint_or_constraint_is_no_success(kind):
 
 
 def test_an_interrupt_ends_with_the_best_iterate(monkeypatch):
-    monkeypatch.setattr(ipopt, "REPORT_PERIOD", 0.0)
+    monkeypatch.setattr("drake_diff.nonlinear_program.REPORT_PERIOD", 0.0)
     lines, former = [], signal.getsignal(signal.SIGINT)
 
     def report(line):
@@ -246,7 +245,7 @@ def test_any_other_error_is_raised():
 
 
 def test_an_error_of_the_report_is_raised(monkeypatch):
-    monkeypatch.setattr(ipopt, "REPORT_PERIOD", 0.0)
+    monkeypatch.setattr("drake_diff.nonlinear_program.REPORT_PERIOD", 0.0)
 
     def report(line):
         raise KeyError("yours")
