@@ -59,7 +59,7 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
     Gives the record. Each file is written aside and moved into place, record.json last, so that at any moment the
     record is complete only if everything it names is.
     """
-    from drake_diff.meshcat_scene import scene_of  # what a script that saves nothing need not load
+    from drake_diff.meshcat_scene import BLUE, scene_of  # what a script that saves nothing need not load
     from drake_diff.meshcat_view import write_replay
     from drake_diff.report import write_report
     from drake_diff.trace import write_trace
@@ -77,7 +77,7 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
         solution.times,
         _drawable(solution) if motion is None else motion.xs,
         contacts=() if motion is None else motion.contacts,
-        planned_xs=solution.xs if solution.transcribed is not None and motion is not None else None,
+        ghosts={"plan": (solution.xs, BLUE)} if solution.transcribed is not None and motion is not None else None,
     )
     write_replay(folder / REPLAY, scene, title=f"{folder.name}: {solution.status.value}")
     write_report(folder / REPORT, solution, fields, folder / REPLAY)

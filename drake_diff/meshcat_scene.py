@@ -30,7 +30,7 @@ from drake_diff.plant_elements import bodies
 from drake_diff.step import set_state
 
 DRAWN = (Box, Capsule, Convex, Cylinder, Ellipsoid, HalfSpace, Mesh, Sphere)
-GREY = Rgba(0.6, 0.6, 0.62, 1)
+GREY, BLUE = Rgba(0.6, 0.6, 0.62, 1), Rgba(0.15, 0.4, 0.95, 0.3)
 LOOKED_AT = 60  # poses of a motion that its bounding box is taken from
 ARROW_PART = 0.2  # of the scene's size: how long the arrow of `Scene.reference_force` is
 SMALLEST_SIZE = 0.3  # [m] less is not zoomed in to
@@ -58,27 +58,35 @@ class Push:
     force: Array
 
 
+@dataclass(frozen=True)
+class Ghost:
+    """Another motion of the same bodies at the same times, translucent; `name` is a path of Meshcat."""
+
+    name: str
+    poses: Poses
+    colour: Rgba
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A motion to be drawn: `poses` of every moving body at `times` (N+1,) [s], `pushes` of each of the N steps.
 
-    `planned` has the ghost's poses, empty where it would hide behind the motion; `trail` (N+1, 3) [m] is the way
-    of the point that is followed.
+    `trail` (N+1, 3) [m] is the way of the point that is followed.
     """
 
     shapes: tuple[Drawn, ...]
     times: Array
     poses: Poses
-    planned: Poses
+    ghosts: tuple[Ghost, ...]
     pushes: tuple[tuple[Push, ...], ...]
     trail: Array
 
     @cached_property
     def box(self) -> tuple[Array, Array]:
-        """The lowest and highest corner (3,) of the box that holds the motion and its ghost."""
+        """The lowest and highest corner (3,) of the box that holds the motion and its ghosts."""
         lows, highs = [np.min(self.trail, axis=0)], [np.max(self.trail, axis=0)]
         for drawn in self.shapes:
-            for poses in (self.poses.get(drawn.body, ()), self.planned.get(drawn.body, ())):
+            for poses in (motion.get(drawn.body, ()) for motion in (self.poses, *(g.poses for g in self.ghosts))):
                 for pose in poses[:: max(1, len(poses) // LOOKED_AT)]:
                     centre = pose @ drawn.centre
                     lows.append(centre - drawn.radius)
@@ -105,20 +113,24 @@ def scene_of(
     xs: Array,
     *,
     contacts: Sequence[Sequence[ContactPoint]] = (),
-    planned_xs: Array | None = None,
+    ghosts: Mapping[str, tuple[Array, Rgba]] | None = None,
     frame: str | None = None,
 ) -> Scene:
-    """The scene of the motion `xs` (N+1, nx) at `times` (N+1,), with `planned_xs` (N+1, nx) as its ghost.
+    """The scene of the motion `xs` (N+1, nx) at `times` (N+1,), with `ghosts`: states (N+1, nx) and colour by name.
 
-    `frame` is the name of the frame or body whose origin leaves a trail; without it, the centre of mass that
-    moves most. UnknownNameError where there is no such frame.
+    A ghost that would hide behind the motion is left out. `frame` is the name of the frame or body whose origin
+    leaves a trail; without it, the centre of mass that moves most. UnknownNameError where there is no such frame.
     """
     poses = poses_of(model, xs)
     return Scene(
         shapes=tuple(shapes_of(model.plant, model.double.context)),
         times=times,
         poses=poses,
-        planned={} if planned_xs is None or np.array_equal(planned_xs, xs) else poses_of(model, planned_xs),
+        ghosts=tuple(
+            Ghost(name, poses_of(model, ghost_xs), colour)
+            for name, (ghost_xs, colour) in (ghosts or {}).items()
+            if not np.array_equal(ghost_xs, xs)
+        ),
         pushes=tuple(tuple(Push(c.point, c.force) for c in step) for step in contacts),
         trail=longest_way(model.plant, poses) if frame is None else _way_of(model, xs, frame),
     )

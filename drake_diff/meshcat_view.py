@@ -31,7 +31,7 @@ logging.getLogger("drake").addFilter(lambda record: "Meshcat listening" not in r
 
 FRAMES_PER_SECOND = 64.0
 REPETITIONS = 5
-RED, TRAIL, GHOST = Rgba(0.85, 0.2, 0.1, 1), Rgba(0.93, 0.55, 0.1, 1), Rgba(0.15, 0.4, 0.95, 0.3)
+RED, TRAIL = Rgba(0.85, 0.2, 0.1, 1), Rgba(0.93, 0.55, 0.1, 1)
 LINES = Rgba(0.72, 0.75, 0.79, 1)
 WORLD = "world"
 TOP, BOTTOM = [0.86, 0.89, 0.93], [0.97, 0.97, 0.98]  # of the background
@@ -43,7 +43,7 @@ FIELD_OF_VIEW = np.deg2rad(75.0)  # Meshcat's camera, from top to bottom
 def write_replay(path: Path, scene: Scene, *, title: str = "") -> None:
     """Write `scene` as one page that opens without a network, plays the motion a few times, and can scrub and pause it.
 
-    Contact forces are arrows, see `Scene.reference_force`; the plan is a translucent ghost, and the trail a line.
+    Contact forces are arrows, see `Scene.reference_force`; ghosts are translucent, and the trail is a line.
     """
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
     draw(meshcat, scene)
@@ -66,11 +66,13 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
     meshcat.StartRecording(frames_per_second=rate, set_visualizations_while_recording=False)
     for (time, k), arrows in zip(frames, pushes, strict=True):
         _pose(meshcat, "motion", scene.poses, k, time)
-        _pose(meshcat, "plan", scene.planned, k, time)
+        for ghost in scene.ghosts:
+            _pose(meshcat, ghost.name, ghost.poses, k, time)
         _place_arrows(meshcat, arrows, slots, time)
     meshcat.StopRecording()
     _pose(meshcat, "motion", scene.poses, 0, None)  # what is seen before play
-    _pose(meshcat, "plan", scene.planned, 0, None)
+    for ghost in scene.ghosts:
+        _pose(meshcat, ghost.name, ghost.poses, 0, None)
     _place_arrows(meshcat, pushes[0], slots, None)
     animation = meshcat.get_mutable_recording()
     animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
@@ -90,8 +92,9 @@ def frames_of(times: Array) -> list[tuple[float, int]]:
 def _draw_bodies(meshcat: Meshcat, scene: Scene) -> None:
     for i, drawn in enumerate(scene.shapes):
         _draw_shape(meshcat, f"motion/{drawn.body or WORLD}/{i}", drawn, drawn.colour, scene)
-        if drawn.body in scene.planned:
-            _draw_shape(meshcat, f"plan/{drawn.body}/{i}", drawn, GHOST, scene)
+        for ghost in scene.ghosts:
+            if drawn.body in ghost.poses:
+                _draw_shape(meshcat, f"{ghost.name}/{drawn.body}/{i}", drawn, ghost.colour, scene)
 
 
 def _draw_shape(meshcat: Meshcat, path: str, drawn: Drawn, colour: Rgba, scene: Scene) -> None:
@@ -100,7 +103,7 @@ def _draw_shape(meshcat: Meshcat, path: str, drawn: Drawn, colour: Rgba, scene: 
     if isinstance(shape, HalfSpace):
         side = 20 * scene.size
         shape, pose = Box(side, side, 0.01), pose @ RigidTransform([0.0, 0.0, -0.005])
-    if isinstance(shape, Mesh) and colour == GHOST:
+    if isinstance(shape, Mesh) and colour.a() < 1:
         meshcat.SetTriangleMesh(path, *_hull(shape), colour)  # a mesh has colours of its own, its hull has none
     else:
         meshcat.SetObject(path, shape, colour)

@@ -35,16 +35,16 @@ def report_data(solution: Solution) -> dict[str, Any]:
     }
 
 
-def _plot(title: str, unit: str, x: Iterable[Any], series: Sequence[Plot], *, axis: str = "time", **rest: Any) -> Plot:
-    base = {"title": title, "unit": unit, "axis": axis, "x": _numbers(x), "series": list(series)}
+def plot(title: str, unit: str, x: Iterable[Any], series: Sequence[Plot], *, axis: str = "time", **rest: Any) -> Plot:
+    base = {"title": title, "unit": unit, "axis": axis, "x": numbers(x), "series": list(series)}
     return base | {"log": False, "limits": [None, None], "note": ""} | rest
 
 
-def _line(name: str, y: Iterable[Any], *, dashed: bool = False, held: bool = False) -> Plot:
-    return {"name": name, "y": _numbers(y), "dashed": dashed, "held": held}
+def line(name: str, y: Iterable[Any], *, dashed: bool = False, held: bool = False) -> Plot:
+    return {"name": name, "y": numbers(y), "dashed": dashed, "held": held}
 
 
-def _numbers(values: Iterable[Any]) -> list[float | None]:
+def numbers(values: Iterable[Any]) -> list[float | None]:
     return [float(f"{v:.8g}") if math.isfinite(v) else None for v in values]
 
 
@@ -65,13 +65,13 @@ def _state_plots(solution: Solution, motion: Rollout | None) -> list[Plot]:
 def _state_plot(solution: Solution, motion: Rollout | None, title: str, unit: str, columns: list[int]) -> Plot:
     names, bounds = solution.problem.model.state_names, solution.problem.bounds
     shown = motion is not None and not np.array_equal(motion.xs, solution.xs)
-    lines = [] if motion is None else [_line(names[i], motion.xs[:, i]) for i in columns]
+    lines = [] if motion is None else [line(names[i], motion.xs[:, i]) for i in columns]
     if motion is None or shown:
-        lines += [_line(f"{names[i]}, plan", solution.xs[:, i], dashed=shown) for i in columns]
+        lines += [line(f"{names[i]}, plan", solution.xs[:, i], dashed=shown) for i in columns]
     limits: list[float | None] = [None, None]
     if len(columns) == 1:
-        limits = _numbers([bounds.x_lower[columns[0]], bounds.x_upper[columns[0]]])
-    return _plot(title, unit, solution.times, lines, limits=limits)
+        limits = numbers([bounds.x_lower[columns[0]], bounds.x_upper[columns[0]]])
+    return plot(title, unit, solution.times, lines, limits=limits)
 
 
 def _input_plots(solution: Solution, motion: Rollout | None) -> list[Plot]:
@@ -80,17 +80,17 @@ def _input_plots(solution: Solution, motion: Rollout | None) -> list[Plot]:
     knots = solution.inputs_at_knots
     held = len(knots) < len(solution.times)
     for i, c in enumerate(model.contract.inputs):
-        planned = _line("plan" if motion is not None else c.name, _as_long(knots[:, i], solution), held=held)
+        planned = line("plan" if motion is not None else c.name, _as_long(knots[:, i], solution), held=held)
         lines = [planned]
         if motion is not None:
             applied = motion.us[:, i]
             same = held and np.array_equal(applied, knots[:, i])
             lines = [
-                _line(c.name, _as_long(applied, solution), held=True),
+                line(c.name, _as_long(applied, solution), held=True),
                 *([] if same else [planned | {"dashed": True}]),
             ]
-        limits = _numbers([bounds.u_lower[i], bounds.u_upper[i]])
-        plots.append(_plot(f"input {c.name}", c.unit, solution.times, lines, limits=limits))
+        limits = numbers([bounds.u_lower[i], bounds.u_upper[i]])
+        plots.append(plot(f"input {c.name}", c.unit, solution.times, lines, limits=limits))
     return plots
 
 
@@ -104,8 +104,8 @@ def _energy_plots(motion: Rollout) -> list[Plot]:
     shown = [("kinetic", motion.kinetic_energy), ("potential", motion.potential_energy), ("total", motion.energy)]
     note = "what neither actuators nor damping account for: the time stepping's error, and what contact takes"
     return [
-        _plot("energy", "J", motion.times, [_line(name, values) for name, values in shown]),
-        _plot("unexplained energy", "J", motion.times, [_line("error", motion.energy_error)], note=note),
+        plot("energy", "J", motion.times, [line(name, values) for name, values in shown]),
+        plot("unexplained energy", "J", motion.times, [line("error", motion.energy_error)], note=note),
     ]
 
 
@@ -113,17 +113,17 @@ def _penetration_plot(solution: Solution, motion: Rollout) -> Plot:
     size, name = thinnest_geometry(solution.problem.model)
     limit = PENETRATION_PART * size
     note = f"limit {limit:.3g} m, a quarter of {name}" if math.isfinite(limit) else "nothing can touch"
-    line = _line("largest overlap", motion.penetration)
-    return _plot("penetration", "m", motion.times, [line], limits=[None, *_numbers([limit])], note=note)
+    line = line("largest overlap", motion.penetration)
+    return plot("penetration", "m", motion.times, [line], limits=[None, *numbers([limit])], note=note)
 
 
 def _replay_plots(solution: Solution) -> list[Plot]:
-    lines = [_line(f"{r.variant}, {r.control}", found) for r in solution.replays if (found := _distance(solution, r))]
+    lines = [line(f"{r.variant}, {r.control}", found) for r in solution.replays if (found := _distance(solution, r))]
     if not lines:
         return []
     note = "the largest difference of a state, in its own unit, in each replay; 0 is not on a log scale"
     plots = [lines[i : i + SERIES_PER_PLOT] for i in range(0, len(lines), SERIES_PER_PLOT)]
-    return [_plot("distance from the plan", "q, v", solution.times, part, log=True, note=note) for part in plots]
+    return [plot("distance from the plan", "q, v", solution.times, part, log=True, note=note) for part in plots]
 
 
 def _distance(solution: Solution, replay: Replay) -> list[float]:
@@ -140,8 +140,8 @@ def _gradient_plots(solution: Solution) -> list[Plot]:
         return []
     zero = not np.any(norms > 0)
     note = "0 at every knot: the cost does not depend on the states" if zero else "0 is not on a log scale"
-    lines = [_line("norm", norms)]
-    return [_plot("gradient norm |d cost / d x_k|", "cost / x", solution.times, lines, log=not zero, note=note)]
+    lines = [line("norm", norms)]
+    return [plot("gradient norm |d cost / d x_k|", "cost / x", solution.times, lines, log=not zero, note=note)]
 
 
 def _iteration_plots(solution: Solution) -> list[Plot]:
@@ -150,14 +150,14 @@ def _iteration_plots(solution: Solution) -> list[Plot]:
         return []
     at, cost = [row.iteration for row in rows], [row.objective for row in rows]
     violations = [
-        _line("constraint violation", [row.primal_infeasibility for row in rows]),
-        _line("optimality", [row.dual_infeasibility for row in rows]),
+        line("constraint violation", [row.primal_infeasibility for row in rows]),
+        line("optimality", [row.dual_infeasibility for row in rows]),
     ]
     positive = all(c > 0 for c in cost if math.isfinite(c))
     note = "as the solver prints it; 0 is not on a log scale"
     return [
-        _plot("cost per iteration", "1", at, [_line("cost", cost)], axis="iteration", log=positive),
-        _plot("violation per iteration", "1", at, violations, axis="iteration", log=True, note=note),
+        plot("cost per iteration", "1", at, [line("cost", cost)], axis="iteration", log=positive),
+        plot("violation per iteration", "1", at, violations, axis="iteration", log=True, note=note),
     ]
 
 
@@ -169,7 +169,7 @@ def _certificate(c: Certificate) -> dict[str, Any]:
         "rows": list(c.rows),
         "columns": list(c.columns),
         "codes": c.codes.ravel().tolist(),
-        "derivative": _numbers(c.derivative.ravel()),
-        "difference": _numbers(c.difference.ravel()),
-        "tolerance": _numbers(c.tolerance.ravel()),
+        "derivative": numbers(c.derivative.ravel()),
+        "difference": numbers(c.difference.ravel()),
+        "tolerance": numbers(c.tolerance.ravel()),
     }

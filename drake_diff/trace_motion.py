@@ -1,6 +1,6 @@
 """The channels of trace.mcap that show motions in simulated time: states, inputs, joints, frames, contact, energies."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -123,18 +123,27 @@ def _joint_rows(shown: Shown, places: list[tuple[str, int, int, int | None]], xs
 def _transforms(shown: Shown) -> Channel:
     """foxglove.FrameTransforms of every body in the world, and of its ghost where the plan is another motion."""
     ghost = not np.array_equal(shown.xs, shown.planned_xs)
-    metadata = {"units": {"translation": "m", "rotation": "1"}, "ghost": GHOST if ghost else "the motion is the plan"}
-    return Channel("/tf", FrameTransforms, _transform_rows(shown, ghost), metadata)
+    motions = {"": shown.xs, **({GHOST: shown.planned_xs} if ghost else {})}
+    count = max(len(shown.xs), len(shown.planned_xs))
+    told = {"ghost": GHOST if ghost else "the motion is the plan"}
+    return transform_channel(shown.model, shown.times(count), motions, told)
 
 
-def _transform_rows(shown: Shown, ghost: bool) -> Rows:
-    plant = shown.model.plant
+def transform_channel(
+    model: Model, times: Array, motions: Mapping[str, Array], told: Mapping[str, str] | None = None
+) -> Channel:
+    """foxglove.FrameTransforms in /tf of the bodies in `motions`, (n, nx) by what their frames' names begin with."""
+    metadata = {"units": {"translation": "m", "rotation": "1"}, **(told or {})}
+    return Channel("/tf", FrameTransforms, _transform_rows(model, times, motions), metadata)
+
+
+def _transform_rows(model: Model, times: Array, motions: Mapping[str, Array]) -> Rows:
+    plant = model.plant
     named = [(b, f"{plant.GetModelInstanceName(b.model_instance())}::{b.name()}") for b in bodies(plant)]
-    actual, planned = shown.xs, shown.planned_xs if ghost else shown.xs
-    for k, t in enumerate(shown.times(max(len(actual), len(planned)))):
+    for k, t in enumerate(times):
         message = FrameTransforms()
-        for xs, prefix in ((actual, ""), (planned, GHOST))[: 1 + ghost]:
-            for name, p, r in _poses(shown.model, named, xs[k]) if k < len(xs) else []:
+        for prefix, xs in motions.items():
+            for name, p, r in _poses(model, named, xs[k]) if k < len(xs) else []:
                 transform = message.transforms.add(parent_frame_id="world", child_frame_id=prefix + name)
                 _stamp(transform.timestamp, t)
                 transform.translation.x, transform.translation.y, transform.translation.z = p

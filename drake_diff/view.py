@@ -18,7 +18,18 @@ from drake_diff.arrays import Array
 from drake_diff.evidence import TRACE
 from drake_diff.exceptions import ArtifactError, ModelError
 from drake_diff.mcap_read import read_mcap
-from drake_diff.meshcat_scene import GREY, Drawn, Push, Scene, body_path, longest_way, moving_bodies, shapes_of
+from drake_diff.meshcat_scene import (
+    BLUE,
+    GREY,
+    Drawn,
+    Ghost,
+    Push,
+    Scene,
+    body_path,
+    longest_way,
+    moving_bodies,
+    shapes_of,
+)
 from drake_diff.meshcat_view import draw
 from drake_diff.model_file import FORMATS, read_into
 from drake_diff.record_file import load_record
@@ -58,14 +69,18 @@ def scene_of_run(directory: str | Path) -> tuple[Scene, tuple[str, ...]]:
         notes = (f"the model cannot be loaded, a ball stands for each body: {error}",)
         motion, plan = _renamed(motion), _renamed(plan)
         shapes = tuple(Drawn(name, Sphere(BALL), RigidTransform(), GREY, np.zeros(3), BALL) for name in motion)
-        return Scene(shapes, times, motion, plan, pushes, _longest(motion)), notes
+        return Scene(shapes, times, motion, _ghosts(plan), pushes, _longest(motion)), notes
     paths = {
         f"{plant.GetModelInstanceName(b.model_instance())}::{b.name()}": body_path(b) for b in moving_bodies(plant)
     }
     moving = {paths[name]: found for name, found in motion.items() if name in paths}
     ghost = {paths[name]: found for name, found in plan.items() if name in paths}
     trail = longest_way(plant, moving)
-    return Scene(tuple(shapes_of(plant, context)), times, moving, ghost, pushes, trail), notes
+    return Scene(tuple(shapes_of(plant, context)), times, moving, _ghosts(ghost), pushes, trail), notes
+
+
+def _ghosts(plan: dict[str, list[RigidTransform]]) -> tuple[Ghost, ...]:
+    return (Ghost("plan", plan, BLUE),) if plan else ()
 
 
 def _text(value: Any) -> str | None:
