@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from drake_diff import cli_mcap, cli_runs
+from drake_diff import cli_engines, cli_mcap, cli_runs
 from drake_diff.cli_runs import plain
 from drake_diff.cli_view import view
 
@@ -23,6 +23,7 @@ HOLDS, CHECK_FAILED, USAGE, MISSING, INTERNAL = range(5)
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 cli_mcap.add_commands(app)
 cli_runs.add_commands(app)
+cli_engines.add_commands(app)
 
 
 @app.callback()

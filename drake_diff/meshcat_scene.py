@@ -60,11 +60,15 @@ class Push:
 
 @dataclass(frozen=True)
 class Ghost:
-    """Another motion of the same bodies at the same times, translucent; `name` is a path of Meshcat."""
+    """Another motion of the same bodies at the same times, translucent; `name` is a path of Meshcat.
+
+    One that is not `framed` may leave the picture.
+    """
 
     name: str
     poses: Poses
     colour: Rgba
+    framed: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +87,12 @@ class Scene:
 
     @cached_property
     def box(self) -> tuple[Array, Array]:
-        """The lowest and highest corner (3,) of the box that holds the motion and its ghosts."""
+        """The lowest and highest corner (3,) of the box that holds the motion and the framed ghosts."""
         lows, highs = [np.min(self.trail, axis=0)], [np.max(self.trail, axis=0)]
         for drawn in self.shapes:
-            for poses in (motion.get(drawn.body, ()) for motion in (self.poses, *(g.poses for g in self.ghosts))):
+            for poses in (
+                motion.get(drawn.body, ()) for motion in (self.poses, *(g.poses for g in self.ghosts if g.framed))
+            ):
                 for pose in poses[:: max(1, len(poses) // LOOKED_AT)]:
                     centre = pose @ drawn.centre
                     lows.append(centre - drawn.radius)

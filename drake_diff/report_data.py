@@ -30,7 +30,7 @@ def report_data(solution: Solution) -> dict[str, Any]:
     return {
         "duration": float(solution.times[-1]),
         "plots": plots,
-        "certificates": [_certificate(c) for c in solution.certificates],
+        "certificates": [certificate_data(c) for c in solution.certificates],
         "verdicts": list(VERDICTS),
     }
 
@@ -113,8 +113,8 @@ def _penetration_plot(solution: Solution, motion: Rollout) -> Plot:
     size, name = thinnest_geometry(solution.problem.model)
     limit = PENETRATION_PART * size
     note = f"limit {limit:.3g} m, a quarter of {name}" if math.isfinite(limit) else "nothing can touch"
-    line = line("largest overlap", motion.penetration)
-    return plot("penetration", "m", motion.times, [line], limits=[None, *numbers([limit])], note=note)
+    overlap = line("largest overlap", motion.penetration)
+    return plot("penetration", "m", motion.times, [overlap], limits=[None, *numbers([limit])], note=note)
 
 
 def _replay_plots(solution: Solution) -> list[Plot]:
@@ -161,7 +161,7 @@ def _iteration_plots(solution: Solution) -> list[Plot]:
     ]
 
 
-def _certificate(c: Certificate) -> dict[str, Any]:
+def certificate_data(c: Certificate) -> dict[str, Any]:
     return {
         "subject": c.subject,
         "method": c.method,

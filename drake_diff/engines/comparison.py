@@ -4,10 +4,11 @@ Drake, as the model is set, is the reference. Every step of another engine is co
 the same state, so that a gap is where it arises and not what has become of it.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -48,6 +49,14 @@ TELLS: Mapping[str, tuple[str, ...]] = {
 LAWS = ("integrator", "limit law", "contact law", "contact pairs", "solver tolerance", "reset")
 
 
+class Probe(NamedTuple):
+    """A state at which Jacobians are compared: "start", "free", "contact" or "deepest"."""
+
+    name: str
+    x: Array
+    u: Array
+
+
 @dataclass(frozen=True)
 class Refused:
     """An engine that is not compared: not installed, or without something that the model has."""
@@ -69,9 +78,11 @@ class Compared:
     step_gaps: Array  # (n - 1,) of each of its steps to the reference's from the same state
     first: Attribution  # of the first step that is apart, or of the first of all
     largest: Attribution  # of the largest gap
+    final_gap: float  # of the last state that both have, on the tangent space
     jacobians: tuple[JacobianAt, ...]
     jacobian_gaps: Array  # one per state, relative to the reference's largest entry
     rollout_jacobian: Array | None
+    rollout_gap: float | None  # relative to the reference's largest entry; None where one of the two broke off
     seconds_per_step: float | None
     seconds_per_jacobian: float | None
 
@@ -125,6 +136,7 @@ class Comparison:
     model: Model
     x0: Array
     us: Array
+    states: tuple[Probe, ...]  # where Jacobians were compared
     engines: tuple[Compared, ...]
     refused: tuple[Refused, ...]
 
@@ -136,6 +148,11 @@ class Comparison:
     def holds(self) -> bool:
         """Whether every engine is the same, or differs by a law that its contract tells of."""
         return all(e.verdict in ("same", "other law") for e in self.engines)
+
+
+def slugs(comparison: Comparison) -> list[str]:
+    """Names of the engines that can be parts of a topic; the place keeps them apart."""
+    return [f"{i}_" + re.sub(r"[^A-Za-z0-9]+", "_", e.engine).strip("_") for i, e in enumerate(comparison.engines)]
 
 
 def compare(
@@ -165,7 +182,7 @@ def compare(
             compared.append(panel.compared(engine))
         except SimulationError as error:
             refused.append(Refused(engine.name, f"it cannot take a step at one of the states: {error}", True))
-    return Comparison(model, x0, us, tuple(compared), tuple(refused))
+    return Comparison(model, x0, us, panel.probes, tuple(compared), tuple(refused))
 
 
 class _Panel:
@@ -176,14 +193,16 @@ class _Panel:
         self.reference, self.x0, self.us = reference, x0, us
         self.coordinates = describe(model).coordinates
         self.motion = move(reference, x0, us)
-        self.probes = _probes(model, self.motion, x0, us, seed)
+        self.probes = _probes(model, self.motion, seed)
         self.jacobians = self._jacobians(reference)
+        self.product = rollout_jacobian(reference, self.space, self.motion)
 
     def compared(self, engine: Engine) -> Compared:
         is_reference = engine is self.reference
         motion = self.motion if is_reference else move(engine, self.x0, self.us)
         jacobians = self.jacobians if is_reference else self._jacobians(engine)
         gaps = self._step_gaps(motion)
+        product = self.product if is_reference else rollout_jacobian(engine, self.space, motion)
         return Compared(
             engine=engine.name,
             version=engine.version,
@@ -193,17 +212,25 @@ class _Panel:
             step_gaps=gaps,
             first=self._attribution(engine, motion, _first_above(gaps, engine.contract.precision) or 0),
             largest=self._attribution(engine, motion, int(np.argmax(gaps)) if len(gaps) else 0),
+            final_gap=float(np.abs(self.space.minus(motion.xs[-1], self.motion.xs[len(motion.xs) - 1])).max()),
             jacobians=jacobians,
             jacobian_gaps=frozen(
                 [_gap(a.jacobian, b.jacobian) for a, b in zip(self.jacobians, jacobians, strict=True)]
             ),
-            rollout_jacobian=rollout_jacobian(engine, self.space, motion),
+            rollout_jacobian=product,
+            rollout_gap=self._rollout_gap(motion, product),
             seconds_per_step=seconds(lambda: engine.step(self.x0, self.us[0])),
             seconds_per_jacobian=seconds(lambda: engine.differentiate_step(self.x0, self.us[0])),
         )
 
     def _jacobians(self, engine: Engine) -> tuple[JacobianAt, ...]:
         return tuple(jacobian_at(engine, self.space, self.names, *probe) for probe in self.probes)
+
+    def _rollout_gap(self, motion: EngineMotion, product: Array | None) -> float | None:
+        """None where one of the two has no derivative, or broke off before the other."""
+        if product is None or self.product is None or len(motion.us) != len(self.motion.us):
+            return None
+        return _gap(self.product, product)
 
     def _step_gaps(self, motion: EngineMotion) -> Array:
         """Relative to the state after the step where that is above 1."""
@@ -258,11 +285,11 @@ def _task(
     return (sample.x if x0 is None else finite_array("x0", x0, (model.nx,))), check_inputs(model, us, num_steps)
 
 
-def _probes(model: Model, motion: EngineMotion, x0: Array, us: Array, seed: int) -> list[tuple[str, Array, Array]]:
-    """Where Jacobians are compared: at the start, sampled free and touching, and at the motion's deepest overlap."""
-    probes = [("start", x0, us[0])]
-    probes += [(sample.kind, sample.x, sample.u) for sample in sample_states(model, 2, seed + 1)]
+def _probes(model: Model, motion: EngineMotion, seed: int) -> tuple[Probe, ...]:
+    """The motion's start, a state sampled free and one touching, and the motion's deepest overlap."""
+    probes = [Probe("start", motion.xs[0], motion.us[0])]
+    probes += [Probe(sample.kind, sample.x, sample.u) for sample in sample_states(model, 2, seed + 1)]
     if motion.depth is not None and np.max(motion.depth[:-1], initial=0.0) > 0:
         k = int(np.argmax(motion.depth[:-1]))
-        probes.append(("deepest", motion.xs[k], motion.us[k]))
-    return probes
+        probes.append(Probe("deepest", motion.xs[k], motion.us[k]))
+    return tuple(probes)

@@ -1,0 +1,92 @@
+"""The command that compares engines."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from drake_diff.cli_runs import plain
+
+COLOURS = {"same": "green", "other law": "yellow", "other model": "red", "unexplained": "red"}
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add the command of this module to `app`."""
+    app.command()(compare)
+
+
+def compare(
+    model: Annotated[Path, typer.Argument(help="A URDF, SDF, MJCF (.xml) or .dmd.yaml file.")],
+    engines: Annotated[
+        str | None, typer.Option(help="Names with commas between, drake:lagged among them; all where not given.")
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="How many steps the motion has; one second where not given.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same start, inputs and states.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="Directory; artifacts/compare_<model> where not given.")] = None,
+    time_step: Annotated[float, typer.Option(help="[s]")] = 0.01,
+    contact_approximation: Annotated[str, typer.Option(help="Drake's: sap, similar or lagged")] = "sap",
+    contact_geometry: Annotated[
+        str | None, typer.Option(help="Around refused pairs: corner_spheres, hydroelastic, differences")
+    ] = None,
+    weld_base: Annotated[str | None, typer.Option(help="A link to fix to the world.")] = None,
+    ground: Annotated[float | None, typer.Option(help="Friction [1] of a ground to add.")] = None,
+) -> None:
+    """Simulate MODEL in every engine on one contract, and say which are the same, which are not, and why.
+
+    Exit status 0 only where every engine is the same as Drake or differs by a law that its contract tells of.
+    """
+    from drake_diff.engines.comparison import compare as compare_engines
+    from drake_diff.engines.comparison_files import PAGE, begin_comparison, save_comparison
+    from drake_diff.model import load_model
+
+    loaded = load_model(
+        model,
+        time_step=time_step,
+        contact_approximation=contact_approximation,
+        contact_geometry=contact_geometry,
+        weld_base=weld_base,
+        ground=ground,
+    )
+    directory = out or Path("artifacts") / f"compare_{model.stem}"
+    begin_comparison(directory, loaded)
+    names = None if engines is None else [name.strip() for name in engines.split(",") if name.strip()]
+    record = save_comparison(compare_engines(loaded, names, num_steps=steps, seed=seed), directory)
+    _print(Console(soft_wrap=True, highlight=False), record)
+    print(f"wrote {directory / PAGE}")
+    raise typer.Exit(0 if record.verdict == "pass" else 1)
+
+
+def _print(console: Console, record: Any) -> None:
+    table = Table(box=None, pad_edge=False)
+    for name in ("engine", "verdict", "step gap", "apart from", "Jacobian gap", "its own", "step", "Jacobian"):
+        table.add_column(name, no_wrap=name != "engine")
+    clock = record.wall_clock
+    for i, e in enumerate(record.engines):
+        verdict = plain(e.verdict, COLOURS[e.verdict]) if i else plain("reference", "dim")
+        own = {True: "yes", False: "no", None: "none"}[e.gradient_is_its_own]
+        table.add_row(
+            plain(e.engine),
+            verdict,
+            f"{e.largest_step_gap:.1e}",
+            "" if e.first_apart_s is None else f"{e.first_apart_s:.4g} s",
+            f"{max((j.gap for j in e.jacobians), default=0.0):.1e}",
+            plain(own, "red" if own == "no" else ""),
+            _time(clock.seconds_per_step[e.engine]),
+            _time(clock.seconds_per_jacobian[e.engine]),
+        )
+    console.print(table)
+    for e in record.engines[1:]:
+        console.print(plain(e.engine, "bold"), plain(e.sentence))
+    for r in record.refused:
+        console.print(plain(r.engine, "bold dim"), plain(f"not compared: {r.reason}", "dim"))
+    console.print(
+        plain(record.verdict, f"{'green' if record.verdict == 'pass' else 'red'} bold"), plain(record.sentence)
+    )
+
+
+def _time(seconds: float | None) -> str:
+    return "-" if seconds is None else f"{1e6 * seconds:.0f} µs"

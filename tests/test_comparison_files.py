@@ -1,0 +1,164 @@
+"""What a comparison leaves on disk: every engine's numbers, readable by others, and nothing that lies."""
+
+import json
+import re
+from hashlib import sha256
+
+import numpy as np
+import pytest
+from conftest import MODELS
+from test_comparison import Doctored
+from test_engines import engine_of, needs
+from typer.testing import CliRunner
+
+import drake_diff as dd
+from drake_diff.cli import app
+from drake_diff.engines import comparison_trace
+from drake_diff.engines.comparison_files import begin_comparison, record_of
+from drake_diff.engines.comparison_page import comparison_data
+from drake_diff.engines.comparison_words import sentence_of, verdict_of
+from drake_diff.record import own_sha256
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """A ball that falls on the ground in Drake, twice, and in Pinocchio, which has none."""
+    needs("pinocchio")
+    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01)
+    x0 = np.array(model.default_state)
+    x0[6] = 0.3
+    return dd.compare(model, ("drake:lagged", "pinocchio", "numpy"), x0=x0, num_steps=30)
+
+
+@pytest.fixture(scope="module")
+def saved(ball, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("comparison")
+    return folder, dd.save_comparison(ball, folder)
+
+
+def test_the_record_has_every_number_and_its_own_hash(ball, saved):
+    folder, record = saved
+    fields = json.loads((folder / "comparison.json").read_text())
+    assert dd.ComparisonRecord.model_validate(fields) == record
+    assert own_sha256(fields) == fields["record_sha256"]
+    for file in record.files:
+        assert sha256((folder / file.path).read_bytes()).hexdigest() == file.sha256
+    assert {file.path for file in record.files} == {"trace.mcap", "replay.html", "comparison.html"}
+    for e, found in zip(ball.engines, record.engines, strict=True):
+        assert (found.engine, found.verdict, found.steps) == (e.engine, e.verdict, 30)
+        assert found.largest_step_gap == e.step_gaps.max()
+        assert np.array_equal(found.jacobians[0].jacobian, e.jacobians[0].jacobian)
+        assert found.largest.effects == e.largest.effects
+    assert [r.engine for r in record.refused] == ["numpy"]
+    assert record.verdict == "pass"
+
+
+def test_the_record_is_the_same_but_for_the_times(ball, saved, tmp_path):
+    again = dd.save_comparison(ball, tmp_path / saved[0].name)
+    apart = {"wall_clock": None, "record_sha256": "", "files": []}
+    assert again.model_copy(update=apart) == saved[1].model_copy(update=apart)
+    assert (tmp_path / saved[0].name / "trace.mcap").read_bytes() == (saved[0] / "trace.mcap").read_bytes()
+
+
+def test_the_trace_has_every_engines_motion(ball, saved):
+    log = dd.read_mcap(saved[0] / "trace.mcap")
+    topics = [t for t in log.messages if t.endswith("/state")]
+    assert topics == ["/0_drake_sap_autodiff/state", "/1_drake_lagged_autodiff/state", "/2_pinocchio/state"]
+    for topic, e in zip(topics, ball.engines, strict=True):
+        states = log.arrays(topic)
+        assert np.array_equal(np.hstack([states["q"], states["v"]]), e.motion.xs)
+        measures = log.arrays(topic.replace("state", "diagnostics"))
+        assert np.array_equal(measures["energy_total"], e.motion.energy)
+        assert np.array_equal(measures["max_penetration"], e.motion.depth)
+    first = log.messages["/tf"][0][1]
+    frames = [t.child_frame_id.split("/")[0] for t in first.transforms]
+    assert list(dict.fromkeys(frames)) == [t.split("/")[1] for t in topics]
+
+
+def test_the_page_plots_every_engine_and_needs_no_network(ball, saved):
+    data = comparison_data(ball)
+    for plot in data["plots"]:
+        assert [s["name"] for s in plot["series"]][1:] == [e.engine for e in ball.engines][1:]
+        assert all(len(s["y"]) == len(plot["x"]) == 31 for s in plot["series"])
+    height = next(p for p in data["plots"] if p["title"] == "ball_z")
+    np.testing.assert_allclose(height["series"][2]["y"], ball.engines[2].motion.xs[:, 6], rtol=1e-7)
+    page = (saved[0] / "comparison.html").read_text()
+    assert "Content-Security-Policy" in page
+    assert not re.search(r'(src|href)="https?:', page)
+    for e in saved[1].engines[1:]:
+        assert e.sentence.split("(")[0].strip() in page
+
+
+def test_the_sentences_say_when_and_why(ball):
+    drake, lagged, pinocchio = ball.engines
+    assert "the same for 0.2" in sentence_of(pinocchio)
+    assert "by the contact law" in sentence_of(pinocchio)
+    assert "has no contact here" in sentence_of(pinocchio)
+    assert "point, sap" in sentence_of(lagged)
+    told = verdict_of(ball)
+    assert "drake (lagged, autodiff) and pinocchio: the same model under another law" in told
+    assert "contact-table" in told
+    assert "within 0.0e+00" in sentence_of(drake)
+
+
+def test_a_gradient_that_is_not_its_own_steps_is_warned_of(load):
+    model = load("pendulum.urdf")
+    drake = engine_of("drake", model)
+
+    def doubled(x, u):
+        found = drake.differentiate_step(x, u)
+        return found._replace(A=2 * found.A)
+
+    found = dd.compare(model, (Doctored(drake, name="doubled", differentiate_step=doubled),), num_steps=5)
+    assert "not those of doubled" in verdict_of(found)
+    assert "its Jacobian at the start state is off by" in sentence_of(found.engines[1])
+    record = record_of(found, "x")
+    assert record.verdict == "fail"
+    assert record.engines[1].gradient_is_its_own is False
+    assert len(comparison_data(found)["certificates"]) == 3
+
+
+def test_names_of_engines_are_escaped(load, tmp_path):
+    model = load("pendulum.urdf")
+    engine = Doctored(engine_of("drake", model), name="<script>alert(1)</script>")
+    dd.save_comparison(dd.compare(model, (engine,), num_steps=5), tmp_path)
+    page = (tmp_path / "comparison.html").read_text()
+    assert "<script>alert" not in page
+    assert "&lt;script&gt;alert" in page
+
+
+def test_what_is_begun_and_not_ended_says_so(ball, tmp_path, monkeypatch):
+    begin_comparison(tmp_path, ball.model)
+    assert json.loads((tmp_path / "comparison.json").read_text())["verdict"] == "incomplete"
+    dd.save_comparison(ball, tmp_path)
+
+    def fails(*_):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(comparison_trace, "write_comparison_trace", fails)
+    with pytest.raises(OSError, match="no space"):
+        dd.save_comparison(ball, tmp_path)
+    assert json.loads((tmp_path / "comparison.json").read_text())["verdict"] == "incomplete"
+    assert not (tmp_path / "comparison.html").exists()
+
+
+def test_the_command(tmp_path):
+    needs("pinocchio")
+    out = tmp_path / "out"
+    words = ["compare", str(MODELS / "cart_pole.urdf"), "--engines", "numpy, pinocchio", "--steps", "20"]
+    found = CliRunner().invoke(app, [*words, "--out", str(out)])
+    assert found.exit_code == 0, found.output
+    assert "numpy and pinocchio: the same simulation as Drake" in found.output
+    assert {p.name for p in out.iterdir()} == {"comparison.json", "trace.mcap", "replay.html", "comparison.html"}
+
+
+def test_the_command_fails_where_the_engines_do_not_agree(tmp_path, monkeypatch):
+    from drake_diff.engines.pinocchio_engine import PinocchioEngine
+
+    needs("pinocchio")
+    right = PinocchioEngine.step
+    monkeypatch.setattr(PinocchioEngine, "step", lambda self, x, u: right(self, x, u) + 1e-6)
+    words = ["compare", str(MODELS / "pendulum.urdf"), "--engines", "pinocchio", "--steps", "5"]
+    found = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")])
+    assert found.exit_code == 1
+    assert "nothing tells why" in found.output
