@@ -182,6 +182,17 @@ def test_the_same_seed_gives_the_same_motion(load):
     assert not np.array_equal(a.reference.motion.xs, c.reference.motion.xs)
 
 
+def test_tools_that_are_no_engines_are_told_of_and_not_pretended(load):
+    found = dd.compare(load("pendulum.urdf"), ("opencv", "gtsam", "isaaclab", "control"), num_steps=2)
+    told = {r.engine: r.reason for r in found.refused}
+    assert len(found.engines) == 1
+    assert "no part in dynamics" in told["opencv"]
+    assert "no part in dynamics" in told["gtsam"]
+    assert "export-model" in told["isaaclab"]
+    with pytest.raises(dd.MissingDependencyError, match="poles and LQR"):
+        dd.load_engine("control", load("pendulum.urdf"))
+
+
 def test_by_default_every_engine_is_asked(load):
     assert default_engines(load("pendulum.urdf"))[:1] == ("numpy",)
     contact = default_engines(load("sphere_on_ground.sdf"))

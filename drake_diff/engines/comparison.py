@@ -20,7 +20,7 @@ from drake_diff.engines.description import describe
 from drake_diff.engines.drake_engine import DrakeEngine
 from drake_diff.engines.engine import Engine, Precision
 from drake_diff.engines.jacobians import JacobianAt, jacobian_at, rollout_jacobian
-from drake_diff.engines.load import ENGINES, load_spec
+from drake_diff.engines.load import ELSEWHERE, ENGINES, load_spec
 from drake_diff.engines.motion import BROKE_OFF, EngineMotion, move, seconds
 from drake_diff.exceptions import MissingDependencyError, ModelError, SimulationError
 from drake_diff.model import Model
@@ -256,10 +256,10 @@ def _gap(reference: Array, other: Array) -> float:
 
 
 def default_engines(model: Model) -> tuple[str, ...]:
-    """Drake's other contact approximations, where something can touch, and every other engine there is."""
+    """Drake's other contact approximations, where something can touch, every other engine, and what is none."""
     own = model.contract.contact
     others = [a for a in ("sap", "similar", "lagged") if own.collision_pairs and a != own.approximation]
-    return (*(f"drake:{a}" for a in others), *(name for name in ENGINES if name != "drake"))
+    return (*(f"drake:{a}" for a in others), *(name for name in ENGINES if name != "drake"), *ELSEWHERE)
 
 
 def _load(model: Model, wanted: tuple[str | Engine, ...]) -> tuple[list[Engine], list[Refused]]:

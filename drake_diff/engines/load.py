@@ -4,7 +4,7 @@ from importlib import import_module
 from typing import Any
 
 from drake_diff.engines.engine import Engine
-from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.exceptions import InputError, MissingDependencyError, UnknownNameError
 from drake_diff.model import Model
 
 ENGINES = {
@@ -12,6 +12,16 @@ ENGINES = {
     "drake": ("drake_engine", "DrakeEngine"),
     "mujoco": ("mujoco_engine", "MujocoEngine"),
     "pinocchio": ("pinocchio_engine", "PinocchioEngine"),
+}
+
+# Tools that people ask for and that are no engine here, and why.
+ELSEWHERE = {
+    "isaaclab": "it needs an environment of its own: drake-diff export-model, then compare what it recorded",
+    "isaacsim": "it stands behind a licence prompt: drake-diff export-model, then compare what it recorded",
+    "gazebo": "it has no Python package: drake-diff export-model, then compare what it recorded",
+    "control": "python-control has no multibody dynamics: it checks linearizations, their poles and LQR gains",
+    "opencv": "it has no part in dynamics: it works on images",
+    "gtsam": "it has no part in dynamics: it estimates from measurements",
 }
 
 
@@ -30,6 +40,8 @@ def load_engine(name: str, model: Any, **options: Any) -> Engine:
     MissingDependencyError, with what to install, where the engine is not there, and ModelError, naming the element,
     where it cannot have the model.
     """
+    if name in ELSEWHERE:
+        raise MissingDependencyError(f"{name} is no engine here: {ELSEWHERE[name]}")
     if name not in ENGINES:
         raise UnknownNameError("engine", got=name, known=ENGINES)
     module, kind = ENGINES[name]
