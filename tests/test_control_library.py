@@ -67,6 +67,6 @@ def test_ilqrs_gain_at_rest_is_python_controls(load):
     x = np.array([0.0, np.pi, 0.0, 0.0])
     Q, R = np.diag([1.0, 10.0, 0.1, 0.1]), np.array([[0.1]])
     found = dd.differentiate_step(model, x, np.zeros(1))
-    K, P, _ = control.dlqr(found.A, found.B, Q, R)
+    K, *_ = control.dlqr(found.A, found.B, Q, R)
     policy = dd.TVLQR(model, np.tile(x, (1501, 1)), np.zeros((1500, 1)), Q=Q, R=R, Qf=Q)
     np.testing.assert_allclose(policy.gains[0], K, rtol=1e-6)
