@@ -39,6 +39,15 @@ from drake_diff.exceptions import NotOfferedError as NotOfferedError
 from drake_diff.exceptions import ShapeError as ShapeError
 from drake_diff.exceptions import SimulationError as SimulationError
 from drake_diff.exceptions import UnknownNameError as UnknownNameError
+from drake_diff.loop.actuator import Actuator as Actuator
+from drake_diff.loop.closed_loop import ClosedLoop as ClosedLoop
+from drake_diff.loop.closed_loop import Loop as Loop
+from drake_diff.loop.closed_loop import Push as Push
+from drake_diff.loop.closed_loop import closed_loop as closed_loop
+from drake_diff.loop.estimator import Hold as Hold
+from drake_diff.loop.estimator import Predictor as Predictor
+from drake_diff.loop.fallback import Fallback as Fallback
+from drake_diff.loop.sensor import Sensor as Sensor
 from drake_diff.mcap_read import read_mcap as read_mcap
 from drake_diff.model import Model as Model
 from drake_diff.model import load_model as load_model

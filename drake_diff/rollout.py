@@ -109,7 +109,7 @@ def roll_states(model: Model, x0: Array, us: Array) -> Array:
 
 
 def _roll(model: Model, x0: ArrayLike, inputs: Array | Policy, count: int) -> Rollout:
-    h, meter = model.time_step, _Meter(model)
+    h, meter = model.time_step, Meter(model)
     xs, us = np.empty((count + 1, model.nx)), np.empty((count, model.nu))
     xs[0] = finite_array("x0", x0, (model.nx,))
     for k in range(count):
@@ -123,7 +123,7 @@ def _roll(model: Model, x0: ArrayLike, inputs: Array | Policy, count: int) -> Ro
     return meter.result(xs, us)
 
 
-class _Meter:
+class Meter:
     """Reads energies, efforts, contacts and violations from the double context, state by state."""
 
     def __init__(self, model: Model):

@@ -10,15 +10,16 @@ import drake_diff
 
 PACKAGE = Path(drake_diff.__file__).parent
 PUBLIC = """
-ArtifactError Barrier Bounds Certificate CertificateError CertificationRecord Comparison ComparisonRecord Constraint
-Contract ContractLine DrakeDiffError Dynamics Engine EvidenceRecord Finding Gaussian GradientError InputError LQR
-MissingDependencyError Model ModelError ModelWarning NonFiniteError NotOfferedError PD ParametricPolicy Problem
-QuadraticCost Recording Rollout RolloutCertificate RolloutGradient ShapeError SimulationError Smoothed SoftContact
-Solution Status StepDerivatives TVLQR Transcribed UnknownNameError Verification audit center_of_mass certify
-certify_jacobian certify_model certify_rollout compare contact_force contact_modes differentiate_rollout
-differentiate_step frame_position frame_rotation_error frame_velocity list_parameters load_engine load_model
-load_record match_contracts model_from_diagram plant_dynamics read_mcap read_trace rollout save save_comparison smooth
-smooth_step softened solve step transcribe_and_solve verify violation_between_nodes
+Actuator ArtifactError Barrier Bounds Certificate CertificateError CertificationRecord ClosedLoop Comparison
+ComparisonRecord Constraint Contract ContractLine DrakeDiffError Dynamics Engine EvidenceRecord Fallback Finding
+Gaussian GradientError Hold InputError LQR Loop MissingDependencyError Model ModelError ModelWarning NonFiniteError
+NotOfferedError PD ParametricPolicy Predictor Problem Push QuadraticCost Recording Rollout RolloutCertificate
+RolloutGradient Sensor ShapeError SimulationError Smoothed SoftContact Solution Status StepDerivatives TVLQR
+Transcribed UnknownNameError Verification audit center_of_mass certify certify_jacobian certify_model certify_rollout
+closed_loop compare contact_force contact_modes differentiate_rollout differentiate_step frame_position
+frame_rotation_error frame_velocity list_parameters load_engine load_model load_record match_contracts
+model_from_diagram plant_dynamics read_mcap read_trace rollout save save_comparison smooth smooth_step softened solve
+step transcribe_and_solve verify violation_between_nodes
 """.split()
 ORDER = """
 exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin model
@@ -36,12 +37,13 @@ engines.description engines.closed_form engines.closed_form_contact engines.nump
 engines.pinocchio_engine engines.mjcf engines.mujoco_contract engines.mujoco_engine engines.contract_match
 engines.load engines.attribution engines.motion engines.jacobians engines.recording engines.comparison
 engines.comparison_record engines.comparison_words engines.comparison_page engines.comparison_trace
-engines.comparison_files ros2_bag cli_mcap cli_runs cli_engines cli_view cli
+engines.comparison_files loop.checks loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop ros2_bag
+cli_mcap cli_runs cli_engines cli_view cli
 """.split()
 
 
 def test_the_public_names_are_these():
-    modules = {path.stem for path in PACKAGE.glob("*.py")} | {"engines"}
+    modules = {path.stem for path in PACKAGE.glob("*.py")} | {"engines", "loop", "panels"}
     functions = {name for name in vars(drake_diff) if not name.startswith("_")}
     assert sorted(functions - (modules - set(PUBLIC))) == sorted(PUBLIC)
     for name in PUBLIC:

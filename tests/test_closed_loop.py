@@ -1,0 +1,248 @@
+"""Loops against closed forms: delays, lags, rates, noise, pushes; and what is done where the controller fails."""
+
+import numpy as np
+import pytest
+from conftest import MODELS
+
+import drake_diff as dd
+from drake_diff.loop.actuator import Actuator
+from drake_diff.loop.closed_loop import Loop, Push, closed_loop
+from drake_diff.loop.estimator import Predictor
+from drake_diff.loop.fallback import Fallback
+from drake_diff.loop.sensor import Sensor
+from drake_diff.tangent import tangent_space
+
+H = 0.01
+BLOCK = """<robot name="cart"><link name="cart"><inertial><mass value="2"/>
+  <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="slide" type="prismatic"><parent link="world"/><child link="cart"/><axis xyz="1 0 0"/>
+  <limit effort="1000"/></joint>
+  <transmission><type>transmission_interface/SimpleTransmission</type><joint name="slide">
+  <hardwareInterface>EffortJointInterface</hardwareInterface></joint><actuator name="motor"/></transmission></robot>"""
+MASS = 2.0
+
+
+@pytest.fixture(scope="module")
+def cart(tmp_path_factory):
+    """A double integrator: v+ = v + h u / 2, x+ = x + h v+."""
+    path = tmp_path_factory.mktemp("models") / "cart.urdf"
+    path.write_text(BLOCK)
+    return dd.load_model(path, time_step=H)
+
+
+def gain(kp, kd):
+    return lambda x, t: np.array([-kp * x[0] - kd * x[1]])
+
+
+def iterated(delay, kp, kd, x, steps, *, every=1):
+    """The double integrator written out, the command `delay` steps late by what is seen, x(0) before that."""
+    seen, xs, y = [np.array(x)] * (delay + 1), [np.array(x)], np.array(x)
+    for k in range(steps):
+        y = seen[0] if k % every == 0 else y
+        u = -kp * y[0] - kd * y[1]
+        v = xs[-1][1] + H * u / MASS
+        xs.append(np.array([xs[-1][0] + H * v, v]))
+        seen = [*seen[1:], xs[-1]]
+    return np.array(xs)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 5])
+def test_a_delayed_sensor_is_the_delayed_recursion(cart, delay):
+    found = closed_loop(cart, gain(30, 8), [1.0, 0.0], 200, Loop(sensor=Sensor(delay=delay)))
+    np.testing.assert_allclose(found.motion.xs, iterated(delay, 30, 8, [1.0, 0.0], 200), atol=1e-12)
+    assert found.ended == ""
+    assert set(found.controller_status) == {"ok"}
+
+
+def test_without_a_loop_around_it_a_controller_is_a_policy(cart):
+    found = closed_loop(cart, gain(30, 8), [1.0, 0.5], 50)
+    plain = dd.rollout(cart, [1.0, 0.5], policy=gain(30, 8), num_steps=50)
+    assert np.array_equal(found.motion.xs, plain.xs)
+    assert np.array_equal(found.motion.energy, plain.energy)
+    assert np.array_equal(found.observations, plain.xs[:-1])
+    assert np.array_equal(found.commands, found.applied)
+
+
+@pytest.mark.parametrize("delay", [1, 2, 4])
+def test_the_stability_limit_of_the_double_integrator_under_a_delay(cart, delay):
+    """z^d (z - 1)^2 + (h^2 kp z + h kd (z - 1)) / m = 0. Without kp what remains is z^d (z - 1) + h kd / m = 0, an
+    integrator, which is stable to h kd / m = 2 sin(pi / (2 (2 d + 1))): Kuruklis 1994.
+    """
+    limit = MASS / H * 2 * np.sin(np.pi / (2 * (2 * delay + 1)))
+    for factor, stable in ((0.97, True), (1.03, False)):
+        loop = Loop(sensor=Sensor(delay=delay))
+        speeds = np.abs(closed_loop(cart, gain(0, factor * limit), [0.0, 1.0], 1500, loop).motion.xs[:, 1])
+        assert (speeds[-50:].max() < speeds[50:100].max()) == stable
+
+
+def test_a_slow_sensor_holds_and_a_predictor_makes_up_for_a_delay(cart):
+    slow = closed_loop(cart, gain(30, 8), [1.0, 0.0], 100, Loop(sensor=Sensor(every=4)))
+    np.testing.assert_allclose(slow.motion.xs, iterated(0, 30, 8, [1.0, 0.0], 100, every=4), atol=1e-12)
+    assert np.isnan(slow.observations[1:4]).all()
+    # With the state of 5 steps ago and the model, the state now is known: as if there were no delay after the first 5.
+    loop = Loop(sensor=Sensor(delay=5), estimator=Predictor(cart, 5))
+    made_up = closed_loop(cart, gain(30, 8), [1.0, 0.0], 100, loop)
+    np.testing.assert_allclose(made_up.estimates, made_up.motion.xs[:-1], atol=1e-12)
+    np.testing.assert_allclose(made_up.motion.xs, iterated(0, 30, 8, [1.0, 0.0], 100), atol=1e-12)
+
+
+def test_noise_and_bias_are_what_was_asked_for(cart):
+    sensor = Sensor(noise=[0.3, 0.0], bias=[0.0, 0.2])
+    found = closed_loop(cart, lambda x, t: np.zeros(1), [0.0, 0.0], 4000, Loop(sensor=sensor), seed=3)
+    error = found.observations - found.motion.xs[:-1]
+    np.testing.assert_allclose(error[:, 1], 0.2, atol=1e-12)
+    # The mean of 4000 is known to 0.3 / sqrt(4000) = 0.005, its standard deviation to 0.0034: four of them.
+    assert abs(error[:, 0].mean()) < 0.02
+    assert abs(error[:, 0].std() - 0.3) < 0.014
+    again = closed_loop(cart, lambda x, t: np.zeros(1), [0.0, 0.0], 4000, Loop(sensor=sensor), seed=3)
+    other = closed_loop(cart, lambda x, t: np.zeros(1), [0.0, 0.0], 10, Loop(sensor=sensor), seed=4)
+    assert np.array_equal(found.observations, again.observations)
+    assert not np.array_equal(found.observations[:10], other.observations)
+
+
+def test_dropouts_are_as_frequent_as_asked_for(cart):
+    loop = Loop(sensor=Sensor(dropout=0.3))
+    found = closed_loop(cart, gain(30, 8), [1.0, 0.0], 4000, loop)
+    lost = np.isnan(found.observations[:, 0]).mean()
+    assert abs(lost - 0.3) < 4 * np.sqrt(0.3 * 0.7 / 4000)
+    assert not np.isnan(found.observations[0]).any()
+
+
+def test_quaternions_are_moved_on_their_sphere(load):
+    model = load("sphere_on_ground.sdf")
+    sensor = Sensor(noise=0.5)
+    found = closed_loop(model, lambda x, t: np.zeros(0), model.default_state, 20, Loop(sensor=sensor))
+    norms = np.linalg.norm(found.observations[:, :4], axis=1)
+    np.testing.assert_allclose(norms, np.linalg.norm(found.motion.xs[:-1, :4], axis=1), rtol=1e-12)
+    turned = tangent_space(model).minus(found.observations[0], found.motion.xs[0])
+    assert np.abs(turned[:3]).max() > 1e-2
+
+
+def test_a_lag_is_the_step_response_of_first_order(cart):
+    tau = 0.07
+    found = closed_loop(cart, lambda x, t: np.array([3.0]), [0.0, 0.0], 50, Loop(actuator=Actuator(lag=tau)))
+    t = H * np.arange(1, 51)
+    np.testing.assert_allclose(found.applied[:, 0], 3 * (1 - np.exp(-t / tau)), rtol=1e-12)
+    np.testing.assert_allclose(found.motion.us, found.applied, atol=0)
+
+
+def test_an_actuator_is_late_held_weak_and_limited(cart):
+    def ramp(x, t):
+        return np.array([100 * t])
+
+    loop = Loop(actuator=Actuator(delay=3, every=2, upper=0.15 * 100, strength=0.5))
+    found = closed_loop(cart, ramp, [0.0, 0.0], 30, loop)
+    k = np.arange(30)
+    held = np.where(k >= 3, np.minimum(2 * ((k - 3) // 2), 15), 0) * 0.5
+    np.testing.assert_allclose(found.applied[:, 0], held, atol=1e-12)
+    np.testing.assert_allclose(found.commands[:, 0], k, atol=1e-12)
+
+
+def test_a_push_is_an_impulse(cart):
+    loop = Loop(pushes=[Push("cart", [0.6, 5.0, 5.0], 0.1)])
+    found = closed_loop(cart, lambda x, t: np.zeros(1), [0.0, 0.0], 30, loop)
+    np.testing.assert_allclose(found.motion.xs[:11, 1], 0, atol=1e-15)
+    np.testing.assert_allclose(found.motion.xs[11:, 1], 0.6 / MASS, rtol=1e-12)
+    assert [e.kind for e in found.events] == ["push"]
+    assert found.events[0].t == pytest.approx(0.1)
+
+
+def test_substeps_are_the_plants_and_the_controller_has_its_own_period(cart):
+    calls = []
+
+    def counted(x, t):
+        calls.append(t)
+        return np.array([1.0])
+
+    found = closed_loop(cart, counted, [0.0, 0.0], 10, Loop(substeps=4))
+    np.testing.assert_allclose(calls, 4 * H * np.arange(10), atol=1e-12)
+    assert found.motion.xs.shape == (41, 2)
+    np.testing.assert_allclose(found.motion.xs[-1, 1], 40 * H / MASS, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("mode", "command"), [("hold", -30.0), ("stop", 0.0), ("damp", -2.0)])
+def test_the_fallback_takes_over_and_the_controller_recovers(cart, mode, command):
+    """It sees nothing for a while: steps 20 to 39 of a sensor that is torn off."""
+
+    class TornOff(Sensor):
+        def start(self, space, random):
+            read = super().start(space, random)
+            return lambda k, x: [read(k, x), None][20 <= k < 40]
+
+    loop = Loop(sensor=TornOff(), fallback=Fallback(mode=mode, patience=4, damping=1.0))
+    found = closed_loop(cart, lambda x, t: np.array([-30.0]), [0.0, 2.0], 60, loop)
+    blind = [k for k, status in enumerate(found.controller_status) if status != "ok"]
+    assert blind == list(range(24, 40))
+    expected = command if mode != "damp" else -found.estimates[24, 1]
+    assert found.commands[24, 0] == pytest.approx(expected)
+    assert [(e.kind, round(e.t / H)) for e in found.events] == [("fallback", 24), ("recovery", 40)]
+    assert mode in found.events[0].message
+
+
+def test_a_controller_that_fails_ends_the_run_or_is_replaced(cart):
+    def breaks(x, t):
+        return np.array([np.nan if t > 0.055 else 1.0])
+
+    alone = closed_loop(cart, breaks, [0.0, 0.0], 20)
+    assert "not finite" in alone.ended
+    assert "0.06" in alone.ended
+    assert alone.motion.xs.shape == (7, 2)
+    assert alone.commands.shape == (6, 1)
+    kept = closed_loop(cart, breaks, [0.0, 0.0], 20, Loop(fallback=Fallback("stop")))
+    assert kept.ended == ""
+    assert kept.controller_status[5:7] == ("ok", "the controller failed: it is not finite")
+    np.testing.assert_allclose(kept.motion.xs[-1, 1], 6 * H / MASS, rtol=1e-12)
+
+
+def test_latency_is_measured_and_changes_nothing(cart):
+    import time
+
+    def slow(x, t):
+        time.sleep(0.003)
+        return np.zeros(1)
+
+    found = closed_loop(cart, slow, [0.0, 1.0], 5, Loop(latency_budget=0.002))
+    assert found.late == 5
+    assert found.latencies.min() >= 0.003
+    quick = closed_loop(cart, lambda x, t: np.zeros(1), [0.0, 1.0], 5, Loop(latency_budget=0.5))
+    assert quick.late == 0
+    assert np.array_equal(found.motion.xs, quick.motion.xs)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Sensor(delay=-1), "Sensor.delay"),
+        (lambda: Sensor(every=0), "Sensor.every"),
+        (lambda: Sensor(dropout=1.0), "Sensor.dropout"),
+        (lambda: Actuator(lag=-1.0), "Actuator.lag"),
+        (lambda: Actuator(lower=1.0, upper=0.0), "Actuator.lower"),
+        (lambda: Fallback("pray"), "hold"),
+    ],
+)
+def test_bad_numbers_are_named(make, said):
+    with pytest.raises(dd.InputError, match=said):
+        make()
+
+
+def test_bad_runs_are_named(cart):
+    for loop, said in (
+        (Loop(sensor=Sensor(noise=[-1.0, 0.0])), "Sensor.noise"),
+        (Loop(sensor=Sensor(noise=np.zeros(3))), "Sensor.noise"),
+        (Loop(pushes=[Push("wheel", [0, 0, 1.0], 0.1)]), "cart"),
+        (Loop(pushes=[Push("cart", [0, 0, 1.0], -0.1)]), "Push.at"),
+        (Loop(substeps=0), "Loop.substeps"),
+    ):
+        with pytest.raises(dd.InputError, match=said):
+            closed_loop(cart, gain(1, 1), [0.0, 0.0], 5, loop)
+
+
+def test_a_cart_pole_is_kept_upright_by_lqr_and_falls_without():
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=H)
+    up = np.array([0.0, np.pi, 0.0, 0.0])
+    policy = dd.LQR(model, up, np.zeros(1), np.eye(4), np.eye(1))
+    start = up + np.array([0.0, 0.1, 0.0, 0.0])
+    kept = closed_loop(model, policy, start, 800, Loop(sensor=Sensor(noise=0.003)))
+    assert np.abs(kept.motion.xs[-1, 1] - np.pi) < 0.1
+    fallen = closed_loop(model, lambda x, t: np.zeros(1), start, 800)
+    assert np.abs(fallen.motion.xs[:, 1] - np.pi).max() > 1
