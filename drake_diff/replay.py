@@ -157,8 +157,8 @@ def _replay_in(
         return [_missing(plan, variant, control, str(error)) for control in controls]
 
 
-def _track(plan: Plan, model: Model, xs: Array, us: Array) -> Policy:
-    """TVLQR about the plan, within the input's bounds."""
+def track(plan: Plan, model: Model, xs: Array, us: Array) -> Policy:
+    """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan, within the input's bounds."""
     bounds = plan.problem.bounds
     policy = TVLQR(model, xs, us, *_weights(plan, us))
     return lambda x, t: np.clip(policy(x, t), bounds.u_lower, bounds.u_upper)
@@ -199,7 +199,7 @@ def _roll(plan: Plan, control: str, model: Model, parts: int) -> Rollout:
     xs, us = plan.sample(parts)
     if control == "open loop":
         return rollout(model, xs[0], us)
-    return rollout(model, xs[0], policy=_track(plan, model, xs, us), num_steps=len(us))
+    return rollout(model, xs[0], policy=track(plan, model, xs, us), num_steps=len(us))
 
 
 def _missing(plan: Plan, variant: str, control: str, why: str) -> Replay:
@@ -210,20 +210,34 @@ def _missing(plan: Plan, variant: str, control: str, why: str) -> Replay:
 
 def _failures(plan: Plan, model: Model, motion: Rollout, parts: int) -> Iterator[str]:
     """What does not hold in a replay, a clause each."""
-    problem, scale, names = plan.problem, plan.scale, plan.problem.model.state_names
-    tolerance = STATE_TOLERANCE * scale
-    missed = np.abs(problem.goal_error(motion.xs[-1]))
-    if np.any(missed > tolerance):
-        worst = int(np.argmax(missed / scale))
-        yield f"{names[worst]} ends {missed[worst]:.3g} from its goal, tolerance {tolerance[worst]:.3g}"
-    lower, upper = problem.bounds.x_lower, problem.bounds.x_upper
-    excess = np.maximum(np.maximum(lower - motion.xs, motion.xs - upper), 0.0)[1:]
-    if np.any(excess > tolerance):
-        k, i = divmod(int(np.argmax(excess / scale)), excess.shape[1])
-        when = motion.times[k + 1]
-        yield f"{names[i]} is {excess[k, i]:.3g} beyond its bound at {when:.3g} s, tolerance {tolerance[i]:.3g}"
+    yield from missed_goal(plan, plan.problem.goal_error(motion.xs[-1]))
+    yield from left_bounds(plan, motion)
     yield from _broken_constraints(plan, motion.xs[::parts], motion.us[::parts])
     yield from _broken_balance(motion)
+    yield from too_deep(model, motion)
+
+
+def missed_goal(plan: Plan, distance: Array) -> Iterator[str]:
+    """Where the `distance` (nx,) from the goal is above the tolerance."""
+    missed, tolerance = np.abs(distance), STATE_TOLERANCE * plan.scale
+    if not np.all(missed <= tolerance):
+        worst = int(np.argmax(np.nan_to_num(missed / plan.scale, nan=np.inf)))
+        name = plan.problem.model.state_names[worst]
+        yield f"{name} ends {missed[worst]:.3g} from its goal, tolerance {tolerance[worst]:.3g}"
+
+
+def left_bounds(plan: Plan, motion: Rollout) -> Iterator[str]:
+    """Where a state of the motion, but the first, is beyond a bound by more than the tolerance."""
+    bounds, scale, tolerance = plan.problem.bounds, plan.scale, STATE_TOLERANCE * plan.scale
+    excess = np.maximum(np.maximum(bounds.x_lower - motion.xs, motion.xs - bounds.x_upper), 0.0)[1:]
+    if np.any(excess > tolerance):
+        k, i = divmod(int(np.argmax(excess / scale)), excess.shape[1])
+        name, when = plan.problem.model.state_names[i], motion.times[k + 1]
+        yield f"{name} is {excess[k, i]:.3g} beyond its bound at {when:.3g} s, tolerance {tolerance[i]:.3g}"
+
+
+def too_deep(model: Model, motion: Rollout) -> Iterator[str]:
+    """Where geometries overlap by more than a quarter of the thinnest."""
     limit, geometry = thinnest_geometry(model)
     limit *= PENETRATION_PART
     depth = float(np.max(motion.penetration))

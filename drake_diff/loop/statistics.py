@@ -1,0 +1,44 @@
+"""Success rates with their uncertainty, and how far a level can go."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from drake_diff.exceptions import InputError
+
+NORMAL_95 = 1.959963984540054  # the two-sided 95 % quantile of the normal distribution
+ENOUGH = 0.95  # of the trials that must succeed
+
+
+class Rate(NamedTuple):
+    """Successes of trials, and Wilson's 95 % interval of the probability."""
+
+    successes: int
+    trials: int
+    lower: float
+    upper: float
+
+    @property
+    def value(self) -> float:
+        return self.successes / self.trials
+
+
+def success_rate(successes: int, trials: int) -> Rate:
+    """Wilson's interval (1927): (p + z^2/2n -+ z sqrt(p (1 - p)/n + z^2/4n^2)) / (1 + z^2/n), z = 1.96, p = k/n."""
+    if not 0 <= successes <= trials or trials < 1:
+        raise InputError("successes", got=f"{successes} of {trials}", expected="at most all of at least one")
+    p, n, z = successes / trials, trials, NORMAL_95
+    middle, half = p + z * z / (2 * n), z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    lower, upper = (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
+    return Rate(successes, trials, float(max(0.0, lower)), float(min(1.0, upper)))
+
+
+def margin(levels: Sequence[float], rates: Sequence[Rate]) -> float:
+    """The largest level up to which, itself included, 95 % of the trials succeed; 0 where already the first fails."""
+    found = 0.0
+    for level, rate in sorted(zip(levels, rates, strict=True)):
+        if rate.value < ENOUGH:
+            break
+        found = level
+    return found
