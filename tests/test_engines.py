@@ -464,6 +464,17 @@ def test_a_free_body_by_frames_of_its_own_is_drakes_in_pinocchio_and_refused_by_
         engine_of("mujoco", model)
 
 
+@pytest.mark.parametrize("name", ["pinocchio", "mujoco"])
+def test_a_weld_at_a_distance_is_drakes(name):
+    plant = Plant(0.01)
+    arm, end = (
+        plant.plant.AddRigidBody(n, SpatialInertia.SolidBoxWithMass(1.0, 0.1, 0.2, 0.3)) for n in ("arm", "end")
+    )
+    plant.plant.AddJoint(RevoluteJoint("hinge", plant.plant.world_frame(), arm.body_frame(), [0, 1, 0]))
+    plant.plant.WeldFrames(arm.body_frame(), end.body_frame(), RigidTransform(RollPitchYaw(0.3, 0.2, 0.1), [0.1, 0, 1]))
+    assert_free_steps_agree(plant.model(), name, 1e-12, 1e-10)  # MuJoCo's Jacobian is of differences
+
+
 def test_geometry_that_mujoco_is_not_given_is_named(tmp_path):
     (tmp_path / "t.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     plant = Plant(0.01)
