@@ -36,9 +36,14 @@ G = 9.81
 
 def needs(engine):
     """Skip, saying what is missing, where the engine is not installed."""
-    module = {"mujoco": "mujoco", "pinocchio": "pinocchio"}.get(engine)
-    if module and find_spec(module) is None:
-        pytest.skip(f"{engine} is not installed: pip install 'drake-diff[engines]'")
+    modules = {
+        "mujoco": ["mujoco"],
+        "pinocchio": ["pinocchio"],
+        "casadi": ["adam", "liecasadi"],
+        "mjx": ["mujoco", "mujoco.mjx", "jax"],
+    }.get(engine, [])
+    if any(find_spec(module) is None for module in modules):
+        pytest.skip(f"{engine} is not installed: pip install 'drake-diff[{'mjx' if engine == 'mjx' else 'engines'}]'")
 
 
 def engine_of(name, model, **options):
@@ -241,7 +246,12 @@ def test_mujoco_is_drake_on_fixed_robots(tmp_path, name):
 @pytest.mark.parametrize("name", ["panda.urdf", "solo12.urdf", "projectile.sdf"])
 def test_mujoco_differs_on_free_bodies_by_the_quaternions_exponential_alone(load, tmp_path, name):
     model = load(name) if name == "projectile.sdf" else robot(name, tmp_path)
-    drake, mujoco, random = dd.load_engine("drake", model), engine_of("mujoco", model), np.random.default_rng(3)
+    assert_free_bodies_differ_by_the_exponential(model, "mujoco")
+
+
+def assert_free_bodies_differ_by_the_exponential(model, name, *, states=3):
+    """From Drake's step, in an engine that has MuJoCo's."""
+    drake, mujoco, random = dd.load_engine("drake", model), engine_of(name, model), np.random.default_rng(3)
     from drake_diff.engines.mujoco_engine import exponential_gap
 
     space = tangent_space(model)
@@ -251,7 +261,7 @@ def test_mujoco_differs_on_free_bodies_by_the_quaternions_exponential_alone(load
         a[:4] = a[:4] / np.linalg.norm(a[:4]) + exponential_gap(x, a, model.time_step, 0, model.nq)
         return a
 
-    for _ in range(3):
+    for _ in range(states):
         x, u = free_state(model, random), random.standard_normal(model.nu)
         a, b = with_gap(x, u), mujoco.step(x, u)
         assert np.abs(b[:4] - drake.step(x, u)[:4]).max() > 1e-8  # there is something to explain
@@ -265,17 +275,20 @@ def test_mujoco_differs_on_free_bodies_by_the_quaternions_exponential_alone(load
             np.testing.assert_allclose(A2[:3, i], (ends[0] - ends[1]) / 2e-6, rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("name", ["pinocchio", "mujoco"])
+def free_box(time_step=0.01):
+    plant = Plant(time_step)
+    plant.plant.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(1.0, 0.1, 0.2, 0.3))
+    return plant.model()
+
+
+@pytest.mark.parametrize("name", ["pinocchio", "mujoco", "mjx"])
 def test_a_swapped_quaternion_or_velocity_frame_is_found(load, monkeypatch, name):
-    plant = Plant(0.01)
-    inertia = SpatialInertia.SolidBoxWithMass(1.0, 0.1, 0.2, 0.3)
-    plant.plant.AddRigidBody("box", inertia)
-    model = plant.model()
+    model = free_box()
     drake, other = dd.load_engine("drake", model), engine_of(name, model)
     assert [line.quantity for line in dd.match_contracts(drake, other) if line.verdict == "different"] == (
-        ["integrator"] if name == "mujoco" else []
+        [] if name == "pinocchio" else ["integrator"]
     )
-    module = sys.modules[f"drake_diff.engines.{name}_engine"]
+    module = sys.modules[f"drake_diff.engines.{'pinocchio_engine' if name == 'pinocchio' else 'mujoco_coordinates'}"]
     real = module.rotation
     wrong = {"quaternion order": lambda q: real(np.roll(q, 1)), "velocity frame": lambda q: np.eye(3)}
     for swapped in wrong.values():
@@ -410,13 +423,13 @@ def test_effort_limits_cut_and_the_derivative_is_zero_there(load):
     model = load("cart_pole.urdf")
     x, u = [0.1, 0.4, 0.2, -0.3], [25.0]
     drake = dd.load_engine("drake", model)
-    for name in ("numpy", "pinocchio", "mujoco"):
+    for name in ("numpy", "pinocchio", "casadi", "mujoco"):
         engine = engine_of(name, model)
         np.testing.assert_allclose(engine.step(x, u), drake.step(x, u), atol=1e-12)
         assert np.abs(engine.differentiate_step(x, u).B).max() == 0
 
 
-@pytest.mark.parametrize("name", ["numpy", "drake", "pinocchio", "mujoco"])
+@pytest.mark.parametrize("name", ["numpy", "drake", "pinocchio", "casadi", "mujoco", "mjx"])
 def test_bad_input_is_named(load, name):
     engine = engine_of(name, load("pendulum.urdf"))
     with pytest.raises(dd.ShapeError, match="x"):
@@ -464,6 +477,17 @@ def test_a_free_body_by_frames_of_its_own_is_drakes_in_pinocchio_and_refused_by_
         engine_of("mujoco", model)
 
 
+@pytest.mark.parametrize("name", ["pinocchio", "casadi", "mujoco"])
+def test_a_weld_at_a_distance_is_drakes(name):
+    plant = Plant(0.01)
+    arm, end = (
+        plant.plant.AddRigidBody(n, SpatialInertia.SolidBoxWithMass(1.0, 0.1, 0.2, 0.3)) for n in ("arm", "end")
+    )
+    plant.plant.AddJoint(RevoluteJoint("hinge", plant.plant.world_frame(), arm.body_frame(), [0, 1, 0]))
+    plant.plant.WeldFrames(arm.body_frame(), end.body_frame(), RigidTransform(RollPitchYaw(0.3, 0.2, 0.1), [0.1, 0, 1]))
+    assert_free_steps_agree(plant.model(), name, 1e-12, 1e-10)  # MuJoCo's Jacobian is of differences
+
+
 def test_geometry_that_mujoco_is_not_given_is_named(tmp_path):
     (tmp_path / "t.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     plant = Plant(0.01)
@@ -499,7 +523,7 @@ def refused(kind):
 
 
 @pytest.mark.parametrize("kind", ["universal", "PD gains", "locked", "damped", "gravity is off"])
-@pytest.mark.parametrize("name", ["pinocchio", "mujoco"])
+@pytest.mark.parametrize("name", ["pinocchio", "casadi", "mujoco", "mjx"])
 def test_a_model_that_other_engines_would_simulate_otherwise_is_refused(name, kind):
     model = refused(kind)
     with pytest.raises(dd.ModelError, match=kind):

@@ -34,7 +34,8 @@ meshcat_view report_data report record_parts record record_schema record_file ce
 provenance problem_record plan_file record_sections metrics invariants failures events evidence rerun verification
 verify runs view sampling certification audit_place audit_contact audit engines.engine engines.euler
 engines.description engines.closed_form engines.closed_form_contact engines.numpy_engine engines.drake_engine
-engines.pinocchio_engine engines.mjcf engines.mujoco_contract engines.mujoco_engine engines.contract_match
+engines.pinocchio_engine engines.urdf engines.casadi_engine engines.mjcf engines.mujoco_coordinates
+engines.mujoco_contract engines.mujoco_model engines.mujoco_engine engines.mjx_engine engines.contract_match
 engines.load engines.attribution engines.motion engines.jacobians engines.recording engines.comparison
 engines.comparison_record engines.comparison_words engines.comparison_page engines.comparison_trace
 engines.comparison_files loop.checks loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop ros2_bag

@@ -149,12 +149,13 @@ def _link(joint: Any, name: str, body_names: dict[Any, str], armature: float, sp
     single = kind in ("revolute", "prismatic")
     about_com = inertia.Shift(inertia.get_com()).CalcRotationalInertia().CopyToFullMatrix3()
     axis = {"revolute": "revolute_axis", "prismatic": "translation_axis"}.get(kind)
+    on_parent = joint.frame_on_parent().GetFixedPoseInBodyFrame()
     return Link(
         body=body_names[body.index()],
         parent=body_names[joint.parent_body().index()],
         joint=name,
         kind=kind,
-        on_parent=joint.frame_on_parent().GetFixedPoseInBodyFrame(),
+        on_parent=on_parent @ joint.X_FM() if kind == "weld" else on_parent,
         on_child=joint.frame_on_child().GetFixedPoseInBodyFrame(),
         axis=np.array(getattr(joint, axis)()) if axis else np.zeros(3),
         q_start=joint.position_start() if kind != "weld" else -1,

@@ -11,7 +11,9 @@ ENGINES = {
     "numpy": ("numpy_engine", "NumpyEngine"),
     "drake": ("drake_engine", "DrakeEngine"),
     "mujoco": ("mujoco_engine", "MujocoEngine"),
+    "mjx": ("mjx_engine", "MjxEngine"),
     "pinocchio": ("pinocchio_engine", "PinocchioEngine"),
+    "casadi": ("casadi_engine", "CasadiEngine"),
 }
 
 # Tools that people ask for and that are no engine here, and why.
@@ -34,11 +36,11 @@ def load_spec(spec: str, model: Model) -> Engine:
 
 
 def load_engine(name: str, model: Any, **options: Any) -> Engine:
-    """The engine `name` (numpy, drake, mujoco, pinocchio) on `model`, a Model or for numpy also a ClosedForm.
+    """The engine `name`, one of ENGINES, on `model`, a Model or for numpy also a ClosedForm.
 
-    Options: contact and method of drake, path (an MJCF of your own) of mujoco, time_step [s] of a ClosedForm. Raises
-    MissingDependencyError, with what to install, where the engine is not there, and ModelError, naming the element,
-    where it cannot have the model.
+    Options: contact and method of drake, path (an MJCF of your own) of mujoco and mjx, time_step [s] of a ClosedForm.
+    Raises MissingDependencyError, with what to install, where the engine is not there, and ModelError, naming the
+    element, where it cannot have the model.
     """
     if name in ELSEWHERE:
         raise MissingDependencyError(f"{name} is no engine here: {ELSEWHERE[name]}")

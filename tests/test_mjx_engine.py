@@ -1,0 +1,279 @@
+"""MJX against hand calculations, Drake, MuJoCo and, in contact, differences of its own step.
+
+JAX compiles for seconds per model: those of more than a few seconds are slow.
+"""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from conftest import MODELS, Plant, contact_properties, random_state
+from pydrake.geometry import Box, Cylinder
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import SpatialInertia
+from test_contract_match import arms, different
+from test_engines import (
+    HERE,
+    G,
+    assert_free_bodies_differ_by_the_exponential,
+    assert_free_steps_agree,
+    block_on_rails,
+    engine_of,
+    free_box,
+    needs,
+    on_tangent,
+    robot,
+)
+
+import drake_diff as dd
+from drake_diff.engines.closed_form import MassSpringDamper
+from drake_diff.engines.description import describe
+from drake_diff.engines.mjcf import mjcf
+from drake_diff.engines.numpy_engine import NumpyEngine
+from drake_diff.tangent import tangent_space
+
+
+def assert_jacobian_is_that_of_the_step(engine, model, x, u, *, step=1e-6, atol=2e-8):
+    """By differences on the tangent space: the solver stops at 1e-14 to 1e-13, so that 1e-6 leaves 1e-8 or so."""
+    space, x_next = tangent_space(model), engine.step(x, u)
+    A = on_tangent(model, engine.differentiate_step(x, u).A, x, x_next)
+    for i, column in enumerate(A.T):
+        e = step * np.eye(len(A))[i]
+        ends = [space.minus(engine.step(space.plus(x, d), u), x_next) for d in (e, -e)]
+        np.testing.assert_allclose(column, (ends[0] - ends[1]) / (2 * step), rtol=0, atol=atol)
+
+
+def own_mjcf(tmp_path, model, *edits):
+    text = mjcf(describe(model), model.time_step)
+    for old, new in edits:
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path / "own.xml"
+    path.write_text(text)
+    return engine_of("mjx", model, path=path)
+
+
+# ---- free motion ---------------------------------------------------------------------------------------------------
+
+
+def test_mass_spring_damper_by_hand_and_jax_is_left_as_it_was(load):
+    model, hand, random = load("mass_spring_damper.sdf"), NumpyEngine(MassSpringDamper(), time_step=0.01), [0.3, -0.2]
+    engine = engine_of("mjx", model)
+    one, two = engine.differentiate_step(random, [1.5]), hand.differentiate_step(random, [1.5])
+    np.testing.assert_allclose(engine.step(random, [1.5]), hand.step(random, [1.5]), rtol=0, atol=1e-14)  # rounding
+    np.testing.assert_allclose(one.A, two.A, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(one.B, two.B, rtol=0, atol=1e-14)
+    assert (one.method, engine.status, engine.contract.precision) == ("jax.jacfwd", "ok", "float64")
+    import jax.numpy as jnp
+
+    assert jnp.ones(1).dtype == jnp.float32
+
+
+# 1e-11: a step through soft limits that are not reached, solved by Newton to 1e-12 and not in closed form.
+@pytest.mark.slow
+@pytest.mark.parametrize("file", [f for f in HERE if f != "projectile.sdf"])
+def test_mjx_is_drake_where_no_body_is_free(load, file):
+    assert_free_steps_agree(load(file), "mjx", 1e-11, 1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ur5_robot.urdf", "double_pendulum_continuous.urdf"])
+def test_mjx_is_drake_on_fixed_robots(tmp_path, name):
+    assert_free_steps_agree(robot(name, tmp_path), "mjx", 1e-11, 1e-11, states=2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["panda.urdf", "solo12.urdf"])
+def test_mjx_differs_on_free_bodies_by_the_quaternions_exponential_alone(tmp_path, name):
+    assert_free_bodies_differ_by_the_exponential(robot(name, tmp_path), "mjx", states=1)
+
+
+def test_mjx_differs_on_a_projectile_by_the_quaternions_exponential_alone(load):
+    assert_free_bodies_differ_by_the_exponential(load("projectile.sdf"), "mjx")
+
+
+def test_a_turn_from_rest_has_its_derivative_and_says_that_mjx_has_it_not():
+    model = free_box()
+    engine, x = engine_of("mjx", model), model.default_state
+    x[4:7] = [1, 2, 3]
+    found = engine.differentiate_step(x, [])
+    assert found.method == "jax.jacfwd, turns from rest by hand"
+    drake = dd.load_engine("drake", model)
+    A, A2 = (on_tangent(model, e.differentiate_step(x, []).A, x, e.step(x, [])) for e in (drake, engine))
+    np.testing.assert_allclose(A2, A, rtol=0, atol=1e-14)  # rounding
+    np.testing.assert_allclose(A2[:3, 6:9], 0.01 * np.eye(3), rtol=0, atol=1e-14)  # by hand: the turn is h w
+    x[7] = 2e-8  # faster than what MJX takes for 0: jacfwd by itself, the same
+    again = engine.differentiate_step(x, [])
+    assert again.method == "jax.jacfwd"
+    np.testing.assert_allclose(on_tangent(model, again.A, x, engine.step(x, [])), A, rtol=0, atol=1e-9)
+
+
+def test_mjx_still_loses_the_turn_from_rest(monkeypatch):
+    """When this fails, `_put_turns_back` can go."""
+    model = free_box()
+    engine, x = engine_of("mjx", model), model.default_state
+    monkeypatch.setattr(type(engine), "_put_turns_back", lambda *_: "")
+    A = on_tangent(model, engine.differentiate_step(x, []).A, x, engine.step(x, []))
+    assert np.abs(A[:3, 6:9]).max() == 0
+
+
+# ---- contact -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("file", ["sphere_on_ground.sdf", "sliding_block.sdf"])
+def test_mjx_rests_as_deep_as_mujoco_and_drake_a15(load, file):
+    model = load(file, time_step=0.005)
+    engine, mujoco, x = engine_of("mjx", model), engine_of("mujoco", model), model.default_state
+    weight, points, radius = {"sphere_on_ground.sdf": (1, 1, 0.1), "sliding_block.sdf": (2, 4, 0.05)}[file]
+    x[6] = radius
+    for _ in range(1000):
+        x = engine.step(x, [])
+    assert engine.status == "ok"
+    assert engine.contact_depth(x) == pytest.approx(weight * G / points / 1e4, rel=1e-9)  # settled for 5 s
+    assert mujoco.contact_depth(x) == pytest.approx(engine.contact_depth(x), rel=1e-12)
+    np.testing.assert_allclose(engine.step(x, []), mujoco.step(x, []), rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_free_bodys_jacobian_in_contact_is_that_of_mjxs_own_step(load):
+    model, random = load("sphere_on_ground.sdf", time_step=0.005), np.random.default_rng(5)
+    engine, mujoco, x = engine_of("mjx", model), engine_of("mujoco", model), model.default_state
+    x[:4] = random_state(model, random)[:4]
+    x[6:] = [0.099, 0.3, 1, -0.5, 0.4, 0.2, -0.1]
+    np.testing.assert_allclose(engine.step(x, []), mujoco.step(x, []), rtol=0, atol=1e-12)  # one law, two solvers
+    assert_jacobian_is_that_of_the_step(engine, model, x, [])
+
+
+@pytest.mark.slow
+def test_sliding_and_sticking_have_the_steps_jacobian_and_not_slipping_at_all_has_none():
+    model, x = block_on_rails()
+    engine, mujoco = engine_of("mjx", model), engine_of("mujoco", model)
+    for speed in (1.0, 0.03, 1e-4):
+        x[2] = speed
+        np.testing.assert_allclose(engine.step(x, []), mujoco.step(x, []), rtol=0, atol=1e-12)
+        assert_jacobian_is_that_of_the_step(engine, model, x, [])
+    x[2] = 0.0
+    np.testing.assert_allclose(engine.step(x, []), mujoco.step(x, []), rtol=0, atol=1e-12)
+    with pytest.raises(dd.GradientError, match="not finite"):  # d sqrt(0) in the line search of elliptic cones
+        engine.differentiate_step(x, [])
+
+
+@pytest.mark.slow
+def test_pyramidal_cones_have_the_derivative_at_rest(tmp_path):
+    model, x = block_on_rails()
+    engine = own_mjcf(tmp_path, model, ('cone="elliptic"', 'cone="pyramidal"'))
+    assert "pyramidal" in engine.contract.contact_law
+    # Pyramids are piecewise linear: a larger step stays right, and the solver's 1e-13 is seen less.
+    assert_jacobian_is_that_of_the_step(engine, model, x, [], step=1e-5)
+
+
+@pytest.mark.slow
+def test_a_pair_that_is_apart_takes_the_derivative_of_one_that_slides(load):
+    model = load("sliding_block.sdf", time_step=0.005)
+    engine, x = engine_of("mjx", model), model.default_state
+    x[6], x[10] = 0.05 - 2 * G / 4e4, 1.0  # four corners slide, four are apart
+    np.testing.assert_allclose(engine.step(x, []), engine_of("mujoco", model).step(x, []), rtol=0, atol=1e-12)
+    with pytest.raises(dd.GradientError, match="not finite"):
+        engine.differentiate_step(x, [])
+
+
+@pytest.mark.slow
+def test_a_solver_that_stops_early_is_said(tmp_path):
+    model, x = block_on_rails()
+    x[2] = 0.03  # between sliding and sticking: no step of Newton's is exact
+    engine = own_mjcf(tmp_path, model, ("<option ", '<option iterations="1" '))
+    engine.step(x, [])
+    assert "unbalanced" in engine.status
+    engine.step([0, 1, 0, 0], [])  # in the air there is nothing to solve
+    assert engine.status == "ok"
+
+
+def test_mjx_still_cannot_have_limits_with_elliptic_cones_and_no_contact(load):
+    """When this fails, the engine need not set the cone."""
+    needs("mjx")
+    import jax
+    from mujoco import mjx
+
+    from drake_diff.engines.mujoco_model import mujoco_model
+
+    _, compiled = mujoco_model(describe(load("cart_pole.urdf")), 0.01, None)
+    model = mjx.put_model(compiled)
+    with pytest.raises(TypeError, match="float32"):
+        jax.eval_shape(mjx.step, model, mjx.make_data(model))
+
+
+# ---- the contract, refusals ----------------------------------------------------------------------------------------
+
+
+def test_the_contract_is_that_of_mjxs_own_model(tmp_path):
+    model = arms(tmp_path)
+    engine, drake = engine_of("mjx", model), dd.load_engine("drake", model)
+    own = different(drake, engine)
+    import jax
+
+    engine.model = engine.model.replace(body_mass=engine.model.body_mass * 1.01)
+    with jax.enable_x64(True):
+        engine.mjx = jax.tree.map(jax.numpy.asarray, engine.model)
+    assert different(drake, engine).keys() - own.keys() == {"mass", "M(q)", "bias(q, v)"}
+
+
+@pytest.mark.parametrize(("new", "said"), [
+    ("implicitfast", None), ("RK4", "RK4, joint damping explicit"),
+])  # fmt: skip
+def test_the_integrator_is_named(tmp_path, new, said):
+    model = arms(tmp_path)
+    found = different(dd.load_engine("drake", model), own_mjcf(tmp_path, model, ('"Euler"', f'"{new}"')))
+    assert (said is None and "integrator" not in found) or said in found["integrator"]
+
+
+def test_an_integrator_and_a_cone_that_mjx_has_not_are_refused(tmp_path):
+    with pytest.raises(dd.ModelError, match="IMPLICIT"):
+        own_mjcf(tmp_path, arms(tmp_path), ('"Euler"', '"implicit"'))
+    with pytest.raises(dd.ModelError, match="condim=1"):
+        own_mjcf(tmp_path, block_on_rails()[0], ('condim="3"', 'condim="1"'))
+
+
+def test_a_pair_that_mjx_has_no_collision_for_is_refused_by_name():
+    plant = Plant(0.01)
+    for name, shape in (("crate", Box(0.1, 0.2, 0.3)), ("can", Cylinder(0.1, 0.2))):
+        body = plant.plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+        plant.shape(body, shape, contact_properties(1e4), RigidTransform())
+    with pytest.raises(dd.ModelError, match=r"CYLINDER.*BOX"):
+        engine_of("mjx", plant.model())
+
+
+def test_other_friction_and_stiffness_are_found(tmp_path):
+    needed = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01)
+    path = tmp_path / "ball.sdf"
+    text = (MODELS / "sphere_on_ground.sdf").read_text()
+    path.write_text(text.replace("mu_dynamic>0.5", "mu_dynamic>0.4", 1))
+    found = different(dd.load_engine("drake", needed), engine_of("mjx", dd.load_model(path, time_step=0.01)))
+    assert "0.444" in found["contact pairs"]
+    same = different(dd.load_engine("drake", needed), engine_of("mjx", needed))
+    assert same.keys() == {"contact law", "solver tolerance", "integrator"}
+
+
+@pytest.mark.slow
+def test_effort_limits_cut_and_the_derivative_is_zero_there(load):
+    model = load("cart_pole.urdf")
+    engine, x, u = engine_of("mjx", model), [0.1, 0.4, 0.2, -0.3], [25.0]
+    np.testing.assert_allclose(engine.step(x, u), dd.load_engine("drake", model).step(x, u), rtol=0, atol=1e-12)
+    assert np.abs(engine.differentiate_step(x, u).B).max() == 0
+
+
+def test_what_mjx_cannot_step_is_an_error(load):
+    engine = engine_of("mjx", load("mass_spring_damper.sdf"))
+    with pytest.raises(dd.SimulationError, match="MJX"):
+        engine.step([0.0, 1e308], [0.0])
+
+
+@pytest.mark.parametrize("module", ["jax", "mujoco.mjx"])
+def test_a_missing_mjx_is_named_with_its_extra(module):
+    code = f"""import sys; sys.modules[{module!r}] = None
+import drake_diff as dd
+try: dd.load_engine("mjx", None)
+except dd.MissingDependencyError as error: print(error)"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "pip install 'drake-diff[mjx]'" in done.stdout
