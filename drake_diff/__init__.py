@@ -47,6 +47,8 @@ from drake_diff.loop.closed_loop import closed_loop as closed_loop
 from drake_diff.loop.estimator import Hold as Hold
 from drake_diff.loop.estimator import Predictor as Predictor
 from drake_diff.loop.fallback import Fallback as Fallback
+from drake_diff.loop.robustness import Robustness as Robustness
+from drake_diff.loop.robustness import robustness as robustness
 from drake_diff.loop.sensor import Sensor as Sensor
 from drake_diff.mcap_read import read_mcap as read_mcap
 from drake_diff.model import Model as Model

@@ -9,6 +9,7 @@ from rich.table import Table
 
 from drake_diff.cli_runs import plain
 
+NOT_A_TERMINAL = 120  # columns of what is written to a file
 COLOURS = {"same": "green", "other law": "yellow", "other model": "red", "unexplained": "red"}
 
 
@@ -55,12 +56,15 @@ def compare(
     begin_comparison(directory, loaded)
     names = None if engines is None else [name.strip() for name in engines.split(",") if name.strip()]
     record = save_comparison(compare_engines(loaded, names, num_steps=steps, seed=seed), directory)
-    _print(Console(soft_wrap=True, highlight=False), record)
+    _print(record)
     print(f"wrote {directory / PAGE}")
     raise typer.Exit(0 if record.verdict == "pass" else 1)
 
 
-def _print(console: Console, record: Any) -> None:
+def _print(record: Any) -> None:
+    console = Console(soft_wrap=True, highlight=False)
+    if not console.is_terminal:
+        console = Console(soft_wrap=True, highlight=False, width=NOT_A_TERMINAL)
     table = Table(box=None, pad_edge=False)
     for name in ("engine", "verdict", "step gap", "apart from", "Jacobian gap", "its own", "step", "Jacobian"):
         table.add_column(name, no_wrap=name != "engine")

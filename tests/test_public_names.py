@@ -13,13 +13,13 @@ PUBLIC = """
 Actuator ArtifactError Barrier Bounds Certificate CertificateError CertificationRecord ClosedLoop Comparison
 ComparisonRecord Constraint Contract ContractLine DrakeDiffError Dynamics Engine EvidenceRecord Fallback Finding
 Gaussian GradientError Hold InputError LQR Loop MissingDependencyError Model ModelError ModelWarning NonFiniteError
-NotOfferedError PD ParametricPolicy Predictor Problem Push QuadraticCost Recording Rollout RolloutCertificate
-RolloutGradient Sensor ShapeError SimulationError Smoothed SoftContact Solution Status StepDerivatives TVLQR
-Transcribed UnknownNameError Verification audit center_of_mass certify certify_jacobian certify_model certify_rollout
-closed_loop compare contact_force contact_modes differentiate_rollout differentiate_step frame_position
-frame_rotation_error frame_velocity list_parameters load_engine load_model load_record match_contracts
-model_from_diagram plant_dynamics read_mcap read_trace rollout save save_comparison smooth smooth_step softened solve
-step transcribe_and_solve verify violation_between_nodes
+NotOfferedError PD ParametricPolicy Predictor Problem Push QuadraticCost Recording Robustness Rollout
+RolloutCertificate RolloutGradient Sensor ShapeError SimulationError Smoothed SoftContact Solution Status
+StepDerivatives TVLQR Transcribed UnknownNameError Verification audit center_of_mass certify certify_jacobian
+certify_model certify_rollout closed_loop compare contact_force contact_modes differentiate_rollout differentiate_step
+frame_position frame_rotation_error frame_velocity list_parameters load_engine load_model load_record match_contracts
+model_from_diagram plant_dynamics read_mcap read_trace robustness rollout save save_comparison smooth smooth_step
+softened solve step transcribe_and_solve verify violation_between_nodes
 """.split()
 ORDER = """
 exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin model
@@ -38,8 +38,9 @@ engines.pinocchio_engine engines.urdf engines.casadi_engine engines.mjcf engines
 engines.mujoco_contract engines.mujoco_model engines.mujoco_engine engines.mjx_engine engines.contract_match
 engines.load engines.attribution engines.motion engines.jacobians engines.recording engines.comparison
 engines.comparison_record engines.comparison_words engines.comparison_page engines.comparison_trace
-engines.comparison_files loop.checks loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop ros2_bag
-cli_mcap cli_runs cli_engines cli_view cli
+engines.comparison_files loop.checks loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop
+loop.perturbation loop.statistics loop.trial loop.sensitivity loop.robustness ros2_bag cli_mcap cli_runs cli_engines
+cli_view cli
 """.split()
 
 

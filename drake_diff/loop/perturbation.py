@@ -47,7 +47,7 @@ class Perturbation:
     def is_of(self, model: Model) -> bool:
         """Whether there is anything in `model` for it to change."""
         if self.quantity:
-            return bool(_of(model, self.quantity))
+            return bool(parameters_of(model, self.quantity))
         needs = {
             "contact_approximation": model.contract.contact.collision_pairs > 0 and model.can_rebuild,
             "time_step": model.can_rebuild,
@@ -78,7 +78,7 @@ def perturbation_named(name: str) -> Perturbation:
     return PERTURBATIONS[name]
 
 
-def _of(model: Model, quantity: str) -> dict[str, Array]:
+def parameters_of(model: Model, quantity: str) -> dict[str, Array]:
     """The parameters of a quantity that are not 0, of whole bodies and not of their geometries."""
     found = {p.name: p.value for p in list_parameters(model) if p.kind.quantity == quantity and "/" not in p.name}
     fixed = {"inertia", "mass"} & {quantity}
@@ -96,7 +96,7 @@ def _scaled(quantity: str) -> Callable[[Setup, float, Random], Setup]:
             raise InputError(f"level of {quantity}", got=level, expected="less than 1, a part of the value")
         values = {
             name: setup.parameters.get(name, value) * (1 + random.uniform(-level, level))
-            for name, value in _of(setup.model, quantity).items()
+            for name, value in parameters_of(setup.model, quantity).items()
         }
         return replace(setup, parameters={**setup.parameters, **values})
 
