@@ -51,7 +51,7 @@ class Sensitivity:
         return float(level * np.linalg.norm(self._effect(name)))
 
     def _effect(self, name: str) -> Array:
-        """(nt, .) the last state's derivative by the numbers that a perturbation of level 1 draws, times their spread."""
+        """(nt, .) the last state's derivative by what a perturbation of level 1 draws, times its spread."""
         start, _, noise, factor = self._effects()
         if name == "initial_state":
             return start
