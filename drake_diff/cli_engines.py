@@ -23,6 +23,9 @@ def compare(
     engines: Annotated[
         str | None, typer.Option(help="Names with commas between, drake:lagged among them; all where not given.")
     ] = None,
+    recording: Annotated[
+        list[Path] | None, typer.Option(help="A recorded motion: CSV, MCAP or a ROS 2 bag; all run its motion.")
+    ] = None,
     steps: Annotated[
         int | None, typer.Option(help="How many steps the motion has; one second where not given.")
     ] = None,
@@ -42,6 +45,7 @@ def compare(
     """
     from drake_diff.engines.comparison import compare as compare_engines
     from drake_diff.engines.comparison_files import PAGE, begin_comparison, save_comparison
+    from drake_diff.engines.recording_files import read_recording
     from drake_diff.model import load_model
 
     loaded = load_model(
@@ -53,9 +57,11 @@ def compare(
         ground=ground,
     )
     directory = out or Path("artifacts") / f"compare_{model.stem}"
+    recordings = [read_recording(path, loaded) for path in recording or ()]
     begin_comparison(directory, loaded)
     names = None if engines is None else [name.strip() for name in engines.split(",") if name.strip()]
-    record = save_comparison(compare_engines(loaded, names, num_steps=steps, seed=seed), directory)
+    found = compare_engines(loaded, names, recordings=recordings, num_steps=steps, seed=seed)
+    record = save_comparison(found, directory)
     _print(record)
     print(f"wrote {directory / PAGE}")
     raise typer.Exit(0 if record.verdict == "pass" else 1)

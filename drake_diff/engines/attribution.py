@@ -54,7 +54,8 @@ class Attribution:
     """`gap`: the largest difference of the two steps, quaternions of norm 1; `effects`: of each term, largest first.
 
     `responsible` is the name of the largest effect, "" where the steps are the same. `assumed` is what an engine does
-    not offer, and is taken to be the other's.
+    not offer, and is taken to be the other's. `as_if` is the one change of the reference that takes the step of a
+    recording, "" where none does.
     """
 
     gap: float
@@ -62,6 +63,7 @@ class Attribution:
     responsible: str
     schemes: tuple[Scheme, Scheme]
     assumed: tuple[str, ...] = ()
+    as_if: str = ""
 
 
 def attribute(
@@ -81,7 +83,7 @@ def attribute(
     }
     effects[INTEGRATOR] = _size(euler(coordinates, x, a, scheme_b) - base)
     left = _size((after_b - euler(coordinates, x, b, scheme_b)) - (after_a - base))
-    what = _what_is_left(coordinates, one, two, x, steps)
+    what = what_is_left(coordinates, one, two, x, steps)
     effects[what] = max(left, effects.get(what, 0.0))
     ranked = dict(sorted(effects.items(), key=lambda item: -item[1]))
     gap = _size(after_b - after_a)
@@ -118,7 +120,7 @@ def _terms_of_both(
     M, no_M = _offered(one, two, "M(q)", lambda engine: engine.mass_matrix(q), np.eye(len(v)))
     bias, no_bias = _offered(one, two, "bias(q, v)", lambda engine: engine.bias(q, v), np.zeros(len(v)))
     a, b = (
-        Terms(M[i], bias[i], *_forces(engine.contract, u), engine.contract.time_step)
+        Terms(M[i], bias[i], *forces(engine.contract, u), engine.contract.time_step)
         for i, engine in enumerate((one, two))
     )
     return a, b, (*no_M, *no_bias)
@@ -139,7 +141,7 @@ def _offered(
     return [known if value is None else value for value in found], missing
 
 
-def _forces(contract: EngineContract, u: Array) -> tuple[Array, Array]:
+def forces(contract: EngineContract, u: Array) -> tuple[Array, Array]:
     """B u and the joints' damping, (nv,) each."""
     limits = np.array(contract.effort_limits)
     actuation = np.array(contract.actuation, dtype=float).reshape(len(contract.actuation), len(u))
@@ -154,7 +156,8 @@ def _scheme(coordinates: Coordinates, x: Array, terms: Terms, after: Array, fits
     return best if misfits[best] <= fits * max(1.0, _size(after)) else SCHEMES[0]
 
 
-def _what_is_left(coordinates: Coordinates, one: Engine, two: Engine, x: Array, steps: tuple[Array, Array]) -> str:
+def what_is_left(coordinates: Coordinates, one: Engine, two: Engine, x: Array, steps: tuple[Array, Array]) -> str:
+    """What makes steps differ that no Euler step explains: a law that is at work at one of the states, if any."""
     if any(_depth(engine, state) > 0 for engine in (one, two) for state in (x, *steps)):
         return CONTACT_LAW
     singles = [j for e in (one, two) for j in zip(_singles(e.contract), coordinates.single, strict=True)]

@@ -8,28 +8,28 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff.arrays import Array, finite_array, frozen
+from drake_diff.arrays import Array, frozen
 from drake_diff.engines.attribution import Attribution, attribute
+from drake_diff.engines.comparison_task import Probe, probes_of, task_of
 from drake_diff.engines.contract_match import ContractLine, match_contracts
 from drake_diff.engines.description import describe
 from drake_diff.engines.drake_engine import DrakeEngine
 from drake_diff.engines.engine import Engine, Precision
 from drake_diff.engines.jacobians import JacobianAt, jacobian_at, rollout_jacobian
 from drake_diff.engines.load import ELSEWHERE, ENGINES, load_spec
-from drake_diff.engines.motion import BROKE_OFF, EngineMotion, move, seconds
+from drake_diff.engines.motion import BROKE_OFF, EngineMotion, measured, move, seconds
+from drake_diff.engines.recorded import NOT_TOLD, advanced, attribute_recorded, precision_of, told_lines
+from drake_diff.engines.recording import Recording, check_recording, steps_between
 from drake_diff.exceptions import MissingDependencyError, ModelError, SimulationError
 from drake_diff.model import Model
-from drake_diff.rollout import check_inputs
-from drake_diff.sampling import sample_states
 from drake_diff.tangent import tangent_space
 
 Verdict = Literal["same", "other law", "other model", "unexplained"]
-DURATION, MOST_STEPS = 1.0, 1000  # [s]; of a motion that is not given
 # One step against the reference's, relative to the state where that is above 1: rounding in solves with M.
 STEP_TOLERANCE: dict[Precision, float] = {"float64": 1e-10, "float32": 1e-4}
 # Relative to the largest entry: what differences of a step, which some engines offer as its derivative, leave.
@@ -49,14 +49,6 @@ TELLS: Mapping[str, tuple[str, ...]] = {
 LAWS = ("integrator", "limit law", "contact law", "contact pairs", "solver tolerance", "reset")
 
 
-class Probe(NamedTuple):
-    """A state at which Jacobians are compared: "start", "free", "contact" or "deepest"."""
-
-    name: str
-    x: Array
-    u: Array
-
-
 @dataclass(frozen=True)
 class Refused:
     """An engine that is not compared: not installed, or without something that the model has."""
@@ -68,7 +60,7 @@ class Refused:
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """One engine beside the reference."""
+    """One engine, or a recording, beside the reference."""
 
     engine: str
     version: str
@@ -105,17 +97,21 @@ class Compared:
     def told(self) -> tuple[ContractLine, ...]:
         """The lines that tell of the terms responsible; none where one of the terms is told of by no line."""
         terms = {self.first.responsible, self.largest.responsible}
-        lines = {term: [x for x in self.different if x.quantity in TELLS.get(term, ())] for term in sorted(terms)}
+        known = [x for x in self.different if x.reason != NOT_TOLD]
+        lines = {term: [x for x in known if x.quantity in TELLS.get(term, ())] for term in sorted(terms)}
         return tuple(dict.fromkeys(x for found in lines.values() for x in found)) if all(lines.values()) else ()
 
     @property
     def verdict(self) -> Verdict:
         """Same: every step and Jacobian is the reference's. Other law: not, and the contract tells of what is at work.
 
-        Other model: the contract is broken. Unexplained: nothing tells why.
+        Other model: the contract is broken. Unexplained: nothing tells why. Of a recording also the one change that
+        takes its steps tells, of a law or of the model.
         """
         if self.broken:
             return "other model"
+        if self.first_apart is not None and self.first.as_if and self.first.as_if == self.largest.as_if:
+            return "other law" if self.first.responsible in LAWS else "other model"
         if self.first_apart is not None:
             return "other law" if self.told else "unexplained"
         broke_off = self.motion.status.startswith(BROKE_OFF)
@@ -159,6 +155,7 @@ def compare(
     model: Model,
     engines: Sequence[str | Engine] | None = None,
     *,
+    recordings: Sequence[Recording] = (),
     x0: ArrayLike | None = None,
     us: ArrayLike | None = None,
     num_steps: int | None = None,
@@ -169,31 +166,36 @@ def compare(
     Without any, Drake's other contact approximations, where something can touch, and every engine there is.
 
     The motion starts at `x0` (nx,) under `us` (N, nu); a random free state, constant random inputs and one second
-    where they are not given, the same for the same `seed`. Engines that are missing or cannot have the model are
+    where they are not given, the same for the same `seed`; those of the first of `recordings` (see `read_recording`)
+    where there is one and no `x0`. The steps of a recording are compared with as many of the reference's as lie between
+    its samples; it has no Jacobians. Engines that are missing or cannot have the model are
     listed in `refused`. Raises InputError for bad input, and ModelError where no engine but Drake can have the model.
     """
-    x0, us = _task(model, x0, us, num_steps, seed)
-    reference: Engine = DrakeEngine(model)
+    for recording in recordings:
+        check_recording(recording, model)
+    x0, us = task_of(model, recordings, x0, us, num_steps, seed)
+    reference = DrakeEngine(model)
     loaded, refused = _load(model, default_engines(model) if engines is None else tuple(engines))
     panel = _Panel(model, reference, x0, us, seed)
     compared = []
-    for engine in (reference, *loaded):
+    each: tuple[Engine | Recording, ...] = (reference, *loaded, *recordings)
+    for one in each:
         try:
-            compared.append(panel.compared(engine))
+            compared.append(panel.recorded(one) if isinstance(one, Recording) else panel.compared(one))
         except SimulationError as error:
-            refused.append(Refused(engine.name, f"it cannot take a step at one of the states: {error}", True))
+            refused.append(Refused(one.name, f"it cannot take a step at one of the states: {error}", True))
     return Comparison(model, x0, us, panel.probes, tuple(compared), tuple(refused))
 
 
 class _Panel:
     """What is asked of each engine, and the reference's answers."""
 
-    def __init__(self, model: Model, reference: Engine, x0: Array, us: Array, seed: int):
+    def __init__(self, model: Model, reference: DrakeEngine, x0: Array, us: Array, seed: int):
         self.space, self.names, self.model = tangent_space(model), model.input_names, model
         self.reference, self.x0, self.us = reference, x0, us
         self.coordinates = describe(model).coordinates
         self.motion = move(reference, x0, us)
-        self.probes = _probes(model, self.motion, seed)
+        self.probes = probes_of(model, self.motion, seed)
         self.jacobians = self._jacobians(reference)
         self.product = rollout_jacobian(reference, self.space, self.motion)
 
@@ -212,7 +214,7 @@ class _Panel:
             step_gaps=gaps,
             first=self._attribution(engine, motion, _first_above(gaps, engine.contract.precision) or 0),
             largest=self._attribution(engine, motion, int(np.argmax(gaps)) if len(gaps) else 0),
-            final_gap=float(np.abs(self.space.minus(motion.xs[-1], self.motion.xs[len(motion.xs) - 1])).max()),
+            final_gap=self._gap_at_the_end(motion.xs),
             jacobians=jacobians,
             jacobian_gaps=frozen(
                 [_gap(a.jacobian, b.jacobian) for a, b in zip(self.jacobians, jacobians, strict=True)]
@@ -223,6 +225,40 @@ class _Panel:
             seconds_per_jacobian=seconds(lambda: engine.differentiate_step(self.x0, self.us[0])),
         )
 
+    def recorded(self, recording: Recording) -> Compared:
+        motion = measured(self.reference, recording.times - recording.times[0], recording.xs, recording.us)
+        count, precision = steps_between(recording, self.model.time_step), precision_of(recording)
+        gaps = self._step_gaps(motion, count)
+        first, largest = (
+            attribute_recorded(
+                self.reference, motion.xs[k], motion.us[k], count, motion.xs[k + 1], STEP_TOLERANCE[precision]
+            )
+            for k in (_first_above(gaps, precision) or 0, int(np.argmax(gaps)))
+        )
+        return Compared(
+            engine=recording.name,
+            version=recording.version,
+            precision=precision,
+            lines=told_lines(recording, self.reference),
+            motion=motion,
+            step_gaps=gaps,
+            first=first,
+            largest=largest,
+            final_gap=self._gap_at_the_end(motion.xs, count),
+            jacobians=(),
+            jacobian_gaps=frozen([]),
+            rollout_jacobian=None,
+            rollout_gap=None,
+            seconds_per_step=None,
+            seconds_per_jacobian=None,
+        )
+
+    def _gap_at_the_end(self, xs: Array, count: int = 1) -> float:
+        """On the tangent space, of the last of `xs`, `count` steps apart, that the reference's motion has too."""
+        ours = self.motion.xs[::count]
+        k = min(len(xs), len(ours)) - 1
+        return float(np.abs(self.space.minus(xs[k], ours[k])).max())
+
     def _jacobians(self, engine: Engine) -> tuple[JacobianAt, ...]:
         return tuple(jacobian_at(engine, self.space, self.names, *probe) for probe in self.probes)
 
@@ -232,11 +268,11 @@ class _Panel:
             return None
         return _gap(self.product, product)
 
-    def _step_gaps(self, motion: EngineMotion) -> Array:
-        """Relative to the state after the step where that is above 1."""
+    def _step_gaps(self, motion: EngineMotion, count: int = 1) -> Array:
+        """Relative to the state after the step where that is above 1; states are `count` steps apart."""
         gaps = []
         for x, u, after in zip(motion.xs, motion.us, motion.xs[1:], strict=False):
-            ours = self.reference.step(x, u)
+            ours = advanced(self.reference, x, u, count)
             gaps.append(np.abs(self.space.minus(after, ours)).max() / max(1.0, np.abs(ours).max()))
         return frozen(gaps)
 
@@ -273,23 +309,3 @@ def _load(model: Model, wanted: tuple[str | Engine, ...]) -> tuple[list[Engine],
         except ModelError as error:
             refused.append(Refused(str(engine), str(error), True))
     return loaded, refused
-
-
-def _task(
-    model: Model, x0: ArrayLike | None, us: ArrayLike | None, num_steps: int | None, seed: int
-) -> tuple[Array, Array]:
-    sample = sample_states(model, 1, seed)[0]
-    if us is None:
-        count = num_steps or min(MOST_STEPS, max(1, round(DURATION / model.time_step)))
-        us = np.tile(sample.u, (count, 1))
-    return (sample.x if x0 is None else finite_array("x0", x0, (model.nx,))), check_inputs(model, us, num_steps)
-
-
-def _probes(model: Model, motion: EngineMotion, seed: int) -> tuple[Probe, ...]:
-    """The motion's start, a state sampled free and one touching, and the motion's deepest overlap."""
-    probes = [Probe("start", motion.xs[0], motion.us[0])]
-    probes += [Probe(sample.kind, sample.x, sample.u) for sample in sample_states(model, 2, seed + 1)]
-    if motion.depth is not None and np.max(motion.depth[:-1], initial=0.0) > 0:
-        k = int(np.argmax(motion.depth[:-1]))
-        probes.append(Probe("deepest", motion.xs[k], motion.us[k]))
-    return tuple(probes)

@@ -30,7 +30,9 @@ def _channels(comparison: Comparison) -> Iterator[Channel]:
         yield input_channel(shown, f"/{slug}/input", motion.times[:-1], motion.us)
         kind = TYPES["Diagnostics"]
         yield Channel(f"/{slug}/diagnostics", kind.cls, _measures(motion, kind.cls), {"units": kind.units})
-    yield transform_channel(model, motions[0].times, {f"{s}/": m.xs for s, m in zip(names, motions, strict=True)})
+    times = motions[0].times
+    alike = {s: m for s, m in zip(names, motions, strict=True) if np.allclose(m.times, times[: len(m.times)])}
+    yield transform_channel(model, times, {f"{s}/": m.xs for s, m in alike.items()})  # not what was sampled otherwise
 
 
 def _measures(motion: EngineMotion, message: Any) -> Iterable[tuple[int, Any]]:

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from drake_diff.engines.comparison import STEP_TOLERANCE, Compared, Comparison
+from drake_diff.engines.recorded import NOT_TOLD
 
 
 def sentence_of(compared: Compared) -> str:
@@ -49,11 +50,12 @@ def _after_contact(others: tuple[Compared, ...]) -> str:
 
 
 def _same(e: Compared) -> str:
-    unused = [line.quantity for line in e.different]
+    unused = [line.quantity for line in e.different if line.reason != NOT_TOLD]
     but = f"; what its contract has otherwise ({_list(unused)}) did not come into play" if unused else ""
+    jacobians = f", Jacobians within {_largest(e.jacobian_gaps)} of their largest entry" if e.jacobians else ""
     return (
-        f"the same simulation: each of {len(e.step_gaps)} steps within {_largest(e.step_gaps)} of Drake's, Jacobians "
-        f"within {_largest(e.jacobian_gaps)} of their largest entry{but}"
+        f"the same simulation: each of {len(e.step_gaps)} steps within {_largest(e.step_gaps)} of Drake's"
+        f"{jacobians}{but}"
     )
 
 
@@ -63,11 +65,12 @@ def _other_law(e: Compared) -> str:
     terms = list(dict.fromkeys((e.first.responsible, e.largest.responsible)))
     lines = {line.quantity: line.reason or line.detail for line in e.told}
     why = "; ".join(lines[term] for term in terms if term in lines) or "; ".join(lines.values())
+    why = "; ".join(part for part in (why, e.first.as_if) if part)
     return f"{before} by the {_list(terms)}, at most {_largest(e.step_gaps)} of the state in one step ({why})"
 
 
 def _other_model(e: Compared) -> str:
-    lines = "; ".join(f"{line.quantity}: {line.detail}" for line in e.broken)
+    lines = "; ".join([f"{line.quantity}: {line.detail}" for line in e.broken] or [e.first.as_if])
     return (
         f"another model ({lines}); a step differs by up to {_largest(e.step_gaps)}, most by its {e.largest.responsible}"
     )

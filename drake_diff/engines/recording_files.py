@@ -1,0 +1,137 @@
+"""Recorded motions from files: CSV, MCAP of this project or of ROS 2, ROS 2 bags, and what is told of their engine."""
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_diff.arrays import Array, frozen
+from drake_diff.engines.description import describe
+from drake_diff.engines.recording import Recording, check_recording
+from drake_diff.engines.recording_ros2 import is_ros2, read_ros2
+from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.mcap_read import read_mcap
+from drake_diff.model import Model
+
+Motion = tuple[Array, Array, Array]  # times (n,) [s], xs (n, nx), us (n - 1, nu)
+SUFFIXES = "a .csv file, an .mcap file or the directory of a ROS 2 bag"
+
+
+def read_recording(path: str | Path, model: Model, *, name: str | None = None) -> Recording:
+    """The motion of `model` that is recorded in `path`: a CSV or MCAP file, or the directory of a ROS 2 bag.
+
+    CSV: a header row, then a row per sample, SI units. Columns, in any order: `time`, `model.state_names`, for which
+    `position.JOINT` and `velocity.JOINT` of a joint of one degree of freedom may stand, and `model.input_names`, which
+    are held until the next sample and may be empty in the last row. MCAP of this project: the channels /state and
+    /input. ROS 2 (needs the extra `ros2`): see `recording_ros2`.
+
+    What is told of the engine stands in NAME.contract.json beside NAME.csv, NAME.mcap or the bag NAME, or in the MCAP's
+    metadata record "contract": a JSON object of some of engine, version, precision, "time step", integrator, "contact
+    law", "limit law", gravity, seeds, "reset distribution". Nothing else is known of it. `name` goes before the file's.
+
+    Raises InputError and its kin, naming file, line and column; ArtifactError of a damaged log;
+    MissingDependencyError without rosbags.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError("recording", got=f"{path}, which is not there", expected=SUFFIXES)
+    facts: Mapping[str, str] = {}
+    if path.suffix == ".csv":
+        motion = _read_csv(path, model)
+    elif path.is_dir() or (path.suffix == ".mcap" and is_ros2(path)):
+        motion, facts = read_ros2(path, model)
+    elif path.suffix == ".mcap":
+        motion, facts = _read_mcap(path, model)
+    else:
+        raise InputError("recording", got=str(path), expected=SUFFIXES)
+    facts = {**facts, **_told(path)}
+    times, xs, us = (frozen(part) for part in motion)
+    recording = Recording(
+        name or facts.get("engine", path.stem), facts.get("version", "not told"), times, xs, us, facts
+    )
+    check_recording(recording, model)
+    return recording
+
+
+def _told(path: Path) -> dict[str, str]:
+    """What stands beside the recording; numbers stay JSON."""
+    beside = path.with_name((path.name if path.is_dir() else path.stem) + ".contract.json")
+    if not beside.exists():
+        return {}
+    try:
+        told = json.loads(beside.read_text())
+    except ValueError as error:
+        raise InputError(str(beside), got=str(error), expected="a JSON object") from error
+    if not isinstance(told, dict):
+        raise InputError(str(beside), got=type(told).__name__, expected="a JSON object")
+    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in told.items()}
+
+
+def _read_csv(path: Path, model: Model) -> Motion:
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        rows = [(line, row) for line, row in enumerate(csv.reader(file), start=1) if row]
+    if not rows:
+        raise InputError(str(path), got="an empty file", expected="a header row and samples")
+    wanted = ("time", *model.state_names, *model.input_names)
+    places = _columns(path, model, rows[0][1], wanted)
+    table = np.zeros((len(rows) - 1, len(wanted)))
+    for k, (line, row) in enumerate(rows[1:]):
+        if len(row) != len(rows[0][1]):
+            raise InputError(f"{path} line {line}", got=f"{len(row)} cells", expected=f"{len(rows[0][1])}")
+        for j, (column, place) in enumerate(zip(wanted, places, strict=True)):
+            if k == len(table) - 1 and j > model.nx and not row[place].strip():
+                continue  # no step begins at the last sample
+            table[k, j] = _number(f"{path} line {line}, column {column}", row[place])
+    if np.any(np.diff(table[:, 0]) <= 0):
+        k = int(np.flatnonzero(np.diff(table[:, 0]) <= 0)[0]) + 1
+        got, before = table[k, 0], table[k - 1, 0]
+        raise InputError(f"{path} line {rows[k + 1][0]}, column time", got=got, expected=f"more than {before}")
+    return table[:, 0], table[:, 1 : model.nx + 1], table[:-1, model.nx + 1 :]
+
+
+def _number(subject: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(subject, got=repr(text), expected="a finite number")
+    return value
+
+
+def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str]) -> list[int]:
+    """Where each wanted column stands."""
+    by_joint = {}
+    for link in describe(model).moving:
+        if link.kind != "quaternion_floating":
+            by_joint[f"position.{link.joint}"] = model.state_names[link.q_start]
+            by_joint[f"velocity.{link.joint}"] = model.state_names[model.nq + link.v_start]
+    names = [by_joint.get(text.strip(), text.strip()) for text in header]
+    for given, column in zip(header, names, strict=True):
+        if column not in wanted:
+            raise UnknownNameError(f"{path} line 1, column", got=given, known=[*wanted, *by_joint])
+        if names.count(column) > 1:
+            raise InputError(f"{path} line 1, column {column}", got="twice", expected="once")
+    for column in wanted:
+        if column not in names:
+            raise InputError(f"{path} line 1, column {column}", got=f"none, of {', '.join(header)}", expected="one")
+    return [names.index(column) for column in wanted]
+
+
+def _read_mcap(path: Path, model: Model) -> tuple[Motion, Mapping[str, str]]:
+    log = read_mcap(path)
+    state, given = log.arrays("/state"), log.arrays("/input")
+    for topic, key, names in (
+        ("/state", "q", model.position_names),
+        ("/state", "v", model.velocity_names),
+        ("/input", "u", model.input_names),
+    ):
+        found: Any = log.channel_metadata[topic].get("names", {}).get(key, [])
+        if tuple(found) != names:
+            raise InputError(f"{path}: names of {key} in {topic}", got=found, expected=str(list(names)))
+    motion = state["time"], np.hstack([state["q"], state["v"]]), given["u"]
+    return motion, log.metadata.get("contract", {})

@@ -1,0 +1,459 @@
+"""Recorded motions: read from every kind of file, compared step by step, and told as if what they had been stepped."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import MODELS
+from pydrake.math import RollPitchYaw
+from test_contract_match import arms
+from test_engines import engine_of, needs
+from typer.testing import CliRunner
+
+import drake_diff as dd
+from drake_diff.cli import app
+from drake_diff.engines.comparison_words import sentence_of
+from drake_diff.engines.mjcf import mjcf
+from drake_diff.engines.motion import move
+from drake_diff.solution import Solution
+from drake_diff.trace import write_trace
+
+H = 0.01
+INPUTS = 2 * np.sin(np.arange(40))[:, None]
+
+
+def record(engine, x0, us, *, every=1, h=H, name="recorded", **facts):
+    """What `engine` does, each `every`-th state kept."""
+    motion = move(engine, np.array(x0, dtype=float), np.repeat(us, every, axis=0))
+    return dd.Recording(name, "1", h * np.arange(len(us) + 1), motion.xs[::every], us, facts)
+
+
+def compared(model, recording, **options):
+    return dd.compare(model, (), recordings=(recording,), **options).engines[-1]
+
+
+def write_csv(path, header, rows):
+    path.write_text("\n".join(",".join(map(str, row)) for row in [header, *rows]) + "\n")
+    return path
+
+
+# ---- compared ----------------------------------------------------------------------------------------------------
+
+
+def test_a_recording_of_the_same_model_is_the_same_and_has_no_jacobians(load):
+    needs("mujoco")
+    model = load("cart_pole.urdf")
+    mujoco = engine_of("mujoco", model)
+    found = dd.compare(model, ("numpy",), recordings=(record(mujoco, [0, 0.7, 0, 0], INPUTS),))
+    numpy, e = found.engines[1:]
+    np.testing.assert_array_equal(found.x0, [0, 0.7, 0, 0])  # the recording's: all engines run the same motion
+    np.testing.assert_array_equal(found.us, INPUTS)
+    np.testing.assert_allclose(numpy.motion.xs, e.motion.xs, atol=1e-10)  # 40 steps, each to rounding
+    assert (e.engine, e.verdict, e.first_apart, e.is_gradient_its_own) == ("recorded", "same", None, None)
+    assert e.step_gaps.max() < 1e-13
+    assert (len(e.jacobians), e.rollout_jacobian, e.seconds_per_step) == (0, None, None)
+    assert e.motion.energy is not None  # Drake's, of the recorded states
+    assert "Jacobian" not in sentence_of(e)
+
+
+def test_the_reference_takes_as_many_steps_as_lie_between_samples(load):
+    model = load("pendulum.urdf")
+    drake = engine_of("drake", model)
+    e = compared(model, record(drake, [0.5, 0], INPUTS[:10], every=5, h=5 * H))
+    assert (e.verdict, e.step_gaps.max(), len(e.step_gaps)) == ("same", 0.0, 10)
+    assert e.final_gap == 0.0
+    late = record(drake, [0.5, 0], INPUTS[:10])
+    late = dd.Recording("late", "1", late.times + 7, late.xs, late.us)
+    assert compared(model, late).motion.times[0] == 0.0  # as the others' are
+    for period in (1.5 * H, 0.5 * H):
+        with pytest.raises(dd.InputError, match=rf"0\.01 s, got {period:g}"):
+            compared(model, record(drake, [0.5, 0], INPUTS[:10], h=period))
+    dropped = dd.Recording("dropped", "1", np.delete(late.times, 4), np.delete(late.xs, 4, axis=0), late.us[:-1])
+    with pytest.raises(dd.InputError, match=r"from sample 3 to 4: expected 0\.01 s throughout.* got 0\.02"):
+        compared(model, dropped)
+
+
+def test_the_command_compares_recordings_and_saves_them(load, tmp_path):
+    """One as it was, one sampled every fifth step and by another time step: exit status 1, and named."""
+    model = load("cart_pole.urdf")
+    header = ["time", *model.state_names, *model.input_names]
+    fast, slow = engine_of("drake", model), engine_of("drake", model.at_time_step(H / 2))
+    for name, engine, every, h in (("same", fast, 1, H), ("other", slow, 10, 5 * H)):
+        r = record(engine, [0, 0.7, 0, 0], np.ones((8, 1)), every=every, h=h)
+        rows = [[*map(repr, map(float, (t, *x))), "1.0"] for t, x in zip(r.times, r.xs, strict=True)]
+        write_csv(tmp_path / f"{name}.csv", header, rows)
+    command = ["compare", str(model.source), "--engines", "numpy", "--out", str(tmp_path / "out")]
+    for name, status in (("same", 0), ("other", 1)):
+        command += ["--recording", str(tmp_path / f"{name}.csv")]
+        done = CliRunner().invoke(app, command)
+        assert done.exit_code == status, done.output
+    assert "as if the time step were half" in done.output
+    log = dd.read_mcap(next((tmp_path / "out").glob("*.mcap")))
+    np.testing.assert_allclose(log.arrays("/3_other/state")["time"], 5 * H * np.arange(9))
+    frames = {t.child_frame_id.split("/")[0] for _, m in log.messages["/tf"] for t in m.transforms}
+    assert "2_same" in frames
+    assert "3_other" not in frames  # it has no state at most of the times
+
+
+def damped_cart_pole(tmp_path, damping):
+    text = (MODELS / "cart_pole.urdf").read_text()
+    path = tmp_path / f"cart_pole_{damping}.urdf"
+    path.write_text(text.replace('<axis xyz="1 0 0"/>', f'<axis xyz="1 0 0"/><dynamics damping="{damping}"/>'))
+    return dd.load_model(path, time_step=H)
+
+
+def explicit_damping(model, tmp_path):
+    """MuJoCo without eulerdamp."""
+    path = tmp_path / "explicit.xml"
+    text = mjcf(engine_of("mujoco", model).description, model.time_step)
+    path.write_text(text.replace('warmstart="disable"', 'warmstart="disable" eulerdamp="disable"'))
+    return engine_of("mujoco", model, path=path)
+
+
+@pytest.mark.parametrize(
+    ("change", "as_if", "term", "verdict"),
+    [
+        ("explicit", "as if joint damping were explicit", "integrator", "other law"),
+        ("half", "as if the time step were half", "time step", "other model"),
+        ("double", "as if the time step were double", "time step", "other model"),
+        ("undamped", "as if joint damping were 0", "damping", "other model"),
+        ("flipped", "as if gravity pointed the other way", "bias", "other model"),
+    ],
+)
+def test_the_one_setting_that_is_another_is_named(tmp_path, change, as_if, term, verdict):
+    model = damped_cart_pole(tmp_path, 0.4)
+    x0, every, h = [0, 0.7, 0.3, -0.2], 1, H
+    if change == "explicit":
+        engine = explicit_damping(model, tmp_path)
+    elif change == "half":
+        engine, every = engine_of("drake", model.at_time_step(H / 2)), 2
+    elif change == "double":
+        engine, h = engine_of("drake", model.at_time_step(2 * H)), 2 * H
+    elif change == "undamped":
+        engine = engine_of("drake", damped_cart_pole(tmp_path, 0.0))
+    else:
+        engine = engine_of("drake", dd.load_model(model.source, time_step=H, gravity=[0, 0, 9.81]))
+    e = compared(model, record(engine, x0, INPUTS, every=every, h=h))
+    assert (e.verdict, e.first.as_if, e.largest.as_if) == (verdict, as_if, as_if)
+    assert (e.first.responsible, e.largest.responsible) == (term, term)
+    assert as_if in sentence_of(e)
+
+
+def test_a_dropped_armature_is_named(tmp_path):
+    model = arms(tmp_path)
+    bare = engine_of("drake", arms(tmp_path, gear=0))  # of one of four joints: not the change, and not said to be
+    assert compared(model, record(bare, np.full(8, 0.1), np.ones((5, 4)), h=0.002)).largest.as_if == ""
+    text = model.source.read_text().replace('rotor_inertia value="0.0001"', 'rotor_inertia value="0"')
+    (tmp_path / "bare.urdf").write_text(text)
+    bare = engine_of("drake", dd.load_model(tmp_path / "bare.urdf", time_step=0.002))
+    e = compared(model, record(bare, np.full(8, 0.1), np.ones((5, 4)), h=0.002))
+    assert (e.verdict, e.largest.as_if, e.largest.responsible) == ("other model", "as if armature were 0", "inertia")
+
+
+def test_mujoco_s_turn_of_a_free_body_is_named(load):
+    needs("mujoco")
+    model = load("projectile.sdf")
+    x0 = [1.0, 0, 0, 0, 0, 0, 5, 3, -2, 4, 1, 0, 2]
+    e = compared(model, record(engine_of("mujoco", model), x0, np.zeros((20, 0))))
+    assert (e.verdict, e.first.as_if) == ("other law", "as if rotations were by the exponential")
+
+
+def test_what_no_single_change_takes_is_unexplained(load):
+    """A push of 1e-3 on every state, and gravity that is another without pointing the other way."""
+    model = load("pendulum.urdf")
+    recording = record(engine_of("drake", model), [0.5, 0], INPUTS)
+    pushed = dd.Recording("pushed", "1", recording.times, recording.xs + 1e-3 * np.arange(41)[:, None], INPUTS)
+    e = compared(model, pushed)
+    assert (e.verdict, e.largest.responsible, e.largest.as_if) == ("unexplained", "unexplained", "")
+    moon = engine_of("drake", dd.load_model(model.source, time_step=H, gravity=[0, 0, -1.62]))
+    e = compared(model, record(moon, [0.5, 0], INPUTS))
+    assert (e.verdict, e.largest.responsible, e.largest.as_if) == ("unexplained", "unexplained", "")
+
+
+def test_contact_is_the_contact_law_s_and_a_told_law_explains_it(load):
+    needs("mujoco")
+    model = load("sphere_on_ground.sdf")
+    x0 = np.array(model.default_state)
+    x0[6] = 0.15
+    recording = record(engine_of("mujoco", model), x0, np.zeros((30, 0)))
+    e = compared(model, recording)
+    assert (e.verdict, e.largest.responsible) == ("unexplained", "contact law")  # no fact tells of the law
+    told = {"contact law": "soft constraint, elliptic cone"}
+    e = compared(model, dd.Recording("told", "1", recording.times, recording.xs, recording.us, told))
+    assert (e.verdict, [line.quantity for line in e.told]) == ("other law", ["contact law"])
+
+
+def test_facts_are_lines_of_the_contract_and_nothing_else_is_known(load):
+    model = load("pendulum.urdf")
+    drake = engine_of("drake", model)
+    facts = {"time step": "0.01", "gravity": "[0, 0, -9.81]", "integrator": "RK4", "seeds": "[7]"}
+    lines = {x.quantity: x for x in compared(model, record(drake, [0.5, 0], INPUTS, **facts)).lines}
+    verdicts = {quantity: lines[quantity].verdict for quantity in facts}
+    assert verdicts == {"time step": "equal", "gravity": "equal", "integrator": "different", "seeds": "mapped"}
+    assert lines["mass"].verdict == lines["contact law"].verdict == lines["reset distribution"].verdict == "different"
+    assert lines["mass"].reason == "the recording does not tell"
+    flipped = compared(model, record(drake, [0.5, 0], INPUTS, gravity="[0, 0, 9.81]"))
+    assert (flipped.verdict, [x.quantity for x in flipped.broken]) == ("other model", ["gravity"])
+    for wrong in ({"gravity": "9.81"}, {"time step": "fast"}, {"precision": "half"}, {"mass": "1"}):
+        with pytest.raises(dd.InputError, match=next(iter(wrong))):
+            compared(model, record(drake, [0.5, 0], INPUTS, **wrong))
+    rounded = record(drake, [0.5, 0], INPUTS, precision="float32")
+    rounded = dd.Recording("r", "1", rounded.times, rounded.xs.astype(np.float32), INPUTS, rounded.facts)
+    assert compared(model, rounded).verdict == "same"
+    strict = dd.Recording("r", "1", rounded.times, rounded.xs, INPUTS)
+    assert compared(model, strict).verdict == "unexplained"  # precision is not guessed
+
+
+def test_a_recording_by_hand_is_checked_too(load):
+    model = load("projectile.sdf")
+    good = record(engine_of("drake", model), model.default_state, np.zeros((3, 0)))
+    bad = np.array(good.xs)
+    bad[:, :4] = [0.5, 0.5, 0, 0]
+    with pytest.raises(dd.InputError, match="norm of"):
+        compared(model, dd.Recording("r", "1", good.times, bad, good.us))
+    with pytest.raises(dd.InputError, match="sample 2"):
+        compared(model, dd.Recording("r", "1", np.array([0, 0.01, 0.01, 0.02]), good.xs, good.us))
+    with pytest.raises(dd.ShapeError, match=r"\(4, 13\)"):
+        compared(model, dd.Recording("r", "1", good.times, good.xs[:, :7], good.us))
+
+
+# ---- CSV ---------------------------------------------------------------------------------------------------------
+
+HEADER = ["time", "slide_x", "position.hinge", "slide_v", "velocity.hinge", "force"]
+ROWS = [[0, 0.1, 0.2, 0.3, 0.4, 1.5], [0.01, 1.1, 1.2, 1.3, 1.4, 2.5], [0.02, 2.1, 2.2, 2.3, 2.4, ""]]
+
+
+def test_csv_columns_are_found_by_name(load, tmp_path):
+    model = load("cart_pole.urdf")
+    plain = dd.read_recording(write_csv(tmp_path / "run.csv", HEADER, ROWS), model)
+    order = [5, 4, 0, 2, 1, 3]
+    turned = [[row[i] for i in order] for row in [HEADER, *ROWS]]
+    other = dd.read_recording(write_csv(tmp_path / "turned.csv", turned[0], turned[1:]), model, name="turned")
+    for recording in (plain, other):
+        np.testing.assert_array_equal(recording.times, [0, 0.01, 0.02])
+        np.testing.assert_array_equal(recording.xs, [row[1:5] for row in ROWS])
+        np.testing.assert_array_equal(recording.us, [[1.5], [2.5]])
+    assert (plain.name, plain.version, other.name) == ("run", "not told", "turned")
+    told = {"engine": "isaaclab", "version": "3.0.0", "time step": 0.01, "gravity": [0, 0, -9.81], "seeds": [1, 2]}
+    (tmp_path / "run.contract.json").write_text(json.dumps(told))
+    plain = dd.read_recording(tmp_path / "run.csv", model)
+    assert (plain.name, plain.version, plain.facts["time step"]) == ("isaaclab", "3.0.0", "0.01")
+
+
+def changed(row, column, value):
+    rows = [list(r) for r in ROWS]
+    rows[row][column] = value
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("header", "rows", "match"),
+    [
+        (HEADER, changed(1, 2, "nan"), r"line 3, column hinge_q: expected a finite number, got 'nan'"),
+        (HEADER, changed(1, 2, "1.2.3"), r"line 3, column hinge_q: .* got '1\.2\.3'"),
+        (HEADER, changed(0, 5, ""), r"line 2, column force"),
+        (HEADER, changed(2, 0, 0.01), r"line 4, column time: expected more than 0\.01"),
+        (HEADER[:4] + HEADER[5:], [r[:4] + r[5:] for r in ROWS], r"column hinge_w: expected one, got none"),
+        ([*HEADER[:5], "frce"], ROWS, r"column: expected one of .*force.*, got 'frce'"),
+        ([*HEADER[:5], "slide_x"], ROWS, r"column slide_x: expected once, got twice"),
+        (HEADER, [*ROWS[:2], ROWS[2][:3]], r"line 4: expected 6, got 3 cells"),
+        (HEADER, ROWS[:1], r"expected two or more"),
+    ],
+)
+def test_a_bad_csv_is_named_by_line_and_column(load, tmp_path, header, rows, match):
+    with pytest.raises(dd.InputError, match=match):
+        dd.read_recording(write_csv(tmp_path / "bad.csv", header, rows), load("cart_pole.urdf"))
+
+
+def test_what_is_no_recording_is_refused(load, tmp_path):
+    model = load("cart_pole.urdf")
+    (tmp_path / "empty.csv").write_text("")
+    (tmp_path / "run.txt").write_text("1")
+    (tmp_path / "junk.mcap").write_bytes(b"junk")
+    for name, error in (("empty.csv", dd.InputError), ("run.txt", dd.InputError), ("none.csv", dd.InputError)):
+        with pytest.raises(error, match=name):
+            dd.read_recording(tmp_path / name, model)
+    with pytest.raises(dd.ArtifactError, match=r"junk\.mcap"):
+        dd.read_recording(tmp_path / "junk.mcap", model)
+    write_csv(tmp_path / "run.csv", HEADER, ROWS)
+    for text, match in (("{", "JSON object"), ("[]", "JSON object"), ('{"color": "red"}', "color")):
+        (tmp_path / "run.contract.json").write_text(text)
+        with pytest.raises(dd.InputError, match=match):
+            dd.read_recording(tmp_path / "run.csv", model)
+
+
+# ---- MCAP of this project, and ROS 2 -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The trace of a cart-pole pushed for 10 steps."""
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
+    problem = dd.Problem(model, x0=[0, 0.3, 0, 0], num_steps=10, final_cost=lambda x: x[0] ** 2)
+    motion = dd.rollout(model, [0, 0.3, 0, 0], np.linspace(0.1, 1, 10)[:, None])
+    solution = Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", motion.xs, motion.us)
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    folder.mkdir()
+    write_trace(folder / "trace.mcap", solution, {})
+    return model, motion, folder
+
+
+def test_our_own_trace_is_a_recording_to_the_bit(run, load):
+    model, motion, folder = run
+    found = dd.read_recording(folder / "trace.mcap", model)
+    assert found.xs.tobytes() == motion.xs.tobytes()
+    assert found.us.tobytes() == motion.us.tobytes()
+    assert compared(model, found).step_gaps.max() == 0
+    with pytest.raises(dd.InputError, match="names of q in /state"):
+        dd.read_recording(folder / "trace.mcap", load("pendulum.urdf"))
+
+
+def test_the_exported_bag_is_a_recording_to_the_bit(run, tmp_path):
+    pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
+    from drake_diff.ros2_bag import export_ros2
+
+    model, motion, folder = run
+    export_ros2(folder, tmp_path / "bag")
+    for path in (tmp_path / "bag", tmp_path / "bag" / "bag.mcap"):
+        found = dd.read_recording(path, model)
+        assert found.xs.tobytes() == motion.xs.tobytes()
+        assert found.us.tobytes() == motion.us.tobytes()
+        assert compared(model, found).verdict == "same"
+
+
+def bag_of(path, messages):
+    """A bag of (topic, type, header frame, stamp [ns], fields) with rosbags."""
+    pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
+        open_topics = {}
+        for topic, kind, frame, stamp, fields in messages:
+            if topic not in open_topics:
+                open_topics[topic] = bag.add_connection(topic, kind, typestore=store)
+            time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
+            header = store.types["std_msgs/msg/Header"](time, frame)
+            message = store.types[kind](header=header, **fields(store.types))
+            bag.write(open_topics[topic], stamp, store.serialize_cdr(message, kind))
+    return path
+
+
+def vector(types, kind, values):
+    return types[f"geometry_msgs/msg/{kind}"](**dict(zip("xyzw", map(float, values), strict=False)))
+
+
+def pose(types, x):
+    w, *xyz = x[:4]
+    return types["geometry_msgs/msg/Pose"](
+        position=vector(types, "Point", x[4:7]), orientation=vector(types, "Quaternion", [*xyz, w])
+    )
+
+
+def twist(types, linear, angular):
+    return types["geometry_msgs/msg/Twist"](
+        linear=vector(types, "Vector3", linear), angular=vector(types, "Vector3", angular)
+    )
+
+
+def odometry(types, x, R):
+    """As REP 105 has it: the twist in the child's frame, the quaternion x y z w."""
+    covariance = np.zeros(36)
+    return {
+        "child_frame_id": "ball",
+        "pose": types["geometry_msgs/msg/PoseWithCovariance"](pose=pose(types, x), covariance=covariance),
+        "twist": types["geometry_msgs/msg/TwistWithCovariance"](
+            twist=twist(types, R.T @ x[10:13], R.T @ x[7:10]), covariance=covariance
+        ),
+    }
+
+
+STAMP = 1_700_000_000_000_000_000
+TURNED = RollPitchYaw(0.3, -0.8, 1.9).ToRotationMatrix()
+BALL = np.array([*TURNED.ToQuaternion().wxyz(), 1, 2, 3, 0.4, -0.5, 0.6, 7, 8, -9.0])
+
+
+def ball_bag(path, parts):
+    """The ball in flight by Drake, at times of today, as messages made of each state."""
+    model = dd.load_model(MODELS / "projectile.sdf", time_step=H)
+    xs = dd.rollout(model, BALL, num_steps=5).xs
+    rows = [part(STAMP + 10_000_000 * k, x) for k, x in enumerate(xs) for part in parts]
+    return model, xs, bag_of(path, rows)
+
+
+def rotation_of(x):
+    from drake_diff.engines.euler import rotation
+
+    return rotation(x[:4])
+
+
+def test_odometry_s_frames_and_quaternion_are_mapped(tmp_path):
+    """The twist is turned from the child frame, w goes to the front: a mistake in either leaves no step the same."""
+    part = lambda t, x: ("/odom", "nav_msgs/msg/Odometry", "world", t, lambda y: odometry(y, x, rotation_of(x)))  # noqa: E731
+    model, xs, path = ball_bag(tmp_path / "bag", [part])
+    found = dd.read_recording(path, model)
+    np.testing.assert_allclose(found.xs[0], BALL, atol=1e-14)  # by hand, the rotation by Drake's own
+    np.testing.assert_allclose(found.xs, xs, atol=1e-14)
+    np.testing.assert_allclose(found.times, H * np.arange(6), atol=1e-9)  # from 0, to the nanosecond
+    assert compared(model, found).verdict == "same"
+    swapped = np.array(found.xs)
+    swapped[:, :4] = np.roll(found.xs[:, :4], -1, axis=1)  # x y z w
+    as_child = np.array(found.xs)
+    as_child[:, 7:10] = found.xs[:, 7:10] @ TURNED.matrix()
+    for wrong in (swapped, as_child):
+        e = compared(model, dd.Recording("wrong", "1", found.times, wrong, found.us))
+        assert e.verdict == "unexplained"
+
+
+@pytest.mark.parametrize("frame", ["world", "ball"])
+def test_pose_and_twist_say_their_frame(tmp_path, frame):
+    def velocity(types, x):
+        R = rotation_of(x).T if frame == "ball" else np.eye(3)
+        return {"twist": twist(types, R @ x[10:13], R @ x[7:10])}
+
+    def poses(t, x):
+        return "/pose", "geometry_msgs/msg/PoseStamped", "world", t, lambda types: {"pose": pose(types, x)}
+
+    def twists(t, x):
+        return "/twist", "geometry_msgs/msg/TwistStamped", frame, t, lambda types: velocity(types, x)
+
+    model, xs, path = ball_bag(tmp_path / "bag", [poses, twists])
+    np.testing.assert_allclose(dd.read_recording(path, model).xs, xs, atol=1e-14)
+    unknown = lambda t, x: (*twists(t, x)[:2], "camera", *twists(t, x)[3:])  # noqa: E731
+    _, _, path = ball_bag(tmp_path / "camera", [poses, unknown])
+    with pytest.raises(dd.InputError, match=r"frame_id of TwistStamped: expected 'world'.*got 'camera'"):
+        dd.read_recording(path, model)
+
+
+def joints(names, position, velocity, effort):
+    values = {"position": np.array(position), "velocity": np.array(velocity), "effort": np.array(effort)}
+    return lambda types: {"name": names, **values}
+
+
+@pytest.mark.parametrize(
+    ("fields", "match"),
+    [
+        (joints(["slide"], [1.0], [1.0], [1.0]), "position of hinge"),
+        (joints(["slide", "hinge"], [1.0, 1.0], [], [1.0, 1.0]), "velocity of slide: .*got 0 of slide, hinge"),
+        (joints(["slide", "hinge"], [1.0, 1.0], [1.0, np.nan], [1.0, 1.0]), "velocity of hinge: .*finite"),
+        (joints(["slide", "hinge"], [1.0, 1.0], [1.0, 1.0], []), "effort of slide"),
+    ],
+)
+def test_what_joint_states_lack_is_named(load, tmp_path, fields, match):
+    rows = [("/joint_states", "sensor_msgs/msg/JointState", "", STAMP + k, fields) for k in (0, 10_000_000)]
+    with pytest.raises(dd.InputError, match=match):
+        dd.read_recording(bag_of(tmp_path / "bag", rows), load("cart_pole.urdf"))
+
+
+def test_a_bag_without_what_the_model_has_is_refused(load, tmp_path):
+    rows = [
+        ("/joint_states", "sensor_msgs/msg/JointState", "", STAMP, joints(["slide"], [1.0], [1.0], [1.0])),
+    ]
+    path = bag_of(tmp_path / "bag", rows)
+    with pytest.raises(dd.InputError, match="topics of geometry_msgs/msg/PoseStamped"):
+        dd.read_recording(path, load("projectile.sdf"))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(dd.ArtifactError, match="no ROS 2 bag"):
+        dd.read_recording(Path(tmp_path / "empty"), load("projectile.sdf"))
