@@ -23,8 +23,10 @@ from drake_diff.engines.comparison_record import ComparisonRecord as ComparisonR
 from drake_diff.engines.contract_match import ContractLine as ContractLine
 from drake_diff.engines.contract_match import match_contracts as match_contracts
 from drake_diff.engines.engine import Engine as Engine
+from drake_diff.engines.export import export_model as export_model
 from drake_diff.engines.load import load_engine as load_engine
 from drake_diff.engines.recording import Recording as Recording
+from drake_diff.engines.recording_files import read_recording as read_recording
 from drake_diff.evidence import save as save
 from drake_diff.exceptions import ArtifactError as ArtifactError
 from drake_diff.exceptions import CertificateError as CertificateError

@@ -14,7 +14,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from drake_diff import cli_engines, cli_mcap, cli_runs
+from drake_diff import cli_engines, cli_export, cli_mcap, cli_runs
+from drake_diff.cli_options import Approximation, ContactModel, Geometry, Ground, ModelFile, TimeStep, WeldBase
 from drake_diff.cli_runs import plain
 from drake_diff.cli_view import view
 
@@ -24,6 +25,7 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_
 cli_mcap.add_commands(app)
 cli_runs.add_commands(app)
 cli_engines.add_commands(app)
+cli_export.add_commands(app)
 
 
 @app.callback()
@@ -64,15 +66,6 @@ def run(
     record = save(solution, directory)
     _print_record(console, record, directory)
     raise typer.Exit(HOLDS if record.verdict == "pass" else CHECK_FAILED)
-
-
-ModelFile = Annotated[Path, typer.Argument(help="A URDF, SDF, MJCF (.xml) or .dmd.yaml file.")]
-TimeStep = Annotated[float, typer.Option(help="[s]")]
-ContactModel = Annotated[str, typer.Option(help="point, hydroelastic or hydroelastic_with_fallback")]
-Approximation = Annotated[str, typer.Option(help="sap, similar or lagged")]
-Geometry = Annotated[str | None, typer.Option(help="Around refused pairs: corner_spheres, hydroelastic, differences")]
-WeldBase = Annotated[str | None, typer.Option(help="A link to fix to the world.")]
-Ground = Annotated[float | None, typer.Option(help="Friction [1] of a ground to add.")]
 
 
 @app.command()

@@ -1,0 +1,219 @@
+"""A model for engines that cannot be had here: what is written is the model, or nothing is written."""
+
+import csv
+import json
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_contract_match import arms
+from test_engines import engine_of, needs, robot
+from typer.testing import CliRunner
+
+import drake_diff as dd
+from drake_diff.cli import app
+from drake_diff.engines import export, read_back, small_models
+from drake_diff.engines.closed_form import BY_MODEL
+from drake_diff.engines.description import describe
+from drake_diff.engines.export import export_model
+from drake_diff.engines.motion import move
+from drake_diff.engines.read_back import complaints, written
+from drake_diff.engines.small_models import check_small_models
+from drake_diff.engines.urdf import urdf
+from drake_diff.sampling import sample_states
+
+FILES = {"contract.json", "initial_states.csv", "inputs.csv", "README.md"}
+MODEL_FILE = {
+    "gazebo": "model.sdf", "isaaclab": "model.urdf", "urdf": "model.urdf", "sdf": "model.sdf", "mjcf": "model.xml",
+}  # fmt: skip
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.reader(file))
+
+
+@pytest.mark.parametrize("target", list(MODEL_FILE))
+def test_the_written_file_steps_as_the_hand_calculation_does(load, tmp_path, target):
+    """A03: 1 kg at 0.5 m, damping 0.1, from the file alone."""
+    files = export_model(load("pendulum.urdf"), tmp_path / "out", target=target, states=3)
+    assert {f.name for f in files} == {f.name for f in (tmp_path / "out").iterdir()} == FILES | {MODEL_FILE[target]}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dd.ModelWarning)  # of what is other engines' alone
+        model = dd.load_model(tmp_path / "out" / MODEL_FILE[target], time_step=0.01)
+    x = dd.step(model, [0.7, -1.2], [0.3])
+    np.testing.assert_allclose(x, [0.686908411253, -1.309158874737], atol=1e-11)  # as many digits as are known
+
+
+def test_the_contract_is_drake_s_in_strict_json(load, tmp_path):
+    export_model(load("cart_pole.urdf"), tmp_path / "out", target="gazebo", states=4, seed=9)
+
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    told = json.loads((tmp_path / "out" / "contract.json").read_text(), parse_constant=refuse)
+    assert (told["time_step"], told["gravity"], told["inputs"]) == (0.01, [0, 0, -9.81], ["force"])
+    assert [j["name"] for j in told["joints"]] == ["slide", "hinge"]
+    assert [j["mass"] for j in told["joints"]] == [1.0, 0.3]
+    assert told["joints"][1]["lower"] is None
+    assert (told["initial_states"]["seed"], told["initial_states"]["count"]) == (9, 4)
+    assert "deviation 0.5" in told["initial_states"]["distribution"]
+
+
+def test_states_and_inputs_are_the_samples_to_the_bit(load, tmp_path):
+    model = load("sphere_on_ground.sdf")
+    export_model(model, tmp_path / "out", target="sdf", states=4, seed=5)
+    states, inputs = rows_of(tmp_path / "out" / "initial_states.csv"), rows_of(tmp_path / "out" / "inputs.csv")
+    samples = sample_states(model, 4, 5)
+    assert states[0] == ["state", "kind", *model.state_names]
+    assert [row[1] for row in states[1:]] == ["free", "contact", "free", "contact"]
+    np.testing.assert_array_equal([[float(n) for n in row[2:]] for row in states[1:]], [s.x for s in samples])
+    assert inputs == [["state"], ["0"], ["1"], ["2"], ["3"]]
+
+
+def test_the_other_side_s_motion_comes_back_and_is_the_same(load, tmp_path):
+    """MuJoCo on the exported file alone, from the exported state and input, recorded in CSV as the README says."""
+    needs("mujoco")
+    model = load("cart_pole.urdf")
+    out = tmp_path / "out"
+    export_model(model, out, target="mjcf", states=3)
+    other = engine_of("mujoco", model, path=out / "model.xml")
+    states, inputs = rows_of(out / "initial_states.csv"), rows_of(out / "inputs.csv")
+    x0, u = np.array(states[2][2:], dtype=float), np.array(inputs[2][1:], dtype=float)
+    motion = move(other, x0, np.tile(u, (30, 1)))  # until the rail's end, which each engine has its own law for
+    header = next(x for x in (out / "README.md").read_text().splitlines() if x.strip().startswith("time,")).strip()
+    samples = [[repr(float(n)) for n in (0.01 * k, *x, *u)] for k, x in enumerate(motion.xs)]
+    (out / "run.csv").write_text("\n".join([header, *map(",".join, samples)]))
+    (out / "run.contract.json").write_text('{"engine": "theirs", "time step": 0.01, "gravity": [0, 0, -9.81]}')
+    e = dd.compare(model, (), recordings=(dd.read_recording(out / "run.csv", model),)).engines[-1]
+    assert (e.engine, e.verdict, len(e.step_gaps)) == ("theirs", "same", 30)
+
+
+@pytest.mark.parametrize("form", ["urdf", "sdf", "mjcf"])
+def test_trees_with_turned_joints_armature_and_limits_come_back(tmp_path, form):
+    for model in (arms(tmp_path), robot("solo12.urdf", tmp_path)):
+        assert complaints(form, model, written(form, describe(model), model.time_step)) == []
+
+
+@pytest.mark.parametrize("form", ["urdf", "sdf"])
+def test_shapes_come_back_where_they_were(load, tmp_path, form):
+    """Overlaps at random states; a half space is in SDF alone."""
+    for name in ("box_push.sdf", "two_spheres.sdf", *(("sphere_on_ground.sdf",) if form == "sdf" else ())):
+        model, path = load(name), tmp_path / f"model.{form}"
+        path.write_text(written(form, describe(model), model.time_step))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", dd.ModelWarning)  # gravity and time step, which Drake takes as options
+            theirs = engine_of("drake", dd.load_model(path, time_step=model.time_step))
+        ours, depths, random = engine_of("drake", model), [], np.random.default_rng(0)
+        for _ in range(20):
+            x = model.default_state + 0.2 * random.standard_normal(model.nx)
+            depths.append(ours.contact_depth(x))
+            assert theirs.contact_depth(x) == pytest.approx(depths[-1], abs=1e-12)  # of poses' rounding
+        assert max(depths) > 0
+        if form == "sdf" and name == "sphere_on_ground.sdf":
+            assert theirs.contract.contacts[0].friction == 0.5
+
+
+def test_mujoco_s_own_urdf_reader_has_the_same_mass_matrix(tmp_path):
+    mujoco = pytest.importorskip("mujoco", reason="no MuJoCo (the extra `engines`)")
+    model = arms(tmp_path)
+    description = describe(model)
+    theirs = mujoco.MjModel.from_xml_string(urdf(description))
+    data = mujoco.MjData(theirs)
+    drake = engine_of("drake", model)
+    armature = np.diag(description.by_velocity("armature"))  # which MuJoCo's reader of URDF leaves out
+    for seed in range(3):
+        data.qpos[:] = q = np.random.default_rng(seed).standard_normal(4)
+        mujoco.mj_forward(theirs, data)
+        M = np.zeros((4, 4))
+        for column, unit in zip(M, np.eye(4), strict=True):
+            mujoco.mj_mulM(theirs, data, column, unit)
+        np.testing.assert_allclose(M, drake.mass_matrix(q) - armature, atol=1e-12)
+
+
+# ---- the gate ----------------------------------------------------------------------------------------------------
+
+
+def test_the_small_models_are_right():
+    checks = check_small_models()
+    assert [c.name for c in checks[:4]] == [
+        "pendulum: step", "pendulum: Jacobian", "pendulum: energy", "pendulum: urdf read back",
+    ]  # fmt: skip
+    assert len(checks) == 12
+    assert all(c.holds for c in checks), [c for c in checks if not c.holds]
+
+
+def wrong_length(monkeypatch):
+    monkeypatch.setitem(BY_MODEL, "pendulum", replace(BY_MODEL["pendulum"], length=0.5 + 1e-9))
+
+
+def wrong_gravity(monkeypatch):
+    monkeypatch.setitem(BY_MODEL, "projectile", replace(BY_MODEL["projectile"], gravity=9.81 + 1e-8))
+
+
+def wrong_file(form):
+    right = read_back.written
+
+    def wrong(asked, description, time_step):
+        text = right(asked, description, time_step)
+        return text.replace("0.1", "0.1001") if asked == form else text
+
+    return lambda monkeypatch: monkeypatch.setattr(small_models, "written", wrong)
+
+
+@pytest.mark.parametrize(
+    ("fault", "named"),
+    [
+        (wrong_length, "'pendulum: step' failed: Drake is .* 1e-12 is allowed"),
+        (wrong_gravity, "'projectile: step' failed"),
+        (wrong_file("urdf"), r"'pendulum: urdf read back' failed: read by drake, damping: hinge: .* 0\.1001"),
+        (wrong_file("sdf"), "'pendulum: sdf read back' failed: read by drake, damping"),
+        (wrong_file("mjcf"), "'pendulum: mjcf read back' failed: read by drake, damping.*read by mujoco, damping"),
+    ],
+)
+def test_nothing_is_exported_where_a_small_model_is_wrong(load, tmp_path, monkeypatch, fault, named):
+    needs("mujoco")
+    fault(monkeypatch)
+    with pytest.raises(dd.CertificateError, match=f"nothing is exported: the check {named}"):
+        export_model(load("cart_pole.urdf"), tmp_path / "out", target="gazebo")
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_a_format_cannot_say_is_refused(load, tmp_path, monkeypatch):
+    model = load("mass_spring_damper.sdf")
+    with pytest.raises(dd.ModelError, match=r"urdf does not hold this model; read by drake, springs: .*50, 0\.1"):
+        export_model(model, tmp_path / "out", target="isaaclab")
+    assert not (tmp_path / "out").exists()
+    export_model(model, tmp_path / "out", target="gazebo")  # SDF has springs
+    monkeypatch.setattr(read_back, "find_spec", lambda name: None)
+    with pytest.raises(dd.ModelError, match="MuJoCo is not installed"):  # and Drake reads no springs in MJCF
+        export_model(model, tmp_path / "mjcf", target="mjcf")
+
+
+def test_bad_input_is_named(load, tmp_path):
+    model = load("pendulum.urdf")
+    with pytest.raises(dd.UnknownNameError, match="gazebo"):
+        export_model(model, tmp_path / "out", target="unity")
+    with pytest.raises(dd.InputError, match="does not exist"):
+        export_model(model, tmp_path, target="sdf")
+    with pytest.raises(dd.InputError, match="states"):
+        export_model(model, tmp_path / "out", target="sdf", states=0)
+
+
+def test_what_is_left_out_is_told(load, tmp_path):
+    export_model(load("sphere_on_ground.sdf"), tmp_path / "lab", target="isaaclab", states=2)
+    assert "to be added by hand: ground::ground#0." in (tmp_path / "lab" / "README.md").read_text()
+    export_model(load("sphere_on_ground.sdf"), tmp_path / "gazebo", target="gazebo", states=2)
+    assert "to be added by hand: none." in (tmp_path / "gazebo" / "README.md").read_text()
+
+
+def test_the_command_exports(load, tmp_path):
+    source = str(load("pendulum.urdf").source)
+    done = CliRunner().invoke(app, ["export-model", source, "--to", "isaaclab", "--out", str(tmp_path / "lab")])
+    assert done.exit_code == 0
+    assert "model.urdf" in done.output
+    text = (tmp_path / "lab" / "README.md").read_text()
+    for words in ("decimation = 1", "sim.dt = 0.01", "friction_combine_mode", "--recording run.csv"):
+        assert words in text
+    assert export.TARGETS["isaaclab"] == "urdf"
