@@ -322,6 +322,20 @@ def test_the_exported_bag_is_a_recording_to_the_bit(run, tmp_path):
         assert compared(model, found).verdict == "same"
 
 
+def test_a_damaged_bag_is_no_recording(run, tmp_path):
+    pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
+    from drake_diff.ros2_bag import export_ros2
+
+    model, _, folder = run
+    export_ros2(folder, tmp_path / "bag")
+    file = tmp_path / "bag" / "bag.mcap"
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    for path in (file, tmp_path / "bag"):
+        with pytest.raises(dd.ArtifactError):
+            dd.read_recording(path, model)
+
+
 def bag_of(path, messages):
     """A bag of (topic, type, header frame, stamp [ns], fields) with rosbags."""
     pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
