@@ -7,7 +7,7 @@ DrakeDiffError
 │   └── UnknownNameError           a joint, parameter, solver, ... that does not exist; lists those that do
 ├── ModelError                     a file or diagram that is no usable robot model
 ├── GradientError                  a derivative that must not be used
-├── CertificateError               a certificate whose verdict is not "agree"
+├── CertificateError               a certificate whose verdict is not "agree", or a check before an export
 ├── SimulationError                Drake could not take a step
 ├── MissingDependencyError         an optional engine or solver that is not there; says what to install
 ├── NotOfferedError                something that an engine does not compute
@@ -64,7 +64,7 @@ class GradientError(DrakeDiffError):
 
 
 class CertificateError(DrakeDiffError):
-    """A certificate whose verdict is not "agree"."""
+    """A certificate whose verdict is not "agree", or a check that must hold before anything is exported."""
 
 
 class SimulationError(DrakeDiffError):

@@ -7,6 +7,7 @@ from math import inf
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from drake_diff.engines.comparison import LAWS
 from drake_diff.engines.contract_match import ContractLine, match_contracts
 from drake_diff.engines.description import Description
 from drake_diff.engines.drake_engine import DrakeEngine
@@ -18,8 +19,6 @@ from drake_diff.engines.urdf import UNLIMITED, urdf
 from drake_diff.exceptions import DrakeDiffError, ModelWarning
 from drake_diff.model import Model, load_model
 
-# What is the engine's own whatever the model, and what formats hold by other names or not at all.
-NOT_THE_MODEL = ("integrator", "limit law", "contact law", "contact pairs", "solver tolerance", "reset")
 SUFFIX = {"urdf": ".urdf", "sdf": ".sdf", "mjcf": ".xml"}
 
 
@@ -59,7 +58,7 @@ def complaints(form: str, model: Model, text: str) -> list[str]:
 
 
 def _counts(line: ContractLine) -> bool:
-    return line.verdict == "different" and line.quantity not in NOT_THE_MODEL
+    return line.verdict == "different" and line.quantity not in LAWS
 
 
 def _read(reader: str, model: Model, path: Path) -> Engine:

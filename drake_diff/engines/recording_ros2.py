@@ -5,8 +5,8 @@ name, efforts as the inputs of the actuators that drive them. nav_msgs/Odometry:
 twist of the one free body. Or geometry_msgs/PoseStamped and TwistStamped, whose header says the frame of the twist: the
 pose's, or the body.
 
-A bag that was cut short is refused; a byte that is another is found only where the writer left a checksum, which rosbags
-does not.
+A bag that was cut short is refused; a byte that is another is found only where the writer left a checksum, which
+rosbags does not.
 """
 
 from collections.abc import Iterator, Mapping
