@@ -35,7 +35,9 @@ provenance problem_record plan_file record_sections metrics invariants failures 
 verify runs view sampling certification audit_place audit_contact audit engines.engine engines.euler
 engines.description engines.closed_form engines.closed_form_contact engines.numpy_engine engines.drake_engine
 engines.pinocchio_engine engines.urdf engines.casadi_engine engines.mjcf engines.mujoco_coordinates
-engines.mujoco_contract engines.mujoco_model engines.mujoco_engine engines.mjx_engine engines.contract_match
+engines.mujoco_contract engines.mujoco_model engines.mujoco_engine engines.mjx_engine
+engines.quiet engines.rigid_links engines.centers engines.newton_contract engines.newton_engine
+engines.contract_match
 engines.load engines.attribution engines.motion engines.jacobians engines.recording engines.comparison
 engines.comparison_record engines.comparison_words engines.comparison_page engines.comparison_trace
 engines.comparison_files loop.checks loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop
@@ -86,7 +88,7 @@ def test_no_module_is_too_long_and_none_asserts():
 
 
 def test_importing_the_package_loads_neither_plots_nor_viewers_nor_logs():
-    late = ("matplotlib", "mcap", "typer", "mujoco", "pinocchio", "casadi")
+    late = ("matplotlib", "mcap", "typer", "mujoco", "pinocchio", "casadi", "newton", "warp", "sapien", "pybullet")
     code = f"import sys, drake_diff; print([m for m in {late} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -14,6 +14,7 @@ ENGINES = {
     "mjx": ("mjx_engine", "MjxEngine"),
     "pinocchio": ("pinocchio_engine", "PinocchioEngine"),
     "casadi": ("casadi_engine", "CasadiEngine"),
+    "newton": ("newton_engine", "NewtonEngine"),
 }
 
 # Tools that people ask for and that are no engine here, and why.
