@@ -10,6 +10,7 @@ import sys
 import numpy as np
 import pytest
 from conftest import MODELS, Plant, contact_properties
+from forward_formula import formula, free_box, turned
 from pydrake.geometry import Convex
 from pydrake.multibody.tree import SpatialInertia
 from test_contract_match import CHANGES, arms, different
@@ -28,39 +29,6 @@ OWN = {"limit law", "solver tolerance", "integrator"}
 
 def newton(model):
     return dd.load_engine("newton", model)
-
-
-def free_box(center=(0.0, 0.0, 0.0), time_step=0.01):
-    plant = Plant(time_step)
-    about_origin = SpatialInertia.SolidBoxWithMass(2.0, 0.1, 0.2, 0.3).Shift(-np.array(center))
-    plant.plant.AddRigidBody("box", about_origin)
-    return plant.model()
-
-
-def formula(model, x, u):
-    """Newton's step in double precision, from Drake's M and bias: explicit damping, free bodies by their centres."""
-    drake, h, nq = dd.load_engine("drake", model), model.time_step, model.nq
-    q, v = np.asarray(x)[:nq], np.asarray(x)[nq:]
-    force = drake.description.actuation @ u - drake.bias(q, v) - drake.description.by_velocity("damping") * v
-    v_next = v + h * np.linalg.solve(drake.mass_matrix(q), force)
-    q_next = q + h * drake.description.coordinates.rate(q) @ v_next
-    for link in drake.description.moving:
-        if link.kind == "quaternion_floating":
-            i, j = link.q_start, link.v_start
-            q_next[i : i + 4] /= np.linalg.norm(q_next[i : i + 4])
-            arms = [turned(p[i : i + 4]) @ link.center_of_mass for p in (q, q_next)]
-            w, a = v[j : j + 3], (v_next - v)[j : j + 6] / h
-            by_center = v[j + 3 : j + 6] + np.cross(w, arms[0])
-            by_center += h * (a[3:] + np.cross(a[:3], arms[0]) + np.cross(w, np.cross(w, arms[0])))
-            q_next[i + 4 : i + 7] = q[i + 4 : i + 7] + arms[0] + h * by_center - arms[1]
-            v_next[j + 3 : j + 6] = by_center - np.cross(v_next[j : j + 3], arms[1])
-    return np.concatenate([q_next, v_next])
-
-
-def turned(quaternion):
-    from pydrake.common.eigen_geometry import Quaternion
-
-    return Quaternion(quaternion / np.linalg.norm(quaternion)).rotation()
 
 
 # ---- the step -------------------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ ENGINES = {
     "pinocchio": ("pinocchio_engine", "PinocchioEngine"),
     "casadi": ("casadi_engine", "CasadiEngine"),
     "newton": ("newton_engine", "NewtonEngine"),
+    "pybullet": ("pybullet_engine", "PybulletEngine"),
 }
 
 # Tools that people ask for and that are no engine here, and why.
