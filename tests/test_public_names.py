@@ -38,6 +38,7 @@ engines.pinocchio_engine engines.urdf engines.casadi_engine engines.mjcf engines
 engines.mujoco_contract engines.mujoco_model engines.mujoco_engine engines.mjx_engine
 engines.quiet engines.rigid_links engines.centers engines.newton_contract engines.newton_engine
 engines.bullet_urdf engines.bullet_contract engines.pybullet_engine
+engines.sapien_contract engines.sapien_engine
 engines.contract_match
 engines.load engines.attribution engines.motion engines.jacobians engines.recording engines.comparison
 engines.comparison_record engines.comparison_words engines.comparison_page engines.comparison_trace

@@ -3,7 +3,8 @@
 Bullet has friction and stiffness by link and makes those of pairs: mu = mu_a mu_b and 1/k = 1/k_a + 1/k_b.
 """
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from drake_diff.engines.engine import JointContract, PairContract
 from drake_diff.engines.euler import rotation
 from drake_diff.engines.rigid_links import RigidLink, RigidLinks
 
+T = TypeVar("T")
 Owner = tuple[int, int]  # Bullet's body and link, -1 for its base
 KINDS = {0: "revolute", 1: "prismatic"}  # pybullet.JOINT_REVOLUTE and JOINT_PRISMATIC
 SMALLEST = 1e-30  # for 0, whose logarithm and whose inverse are needed
@@ -31,9 +33,9 @@ def side_values(tree: RigidLinks, owners: dict[str, Owner]) -> dict[Owner, tuple
     None where no pair of the link has one. Where pairs disagree it is the least squares' solution, which the contract
     shows.
     """
-    logarithms = {x.names: np.log(max(x.friction, SMALLEST)) for x in tree.pairs if x.friction is not None}
-    inverses = {x.names: 1 / max(x.stiffness, SMALLEST) for x in tree.pairs if x.stiffness is not None}
-    friction, compliance = _split(tree, owners, logarithms), _split(tree, owners, inverses)
+    pairs = [(owners_of(pair, owners), pair) for pair in tree.pairs]
+    friction = split([(x, np.log(max(pair.friction, SMALLEST))) for x, pair in pairs if pair.friction is not None])
+    compliance = split([(x, 1 / max(pair.stiffness, SMALLEST)) for x, pair in pairs if pair.stiffness is not None])
     touching = {owner for pair in tree.pairs for owner in owners_of(pair, owners)}
     return {
         owner: (
@@ -44,17 +46,14 @@ def side_values(tree: RigidLinks, owners: dict[str, Owner]) -> dict[Owner, tuple
     }
 
 
-def _split(tree: RigidLinks, owners: dict[str, Owner], wanted: dict[tuple[str, str], float]) -> dict[Owner, float]:
-    """s with s_a + s_b = the wanted value of each pair of links, the smallest where there are many."""
-    given = [(owners_of(pair, owners), wanted[pair.names]) for pair in tree.pairs if pair.names in wanted]
-    if not given:
-        return {}
-    found = sorted({owner for pair, _ in given for owner in pair})
+def split(given: Sequence[tuple[tuple[T, T], float]]) -> dict[T, float]:
+    """s with s_a + s_b = the value of each pair (a, b): the least squares' solution, the smallest where many are."""
+    found = list(dict.fromkeys(side for pair, _ in given for side in pair))
     sums = np.zeros((len(given), len(found)))
     for row, (pair, _) in zip(sums, given, strict=True):
-        for owner in pair:
-            row[found.index(owner)] += 1.0
-    values = np.linalg.lstsq(sums, np.array([value for _, value in given]), rcond=None)[0]
+        for side in pair:
+            row[found.index(side)] += 1.0
+    values = np.linalg.lstsq(sums, np.array([value for _, value in given]), rcond=None)[0] if given else []
     return dict(zip(found, (float(value) for value in values), strict=True))
 
 
