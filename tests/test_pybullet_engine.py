@@ -67,7 +67,7 @@ def test_without_damping_the_step_is_drakes(load, name):
     for _ in range(3):
         x, u = free_state(model, random), random.standard_normal(model.nu)
         expected = formula(model, x, u) if damped else drake.step(x, u)
-        np.testing.assert_allclose(engine.step(x, u), expected, rtol=0, atol=1e-12 * max(1, abs(expected).max()))
+        np.testing.assert_allclose(engine.step(x, u), expected, rtol=0, atol=1e-14 * max(1, abs(expected).max()))
         assert engine.energy(x) == pytest.approx(drake.energy(x), rel=1e-12, abs=1e-12)
 
 
@@ -78,8 +78,7 @@ def test_robots_step_by_the_formula(tmp_path, name):
     for _ in range(2):
         x, u = free_state(model, random), random.standard_normal(model.nu)
         expected = formula(model, x, u, exponential=True)
-        # the links that weigh grams magnify rounding
-        np.testing.assert_allclose(engine.step(x, u), expected, rtol=0, atol=1e-9 * max(1, abs(expected).max()))
+        np.testing.assert_allclose(engine.step(x, u), expected, rtol=0, atol=1e-13 * max(1, abs(expected).max()))
 
 
 def test_effort_limits_cut(load):
@@ -192,6 +191,24 @@ def test_it_rests_as_deep_as_drake_slides_and_stops():
         v.append(x[2])
     np.testing.assert_allclose(np.diff(v)[:50], -h * mu * G, rtol=1e-7)
     np.testing.assert_allclose(v[52:], 0.0, atol=1e-12)
+
+
+def test_links_are_given_what_makes_drakes_pairs_and_the_least_squares_where_pairs_disagree():
+    plant = Plant(0.002)
+    for name, k, mu in (("one", 1e4, 0.2), ("two", 3e4, 0.8)):
+        plant.ball(name, 1.0, 0.1, contact_properties(k, 1, mu))
+    plant.ground(contact_properties(2e4, 1, 0.5))
+    drake = dd.load_engine("drake", plant.model())
+    engine = bullet(drake.model)
+    wanted = {pair.names: pair for pair in drake.contract.contacts}
+    for pair in engine.contract.contacts:  # with three pairs of three links all can be had
+        assert pair.stiffness == pytest.approx(wanted[pair.names].stiffness, rel=1e-12)
+        assert pair.friction == pytest.approx(wanted[pair.names].friction, rel=1e-12)
+    assert "contact pairs" not in different(drake, engine)
+    split = sys.modules["drake_diff.engines.bullet_contract"].split
+    square = [(("a", "b"), 1.0), (("b", "c"), 2.0), (("c", "d"), 1.0), (("d", "a"), 1.0)]  # a + c, b + d: 3 and 2
+    found = split(square)
+    assert [found[x] + found[y] for (x, y), _ in square] == pytest.approx([1.25, 1.75, 1.25, 0.75], rel=1e-12)
 
 
 @pytest.mark.parametrize(("shape", "height"), [(Box(0.2, 0.3, 0.4), 0.2), (Cylinder(0.1, 0.4), 0.2),

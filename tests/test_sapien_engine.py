@@ -80,7 +80,7 @@ def test_the_step_is_drakes_and_so_is_the_energy(load, name):
     for _ in range(3):
         x, u = free_state(model, random), random.standard_normal(model.nu)
         expected = drake.step(x, u)
-        np.testing.assert_allclose(engine.step(x, u), expected, rtol=0, atol=2e-6 * max(1, abs(expected).max()))
+        np.testing.assert_allclose(engine.step(x, u), expected, rtol=0, atol=1e-6 * max(1, abs(expected).max()))
         assert engine.energy(x) == pytest.approx(drake.energy(x), rel=1e-5, abs=1e-5)
 
 
@@ -92,7 +92,7 @@ def test_fixed_robots_step_as_in_drake(tmp_path, name):
         x, u = free_state(model, random), random.standard_normal(model.nu)
         expected = drake.step(x, u)
         # single precision, magnified by the small inertias of wrists
-        np.testing.assert_allclose(engine.step(x, u), expected, rtol=0, atol=1e-5 * max(1, abs(expected).max()))
+        np.testing.assert_allclose(engine.step(x, u), expected, rtol=0, atol=1e-6 * max(1, abs(expected).max()))
 
 
 def test_a_free_robot_steps_by_the_formula(tmp_path):
@@ -101,7 +101,7 @@ def test_a_free_robot_steps_by_the_formula(tmp_path):
     for _ in range(2):
         x, u = free_state(model, random), random.standard_normal(model.nu)
         expected = formula(model, x, u, exponential=True)
-        np.testing.assert_allclose(engine.step(x, u), expected, rtol=0, atol=5e-5 * max(1, abs(expected).max()))
+        np.testing.assert_allclose(engine.step(x, u), expected, rtol=0, atol=5e-6 * max(1, abs(expected).max()))
 
 
 def test_effort_limits_cut(load):

@@ -59,7 +59,9 @@ class NewtonEngine:
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
         before, control = self._given(*self._point(x, u))
         after = self.newton.state(requires_grad=True)
-        self.solver.step(before, after, control, self._contacts(before), self.time_step)
+        contacts = self._contacts(before)
+        self.solver.step(before, after, control, contacts, self.time_step)
+        self.status = _status(contacts)
         return self._drakes(after, x, u)
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
@@ -238,8 +240,7 @@ class NewtonEngine:
             return None
         contacts = self.pipeline.contacts()
         self.pipeline.collide(state, contacts)
-        found, room = int(contacts.rigid_contact_count.numpy()[0]), contacts.rigid_contact_max
-        self.status = "ok" if found <= room else f"{found} contacts, and Newton has room for {room}"
+        room = contacts.rigid_contact_max
         stiffness, friction = np.zeros(room, dtype=np.float32), np.zeros(room, dtype=np.float32)
         sides = [array.numpy() for array in (contacts.rigid_contact_shape0, contacts.rigid_contact_shape1)]
         for i in range(_count(contacts)):
@@ -309,6 +310,11 @@ def _row(values: Array) -> tuple[float, ...]:
 def _pose(X: RigidTransform) -> Any:
     w, x, y, z = X.rotation().ToQuaternion().wxyz()
     return wp.transform(_row(X.translation()), wp.quat(x, y, z, w))
+
+
+def _status(contacts: Any) -> str:
+    found, room = (0, 0) if contacts is None else (int(contacts.rigid_contact_count.numpy()[0]), _count(contacts))
+    return "ok" if found <= room else f"{found} contacts, and Newton has room for {room}"
 
 
 def _count(contacts: Any) -> int:
