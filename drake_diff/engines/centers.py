@@ -63,3 +63,11 @@ def unit(coordinates: Coordinates, q: Array) -> Array:
     for i, _ in coordinates.free:
         found[i : i + 4] /= np.linalg.norm(q[i : i + 4])
     return found
+
+
+def zero(coordinates: Coordinates) -> Array:
+    """(nq,) with free bodies at the origin, unturned."""
+    q = np.zeros(coordinates.nq)
+    for i, _ in coordinates.free:
+        q[i] = 1.0
+    return q

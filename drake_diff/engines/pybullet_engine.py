@@ -19,7 +19,7 @@ from pydrake.math import RotationMatrix
 from drake_diff.arrays import Array, finite_array
 from drake_diff.engines.bullet_contract import owners_of, read_joint, read_pairs, read_part, side_values
 from drake_diff.engines.bullet_urdf import bullet_urdf
-from drake_diff.engines.centers import Centers, unit
+from drake_diff.engines.centers import Centers, unit, zero
 from drake_diff.engines.description import Geometry, describe
 from drake_diff.engines.engine import EngineContract, StepJacobian
 from drake_diff.engines.euler import rotation
@@ -136,7 +136,7 @@ class PybulletEngine:
     def contract(self) -> EngineContract:
         left_out = list(self.tree.left_out)
         order = sorted(range(len(self.tree.links)), key=lambda i: self.tree.links[i].joint.v_start)
-        self._set(np.concatenate([self._zero(), np.zeros(self.nv)]))
+        self._set(np.concatenate([zero(self.coordinates), np.zeros(self.nv)]))
         parameters = self.bullet.getPhysicsEngineParameters()
         gravity = tuple(float(parameters[f"gravityAcceleration{axis}"]) for axis in "XYZ")
         damping = sorted({self.bullet.getDynamicsInfo(*o)[8] for o in self.owners.values()})
@@ -221,12 +221,6 @@ class PybulletEngine:
         self.centers = Centers(self.coordinates, tuple(np.array(info[3]) for info in found))
         self.principal = [rotation(np.array(info[4])[[3, 0, 1, 2]]) for info in found]
         self.bases = [bodies[v][0] for _, v in self.coordinates.free]
-
-    def _zero(self) -> Array:
-        q = np.zeros(self.nq)
-        for i, _ in self.coordinates.free:
-            q[i] = 1.0
-        return q
 
     def _single(self, q: Array) -> Array:
         """(nv,) the positions of hinges and slides."""

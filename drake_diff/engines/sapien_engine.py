@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_diff.arrays import Array, finite_array
-from drake_diff.engines.centers import Centers, unit
+from drake_diff.engines.centers import Centers, unit, zero
 from drake_diff.engines.description import Geometry, describe
 from drake_diff.engines.engine import EngineContract, PairContract, StepJacobian
 from drake_diff.engines.mjcf import principal
@@ -120,10 +120,7 @@ class SapienEngine:
     @property
     def contract(self) -> EngineContract:
         left_out = [*self.tree.left_out, *self.adjacent]
-        zero = np.zeros(self.nq + self.nv)
-        for i, _ in self.coordinates.free:
-            zero[i] = 1.0
-        world = self._world(zero, np.zeros(self.nv))
+        world = self._world(np.concatenate([zero(self.coordinates), np.zeros(self.nv)]), np.zeros(self.nv))
         joints = {x.joint.v_start: read_joint(link, x) for link, x in zip(world.links, self.tree.links, strict=True)}
         names = [joint.name for tree in world.trees for joint in tree.joints if joint.type in KINDS]
         return EngineContract(
