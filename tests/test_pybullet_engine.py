@@ -242,7 +242,8 @@ def test_bad_input_and_what_bullet_has_not_are_named(load):
 def test_pybullet_says_nothing_and_a_missing_one_is_named_with_its_extra():
     code = f"""import drake_diff as dd
 model = dd.load_model({str(MODELS / "pendulum.urdf")!r}, time_step=0.01)
-dd.load_engine('pybullet', model).step([0, 0], [0])"""
+engine = dd.load_engine('pybullet', model)
+engine.step([0, 0], [0])  # and it lives to the end"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "")
     code = """import sys; sys.modules['pybullet'] = None

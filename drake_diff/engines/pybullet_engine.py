@@ -8,9 +8,11 @@ A free body's native pose is that of the principal axes in its centre of mass, q
 of the centre of mass and angular, both in world.
 """
 
+from functools import partial
 from importlib.metadata import version
 from tempfile import NamedTemporaryFile
 from typing import Any
+from weakref import finalize
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,7 +34,6 @@ from drake_diff.model import Model
 try:
     with without_lines("pybullet build time"):
         import pybullet as p
-        from pybullet_utils.bullet_client import BulletClient
 except ImportError as error:
     raise MissingDependencyError(
         "this engine needs pybullet, which has wheels up to Python 3.11: pip install 'drake-diff[forward]'"
@@ -43,6 +44,17 @@ EVERY_TIME_STEP = {"reportSolverAnalytics": 1, "warmStartingFactor": 0.0, "conta
 INERT = {"linearDamping": 0.0, "angularDamping": 0.0, "maxJointVelocity": 1e10, "collisionMargin": 0.0}
 NO_OTHER_FRICTION = {"rollingFriction": 0.0, "spinningFriction": 0.0, "restitution": 0.0}
 NO_BIAS = "pybullet's inverse dynamics of a free body is not that of Bullet's own step"
+
+
+class Client:
+    """pybullet's functions on a server of its own, which ends with it."""
+
+    def __init__(self) -> None:
+        self.number = p.connect(p.DIRECT)
+        finalize(self, p.disconnect, self.number)
+
+    def __getattr__(self, name: str) -> Any:
+        return partial(getattr(p, name), physicsClientId=self.number)
 
 
 class PybulletEngine:
@@ -59,7 +71,7 @@ class PybulletEngine:
         self.actuation, self.limits = self.description.actuation, self.description.effort_limits
         self.stiffness, self.rest = (self.description.by_velocity(name) for name in ("stiffness", "rest"))
         with without_lines("argv[0]="):
-            self.bullet: Any = BulletClient(p.DIRECT)
+            self.bullet: Any = Client()
         self.bullet.setTimeStep(model.time_step)
         self.bullet.setGravity(*(float(g) for g in self.description.gravity))
         self.bullet.setPhysicsEngineParameter(**EVERY_TIME_STEP)
