@@ -24,6 +24,7 @@ import drake_diff as dd
 from drake_diff.engines.closed_form import BY_MODEL, CartPole, DoublePendulum, MassSpringDamper, Pendulum, Projectile
 from drake_diff.engines.closed_form_contact import SlidingBlock, SphereOnGround
 from drake_diff.engines.numpy_engine import NumpyEngine
+from drake_diff.engines.quiet import without_lines
 from drake_diff.tangent import tangent_space
 
 HAND = ["pendulum.urdf", "double_pendulum.urdf", "cart_pole.urdf", "mass_spring_damper.sdf", "projectile.sdf"]
@@ -538,3 +539,9 @@ try: dd.load_engine({name!r}, None)
 except dd.MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "pip install 'drake-diff[engines]'" in done.stdout
+
+
+def test_what_is_not_a_greeting_is_passed_on(capfd):
+    with without_lines("hello"):
+        subprocess.run([sys.executable, "-c", "import sys; print('hello you'); print('trouble', file=sys.stderr)"])
+    assert capfd.readouterr() == ("", "trouble\n")

@@ -19,8 +19,7 @@ StepDerivatives TVLQR Transcribed UnknownNameError Verification audit center_of_
 certify_model certify_rollout closed_loop compare contact_force contact_modes differentiate_rollout differentiate_step
 export_model frame_position frame_rotation_error frame_velocity list_parameters load_engine load_model load_record
 match_contracts model_from_diagram plant_dynamics read_mcap read_recording read_trace robustness rollout save
-save_comparison smooth smooth_step
-softened solve step transcribe_and_solve verify violation_between_nodes
+save_comparison smooth smooth_step softened solve step transcribe_and_solve verify violation_between_nodes
 """.split()
 ORDER = """
 exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin model
@@ -36,15 +35,15 @@ provenance problem_record plan_file record_sections metrics invariants failures 
 verify runs view sampling certification audit_place audit_contact audit engines.engine engines.euler
 engines.description engines.closed_form engines.closed_form_contact engines.numpy_engine engines.drake_engine
 engines.pinocchio_engine engines.urdf engines.casadi_engine engines.mjcf engines.mujoco_coordinates
-engines.mujoco_contract engines.mujoco_model engines.mujoco_engine engines.mjx_engine engines.contract_match
-engines.load engines.attribution engines.motion engines.jacobians engines.recording
-engines.recording_ros2 engines.recording_files engines.recorded engines.comparison_task engines.comparison
-engines.comparison_record engines.comparison_words engines.comparison_page engines.comparison_trace
-engines.comparison_files
-engines.sdf engines.usd engines.read_back engines.small_models engines.export_readme engines.export
-loop.checks loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop
-loop.perturbation loop.statistics loop.trial loop.sensitivity loop.robustness ros2_bag cli_mcap cli_runs cli_engines
-cli_options cli_export cli_view cli
+engines.mujoco_contract engines.mujoco_model engines.mujoco_engine engines.mjx_engine engines.quiet
+engines.rigid_links engines.centers engines.newton_contract engines.newton_engine engines.bullet_urdf
+engines.bullet_contract engines.pybullet_engine engines.sapien_contract engines.sapien_engine engines.contract_match
+engines.load engines.attribution engines.motion engines.jacobians engines.recording engines.recording_ros2
+engines.recording_files engines.recorded engines.comparison_task engines.comparison engines.comparison_record
+engines.comparison_words engines.comparison_page engines.comparison_trace engines.comparison_files engines.sdf
+engines.usd engines.read_back engines.small_models engines.export_readme engines.export loop.checks loop.sensor
+loop.estimator loop.actuator loop.fallback loop.closed_loop loop.perturbation loop.statistics loop.trial
+loop.sensitivity loop.robustness ros2_bag cli_mcap cli_runs cli_engines cli_options cli_export cli_view cli
 """.split()
 
 

@@ -246,12 +246,7 @@ def joint_contract(
     *, kind: str, axis: Array, anchor: Array, carried: list[tuple[float, Array, Array]], **rest: Any
 ) -> JointContract:
     """A JointContract from parts (mass, centre of mass (3,), inertia (3, 3) about it) in the world frame."""
-    mass = sum(m for m, _, _ in carried)
-    com = sum((m * c for m, c, _ in carried), np.zeros(3)) / mass if mass else np.zeros(3)
-    total = np.zeros((3, 3))
-    for m, c, inertia in carried:
-        arm = c - com
-        total += inertia + m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    mass, com, total = merged(carried)
     i, j = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
     on_axis = anchor - axis * (axis @ anchor) if kind == "revolute" else np.zeros(3)
     numbers = [tuple(float(n) for n in values) for values in (axis, on_axis, com, total[i, j])]
@@ -259,8 +254,19 @@ def joint_contract(
         kind=kind,
         axis=numbers[0],
         anchor=numbers[1],
-        mass=float(mass),
+        mass=mass,
         center_of_mass=numbers[2],
         inertia=numbers[3],
         **rest,
     )
+
+
+def merged(parts: list[tuple[float, Array, Array]]) -> tuple[float, Array, Array]:
+    """Parts (mass, centre of mass (3,), inertia (3, 3) about it) as one."""
+    mass = float(sum(m for m, _, _ in parts))
+    com = sum((m * c for m, c, _ in parts), np.zeros(3)) / mass if mass else np.zeros(3)
+    total = np.zeros((3, 3))
+    for m, c, inertia in parts:
+        arm = c - com
+        total += inertia + m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return mass, com, total

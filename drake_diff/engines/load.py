@@ -14,6 +14,9 @@ ENGINES = {
     "mjx": ("mjx_engine", "MjxEngine"),
     "pinocchio": ("pinocchio_engine", "PinocchioEngine"),
     "casadi": ("casadi_engine", "CasadiEngine"),
+    "newton": ("newton_engine", "NewtonEngine"),
+    "pybullet": ("pybullet_engine", "PybulletEngine"),
+    "sapien": ("sapien_engine", "SapienEngine"),
 }
 
 # Tools that people ask for and that are no engine here, and why.

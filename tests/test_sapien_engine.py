@@ -1,0 +1,301 @@
+"""PhysX's step against hand calculations, against Drake where both have the same, and its contact where it rests."""
+
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from conftest import MODELS, Plant, contact_properties
+from forward_formula import formula, free_box, turned
+from pydrake.geometry import Box, Capsule, Convex, Cylinder
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import PrismaticJoint, SpatialInertia
+from test_contract_match import CHANGES, FOLLOWS, arms, different
+from test_engines import block_on_rails, free_state, robot
+
+import drake_diff as dd
+
+pytest.importorskip("sapien", reason="sapien is not installed: pip install 'drake-diff[forward]'")
+G = 9.81
+# What no engine but Drake has as Drake has it, and what PhysX does not give.
+OWN = {"limit law", "solver tolerance", *FOLLOWS}
+
+
+def physx(model):
+    return dd.load_engine("sapien", model)
+
+
+# ---- the step -------------------------------------------------------------------------------------------------------
+
+
+def test_a_damped_pendulums_step_by_hand_has_implicit_damping(load):
+    engine, h, inertia, damping = physx(load("pendulum.urdf")), 0.01, 0.25, 0.1
+    x, u = [0.7, -1.2], 0.3
+    force = u - damping * x[1] - inertia * G / 0.5 * np.sin(x[0])
+    v = x[1] + h * force / (inertia + h * damping)
+    np.testing.assert_allclose(engine.step(x, [u]), [x[0] + h * v, v], rtol=3e-7)  # single precision: 6e-8 a rounding
+    explicit = x[1] + h * force / inertia
+    assert abs(engine.step(x, [u])[1] - explicit) > 1e-4  # it could be told
+
+
+def test_nothing_is_clamped_or_dragged_by_itself(load):
+    engine, h = physx(load("pendulum.urdf")), 0.01
+    v = 500 / (1 + h * 0.1 / 0.25)  # PhysX would clamp at 100 rad/s
+    np.testing.assert_allclose(engine.step([0.0, 500.0], [0.0]), [h * v, v], rtol=1e-6)
+    after = physx(free_box()).step([1, 0, 0, 0, 0, 0, 1, 0, 0, 60, 500, 0, 0], [])
+    np.testing.assert_allclose(after[[9, 10]], [60, 500], rtol=1e-6)
+
+
+def test_a_spinning_body_by_hand_turns_by_the_exponential_and_moves_by_its_center():
+    center, h = np.array([0.1, 0.2, 0.3]), 0.01
+    engine = physx(free_box(center, h))
+    v_center, w = np.array([0.5, -0.2, 0.1]), np.array([0.0, 0.0, 3.0])  # about a principal axis: w stays
+    x = np.array([1, 0, 0, 0, 0, 0, 1, *w, *(v_center - np.cross(w, center))])
+    quaternion = np.array([np.cos(h * 3 / 2), 0, 0, np.sin(h * 3 / 2)])
+    v_next = v_center - h * np.array([0, 0, G])
+    arm = turned(quaternion) @ center
+    expected = [*quaternion, *([0, 0, 1] + center + h * v_next - arm), *w, *(v_next - np.cross(w, arm))]
+    np.testing.assert_allclose(engine.step(x, []), expected, rtol=0, atol=1e-6)
+
+
+def test_a_tumbling_body_keeps_the_size_of_its_angular_momentum():
+    h, w = 0.01, np.array([1.0, 2.0, 3.0])
+    model = free_box((0, 0, 0), h)
+    inertia = np.diag(
+        model.plant.GetBodyByName("box").default_spatial_inertia().CalcRotationalInertia().CopyToFullMatrix3()
+    )
+    after = physx(model).step([1, 0, 0, 0, 0, 0, 1, *w, 0, 0, 0], [])
+    explicit = w - h * np.cross(w, inertia * w) / inertia
+    scaled = explicit * np.linalg.norm(inertia * w) / np.linalg.norm(inertia * explicit)
+    np.testing.assert_allclose(after[7:10], scaled, rtol=0, atol=1e-6)
+    assert np.abs(scaled - explicit).max() > 1e-5  # it could be told
+
+
+@pytest.mark.parametrize("name", ["double_pendulum.urdf", "cart_pole.urdf", "acrobot.xml", "mass_spring_damper.sdf"])
+def test_the_step_is_drakes_and_so_is_the_energy(load, name):
+    model = load(name)
+    drake, engine, random = dd.load_engine("drake", model), physx(model), np.random.default_rng(0)
+    assert different(drake, engine).keys() <= OWN
+    for _ in range(3):
+        x, u = free_state(model, random), random.standard_normal(model.nu)
+        expected = drake.step(x, u)
+        np.testing.assert_allclose(engine.step(x, u), expected, rtol=0, atol=1e-6 * max(1, abs(expected).max()))
+        assert engine.energy(x) == pytest.approx(drake.energy(x), rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", ["ur5_robot.urdf", "double_pendulum_continuous.urdf"])
+def test_fixed_robots_step_as_in_drake(tmp_path, name):
+    model, random = robot(name, tmp_path), np.random.default_rng(3)
+    drake, engine = dd.load_engine("drake", model), physx(model)
+    for _ in range(2):
+        x, u = free_state(model, random), random.standard_normal(model.nu)
+        expected = drake.step(x, u)
+        # single precision, magnified by the small inertias of wrists
+        np.testing.assert_allclose(engine.step(x, u), expected, rtol=0, atol=1e-6 * max(1, abs(expected).max()))
+
+
+def test_a_free_robot_steps_by_the_formula(tmp_path):
+    model, random = robot("solo12.urdf", tmp_path), np.random.default_rng(3)
+    engine = physx(model)
+    for _ in range(2):
+        x, u = free_state(model, random), random.standard_normal(model.nu)
+        expected = formula(model, x, u, exponential=True)
+        np.testing.assert_allclose(engine.step(x, u), expected, rtol=0, atol=5e-6 * max(1, abs(expected).max()))
+
+
+def test_effort_limits_cut(load):
+    engine, x = physx(load("cart_pole.urdf")), [0.1, 0.4, 0.2, -0.3]  # of 20 N
+    assert engine.step(x, [25.0]).tobytes() == engine.step(x, [20.0]).tobytes()
+
+
+def test_a_limit_is_not_crossed_within_the_step_and_beyond_it_four_fifths_come_back(load):
+    engine, h = physx(load("cart_pole.urdf")), 0.01  # the slide from -2 to 2
+    np.testing.assert_allclose(engine.step([1.999, 0, 3.0, 0], [0])[[0, 2]], [2.0, 0.001 / h], atol=1e-4)
+    assert engine.step([2.01, 0, 0, 0], [0])[2] == pytest.approx(-0.8 * 0.01 / h, abs=1e-4)
+    assert engine.step([1.9, 0, 3.0, 0], [0])[2] == pytest.approx(3.0, abs=1e-6)
+
+
+def test_each_step_depends_on_its_arguments_alone(load):
+    model = load("sliding_block.sdf", time_step=0.002)
+    one, two, x = physx(model), physx(model), np.array(model.default_state)
+    x[6] = 0.0495
+    states = [x + d * np.array([0] * 7 + [0.1, 0.2, 0, 1, 0.5, -0.1]) for d in (0.0, 1.0, 2.0)]
+    first = [one.step(x, []).tobytes() for x in states]
+    assert first == [two.step(x, []).tobytes() for x in reversed(states)][::-1]
+    two.contact_depth(states[2])
+    two.energy(states[2])
+    assert first[1] == two.step(states[1], []).tobytes()
+
+
+# ---- the contract ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_change_is_found_and_named(tmp_path, change):
+    changes, must, may, words = CHANGES[change]
+    reference = dd.load_engine("drake", arms(tmp_path))
+    own = different(reference, physx(arms(tmp_path)))
+    assert own.keys() <= OWN
+    found = different(reference, physx(arms(tmp_path, **changes)))
+    assert must - FOLLOWS <= found.keys() - own.keys() <= must | may
+    first = next(quantity for quantity in found if quantity in must - FOLLOWS)
+    numbers = r"[\d.e-]*\.[\d.e-]*\d"
+    shown = re.sub(numbers, lambda m: f"{float(m[0]):.6g}", found[first])  # 1.299999952 is 1.3 in single
+    assert all(word in shown for word in words), found[first]
+
+
+@pytest.mark.parametrize("wrong", ["quaternion order", "velocity frame", "none"])
+def test_a_swapped_quaternion_or_velocity_frame_is_found(wrong, monkeypatch):
+    model = free_box((0.1, 0.2, 0.3))
+    engine = physx(model)
+    x = np.array([0.5, 0.1, -0.7, 0.5, 1, 2, 3, 0.3, -0.4, 0.5, 1, 2, 3])
+    x[:4] /= np.linalg.norm(x[:4])
+    expected = formula(model, x, [], exponential=True)
+    if wrong == "quaternion order":
+        real = engine.centers.turn
+        monkeypatch.setattr(
+            type(engine.centers), "turn", lambda self, q: real(np.concatenate([np.roll(q[:4], 1), q[4:]]))
+        )
+    elif wrong == "velocity frame":
+        monkeypatch.setattr("drake_diff.engines.centers.rotation", lambda q: np.eye(3))
+    assert (np.abs(engine.step(x, []) - expected).max() < 2e-6) == (wrong == "none")
+
+
+def test_contacts_are_drakes_pairs_and_a_shape_that_is_not_built_is_named(load, tmp_path):
+    for name, friction in (("sphere_on_ground.sdf", 0.5), ("sliding_block.sdf", 0.4)):
+        model = load(name)
+        found = different(dd.load_engine("drake", model), physx(model))
+        assert found.keys() <= {*OWN, "integrator", "contact law", "contact pairs"}, name
+        assert "no stiffness" in found["contact pairs"]
+        assert [pair.friction for pair in physx(model).contract.contacts] == pytest.approx(
+            [friction] * len(physx(model).contract.contacts), rel=1e-6
+        )
+    (tmp_path / "t.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    plant = Plant(0.01)
+    body = plant.plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    plant.shape(body, Convex(str(tmp_path / "t.obj")), contact_properties(1e4))
+    plant.ground(contact_properties(1e4))
+    model = plant.model()
+    assert "body_shape" in different(dd.load_engine("drake", model), physx(model))["contact pairs"]
+
+
+# ---- contact --------------------------------------------------------------------------------------------------------
+
+
+def test_it_rests_at_no_depth_slides_by_coulomb_and_stops():
+    h, mu = 0.002, 0.5
+    model, _ = block_on_rails(h, mu)
+    engine, x, v = physx(model), np.array([0, 0.1, 0.5, 0]), [0.5]
+    for _ in range(150):
+        x = engine.step(x, [])
+        v.append(x[2])
+        assert engine.contact_depth(x) < 1e-6
+    np.testing.assert_allclose(np.diff(v)[:50], -h * mu * G, rtol=1e-3)  # single precision of 0.5 m/s, over 0.01
+    np.testing.assert_allclose(v[53:], 0.0, atol=1e-5)
+
+
+def test_what_is_deep_comes_out_and_what_would_not_touch_falls_through(load):
+    model = load("sphere_on_ground.sdf", time_step=0.002)
+    engine, x = physx(model), np.array(model.default_state)
+    x[6] = 0.099
+    assert engine.contact_depth(x) == pytest.approx(0.001, abs=1e-6)
+    assert engine.step(x, [])[12] > 0
+    plant = Plant(0.002)
+    for name, height in (("one", 0.0), ("two", 0.15)):
+        body = plant.ball(name, 1.0, 0.1, contact_properties(1e4))
+        plant.plant.SetDefaultFloatingBaseBodyPose(body, RigidTransform([0, 0, height]))
+    model = plant.model()
+    engine = physx(model)
+    assert engine.contact_depth(model.default_state) == pytest.approx(0.05, abs=1e-6)  # two balls of one model do touch
+    engine.groups = {}
+    assert engine.contact_depth(model.default_state) == 0  # and without their groups they do not
+
+
+def test_friction_of_a_pair_is_the_mean_of_the_two():
+    h = 0.002
+    model, _ = block_on_rails(h, 0.5)
+    engine = physx(model)
+    a, b = engine.pairs[0].names
+    engine.friction = {a: 0.2, b: 0.6}
+    after = engine.step(engine.step([0, 0.1, 1.0, 0], []), [])
+    assert after[2] == pytest.approx(1.0 - 2 * h * 0.4 * G, abs=1e-5)
+    assert engine.contract.contacts[0].friction == pytest.approx(0.4, rel=1e-6)
+
+
+def test_a_link_and_its_parent_never_touch_and_the_contract_says_so():
+    plant = Plant(0.002)
+    one = plant.ball("one", 1.0, 0.1, contact_properties(1e4))
+    lid = plant.plant.AddRigidBody("lid", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    plant.plant.WeldFrames(one.body_frame(), lid.body_frame(), RigidTransform([0, 0, 0.5]))
+    plant.shape(lid, Box(0.2, 0.2, 0.2), contact_properties(1e4))
+    two = plant.plant.AddRigidBody("two", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    plant.plant.AddJoint(PrismaticJoint("slide", one.body_frame(), two.body_frame(), [0, 0, 1]))
+    plant.shape(two, Box(0.2, 0.2, 0.2), contact_properties(1e4))
+    model = plant.model()
+    x = np.array([1, 0, 0, 0, 0, 0, 0, 0.35, *[0] * 7])
+    drake, engine = dd.load_engine("drake", model), physx(model)
+    assert drake.contact_depth(x) == pytest.approx(0.05, abs=1e-9)  # Drake lets two touch what is welded to one
+    assert "lid_shape" in different(drake, engine)["contact pairs"]
+    every = {geometry.name: (1, 1) for _, geometry in engine.tree.geometries}
+    engine.groups = every
+    assert engine.contact_depth(x) == 0  # even where their groups would
+
+
+@pytest.mark.parametrize(("shape", "height"), [(Box(0.2, 0.3, 0.4), 0.2), (Cylinder(0.1, 0.4), 0.2),
+                                               (Capsule(0.1, 0.4), 0.3)])  # fmt: skip
+def test_shapes_stand_where_drakes_stand(shape, height):
+    plant = Plant(0.002)
+    body = plant.plant.AddRigidBody("body", SpatialInertia.SolidBoxWithMass(1.0, 0.2, 0.3, 0.4))
+    plant.shape(body, shape, contact_properties(1e4), RigidTransform([0.1, 0.2, 0.3]))
+    plant.ground(contact_properties(1e4))
+    x = np.array([1, 0, 0, 0, 0, 0, height - 0.3 - 0.001, *[0] * 6])
+    assert physx(plant.model()).contact_depth(x) == pytest.approx(0.001, abs=1e-6)  # single precision of 0.3 m
+
+
+# ---- refusals -------------------------------------------------------------------------------------------------------
+
+
+def test_bad_input_and_what_physx_has_not_are_named(load):
+    engine = physx(load("pendulum.urdf"))
+    with pytest.raises(dd.ShapeError, match="x"):
+        engine.step([0.0], [0.0])
+    with pytest.raises(dd.NonFiniteError, match="u"):
+        engine.step([0.0, 0.0], [np.nan])
+    with pytest.raises(dd.NotOfferedError, match="no derivatives"):
+        engine.differentiate_step([0.0, 0.0], [0.0])
+    for call in (lambda: engine.mass_matrix([0.0]), lambda: engine.bias([0.0], [0.0])):
+        with pytest.raises(dd.NotOfferedError, match="neither mass matrix"):
+            call()
+    with pytest.raises(dd.SimulationError, match="PhysX"):
+        engine.step([0.0, 1e300], [0.0])
+
+
+def test_more_groups_than_physx_has_are_refused():
+    from drake_diff.engines.engine import PairContract
+    from drake_diff.engines.sapien_contract import groups_by_shape
+
+    chain = tuple(PairContract((f"shape {i}", f"shape {i + 1}"), 0.5, None) for i in range(40))
+    with pytest.raises(dd.ModelError, match="32 groups"):
+        groups_by_shape(chain)
+    groups = groups_by_shape(chain[:20])
+    for i in range(21):
+        for j in range(21):
+            touch = groups[f"shape {i}"][0] & groups[f"shape {j}"][1]
+            assert bool(touch) == (abs(i - j) == 1)
+
+
+def test_sapien_says_nothing_leaves_its_settings_and_a_missing_one_is_named_with_its_extra():
+    code = f"""import drake_diff as dd
+model = dd.load_model({str(MODELS / "pendulum.urdf")!r}, time_step=0.01)
+dd.load_engine('sapien', model).step([0, 0], [0])
+from sapien import physx
+if not physx.get_scene_config().enable_tgs or physx.get_body_config().sleep_threshold == 0: print('changed')"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("", "")
+    code = """import sys; sys.modules['sapien'] = None
+import drake_diff as dd
+try: dd.load_engine('sapien', None)
+except dd.MissingDependencyError as error: print(error)"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "pip install 'drake-diff[forward]'" in done.stdout
