@@ -16,7 +16,7 @@ from drake_diff.contract import Contract as Contract
 from drake_diff.cost import QuadraticCost as QuadraticCost
 from drake_diff.dynamics import Dynamics as Dynamics
 from drake_diff.dynamics import plant_dynamics as plant_dynamics
-from drake_diff.engines.comparison import Comparison as Comparison
+from drake_diff.engines.compared import Comparison as Comparison
 from drake_diff.engines.comparison import compare as compare
 from drake_diff.engines.comparison_files import save_comparison as save_comparison
 from drake_diff.engines.comparison_record import ComparisonRecord as ComparisonRecord

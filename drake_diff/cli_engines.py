@@ -77,7 +77,7 @@ def _print(record: Any) -> None:
     clock = record.wall_clock
     for i, e in enumerate(record.engines):
         verdict = plain(e.verdict, COLOURS[e.verdict]) if i else plain("reference", "dim")
-        own = {True: "yes", False: "no", None: "none"}[e.gradient_is_its_own]
+        own = {"its own step's": "yes", "not its own step's": "no"}.get(e.gradient, e.gradient)
         table.add_row(
             plain(e.engine),
             verdict,

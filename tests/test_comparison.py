@@ -8,7 +8,8 @@ from test_contract_match import arms
 from test_engines import engine_of, needs
 
 import drake_diff as dd
-from drake_diff.engines.comparison import JACOBIAN_TOLERANCE, STEP_TOLERANCE, default_engines
+from drake_diff.engines.compared import JACOBIAN_TOLERANCE, STEP_TOLERANCE
+from drake_diff.engines.comparison import default_engines
 from drake_diff.engines.load import load_spec
 from drake_diff.tangent import tangent_space
 
@@ -41,7 +42,7 @@ def test_a_free_model_is_the_same_in_every_engine(load):
         "drake (sap, autodiff)", "numpy", "mujoco", "pinocchio", "drake (lagged, implicit)",
     ]  # fmt: skip
     for e in found.engines:
-        assert (e.verdict, e.first_apart, e.is_gradient_its_own) == ("same", None, True)
+        assert (e.verdict, e.first_apart, e.gradient) == ("same", None, "its own step's")
         assert e.step_gaps.shape == (50,)
         assert e.step_gaps.max() < 1e-13
         assert e.jacobian_gaps.max() < 1e-10
@@ -122,7 +123,7 @@ def test_a_wrong_jacobian_is_found_where_every_step_is_right(load):
     found = dd.compare(model, (Doctored(drake, name="wrong", differentiate_step=wrong),), num_steps=10)
     e = by_name(found)["wrong"]
     assert e.step_gaps.max() == 0
-    assert (e.verdict, e.is_gradient_its_own) == ("unexplained", False)
+    assert (e.verdict, e.gradient) == ("unexplained", "not its own step's")
     assert e.jacobian_gaps.max() > JACOBIAN_TOLERANCE["float64"]
     assert not found.holds
 
@@ -135,7 +136,7 @@ def test_without_derivatives_differences_of_the_steps_are_compared(load):
         raise dd.NotOfferedError("forward only")
 
     e = by_name(dd.compare(model, (Doctored(drake, name="blind", differentiate_step=none),), num_steps=10))["blind"]
-    assert (e.verdict, e.is_gradient_its_own, e.rollout_jacobian, e.seconds_per_jacobian) == ("same", None, None, None)
+    assert (e.verdict, e.gradient, e.rollout_jacobian, e.seconds_per_jacobian) == ("same", "none", None, None)
     assert e.jacobians[0].method.startswith("central differences")
     assert e.jacobian_gaps.max() < 1e-9
 
@@ -219,3 +220,49 @@ def test_a_float32_engine_has_its_own_tolerance(load):
         other = Doctored(drake, contract=contract, step=lambda x, u, push=push: drake.step(x, u) + push)
         other.name = "single"
         assert by_name(dd.compare(model, (other,), num_steps=5))["single"].verdict == verdict
+
+
+def test_another_jacobian_in_contact_is_another_law_and_not_unexplained(load):
+    """The motion never touches; at the sampled contact state Pinocchio, which has no contact, has another Jacobian."""
+    needs("pinocchio")
+    model = load("sphere_on_ground.sdf")
+    x0 = np.array(model.default_state)
+    x0[6] = 3.0
+    e = by_name(dd.compare(model, ("pinocchio",), x0=x0, num_steps=5))["pinocchio"]
+    assert e.first_apart is None
+    assert e.verdict == "other law"
+    assert [e.laws[i] for i in e.other_states] == ["contact law"]
+    assert [e.jacobians[i].state for i in e.other_states] == ["contact"]
+
+
+def test_another_jacobian_in_contact_that_no_contract_tells_of_is_unexplained(load):
+    model = load("sphere_on_ground.sdf")
+    x0 = np.array(model.default_state)
+    x0[6] = 3.0
+    drake = engine_of("drake", model)
+
+    def softer(x, u):
+        found = drake.differentiate_step(x, u)
+        return found._replace(A=found.A * (0.9 if drake.contact_depth(x) else 1.0))
+
+    e = by_name(dd.compare(model, (Doctored(drake, name="soft", differentiate_step=softer),), x0=x0, num_steps=5))
+    assert e["soft"].verdict == "unexplained"
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(1.0, "its own step's"), (1.05, "undecided")])
+def test_single_precision_is_never_called_wrong_by_differences_of_itself(load, factor, verdict):
+    model = load("double_pendulum.urdf")
+    drake = engine_of("drake", model)
+
+    def rounded(x, u):
+        return np.float64(np.float32(drake.step(x, u)))
+
+    def scaled(x, u):
+        found = drake.differentiate_step(x, u)
+        return found._replace(A=factor * found.A)
+
+    contract = replace(drake.contract, precision="float32")
+    single = Doctored(drake, name="single", contract=contract, step=rounded, differentiate_step=scaled)
+    e = by_name(dd.compare(model, (single,), num_steps=5))["single"]
+    assert e.gradient == verdict
+    assert all(j.certificate is None for j in e.jacobians)

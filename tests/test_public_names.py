@@ -39,11 +39,12 @@ engines.mujoco_contract engines.mujoco_model engines.mujoco_engine engines.mjx_e
 engines.rigid_links engines.centers engines.newton_contract engines.newton_engine engines.bullet_urdf
 engines.bullet_contract engines.pybullet_engine engines.sapien_contract engines.sapien_engine engines.contract_match
 engines.load engines.attribution engines.motion engines.jacobians engines.recording engines.recording_ros2
-engines.recording_files engines.recorded engines.comparison_task engines.comparison engines.comparison_record
-engines.comparison_words engines.comparison_page engines.comparison_trace engines.comparison_files engines.sdf
-engines.usd engines.read_back engines.small_models engines.export_readme engines.export loop.checks loop.sensor
-loop.estimator loop.actuator loop.fallback loop.closed_loop loop.perturbation loop.statistics loop.trial
-loop.sensitivity loop.robustness ros2_bag cli_mcap cli_runs cli_engines cli_options cli_export cli_view cli
+engines.recording_files engines.recorded engines.comparison_task engines.compared engines.comparison
+engines.comparison_record engines.comparison_words engines.comparison_page engines.comparison_trace
+engines.comparison_files engines.sdf engines.usd engines.read_back engines.small_models engines.export_readme
+engines.export loop.checks loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop loop.perturbation
+loop.statistics loop.trial loop.sensitivity loop.robustness ros2_bag cli_mcap cli_runs cli_engines cli_options
+cli_export cli_view cli
 """.split()
 
 

@@ -4,151 +4,27 @@ Drake, as the model is set, is the reference. Every step of another engine is co
 the same state, so that a gap is where it arises and not what has become of it.
 """
 
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Literal
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff.arrays import Array, frozen
-from drake_diff.engines.attribution import Attribution, attribute
+from drake_diff.engines.attribution import CONTACT_LAW, LIMIT_LAW, Attribution, attribute, what_is_left
+from drake_diff.engines.compared import STEP_TOLERANCE, Compared, Comparison, Refused, first_above
 from drake_diff.engines.comparison_task import Probe, probes_of, task_of
-from drake_diff.engines.contract_match import ContractLine, match_contracts
+from drake_diff.engines.contract_match import match_contracts
 from drake_diff.engines.description import describe
 from drake_diff.engines.drake_engine import DrakeEngine
-from drake_diff.engines.engine import Engine, Precision
+from drake_diff.engines.engine import Engine
 from drake_diff.engines.jacobians import JacobianAt, jacobian_at, rollout_jacobian
 from drake_diff.engines.load import ELSEWHERE, ENGINES, load_spec
-from drake_diff.engines.motion import BROKE_OFF, EngineMotion, measured, move, seconds
-from drake_diff.engines.recorded import NOT_TOLD, advanced, attribute_recorded, precision_of, told_lines
+from drake_diff.engines.motion import EngineMotion, measured, move, seconds
+from drake_diff.engines.recorded import advanced, attribute_recorded, precision_of, told_lines
 from drake_diff.engines.recording import Recording, check_recording, steps_between
 from drake_diff.exceptions import MissingDependencyError, ModelError, SimulationError
 from drake_diff.model import Model
 from drake_diff.tangent import tangent_space
-
-Verdict = Literal["same", "other law", "other model", "unexplained"]
-# One step against the reference's, relative to the state where that is above 1: rounding in solves with M.
-STEP_TOLERANCE: dict[Precision, float] = {"float64": 1e-10, "float32": 1e-4}
-# Relative to the largest entry: what differences of a step, which some engines offer as its derivative, leave.
-JACOBIAN_TOLERANCE: dict[Precision, float] = {"float64": 1e-8, "float32": 1e-2}
-# The lines of a contract that tell of a term.
-TELLS: Mapping[str, tuple[str, ...]] = {
-    "inertia": ("mass", "center of mass", "inertia", "frames", "armature", "joint types", "joint order and names"),
-    "bias": ("gravity", "springs", "mass", "center of mass", "inertia", "frames", "joint order and names"),
-    "actuation": ("actuator mapping", "effort limits"),
-    "damping": ("damping", "integrator"),
-    "time step": ("time step",),
-    "integrator": ("integrator",),
-    "contact law": ("contact law", "contact pairs", "solver tolerance"),
-    "limit law": ("limit law", "position limits"),
-}
-# What is the engine's own whatever the model.
-LAWS = ("integrator", "limit law", "contact law", "contact pairs", "solver tolerance", "reset")
-
-
-@dataclass(frozen=True)
-class Refused:
-    """An engine that is not compared: not installed, or without something that the model has."""
-
-    engine: str
-    reason: str
-    installed: bool
-
-
-@dataclass(frozen=True, eq=False)
-class Compared:
-    """One engine, or a recording, beside the reference."""
-
-    engine: str
-    version: str
-    precision: Precision
-    lines: tuple[ContractLine, ...]  # of its contract against the reference's
-    motion: EngineMotion
-    step_gaps: Array  # (n - 1,) of each of its steps to the reference's from the same state
-    first: Attribution  # of the first step that is apart, or of the first of all
-    largest: Attribution  # of the largest gap
-    final_gap: float  # of the last state that both have, on the tangent space
-    jacobians: tuple[JacobianAt, ...]
-    jacobian_gaps: Array  # one per state, relative to the reference's largest entry
-    rollout_jacobian: Array | None
-    rollout_gap: float | None  # relative to the reference's largest entry; None where one of the two broke off
-    seconds_per_step: float | None
-    seconds_per_jacobian: float | None
-
-    @property
-    def different(self) -> tuple[ContractLine, ...]:
-        """The lines of the contract that are different."""
-        return tuple(line for line in self.lines if line.verdict == "different")
-
-    @cached_property
-    def first_apart(self) -> int | None:
-        """The first step whose gap is above the tolerance."""
-        return _first_above(self.step_gaps, self.precision)
-
-    @property
-    def broken(self) -> tuple[ContractLine, ...]:
-        """The lines that are different without being the engine's doing: it simulates another model."""
-        return tuple(line for line in self.different if not line.reason and line.quantity not in LAWS)
-
-    @property
-    def told(self) -> tuple[ContractLine, ...]:
-        """The lines that tell of the terms responsible; none where one of the terms is told of by no line."""
-        terms = {self.first.responsible, self.largest.responsible}
-        known = [x for x in self.different if x.reason != NOT_TOLD]
-        lines = {term: [x for x in known if x.quantity in TELLS.get(term, ())] for term in sorted(terms)}
-        return tuple(dict.fromkeys(x for found in lines.values() for x in found)) if all(lines.values()) else ()
-
-    @property
-    def verdict(self) -> Verdict:
-        """Same: every step and Jacobian is the reference's. Other law: not, and the contract tells of what is at work.
-
-        Other model: the contract is broken. Unexplained: nothing tells why. Of a recording also the one change that
-        takes its steps tells, of a law or of the model.
-        """
-        if self.broken:
-            return "other model"
-        if self.first_apart is not None and self.first.as_if and self.first.as_if == self.largest.as_if:
-            return "other law" if self.first.responsible in LAWS else "other model"
-        if self.first_apart is not None:
-            return "other law" if self.told else "unexplained"
-        broke_off = self.motion.status.startswith(BROKE_OFF)
-        same = np.all(self.jacobian_gaps <= JACOBIAN_TOLERANCE[self.precision])
-        return "unexplained" if broke_off or not same else "same"
-
-    @property
-    def is_gradient_its_own(self) -> bool | None:
-        """Whether each Jacobian is the derivative of the engine's own step; None where it offers none."""
-        verdicts = [j.own.verdict for j in self.jacobians if j.own is not None]
-        return all(verdict == "agree" for verdict in verdicts) if verdicts else None
-
-
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """Engines on one model; the first of `engines` is Drake, the reference."""
-
-    model: Model
-    x0: Array
-    us: Array
-    states: tuple[Probe, ...]  # where Jacobians were compared
-    engines: tuple[Compared, ...]
-    refused: tuple[Refused, ...]
-
-    @property
-    def reference(self) -> Compared:
-        return self.engines[0]
-
-    @property
-    def holds(self) -> bool:
-        """Whether every engine is the same, or differs by a law that its contract tells of."""
-        return all(e.verdict in ("same", "other law") for e in self.engines)
-
-
-def slugs(comparison: Comparison) -> list[str]:
-    """Names of the engines that can be parts of a topic; the place keeps them apart."""
-    return [f"{i}_" + re.sub(r"[^A-Za-z0-9]+", "_", e.engine).strip("_") for i, e in enumerate(comparison.engines)]
 
 
 def compare(
@@ -212,10 +88,11 @@ class _Panel:
             lines=match_contracts(self.reference, engine),
             motion=motion,
             step_gaps=gaps,
-            first=self._attribution(engine, motion, _first_above(gaps, engine.contract.precision) or 0),
+            first=self._attribution(engine, motion, first_above(gaps, engine.contract.precision) or 0),
             largest=self._attribution(engine, motion, int(np.argmax(gaps)) if len(gaps) else 0),
             final_gap=self._gap_at_the_end(motion.xs),
             jacobians=jacobians,
+            laws=tuple(self._law(engine, probe) for probe in self.probes),
             jacobian_gaps=frozen(
                 [_gap(a.jacobian, b.jacobian) for a, b in zip(self.jacobians, jacobians, strict=True)]
             ),
@@ -233,7 +110,7 @@ class _Panel:
             attribute_recorded(
                 self.reference, motion.xs[k], motion.us[k], count, motion.xs[k + 1], STEP_TOLERANCE[precision]
             )
-            for k in (_first_above(gaps, precision) or 0, int(np.argmax(gaps)))
+            for k in (first_above(gaps, precision) or 0, int(np.argmax(gaps)))
         )
         return Compared(
             engine=recording.name,
@@ -247,11 +124,18 @@ class _Panel:
             final_gap=self._gap_at_the_end(motion.xs, count),
             jacobians=(),
             jacobian_gaps=frozen([]),
+            laws=(),
             rollout_jacobian=None,
             rollout_gap=None,
             seconds_per_step=None,
             seconds_per_jacobian=None,
         )
+
+    def _law(self, engine: Engine, probe: Probe) -> str:
+        """The law that is at work in a step from there, of either engine."""
+        steps = self.reference.step(probe.x, probe.u), engine.step(probe.x, probe.u)
+        found = what_is_left(self.coordinates, self.reference, engine, probe.x, steps)
+        return found if found in (CONTACT_LAW, LIMIT_LAW) else ""
 
     def _gap_at_the_end(self, xs: Array, count: int = 1) -> float:
         """On the tangent space, of the last of `xs`, `count` steps apart, that the reference's motion has too."""
@@ -279,11 +163,6 @@ class _Panel:
     def _attribution(self, engine: Engine, motion: EngineMotion, k: int) -> Attribution:
         x, u = motion.xs[k], self.us[k]
         return attribute(self.coordinates, self.reference, engine, x, u, (self.reference.step(x, u), engine.step(x, u)))
-
-
-def _first_above(gaps: Array, precision: Precision) -> int | None:
-    above = np.flatnonzero(~(gaps <= STEP_TOLERANCE[precision]))
-    return int(above[0]) if len(above) else None
 
 
 def _gap(reference: Array, other: Array) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_diff.arrays import Array
 from drake_diff.engines.attribution import Attribution
-from drake_diff.engines.comparison import JACOBIAN_TOLERANCE, STEP_TOLERANCE, Compared, Comparison, slugs
+from drake_diff.engines.compared import JACOBIAN_TOLERANCE, STEP_TOLERANCE, Compared, Comparison, slugs
 from drake_diff.engines.comparison_record import (
     AttributionEvidence,
     ComparisonRecord,
@@ -133,13 +133,15 @@ def _engine(e: Compared) -> EngineEvidence:
                 method=j.method,
                 gap=float(gap),
                 jacobian=_rows(j.jacobian),
-                own=None if j.own is None else gradient_evidence(j.own),
+                law=law,
+                own=j.own,
+                certificate=None if j.certificate is None else gradient_evidence(j.certificate),
             )
-            for j, gap in zip(e.jacobians, e.jacobian_gaps, strict=True)
+            for j, gap, law in zip(e.jacobians, e.jacobian_gaps, e.laws, strict=True)
         ],
         rollout_jacobian=None if e.rollout_jacobian is None else _rows(e.rollout_jacobian),
         rollout_gap=e.rollout_gap,
-        gradient_is_its_own=e.is_gradient_its_own,
+        gradient=e.gradient,
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_diff.arrays import Array
 from drake_diff.certificate import VERDICTS
-from drake_diff.engines.comparison import JACOBIAN_TOLERANCE, STEP_TOLERANCE, Compared, Comparison
+from drake_diff.engines.compared import JACOBIAN_TOLERANCE, STEP_TOLERANCE, Compared, Comparison
 from drake_diff.engines.comparison_record import ComparisonRecord, EngineEvidence
 from drake_diff.engines.motion import EngineMotion
 from drake_diff.html_parts import (
@@ -41,7 +41,10 @@ def write_comparison_page(path: Path, comparison: Comparison, record: Comparison
 def comparison_data(comparison: Comparison) -> dict[str, Any]:
     """What the page plots; see `report_data`."""
     doubtful = [
-        j.own for e in comparison.engines for j in e.jacobians if j.own is not None and j.own.verdict != "agree"
+        j.certificate
+        for e in comparison.engines
+        for j in e.jacobians
+        if j.certificate is not None and j.certificate.verdict != "agree"
     ]
     return {
         "duration": float(comparison.reference.motion.times[-1]),
@@ -195,7 +198,7 @@ def _jacobians(record: ComparisonRecord) -> str:
     rows: list[Row] = []
     for e in record.engines:
         for j in e.jacobians:
-            own = Mark("undecided", "made of differences") if j.own is None else _own(j.own.verdict)
+            own = Mark("undecided", "made of differences") if j.own is None else _own(j.own)
             rows.append((e.engine, j.state, j.method, short_number(j.gap), own, short_number(e.rollout_gap)))
     note = f"relative to the largest entry; tolerances: {_tolerances(JACOBIAN_TOLERANCE)}"
     return table(head, rows) + f'<p class="note">{escaped(note)}</p>'

@@ -38,7 +38,9 @@ class JacobianEvidence(Part):
     method: str
     gap: float
     jacobian: list[Numbers]
-    own: Certified | None
+    law: str  # of contact or limits, where one is at work there
+    own: str | None
+    certificate: Certified | None
 
 
 class EngineEvidence(Part):
@@ -62,7 +64,7 @@ class EngineEvidence(Part):
     jacobians: list[JacobianEvidence]
     rollout_jacobian: list[Numbers] | None
     rollout_gap: float | None
-    gradient_is_its_own: bool | None
+    gradient: Literal["its own step's", "not its own step's", "undecided", "none"]
 
 
 class StateEvidence(Part):

@@ -13,7 +13,7 @@ from drake_diff.model import Model
 from drake_diff.rollout import check_inputs
 from drake_diff.sampling import sample_states
 
-DURATION, MOST_STEPS = 1.0, 1000  # [s]; of a motion that is not given
+DURATION, MOST_STEPS = 1.0, 500  # [s]; of a motion that is not given
 
 
 class Probe(NamedTuple):

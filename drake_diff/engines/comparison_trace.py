@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff.engines.comparison import Comparison, slugs
+from drake_diff.engines.compared import Comparison, slugs
 from drake_diff.engines.motion import EngineMotion
 from drake_diff.mcap_log import Channel, write_mcap
 from drake_diff.mcap_messages import TYPES

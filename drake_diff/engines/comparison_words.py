@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from drake_diff.engines.comparison import STEP_TOLERANCE, Compared, Comparison
+from drake_diff.engines.compared import STEP_TOLERANCE, Compared, Comparison
 from drake_diff.engines.recorded import NOT_TOLD
 
 
@@ -34,11 +34,13 @@ def verdict_of(comparison: Comparison) -> str:
 
 
 def _trust(comparison: Comparison) -> str:
-    own = [e.engine for e in comparison.engines if e.is_gradient_its_own]
-    wrong = [e.engine for e in comparison.engines if e.is_gradient_its_own is False]
-    blind = [e.engine for e in comparison.engines if e.is_gradient_its_own is None]
+    own, wrong, open_, blind = (
+        [e.engine for e in comparison.engines if e.gradient == kind]
+        for kind in ("its own step's", "not its own step's", "undecided", "none")
+    )
     parts = [f"Gradients to trust at the states looked at: {_list(own)}"] if own else ["No gradient to trust"]
     parts += [f"not those of {_list(wrong)}, which are not the derivatives of their own steps"] if wrong else []
+    parts += [f"those of {_list(open_)} could not be decided"] if open_ else []
     parts += [f"{_list(blind)} {'offer' if len(blind) > 1 else 'offers'} none"] if blind else []
     return "; ".join(parts) + "."
 
@@ -60,6 +62,13 @@ def _same(e: Compared) -> str:
 
 
 def _other_law(e: Compared) -> str:
+    if e.first_apart is None:
+        i = max(e.other_states, key=lambda state: e.jacobian_gaps[state])
+        reason = "; ".join(dict.fromkeys(line.reason or line.detail for line in e.tells(e.laws[i])[:1]))
+        return (
+            f"the same motion, each of {len(e.step_gaps)} steps within {_largest(e.step_gaps)} of Drake's; another "
+            f"Jacobian at the {e.jacobians[i].state} state, by the {e.laws[i]} ({reason})"
+        )
     k = e.first_apart or 0
     before = "from the first step on" if k == 0 else f"the same for {e.motion.times[k]:.4g} s, then apart"
     terms = list(dict.fromkeys((e.first.responsible, e.largest.responsible)))

@@ -17,37 +17,50 @@ from drake_diff.tangent import TangentSpace
 
 # Steps of differences for engines without derivatives: where rounding and truncation are both small.
 DIFFERENCE_STEP: dict[Precision, float] = {"float64": 1e-5, "float32": 1e-2}
+# The certificate allows a hundred times what is left unsolved.
+DIFFERENCES_LEAVE = 1e-10
+
+
+AGREES = "agree"
+SINGLE = 1e-2  # of the largest entry: as far as differences of single precision tell
 
 
 @dataclass(frozen=True, eq=False)
 class JacobianAt:
     """[A B] (2 nv, 2 nv + nu) of one engine's step at one state, on the tangent space.
 
-    `own` certifies it against differences of the engine's own step; None where it is made of them.
+    `own` says whether it is the derivative of the engine's own step: the certificate's verdict, in single precision
+    "agree" or "undecided"; None where it is made of differences.
     """
 
     state: str  # "start", "free", "contact", "deepest"
     jacobian: Array
     method: str
-    own: Certificate | None
+    own: str | None
+    certificate: Certificate | None
 
 
 def jacobian_at(
     engine: Engine, space: TangentSpace, names: tuple[str, ...], state: str, x: Array, u: Array
 ) -> JacobianAt:
     """The engine's Jacobian at `x` (nx,) and `u` (nu,), with the certificate; `names` (nu,) are the inputs'."""
-    size = space.size + len(u)
+    size, precision = space.size + len(u), engine.contract.precision
 
     def step(d: Array) -> Array:
         return engine.step(space.plus(x, d[: space.size]), u + d[space.size :])
 
+    def quotients() -> Array:
+        return differences(step, size, DIFFERENCE_STEP[precision], minus=space.minus).central
+
     try:
         found = engine.differentiate_step(x, u)
     except NotOfferedError:
-        width = DIFFERENCE_STEP[engine.contract.precision]
-        quotients = differences(step, size, width, minus=space.minus)
-        return JacobianAt(state, frozen(quotients.central), f"central differences of its steps, {width:g} wide", None)
+        method = f"central differences of its steps, {DIFFERENCE_STEP[precision]:g} wide"
+        return JacobianAt(state, frozen(quotients()), method, None, None)
     jacobian = on_tangent(space, x, engine.step(x, u), found.A, found.B)
+    if precision == "float32":
+        gap = np.abs(jacobian - quotients()).max() / np.abs(jacobian).max()
+        return JacobianAt(state, frozen(jacobian), found.method, AGREES if gap <= SINGLE else "undecided", None)
     certificate = certify_displacement(
         step,
         jacobian,
@@ -55,11 +68,21 @@ def jacobian_at(
         columns=(*space.names, *names),
         scale=np.ones(size),
         minus=space.minus,
-        solver_tolerance=(engine.contract.solver_tolerance or 0.0) if engine.contact_depth(x) else 0.0,
+        solver_tolerance=max(_unsolved(engine, x), _rounding(found.method)),
         method=found.method,
         subject=f"the Jacobian of {engine.name} at the {state} state",
     )
-    return JacobianAt(state, frozen(jacobian), found.method, certificate)
+    return JacobianAt(state, frozen(jacobian), found.method, certificate.verdict, certificate)
+
+
+def _unsolved(engine: Engine, x: Array) -> float:
+    """What the engine's solver leaves unsolved of a step in contact, relative."""
+    return (engine.contract.solver_tolerance or 0.0) if engine.contact_depth(x) else 0.0
+
+
+def _rounding(method: str) -> float:
+    """Of an engine's own derivative that is made of differences: each entry is good to 1e-8 of the row's largest."""
+    return DIFFERENCES_LEAVE if "differences" in method else 0.0
 
 
 def on_tangent(space: TangentSpace, x: Array, x_next: Array, A: Array, B: Array) -> Array:

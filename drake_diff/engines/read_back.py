@@ -7,7 +7,7 @@ from math import inf
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from drake_diff.engines.comparison import LAWS
+from drake_diff.engines.compared import LAWS
 from drake_diff.engines.contract_match import ContractLine, match_contracts
 from drake_diff.engines.description import Description
 from drake_diff.engines.drake_engine import DrakeEngine
