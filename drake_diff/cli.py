@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from drake_diff import cli_engines, cli_mcap, cli_runs
+from drake_diff import cli_contact, cli_engines, cli_mcap, cli_runs
 from drake_diff.cli_runs import plain
 from drake_diff.cli_view import view
 
@@ -24,6 +24,7 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_
 cli_mcap.add_commands(app)
 cli_runs.add_commands(app)
 cli_engines.add_commands(app)
+cli_contact.add_commands(app)
 
 
 @app.callback()

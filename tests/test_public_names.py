@@ -16,8 +16,8 @@ Gaussian GradientError Hold InputError LQR Loop MissingDependencyError Model Mod
 NotOfferedError PD ParametricPolicy Predictor Problem Push QuadraticCost Recording Robustness Rollout
 RolloutCertificate RolloutGradient Sensor ShapeError SimulationError Smoothed SoftContact Solution Status
 StepDerivatives TVLQR Transcribed UnknownNameError Verification audit center_of_mass certify certify_jacobian
-certify_model certify_rollout closed_loop compare contact_force contact_modes differentiate_rollout differentiate_step
-frame_position frame_rotation_error frame_velocity list_parameters load_engine load_model load_record match_contracts
+certify_model certify_rollout closed_loop compare contact_force contact_modes contact_table differentiate_rollout
+differentiate_step frame_position frame_rotation_error frame_velocity list_parameters load_engine load_model load_record match_contracts
 model_from_diagram plant_dynamics read_mcap read_trace robustness rollout save save_comparison smooth smooth_step
 softened solve step transcribe_and_solve verify violation_between_nodes
 """.split()
@@ -38,9 +38,10 @@ engines.pinocchio_engine engines.urdf engines.casadi_engine engines.mjcf engines
 engines.mujoco_contract engines.mujoco_model engines.mujoco_engine engines.mjx_engine engines.contract_match
 engines.load engines.attribution engines.motion engines.jacobians engines.recording engines.comparison
 engines.comparison_record engines.comparison_words engines.comparison_page engines.comparison_trace
-engines.comparison_files loop.checks loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop
+engines.comparison_files engines.contact_cases engines.contact_laws engines.contact_table engines.contact_words
+loop.checks loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop
 loop.perturbation loop.statistics loop.trial loop.sensitivity loop.robustness ros2_bag cli_mcap cli_runs cli_engines
-cli_view cli
+cli_view cli_contact cli
 """.split()
 
 
