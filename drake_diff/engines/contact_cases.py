@@ -176,10 +176,11 @@ def time_of_impact(height: float, gravity: float) -> float:
 
 
 def rebound(height: float, gravity: float, restitution: float, duration: float) -> tuple[float, float, float]:
-    """After a drop from H: the rebound's height e^2 H [m], height above the floor at t [m], and its derivative by H.
+    """After a drop from H: the rebound's height e^2 H [m], and t after the start the height above the floor [m] and its
+    derivative by H.
 
-    z = e v t' - g t'^2 / 2 with v = sqrt(2 g H), t' = t - v / g; dz/dH = 2 e g t' / v ... as the saltation matrix
-    [[-e, 0], [-(1 + e) g / v, -e]] gives it (ORACLES A26): e g t' / v - e + g t' / v.
+    With v = sqrt(2 g H) and t' = t - v / g these are e v t' - g t'^2 / 2 and (1 + e) g t' / v - e: the fall, then the
+    saltation matrix [[-e, 0], [(1 + e) g / v, -e]], then the flight (ORACLES A26).
     """
     v = sqrt(2 * gravity * height)
     left = duration - v / gravity

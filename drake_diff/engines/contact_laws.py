@@ -113,8 +113,8 @@ class Law:
         does = f"has restitution {sqrt(height / case.height):.3g}" if free else "does not leave the ground"
         gradient, _ = impact_gradients(self.force, case)
         _, seen = impact_gradients(self.stepped, case)
-        step = "" if self.force is self.stepped else ", and a step of h is a damper k h besides"
-        missed = f"a damper's force jumps at touch{step}; step Jacobians do not see that, and without it {seen:.3g}"
+        by = "by its damper" if self.force is self.stepped else "by its damper and by the step's own, k h v"
+        missed = f"at touch the force jumps {by}; step Jacobians do not see that, and without it {seen:.3g}"
         return Answer(height, gradient, f"m z'' = -m g + {self.normal} {does}", missed)
 
 
