@@ -9,7 +9,7 @@ from rich.table import Table
 
 from drake_diff.cli_runs import plain
 
-COLOURS = {"rigid answer": "green", "right": "green", "own law's": "yellow", "not asked": "dim", "none offered": "dim"}
+COLOURS = {"rigid answer": "green", "right": "green", "own law's": "yellow", "not asked": "dim", "none": "dim"}
 
 
 def add_commands(app: typer.Typer) -> None:

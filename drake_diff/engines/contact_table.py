@@ -17,12 +17,12 @@ from drake_diff.engines.jacobians import rollout_jacobian
 from drake_diff.engines.load import load_spec
 from drake_diff.engines.motion import EngineMotion, move
 from drake_diff.engines.numpy_engine import NumpyEngine
-from drake_diff.exceptions import MissingDependencyError, ModelError
+from drake_diff.exceptions import GradientError, MissingDependencyError, ModelError, SimulationError
 from drake_diff.model import Model
 from drake_diff.tangent import tangent_space
 
 Verdict = Literal["rigid answer", "own law's", "off", "falls through", "broke off"]
-GradientVerdict = Literal["right", "own law's", "zero", "wrong", "none offered", "not asked"]
+GradientVerdict = Literal["right", "own law's", "zero", "wrong", "none", "not asked"]
 Spec = str | Callable[[Model], Engine]
 
 
@@ -137,16 +137,24 @@ class _Run:
         self.case, self.engine, self.space = case, engine, tangent_space(model)
         self.motion = move(engine, case.x0, np.zeros((case.num_steps, 0)))
         self.xs = self.motion.xs
+        self.no_gradient = "the engine has no derivative of a step in contact"
 
     @cached_property
     def jacobian(self) -> Array | None:
-        return rollout_jacobian(self.engine, self.space, self.motion)
+        return self._product(self.motion)
+
+    def _product(self, motion: EngineMotion) -> Array | None:
+        try:
+            return rollout_jacobian(self.engine, self.space, motion)
+        except (GradientError, SimulationError) as error:
+            self.no_gradient = str(error)
+            return None
 
     def row(self, name: str, n: int) -> Array | None:
         """See `contact_laws.Ran`."""
         m = self.motion
         cut = EngineMotion(m.times[: n + 1], m.xs[: n + 1], m.us[:n], None, None, m.status)
-        found = self.jacobian if n == len(m.us) else rollout_jacobian(self.engine, self.space, cut)
+        found = self.jacobian if n == len(m.us) else self._product(cut)
         return None if found is None else np.asarray(found[self._place(name)])
 
     @property
@@ -192,9 +200,11 @@ def rebound_height(case: ContactCase, xs: Array) -> float:
 def _load(case: ContactCase, model: Model, spec: Spec) -> Engine:
     if callable(spec):
         return spec(model)
-    if spec == "numpy" and case.axes == ("z",):
-        return NumpyEngine(_hand(case), time_step=model.time_step)
-    return load_spec(spec, model)
+    if spec != "numpy":
+        return load_spec(spec, model)
+    if case.axes != ("z",):
+        raise ModelError("there is a hand calculation of a ball on a vertical rail alone")
+    return NumpyEngine(_hand(case), time_step=model.time_step)
 
 
 def _hand(case: ContactCase) -> SphereOnGround:
@@ -231,7 +241,7 @@ def _row(case: ContactCase, model: Model, spec: Spec) -> ContactRow:
         law=answer.value if answer else None,
         tolerance=tolerance.value,
         verdict=verdict,
-        why=why + extra,
+        why="; ".join(said for said in (why, extra) if said),
         derivative=derivative,
         gradient=gradient,
         rigid_gradient=case.rigid_gradient,
@@ -248,8 +258,7 @@ def _extrapolated(case: ContactCase, model: Model, spec: Spec, value: float) -> 
     finer = _load(half, model.at_time_step(half.time_step), spec)
     motion = move(finer, half.x0, np.zeros((half.num_steps, 0)))
     limit = 2 * rebound_height(half, motion.xs) - value
-    told = f"; at h = {case.time_step:g} s it is {value:.4g} m: a step is itself a damper" if value else ""
-    return limit, told
+    return limit, f"at h = {case.time_step:g} s it is {value:.4g} m"
 
 
 def _tolerance(run: _Run) -> Tolerance:
@@ -283,13 +292,13 @@ def _judge(run: _Run, value: float, answer: Answer | None) -> tuple[Verdict, str
 def _shown(value: float, reference: float, unit: str) -> str:
     if reference == 0:
         return f"{value:+.2g} {unit}"
-    return f"{100 * (value / reference - 1):+.2g} %"
+    return f"{100 * (value / reference - 1):+.3g} %"
 
 
 def _judge_gradient(run: _Run, gradient: float | None, answer: Answer | None) -> tuple[GradientVerdict, str]:
     case, allowed = run.case, _tolerance(run).gradient
     if gradient is None:
-        return "none offered", "the engine has no derivative of a step in contact"
+        return "none", run.no_gradient
     if _near(run, gradient, case.rigid_gradient, allowed):
         return "right", ""
     law = None if answer is None else answer.gradient

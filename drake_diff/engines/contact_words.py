@@ -11,8 +11,10 @@ def sentence_of(table: ContactTable, engine: str) -> str:
     rows = [row for row in table.rows if row.engine == engine]
     values = _grouped(rows, {row.case: row.verdict for row in rows})
     gradients = _grouped(rows, {row.case: row.gradient_verdict for row in rows})
-    reasons = [f"{row.case}: {row.why}" for row in rows if row.verdict in ("off", "broke off")]
+    reasons = [f"{row.case}: {row.why}" for row in rows if row.verdict in ("own law's", "off")]
+    reasons += [row.why for row in rows if row.verdict in ("falls through", "broke off")][:1]
     reasons += [f"gradient of {row.case}: {row.gradient_why}" for row in rows if row.gradient_verdict in NOT_TO_TRUST]
+    reasons += [f"no gradient: {row.gradient_why}" for row in rows if row.gradient_verdict == "none"][:1]
     return f"values: {values}; gradients: {gradients}." + (f" {'; '.join(reasons)}." if reasons else "")
 
 
