@@ -49,6 +49,7 @@ def table(
     for refused in found.refused:
         console.print(plain(f"{refused.engine} is not there: {refused.reason}", "dim"))
     if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
         write_whole(out, as_json(found).encode())
         console.print(plain(f"wrote {out}"))
     raise typer.Exit(1 if found.off else 0)

@@ -186,6 +186,19 @@ def test_wrong_gradients_are_those_without_the_jump(found):
         assert found.row(kind, "mujoco").gradient == pytest.approx(seen, rel=5e-3)  # 1 h omega of its softer spring
 
 
+def test_smaller_steps_mend_the_steps_damper_and_not_the_jump():
+    """By the hand calculation, which is Drake's sap: without a damper the gradient tends to its law's, with one not."""
+    gaps = {}
+    for kind in ("bounce", "damped bounce"):
+        for finer in (1, 8):
+            case = replace(CASES[kind], time_step=2e-4 / finer, num_steps=1000 * finer)
+            row = contact_table(("numpy",), (case,)).rows[0]
+            gaps[kind, finer] = row.gradient - row.law_gradient
+    assert abs(gaps["bounce", 8]) < abs(gaps["bounce", 1]) / 4  # first order, and the chance of when it touches
+    with_jump, without = impact_gradients(law_of("point, sap", CASES["damped bounce"]).force, CASES["damped bounce"])
+    assert gaps["damped bounce", 8] == pytest.approx(without - with_jump, abs=0.03)  # of 0.98
+
+
 def test_a_hard_fall_on_mujocos_critical_damper_bounces_by_exp_minus_2():
     """Where gravity hardly matters, g / (v omega) = 0.016: exit speed to impact speed."""
     needs("mujoco")
@@ -219,12 +232,13 @@ def test_the_hand_calculation_is_drakes_sap_where_there_is_one(found):
 # ---- what must be refused ---------------------------------------------------------------------------------------
 
 
-def doctored(case, contact="lagged", **changes):
-    """Drake on a model with fields of the case scaled."""
+def doctored(case, engine="drake", contact=None, **changes):
+    """An engine on a model with fields of the case scaled."""
 
     def load(model):
         scaled = {name: getattr(case, name) * factor for name, factor in changes.items()}
-        return dd.load_engine("drake", model.changed(**scaled), contact=contact)
+        options = {"contact": contact} if contact else {}
+        return dd.load_engine(engine, model.changed(**scaled), **options)
 
     return load
 
@@ -251,14 +265,31 @@ def doctored(case, contact="lagged", **changes):
 )
 def test_a_doctored_engine_is_off(kind, changes):
     contact = "sap" if "relaxation_time" in changes or kind == "rest" else "lagged"
-    row = contact_table((doctored(CASES[kind], contact, **changes),), (CASES[kind],)).rows[0]
+    row = contact_table((doctored(CASES[kind], contact=contact, **changes),), (CASES[kind],)).rows[0]
     assert row.verdict == "off", row
     assert "%" in row.why or "m/s" in row.why
 
 
+@pytest.mark.parametrize(
+    ("kind", "changes"),
+    [
+        ("rest", {"stiffness": 1.001}),
+        ("stop", {"friction": 1.1}),
+        ("slide", {"friction": 1.1}),
+        ("slide", {"gravity": 1.01}),
+        ("hold", {"gravity": 1.01}),
+        ("roll", {"gravity": 1.01}),
+    ],
+)
+def test_a_doctored_mujoco_is_off(kind, changes):
+    needs("mujoco")
+    row = contact_table((doctored(CASES[kind], "mujoco", **changes),), (CASES[kind],)).rows[0]
+    assert row.verdict == "off", row
+
+
 def test_creep_of_regularized_friction_does_not_know_gravity():
     """s tan a / sqrt(mu^2 - tan^2 a): what the case cannot find, rest and roll do."""
-    row = contact_table((doctored(CASES["hold"], gravity=1.01),), (CASES["hold"],)).rows[0]
+    row = contact_table((doctored(CASES["hold"], contact="lagged", gravity=1.01),), (CASES["hold"],)).rows[0]
     assert row.verdict == "own law's"
 
 

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from drake_diff.arrays import Array
-from drake_diff.engines.closed_form_contact import SlidingBlock
+from drake_diff.engines.closed_form_contact import SlidingBlock, SphereOnGround
 from drake_diff.engines.contact_cases import RAILS, ContactCase, rolling_factor, slid, sliding_speed
 from drake_diff.engines.mjcf import FRICTION_IMPEDANCE_RATIO, IMPEDANCE
 
@@ -53,7 +53,6 @@ class Law:
     stepped: Force  # what it amounts to in steps of h, to the first order
     creep: float  # speed at which it holds on the slope [m/s]
     creep_gradient: float  # of the way that a start's speed makes it creep [s]
-    slips_above: float  # speed from which on friction is mu N where N = m g [m/s]
     tail: float  # how far it goes on below, by its speed there [s]
 
     def answer(self, ran: Ran) -> Answer:
@@ -93,7 +92,7 @@ class Law:
             gradient = h * n - mu * float(by_z[vx]) + self.tail * (1 - mu * float(by_vz[vx]))
         why = f"friction is mu N, and {self.normal} lifts the ball as it slides: -mu dz for {n} steps"
         if self.tail:
-            why += f"; below {self.slips_above:.2g} m/s or so friction is a damper"
+            why += f"; {self.sticking}"
         return Answer(value, gradient, why, "-mu d z / d v_0" + (", and the damper" if self.tail else ""))
 
     def _hold(self, ran: Ran) -> Answer:
@@ -179,7 +178,7 @@ def law_of(contact_law: str, case: ContactCase) -> Law | None:
     """Of what an engine's contract calls its `contact_law`; None where no formula stands here."""
     known = {
         "point, sap": _sap,
-        "linear spring and relaxation time, implicit": _sap,
+        SphereOnGround.contact_law: _sap,
         "point, similar": _hunt_crossley,
         "point, lagged": _hunt_crossley,
     }
@@ -206,7 +205,6 @@ def _sap(case: ContactCase) -> Law:
         creep,
         # A step leaves r / (1 + r) of a speed, r = sigma w m, and the sum of its powers is r.
         case.time_step * SIGMA * per_axis * case.mass,
-        10 * STICTION_TOLERANCE,
         0.0,
     )
 
@@ -223,7 +221,6 @@ def _hunt_crossley(case: ContactCase) -> Law:
         _spring(case.stiffness, case.time_step, case.dissipation),
         creep,
         creep_gradient,
-        10 * s,
         0.0,
     )
 
@@ -263,11 +260,10 @@ def _mujoco(case: ContactCase) -> Law:
     return Law(
         case,
         f"a damper of {b / (1 / case.mass + R):.3g} N s/m and a spring",
-        "friction that sticks is a damper, R f = -b v",
+        f"friction below {case.friction * case.normal_gravity * holds:.2g} m/s or so is a damper, R f = -b v",
         force,
         force,
         case.mass * R / FRICTION_IMPEDANCE_RATIO * case.slope_gravity / b,
         holds - case.time_step,
-        case.friction * case.normal_gravity * holds,
         holds - case.time_step,
     )
