@@ -371,7 +371,9 @@ def test_an_engine_that_breaks_off_says_so():
     assert "the solver gave up" in row.why
 
 
-def test_bad_input_is_named():
+def test_bad_input_is_named(found):
+    with pytest.raises(dd.UnknownNameError, match="slide of mujoco"):
+        found.row("fly", "mujoco")
     with pytest.raises(dd.UnknownNameError, match="mujoco"):
         contact_table(("bullet-proof",))
     with pytest.raises(dd.InputError, match="slope"):

@@ -13,11 +13,11 @@ PUBLIC = """
 Actuator ArtifactError Barrier Bounds Certificate CertificateError CertificationRecord ClosedLoop Comparison
 ComparisonRecord Constraint Contract ContractLine DrakeDiffError Dynamics Engine EvidenceRecord Fallback Finding
 Gaussian GradientError Hold InputError LQR Loop MissingDependencyError Model ModelError ModelWarning NonFiniteError
-NotOfferedError PD ParametricPolicy Predictor Problem Push QuadraticCost Recording Robustness Rollout
-RolloutCertificate RolloutGradient Sensor ShapeError SimulationError Smoothed SoftContact Solution Status
-StepDerivatives TVLQR Transcribed UnknownNameError Verification audit center_of_mass certify certify_jacobian
-certify_model certify_rollout closed_loop compare contact_force contact_modes contact_table differentiate_rollout
-differentiate_step frame_position frame_rotation_error frame_velocity list_parameters load_engine load_model load_record match_contracts
+NotOfferedError PD ParametricPolicy Predictor Problem Push QuadraticCost Recording Robustness Rollout RolloutCertificate
+RolloutGradient Sensor ShapeError SimulationError Smoothed SoftContact Solution Status StepDerivatives TVLQR Transcribed
+UnknownNameError Verification audit center_of_mass certify certify_jacobian certify_model certify_rollout closed_loop
+compare contact_force contact_modes contact_table differentiate_rollout differentiate_step frame_position
+frame_rotation_error frame_velocity list_parameters load_engine load_model load_record match_contracts
 model_from_diagram plant_dynamics read_mcap read_trace robustness rollout save save_comparison smooth smooth_step
 softened solve step transcribe_and_solve verify violation_between_nodes
 """.split()

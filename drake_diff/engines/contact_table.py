@@ -17,7 +17,7 @@ from drake_diff.engines.jacobians import rollout_jacobian
 from drake_diff.engines.load import load_spec
 from drake_diff.engines.motion import EngineMotion, move
 from drake_diff.engines.numpy_engine import NumpyEngine
-from drake_diff.exceptions import GradientError, MissingDependencyError, ModelError, SimulationError
+from drake_diff.exceptions import GradientError, MissingDependencyError, ModelError, SimulationError, UnknownNameError
 from drake_diff.model import Model
 from drake_diff.tangent import tangent_space
 
@@ -95,9 +95,13 @@ class ContactTable:
         """Those with rows."""
         return tuple(dict.fromkeys(row.engine for row in self.rows))
 
-    def row(self, case: Kind, engine: str) -> ContactRow:
-        """KeyError where there is none."""
-        return {(row.case, row.engine): row for row in self.rows}[case, engine]
+    def row(self, case: str, engine: str) -> ContactRow:
+        """UnknownNameError where there is none."""
+        rows = {(str(row.case), row.engine): row for row in self.rows}
+        if (case, engine) not in rows:
+            known = [f"{a} of {b}" for a, b in rows]
+            raise UnknownNameError("row of the contact table", got=f"{case} of {engine}", known=known)
+        return rows[case, engine]
 
     @property
     def off(self) -> tuple[ContactRow, ...]:
