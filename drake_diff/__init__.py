@@ -20,6 +20,7 @@ from drake_diff.engines.compared import Comparison as Comparison
 from drake_diff.engines.comparison import compare as compare
 from drake_diff.engines.comparison_files import save_comparison as save_comparison
 from drake_diff.engines.comparison_record import ComparisonRecord as ComparisonRecord
+from drake_diff.engines.contact_table import contact_table as contact_table
 from drake_diff.engines.contract_match import ContractLine as ContractLine
 from drake_diff.engines.contract_match import match_contracts as match_contracts
 from drake_diff.engines.engine import Engine as Engine

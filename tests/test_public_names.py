@@ -16,10 +16,11 @@ Gaussian GradientError Hold InputError LQR Loop MissingDependencyError Model Mod
 NotOfferedError PD ParametricPolicy Predictor Problem Push QuadraticCost Recording Robustness Rollout
 RolloutCertificate RolloutGradient Sensor ShapeError SimulationError Smoothed SoftContact Solution Status
 StepDerivatives TVLQR Transcribed UnknownNameError Verification audit center_of_mass certify certify_jacobian
-certify_model certify_rollout closed_loop compare contact_force contact_modes differentiate_rollout differentiate_step
-export_model frame_position frame_rotation_error frame_velocity list_parameters load_engine load_model load_record
-match_contracts model_from_diagram plant_dynamics read_mcap read_recording read_trace robustness rollout save
-save_comparison smooth smooth_step softened solve step transcribe_and_solve verify violation_between_nodes
+certify_model certify_rollout closed_loop compare contact_force contact_modes contact_table differentiate_rollout
+differentiate_step export_model frame_position frame_rotation_error frame_velocity list_parameters load_engine
+load_model load_record match_contracts model_from_diagram plant_dynamics read_mcap read_recording read_trace
+robustness rollout save save_comparison smooth smooth_step softened solve step transcribe_and_solve verify
+violation_between_nodes
 """.split()
 ORDER = """
 exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin model
@@ -41,10 +42,11 @@ engines.bullet_contract engines.pybullet_engine engines.sapien_contract engines.
 engines.load engines.attribution engines.motion engines.jacobians engines.recording engines.recording_ros2
 engines.recording_files engines.recorded engines.comparison_task engines.compared engines.comparison
 engines.comparison_record engines.comparison_words engines.comparison_page engines.comparison_trace
-engines.comparison_files engines.sdf engines.usd engines.read_back engines.small_models engines.export_readme
-engines.export loop.checks loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop loop.perturbation
-loop.statistics loop.trial loop.sensitivity loop.robustness ros2_bag cli_mcap cli_runs cli_engines cli_options
-cli_export cli_view cli
+engines.comparison_files engines.contact_cases engines.contact_laws engines.contact_table engines.contact_words
+engines.sdf engines.usd engines.read_back engines.small_models engines.export_readme engines.export loop.checks
+loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop loop.perturbation loop.statistics loop.trial
+loop.sensitivity loop.robustness ros2_bag cli_mcap cli_runs cli_engines cli_options cli_export cli_view cli_contact
+cli
 """.split()
 
 

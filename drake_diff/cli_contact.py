@@ -1,0 +1,55 @@
+"""The command contact-table: the textbook contact cases in every engine."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from drake_diff.cli_runs import plain
+
+COLOURS = {"rigid answer": "green", "right": "green", "own law's": "yellow", "not asked": "dim", "none": "dim"}
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add the command of this module to `app`."""
+    app.command("contact-table")(table)
+
+
+def table(
+    engines: Annotated[
+        str | None, typer.Option(help="Names with commas between: drake,drake:lagged,mujoco. All there are.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="A JSON file to write too.")] = None,
+) -> None:
+    """Rest, stop, slide, hold, roll and bounce in every engine, beside the rigid answer and the engine's own law.
+
+    Exit status 1 where a value is neither.
+    """
+    from drake_diff.engines.contact_table import contact_table
+    from drake_diff.engines.contact_words import as_json, sentence_of
+    from drake_diff.whole_file import write_whole
+
+    found = contact_table(None if engines is None else engines.split(","))
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    shown = Table(box=None, pad_edge=False, header_style="dim")
+    for name in ("case", "engine", "value", "rigid", "own law", "verdict", "gradient", "rigid", "own law", "verdict"):
+        shown.add_column(name, overflow="fold")
+    for row in found.rows:
+        numbers = [
+            plain(number)
+            for number in (row.value, row.rigid, row.law, row.gradient, row.rigid_gradient, row.law_gradient)
+        ]
+        verdict, gradient = (plain(v, COLOURS.get(v, "red")) for v in (row.verdict, row.gradient_verdict))
+        shown.add_row(plain(row.case), plain(row.engine), *numbers[:3], verdict, *numbers[3:], gradient)
+    console.print(shown)
+    for engine in found.engines:
+        console.print(plain(engine, "bold"), plain(sentence_of(found, engine)))
+    for refused in found.refused:
+        console.print(plain(f"{refused.engine} is not there: {refused.reason}", "dim"))
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(out, as_json(found).encode())
+        console.print(plain(f"wrote {out}"))
+    raise typer.Exit(1 if found.off else 0)
