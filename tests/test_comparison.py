@@ -228,7 +228,7 @@ def test_another_jacobian_in_contact_is_another_law_and_not_unexplained(load):
     model = load("sphere_on_ground.sdf")
     x0 = np.array(model.default_state)
     x0[6] = 3.0
-    e = by_name(dd.compare(model, ("pinocchio",), x0=x0, num_steps=5))["pinocchio"]
+    e = by_name(dd.compare(model, ("pinocchio",), x0=x0, num_steps=5, seed=4))["pinocchio"]
     assert e.first_apart is None
     assert e.verdict == "other law"
     assert [e.laws[i] for i in e.other_states] == ["contact law"]
@@ -245,7 +245,9 @@ def test_another_jacobian_in_contact_that_no_contract_tells_of_is_unexplained(lo
         found = drake.differentiate_step(x, u)
         return found._replace(A=found.A * (0.9 if drake.contact_depth(x) else 1.0))
 
-    e = by_name(dd.compare(model, (Doctored(drake, name="soft", differentiate_step=softer),), x0=x0, num_steps=5))
+    e = by_name(
+        dd.compare(model, (Doctored(drake, name="soft", differentiate_step=softer),), x0=x0, num_steps=5, seed=4)
+    )
     assert e["soft"].verdict == "unexplained"
 
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from drake_diff.arrays import Array
 from drake_diff.engines.closed_form_contact import SphereOnGround
-from drake_diff.engines.comparison import Refused, default_engines
+from drake_diff.engines.compared import Refused
+from drake_diff.engines.comparison import default_engines
 from drake_diff.engines.contact_cases import QUANTITIES, ContactCase, Kind, contact_cases
 from drake_diff.engines.contact_laws import Answer, law_of
 from drake_diff.engines.engine import Engine
