@@ -4,10 +4,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
-from drake_diff.cli_runs import plain
+from drake_diff.cli_runs import plain, wide_console
 
 COLOURS = {"rigid answer": "green", "right": "green", "own law's": "yellow", "not asked": "dim", "none": "dim"}
 
@@ -28,14 +27,14 @@ def table(
     Exit status 1 where a value is neither.
     """
     from drake_diff.engines.contact_table import contact_table
-    from drake_diff.engines.contact_words import as_json, sentence_of
+    from drake_diff.engines.contact_words import as_json, lines_of
     from drake_diff.whole_file import write_whole
 
     found = contact_table(None if engines is None else engines.split(","))
-    console = Console(soft_wrap=True, highlight=False, markup=False)
+    console = wide_console()
     shown = Table(box=None, pad_edge=False, header_style="dim")
     for name in ("case", "engine", "value", "rigid", "own law", "verdict", "gradient", "rigid", "own law", "verdict"):
-        shown.add_column(name, overflow="fold")
+        shown.add_column(name, no_wrap=True)
     for row in found.rows:
         numbers = [
             plain(number)
@@ -45,7 +44,10 @@ def table(
         shown.add_row(plain(row.case), plain(row.engine), *numbers[:3], verdict, *numbers[3:], gradient)
     console.print(shown)
     for engine in found.engines:
-        console.print(plain(engine, "bold"), plain(sentence_of(found, engine)))
+        first, *reasons = lines_of(found, engine)
+        console.print(plain(engine, "bold"), plain(first))
+        for reason in reasons:
+            console.print(plain(f"    {reason}", "dim"))
     for refused in found.refused:
         console.print(plain(f"{refused.engine} is not there: {refused.reason}", "dim"))
     if out is not None:

@@ -4,12 +4,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
-from drake_diff.cli_runs import plain
+from drake_diff.cli_runs import plain, wide_console
 
-NOT_A_TERMINAL = 120  # columns of what is written to a file
 COLOURS = {"same": "green", "other law": "yellow", "other model": "red", "unexplained": "red"}
 
 
@@ -68,9 +66,7 @@ def compare(
 
 
 def _print(record: Any) -> None:
-    console = Console(soft_wrap=True, highlight=False)
-    if not console.is_terminal:
-        console = Console(soft_wrap=True, highlight=False, width=NOT_A_TERMINAL)
+    console = wide_console()
     table = Table(box=None, pad_edge=False)
     for name in ("engine", "verdict", "step gap", "apart from", "Jacobian gap", "its own", "step", "Jacobian"):
         table.add_column(name, no_wrap=name != "engine")

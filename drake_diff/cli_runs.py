@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 COLOURS = {"pass": "green", "holds": "green", "fail": "red", "broken": "red"}
+NOT_FOLDED = 160  # columns
 RunDirectory = Annotated[Path, typer.Argument(help="A run directory.")]
 
 
@@ -95,6 +96,12 @@ def schema() -> None:
 
 def _console() -> Console:
     return Console(soft_wrap=True, highlight=False, markup=False)
+
+
+def wide_console() -> Console:
+    """For tables of many columns: into a file or a pipe they are not folded to a terminal's width."""
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    return console if console.is_terminal else Console(soft_wrap=True, highlight=False, markup=False, width=NOT_FOLDED)
 
 
 def _table(*columns: str) -> Table:

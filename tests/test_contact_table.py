@@ -26,7 +26,7 @@ from drake_diff.engines.contact_cases import (
 )
 from drake_diff.engines.contact_laws import impact, impact_gradients, law_of
 from drake_diff.engines.contact_table import TOLERANCES, contact_table, rebound_height
-from drake_diff.engines.contact_words import as_json, sentence_of
+from drake_diff.engines.contact_words import as_json, lines_of
 
 G = 9.81
 DRAKES = ["drake (sap, autodiff)", "drake (similar, autodiff)", "drake (lagged, autodiff)"]
@@ -400,7 +400,7 @@ def test_the_rebound_is_read_at_any_step_of_the_flight():
 
 
 def test_sentences_and_json(found):
-    said = sentence_of(found, SAP)
+    said = " ".join(lines_of(found, SAP))
     assert "rigid answer (rest, bounce)" in said
     assert "wrong (bounce, damped bounce)" in said
     assert "gradient of damped bounce" in said
@@ -424,6 +424,6 @@ def test_every_engine_that_is_here_is_told_of():
     found = contact_table()
     assert set(DRAKES) <= set(found.engines)
     for engine in found.engines:
-        assert sentence_of(found, engine)
+        assert " ".join(lines_of(found, engine))
         for row in found.rows:
             assert row.why or row.verdict == "rigid answer"

@@ -1,4 +1,4 @@
-"""A contact table as a sentence per engine and as JSON."""
+"""A contact table as a few lines per engine and as JSON."""
 
 import json
 from dataclasses import asdict
@@ -6,7 +6,7 @@ from dataclasses import asdict
 from drake_diff.engines.contact_table import ContactRow, ContactTable
 
 
-def sentence_of(table: ContactTable, engine: str) -> str:
+def lines_of(table: ContactTable, engine: str) -> tuple[str, ...]:
     """Which values and gradients of `engine` are the rigid answer's, which its own law's, which neither, and why."""
     rows = [row for row in table.rows if row.engine == engine]
     values = _grouped(rows, {row.case: row.verdict for row in rows})
@@ -15,7 +15,7 @@ def sentence_of(table: ContactTable, engine: str) -> str:
     reasons += [row.why for row in rows if row.verdict in ("falls through", "broke off")][:1]
     reasons += [f"gradient of {row.case}: {row.gradient_why}" for row in rows if row.gradient_verdict in NOT_TO_TRUST]
     reasons += [f"no gradient: {row.gradient_why}" for row in rows if row.gradient_verdict == "none"][:1]
-    return f"values: {values}; gradients: {gradients}." + (f" {'; '.join(reasons)}." if reasons else "")
+    return (f"values: {values}; gradients: {gradients}", *reasons)
 
 
 def as_json(table: ContactTable) -> str:
