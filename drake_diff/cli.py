@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from drake_diff import cli_contact, cli_engines, cli_export, cli_mcap, cli_runs
+from drake_diff import cli_contact, cli_engines, cli_export, cli_gradients, cli_mcap, cli_runs
 from drake_diff.cli_options import Approximation, ContactModel, Geometry, Ground, ModelFile, TimeStep, WeldBase
 from drake_diff.cli_runs import plain
 from drake_diff.cli_view import view
@@ -27,6 +27,7 @@ cli_runs.add_commands(app)
 cli_engines.add_commands(app)
 cli_export.add_commands(app)
 cli_contact.add_commands(app)
+cli_gradients.add_commands(app)
 
 
 @app.callback()

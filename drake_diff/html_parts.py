@@ -15,9 +15,12 @@ Row = Sequence[Any]
 
 
 def write_page(
-    path: Path, title: str, body: str, data: Mapping[str, Any], record: Mapping[str, Any], view: str
+    path: Path, title: str, body: str, data: Mapping[str, Any], record: Mapping[str, Any], view: str = ""
 ) -> None:
-    """Write one page: `body` with plots of `data` (see `report_data`), `record` to be downloaded, the replay `view`."""
+    """Write one page: `body` with plots of `data` (see `report_data`), `record` to be downloaded, the replay `view`.
+
+    A page without `view` has neither `stage` nor `slider`.
+    """
     embedded = script_json("data", data) + script_json("record", record)
     scripts = "".join(f"<script>{asset(name)}</script>\n" for name in ("uPlot.iife.min.js", "report.js"))
     style = asset("uPlot.min.css") + asset("report.css")

@@ -12,15 +12,15 @@ PACKAGE = Path(drake_diff.__file__).parent
 PUBLIC = """
 Actuator ArtifactError Barrier Bounds Certificate CertificateError CertificationRecord ClosedLoop Comparison
 ComparisonRecord Constraint Contract ContractLine DrakeDiffError Dynamics Engine EvidenceRecord Fallback Finding
-Gaussian GradientError Hold InputError LQR Loop MissingDependencyError Model ModelError ModelWarning NonFiniteError
-NotOfferedError PD ParametricPolicy Predictor Problem Push QuadraticCost Recording Robustness Rollout
-RolloutCertificate RolloutGradient Sensor ShapeError SimulationError Smoothed SoftContact Solution Status
-StepDerivatives TVLQR Transcribed UnknownNameError Verification audit center_of_mass certify certify_jacobian
+Gaussian GradientCase GradientError GradientPanel Hold InputError LQR Loop MissingDependencyError Model ModelError
+ModelWarning NonFiniteError NotOfferedError PD ParametricPolicy Predictor Problem Push QuadraticCost Recording
+Robustness Rollout RolloutCertificate RolloutGradient Sensor ShapeError SimulationError Smoothed SoftContact Solution
+Status StepDerivatives TVLQR Transcribed UnknownNameError Verification audit center_of_mass certify certify_jacobian
 certify_model certify_rollout closed_loop compare contact_force contact_modes contact_table differentiate_rollout
-differentiate_step export_model frame_position frame_rotation_error frame_velocity list_parameters load_engine
-load_model load_record match_contracts model_from_diagram plant_dynamics read_mcap read_recording read_trace
-robustness rollout save save_comparison smooth smooth_step softened solve step transcribe_and_solve verify
-violation_between_nodes
+differentiate_step export_model frame_position frame_rotation_error frame_velocity gradient_panel list_parameters
+load_engine load_model load_record match_contracts model_from_diagram plant_dynamics read_mcap read_recording
+read_trace robustness rollout save save_comparison save_gradient_panel smooth smooth_step softened solve step
+transcribe_and_solve verify violation_between_nodes
 """.split()
 ORDER = """
 exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin model
@@ -45,7 +45,8 @@ engines.comparison_record engines.comparison_words engines.comparison_page engin
 engines.comparison_files engines.contact_cases engines.contact_laws engines.contact_table engines.contact_words
 engines.sdf engines.usd engines.read_back engines.small_models engines.export_readme engines.export loop.checks
 loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop loop.perturbation loop.statistics loop.trial
-loop.sensitivity loop.robustness ros2_bag cli_mcap cli_runs cli_engines cli_options cli_export cli_view cli_contact
+loop.sensitivity loop.robustness gradient_estimate gradient_descent gradient_panel_cases gradient_panel
+gradient_panel_files ros2_bag cli_mcap cli_runs cli_engines cli_gradients cli_options cli_export cli_view cli_contact
 cli
 """.split()
 

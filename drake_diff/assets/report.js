@@ -7,7 +7,7 @@
   const timed = [];  // the plots over time
   let time = 0, playing = false, last = 0;
 
-  const viewer = () => frame.contentWindow && frame.contentWindow.viewer;
+  const viewer = () => frame && frame.contentWindow && frame.contentWindow.viewer;
   function isReady() {
     const v = viewer();
     return Boolean(v && v.animator && v.animator.actions.length);
@@ -166,15 +166,19 @@
 
   data.plots.forEach(draw);
   drawMaps();
-  slider.addEventListener("input", () => { setPlaying(false); setTime(Number(slider.value)); });
-  play.addEventListener("click", () => setPlaying(!playing));
+  if (slider) {
+    slider.addEventListener("input", () => { setPlaying(false); setTime(Number(slider.value)); });
+    play.addEventListener("click", () => setPlaying(!playing));
+    setTime(0);
+  }
   byId("download").addEventListener("click", () => {
     const link = document.createElement("a");
     link.href = URL.createObjectURL(new Blob([byId("record").textContent], { type: "application/json" }));
     link.download = "record.json";
     link.click();
   });
-  whenReady(() => {
+  if (!frame) document.documentElement.dataset.ready = "yes";  // a page without a motion
+  else whenReady(() => {
     const v = viewer();
     v.gui.domElement.style.display = "none";  // the slider is the page's own
     v.animator.play();
@@ -192,5 +196,4 @@
     byId("still").src = viewer().renderer.domElement.toDataURL("image/png");
   });
   addEventListener("afterprint", () => { document.documentElement.classList.remove("printed"); redraw(); });
-  setTime(0);
 })();
