@@ -18,7 +18,10 @@ def gradient_panel(
     seeds: Annotated[int, typer.Option(help="How many estimates and how many descents.")] = 10,
     out: Annotated[Path, typer.Option(help="Directory.")] = Path("artifacts/gradient_panel"),
 ) -> None:
-    """Compare first-order, zeroth-order and blended gradients: variance, bias, and whether a descent arrives."""
+    """Compare first-order, zeroth-order and blended gradients: variance, bias, and whether a descent arrives.
+
+    All cases take minutes. Writes gradient_panel.json, .csv and .html.
+    """
     from drake_diff.gradient_panel import gradient_panel as compare
     from drake_diff.gradient_panel_files import PAGE, save_gradient_panel
 

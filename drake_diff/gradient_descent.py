@@ -49,8 +49,7 @@ def descend(
     measured = []
     for point in visited:
         try:
-            truth = truth_of(case, point, sigma, samples)
-            measured.append((truth.value, truth.value_error))
+            measured.append(_measured(case, point, sigma, samples))
         except (GradientError, SimulationError, NonFiniteError) as error:
             failure = failure or f"{type(error).__name__}: {error}"
             measured.append(measured[-1])
@@ -64,6 +63,14 @@ def _stepped(case: GradientCase, order: str, x: Array, sigma: float, batch: int,
     if not np.isfinite(after).all():
         raise GradientError(f"a step from {x.tolist()} leads to {after.tolist()}")
     return frozen(after)
+
+
+def _measured(case: GradientCase, x: Array, sigma: float, samples: int) -> tuple[float, float]:
+    """F and its standard error."""
+    truth = truth_of(case, x, sigma, samples)
+    if not np.isfinite(truth.value):
+        raise GradientError(f"F({x.tolist()}) is {truth.value}")
+    return truth.value, truth.value_error
 
 
 def _seed(seed: int, step: int) -> int:

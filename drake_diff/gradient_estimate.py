@@ -24,8 +24,8 @@ class GradientCase:
     """A loss `f` of x (n,) with its `derivative` (n,), and the task of making F small by gradient descent.
 
     Gradients are compared at `start` (n,), where the descent begins too; it takes steps x - `rate` * gradient at the
-    largest of `sigmas` (in the units of x) and has succeeded where F is at most `goal`. `closed_form`(x, sigma) gives
-    F and its gradient where they are known. Raises InputError.
+    largest of `sigmas` (in the units of x) and has arrived where F at that sigma is at most `goal`.
+    `closed_form`(x, sigma) gives F and its gradient where they are known. Raises InputError.
     """
 
     name: str

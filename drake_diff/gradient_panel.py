@@ -63,7 +63,7 @@ class CasePanel:
         found = [f"least mean squared error at equal evaluations: {best}"]
         for order in orders:
             biased = [self.at(order, s) for s in self.sigmas if self.at(order, s).biased]
-            told = ", ".join(f"sigma {q.sigma:g} ({_errors(q.bias_in_errors)})" for q in biased)
+            told = ", ".join(f"sigma {q.sigma:g} (by {_size(q)})" for q in biased)
             found.append(f"{_label(order)} is biased at {told}" if biased else f"{_label(order)} shows no bias")
         rates = {order: self.rate(order) for order in orders}
         arrived = ", ".join(f"{order} {r.successes} of {r.trials}" for order, r in rates.items())
@@ -175,8 +175,9 @@ def _label(order: str) -> str:
     return {"point": "the derivative at the point", "blend": "the blend"}.get(order, f"{order} order")
 
 
-def _errors(ratio: float) -> str:
-    return f"{ratio:.0f} standard errors" if np.isfinite(ratio) else "both are exact"
+def _size(q: Quality) -> str:
+    errors = f"{q.bias_in_errors:.0f} standard errors" if np.isfinite(q.bias_in_errors) else "exactly"
+    return f"{np.linalg.norm(q.bias):.2g}, {errors}"
 
 
 def _row(panel: CasePanel, q: Quality) -> Json:

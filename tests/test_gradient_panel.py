@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_report import browser as browser  # a fixture
+from test_report import browsing
 from typer.testing import CliRunner
 
 import drake_diff as dd
@@ -70,7 +72,7 @@ def test_variance_and_bias_are_those_of_the_closed_forms(case):
     if case is STEP:
         assert first.bias[0] == pytest.approx(-P, rel=1e-12)
         assert first.bias_in_errors == np.inf
-        assert "first order is biased at sigma 0.5 (both are exact)" in found.verdict
+        assert "first order is biased at sigma 0.5 (by 0.67, exactly)" in found.verdict  # density(0.6) / 0.5
         assert found.least_error(SIGMA) == "zeroth"
     else:
         assert found.least_error(SIGMA) == "first"
@@ -228,6 +230,7 @@ def test_a_descent_that_leaves_the_numbers_says_so_and_has_not_arrived():
     assert not run.succeeded
     assert run.failure.startswith("GradientError")
     assert np.isfinite(run.losses).all()
+    assert len(run.losses) == len(run.evaluations) == 6
 
 
 def test_the_same_seeds_give_the_same_bytes(tmp_path):
@@ -254,6 +257,16 @@ def test_the_command_writes_table_numbers_and_page(tmp_path):
     page = (tmp_path / "gradient_panel.html").read_text()
     assert 'id="plots"' in page
     assert "<iframe" not in page
+
+
+@browsing
+def test_the_page_needs_no_motion_to_draw_its_plots(tmp_path, browser):
+    dd.save_gradient_panel(dd.gradient_panel([wall()], seeds=2), tmp_path)
+    browser.get_log("browser")
+    browser.get((tmp_path / "gradient_panel.html").as_uri())
+    assert browser.execute_script("return document.documentElement.dataset.ready") == "yes"
+    assert browser.execute_script("return document.querySelectorAll('.plot canvas').length") == 3
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
 
 
 @pytest.mark.parametrize(
