@@ -205,6 +205,20 @@ def test_stiffness_makes_first_order_vary_and_zeroth_no_more_than_before():
     assert stiff[0] > stiff[1]
 
 
+def test_on_stiff_ground_the_jumps_of_the_step_turn_the_sign_of_first_order():
+    """The truth by the trapezoid rule over 401 heights, which needs neither derivatives nor samples."""
+    case, sigma = bounce(1e5), 0.01
+    w = np.linspace(-5, 5, 401) * sigma
+    f = np.array([case.f(case.start + a) for a in w])
+    weights = np.exp(-((w / sigma) ** 2) / 2)
+    gradient = np.sum(weights * f * w) / np.sum(weights) / sigma**2
+    found = dd.gradient_panel([case], sigmas=[sigma], samples=20, seeds=3, budget=21, reference_samples=300).cases[0]
+    assert abs(found.truths[0].gradient[0] - gradient) < 5 * found.truths[0].error[0]
+    first, zeroth = found.at("first", sigma), found.at("zeroth", sigma)
+    assert (first.biased, first.cosine) == (True, -1)
+    assert (zeroth.biased, found.least_error(sigma)) == (False, "zeroth")
+
+
 def test_a_long_chaotic_horizon_makes_first_order_vary_and_zeroth_hardly():
     short, long = (qualities(double_pendulum(num_steps=n), 0.3, 30, 1) for n in (25, 150))
     assert long[0] > 1000 * short[0]
