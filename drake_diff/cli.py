@@ -1,4 +1,7 @@
-"""The command `drake-diff`. Exit status: 0 it holds, 1 a check failed, 2 usage, 3 something is missing, 4 internal."""
+"""The command `drake-diff`. Exit status: 0 it holds, 1 a check failed, 2 usage, 3 something is missing, 4 internal.
+
+A panel that Ctrl-C ended exits with 130.
+"""
 
 import importlib.util
 import sys
@@ -14,7 +17,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from drake_diff import cli_engines, cli_mcap, cli_runs
+from drake_diff import cli_engines, cli_mcap, cli_panel, cli_runs
 from drake_diff.cli_runs import plain
 from drake_diff.cli_view import view
 
@@ -24,6 +27,7 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_
 cli_mcap.add_commands(app)
 cli_runs.add_commands(app)
 cli_engines.add_commands(app)
+cli_panel.add_commands(app)
 
 
 @app.callback()

@@ -18,8 +18,8 @@ RolloutGradient Sensor ShapeError SimulationError Smoothed SoftContact Solution 
 Transcribed UnknownNameError Verification audit center_of_mass certify certify_jacobian certify_model certify_rollout
 closed_loop compare contact_force contact_modes differentiate_rollout differentiate_step frame_position
 frame_rotation_error frame_velocity list_parameters load_engine load_model load_record match_contracts
-model_from_diagram plant_dynamics read_mcap read_trace rollout save save_comparison smooth smooth_step softened solve
-step transcribe_and_solve verify violation_between_nodes
+model_from_diagram plant_dynamics read_mcap read_trace rollout run_panel save save_comparison smooth smooth_step
+softened solve step transcribe_and_solve verify violation_between_nodes
 """.split()
 ORDER = """
 exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin model
@@ -37,8 +37,9 @@ engines.description engines.closed_form engines.closed_form_contact engines.nump
 engines.pinocchio_engine engines.mjcf engines.mujoco_contract engines.mujoco_engine engines.contract_match
 engines.load engines.attribution engines.motion engines.jacobians engines.recording engines.comparison
 engines.comparison_record engines.comparison_words engines.comparison_page engines.comparison_trace
-engines.comparison_files loop.checks loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop ros2_bag
-cli_mcap cli_runs cli_engines cli_view cli
+engines.comparison_files loop.checks loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop
+panels.panel_file panels.trial_row panels.journal panels.local_workers panels.ray_workers panels.workers panels.table
+panels.panel ros2_bag cli_mcap cli_runs cli_engines cli_panel cli_view cli
 """.split()
 
 
@@ -84,7 +85,7 @@ def test_no_module_is_too_long_and_none_asserts():
 
 
 def test_importing_the_package_loads_neither_plots_nor_viewers_nor_logs():
-    late = ("matplotlib", "mcap", "typer", "mujoco", "pinocchio", "casadi")
+    late = ("matplotlib", "mcap", "typer", "mujoco", "pinocchio", "casadi", "ray")
     code = f"import sys, drake_diff; print([m for m in {late} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
