@@ -357,10 +357,12 @@ def test_the_summary_of_a_cell_by_hand(tmp_path):
 def test_wilsons_interval_solves_its_equation():
     """Its ends are the rates p that are z standard deviations, sqrt(p (1 - p) / n), from the rate that was seen."""
     for successes, count in [(0, 5), (3, 10), (10, 10), (500, 1000)]:
-        for p in wilson(successes, count):
-            z = abs(successes / count - p) / math.sqrt(p * (1 - p) / count) if 0 < p < 1 else 1.959963984540054
-            assert z == pytest.approx(1.959963984540054, rel=1e-9)  # rounding, of a difference of rates
-    assert wilson(0, 5)[0] == pytest.approx(0, abs=1e-15)
+        low, high = wilson(successes, count)
+        assert (low == 0) == (successes == 0)
+        assert (high == 1) == (successes == count)
+        for p in {low, high} - {0, 1}:
+            deviations = abs(successes / count - p) / math.sqrt(p * (1 - p) / count)
+            assert deviations == pytest.approx(1.959963984540054, rel=1e-9)  # rounding, of a difference of rates
 
 
 # --- the file ---------------------------------------------------------------------------------------------------------

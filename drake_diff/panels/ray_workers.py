@@ -1,6 +1,7 @@
 """Trials as tasks of Ray: on a cluster that runs already, or on one of this machine alone."""
 
 import os
+import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -21,22 +22,25 @@ def ray_pool(function: TrialFunction, workers: int | None, address: str | None) 
     """
     ray = _import(address)
     cores = {"num_cpus": workers or os.cpu_count(), "include_dashboard": False} if address is None else {}
-    try:
-        ray.init(
-            address=address or "local",
-            runtime_env={"env_vars": ONE_THREAD},
-            log_to_driver=False,
-            logging_level="error",
-            **cores,
-        )
-    except ConnectionError as error:
-        raise InputError("address", got=f"{address}: {error}", expected="HOST:PORT of a running Ray head") from error
+    _check_listens(address)
+    environment = {"env_vars": ONE_THREAD}
+    ray.init(address or "local", runtime_env=environment, log_to_driver=False, logging_level="error", **cores)
     try:
         if address is None and ray.util.get_node_ip_address() != "127.0.0.1":
             raise InputError("ray", got="an import of it before", expected="none: it listens on all interfaces so")
         yield lambda trials: _answers(ray, trials, function, workers)
     finally:
         ray.shutdown()
+
+
+def _check_listens(address: str | None) -> None:
+    """Refuse an address at which nothing listens: Ray itself would wait for minutes, and end this process."""
+    host, _, port = (address or "").rpartition(":")
+    try:
+        if address is not None:
+            socket.create_connection((host, int(port)), timeout=5).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise InputError("address", got=f"{address}: {error}", expected="HOST:PORT of a running Ray head") from error
 
 
 def _import(address: str | None) -> Any:

@@ -113,4 +113,6 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
     rate, z2 = successes / count, Z_95**2
     middle = (rate + z2 / (2 * count)) / (1 + z2 / count)
     half = Z_95 / (1 + z2 / count) * math.sqrt(rate * (1 - rate) / count + z2 / (4 * count**2))
-    return max(0.0, middle - half), min(1.0, middle + half)
+    low = middle - half if successes else 0.0  # exactly, where rounding would leave 1e-17
+    high = middle + half if successes < count else 1.0
+    return low, high

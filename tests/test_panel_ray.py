@@ -1,0 +1,132 @@
+"""The same panel as tasks of a real Ray cluster on this machine."""
+
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+
+pytest.importorskip("ray")
+pytestmark = pytest.mark.slow
+
+FUNCTIONS = """
+import os, time
+import numpy as np
+
+def cheap(trial):
+    with open("log", "ab", buffering=0) as file:
+        file.write(f"{os.getpid()} {trial['level']} {trial['repeat']}\\n".encode())
+    time.sleep(0.02)
+    if trial["level"] == 3 and trial["repeat"] < 2:
+        raise ValueError("no, that one not")
+    rng = np.random.default_rng(trial["seed"])
+    return {"success": bool(rng.random() < 0.5), "cost": rng.normal(), "threads": os.environ["OPENBLAS_NUM_THREADS"]}
+
+def dies(trial):
+    if trial["level"] == 3 and trial["repeat"] == 4:
+        os._exit(1)
+    return {"cost": trial["level"]}
+"""
+PANEL = 'evaluate = "trials.py:{}"\nseeds = 50\n[axes]\nlevel = [1, 2, 3, 4]\n'
+# In a process of its own: Ray can be made to listen on loopback only where nothing has imported it before.
+KILLED = """
+import os, signal, sys, time
+import drake_diff as dd
+
+def kill(finished, count, errors):
+    if finished == 40:
+        pids = [int(line.split()[0]) for line in open("log")]
+        print("of", len(set(pids)), "workers one is killed:", pids[-1])
+        os.kill(pids[-1], signal.SIGKILL)
+
+if __name__ == "__main__":
+    dd.run_panel("panel.toml", out="ray", workers=2, engine="ray", progress=kill)
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write_panel(function):
+        (tmp_path / "trials.py").write_text(FUNCTIONS)
+        (tmp_path / "panel.toml").write_text(PANEL.format(function))
+
+    return write_panel
+
+
+def panel(folder, *words):
+    command = [sys.executable, "-m", "drake_diff.cli", "panel", "panel.toml", *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=240)
+
+
+def files(directory):
+    return {name: (directory / name).read_bytes() for name in ("table.csv", "summary.json")}
+
+
+def test_a_cluster_of_which_a_worker_is_killed_gives_the_table_of_local_processes(write, tmp_path):
+    write("cheap")
+    assert panel(tmp_path, "--out", "local", "--workers", "2").returncode == 1  # two rows are errors
+    (tmp_path / "log").unlink()
+    (tmp_path / "script.py").write_text(KILLED)
+    done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    assert "of 2 workers one is killed" in done.stdout
+    assert files(tmp_path / "ray") == files(tmp_path / "local")
+    trials = [line.split(maxsplit=1) for line in (tmp_path / "log").read_text().splitlines()]
+    assert len({pid for pid, _ in trials}) == 3  # the two, and the one that took the place of the killed
+    assert 200 < len(trials) <= 202  # the killed one's trial, and what it had been sent, began twice; no other
+
+
+def test_a_trial_that_kills_its_worker_twice_is_the_same_row_on_a_cluster(write, tmp_path):
+    write("dies")
+    for engine in ("local", "ray"):
+        done = panel(tmp_path, "--out", engine, "--engine", engine, "--workers", "2")
+        assert done.returncode == 1, done.stderr
+        assert "200 trials, 1 errors" in done.stdout
+    assert files(tmp_path / "ray") == files(tmp_path / "local")
+
+
+def test_a_cluster_that_is_not_there_is_refused(write, tmp_path):
+    write("cheap")
+    done = panel(tmp_path, "--engine", "ray", "--address", "127.0.0.1:1")
+    assert done.returncode == 2
+    assert "address: expected HOST:PORT of a running Ray head" in done.stderr
+
+
+@pytest.fixture
+def cluster(monkeypatch):
+    """Two nodes of one core each, the second joined to the first, as on two machines; on loopback."""
+    monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    ray = [sys.executable, "-m", "ray.scripts.scripts", "start", "--num-cpus=1", "--block"]
+    nodes = [subprocess.Popen([*ray, "--head", f"--port={port}", "--include-dashboard=false"])]
+    wait_for(lambda: listens(port))
+    nodes.append(subprocess.Popen([*ray, f"--address=127.0.0.1:{port}"]))
+    yield f"127.0.0.1:{port}"
+    for node in reversed(nodes):
+        node.terminate()
+        node.wait(30)
+
+
+def listens(port):
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def wait_for(condition):
+    end = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def test_a_cluster_that_runs_already_gives_the_table_of_local_processes(write, tmp_path, cluster):
+    write("cheap")
+    for options in (["--out", "ray", "--engine", "ray", "--address", cluster], ["--out", "local"]):
+        done = panel(tmp_path, *options)
+        assert done.returncode == 1, done.stderr
+        assert "200 trials, 2 errors" in done.stdout
+    assert files(tmp_path / "ray") == files(tmp_path / "local")
