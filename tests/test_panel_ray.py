@@ -1,5 +1,6 @@
 """The same panel as tasks of a real Ray cluster on this machine."""
 
+import secrets
 import socket
 import subprocess
 import sys
@@ -43,6 +44,13 @@ def kill(finished, count, errors):
 if __name__ == "__main__":
     dd.run_panel("panel.toml", out="ray", workers=2, engine="ray", progress=kill)
 """
+
+
+@pytest.fixture(autouse=True)
+def token(monkeypatch):
+    """A token for these clusters alone: without one Ray writes its own into the home directory."""
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(32))
 
 
 @pytest.fixture
@@ -95,20 +103,18 @@ def test_a_cluster_that_is_not_there_is_refused(write, tmp_path):
 
 @pytest.fixture
 def cluster(monkeypatch):
-    """Two nodes of one core each, the second joined to the first, as on two machines; on loopback."""
+    """A head that runs already, of two cores, on loopback alone."""
     monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    ray = [sys.executable, "-m", "ray.scripts.scripts", "start", "--num-cpus=1", "--block"]
-    nodes = [subprocess.Popen([*ray, "--head", f"--port={port}", "--include-dashboard=false"])]
+    command = [sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--num-cpus=2", "--block"]
+    head = subprocess.Popen([*command, f"--port={port}", "--include-dashboard=false"])
     wait_for(lambda: listens(port))
-    nodes.append(subprocess.Popen([*ray, f"--address=127.0.0.1:{port}"]))
     yield f"127.0.0.1:{port}"
-    for node in reversed(nodes):
-        node.terminate()
-        node.wait(30)
+    head.terminate()
+    head.wait(60)
 
 
 def listens(port):

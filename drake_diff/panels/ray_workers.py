@@ -24,7 +24,10 @@ def ray_pool(function: TrialFunction, workers: int | None, address: str | None) 
     cores = {"num_cpus": workers or os.cpu_count(), "include_dashboard": False} if address is None else {}
     _check_listens(address)
     environment = {"env_vars": ONE_THREAD}
-    ray.init(address or "local", runtime_env=environment, log_to_driver=False, logging_level="error", **cores)
+    try:
+        ray.init(address or "local", runtime_env=environment, log_to_driver=False, logging_level="error", **cores)
+    except ConnectionError as error:
+        raise InputError("address", got=f"{address}: {error}", expected="a Ray cluster of ours") from error
     try:
         if address is None and ray.util.get_node_ip_address() != "127.0.0.1":
             raise InputError("ray", got="an import of it before", expected="none: it listens on all interfaces so")
