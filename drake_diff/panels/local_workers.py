@@ -90,9 +90,9 @@ def _hand_out(worker: _Worker, waiting: deque[Trial], crew: list[_Worker]) -> No
 
 def _end(worker: _Worker) -> None:
     """Kill it at once: all that it had to say is on the disk, or is evaluated again."""
-    worker.pipe.close()
     worker.process.kill()
     worker.process.join()
+    worker.pipe.close()
 
 
 @contextmanager
@@ -120,18 +120,15 @@ def _work(function: TrialFunction, pipe: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    try:
-        call = function.enter()
-    except Exception as error:
-        pipe.send(f"{type(error).__name__}: {error}")
-        return
-    pipe.send(None)
-    while True:
+    with suppress(EOFError, ConnectionError):  # the parent is gone, and nobody waits for an answer
         try:
-            fields = pipe.recv()
-        except EOFError:
+            call = function.enter()
+        except Exception as error:
+            pipe.send(f"{type(error).__name__}: {error}")
             return
-        pipe.send(row_of(call, fields))
+        pipe.send(None)
+        while True:
+            pipe.send(row_of(call, pipe.recv()))
 
 
 def _end_with_parent() -> None:
