@@ -61,6 +61,7 @@ from drake_diff.mcap_read import read_mcap as read_mcap
 from drake_diff.model import Model as Model
 from drake_diff.model import load_model as load_model
 from drake_diff.model import model_from_diagram as model_from_diagram
+from drake_diff.panels.panel import run_panel as run_panel
 from drake_diff.parameters import list_parameters as list_parameters
 from drake_diff.policy import LQR as LQR
 from drake_diff.policy import PD as PD

@@ -1,4 +1,7 @@
-"""The command `drake-diff`. Exit status: 0 it holds, 1 a check failed, 2 usage, 3 something is missing, 4 internal."""
+"""The command `drake-diff`. Exit status: 0 it holds, 1 a check failed, 2 usage, 3 something is missing, 4 internal.
+
+A panel that Ctrl-C ended exits with 130.
+"""
 
 import importlib.util
 import sys
@@ -14,7 +17,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from drake_diff import cli_contact, cli_engines, cli_export, cli_gradients, cli_mcap, cli_runs
+from drake_diff import cli_contact, cli_engines, cli_export, cli_gradients, cli_mcap, cli_panel, cli_runs
 from drake_diff.cli_options import Approximation, ContactModel, Geometry, Ground, ModelFile, TimeStep, WeldBase
 from drake_diff.cli_runs import plain
 from drake_diff.cli_view import view
@@ -28,6 +31,7 @@ cli_engines.add_commands(app)
 cli_export.add_commands(app)
 cli_contact.add_commands(app)
 cli_gradients.add_commands(app)
+cli_panel.add_commands(app)
 
 
 @app.callback()

@@ -19,8 +19,8 @@ Status StepDerivatives TVLQR Transcribed UnknownNameError Verification audit cen
 certify_model certify_rollout closed_loop compare contact_force contact_modes contact_table differentiate_rollout
 differentiate_step export_model frame_position frame_rotation_error frame_velocity gradient_panel list_parameters
 load_engine load_model load_record match_contracts model_from_diagram plant_dynamics read_mcap read_recording
-read_trace robustness rollout save save_comparison save_gradient_panel smooth smooth_step softened solve step
-transcribe_and_solve verify violation_between_nodes
+read_trace robustness rollout run_panel save save_comparison save_gradient_panel smooth smooth_step softened solve
+step transcribe_and_solve verify violation_between_nodes
 """.split()
 ORDER = """
 exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin model
@@ -44,10 +44,11 @@ engines.recording_files engines.recorded engines.comparison_task engines.compare
 engines.comparison_record engines.comparison_words engines.comparison_page engines.comparison_trace
 engines.comparison_files engines.contact_cases engines.contact_laws engines.contact_table engines.contact_words
 engines.sdf engines.usd engines.read_back engines.small_models engines.export_readme engines.export loop.checks
-loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop loop.perturbation loop.statistics loop.trial
-loop.sensitivity loop.robustness gradient_estimate gradient_descent gradient_panel_cases gradient_panel
-gradient_panel_files ros2_bag cli_mcap cli_runs cli_engines cli_gradients cli_options cli_export cli_view cli_contact
-cli
+loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop panels.panel_file panels.trial_row
+panels.journal panels.local_workers panels.ray_workers panels.workers panels.table panels.panel loop.perturbation
+loop.statistics loop.trial loop.sensitivity loop.robustness gradient_estimate gradient_descent gradient_panel_cases
+gradient_panel gradient_panel_files ros2_bag cli_mcap cli_runs cli_engines cli_panel cli_gradients cli_options
+cli_export cli_view cli_contact cli
 """.split()
 
 

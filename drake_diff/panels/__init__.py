@@ -1,0 +1,1 @@
+"""Many trials from one declarative file: every combination evaluated once, in one table."""

@@ -1,0 +1,151 @@
+"""The declarative file of a panel, and the trials that it stands for.
+
+evaluate = "trials.py:balance"   # a file beside this one, or "package.module:function"
+seed = 0
+seeds = 20                       # trials in each cell
+
+[axes]                           # every combination is a cell
+method = ["ilqr", "shooting"]
+level = [0.0, 0.1]
+
+[fixed]                          # what all trials share
+model = "models/pendulum.urdf"
+
+[[cells]]                        # cells beside those of the axes
+method = "none"
+"""
+
+import json
+import tomllib
+from dataclasses import dataclass, field
+from hashlib import sha256
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from drake_diff.exceptions import InputError
+from drake_diff.record_parts import FiniteTable
+
+# What drake_diff itself gives each trial: no axis, cell or fixed value is called so.
+OURS = ("id", "repeat", "seed")
+
+
+class Panel(BaseModel):
+    """What a panel file says."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    evaluate: Annotated[str, Field(pattern=r"^[^:]+:[A-Za-z_]\w*$")]
+    seed: Annotated[int, Field(ge=0)] = 0
+    seeds: Annotated[int, Field(ge=1)] = 1
+    axes: Annotated[FiniteTable, Field(default_factory=dict)]
+    fixed: Annotated[FiniteTable, Field(default_factory=dict)]
+    cells: Annotated[list[FiniteTable], Field(default_factory=list)]
+
+    @field_validator("axes")
+    @classmethod
+    def _are_lists(cls, axes: FiniteTable) -> FiniteTable:
+        for name, values in axes.items():
+            if not isinstance(values, list) or not values:
+                raise ValueError(f"axis {name}: expected a list of at least one value, got {values!r}")
+        return axes
+
+    @model_validator(mode="after")
+    def _names_are_told_apart(self) -> "Panel":
+        if not self.axes and not self.cells:
+            raise ValueError("expected at least one axis or one of [[cells]], got neither")
+        for name in {*self.axes, *(name for cell in self.cells for name in cell)} & {*self.fixed, *OURS}:
+            raise ValueError(f"axes and cells: expected no {name}, which is fixed or given by drake_diff, got it")
+        for name in self.fixed.keys() & set(OURS):
+            raise ValueError(f"fixed: expected no {name}, which drake_diff gives, got it")
+        return self
+
+    @property
+    def sha256(self) -> str:
+        """The hash of what the file says; comments and the order of its tables are no part of it."""
+        return sha256(canonical(self.model_dump())).hexdigest()
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One trial: its `cell` (what the axes say), and `fields`, all that its function is given.
+
+    `fields` are the cell, what is fixed, `repeat` (its number within the cell, from 0) and its own `seed`, of 53 bits,
+    drawn from the panel's seed and all other fields: another value on an axis changes no other trial. `id` is the
+    start of the SHA-256 of the fields.
+    """
+
+    cell: dict[str, Any]
+    fields: dict[str, Any]
+    id: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "id", sha256(canonical(self.fields)).hexdigest()[:16])
+
+    @property
+    def name(self) -> str:
+        """As people read it: `method=ilqr level=0.1 repeat=3`."""
+        return f"{cell_name(self.cell)} repeat={self.fields['repeat']}"
+
+
+def canonical(value: Any) -> bytes:
+    """`value` as the one JSON text that it has here: sorted keys, no spaces, floats by repr, no NaN."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def cell_name(cell: dict[str, Any]) -> str:
+    """A cell in one line."""
+    return " ".join(f"{k}={v if isinstance(v, str) else canonical(v).decode()}" for k, v in cell.items())
+
+
+def load_panel(path: Path) -> Panel:
+    """The panel in the TOML file at `path`; InputError, naming every entry that is not right."""
+    try:
+        said = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(str(path), got=f"{type(error).__name__}: {error}", expected="a panel in TOML") from error
+    try:
+        return Panel.model_validate(said)
+    except ValidationError as error:
+        raise InputError(str(path), got="; ".join(_wrong(error)), expected=f"the fields {_FIELDS}") from error
+
+
+_FIELDS = ", ".join(Panel.model_fields)
+
+
+def _wrong(error: ValidationError) -> list[str]:
+    wrong = []
+    for found in error.errors():
+        place = ".".join(str(part) for part in found["loc"])
+        if found["type"] == "extra_forbidden":
+            wrong.append(f"{place}, which is none of them")
+        elif found["type"] == "missing":
+            wrong.append(f"no {place}")
+        else:
+            got = "" if found["type"] == "value_error" else f", got {found['input']!r:.80}"
+            wrong.append(f"{place or 'panel'}: {found['msg'].removeprefix('Value error, ')}{got}")
+    return wrong
+
+
+def expand(panel: Panel) -> tuple[Trial, ...]:
+    """Every trial: the axes' combinations (the last axis fastest), then the cells, each `panel.seeds` times."""
+    axes: dict[str, Any] = panel.axes
+    combinations = product(*axes.values()) if axes else ()
+    cells = [*(dict(zip(axes, values, strict=True)) for values in combinations), *panel.cells]
+    trials = tuple(_trial(panel, cell, repeat) for cell in cells for repeat in range(panel.seeds))
+    seen: set[str] = set()
+    for trial in trials:
+        if trial.id in seen:
+            raise InputError("axes and cells", got=f"{cell_name(trial.cell)} twice", expected="each cell once")
+        seen.add(trial.id)
+    return trials
+
+
+def _trial(panel: Panel, cell: dict[str, Any], repeat: int) -> Trial:
+    fields = {**panel.fixed, **cell, "repeat": repeat}
+    words = np.frombuffer(sha256(canonical(fields)).digest(), "<u4")
+    state = np.random.SeedSequence([panel.seed, *words.tolist()]).generate_state(1, np.uint64)
+    return Trial(cell, {**fields, "seed": int(state[0]) >> 11})

@@ -1,0 +1,118 @@
+"""What a panel found: a row for each trial, and a summary of each cell. No byte of it depends on who evaluated what."""
+
+import csv
+import io
+import json
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drake_diff.panels.panel_file import Trial, canonical
+from drake_diff.panels.trial_row import Row
+from drake_diff.whole_file import write_whole
+
+TABLE, SUMMARY = "table.csv", "summary.json"
+Z_95 = 1.959963984540054  # the normal distribution's 97.5 % quantile
+
+
+@dataclass(frozen=True)
+class PanelTable:
+    """The `rows` of a panel in its order (the trial's cell, id, repeat and seed, then what its function said) and its
+    `summary`, as in the files `table.csv` and `summary.json` of `directory`. `errors` counts the rows with an error.
+    """
+
+    directory: Path
+    rows: tuple[Row, ...]
+    summary: dict[str, Any]
+
+    @property
+    def errors(self) -> int:
+        return int(self.summary["errors"])
+
+
+def write_table(
+    directory: Path, trials: Sequence[Trial], found: Mapping[str, Row], made: Mapping[str, Any]
+) -> PanelTable:
+    """Write `table.csv` and `summary.json` of all `trials` into `directory`; `made` says what the panel is."""
+    rows = tuple(_row(trial, found[trial.id]) for trial in trials)
+    summary = {"panel": dict(made), **_summary(trials, found)}
+    write_whole(directory / TABLE, _csv(rows, {name for row in found.values() for name in row}))
+    text = json.dumps(summary, indent=1, allow_nan=False, ensure_ascii=False)
+    write_whole(directory / SUMMARY, text.encode() + b"\n")
+    return PanelTable(directory, rows, summary)
+
+
+def _row(trial: Trial, row: Row) -> Row:
+    return {"id": trial.id, **trial.cell, "repeat": trial.fields["repeat"], "seed": trial.fields["seed"], **row}
+
+
+def _csv(rows: Sequence[Row], answered: set[str]) -> bytes:
+    """RFC 4180: the cells' columns before the function's, each in the order in which it first appears; error last."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    ours = [name for name in names if name not in answered and name not in ("repeat", "seed")]
+    theirs = [name for name in names if name in answered and name != "error"]
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    columns = [*ours, "repeat", "seed", *theirs, "error"]
+    writer.writerow(columns)
+    writer.writerows([_text(row.get(name)) for name in columns] for row in rows)
+    return text.getvalue().encode()
+
+
+def _text(value: Any) -> str:
+    """A value in a field: nothing for null, words as they are, everything else as in JSON."""
+    return "" if value is None else value if isinstance(value, str) else canonical(value).decode()
+
+
+def _summary(trials: Sequence[Trial], found: Mapping[str, Row]) -> dict[str, Any]:
+    cells: dict[bytes, list[Trial]] = {}
+    for trial in trials:
+        cells.setdefault(canonical(trial.cell), []).append(trial)
+    judged = any(isinstance(row.get("success"), bool) for row in found.values())
+    return {
+        "trials": len(trials),
+        "errors": sum("error" in row for row in found.values()),
+        "cells": [_cell(group[0].cell, [found[t.id] for t in group], judged) for group in cells.values()],
+    }
+
+
+def _cell(cell: dict[str, Any], rows: Sequence[Row], judged: bool) -> dict[str, Any]:
+    """One cell: a trial that ended in an error is no success."""
+    names = dict.fromkeys(name for row in rows for name, value in row.items() if _is_number(value))
+    summary: dict[str, Any] = {"cell": cell, "trials": len(rows), "errors": sum("error" in row for row in rows)}
+    if judged:
+        successes = sum(row.get("success") is True for row in rows)
+        low, high = wilson(successes, len(rows))
+        summary["success"] = {"count": successes, "rate": successes / len(rows), "low": low, "high": high}
+    numbers = {name: _numbers([row[name] for row in rows if _is_number(row.get(name))]) for name in names}
+    return {**summary, "numbers": numbers}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _numbers(values: Sequence[float]) -> dict[str, Any]:
+    """Count, mean, sample standard deviation (null of one value), least and largest; exact sums, rounded once."""
+    floats = [float(value) for value in values]
+    deviation = statistics.stdev(floats) if len(floats) > 1 else None
+    return {
+        "count": len(floats),
+        "mean": statistics.mean(floats),
+        "std": deviation,
+        "min": min(floats),
+        "max": max(floats),
+    }
+
+
+def wilson(successes: int, count: int) -> tuple[float, float]:
+    """The 95 % interval of a rate of which `successes` of `count` were seen; Wilson 1927."""
+    rate, z2 = successes / count, Z_95**2
+    middle = (rate + z2 / (2 * count)) / (1 + z2 / count)
+    half = Z_95 / (1 + z2 / count) * math.sqrt(rate * (1 - rate) / count + z2 / (4 * count**2))
+    low = middle - half if successes else 0.0  # exactly, where rounding would leave 1e-17
+    high = middle + half if successes < count else 1.0
+    return low, high

@@ -1,0 +1,435 @@
+"""Panels: the same table to the byte whoever evaluates what, whatever dies, and however often it is taken up again."""
+
+import csv
+import json
+import math
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+from drake_diff.panels.panel_file import expand, load_panel
+from drake_diff.panels.table import wilson
+from drake_diff.panels.trial_row import row_of
+
+FUNCTIONS = """
+import os, random, time
+import numpy as np
+
+def cheap(trial):
+    log(trial)
+    time.sleep(trial["seconds"])
+    rng = np.random.default_rng(trial["seed"])
+    return {"success": bool(rng.random() < 0.5), "cost": rng.normal() * trial["level"], "also": None}
+
+def log(trial):
+    line = f"{os.getpid()} {trial['method']} {trial['level']} {trial['repeat']}\\n"
+    with open("log", "ab", buffering=0) as file:
+        file.write(line.encode())
+
+def hidden_state(trial):
+    return {"numpy": np.random.random(), "python": random.random()}
+
+def dies_once(trial):
+    if trial["level"] == 2 and not os.path.exists("died"):
+        open("died", "w").close()
+        os._exit(1)
+    return {"cost": trial["level"]}
+
+def dies(trial):
+    if trial["level"] == 2:
+        os._exit(1)
+    return {"cost": trial["level"]}
+
+def fails(trial):
+    if trial["level"] == 2:
+        raise ValueError("no, that one not")
+    return {"cost": trial["level"], "threads": os.environ["OPENBLAS_NUM_THREADS"]}
+"""
+PANEL = """
+evaluate = "trials.py:{function}"
+seed = 7
+seeds = {seeds}
+[fixed]
+seconds = {seconds}
+[axes]
+method = {methods}
+level = [0.5, 1, 2, 4, 8]
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    """A panel file beside the functions above."""
+
+    def write_panel(function="fails", *, seeds=1, seconds=0.0, methods='["a"]', folder=tmp_path):
+        (folder / "trials.py").write_text(FUNCTIONS)
+        path = folder / "panel.toml"
+        path.write_text(PANEL.format(function=function, seeds=seeds, seconds=seconds, methods=methods))
+        return path
+
+    return write_panel
+
+
+def files(directory):
+    return {name: (directory / name).read_bytes() for name in ("table.csv", "summary.json")}
+
+
+def column(directory, name):
+    with open(directory / "table.csv", newline="") as file:
+        return [row[name] for row in csv.DictReader(file)]
+
+
+def start(path, out, *words):
+    command = [sys.executable, "-m", "drake_diff.cli", "panel", str(path), "--out", str(out), *map(str, words)]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+
+
+def finished(journal):
+    """The ids in the whole lines of a journal."""
+    lines = journal.read_bytes().split(b"\n")[1:-1] if journal.exists() else []
+    return {json.loads(line)["id"] for line in lines}
+
+
+def wait_for(condition, seconds=60):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.002)
+
+
+def logged(path):
+    """(pid, trial) of every evaluation that began."""
+    log = path.parent / "log"
+    return [line.split(" ", 1) for line in log.read_text().splitlines()] if log.exists() else []
+
+
+def lives(pid):
+    """Whether there is such a process, and not only its entry that nobody has asked for yet."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+def no_worker_lives(path):
+    return not any(lives(int(pid)) for pid in {pid for pid, _ in logged(path)})
+
+
+# --- the same bytes ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def thousand(tmp_path_factory):
+    """1,000 trials and their table, evaluated by one worker without interruption."""
+    folder = tmp_path_factory.mktemp("thousand")
+    (folder / "trials.py").write_text(FUNCTIONS)
+    path = folder / "panel.toml"
+    path.write_text(PANEL.format(function="cheap", seeds=100, seconds=0.002, methods='["ilqr", "b,c"]'))
+    dd.run_panel(path, out=folder / "one", workers=1)
+    assert len(logged(path)) == 1000
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [2, 4])
+def test_a_thousand_trials_give_the_same_bytes_whatever_the_number_of_workers(thousand, workers):
+    out = thousand.parent / f"with_{workers}"
+    dd.run_panel(thousand, out=out, workers=workers)
+    assert files(out) == files(thousand.parent / "one")
+
+
+@pytest.mark.slow
+def test_a_thousand_trials_killed_three_times_at_random_give_the_same_bytes(thousand):
+    out, journal = thousand.parent / "killed", thousand.parent / "killed" / "trials.jsonl"
+    names = {trial.id: f"{trial.cell['method']} {trial.cell['level']} {trial.fields['repeat']}" for trial in
+             expand(load_panel(thousand))}  # fmt: skip
+    (thousand.parent / "log").unlink()
+    drawn = random.Random()
+    for least in sorted(drawn.sample(range(1, 950), 3)):
+        process = start(thousand, out, "--workers", 2)
+        wait_for(lambda least=least: len(finished(journal)) >= least)
+        time.sleep(drawn.uniform(0, 0.01))
+        os.kill(process.pid, signal.SIGKILL)
+        process.communicate()
+        wait_for(lambda: no_worker_lives(thousand), seconds=5)
+        done, begun = finished(journal), len(logged(thousand))
+        assert least <= len(done) < 1000
+        assert not (out / "table.csv").exists()
+    output = start(thousand, out, "--workers", 2).communicate()[0]
+    assert "1000 trials, 0 errors" in output
+    assert files(out) == files(thousand.parent / "one")
+    trials = [trial for _, trial in logged(thousand)]
+    assert not {names[id] for id in done} & set(trials[begun:])  # what was finished is not evaluated again
+    assert set(trials) == set(names.values())
+    assert len(trials) <= 1000 + 3 * 2 * 2  # at most what each of two workers had in hand, or had sent, at each kill
+
+
+def test_one_and_two_workers_give_the_same_bytes(write, tmp_path):
+    path = write("cheap", seeds=3)
+    for workers in (1, 2):
+        dd.run_panel(path, out=tmp_path / str(workers), workers=workers)
+    assert files(tmp_path / "1") == files(tmp_path / "2")
+
+
+def test_a_finished_panel_is_read_and_written_again_to_the_same_bytes_without_any_evaluation(write, tmp_path):
+    path = write("cheap")
+    dd.run_panel(path, out=tmp_path / "out", workers=1)
+    before, begun = files(tmp_path / "out"), logged(path)
+    table = dd.run_panel(path, out=tmp_path / "out", workers=1)
+    assert files(tmp_path / "out") == before
+    assert logged(path) == begun
+    assert list(table.rows[0]) == ["id", "method", "level", "repeat", "seed", "success", "cost", "also"]
+
+
+def test_global_generators_start_from_the_trials_own_seed():
+    def function(trial):
+        return {"numpy": np.random.random(), "python": random.random()}
+
+    first, other = (row_of(function, {"seed": seed}) for seed in (2**52 + 1, 5))
+    assert row_of(function, {"seed": 5}) == other != first
+    assert other["numpy"] == np.random.RandomState(5).random_sample()
+
+
+# --- what dies --------------------------------------------------------------------------------------------------------
+
+
+def test_a_worker_that_dies_loses_only_its_trial_which_is_evaluated_once_more(write, tmp_path):
+    table = dd.run_panel(write("dies_once"), out=tmp_path / "out", workers=2)
+    assert [row["cost"] for row in table.rows] == [0.5, 1, 2, 4, 8]
+
+
+def test_a_trial_whose_worker_dies_twice_is_a_row_that_says_so(write, tmp_path):
+    table = dd.run_panel(write("dies"), out=tmp_path / "out", workers=1)
+    assert table.errors == 1
+    assert table.rows[2]["error"].startswith("WorkerDied: ")
+    assert [row["cost"] for row in table.rows if "cost" in row] == [0.5, 1, 4, 8]
+
+
+def test_workers_end_with_their_parent_in_the_middle_of_a_trial(write, tmp_path):
+    path = write("cheap", seconds=60)
+    process = start(path, tmp_path / "out", "--workers", 2)
+    wait_for(lambda: len(logged(path)) == 2)
+    assert not no_worker_lives(path)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    wait_for(lambda: no_worker_lives(path), seconds=5)
+
+
+def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(write, tmp_path):
+    path, out = write("cheap", seeds=100, seconds=0.02), tmp_path / "out"
+    process = start(path, out, "--workers", 2)
+    wait_for(lambda: len(finished(out / "trials.jsonl")) >= 3)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all processes at once
+    output = process.communicate(timeout=30)[0]
+    assert process.returncode == 130
+    assert "the same command goes on" in output
+    assert "Traceback" not in output
+    assert no_worker_lives(path)
+    assert 3 <= len(finished(out / "trials.jsonl")) < 500
+
+
+# --- the journal ------------------------------------------------------------------------------------------------------
+
+
+def test_a_torn_last_line_is_dropped_and_its_trial_evaluated_again(write, tmp_path):
+    path, out = write("cheap"), tmp_path / "out"
+    dd.run_panel(path, out=out, workers=1)
+    before, whole = files(out), (out / "trials.jsonl").read_bytes()
+    for cut in (1, 30, len(whole.split(b"\n")[-2])):  # also one that lacks nothing but its end
+        (out / "trials.jsonl").write_bytes(whole[:-cut])
+        begun = len(logged(path))
+        dd.run_panel(path, out=out, workers=1)
+        assert len(logged(path)) == begun + 1
+        assert (out / "trials.jsonl").read_bytes() == whole
+        assert files(out) == before
+    (out / "trials.jsonl").write_bytes(whole[:20])  # of the first line, which says what the panel is
+    dd.run_panel(path, out=out, workers=1)
+    assert files(out) == before
+
+
+def test_a_changed_byte_in_any_line_is_refused(write, tmp_path):
+    path, out = write("cheap"), tmp_path / "out"
+    dd.run_panel(path, out=out, workers=1)
+    whole = (out / "trials.jsonl").read_bytes()
+    drawn = random.Random(0)
+    for place in drawn.sample(range(len(whole) - 1), 40):
+        changed = bytes([*whole[:place], whole[place] ^ 1 << drawn.randrange(7), *whole[place + 1 :]])
+        if whole[place : place + 1] == b"\n":
+            continue
+        (out / "trials.jsonl").write_bytes(changed)
+        with pytest.raises(dd.ArtifactError, match=r"trials\.jsonl"):
+            dd.run_panel(path, out=out, workers=1)
+        assert (out / "trials.jsonl").read_bytes() == changed
+
+
+def test_a_line_twice_is_refused(write, tmp_path):
+    path, out = write("cheap"), tmp_path / "out"
+    dd.run_panel(path, out=out, workers=1)
+    lines = (out / "trials.jsonl").read_bytes().splitlines(keepends=True)
+    (out / "trials.jsonl").write_bytes(b"".join([*lines, lines[1]]))
+    with pytest.raises(dd.ArtifactError, match=r"line 7: trial .* stands there twice"):
+        dd.run_panel(path, out=out, workers=1)
+
+
+def test_another_panels_journal_is_refused_and_so_is_one_of_its_lines(write, tmp_path):
+    dd.run_panel(write("cheap"), out=tmp_path / "out", workers=1)
+    dd.run_panel(write("cheap", methods='["other"]'), out=tmp_path / "other", workers=1)
+    with pytest.raises(dd.ArtifactError, match="another panel: its sha256: expected "):
+        dd.run_panel(write("cheap"), out=tmp_path / "other", workers=1)
+    foreign = (tmp_path / "other" / "trials.jsonl").read_bytes().splitlines(keepends=True)[1]
+    with open(tmp_path / "out" / "trials.jsonl", "ab") as file:
+        file.write(foreign)
+    with pytest.raises(dd.ArtifactError, match="line 7 is damaged or another panel's"):
+        dd.run_panel(write("cheap"), out=tmp_path / "out", workers=1)
+
+
+def test_a_comment_changes_no_panel_but_another_function_does(write, tmp_path):
+    path, out = write("cheap"), tmp_path / "out"
+    dd.run_panel(path, out=out, workers=1)
+    path.write_text("# said in passing\n" + path.read_text())
+    dd.run_panel(path, out=out, workers=1)
+    with open(tmp_path / "trials.py", "a") as file:
+        file.write("# changed\n")
+    with pytest.raises(dd.ArtifactError, match="its function_sha256"):
+        dd.run_panel(path, out=out, workers=1)
+
+
+def test_two_at_once_on_one_directory_are_refused(write, tmp_path):
+    path, out = write("cheap", seconds=60), tmp_path / "out"
+    process = start(path, out, "--workers", 1)
+    wait_for(lambda: len(logged(path)) == 1)
+    with pytest.raises(dd.ArtifactError, match="another process is at work"):
+        dd.run_panel(path, out=out, workers=1)
+    process.kill()
+    process.communicate()
+
+
+# --- rows and their summary -------------------------------------------------------------------------------------------
+
+
+def test_an_exception_is_a_row_and_exit_status_1(write, tmp_path):
+    process = start(write("fails"), tmp_path / "out", "--workers", 1)
+    output = process.communicate(timeout=60)[0]
+    assert process.returncode == 1
+    assert "5 trials, 1 errors" in output
+    assert column(tmp_path / "out", "error") == ["", "", "ValueError: no, that one not", "", ""]
+    assert column(tmp_path / "out", "threads") == ["1", "1", "", "1", "1"]
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert [cell["errors"] for cell in summary["cells"]] == [0, 0, 1, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("answer", "row"),
+    [
+        ({"a": math.nan, "b": -math.inf, "c": np.float64(0.1)}, {"a": None, "b": None, "c": 0.1}),
+        ({"a": np.bool_(True), "b": np.arange(2), "c": (1, {"d": math.nan})}, {"a": True, "b": [0, 1],
+         "c": [1, {"d": None}]}),
+        (3, {"error": "InputError: row: expected a mapping of names to values, got int"}),
+        ({"level": 1}, {"error": "InputError: row: expected names that are not the trial's own, got 'level'"}),
+        ({"a": 1j}, {"error": "InputError: row: expected numbers, words, lists and mappings, got complex 1j"}),
+    ],
+)  # fmt: skip
+def test_what_a_function_answers_becomes_a_row_of_json(answer, row):
+    assert row_of(lambda trial: answer, {"level": 2, "seed": 0}) == row
+
+
+def test_the_summary_of_a_cell_by_hand(tmp_path):
+    (tmp_path / "trials.py").write_text(
+        "def f(trial):\n    k = trial['repeat']\n    return {'cost': [1, 2, 6][k], 'success': k > 0}\n"
+    )
+    (tmp_path / "p.toml").write_text('evaluate = "trials.py:f"\nseeds = 3\n[[cells]]\nmethod = "a"\n')
+    cell = dd.run_panel(tmp_path / "p.toml", out=tmp_path / "out", workers=1).summary["cells"][0]
+    # (4 + 1 + 9) / 2 = 7 is the variance of 1, 2, 6
+    assert cell["numbers"] == {"cost": {"count": 3, "mean": 3.0, "std": math.sqrt(7), "min": 1.0, "max": 6.0}}
+    assert (cell["success"]["count"], cell["success"]["rate"]) == (2, 2 / 3)
+
+
+def test_wilsons_interval_solves_its_equation():
+    """Its ends are the rates p that are z standard deviations, sqrt(p (1 - p) / n), from the rate that was seen."""
+    for successes, count in [(0, 5), (3, 10), (10, 10), (500, 1000)]:
+        low, high = wilson(successes, count)
+        assert (low == 0) == (successes == 0)
+        assert (high == 1) == (successes == count)
+        for p in {low, high} - {0, 1}:
+            deviations = abs(successes / count - p) / math.sqrt(p * (1 - p) / count)
+            assert deviations == pytest.approx(1.959963984540054, rel=1e-9)  # rounding, of a difference of rates
+
+
+# --- the file ---------------------------------------------------------------------------------------------------------
+
+
+def test_another_value_on_an_axis_changes_no_other_trial(write):
+    few = expand(load_panel(write(seeds=3, methods='["a"]')))
+    more = expand(load_panel(write(seeds=4, methods='["b", "a"]')))
+    assert {trial.id: trial.fields for trial in few}.items() <= {trial.id: trial.fields for trial in more}.items()
+    assert len({trial.fields["seed"] for trial in more}) == len(more) == 40
+    assert more[1].name == "method=b level=0.5 repeat=1"
+
+
+def test_cells_stand_beside_the_axes(tmp_path):
+    path = tmp_path / "p.toml"
+    path.write_text('evaluate = "a:b"\n[axes]\nx = [1, 2]\ny = [3, 4]\n[[cells]]\nx = 9\n')
+    assert [trial.cell for trial in expand(load_panel(path))] == [
+        {"x": 1, "y": 3}, {"x": 1, "y": 4}, {"x": 2, "y": 3}, {"x": 2, "y": 4}, {"x": 9}
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("evaluate =", "expected a panel in TOML, got TOMLDecodeError"),
+        ("[axes]\nx = [1]", "expected the fields evaluate, seed, seeds, axes, fixed, cells, got no evaluate"),
+        ('evaluate = "a:b"\ncolour = 1\nsize = 2\n[axes]\nx = [1]', "got colour, which is none of them; size, which"),
+        ('evaluate = "a"\n[axes]\nx = [1]', "evaluate: String should match pattern"),
+        ('evaluate = "a:b"\nseeds = 0\n[axes]\nx = [1]', "seeds: Input should be greater than or equal to 1, got 0"),
+        ('evaluate = "a:b"\nseeds = "3"\n[axes]\nx = [1]', "seeds: Input should be a valid integer, got '3'"),
+        ('evaluate = "a:b"', "expected at least one axis or one of .*, got neither"),
+        ('evaluate = "a:b"\n[axes]\nx = []', "axis x: expected a list of at least one value"),
+        ('evaluate = "a:b"\n[axes]\nx = [nan]', "expected finite numbers"),
+        ('evaluate = "a:b"\n[axes]\nx = [2026-01-01]', "axes"),
+        ('evaluate = "a:b"\n[axes]\nseed = [1]', "expected no seed, which is fixed or given by drake_diff"),
+        ('evaluate = "a:b"\n[axes]\nx = [1]\n[fixed]\nx = 1', "expected no x"),
+        ('evaluate = "a:b"\n[axes]\nx = [1, 1]', "expected each cell once, got x=1 twice"),
+        (
+            'evaluate = "no_such_module:b"\n[axes]\nx = [1]',
+            "evaluate: expected .*, got no_such_module:b: ModuleNotFound",
+        ),
+        (
+            'evaluate = "no_such_file.py:b"\n[axes]\nx = [1]',
+            "evaluate: expected .*, got no_such_file.py:b: FileNotFound",
+        ),
+        ('evaluate = "math:nothing"\n[axes]\nx = [1]', "evaluate: expected a function, got math:nothing"),
+    ],
+)
+def test_a_file_that_cannot_be_right_is_refused_before_anything_is_written(tmp_path, text, message):
+    path = tmp_path / "p.toml"
+    path.write_text(text)
+    with pytest.raises(dd.InputError, match=message):
+        dd.run_panel(path, out=tmp_path / "out", workers=1)
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_options_are_refused(write, tmp_path):
+    for options, message in [
+        ({"workers": 0}, "workers: expected a whole number of at least 1, got 0"),
+        ({"engine": "dask"}, "engine: expected one of local, ray, got 'dask'"),
+        ({"address": "host:1"}, 'address: expected none for engine="local"'),
+    ]:
+        with pytest.raises(dd.InputError, match=message):
+            dd.run_panel(write(), out=tmp_path / "out", **options)
+
+
+def test_without_ray_its_extra_is_named(write, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(dd.MissingDependencyError, match=r"pip install 'drake-diff\[cluster\]'"):
+        dd.run_panel(write(), out=tmp_path / "out", engine="ray")

@@ -1,0 +1,147 @@
+"""The same panel as tasks of a real Ray cluster on this machine."""
+
+import secrets
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+
+pytest.importorskip("ray")
+pytestmark = pytest.mark.slow
+
+FUNCTIONS = """
+import os, time
+import numpy as np
+
+def cheap(trial):
+    with open("log", "ab", buffering=0) as file:
+        file.write(f"{os.getpid()} {trial['level']} {trial['repeat']}\\n".encode())
+    time.sleep(0.02)
+    if trial["level"] == 2 and trial["repeat"] == 10 and not os.path.exists("victim"):
+        with open("unnamed", "w") as file:
+            file.write(str(os.getpid()))
+        os.rename("unnamed", "victim")
+        time.sleep(trial["seconds"])
+    if trial["level"] == 3 and trial["repeat"] < 2:
+        raise ValueError("no, that one not")
+    rng = np.random.default_rng(trial["seed"])
+    return {"success": bool(rng.random() < 0.5), "cost": rng.normal(), "threads": os.environ["OPENBLAS_NUM_THREADS"]}
+
+def dies(trial):
+    if trial["level"] == 3 and trial["repeat"] == 4:
+        os._exit(1)
+    return {"cost": trial["level"]}
+"""
+PANEL = 'evaluate = "trials.py:{}"\nseeds = 50\n[fixed]\nseconds = {}\n[axes]\nlevel = [1, 2, 3, 4]\n'
+# In a process of its own: Ray can be made to listen on loopback only where nothing has imported it before.
+KILLED = """
+import os, signal, sys, time
+import drake_diff as dd
+
+def kill(finished, count, errors):
+    if os.path.exists("victim") and not os.path.exists("killed"):
+        pids = {line.split()[0] for line in open("log")}
+        os.kill(int(open("victim").read()), signal.SIGKILL)
+        open("killed", "w").close()
+        print("of", len(pids), "workers one is killed after", finished, "trials")
+
+if __name__ == "__main__":
+    dd.run_panel("panel.toml", out="ray", workers=2, engine="ray", progress=kill)
+"""
+
+
+@pytest.fixture(autouse=True)
+def token(monkeypatch):
+    """A token for these clusters alone: without one Ray writes its own into the home directory."""
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(32))
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write_panel(function, *, seconds=0.0):
+        (tmp_path / "trials.py").write_text(FUNCTIONS)
+        (tmp_path / "panel.toml").write_text(PANEL.format(function, seconds))
+
+    return write_panel
+
+
+def panel(folder, *words):
+    command = [sys.executable, "-m", "drake_diff.cli", "panel", "panel.toml", *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=240)
+
+
+def files(directory):
+    return {name: (directory / name).read_bytes() for name in ("table.csv", "summary.json")}
+
+
+def test_a_cluster_of_which_a_worker_is_killed_gives_the_table_of_local_processes(write, tmp_path):
+    write("cheap", seconds=5.0)
+    assert panel(tmp_path, "--out", "local", "--workers", "2").returncode == 1  # two rows are errors
+    (tmp_path / "log").unlink()
+    (tmp_path / "victim").unlink()
+    (tmp_path / "script.py").write_text(KILLED)
+    done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    assert "of 2 workers one is killed" in done.stdout
+    assert files(tmp_path / "ray") == files(tmp_path / "local")
+    evaluated = [line.split(maxsplit=1) for line in (tmp_path / "log").read_text().splitlines()]
+    assert len({pid for pid, _ in evaluated}) == 3  # the two, and the one that took the place of the killed
+    trials = [trial for _, trial in evaluated]
+    assert sorted(trials) == sorted([*set(trials), "2 10"])  # each once, and twice the one that was killed
+    assert len(set(trials)) == 200
+
+
+def test_a_trial_that_kills_its_worker_twice_is_the_same_row_on_a_cluster(write, tmp_path):
+    write("dies")
+    for engine in ("local", "ray"):
+        done = panel(tmp_path, "--out", engine, "--engine", engine, "--workers", "2")
+        assert done.returncode == 1, done.stderr
+        assert "200 trials, 1 errors" in done.stdout
+    assert files(tmp_path / "ray") == files(tmp_path / "local")
+
+
+def test_a_cluster_that_is_not_there_is_refused(write, tmp_path):
+    write("cheap")
+    done = panel(tmp_path, "--engine", "ray", "--address", "127.0.0.1:1")
+    assert done.returncode == 2
+    assert "address: expected HOST:PORT of a running Ray head" in done.stderr
+
+
+@pytest.fixture
+def cluster(monkeypatch):
+    """A head that runs already, of two cores, on loopback alone."""
+    monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--num-cpus=2", "--block"]
+    head = subprocess.Popen([*command, f"--port={port}", "--include-dashboard=false"])
+    wait_for(lambda: listens(port))
+    yield f"127.0.0.1:{port}"
+    head.terminate()
+    head.wait(60)
+
+
+def listens(port):
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def wait_for(condition):
+    end = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def test_a_cluster_that_runs_already_gives_the_table_of_local_processes(write, tmp_path, cluster):
+    write("cheap")
+    for options in (["--out", "ray", "--engine", "ray", "--address", cluster], ["--out", "local"]):
+        done = panel(tmp_path, *options)
+        assert done.returncode == 1, done.stderr
+        assert "200 trials, 2 errors" in done.stdout
+    assert files(tmp_path / "ray") == files(tmp_path / "local")
