@@ -82,9 +82,9 @@ def test_a_change_is_found_and_named(tmp_path, name, change):
 @pytest.mark.parametrize("name", ENGINES)
 def test_the_same_model_is_the_same_in_every_engine(tmp_path, name):
     lines = dd.match_contracts(dd.load_engine("drake", arms(tmp_path)), engine_of(name, arms(tmp_path)))
-    assert len({line.quantity for line in lines}) == len(lines) == 23
+    assert len({line.quantity for line in lines}) == len(lines) == 25
     assert all(str(line).startswith(line.verdict) for line in lines)
-    assert {line.quantity for line in lines if line.verdict == "mapped"} == set()
+    assert {line.quantity for line in lines if line.verdict == "mapped"} <= {"derivative convention"}
 
 
 HAND = {
@@ -258,3 +258,12 @@ def test_single_precision_is_allowed_its_rounding_and_no_more(load, precision, v
         other = Other(drake, precision=precision, joints=(replace(joint, mass=joint.mass * factor),))
         lines = {line.quantity: line.verdict for line in dd.match_contracts(drake, other)}
         assert lines["mass"] == expected
+        assert lines["scalar type"] == ("equal" if precision == "float64" else "different")
+
+
+def test_the_convention_of_derivatives_is_a_line(load):
+    drake = engine_of("drake", load("pendulum.urdf"))
+    for told, verdict in (("by every entry of x and u", "equal"), ("by small turns", "mapped"), ("none", "different")):
+        lines = {line.quantity: line for line in dd.match_contracts(drake, Other(drake, derivatives=told))}
+        assert lines["derivative convention"].verdict == verdict
+    assert "offers no derivatives" in lines["derivative convention"].reason

@@ -144,6 +144,7 @@ class CasadiEngine:
             solver_tolerance=None,
             limit_law="none",
             reset=EACH_CALL,
+            derivatives="by q and v, adam's expressions differentiated by CasADi",
             reasons={
                 "contact law": NO_CONTACT,
                 "contact pairs": NO_CONTACT,

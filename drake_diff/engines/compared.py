@@ -36,7 +36,16 @@ TELLS: Mapping[str, tuple[str, ...]] = {
     "limit law": ("limit law", "position limits"),
 }
 # What is the engine's own whatever the model.
-LAWS = ("integrator", "limit law", "contact law", "contact pairs", "solver tolerance", "reset")
+LAWS = (
+    "integrator",
+    "scalar type",
+    "derivative convention",
+    "limit law",
+    "contact law",
+    "contact pairs",
+    "solver tolerance",
+    "reset",
+)
 
 
 @dataclass(frozen=True)

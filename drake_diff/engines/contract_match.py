@@ -57,6 +57,8 @@ def match_contracts(a: Engine, b: Engine) -> tuple[ContractLine, ...]:
         _contact_pairs(one, two),
         _solver_tolerance(one, two),
         _text(one, two, "reset", one.reset, two.reset),
+        _scalar_type(one, two),
+        _derivatives(one, two),
     )
 
 
@@ -273,3 +275,20 @@ def _solver_tolerance(one: EngineContract, two: EngineContract) -> ContractLine:
         return ContractLine(quantity, "equal", "nothing to solve: neither contact nor limits")
     a, b = ("none" if c.solver_tolerance is None else f"{c.solver_tolerance:g}" for c in (one, two))
     return _text(one, two, quantity, a, b)
+
+
+def _scalar_type(one: EngineContract, two: EngineContract) -> ContractLine:
+    if one.precision == two.precision:
+        return ContractLine("scalar type", "equal", one.precision)
+    what = f"{one.engine}: {one.precision}; {two.engine}: {two.precision}"
+    return ContractLine("scalar type", "different", what, f"its arithmetic is {_coarser(one, two)}")
+
+
+def _derivatives(one: EngineContract, two: EngineContract) -> ContractLine:
+    quantity = "derivative convention"
+    if one.derivatives == two.derivatives:
+        return ContractLine(quantity, "equal", one.derivatives)
+    what = f"{one.engine}: {one.derivatives}; {two.engine}: {two.derivatives}"
+    if "none" in (one.derivatives, two.derivatives):
+        return ContractLine(quantity, "different", what, "it offers no derivatives")
+    return ContractLine(quantity, "mapped", what)

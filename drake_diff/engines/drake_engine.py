@@ -78,6 +78,7 @@ class DrakeEngine:
             solver_tolerance=contact.solver_relative_tolerance,
             limit_law="implicit springs in the step's solver",
             reset=EACH_CALL,
+            derivatives="by every entry of x and u",
         )
 
     def _set(self, x: Array) -> None:

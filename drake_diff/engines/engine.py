@@ -62,6 +62,7 @@ class EngineContract:
     limit_law: str
     reset: str
     precision: Precision = "float64"  # of the engine's arithmetic
+    derivatives: str = "none"  # by what they are taken in the engine, before they are mapped to Drake's x and u
     # By quantity of the match: why this engine cannot have what Drake has.
     reasons: Mapping[str, str] = field(default_factory=dict)
 

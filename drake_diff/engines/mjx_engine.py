@@ -130,8 +130,9 @@ class MjxEngine:
         terms = self._terms(np.concatenate([self.native.zero(), np.zeros(self.nv)]))
         precision = str(self.model.qpos0.dtype)
         return read_contract(
-            self.model, terms, self.native, self.description, who="MJX", engine=self.name, precision=precision
-        )
+            self.model, terms, self.native, self.description, who="MJX", engine=self.name, precision=precision,
+            derivatives="by tangent vectors of qpos and by qvel, jax.jacfwd",
+        )  # fmt: skip
 
     def _point(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
         return finite_array("x", x, (self.nq + self.nv,)), finite_array("u", u, (self.nu,))

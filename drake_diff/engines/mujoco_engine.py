@@ -106,7 +106,16 @@ class MujocoEngine:
     def contract(self) -> EngineContract:
         self._set(np.concatenate([self.native.zero(), np.zeros(self.nv)]), np.zeros(self.nu))
         mujoco.mj_forward(self.model, self.data)
-        return read_contract(self.model, self.data, self.native, self.description, who="MuJoCo", engine=self.name)
+        derivatives = "by tangent vectors of qpos and by qvel, centred differences in C"
+        return read_contract(
+            self.model,
+            self.data,
+            self.native,
+            self.description,
+            who="MuJoCo",
+            engine=self.name,
+            derivatives=derivatives,
+        )
 
     def _point(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
         return finite_array("x", x, (self.nq + self.nv,)), finite_array("u", u, (self.nu,))

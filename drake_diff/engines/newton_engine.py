@@ -147,6 +147,7 @@ class NewtonEngine:
             solver_tolerance=None,
             limit_law=f"explicit springs of {springs} and dampers of {dampers} (SI) beyond the limit",
             reset=EACH_CALL,
+            derivatives="by every number of Newton's state, warp's tape backwards",
             precision="float32",
             reasons={
                 "integrator": "Newton's joint damping is explicit, and its free bodies move by their centres of mass",

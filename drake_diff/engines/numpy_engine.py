@@ -75,6 +75,7 @@ class NumpyEngine:
             solver_tolerance=None,
             limit_law="none",
             reset=EACH_CALL,
+            derivatives="by every entry of x and u",
             reasons={
                 "limit law": "the hand calculation has no joint limits",
                 "contact pairs": "the hand calculation has its one contact in its law",

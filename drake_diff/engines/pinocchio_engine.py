@@ -175,6 +175,7 @@ class PinocchioEngine:
             solver_tolerance=None,
             limit_law="none",
             reset=EACH_CALL,
+            derivatives="by tangent vectors of q in the body, and by v in the body",
             reasons={
                 "contact law": "Pinocchio's forward dynamics has no contact here",
                 "contact pairs": "Pinocchio's forward dynamics has no contact here",
