@@ -25,7 +25,7 @@ pytest.importorskip("newton", reason="newton is not installed: pip install 'drak
 pytestmark = pytest.mark.slow
 G = 9.81
 # What no engine but Drake has as Drake has it, and Newton's damping, which is explicit.
-OWN = {"limit law", "solver tolerance", "integrator"}
+OWN = {"limit law", "solver tolerance", "integrator", "scalar type"}
 
 
 def newton(model):
@@ -172,7 +172,7 @@ def test_a_swapped_quaternion_or_velocity_frame_is_found(wrong, monkeypatch):
 def test_contacts_are_drakes_pairs_and_a_shape_that_is_not_built_is_named(load, tmp_path):
     model = load("sphere_on_ground.sdf")
     assert different(dd.load_engine("drake", model), newton(model)).keys() == {
-        "integrator", "contact law", "solver tolerance"}  # fmt: skip
+        "integrator", "contact law", "solver tolerance", "scalar type"}  # fmt: skip
     (tmp_path / "t.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     plant = Plant(0.01)
     body = plant.plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))

@@ -19,7 +19,7 @@ import drake_diff as dd
 pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'drake-diff[forward]' (Python 3.11)")
 G = 9.81
 # What no engine but Drake has as Drake has it, and Bullet's damping, which is explicit.
-OWN = {"limit law", "solver tolerance", "integrator"}
+OWN = {"limit law", "solver tolerance", "integrator", "derivative convention"}
 
 
 def bullet(model):

@@ -19,7 +19,7 @@ import drake_diff as dd
 pytest.importorskip("sapien", reason="sapien is not installed: pip install 'drake-diff[forward]'")
 G = 9.81
 # What no engine but Drake has as Drake has it, and what PhysX does not give.
-OWN = {"limit law", "solver tolerance", *FOLLOWS}
+OWN = {"limit law", "solver tolerance", "scalar type", "derivative convention", *FOLLOWS}
 
 
 def physx(model):
