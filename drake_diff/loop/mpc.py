@@ -13,7 +13,7 @@ import numpy as np
 
 from drake_diff.arrays import Array, finite_array, positive_int
 from drake_diff.bounds import Bounds
-from drake_diff.cost import CostToGo, QuadraticCost
+from drake_diff.cost import QuadraticCost
 from drake_diff.exceptions import DrakeDiffError, InputError
 from drake_diff.ilqr import check_problem, costs_to_go, solve_ilqr
 from drake_diff.model import Model
