@@ -17,7 +17,6 @@ from drake_diff.expansion import Motion, expand, jacobians_along
 from drake_diff.ilqr import _Search, solve_ilqr
 from drake_diff.nonlinear_program import Limits, Outcome
 from drake_diff.riccati import minimize_in_box, solve_riccati
-from drake_diff.rollout_gradient import linearize
 from drake_diff.solution import Status
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
@@ -516,16 +515,19 @@ def test_a_sweep_takes_less_than_five_milliseconds():
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_inputs_leave_an_effort_limit_at_which_the_plants_derivative_is_zero(write_urdf, side):
-    """All inputs of the guess at the actuator's limit, where Riccati's optimum is inside: |u| <= 2.7 of A30."""
+def test_an_effort_limit_is_a_bound_like_any_other(write_urdf, side):
+    """A30 from a guess at |u| = 1, where the optimum begins at it: of a plant with that limit, at which its derivative
+    is 0, and of one without, bounded. The cost's rounding, 1e-15 of 14, is 1e-7 of an input."""
     h, count, Q, R, Qf = A30
-    model = write_urdf(time_step=h, limit=5.0)
-    at_limit = np.full((count, 1), side * 5.0)
-    assert not any(d.B.any() for d in linearize(model, np.array([1.0, 0.0]), at_limit))
     costs = {"running_cost": dd.QuadraticCost(Q=Q / h, R=[[R / h]]), "final_cost": dd.QuadraticCost(Q=Qf)}
-    problem = dd.Problem(model, x0=[1, 0], num_steps=count, **costs)
-    guess = dd.rollout(model, problem.x0, at_limit).xs
-    result, xs, us = solve_ilqr(problem, guess, at_limit, limits=Limits(100, np.inf, 1e-8), report=None)
-    assert result.outcome is Outcome.SOLVED
-    for x, u, K in zip(xs, us, riccati(*A30)[1], strict=False):
-        assert u == pytest.approx(-K @ x, abs=1e-10)
+    at_limit, found = np.full((count, 1), -float(side)), []
+    for limit in (1.0, 1e9):
+        bounds = dd.Bounds(u_lower=[-1.0], u_upper=[1.0])
+        model = write_urdf(time_step=h, limit=limit)
+        problem = dd.Problem(model, x0=[side, 0], num_steps=count, bounds=bounds, **costs)
+        guess = dd.rollout(model, problem.x0, at_limit).xs
+        result, _, us = solve_ilqr(problem, guess, at_limit, limits=Limits(100, np.inf, 1e-8), report=None)
+        assert result.outcome is Outcome.SOLVED
+        found.append(us)
+    assert found[0][0] == -side
+    np.testing.assert_allclose(found[0], found[1], atol=1e-7)
