@@ -4,7 +4,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from drake_diff.arrays import finite_array, positive_float
+from drake_diff.arrays import finite_array, positive_float, positive_int
 from drake_diff.exceptions import InputError
 from drake_diff.replay import track
 from drake_diff.rollout import Policy
@@ -26,11 +26,12 @@ class OpenLoop:
         return self.us[min(max(round(t / self.time_step), 0), len(self.us) - 1)]
 
 
-def tracking(solution: Solution) -> Policy:
-    """TVLQR about `solution` at its own time step, clipped to the problem's input bounds.
+def tracking(solution: Solution, parts: int = 1) -> Policy:
+    """TVLQR about `solution` in steps of a `parts`-th of its own, clipped to the problem's input bounds.
 
-    The weights are those of the solution's own replays (`replay.regulator_weights`). Raises GradientError or ModelError
-    where the plant cannot be linearized along the plan or built at its time step.
+    A collocated motion may need 2 to 16 parts before the plant's steps follow it. The weights are those of the
+    solution's own replays (`replay.regulator_weights`). Raises GradientError or ModelError where the plant cannot be
+    linearized along the plan or built at that time step.
     """
     plan = solution.plan
-    return track(plan, plan.model_at(1), *plan.sample(1))
+    return track(plan, plan.model_at(parts), *plan.sample(positive_int("parts", parts)))
