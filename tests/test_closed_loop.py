@@ -82,8 +82,8 @@ def test_the_stability_limits_of_the_pendulum_under_a_delay_of_one_step(load, up
         w+ = s (w - h c (g / l) q + h u / I),  q+ = q + h w+,  s = 1 / (1 + h b / I),  u_k = -kp q_(k-1) - kd w_(k-1).
     With B = h s / I, p = h B kp, y = B kd, a = c h^2 s g / l and h z w = (z - 1) q this is
         z^3 - (1 + s - a) z^2 + (s + p + y) z - y = 0.
-    A pair z, 1/z on the unit circle leaves y as the third root; comparing coefficients, y^2 - (s - a) y + s + p - 1 = 0:
-    stable between its two roots. (Jury's conditions at z = 1 and -1 hold with p > -a and these numbers.)
+    A pair z, 1/z on the unit circle leaves y as the third root, and by the coefficients y^2 - (s - a) y + s + p - 1 is
+    0: it is stable between the two y that make it so. (Jury's conditions at 1 and -1 hold with these numbers.)
     """
     g, length, inertia, damping, kp = 9.81, 0.5, 0.25, 0.1, 200.0
     s = 1 / (1 + H * damping / inertia)
@@ -95,7 +95,7 @@ def test_the_stability_limits_of_the_pendulum_under_a_delay_of_one_step(load, up
     model, rest = load("pendulum.urdf", time_step=H), np.array([np.pi if upright else 0.0, 0.0])
     loop = Loop(sensor=Sensor(delay=1))
     for factor in (0.97, 1.03):
-        law, start = gain(kp, factor * y / B), rest + [1e-6, 0.0]  # 1e-6 rad stay small: sin q is q to 1e-13
+        law, start = gain(kp, factor * y / B), rest + np.array([1e-6, 0.0])  # 1e-6 rad stay small: sin q is q to 1e-13
         found = closed_loop(model, lambda x, t, law=law: law(x - rest, t), start, 800, loop)
         sizes = np.linalg.norm((found.motion.xs - rest) * [1, H], axis=1)
         assert (sizes[-50:].max() < sizes[50:100].max()) == ((factor < 1) == (limit == "upper"))
