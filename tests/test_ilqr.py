@@ -14,7 +14,7 @@ from test_solution import MODELS, block
 import drake_diff as dd
 from drake_diff.augmented_lagrangian import AugmentedLagrangian
 from drake_diff.expansion import Motion, expand, jacobians_along
-from drake_diff.ilqr import _Search, solve_ilqr
+from drake_diff.ilqr import _Search, costs_to_go, solve_ilqr
 from drake_diff.nonlinear_program import Limits, Outcome
 from drake_diff.riccati import minimize_in_box, solve_riccati
 from drake_diff.solution import Status
@@ -531,3 +531,25 @@ def test_an_effort_limit_is_a_bound_like_any_other(write_urdf, side):
         found.append(us)
     assert found[0][0] == -side
     np.testing.assert_allclose(found[0], found[1], atol=1e-7)
+
+
+def test_costs_to_go_are_what_the_best_inputs_from_there_cost():
+    """Of A30, about a motion that is not the optimum's: V_k(x) - V_k(y) = x' P_k x - y' P_k y."""
+    h, count, Q, R, Qf = A30
+    random = np.random.default_rng(3)
+    us = random.standard_normal((count, 1))
+    problem = lqr(*A30)
+    found = costs_to_go(problem, dd.rollout(problem.model, problem.x0, us).xs, us)
+    assert len(found) == count + 1
+    for k, cost in enumerate(found):
+        P = riccati(h, count - k, Q, R, Qf)[0]
+        x, y = random.standard_normal((2, 2))
+        assert cost(x) - cost(y) == pytest.approx(x @ P @ x - y @ P @ y, rel=1e-9, abs=1e-9)
+
+
+def test_a_cost_without_a_best_input_has_no_cost_to_go():
+    """-1e4 u^2, which no QuadraticCost and no difference of gradients lets through: put in below those."""
+    problem = lqr(*A30)
+    object.__setattr__(problem.running_cost, "R", np.array([[-1e4]]))
+    with pytest.raises(dd.InputError, match="curvature"):
+        costs_to_go(problem, np.zeros((21, 2)), np.zeros((20, 1)))
