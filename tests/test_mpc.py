@@ -134,6 +134,27 @@ def test_a_refused_solve_is_told_and_the_last_plan_followed(swung, monkeypatch):
     assert mpc.status == "ok"
 
 
+def test_a_loop_logs_the_steps_whose_solve_failed(swung, monkeypatch):
+    """Steps 4 to 6 by the shifted plan, which unperturbed is what would be planned: the motion is the same."""
+    mpc = dd.MPC(swung.problem, horizon=30, plan=swung)
+    undisturbed = dd.closed_loop(swung.problem.model, mpc, np.zeros(4), 10)
+    original, calls = mpc._ahead, []
+
+    def refusing(x, k):
+        calls.append(k)
+        if 4 <= k <= 6:
+            raise dd.SimulationError("no")
+        return original(x, k)
+
+    monkeypatch.setattr(mpc, "_ahead", refusing)
+    found = dd.closed_loop(swung.problem.model, mpc, np.zeros(4), 10)
+    told = "the last plan is followed further: SimulationError: no"
+    assert found.controller_status == ("ok",) * 4 + (told,) * 3 + ("ok",) * 3
+    assert calls == list(range(10))
+    assert found.ended == ""
+    np.testing.assert_allclose(found.motion.xs, undisturbed.motion.xs, atol=1e-4)  # as above: two minima's distance
+
+
 def test_too_few_iterations_are_told(swung):
     mpc = dd.MPC(swung.problem, horizon=30, plan=swung, max_iterations=1)
     mpc(np.array([0.3, 0.5, 0, 0]), 0.0)

@@ -16,6 +16,7 @@ from drake_diff.bounds import Bounds
 from drake_diff.cost import QuadraticCost
 from drake_diff.exceptions import DrakeDiffError, InputError
 from drake_diff.ilqr import check_problem, costs_to_go, solve_ilqr
+from drake_diff.loop.closed_loop import OK
 from drake_diff.model import Model
 from drake_diff.nonlinear_program import Limits, Outcome
 from drake_diff.policy import LQR
@@ -26,7 +27,6 @@ from drake_diff.solver import solve
 from drake_diff.step_derivatives import differentiate_step
 from drake_diff.tangent import tangent_space
 
-OK = "ok"
 TOLERANCE = 1e-8
 PLAN_ITERATIONS = 500  # of the first plan, made once
 # Of the plan's mean cost a step: what being off the goal by a whole range costs in a step that stays there. As a cost
@@ -37,16 +37,18 @@ STAY = 1e4
 class MPC:
     """u (nu,) = mpc(x (nx,), t [s]): the first input of a plan over at most `horizon` steps of the problem's model.
 
-    It plans again each `replan_every` steps, in at most `max_iterations` iLQR steps, and gives the plan's inputs as
-    they are in between. `plan` is a Solution or (xs (N+1, nx), us (N, nu)) to begin with; without one the problem is
-    solved. Input bounds are kept; state bounds as well as so few steps can, from where the estimate is.
+    t is taken to the nearest step of the problem, whatever the period of the calls. It plans again each `replan_every`
+    steps, in at most `max_iterations` iLQR steps, and gives the plan's inputs as they are in between. `plan` is a
+    Solution or (xs (N+1, nx), us (N, nu)) to begin with; without one the problem is solved. Input bounds are kept;
+    state bounds as well as so few steps can, and one that the estimate is beyond is where the estimate is.
 
     `status` is "ok" where the last plan is a minimum, else what the solver said of it; where there was no plan to be
     made, the last one is followed further and `status` says so and why. The same calls give the same bytes: no clock
     is read. `start` forgets all but the first plan.
 
     Raises InputError and its kin for a problem with waypoints, constraints, a free horizon or initial state, a goal
-    with free entries or that no input within the bounds holds, and where the plan without `plan` is not found.
+    with free entries or that no input within the bounds holds, and where the plan without `plan` is not found;
+    GradientError or SimulationError where the whole cannot be planned from `plan`. Calls raise nothing of the kind.
     """
 
     def __init__(
