@@ -51,9 +51,11 @@ from drake_diff.loop.closed_loop import ClosedLoop as ClosedLoop
 from drake_diff.loop.closed_loop import Loop as Loop
 from drake_diff.loop.closed_loop import Push as Push
 from drake_diff.loop.closed_loop import closed_loop as closed_loop
+from drake_diff.loop.controllers import OpenLoop as OpenLoop
 from drake_diff.loop.estimator import Hold as Hold
 from drake_diff.loop.estimator import Predictor as Predictor
 from drake_diff.loop.fallback import Fallback as Fallback
+from drake_diff.loop.mpc import MPC as MPC
 from drake_diff.loop.robustness import Robustness as Robustness
 from drake_diff.loop.robustness import robustness as robustness
 from drake_diff.loop.sensor import Sensor as Sensor

@@ -64,6 +64,23 @@ class ConstantCost:
         return self.rate + 0.0 * x[0]
 
 
+@dataclass(frozen=True, eq=False)
+class CostToGo:
+    """gradient' d + d' hessian d / 2 with d = x - x_ref: a final cost that stands for all that comes after.
+
+    x_ref and gradient (nx,), hessian (nx, nx), symmetric; in the cost's unit.
+    """
+
+    x_ref: Array
+    gradient: Array
+    hessian: Array
+
+    def __call__(self, x: Any) -> Any:
+        """The cost of x (nx,): floats or AutoDiffXd."""
+        d = x - self.x_ref
+        return self.gradient @ d + d @ (self.hessian @ d) / 2
+
+
 def _form(weight: Any, z: Any, reference: Any) -> Any:
     d = z if reference is None else z - reference
     return d @ (weight @ d)
@@ -94,6 +111,8 @@ def differentiate_final_cost(cost: FinalCost, x: Array) -> tuple[float, Array]:
     """(value, gradient (nx,)) of a final cost."""
     if isinstance(cost, QuadraticCost):
         return float(cost(x)), _quadratic_gradient(cost, x, np.zeros(0))[0]
+    if isinstance(cost, CostToGo):
+        return float(cost(x)), cost.gradient + cost.hessian @ (x - cost.x_ref)
     return gradient_of(cost, x)
 
 
@@ -126,6 +145,8 @@ def final_cost_hessian(cost: FinalCost, x: Array) -> Array:
     """(nx, nx): like `running_cost_hessian`, by x."""
     if isinstance(cost, QuadraticCost):
         return np.zeros((len(x), len(x))) if cost.Q is None else 2 * cost.Q
+    if isinstance(cost, CostToGo):
+        return cost.hessian
     return _difference_hessian(lambda z: differentiate_final_cost(cost, z)[1], x)
 
 

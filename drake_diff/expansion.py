@@ -46,8 +46,14 @@ class Motion:
 
 
 def jacobians_along(problem: Problem, motion: Motion) -> Array:
-    """(N, nx, nx + nu): [A_k, B_k]; raises GradientError or SimulationError where one, or a step, is refused."""
-    steps = linearize(problem.model, motion.xs[0], motion.us, xs=motion.xs[:-1])
+    """(N, nx, nx + nu): [A_k, B_k]; raises GradientError or SimulationError where one, or a step, is refused.
+
+    Those of an input on a bound are from inside it: a bound is often the actuator's limit, at which Drake's derivative
+    is 0, as beyond it, while a minimization needs to know what leaving the bound would do.
+    """
+    us, lower, upper = motion.us, problem.bounds.u_lower, problem.bounds.u_upper
+    inside = np.where(us == upper, np.nextafter(us, lower), np.where(us == lower, np.nextafter(us, upper), us))
+    steps = linearize(problem.model, motion.xs[0], inside, xs=motion.xs[:-1])
     return np.concatenate([[d.A for d in steps], [d.B for d in steps]], axis=2)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from drake_diff.arrays import Array
 from drake_diff.augmented_lagrangian import GROWTH, LARGEST_PENALTY, AugmentedLagrangian
+from drake_diff.cost import CostToGo
 from drake_diff.exceptions import InputError, SimulationError
 from drake_diff.expansion import Motion, expand, jacobians_along
 from drake_diff.nonlinear_program import (
@@ -88,6 +89,21 @@ def solve_ilqr(
     message = f"iLQR: {outcome.value} after {len(search.rows) - 1} steps"
     motion = search.motion
     return NlpResult(motion.us.ravel(), outcome, message, tuple(search.rows)), motion.xs, motion.us
+
+
+def costs_to_go(problem: Problem, xs: Array, us: Array) -> tuple[CostToGo, ...]:
+    """N+1 of them: what remains to be paid of `problem` from each state of xs (N+1, nx), us (N, nu) on, best followed.
+
+    To second order in the distance from xs, without the dynamics' second derivatives; an input on a bound stays there.
+    Raises GradientError where a derivative is refused, InputError where the cost has no minimum.
+    """
+    search = _Search(problem, xs, us, Limits(1, math.inf, 1.0), None)
+    model = search._expand()
+    policy = solve_riccati(model, 0.0) or solve_riccati(model, SMALLEST_REGULARIZATION)
+    if policy is None:
+        raise InputError("running_cost", got="no positive curvature by the inputs", expected="a cost with a minimum")
+    parts = zip(search.motion.xs, policy.value_gradients, policy.value_hessians, strict=True)
+    return tuple(CostToGo(*part) for part in parts)
 
 
 def _best_policy(models: Iterable[LinearQuadratic], regularization: float) -> Policy | None:

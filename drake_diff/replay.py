@@ -160,12 +160,12 @@ def _replay_in(
 def track(plan: Plan, model: Model, xs: Array, us: Array) -> Policy:
     """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan, within the input's bounds."""
     bounds = plan.problem.bounds
-    policy = TVLQR(model, xs, us, *_weights(plan, us))
+    policy = TVLQR(model, xs, us, *regulator_weights(plan, us))
     return lambda x, t: np.clip(policy(x, t), bounds.u_lower, bounds.u_upper)
 
 
-def _weights(plan: Plan, us: Array) -> tuple[Array, Array, Array]:
-    """Q, R and Qf by Bryson's rule, one over the square of each range; that of a rotation is a radian."""
+def regulator_weights(plan: Plan, us: Array) -> tuple[Array, Array, Array]:
+    """Q (nt, nt), R (nu, nu) and Qf by Bryson's rule, one over the square of each range; a rotation's is a radian."""
     model = plan.problem.model
     space = tangent_space(model)
     scale = plan.scale if space.size == model.nx else np.ones(space.size)

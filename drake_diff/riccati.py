@@ -39,6 +39,8 @@ class LinearQuadratic:
 class Policy:
     """du_k = feedforward_k + feedback_k dx_k from dx_0 = start; what it promises where all gaps are 0.
 
+    What remains to be paid from knot k on is value_gradients_k' dx_k + dx_k' value_hessians_k dx_k / 2, and a constant.
+
     `slope` and `curvature` are those of the quadratic model along the step: it changes the cost by
     a slope + a^2 curvature / 2 at the step size a. `gradient` is the largest |d cost / d u| of an input, or
     |d cost / d x_0|, that no bound holds.
@@ -47,6 +49,8 @@ class Policy:
     start: Array  # (n,)
     feedforward: Array  # (N, m)
     feedback: Array  # (N, m, n)
+    value_gradients: Array  # (N+1, n)
+    value_hessians: Array  # (N+1, n, n)
     slope: float
     curvature: float
     gradient: float
@@ -62,6 +66,7 @@ def solve_riccati(problem: LinearQuadratic, regularization: float) -> Policy | N
     n, (count, m) = problem.num_states, problem.lower.shape
     s, P = problem.final_gradient, problem.final_hessian
     feedforward, feedback = np.zeros((count, m)), np.zeros((count, m, n))
+    gradients, hessians = np.tile(s, (count + 1, 1)), np.tile(P, (count + 1, 1, 1))
     slope = curvature = gradient = 0.0
     ridge = regularization * np.eye(m)
     try:
@@ -81,12 +86,13 @@ def solve_riccati(problem: LinearQuadratic, regularization: float) -> Policy | N
             P = Q[:n, :n] + K.T @ Q_uu @ K + KQ + KQ.T
             P = (P + P.T) / 2
             feedforward[k], feedback[k] = d, K
+            gradients[k], hessians[k] = s, P
         start, left = _best_start(problem, P, s, regularization)
     except np.linalg.LinAlgError:
         return None
     slope += float(s @ start)
     curvature += float(start @ P @ start)
-    return Policy(start, feedforward, feedback, slope, curvature, max(gradient, left))
+    return Policy(start, feedforward, feedback, gradients, hessians, slope, curvature, max(gradient, left))
 
 
 def _best_input(hessian: Array, q_u: Array, Q_ux: Array, lower: Array, upper: Array) -> tuple[Array, Array, float]:

@@ -75,6 +75,32 @@ def test_the_stability_limit_of_the_double_integrator_under_a_delay(cart, delay)
         assert (speeds[-50:].max() < speeds[50:100].max()) == stable
 
 
+@pytest.mark.parametrize("upright", [False, True])
+@pytest.mark.parametrize("limit", ["lower", "upper"])
+def test_the_stability_limits_of_the_pendulum_under_a_delay_of_one_step(load, upright, limit):
+    """Linearized about hanging (c = 1) or upright (c = -1), q from there, m = 1 kg, l = 0.5 m, I = m l^2, b = 0.1,
+        w+ = s (w - h c (g / l) q + h u / I),  q+ = q + h w+,  s = 1 / (1 + h b / I),  u_k = -kp q_(k-1) - kd w_(k-1).
+    With B = h s / I, p = h B kp, y = B kd, a = c h^2 s g / l and h z w = (z - 1) q this is
+        z^3 - (1 + s - a) z^2 + (s + p + y) z - y = 0.
+    A pair z, 1/z on the unit circle leaves y as the third root, and by the coefficients y^2 - (s - a) y + s + p - 1 is
+    0: it is stable between the two y that make it so. (Jury's conditions at 1 and -1 hold with these numbers.)
+    """
+    g, length, inertia, damping, kp = 9.81, 0.5, 0.25, 0.1, 200.0
+    s = 1 / (1 + H * damping / inertia)
+    B, a = H * s / inertia, (-1 if upright else 1) * H**2 * s * g / length
+    p = H * B * kp
+    y = ((s - a) + {"lower": -1, "upper": 1}[limit] * np.sqrt((s - a) ** 2 - 4 * (s + p - 1))) / 2
+    polynomial = [1, -(1 + s - a), s + p + y, -y]
+    assert np.sort(np.abs(np.roots(polynomial)))[-2:] == pytest.approx([1, 1], abs=1e-9)
+    model, rest = load("pendulum.urdf", time_step=H), np.array([np.pi if upright else 0.0, 0.0])
+    loop = Loop(sensor=Sensor(delay=1))
+    for factor in (0.97, 1.03):
+        law, start = gain(kp, factor * y / B), rest + np.array([1e-6, 0.0])  # 1e-6 rad stay small: sin q is q to 1e-13
+        found = closed_loop(model, lambda x, t, law=law: law(x - rest, t), start, 800, loop)
+        sizes = np.linalg.norm((found.motion.xs - rest) * [1, H], axis=1)
+        assert (sizes[-50:].max() < sizes[50:100].max()) == ((factor < 1) == (limit == "upper"))
+
+
 def test_a_slow_sensor_holds_and_a_predictor_makes_up_for_a_delay(cart):
     slow = closed_loop(cart, gain(30, 8), [1.0, 0.0], 100, Loop(sensor=Sensor(every=4)))
     np.testing.assert_allclose(slow.motion.xs, iterated(0, 30, 8, [1.0, 0.0], 100, every=4), atol=1e-12)

@@ -6,6 +6,7 @@ from pydrake.autodiffutils import InitializeAutoDiff
 
 import drake_diff as dd
 from drake_diff.cost import (
+    CostToGo,
     differentiate_cost,
     differentiate_final_cost,
     final_cost_hessian,
@@ -27,6 +28,18 @@ def test_a_quadratic_costs_gradient_is_that_of_autodiff_through_it():
     autodiff = cost(z[:3], z[3:])
     assert autodiff.value() == pytest.approx(value, rel=1e-14)  # rounding of a few sums
     assert np.concatenate([by_x, by_u]) == pytest.approx(autodiff.derivatives(), rel=1e-12)
+
+
+def test_a_cost_to_gos_derivatives_are_those_of_autodiff_through_it():
+    random = np.random.default_rng(1)
+    cost = CostToGo(random.random(3), random.standard_normal(3), random_weight(random, 3))
+    x = random.standard_normal(3)
+    value, gradient = differentiate_final_cost(cost, x)
+    autodiff = cost(InitializeAutoDiff(x).ravel())
+    assert autodiff.value() == pytest.approx(value, rel=1e-14)  # rounding of a few sums
+    assert gradient == pytest.approx(autodiff.derivatives(), rel=1e-12)
+    moved = differentiate_final_cost(cost, x + np.eye(3)[1])[1] - gradient
+    assert final_cost_hessian(cost, x)[1] == pytest.approx(moved, rel=1e-12)
 
 
 def test_a_functions_gradient_is_the_closed_form():

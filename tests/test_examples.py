@@ -1,6 +1,8 @@
 """The examples do what their texts say."""
 
+import dataclasses
 import importlib.util
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -99,3 +101,32 @@ def test_the_hidden_parameters_are_found():
         module.problem(model, x0, us, {"ball.friction": 0.25}, {"ball.friction": 0.5}), method="shooting"
     )
     assert solution.vector.to_dict()["ball.friction"][0] == pytest.approx(0.25, rel=1e-4)
+
+
+def test_the_cart_pole_stands_again_after_pushes_and_how_fast_is_told():
+    """What it takes depends on the machine: only what is said of it is checked, on latencies that are given."""
+    module = example("mpc_under_pushes")
+    controller, problem, loop, steps = module.cart_pole()
+    run = module.run((controller, problem, loop, steps))
+    assert np.abs(problem.goal_error(run.motion.xs[-1])).max() < 0.02
+    assert [event.kind for event in run.events] == ["push", "push"]
+    assert "period 20 ms" in module.told("cart-pole", run, problem)
+    for latencies, said in (
+        ([0.01, 0.01, 0.01], ": in real time"),
+        ([0.01, 0.01, 0.03], "in real time but for 1 of 3 steps"),
+        ([0.05, 0.05, 0.05], "2.5 times slower than real time"),
+    ):
+        made_up = dataclasses.replace(run, latencies=np.array(latencies))
+        assert module.told("cart-pole", made_up, problem).endswith(said)
+
+
+def test_the_panda_arrives_although_it_is_pushed(tmp_path):
+    module = example("mpc_under_pushes")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dd.ModelWarning)  # meshes of visuals are skipped
+        case = module.panda(module.panda_file(tmp_path))
+    run, problem = module.run(case), case[1]
+    change = np.abs(np.diff(run.motion.xs[:, 7:], axis=0)).max(axis=1)
+    assert change[20] > 10 * change[19]  # at 0.4 s it is hit
+    assert np.abs(problem.goal_error(run.motion.xs[-1])).max() < 1e-3
+    assert np.all(np.abs(run.commands) <= problem.bounds.u_upper)

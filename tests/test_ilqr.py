@@ -14,8 +14,8 @@ from test_solution import MODELS, block
 import drake_diff as dd
 from drake_diff.augmented_lagrangian import AugmentedLagrangian
 from drake_diff.expansion import Motion, expand, jacobians_along
-from drake_diff.ilqr import _Search
-from drake_diff.nonlinear_program import Limits
+from drake_diff.ilqr import _Search, costs_to_go, solve_ilqr
+from drake_diff.nonlinear_program import Limits, Outcome
 from drake_diff.riccati import minimize_in_box, solve_riccati
 from drake_diff.solution import Status
 
@@ -512,3 +512,44 @@ def test_a_sweep_takes_less_than_five_milliseconds():
         return time.perf_counter() - start
 
     assert min(seconds() for _ in range(10)) < 5e-3
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_an_effort_limit_is_a_bound_like_any_other(write_urdf, side):
+    """A30 from a guess at |u| = 1, where the optimum begins at it: of a plant with that limit, at which its derivative
+    is 0, and of one without, bounded. The cost's rounding, 1e-15 of 14, is 1e-7 of an input."""
+    h, count, Q, R, Qf = A30
+    costs = {"running_cost": dd.QuadraticCost(Q=Q / h, R=[[R / h]]), "final_cost": dd.QuadraticCost(Q=Qf)}
+    at_limit, found = np.full((count, 1), -float(side)), []
+    for limit in (1.0, 1e9):
+        bounds = dd.Bounds(u_lower=[-1.0], u_upper=[1.0])
+        model = write_urdf(time_step=h, limit=limit)
+        problem = dd.Problem(model, x0=[side, 0], num_steps=count, bounds=bounds, **costs)
+        guess = dd.rollout(model, problem.x0, at_limit).xs
+        result, _, us = solve_ilqr(problem, guess, at_limit, limits=Limits(100, np.inf, 1e-8), report=None)
+        assert result.outcome is Outcome.SOLVED
+        found.append(us)
+    assert found[0][0] == -side
+    np.testing.assert_allclose(found[0], found[1], atol=1e-7)
+
+
+def test_costs_to_go_are_what_the_best_inputs_from_there_cost():
+    """Of A30, about a motion that is not the optimum's: V_k(x) - V_k(y) = x' P_k x - y' P_k y."""
+    h, count, Q, R, Qf = A30
+    random = np.random.default_rng(3)
+    us = random.standard_normal((count, 1))
+    problem = lqr(*A30)
+    found = costs_to_go(problem, dd.rollout(problem.model, problem.x0, us).xs, us)
+    assert len(found) == count + 1
+    for k, cost in enumerate(found):
+        P = riccati(h, count - k, Q, R, Qf)[0]
+        x, y = random.standard_normal((2, 2))
+        assert cost(x) - cost(y) == pytest.approx(x @ P @ x - y @ P @ y, rel=1e-9, abs=1e-9)
+
+
+def test_a_cost_without_a_best_input_has_no_cost_to_go():
+    """-1e4 u^2, which no QuadraticCost and no difference of gradients lets through: put in below those."""
+    problem = lqr(*A30)
+    object.__setattr__(problem.running_cost, "R", np.array([[-1e4]]))
+    with pytest.raises(dd.InputError, match="curvature"):
+        costs_to_go(problem, np.zeros((21, 2)), np.zeros((20, 1)))

@@ -1,0 +1,200 @@
+"""Model predictive control: a few iLQR steps over a horizon that moves on, from the estimate, warm from the last plan.
+
+The horizon ends at the problem's end at the latest, and where it ends before, it ends in the cost-to-go of the problem
+about a plan of the whole: with linear dynamics and quadratic costs the horizon's length then changes nothing. A hard
+goal cannot be kept in a few steps, so that there it is a cost: that of staying at the goal from the end on under LQR.
+After the end that is what is minimized; without a goal, the problem's own costs over the moving horizon.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from drake_diff.arrays import Array, finite_array, positive_int
+from drake_diff.bounds import Bounds
+from drake_diff.cost import QuadraticCost
+from drake_diff.exceptions import DrakeDiffError, InputError
+from drake_diff.ilqr import check_problem, costs_to_go, solve_ilqr
+from drake_diff.loop.closed_loop import OK
+from drake_diff.model import Model
+from drake_diff.nonlinear_program import Limits, Outcome
+from drake_diff.policy import LQR
+from drake_diff.problem import Problem
+from drake_diff.replay import Plan, held, regulator_weights
+from drake_diff.solution import Solution
+from drake_diff.solver import solve
+from drake_diff.step_derivatives import differentiate_step
+from drake_diff.tangent import tangent_space
+
+TOLERANCE = 1e-8
+PLAN_ITERATIONS = 500  # of the first plan, made once
+# Of the plan's mean cost a step: what being off the goal by a whole range costs in a step that stays there. As a cost
+# the goal is missed by about 0.2 % of a range where the cart-pole swings up; ten times less weight, by 1 %.
+STAY = 1e4
+
+
+class MPC:
+    """u (nu,) = mpc(x (nx,), t [s]): the first input of a plan over at most `horizon` steps of the problem's model.
+
+    t is taken to the nearest step of the problem, whatever the period of the calls. It plans again each `replan_every`
+    steps, in at most `max_iterations` iLQR steps, and gives the plan's inputs as they are in between. `plan` is a
+    Solution or (xs (N+1, nx), us (N, nu)) to begin with; without one the problem is solved. Input bounds are kept;
+    state bounds as well as so few steps can, and one that the estimate is beyond is where the estimate is.
+
+    `status` is "ok" where the last plan is a minimum, else what the solver said of it; where there was no plan to be
+    made, the last one is followed further and `status` says so and why. The same calls give the same bytes: no clock
+    is read. `start` forgets all but the first plan.
+
+    Raises InputError and its kin for a problem with waypoints, constraints, a free horizon or initial state, a goal
+    with free entries or that no input within the bounds holds, and where the plan without `plan` is not found;
+    GradientError or SimulationError where the whole cannot be planned from `plan`. Calls raise nothing of the kind.
+    """
+
+    def __init__(
+        self, problem: Problem, *, horizon: int, plan: Any = None, replan_every: int = 1, max_iterations: int = 5
+    ):
+        _check(problem)
+        self.horizon = positive_int("horizon", horizon)
+        self.replan_every = positive_int("replan_every", replan_every)
+        self._limits = Limits(positive_int("max_iterations", max_iterations), np.inf, TOLERANCE)
+        xs, us = _first_plan(problem, plan)
+        self._stay = None if problem.x_goal is None else _staying(problem, xs, us)
+        self._problem = _without_goal(problem, self._stay)
+        self._reference = self._plan_whole(xs, us)
+        self._tails = costs_to_go(self._problem, *self._reference)
+        self.start(problem.x0)
+
+    def start(self, x0: Array) -> None:
+        """Forget everything but the first plan, whatever `x0` (nx,) is: the first call plans from its estimate."""
+        self._begin, (self._xs, self._us) = 0, self._reference
+        self._fresh = True
+        self.status = OK
+
+    def __call__(self, x: Any, t: float) -> Array:
+        k = max(round(t / self._problem.model.time_step), 0)
+        if self._fresh or not self._begin <= k < self._begin + self.replan_every:
+            self._replan(x, k)
+        return np.array(self._input(k))
+
+    def _replan(self, x: Any, k: int) -> None:
+        """From step `k` on, or the last plan moved on to it where none can be made."""
+        count = self._count(k)
+        xs = np.array([self._state(i) for i in range(k, k + count + 1)])
+        us = np.array([self._input(i) for i in range(k, k + count)])
+        try:
+            x = finite_array("x", x, (self._problem.model.nx,))
+            result, found_xs, found_us = solve_ilqr(self._ahead(x, k), xs, us, limits=self._limits, report=None)
+        except (DrakeDiffError, np.linalg.LinAlgError) as error:
+            self.status = f"the last plan is followed further: {type(error).__name__}: {error}"
+        else:
+            if result.outcome is Outcome.INTERRUPTED:
+                raise KeyboardInterrupt
+            xs, us = found_xs, found_us
+            self.status = OK if result.outcome is Outcome.SOLVED else result.message
+        self._begin, self._xs, self._us, self._fresh = k, xs, us, False
+
+    def _count(self, k: int) -> int:
+        """How many steps are planned from step `k`."""
+        left = self._problem.num_steps - k
+        return min(self.horizon, left) if left > 0 else self.horizon
+
+    def _ahead(self, x: Array, k: int) -> Problem:
+        """What is minimized from `x` at step `k`."""
+        problem, count = self._problem, self._count(k)
+        running, final = problem.running_cost, problem.final_cost
+        if k + count < problem.num_steps:
+            final = self._tails[k + count]
+        elif k >= problem.num_steps and self._stay is not None:
+            running, final = self._stay.running, self._stay.final
+        b = problem.bounds
+        bounds = Bounds(np.minimum(b.x_lower, x), np.maximum(b.x_upper, x), b.u_lower, b.u_upper)
+        return replace(problem, x0=x, num_steps=count, us=None, running_cost=running, final_cost=final, bounds=bounds)
+
+    def _state(self, k: int) -> Array:
+        """The state that the last plan has at step `k`; where it has none, the first one's, or what it ends in."""
+        if self._begin <= k < self._begin + len(self._xs):
+            return self._xs[k - self._begin]
+        xs = self._reference[0]
+        return xs[k] if k < len(xs) else xs[-1] if self._stay is None else self._stay.x
+
+    def _input(self, k: int) -> Array:
+        """The input that the last plan has at step `k`; where it has none, the first one's, or what it ends in."""
+        if self._begin <= k < self._begin + len(self._us):
+            return self._us[k - self._begin]
+        us = self._reference[1]
+        return us[k] if k < len(us) else us[-1] if self._stay is None else self._stay.u
+
+    def _plan_whole(self, xs: Array, us: Array) -> tuple[Array, Array]:
+        limits = replace(self._limits, max_iterations=PLAN_ITERATIONS)
+        result, xs, us = solve_ilqr(self._problem, xs, us, limits=limits, report=None)
+        if result.outcome not in (Outcome.SOLVED, Outcome.INACCURATE):
+            raise InputError("plan", got=result.message, expected="one from which iLQR finds a minimum")
+        return xs, us
+
+
+@dataclass(frozen=True, eq=False)
+class _Staying:
+    """How the goal `x` is stayed at, by the input `u`; `final` is what staying costs from a state near it."""
+
+    x: Array
+    u: Array
+    running: QuadraticCost
+    final: QuadraticCost
+
+
+def _staying(problem: Problem, xs: Array, us: Array) -> _Staying:
+    """Regulation at the goal: Bryson's weights along the plan, in the unit of its mean cost a step, and LQR's tail."""
+    model, goal, bounds = problem.model, np.asarray(problem.x_goal), problem.bounds
+    if np.any(np.isnan(goal)):
+        raise InputError("x_goal", got="free entries", expected="a whole state to be stayed at, or a final_cost")
+    u = _holding_input(model, goal)
+    if np.any(u < bounds.u_lower) or np.any(u > bounds.u_upper):
+        raise InputError("x_goal", got=f"held by u = {u}", expected="one that inputs within the bounds hold")
+    plan = Plan(problem, problem.parameters, model.time_step, held(xs, us), False)
+    cost = problem.objective(xs, us)
+    unit = STAY * (cost if cost > 0 else 1.0) / problem.num_steps
+    Q, R, _ = (unit * weight for weight in regulator_weights(plan, us))
+    regulator, to_tangent = LQR(model, goal, u, Q, R), tangent_space(model).derivative_of_minus(goal)
+    h, Q, P = model.time_step, to_tangent.T @ Q @ to_tangent, to_tangent.T @ regulator.cost_to_go @ to_tangent
+    running = QuadraticCost(Q=Q / h, R=R / h, x_ref=goal, u_ref=u)
+    return _Staying(goal, u, running, QuadraticCost(Q=(P + P.T) / 2, x_ref=goal))
+
+
+def _holding_input(model: Model, goal: Array) -> Array:
+    """(nu,) the input that comes closest to a step from the goal to itself, which is linear in it without contact."""
+    d = differentiate_step(model, goal, np.zeros(model.nu))
+    return np.asarray(np.linalg.lstsq(d.B, goal - d.x_next, rcond=None)[0])
+
+
+def _without_goal(problem: Problem, stay: _Staying | None) -> Problem:
+    """`problem` with the cost of staying at its goal in place of the goal."""
+    if stay is None:
+        return problem
+    own, final = problem.final_cost, stay.final
+    both = final if own is None else lambda x: own(x) + final(x)
+    return replace(problem, x_goal=None, final_cost=both)
+
+
+def _first_plan(problem: Problem, plan: Any) -> tuple[Array, Array]:
+    if plan is None:
+        plan = solve(problem)
+        if not plan.success:
+            raise InputError("problem", got=f"solve: {plan.message}", expected="one that is solved, or a plan")
+    if isinstance(plan, Solution):
+        plan = (plan.xs, plan.us)
+    if not (isinstance(plan, (tuple, list)) and len(plan) == 2):
+        raise InputError("plan", got=type(plan).__name__, expected="None, (xs, us) or a Solution")
+    xs = finite_array("plan xs", plan[0], (problem.num_steps + 1, problem.model.nx))
+    return xs, finite_array("plan us", plan[1], (problem.num_steps, problem.model.nu))
+
+
+def _check(problem: Problem) -> None:
+    if not isinstance(problem, Problem):
+        raise InputError("problem", got=type(problem).__name__, expected="a Problem")
+    check_problem(problem)
+    for subject in ("horizon", "waypoints", "constraints"):
+        if getattr(problem, subject):
+            raise InputError(subject, got="given", expected="none for MPC, which cannot keep it")
+    if not problem.initial_state_is_given:
+        raise InputError("optimize", got=list(problem.optimize), expected='"controls" for MPC')

@@ -1,0 +1,94 @@
+"""MPC of the cart-pole's swing-up and of a Panda arm that moves to a pose, both pushed, and whether it is in real time.
+
+    python examples/mpc_under_pushes.py
+
+The Panda is that of the Python package example-robot-data (`pip install example-robot-data`).
+"""
+
+import tempfile
+from importlib.metadata import files
+from pathlib import Path
+
+import numpy as np
+
+import drake_diff as dd
+
+CART_POLE = Path(__file__).parent.parent / "models" / "cart_pole.urdf"
+MOTOR = """<transmission><type>transmission_interface/SimpleTransmission</type><joint name="panda_joint{i}">
+<hardwareInterface>EffortJointInterface</hardwareInterface></joint><actuator name="motor{i}"/></transmission>
+"""
+POSE = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])  # [rad] the arm's usual one, elbow up
+
+
+def cart_pole() -> tuple[dd.MPC, dd.Problem, dd.Loop, int]:
+    """(controller, problem, loop, steps): pushed on its way up and when it stands."""
+    model = dd.load_model(CART_POLE, time_step=0.02)
+    problem = dd.Problem(
+        model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=100, running_cost=dd.QuadraticCost(R=[[1.0]])
+    )
+    pushes = [dd.Push("pole", [1.5, 0, 0], 0.8), dd.Push("pole", [-0.5, 0, 0], 2.6)]
+    loop = dd.Loop(pushes=pushes, latency_budget=model.time_step)
+    return dd.MPC(problem, horizon=30, max_iterations=2), problem, loop, 300
+
+
+def panda(path: Path) -> tuple[dd.MPC, dd.Problem, dd.Loop, int]:
+    """The same of an arm of seven joints that turns 0.3 rad about its base, pushed at its hand on the way."""
+    model = dd.load_model(path, time_step=0.02, weld_base="panda_link0")
+    goal = np.concatenate([POSE, np.zeros(7)])
+    x0 = goal - 0.3 * np.eye(14)[0]
+    cost = dd.QuadraticCost(Q=np.diag([1.0] * 7 + [0.1] * 7), R=1e-6 * np.eye(7), x_ref=goal)
+    problem = dd.Problem(model, x0=x0, x_goal=goal, num_steps=50, running_cost=cost)
+    loop = dd.Loop(pushes=[dd.Push("panda_hand", [2.0, 2.0, 0.0], 0.4)], latency_budget=model.time_step)
+    guess = np.linspace(x0, goal, 51), np.tile(holding(model, goal), (50, 1))
+    return dd.MPC(problem, horizon=10, plan=guess, max_iterations=1), problem, loop, 100
+
+
+def holding(model: dd.Model, x: np.ndarray) -> np.ndarray:
+    """(nu,) the torques [N m] that stand up to gravity."""
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositionsAndVelocities(context, x)
+    return -model.plant.CalcGravityGeneralizedForces(context)
+
+
+def panda_file(folder: Path) -> Path:
+    """The arm of example-robot-data with a motor in each joint, and with fingers that are fixed: one mimics the other,
+    which is a constraint for which there are no derivatives here."""
+    path = next(Path(str(f.locate())) for f in files("example-robot-data") or () if str(f).endswith("/panda.urdf"))
+    lines = [line for line in path.read_text().splitlines() if "<mimic" not in line]
+    text = "\n".join(lines).replace('type="prismatic"', 'type="fixed"')
+    motors = "".join(MOTOR.format(i=i) for i in range(1, 8))
+    (folder / path.name).write_text(text.replace("</robot>", motors + "</robot>"))
+    return folder / path.name
+
+
+def told(name: str, run: dd.ClosedLoop, problem: dd.Problem) -> str:
+    """Where it ended and what the controller took, against its period."""
+    period, error = problem.model.time_step, np.abs(problem.goal_error(run.motion.xs[-1])).max()
+    median, most, worst = np.percentile(run.latencies, [50, 95, 100])
+    if median > period:
+        pace = f"{median / period:.1f} times slower than real time"
+    elif worst > period:
+        pace = f"in real time but for {run.late} of {len(run.latencies)} steps"
+    else:
+        pace = "in real time"
+    return (
+        f"{name}: {run.ended or f'ends {error:.2g} from its goal'}; latency {1e3 * median:.1f} ms median, "
+        f"{1e3 * most:.1f} ms 95 %, {1e3 * worst:.1f} ms worst, period {1e3 * period:.0f} ms: {pace}"
+    )
+
+
+def run(case: tuple[dd.MPC, dd.Problem, dd.Loop, int]) -> dd.ClosedLoop:
+    controller, problem, loop, steps = case
+    return dd.closed_loop(problem.model, controller, problem.x0, steps, loop)
+
+
+def main() -> None:
+    case = cart_pole()
+    print(told("cart-pole", run(case), case[1]))
+    with tempfile.TemporaryDirectory() as folder:
+        case = panda(panda_file(Path(folder)))
+        print(told("panda", run(case), case[1]))
+
+
+if __name__ == "__main__":
+    main()

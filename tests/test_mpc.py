@@ -1,0 +1,220 @@
+"""MPC against Riccati's recursion and Drake's regulator, on the pushed cart-pole, and where its solve fails."""
+
+import numpy as np
+import pytest
+from conftest import MODELS
+from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
+from test_ilqr import A30, OTHERS, lqr, riccati
+from test_solution import block
+
+import drake_diff as dd
+from drake_diff.loop.controllers import tracking
+from drake_diff.replay import missed_goal, regulator_weights
+from drake_diff.step import advance
+
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+
+
+def straight(problem):
+    """A guess that is no motion: with linear dynamics and quadratic costs any will do."""
+    return np.tile(problem.x0, (problem.num_steps + 1, 1)), np.zeros((problem.num_steps, 1))
+
+
+def swing_up():
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
+    return dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=100, running_cost=EFFORT)
+
+
+@pytest.fixture(scope="module")
+def swung():
+    return dd.solve(swing_up())
+
+
+@pytest.mark.parametrize("case", OTHERS)
+@pytest.mark.parametrize("horizon", [1, 4, 1000])
+def test_it_is_the_remaining_horizons_lqr_whatever_its_own_horizon(case, horizon):
+    """From states far from any plan; 1e-9 of an input of about 5: the sums of a few dozen rounded terms."""
+    problem, gains = lqr(*case), riccati(*case)[1]
+    mpc = dd.MPC(problem, horizon=horizon, plan=straight(problem))
+    random = np.random.default_rng(0)
+    for k, K in enumerate(gains):
+        x = random.standard_normal(2)
+        assert mpc(x, k * case[0]) == pytest.approx(-K @ x, abs=1e-9)
+        assert mpc.status == "ok"
+
+
+@pytest.mark.parametrize("horizon", [1, 7])
+def test_with_the_infinite_cost_to_go_as_its_final_cost_it_is_lqr_for_ever(horizon):
+    h, count, Q, R, _ = A30
+    A, B = np.array([[1, h], [0, 1]]), np.array([[h**2], [h]])
+    K, P = DiscreteTimeLinearQuadraticRegulator(A, B, Q, np.array([[R]]))
+    problem = lqr(h, count, Q, R, P)
+    mpc = dd.MPC(problem, horizon=horizon, plan=straight(problem))
+    for k in (0, 3, count - 1, count, count + 1, 5 * count):
+        x = np.array([1.0, -0.3 * k])
+        assert mpc(x, k * h) == pytest.approx(-K @ x, abs=1e-9 * (1 + k))
+
+
+def test_after_the_end_the_goal_is_stayed_at_by_lqr():
+    problem = dd.Problem(block(time_step=0.1), x0=[1, 0], x_goal=[0, 0], num_steps=20, running_cost=EFFORT)
+    plan = dd.solve(problem, method="ilqr")
+    mpc = dd.MPC(problem, horizon=5, plan=plan)
+    A, B = np.array([[1, 0.1], [0, 1]]), np.array([[0.01], [0.1]])
+    K, _ = DiscreteTimeLinearQuadraticRegulator(A, B, *regulator_weights(plan.plan, plan.us)[:2])
+    for k in (20, 21, 90):
+        assert mpc([0.3, 0.1], 0.1 * k) == pytest.approx(-K @ [0.3, 0.1], abs=1e-9)
+
+
+def test_a_goal_that_gravity_pulls_away_from_is_stayed_at_by_the_input_that_holds_it():
+    """m g l sin q = 9.81 / 2 N m holds the pendulum of 1 kg and 0.5 m level; 1e-6 is LQR's own check."""
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[np.pi / 2, 0], num_steps=50, running_cost=EFFORT)
+    mpc = dd.MPC(problem, horizon=20)
+    assert mpc([np.pi / 2, 0], 10.0) == pytest.approx(9.81 / 2, abs=1e-6)
+    bounds = dd.Bounds(u_lower=[-4.0], u_upper=[4.0])
+    weak = dd.Problem(model, x0=[0, 0], x_goal=[np.pi / 2, 0], num_steps=50, running_cost=EFFORT, bounds=bounds)
+    with pytest.raises(dd.InputError, match=r"held by u = \[4\.9"):
+        dd.MPC(weak, horizon=20, plan=(np.zeros((51, 2)), np.zeros((50, 1))))
+
+
+def test_the_pushed_cart_pole_ends_upright(swung):
+    """One push on the way that open loop does not survive, one when it stands; both within |u| <= 20."""
+    problem, pushes = swung.problem, [dd.Push("pole", [1.5, 0, 0], 0.8), dd.Push("pole", [-0.5, 0, 0], 2.6)]
+    runs = {}
+    for name, controller in (
+        ("mpc", dd.MPC(problem, horizon=30, plan=swung, max_iterations=3)),
+        ("open loop", dd.OpenLoop(swung.us, 0.02)),
+    ):
+        runs[name] = dd.closed_loop(problem.model, controller, problem.x0, 300, dd.Loop(pushes=pushes))
+    end = runs["mpc"].motion.xs[-1]
+    assert np.abs(end - [1, np.pi, 0, 0]).max() < 0.02  # 3.4 s after the push, and the cart is slow to come back
+    assert np.abs(runs["open loop"].motion.xs[-1] - end).max() > 1
+    assert np.abs(runs["mpc"].commands).max() <= 20
+    assert np.abs(runs["mpc"].commands).max() > 19.9  # the bound is met, at which Drake's derivative is 0
+    assert runs["mpc"].ended == ""
+
+
+def test_the_same_calls_give_the_same_bytes_and_start_forgets(swung):
+    def run(mpc):
+        loop = dd.Loop(pushes=[dd.Push("pole", [1.0, 0, 0], 0.1)])
+        return dd.closed_loop(mpc._problem.model, mpc, np.zeros(4), 20, loop).commands.tobytes()
+
+    first = dd.MPC(swung.problem, horizon=30, plan=swung)
+    other = dd.MPC(swing_up(), horizon=30, plan=swung)
+    assert run(first) == run(first) == run(other)
+
+
+def test_between_two_plans_the_first_ones_inputs_are_given(swung):
+    """Only steps 0, 3 and 6 look at the state, and there it is as planned: 1e-4 of 3 N is what two minima of a cost of
+    59 can differ by that both leave 1e-16 of it."""
+    mpc = dd.MPC(swung.problem, horizon=30, plan=swung, replan_every=3)
+    xs, us = mpc._reference
+    given = [mpc(xs[k] + (0.1 if k % 3 else 0.0), 0.02 * k) for k in range(7)]
+    np.testing.assert_allclose(np.array(given), us[:7], atol=1e-4)
+    assert not np.allclose(mpc(xs[9] + 0.1, 0.18), us[9], atol=1e-2)
+
+
+def test_a_refused_solve_is_told_and_the_last_plan_followed(swung, monkeypatch):
+    mpc = dd.MPC(swung.problem, horizon=30, plan=swung)
+    x1 = advance(swung.problem.model.double, np.zeros(4), mpc(np.zeros(4), 0.0))
+    planned = np.array(mpc._us)
+    with monkeypatch.context() as patch:
+
+        def refuse(*_, **__):
+            raise dd.GradientError("this far and no further")
+
+        patch.setattr("drake_diff.expansion.linearize", refuse)
+        for k in (1, 2, 35):
+            command = mpc(x1, 0.02 * k)
+            assert mpc.status == "the last plan is followed further: GradientError: this far and no further"
+            assert np.array_equal(command, planned[k] if k < 30 else mpc._reference[1][k])
+    assert mpc(np.full(4, np.nan), 0.02 * 36) == pytest.approx(mpc._reference[1][36])
+    assert "NonFiniteError" in mpc.status
+    assert mpc(mpc._reference[0][37], 0.02 * 37) == pytest.approx(mpc._reference[1][37], abs=1e-4)
+    assert mpc.status == "ok"
+
+
+def test_a_loop_logs_the_steps_whose_solve_failed(swung, monkeypatch):
+    """Steps 4 to 6 by the shifted plan, which unperturbed is what would be planned: the motion is the same."""
+    mpc = dd.MPC(swung.problem, horizon=30, plan=swung)
+    undisturbed = dd.closed_loop(swung.problem.model, mpc, np.zeros(4), 10)
+    original, calls = mpc._ahead, []
+
+    def refusing(x, k):
+        calls.append(k)
+        if 4 <= k <= 6:
+            raise dd.SimulationError("no")
+        return original(x, k)
+
+    monkeypatch.setattr(mpc, "_ahead", refusing)
+    found = dd.closed_loop(swung.problem.model, mpc, np.zeros(4), 10)
+    told = "the last plan is followed further: SimulationError: no"
+    assert found.controller_status == ("ok",) * 4 + (told,) * 3 + ("ok",) * 3
+    assert calls == list(range(10))
+    assert found.ended == ""
+    np.testing.assert_allclose(found.motion.xs, undisturbed.motion.xs, atol=1e-4)  # as above: two minima's distance
+
+
+def test_too_few_iterations_are_told(swung):
+    mpc = dd.MPC(swung.problem, horizon=30, plan=swung, max_iterations=1)
+    mpc(np.array([0.3, 0.5, 0, 0]), 0.0)
+    assert mpc.status == "iLQR: iteration limit after 1 steps"
+
+
+def test_ctrl_c_is_no_bad_solve(swung, monkeypatch):
+    from drake_diff.nonlinear_program import NlpResult, Outcome
+
+    mpc = dd.MPC(swung.problem, horizon=30, plan=swung)
+    interrupted = NlpResult(np.zeros(30), Outcome.INTERRUPTED, "", ())
+    monkeypatch.setattr("drake_diff.loop.mpc.solve_ilqr", lambda *_, **__: (interrupted, None, None))
+    with pytest.raises(KeyboardInterrupt):
+        mpc(np.zeros(4), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "options", "said"),
+    [
+        ({}, {"horizon": 0}, "horizon"),
+        ({}, {"replan_every": 0}, "replan_every"),
+        ({}, {"max_iterations": 0}, "max_iterations"),
+        ({}, {"plan": "a plan"}, "plan"),
+        ({}, {"plan": (np.zeros((5, 2)), np.zeros((20, 1)))}, "plan xs"),
+        ({"waypoints": {3: [0.5, 0]}}, {}, "waypoints"),
+        ({"constraints": dd.Constraint(lambda x, u: x[0], upper=3.0)}, {}, "constraints"),
+        ({"horizon": (1.0, 3.0)}, {}, "horizon"),
+        ({"x_goal": [0, np.nan]}, {}, "free entries"),
+        ({"x_goal": [0, 1]}, {}, "fixed point"),
+        ({"optimize": ("controls", "initial_state"), "initial_state_mask": [True, False]}, {}, "optimize"),
+    ],
+)
+def test_what_it_cannot_do_is_refused_at_once(changes, options, said):
+    fields = {"x0": [1, 0], "x_goal": [0, 0], "num_steps": 20, "running_cost": EFFORT, **changes}
+    problem = dd.Problem(block(time_step=0.1), **fields)
+    with pytest.raises(dd.InputError, match=said):
+        dd.MPC(problem, **{"horizon": 5, "plan": straight(problem), **options})
+
+
+def test_an_open_loop_holds_its_last_input():
+    controller = dd.OpenLoop([[1.0], [2.0], [3.0]], 0.1)
+    assert [controller(None, t)[0] for t in (0.0, 0.1, 0.1999, 0.2, 9.0)] == [1, 2, 3, 3, 3]
+    with pytest.raises(dd.InputError, match="0 steps"):
+        dd.OpenLoop(np.zeros((0, 1)), 0.1)
+    with pytest.raises(dd.InputError, match="time_step"):
+        dd.OpenLoop([[1.0]], 0.0)
+
+
+def test_tracking_is_the_regulator_of_the_replays_within_bounds(swung):
+    controller = tracking(swung)
+    xs, us = swung.plan.sample(1)
+    gains = dd.TVLQR(swung.problem.model, xs, us, *regulator_weights(swung.plan, us)).gains
+    d = np.array([0.01, -0.02, 0.0, 0.01])
+    assert controller(xs[40] + d, 0.8) == pytest.approx(us[40] - gains[40] @ d, abs=1e-12)
+    assert controller(xs[40] + 1e6, 0.8)[0] in (-20, 20)
+
+
+@pytest.mark.parametrize(("parts", "arrives"), [(1, False), (4, True)])
+def test_a_collocated_plan_is_tracked_where_the_steps_are_short_enough(swung, parts, arrives):
+    """Arrival as the package judges it: within 5 % of each state's range."""
+    model = swung.plan.model_at(parts)
+    end = dd.closed_loop(model, tracking(swung, parts), swung.xs[0], 100 * parts).motion.xs[-1]
+    assert (not list(missed_goal(swung.plan, swung.problem.goal_error(end)))) == arrives
