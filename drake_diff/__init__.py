@@ -58,6 +58,8 @@ from drake_diff.loop.fallback import Fallback as Fallback
 from drake_diff.loop.mpc import MPC as MPC
 from drake_diff.loop.robustness import Robustness as Robustness
 from drake_diff.loop.robustness import robustness as robustness
+from drake_diff.loop.robustness_files import save_robustness as save_robustness
+from drake_diff.loop.robustness_record import RobustnessRecord as RobustnessRecord
 from drake_diff.loop.sensor import Sensor as Sensor
 from drake_diff.mcap_read import read_mcap as read_mcap
 from drake_diff.model import Model as Model

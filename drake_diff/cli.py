@@ -17,7 +17,16 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from drake_diff import cli_contact, cli_engines, cli_export, cli_gradients, cli_mcap, cli_panel, cli_runs
+from drake_diff import (
+    cli_contact,
+    cli_engines,
+    cli_export,
+    cli_gradients,
+    cli_mcap,
+    cli_panel,
+    cli_robustness,
+    cli_runs,
+)
 from drake_diff.cli_options import Approximation, ContactModel, Geometry, Ground, ModelFile, TimeStep, WeldBase
 from drake_diff.cli_runs import plain
 from drake_diff.cli_view import view
@@ -32,6 +41,7 @@ cli_export.add_commands(app)
 cli_contact.add_commands(app)
 cli_gradients.add_commands(app)
 cli_panel.add_commands(app)
+cli_robustness.add_commands(app)
 
 
 @app.callback()

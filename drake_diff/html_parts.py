@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from drake_diff.page import content_policy
 from drake_diff.whole_file import write_whole
@@ -41,7 +42,7 @@ def stage(view: str, caption: str) -> str:
         f'<iframe id="view" title="the motion in 3D" srcdoc="{html.escape(view)}"></iframe>'
         f'<p class="note">{escaped(caption)}</p>'
         '<img id="still" alt="the motion at the time of the slider"></section>'
-        '<section><h2>Plots</h2><div id="plots" class="plots"></div></section></div>'
+        f"<section><h2>Plots</h2>{plots('plots')}</section></div>"
     )
 
 
@@ -76,8 +77,24 @@ class Mark(str):
         return mark
 
 
+class Link(str):
+    """A text that leads to a file beside the page."""
+
+    target: str
+
+    def __new__(cls, target: str, text: str) -> "Link":
+        link = super().__new__(cls, text)
+        link.target = target
+        return link
+
+
 def section(title: str, body: str) -> str:
     return f"<section><h2>{escaped(title)}</h2>{body}</section>"
+
+
+def plots(place: str) -> str:
+    """Where the plots go whose `place` this is."""
+    return f'<div id="{escaped(place)}" class="plots"></div>'
 
 
 def table(head: Sequence[str], rows: Iterable[Row]) -> str:
@@ -88,7 +105,8 @@ def table(head: Sequence[str], rows: Iterable[Row]) -> str:
 
 def _cell(cell: Any) -> str:
     mark = f' class="{cell.kind}"' if isinstance(cell, Mark) else ""
-    return f"<td{mark}>{escaped(cell)}</td>"
+    text = f'<a href="{escaped(quote(cell.target))}">{escaped(cell)}</a>' if isinstance(cell, Link) else escaped(cell)
+    return f"<td{mark}>{text}</td>"
 
 
 def escaped(value: Any) -> str:

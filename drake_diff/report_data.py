@@ -21,7 +21,9 @@ def report_data(solution: Solution) -> dict[str, Any]:
     """`plots` over time or iterations, `certificates` for heat maps, and the `duration` [s]; None stands for no number.
 
     A plot has `title`, `unit`, `axis` ("time", "knot" or "iteration"), `x`, `series` (name, y, dashed, held), `log`,
-    `limits` [lower, upper] and a `note`.
+    `limits` [lower, upper], a `note`, `marks` ("lines", "points" or "both"), `levels` (whether x is the few levels of
+    something, on a log scale), `range` of y where it is given, and a `place`, that of `html_parts.plots`. Between the
+    last two series of a `band` it is shaded.
     """
     motion = solution.replay
     plots = [*_state_plots(solution, motion), *_input_plots(solution, motion)]
@@ -37,7 +39,8 @@ def report_data(solution: Solution) -> dict[str, Any]:
 
 def plot(title: str, unit: str, x: Iterable[Any], series: Sequence[Plot], *, axis: str = "time", **rest: Any) -> Plot:
     base = {"title": title, "unit": unit, "axis": axis, "x": numbers(x), "series": list(series)}
-    return base | {"log": False, "limits": [None, None], "note": ""} | rest
+    plain = {"log": False, "levels": False, "limits": [None, None], "note": "", "marks": "lines", "band": False}
+    return base | plain | {"place": "plots", "range": None} | rest
 
 
 def line(name: str, y: Iterable[Any], *, dashed: bool = False, held: bool = False) -> Plot:

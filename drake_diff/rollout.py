@@ -161,7 +161,7 @@ class Meter:
         return float(max([beyond, *norms]))
 
     def result(self, xs: Array, us: Array) -> Rollout:
-        states, steps = np.array(self.states), np.vstack([np.zeros((1, 2)), np.array(self.steps)])
+        states, steps = np.array(self.states), np.array([(0.0, 0.0), *self.steps])
         return Rollout(
             times=frozen(self.model.time_step * np.arange(len(xs))),
             xs=frozen(xs),

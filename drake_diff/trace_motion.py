@@ -72,13 +72,13 @@ def _stamp(stamp: Any, time: float) -> None:
     stamp.seconds, stamp.nanos = divmod(nanoseconds(time), 1_000_000_000)
 
 
-def state_channel(shown: Shown, topic: str, xs: Array) -> Channel:
-    """drake_diff.State of states (n, nx) at the times k h: exact, any plant, names and units as metadata."""
+def state_channel(shown: Shown, topic: str, xs: Array, times: Array | None = None) -> Channel:
+    """drake_diff.State of states (n, nx) at `times` (n,), k h where left out: exact, names and units as metadata."""
     kind, model = TYPES["State"], shown.model
     nq, contract = model.nq, model.contract
+    at = shown.times(len(xs)) if times is None else times
     rows = (
-        (nanoseconds(t), kind.cls(time=t, q=x[:nq], v=x[nq:]))
-        for t, x in zip(shown.times(len(xs)).tolist(), xs.tolist(), strict=True)
+        (nanoseconds(t), kind.cls(time=t, q=x[:nq], v=x[nq:])) for t, x in zip(at.tolist(), xs.tolist(), strict=True)
     )
     units = {
         "q": {c.name: c.unit for c in contract.positions},

@@ -1,6 +1,7 @@
-"""`verify`: is a run directory what was written, and do its numbers come out again?"""
+"""`verify`: is a run directory what was written, and do its numbers come out again? `recalled` takes it up again."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -56,6 +57,28 @@ def verify(directory: str | Path) -> Verification:
         why = f"not re-run: {record.sentence}"
         return Verification(folder, record, not_rerun=(why,), undecided=(why,))
     return _run_again(folder, record, fields)
+
+
+@contextmanager
+def recalled(directory: str | Path) -> Iterator[Solution]:
+    """The solution in a run directory, its model rebuilt from there, for as long as the block runs.
+
+    ArtifactError where there is none, it is damaged or it did not end; ModelError where it cannot be built again.
+    """
+    folder = Path(directory)
+    fields = read_fields(folder / RECORD)
+    record = parse_record(folder / RECORD, fields)
+    _refuse(folder, (*_damage_of_record(folder, fields), *_damage_of_files(folder, record)))
+    _refuse(folder, () if record.solver is not None else (f"it has no plan: {record.sentence}",))
+    plan, trace = read_plan(folder / PLAN), read_trace(folder / TRACE)
+    with rebuilt(record, trace.attachments) as model:
+        _refuse(folder, (*_odd_trace(trace, plan, fields), *_odd_contract(record, model.contract.to_dict())))
+        yield resolve(record, model, plan)
+
+
+def _refuse(folder: Path, problems: Sequence[str]) -> None:
+    if problems:
+        raise ArtifactError(f"{folder}: {problems[0]}")
 
 
 def _damage_of_record(folder: Path, fields: dict[str, Any]) -> Iterator[str]:

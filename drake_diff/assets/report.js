@@ -54,8 +54,10 @@
     const top = Math.ceil(Math.log10(high) + 1e-9), bottom = Math.floor(Math.log10(Math.max(low, high * 1e-16)));
     return [10 ** Math.min(bottom, top - 1), 10 ** top];
   }
+  const levels = (xs) => () => [xs[0] / 1.3, xs[xs.length - 1] * 1.3];
   function range(plot) {
     return (u, low, high) => {
+      if (plot.range) return plot.range;
       if (plot.log) return decades(low, high);
       if (low === null || (low === 0 && high === 0)) return [0, 1];
       const span = Math.max(high - low, Math.abs(high) * 1e-3, 1e-12);
@@ -85,19 +87,22 @@
     unit.textContent = "[" + plot.unit + "]";
     title.append(unit);
     box.append(title);
-    byId("plots").append(box);
+    byId(plot.place).append(box);
     const solid = plot.series.filter((s) => !s.dashed).length;
     const axis = { stroke: () => colour("soft"), grid: { stroke: () => colour("line"), width: 1 },
       ticks: { stroke: () => colour("line"), width: 1 }, font: "11px system-ui, sans-serif" };
     const options = {
       width: Math.max(box.clientWidth, 200), height: 190,
       cursor: { y: false, drag: { x: false, y: false }, points: { size: 6 } },
-      scales: { x: { time: false }, y: { range: range(plot), distr: plot.log ? 3 : 1 } },
-      axes: [{ ...axis, size: 30 }, { ...axis, size: 58, values: (u, ticks) => ticks.map((v) => v === null ? "" : shorten(v)) }],
+      scales: { x: { time: false, distr: plot.levels ? 3 : 1, range: plot.levels ? levels(plot.x) : undefined }, y: { range: range(plot), distr: plot.log ? 3 : 1 } },
+      legend: { live: plot.marks !== "points" },
+      bands: plot.band ? [{ series: [plot.series.length, plot.series.length - 1], fill: () => colour("s0") + "33" }] : [],
+      axes: [{ ...axis, size: 30, ...(plot.levels ? { splits: () => plot.x, filter: (u, all) => all, values: (u, all) => all.map(shorten) } : {}) }, { ...axis, size: 58, values: (u, ticks) => ticks.map((v) => v === null ? "" : shorten(v)) }],
       series: [{ label: plot.axis === "time" ? "t [s]" : plot.axis, value: (u, v) => shorten(v) }].concat(
-        plot.series.map((s, i) => ({ label: s.name, stroke: () => colour("s" + (s.dashed ? i - solid : i) % 6), width: 1.8,
-          dash: s.dashed ? [6, 4] : [], paths: s.held ? uPlot.paths.stepped({ align: 1 }) : undefined,
-          points: { show: plot.x.length < 3 }, value: (u, v) => shorten(v) }))),
+        plot.series.map((s, i) => ({ label: s.name, stroke: () => colour("s" + (plot.band ? 0 : s.dashed ? i - solid : i) % 6), width: 1.8,
+          dash: s.dashed ? [6, 4] : [], paths: plot.marks === "points" ? () => null
+            : s.held ? uPlot.paths.stepped({ align: 1 }) : undefined,
+          points: { show: plot.marks === "lines" ? plot.x.length < 3 : !(plot.band && s.dashed), size: 6 }, value: (u, v) => shorten(v) }))),
       hooks: { drawClear: [shade(plot)], setCursor: [(u) => follow(u)] },
     };
     const values = plot.series.map((s) => plot.log ? s.y.map((v) => v > 0 ? v : null) : s.y);

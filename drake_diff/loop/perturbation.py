@@ -51,9 +51,8 @@ class Perturbation:
         needs = {
             "contact_approximation": model.contract.contact.collision_pairs > 0 and model.can_rebuild,
             "time_step": model.can_rebuild,
-            "actuator_strength": model.nu > 0,
         }
-        return needs.get(self.name, True)
+        return needs.get(self.name, model.nu > 0 or self.name in ("initial_state", "push"))
 
 
 def perturbed(setup: Setup, levels: Mapping[str, float], seed: int) -> Setup:
@@ -105,7 +104,10 @@ def _scaled(quantity: str) -> Callable[[Setup, float, Random], Setup]:
 
 def _initial_state(setup: Setup, level: float, random: Random) -> Setup:
     space = tangent_space(setup.model)
-    return replace(setup, x0=space.plus(setup.x0, level * random.standard_normal(space.size)))
+    x0 = space.plus(setup.x0, level * random.standard_normal(space.size))
+    if not np.all(np.isfinite(x0)):
+        raise InputError("level of initial_state", got=level, expected="one that leaves every start finite")
+    return replace(setup, x0=x0)
 
 
 def _time_step(setup: Setup, level: float, random: Random) -> Setup:

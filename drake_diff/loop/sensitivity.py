@@ -13,6 +13,7 @@ import numpy as np
 
 from drake_diff.arrays import Array
 from drake_diff.engines.jacobians import on_tangent
+from drake_diff.loop.estimator import Hold
 from drake_diff.loop.perturbation import PERTURBATIONS, parameters_of
 from drake_diff.loop.trial import Task
 from drake_diff.parameters import applied, select
@@ -20,15 +21,18 @@ from drake_diff.step_derivatives import differentiate_step
 from drake_diff.tangent import tangent_space
 
 UNIFORM = 1 / np.sqrt(3)  # the standard deviation of U of level 1
-DIFFERENCE = 1e-6  # of the controller's answer by what it sees
-FACTORS = ("mass", "inertia", "friction", "stiffness", "damping", "gravity")
+DIFFERENCE = (
+    1e-5  # of the controller's answer by what it sees: about the cube root of rounding, central differences' best
+)
+FACTORS = ("inertia", "mass", "friction", "stiffness", "damping", "gravity")
 TOLD = ("initial_state", "sensor_noise", "sensor_bias", "actuator_strength", *FACTORS)
 
 
 class Sensitivity:
     """The first-order effect of perturbations on the last state of a task's unperturbed run.
 
-    Only of runs in an ideal loop: with a delay, a lag or another estimator `predicted` is None.
+    Only of runs in an ideal loop: with a delay, a lag, lost samples, another estimator or a fallback in charge
+    `predicted` is None.
     """
 
     def __init__(self, task: Task):
@@ -39,7 +43,10 @@ class Sensitivity:
             and loop.sensor.delay == loop.actuator.delay == 0
             and loop.sensor.every == loop.actuator.every == 1
             and loop.actuator.lag == 0
+            and loop.sensor.dropout == 0
+            and type(loop.estimator) is Hold
             and not task.nominal.run.ended
+            and not any(event.kind == "fallback" for event in task.nominal.run.events)
         )
         self.parameters = {name: parameters_of(task.model, name) for name in FACTORS}
         self._products: tuple[Array, Array, Array, Array] | None = None
@@ -48,7 +55,8 @@ class Sensitivity:
         """The root mean square of the last state's displacement; None where no gradient tells."""
         if not self.is_known or name not in TOLD or not PERTURBATIONS[name].is_of(self.task.model):
             return None
-        return float(level * np.linalg.norm(self._effect(name)))
+        found = float(level * np.linalg.norm(self._effect(name)))
+        return found if np.isfinite(found) else None
 
     def _effect(self, name: str) -> Array:
         """(nt, .) the last state's derivative by what a perturbation of level 1 draws, times its spread."""
@@ -80,16 +88,19 @@ class Sensitivity:
 
     def _along(self) -> tuple[Array, Array, Array, Array]:
         task, size = self.task, self.space.size
-        run, names = task.nominal.run, [n for found in self.parameters.values() for n in found]
-        xs, us, h = run.motion.xs, run.applied, task.model.time_step
+        run, h = task.nominal.run, task.model.time_step
+        xs, us = run.motion.xs, run.applied
         start, noise, factor = np.eye(size), np.zeros((size, 0)), np.zeros((size, task.model.nu))
         by_parameter: Array | None = None
+        # The inertia apart: a mass that is changed alone takes it along, one that is set beside it does not.
+        inertia, others = list(self.parameters["inertia"]), [n for q in FACTORS[1:] for n in self.parameters[q]]
+        groups = [inertia, others] if inertia else [others]
         with applied(select(task.setup.model, task.setup.parameters)) as model:
             for k, u in enumerate(us):
-                step = differentiate_step(model, xs[k], u, parameters=names)
-                AB = on_tangent(self.space, xs[k], xs[k + 1], step.A, step.B)
+                steps = [differentiate_step(model, xs[k], u, parameters=names) for names in groups]
+                AB = on_tangent(self.space, xs[k], xs[k + 1], steps[0].A, steps[0].B)
                 A, B = AB[:, :size], AB[:, size:]
-                C = self.space.derivative_of_minus(xs[k + 1]) @ step.C
+                C = self.space.derivative_of_minus(xs[k + 1]) @ np.hstack([step.C for step in steps])
                 K = self._gain(xs[k], k * h)
                 loop = A + B @ K
                 start, noise = loop @ start, np.hstack([loop @ noise, B @ K])

@@ -1,0 +1,448 @@
+"""Perturbations, rates, labels and predictions against closed forms: the double integrator written out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import MODELS
+from test_closed_loop import BLOCK, MASS, H
+
+import drake_diff as dd
+from drake_diff.loop.perturbation import PERTURBATIONS, Setup, parameters_of, perturbed
+from drake_diff.loop.robustness import levels_of, trial_seed
+from drake_diff.loop.sensitivity import TOLD, Sensitivity
+from drake_diff.loop.statistics import margin, success_rate
+from drake_diff.loop.trial import Task, run_trial
+from drake_diff.parameters import list_parameters
+
+STEPS = 40
+A, B = np.array([[1.0, H], [0.0, 1.0]]), np.array([[H * H], [H]]) / MASS  # v+ = v + h u / m, x+ = x + h v+
+K = np.array([[-300.0, -40.0]])  # u = K x
+PHI = A + B @ K
+SPREAD = 1 / np.sqrt(3)  # the standard deviation of a number that is uniform in [-1, 1]
+
+
+@pytest.fixture(scope="module")
+def cart(tmp_path_factory):
+    path = tmp_path_factory.mktemp("models") / "cart.urdf"
+    path.write_text(BLOCK)
+    return dd.load_model(path, time_step=H)
+
+
+def plan(model, us, x0, x_goal=None):
+    """The motion of `us`, as if it had been solved for."""
+    xs = dd.rollout(model, x0, us).xs
+    cost = dd.QuadraticCost(R=np.eye(model.nu)) if model.nu else dd.QuadraticCost(Q=np.eye(model.nx))
+    problem = dd.Problem(model, x0=x0, num_steps=len(us), x_goal=x_goal, running_cost=cost)
+    return dd.Solution(problem, "given", "none", dd.Status.CONVERGED, "", xs=xs, us=np.array(us))
+
+
+def regulated(model, steps=STEPS):
+    """From [1, 0] under u = K x."""
+    x, us = np.array([1.0, 0.0]), []
+    for _ in range(steps):
+        us.append(K @ x)
+        x = PHI @ x
+    return plan(model, us, [1.0, 0.0])
+
+
+def feedback(plan, model, xs, us):
+    return lambda x, t: K @ x
+
+
+def pushed_and_stopped(model, factor=1.0):
+    """Half the time forward, half the time back: from rest at 0 to rest at 50 (N/2)^2 h^2 = 2 m, `factor` 1."""
+    us = factor * 100.0 * np.repeat([[1.0], [-1.0]], STEPS // 2, axis=0)
+    return plan(model, us, [0.0, 0.0], [100 / MASS * (STEPS // 2 * H) ** 2, 0.0])
+
+
+# ---- rates and margins
+
+
+def test_intervals_are_the_published_ones():
+    """Newcombe, Statistics in Medicine 17 (1998), table I, method 3; given there to four digits."""
+    for (successes, trials), interval in {
+        (81, 263): (0.2553, 0.3662),
+        (15, 148): (0.0624, 0.1605),
+        (0, 20): (0.0, 0.1611),
+        (1, 29): (0.0061, 0.1718),
+    }.items():
+        np.testing.assert_allclose(success_rate(successes, trials)[2:], interval, atol=5.1e-5)
+
+
+def test_the_edges_are_where_the_score_test_is_significant():
+    """(k/n - p)^2 = z^2 p (1 - p) / n at both, exactly."""
+    for k, n in ((3, 10), (19, 20), (50, 100)):
+        rate = success_rate(k, n)
+        for p in (rate.lower, rate.upper):
+            assert (k / n - p) ** 2 == pytest.approx(1.959963984540054**2 * p * (1 - p) / n, rel=1e-12)
+    assert success_rate(20, 20).upper == 1.0
+    for k, n in ((21, 20), (-1, 20), (0, 0)):
+        with pytest.raises(dd.InputError, match="successes"):
+            success_rate(k, n)
+
+
+def test_the_interval_covers_what_it_says():
+    """By SciPy's binomial: averaged over p it covers 95 %, as Brown, Cai and DasGupta (2001) find, within 1 %."""
+    binom = pytest.importorskip("scipy.stats").binom
+    n = 50
+    rates = [success_rate(k, n) for k in range(n + 1)]
+    p = np.linspace(0.01, 0.99, 197)
+    inside = np.array([[r.lower <= q <= r.upper for r in rates] for q in p])
+    coverage = (inside * binom.pmf(np.arange(n + 1), n, p[:, None])).sum(axis=1)
+    assert abs(coverage.mean() - 0.95) < 0.01
+    assert coverage.min() > 0.85
+
+
+@pytest.mark.parametrize(
+    ("rates", "found"), [([100, 95, 94], 0.2), ([94, 100, 100], 0.0), ([100, 90, 100], 0.1), ([100, 99, 95], 0.3)]
+)
+def test_a_margin_ends_at_the_first_level_that_fails(rates, found):
+    assert margin([0.1, 0.2, 0.3], [success_rate(k, 100) for k in rates]) == found
+    assert margin([0.3, 0.2, 0.1], [success_rate(k, 100) for k in rates[::-1]]) == found
+
+
+# ---- what each perturbation does
+
+
+def draws(setup, name, level, count=400):
+    return [perturbed(setup, {name: level}, seed) for seed in range(count)]
+
+
+def is_uniform(values, level):
+    """In [-level, level], mean 0 and standard deviation level / sqrt(3), each within four of its standard errors."""
+    values = np.asarray(values)
+    assert np.abs(values).max() <= level
+    assert abs(values.mean()) < 4 * level * SPREAD / np.sqrt(values.size)
+    assert abs(values.std() / (level * SPREAD) - 1) < 4 * np.sqrt(0.2 / values.size)  # kurtosis 9/5: (k - 1) / 4
+
+
+@pytest.fixture(scope="module")
+def setup(cart):
+    return Task(pushed_and_stopped(cart).plan, "open_loop").setup
+
+
+def test_the_start_moves_by_a_normal_number(setup):
+    moved = np.array([s.x0 - setup.x0 for s in draws(setup, "initial_state", 0.3)])
+    assert np.abs(moved.mean(axis=0)).max() < 4 * 0.3 / 20
+    assert np.abs(moved.std(axis=0) / 0.3 - 1).max() < 4 / np.sqrt(800)
+    assert abs(np.corrcoef(moved.T)[0, 1]) < 4 / 20
+
+
+def test_factors_are_uniform_and_the_plant_has_them(cart, setup):
+    name = "cart.mass"
+    found = draws(setup, "mass", 0.4)
+    is_uniform([s.parameters[name] / MASS - 1 for s in found], 0.4)
+    task = Task(pushed_and_stopped(cart).plan, "open_loop")
+    before = {p.name: np.array(p.value) for p in list_parameters(task.setup.model)}
+    trial = run_trial(task, {"mass": 0.4}, 3)
+    mass = perturbed(task.setup, {"mass": 0.4}, 3).parameters[name].item()
+    half = trial.outcome.run.motion.xs[STEPS // 2, 1]
+    assert half == pytest.approx(STEPS // 2 * H * 100 / mass, rel=1e-12)  # v = n h u / m of that mass
+    for p in list_parameters(task.setup.model):
+        assert np.array_equal(p.value, before[p.name]), p.name
+
+
+@pytest.mark.parametrize(
+    ("file", "name", "owners"),
+    [
+        ("pendulum.urdf", "damping", {"hinge"}),
+        ("pendulum.urdf", "gravity", {"model"}),
+        ("double_pendulum.urdf", "mass", {"upper", "lower"}),
+        ("sphere_on_ground.sdf", "inertia", {"ball"}),
+        ("sphere_on_ground.sdf", "friction", {"ball", "ground"}),
+        ("sphere_on_ground.sdf", "stiffness", {"ball", "ground"}),
+    ],
+)
+def test_each_factor_is_of_its_own_quantity(file, name, owners):
+    """One factor for all of a vector, another for each owner; the world's mass is none."""
+    model = dd.load_model(MODELS / file, time_step=H)
+    own = {p.name: p.value for p in list_parameters(model)}
+    plain = Setup(model, model.default_state, dd.Loop(), 1.0, {})
+    factors = []
+    for s in draws(plain, name, 0.2, 100):
+        assert set(s.parameters) == {f"{owner}.{name}" for owner in owners}
+        ratios = [s.parameters[key][own[key] != 0] / own[key][own[key] != 0] for key in s.parameters]
+        assert all(np.ptp(ratio) < 1e-12 for ratio in ratios)
+        factors.append([ratio[0] for ratio in ratios])
+    is_uniform(np.array(factors) - 1, 0.2)
+    assert len({f for row in factors for f in row}) == 100 * len(owners)
+
+
+def test_steps_of_the_plant_are_cut_and_the_controller_keeps_its_period(setup):
+    finer = perturbed(setup, {"time_step": 4}, 0)
+    assert finer.model.time_step == H / 4
+    assert finer.loop.substeps == 4
+    run = run_trial(Task(pushed_and_stopped(setup.model).plan, "open_loop"), {"time_step": 4}, 0).outcome.run
+    assert (len(run.commands), len(run.motion.us)) == (STEPS, 4 * STEPS)
+    # n steps of h / 4 under a constant u: v = n h u / 4 m, x = (h / 4)^2 u / m (1 + 2 + ... + n).
+    n = 4 * STEPS // 2
+    expected = [100 / MASS * (H / 4) ** 2 * n * (n + 1) / 2, 100 / MASS * n * H / 4]
+    np.testing.assert_allclose(run.motion.xs[n], expected, rtol=1e-12)
+
+
+def test_contact_is_another_approximation():
+    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=H)
+    plain = Setup(model, model.default_state, dd.Loop(), 1.0, {})
+    found = [s.model.contract.contact.approximation for s in draws(plain, "contact_approximation", 1, 8)]
+    assert set(found) == {"similar", "lagged"}
+
+
+def test_what_feeds_no_input_is_not_tried():
+    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=H)
+    tried = {name for name, kind in PERTURBATIONS.items() if kind.is_of(model)}
+    plant = {"mass", "inertia", "friction", "stiffness", "gravity", "time_step", "contact_approximation"}
+    assert tried == {"initial_state", "push", *plant}
+
+
+def test_what_is_around_the_controller_changes(setup):
+    is_uniform([s.loop.actuator.strength[0] - 1 for s in draws(setup, "actuator_strength", 0.2)], 0.2)
+    is_uniform(np.array([s.loop.sensor.bias for s in draws(setup, "sensor_bias", 0.1)]).ravel(), 0.1)
+    blows = [s.loop.pushes[0] for s in draws(setup, "push", 0.3)]
+    assert {b.body for b in blows} == {"cart"}
+    impulses = np.array([b.impulse for b in blows])
+    np.testing.assert_allclose(np.linalg.norm(impulses, axis=1), 0.3, rtol=1e-12)
+    assert np.all(impulses[:, 2] == 0)
+    assert np.abs(impulses.mean(axis=0)).max() < 4 * 0.3 / np.sqrt(2 * 400)
+    at = np.array([b.at for b in blows]) / (0.75 * setup.duration)
+    is_uniform(2 * at - 1, 1.0)
+    noisy = replace(setup, loop=dd.Loop(sensor=dd.Sensor(noise=0.3, delay=2, dropout=0.5)))
+    assert perturbed(noisy, {"sensor_noise": 0.4}, 0).loop.sensor.noise == pytest.approx(0.5)  # variances add
+    assert perturbed(noisy, {"latency": 3}, 0).loop.sensor.delay == 5
+    assert perturbed(noisy, {"dropped_frames": 0.2}, 0).loop.sensor.dropout == pytest.approx(0.6)
+    assert perturbed(setup, {"actuator_delay": 3}, 0).loop.actuator.delay == 3
+
+
+def test_perturbations_do_not_disturb_each_other(setup):
+    both = perturbed(setup, {"push": 0.3, "mass": 0.2, "initial_state": 0.1}, 5)
+    assert both.parameters == perturbed(setup, {"mass": 0.2}, 5).parameters
+    assert np.array_equal(both.x0, perturbed(setup, {"initial_state": 0.1}, 5).x0)
+    assert perturbed(setup, {}, 5) is setup
+    assert perturbed(setup, {"mass": 0}, 5) is setup
+
+
+def test_unknown_names_and_levels_are_named(cart, setup):
+    task = Task(pushed_and_stopped(cart).plan)
+    with pytest.raises(dd.UnknownNameError, match="initial_state"):
+        perturbed(setup, {"wind": 1.0}, 0)
+    with pytest.raises(dd.UnknownNameError, match="actuator_delay"):
+        levels_of(task, ["wind"])
+    with pytest.raises(dd.UnknownNameError, match="tvlqr"):
+        Task(task.plan, "prayer")
+    for name, level in (("mass", -0.1), ("mass", np.nan), ("mass", 1.0), ("latency", 1.5), ("time_step", 2.5)):
+        with pytest.raises(dd.InputError, match=f"level of {name}"):
+            perturbed(setup, {name: level}, 0)
+    with np.errstate(over="ignore"), pytest.raises(dd.InputError, match="level of initial_state"):
+        draws(setup, "initial_state", 1.7e308)
+    for name in ("friction", "contact_approximation"):
+        with pytest.raises(dd.InputError, match="one that cart has something for"):
+            levels_of(task, [name])
+        with pytest.raises(dd.InputError, match="one that cart has something for"):
+            perturbed(setup, {name: 0.1}, 0)
+    for levels in ([], [0.0], [np.inf]):
+        with pytest.raises(dd.InputError, match="levels of mass"):
+            levels_of(task, {"mass": levels})
+    with pytest.raises(dd.InputError, match="trials"):
+        dd.robustness(pushed_and_stopped(cart), ["mass"], trials=0)
+    assert levels_of(task, {"mass": [0.2, 0.1]}) == {"mass": (0.1, 0.2)}
+    assert "friction" not in levels_of(task, None)
+
+
+# ---- whose fault it is
+
+
+def label_of(task, levels, seeds=range(20)):
+    """The labels of the trials that fail."""
+    return {t.label for s in seeds if (t := run_trial(task, levels, s)).label is not None}
+
+
+def test_a_biased_sensor_is_a_perception_error(cart):
+    assert label_of(Task(pushed_and_stopped(cart).plan, "tvlqr"), {"sensor_bias": 1.0}) == {"perception_error"}
+
+
+@pytest.mark.parametrize("levels", [{"mass": 0.4}, {"initial_state": 0.5}, {"push": 5.0}])
+def test_another_plant_or_start_is_a_state_error(cart, levels):
+    assert label_of(Task(pushed_and_stopped(cart).plan, "open_loop"), levels) == {"state_error"}
+
+
+def test_a_plan_that_fails_by_itself_is_a_planning_error(cart):
+    task = Task(pushed_and_stopped(cart, factor=0.8).plan, "open_loop")
+    assert not task.nominal.success
+    trial = run_trial(task, {"mass": 0.02}, 0)
+    assert trial.label == "planning_error"
+    assert "unperturbed it fails too" in trial.reason
+
+
+def test_a_late_actuator_is_a_control_error(cart):
+    assert label_of(Task(pushed_and_stopped(cart).plan, "open_loop"), {"actuator_delay": 8}) == {"control_error"}
+
+
+def test_a_controller_that_raises_is_a_control_error(cart):
+    def made(plan, model, xs, us):
+        def raises(x, t):
+            if abs(x[0]) > 1:
+                raise ZeroDivisionError("out of its range")
+            return us[min(round(t / H), len(us) - 1)]
+
+        return raises
+
+    trial = run_trial(Task(pushed_and_stopped(cart).plan, made), {"mass": 0.01}, 0)
+    assert trial.label == "control_error"
+    assert "out of its range" in trial.outcome.run.ended
+    assert "the controller itself failed" in trial.reason
+
+
+def test_where_no_single_thing_helps_the_controller_is_to_blame(cart):
+    task = Task(pushed_and_stopped(cart).plan, "open_loop")
+    trial = run_trial(task, {"mass": 0.4, "actuator_delay": 8}, 0)
+    assert trial.label == "control_error"
+    assert "neither" in trial.reason
+
+
+def test_a_goal_error_that_is_not_finite_cannot_be_judged(cart):
+    """From -1e308 m, pushed past 0.8e308 m: a distance beyond 1.8e308 m, the largest number, overflows."""
+    task = Task(plan(cart, np.zeros((300, 1)), [-1e308, 0.0], [-1e308, 0.0]).plan, "open_loop")
+    assert task.nominal.success
+    labels = []
+    with np.errstate(all="ignore"):
+        for seed in range(60):
+            push = perturbed(task.setup, {"push": 1.7e308}, seed).loop.pushes[0]
+            if 1.9 < push.impulse[0] / 1e308 / MASS * (3.0 - push.at) < 2.7:
+                labels.append(run_trial(task, {"push": 1.7e308}, seed).label)
+    assert labels
+    assert set(labels) == {"evaluation_error"}
+
+
+def test_a_success_has_no_label(cart):
+    trial = run_trial(Task(pushed_and_stopped(cart).plan, "tvlqr"), {"mass": 0.01}, 0)
+    assert (trial.label, trial.reason, trial.outcome.failures) == (None, "", ())
+
+
+# ---- what gradients predict
+
+
+def closed_form(steps=STEPS):
+    """By perturbation of level 1, the root mean square of the last displacement, with powers of PHI."""
+    powers = [np.linalg.matrix_power(PHI, steps - 1 - k) for k in range(steps)]
+    x = [np.linalg.matrix_power(PHI, k) @ [1.0, 0.0] for k in range(steps)]
+    noise = [P @ B @ K for P in powers]
+    force = sum(P @ B @ K @ y for P, y in zip(powers, x, strict=True))
+    return {
+        "initial_state": np.linalg.norm(np.linalg.matrix_power(PHI, steps)),
+        "sensor_noise": np.sqrt(sum(np.sum(N**2) for N in noise)),
+        "sensor_bias": SPREAD * np.linalg.norm(sum(noise)),
+        "actuator_strength": SPREAD * np.linalg.norm(force),
+        "mass": SPREAD * np.linalg.norm(force),  # d (u / m) = -u / m dm / m
+    }
+
+
+@pytest.fixture(scope="module")
+def regulator(cart):
+    return Task(regulated(cart).plan, feedback)
+
+
+def test_predictions_are_the_closed_form(regulator):
+    sensitivity = Sensitivity(regulator)
+    for name, value in closed_form().items():
+        assert sensitivity.predicted(name, 1.0) == pytest.approx(value, rel=1e-9), name
+        assert sensitivity.predicted(name, 0.03) == pytest.approx(0.03 * value, rel=1e-9), name
+
+
+@pytest.mark.parametrize(("name", "level"), [("initial_state", 0.01), ("sensor_noise", 0.01), ("sensor_bias", 0.01)])
+def test_what_is_measured_is_what_is_predicted(cart, name, level):
+    """The loop is linear, so the mean square is exact; 2000 trials know it to their standard error, of which three."""
+    found = dd.robustness(regulated(cart, 10), {name: [level]}, trials=2000, controller=feedback).cells[0]
+    last = np.linalg.matrix_power(PHI, 10) @ [1.0, 0.0]
+    squares = np.array([np.sum((e.last - last) ** 2) for e in found.endings])
+    assert np.sqrt(squares.mean()) == pytest.approx(found.displacement, rel=1e-9)
+    expected = (level * closed_form(10)[name]) ** 2
+    assert abs(squares.mean() - expected) < 3 * squares.std() / np.sqrt(len(squares))
+    assert found.predicted == pytest.approx(np.sqrt(expected), rel=1e-9)
+    assert found.ratio == pytest.approx(found.displacement / found.predicted)
+
+
+def test_small_changes_of_the_plant_move_it_as_predicted(cart):
+    """To first order: a mass 1 % other, on 300 trials, whose mean square is known to sqrt(0.8 / 300) = 5 %."""
+    for name in ("mass", "actuator_strength"):
+        found = dd.robustness(regulated(cart, 10), {name: [0.01]}, trials=300, controller=feedback).cells[0]
+        assert found.ratio == pytest.approx(1, abs=3 * 0.5 * np.sqrt(0.8 / 300) + 0.01)
+
+
+@pytest.mark.parametrize("name", ["mass", "inertia", "damping", "gravity"])
+def test_predictions_of_one_parameter_alone_are_central_differences(name, tmp_path):
+    """Of the whole closed loop by a factor 1 +- 1e-4, whose error is of its square: 1e-6 is far above.
+
+    A mass that is changed alone takes the inertia along: with the inertia's own derivative beside it it would not.
+    """
+    path = tmp_path / "rod.urdf"
+    path.write_text(
+        (MODELS / "pendulum.urdf").read_text().replace('ixx="0" iyy="0" izz="0"', 'ixx="1" iyy="1" izz="1"')
+    )
+    model = dd.load_model(path, time_step=H)
+    task = Task(plan(model, np.full((30, 1), 3.0), [0.5, 0.0]).plan, "tvlqr")
+    own = parameters_of(model, name)
+
+    def end(factor):
+        setup = replace(task.setup, parameters={key: factor * value for key, value in own.items()})
+        return task.run(setup, 0).run.motion.xs[-1]
+
+    slope = (end(1 + 1e-4) - end(1 - 1e-4)) / 2e-4
+    assert np.linalg.norm(slope) > 0
+    assert Sensitivity(task).predicted(name, 1.0) == pytest.approx(SPREAD * np.linalg.norm(slope), rel=1e-6)
+
+
+def test_nothing_is_predicted_of_what_no_gradient_tells(regulator):
+    sensitivity = Sensitivity(regulator)
+    for name in ("latency", "push", "time_step", "dropped_frames", "friction"):
+        assert sensitivity.predicted(name, 1) is None
+    for loop in (
+        dd.Loop(sensor=dd.Sensor(delay=1)),
+        dd.Loop(sensor=dd.Sensor(dropout=0.1)),
+        dd.Loop(actuator=dd.Actuator(lag=0.1)),
+        dd.Loop(estimator=dd.Predictor(regulator.model, 2)),
+    ):
+        unknown = Sensitivity(Task(regulator.plan, feedback, loop))
+        assert all(unknown.predicted(name, 0.1) is None for name in TOLD)
+
+
+# ---- the whole of it
+
+
+def test_the_same_seed_gives_the_same_trials(cart):
+    solution = pushed_and_stopped(cart)
+
+    def ends(seed):
+        result = dd.robustness(solution, {"mass": [0.1], "sensor_noise": [0.1]}, trials=4, seed=seed)
+        return [e.last.tobytes() for c in result.cells for e in c.endings]
+
+    assert ends(1) == ends(1)
+    assert not set(ends(1)) & set(ends(2))
+    assert len({trial_seed(0, k) for k in range(1000)}) == 1000
+
+
+def test_rates_margins_and_the_worst_are_of_the_trials(cart):
+    """Open loop a mass m (1 + U) ends at 2 m / (1 + U), which may be 5 % off: |U / (1 + U)| <= 0.05."""
+    result = dd.robustness(pushed_and_stopped(cart), {"mass": [0.4, 0.02]}, trials=60, controller="open_loop")
+    small, large = result.of("mass")
+    assert (small.level, small.rate.successes, small.ratio) == (0.02, 60, pytest.approx(1, abs=0.25))
+    factors = [
+        perturbed(result.task.setup, {"mass": 0.4}, trial_seed(0, k)).parameters["cart.mass"].item() / MASS
+        for k in range(60)
+    ]
+    distances = np.abs(2 / np.array(factors) - 2)
+    assert large.rate.successes == np.sum(distances <= 0.05 * 2)
+    assert large.worst_goal_error == pytest.approx(max(distances), rel=1e-9)
+    assert large.goal_error == pytest.approx(np.median(distances), rel=1e-9)
+    assert large.labels == {"state_error": 60 - large.rate.successes}
+    assert large.worst.seed == trial_seed(0, int(np.argmax(distances)))
+    assert result.worst("mass") is large
+    assert result.margins == {"mass": 0.02}
+    assert result.success
+    assert "95 % survive up to: mass 0.02" in str(result)
+
+
+def test_a_plan_that_fails_has_no_success(cart):
+    result = dd.robustness(pushed_and_stopped(cart, 0.8), {"mass": [0.02]}, trials=2, controller="open_loop")
+    assert not result.success
+    assert result.margins == {"mass": 0.0}
+    assert "unperturbed it fails" in str(result)

@@ -1,0 +1,427 @@
+"""What trials leave on disk: every number, worst trials that can be run again, and nothing that lies."""
+
+import csv
+import json
+import re
+import shutil
+from dataclasses import replace
+from hashlib import sha256
+
+import numpy as np
+import pytest
+from conftest import MODELS
+from test_closed_loop import BLOCK, H
+from test_report import browser as browser
+from test_report import browsing, errors, move_slider, open_page, view_of
+from test_robustness import plan, pushed_and_stopped
+from typer.testing import CliRunner
+
+import drake_diff as dd
+from drake_diff.cli import app
+from drake_diff.loop import robustness_page
+from drake_diff.loop.panel_trial import evaluate
+from drake_diff.loop.robustness_files import begin_robustness, record_of
+from drake_diff.loop.robustness_plots import robustness_data
+from drake_diff.loop.robustness_words import verdict_of, weakest_of
+from drake_diff.loop.statistics import success_rate
+from drake_diff.record import own_sha256
+from drake_diff.verify import recalled
+
+LEVELS = {"mass": [0.02, 0.4], "actuator_delay": [1, 8], "time_step": [2], "sensor_bias": [0.01]}
+WORST = ["mass_0.4", "actuator_delay_1", "time_step_2", "sensor_bias_0.01"]
+TRIAL_FILES = {"trial.json", "trace.mcap", "replay.html", "latencies.json"}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A pendulum on its way up in 0.4 s."""
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    options = {"x0": [0, 0], "x_goal": [1.0, 0], "num_steps": 20, "running_cost": dd.QuadraticCost(R=[[1.0]])}
+    directory = tmp_path_factory.mktemp("runs") / "pendulum"
+    dd.save(dd.solve(dd.Problem(model, **options), method="shooting"), directory)
+    return directory
+
+
+@pytest.fixture(scope="module")
+def result(run):
+    with recalled(run) as solution:
+        yield dd.robustness(solution, LEVELS, trials=6, controller="open_loop")
+
+
+@pytest.fixture(scope="module")
+def saved(result, run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("robustness") / "tried"
+    return folder, dd.save_robustness(result, folder, run)
+
+
+@pytest.fixture(scope="module")
+def cart(tmp_path_factory):
+    path = tmp_path_factory.mktemp("models") / "cart.urdf"
+    path.write_text(BLOCK)
+    return dd.load_model(path, time_step=H)
+
+
+def test_the_record_has_every_number_and_its_own_hash(result, saved, run):
+    folder, record = saved
+    fields = json.loads((folder / "robustness.json").read_text())
+    assert dd.RobustnessRecord.model_validate(fields) == record
+    assert own_sha256(fields) == fields["record_sha256"]
+    for file in record.files:
+        assert sha256((folder / file.path).read_bytes()).hexdigest() == file.sha256
+    expected = {"robustness.html", "trials.csv", *(f"worst/{name}/{file}" for name in WORST for file in TRIAL_FILES)}
+    assert {file.path for file in record.files} == expected
+    assert {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} == {
+        *expected,
+        "robustness.json",
+    }
+    assert record.run.record_sha256 == dd.load_record(run).record_sha256
+    assert [p.name for p in record.perturbations] == list(LEVELS)
+    for p in record.perturbations:
+        assert p.margin == result.margins[p.name]
+        for c, cell in zip(p.cells, result.of(p.name), strict=True):
+            assert (c.level, c.successes, c.trials, c.rate) == (cell.level, cell.rate[0], 6, cell.rate.value)
+            assert (c.lower_95, c.upper_95) == cell.rate[2:]
+            assert (c.goal_error_median, c.displacement, c.predicted) == (
+                cell.goal_error,
+                cell.displacement,
+                cell.predicted,
+            )
+            assert c.distinct == (1 if p.name in ("time_step", "actuator_delay") else 6 if p.name == "mass" else 1)
+    assert record.verdict == ("pass" if result.success else "fail")
+    assert record.loop.latency_budget_s == 0.02
+    assert record.wall_clock.controller_steps == 20 * (1 + len(result.cells))
+
+
+def test_everything_but_wall_clock_is_the_same_byte_for_byte(saved, run, tmp_path):
+    folder, record = saved
+    with recalled(run) as solution:
+        again = dd.save_robustness(
+            dd.robustness(solution, LEVELS, trials=6, controller="open_loop"), tmp_path / "tried", run
+        )
+    apart = {"wall_clock": None, "record_sha256": "", "files": []}
+    assert again.model_copy(update=apart) == record.model_copy(update=apart)
+
+    def bytes_of(directory, name):
+        text = (directory / name).read_text() if name == "robustness.html" else (directory / name).read_bytes()
+        return re.sub(r'<p id="(measured-latency|wall-clock)".*?</p>', "", text) if isinstance(text, str) else text
+
+    for file in record.files:
+        if not file.path.endswith("latencies.json"):
+            assert bytes_of(tmp_path / "tried", file.path) == bytes_of(folder, file.path), file.path
+
+
+def test_a_worst_trial_is_run_again_from_its_file_alone(result, saved):
+    for name in result.names:
+        worst = result.worst(name)
+        fields = json.loads((saved[0] / f"worst/{name}_{worst.level:g}/trial.json").read_text())
+        row = evaluate(fields)
+        assert json.loads(json.dumps(row, allow_nan=False)) == row
+        assert row == {key: fields[key] for key in row}
+        assert fields["label"] == worst.worst.label
+        assert fields["reason"] == worst.worst.reason
+        assert fields["seed"] in [e.seed for e in worst.endings]
+    assert fields["plant_time_step_s"] == 0.02
+
+
+def test_it_is_the_worst_at_the_lowest_level_that_fails(result):
+    for name, level in (("mass", 0.4), ("actuator_delay", 1)):
+        cell = result.worst(name)
+        assert cell.level == level
+        failed = [e.goal_error for e in cell.endings if e.label is not None]
+        assert cell.worst.outcome.goal_error == max(failed)
+        assert all(c.rate.successes == 6 for c in result.of(name) if c.level < level)
+
+
+def test_the_trace_has_all_that_the_loop_saw_and_did(result, saved):
+    trial = result.worst("actuator_delay").worst
+    log, found = dd.read_mcap(saved[0] / "worst/actuator_delay_1/trace.mcap"), trial.outcome.run
+    for topic, rows in (
+        ("/state", found.motion.xs),
+        ("/observation", found.observations),
+        ("/estimate", found.estimates),
+    ):
+        states = log.arrays(topic)
+        assert np.array_equal(np.hstack([states["q"], states["v"]]), rows), topic
+    assert np.array_equal(log.arrays("/command")["u"], found.commands)
+    assert np.array_equal(log.arrays("/applied")["u"], found.applied)
+    assert np.array_equal(log.arrays("/input")["u"], found.motion.us)
+    planned = log.arrays("/planned/state")
+    assert np.array_equal(np.hstack([planned["q"], planned["v"]]), result.task.xs)
+    assert [m.message for _, m in log.messages["/controller/status"]] == ["ok"] * 20
+    assert [m.failure_label for _, m in log.messages["/events"]] == ["control_error"]
+    latencies = json.loads((saved[0] / "worst/actuator_delay_1/latencies.json").read_text())
+    assert latencies["latencies_s"] == found.latencies.tolist()
+
+
+def test_the_table_has_a_row_for_each_trial(result, saved):
+    rows = list(csv.DictReader((saved[0] / "trials.csv").open()))
+    assert len(rows) == 6 * len(result.cells)
+    for c in result.cells:
+        mine = [r for r in rows if (r["perturbation"], float(r["level"])) == (c.perturbation, c.level)]
+        assert sum(int(r["success"]) for r in mine) == c.rate.successes
+        assert [float(r["last hinge_q"]) for r in mine] == [e.last[0] for e in c.endings]
+
+
+def test_the_page_says_and_plots_it_and_needs_no_network(result, saved):
+    folder = saved[0]
+    page, plots = (folder / "robustness.html").read_text(), robustness_data(result)["plots"]
+    assert "Content-Security-Policy" in page
+    assert not re.search(r'(src|href)="https?:', page)
+    for target in re.findall(r'<a href="([^"]+)"', page):
+        assert (folder / target).is_file()
+    assert len(re.findall(r'<a href="', page)) == len(LEVELS)
+    for name in LEVELS:
+        success, moved, last = (p for p in plots if p["place"] == name)
+        cells = result.of(name)
+        assert success["x"] == [c.level for c in cells]
+        assert success["series"][0]["y"] == pytest.approx([c.rate.value for c in cells])
+        assert success["series"][1]["y"] == pytest.approx([c.rate.lower for c in cells])
+        assert moved["series"][0]["y"] == pytest.approx([c.displacement for c in cells])
+        points = [[y for y in s["y"] if y is not None] for s in last["series"]]
+        assert [len(p) for p in points] == [6] * len(cells) + [1]
+        assert sorted(points[0]) == pytest.approx(sorted(e.last[1] for e in cells[0].endings), rel=1e-7)
+        assert f'id="{name}" class="plots"' in page
+    trial = result.worst(weakest_of(result)).worst
+    angle = next(p for p in plots if p["title"] == "hinge_q")
+    assert [s["name"] for s in angle["series"]] == ["true", "observed", "estimated", "plan"]
+    assert angle["series"][0]["y"] == pytest.approx(trial.outcome.run.motion.xs[:, 0], rel=1e-7)
+    assert all(len(s["y"]) == len(p["x"]) for p in plots for s in p["series"])
+    assert "Nothing is drawn" in page
+    assert "Budget: 20 ms, the controller&#x27;s period" in page
+
+
+@browsing
+@pytest.mark.parametrize(("size", "scheme"), [((1440, 900), "light"), ((390, 844), "dark")], ids=["laptop", "phone"])
+def test_the_page_opens_without_a_network_and_without_an_error(saved, browser, tmp_path, size, scheme):
+    page = tmp_path / "report.html"
+    shutil.copy(saved[0] / "robustness.html", page)
+    open_page(browser, page, size=size, scheme=scheme)
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= size[0]
+    count = browser.execute_script("return document.querySelectorAll('.plot canvas').length")
+    assert count == browser.execute_script(
+        "return JSON.parse(document.getElementById('data').textContent).plots.length"
+    )
+    assert count == 4 + 3 * len(LEVELS)  # angle, speed, torque, status
+    move_slider(browser, 0.7)
+    assert len(np.unique(view_of(browser).reshape(-1, 3), axis=0)) > 50  # not blank
+    assert errors(browser) == []
+
+
+def doctored(result, rates, **changes):
+    """`result` with other successes of 100 by perturbation and level."""
+    cells = [
+        replace(c, rate=success_rate(rates[c.perturbation][i], 100), labels={"state_error": 1}, **changes)
+        for name in result.names
+        for i, c in enumerate(result.of(name))
+    ]
+    return replace(result, cells=tuple(cells))
+
+
+def test_the_words_name_the_weakest_point_and_who_is_to_blame(result):
+    rates = {"mass": [100, 100], "actuator_delay": [100, 90], "time_step": [100], "sensor_bias": [100]}
+    # Margins, as parts of the largest usual levels: 0.4 / 0.4, 1 / 8, 2 / 4, 0.01 / 0.1.
+    assert weakest_of(doctored(result, rates)) == "sensor_bias"
+    rates["actuator_delay"] = [94, 90]
+    told = doctored(result, rates)
+    assert weakest_of(told) == "actuator_delay"
+    assert "Weakest point: actuator_delay, with no margin: at 1 steps 94 of 100 succeed" in verdict_of(told)
+    assert "Of 6 failed trials: 6 state errors." in verdict_of(told)
+    assert "they tell nothing of actuator_delay" in verdict_of(told)
+
+
+def test_the_words_say_whether_gradients_knew(result):
+    rates = {"mass": [100, 50], "actuator_delay": [100, 100], "time_step": [100], "sensor_bias": [100]}
+    all_of, none_of = "in 6 of the 6 cells that they tell of; of mass in 2 of 2.", "in 0 of the 6 cells"
+    for factor, told in ((1.9, all_of), (2.1, none_of), (0.51, all_of), (0.49, none_of)):
+        assert told in verdict_of(doctored(result, rates, displacement=factor, predicted=1.0))
+    assert "No gradient predicts any of it" in verdict_of(doctored(result, rates, predicted=None))
+    perfect = doctored(result, {name: [100] * 2 for name in LEVELS})
+    assert "No trial fails" in verdict_of(perfect)
+    assert record_of(perfect, "x").verdict == "pass"
+    assert record_of(doctored(result, {name: [94] * 2 for name in LEVELS}), "x").verdict == "fail"
+
+
+def test_what_is_begun_and_not_ended_says_so(result, tmp_path, monkeypatch):
+    other = tmp_path / "worst" / "mine"
+    other.mkdir(parents=True)
+    (other / "notes.txt").write_text("keep")
+    begin_robustness(tmp_path, result.task.model)
+    assert json.loads((tmp_path / "robustness.json").read_text())["verdict"] == "incomplete"
+    dd.save_robustness(result, tmp_path)
+
+    def fails(*_):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(robustness_page, "write_robustness_page", fails)
+    with pytest.raises(OSError, match="no space"):
+        dd.save_robustness(result, tmp_path)
+    assert json.loads((tmp_path / "robustness.json").read_text())["verdict"] == "incomplete"
+    assert not (tmp_path / "robustness.html").exists()
+    begin_robustness(tmp_path, result.task.model)
+    assert [p.name for p in (tmp_path / "worst").iterdir()] == ["mine"]
+    assert (other / "notes.txt").read_text() == "keep"
+
+
+def test_a_loop_of_ones_own_is_not_said_to_run_again(cart, run, tmp_path):
+    result = dd.robustness(
+        pushed_and_stopped(cart),
+        {"mass": [0.4]},
+        trials=2,
+        loop=dd.Loop(sensor=dd.Sensor(noise=0.01), latency_budget=1),
+    )
+    record = dd.save_robustness(result, tmp_path, run)
+    trial = json.loads((tmp_path / record.perturbations[0].worst / "trial.json").read_text())
+    assert trial["run"] is None
+    assert record.loop.sensor["noise"] == 0.01
+    assert (record.loop.latency_budget_s, record.loop.latency_budget_is) == (1.0, "stated")
+    assert record.loop.actuator["upper"] is None
+    with pytest.raises(dd.InputError, match="trial: run"):
+        evaluate(trial)
+
+
+def test_a_run_that_breaks_off_at_once_and_one_with_a_fallback_are_kept(cart, tmp_path):
+    def made(plan, model, xs, us):
+        def fails(x, t):
+            raise ZeroDivisionError("no answer")
+
+        return fails
+
+    solution = pushed_and_stopped(cart)
+    result = dd.robustness(solution, {"mass": [0.1]}, trials=1, controller=made)
+    record = dd.save_robustness(result, tmp_path / "broken")
+    assert record.nominal.ended.endswith("no answer")
+    assert record.perturbations[0].cells[0].labels == {"control_error": 1}
+    assert record.loop.controller == "a user's function"
+    assert record.run is None
+    loop = dd.Loop(fallback=dd.Fallback("stop"))
+    found = dd.robustness(solution, {"mass": [0.1]}, trials=1, controller=made, loop=loop)
+    dd.save_robustness(found, tmp_path / "kept")
+    log = dd.read_mcap(tmp_path / "kept/worst/mass_0.1/trace.mcap")
+    assert [m.kind for _, m in log.messages["/events"]] == ["fallback", "failure"]
+    assert {m.code for _, m in log.messages["/controller/status"]} == {"other"}
+    status = next(p for p in robustness_data(found)["plots"] if p["title"] == "controller status")
+    assert set(status["series"][0]["y"]) == {0.0}
+    assert "no answer" in status["note"]
+
+
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning", "ignore:invalid:RuntimeWarning")
+@pytest.mark.parametrize("levels", [{"push": [1.7e308]}, {"push": [1e20]}])
+def test_what_runs_away_is_kept(cart, tmp_path, levels):
+    """Beyond what can be judged or drawn; the last one only beyond what can be drawn."""
+    start = [0.0 if levels == {"push": [1e20]} else -1e308, 0.0]
+    result = dd.robustness(
+        plan(cart, np.zeros((300, 1)), start, start), levels, trials=8, controller="open_loop", seed=1
+    )
+    record = dd.save_robustness(result, tmp_path)
+    worst = result.cells[0].worst
+    fields = json.loads((tmp_path / record.perturbations[0].worst / "trial.json").read_text())
+    assert fields["label"] == worst.label
+    assert (fields["goal_error"] is None) == (worst.label == "evaluation_error")
+    log = dd.read_mcap(tmp_path / record.perturbations[0].worst / "trace.mcap")
+    assert np.array_equal(log.arrays("/state")["q"], worst.outcome.run.motion.xs[:, :1])
+    replay = (tmp_path / record.perturbations[0].worst / "replay.html").read_text()
+    assert "drawn up to 1e+06 only" in replay
+
+
+def test_plants_with_contact_finer_steps_and_no_inputs_are_kept(thrown, tmp_path):
+    levels = {"contact_approximation": [1], "time_step": [2], "friction": [0.4]}
+    result = dd.robustness(thrown, levels, trials=2)
+    record = dd.save_robustness(result, tmp_path)
+    fields = json.loads((tmp_path / "worst/time_step_2/trial.json").read_text())
+    assert (fields["plant_time_step_s"], fields["controller_period_s"]) == (0.0025, 0.005)
+    log = dd.read_mcap(tmp_path / "worst/time_step_2/trace.mcap")
+    assert len(log.arrays("/state")["q"]) == len(log.arrays("/planned/state")["q"]) == 121
+    assert len(log.arrays("/estimate")["q"]) == 60
+    assert log.messages["/contacts"]
+    assert record.loop.judged_by == "the plan's end"
+    assert all(c.distinct == 1 for p in record.perturbations[1:2] for c in p.cells)
+
+
+def test_names_are_escaped(tmp_path):
+    text = BLOCK.replace('name="cart"', 'name="&lt;script&gt;alert(1)"').replace(
+        'link="cart"', 'link="&lt;script&gt;alert(1)"'
+    )
+    path = tmp_path / "evil.urdf"
+    path.write_text(text)
+    model = dd.load_model(path, time_step=H)
+    result = dd.robustness(plan(model, np.ones((5, 1)), [0.0, 0.0]), {"push": [0.1]}, trials=1)
+    dd.save_robustness(result, tmp_path / "out")
+    assert "<script>alert" not in (tmp_path / "out/robustness.html").read_text()
+
+
+# ---- panels
+
+
+TRIAL = {"controller": "tvlqr", "perturbation": "mass", "level": 0.02, "seed": 7, "repeat": 0}
+
+
+def test_panels_call_it_by_name(run):
+    row = evaluate({**TRIAL, "run": str(run)})
+    assert row["success"]
+    assert set(row) == {"success", "label", "goal_error", "displacement", "failures", "ended"}
+    assert row == evaluate({**TRIAL, "run": str(run)})
+    assert row != evaluate({**TRIAL, "run": str(run), "seed": 8})
+    assert evaluate({**TRIAL, "run": str(run), "level": 0})["displacement"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "said"),
+    [
+        ({"seed": None}, dd.InputError, "trial: seed"),
+        ({"seed": True}, dd.InputError, "trial: seed"),
+        ({"seed": -1}, dd.InputError, "at least 0"),
+        ({"level": "much"}, dd.InputError, "trial: level"),
+        ({"level": -1.0}, dd.InputError, "level of mass"),
+        ({"perturbation": "wind"}, dd.UnknownNameError, "actuator_delay"),
+        ({"controller": "prayer"}, dd.UnknownNameError, "open_loop"),
+        ({"run": "/nowhere"}, dd.ArtifactError, "no such record"),
+    ],
+)
+def test_panels_are_told_what_is_wrong(run, changes, error, said):
+    with pytest.raises(error, match=said):
+        evaluate({**TRIAL, "run": str(run), **changes})
+
+
+# ---- the command
+
+
+def call(*words):
+    return CliRunner().invoke(app, ["robustness", *map(str, words)])
+
+
+def test_the_command(run, tmp_path):
+    here = tmp_path / "mine"
+    shutil.copytree(run, here)
+    found = call(here, "--trials", 3, "--perturbations", "mass, sensor_bias", "--seed", 1)
+    assert found.exit_code == 0, found.output
+    assert "Unperturbed it succeeds" in found.output
+    out = tmp_path / "mine_robustness"
+    record = json.loads((out / "robustness.json").read_text())
+    assert (record["verdict"], record["trials"], record["seed"]) == ("pass", 3, 1)
+    assert [p["name"] for p in record["perturbations"]] == ["mass", "sensor_bias"]
+    assert dd.verify(here).holds  # nothing is written into the run
+
+
+def test_the_command_fails_where_the_plan_does_not_survive(run, tmp_path):
+    words = ("--trials", 2, "--perturbations", "actuator_delay", "--controller", "open_loop", "--out", tmp_path / "out")
+    found = call(run, *words)
+    assert found.exit_code == 1
+    assert "Weakest point: actuator_delay, with no margin: at 1 steps 0 of 2 succeed" in found.output
+    assert "2 control" in found.output
+
+
+def test_the_command_refuses_what_it_cannot_try(run, tmp_path):
+    broken = tmp_path / "broken"
+    shutil.copytree(run, broken)
+    data = bytearray((broken / "plan.npz").read_bytes())
+    data[len(data) // 2] ^= 1
+    (broken / "plan.npz").write_bytes(bytes(data))
+    found = call(broken)
+    assert isinstance(found.exception, dd.ArtifactError)
+    assert "plan.npz" in str(found.exception)
+    assert not (tmp_path / "broken_robustness").exists()
+    assert isinstance(call(tmp_path).exception, dd.ArtifactError)
+    for words in (("--perturbations", "wind"), ("--controller", "prayer")):
+        found = call(run, *words, "--out", tmp_path / "out")
+        assert isinstance(found.exception, dd.UnknownNameError)
+        assert json.loads((tmp_path / "out" / "robustness.json").read_text())["verdict"] == "incomplete"
