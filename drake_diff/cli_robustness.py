@@ -26,7 +26,7 @@ def robustness(
         str | None,
         typer.Option(help="Names with commas between; all that the model has something for where not given."),
     ] = None,
-    controller: Annotated[str, typer.Option(help="tvlqr or open_loop")] = "tvlqr",
+    controller: Annotated[str, typer.Option(help="tvlqr, mpc or open_loop")] = "tvlqr",
     seed: Annotated[int, typer.Option(help="The same seed gives the same trials.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Directory; <RUN>_robustness where not given.")] = None,
 ) -> None:

@@ -446,3 +446,16 @@ def test_a_plan_that_fails_has_no_success(cart):
     assert not result.success
     assert result.margins == {"mass": 0.0}
     assert "unperturbed it fails" in str(result)
+
+
+def test_mpc_is_a_controller_by_name():
+    """Of a linear plant and a quadratic cost it is TVLQR of the same cost: the same displacement, unperturbed none."""
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
+    cost = dd.QuadraticCost(np.eye(2), np.eye(1))
+    problem = dd.Problem(model, x0=[0.3, 0.0], num_steps=15, running_cost=cost, final_cost=cost)
+    solution = dd.solve(problem, method="ilqr")
+    found = dd.robustness(solution, {"initial_state": [0.01]}, trials=3, controller="mpc")
+    assert found.task.nominal.success
+    np.testing.assert_allclose(found.task.nominal.run.motion.xs, solution.xs, atol=1e-6)
+    assert found.cells[0].rate.successes == 3
+    assert 0 < found.cells[0].displacement < 0.02

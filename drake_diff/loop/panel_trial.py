@@ -21,7 +21,8 @@ atexit.register(_open.close)
 def evaluate(trial: Mapping[str, Any]) -> dict[str, Any]:
     """Run the plan of the run directory `trial["run"]` once and judge it; the same fields give the same row.
 
-    `trial` has run, controller ("tvlqr", "open_loop"), perturbation, level (0: unperturbed) and seed; other fields are
+    `trial` has run, controller ("tvlqr", "mpc", "open_loop"), perturbation, level (0: unperturbed) and seed; other
+    fields are
     left alone, so that a trial.json will do. The row is JSON: success, label (None for a success), goal_error,
     displacement of the last state (None where it is not finite or the run broke off), failures and ended. The run is
     rebuilt once per process. Raises InputError, UnknownNameError, and ArtifactError where the run is damaged.

@@ -21,7 +21,9 @@ from drake_diff.arrays import Array
 from drake_diff.exceptions import ModelError, UnknownNameError
 from drake_diff.loop.actuator import Actuator
 from drake_diff.loop.closed_loop import ClosedLoop, Controller, Loop, closed_loop
+from drake_diff.loop.controllers import OpenLoop
 from drake_diff.loop.estimator import Hold
+from drake_diff.loop.mpc import MPC
 from drake_diff.loop.perturbation import Setup, perturbed
 from drake_diff.loop.sensor import Sensor
 from drake_diff.model import Model
@@ -30,7 +32,8 @@ from drake_diff.replay import FINEST, Plan, left_bounds, missed_goal, too_deep, 
 from drake_diff.tangent import tangent_space
 
 Label = Literal["perception_error", "state_error", "planning_error", "control_error", "evaluation_error"]
-CONTROLLERS = ("tvlqr", "open_loop")
+CONTROLLERS = ("tvlqr", "mpc", "open_loop")
+MPC_HORIZON = 20  # steps
 MakeController = Callable[[Plan, Model, Array, Array], Controller]
 
 
@@ -63,9 +66,9 @@ class Trial:
 class Task:
     """A plan to be followed: its controller, made on the plant as planned, and how a run of it is judged.
 
-    `controller` is "tvlqr", "open_loop", or a function of (plan, model, xs (N+1, nx), us (N, nu)) that makes one. The
-    controller's period is the longest of the plan's interval and its halves, quarters ... 16ths in which the
-    unperturbed run succeeds; the interval itself where it does in none.
+    `controller` is "tvlqr", "mpc" (over 20 steps), "open_loop", or a function of (plan, model, xs (N+1, nx), us (N, nu))
+    that makes one. The controller's period is the longest of the plan's interval and its halves, quarters ... 16ths in
+    which the unperturbed run succeeds; the interval itself where it does in none, and of MPC, which plans in it.
     """
 
     def __init__(self, plan: Plan, controller: str | MakeController = "tvlqr", loop: Loop | None = None):
@@ -75,7 +78,7 @@ class Task:
         self.judged_by = "the plan's end" if np.all(np.isnan(plan.problem.goal)) else "the goal"
         self._use(1)
         parts = 1
-        while not self.nominal.success and plan.continuous and parts < FINEST:
+        while not self.nominal.success and plan.continuous and controller != "mpc" and parts < FINEST:
             parts *= 2
             self._use(parts)
         if not self.nominal.success:
@@ -94,8 +97,9 @@ class Task:
             return self.controller(self.plan, model, self.xs, self.us)
         if self.controller == "tvlqr" and model.nu:
             return track(self.plan, model, self.xs, self.us)
-        h, us = model.time_step, self.us
-        return lambda x, t: us[min(round(t / h), len(us) - 1)]
+        if self.controller == "mpc" and model.nu:
+            return MPC(self.plan.problem, horizon=MPC_HORIZON, plan=(self.xs, self.us))
+        return OpenLoop(self.us, model.time_step)
 
     @cached_property
     def setup(self) -> Setup:
