@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from drake_diff.cli_runs import plain
+from drake_diff.cli_runs import plain, wide_console
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 EVERY = 5.0  # seconds between two lines of progress where there is no terminal
@@ -35,7 +35,7 @@ def panel(
     """
     from drake_diff.panels.panel import run_panel
 
-    console = Console(soft_wrap=True, highlight=False, markup=False)
+    console = wide_console()
     directory = out or Path("artifacts") / file.stem
     try:
         with _progress(console) as progress:
@@ -78,7 +78,7 @@ def _print(console: Console, found: Any) -> None:
     axes = list(dict.fromkeys(name for cell in cells for name in cell["cell"]))
     table = Table(box=None, pad_edge=False, header_style="dim")
     for name in (*axes, "trials", "errors", *(["success", "95 %"] if judged else []), *names):
-        table.add_column(plain(name), overflow="fold")
+        table.add_column(plain(name), overflow="fold", no_wrap=not console.is_terminal)
     for cell in cells:
         words = [cell["cell"].get(name) for name in axes] + [cell["trials"], cell["errors"]]
         if judged:

@@ -9,9 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from drake_diff.cli_runs import plain
-
-NOT_A_TERMINAL = 120  # columns of what is written to a file
+from drake_diff.cli_runs import plain, wide_console
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -41,7 +39,7 @@ def robustness(
     names = None if perturbations is None else [name.strip() for name in perturbations.split(",") if name.strip()]
     whole = run.resolve()
     directory = out or whole.with_name(f"{whole.name}_robustness")
-    console = _console()
+    console = wide_console()
     with recalled(run) as solution:
         begin_robustness(directory, solution.problem.model)
         with _progress(console) as report:
@@ -50,11 +48,6 @@ def robustness(
     _print(console, record)
     console.print(plain(f"wrote {directory / PAGE}"))
     raise typer.Exit(0 if record.verdict == "pass" else 1)
-
-
-def _console() -> Console:
-    console = Console(soft_wrap=True, highlight=False)
-    return console if console.is_terminal else Console(soft_wrap=True, highlight=False, width=NOT_A_TERMINAL)
 
 
 @contextmanager

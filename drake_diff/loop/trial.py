@@ -66,7 +66,7 @@ class Trial:
 class Task:
     """A plan to be followed: its controller, made on the plant as planned, and how a run of it is judged.
 
-    `controller` is "tvlqr", "mpc" (over 20 steps), "open_loop", or a function of (plan, model, xs (N+1, nx), us (N, nu))
+    `controller` is "tvlqr", "mpc" (of 20 steps), "open_loop", or a function of (plan, model, xs (N+1, nx), us (N, nu))
     that makes one. The controller's period is the longest of the plan's interval and its halves, quarters ... 16ths in
     which the unperturbed run succeeds; the interval itself where it does in none, and of MPC, which plans in it.
     """
