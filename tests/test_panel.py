@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
+from drake_diff.loop.statistics import success_rate
 from drake_diff.panels.panel_file import expand, load_panel
-from drake_diff.panels.table import wilson
 from drake_diff.panels.trial_row import row_of
 
 FUNCTIONS = """
@@ -357,7 +357,7 @@ def test_the_summary_of_a_cell_by_hand(tmp_path):
 def test_wilsons_interval_solves_its_equation():
     """Its ends are the rates p that are z standard deviations, sqrt(p (1 - p) / n), from the rate that was seen."""
     for successes, count in [(0, 5), (3, 10), (10, 10), (500, 1000)]:
-        low, high = wilson(successes, count)
+        low, high = success_rate(successes, count)[2:]
         assert (low == 0) == (successes == 0)
         assert (high == 1) == (successes == count)
         for p in {low, high} - {0, 1}:

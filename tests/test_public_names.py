@@ -43,10 +43,10 @@ engines.load engines.attribution engines.motion engines.jacobians engines.record
 engines.recording_files engines.recorded engines.comparison_task engines.compared engines.comparison
 engines.comparison_record engines.comparison_words engines.comparison_page engines.comparison_trace
 engines.comparison_files engines.contact_cases engines.contact_laws engines.contact_table engines.contact_words
-engines.sdf engines.usd engines.read_back engines.small_models engines.export_readme engines.export loop.checks
-loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop loop.controllers loop.mpc panels.panel_file
-panels.trial_row panels.journal panels.local_workers panels.ray_workers panels.workers panels.table panels.panel
-loop.perturbation loop.statistics loop.trial loop.sensitivity loop.robustness loop.robustness_record
+engines.sdf engines.usd engines.read_back engines.small_models engines.export_readme engines.export loop.statistics
+loop.checks loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop loop.controllers loop.mpc
+panels.panel_file panels.trial_row panels.journal panels.local_workers panels.ray_workers panels.workers panels.table
+panels.panel loop.perturbation loop.trial loop.sensitivity loop.robustness loop.robustness_record
 loop.robustness_words loop.trial_trace loop.trial_files loop.robustness_plots loop.robustness_page
 loop.robustness_files loop.panel_trial gradient_estimate gradient_descent gradient_panel_cases gradient_panel
 gradient_panel_files ros2_bag cli_mcap cli_runs cli_engines cli_panel cli_gradients cli_options cli_export cli_view

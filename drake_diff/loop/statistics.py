@@ -30,8 +30,10 @@ def success_rate(successes: int, trials: int) -> Rate:
         raise InputError("successes", got=f"{successes} of {trials}", expected="at most all of at least one")
     p, n, z = successes / trials, trials, NORMAL_95
     middle, half = p + z * z / (2 * n), z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    lower, upper = (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
-    return Rate(successes, trials, float(max(0.0, lower)), float(min(1.0, upper)))
+    # Exactly 0 and 1 at the ends, where rounding would leave 1e-17.
+    lower = (middle - half) / (1 + z * z / n) if successes else 0.0
+    upper = (middle + half) / (1 + z * z / n) if successes < trials else 1.0
+    return Rate(successes, trials, float(lower), float(upper))
 
 
 def margin(levels: Sequence[float], rates: Sequence[Rate]) -> float:

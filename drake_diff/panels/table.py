@@ -3,19 +3,18 @@
 import csv
 import io
 import json
-import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from drake_diff.loop.statistics import success_rate
 from drake_diff.panels.panel_file import Trial, canonical
 from drake_diff.panels.trial_row import Row
 from drake_diff.whole_file import write_whole
 
 TABLE, SUMMARY = "table.csv", "summary.json"
-Z_95 = 1.959963984540054  # the normal distribution's 97.5 % quantile
 
 
 @dataclass(frozen=True)
@@ -85,8 +84,8 @@ def _cell(cell: dict[str, Any], rows: Sequence[Row], judged: bool) -> dict[str, 
     summary: dict[str, Any] = {"cell": cell, "trials": len(rows), "errors": sum("error" in row for row in rows)}
     if judged:
         successes = sum(row.get("success") is True for row in rows)
-        low, high = wilson(successes, len(rows))
-        summary["success"] = {"count": successes, "rate": successes / len(rows), "low": low, "high": high}
+        rate = success_rate(successes, len(rows))
+        summary["success"] = {"count": successes, "rate": rate.value, "low": rate.lower, "high": rate.upper}
     numbers = {name: _numbers([row[name] for row in rows if _is_number(row.get(name))]) for name in names}
     return {**summary, "numbers": numbers}
 
@@ -106,13 +105,3 @@ def _numbers(values: Sequence[float]) -> dict[str, Any]:
         "min": min(floats),
         "max": max(floats),
     }
-
-
-def wilson(successes: int, count: int) -> tuple[float, float]:
-    """The 95 % interval of a rate of which `successes` of `count` were seen; Wilson 1927."""
-    rate, z2 = successes / count, Z_95**2
-    middle = (rate + z2 / (2 * count)) / (1 + z2 / count)
-    half = Z_95 / (1 + z2 / count) * math.sqrt(rate * (1 - rate) / count + z2 / (4 * count**2))
-    low = middle - half if successes else 0.0  # exactly, where rounding would leave 1e-17
-    high = middle + half if successes < count else 1.0
-    return low, high
