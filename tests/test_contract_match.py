@@ -14,7 +14,8 @@ from drake_diff.engines.description import describe
 from drake_diff.engines.mjcf import mjcf
 from drake_diff.engines.numpy_engine import NumpyEngine
 
-ENGINES = ["drake", "mujoco", "mjx", "pinocchio", "casadi"]
+MJX = pytest.param("mjx", marks=pytest.mark.slow)  # JAX compiles for seconds
+ENGINES = ["drake", "mujoco", MJX, "pinocchio", "casadi"]
 LINK = """<link name="{name}"><inertial><origin xyz="0.02 0.01 -0.25"/><mass value="{mass}"/>
   <inertia ixx="0.02" iyy="0.03" izz="0.015" ixy="{ixy}" ixz="0.002" iyz="-0.001"/></inertial></link>"""
 JOINT = """<joint name="{name}" type="revolute"><origin xyz="0 0.1 -0.5" rpy="{rpy}"/><parent link="{parent}"/>
@@ -199,7 +200,7 @@ def test_an_mjcf_that_mujoco_does_not_read_is_refused(tmp_path):
         own_mjcf(tmp_path, arms(tmp_path), ("<option", "<opinion"))
 
 
-@pytest.mark.parametrize("name", ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["mujoco", MJX])
 def test_another_order_inside_mujoco_is_mapped(tmp_path, name):
     needed = arms(tmp_path)
     turned = arms(tmp_path, order=("right", "left"))

@@ -1,6 +1,6 @@
 """MJX against hand calculations, Drake, MuJoCo and, in contact, differences of its own step.
 
-JAX compiles for seconds per model: those of more than a few seconds are slow.
+JAX compiles for seconds per model: all of them are slow.
 """
 
 import subprocess
@@ -32,6 +32,8 @@ from drake_diff.engines.description import describe
 from drake_diff.engines.mjcf import mjcf
 from drake_diff.engines.numpy_engine import NumpyEngine
 from drake_diff.tangent import tangent_space
+
+pytestmark = pytest.mark.slow
 
 
 def assert_jacobian_is_that_of_the_step(engine, model, x, u, *, step=1e-6, atol=2e-8):
@@ -71,19 +73,16 @@ def test_mass_spring_damper_by_hand_and_jax_is_left_as_it_was(load):
 
 
 # 1e-11: a step through soft limits that are not reached, solved by Newton to 1e-12 and not in closed form.
-@pytest.mark.slow
 @pytest.mark.parametrize("file", [f for f in HERE if f != "projectile.sdf"])
 def test_mjx_is_drake_where_no_body_is_free(load, file):
     assert_free_steps_agree(load(file), "mjx", 1e-11, 1e-11)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ur5_robot.urdf", "double_pendulum_continuous.urdf"])
 def test_mjx_is_drake_on_fixed_robots(tmp_path, name):
     assert_free_steps_agree(robot(name, tmp_path), "mjx", 1e-11, 1e-11, states=2)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["panda.urdf", "solo12.urdf"])
 def test_mjx_differs_on_free_bodies_by_the_quaternions_exponential_alone(tmp_path, name):
     assert_free_bodies_differ_by_the_exponential(robot(name, tmp_path), "mjx", states=1)
@@ -121,7 +120,6 @@ def test_mjx_still_loses_the_turn_from_rest(monkeypatch):
 # ---- contact -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("file", ["sphere_on_ground.sdf", "sliding_block.sdf"])
 def test_mjx_rests_as_deep_as_mujoco_and_drake_a15(load, file):
     model = load(file, time_step=0.005)
@@ -136,7 +134,6 @@ def test_mjx_rests_as_deep_as_mujoco_and_drake_a15(load, file):
     np.testing.assert_allclose(engine.step(x, []), mujoco.step(x, []), rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_a_free_bodys_jacobian_in_contact_is_that_of_mjxs_own_step(load):
     model, random = load("sphere_on_ground.sdf", time_step=0.005), np.random.default_rng(5)
     engine, mujoco, x = engine_of("mjx", model), engine_of("mujoco", model), model.default_state
@@ -146,7 +143,6 @@ def test_a_free_bodys_jacobian_in_contact_is_that_of_mjxs_own_step(load):
     assert_jacobian_is_that_of_the_step(engine, model, x, [])
 
 
-@pytest.mark.slow
 def test_sliding_and_sticking_have_the_steps_jacobian_and_not_slipping_at_all_has_none():
     model, x = block_on_rails()
     engine, mujoco = engine_of("mjx", model), engine_of("mujoco", model)
@@ -160,7 +156,6 @@ def test_sliding_and_sticking_have_the_steps_jacobian_and_not_slipping_at_all_ha
         engine.differentiate_step(x, [])
 
 
-@pytest.mark.slow
 def test_pyramidal_cones_have_the_derivative_at_rest(tmp_path):
     model, x = block_on_rails()
     engine = own_mjcf(tmp_path, model, ('cone="elliptic"', 'cone="pyramidal"'))
@@ -169,7 +164,6 @@ def test_pyramidal_cones_have_the_derivative_at_rest(tmp_path):
     assert_jacobian_is_that_of_the_step(engine, model, x, [], step=1e-5)
 
 
-@pytest.mark.slow
 def test_a_pair_that_is_apart_takes_the_derivative_of_one_that_slides(load):
     model = load("sliding_block.sdf", time_step=0.005)
     engine, x = engine_of("mjx", model), model.default_state
@@ -179,7 +173,6 @@ def test_a_pair_that_is_apart_takes_the_derivative_of_one_that_slides(load):
         engine.differentiate_step(x, [])
 
 
-@pytest.mark.slow
 def test_a_solver_that_stops_early_is_said(tmp_path):
     model, x = block_on_rails()
     x[2] = 0.03  # between sliding and sticking: no step of Newton's is exact
@@ -255,7 +248,6 @@ def test_other_friction_and_stiffness_are_found(tmp_path):
     assert same.keys() == {"contact law", "solver tolerance", "integrator"}
 
 
-@pytest.mark.slow
 def test_effort_limits_cut_and_the_derivative_is_zero_there(load):
     model = load("cart_pole.urdf")
     engine, x, u = engine_of("mjx", model), [0.1, 0.4, 0.2, -0.3], [25.0]
