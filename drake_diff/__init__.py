@@ -42,6 +42,7 @@ from drake_diff.exceptions import NotOfferedError as NotOfferedError
 from drake_diff.exceptions import ShapeError as ShapeError
 from drake_diff.exceptions import SimulationError as SimulationError
 from drake_diff.exceptions import UnknownNameError as UnknownNameError
+from drake_diff.linearization import linearize as linearize
 from drake_diff.loop.actuator import Actuator as Actuator
 from drake_diff.loop.closed_loop import ClosedLoop as ClosedLoop
 from drake_diff.loop.closed_loop import Loop as Loop

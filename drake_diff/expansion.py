@@ -17,9 +17,9 @@ from drake_diff.cost import (
     final_cost_hessian,
     running_cost_hessian,
 )
+from drake_diff.linearization import linearize
 from drake_diff.problem import Problem
 from drake_diff.riccati import LinearQuadratic
-from drake_diff.rollout_gradient import linearize
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +47,8 @@ class Motion:
 
 def jacobians_along(problem: Problem, motion: Motion) -> Array:
     """(N, nx, nx + nu): [A_k, B_k]; raises GradientError or SimulationError where one, or a step, is refused."""
-    steps = linearize(problem.model, motion.xs[0], motion.us, xs=motion.xs[:-1])
-    return np.concatenate([[d.A for d in steps], [d.B for d in steps]], axis=2)
+    A, B, _ = linearize(problem.model, motion.xs, motion.us, x_next=motion.xs[1:] + motion.gaps)
+    return np.concatenate([A, B], axis=2)
 
 
 def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: AugmentedLagrangian) -> LinearQuadratic:
