@@ -53,66 +53,79 @@ class Analytic:
     damping: Array  # (nv,) D
     rest: Array  # (nv,) c
     positions: NDArray[np.intp]  # (nv,) the index in q of hinges and slides; 0 for free bodies, where K is 0
-    velocity_next: NDArray[np.intp]  # where v' stands by v in the flat Jacobian (nx, nx + nu), and q' by q
-    position_next: NDArray[np.intp]
+    sprung: bool  # whether any K is not 0
+    eye: Array  # (nv, nv)
 
     def __call__(self, steps: Steps) -> tuple[Array, NDArray[np.bool_]]:
         """(N, nx, nx + nu) of the steps, and which (N,) are smooth: those that lead where Drake's do."""
-        jacobians, x_next = (
-            self._free(steps.starts, steps.us) if self.coordinates.free else self._fixed(steps.starts, steps.us)
-        )
-        size = np.maximum(np.abs(steps.ends).max(axis=1), 1.0)
-        return jacobians, ~steps.touching & (np.abs(x_next - steps.ends).max(axis=1) <= STEP_TOLERANCE * size)
+        jacobians, x_next = self.differentiate(steps.starts, steps.us)
+        apart = np.abs(x_next - steps.ends) <= STEP_TOLERANCE * np.maximum(np.abs(steps.ends), 1.0)
+        return jacobians, apart.all(axis=1) & ~steps.touching
+
+    def differentiate(self, xs: Array, us: Array) -> tuple[Array, Array]:
+        """(N, nx, nx + nu) and x' (N, nx) of the steps from xs (N, nx) under us (N, nu), were they smooth."""
+        return self._free(xs, us) if self.coordinates.free else self._fixed(xs, us)
 
     def _fixed(self, xs: Array, us: Array) -> tuple[Array, Array]:
-        """Jacobians and x' (N, nx) of hinges and slides, where N(q) = 1."""
-        n, h, velocity = self.coordinates.nv, self.time_step, self.form.velocity
-        nx, nu = 2 * n, len(velocity)
+        """Of hinges and slides, where N(q) = 1 and Pinocchio's velocities are Drake's."""
+        n, h = self.coordinates.nv, self.time_step
+        nx, nu = 2 * n, us.shape[1]
         q, v = xs[:, :n], xs[:, n:]
-        force = self._force(q, v, us)
-        jacobians, a = np.empty((len(xs), nx, nx + nu)), np.empty((len(xs), n))
-        lower = jacobians[:, n:]
-        inverse = np.empty((len(xs), n, n))
-        self._differentiate(q, v, force, (lower[:, :, :n], lower[:, :, n:nx], inverse, a))
-        lower[:, :, :n] -= inverse * self.stiffness
-        lower[:, :, n:nx] -= inverse * self.damping
-        lower[:, :, nx:] = inverse[:, :, velocity] * (np.abs(us) < self.limit)[:, None]
+        jacobians, inverse, a = np.empty((len(xs), nx, nx + nu)), np.empty((len(xs), n, n)), np.empty((len(xs), n))
+        upper, lower = jacobians[:, :n], jacobians[:, n:]
+        by_q, by_v = lower[:, :, :n], lower[:, :, n:nx]
+        force, clipped = self._force(q, v, us)
+        self._accelerate(q, v, force, (by_q, by_v, inverse, a))
+        if self.sprung:
+            by_q -= inverse * self.stiffness
+        by_v -= inverse * self.damping
+        lower[:, :, nx:] = self._by_input(inverse, clipped)
         lower *= h
-        flat = jacobians.reshape(len(xs), -1)
-        flat[:, self.velocity_next] += 1.0
-        np.multiply(lower, h, out=jacobians[:, :n])
-        flat[:, self.position_next] += 1.0
+        by_v += self.eye
+        np.multiply(lower, h, out=upper)
+        upper[:, :, :n] += self.eye
         v_next = v + h * a
         return jacobians, np.concatenate([q + h * v_next, v_next], axis=1)
 
-    def _differentiate(self, q: Array, v: Array, force: Array, into: tuple[Array, Array, Array, Array]) -> None:
+    def _accelerate(self, q: Array, v: Array, force: Array, into: tuple[Array, Array, Array, Array]) -> None:
         """Pinocchio's da/dq, da/dv, da/dforce (each (N, nv, nv)) and a (N, nv), written into the arrays given."""
         model, data, derivatives = self.pinocchio, self.data, self.derivatives
         for q_k, v_k, force_k, by_q, by_v, inverse, a in zip(q, v, force, *into, strict=True):
             by_q[:], by_v[:], inverse[:] = derivatives(model, data, q_k, v_k, force_k)
             a[:] = data.ddq
 
-    def _force(self, q: Array, v: Array, us: Array) -> Array:
-        """(N, nv) B u + c - K q - D v."""
-        force = self.rest - self.stiffness * q[:, self.positions] - self.damping * v
-        return np.asarray(force + np.clip(us, -self.limit, self.limit) @ self.form.actuation.T)
+    def _force(self, q: Array, v: Array, us: Array) -> tuple[Array, NDArray[np.bool_] | None]:
+        """(N, nv) B u + c - K q - D v, and which inputs (N, nu) are clipped, None where none is."""
+        clipped = np.abs(us) >= self.limit
+        some = bool(clipped.any())
+        if some:
+            us = np.clip(us, -self.limit, self.limit)
+        force = us @ self.form.actuation.T + self.rest - self.damping * v
+        if self.sprung:
+            force -= self.stiffness * q[:, self.positions]
+        return force, clipped if some else None
+
+    def _by_input(self, inverse: Array, clipped: NDArray[np.bool_] | None) -> Array:
+        """(N, nv, nu) M^-1 B, 0 for clipped inputs."""
+        columns = inverse.take(self.form.velocity, axis=2)
+        return columns if clipped is None else columns * ~clipped[:, None]
 
     def _free(self, xs: Array, us: Array) -> tuple[Array, Array]:
         """Jacobians and x' (N, nx) with free bodies, whose velocities Pinocchio has in their own"""
         c, h = self.coordinates, self.time_step
         q, v = xs[:, : c.nq], xs[:, c.nq :]
-        force = self._force(q, v, us)
+        force, clipped = self._force(q, v, us)
         Q = turn(c, q)
         by_q, by_v, inverse = (np.empty((len(xs), c.nv, c.nv)) for _ in range(3))
         native = np.empty((len(xs), c.nv))
-        self._differentiate(native_positions(c, q), (Q @ v[..., None])[..., 0], force, (by_q, by_v, inverse, native))
+        self._accelerate(native_positions(c, q), (Q @ v[..., None])[..., 0], force, (by_q, by_v, inverse, native))
         into, out, out_v = turn_derivatives(c, q, v, native)
         Q_t = np.swapaxes(Q, -1, -2)
         by_motion = Q_t @ (by_q @ Q + by_v @ into - inverse * self.stiffness) + out
         by_velocity = Q_t @ (by_v @ Q - inverse * self.damping) + out_v
-        by_input = Q_t @ inverse[:, :, self.form.velocity] * (np.abs(us) < self.limit)[:, None]
+        by_input = Q_t @ self._by_input(inverse, clipped)
         lower = h * np.concatenate([by_motion @ c.motion(q), by_velocity, by_input], axis=2)
-        lower[:, :, c.nq : c.nq + c.nv] += np.eye(c.nv)
+        lower[:, :, c.nq : c.nq + c.nv] += self.eye
         a = (Q_t @ native[..., None])[..., 0] + turning(c, v)
         v_next, N = v + h * a, c.rate(q)
         upper = h * N @ lower
@@ -142,9 +155,7 @@ def build_analytic(model: Model) -> Analytic:
     if form.excluded:
         raise ModelError(form.excluded)
     description = describe_tree(model)
-    from pinocchio import computeABADerivatives
-
-    from drake_diff.engines.pinocchio_model import build  # here, as Pinocchio is an extra
+    from drake_diff.engines.pinocchio_model import acceleration_derivatives, build  # here, as Pinocchio is an extra
 
     built, _ = build(description.links, description.gravity)
     stiffness, damping, rest = _springs(model, form, description)
@@ -153,11 +164,10 @@ def build_analytic(model: Model) -> Analytic:
     for i, j in description.coordinates.single:
         positions[j] = i
     controlled = np.array([a.has_controller() for a in form.actuators], dtype=bool)
-    width = model.nx + model.nu
     return Analytic(
         pinocchio=built,
         data=built.createData(),
-        derivatives=computeABADerivatives,
+        derivatives=acceleration_derivatives,
         coordinates=description.coordinates,
         form=form,
         time_step=model.time_step,
@@ -166,8 +176,8 @@ def build_analytic(model: Model) -> Analytic:
         damping=damping,
         rest=rest,
         positions=positions,
-        velocity_next=np.arange(model.nq, model.nx) * (width + 1),
-        position_next=np.arange(model.nq) * (width + 1),
+        sprung=bool(stiffness.any()),
+        eye=np.eye(model.nv),
     )
 
 
@@ -214,8 +224,7 @@ def _first_difference(model: Model, analytic: Analytic) -> str:
 
 def _difference(model: Model, analytic: Analytic, point: tuple[Array, Array, Array], exact: Any) -> str:
     x, u, end = point
-    find = analytic._free if analytic.coordinates.free else analytic._fixed
-    jacobians, ends = find(x[None], u[None])
+    jacobians, ends = analytic.differentiate(x[None], u[None])
     rows = gradient_rows(exact, model.nx + model.nu)
     gap = float(np.abs(ends[0] - end).max())
     if not gap <= SAME_STEP * max(1.0, float(np.abs(end).max())):

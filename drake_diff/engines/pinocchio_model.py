@@ -13,8 +13,10 @@ try:
     import pinocchio as pin
 except ImportError as error:
     raise MissingDependencyError(
-        "Pinocchio is not installed: pip install 'drake-diff[fast]', or 'drake-diff[engines]' with others"
+        "Pinocchio is not installed: pip install 'drake-diff[engines]', or 'drake-diff[fast]' alone"
     ) from error
+
+acceleration_derivatives = pin.computeABADerivatives
 
 
 def build(links: tuple[Link, ...], gravity: Array) -> tuple[Any, float]:
