@@ -45,6 +45,7 @@ class Analytic:
     pinocchio: Any  # pin.Model, with h D in its armature
     data: Any
     derivatives: Any  # pin.computeABADerivatives
+    outputs: list[memoryview]  # where in data it leaves da/dq, da/dv, da/dforce and a: four joined are one copy
     coordinates: Coordinates
     form: Form
     time_step: float
@@ -71,28 +72,30 @@ class Analytic:
         n, h = self.coordinates.nv, self.time_step
         nx, nu = 2 * n, us.shape[1]
         q, v = xs[:, :n], xs[:, n:]
-        jacobians, inverse, a = np.empty((len(xs), nx, nx + nu)), np.empty((len(xs), n, n)), np.empty((len(xs), n))
-        upper, lower = jacobians[:, :n], jacobians[:, n:]
-        by_q, by_v = lower[:, :, :n], lower[:, :, n:nx]
         force, clipped = self._force(q, v, us)
-        self._accelerate(q, v, force, (by_q, by_v, inverse, a))
-        if self.sprung:
-            by_q -= inverse * self.stiffness
-        by_v -= inverse * self.damping
-        lower[:, :, nx:] = self._by_input(inverse, clipped)
-        lower *= h
-        by_v += self.eye
+        by_q, by_v, inverse, a = self._accelerate(q, v, force)
+        jacobians = np.empty((len(xs), nx, nx + nu))
+        upper, lower = jacobians[:, :n], jacobians[:, n:]
+        np.multiply(by_q - inverse * self.stiffness if self.sprung else by_q, h, out=lower[:, :, :n])
+        np.multiply(by_v - inverse * self.damping, h, out=lower[:, :, n:nx])
+        np.multiply(self._by_input(inverse, clipped), h, out=lower[:, :, nx:])
+        lower[:, :, n:nx] += self.eye
         np.multiply(lower, h, out=upper)
         upper[:, :, :n] += self.eye
         v_next = v + h * a
         return jacobians, np.concatenate([q + h * v_next, v_next], axis=1)
 
-    def _accelerate(self, q: Array, v: Array, force: Array, into: tuple[Array, Array, Array, Array]) -> None:
-        """Pinocchio's da/dq, da/dv, da/dforce (each (N, nv, nv)) and a (N, nv), written into the arrays given."""
-        model, data, derivatives = self.pinocchio, self.data, self.derivatives
-        for q_k, v_k, force_k, by_q, by_v, inverse, a in zip(q, v, force, *into, strict=True):
-            by_q[:], by_v[:], inverse[:] = derivatives(model, data, q_k, v_k, force_k)
-            a[:] = data.ddq
+    def _accelerate(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array, Array]:
+        """Pinocchio's da/dq, da/dv, da/dforce (each (N, nv, nv)) and a (N, nv)."""
+        model, data, derivatives, outputs = self.pinocchio, self.data, self.derivatives, self.outputs
+        rows = []
+        for q_k, v_k, force_k in zip(q, v, force, strict=True):
+            derivatives(model, data, q_k, v_k, force_k)
+            rows.append(b"".join(outputs))
+        n = v.shape[1]
+        found = np.frombuffer(b"".join(rows)).reshape(len(q), 3 * n * n + n)
+        by_q, by_v, inverse = (found[:, k * n * n : (k + 1) * n * n].reshape(len(q), n, n) for k in range(3))
+        return by_q, by_v, inverse, found[:, 3 * n * n :]
 
     def _force(self, q: Array, v: Array, us: Array) -> tuple[Array, NDArray[np.bool_] | None]:
         """(N, nv) B u + c - K q - D v, and which inputs (N, nu) are clipped, None where none is."""
@@ -116,9 +119,8 @@ class Analytic:
         q, v = xs[:, : c.nq], xs[:, c.nq :]
         force, clipped = self._force(q, v, us)
         Q = turn(c, q)
-        by_q, by_v, inverse = (np.empty((len(xs), c.nv, c.nv)) for _ in range(3))
-        native = np.empty((len(xs), c.nv))
-        self._accelerate(native_positions(c, q), (Q @ v[..., None])[..., 0], force, (by_q, by_v, inverse, native))
+        native_v = (Q @ v[..., None])[..., 0]
+        by_q, by_v, inverse, native = self._accelerate(native_positions(c, q), native_v, force)
         into, out, out_v = turn_derivatives(c, q, v, native)
         Q_t = np.swapaxes(Q, -1, -2)
         by_motion = Q_t @ (by_q @ Q + by_v @ into - inverse * self.stiffness) + out
@@ -159,6 +161,7 @@ def build_analytic(model: Model) -> Analytic:
 
     built, _ = build(description.links, description.gravity)
     stiffness, damping, rest = _springs(model, form, description)
+    data = built.createData()
     built.armature = description.by_velocity("armature") + model.time_step * damping
     positions = np.zeros(model.nv, dtype=int)
     for i, j in description.coordinates.single:
@@ -166,8 +169,9 @@ def build_analytic(model: Model) -> Analytic:
     controlled = np.array([a.has_controller() for a in form.actuators], dtype=bool)
     return Analytic(
         pinocchio=built,
-        data=built.createData(),
+        data=data,
         derivatives=acceleration_derivatives,
+        outputs=[memoryview(x).cast("B") for x in (data.ddq_dq, data.ddq_dv, data.Minv, data.ddq)],
         coordinates=description.coordinates,
         form=form,
         time_step=model.time_step,

@@ -85,7 +85,8 @@ def smooth_jacobians(
 
 
 def _checked(model: Model, found: SmoothJacobians) -> SmoothJacobians:
-    check_derivatives(model, found.jacobians[found.smooth].reshape(-1, model.nx + model.nu))
+    smooth = found.jacobians if found.smooth.all() else found.jacobians[found.smooth]
+    check_derivatives(model, smooth.reshape(-1, model.nx + model.nu))
     return found
 
 
