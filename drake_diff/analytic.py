@@ -55,7 +55,6 @@ class Analytic:
     rest: Array  # (nv,) c
     positions: NDArray[np.intp]  # (nv,) the index in q of hinges and slides; 0 for free bodies, where K is 0
     sprung: bool  # whether any K is not 0
-    eye: Array  # (nv, nv)
 
     def __call__(self, steps: Steps) -> tuple[Array, NDArray[np.bool_]]:
         """(N, nx, nx + nu) of the steps, and which (N,) are smooth: those that lead where Drake's do."""
@@ -79,9 +78,10 @@ class Analytic:
         np.multiply(by_q - inverse * self.stiffness if self.sprung else by_q, h, out=lower[:, :, :n])
         np.multiply(by_v - inverse * self.damping, h, out=lower[:, :, n:nx])
         np.multiply(self._by_input(inverse, clipped), h, out=lower[:, :, nx:])
-        lower[:, :, n:nx] += self.eye
+        diagonal = jacobians.reshape(len(xs), -1)[:, :: nx + nu + 1]  # of the first nx columns; a view
+        diagonal[:, n:] += 1.0
         np.multiply(lower, h, out=upper)
-        upper[:, :, :n] += self.eye
+        diagonal[:, :n] += 1.0
         v_next = v + h * a
         return jacobians, np.concatenate([q + h * v_next, v_next], axis=1)
 
@@ -127,7 +127,7 @@ class Analytic:
         by_velocity = Q_t @ (by_v @ Q - inverse * self.damping) + out_v
         by_input = Q_t @ self._by_input(inverse, clipped)
         lower = h * np.concatenate([by_motion @ c.motion(q), by_velocity, by_input], axis=2)
-        lower[:, :, c.nq : c.nq + c.nv] += self.eye
+        lower[:, :, c.nq : c.nq + c.nv] += np.eye(c.nv)
         a = (Q_t @ native[..., None])[..., 0] + turning(c, v)
         v_next, N = v + h * a, c.rate(q)
         upper = h * N @ lower
@@ -181,7 +181,6 @@ def build_analytic(model: Model) -> Analytic:
         rest=rest,
         positions=positions,
         sprung=bool(stiffness.any()),
-        eye=np.eye(model.nv),
     )
 
 

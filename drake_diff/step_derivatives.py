@@ -237,7 +237,9 @@ def check_parity(model: Model, autodiff: Array, double: Array) -> None:
 
 def check_derivatives(model: Model, jacobian: Array) -> None:
     """Refuse a derivative by x or u that is not finite or implausibly large, and by a parameter that is not finite."""
-    if jacobian.max(initial=0.0) <= MAGNITUDE_BOUND and jacobian.min(initial=0.0) >= -MAGNITUDE_BOUND:  # NaN is not
+    if (
+        np.max(jacobian, initial=0.0) <= MAGNITUDE_BOUND and np.min(jacobian, initial=0.0) >= -MAGNITUDE_BOUND
+    ):  # not NaN
         return
     bound = np.full(jacobian.shape[1], MAGNITUDE_BOUND)
     bound[model.nx + model.nu :] = np.finfo(float).max  # its size is a matter of the parameter's unit
