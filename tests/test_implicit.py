@@ -1,7 +1,6 @@
 """The implicit step Jacobian is that of AutoDiffXd wherever a step is smooth, and is handed over wherever it is not."""
 
 import re
-import sys
 import warnings
 from pathlib import Path
 
@@ -380,9 +379,7 @@ def test_a_box_in_the_air_that_autodiff_refuses_on_a_broad_phase_hit(ground):
     assert refused or ground == "half space"  # which 1.51 refuses and 1.58 does not
 
 
-def test_the_automatic_choice_says_what_it_took_and_why(load, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pinocchio", None)  # as where it is not installed
-    monkeypatch.delitem(sys.modules, "drake_diff.engines.pinocchio_model", raising=False)
+def test_the_automatic_choice_says_what_it_took_and_why(load, without_pinocchio):
     model = load("double_pendulum.urdf")
     point = [0.4, -0.9, 1.3, -0.6], [0.25, -0.15]
     d = dd.differentiate_step(model, *point)

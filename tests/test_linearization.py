@@ -1,6 +1,5 @@
 """Many steps linearized in one call, by Pinocchio where that is certified: closed forms, AutoDiffXd, and refusals."""
 
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -212,9 +211,7 @@ def test_a_model_that_pinocchio_is_not_given_says_why():
     assert analytic_of(locked) == "a joint is locked"
 
 
-def test_without_pinocchio_the_others_serve(load, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pinocchio", None)
-    monkeypatch.delitem(sys.modules, "drake_diff.engines.pinocchio_model", raising=False)
+def test_without_pinocchio_the_others_serve(load, without_pinocchio):
     model = load("double_pendulum.urdf")
     xs, us = np.array([[0.4, -0.9, 1.3, -0.6]] * 2), np.array([[0.25, -0.15]] * 2)
     _, _, methods = dd.linearize(model, xs, us)
