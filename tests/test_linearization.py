@@ -136,9 +136,13 @@ def test_a_joint_limit_that_acts_is_no_smooth_step():
 
 
 def test_a_controller_at_its_limit_is_no_smooth_step():
-    model = springs_and_motors(limit=3.0, kp=(20.0, 5.0, 8.0))
-    equal(model, np.array([POINT[0]]), np.array([[0.4, 900.0, -900.0]]), expected=("implicit",))
-    assert dd.differentiate_step(model, *POINT).method != "finite_difference"
+    """Gains that hold the joints near their references, and inputs that do and do not exceed 30 N or N m."""
+    model = springs_and_motors(limit=30.0, kp=(20.0, 5.0, 8.0))
+    xs, us = np.array([POINT[0]] * 2), np.array([POINT[1], [0.4, 900.0, -900.0]])
+    _, _, methods = equal(model, xs, us, expected=("analytic", "implicit"))
+    assert methods[0] == "analytic"
+    hardly_ever_free = springs_and_motors(limit=1e-3, kp=(20.0, 5.0, 8.0))
+    assert "controllers are at their limits in all but" in analytic_of(hardly_ever_free)
 
 
 def test_x_next_that_is_wrong_is_found(load):
