@@ -46,6 +46,7 @@ from drake_diff.gradient_estimate import GradientCase as GradientCase
 from drake_diff.gradient_panel import GradientPanel as GradientPanel
 from drake_diff.gradient_panel import gradient_panel as gradient_panel
 from drake_diff.gradient_panel_files import save_gradient_panel as save_gradient_panel
+from drake_diff.linearization import linearize as linearize
 from drake_diff.loop.actuator import Actuator as Actuator
 from drake_diff.loop.closed_loop import ClosedLoop as ClosedLoop
 from drake_diff.loop.closed_loop import Loop as Loop

@@ -17,9 +17,9 @@ from drake_diff.cost import (
     final_cost_hessian,
     running_cost_hessian,
 )
+from drake_diff.linearization import linearize
 from drake_diff.problem import Problem
 from drake_diff.riccati import LinearQuadratic
-from drake_diff.rollout_gradient import linearize
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +53,8 @@ def jacobians_along(problem: Problem, motion: Motion) -> Array:
     """
     us, lower, upper = motion.us, problem.bounds.u_lower, problem.bounds.u_upper
     inside = np.where(us == upper, np.nextafter(us, lower), np.where(us == lower, np.nextafter(us, upper), us))
-    steps = linearize(problem.model, motion.xs[0], inside, xs=motion.xs[:-1])
-    return np.concatenate([[d.A for d in steps], [d.B for d in steps]], axis=2)
+    A, B, _ = linearize(problem.model, motion.xs, inside, x_next=motion.xs[1:] + motion.gaps)
+    return np.concatenate([A, B], axis=2)
 
 
 def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: AugmentedLagrangian) -> LinearQuadratic:

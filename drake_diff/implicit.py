@@ -64,7 +64,7 @@ def implicit_jacobian(model: Model, vector: ParameterVector, x: Array, u: Array,
     The vector is applied to `model`, whose double twin stands at the step from (x, u) to `x_next`, as
     `step.advance` leaves it. Raises NotSmoothError where something else than smooth forces acts.
     """
-    form = _form_of(model)
+    form = form_of(model)
     if form.excluded:
         raise NotSmoothError(form.excluded)
     if form.can_touch and model.double.touches():
@@ -76,31 +76,51 @@ def implicit_jacobian(model: Model, vector: ParameterVector, x: Array, u: Array,
     return _by_autodiff(model, form, vector, x, u, x_next)
 
 
-def implicit_jacobians(
-    model: Model, x0: Array, us: Array, xs: Array | None = None
-) -> tuple[Array, list[Array | None]] | None:
-    """Steps from x0 (nx,) under us (N, nu), or from each of xs (N, nx): their ends (N, nx), and (nx, nx + nu) each.
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """N steps from starts (N, nx) under us (N, nu) to ends (N, nx), and where a contact acts (N,)."""
 
-    A step that is not smooth has None; None altogether where there is no tree, or parameters are set: then the steps
-    are differentiated one by one.
+    starts: Array
+    us: Array
+    ends: Array
+    touching: NDArray[np.bool_]
+
+
+def take_steps(model: Model, x0: Array, us: Array, xs: Array | None = None, x_next: Array | None = None) -> Steps:
+    """Drake's steps from x0 (nx,) under us (N, nu), or from each of xs (N, nx).
+
+    Where the steps from xs are known to lead to `x_next` (N, nx), Drake is asked only what overlaps.
     """
-    form = _form_of(model)
-    if form.excluded or form.tree is None or model.has_other_parameters:
-        return None
+    form = form_of(model)
     starts, ends = np.empty((len(us), model.nx)), np.empty((len(us), model.nx))
     touching = np.zeros(len(us), dtype=bool)
+    if xs is not None and x_next is not None:
+        for k in range(len(us) if form.can_touch else 0):
+            set_state(model.double, xs[k])
+            touching[k] = model.double.overlaps()
+        return Steps(xs, us, x_next, touching)
     x = x0
     for k, u in enumerate(us):
         starts[k] = x if xs is None else xs[k]
         x = ends[k] = advance(model.double, starts[k], u)
         touching[k] = form.can_touch and model.double.touches()
-    jacobians, missing = _by_tree(model, form, form.tree, starts, us, ends)
-    smooth = ~touching & (missing <= RESIDUAL_TOLERANCE)
-    return ends, [jacobian if good else None for jacobian, good in zip(jacobians, smooth, strict=True)]
+    return Steps(starts, us, ends, touching)
+
+
+def implicit_jacobians(model: Model, steps: Steps) -> tuple[Array, NDArray[np.bool_]] | None:
+    """(N, nx, nx + nu) of the steps, and which of them (N,) are smooth; the Jacobians of the others mean nothing.
+
+    None where there is no tree, or parameters are set: then the steps are differentiated one by one.
+    """
+    form = form_of(model)
+    if form.excluded or form.tree is None or model.has_other_parameters:
+        return None
+    jacobians, missing = _by_tree(model, form, form.tree, steps.starts, steps.us, steps.ends)
+    return jacobians, ~steps.touching & (missing <= RESIDUAL_TOLERANCE)
 
 
 def _by_tree(
-    model: Model, form: "_Form", tree: TreeDynamics, xs: Array, us: Array, x_nexts: Array
+    model: Model, form: "Form", tree: TreeDynamics, xs: Array, us: Array, x_nexts: Array
 ) -> tuple[Array, Array]:
     """(N, nx, nx + nu) the derivatives of N steps, and (N,) the force that is not accounted for, as a part."""
     n, h, damping = model.nv, model.time_step, tree.damping
@@ -122,7 +142,7 @@ def _by_tree(
     return np.concatenate([positions, velocities], axis=1), _missing(d.tau, rest)
 
 
-def _by_autodiff(model: Model, form: "_Form", vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array:
+def _by_autodiff(model: Model, form: "Form", vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array:
     twin, nq, nx, h = model.double, model.nq, model.nx, model.time_step
     v_next = x_next[nq:]
     change, damping = v_next - x[nq:], twin.damping()
@@ -166,7 +186,7 @@ def _positions(model: Model, v_next: Array, velocities: Array, num_parameters: i
     """(nq, nx + nu + np) the derivative of q' = q + h N(q) v'; the AutoDiffXd twin stands at the step's state."""
     if model.plant.IsVelocityEqualToQDot():
         moved = model.time_step * velocities
-        moved[_form_of(model).diagonal] += 1.0
+        moved[form_of(model).diagonal] += 1.0
         return np.asarray(moved)
     own = np.eye(model.nq, velocities.shape[1])
     twin = model.autodiff
@@ -177,7 +197,7 @@ def _positions(model: Model, v_next: Array, velocities: Array, num_parameters: i
 
 
 @dataclass(frozen=True, eq=False)
-class _Form:
+class Form:
     """What of a model does not change from step to step."""
 
     excluded: str  # why the form describes no step of the model; empty where it may
@@ -209,10 +229,10 @@ class _Form:
         return np.array([g.p if g else 0.0 for g in gains]), np.array([g.d if g else 0.0 for g in gains])
 
 
-_FORMS: WeakKeyDictionary[Model, _Form] = WeakKeyDictionary()
+_FORMS: WeakKeyDictionary[Model, Form] = WeakKeyDictionary()
 
 
-def _form_of(model: Model) -> _Form:
+def form_of(model: Model) -> Form:
     """Read once, from the model's own parameters: while it has others, no tree is made and nothing is kept."""
     if model in _FORMS:
         return _FORMS[model]
@@ -220,7 +240,7 @@ def _form_of(model: Model) -> _Form:
     velocity = np.array([a.joint().velocity_start() for a in found], dtype=int)
     actuation = np.zeros((model.nv, len(found)))
     actuation[velocity, np.arange(len(found))] = 1.0
-    form = _Form(
+    form = Form(
         excluded=why_not_implicit(model),
         actuators=found,
         velocity=velocity,
@@ -240,7 +260,7 @@ def _form_of(model: Model) -> _Form:
 
 def tree_for(model: Model) -> TreeDynamics | None:
     """The model's tree of hinges and slides, None where it is none or differs from AutoDiffXd through Drake."""
-    return _form_of(model).tree
+    return form_of(model).tree
 
 
 def _checked_tree(model: Model) -> TreeDynamics | None:

@@ -18,6 +18,7 @@ from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 from drake_diff.arrays import Array, finite_array, frozen
 from drake_diff.autodiff import gradient_rows
 from drake_diff.exceptions import GradientError, InputError
+from drake_diff.linearization import linearize
 from drake_diff.model import Model
 from drake_diff.plant_elements import actuators
 from drake_diff.step_derivatives import PARITY_TOLERANCE, differentiate_step
@@ -140,8 +141,9 @@ class TVLQR:
         self._space = tangent_space(model)
         weights = _weight("Q", Q, self._space.size), _weight("R", R, model.nu, definite=True)
         final = weights[0] if Qf is None else _weight("Qf", Qf, self._space.size)
-        points = zip(self.xs[:-1], self.us, self.xs[1:], strict=True)
-        steps = [_tangent_step(model, self._space, *point)[:2] for point in points]
+        A, B, _ = linearize(model, self.xs, self.us)
+        points = zip(self.xs[:-1], self.xs[1:], A, B, strict=True)
+        steps = [_on_tangent(self._space, *point) for point in points]
         gains, cost_to_go = _riccati(steps, *weights, final)
         self.gains, self.cost_to_go = frozen(gains), frozen(cost_to_go)
         self.parameters = frozen(self.gains.ravel())
@@ -242,8 +244,12 @@ def _check(numbers: Any, rows: Array, u: Array) -> None:
 def _tangent_step(model: Model, space: TangentSpace, x: Array, u: Array, x_to: Array) -> tuple[Array, Array, Array]:
     """(A (nt, nt), B (nt, nu), x_next): the step's Jacobians from the tangent space at `x` to the one at `x_to`."""
     d = differentiate_step(model, x, u)
+    return (*_on_tangent(space, x, x_to, d.A, d.B), d.x_next)
+
+
+def _on_tangent(space: TangentSpace, x: Array, x_to: Array, A: Array, B: Array) -> tuple[Array, Array]:
     lower = space.derivative_of_minus(x_to)
-    return lower @ d.A @ space.derivative_of_plus(x), lower @ d.B, d.x_next
+    return lower @ A @ space.derivative_of_plus(x), lower @ B
 
 
 def _regulator(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:

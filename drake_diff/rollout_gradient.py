@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from drake_diff.arrays import Array, finite_array, frozen, positive_int
 from drake_diff.autodiff import gradient_of
 from drake_diff.exceptions import InputError
+from drake_diff.linearization import smooth_steps
 from drake_diff.model import Model
 from drake_diff.parameters import Parameters, ParameterVector, applied, select
 from drake_diff.policy import active_parameters, differentiate_policy, policy_parameters
 from drake_diff.rollout import Policy, check_inputs
-from drake_diff.step_derivatives import StepDerivatives, check_method, smooth_steps, step_jacobians
+from drake_diff.step_derivatives import StepDerivatives, check_method, step_jacobians
 
 Loss = Callable[..., Any]
 # A policy's derivatives (nu, nx) by the state and (nu, n) by those of its parameters that act, and which they are.
@@ -99,7 +100,7 @@ def differentiate_rollout(
     with applied(vector) as set_model:
         if policy is None:
             inputs = check_inputs(model, us, num_steps)
-            linearization = linearize(set_model, x0, inputs, vector=vector, method=method)
+            linearization = derivatives_along(set_model, x0, inputs, vector=vector, method=method)
         else:
             steps = positive_int("num_steps", num_steps)
             linearization, feedback, inputs = _close_the_loop(set_model, x0, policy, steps, vector, method)
@@ -122,7 +123,7 @@ def differentiate_rollout(
     )
 
 
-def linearize(
+def derivatives_along(
     model: Model,
     x0: Array,
     us: Array,
@@ -137,7 +138,7 @@ def linearize(
     """
     found: list[StepDerivatives] = []
     vector = vector or select(model, ())
-    if method in ("auto", "implicit") and not vector.parameters:
+    if not vector.parameters:
         found = smooth_steps(model, x0, us, method, xs)
     for k in range(len(found), len(us)):
         x = (found[-1].x_next if found else x0) if xs is None else xs[k]

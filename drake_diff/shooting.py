@@ -15,7 +15,7 @@ from drake_diff.parameter_coordinates import ParameterCoordinates
 from drake_diff.parameters import ParameterVector, applied
 from drake_diff.problem import Problem
 from drake_diff.rollout import roll_states
-from drake_diff.rollout_gradient import Totals, accumulate, differentiate_loss, linearize
+from drake_diff.rollout_gradient import Totals, accumulate, derivatives_along, differentiate_loss
 from drake_diff.step_derivatives import StepDerivatives
 
 
@@ -91,7 +91,7 @@ class ShootingVariables:
             (x0, us), vector = self.unpack(z), self.parameters(z)
             with applied(vector) as model:
                 given = None if self.around is None else self.around[:-1]
-                self._linearization = linearize(model, x0, us, vector=vector, xs=given)
+                self._linearization = derivatives_along(model, x0, us, vector=vector, xs=given)
             self._at = z.tobytes()
         return self._linearization
 

@@ -9,16 +9,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
 
+from drake_diff.analytic import analytic_jacobian, analytic_of
 from drake_diff.arrays import Array, frozen
 from drake_diff.autodiff import gradient_rows
 from drake_diff.exceptions import GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.finite_difference import differences, plateau
-from drake_diff.implicit import NotSmoothError, implicit_jacobian, implicit_jacobians
+from drake_diff.implicit import NotSmoothError, implicit_jacobian
 from drake_diff.model import Model
 from drake_diff.parameters import Parameters, ParameterVector, applied, select, write_autodiff
 from drake_diff.step import advance, check_point
 
-METHODS = ("auto", "autodiff", "implicit", "finite_difference")
+METHODS = ("auto", "analytic", "autodiff", "implicit", "finite_difference")
 # The AutoDiffXd and the double step run the same algorithm, so they differ by rounding only.
 PARITY_TOLERANCE = 1e-9
 # Lagged contact reaches 4e4 where it is right; Drake's singular poses give 1e15 and more.
@@ -29,6 +30,7 @@ DIFFERENCE_STEP = 1e-5
 SAME_JACOBIAN = 1e-10
 # Implicit is 0.9 to 2 times as fast as autodiff; a choice at the break-even would change from run to run.
 TIMED_CALLS, MUCH_SLOWER = 3, 3.0
+CERTIFIED = "equal to autodiff, as certified on this model"
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +57,14 @@ def differentiate_step(
 
     `parameters` names what C is by, at the model's own values, or maps the names to other values. `method` is
 
+    - "analytic": Pinocchio's derivatives, for smooth steps of a model on which they were certified equal to autodiff;
+      a step that is not smooth, and derivatives by parameters or at other parameters, are as by "auto" without it;
     - "autodiff": AutoDiffXd through Drake's step;
     - "implicit": from the equation of a smooth step, two to three times as fast from five joints on; autodiff where
       contact or a constraint acts;
     - "finite_difference": central differences of the double step;
-    - "auto": implicit where it was measured to be equal to autodiff and not much slower on this model, else autodiff,
-      and differences where Drake refuses AutoDiffXd.
+    - "auto": analytic where Pinocchio is installed and the model and step allow it, else implicit where it was measured
+      to be equal to autodiff and not much slower here, else autodiff, and differences where Drake refuses AutoDiffXd.
 
     `method` and `reason` of the result say what it was. Raises GradientError where the AutoDiffXd step is not the
     double step, or a derivative is not finite or beyond 1e8; SimulationError where Drake cannot take the step.
@@ -82,7 +86,7 @@ def step_jacobians(model: Model, vector: ParameterVector, x: Array, u: Array, me
     """`differentiate_step` on a model that the vector is applied to; sizes are the caller's business."""
     x_next = advance(model.double, x, u)
     jacobian, used, reason = _SOURCES[method](model, vector, x, u, x_next)
-    if len(vector.differenced) and used != "finite_difference":
+    if vector.parameters and len(vector.differenced) and used != "finite_difference":
         jacobian[:, model.nx + model.nu + vector.differenced] = _parameter_differences(model, vector, x, u, x_next)
     check_derivatives(model, jacobian)
     nx, end = model.nx, model.nx + model.nu
@@ -96,33 +100,6 @@ def step_jacobians(model: Model, vector: ParameterVector, x: Array, u: Array, me
         method=used,
         reason=reason,
     )
-
-
-def smooth_steps(model: Model, x0: Array, us: Array, method: str, xs: Array | None = None) -> list[StepDerivatives]:
-    """The derivatives of the steps from `x0` under `us` (N, nu), or from each of xs (N, nx), all in one call.
-
-    Empty where they cannot be. A step that is not smooth is differentiated on its own. What `method` "auto" takes is
-    settled by the first.
-    """
-    vector, nx = select(model, ()), model.nx
-    if method == "auto" and model not in _CHOICES:
-        step_jacobians(model, vector, x0, us[0], method)
-    if method == "auto" and not (model in _CHOICES and _CHOICES[model].use_implicit):
-        return []
-    at_once = implicit_jacobians(model, x0, us, xs)
-    if at_once is None:
-        return []
-    ends, jacobians = at_once
-    check_derivatives(model, np.concatenate([j for j in jacobians if j is not None] or [np.zeros((0, nx))]))
-    reason = "asked for" if method == "implicit" else _CHOICES[model].reason
-    starts = np.vstack([x0, ends[:-1]]) if xs is None else xs
-    none = frozen(np.zeros((nx, 0)))
-    return [
-        step_jacobians(model, vector, starts[k], us[k], method)
-        if j is None
-        else StepDerivatives(frozen(ends[k]), frozen(j[:, :nx]), frozen(j[:, nx:]), none, (), (), "implicit", reason)
-        for k, j in enumerate(jacobians)
-    ]
 
 
 Source = tuple[Array, str, str]  # the Jacobian (nx, nx + nu + np), the method and why it was taken
@@ -144,7 +121,30 @@ def _by_implicit(model: Model, vector: ParameterVector, x: Array, u: Array, x_ne
 
 
 def _by_choice(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
-    """What is exact and fastest on this model, measured on the first smooth step that is met."""
+    """What is exact and fastest on this model."""
+    jacobian = _analytic(model, vector, x, u, x_next)
+    if isinstance(jacobian, str):
+        return _without_analytic(model, vector, x, u, x_next)
+    return jacobian, "analytic", CERTIFIED
+
+
+def _by_analytic(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
+    jacobian = _analytic(model, vector, x, u, x_next)
+    if isinstance(jacobian, str):
+        other, method, reason = _without_analytic(model, vector, x, u, x_next)
+        return other, method, f"not analytic: {jacobian}; {reason}"
+    return jacobian, "analytic", "asked for"
+
+
+def _analytic(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array | str:
+    """The Jacobian by Pinocchio, or why it cannot be had so."""
+    if vector.parameters:
+        return "derivatives by parameters are asked for"
+    return analytic_jacobian(model, x, u, x_next)
+
+
+def _without_analytic(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
+    """Implicit or autodiff as measured on the first smooth step that is met; differences where both are refused."""
     why = "the first choice"
     try:
         if model not in _CHOICES or _CHOICES[model].use_implicit:
@@ -169,6 +169,7 @@ _SOURCES: dict[str, Callable[[Model, ParameterVector, Array, Array, Array], Sour
     "autodiff": _by_autodiff,
     "finite_difference": _by_finite_difference,
     "implicit": _by_implicit,
+    "analytic": _by_analytic,
     "auto": _by_choice,
 }
 
@@ -182,15 +183,23 @@ class _Choice:
 _CHOICES: WeakKeyDictionary[Model, _Choice] = WeakKeyDictionary()
 
 
+def implicit_reason(model: Model) -> str | None:
+    """Why "auto" takes implicit where it cannot take analytic; None where it does not, or met no smooth step so far."""
+    choice = _CHOICES.get(model)
+    return choice.reason if choice is not None and choice.use_implicit else None
+
+
 def _compare(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array, jacobian: Array) -> _Choice:
     """Implicit or autodiff from now on: the one is measured against the other at this smooth step."""
+    analytic = analytic_of(model)
+    why_not = f"; not analytic: {analytic}" if isinstance(analytic, str) else ""
     try:
         other = _autodiff(model, vector, x, u, x_next)
     except (ModelError, SimulationError) as error:
-        return _Choice(True, f"AutoDiffXd refuses the whole step: {error}")
+        return _Choice(True, f"AutoDiffXd refuses the whole step: {error}{why_not}")
     gap = float(np.abs(jacobian - other).max())
     if not gap <= SAME_JACOBIAN * max(1.0, float(np.abs(other).max())):
-        return _Choice(False, f"implicit differs from autodiff by {gap:.2g} on this model")
+        return _Choice(False, f"implicit differs from autodiff by {gap:.2g} on this model{why_not}")
 
     def seconds(f: Callable[..., Array]) -> float:
         times = []
@@ -201,8 +210,8 @@ def _compare(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: 
         return min(times)
 
     if seconds(implicit_jacobian) < MUCH_SLOWER * seconds(_autodiff):
-        return _Choice(True, "equal to autodiff, and not much slower, as measured on this model")
-    return _Choice(False, f"implicit takes {MUCH_SLOWER:g} times as long, as measured on this model")
+        return _Choice(True, f"equal to autodiff, and not much slower, as measured on this model{why_not}")
+    return _Choice(False, f"implicit takes {MUCH_SLOWER:g} times as long, as measured on this model{why_not}")
 
 
 def _autodiff(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array:
@@ -228,6 +237,8 @@ def check_parity(model: Model, autodiff: Array, double: Array) -> None:
 
 def check_derivatives(model: Model, jacobian: Array) -> None:
     """Refuse a derivative by x or u that is not finite or implausibly large, and by a parameter that is not finite."""
+    if np.vdot(jacobian, jacobian) <= MAGNITUDE_BOUND**2:  # then no entry is larger; NaN is not below
+        return
     bound = np.full(jacobian.shape[1], MAGNITUDE_BOUND)
     bound[model.nx + model.nu :] = np.finfo(float).max  # its size is a matter of the parameter's unit
     size = np.where(np.isfinite(jacobian), np.abs(jacobian), np.inf) / bound

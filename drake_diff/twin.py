@@ -69,6 +69,10 @@ class Twin:
         contacts = self.plant.get_contact_results_output_port().Eval(self.context)
         return bool(contacts.num_point_pair_contacts() or contacts.num_hydroelastic_contacts())
 
+    def overlaps(self) -> bool:
+        """Whether any two geometries that may collide do, in the context's state; no step is taken."""
+        return bool(self.plant.get_geometry_query_input_port().Eval(self.context).HasCollisions())
+
     def inverse_dynamics(self, acceleration: Any) -> Any:
         """(nv,) M a + bias less gravity, springs, damping and added forces, at the context's state."""
         forces = MultibodyForces_[self.scalar](self.plant)

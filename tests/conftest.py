@@ -1,5 +1,6 @@
 """What many tests need: the models of this repository, and small plants built by hand."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,13 @@ def write_urdf(tmp_path):
         return dd.load_model(path, time_step=time_step)
 
     return write
+
+
+@pytest.fixture
+def without_pinocchio(monkeypatch):
+    """As where it is not installed, for models loaded from here on."""
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    monkeypatch.delitem(sys.modules, "drake_diff.engines.pinocchio_model", raising=False)
 
 
 @pytest.fixture(scope="session")

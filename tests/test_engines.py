@@ -289,7 +289,7 @@ def test_a_swapped_quaternion_or_velocity_frame_is_found(load, monkeypatch, name
     assert [line.quantity for line in dd.match_contracts(drake, other) if line.verdict == "different"] == (
         [] if name == "pinocchio" else ["integrator"]
     )
-    module = sys.modules[f"drake_diff.engines.{'pinocchio_engine' if name == 'pinocchio' else 'mujoco_coordinates'}"]
+    module = sys.modules[f"drake_diff.engines.{'body_frame' if name == 'pinocchio' else 'mujoco_coordinates'}"]
     real = module.rotation
     wrong = {"quaternion order": lambda q: real(np.roll(q, 1)), "velocity frame": lambda q: np.eye(3)}
     for swapped in wrong.values():

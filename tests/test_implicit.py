@@ -379,13 +379,14 @@ def test_a_box_in_the_air_that_autodiff_refuses_on_a_broad_phase_hit(ground):
     assert refused or ground == "half space"  # which 1.51 refuses and 1.58 does not
 
 
-def test_the_automatic_choice_says_what_it_took_and_why(load):
+def test_the_automatic_choice_says_what_it_took_and_why(load, without_pinocchio):
     model = load("double_pendulum.urdf")
     point = [0.4, -0.9, 1.3, -0.6], [0.25, -0.15]
     d = dd.differentiate_step(model, *point)
     assert d.method in ("implicit", "autodiff")
     assert "as measured on this model" in d.reason
     assert ("equal to autodiff" in d.reason) == (d.method == "implicit")
+    assert "Pinocchio is not installed: pip install" in d.reason
     again = dd.differentiate_step(model, [0.1, 0.2, 0.3, 0.4], [0.0, 1.0])
     assert (again.method, again.reason) == (d.method, d.reason)  # once and for all
 

@@ -18,39 +18,40 @@ Recording Robustness RobustnessRecord Rollout RolloutCertificate RolloutGradient
 Smoothed SoftContact Solution Status StepDerivatives TVLQR Transcribed UnknownNameError Verification audit
 center_of_mass certify certify_jacobian certify_model certify_rollout closed_loop compare contact_force contact_modes
 contact_table differentiate_rollout differentiate_step export_model frame_position frame_rotation_error frame_velocity
-gradient_panel list_parameters load_engine load_model load_record match_contracts model_from_diagram plant_dynamics
-read_mcap read_recording read_trace robustness rollout run_panel save save_comparison save_gradient_panel
-save_robustness smooth smooth_step softened solve step transcribe_and_solve verify violation_between_nodes
+gradient_panel linearize list_parameters load_engine load_model load_record match_contracts model_from_diagram
+plant_dynamics read_mcap read_recording read_trace robustness rollout run_panel save save_comparison
+save_gradient_panel save_robustness smooth smooth_step softened solve step transcribe_and_solve verify
+violation_between_nodes
 """.split()
 ORDER = """
 exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin model
 soft_contact read_contract tangent inertia parameter_kinds contact_parameters parameters parameter_coordinates step
-finite_difference tree_dynamics implicit step_derivatives smoothing policy contact quantities mode_changes certificate
-rollout rollout_gradient refinement certify continuous cost bounds constraint problem replay dynamics
-nonlinear_program transcription_scheme optimal_control transcribed symbolic symbolic_tree knot_functions
+finite_difference tree_dynamics engines.engine engines.euler engines.description engines.body_frame
+engines.pinocchio_model implicit analytic step_derivatives linearization smoothing policy contact quantities
+mode_changes certificate rollout rollout_gradient refinement certify continuous cost bounds constraint problem replay
+dynamics nonlinear_program transcription_scheme optimal_control transcribed symbolic symbolic_tree knot_functions
 transcription_program ipopt transcription solution mathematical_program collocation shooting shooting_program riccati
 secant augmented_lagrangian expansion ilqr contact_sequence goal_restoration continuation verdict run solver
 mcap_messages mcap_read mcap_log mcap_recover trace_read trace_motion trace_solve trace page html_parts meshcat_scene
 meshcat_view report_data report record_parts record record_schema record_file certification_record named_files
 provenance problem_record plan_file record_sections metrics invariants failures events evidence rerun verification
-verify runs view sampling certification audit_place audit_contact audit engines.engine engines.euler
-engines.description engines.closed_form engines.closed_form_contact engines.numpy_engine engines.drake_engine
-engines.pinocchio_engine engines.urdf engines.casadi_engine engines.mjcf engines.mujoco_coordinates
-engines.mujoco_contract engines.mujoco_model engines.mujoco_engine engines.mjx_engine engines.quiet
-engines.rigid_links engines.centers engines.newton_contract engines.newton_engine engines.bullet_urdf
-engines.bullet_contract engines.pybullet_engine engines.sapien_contract engines.sapien_engine engines.contract_match
-engines.load engines.attribution engines.motion engines.jacobians engines.recording engines.recording_ros2
-engines.recording_files engines.recorded engines.comparison_task engines.compared engines.comparison
-engines.comparison_record engines.comparison_words engines.comparison_page engines.comparison_trace
-engines.comparison_files engines.contact_cases engines.contact_laws engines.contact_table engines.contact_words
-engines.sdf engines.usd engines.read_back engines.small_models engines.export_readme engines.export loop.statistics
-loop.checks loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop loop.controllers loop.mpc
-panels.panel_file panels.trial_row panels.journal panels.local_workers panels.ray_workers panels.workers panels.table
-panels.panel loop.perturbation loop.trial loop.sensitivity loop.robustness loop.robustness_record
-loop.robustness_words loop.trial_trace loop.trial_files loop.robustness_plots loop.robustness_page
-loop.robustness_files loop.panel_trial gradient_estimate gradient_descent gradient_panel_cases gradient_panel
-gradient_panel_files ros2_bag cli_mcap cli_runs cli_engines cli_panel cli_gradients cli_options cli_export cli_view
-cli_contact cli_robustness cli
+verify runs view sampling certification audit_place audit_contact audit engines.closed_form
+engines.closed_form_contact engines.numpy_engine engines.drake_engine engines.pinocchio_engine engines.urdf
+engines.casadi_engine engines.mjcf engines.mujoco_coordinates engines.mujoco_contract engines.mujoco_model
+engines.mujoco_engine engines.mjx_engine engines.quiet engines.rigid_links engines.centers engines.newton_contract
+engines.newton_engine engines.bullet_urdf engines.bullet_contract engines.pybullet_engine engines.sapien_contract
+engines.sapien_engine engines.contract_match engines.load engines.attribution engines.motion engines.jacobians
+engines.recording engines.recording_ros2 engines.recording_files engines.recorded engines.comparison_task
+engines.compared engines.comparison engines.comparison_record engines.comparison_words engines.comparison_page
+engines.comparison_trace engines.comparison_files engines.contact_cases engines.contact_laws engines.contact_table
+engines.contact_words engines.sdf engines.usd engines.read_back engines.small_models engines.export_readme
+engines.export loop.statistics loop.checks loop.sensor loop.estimator loop.actuator loop.fallback loop.closed_loop
+loop.controllers loop.mpc panels.panel_file panels.trial_row panels.journal panels.local_workers panels.ray_workers
+panels.workers panels.table panels.panel loop.perturbation loop.trial loop.sensitivity loop.robustness
+loop.robustness_record loop.robustness_words loop.trial_trace loop.trial_files loop.robustness_plots
+loop.robustness_page loop.robustness_files loop.panel_trial gradient_estimate gradient_descent gradient_panel_cases
+gradient_panel gradient_panel_files ros2_bag cli_mcap cli_runs cli_engines cli_panel cli_gradients cli_options
+cli_export cli_view cli_contact cli_robustness cli
 """.split()
 
 

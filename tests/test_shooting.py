@@ -174,7 +174,7 @@ def test_a_pendulum_too_weak_and_too_late_is_infeasible(solver):
 
 
 @pytest.mark.parametrize(("row", "column"), [(i, j) for i in range(2) for j in range(3)])
-def test_a_step_derivative_that_is_one_percent_off_is_named(row, column, monkeypatch):
+def test_a_step_derivative_that_is_one_percent_off_is_named(row, column, monkeypatch, without_pinocchio):
     """Each entry of [A B] of the pendulum; the wrong one is used by the solver and by the certificate alike."""
     module = sys.modules["drake_diff.step_derivatives"]
     honest = module._autodiff
@@ -195,7 +195,7 @@ def test_an_honest_derivative_lets_the_same_solve_succeed():
     assert shoot(pendulum(num_steps=20, x_goal=[0.3, 0]), max_iterations=50).success
 
 
-def test_a_wrong_derivative_is_not_believed_by_ilqr(monkeypatch):
+def test_a_wrong_derivative_is_not_believed_by_ilqr(monkeypatch, without_pinocchio):
     module = sys.modules["drake_diff.step_derivatives"]
     honest = module._autodiff
     monkeypatch.setattr(module, "_autodiff", lambda *args: honest(*args) * [[1, 1, 1], [1, 1, 1.01]])

@@ -13,7 +13,7 @@ from test_silent_faults import pd_pendulum
 
 import drake_diff as dd
 from drake_diff.nonlinear_program import NlpResult, Outcome
-from drake_diff.rollout_gradient import linearize
+from drake_diff.rollout_gradient import derivatives_along
 from drake_diff.run import Run
 from drake_diff.solution import Status
 
@@ -456,7 +456,7 @@ def acrobot_swing_up(load):
 )
 def test_a_step_refused_in_the_middle_of_a_solve_is_named(load, monkeypatch, solver, error, status):
     """SNOPT, in Drake, cannot be told that a step was too long, and wraps what is raised with its traceback."""
-    original, calls = linearize, []
+    original, calls = derivatives_along, []
 
     def refusing(*args, **options):
         calls.append(1)
@@ -464,7 +464,7 @@ def test_a_step_refused_in_the_middle_of_a_solve_is_named(load, monkeypatch, sol
             raise error("this far and no further")
         return original(*args, **options)
 
-    monkeypatch.setattr("drake_diff.shooting.linearize", refusing)
+    monkeypatch.setattr("drake_diff.shooting.derivatives_along", refusing)
     monkeypatch.setattr("drake_diff.shooting.ShootingVariables.attempt", lambda self, evaluate, failed: evaluate())
     solution = dd.solve(swing_up(load, 20), method="shooting", solver=solver)
     assert solution.status is status

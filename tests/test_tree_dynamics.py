@@ -21,9 +21,9 @@ from test_model import robot
 from test_silent_faults import pd_pendulum
 
 import drake_diff as dd
-from drake_diff.implicit import _form_of, implicit_jacobians
+from drake_diff.implicit import form_of, implicit_jacobians, take_steps
 from drake_diff.parameters import applied, select
-from drake_diff.rollout_gradient import linearize
+from drake_diff.rollout_gradient import derivatives_along
 from drake_diff.tree_dynamics import TreeDynamics, tree_of
 
 
@@ -167,7 +167,7 @@ def without_gravity():
 def test_what_is_no_such_tree_is_told_and_taken_by_autodiff(make, words):
     model = make()
     assert words in tree_of(model)
-    assert _form_of(model).tree is None
+    assert form_of(model).tree is None
     x = model.default_state + 0.01
     if model.nq != model.nv:
         x[:4] = [1, 0, 0, 0]
@@ -186,7 +186,7 @@ def test_a_tree_that_is_not_drakes_is_not_used(monkeypatch):
 
     monkeypatch.setattr("drake_diff.implicit.tree_of", wrong)
     model = random_tree(5)
-    assert _form_of(model).tree is None
+    assert form_of(model).tree is None
     x = 0.1 * np.ones(model.nx)
     u = 0.1 * np.ones(model.nu)
     a, b = (dd.differentiate_step(model, x, u, method=m) for m in ("implicit", "autodiff"))
@@ -198,8 +198,8 @@ def test_a_whole_rollout_in_one_call_is_the_one_by_autodiff(load, name):
     model = load(name)
     random = np.random.default_rng(0)
     x0, us = 0.3 * random.standard_normal(model.nx), random.standard_normal((30, model.nu))
-    ours, drakes = (linearize(model, x0, us, method=method) for method in ("implicit", "autodiff"))
-    assert implicit_jacobians(model, x0, us) is not None
+    ours, drakes = (derivatives_along(model, x0, us, method=method) for method in ("implicit", "autodiff"))
+    assert implicit_jacobians(model, take_steps(model, x0, us)) is not None
     for a, b in zip(ours, drakes, strict=True):
         assert a.method == "implicit"
         assert np.array_equal(a.x_next, b.x_next)
@@ -214,7 +214,7 @@ def test_in_a_rollout_through_a_joint_limit_the_steps_at_it_are_autodiffs():
     x0 = model.default_state
     upper = model.plant.GetPositionUpperLimits()
     x0[2], x0[model.nq + 2] = upper[2] - 0.02, 3.0  # runs into its limit
-    ours, drakes = (linearize(model, x0, np.zeros((20, model.nu)), method=m) for m in ("implicit", "autodiff"))
+    ours, drakes = (derivatives_along(model, x0, np.zeros((20, model.nu)), method=m) for m in ("implicit", "autodiff"))
     assert {d.method for d in ours} == {"implicit", "autodiff"}
     for a, b in zip(ours, drakes, strict=True):
         assert pytest.approx(b.A, abs=1e-8 * np.abs(b.A).max()) == a.A
@@ -224,7 +224,7 @@ def test_states_that_are_no_rollout_are_each_their_own(load):
     model, random = load("acrobot.xml"), np.random.default_rng(2)
     xs, us = random.standard_normal((6, 4)), random.standard_normal((6, 1))
     for method in ("implicit", "autodiff"):
-        found = linearize(model, xs[0], us, method=method, xs=xs)
+        found = derivatives_along(model, xs[0], us, method=method, xs=xs)
         for d, x, u in zip(found, xs, us, strict=True):
             alone = dd.differentiate_step(model, x, u, method="autodiff")
             assert pytest.approx(alone.A, abs=1e-10) == d.A
@@ -234,7 +234,7 @@ def test_states_that_are_no_rollout_are_each_their_own(load):
 def test_pd_control_and_clipped_inputs_in_one_call_too():
     model = pd_pendulum()
     x0, us = np.array([0.7, -1.2]), np.linspace(-1, 1, 15)[:, None]
-    ours, drakes = (linearize(model, x0, us, method=method) for method in ("implicit", "autodiff"))
+    ours, drakes = (derivatives_along(model, x0, us, method=method) for method in ("implicit", "autodiff"))
     assert {d.method for d in ours} == {"implicit"}
     for a, b in zip(ours, drakes, strict=True):
         assert pytest.approx(b.A, abs=1e-10) == a.A
@@ -244,7 +244,7 @@ def test_pd_control_and_clipped_inputs_in_one_call_too():
 def test_a_clipped_input_has_no_derivative(write_urdf):
     """The block's limit is 2 N: beyond it the push is 2 N and its derivative 0."""
     model = write_urdf(mass=1.5, limit=2.0)
-    found = linearize(model, np.zeros(2), np.array([[1.9], [2.1], [-3.0]]), method="implicit")
+    found = derivatives_along(model, np.zeros(2), np.array([[1.9], [2.1], [-3.0]]), method="implicit")
     assert [d.B[1, 0] for d in found] == pytest.approx([0.1 / 1.5, 0.0, 0.0], abs=1e-15)
 
 
@@ -255,6 +255,6 @@ def test_a_tree_is_not_made_of_another_models_parameters(load, name):
     x0, us = np.array([0.7, -1.2]), np.zeros((5, 1))
     for parameters in ({name: value}, {}):
         with applied(select(model, parameters)) as set_model:
-            ours, drakes = (linearize(set_model, x0, us, method=method) for method in ("implicit", "autodiff"))
+            ours, drakes = (derivatives_along(set_model, x0, us, method=method) for method in ("implicit", "autodiff"))
         for a, b in zip(ours, drakes, strict=True):
             assert pytest.approx(b.A, abs=1e-10) == a.A

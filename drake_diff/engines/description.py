@@ -95,6 +95,14 @@ class Description:
 
 def describe(model: Model) -> Description:
     """The description of `model`; ModelError, naming the element, where the plant has what no other engine is given."""
+    controlled = [f"actuator {a.name()} has PD gains" for a in actuators(model.plant) if a.has_controller()]
+    if controlled:
+        raise ModelError("no other engine is given this model: " + "; ".join(controlled))
+    return describe_tree(model)
+
+
+def describe_tree(model: Model) -> Description:
+    """As `describe`, PD control of the actuators left out."""
     plant = model.plant
     _check(model)
     springs = springs_of(plant)
@@ -126,7 +134,6 @@ def _check(model: Model) -> None:
     plant = model.plant
     found = [f"joint {j.name()} is of type {j.type_name()}" for j in joints(plant) if j.type_name() not in _KNOWN]
     found += [f"joint {j.name()} is locked" for j in joints(plant) if j.is_locked(model.double.context)]
-    found += [f"actuator {a.name()} has PD gains" for a in actuators(plant) if a.has_controller()]
     found += [
         f"the free body of joint {j.name()} is damped"
         for j in joints(plant)

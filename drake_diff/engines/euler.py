@@ -28,31 +28,35 @@ class Coordinates:
         return 6 * len(self.free) + len(self.single)
 
     def rate(self, q: Array) -> Array:
-        """N (nq, nv) with dq/dt = N v."""
-        N = np.zeros((self.nq, self.nv))
+        """N (..., nq, nv) with dq/dt = N v, at q (..., nq)."""
+        N = np.zeros((*q.shape[:-1], self.nq, self.nv))
         for i, j in self.single:
-            N[i, j] = 1.0
+            N[..., i, j] = 1.0
         for i, j in self.free:
-            N[i : i + 4, j : j + 3] = 0.5 * _times_from_left(q[i : i + 4])
-            N[i + 4 : i + 7, j + 3 : j + 6] = np.eye(3)
+            N[..., i : i + 4, j : j + 3] = 0.5 * _times_from_left(q[..., i : i + 4])
+            N[..., i + 4 : i + 7, j + 3 : j + 6] = np.eye(3)
         return N
 
     def rate_by_position(self, v: Array) -> Array:
-        """(nq, nq) the derivative of N(q) v by q, which does not depend on q."""
-        derivative = np.zeros((self.nq, self.nq))
+        """(..., nq, nq) the derivative of N(q) v by q, which does not depend on q, at v (..., nv)."""
+        derivative = np.zeros((*v.shape[:-1], self.nq, self.nq))
         for i, j in self.free:
-            derivative[i : i + 4, i : i + 4] = 0.5 * _left_product(v[j : j + 3])
+            derivative[..., i : i + 4, i : i + 4] = 0.5 * _left_product(v[..., j : j + 3])
         return derivative
 
     def motion(self, q: Array) -> Array:
-        """W (nv, nq): the small motion, in the sense of v, that a change of q is; W N = 1, and W q = 0 for a norm."""
-        W = np.zeros((self.nv, self.nq))
+        """W (..., nv, nq): the small motion, in the sense of v, that a change of q (..., nq) is.
+
+        W N = 1, and W q = 0 for a norm.
+        """
+        W = np.zeros((*q.shape[:-1], self.nv, self.nq))
         for j, i in ((j, i) for i, j in self.single):
-            W[j, i] = 1.0
+            W[..., j, i] = 1.0
         for i, j in self.free:
-            quaternion = q[i : i + 4]
-            W[j : j + 3, i : i + 4] = 2 * _times_from_left(quaternion).T / (quaternion @ quaternion)
-            W[j + 3 : j + 6, i + 4 : i + 7] = np.eye(3)
+            quaternion = q[..., i : i + 4]
+            norm = (quaternion**2).sum(axis=-1)[..., None, None]
+            W[..., j : j + 3, i : i + 4] = 2 * np.swapaxes(_times_from_left(quaternion), -1, -2) / norm
+            W[..., j + 3 : j + 6, i + 4 : i + 7] = np.eye(3)
         return W
 
 
@@ -87,14 +91,16 @@ def exponential_turn(quaternion: Array, angle: Array) -> Array:
 
 
 def skew(w: Array) -> Array:
-    """(3, 3) with skew(w) x = w x x."""
-    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+    """(..., 3, 3) with skew(w) x = w x x, at w (..., 3)."""
+    x, y, z = _entries(w)
+    o = 0 * x
+    return _matrix([[o, -z, y], [z, o, -x], [-y, x, o]])
 
 
 def rotation(quaternion: Array) -> Array:
-    """(3, 3) of a quaternion (w, x, y, z) of any norm."""
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array(
+    """(..., 3, 3) of a quaternion (w, x, y, z) (..., 4) of any norm."""
+    w, x, y, z = _entries(quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True))
+    return _matrix(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -104,13 +110,23 @@ def rotation(quaternion: Array) -> Array:
 
 
 def _times_from_left(q: Array) -> Array:
-    """(4, 3): w -> (0, w) * q."""
-    s, x, y, z = q
-    return np.array([[-x, -y, -z], [s, z, -y], [-z, s, x], [y, -x, s]])
+    """(..., 4, 3): w -> (0, w) * q."""
+    s, x, y, z = _entries(q)
+    return _matrix([[-x, -y, -z], [s, z, -y], [-z, s, x], [y, -x, s]])
 
 
 def _left_product(w: Array) -> Array:
-    """(4, 4): q -> (0, w) * q."""
-    product = np.zeros((4, 4))
-    product[0, 1:], product[1:, 0], product[1:, 1:] = -w, w, skew(w)
+    """(..., 4, 4): q -> (0, w) * q."""
+    product = np.zeros((*w.shape[:-1], 4, 4))
+    product[..., 0, 1:], product[..., 1:, 0], product[..., 1:, 1:] = -w, w, skew(w)
     return product
+
+
+def _entries(vectors: Array) -> Array:
+    """(n, ...) of vectors (..., n)."""
+    return np.moveaxis(vectors, -1, 0)
+
+
+def _matrix(rows: list[list[Array]]) -> Array:
+    """(..., m, n) of m rows of n arrays (...,)."""
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))

@@ -1,21 +1,19 @@
 """Pinocchio: a model built joint by joint from Drake's plant, its RNEA derivatives in Drake's semi-implicit Euler step.
 
-A free body's native state is (p, quaternion x y z w) and (v, w) in the body's own frame. With R its orientation,
-v_native = Q v and a small motion is Q d, Q = [[0, R'], [R', 0]]; dv/dt = Q' a_native + (0, w x v).
+See `body_frame` for its coordinates.
 """
-
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.math import RigidTransform
 
 from drake_diff.arrays import Array, finite_array, frozen
-from drake_diff.engines.description import Link, describe, joint_contract
+from drake_diff.engines.body_frame import native_positions, turn, turn_derivatives, turning
+from drake_diff.engines.description import describe, joint_contract
 from drake_diff.engines.engine import EngineContract, JointContract, StepJacobian
-from drake_diff.engines.euler import euler_acceleration, euler_jacobian, euler_step, rotation, skew
+from drake_diff.engines.euler import euler_acceleration, euler_jacobian, euler_step
 from drake_diff.engines.numpy_engine import DRAKES_STEP, EACH_CALL
-from drake_diff.exceptions import MissingDependencyError, ModelError
+from drake_diff.engines.pinocchio_model import build
+from drake_diff.exceptions import MissingDependencyError
 from drake_diff.model import Model
 
 try:
@@ -37,7 +35,7 @@ class PinocchioEngine:
         self.damping, self.stiffness = (self.description.by_velocity(name) for name in ("damping", "stiffness"))
         self.rest = self.description.by_velocity("rest")
         self.actuation, self.limits = self.description.actuation, self.description.effort_limits
-        self.pin, self.anchored_energy = _build(self.description.links, self.description.gravity)
+        self.pin, self.anchored_energy = build(self.description.links, self.description.gravity)
         self.pin.armature = self.description.by_velocity("armature")
         self.data = self.pin.createData()
         self.version = str(pin.__version__)
@@ -71,13 +69,13 @@ class PinocchioEngine:
 
     def mass_matrix(self, q: ArrayLike) -> Array:
         q = finite_array("q", q, (self.nq,))
-        Q = self._turn(q)
+        Q = turn(self.coordinates, q)
         return np.asarray(Q.T @ self._mass(self._q(q)) @ Q)
 
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
         q, v = finite_array("q", q, (self.nq,)), finite_array("v", v, (self.nv,))
-        Q = self._turn(q)
-        needed = pin.rnea(self.pin, self.data, self._q(q), Q @ v, -Q @ self._turning(v))
+        Q = turn(self.coordinates, q)
+        needed = pin.rnea(self.pin, self.data, self._q(q), Q @ v, -Q @ turning(self.coordinates, v))
         return np.asarray(Q.T @ needed + self.stiffness * (self._single(q) - self.rest))
 
     def _point(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
@@ -86,22 +84,22 @@ class PinocchioEngine:
     def _acceleration(self, x: Array, u: Array) -> Array:
         """(nv,) of the step, native."""
         q, v = x[: self.nq], x[self.nq :]
-        native_q, native_v = self._q(q), self._turn(q) @ v
+        native_q, native_v = self._q(q), turn(self.coordinates, q) @ v
         springs = self.stiffness * (self._single(q) - self.rest)
         force = self.actuation @ np.clip(u, -self.limits, self.limits) - springs
         force -= pin.rnea(self.pin, self.data, native_q, native_v, np.zeros(self.nv))
         return euler_acceleration(self._mass(native_q), self.damping, self.time_step, native_v, force)
 
     def _drakes(self, x: Array, native: Array) -> Array:
-        return np.asarray(self._turn(x[: self.nq]).T @ native + self._turning(x[self.nq :]))
+        return np.asarray(turn(self.coordinates, x[: self.nq]).T @ native + turning(self.coordinates, x[self.nq :]))
 
     def _acceleration_derivative(self, x: Array, u: Array, native: Array) -> Array:
         """(nv, 2 nv + nu) of Drake's acceleration by small motion, by v and by u."""
         q, v = x[: self.nq], x[self.nq :]
-        Q, native_q, D = self._turn(q), self._q(q), np.diag(self.damping)
+        Q, native_q, D = turn(self.coordinates, q), self._q(q), np.diag(self.damping)
         by_q, by_v, _ = pin.computeRNEADerivatives(self.pin, self.data, native_q, Q @ v, native)
         by_v = by_v + D
-        velocity_by_motion, out_by_motion, out_by_v = self._turn_derivatives(q, v, native)
+        velocity_by_motion, out_by_motion, out_by_v = turn_derivatives(self.coordinates, q, v, native)
         residual = np.hstack(
             [
                 by_q @ Q + by_v @ velocity_by_motion + np.diag(self.stiffness),
@@ -119,11 +117,7 @@ class PinocchioEngine:
         return np.asarray(upper + np.triu(upper, 1).T)
 
     def _q(self, q: Array) -> Array:
-        native = np.array(q)
-        for i, _ in self.coordinates.free:
-            quaternion = q[i : i + 4] / np.linalg.norm(q[i : i + 4])
-            native[i : i + 3], native[i + 3 : i + 7] = q[i + 4 : i + 7], quaternion[[1, 2, 3, 0]]
-        return native
+        return native_positions(self.coordinates, q)
 
     def _single(self, q: Array) -> Array:
         """(nv,) the positions of hinges and slides."""
@@ -131,31 +125,6 @@ class PinocchioEngine:
         for i, j in self.coordinates.single:
             found[j] = q[i]
         return found
-
-    def _turn(self, q: Array) -> Array:
-        """Q (nv, nv)."""
-        Q = np.eye(self.nv)
-        for i, j in self.coordinates.free:
-            R_t = rotation(q[i : i + 4]).T
-            Q[j : j + 6, j : j + 6] = np.block([[np.zeros((3, 3)), R_t], [R_t, np.zeros((3, 3))]])
-        return Q
-
-    def _turning(self, v: Array) -> Array:
-        """(nv,) w x v of free bodies."""
-        found = np.zeros(self.nv)
-        for _, j in self.coordinates.free:
-            found[j + 3 : j + 6] = np.cross(v[j : j + 3], v[j + 3 : j + 6])
-        return found
-
-    def _turn_derivatives(self, q: Array, v: Array, native: Array) -> tuple[Array, Array, Array]:
-        """(nv, nv) of Q v by small motion at fixed v; of Q' a_native + w x v by small motion, and by v."""
-        into, out, out_v = np.zeros((3, self.nv, self.nv))
-        for i, j in self.coordinates.free:
-            R, turn, move = rotation(q[i : i + 4]), slice(j, j + 3), slice(j + 3, j + 6)
-            into[turn, turn], into[move, turn] = R.T @ skew(v[move]), R.T @ skew(v[turn])
-            out[turn, turn], out[move, turn] = -skew(R @ native[move]), -skew(R @ native[turn])
-            out_v[move, turn], out_v[move, move] = -skew(v[move]), skew(v[turn])
-        return into, out, out_v
 
     @property
     def contract(self) -> EngineContract:
@@ -204,36 +173,3 @@ class PinocchioEngine:
                 )
             )  # fmt: skip
         return tuple(found)
-
-
-def _build(links: tuple[Link, ...], gravity: Array) -> tuple[Any, float]:
-    """The pin.Model, and the potential energy of what is fixed to the world."""
-    model, fixed = pin.Model(), 0.0
-    model.gravity.linear = gravity
-    carrier: dict[str, tuple[int, Any]] = {"world": (0, pin.SE3.Identity())}
-    for link in links:
-        parent, pose = carrier[link.parent]
-        frame, in_frame = pose * _pose(link.on_parent), _pose(link.on_child.inverse())
-        if link.kind == "weld":
-            carrier[link.body] = (parent, frame * in_frame)
-        else:
-            carrier[link.body] = (model.addJoint(parent, _joint(link), frame, link.joint), in_frame)
-        number, pose = carrier[link.body]
-        model.appendBodyToJoint(number, pin.Inertia(link.mass, link.center_of_mass, link.inertia), pose)
-        if number == 0:
-            fixed -= link.mass * float(gravity @ pose.act(link.center_of_mass))
-    starts = [x.v_start for x in links if x.kind != "weld"]
-    if list(model.idx_vs)[1:] != starts:
-        raise ModelError(f"joints in the order of v: expected starts {starts}, got {list(model.idx_vs)[1:]}")
-    return model, fixed
-
-
-def _joint(link: Link) -> Any:
-    if link.kind == "quaternion_floating":
-        return pin.JointModelFreeFlyer()
-    kind = pin.JointModelRevoluteUnaligned if link.kind == "revolute" else pin.JointModelPrismaticUnaligned
-    return kind(link.axis / np.linalg.norm(link.axis))
-
-
-def _pose(X: RigidTransform) -> Any:
-    return pin.SE3(np.array(X.rotation().matrix()), np.array(X.translation()))

@@ -1,0 +1,272 @@
+"""Many steps linearized in one call, by Pinocchio where that is certified: closed forms, AutoDiffXd, and refusals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import MODELS, random_state
+from pydrake.multibody.tree import RpyFloatingJoint
+from test_engines import ROBOTS, G, free_state, robot
+from test_implicit import POINT, floating, in_the_air, limited_pendulum, springs_and_motors
+
+import drake_diff as dd
+from drake_diff.analytic import _FOUND, analytic_of, build_analytic, certified
+from drake_diff.parameters import applied, select
+
+NAMES = sorted(path.name for path in MODELS.iterdir())
+SAME = 1e-9  # of the largest entry, as the gate has it: one derivative in two orders of operations
+
+
+@pytest.fixture(autouse=True)
+def _pinocchio():
+    pytest.importorskip("pinocchio", reason="pip install 'drake-diff[fast]'")
+
+
+def equal(model, xs, us, method="auto", expected=("analytic",), **known):
+    """linearize, each step of it confirmed by AutoDiffXd."""
+    A, B, methods = dd.linearize(model, xs, us, method, **known)
+    assert A.shape == (len(us), model.nx, model.nx)
+    assert B.shape == (len(us), model.nx, model.nu)
+    for k, u in enumerate(us):
+        d = dd.differentiate_step(model, xs[k], u, method="autodiff")
+        ours, theirs = np.hstack([A[k], B[k]]), np.hstack([d.A, d.B])
+        assert np.abs(ours - theirs).max() <= SAME * np.abs(theirs).max(), k
+    assert set(methods) == set(expected)
+    return A, B, methods
+
+
+# ---- closed forms --------------------------------------------------------------------------------------------------
+
+
+def test_the_damped_pendulum_a03(load):
+    """theta'' = (u - m g l sin theta - d theta') / (m l^2) with damping implicit, at three states in one call."""
+    theta, h, gl = np.array([0.7, -2.0, 3.0]), 0.01, G / 0.5
+    s, c = 1 / (1 + h * 0.1 / 0.25), np.cos(theta)
+    xs = np.column_stack([theta, [-1.2, 0.0, 2.0]])
+    A, B, methods = dd.linearize(load("pendulum.urdf"), xs, [[0.3], [0.0], [-0.1]])
+    one = np.ones(3)
+    expected = np.array([[1 - h * h * s * gl * c, h * s * one], [-h * s * gl * c, s * one]]).transpose(2, 0, 1)
+    np.testing.assert_allclose(A, expected, rtol=1e-12)  # numbers of the URDF, 12 digits as Drake reads them
+    np.testing.assert_allclose(B[:, :, 0], np.outer(one, [h * h * s / 0.25, h * s / 0.25]), rtol=1e-12)
+    assert methods == ("analytic",) * 3
+
+
+def test_a_thrown_body_a01(load):
+    """A hundred steps' product is N h by velocity."""
+    model, x = load("projectile.sdf"), np.array([1.0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 2, 1, 5])
+    xs = dd.rollout(model, x, num_steps=100).xs
+    A, B, methods = dd.linearize(model, xs, np.zeros((100, 0)))
+    np.testing.assert_allclose(np.linalg.multi_dot(A[::-1])[4:7, 10:13], np.eye(3), atol=1e-12)
+    assert B.shape == (100, 13, 0)
+    assert set(methods) == {"analytic"}
+
+
+# ---- AutoDiffXd ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_model_of_this_repository(load, name):
+    model, random = load(name), np.random.default_rng(5)
+    xs = np.array([in_the_air(model, random_state(model, random, 0.7)) for _ in range(4)])
+    us = random.standard_normal((4, model.nu))
+    free = equal(model, xs, us)
+    known = np.array([dd.step(model, x, u) for x, u in zip(xs, us, strict=True)])
+    assert all(np.array_equal(a, b) for a, b in zip(free, equal(model, xs, us, x_next=known), strict=True))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_real_robots(tmp_path, name):
+    model, random = robot(name, tmp_path), np.random.default_rng(5)
+    xs = np.array([free_state(model, random) for _ in range(3)])
+    equal(model, xs, 0.3 * random.standard_normal((3, model.nu)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_free_body_with_a_sprung_arm_turned_by_a_quaternion_of_any_norm(seed):
+    model, random = floating(None, seed), np.random.default_rng(seed)
+    x = random_state(model, random)
+    x[:4] *= 1.1
+    equal(model, x[None], random.standard_normal((1, 1)))
+    x_next, d = dd.step(model, x, [0.2]), dd.differentiate_step(model, x, [0.2], method="analytic")
+    assert d.method == "analytic"
+    assert np.array_equal(d.x_next, x_next)  # Drake's own
+    by_differences = dd.differentiate_step(model, x, [0.2], method="finite_difference")
+    np.testing.assert_allclose(d.A, by_differences.A, atol=1e-7)  # central differences with step 1e-5
+
+
+@pytest.mark.parametrize("kp", [(0.0, 0.0, 0.0), (20.0, 5.0, 8.0), (0.0, 30.0, 0.0), (3000.0, 900.0, 400.0)])
+def test_springs_damping_gears_and_pd_control(kp):
+    model = springs_and_motors(kp=kp, gear=-12.0)
+    equal(model, np.array([POINT[0], np.zeros(6)]), np.array([POINT[1], [1.0, 2.0, 3.0]]))
+
+
+def test_inputs_at_their_effort_limits_have_no_effect():
+    model = springs_and_motors(limit=3.0)
+    _, B, _ = equal(model, np.array([POINT[0]] * 2), np.array([[30.0, -0.3, -0.2], [0.4, 3.1, -9.0]]))
+    assert not B[0, :, 0].any()
+    assert not B[1, :, 1:].any()
+    assert np.all(np.abs(B[0, :, 1:]).max(axis=0) > 0)
+
+
+# ---- steps that are not smooth go elsewhere, and say so --------------------------------------------------------------
+
+
+def test_steps_in_contact_are_taken_by_others_and_named(load):
+    model = load("sphere_on_ground.sdf", time_step=0.005)
+    x = model.default_state
+    x[6] = 0.12
+    xs = dd.rollout(model, x, num_steps=30).xs
+    us = np.zeros((30, 0))
+    _, _, methods = equal(model, xs, us, expected=("analytic", "autodiff"))
+    touches = [bool(contacts) for contacts in dd.rollout(model, x, num_steps=30).contacts]
+    assert [m != "analytic" for m in methods] == touches
+    assert equal(model, xs, us, expected=set(methods), x_next=xs[1:])[2] == methods  # without Drake's steps
+    reasons = {d.method: d.reason for d in (dd.differentiate_step(model, xs[k], method="analytic") for k in (0, -1))}
+    assert reasons["analytic"] == "asked for"
+    assert "not analytic: geometries touch" in reasons["autodiff"]
+
+
+def test_a_joint_limit_that_acts_is_no_smooth_step():
+    model = limited_pendulum()
+    xs, us = np.array([[0.3, 0.2], [0.999, 2.0]]), np.array([[0.1], [0.1]])
+    _, _, methods = equal(model, xs, us, expected=("analytic", "autodiff"))
+    assert methods[0] == "analytic"
+    free = np.array([dd.step(model, xs[0], us[0]), xs[1] + 0.01])  # the second is not where the step leads
+    assert equal(model, xs, us, expected=methods, x_next=free)[2] == methods
+
+
+def test_a_controller_at_its_limit_is_no_smooth_step():
+    """Gains that hold the joints near their references, and inputs that do and do not exceed 30 N or N m."""
+    model = springs_and_motors(limit=30.0, kp=(20.0, 5.0, 8.0))
+    xs, us = np.array([POINT[0]] * 2), np.array([POINT[1], [0.4, 900.0, -900.0]])
+    _, _, methods = equal(model, xs, us, expected=("analytic", "implicit"))
+    assert methods[0] == "analytic"
+    hardly_ever_free = springs_and_motors(limit=1e-3, kp=(20.0, 5.0, 8.0))
+    assert "controllers are at their limits in all but" in analytic_of(hardly_ever_free)
+
+
+def test_x_next_that_is_wrong_is_found(load):
+    model = load("double_pendulum.urdf")
+    xs, us = np.array([[0.4, -0.9, 1.3, -0.6]]), np.array([[0.25, -0.15]])
+    wrong = dd.step(model, xs[0], us[0])[None] + [[0, 0, 1e-8, 0]]
+    _, _, methods = equal(model, xs, us, x_next=wrong, expected=("analytic",))  # of the step itself
+    assert methods == ("analytic",)
+
+
+# ---- the gate ------------------------------------------------------------------------------------------------------
+
+
+def test_a_doctored_inertia_is_caught(load):
+    model = load("acrobot.xml")
+    analytic = build_analytic(model)
+    assert certified(model, analytic) is analytic
+    analytic.pinocchio.inertias[2].mass *= 1 + 1e-6
+    assert "its step differs from Drake's" in certified(model, analytic)
+
+
+@pytest.mark.parametrize("part", ["ddq_dq", "ddq_dv", "Minv"])
+def test_a_derivative_that_is_not_its_steps_is_caught(load, part):
+    model = load("acrobot.xml")
+    analytic = build_analytic(model)
+
+    def wrong(pinocchio, data, *point):
+        analytic.derivatives(pinocchio, data, *point)
+        matrix = getattr(data, part)  # a view
+        matrix[:] *= 1 + 1e-4
+
+    assert "its Jacobian differs from AutoDiffXd's" in certified(model, replace(analytic, derivatives=wrong))
+
+
+def test_other_parameters_are_never_answered_by_the_models_own(load):
+    """Pinocchio's model is built from the defaults."""
+    model, x, u = load("double_pendulum.urdf"), np.array([0.4, -0.9, 1.3, -0.6]), np.array([0.25, -0.15])
+    own = dd.differentiate_step(model, x, u)
+    assert own.method == "analytic"
+    name = next(p.name for p in dd.list_parameters(model) if p.name.endswith(".mass"))
+    vector = select(model, {name: 2 * next(p.value for p in dd.list_parameters(model) if p.name == name)})
+    with applied(vector) as heavier:
+        assert isinstance(analytic_of(heavier), str)
+        A, _, methods = dd.linearize(heavier, x[None], u[None], "analytic")
+        exact = dd.differentiate_step(model, x, u, parameters=vector.to_dict(), method="autodiff")
+    assert "analytic" not in methods
+    assert np.abs(A[0] - exact.A).max() <= SAME * np.abs(exact.A).max()
+    assert np.abs(A[0] - own.A).max() > 1e-4
+    assert dd.differentiate_step(model, x, u).method == "analytic"
+
+
+def test_derivatives_by_parameters_keep_their_source(load):
+    d = dd.differentiate_step(
+        load("pendulum.urdf"), [0.7, -1.2], [0.3], parameters=("hinge.damping",), method="analytic"
+    )
+    assert d.method in ("implicit", "autodiff")
+    assert "not analytic: derivatives by parameters are asked for" in d.reason
+    assert d.C.shape == (2, 1)
+
+
+def test_a_model_that_pinocchio_is_not_given_says_why():
+    model = floating(RpyFloatingJoint, 0)
+    assert "joint free is of type rpy_floating" in analytic_of(model)
+    d = dd.differentiate_step(model, np.full(model.nx, 0.1), [0.3])
+    assert d.method in ("implicit", "autodiff")
+    assert "not analytic: " in d.reason
+    locked = springs_and_motors()
+    for twin in (locked.double, locked.autodiff):
+        twin.plant.GetJointByName("hinge1").Lock(twin.context)
+    assert analytic_of(locked) == "a joint is locked"
+
+
+def test_without_pinocchio_the_others_serve(load, without_pinocchio):
+    model = load("double_pendulum.urdf")
+    xs, us = np.array([[0.4, -0.9, 1.3, -0.6]] * 2), np.array([[0.25, -0.15]] * 2)
+    _, _, methods = dd.linearize(model, xs, us)
+    assert set(methods) <= {"implicit", "autodiff"}
+    assert "pip install 'drake-diff" in dd.differentiate_step(model, xs[0], us[0], method="analytic").reason
+
+
+@pytest.mark.parametrize(
+    ("xs", "us", "wanted"),
+    [
+        (np.zeros((4, 2)), np.zeros((2, 1)), r"xs: expected shape \(2 or 3, 2\)"),
+        (np.zeros((2, 3)), np.zeros((2, 1)), r"xs: expected shape \(N, 2\)"),
+        (np.full((2, 2), np.nan), np.zeros((2, 1)), "a finite number"),
+        (np.zeros((2, 2)), np.zeros((2, 2)), r"us: expected shape \(N, 1\)"),
+    ],
+)
+def test_bad_input_is_named(load, xs, us, wanted):
+    with pytest.raises(dd.InputError, match=wanted):
+        dd.linearize(load("pendulum.urdf"), xs, us)
+    with pytest.raises(dd.UnknownNameError, match="analytic"):
+        dd.linearize(load("pendulum.urdf"), np.zeros((2, 2)), np.zeros((2, 1)), "guess")
+
+
+# ---- who uses it ---------------------------------------------------------------------------------------------------
+
+
+def with_and_without(load, f):
+    found = []
+    for source in ("analytic", "another"):
+        model = load("double_pendulum.urdf", time_step=0.02)
+        if source == "another":
+            _FOUND[model] = "switched off by a test"
+        assert (dd.differentiate_step(model, np.zeros(4), np.zeros(2)).method == "analytic") == (source == "analytic")
+        found.append(f(model))
+    return found
+
+
+def test_ilqr_is_the_same_with_and_without(load):
+    def solved(model):
+        cost = dd.QuadraticCost(Q=np.eye(4), R=0.1 * np.eye(2), x_ref=[0.5, -0.3, 0, 0])
+        return dd.solve(dd.Problem(model, x0=np.zeros(4), num_steps=30, running_cost=cost), method="ilqr")
+
+    ours, theirs = with_and_without(load, solved)
+    np.testing.assert_allclose(ours.xs, theirs.xs, atol=1e-9)
+    np.testing.assert_allclose(ours.us, theirs.us, atol=1e-9)
+
+
+def test_tvlqr_is_the_same_with_and_without(load):
+    def gains(model):
+        us = 0.2 * np.random.default_rng(0).standard_normal((20, 2))
+        return dd.TVLQR(model, dd.rollout(model, [0.4, -0.9, 1.3, -0.6], us).xs, us, np.eye(4), np.eye(2)).gains
+
+    ours, theirs = with_and_without(load, gains)
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
