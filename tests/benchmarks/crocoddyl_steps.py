@@ -36,6 +36,7 @@ class Side:
     def linearization(self, horizon: int):
         if horizon not in self.problems:
             self.problems[horizon] = crocoddyl.ShootingProblem(self.x, [self.model] * horizon, self.model)
+            self.problems[horizon].nthreads = 1  # the others have one too
         problem, us = self.problems[horizon], [self.u] * horizon
         xs = problem.rollout(us)
         problem.calc(xs, us)

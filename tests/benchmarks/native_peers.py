@@ -3,15 +3,23 @@
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from cases import Case
-from peers import QUANTITIES, Casadi, DrakeAutodiff, DrakeDiff, DrakeDifferences, Engine, Linear, Peer, Pinocchio
-from peers import PinocchioAlone
-from timing import Block, block
+from peers import (
+    Casadi,
+    DrakeAutodiff,
+    DrakeDiff,
+    DrakeDifferences,
+    Engine,
+    Linear,
+    Peer,
+    Pinocchio,
+    PinocchioAlone,
+)
+from timing import Block
 
 import drake_diff as dd
 from drake_diff.engines.description import describe

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from cases import BY_HORIZON, CASES, HORIZON, HORIZONS, Case, case
+from cases import BY_HORIZON, HORIZON, HORIZONS, Case, case
 from native_peers import Mjx, peers_of
 from peers import BASE, QUANTITIES, Peer
 from timing import Sample, Spread, measure, ratios, spread

@@ -5,7 +5,7 @@ import os
 import platform
 import subprocess
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -17,9 +17,8 @@ from suite import Missing, Row
 from timing import Spread
 
 FORMAT = 1
-PACKAGES = (
-    "drake-diff drake numpy mujoco mujoco-mjx jax pin casadi adam-robotics example-robot-data"
-).split()
+SAME = 1e-6  # differences are up to 1e-8 off, another law of contact 1e-3
+PACKAGES = ["drake-diff", "drake", "numpy", "mujoco", "mujoco-mjx", "jax", "pin", "casadi", "adam-robotics"]
 ROOT = Path(__file__).parents[2]
 
 
@@ -72,7 +71,8 @@ def show(found: dict) -> None:
     about = found["machine"]
     console.print(
         f"{about['processor']}, {about['cores']} cores, load {about['load']:.1f} to {about['load_after']:.1f}; "
-        "processor time over the base's, median of rounds and half the distance of their quartiles"
+        f"{found['versions']['commit']}\nProcessor time over the base's: median of rounds, half the distance of their "
+        f"quartiles. * an answer more than {SAME:g} of its largest entry (1 at least) from the base's."
     )
     rows = found["rows"]
     for quantity, horizon in dict.fromkeys((r["quantity"], r["horizon"]) for r in rows if r["quantity"] != "solve"):
@@ -82,11 +82,25 @@ def show(found: dict) -> None:
         console.print(_solves(solves))
     if found["layers"]:
         console.print(_layers(found["layers"]))
-    for line in dict.fromkeys(f"{r['peer']}, {r['quantity']}: {r['how']}" for r in rows if r["how"]):
-        if ", solve:" not in line:
-            console.print(line, highlight=False)
-    for one in found["missing"]:
-        console.print(f"no {one['peer']} of {one['model']}, {one['quantity']}: {one['reason']}", highlight=False)
+    for line in [*_how(rows), *_missing(found["missing"])]:
+        console.print(line, highlight=False)
+
+
+def _how(rows: list[dict]) -> Iterator[str]:
+    """A line a peer: what was called for which quantities."""
+    for peer in dict.fromkeys(row["peer"] for row in rows if row["quantity"] != "solve"):
+        told = dict.fromkeys((r["how"], r["quantity"]) for r in rows if r["peer"] == peer and r["quantity"] != "solve")
+        by = {how: [q for h, q in told if h == how] for how, _ in told}
+        yield f"{peer}: " + "; ".join(f"{', '.join(quantities)}: {how}" for how, quantities in by.items())
+
+
+def _missing(missing: list[dict]) -> Iterator[str]:
+    """A line a reason, with the models it is of."""
+    models: dict[tuple[str, str, str], list[str]] = {}
+    for one in missing:
+        models.setdefault((one["peer"], one["quantity"], one["reason"]), []).append(one["model"])
+    for (peer, quantity, reason), names in models.items():
+        yield f"no {peer}, {quantity}, of {', '.join(names)}: {reason}"
 
 
 def seconds(value: float) -> str:
@@ -117,7 +131,7 @@ def _ratios(title: str, rows: list[dict]) -> Table:
 
 def _apart(gap: float | None) -> str:
     """A mark where the answer is another than the base's."""
-    return " *" if gap is not None and gap > 1e-6 else ""
+    return " *" if gap is not None and gap > SAME else ""
 
 
 def _solves(rows: Iterable[dict]) -> Table:
