@@ -12,6 +12,7 @@ Crocoddyl runs in the environment whose Python $CROCODDYL_PYTHON names (see croc
 import argparse
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
@@ -45,21 +46,32 @@ def chosen(only: str, quick: bool) -> tuple[list[str], list[str], list[str]]:
     return models, kinds, solves if "solve" in kinds else []
 
 
-def run(only: str, quick: bool) -> dict:
-    """The suite, as the JSON has it."""
+def run(only: str, quick: bool, out: Path | None) -> dict:
+    """The suite, as the JSON has it; `out` has what there is after each model."""
     models, kinds, solves = chosen(only, quick)
-    before, rows, missing = machine(), [], []
-    quantities = [kind for kind in kinds if kind in QUANTITIES]
-    found = [*(measured(models, quantities, quick) if quantities else ()), *solved(solves, quick)]
-    rows = [one for one in found if isinstance(one, Row)]
-    missing = [one for one in found if isinstance(one, Missing)]
-    parts = _layers(models) if "layers" in kinds else []
-    return document(rows, missing, parts, before, {"only": only, "quick": quick})
+    before, quantities = machine(), [kind for kind in kinds if kind in QUANTITIES]
+    found: list[Row | Missing | Layers] = []
+    for part in _parts(models, quantities, solves, "layers" in kinds, quick):
+        found += part
+        rows, missing, parts = ([one for one in found if isinstance(one, kind)] for kind in (Row, Missing, Layers))
+        whole = document(rows, missing, parts, before, {"only": only, "quick": quick})
+        if out:
+            save(out, whole)
+    return whole
 
 
-def _layers(models: list[str]) -> list[Layers]:
-    cases = [case(name) for name in models if name in LAYERS_OF]
-    return [layers(one, q, 0 if q in QUANTITIES[:2] else LAYERS_HORIZON) for one in cases for q in QUANTITIES]
+def _parts(
+    models: list[str], quantities: list[str], solves: list[str], split: bool, quick: bool
+) -> Iterator[list[Row | Missing] | list[Layers]]:
+    for name in models:
+        yield [*measured(name, quantities, quick)] if quantities else []
+        yield _layers(name) if split and name in LAYERS_OF else []
+    yield [*solved(solves, quick)]
+
+
+def _layers(name: str) -> list[Layers]:
+    one = case(name)
+    return [layers(one, kind, 0 if kind in QUANTITIES[:2] else LAYERS_HORIZON) for kind in QUANTITIES]
 
 
 def main() -> None:
@@ -73,12 +85,9 @@ def main() -> None:
         if given.compare:
             compare.show(*compare.changes(*(compare.read(path) for path in given.compare)))
             return
-        found = run(given.only, given.quick)
+        show(run(given.only, given.quick, given.out))
     except (InputError, UnknownNameError) as error:
         sys.exit(str(error))
-    if given.out:
-        save(given.out, found)
-    show(found)
 
 
 if __name__ == "__main__":

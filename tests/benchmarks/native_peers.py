@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 from pathlib import Path
 from typing import Any, ClassVar
@@ -25,7 +26,7 @@ import drake_diff as dd
 from drake_diff.engines.description import describe
 from drake_diff.engines.urdf import urdf
 
-LARGEST_MJX = 10  # joints; a chain of 20 takes minutes to compile
+LARGEST_MJX = 7  # velocities; what has more compiles for minutes
 SMALL = 1e-6  # of mjd_transitionFD, as in its own documentation
 
 
@@ -86,8 +87,8 @@ class Mjx(Native):
     how: ClassVar = {"": "jax.jit, jax.jacfwd in float64 on the CPU, one call a step; all threads' time"}
 
     def __init__(self, case: Case):
-        if case.model.nv > LARGEST_MJX and not case.floats:
-            raise dd.ModelError(f"more than {LARGEST_MJX} joints take minutes to compile")
+        if case.model.nv > LARGEST_MJX:
+            raise dd.ModelError(f"left out: more than {LARGEST_MJX} velocities compile for minutes")
         super().__init__(case)
         import jax
 
@@ -128,6 +129,8 @@ class Crocoddyl(Peer):
         python = os.environ.get("CROCODDYL_PYTHON")
         if not python:
             raise dd.MissingDependencyError("no $CROCODDYL_PYTHON: see crocoddyl_peer.py for its environment")
+        if not shutil.which(python):
+            raise dd.MissingDependencyError(f"$CROCODDYL_PYTHON: expected a Python, got {python}")
         if case.floats:
             raise dd.ModelError("its side here is for joints on a fixed base alone")
         self.actuation = describe(case.model).actuation
@@ -180,6 +183,6 @@ def peers_of(case: Case, left_out: set[str]) -> tuple[list[Peer], dict[str, str]
             continue
         try:
             found.append(kind(case))
-        except (dd.ModelError, dd.MissingDependencyError) as error:
+        except (dd.ModelError, dd.MissingDependencyError, dd.SimulationError) as error:
             missing[kind.name] = str(error)
     return found, missing

@@ -138,7 +138,7 @@ class DrakeDiff(Peer):
         super().__init__(case)
         method = dd.differentiate_step(self.model, self.x, self.u).method
         self.public = getattr(dd, "linearize", None)
-        many = "dd.linearize" if self.public else "a loop of dd.differentiate_step"
+        many = "dd.step, then dd.linearize of all" if self.public else "a loop of dd.differentiate_step"
         self.how = {
             "step": "dd.step",
             "step_jacobian": f"dd.differentiate_step ({method})",
@@ -155,7 +155,10 @@ class DrakeDiff(Peer):
 
     def linearization(self, horizon: int) -> Any:
         if self.public:
-            return self.public(self.model, self.x, self.case.inputs(horizon))
+            xs, us = [self.x], self.case.inputs(horizon)
+            for u in us:
+                xs.append(dd.step(self.model, xs[-1], u))
+            return self.public(self.model, np.array(xs[:-1]), us, x_next=np.array(xs[1:]))
         return super().linearization(horizon)
 
     def rollout_gradient(self, horizon: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from timing import Sample, Spread, measure, ratios, spread
 import drake_diff as dd
 
 QUICK_MODELS = ("pendulum", "panda", "solo12", "sphere", "chain5")
-BUDGET, QUICK_BUDGET = 6.0, 1.0  # [s] of rounds for one model and quantity
+BUDGET, QUICK_BUDGET = 3.0, 1.0  # [s] of rounds for one model and quantity
 CHECKED = 10  # steps of a gradient that is compared before it is timed
 
 
@@ -49,20 +49,19 @@ class Missing:
     reason: str
 
 
-def measured(models: list[str], quantities: list[str], quick: bool) -> Iterator[Row | Missing]:
-    """Model by model, the rows of each quantity and horizon."""
-    for name in models:
-        chosen = case(name)
-        found, refused = peers_of(chosen, {Mjx.name} if quick else set())
-        yield from (Missing(name, "all", peer, reason) for peer, reason in refused.items())
-        try:
-            for quantity in quantities:
-                for horizon in _horizons(name, quantity, quick):
-                    print(f"{name}, {quantity}{f' over {horizon}' if horizon else ''}", file=sys.stderr, flush=True)
-                    yield from _group(chosen, quantity, horizon, found, QUICK_BUDGET if quick else BUDGET)
-        finally:
-            for peer in found:
-                peer.close()
+def measured(name: str, quantities: list[str], quick: bool) -> Iterator[Row | Missing]:
+    """The rows of one model, of each quantity and horizon."""
+    chosen = case(name)
+    found, refused = peers_of(chosen, {Mjx.name} if quick else set())
+    yield from (Missing(name, "all", peer, reason) for peer, reason in refused.items())
+    try:
+        for quantity in quantities:
+            for horizon in _horizons(name, quantity, quick):
+                print(f"{name}, {quantity}{f' over {horizon}' if horizon else ''}", file=sys.stderr, flush=True)
+                yield from _group(chosen, quantity, horizon, found, QUICK_BUDGET if quick else BUDGET)
+    finally:
+        for peer in found:
+            peer.close()
 
 
 def _horizons(name: str, quantity: str, quick: bool) -> tuple[int, ...]:
