@@ -91,23 +91,32 @@ class Mjx(Native):
             raise dd.ModelError(f"left out: more than {LARGEST_MJX} velocities compile for minutes")
         super().__init__(case)
         import jax
+        from mujoco import mjx
 
-        from drake_diff.engines import mjx_engine
+        nq, nv = case.model.nq, case.model.nv
 
-        self.jax, self.functions = jax, mjx_engine
+        def stepped(m: Any, d: Any, z: Any) -> Any:
+            d = mjx.step(m, d.replace(qpos=z[:nq], qvel=z[nq : nq + nv], ctrl=z[nq + nv :]))
+            return jax.numpy.concatenate([d.qpos, d.qvel])
+
+        self.jax, self.stepped = jax, jax.jit(stepped)
+        self.derivative = jax.jit(jax.jacfwd(stepped, argnums=2))
 
     def run(self, function: Any, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         with self.jax.enable_x64(True):
-            return np.asarray(function(self.peer.mjx, self.peer.data, np.concatenate([x, u]))[0])
+            found = np.asarray(function(self.peer.mjx, self.peer.data, np.concatenate([x, u])))
+        if not np.all(np.isfinite(found)):
+            raise dd.GradientError("MJX's answer is not finite")
+        return found
 
     def step(self) -> np.ndarray:
-        return self.run(self.functions._step, self.x, self.u)
+        return self.run(self.stepped, self.x, self.u)
 
     def step_jacobian(self) -> np.ndarray:
-        return self.run(self.functions._step_derivative, self.x, self.u)
+        return self.run(self.derivative, self.x, self.u)
 
     def advance(self, x: np.ndarray, u: np.ndarray) -> Linear:
-        by, x_next = self.run(self.functions._step_derivative, x, u), self.run(self.functions._step, x, u)
+        by, x_next = self.run(self.derivative, x, u), self.run(self.stepped, x, u)
         nq = self.model.nq
         drakes = (self.native.to_drake(z[:nq], z[nq:]) for z in (x, x_next))
         return x_next, *self.native.on_tangent(*drakes, by)

@@ -211,7 +211,9 @@ class PinocchioAlone(Engine):
         import pinocchio
 
         self.pin, nq = pinocchio, case.model.nq
-        self.q, self.v = self.peer._q(self.x[:nq]), self.peer._turn(self.x[:nq]) @ self.x[nq:]
+        # Its time does not depend on where a free body is, whose coordinates are others there.
+        self.q = pinocchio.neutral(self.peer.pin) if case.floats else self.x[:nq]
+        self.v = self.x[nq:]
         self.effort = self.peer.actuation @ self.u
 
     def step(self) -> Any:

@@ -12,7 +12,7 @@ from pathlib import Path
 import collocation
 import ilqr
 from suite import Missing, Row, row
-from timing import Block, block, measure
+from timing import Block, block, measure, timed
 
 import drake_diff as dd
 
@@ -44,29 +44,29 @@ def _collocated(name: str, problem: dd.Problem, budget: float) -> Iterator[Row]:
     }
     if name == "kelly":
         calls["CasADi by hand, Hermite-Simpson"] = collocation.kelly_by_hand
-    told = {who: _told(*call()[1:]) for who, call in calls.items()}
+    firsts = {who: timed(call) for who, call in calls.items()}
     samples = measure({who: block(call) for who, call in calls.items()}, budget)
     about = {"model": name, "joints": problem.model.nv, "quantity": "solve", "horizon": problem.num_steps}
     for who, sample in samples.items():
-        yield row(about, who, told[who], sample, base, samples[base], None)
+        answer, first = firsts[who]
+        yield row(about, who, _told(*answer[1:]), first, sample, (base, samples[base]), None)
 
 
 def _reach(task: dict, budget: float) -> Iterator[Row | Missing]:
     who, python = "drake_diff iLQR", os.environ.get("CROCODDYL_PYTHON")
-    found, blocks = ilqr.ours(task), {who: block(lambda: ilqr.ours(task))}
-    told = {who: _told("solved" if found["ok"] else "not solved", found["cost"], found["iterations"])}
-    told[who] += ", the model's loading included"
+    firsts, blocks = {who: timed(lambda: ilqr.ours(task))}, {who: block(lambda: ilqr.ours(task))}
+    notes = {who: "the model's loading included", FDDP: "on the wall"}
     if python:
-        side = _crocoddyl(python, task)
-        told[FDDP] = _told("solved" if side["ok"] else "not solved", side["cost"], side["iterations"])
-        told[FDDP] += ", on the wall"
+        firsts[FDDP] = timed(lambda: _crocoddyl(python, task))
         blocks[FDDP] = _by_its_own_clock(python, task)
     else:
         yield Missing("panda_reach", "solve", FDDP, "no $CROCODDYL_PYTHON: see crocoddyl_peer.py")
     samples = measure(blocks, budget)
     about = {"model": "panda_reach", "joints": 7, "quantity": "solve", "horizon": task["count"]}
     for name, sample in samples.items():
-        yield row(about, name, told[name], sample, who, samples[who], None)
+        answer, first = firsts[name]
+        told = _told("solved" if answer["ok"] else "not solved", answer["cost"], answer["iterations"])
+        yield row(about, name, f"{told}, {notes[name]}", first, sample, (who, samples[who]), None)
 
 
 def _by_its_own_clock(python: str, task: dict) -> Block:

@@ -8,7 +8,7 @@ import numpy as np
 from cases import BY_HORIZON, HORIZON, HORIZONS, Case, case
 from native_peers import Mjx, peers_of
 from peers import BASE, QUANTITIES, Peer
-from timing import Sample, Spread, measure, ratios, spread
+from timing import Sample, Spread, measure, ratios, spread, timed
 
 import drake_diff as dd
 
@@ -27,7 +27,7 @@ class Row:
     horizon: int | None
     peer: str
     how: str
-    first: float  # of the first call, on the wall
+    first: float  # on the wall, of the first call, of CHECKED steps where it has a horizon
     calls: int  # in one block
     blocks: int
     wall: Spread
@@ -74,13 +74,13 @@ def _horizons(name: str, quantity: str, quick: bool) -> tuple[int, ...]:
 
 
 def _group(case: Case, quantity: str, horizon: int, peers: list[Peer], budget: float) -> Iterator[Row | Missing]:
-    able, gaps = {}, {}
-    base = None
+    able, gaps, first, base = {}, {}, {}, None
     for peer in peers:
         reason = peer.missing.get(quantity)
         try:
             if reason is None:
-                answer = peer.in_drake(quantity, peer.answer(quantity, CHECKED))
+                found, first[peer.name] = timed(lambda peer=peer: peer.answer(quantity, CHECKED))
+                answer = peer.in_drake(quantity, found)
                 base = answer if peer.name == BASE else base
                 gaps[peer.name], able[peer.name] = _gap(answer, base), peer
         except (dd.GradientError, dd.SimulationError) as error:
@@ -92,22 +92,24 @@ def _group(case: Case, quantity: str, horizon: int, peers: list[Peer], budget: f
     for name, sample in samples.items():
         how = able[name].how.get(quantity) or able[name].how.get("", "")
         about = {"model": case.name, "joints": case.model.nv, "quantity": quantity, "horizon": horizon or None}
-        yield row(about, name, how, sample, BASE, samples[BASE], gaps[name])
+        yield row(about, name, how, first[name], sample, (BASE, samples[BASE]), gaps[name])
 
 
-def row(about: dict, peer: str, how: str, sample: Sample, base: str, unit: Sample, gap: float | None) -> Row:
-    """`unit` is the sample of `base`; `about` has model, joints, quantity and horizon."""
+def row(
+    about: dict, peer: str, how: str, first: float, sample: Sample, base: tuple[str, Sample], gap: float | None
+) -> Row:
+    """`about` has model, joints, quantity and horizon."""
     return Row(
         **about,
         peer=peer,
         how=how,
-        first=sample.first,
+        first=first,
         calls=sample.calls,
         blocks=len(sample.cpu),
         wall=spread(sample.wall),
         cpu=spread(sample.cpu),
-        base=base,
-        ratio=spread(ratios(sample, unit)),
+        base=base[0],
+        ratio=spread(ratios(sample, base[1])),
         gap=gap,
     )
 

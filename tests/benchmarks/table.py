@@ -89,9 +89,11 @@ def show(found: dict) -> None:
 def _how(rows: list[dict]) -> Iterator[str]:
     """A line a peer: what was called for which quantities."""
     for peer in dict.fromkeys(row["peer"] for row in rows if row["quantity"] != "solve"):
-        told = dict.fromkeys((r["how"], r["quantity"]) for r in rows if r["peer"] == peer and r["quantity"] != "solve")
+        own = [row for row in rows if row["peer"] == peer and row["quantity"] != "solve"]
+        told = dict.fromkeys((row["how"], row["quantity"]) for row in own)
         by = {how: [q for h, q in told if h == how] for how, _ in told}
-        yield f"{peer}: " + "; ".join(f"{', '.join(quantities)}: {how}" for how, quantities in by.items())
+        calls = "; ".join(f"{', '.join(quantities)}: {how}" for how, quantities in by.items())
+        yield f"{peer}: {calls}; first calls up to {seconds(max(row['first'] for row in own))}"
 
 
 def _missing(missing: list[dict]) -> Iterator[str]:

@@ -10,7 +10,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 BLOCK = 0.02  # [s] of calls in one block, one call at least
 SHORT = 0.01  # [s] of calls that one is made before each block for, which does not count
@@ -29,7 +29,6 @@ class Spread(NamedTuple):
 class Sample:
     """Seconds a call, one number each block."""
 
-    first: float  # [s] on the wall of the first call
     calls: int
     wall: list[float] = field(default_factory=list)
     cpu: list[float] = field(default_factory=list)
@@ -47,8 +46,14 @@ def block(call: Callable[[], object]) -> Block:
     return run
 
 
+def timed(call: Callable[[], Any]) -> tuple[Any, float]:
+    """What it returns, and its seconds on the wall."""
+    start = time.perf_counter()
+    return call(), time.perf_counter() - start
+
+
 def measure(peers: Mapping[str, Block], budget: float) -> dict[str, Sample]:
-    """Up to ROUNDS rounds, FEWEST at least, the last begun before `budget` [s] is spent; first calls cost no budget."""
+    """Up to ROUNDS rounds, FEWEST at least, the last begun before `budget` [s] is spent."""
     samples = {name: _calibrated(run) for name, run in peers.items()}
     order, turn = list(peers), random.Random(0)
     start = time.perf_counter()
@@ -67,10 +72,10 @@ def measure(peers: Mapping[str, Block], budget: float) -> dict[str, Sample]:
 
 
 def _calibrated(run: Block) -> Sample:
-    first, calls = run(1)[0], 1
+    calls = 1
     while (wall := run(calls)[0]) < BLOCK:
         calls = max(2 * calls, int(calls * BLOCK / max(wall, 1e-6)))
-    return Sample(first, calls)
+    return Sample(calls)
 
 
 def spread(values: list[float]) -> Spread:
