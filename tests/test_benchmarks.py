@@ -162,7 +162,7 @@ def test_short_calls_are_made_many_times_in_a_block(part):
 def test_another_answer_than_the_bases_is_marked(part):
     suite, table = part("suite"), part("table")
     right = np.array([1.0, 10.0])
-    assert suite._gap(right + [0.0, 0.1], right) == pytest.approx(0.01, rel=1e-12)  # rounding
+    assert suite._gap(np.array([1.0, 10.1]), right) == pytest.approx(0.01, rel=1e-12)  # rounding
     assert suite._gap(None, right) is None
     assert [table._apart(gap) for gap in (None, 1e-9, 0.01)] == ["", "", " *"]
 

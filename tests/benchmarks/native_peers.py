@@ -33,6 +33,7 @@ SMALL = 1e-6  # of mjd_transitionFD, as in its own documentation
 class Native(Engine):
     """x is (qpos, qvel), the Jacobian that of MuJoCo's tangent coordinates."""
 
+    contact: ClassVar = True
     step_jacobian = Peer.step_jacobian
 
     def __init__(self, case: Case):

@@ -170,9 +170,12 @@ class Engine(Peer):
     """drake_diff's engine of a peer: Drake's coordinates and step, the peer's terms."""
 
     engine: ClassVar[str]
+    contact: ClassVar = False
 
     def __init__(self, case: Case):
         super().__init__(case)
+        if not self.contact and dd.load_engine("drake", case.model).contact_depth(case.x) > 0:
+            raise dd.ModelError("it has no contact here, and falls through the ground")
         self.peer: Any = dd.load_engine(self.engine, case.model)
 
     def step(self) -> np.ndarray:
