@@ -47,7 +47,7 @@ CALLS, REPEATS = 5, 15  # short blocks, of which a busy machine disturbs few
 
 @dataclass(frozen=True)
 class Layers:
-    """Seconds a call of each layer, medians; `clocks` is the time with them over the time without."""
+    """Seconds a call of each layer, medians; `clocks` is the time with them over the time without, in turns."""
 
     model: str
     quantity: str
@@ -88,15 +88,16 @@ def layers(case: Case, quantity: str, horizon: int) -> Layers:
     call = DrakeDiff(case).call(quantity, horizon)
     count = CALLS if quantity in ("step", "step_jacobian") else 1
     call()
-    clock = Clock()
-    plain = [_split(call, count, clock) for _ in range(REPEATS)]
-    with clocked(clock):
-        call()
-        found = [_split(call, count, clock) for _ in range(REPEATS)]
-    plain += [_split(call, count, clock) for _ in range(REPEATS)]
+    clock, plain, found = Clock(), [], []
+    for _ in range(REPEATS):
+        _split(call, count, clock)  # Python's caches of what was patched are filled anew
+        plain.append(sum(_split(call, count, clock).values()))
+        with clocked(clock):
+            _split(call, count, clock)
+            found.append(_split(call, count, clock))
     seconds = {layer: statistics.median(one[layer] for one in found) for layer in clock.seconds}
-    whole = statistics.median(sum(one.values()) for one in plain)
-    return Layers(case.name, quantity, horizon or None, seconds, sum(seconds.values()) / whole)
+    clocks = statistics.median(sum(one.values()) / without for one, without in zip(found, plain, strict=True))
+    return Layers(case.name, quantity, horizon or None, seconds, clocks)
 
 
 def _split(call: Callable[[], Any], count: int, clock: Clock) -> dict[str, float]:
