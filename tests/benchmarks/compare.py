@@ -15,7 +15,7 @@ from timing import Spread
 
 from drake_diff.exceptions import InputError
 
-LEAST = 1.1  # two runs of the same commit are up to 10 % apart with disjoint quartiles on a busy machine
+LEAST = 1.1  # less than quartiles of few rounds can be apart by chance
 KEY = ("model", "quantity", "horizon", "peer", "base")
 
 
