@@ -90,9 +90,7 @@ class Mjx(Native):
     """
 
     name, engine = "MJX", "mjx"
-    how: ClassVar = {
-        "": "jax.jit, jax.jacfwd in float64 on the CPU, one call a step; all threads' time; Drake's contact step is slower beside it"
-    }
+    how: ClassVar = {"": "jax.jit, jax.jacfwd, float64, CPU; all threads' time; it slows Drake's contact step"}
 
     def __init__(self, case: Case):
         if case.model.nv > LARGEST_MJX:
