@@ -46,7 +46,7 @@ def state(model: dd.Model, random: np.random.Generator) -> tuple[np.ndarray, np.
     lower, upper = model.plant.GetPositionLowerLimits(), model.plant.GetPositionUpperLimits()
     limited = np.isfinite(lower) & np.isfinite(upper)
     x = model.default_state
-    x[: model.nq][limited] = ((lower + upper) / 2)[limited] + 0.05 * random.standard_normal(int(limited.sum()))
+    x[: model.nq][limited] = (lower[limited] + upper[limited]) / 2 + 0.05 * random.standard_normal(int(limited.sum()))
     x[model.nq :] = 0.5 * random.standard_normal(model.nv)
     return x, 0.1 * random.standard_normal(model.nu)
 

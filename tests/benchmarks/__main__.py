@@ -1,0 +1,94 @@
+"""The benchmark suite: one command, one table, JSON where asked for.
+
+    pip install -e '.[bench]'
+    python tests/benchmarks [--quick] [--only panda,step_jacobian] [--out FILE.json]
+    python tests/benchmarks --compare OLD.json NEW.json
+
+Models: cases.CASES and the whole solves of solves.SOLVES; quantities: those of peers.QUANTITIES, solve and layers.
+--quick takes less than two minutes: five models, short horizons, no MJX. Peers that are not installed are named;
+Crocoddyl runs in the environment whose Python $CROCODDYL_PYTHON names (see crocoddyl_peer.py).
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(threads, "1")  # read when NumPy is imported: small matrices are slower on threads
+
+import compare  # noqa: E402
+from cases import CASES, case  # noqa: E402
+from layers import Layers, layers  # noqa: E402
+from peers import QUANTITIES  # noqa: E402
+from solves import QUICK_SOLVES, SOLVES, solved  # noqa: E402
+from suite import QUICK_MODELS, Missing, Row, measured  # noqa: E402
+from table import document, machine, save, show  # noqa: E402
+
+from drake_diff.exceptions import InputError, UnknownNameError  # noqa: E402
+
+KINDS = (*QUANTITIES, "solve", "layers")
+LAYERS_OF = ("pendulum", "panda", "solo12", "sphere", "chain30")
+LAYERS_HORIZON = 10
+
+
+def chosen(only: str, quick: bool) -> tuple[list[str], list[str], list[str]]:
+    """Models, quantities and whole solves: those of the names given, all of a kind of which none is."""
+    names = [name for name in only.split(",") if name]
+    for name in names:
+        if name not in (*CASES, *KINDS, *SOLVES):
+            raise UnknownNameError("benchmark", got=name, known=(*CASES, *KINDS, *SOLVES))
+    places = [name for name in names if name not in KINDS]
+    models = [n for n in CASES if (n in places if places else not quick or n in QUICK_MODELS)]
+    solves = [n for n in SOLVES if (n in places if places else not quick or n in QUICK_SOLVES)]
+    kinds = [n for n in KINDS if n in names] or list(KINDS)
+    return models, kinds, solves if "solve" in kinds else []
+
+
+def run(only: str, quick: bool, out: Path | None) -> dict:
+    """The suite, as the JSON has it; `out` has what there is after each model."""
+    models, kinds, solves = chosen(only, quick)
+    before, quantities = machine(), [kind for kind in kinds if kind in QUANTITIES]
+    found: list[Row | Missing | Layers] = []
+    for part in _parts(models, quantities, solves, "layers" in kinds, quick):
+        found += part
+        rows, missing, parts = ([one for one in found if isinstance(one, kind)] for kind in (Row, Missing, Layers))
+        whole = document(rows, missing, parts, before, {"only": only, "quick": quick})
+        if out:
+            save(out, whole)
+    return whole
+
+
+def _parts(
+    models: list[str], quantities: list[str], solves: list[str], split: bool, quick: bool
+) -> Iterator[list[Row | Missing] | list[Layers]]:
+    for name in models:
+        yield [*measured(name, quantities, quick)] if quantities else []
+        yield _layers(name) if split and name in LAYERS_OF else []
+    yield [*solved(solves, quick)]
+
+
+def _layers(name: str) -> list[Layers]:
+    one = case(name)
+    return [layers(one, kind, 0 if kind in QUANTITIES[:2] else LAYERS_HORIZON) for kind in QUANTITIES]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python tests/benchmarks", description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="less than two minutes")
+    parser.add_argument("--only", default="", help="models, quantities and solves, separated by commas")
+    parser.add_argument("--out", type=Path, help="where the JSON goes")
+    parser.add_argument("--compare", nargs=2, type=Path, metavar=("OLD", "NEW"), help="two saved runs")
+    given = parser.parse_args()
+    try:
+        if given.compare:
+            compare.show(*compare.changes(*(compare.read(path) for path in given.compare)))
+            return
+        show(run(given.only, given.quick, given.out))
+    except (InputError, UnknownNameError) as error:
+        sys.exit(str(error))
+
+
+if __name__ == "__main__":
+    main()
