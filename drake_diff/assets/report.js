@@ -55,6 +55,11 @@
     return [10 ** Math.min(bottom, top - 1), 10 ** top];
   }
   const levels = (xs) => () => [xs[0] / 1.3, xs[xs.length - 1] * 1.3];
+  function powers(low, high) {  // of ten, six of them at most
+    const first = Math.round(Math.log10(low)), last = Math.round(Math.log10(high));
+    const apart = Math.max(1, Math.ceil((last - first) / 5));
+    return Array.from({ length: Math.floor((last - first) / apart) + 1 }, (_, k) => 10 ** (first + k * apart));
+  }
   function range(plot) {
     return (u, low, high) => {
       if (plot.range) return plot.range;
@@ -97,7 +102,8 @@
       scales: { x: { time: false, distr: plot.levels ? 3 : 1, range: plot.levels ? levels(plot.x) : undefined }, y: { range: range(plot), distr: plot.log ? 3 : 1 } },
       legend: { live: plot.marks !== "points" },
       bands: plot.band ? [{ series: [plot.series.length, plot.series.length - 1], fill: () => colour("s0") + "33" }] : [],
-      axes: [{ ...axis, size: 30, ...(plot.levels ? { splits: () => plot.x, filter: (u, all) => all, values: (u, all) => all.map(shorten) } : {}) }, { ...axis, size: 58, values: (u, ticks) => ticks.map((v) => v === null ? "" : shorten(v)) }],
+      axes: [{ ...axis, size: 30, ...(plot.levels ? { splits: () => plot.x, filter: (u, all) => all, values: (u, all) => all.map(shorten) } : {}) }, { ...axis, size: 58, values: (u, ticks) => ticks.map((v) => v === null ? "" : shorten(v)),
+        ...(plot.log ? { splits: (u, i, low, high) => powers(low, high), filter: (u, ticks) => ticks } : {}) }],
       series: [{ label: plot.axis === "time" ? "t [s]" : plot.axis, value: (u, v) => shorten(v) }].concat(
         plot.series.map((s, i) => ({ label: s.name, stroke: () => colour("s" + (plot.band ? 0 : s.dashed ? i - solid : i) % 6), width: 1.8,
           dash: s.dashed ? [6, 4] : [], paths: plot.marks === "points" ? () => null

@@ -123,7 +123,7 @@ class CasadiEngine:
         D = np.diag(self.damping)
         effort = -self.actuation * (np.abs(u) <= self.limits)
         residual = np.hstack([by_q @ self.coordinates.rate(q), by_v + D, effort])
-        return -np.linalg.solve(self.mass_matrix(q) + self.time_step * D, residual)
+        return np.asarray(-np.linalg.solve(self.mass_matrix(q) + self.time_step * D, residual))
 
     @property
     def contract(self) -> EngineContract:

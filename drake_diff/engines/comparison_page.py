@@ -25,6 +25,7 @@ from drake_diff.html_parts import (
 )
 from drake_diff.report_data import Plot, certificate_data, line, plot
 
+SAME_TIME = 1e-6  # [s] clocks in single precision are within it
 MOST_PLOTS = 12  # of coordinates; those whose motions are furthest apart
 KINDS = {"same": "pass", "other law": "undecided", "other model": "fail", "unexplained": "fail"}
 APART = ("wall_clock", "files", "record_sha256")
@@ -57,8 +58,8 @@ def comparison_data(comparison: Comparison) -> dict[str, Any]:
 def _on(times: Array, motion: EngineMotion, values: Array) -> Array:
     """`values` (n,) of a motion at `times`, NaN where it has none."""
     found = np.full(len(times), np.nan)
-    at = np.searchsorted(times, motion.times - 1e-9)
-    known = (at < len(times)) & (np.abs(times[np.minimum(at, len(times) - 1)] - motion.times) < 1e-6)
+    at = np.searchsorted(times, motion.times - SAME_TIME)
+    known = (at < len(times)) & (np.abs(times[np.minimum(at, len(times) - 1)] - motion.times) < SAME_TIME)
     found[at[known]] = np.asarray(values)[known]
     return found
 

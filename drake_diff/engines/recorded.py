@@ -91,7 +91,7 @@ def _line(recording: Recording, ours: EngineContract, line: ContractLine) -> Con
         same = told == own
     else:
         theirs = _numbers(recording, quantity, told, len(own))
-        same = np.allclose(theirs, own, rtol=SAME_NUMBER[precision_of(recording)], atol=0.0)
+        same = np.allclose(theirs, np.array(own), rtol=SAME_NUMBER[precision_of(recording)], atol=0.0)
     if same:
         return ContractLine(quantity, "equal", told)
     return ContractLine(quantity, "different", f"{ours.engine}: {own}; {recording.name}: {told}")
