@@ -225,6 +225,19 @@ def test_workers_end_with_their_parent_in_the_middle_of_a_trial(write, tmp_path)
     wait_for(lambda: no_worker_lives(path), seconds=5)
 
 
+def test_no_worker_hears_ctrl_c_while_it_starts(write, tmp_path):
+    """Also not the first one, whose start runs multiprocessing's resource tracker, which unblocks the signal."""
+    path, out = write("cheap", seeds=100, seconds=0.02), tmp_path / "out"
+    process = start(path, out, "--workers", 2)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    wait_for(lambda: len(children.read_text().split()) >= 3)  # the tracker and both workers
+    time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGINT)
+    output = process.communicate(timeout=30)[0]
+    assert process.returncode == 130
+    assert "Traceback" not in output
+
+
 def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(write, tmp_path):
     path, out = write("cheap", seeds=100, seconds=0.02), tmp_path / "out"
     process = start(path, out, "--workers", 2)
