@@ -1,7 +1,6 @@
 """Certify a whole model: its step's derivatives at seeded states, in free motion and in contact, as one record."""
 
 import time
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
@@ -14,7 +13,7 @@ from drake_diff.contact import active_modes
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model import Model
 from drake_diff.parameters import Parameters, select
-from drake_diff.provenance import gradient_evidence, model_input, provenance_of
+from drake_diff.provenance import gradient_evidence, model_input, provenance_of, written_now
 from drake_diff.record_parts import WallClock
 from drake_diff.sampling import SampledState, sample_states
 from drake_diff.step import advance
@@ -47,7 +46,7 @@ def certify_model(
     found: list[StateEvidence] = []
 
     def record(verdict: Literal["pass", "fail", "incomplete"], sentence: str) -> CertificationRecord:
-        now = datetime.now(UTC).isoformat(timespec="seconds")
+        now = written_now()
         made = CertificationRecord(
             name=model.name,
             verdict=verdict,

@@ -67,7 +67,7 @@ def _certify_step(
         return step_at(model, vector, moved[: model.nx], moved[model.nx : end], moved[end:])
 
     def on_tangent(at: Array, d: StepDerivatives) -> Array:
-        return np.asarray(_on_tangent(space, at[: model.nx], d) * scale)
+        return space.jacobian(at[: model.nx], d.x_next, d.A, d.B, d.C) * scale
 
     d = given or step_jacobians(model, vector, x, u, method)
     beside = None
@@ -94,16 +94,6 @@ def _certify_step(
         subject=f"the step of {model.name}",
     )
     return replace(certificate, mode_changes=changes)
-
-
-def _on_tangent(space: TangentSpace, x: Array, d: StepDerivatives) -> Array:
-    """[A B C] from and to the tangent space."""
-    full = np.hstack([d.A, d.B, d.C])
-    free = full.shape[1] - space.nx
-    plus = np.zeros((full.shape[1], space.size + free))
-    plus[: space.nx, : space.size] = space.derivative_of_plus(x)
-    plus[space.nx :, space.size :] = np.eye(free)
-    return np.asarray(space.derivative_of_minus(d.x_next) @ full @ plus)
 
 
 def certify_rollout(

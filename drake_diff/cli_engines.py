@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from drake_diff.cli_options import Approximation, Geometry, Ground, ModelFile, TimeStep, WeldBase
 from drake_diff.cli_runs import plain, wide_console
 
 COLOURS = {"same": "green", "other law": "yellow", "other model": "red", "unexplained": "red"}
@@ -17,7 +18,7 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def compare(
-    model: Annotated[Path, typer.Argument(help="A URDF, SDF, MJCF (.xml) or .dmd.yaml file.")],
+    model: ModelFile,
     engines: Annotated[
         str | None, typer.Option(help="Names with commas between, drake:lagged among them; all where not given.")
     ] = None,
@@ -29,13 +30,11 @@ def compare(
     ] = None,
     seed: Annotated[int, typer.Option(help="The same seed gives the same start, inputs and states.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Directory; artifacts/compare_<model> where not given.")] = None,
-    time_step: Annotated[float, typer.Option(help="[s]")] = 0.01,
-    contact_approximation: Annotated[str, typer.Option(help="Drake's: sap, similar or lagged")] = "sap",
-    contact_geometry: Annotated[
-        str | None, typer.Option(help="Around refused pairs: corner_spheres, hydroelastic, differences")
-    ] = None,
-    weld_base: Annotated[str | None, typer.Option(help="A link to fix to the world.")] = None,
-    ground: Annotated[float | None, typer.Option(help="Friction [1] of a ground to add.")] = None,
+    time_step: TimeStep = 0.01,
+    contact_approximation: Approximation = "sap",
+    contact_geometry: Geometry = None,
+    weld_base: WeldBase = None,
+    ground: Ground = None,
 ) -> None:
     """Simulate MODEL in every engine on one contract, and say which are the same, which are not, and why.
 

@@ -3,7 +3,6 @@
 A run directory is written so that record.json is complete last: a run that is killed leaves one that says so.
 """
 
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from drake_diff.named_files import file_evidence
 from drake_diff.plan_file import PLAN, write_plan
 from drake_diff.problem import Problem
 from drake_diff.problem_record import UNITS, describe_problem
-from drake_diff.provenance import provenance_of
+from drake_diff.provenance import provenance_of, written_now
 from drake_diff.record import EvidenceRecord, reproducible
 from drake_diff.record_file import RECORD
 from drake_diff.record_parts import Event, FileEvidence, WallClock
@@ -133,7 +132,7 @@ def _complete(name: str, solution: Solution) -> EvidenceRecord:
 
 def _record(name: str, problem: Problem, solution: Solution | None = None, **fields: Any) -> EvidenceRecord:
     time_step = problem.model.time_step if solution is None else solution.time_step
-    written = datetime.now(UTC).isoformat(timespec="seconds")
+    written = written_now()
     return EvidenceRecord(
         name=name,
         claim=claim_of(problem),

@@ -143,7 +143,7 @@ class TVLQR:
         final = weights[0] if Qf is None else _weight("Qf", Qf, self._space.size)
         A, B, _ = linearize(model, self.xs, self.us)
         points = zip(self.xs[:-1], self.xs[1:], A, B, strict=True)
-        steps = [_on_tangent(self._space, *point) for point in points]
+        steps = [_split(self._space, self._space.jacobian(*point)) for point in points]
         gains, cost_to_go = _riccati(steps, *weights, final)
         self.gains, self.cost_to_go = frozen(gains), frozen(cost_to_go)
         self.parameters = frozen(self.gains.ravel())
@@ -244,12 +244,11 @@ def _check(numbers: Any, rows: Array, u: Array) -> None:
 def _tangent_step(model: Model, space: TangentSpace, x: Array, u: Array, x_to: Array) -> tuple[Array, Array, Array]:
     """(A (nt, nt), B (nt, nu), x_next): the step's Jacobians from the tangent space at `x` to the one at `x_to`."""
     d = differentiate_step(model, x, u)
-    return (*_on_tangent(space, x, x_to, d.A, d.B), d.x_next)
+    return (*_split(space, space.jacobian(x, x_to, d.A, d.B)), d.x_next)
 
 
-def _on_tangent(space: TangentSpace, x: Array, x_to: Array, A: Array, B: Array) -> tuple[Array, Array]:
-    lower = space.derivative_of_minus(x_to)
-    return lower @ A @ space.derivative_of_plus(x), lower @ B
+def _split(space: TangentSpace, jacobian: Array) -> tuple[Array, Array]:
+    return jacobian[:, : space.size], jacobian[:, space.size :]
 
 
 def _regulator(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:

@@ -3,6 +3,7 @@
 import platform
 import subprocess
 import sys
+from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -45,6 +46,11 @@ def model_input(model: Model) -> ModelInput:
         return ModelInput(file=None, options=None)
     plain = {key: v if v is None or isinstance(v, str) else np.asarray(v).tolist() for key, v in options.items()}
     return ModelInput(file=file_evidence(source, source.name), named=named_files(source), options=plain)
+
+
+def written_now() -> str:
+    """The wall clock, for the part of a record that differs from run to run."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def provenance_of() -> Provenance:

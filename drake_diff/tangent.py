@@ -75,6 +75,10 @@ class TangentSpace:
                 row += width
         return derivative
 
+    def jacobian(self, x: Array, x_next: Array, by_x: Array, *others: Array) -> Array:
+        """(size, size + ...): a step's Jacobians by x (nx, nx), by u, ... (nx, n) side by side, of tangents."""
+        return np.asarray(self.derivative_of_minus(x_next) @ np.hstack([by_x @ self.derivative_of_plus(x), *others]))
+
     def _blocks(self) -> list[tuple[int, int, bool]]:
         """(start, stop, whether it is a quaternion) of each quaternion and each run between them, in order."""
         blocks, start = [], 0

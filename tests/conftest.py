@@ -135,3 +135,18 @@ def random_state(model, random, size=1.0):
         x[:4] = random.standard_normal(4)
         x[:4] /= np.linalg.norm(x[:4])
     return x
+
+
+@pytest.fixture(scope="module")
+def pushed(tmp_path_factory):
+    """A cart-pole pushed for 10 steps, its pole not driven: the model, its motion, and a folder with its trace."""
+    from drake_diff.trace import write_trace
+
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
+    problem = dd.Problem(model, x0=[0, 0.3, 0, 0], num_steps=10, final_cost=lambda x: x[0] ** 2)
+    motion = dd.rollout(model, [0, 0.3, 0, 0], np.linspace(0.1, 1, 10)[:, None])
+    solution = dd.Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", motion.xs, motion.us)
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    folder.mkdir()
+    write_trace(folder / "trace.mcap", solution, {})
+    return model, motion, folder

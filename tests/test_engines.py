@@ -489,13 +489,17 @@ def test_a_weld_at_a_distance_is_drakes(name):
     assert_free_steps_agree(plant.model(), name, 1e-12, 1e-10)  # MuJoCo's Jacobian is of differences
 
 
-def test_geometry_that_mujoco_is_not_given_is_named(tmp_path):
+def tetrahedron_on_ground(tmp_path):
     (tmp_path / "t.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     plant = Plant(0.01)
     body = plant.plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
     plant.shape(body, Convex(str(tmp_path / "t.obj")), contact_properties(1e4))
     plant.ground(contact_properties(1e4))
-    model = plant.model()
+    return plant.model()
+
+
+def test_geometry_that_mujoco_is_not_given_is_named(tmp_path):
+    model = tetrahedron_on_ground(tmp_path)
     lines = dd.match_contracts(dd.load_engine("drake", model), engine_of("mujoco", model))
     detail = next(line.detail for line in lines if line.quantity == "contact pairs" and line.verdict == "different")
     assert "body_shape" in detail

@@ -50,7 +50,7 @@ loop.controllers loop.mpc panels.panel_file panels.trial_row panels.journal pane
 panels.workers panels.table panels.panel loop.perturbation loop.trial loop.sensitivity loop.robustness
 loop.robustness_record loop.robustness_words loop.trial_trace loop.trial_files loop.robustness_plots
 loop.robustness_page loop.robustness_files loop.panel_trial gradient_estimate gradient_descent gradient_panel_cases
-gradient_panel gradient_panel_files ros2_bag cli_mcap cli_runs cli_engines cli_panel cli_gradients cli_options
+gradient_panel gradient_panel_files ros2_bag cli_options cli_mcap cli_runs cli_engines cli_panel cli_gradients
 cli_export cli_view cli_contact cli_robustness cli
 """.split()
 

@@ -8,11 +8,11 @@ import pytest
 import test_contract_match
 from conftest import MODELS, Plant, contact_properties
 from forward_formula import formula, free_box, turned
-from pydrake.geometry import Box, Capsule, Convex, Cylinder
+from pydrake.geometry import Box, Capsule, Cylinder
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import SpatialInertia
 from test_contract_match import CHANGES, arms, different
-from test_engines import block_on_rails, free_state, robot
+from test_engines import block_on_rails, free_state, robot, tetrahedron_on_ground
 
 import drake_diff as dd
 
@@ -154,12 +154,7 @@ def test_contacts_are_drakes_pairs_and_a_shape_that_is_not_built_is_named(load, 
         model = load(name)
         found = different(dd.load_engine("drake", model), bullet(model)).keys()
         assert found <= {*OWN, "contact law", "bias(q, v)"}, name
-    (tmp_path / "t.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
-    plant = Plant(0.01)
-    body = plant.plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
-    plant.shape(body, Convex(str(tmp_path / "t.obj")), contact_properties(1e4))
-    plant.ground(contact_properties(1e4))
-    model = plant.model()
+    model = tetrahedron_on_ground(tmp_path)
     assert "body_shape" in different(dd.load_engine("drake", model), bullet(model))["contact pairs"]
 
 

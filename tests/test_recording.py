@@ -16,8 +16,6 @@ from drake_diff.cli import app
 from drake_diff.engines.comparison_words import sentence_of
 from drake_diff.engines.mjcf import mjcf
 from drake_diff.engines.motion import move
-from drake_diff.solution import Solution
-from drake_diff.trace import write_trace
 
 H = 0.01
 INPUTS = 2 * np.sin(np.arange(40))[:, None]
@@ -287,16 +285,8 @@ def test_what_is_no_recording_is_refused(load, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """The trace of a cart-pole pushed for 10 steps."""
-    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
-    problem = dd.Problem(model, x0=[0, 0.3, 0, 0], num_steps=10, final_cost=lambda x: x[0] ** 2)
-    motion = dd.rollout(model, [0, 0.3, 0, 0], np.linspace(0.1, 1, 10)[:, None])
-    solution = Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", motion.xs, motion.us)
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    folder.mkdir()
-    write_trace(folder / "trace.mcap", solution, {})
-    return model, motion, folder
+def run(pushed):
+    return pushed
 
 
 def test_our_own_trace_is_a_recording_to_the_bit(run, load):

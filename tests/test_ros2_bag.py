@@ -8,24 +8,14 @@ import pytest
 
 import drake_diff as dd
 from drake_diff.ros2_bag import export_ros2
-from drake_diff.solution import Solution
-from drake_diff.trace import write_trace
 
 pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
 MODELS = Path(__file__).parent.parent / "models"
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A cart-pole pushed for 10 steps; the pole is not driven."""
-    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
-    problem = dd.Problem(model, x0=[0, 0.3, 0, 0], num_steps=10, final_cost=lambda x: x[0] ** 2)
-    motion = dd.rollout(model, [0, 0.3, 0, 0], np.linspace(0.1, 1, 10)[:, None])
-    solution = Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", motion.xs, motion.us)
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    folder.mkdir()
-    write_trace(folder / "trace.mcap", solution, {})
-    return folder
+def run(pushed):
+    return pushed[2]
 
 
 @pytest.fixture(scope="module")

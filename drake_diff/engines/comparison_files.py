@@ -1,7 +1,6 @@
 """A comparison saved: its record, a trace of every engine's motion, a replay with the engines as ghosts, a page."""
 
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from drake_diff.engines.comparison_record import (
 from drake_diff.engines.comparison_words import sentence_of, verdict_of
 from drake_diff.model import Model
 from drake_diff.named_files import file_evidence
-from drake_diff.provenance import gradient_evidence, model_input, provenance_of
+from drake_diff.provenance import gradient_evidence, model_input, provenance_of, written_now
 from drake_diff.whole_file import write_whole
 
 RECORD, TRACE, REPLAY, PAGE = "comparison.json", "trace.mcap", "replay.html", "comparison.html"
@@ -76,7 +75,7 @@ def record_of(comparison: Comparison, name: str) -> ComparisonRecord:
         engines=[_engine(e) for e in comparison.engines],
         refused=[RefusedEvidence(engine=r.engine, reason=r.reason, installed=r.installed) for r in comparison.refused],
         wall_clock=Times(
-            written=_now(),
+            written=written_now(),
             seconds_per_step={e.engine: e.seconds_per_step for e in comparison.engines},
             seconds_per_jacobian={e.engine: e.seconds_per_jacobian for e in comparison.engines},
         ),
@@ -84,7 +83,13 @@ def record_of(comparison: Comparison, name: str) -> ComparisonRecord:
 
 
 def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -> ComparisonRecord:
-    found: dict[str, Any] = {"states": [], "engines": [], "refused": [], "wall_clock": Times(written=_now()), **rest}
+    found: dict[str, Any] = {
+        "states": [],
+        "engines": [],
+        "refused": [],
+        "wall_clock": Times(written=written_now()),
+        **rest,
+    }
     return ComparisonRecord(
         name=name,
         verdict=verdict,
@@ -102,10 +107,6 @@ def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -
         provenance=provenance_of(),
         **found,
     )
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def _engine(e: Compared) -> EngineEvidence:

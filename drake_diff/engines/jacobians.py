@@ -57,7 +57,7 @@ def jacobian_at(
     except NotOfferedError:
         method = f"central differences of its steps, {DIFFERENCE_STEP[precision]:g} wide"
         return JacobianAt(state, frozen(quotients()), method, None, None)
-    jacobian = on_tangent(space, x, engine.step(x, u), found.A, found.B)
+    jacobian = space.jacobian(x, engine.step(x, u), found.A, found.B)
     if precision == "float32":
         gap = np.abs(jacobian - quotients()).max() / np.abs(jacobian).max()
         return JacobianAt(state, frozen(jacobian), found.method, AGREES if gap <= SINGLE else "undecided", None)
@@ -85,11 +85,6 @@ def _rounding(method: str) -> float:
     return DIFFERENCES_LEAVE if "differences" in method else 0.0
 
 
-def on_tangent(space: TangentSpace, x: Array, x_next: Array, A: Array, B: Array) -> Array:
-    """(size, size + nu) from A (nx, nx) and B (nx, nu)."""
-    return np.asarray(space.derivative_of_minus(x_next) @ np.hstack([A @ space.derivative_of_plus(x), B]))
-
-
 def rollout_jacobian(engine: Engine, space: TangentSpace, motion: EngineMotion) -> Array | None:
     """(size, size) d x_N / d x_0 along the engine's own motion; None where it offers no derivative."""
     product = np.eye(space.size)
@@ -98,5 +93,5 @@ def rollout_jacobian(engine: Engine, space: TangentSpace, motion: EngineMotion) 
             found = engine.differentiate_step(x, u)
         except NotOfferedError:
             return None
-        product = on_tangent(space, x, x_next, found.A, found.B)[:, : space.size] @ product
+        product = space.jacobian(x, x_next, found.A) @ product
     return frozen(product)

@@ -9,7 +9,6 @@ import numpy as np
 
 from drake_diff.arrays import Array
 from drake_diff.engines.drake_engine import DrakeEngine
-from drake_diff.engines.jacobians import on_tangent
 from drake_diff.engines.numpy_engine import NumpyEngine
 from drake_diff.engines.read_back import SUFFIX, complaints, written
 from drake_diff.model import Model, load_model
@@ -83,4 +82,4 @@ def _gap(
 
 def _jacobian(engine: DrakeEngine | NumpyEngine, model: Model, x: Array, u: Array) -> Array:
     found = engine.differentiate_step(x, u)
-    return on_tangent(tangent_space(model), x, engine.step(x, u), found.A, found.B)
+    return tangent_space(model).jacobian(x, engine.step(x, u), found.A, found.B)

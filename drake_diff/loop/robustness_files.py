@@ -2,7 +2,6 @@
 
 import csv
 import io
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ from drake_diff.loop.trial_files import FILES as TRIAL_FILES
 from drake_diff.loop.trial_files import REPLAY, controller_name, finite, write_trial
 from drake_diff.model import Model
 from drake_diff.named_files import file_evidence
-from drake_diff.provenance import model_input, provenance_of
+from drake_diff.provenance import model_input, provenance_of, written_now
 from drake_diff.record_file import load_record
 from drake_diff.whole_file import write_whole
 
@@ -102,7 +101,7 @@ def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> 
 
 def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -> RobustnessRecord:
     nothing = dict.fromkeys(("run", "trials", "seed", "loop", "nominal"))
-    found: dict[str, Any] = {**nothing, "perturbations": [], "wall_clock": Times(written=_now()), **rest}
+    found: dict[str, Any] = {**nothing, "perturbations": [], "wall_clock": Times(written=written_now()), **rest}
     return RobustnessRecord(
         name=name,
         verdict=verdict,
@@ -114,10 +113,6 @@ def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -
         provenance=provenance_of(),
         **found,
     )
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def _place(cell: Cell) -> str:
@@ -198,10 +193,10 @@ def _times(result: Robustness) -> Times:
     runs = [result.task.nominal.run, *(c.worst.outcome.run for c in result.cells)]
     taken = np.concatenate([run.latencies for run in runs])
     if not len(taken):
-        return Times(written=_now())
+        return Times(written=written_now())
     budget = _loop(result.task).latency_budget_s
     return Times(
-        written=_now(),
+        written=written_now(),
         latency_median_s=float(np.median(taken)),
         latency_99_percent_s=float(np.quantile(taken, 0.99)),
         latency_largest_s=float(np.max(taken)),

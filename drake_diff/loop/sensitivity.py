@@ -12,7 +12,6 @@ its root mean square: sqrt(E |d_N|^2) of independent perturbations as `loop.pert
 import numpy as np
 
 from drake_diff.arrays import Array
-from drake_diff.engines.jacobians import on_tangent
 from drake_diff.loop.estimator import Hold
 from drake_diff.loop.perturbation import PERTURBATIONS, parameters_of
 from drake_diff.loop.trial import Task
@@ -98,9 +97,8 @@ class Sensitivity:
         with applied(select(task.setup.model, task.setup.parameters)) as model:
             for k, u in enumerate(us):
                 steps = [differentiate_step(model, xs[k], u, parameters=names) for names in groups]
-                AB = on_tangent(self.space, xs[k], xs[k + 1], steps[0].A, steps[0].B)
-                A, B = AB[:, :size], AB[:, size:]
-                C = self.space.derivative_of_minus(xs[k + 1]) @ np.hstack([step.C for step in steps])
+                found = self.space.jacobian(xs[k], xs[k + 1], steps[0].A, steps[0].B, *(step.C for step in steps))
+                A, B, C = np.split(found, [size, size + task.model.nu], axis=1)
                 K = self._gain(xs[k], k * h)
                 loop = A + B @ K
                 start, noise = loop @ start, np.hstack([loop @ noise, B @ K])
