@@ -1,6 +1,7 @@
 """Parameters of contact, by body ("ball.friction", all its geometries) or by geometry ("ball/tip.friction").
 
-Drake takes them as plain numbers only, so their derivative is a difference of the double step.
+Drake takes them as plain numbers only, so their derivative is a difference of the double step, but where
+`contact_jacobian` has it in closed form.
 """
 
 from collections.abc import Callable
@@ -24,7 +25,7 @@ _PROPERTIES = {  # quantity: (group, name, unit)
 _ROUND = (Sphere, Cylinder, Capsule)
 
 
-def _geometries(twin: Twin) -> dict[str, list[Any]]:
+def geometries_of(twin: Twin) -> dict[str, list[Any]]:
     """Collision geometries by the label of a body, and one by one."""
     inspector, plant = twin.inspector, twin.plant
     if inspector is None or twin.scene_graph is None:
@@ -41,7 +42,7 @@ def _geometries(twin: Twin) -> dict[str, list[Any]]:
 
 def _find(quantity: str, unit: str, read: Callable[[SceneGraphInspector, Any], float | None]) -> Kind:
     def find(model: Model) -> Found:
-        for label, ids in _geometries(model.double).items():
+        for label, ids in geometries_of(model.double).items():
             values = {read(model.double.inspector, i) for i in ids}
             value = values.pop()
             if value is not None and not values:  # of geometries that differ each has its own value
@@ -75,7 +76,7 @@ def _write_property(quantity: str) -> Callable[[Twin, str, Values], None]:
     def write(twin: Twin, label: str, value: Values) -> None:
         new, inspector = float(value[0]), twin.inspector
         root = twin.scene_graph.GetMyMutableContextFromRoot(twin.root_context)
-        for geometry in _geometries(twin)[label]:
+        for geometry in geometries_of(twin)[label]:
             properties = ProximityProperties(inspector.GetProximityProperties(geometry))
             properties.UpdateProperty(group, name, CoulombFriction(new, new) if quantity == "friction" else new)
             twin.scene_graph.AssignRole(root, twin.plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
@@ -86,7 +87,7 @@ def _write_property(quantity: str) -> Callable[[Twin, str, Values], None]:
 def _write_radius(twin: Twin, label: str, value: Values) -> None:
     radius, inspector = float(value[0]), twin.inspector
     root = twin.scene_graph.GetMyMutableContextFromRoot(twin.root_context)
-    for geometry in _geometries(twin)[label]:
+    for geometry in geometries_of(twin)[label]:
         shape = inspector.GetShape(geometry)
         new = Sphere(radius) if isinstance(shape, Sphere) else type(shape)(radius, shape.length())
         twin.scene_graph.ChangeShape(root, twin.plant.get_source_id(), geometry, new)

@@ -85,6 +85,10 @@ class Steps:
     ends: Array
     touching: NDArray[np.bool_]
 
+    def part(self, which: NDArray[np.intp]) -> "Steps":
+        """Some of the steps."""
+        return Steps(self.starts[which], self.us[which], self.ends[which], self.touching[which])
+
 
 def take_steps(model: Model, x0: Array, us: Array, xs: Array | None = None, x_next: Array | None = None) -> Steps:
     """Drake's steps from x0 (nx,) under us (N, nu), or from each of xs (N, nx).

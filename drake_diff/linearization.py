@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_diff.analytic import analytic_of
+from drake_diff.analytic import analytic_jacobians, analytic_of
 from drake_diff.arrays import Array, finite_array, frozen
 from drake_diff.exceptions import ShapeError
 from drake_diff.implicit import Steps, implicit_jacobians, take_steps
@@ -72,8 +72,8 @@ def smooth_jacobians(
         analytic = analytic_of(model)
         if not isinstance(analytic, str):
             steps = take_steps(model, x0, us, xs, x_next)
-            jacobians, smooth = analytic(steps)
-            return _checked(model, SmoothJacobians(steps, jacobians, smooth, "analytic", CERTIFIED))
+            known = analytic_jacobians(model, analytic, select(model, ()), steps)
+            return _checked(model, SmoothJacobians(steps, *known, "analytic", CERTIFIED))
         if implicit_reason(model) is None:
             step_jacobians(model, select(model, ()), x0, us[0], "auto")
     reason = implicit_reason(model) if method in ("auto", "analytic") else "asked for"

@@ -12,6 +12,7 @@ from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
 from drake_diff.analytic import analytic_jacobian, analytic_of
 from drake_diff.arrays import Array, frozen
 from drake_diff.autodiff import gradient_rows
+from drake_diff.contact_material import CONTACT_QUANTITIES
 from drake_diff.exceptions import GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.finite_difference import differences, plateau
 from drake_diff.implicit import NotSmoothError, implicit_jacobian
@@ -30,6 +31,7 @@ DIFFERENCE_STEP = 1e-5
 SAME_JACOBIAN = 1e-10
 # Implicit is 0.9 to 2 times as fast as autodiff; a choice at the break-even would change from run to run.
 TIMED_CALLS, MUCH_SLOWER = 3, 3.0
+OF_ONE_KIND = ("analytic", "finite_difference")  # methods whose columns by parameters are such, too
 CERTIFIED = "equal to autodiff, as certified on this model"
 
 
@@ -57,8 +59,9 @@ def differentiate_step(
 
     `parameters` names what C is by, at the model's own values, or maps the names to other values. `method` is
 
-    - "analytic": Pinocchio's derivatives, for smooth steps of a model on which they were certified equal to autodiff;
-      a step that is not smooth, and derivatives by parameters or at other parameters, are as by "auto" without it;
+    - "analytic": Pinocchio's derivatives, for smooth steps and steps with SAP's contact of spheres, on a model on which
+      they were certified equal to autodiff; other steps, and derivatives by or at parameters other than contact's
+      friction, stiffness, dissipation and relaxation time, are as by "auto" without it;
     - "autodiff": AutoDiffXd through Drake's step;
     - "implicit": from the equation of a smooth step, two to three times as fast from five joints on; autodiff where
       contact or a constraint acts;
@@ -86,7 +89,7 @@ def step_jacobians(model: Model, vector: ParameterVector, x: Array, u: Array, me
     """`differentiate_step` on a model that the vector is applied to; sizes are the caller's business."""
     x_next = advance(model.double, x, u)
     jacobian, used, reason = _SOURCES[method](model, vector, x, u, x_next)
-    if vector.parameters and len(vector.differenced) and used != "finite_difference":
+    if vector.parameters and len(vector.differenced) and used not in OF_ONE_KIND:
         jacobian[:, model.nx + model.nu + vector.differenced] = _parameter_differences(model, vector, x, u, x_next)
     check_derivatives(model, jacobian)
     nx, end = model.nx, model.nx + model.nu
@@ -96,7 +99,7 @@ def step_jacobians(model: Model, vector: ParameterVector, x: Array, u: Array, me
         B=frozen(jacobian[:, nx:end]),
         C=frozen(jacobian[:, end:]),
         parameters=vector.names,
-        sources=vector.sources if used != "finite_difference" else ("finite_difference",) * len(vector.names),
+        sources=(used,) * len(vector.names) if used in OF_ONE_KIND else vector.sources,
         method=used,
         reason=reason,
     )
@@ -138,9 +141,9 @@ def _by_analytic(model: Model, vector: ParameterVector, x: Array, u: Array, x_ne
 
 def _analytic(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array | str:
     """The Jacobian by Pinocchio, or why it cannot be had so."""
-    if vector.parameters:
-        return "derivatives by parameters are asked for"
-    return analytic_jacobian(model, x, u, x_next)
+    if any(p.kind.quantity not in CONTACT_QUANTITIES for p in vector.parameters):
+        return "derivatives by parameters other than of contact are asked for"
+    return analytic_jacobian(model, vector, x, u, x_next)
 
 
 def _without_analytic(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:

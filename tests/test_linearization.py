@@ -111,19 +111,30 @@ def test_inputs_at_their_effort_limits_have_no_effect():
 # ---- steps that are not smooth go elsewhere, and say so --------------------------------------------------------------
 
 
-def test_steps_in_contact_are_taken_by_others_and_named(load):
-    model = load("sphere_on_ground.sdf", time_step=0.005)
+def _a_fall(load, **options):
+    model = load("sphere_on_ground.sdf", time_step=0.005, **options)
     x = model.default_state
     x[6] = 0.12
-    xs = dd.rollout(model, x, num_steps=30).xs
+    motion = dd.rollout(model, x, num_steps=30)
+    return model, motion.xs, [bool(contacts) for contacts in motion.contacts]
+
+
+def test_steps_with_contact_are_taken_in_the_same_call(load):
+    model, xs, touches = _a_fall(load)
+    assert 0 < sum(touches) < 30
+    equal(model, xs, np.zeros((30, 0)))
+    equal(model, xs, np.zeros((30, 0)), x_next=xs[1:])  # without Drake's steps
+
+
+def test_steps_with_other_contact_are_taken_by_others_and_named(load):
+    model, xs, touches = _a_fall(load, contact_approximation="similar")
     us = np.zeros((30, 0))
     _, _, methods = equal(model, xs, us, expected=("analytic", "autodiff"))
-    touches = [bool(contacts) for contacts in dd.rollout(model, x, num_steps=30).contacts]
     assert [m != "analytic" for m in methods] == touches
     assert equal(model, xs, us, expected=set(methods), x_next=xs[1:])[2] == methods  # without Drake's steps
     reasons = {d.method: d.reason for d in (dd.differentiate_step(model, xs[k], method="analytic") for k in (0, -1))}
     assert reasons["analytic"] == "asked for"
-    assert "not analytic: geometries touch" in reasons["autodiff"]
+    assert "not analytic: the contact approximation is similar, not sap" in reasons["autodiff"]
 
 
 def test_a_joint_limit_that_acts_is_no_smooth_step():
@@ -142,7 +153,9 @@ def test_a_controller_at_its_limit_is_no_smooth_step():
     _, _, methods = equal(model, xs, us, expected=("analytic", "implicit"))
     assert methods[0] == "analytic"
     hardly_ever_free = springs_and_motors(limit=1e-3, kp=(20.0, 5.0, 8.0))
-    assert "controllers are at their limits in all but" in analytic_of(hardly_ever_free)
+    assert "in all but 0 geometries touch, or joints or controllers are at their limits" in analytic_of(
+        hardly_ever_free
+    )
 
 
 def test_x_next_that_is_wrong_is_found(load):
@@ -199,7 +212,7 @@ def test_derivatives_by_parameters_keep_their_source(load):
         load("pendulum.urdf"), [0.7, -1.2], [0.3], parameters=("hinge.damping",), method="analytic"
     )
     assert d.method in ("implicit", "autodiff")
-    assert "not analytic: derivatives by parameters are asked for" in d.reason
+    assert "not analytic: derivatives by parameters other than of contact are asked for" in d.reason
     assert d.C.shape == (2, 1)
 
 

@@ -7,7 +7,7 @@ With R its orientation, v_native = Q v and a small motion is Q d, Q = [[0, R'], 
 import numpy as np
 
 from drake_diff.arrays import Array
-from drake_diff.engines.euler import Coordinates, rotation, skew
+from drake_diff.engines.euler import Coordinates, cross, rotation, skew
 
 
 def native_positions(coordinates: Coordinates, q: Array) -> Array:
@@ -34,19 +34,28 @@ def turning(coordinates: Coordinates, v: Array) -> Array:
     """(..., nv) w x v of free bodies, in Drake's v (..., nv)."""
     found = np.zeros_like(v)
     for _, j in coordinates.free:
-        found[..., j + 3 : j + 6] = np.cross(v[..., j : j + 3], v[..., j + 3 : j + 6])
+        found[..., j + 3 : j + 6] = cross(v[..., j : j + 3], v[..., j + 3 : j + 6])
     return found
 
 
-def turn_derivatives(coordinates: Coordinates, q: Array, v: Array, native: Array) -> tuple[Array, Array, Array]:
+def turn_change(coordinates: Coordinates, Q: Array, v: Array) -> Array:
+    """(..., nv, nv) the derivative of Q v by small motion at fixed v (..., nv), Q being that of `turn`."""
+    change = np.zeros((*v.shape, coordinates.nv))
+    for _, j in coordinates.free:
+        about, move = slice(j, j + 3), slice(j + 3, j + 6)
+        R_t = Q[..., about, move]
+        change[..., about, about] = R_t @ skew(v[..., move])
+        change[..., move, about] = R_t @ skew(v[..., about])
+    return change
+
+
+def turn_derivatives(coordinates: Coordinates, Q: Array, v: Array, native: Array) -> tuple[Array, Array, Array]:
     """(..., nv, nv) of Q v by small motion at fixed v; of Q' a_native + w x v by small motion, and by v."""
-    into, out, out_v = np.zeros((3, *v.shape, coordinates.nv))
-    for i, j in coordinates.free:
-        R, move = rotation(q[..., i : i + 4]), slice(j + 3, j + 6)
-        R_t, about = np.swapaxes(R, -1, -2), slice(j, j + 3)
-        into[..., about, about] = R_t @ skew(v[..., move])
-        into[..., move, about] = R_t @ skew(v[..., about])
+    out, out_v = np.zeros((2, *v.shape, coordinates.nv))
+    for _, j in coordinates.free:
+        about, move = slice(j, j + 3), slice(j + 3, j + 6)
+        R = np.swapaxes(Q[..., about, move], -1, -2)
         out[..., about, about] = -skew((R @ native[..., move, None])[..., 0])
         out[..., move, about] = -skew((R @ native[..., about, None])[..., 0])
         out_v[..., move, about], out_v[..., move, move] = -skew(v[..., move]), skew(v[..., about])
-    return into, out, out_v
+    return turn_change(coordinates, Q, v), out, out_v

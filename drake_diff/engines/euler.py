@@ -92,41 +92,38 @@ def exponential_turn(quaternion: Array, angle: Array) -> Array:
 
 def skew(w: Array) -> Array:
     """(..., 3, 3) with skew(w) x = w x x, at w (..., 3)."""
-    x, y, z = _entries(w)
-    o = 0 * x
-    return _matrix([[o, -z, y], [z, o, -x], [-y, x, o]])
+    return np.asarray((w @ _SKEW).reshape(*w.shape[:-1], 3, 3))
+
+
+def cross(a: Array, b: Array) -> Array:
+    """a x b of vectors (..., 3), broadcast."""
+    return np.asarray(a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1))
 
 
 def rotation(quaternion: Array) -> Array:
     """(..., 3, 3) of a quaternion (w, x, y, z) (..., 4) of any norm."""
-    w, x, y, z = _entries(quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True))
-    return _matrix(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    vector = skew(quaternion[..., 1:])
+    scale = 2 / (quaternion * quaternion).sum(axis=-1)[..., None, None]
+    return np.asarray(np.eye(3) + scale * (quaternion[..., :1, None] * vector + vector @ vector))
 
 
 def _times_from_left(q: Array) -> Array:
     """(..., 4, 3): w -> (0, w) * q."""
-    s, x, y, z = _entries(q)
-    return _matrix([[-x, -y, -z], [s, z, -y], [-z, s, x], [y, -x, s]])
+    return np.asarray((q @ _TIMES_FROM_LEFT).reshape(*q.shape[:-1], 4, 3))
 
 
 def _left_product(w: Array) -> Array:
     """(..., 4, 4): q -> (0, w) * q."""
-    product = np.zeros((*w.shape[:-1], 4, 4))
-    product[..., 0, 1:], product[..., 1:, 0], product[..., 1:, 1:] = -w, w, skew(w)
-    return product
+    return np.asarray((w @ _LEFT_PRODUCT).reshape(*w.shape[:-1], 4, 4))
 
 
-def _entries(vectors: Array) -> Array:
-    """(n, ...) of vectors (..., n)."""
-    return np.moveaxis(vectors, -1, 0)
-
-
-def _matrix(rows: list[list[Array]]) -> Array:
-    """(..., m, n) of m rows of n arrays (...,)."""
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+# Matrices whose entries are linear in a vector: row i holds the matrix of the vector's entry i, flattened.
+_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
+_CROSS = np.array(
+    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]],
+    dtype=float,
+)
+_PRODUCT = np.zeros((3, 4, 4))
+_PRODUCT[:, 0, 1:], _PRODUCT[:, 1:, 0], _PRODUCT[:, 1:, 1:] = -np.eye(3), np.eye(3), _CROSS
+_SKEW, _LEFT_PRODUCT = _CROSS.reshape(3, 9), _PRODUCT.reshape(3, 16)
+_TIMES_FROM_LEFT = np.transpose(_PRODUCT, (2, 1, 0)).reshape(4, 12)

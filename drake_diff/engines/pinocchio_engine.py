@@ -99,7 +99,7 @@ class PinocchioEngine:
         Q, native_q, D = turn(self.coordinates, q), self._q(q), np.diag(self.damping)
         by_q, by_v, _ = pin.computeRNEADerivatives(self.pin, self.data, native_q, Q @ v, native)
         by_v = by_v + D
-        velocity_by_motion, out_by_motion, out_by_v = turn_derivatives(self.coordinates, q, v, native)
+        velocity_by_motion, out_by_motion, out_by_v = turn_derivatives(self.coordinates, Q, v, native)
         residual = np.hstack(
             [
                 by_q @ Q + by_v @ velocity_by_motion + np.diag(self.stiffness),

@@ -1,0 +1,193 @@
+"""The Jacobian of a step with contact from its own equation, without differentiating Drake's solver.
+
+Drake's SAP step solves A (v' - v*) = sum_c J_c' g_c(J_c v'), with A = M + h D, v* the velocity without contact and g_c
+the impulse of contact c (`friction_cone`). At Drake's own v' it is a smooth step under a known force A (v' - v*) / h,
+which Pinocchio differentiates (`analytic_step`); what the impulses change is solved for:
+
+    (A + sum_c J_c' G_c J_c) dv' = A dv'|_g + sum_c d(J_c' g_c)|_v',   G_c = -dg_c / d(J_c v').
+
+That v' solves the equation is checked, in the norm and to the tolerance of Drake's solver, and that no joint limit
+acts. What is left out here, as a shape that is not known, shows there.
+"""
+
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_diff.analytic_step import Analytic
+from drake_diff.arrays import Array
+from drake_diff.contact_material import Material, MaterialChange, read_material
+from drake_diff.contact_motion import Contacts, Topology, Weight, diagonal_change, mass_matrix, topology_of
+from drake_diff.contact_pairs import ContactPairs, Indices, Touches, read_pairs
+from drake_diff.engines.description import describe_tree
+from drake_diff.engines.euler import cross
+from drake_diff.friction_cone import Cone, Impulse
+from drake_diff.implicit import Steps
+from drake_diff.model import Model
+from drake_diff.plant_elements import bodies, labelled
+from drake_diff.step import set_state
+
+# Of the momentum: Drake's solver ends at 1e-6 of it, in the same norm.
+OPTIMALITY = 2e-6
+ROUNDING = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class ContactForm:
+    """What of a model with contact does not change from step to step."""
+
+    pairs: ContactPairs
+    topology: Topology
+    by_body: Array  # (bodies, nv) 1 where a degree of freedom moves the body
+    armature: Array  # (nv, nv) of reflected inertia and h D, a diagonal
+    near_rigid: float
+    own: Material
+
+
+def contact_form(model: Model, analytic: Analytic) -> ContactForm | str:
+    """Read once; else why the form describes no step of the model with contact."""
+    if model not in _FORMS:
+        _FORMS[model] = _read(model, analytic)
+    return _FORMS[model]
+
+
+_FORMS: WeakKeyDictionary[Model, ContactForm | str] = WeakKeyDictionary()
+
+
+def _read(model: Model, analytic: Analytic) -> ContactForm | str:
+    contact = model.contract.contact
+    if contact.approximation != "sap":
+        return f"the contact approximation is {contact.approximation}, not sap"
+    if contact.model != "point":
+        return f"the contact model is {contact.model}, not point"
+    if analytic.form.pd:
+        return "PD controllers act beside contact"
+    pairs = read_pairs(model)
+    if not pairs.ids:
+        return "no sphere may touch a sphere, box, capsule or half space"
+    topology = topology_of(describe_tree(model))
+    labels = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
+    return ContactForm(
+        pairs=pairs,
+        topology=topology,
+        by_body=np.array([topology.bodies[labels.get(body.index(), "world")] for body in pairs.bodies]),
+        armature=np.diag(analytic.pinocchio.armature),
+        near_rigid=float(model.plant.get_sap_near_rigid_threshold()),
+        own=read_material(model.double, pairs),
+    )
+
+
+def place(model: Model, form: ContactForm, xs: Array) -> Array:
+    """(N, bodies, 3, 4) the poses of the bodies of the pairs at xs (N, nx), the only one of which the context is at.
+
+    Of several the double context is left at the last.
+    """
+    plant, context = model.plant, model.double.context
+    poses = np.empty((len(xs), len(form.pairs.bodies), 3, 4))
+    for k, x in enumerate(xs):
+        if len(xs) > 1:
+            set_state(model.double, x)
+        for i, body in enumerate(form.pairs.bodies):
+            poses[k, i] = plant.EvalBodyPoseInWorld(context, body).GetAsMatrix34()
+    return poses
+
+
+def contact_jacobians(
+    form: ContactForm, analytic: Analytic, steps: Steps, poses: Array, material: Material, change: MaterialChange | None
+) -> tuple[Array, NDArray[np.bool_]]:
+    """(N, nx, nx + nu + np) of steps from states with the bodies at `poses`, and which (N,) are as Drake took them."""
+    c, h, count = analytic.coordinates, analytic.time_step, len(steps.starts)
+    native, v_next = analytic.into_native(steps.starts[:, : c.nq], steps.starts[:, c.nq :]), steps.ends[:, c.nq :]
+    S, inertia, v_star = analytic.motions(native, steps.us)
+    A = mass_matrix(S, inertia, form.topology) + form.armature
+    diagonal = np.einsum("kii->ki", A)
+    touch = form.pairs.touching(poses)
+    at = touch.state
+    contacts = _contacts(form, touch, S, material)
+    J = contacts.jacobian
+    weight = contacts.weight(diagonal[at])
+    velocity = (v_next[at][:, None, :] @ J)[:, 0]
+    impulse = _cone(form, touch, material, velocity, weight, h).solve()
+    force = impulse.impulse
+    push = _sum(at, (J @ force[..., None])[..., 0], count)
+    momentum = (A @ np.stack([v_next - v_star, v_next], axis=-1)).swapaxes(-1, -2)  # gained, and had
+    velocities = analytic.pushed(native, steps.us, momentum[:, 0] / h)
+
+    point, normal, phi = contacts.displacement()
+    by_motion = impulse.by_state(
+        velocity=contacts.velocity_change(v_next[at], point),
+        normal=normal,
+        phi=phi,
+        weight=contacts.weight_change(weight, diagonal[at], diagonal_change(S, inertia, form.topology)[at], point),
+    )
+    right = A @ velocities
+    right[:, :, : c.nv] += _sum(at, contacts.force_change(force, point) + J @ np.swapaxes(by_motion, -1, -2), count)
+    if change is not None:
+        by_material = _by_material(contacts, impulse, weight, diagonal[at], v_next[at], change.part(touch.pair))
+        right = np.concatenate([right, _sum(at, by_material, count)], axis=2)
+    left = A - _sum(at, J @ impulse.by_velocity() @ np.swapaxes(J, -1, -2), count)
+    jacobians, _ = analytic.assemble(native, np.linalg.solve(left, right), v_next)
+    solved = _is_solved(momentum[:, 0] - push, momentum[:, 1], push, diagonal)
+    return jacobians, solved & ~analytic.at_a_limit(steps)
+
+
+def _by_material(
+    contacts: Contacts, impulse: Impulse, weight: Weight, diagonal: Array, v: Array, change: MaterialChange
+) -> Array:
+    """(M, nv, np) the change of J' g by parameters: through the law, and through where on the normal p is."""
+    touch, nothing = contacts.touch, np.zeros((*change.friction.shape, 3))
+    point = -(touch.phi[:, None] * change.other_part)[..., None] * touch.normal[:, None]
+    changed = impulse.by_material(change.friction, change.stiffness, change.time) + impulse.by_state(
+        velocity=contacts.velocity_change(v, point, moves=False),
+        normal=nothing,
+        phi=nothing[..., 0],
+        weight=contacts.weight_change(weight, diagonal, None, point),
+    )
+    return contacts.force_change(impulse.impulse, point, moves=False) + contacts.jacobian @ np.swapaxes(changed, -1, -2)
+
+
+def _cone(form: ContactForm, touch: Touches, material: Material, velocity: Array, weight: Weight, h: float) -> Cone:
+    return Cone(
+        velocity=velocity,
+        normal=touch.normal,
+        phi=touch.phi,
+        weight=weight.value,
+        friction=material.friction[touch.pair],
+        stiffness=material.stiffness[touch.pair],
+        time=material.time[touch.pair],
+        time_step=h,
+        near_rigid=form.near_rigid,
+    )
+
+
+def _contacts(form: ContactForm, touch: Touches, S: Array, material: Material) -> Contacts:
+    own, part = S[touch.state], material.other_part[touch.pair]
+    linear, angular = own[..., :3], own[..., 3:]
+    reach = form.pairs.radius[touch.pair] + part * touch.phi
+    point = touch.center - reach[:, None] * touch.normal
+    return Contacts(
+        touch=touch,
+        moves=form.topology.moves,
+        sphere=form.by_body[form.pairs.sphere_body[touch.pair]],
+        other=form.by_body[form.pairs.other_body[touch.pair]],
+        angular=angular,
+        point=point,
+        at_point=linear + cross(angular, point[:, None, :]),
+        reach=reach,
+        other_part=part,
+    )
+
+
+def _sum(at: Indices, of_contacts: Array, count: int) -> Array:
+    """(N, ...) of contributions (M, ...) of contacts, each of one of N = `count` states."""
+    total = np.zeros((count, *of_contacts.shape[1:]))
+    np.add.at(total, at, of_contacts)
+    return total
+
+
+def _is_solved(missing: Array, momentum: Array, push: Array, diagonal: Array) -> NDArray[np.bool_]:
+    """(N,) whether the impulse that is missing (N, nv) is what Drake's solver leaves, in the norm that it ends by."""
+    left, had, given = (np.sqrt((part * part / diagonal).sum(axis=1)) for part in (missing, momentum, push))
+    return np.asarray(left <= OPTIMALITY * np.maximum(had, given) + ROUNDING)

@@ -1,0 +1,138 @@
+"""The impulse of Drake's SAP contact at its own solution, and how it changes.
+
+With vn and vt the normal and tangential velocity after the step, phi the signed distance before it, w the size of the
+effective inverse mass, h the time step and tau the relaxation time (Castro, Permenter and Han, "An unconstrained convex
+formulation of compliant contact", 2021),
+
+    R_n = max(beta^2 / (4 pi^2) w, 1 / (h k (h + tau))),   R_t = sigma w
+    y_n = (-phi / (h + tau) - vn) / R_n,   y_t = -vt / R_t,   y_r = sqrt(|y_t|^2 + s^2)
+
+the impulse is y inside the friction cone (y_r <= mu y_n: it sticks), 0 inside its polar, and else, sliding,
+
+    g_n = (y_n + mu R_t / R_n y_r) / (1 + mu^2 R_t / R_n),   g_t = mu g_n y_t / y_r.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_diff.arrays import Array
+
+SIGMA = 1e-3
+SOFT_NORM = 1e-7  # s [N s]
+
+
+@dataclass(frozen=True, eq=False)
+class Cone:
+    """M contacts of the SAP approximation."""
+
+    velocity: Array  # (M, 3) after the step, of the sphere's side less the other's [m/s]
+    normal: Array  # (M, 3)
+    phi: Array  # (M,) [m]
+    weight: Array  # (M,) w [1/kg]
+    friction: Array  # (M,)
+    stiffness: Array  # (M,) k [N/m]
+    time: Array  # (M,) tau [s]
+    time_step: float
+    near_rigid: float  # beta
+
+    def solve(self) -> "Impulse":
+        """The impulses, and what their derivatives are made of."""
+        h, mu = self.time_step, self.friction
+        soft = h + self.time
+        compliant = 1.0 / (h * self.stiffness * soft)
+        rigid = (self.near_rigid / (2 * np.pi)) ** 2 * self.weight
+        R_n, R_t = np.maximum(rigid, compliant), SIGMA * self.weight
+        vn = (self.velocity * self.normal).sum(axis=-1)
+        y_n = (-self.phi / soft - vn) / R_n
+        y_t = (vn[:, None] * self.normal - self.velocity) / R_t[:, None]
+        y_r = np.sqrt((y_t * y_t).sum(axis=-1) + SOFT_NORM**2)
+        tangent, ratio = y_t / y_r[:, None], R_t / R_n
+        sticks = y_r <= mu * y_n
+        pushes = sticks | (-mu * ratio * y_r < y_n)
+        g_n = np.where(sticks, y_n, np.where(pushes, (y_n + mu * ratio * y_r) / (1 + mu * mu * ratio), 0.0))
+        g_t = np.where(sticks[:, None], y_t, (mu * g_n)[:, None] * tangent)
+        return Impulse(self, soft, rigid > compliant, R_n, R_t, vn, y_n, y_t, y_r, tangent, sticks, pushes, g_n, g_t)
+
+
+@dataclass(frozen=True, eq=False)
+class Impulse:
+    """The solution of a Cone; `change` is its derivative along K directions."""
+
+    cone: Cone
+    soft: Array  # h + tau
+    is_rigid: NDArray[np.bool_]
+    R_n: Array
+    R_t: Array
+    vn: Array
+    y_n: Array
+    y_t: Array
+    y_r: Array
+    tangent: Array
+    sticks: NDArray[np.bool_]
+    pushes: NDArray[np.bool_]
+    g_n: Array
+    g_t: Array
+
+    @property
+    def impulse(self) -> Array:
+        """(M, 3) on the sphere's side [N s]."""
+        return self.g_t + self.g_n[:, None] * self.cone.normal
+
+    def by_velocity(self) -> Array:
+        """(M, 3, 3) the derivative of the impulse by the velocity: symmetric and negative semidefinite."""
+        mu, n = self.cone.friction, self.cone.normal
+        nn = n[:, :, None] * n[:, None, :]
+        ratio, tt = self.R_t / self.R_n, self.tangent[:, :, None] * self.tangent[:, None, :]
+        across = np.eye(3) - nn
+        factor = 1 / (1 + mu * mu * ratio)
+        stick = across / self.R_t[:, None, None] + nn / self.R_n[:, None, None]
+        mixed = mu[:, None] * self.tangent + n
+        along = (factor / self.R_n)[:, None, None] * mixed[:, :, None] * mixed[:, None, :]
+        turn = (mu * self.g_n / (self.y_r * self.R_t))[:, None, None] * (across - tt)
+        return -np.where(self.sticks[:, None, None], stick, np.where(self.pushes[:, None, None], along + turn, 0.0))
+
+    def by_state(self, velocity: Array, normal: Array, phi: Array, weight: Array) -> Array:
+        """(M, K, 3) the change of the impulse along K changes, all but phi's and weight's (M, K) being (M, K, 3)."""
+        c, n = self.cone, self.cone.normal[:, None, :]
+        R_n, R_t = self.R_n[:, None], self.R_t[:, None]
+        d_vn = (velocity * n).sum(axis=-1) + (c.velocity[:, None, :] * normal).sum(axis=-1)
+        d_vt = velocity - d_vn[..., None] * n - self.vn[:, None, None] * normal
+        d_Rt = weight / c.weight[:, None]  # as a part of R_t
+        d_Rn = np.where(self.is_rigid[:, None], d_Rt, 0.0)
+        d_yn = -(d_vn + phi / self.soft[:, None]) / R_n - self.y_n[:, None] * d_Rn
+        d_yt = -d_vt / R_t[..., None] - self.y_t[:, None, :] * d_Rt[..., None]
+        return self._projected(d_yn, d_yt, d_Rt - d_Rn, normal)
+
+    def _projected(self, d_yn: Array, d_yt: Array, d_ratio: Array, d_normal: Array) -> Array:
+        """The change of the impulse by those of y_n, y_t, of R_t / R_n as a part of it, and of the normal."""
+        mu, ratio = self.cone.friction[:, None], (self.R_t / self.R_n)[:, None]
+        tangent, y_r, g_n = self.tangent[:, None, :], self.y_r[:, None], self.g_n[:, None]
+        d_yr = (tangent * d_yt).sum(axis=-1)
+        factor = 1 / (1 + mu * mu * ratio)
+        slide = factor * (d_yn + mu * ratio * (d_yr + (y_r - mu * g_n) * d_ratio))
+        d_tangent = (d_yt - tangent * d_yr[..., None]) / y_r[..., None]
+        slide_t = mu[..., None] * (slide[..., None] * tangent + g_n[..., None] * d_tangent)
+        sticks = self.sticks[:, None]
+        d_gn = np.where(sticks, d_yn, slide)
+        d_gt = np.where(sticks[..., None], d_yt, slide_t)
+        found = d_gt + d_gn[..., None] * self.cone.normal[:, None, :] + g_n[..., None] * d_normal
+        return np.where(self.pushes[:, None, None], found, 0.0)
+
+    def by_material(self, friction: Array, stiffness: Array, time: Array) -> Array:
+        """(M, K, 3) the change of the impulse along K changes (M, K) of the material."""
+        c = self.cone
+        soft, compliant = self.soft[:, None], ~self.is_rigid[:, None]
+        d_Rn = np.where(compliant, -stiffness / c.stiffness[:, None] - time / soft, 0.0)
+        d_yn = c.phi[:, None] / soft**2 * time / self.R_n[:, None] - self.y_n[:, None] * d_Rn
+        nothing = np.zeros((*friction.shape, 3))
+        found = self._projected(d_yn, nothing, -d_Rn, nothing)
+        return found + self._by_friction(friction)
+
+    def _by_friction(self, friction: Array) -> Array:
+        mu, ratio = self.cone.friction, self.R_t / self.R_n
+        slides = self.pushes & ~self.sticks
+        by_n = ratio * (self.y_r - 2 * mu * self.g_n) / (1 + mu * mu * ratio)
+        by_mu = (self.g_n + mu * by_n)[:, None] * self.tangent + by_n[:, None] * self.cone.normal
+        return np.where(slides[:, None, None], friction[..., None] * by_mu[:, None, :], 0.0)

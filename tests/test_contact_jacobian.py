@@ -1,0 +1,379 @@
+"""Steps with contact, differentiated from their own equation: against closed forms, AutoDiffXd and differences."""
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+from drake_diff import analytic, friction_cone
+from drake_diff.contact_pairs import read_pairs
+from drake_diff.friction_cone import Cone
+from drake_diff.step import set_state
+
+pytest.importorskip("pinocchio")
+
+MATERIAL = (
+    "<drake:proximity_properties><drake:point_contact_stiffness>{k}</drake:point_contact_stiffness>"
+    "<drake:relaxation_time>{tau}</drake:relaxation_time><drake:mu_static>{mu}</drake:mu_static>"
+    "<drake:mu_dynamic>{mu}</drake:mu_dynamic></drake:proximity_properties>"
+)
+SHAPES = {
+    "ground": "<plane><normal>0 0 1</normal></plane>",
+    "box": "<box><size>0.4 0.3 0.2</size></box>",
+    "capsule": "<capsule><radius>0.06</radius><length>0.3</length></capsule>",
+    "ball": "<sphere><radius>0.15</radius></sphere>",
+    "cylinder": "<cylinder><radius>0.1</radius><length>0.2</length></cylinder>",
+}
+
+
+def _collision(name, shape, pose="0 0 0 0 0 0", k=2e4, tau=0.01, mu=0.6):
+    material = MATERIAL.format(k=k, tau=tau, mu=mu)
+    return f'<collision name="{name}"><pose>{pose}</pose><geometry>{shape}</geometry>{material}</collision>'
+
+
+def _sphere(name, at, radius=0.04, **material):
+    return _collision(name, f"<sphere><radius>{radius}</radius></sphere>", f"{at} 0 0 0", **material)
+
+
+def _link(name, collisions="", mass=1.0, moments=(0.01, 0.02, 0.025), com="0 0 0", pose="0 0 0 0 0 0"):
+    ixx, iyy, izz = moments
+    return (
+        f'<link name="{name}"><pose>{pose}</pose><inertial><pose>{com} 0.2 0.1 0.3</pose><mass>{mass}</mass>'
+        f"<inertia><ixx>{ixx}</ixx><iyy>{iyy}</iyy><izz>{izz}</izz><ixy>0</ixy><ixz>0</ixz><iyz>0</iyz></inertia></inertial>{collisions}</link>"
+    )
+
+
+def _joint(name, kind, parent, child, axis, damping=0.0, limit=1e9, effort=0):
+    return (
+        f'<joint name="{name}" type="{kind}"><parent>{parent}</parent><child>{child}</child><axis><xyz>{axis}</xyz>'
+        f"<limit><lower>{-limit}</lower><upper>{limit}</upper><effort>{effort}</effort></limit>"
+        f"<dynamics><damping>{damping}</damping></dynamics></axis></joint>"
+    )
+
+
+def _load(tmp_path, ground, moving, time_step=0.005, **options):
+    file = tmp_path / "scene.sdf"
+    file.write_text(
+        '<sdf version="1.9" xmlns:drake="drake.mit.edu"><world name="w"><model name="fixed"><static>true</static>'
+        f'<link name="fixed">{ground}</link></model><model name="robot">{moving}</model></world></sdf>'
+    )
+    return dd.load_model(file, time_step=time_step, **options)
+
+
+def _walker(tmp_path, **options):
+    """A tumbling trunk with a hinged leg, a sliding foot on it and a second leg, over tilted ground, all off centre."""
+    ground = _collision("ground", SHAPES["ground"], "0 0 0 0.1 -0.2 0.3", k=3e4, tau=0.02, mu=0.5)
+    feet = _sphere("toe", "0.02 0.01 -0.2", k=1e4) + _sphere("heel", "-0.05 0 -0.2", 0.03, mu=0.3)
+    links = [
+        _link("trunk", _sphere("belly", "0.1 0.05 -0.1", 0.05), 2.0, (0.03, 0.05, 0.06), "0.02 -0.01 0.03"),
+        _link("leg", mass=0.5, com="0 0.01 -0.1", pose="0.15 0.1 -0.05 0.1 0 0"),
+        _link("foot", feet, 0.2, (1e-3, 2e-3, 2.5e-3), "0.01 0 -0.15", "0.15 0.1 -0.1 0 0.1 0"),
+        _link(
+            "tail", _sphere("tip", "0 0 -0.25", 0.05, tau=0.03), 0.3, (2e-3, 2e-3, 1e-3), "0 0 -0.1", "-0.15 0 0 0 0 0"
+        ),
+    ]
+    joints = [
+        _joint("hip", "revolute", "trunk", "leg", "0 1 0.2", 0.2, effort=50),
+        _joint("shin", "prismatic", "leg", "foot", "0.1 0 1", 1.5, effort=50),
+        _joint("root", "revolute", "trunk", "tail", "1 0.3 0"),
+    ]
+    return _load(tmp_path, ground, "".join(links + joints), **options)
+
+
+def _by_both(model, x, u):
+    """The Jacobians [A, B] by contact's own equation and by AutoDiffXd."""
+    ours = dd.differentiate_step(model, x, u)
+    exact = dd.differentiate_step(model, x, u, method="autodiff")
+    return ours, np.hstack([ours.A, ours.B]), np.hstack([exact.A, exact.B])
+
+
+def _agree(model, x, u):
+    ours, found, exact = _by_both(model, x, u)
+    assert ours.method == "analytic", ours.reason
+    # Both are right to rounding, which near-rigid contact and the inverse of a mass matrix magnify.
+    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-9 * np.abs(exact).max())
+
+
+def _contacts(model):
+    results = model.plant.get_contact_results_output_port().Eval(model.double.context)
+    return [results.point_pair_contact_info(i) for i in range(results.num_point_pair_contacts())]
+
+
+def _touching_states(model, count, seed, spread=1.0):
+    """States of a robot that falls and tumbles, from every one of which a step has contact; quaternions of any norm."""
+    random, found = np.random.default_rng(seed), []
+    while len(found) < count:
+        x = model.default_state
+        x[:4] = random.standard_normal(4)
+        x[4:7] = [0, 0, 0.45]
+        x[7 : model.nq] = 0.2 * random.standard_normal(model.nq - 7)
+        x[model.nq :] = spread * random.standard_normal(model.nv)
+        for _ in range(random.integers(20, 80)):
+            u = 2 * random.standard_normal(model.nu)
+            x = dd.step(model, x, u)
+        dd.step(model, x, u)
+        if _contacts(model):
+            found.append((x, u))
+    return found
+
+
+def test_a_tumbling_robots_steps_are_autodiffs(tmp_path):
+    model = _walker(tmp_path)
+    states, modes = _touching_states(model, 25, seed=3), set()
+    for x, u in states:
+        _agree(model, x, u)
+        modes |= set(dd.contact_modes(model, x, u).values())
+    assert modes == {"sticking", "sliding", "separated"}
+
+
+def test_many_steps_in_one_call_are_the_same(tmp_path):
+    model = _walker(tmp_path)
+    states = _touching_states(model, 8, seed=5)
+    free = (model.default_state, np.zeros(model.nu))
+    free[0][6] = 2.0
+    points = [*states[:4], free, *states[4:]]
+    xs, us = (np.array(part) for part in zip(*points, strict=True))
+    A, B, methods = dd.linearize(model, xs, us)
+    assert set(methods) == {"analytic"}
+    for k, (x, u) in enumerate(points):
+        one = dd.differentiate_step(model, x, u, method="autodiff")
+        size = np.abs(one.A).max()
+        np.testing.assert_allclose(A[k], one.A, rtol=0, atol=1e-9 * size)
+        np.testing.assert_allclose(B[k], one.B, rtol=0, atol=1e-9 * size)
+
+
+@pytest.mark.parametrize("other", ["box", "capsule", "ball"])
+def test_spheres_meet_moving_shapes(tmp_path, other):
+    """Faces, edges, corners and insides of a shape on a body that moves; two free bodies, off the origin."""
+    moving = _link("a", _collision("shape", SHAPES[other], "0.05 0 0.02 0.3 0.2 0.1", k=5e3, mu=0.9), 1.5)
+    moving += _link("b", _sphere("probe", "0.03 -0.02 0.01", 0.12, tau=0.005), 0.7)
+    model = _load(tmp_path, "", moving)
+    random, seen = np.random.default_rng(11), 0
+    for _ in range(300):
+        x = np.concatenate(
+            [*(np.r_[random.standard_normal(4), random.uniform(-0.22, 0.22, 3)] for _ in "ab"), np.zeros(12)]
+        )
+        x[[4, 11]] += 3.0
+        x[model.nq :] = 0.5 * random.standard_normal(12)
+        set_state(model.double, x)
+        if model.double.overlaps():
+            seen += 1
+            _agree(model, x, np.zeros(0))
+    assert seen > 40
+
+
+@pytest.mark.parametrize("other", ["ground", "box", "capsule", "ball"])
+def test_distances_and_normals_are_drakes(tmp_path, other):
+    fixed = _collision("shape", SHAPES[other], "0.1 -0.2 0.05 0.4 -0.3 0.2")
+    model = _load(tmp_path, fixed, _link("b", _sphere("probe", "0.01 0.02 0.03", 0.08)))
+    pairs, random = read_pairs(model), np.random.default_rng(2)
+    port, seen = model.plant.get_geometry_query_input_port(), 0
+    for _ in range(400):
+        x = model.default_state
+        x[:4], x[4:7] = random.standard_normal(4), np.array([0.1, -0.2, 0.05]) + random.uniform(-0.3, 0.3, 3)
+        set_state(model.double, x)
+        poses = [model.plant.EvalBodyPoseInWorld(model.double.context, b).GetAsMatrix34() for b in pairs.bodies]
+        touch = pairs.touching(np.array(poses)[None])
+        exact = port.Eval(model.double.context).ComputePointPairPenetration()
+        assert len(touch.phi) == len(exact)
+        for pair in exact:
+            seen += 1
+            to_sphere = 1 if pair.id_A == pairs.ids[0][0] else -1  # Drake's normal leads into A
+            np.testing.assert_allclose(touch.phi[0], -pair.depth, atol=1e-14)
+            np.testing.assert_allclose(touch.normal[0], to_sphere * pair.nhat_BA_W, atol=1e-12)
+    assert seen > 30
+
+
+def _puck(tmp_path, **options):
+    """A ball of 0.5 kg on slides along x and z, over level ground."""
+    links = _link("x", mass=0.3) + _link("z", _sphere("tip", "0 0 0", 0.1, k=1e4, tau=0.02, mu=0.4), 0.2)
+    joints = _joint("along", "prismatic", "world", "x", "1 0 0") + _joint("up", "prismatic", "x", "z", "0 0 1")
+    ground = _collision("ground", SHAPES["ground"], k=3e4, tau=0.03, mu=0.6)
+    return _load(tmp_path, ground, links + joints, time_step=0.004, **options)
+
+
+def test_a_sticking_balls_step_in_closed_form(tmp_path):
+    """m (v' - v*) = g with g_n = (-phi / (h + tau) - v') / R_n and g_t = -v' / R_t: two numbers each."""
+    model, h = _puck(tmp_path), 0.004
+    k, soft, z = 1e4 * 3e4 / 4e4, h + 0.05, 0.1 - 1e-3
+    m_x, m_z = 0.5, 0.2
+    R_n, R_t = 1 / (h * k * soft), 1e-3 * np.hypot(1 / m_x, 1 / m_z) / 3
+    d = dd.differentiate_step(model, [0.0, z, 1e-4, -0.02])
+    assert d.method == "analytic", d.reason
+    to_x, to_z = R_t * m_x / (1 + R_t * m_x), R_n * m_z / (1 + R_n * m_z)
+    by_phi = -1 / (soft * (1 + R_n * m_z))
+    v_z = to_z * (-0.02 - 9.81 * h) + 1e-3 / (soft * (1 + R_n * m_z))
+    np.testing.assert_allclose(d.x_next[2:], [to_x * 1e-4, v_z], rtol=1e-6)  # SAP ends at 1e-6 of the momentum
+    exact = np.array([[0, 0, to_x, 0], [0, by_phi, 0, to_z]])
+    np.testing.assert_allclose(d.A[2:], exact, atol=1e-10)
+    np.testing.assert_allclose(d.A[:2], [[1, 0, 0, 0], [0, 1, 0, 0]] + h * exact, atol=1e-12)
+
+
+def test_a_sliding_balls_friction_in_closed_form(tmp_path):
+    """g_n D = a + mu v_x, a = -phi / (h + tau) - v*, D = R_n + mu^2 (R_t + 1 / m_x) + 1 / m_z.
+
+    Both from v_x' > 0 and y_n, y_t of `friction_cone`, but for its soft norm.
+    """
+    model, h = _puck(tmp_path), 0.004
+    mu, soft, v_x, v_z = 2 * 0.4 * 0.6 / (0.4 + 0.6), h + 0.05, 1.0, -0.02 - 9.81 * h
+    R_n, R_t = 1 / (h * 7.5e3 * soft), 1e-3 * np.hypot(1 / 0.5, 1 / 0.2) / 3
+    d = dd.differentiate_step(model, [0.0, 0.1 - 1e-3, 1.0, -0.02], parameters=["z.friction", "z.stiffness"])
+    assert d.sources == ("analytic", "analytic"), d.reason
+    a, D, by_mu = 1e-3 / soft - v_z, R_n + mu**2 * (R_t + 2) + 5, 2 * mu * (R_t + 2)
+    g_n = (a + mu * v_x) / D
+    g_mu = v_x / D - g_n * by_mu / D
+    g_k = g_n * R_n / 7.5e3 / D
+    mu_s, k_s = 2 * 0.6**2, 0.75**2  # d mu / d mu_s = 2 mu_o^2 / (mu_s + mu_o)^2, and the same of stiffness by half
+    exact = [[-(g_n + mu * g_mu) / 0.5 * mu_s, -mu * g_k / 0.5 * k_s], [g_mu / 0.2 * mu_s, g_k / 0.2 * k_s]]
+    np.testing.assert_allclose(d.x_next[2:], [v_x - mu * g_n / 0.5, v_z + g_n / 0.2], rtol=1e-6)
+    # The soft norm of 1e-7 N s, beside impulses y_t of v_x / R_t = 1e3 N s, is lost in rounding.
+    np.testing.assert_allclose(d.C[2:], exact, rtol=1e-6)
+
+
+def test_columns_by_the_material_are_differences_of_the_step(tmp_path):
+    model = _walker(tmp_path)
+    wanted = ["fixed.friction", "fixed.stiffness", "fixed.relaxation_time", "foot/toe.stiffness", "foot/heel.friction"]
+    wanted += ["tail.relaxation_time", "trunk.stiffness", "tail.dissipation"] if _has(model, "tail.dissipation") else []
+    for x, u in _touching_states(model, 6, seed=8):
+        ours = dd.differentiate_step(model, x, u, parameters=wanted)
+        differences = dd.differentiate_step(model, x, u, parameters=wanted, method="finite_difference")
+        assert set(ours.sources) == {"analytic"}
+        assert set(differences.sources) == {"finite_difference"}
+        # SAP leaves 1e-6 of the momentum unsolved, which differences show.
+        allowed = 2e-4 * np.abs(differences.C).max(axis=0) + 1e-6 / _values(model, wanted)
+        assert (np.abs(ours.C - differences.C) <= allowed).all()
+
+
+def _values(model, names):
+    """(np,) the parameters' values: what a derivative by them is per."""
+    values = {p.name: float(p.value[0]) for p in dd.list_parameters(model)}
+    return np.array([values[name] for name in names])
+
+
+def _has(model, name):
+    return name in {p.name for p in dd.list_parameters(model)}
+
+
+def test_values_of_the_material_that_are_given_are_those_of_the_derivative(tmp_path):
+    model = _puck(tmp_path)
+    x = [0.0, 0.1 - 1e-3, 1.0, -0.02]
+    given = {"z.friction": 0.9, "fixed.stiffness": 5e4}
+    ours = dd.differentiate_step(model, x, parameters=given)
+    exact = dd.differentiate_step(model, x, parameters=given, method="autodiff")
+    assert ours.method == "analytic"
+    assert exact.method == "autodiff"
+    np.testing.assert_allclose(ours.A, exact.A, atol=1e-10)
+    assert not np.allclose(ours.A, dd.differentiate_step(model, x).A)
+
+
+def _cones(count, seed):
+    """Contacts that stick, slide and part, compliant and near-rigid."""
+    random = np.random.default_rng(seed)
+    normal = random.standard_normal((count, 3))
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    velocity = 0.02 * random.standard_normal((count, 1)) * normal
+    velocity += 10 ** random.uniform(-5, 0, (count, 1)) * random.standard_normal((count, 3))
+    return Cone(
+        velocity=velocity,
+        normal=normal,
+        phi=-1e-3 * random.random(count),
+        weight=random.uniform(0.5, 5.0, count),
+        friction=random.uniform(0.1, 1.5, count),
+        stiffness=10 ** random.uniform(3, 8, count),
+        time=random.uniform(0.0, 0.1, count),
+        time_step=0.005,
+        near_rigid=1.0,
+    )
+
+
+def _moved(cone, step, **changes):
+    fields = {name: getattr(cone, name) + step * change for name, change in changes.items()}
+    return Cone(**{**vars(cone), **fields})
+
+
+@pytest.mark.parametrize("name", ["velocity", "normal", "phi", "weight", "friction", "stiffness", "time"])
+def test_the_impulses_derivative_is_its_difference(name):
+    cone = _cones(400, 1)
+    solved, random = cone.solve(), np.random.default_rng(4)
+    assert solved.sticks.any()
+    assert (solved.pushes & ~solved.sticks).any()
+    assert not solved.pushes.all()
+    assert solved.is_rigid.any()
+    assert not solved.is_rigid.all()
+    change = np.array(random.standard_normal(getattr(cone, name).shape))
+    if name == "stiffness":
+        change *= cone.stiffness
+    step = 1e-8 if name == "velocity" else 1e-7  # soft norms turn within 1e-7 of it
+    sides = [_moved(cone, s * step, **{name: change}).solve() for s in (1, -1)]
+    same = [
+        np.all([s.sticks == solved.sticks, s.pushes == solved.pushes, s.is_rigid == solved.is_rigid], axis=0)
+        for s in sides
+    ]
+    differences = (sides[0].impulse - sides[1].impulse) / (2 * step)
+    if name in ("friction", "stiffness", "time"):
+        columns = {n: np.where(n == name, change, 0.0)[:, None] for n in ("friction", "stiffness", "time")}
+        found = solved.by_material(**columns)[:, 0]
+    else:
+        empty = {"velocity": np.zeros((400, 1, 3)), "normal": np.zeros((400, 1, 3))}
+        empty |= {"phi": np.zeros((400, 1)), "weight": np.zeros((400, 1))}
+        found = solved.by_state(**{**empty, name: change[:, None]})[:, 0]
+    keep = same[0] & same[1]
+    assert keep.sum() > 350
+    size = np.maximum(np.abs(differences).max(axis=1), 1e-3)[:, None]
+    np.testing.assert_allclose((found / size)[keep], (differences / size)[keep], atol=2e-5)  # the step's own error
+    if name == "velocity":
+        np.testing.assert_allclose(
+            (solved.by_velocity() @ change[:, :, None])[..., 0], found, atol=1e-12 * np.abs(found).max()
+        )
+
+
+def test_another_law_is_found_out(tmp_path, monkeypatch):
+    """A wrong constant moves v' off the solution, or, where it hardly does, the Jacobian off AutoDiffXd's."""
+    x = [0.0, 0.1 - 1e-3, 1e-4, -0.02]
+    monkeypatch.setattr(friction_cone, "SIGMA", 1.1e-3)
+    d = dd.differentiate_step(_puck(tmp_path), x)
+    assert d.method == "autodiff"
+    assert analytic.SAME_JACOBIAN == 1e-9
+
+
+def test_a_joint_limit_beside_contact_is_refused(tmp_path):
+    links = _link("x", mass=0.3) + _link("z", _sphere("tip", "0 0 0", 0.1), 0.2)
+    joints = _joint("along", "prismatic", "world", "x", "1 0 0", limit=0.01) + _joint(
+        "up", "prismatic", "x", "z", "0 0 1"
+    )
+    model = _load(tmp_path, _collision("ground", SHAPES["ground"]), links + joints)
+    free = dd.differentiate_step(model, [0.0, 0.099, 0.5, 0.0])
+    assert free.method == "analytic", dd.differentiate_step(model, [0.0, 0.099, 0.5, 0.0], method="analytic").reason
+    held = dd.differentiate_step(model, [0.0095, 0.099, 0.5, 0.0], method="analytic")
+    assert held.method == "autodiff"
+    assert "something else acts beside contact" in held.reason
+
+
+def test_what_the_form_does_not_describe_is_differentiated_otherwise(tmp_path):
+    x = [0.0, 0.099, 0.5, 0.0]
+    for approximation in ("similar", "lagged"):
+        d = dd.differentiate_step(_puck(tmp_path, contact_approximation=approximation), x, method="analytic")
+        assert d.method == "autodiff"
+        assert f"the contact approximation is {approximation}, not sap" in d.reason
+    links = _link("x", mass=0.3) + _link("z", _sphere("tip", "0 0 0", 0.1), 0.2)
+    joints = _joint("along", "prismatic", "world", "x", "1 0 0") + _joint("up", "prismatic", "x", "z", "0 0 1")
+    beside = _collision("post", SHAPES["cylinder"], "0.15 0 0.1 0 0 0")
+    model = _load(tmp_path, beside, links + joints)
+    d = dd.differentiate_step(model, [0.0, 0.1, 0.5, 0.0], method="analytic")
+    assert d.method == "autodiff"
+    assert "no sphere may touch a sphere, box, capsule or half space" in d.reason
+    model = _load(tmp_path, beside + _collision("ground", SHAPES["ground"]), links + joints)
+    d = dd.differentiate_step(model, [0.0, 0.099, 0.5, 0.0], method="analytic")
+    assert d.method == "autodiff"
+    assert "something else acts beside contact" in d.reason
+
+
+def test_other_parameters_than_of_contact_are_left_to_autodiff(tmp_path):
+    d = dd.differentiate_step(_puck(tmp_path), [0.0, 0.099, 0.5, 0.0], parameters=["z.mass", "z.friction"])
+    assert d.method != "analytic"
+    assert d.sources == ("autodiff", "finite_difference")
+
+
+def test_parameters_of_contact_do_nothing_where_nothing_touches(tmp_path):
+    d = dd.differentiate_step(_puck(tmp_path), [0.0, 0.5, 0.5, 0.0], parameters=["z.friction", "fixed.stiffness"])
+    assert d.sources == ("analytic", "analytic")
+    np.testing.assert_array_equal(d.C, 0.0)
