@@ -45,8 +45,24 @@ cli_panel.add_commands(app)
 cli_robustness.add_commands(app)
 
 
+def _print_version(asked: bool) -> None:
+    from importlib.metadata import PackageNotFoundError, version
+
+    if not asked:
+        return
+    try:
+        typer.echo(f"drake-diff {version('drake-diff')}")
+    except PackageNotFoundError as error:
+        raise MissingDependencyError("drake-diff runs from a folder that is not installed: pip install -e .") from error
+    raise typer.Exit
+
+
 @app.callback()
-def about() -> None:
+def about(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
     """Trajectory optimization on Drake with gradients that are checked before they are used."""
 
 

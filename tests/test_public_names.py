@@ -125,7 +125,7 @@ def test_importing_the_package_loads_nothing_heavy():
     assert fresh("import drake_diff; print(loaded([*loaded.__defaults__[0], 'typer', 'rich']))") == "[]\n"
 
 
-@pytest.mark.parametrize("words", [["--help"]])
+@pytest.mark.parametrize("words", [["--help"], ["--version"]])
 def test_the_commands_first_words_load_nothing_heavy(words):
     code = """
 from drake_diff.cli import main
