@@ -30,6 +30,7 @@ from drake_diff import (
 from drake_diff.cli_options import Approximation, ContactModel, Geometry, Ground, ModelFile, TimeStep, WeldBase
 from drake_diff.cli_runs import plain
 from drake_diff.cli_view import view
+from drake_diff.exceptions import DrakeDiffError, InputError, MissingDependencyError
 
 HOLDS, CHECK_FAILED, USAGE, MISSING, INTERNAL = range(5)
 
@@ -44,8 +45,24 @@ cli_panel.add_commands(app)
 cli_robustness.add_commands(app)
 
 
+def _print_version(asked: bool) -> None:
+    from importlib.metadata import PackageNotFoundError, version
+
+    if not asked:
+        return
+    try:
+        typer.echo(f"drake-diff {version('drake-diff')}")
+    except PackageNotFoundError as error:
+        raise MissingDependencyError("drake-diff runs from a folder that is not installed: pip install -e .") from error
+    raise typer.Exit
+
+
 @app.callback()
-def about() -> None:
+def about(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
     """Trajectory optimization on Drake with gradients that are checked before they are used."""
 
 
@@ -57,15 +74,16 @@ def run(
     out: Annotated[Path | None, typer.Option(help="Run directory; artifacts/<script> where not given.")] = None,
 ) -> None:
     """Solve the problem that SCRIPT defines, measure the solution again, and write the run directory."""
-    from drake_diff.evidence import begin, save, save_failure
-    from drake_diff.solver import solve
-
     console = Console(soft_wrap=True, highlight=False)
     module = _load(script)
     problem = module.problem()
     options = dict(getattr(module, "solve_options", {}))
     directory = out or Path("artifacts") / script.stem
     console.print(f"[bold]{escape(script.name)}[/]: {escape(repr(problem.model))}, {problem.num_steps} steps")
+    # Only here: a script that is not there, or is wrong, is told of at once.
+    from drake_diff.evidence import begin, save, save_failure
+    from drake_diff.solver import solve
+
     begun: list[Path] = []
 
     def on_start() -> None:
@@ -167,8 +185,6 @@ app.command()(view)
 
 def main() -> None:
     """The entry point: every error of ours becomes a sentence and an exit status."""
-    from drake_diff.exceptions import DrakeDiffError, MissingDependencyError
-
     try:
         app()
     except MissingDependencyError as error:
@@ -188,8 +204,6 @@ def _fail(error: Exception, status: int) -> None:
 
 def _load(script: Path) -> ModuleType:
     """The script as a module; its `if __name__ == "__main__"` part does not run."""
-    from drake_diff.exceptions import InputError
-
     if not script.is_file():
         raise InputError("SCRIPT", got=str(script), expected="a Python file that exists")
     spec = importlib.util.spec_from_file_location("drake_diff_script", script)

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 from pydrake.autodiffutils import ExtractValue
-from pydrake.planning import DirectCollocation
 
 from drake_diff.arrays import Array
 from drake_diff.autodiff import chain
@@ -36,6 +35,8 @@ class _Transcription:
     """Drake's program with this problem's costs and constraints on it."""
 
     def __init__(self, problem: Problem):
+        from pydrake.planning import DirectCollocation  # as slow to import as NumPy, and of this method alone
+
         self.problem = problem
         h, count = problem.model.time_step, problem.num_steps
         system = ContinuousSystem(EquationsOfMotion(problem.model))

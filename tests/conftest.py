@@ -15,6 +15,9 @@ import drake_diff as dd
 
 MODELS = Path(__file__).parent.parent / "models"
 
+for public in dd.__all__:  # a module that is first loaded while a test has patched another would keep the patch
+    getattr(dd, public)
+
 
 @pytest.fixture
 def load():

@@ -118,6 +118,23 @@ def test_a_change_is_one_beyond_the_spread(part, old, new, changed):
     assert found.factor == new[0] / old[0]
 
 
+def test_starts_are_those_of_fresh_processes_beside_numpys(part, monkeypatch):
+    starts = part("starts")
+    monkeypatch.setattr(starts, "QUICK_BUDGET", 0.0)
+    rows = {row.peer: row for row in starts.started(quick=True)}
+    assert list(rows) == list(starts.STARTS)
+    assert {(row.quantity, row.base, row.blocks) for row in rows.values()} == {("start", "import numpy", 3)}
+    assert rows["import numpy"].ratio == (1.0, 1.0, 1.0)
+    assert all(row.cpu.median > 0 for row in rows.values())
+
+
+def test_a_start_that_fails_is_not_timed(part, monkeypatch):
+    starts = part("starts")
+    monkeypatch.setitem(starts.STARTS, "broken", ["-c", "import no_such_library"])
+    with pytest.raises(subprocess.CalledProcessError):
+        list(starts.started(quick=True))
+
+
 def test_what_is_no_saved_run_is_refused(part, tmp_path):
     path = tmp_path / "other.json"
     for text, said in (('{"format": 0}', '"format": 1'), ("[]", '"format": 1'), ("no JSON", "--out")):

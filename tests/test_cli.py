@@ -6,11 +6,13 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 
 import drake_diff as dd
+from drake_diff import cli
 
 ROOT = Path(__file__).parent.parent
 PENDULUM = f"""
@@ -155,3 +157,20 @@ def wait_until(condition, timeout=60.0):
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.02)
+
+
+def test_the_version_is_that_of_the_installation(tmp_path):
+    done = drake_diff("--version", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (0, f"drake-diff {metadata.version('drake-diff')}\n")
+
+
+def test_without_an_installation_there_is_no_version(monkeypatch, capsys):
+    def unknown(name):
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", unknown)
+    monkeypatch.setattr(sys, "argv", ["drake-diff", "--version"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == cli.MISSING
+    assert "MissingDependencyError: drake-diff runs from a folder" in capsys.readouterr().err

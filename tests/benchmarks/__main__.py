@@ -4,7 +4,8 @@
     python tests/benchmarks [--quick] [--only panda,step_jacobian] [--out FILE.json]
     python tests/benchmarks --compare OLD.json NEW.json
 
-Models: cases.CASES and the whole solves of solves.SOLVES; quantities: those of peers.QUANTITIES, solve and layers.
+Models: cases.CASES and the whole solves of solves.SOLVES; quantities: those of peers.QUANTITIES, solve,
+start (of processes: imports and --help) and layers.
 --quick takes less than two minutes: five models, short horizons, no MJX. Peers that are not installed are named;
 Crocoddyl runs in the environment whose Python $CROCODDYL_PYTHON names (see crocoddyl_peer.py).
 """
@@ -23,12 +24,13 @@ from cases import CASES, case  # noqa: E402
 from layers import Layers, layers  # noqa: E402
 from peers import QUANTITIES  # noqa: E402
 from solves import QUICK_SOLVES, SOLVES, solved  # noqa: E402
+from starts import started  # noqa: E402
 from suite import QUICK_MODELS, Missing, Row, measured  # noqa: E402
 from table import document, machine, save, show  # noqa: E402
 
 from drake_diff.exceptions import InputError, UnknownNameError  # noqa: E402
 
-KINDS = (*QUANTITIES, "solve", "layers")
+KINDS = (*QUANTITIES, "solve", "start", "layers")
 LAYERS_OF = ("pendulum", "panda", "solo12", "sphere", "chain30")
 LAYERS_HORIZON = 10
 
@@ -42,7 +44,7 @@ def chosen(only: str, quick: bool) -> tuple[list[str], list[str], list[str]]:
     places = [name for name in names if name not in KINDS]
     models = [n for n in CASES if (n in places if places else not quick or n in QUICK_MODELS)]
     solves = [n for n in SOLVES if (n in places if places else not quick or n in QUICK_SOLVES)]
-    kinds = [n for n in KINDS if n in names] or list(KINDS)
+    kinds = [n for n in KINDS if n in names] or [n for n in KINDS if n != "start" or not places]
     return models, kinds, solves if "solve" in kinds else []
 
 
@@ -51,7 +53,7 @@ def run(only: str, quick: bool, out: Path | None) -> dict:
     models, kinds, solves = chosen(only, quick)
     before, quantities = machine(), [kind for kind in kinds if kind in QUANTITIES]
     found: list[Row | Missing | Layers] = []
-    for part in _parts(models, quantities, solves, "layers" in kinds, quick):
+    for part in _parts(models, quantities, solves, kinds, quick):
         found += part
         rows, missing, parts = ([one for one in found if isinstance(one, kind)] for kind in (Row, Missing, Layers))
         whole = document(rows, missing, parts, before, {"only": only, "quick": quick})
@@ -61,12 +63,13 @@ def run(only: str, quick: bool, out: Path | None) -> dict:
 
 
 def _parts(
-    models: list[str], quantities: list[str], solves: list[str], split: bool, quick: bool
+    models: list[str], quantities: list[str], solves: list[str], kinds: list[str], quick: bool
 ) -> Iterator[list[Row | Missing] | list[Layers]]:
     for name in models:
         yield [*measured(name, quantities, quick)] if quantities else []
-        yield _layers(name) if split and name in LAYERS_OF else []
+        yield _layers(name) if "layers" in kinds and name in LAYERS_OF else []
     yield [*solved(solves, quick)]
+    yield [*started(quick)] if "start" in kinds else []
 
 
 def _layers(name: str) -> list[Layers]:

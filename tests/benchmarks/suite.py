@@ -22,7 +22,7 @@ class Row:
     """One peer's time for one quantity; seconds a call, ratios of processor time to the base's, round by round."""
 
     model: str
-    joints: int  # nv
+    joints: int  # nv, 0 where there is no model
     quantity: str
     horizon: int | None
     peer: str
