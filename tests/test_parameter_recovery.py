@@ -62,7 +62,11 @@ def all_recovered(outcomes, *, certified=True):
 
 
 @pytest.mark.parametrize(
-    ("name", "parameter", "size"), [("pendulum.urdf", "pole.mass", 2.0), ("acrobot.xml", "lower.mass", 1.0)]
+    ("name", "parameter", "size"),
+    [
+        ("pendulum.urdf", "pole.mass", 2.0),
+        pytest.param("acrobot.xml", "lower.mass", 1.0, marks=pytest.mark.slow),
+    ],
 )
 def test_a_hidden_mass(load, name, parameter, size):
     model = load(name, time_step=0.02)
@@ -78,6 +82,7 @@ def test_a_hidden_mass(load, name, parameter, size):
     all_recovered(outcomes)
 
 
+@pytest.mark.slow
 def test_the_hidden_mass_of_a_cart_poles_bob(load):
     model = load("cart_pole.urdf", time_step=0.02)
     free = dd.Bounds(x_lower=[-np.inf] * 4, x_upper=[np.inf] * 4)

@@ -57,6 +57,7 @@ def test_without_the_second_layer_the_same_gradient_agrees(bouncer):
     assert abs(certificate.entries[0].derivative + 1) > 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stiffness", "mass"), [(400.0, 1.0), (250.0, 0.8)])
 def test_where_the_step_resolves_the_contact_the_limit_is_the_compliant_closed_form(bouncer, stiffness, mass):
     """A spring of half a period pi / w, w^2 = k / m, returns the ball: d y / d y0 = -1, d y / d v0 = -(T - pi / w)."""
