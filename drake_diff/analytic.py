@@ -14,8 +14,8 @@ from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
 from drake_diff.analytic_step import Analytic, build_analytic
 from drake_diff.arrays import Array
 from drake_diff.autodiff import gradient_rows
-from drake_diff.contact_jacobian import contact_form, contact_jacobians, place
-from drake_diff.contact_material import CONTACT_QUANTITIES, material_change, read_material
+from drake_diff.contact_jacobian import contact_form, contact_jacobians, material_of, place
+from drake_diff.contact_material import CONTACT_QUANTITIES, material_change
 from drake_diff.engines.euler import Coordinates
 from drake_diff.exceptions import MissingDependencyError, ModelError, SimulationError
 from drake_diff.implicit import Steps, form_of
@@ -148,10 +148,8 @@ def _with_contact(
     left = _LEFT.setdefault(model, CERTIFIED_STATES)
     if isinstance(left, str):
         return left
-    material, change = form.own, None
-    if vector.parameters:
-        material = read_material(model.double, form.pairs)
-        change = material_change(form.pairs, material, vector, model.double)
+    material = material_of(model, form)
+    change = material_change(form.pairs, material, vector, model.double) if vector.parameters else None
     poses = place(model, form, steps.starts)
     jacobians, known = contact_jacobians(form, analytic, steps, poses, material, change)
     for k in np.flatnonzero(known)[:left]:

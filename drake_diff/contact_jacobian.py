@@ -43,7 +43,6 @@ class ContactForm:
     by_body: Array  # (bodies, nv) 1 where a degree of freedom moves the body
     armature: Array  # (nv, nv) of reflected inertia and h D, a diagonal
     near_rigid: float
-    own: Material
 
 
 def contact_form(model: Model, analytic: Analytic) -> ContactForm | str:
@@ -75,8 +74,19 @@ def _read(model: Model, analytic: Analytic) -> ContactForm | str:
         by_body=np.array([topology.bodies[labels.get(body.index(), "world")] for body in pairs.bodies]),
         armature=np.diag(analytic.pinocchio.armature),
         near_rigid=float(model.plant.get_sap_near_rigid_threshold()),
-        own=read_material(model.double, pairs),
     )
+
+
+def material_of(model: Model, form: ContactForm) -> Material:
+    """The model's own, read once, or with the parameters that are applied."""
+    if model.has_other_parameters:
+        return read_material(model.double, form.pairs)
+    if model not in _OWN:
+        _OWN[model] = read_material(model.double, form.pairs)
+    return _OWN[model]
+
+
+_OWN: WeakKeyDictionary[Model, Material] = WeakKeyDictionary()
 
 
 def place(model: Model, form: ContactForm, xs: Array) -> Array:

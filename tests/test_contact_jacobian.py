@@ -265,6 +265,13 @@ def test_values_of_the_material_that_are_given_are_those_of_the_derivative(tmp_p
     assert not np.allclose(ours.A, dd.differentiate_step(model, x).A)
 
 
+def test_given_values_are_not_kept(tmp_path):
+    x, given = [0.0, 0.1 - 1e-3, 1.0, -0.02], {"z.friction": 0.9}
+    first = _puck(tmp_path)
+    dd.differentiate_step(first, x, parameters=given)
+    np.testing.assert_array_equal(dd.differentiate_step(first, x).A, dd.differentiate_step(_puck(tmp_path), x).A)
+
+
 def _cones(count, seed):
     """Contacts that stick, slide and part, compliant and near-rigid."""
     random = np.random.default_rng(seed)
