@@ -15,7 +15,7 @@ from drake_diff.analytic_step import Analytic, build_analytic
 from drake_diff.arrays import Array
 from drake_diff.autodiff import gradient_rows
 from drake_diff.contact_jacobian import contact_form, contact_jacobians, material_of, place
-from drake_diff.contact_material import CONTACT_QUANTITIES, material_change
+from drake_diff.contact_material import QUANTITIES, material_change
 from drake_diff.engines.euler import Coordinates
 from drake_diff.exceptions import MissingDependencyError, ModelError, SimulationError
 from drake_diff.implicit import Steps, form_of
@@ -33,7 +33,7 @@ FAR = 4.0  # [m or rad]
 
 def analytic_of(model: Model) -> Analytic | str:
     """The model's analytic step, certified when it is first asked for; else why there is none."""
-    if model.other_quantities - CONTACT_QUANTITIES:
+    if model.other_quantities.difference(QUANTITIES):
         return "parameters are applied that are not the model's own"
     if model not in _FOUND:
         try:

@@ -1,8 +1,8 @@
 """The Jacobian of a step with contact from its own equation, without differentiating Drake's solver.
 
-Drake's SAP step solves A (v' - v*) = sum_c J_c' g_c(J_c v'), with A = M + h D, v* the velocity without contact and g_c
-the impulse of contact c (`friction_cone`). At Drake's own v' it is a smooth step under a known force A (v' - v*) / h,
-which Pinocchio differentiates (`analytic_step`); what the impulses change is solved for:
+Drake's step solves A (v' - v*) = sum_c J_c' g_c(J_c v'), with A = M + h D, v* the velocity without contact and g_c the
+impulse of contact c (`friction_cone`, `hunt_crossley`). At Drake's own v' it is a smooth step under a known force
+A (v' - v*) / h, which Pinocchio differentiates (`analytic_step`); what the impulses change is solved for:
 
     (A + sum_c J_c' G_c J_c) dv' = A dv'|_g + sum_c d(J_c' g_c)|_v',   G_c = -dg_c / d(J_c v').
 
@@ -23,7 +23,8 @@ from drake_diff.contact_motion import Contacts, Topology, Weight, diagonal_chang
 from drake_diff.contact_pairs import ContactPairs, Indices, Touches, read_pairs
 from drake_diff.engines.description import describe_tree
 from drake_diff.engines.euler import cross
-from drake_diff.friction_cone import Cone, Impulse
+from drake_diff.friction_cone import Cone, Impulse, StateChange
+from drake_diff.hunt_crossley import HuntCrossley, HuntCrossleyImpulse
 from drake_diff.implicit import Steps
 from drake_diff.model import Model
 from drake_diff.plant_elements import bodies, labelled
@@ -32,6 +33,8 @@ from drake_diff.step import set_state
 # Of the momentum: Drake's solver ends at 1e-6 of it, in the same norm.
 OPTIMALITY = 2e-6
 ROUNDING = 1e-12
+# Drake's default [m/s], which it does not give back: another one shows in what it leaves unsolved.
+STICTION_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +45,8 @@ class ContactForm:
     topology: Topology
     by_body: Array  # (bodies, nv) 1 where a degree of freedom moves the body
     armature: Array  # (nv, nv) of reflected inertia and h D, a diagonal
+    approximation: str
+    time_step: float
     near_rigid: float
 
 
@@ -57,8 +62,6 @@ _FORMS: WeakKeyDictionary[Model, ContactForm | str] = WeakKeyDictionary()
 
 def _read(model: Model, analytic: Analytic) -> ContactForm | str:
     contact = model.contract.contact
-    if contact.approximation != "sap":
-        return f"the contact approximation is {contact.approximation}, not sap"
     if contact.model != "point":
         return f"the contact model is {contact.model}, not point"
     if analytic.form.pd:
@@ -73,6 +76,8 @@ def _read(model: Model, analytic: Analytic) -> ContactForm | str:
         topology=topology,
         by_body=np.array([topology.bodies[labels.get(body.index(), "world")] for body in pairs.bodies]),
         armature=np.diag(analytic.pinocchio.armature),
+        approximation=contact.approximation,
+        time_step=model.time_step,
         near_rigid=float(model.plant.get_sap_near_rigid_threshold()),
     )
 
@@ -118,24 +123,31 @@ def contact_jacobians(
     contacts = _contacts(form, touch, S, material)
     J = contacts.jacobian
     weight = contacts.weight(diagonal[at])
-    velocity = (v_next[at][:, None, :] @ J)[:, 0]
-    impulse = _cone(form, touch, material, velocity, weight, h).solve()
+    impulse = _law(form, contacts, material, weight, native.v[at], v_next[at]).solve()
     force = impulse.impulse
     push = _sum(at, (J @ force[..., None])[..., 0], count)
     momentum = (A @ np.stack([v_next - v_star, v_next], axis=-1)).swapaxes(-1, -2)  # gained, and had
     velocities = analytic.pushed(native, steps.us, momentum[:, 0] / h)
 
     point, normal, phi = contacts.displacement()
+    before = contacts.velocity_change(native.v[at], point) @ touch.normal[:, :, None]
     by_motion = impulse.by_state(
-        velocity=contacts.velocity_change(v_next[at], point),
-        normal=normal,
-        phi=phi,
-        weight=contacts.weight_change(weight, diagonal[at], diagonal_change(S, inertia, form.topology)[at], point),
+        StateChange(
+            velocity=contacts.velocity_change(v_next[at], point),
+            normal=normal,
+            phi=phi,
+            weight=contacts.weight_change(weight, diagonal[at], diagonal_change(S, inertia, form.topology)[at], point),
+            before=before[..., 0] + (normal @ (native.v[at][:, None, :] @ J)[:, 0, :, None])[..., 0],
+        )
     )
     right = A @ velocities
     right[:, :, : c.nv] += _sum(at, contacts.force_change(force, point) + J @ np.swapaxes(by_motion, -1, -2), count)
+    if isinstance(impulse, HuntCrossleyImpulse):
+        by_v = (J @ impulse.by_before()[..., None]) @ np.swapaxes(J @ touch.normal[..., None], -1, -2)
+        right[:, :, c.nv : 2 * c.nv] += _sum(at, by_v, count)
     if change is not None:
-        by_material = _by_material(contacts, impulse, weight, diagonal[at], v_next[at], change.part(touch.pair))
+        speeds = native.v[at], v_next[at]
+        by_material = _by_material(contacts, impulse, weight, diagonal[at], speeds, change.part(touch.pair))
         right = np.concatenate([right, _sum(at, by_material, count)], axis=2)
     left = A - _sum(at, J @ impulse.by_velocity() @ np.swapaxes(J, -1, -2), count)
     jacobians, _ = analytic.assemble(native, np.linalg.solve(left, right), v_next)
@@ -144,31 +156,49 @@ def contact_jacobians(
 
 
 def _by_material(
-    contacts: Contacts, impulse: Impulse, weight: Weight, diagonal: Array, v: Array, change: MaterialChange
+    contacts: Contacts,
+    impulse: Impulse | HuntCrossleyImpulse,
+    weight: Weight,
+    diagonal: Array,
+    speeds: tuple[Array, Array],
+    change: MaterialChange,
 ) -> Array:
     """(M, nv, np) the change of J' g by parameters: through the law, and through where on the normal p is."""
     touch, nothing = contacts.touch, np.zeros((*change.friction.shape, 3))
     point = -(touch.phi[:, None] * change.other_part)[..., None] * touch.normal[:, None]
-    changed = impulse.by_material(change.friction, change.stiffness, change.time) + impulse.by_state(
-        velocity=contacts.velocity_change(v, point, moves=False),
+    before, after = (contacts.velocity_change(v, point, moves=False) for v in speeds)
+    moved = StateChange(
+        velocity=after,
         normal=nothing,
         phi=nothing[..., 0],
         weight=contacts.weight_change(weight, diagonal, None, point),
+        before=(before @ touch.normal[:, :, None])[..., 0],
     )
-    return contacts.force_change(impulse.impulse, point, moves=False) + contacts.jacobian @ np.swapaxes(changed, -1, -2)
+    changed = np.swapaxes(impulse.by_material(change) + impulse.by_state(moved), -1, -2)
+    return np.asarray(contacts.force_change(impulse.impulse, point, moves=False) + contacts.jacobian @ changed)
 
 
-def _cone(form: ContactForm, touch: Touches, material: Material, velocity: Array, weight: Weight, h: float) -> Cone:
-    return Cone(
-        velocity=velocity,
+def _law(
+    form: ContactForm, contacts: Contacts, material: Material, weight: Weight, v: Array, v_next: Array
+) -> Cone | HuntCrossley:
+    touch, pair, J = contacts.touch, contacts.touch.pair, contacts.jacobian
+    before, after = ((u[:, None, :] @ J)[:, 0] for u in (v, v_next))
+    friction, stiffness, h = material.friction[pair], material.stiffness[pair], form.time_step
+    if form.approximation == "sap":
+        time = material.time[pair]
+        return Cone(after, touch.normal, touch.phi, weight.value, friction, stiffness, time, h, form.near_rigid)
+    return HuntCrossley(
+        velocity=after,
+        before=(before * touch.normal).sum(axis=-1),
         normal=touch.normal,
         phi=touch.phi,
         weight=weight.value,
-        friction=material.friction[touch.pair],
-        stiffness=material.stiffness[touch.pair],
-        time=material.time[touch.pair],
+        friction=friction,
+        stiffness=stiffness,
+        dissipation=material.dissipation[pair],
         time_step=h,
-        near_rigid=form.near_rigid,
+        stiction_tolerance=STICTION_TOLERANCE,
+        lagged=form.approximation == "lagged",
     )
 
 

@@ -1,12 +1,14 @@
-"""What the two sides of a contact are made of, and the pair's friction, stiffness and relaxation time that Drake makes.
+"""What the two sides of a contact are made of, and what Drake makes of the two.
 
-    mu = 2 mu_s mu_o / (mu_s + mu_o),   k = k_s k_o / (k_s + k_o),   tau = tau_s + tau_o,   b = k_o / (k_s + k_o)
+    mu = 2 mu_s mu_o / (mu_s + mu_o),   k = k_s k_o / (k_s + k_o),   b = k_o / (k_s + k_o)
+    tau = tau_s + tau_o,   d = b d_s + (1 - b) d_o
 
-of the sphere's and the other side; dissipation is Hunt and Crossley's number, which SAP does not know.
+of the sphere's and the other side: friction, stiffness, relaxation time (of `sap` alone) and Hunt and Crossley's
+dissipation (of `similar` and `lagged` alone).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -17,18 +19,21 @@ from drake_diff.contact_parameters import geometries_of
 from drake_diff.parameters import ParameterVector
 from drake_diff.twin import Twin
 
-QUANTITIES = ("friction", "stiffness", "relaxation_time")
-CONTACT_QUANTITIES = frozenset({*QUANTITIES, "dissipation"})  # whose derivatives have a closed form here
+QUANTITIES = ("friction", "stiffness", "relaxation_time", "dissipation")  # whose derivatives have a closed form
+
+
+_NAMES = ("coulomb_friction", "point_contact_stiffness", "relaxation_time", "hunt_crossley_dissipation")  # Drake's
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Of P pairs; `sides` (P, 2, 3) is that of the sphere and of the other, in the order of QUANTITIES."""
+    """Of P pairs; `sides` (P, 2, 4) is that of the sphere and of the other, in the order of QUANTITIES."""
 
     sides: Array
     friction: Array  # (P,) mu
     stiffness: Array  # (P,) k [N/m]
     time: Array  # (P,) tau [s]
+    dissipation: Array  # (P,) d [s/m]
     other_part: Array  # (P,) b
 
 
@@ -39,11 +44,12 @@ class MaterialChange:
     friction: Array
     stiffness: Array
     time: Array
+    dissipation: Array
     other_part: Array
 
     def part(self, pairs: Indices) -> "MaterialChange":
         """That of some pairs (M,)."""
-        return MaterialChange(self.friction[pairs], self.stiffness[pairs], self.time[pairs], self.other_part[pairs])
+        return MaterialChange(*(getattr(self, f.name)[pairs] for f in fields(self)))
 
 
 def read_material(twin: Twin, pairs: ContactPairs) -> Material:
@@ -51,14 +57,12 @@ def read_material(twin: Twin, pairs: ContactPairs) -> Material:
     inspector, read = twin.inspector, {}
     for i in {i for ids in pairs.ids for i in ids}:
         properties = inspector.GetProximityProperties(i)
-        mu, k, tau = (
-            properties.GetProperty("material", name)
-            for name in ("coulomb_friction", "point_contact_stiffness", "relaxation_time")
-        )
-        read[i] = (mu.dynamic_friction(), k, tau)
-    sides = np.array([[read[i] for i in ids] for ids in pairs.ids], dtype=float).reshape(len(pairs.ids), 2, 3)
-    mu, k, tau = np.moveaxis(sides, -1, 0)
-    return Material(sides, 2 * _harmonic(mu), _harmonic(k), tau.sum(axis=1), k[:, 1] / k.sum(axis=1))
+        friction, *rest = (properties.GetProperty("material", name) for name in _NAMES)
+        read[i] = (friction.dynamic_friction(), *rest)
+    sides = np.array([[read[i] for i in ids] for ids in pairs.ids], dtype=float).reshape(len(pairs.ids), 2, 4)
+    mu, k, tau, d = np.moveaxis(sides, -1, 0)
+    b = k[:, 1] / k.sum(axis=1)
+    return Material(sides, 2 * _harmonic(mu), _harmonic(k), tau.sum(axis=1), b * d[:, 0] + (1 - b) * d[:, 1], b)
 
 
 def _harmonic(sides: Array) -> Array:
@@ -68,21 +72,22 @@ def _harmonic(sides: Array) -> Array:
 
 
 def material_change(pairs: ContactPairs, material: Material, vector: ParameterVector, twin: Twin) -> MaterialChange:
-    """By the entries of a vector all of whose quantities are CONTACT_QUANTITIES."""
+    """By the entries of a vector all of whose quantities are QUANTITIES."""
     by_sides = np.zeros((len(vector.values), *material.sides.shape))
     of_label = geometries_of(twin)
     for column, parameter in zip(by_sides, vector.parameters, strict=True):
-        if parameter.kind.quantity in QUANTITIES:
-            has = np.array([_which(ids, of_label[parameter.label]) for ids in pairs.ids])
-            column[..., QUANTITIES.index(parameter.kind.quantity)] = has
-    by_mu, by_k, by_tau = np.moveaxis(by_sides, (-1, 0), (0, -1))  # (P, 2, np)
-    mu, k, _ = np.moveaxis(material.sides, -1, 0)
-    total = k.sum(axis=1)[:, None]
+        has = np.array([_which(ids, of_label[parameter.label]) for ids in pairs.ids])
+        column[..., QUANTITIES.index(parameter.kind.quantity)] = has
+    by_mu, by_k, by_tau, by_d = np.moveaxis(by_sides, (-1, 0), (0, -1))  # (P, 2, np)
+    mu, k, _, d = np.moveaxis(material.sides, -1, 0)
+    b = material.other_part[:, None]
+    by_b = (by_k[:, 1] * k[:, :1] - by_k[:, 0] * k[:, 1:]) / k.sum(axis=1)[:, None] ** 2
     return MaterialChange(
         friction=2 * _harmonic_change(mu, by_mu),
         stiffness=_harmonic_change(k, by_k),
         time=by_tau.sum(axis=1),
-        other_part=(by_k[:, 1] * k[:, :1] - by_k[:, 0] * k[:, 1:]) / total**2,
+        dissipation=b * by_d[:, 0] + (1 - b) * by_d[:, 1] + (d[:, :1] - d[:, 1:]) * by_b,
+        other_part=by_b,
     )
 
 

@@ -18,9 +18,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff.arrays import Array
+from drake_diff.contact_material import MaterialChange
 
 SIGMA = 1e-3
 SOFT_NORM = 1e-7  # s [N s]
+
+
+@dataclass(frozen=True, eq=False)
+class StateChange:
+    """K changes of the states of M contacts."""
+
+    velocity: Array  # (M, K, 3) after the step
+    normal: Array  # (M, K, 3)
+    phi: Array  # (M, K), as all below
+    weight: Array
+    before: Array  # of the normal velocity before the step, which SAP does not know
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,17 +105,17 @@ class Impulse:
         turn = (mu * self.g_n / (self.y_r * self.R_t))[:, None, None] * (across - tt)
         return -np.where(self.sticks[:, None, None], stick, np.where(self.pushes[:, None, None], along + turn, 0.0))
 
-    def by_state(self, velocity: Array, normal: Array, phi: Array, weight: Array) -> Array:
-        """(M, K, 3) the change of the impulse along K changes, all but phi's and weight's (M, K) being (M, K, 3)."""
+    def by_state(self, change: StateChange) -> Array:
+        """(M, K, 3) the change of the impulse."""
         c, n = self.cone, self.cone.normal[:, None, :]
         R_n, R_t = self.R_n[:, None], self.R_t[:, None]
-        d_vn = (velocity * n).sum(axis=-1) + (c.velocity[:, None, :] * normal).sum(axis=-1)
-        d_vt = velocity - d_vn[..., None] * n - self.vn[:, None, None] * normal
-        d_Rt = weight / c.weight[:, None]  # as a part of R_t
+        d_vn = (change.velocity * n).sum(axis=-1) + (c.velocity[:, None, :] * change.normal).sum(axis=-1)
+        d_vt = change.velocity - d_vn[..., None] * n - self.vn[:, None, None] * change.normal
+        d_Rt = change.weight / c.weight[:, None]  # as a part of R_t
         d_Rn = np.where(self.is_rigid[:, None], d_Rt, 0.0)
-        d_yn = -(d_vn + phi / self.soft[:, None]) / R_n - self.y_n[:, None] * d_Rn
+        d_yn = -(d_vn + change.phi / self.soft[:, None]) / R_n - self.y_n[:, None] * d_Rn
         d_yt = -d_vt / R_t[..., None] - self.y_t[:, None, :] * d_Rt[..., None]
-        return self._projected(d_yn, d_yt, d_Rt - d_Rn, normal)
+        return self._projected(d_yn, d_yt, d_Rt - d_Rn, change.normal)
 
     def _projected(self, d_yn: Array, d_yt: Array, d_ratio: Array, d_normal: Array) -> Array:
         """The change of the impulse by those of y_n, y_t, of R_t / R_n as a part of it, and of the normal."""
@@ -120,15 +132,14 @@ class Impulse:
         found = d_gt + d_gn[..., None] * self.cone.normal[:, None, :] + g_n[..., None] * d_normal
         return np.where(self.pushes[:, None, None], found, 0.0)
 
-    def by_material(self, friction: Array, stiffness: Array, time: Array) -> Array:
+    def by_material(self, change: MaterialChange) -> Array:
         """(M, K, 3) the change of the impulse along K changes (M, K) of the material."""
         c = self.cone
         soft, compliant = self.soft[:, None], ~self.is_rigid[:, None]
-        d_Rn = np.where(compliant, -stiffness / c.stiffness[:, None] - time / soft, 0.0)
-        d_yn = c.phi[:, None] / soft**2 * time / self.R_n[:, None] - self.y_n[:, None] * d_Rn
-        nothing = np.zeros((*friction.shape, 3))
-        found = self._projected(d_yn, nothing, -d_Rn, nothing)
-        return found + self._by_friction(friction)
+        d_Rn = np.where(compliant, -change.stiffness / c.stiffness[:, None] - change.time / soft, 0.0)
+        d_yn = c.phi[:, None] / soft**2 * change.time / self.R_n[:, None] - self.y_n[:, None] * d_Rn
+        nothing = np.zeros((*change.friction.shape, 3))
+        return self._projected(d_yn, nothing, -d_Rn, nothing) + self._by_friction(change.friction)
 
     def _by_friction(self, friction: Array) -> Array:
         mu, ratio = self.cone.friction, self.R_t / self.R_n

@@ -12,7 +12,7 @@ from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
 from drake_diff.analytic import analytic_jacobian, analytic_of
 from drake_diff.arrays import Array, frozen
 from drake_diff.autodiff import gradient_rows
-from drake_diff.contact_material import CONTACT_QUANTITIES
+from drake_diff.contact_material import QUANTITIES
 from drake_diff.exceptions import GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.finite_difference import differences, plateau
 from drake_diff.implicit import NotSmoothError, implicit_jacobian
@@ -59,7 +59,7 @@ def differentiate_step(
 
     `parameters` names what C is by, at the model's own values, or maps the names to other values. `method` is
 
-    - "analytic": Pinocchio's derivatives, for smooth steps and steps with SAP's contact of spheres, on a model on which
+    - "analytic": Pinocchio's derivatives, for smooth steps and steps with contact of spheres, on a model on which
       they were certified equal to autodiff; other steps, and derivatives by or at parameters other than contact's
       friction, stiffness, dissipation and relaxation time, are as by "auto" without it;
     - "autodiff": AutoDiffXd through Drake's step;
@@ -141,7 +141,7 @@ def _by_analytic(model: Model, vector: ParameterVector, x: Array, u: Array, x_ne
 
 def _analytic(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array | str:
     """The Jacobian by Pinocchio, or why it cannot be had so."""
-    if any(p.kind.quantity not in CONTACT_QUANTITIES for p in vector.parameters):
+    if any(p.kind.quantity not in QUANTITIES for p in vector.parameters):
         return "derivatives by parameters other than of contact are asked for"
     return analytic_jacobian(model, vector, x, u, x_next)
 

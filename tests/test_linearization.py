@@ -119,22 +119,23 @@ def _a_fall(load, **options):
     return model, motion.xs, [bool(contacts) for contacts in motion.contacts]
 
 
-def test_steps_with_contact_are_taken_in_the_same_call(load):
-    model, xs, touches = _a_fall(load)
+@pytest.mark.parametrize("approximation", ["sap", "similar", "lagged"])
+def test_steps_with_contact_are_taken_in_the_same_call(load, approximation):
+    model, xs, touches = _a_fall(load, contact_approximation=approximation)
     assert 0 < sum(touches) < 30
     equal(model, xs, np.zeros((30, 0)))
     equal(model, xs, np.zeros((30, 0)), x_next=xs[1:])  # without Drake's steps
 
 
 def test_steps_with_other_contact_are_taken_by_others_and_named(load):
-    model, xs, touches = _a_fall(load, contact_approximation="similar")
+    model, xs, touches = _a_fall(load, contact_model="hydroelastic_with_fallback")
     us = np.zeros((30, 0))
     _, _, methods = equal(model, xs, us, expected=("analytic", "autodiff"))
     assert [m != "analytic" for m in methods] == touches
     assert equal(model, xs, us, expected=set(methods), x_next=xs[1:])[2] == methods  # without Drake's steps
     reasons = {d.method: d.reason for d in (dd.differentiate_step(model, xs[k], method="analytic") for k in (0, -1))}
     assert reasons["analytic"] == "asked for"
-    assert "not analytic: the contact approximation is similar, not sap" in reasons["autodiff"]
+    assert "not analytic: the contact model is hydroelastic_with_fallback, not point" in reasons["autodiff"]
 
 
 def test_a_joint_limit_that_acts_is_no_smooth_step():

@@ -34,7 +34,7 @@ ORDER = """
 lazy exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin model
 soft_contact read_contract tangent inertia parameter_kinds contact_parameters parameters parameter_coordinates step
 finite_difference tree_dynamics engines.engine engines.euler engines.description engines.body_frame
-engines.pinocchio_model implicit contact_pairs contact_material friction_cone contact_motion
+engines.pinocchio_model implicit contact_pairs contact_material friction_cone hunt_crossley contact_motion
 analytic_step contact_jacobian analytic step_derivatives linearization smoothing policy contact quantities
 mode_changes certificate rollout rollout_gradient refinement certify continuous cost bounds constraint problem replay
 dynamics nonlinear_program transcription_scheme optimal_control transcribed symbolic symbolic_tree knot_functions
