@@ -13,6 +13,7 @@ What is not in the tree shows in the comparison with Drake.
 
 from dataclasses import dataclass, replace
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -40,7 +41,21 @@ class PlantFunctions:
 
 
 def symbolic_plant(model: Model) -> PlantFunctions | str:
-    """The equations of motion as SX functions, or why there are none; compared with Drake's plant at two states."""
+    """The equations of motion as SX functions, or why there are none; compared with Drake's plant at two states.
+
+    Made once, for the model's own parameters: what is made while it has others is not kept.
+    """
+    if model.has_other_parameters:
+        return _compared(model)
+    if model not in _KNOWN:
+        _KNOWN[model] = _compared(model)
+    return _KNOWN[model]
+
+
+_KNOWN: WeakKeyDictionary[Model, PlantFunctions | str] = WeakKeyDictionary()
+
+
+def _compared(model: Model) -> PlantFunctions | str:
     tree = tree_for(model)
     if tree is None:
         found = tree_of(model)
