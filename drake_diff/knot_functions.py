@@ -4,6 +4,7 @@ Both give `values` (m, K), the nonzeros of the K Jacobians by the knot, and, whe
 weights (m, K) times values. `jacobian_at` and `hessian_at` are (rows, columns) of the nonzeros of one knot.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +21,7 @@ from drake_diff.optimal_control import OptimalControl
 from drake_diff.symbolic import trace
 from drake_diff.symbolic_tree import PlantFunctions, symbolic_plant
 
+THREAD_WORTH = 500_000  # instructions of 1 to 5 ns; to start a thread costs 50 us
 Values = Callable[[Array], Array]  # knots (K, nx + nu) -> (K, m)
 Linearize = Callable[[Array], tuple[Array, Array]]  # -> (K, m), (K, m, nx + nu)
 
@@ -36,17 +38,17 @@ class Symbolic:
         self.jacobian_at = _places(self._jacobian.sparsity_out(0))
 
     def values(self, knots: Any) -> Any:
-        return self.function.map(knots.shape[1])(knots)
+        return _at_all(self.function, knots)
 
     def jacobian(self, knots: Any) -> Any:
-        return ca.vec(self._jacobian.map(knots.shape[1])(knots).nz[:])
+        return ca.vec(_at_all(self._jacobian, knots).nz[:])
 
     def jacobian_of(self, knot: Array) -> Array:
         """(m, nx + nu) at one `knot` (nx + nu,)."""
         return np.asarray(self._jacobian(knot).full())
 
     def hessian(self, knots: Any, weights: Any) -> Any:
-        return ca.vec(self._hessian.map(knots.shape[1])(knots, weights).nz[:])
+        return ca.vec(_at_all(self._hessian, knots, weights).nz[:])
 
     @property
     def hessian_at(self) -> tuple[Indices, Indices]:
@@ -63,6 +65,13 @@ class Symbolic:
         knot, weights = ca.SX.sym("knot", self.width), ca.SX.sym("weights", self.rows)
         hessian, _ = ca.hessian(ca.dot(weights, self.function(knot)), knot)
         return ca.Function("hessian", [knot, weights], [ca.triu(hessian)])
+
+
+def _at_all(function: Any, knots: Any, *others: Any) -> Any:
+    """`function` of each column, on as many cores as have enough to do: their threads start anew at every call."""
+    count = knots.shape[1]
+    threads = min(os.cpu_count() or 1, count * function.n_instructions() // THREAD_WORTH)
+    return function.map(count, *(("thread", threads) if threads > 1 else ()))(knots, *others)
 
 
 class Called:
