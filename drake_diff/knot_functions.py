@@ -31,10 +31,8 @@ class Symbolic:
 
     why_not = ""
 
-    def __init__(self, function: Any, jacobian: Any = None, hessian: Any = None):
+    def __init__(self, function: Any):
         self.function, self.rows, self.width = function, function.size1_out(0), function.size1_in(0)
-        if jacobian is not None:
-            self._jacobian, self._hessian = jacobian, hessian
         self.jacobian_at = _places(self._jacobian.sparsity_out(0))
 
     def values(self, knots: Any) -> Any:
@@ -68,10 +66,53 @@ class Symbolic:
 
 
 def _at_all(function: Any, knots: Any, *others: Any) -> Any:
-    """`function` of each column, on as many cores as have enough to do: their threads start anew at every call."""
-    count = knots.shape[1]
+    return _mapped(function, knots.shape[1])(knots, *others)
+
+
+def _mapped(function: Any, count: int) -> Any:
+    """`function` of `count` columns, on as many cores as have enough to do: their threads start anew at every call."""
     threads = min(os.cpu_count() or 1, count * function.n_instructions() // THREAD_WORTH)
-    return function.map(count, *(("thread", threads) if threads > 1 else ()))(knots, *others)
+    return function.map(count, *(("thread", threads) if threads > 1 else ()))
+
+
+class SymbolicPlant(Symbolic):
+    """A plant's equations of motion, whose Hessians take the Jacobians that were computed at the same knots before."""
+
+    def __init__(self, plant: PlantFunctions):
+        self._plant, self.error = plant, None
+        self._kept: dict[int, _Callback] = {}  # by the number of knots; CasADi holds no reference to its callbacks
+        super().__init__(plant.function)
+
+    def jacobian(self, knots: Any) -> Any:
+        count = knots.shape[1]
+        if count not in self._kept:
+            self._kept[count] = _Callback(self, count, self._jacobian.nnz_out(0), self._compute(count))
+        return ca.vec(self._kept[count](knots))
+
+    def hessian(self, knots: Any, weights: Any) -> Any:
+        function = _mapped(self._hessian, knots.shape[1])
+        rows = ca.MX(function.sparsity_in(2), self.jacobian(knots))
+        return ca.vec(function(knots, weights, rows).nz[:])
+
+    @property
+    def _jacobian(self) -> Any:
+        return self._plant.jacobian
+
+    @property
+    def _hessian(self) -> Any:
+        return self._plant.hessian
+
+    def _compute(self, count: int) -> Values:
+        found = np.empty((count, self._jacobian.nnz_out(0)))
+        buffer, evaluate = _mapped(self._jacobian, count).buffer()
+        buffer.set_res(0, memoryview(found))
+
+        def nonzeros(knots: Array) -> Array:
+            buffer.set_arg(0, memoryview(knots))
+            evaluate()
+            return found
+
+        return nonzeros
 
 
 class Called:
@@ -103,7 +144,7 @@ class Called:
 class _Callback(ca.Callback):  # type: ignore[misc]
     """(nx + nu, K) -> (rows, K); the last result is kept, since a solver asks twice for its first iterate's."""
 
-    def __init__(self, owner: Called, count: int, rows: int, at_knots: Values):
+    def __init__(self, owner: Any, count: int, rows: int, at_knots: Values):
         ca.Callback.__init__(self)
         self.owner, self.count, self.rows, self.at_knots = owner, count, rows, at_knots
         self.last: tuple[bytes, Array] | None = None
@@ -238,7 +279,7 @@ def _dynamics(dynamics: Dynamics) -> KnotFunction:
     elif isinstance(form, Pointwise):
         found = trace(form.f, dynamics.nx, probe, form.values(probe))
     if isinstance(found, PlantFunctions):
-        return Symbolic(found.function, found.jacobian, found.hessian)
+        return SymbolicPlant(found)
     if not isinstance(found, str):
         return Symbolic(found)
     return Called(found, dynamics.values, dynamics.linearize, dynamics.nx, dynamics.nx + dynamics.nu)
