@@ -79,7 +79,8 @@ class SymbolicPlant(Symbolic):
     """A plant's equations of motion, whose Hessians take the Jacobians that were computed at the same knots before."""
 
     def __init__(self, plant: PlantFunctions):
-        self._plant, self.error = plant, None
+        self._plant = plant
+        self.error: Exception | None = None
         self._kept: dict[int, _Callback] = {}  # by the number of knots; CasADi holds no reference to its callbacks
         super().__init__(plant.function)
 
@@ -144,7 +145,7 @@ class Called:
 class _Callback(ca.Callback):  # type: ignore[misc]
     """(nx + nu, K) -> (rows, K); the last result is kept, since a solver asks twice for its first iterate's."""
 
-    def __init__(self, owner: Any, count: int, rows: int, at_knots: Values):
+    def __init__(self, owner: Called | SymbolicPlant, count: int, rows: int, at_knots: Values):
         ca.Callback.__init__(self)
         self.owner, self.count, self.rows, self.at_knots = owner, count, rows, at_knots
         self.last: tuple[bytes, Array] | None = None
@@ -163,7 +164,7 @@ class _Callback(ca.Callback):  # type: ignore[misc]
         return ca.Sparsity.dense(self.rows, self.count)
 
     def has_jacobian(self) -> bool:
-        return self.rows == self.owner.rows
+        return isinstance(self.owner, Called) and self.rows == self.owner.rows
 
     def has_jac_sparsity(self, i: int, j: int) -> bool:
         return self.has_jacobian()
@@ -224,7 +225,8 @@ class KnotFunctions:
     @property
     def error(self) -> Exception | None:
         """The first error that one of them raised."""
-        called = [f for f in (self.dynamics, self.rate, self.final, *self.paths) if isinstance(f, Called)]
+        every = (self.dynamics, self.rate, self.final, *self.paths)
+        called = [f for f in every if isinstance(f, (Called, SymbolicPlant))]
         return next((f.error for f in called if f.error is not None), None)
 
 

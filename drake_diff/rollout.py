@@ -152,7 +152,7 @@ class Meter:
         """The rollout with states xs (N+1, nx) and us (N, nu)."""
         at, kinetic, potential, deepest = (np.array(column) for column in zip(*self.states, strict=True))
         nq, h, efforts = self.model.nq, self.model.time_step, np.array(self.efforts).reshape(us.shape)
-        after = np.array(self.ends).reshape(len(us), -1)[:, nq:]
+        after = np.array(self.ends).reshape(len(us), self.model.nx)[:, nq:]
         middle = (at[:-1, nq:] + after) / 2
         work = h * np.einsum("ki,ki->k", middle, efforts @ self.actuation.T)
         dissipation = h * np.einsum("ki,ki->k", middle, self.damping * after)
