@@ -53,8 +53,9 @@ def grown(running_cost, most):
     problem = dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=10, running_cost=running_cost)
     xs, us = np.zeros((11, 4)), 0.5 * np.random.default_rng(0).standard_normal((10, 1))
     kept, rows = [], []
-    for count in (2, 20, most):  # the first fills what is kept of a model
-        tracemalloc.start()
+    for count in (most, 20, most):  # the first fills what is kept of a model, and the interpreter's caches
+        if rows:
+            tracemalloc.start()
         found = solve_shooting(problem, xs, us, solver="snopt", limits=Limits(count, 1e3, 1e-30), report=None)
         rows.append(len(found[0].iterations))
         kept.append(tracemalloc.get_traced_memory()[0])
@@ -63,13 +64,13 @@ def grown(running_cost, most):
 
 
 def test_memory_is_flat_in_iterations():
-    """But for rows of five numbers, 120 to 260 bytes; the states of one motion are 11 x 4 x 8 = 352 and an array."""
-    growth, rows = grown(EFFORT, 200)
-    assert rows > 100
-    assert growth < 300 * rows
+    """A row of five numbers is 250 bytes, Drake 1.51 leaves some 400 more; one motion's derivatives are above 5000."""
+    growth, rows = grown(EFFORT, 100)
+    assert rows > 50
+    assert growth < 2000 * rows
     seen = []
-    growth, rows = grown(lambda x, u: (seen.append(np.array(x)), u @ u)[1], 40)
-    assert growth > 300 * rows > 0
+    growth, rows = grown(lambda x, u: (seen.append(np.array(x)), u @ u)[1], 30)
+    assert growth > 2000 * rows > 0
 
 
 @pytest.mark.parametrize("optimize", [("controls",), ("initial_state",), ("controls", "initial_state")])
