@@ -126,7 +126,8 @@ class Meter:
 
     def __init__(self, model: Model):
         self.model, self.plant, self.context = model, model.plant, model.double.context
-        self.can_touch = model.contract.contact.collision_pairs > 0
+        inspector = model.double.inspector
+        self.can_touch = inspector is not None and bool(inspector.GetCollisionCandidates())
         self.damping = model.double.damping()
         self.actuation = self.plant.MakeActuationMatrix()
         self.states: list[tuple[Array, float, float, float]] = []
