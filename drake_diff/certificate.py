@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_diff.arrays import Array, finite_array, frozen
 from drake_diff.exceptions import CertificateError, GradientError, ShapeError
-from drake_diff.finite_difference import ROUNDING, Difference, Function, differences, richardson
+from drake_diff.finite_difference import ROUNDING, Difference, Function, Many, one_by_one, richardson, sweep_of
 from drake_diff.mode_changes import ModeChange
 
 STEPS = tuple(10.0 ** (-k / 2) for k in range(4, 17))  # 1e-2 ... 1e-8
@@ -134,6 +134,30 @@ def certify_jacobian(
     `solver_tolerance` is how accurately `f` is solved, relative to max(1, |f|), where it is solved iteratively.
     Given a function, the derivative is also taken 1e-9 beside `x`.
     """
+    return certify_jacobian_of_many(
+        one_by_one(lambda at: np.asarray(f(at), dtype=float)),
+        x,
+        jacobian,
+        rows=rows,
+        columns=columns,
+        solver_tolerance=solver_tolerance,
+        method=method,
+        subject=subject,
+    )
+
+
+def certify_jacobian_of_many(
+    f: Many,
+    x: ArrayLike,
+    jacobian: ArrayLike | Callable[[Array], Array],
+    *,
+    rows: Sequence[str] | None = None,
+    columns: Sequence[str] | None = None,
+    solver_tolerance: float = 0.0,
+    method: str = "given",
+    subject: str = "the derivative",
+) -> Certificate:
+    """`certify_jacobian` of `f`: (K, n) -> (K, m), which is called once for all points of the differences."""
     x = finite_array("x", x, ("n",))
     scale = np.maximum(1.0, np.abs(x))
     at_x = np.asarray(jacobian(x) if callable(jacobian) else jacobian, dtype=float)
@@ -141,7 +165,7 @@ def certify_jacobian(
     if callable(jacobian):
         beside = np.asarray(jacobian(x + JITTER * scale * jitter_direction(len(x))), dtype=float)
     return certify_displacement(
-        lambda d: np.asarray(f(x + scale * d), dtype=float),
+        lambda d: f(x + scale * d),
         at_x * scale,
         beside=None if beside is None else beside * scale,
         scale=scale,
@@ -160,7 +184,7 @@ def jitter_direction(size: int) -> Array:
 
 
 def certify_displacement(
-    f: Function,
+    f: Many,
     derivative: Array,
     *,
     rows: tuple[str, ...],
@@ -172,7 +196,7 @@ def certify_displacement(
     method: str = "given",
     subject: str = "the derivative",
 ) -> Certificate:
-    """Certify `derivative` (m, n) of `f`, a function of a scaled displacement (n,), at 0.
+    """Certify `derivative` (m, n) of `f` at 0, a function of scaled displacements (K, n) with values (K, m).
 
     `beside` is the derivative at a point 1e-9 away; `scale` (n,) takes the scaling out of what is reported;
     `minus` subtracts two values of `f`, on a tangent space if need be.
@@ -181,9 +205,8 @@ def certify_displacement(
         raise ShapeError("derivative", got=derivative.shape, expected=(len(rows), len(columns)))
     if not np.all(np.isfinite(derivative)):
         raise GradientError(f"{subject} is not finite: {derivative}")
-    centre = f(np.zeros(len(columns)))
-    sweep = [differences(f, len(columns), h, at_zero=centre, minus=minus) for h in STEPS]
-    forward, backward = np.array([d.forward for d in sweep]), np.array([d.backward for d in sweep])
+    sweep = sweep_of(f, len(columns), STEPS, minus=minus)
+    centre, forward, backward = sweep.centre, sweep.forward, sweep.backward
     values = np.abs(minus(centre, np.zeros_like(centre))) if minus is np.subtract else np.ones(len(rows))
     value_scale = np.maximum(1.0, values)
     difference, tolerance, codes = _judge(derivative, (forward + backward) / 2, value_scale, solver_tolerance)
@@ -257,14 +280,15 @@ def _does_not_shrink(gap: Array, a: Array, noise: Array, steepest: float) -> NDA
     tells = gap * np.array(STEPS)[:, None, None] > noise[None, :, None]
     significant = RESOLVED * np.maximum(np.abs(a), NEGLIGIBLE * np.abs(a).max(axis=1, keepdims=True, initial=0))
     found = np.zeros(a.shape, dtype=bool)
-    for i, j in np.argwhere(tells[3:].any(axis=0)):
-        last = int(np.flatnonzero(tells[:, i, j])[-1])
-        steps, gaps = np.array(STEPS[last - 3 : last + 1]), gap[last - 3 : last + 1, i, j]
-        # Where a kink of this size would still tell at the next smaller step, and does not: it is not at the point.
-        ends_early = last + 1 < len(STEPS) and gaps[-1] * STEPS[last + 1] > 2 * noise[i]
-        if ends_early or gaps[-1] <= significant[i, j] or np.min(gaps) == 0:
-            continue
-        found[i, j] = np.polyfit(np.log(steps), np.log(gaps), 1)[0] < steepest
+    i, j = np.nonzero(tells[3:].any(axis=0))
+    last = len(STEPS) - 1 - np.argmax(tells[::-1, i, j], axis=0)
+    gaps = gap[last + np.arange(-3, 1)[:, None], i, j]
+    # Where a kink of this size would still tell at the next smaller step, and does not: it is not at the point.
+    ends_early = gaps[-1] * np.array([*STEPS[1:], 0.0])[last] > 2 * noise[i]
+    told = ~ends_early & (gaps[-1] > significant[i, j]) & (gaps.min(axis=0, initial=np.inf) > 0)
+    # The slope of the line through the four points; their steps are half a decade apart.
+    slope = np.array([1.5, 0.5, -0.5, -1.5]) @ np.log(gaps[:, told]) / (5 * np.log(10) / 2)
+    found[i[told], j[told]] = slope < steepest
     return found
 
 

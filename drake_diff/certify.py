@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from drake_diff.arrays import Array, finite_array
 from drake_diff.certificate import JITTER, VERDICTS, Certificate, certify_displacement, jitter_direction
+from drake_diff.finite_difference import one_by_one
 from drake_diff.mode_changes import ModeChange, find_mode_changes
 from drake_diff.model import Model
 from drake_diff.parameters import Parameters, ParameterVector, applied, select
@@ -82,7 +83,7 @@ def _certify_step(
             model, f, derivative, rows=space.names, columns=by_point, scale=scale, minus=space.minus
         )
     certificate = certify_displacement(
-        f,
+        one_by_one(f),
         derivative,
         rows=space.names,
         columns=by_point + vector.names,
@@ -147,7 +148,7 @@ def certify_rollout(
         if wanted:
             refinements.append(by(model, x0, us, loss, vector, columns, method, gradient))
     certificate = certify_displacement(
-        f,
+        one_by_one(f),
         derivative,
         rows=("loss",),
         columns=columns,

@@ -36,13 +36,28 @@ class EquationsOfMotion:
             raise ModelError("collocation: the model's constraints have no continuous form; use method='shooting'")
         self.model = model
         self.actuation = model.plant.MakeActuationMatrix()
+        self.plain_rates = model.plant.IsVelocityEqualToQDot()
 
     def __call__(self, x: Array, u: Array) -> Array:
-        """(nx,) dx/dt at `x` (nx,), `u` (nu,)."""
-        twin = self.model.double
-        set_state(twin, x)
-        acceleration, _ = self.acceleration(u)
-        return np.concatenate([self.q_dot(twin, x), acceleration])
+        """(nx,) dx/dt at `x` (nx,), `u` (nu,); SimulationError where they are not finite."""
+        set_state(self.model.double, x)
+        return np.asarray(self.values(np.concatenate([x, u])[None])[0])
+
+    def values(self, knots: Array) -> Array:
+        """(K, nx) dx/dt at `knots` (K, nx + nu), rows [x, u]; NaN where a knot is not finite."""
+        model, twin = self.model, self.model.double
+        finite = np.isfinite(knots).all(axis=1)
+        rates, still = np.full((len(knots), model.nx), np.nan), np.zeros(model.nv)
+        rest, mass = np.zeros((len(knots), model.nv)), np.tile(np.eye(model.nv), (len(knots), 1, 1))
+        for k in np.flatnonzero(finite).tolist():
+            x = knots[k, : model.nx]
+            twin.plant.SetPositionsAndVelocities(twin.context, x)
+            rest[k] = twin.inverse_dynamics(still)
+            mass[k] = twin.plant.CalcMassMatrix(twin.context)
+            rates[k, : model.nq] = x[model.nq :] if self.plain_rates else self.q_dot(twin, x)
+        force = knots[:, model.nx :] @ self.actuation.T - rest
+        rates[finite, model.nq :] = np.linalg.solve(mass, force[..., None])[finite, :, 0]
+        return rates
 
     def autodiff(self, x: Any, u: Any) -> Any:
         """The same with AutoDiffXd in and out."""

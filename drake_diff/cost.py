@@ -53,6 +53,15 @@ class QuadraticCost:
             total = total + _form(self.R, u, self.u_ref)
         return total
 
+    def along(self, xs: Array, us: Array) -> Array:
+        """(K,) the costs of xs (K, nx) and us (K, nu)."""
+        total = np.zeros(len(xs))
+        for weight, z, reference in ((self.Q, xs, self.x_ref), (self.R, us, self.u_ref)):
+            if weight is not None:
+                d = z if reference is None else z - reference
+                total += np.einsum("ki,ki->k", d, d @ weight)
+        return total
+
 
 @dataclass(frozen=True)
 class ConstantCost:

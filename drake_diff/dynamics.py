@@ -181,15 +181,10 @@ class PlantKnots:
 
     def __init__(self, model: Model):
         self.equations, self.model = EquationsOfMotion(model), model
-        self.plain_rates = model.plant.IsVelocityEqualToQDot()
         self.tree = tree_for(model)
 
     def values(self, knots: Array) -> Array:
-        nx = self.model.nx
-        if self.tree is None:
-            return np.array([self.equations(k[:nx], k[nx:]) for k in knots])
-        v, acceleration = knots[:, nx // 2 : nx], self._accelerate(self.tree, knots)[1]
-        return np.concatenate([v, acceleration], axis=1)
+        return self.equations.values(knots)
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
         if self.tree is not None:
@@ -197,25 +192,15 @@ class PlantKnots:
         found = [self._linearize(k[: self.model.nx], k[self.model.nx :]) for k in knots]
         return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
 
-    def _accelerate(self, tree: TreeDynamics, knots: Array) -> tuple[Array, Array]:
-        """(K, n, 3, 4) where the bodies are and (K, n) dv/dt at knots [q, v, u]."""
-        n = self.model.nv
-        q, v, u = knots[:, :n], knots[:, n : 2 * n], knots[:, 2 * n :]
-        poses = tree.place(self.model, q)
-        at_rest = tree(poses, q, v, np.zeros_like(v))
-        force = u @ self.equations.actuation.T - at_rest.tau
-        return poses, np.linalg.solve(at_rest.mass, force[..., None])[..., 0]
-
     def _linearize_tree(self, tree: TreeDynamics, knots: Array) -> tuple[Array, Array]:
         n, actuation = self.model.nv, self.equations.actuation
-        poses, acceleration = self._accelerate(tree, knots)
-        v = knots[:, n : 2 * n]
-        d = tree(poses, knots[:, :n], v, acceleration)
+        q, values = knots[:, :n], self.values(knots)
+        d = tree(tree.place(self.model, q), q, values[:, :n], values[:, n:])
         by_u = np.broadcast_to(-actuation, (len(knots), *actuation.shape))
         rows = np.zeros((len(knots), 2 * n, knots.shape[1]))
         rows[:, :n, n : 2 * n] = np.eye(n)
         rows[:, n:] = -np.linalg.solve(d.mass, np.concatenate([d.by_q, d.by_v, by_u], axis=2))
-        return np.concatenate([v, acceleration], axis=1), rows
+        return values, rows
 
     def _linearize(self, x: Array, u: Array) -> tuple[Array, Array]:
         equations, model, twin = self.equations, self.model, self.model.autodiff
@@ -227,7 +212,7 @@ class PlantKnots:
         constant = np.array([AutoDiffXd(a) for a in acceleration])
         residual = twin.inverse_dynamics(constant)
         rows = np.zeros((model.nx, model.nx + model.nu))
-        if self.plain_rates:
+        if equations.plain_rates:
             rows[: model.nq, model.nq : model.nx] = np.eye(model.nq)
         else:
             rows[: model.nq, : model.nx] = gradient_rows(equations.q_dot(twin, variables), model.nx)

@@ -1,6 +1,6 @@
 """Forward, backward and central differences of any function; knows no robots."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from drake_diff.arrays import Array
 
 Function = Callable[[Array], Array]
+Many = Callable[[Array], Array]  # displacements (K, n) -> values (K, m)
 Difference = Callable[[Array, Array], Array]
 
 RATIO_SQUARED = 10.0  # of neighbouring steps of a sweep: half a decade
@@ -42,6 +43,32 @@ def differences(
     forward = np.array([c[0] for c in columns]).reshape(size, rows).T
     backward = np.array([c[1] for c in columns]).reshape(size, rows).T
     return Differences(step, forward, backward)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One-sided difference quotients (s, m, n) of several step sizes around `centre`, the value (m,) there."""
+
+    centre: Array
+    forward: Array
+    backward: Array
+
+
+def sweep_of(f: Many, size: int, steps: Sequence[float], *, minus: Difference = np.subtract) -> Sweep:
+    """`differences` of `f`: (K, size) -> (K, m) with each of `steps`, from one call of `f` with all displacements."""
+    h = np.array(steps)[:, None, None]
+    sides = np.stack([h * np.eye(size), -h * np.eye(size)])  # (2, s, n, n)
+    values = np.asarray(f(np.vstack([np.zeros((1, size)), sides.reshape(-1, size)])), dtype=float)
+    centre = values[0]
+    apart = values[1:] - centre if minus is np.subtract else np.array([minus(v, centre) for v in values[1:]])
+    rows = len(minus(centre, centre))
+    ahead, behind = apart.reshape(2, len(steps), size, rows).swapaxes(2, 3) / h
+    return Sweep(centre, ahead, -behind)
+
+
+def one_by_one(f: Function) -> Many:
+    """`f` of a displacement as a function of many."""
+    return lambda displacements: np.array([f(d) for d in displacements])
 
 
 def richardson(central: Array) -> Array:

@@ -4,6 +4,7 @@ Both give `values` (m, K), the nonzeros of the K Jacobians by the knot, and, whe
 weights (m, K) times values. `jacobian_at` and `hessian_at` are (rows, columns) of the nonzeros of one knot.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +21,7 @@ from drake_diff.optimal_control import OptimalControl
 from drake_diff.symbolic import trace
 from drake_diff.symbolic_tree import PlantFunctions, symbolic_plant
 
+THREAD_WORTH = 500_000  # instructions of 1 to 5 ns; to start a thread costs 50 us
 Values = Callable[[Array], Array]  # knots (K, nx + nu) -> (K, m)
 Linearize = Callable[[Array], tuple[Array, Array]]  # -> (K, m), (K, m, nx + nu)
 
@@ -29,24 +31,22 @@ class Symbolic:
 
     why_not = ""
 
-    def __init__(self, function: Any, jacobian: Any = None, hessian: Any = None):
+    def __init__(self, function: Any):
         self.function, self.rows, self.width = function, function.size1_out(0), function.size1_in(0)
-        if jacobian is not None:
-            self._jacobian, self._hessian = jacobian, hessian
         self.jacobian_at = _places(self._jacobian.sparsity_out(0))
 
     def values(self, knots: Any) -> Any:
-        return self.function.map(knots.shape[1])(knots)
+        return _at_all(self.function, knots)
 
     def jacobian(self, knots: Any) -> Any:
-        return ca.vec(self._jacobian.map(knots.shape[1])(knots).nz[:])
+        return ca.vec(_at_all(self._jacobian, knots).nz[:])
 
     def jacobian_of(self, knot: Array) -> Array:
         """(m, nx + nu) at one `knot` (nx + nu,)."""
         return np.asarray(self._jacobian(knot).full())
 
     def hessian(self, knots: Any, weights: Any) -> Any:
-        return ca.vec(self._hessian.map(knots.shape[1])(knots, weights).nz[:])
+        return ca.vec(_at_all(self._hessian, knots, weights).nz[:])
 
     @property
     def hessian_at(self) -> tuple[Indices, Indices]:
@@ -63,6 +63,57 @@ class Symbolic:
         knot, weights = ca.SX.sym("knot", self.width), ca.SX.sym("weights", self.rows)
         hessian, _ = ca.hessian(ca.dot(weights, self.function(knot)), knot)
         return ca.Function("hessian", [knot, weights], [ca.triu(hessian)])
+
+
+def _at_all(function: Any, knots: Any, *others: Any) -> Any:
+    return _mapped(function, knots.shape[1])(knots, *others)
+
+
+def _mapped(function: Any, count: int) -> Any:
+    """`function` of `count` columns, on as many cores as have enough to do: their threads start anew at every call."""
+    threads = min(os.cpu_count() or 1, count * function.n_instructions() // THREAD_WORTH)
+    return function.map(count, *(("thread", threads) if threads > 1 else ()))
+
+
+class SymbolicPlant(Symbolic):
+    """A plant's equations of motion, whose Hessians take the Jacobians that were computed at the same knots before."""
+
+    def __init__(self, plant: PlantFunctions):
+        self._plant = plant
+        self.error: Exception | None = None
+        self._kept: dict[int, _Callback] = {}  # by the number of knots; CasADi holds no reference to its callbacks
+        super().__init__(plant.function)
+
+    def jacobian(self, knots: Any) -> Any:
+        count = knots.shape[1]
+        if count not in self._kept:
+            self._kept[count] = _Callback(self, count, self._jacobian.nnz_out(0), self._compute(count))
+        return ca.vec(self._kept[count](knots))
+
+    def hessian(self, knots: Any, weights: Any) -> Any:
+        function = _mapped(self._hessian, knots.shape[1])
+        rows = ca.MX(function.sparsity_in(2), self.jacobian(knots))
+        return ca.vec(function(knots, weights, rows).nz[:])
+
+    @property
+    def _jacobian(self) -> Any:
+        return self._plant.jacobian
+
+    @property
+    def _hessian(self) -> Any:
+        return self._plant.hessian
+
+    def _compute(self, count: int) -> Values:
+        found = np.empty((count, self._jacobian.nnz_out(0)))
+        buffer, evaluate = _mapped(self._jacobian, count).buffer()
+        buffer.set_res(0, memoryview(found))
+
+        def nonzeros(knots: Array) -> Array:
+            buffer.set_arg(0, memoryview(knots))
+            evaluate()
+            return found
+
+        return nonzeros
 
 
 class Called:
@@ -94,7 +145,7 @@ class Called:
 class _Callback(ca.Callback):  # type: ignore[misc]
     """(nx + nu, K) -> (rows, K); the last result is kept, since a solver asks twice for its first iterate's."""
 
-    def __init__(self, owner: Called, count: int, rows: int, at_knots: Values):
+    def __init__(self, owner: Called | SymbolicPlant, count: int, rows: int, at_knots: Values):
         ca.Callback.__init__(self)
         self.owner, self.count, self.rows, self.at_knots = owner, count, rows, at_knots
         self.last: tuple[bytes, Array] | None = None
@@ -113,7 +164,7 @@ class _Callback(ca.Callback):  # type: ignore[misc]
         return ca.Sparsity.dense(self.rows, self.count)
 
     def has_jacobian(self) -> bool:
-        return self.rows == self.owner.rows
+        return isinstance(self.owner, Called) and self.rows == self.owner.rows
 
     def has_jac_sparsity(self, i: int, j: int) -> bool:
         return self.has_jacobian()
@@ -174,7 +225,8 @@ class KnotFunctions:
     @property
     def error(self) -> Exception | None:
         """The first error that one of them raised."""
-        called = [f for f in (self.dynamics, self.rate, self.final, *self.paths) if isinstance(f, Called)]
+        every = (self.dynamics, self.rate, self.final, *self.paths)
+        called = [f for f in every if isinstance(f, (Called, SymbolicPlant))]
         return next((f.error for f in called if f.error is not None), None)
 
 
@@ -229,7 +281,7 @@ def _dynamics(dynamics: Dynamics) -> KnotFunction:
     elif isinstance(form, Pointwise):
         found = trace(form.f, dynamics.nx, probe, form.values(probe))
     if isinstance(found, PlantFunctions):
-        return Symbolic(found.function, found.jacobian, found.hessian)
+        return SymbolicPlant(found)
     if not isinstance(found, str):
         return Symbolic(found)
     return Called(found, dynamics.values, dynamics.linearize, dynamics.nx, dynamics.nx + dynamics.nu)

@@ -39,7 +39,7 @@ class RunningRate:
         if self.constant is not None:
             return np.full(len(knots), self.constant)
         if self.quadratic:
-            return np.array([float(self.cost(k[: self.nx], k[self.nx :])) for k in knots])
+            return np.asarray(self.cost.along(knots[:, : self.nx], knots[:, self.nx :]))
         return self._at.values(knots)[:, 0]
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:

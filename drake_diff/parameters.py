@@ -231,6 +231,7 @@ def applied(vector: ParameterVector) -> Iterator[Model]:
         return
     h = vector.time_step(vector.values)
     model = vector.model if h == vector.model.time_step else vector.model.at_time_step(h)
+    model.contract  # noqa: B018  the model's own, so it is read before anything else is set
     try:
         vector.write(model.double, vector.values)
         model.other_quantities = frozenset(p.kind.quantity for p in vector.parameters)

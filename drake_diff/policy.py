@@ -266,7 +266,8 @@ def _riccati(steps: list[tuple[Array, Array]], Q: Array, R: Array, Qf: Array) ->
     cost_to_go = [Qf]
     for A, B in reversed(steps):
         P = cost_to_go[-1]
-        gain = np.asarray(np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A), dtype=float)
+        BP = B.T @ P
+        gain = np.asarray(np.linalg.solve(R + BP @ B, BP @ A), dtype=float)
         before = Q + A.T @ P @ (A - B @ gain)
         gains.append(gain)
         cost_to_go.append((before + before.T) / 2)

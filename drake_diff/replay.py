@@ -161,7 +161,7 @@ def track(plan: Plan, model: Model, xs: Array, us: Array) -> Policy:
     """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan, within the input's bounds."""
     bounds = plan.problem.bounds
     policy = TVLQR(model, xs, us, *regulator_weights(plan, us))
-    return lambda x, t: np.clip(policy(x, t), bounds.u_lower, bounds.u_upper)
+    return lambda x, t: np.minimum(np.maximum(policy(x, t), bounds.u_lower), bounds.u_upper)
 
 
 def regulator_weights(plan: Plan, us: Array) -> tuple[Array, Array, Array]:

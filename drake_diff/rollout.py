@@ -12,7 +12,7 @@ from drake_diff.contact import ContactPoint, contacts_of_the_step, penetration
 from drake_diff.exceptions import InputError
 from drake_diff.model import Model
 from drake_diff.parameters import applied, select
-from drake_diff.step import advance, check_point, set_state
+from drake_diff.step import advance, set_state
 from drake_diff.tangent import tangent_space
 
 Policy = Callable[[Array, float], ArrayLike]
@@ -113,68 +113,73 @@ def _roll(model: Model, x0: ArrayLike, inputs: Array | Policy, count: int) -> Ro
     xs, us = np.empty((count + 1, model.nx)), np.empty((count, model.nu))
     xs[0] = finite_array("x0", x0, (model.nx,))
     for k in range(count):
-        u = inputs(xs[k].copy(), k * h) if callable(inputs) else inputs[k]
-        us[k] = check_point(model, xs[k], u)[1]
+        us[k] = finite_array("u", inputs(xs[k].copy(), k * h), (model.nu,)) if callable(inputs) else inputs[k]
         xs[k + 1] = advance(model.double, xs[k], us[k])
-        meter.measure_state()  # of the state before the step
         meter.measure_step(xs[k], xs[k + 1])
     set_state(model.double, xs[-1])
-    meter.measure_state()
+    meter.measure_state(xs[-1])
     return meter.result(xs, us)
 
 
 class Meter:
-    """Reads energies, efforts, contacts and violations from the double context, state by state."""
+    """Reads energies, efforts and contacts from the double context, state by state, as `advance` leaves it."""
 
     def __init__(self, model: Model):
         self.model, self.plant, self.context = model, model.plant, model.double.context
-        self.space = tangent_space(model)
+        inspector = model.double.inspector
+        self.can_touch = inspector is not None and bool(inspector.GetCollisionCandidates())
         self.damping = model.double.damping()
         self.actuation = self.plant.MakeActuationMatrix()
-        self.limits = self.plant.GetPositionLowerLimits(), self.plant.GetPositionUpperLimits()
-        self.states: list[tuple[float, float, float, float]] = []
-        self.steps: list[tuple[float, float]] = []
+        self.states: list[tuple[Array, float, float, float]] = []
+        self.ends: list[Array] = []
         self.efforts: list[Array] = []
         self.contacts: list[tuple[ContactPoint, ...]] = []
 
-    def measure_state(self) -> None:
+    def measure_state(self, x: Array) -> None:
+        """Of the state `x` (nx,) in the context."""
         kinetic = self.plant.CalcKineticEnergy(self.context)
         potential = self.plant.CalcPotentialEnergy(self.context)
         potential += sum(f.potential(self.plant, self.context) for f in self.model.double.forces)
-        self.states.append((kinetic, potential, penetration(self.model), self._violation()))
+        self.states.append((x, kinetic, potential, penetration(self.model) if self.can_touch else 0.0))
 
     def measure_step(self, x: Array, x_next: Array) -> None:
-        nq, h = self.model.nq, self.model.time_step
-        net = np.asarray(self.plant.get_net_actuation_output_port().Eval(self.context))
-        middle = (x[nq:] + x_next[nq:]) / 2
-        work = h * float(middle @ self.actuation @ net)
-        self.steps.append((work, h * float(middle @ (self.damping * x_next[nq:]))))
-        self.efforts.append(net)
-        self.contacts.append(contacts_of_the_step(self.model))
-
-    def _violation(self) -> float:
-        if self.plant.num_constraints():
-            return float("inf")  # pydrake does not tell where a coupler, ball, weld or distance should be
-        q = np.asarray(self.plant.GetPositions(self.context))
-        beyond = np.maximum(self.limits[0] - q, q - self.limits[1]).max(initial=0.0)
-        norms = [abs(np.linalg.norm(q[start : start + 4]) - 1) for start in self.space.quaternions]
-        return float(max([beyond, *norms]))
+        """Of the step from `x` to `x_next` (nx,) that was taken last, and of the state `x`."""
+        self.measure_state(x)
+        self.ends.append(x_next)
+        self.efforts.append(np.array(self.plant.get_net_actuation_output_port().Eval(self.context)))
+        self.contacts.append(contacts_of_the_step(self.model) if self.can_touch else ())
 
     def result(self, xs: Array, us: Array) -> Rollout:
-        states, steps = np.array(self.states), np.array([(0.0, 0.0), *self.steps])
+        """The rollout with states xs (N+1, nx) and us (N, nu)."""
+        at, kinetic, potential, deepest = (np.array(column) for column in zip(*self.states, strict=True))
+        nq, h, efforts = self.model.nq, self.model.time_step, np.array(self.efforts).reshape(us.shape)
+        after = np.array(self.ends).reshape(len(us), self.model.nx)[:, nq:]
+        middle = (at[:-1, nq:] + after) / 2
+        work = h * np.einsum("ki,ki->k", middle, efforts @ self.actuation.T)
+        dissipation = h * np.einsum("ki,ki->k", middle, self.damping * after)
         return Rollout(
             times=frozen(self.model.time_step * np.arange(len(xs))),
             xs=frozen(xs),
             us=frozen(us),
-            efforts=frozen(np.array(self.efforts).reshape(us.shape)),
-            kinetic_energy=frozen(states[:, 0]),
-            potential_energy=frozen(states[:, 1]),
-            work=frozen(np.cumsum(steps[:, 0])),
-            dissipation=frozen(np.cumsum(steps[:, 1])),
-            penetration=frozen(states[:, 2]),
-            constraint_violation=frozen(states[:, 3]),
+            efforts=frozen(efforts),
+            kinetic_energy=frozen(kinetic),
+            potential_energy=frozen(potential),
+            work=frozen(np.append(0.0, np.cumsum(work))),
+            dissipation=frozen(np.append(0.0, np.cumsum(dissipation))),
+            penetration=frozen(deepest),
+            constraint_violation=frozen(self._violations(at[:, :nq])),
             contacts=tuple(self.contacts),
         )
+
+    def _violations(self, qs: Array) -> Array:
+        """(N+1,) at the positions qs (N+1, nq)."""
+        if self.plant.num_constraints():
+            return np.full(len(qs), np.inf)  # pydrake does not tell where a coupler, ball, weld or distance should be
+        lower, upper = self.plant.GetPositionLowerLimits(), self.plant.GetPositionUpperLimits()
+        found = np.maximum(lower - qs, qs - upper).max(axis=1, initial=0.0)
+        for start in tangent_space(self.model).quaternions:
+            found = np.maximum(found, np.abs(np.linalg.norm(qs[:, start : start + 4], axis=1) - 1))
+        return np.asarray(found)
 
 
 def smooth_mean(series: Array) -> float:

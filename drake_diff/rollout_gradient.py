@@ -16,6 +16,7 @@ from drake_diff.model import Model
 from drake_diff.parameters import Parameters, ParameterVector, applied, select
 from drake_diff.policy import active_parameters, differentiate_policy, policy_parameters
 from drake_diff.rollout import Policy, check_inputs
+from drake_diff.step import advance
 from drake_diff.step_derivatives import StepDerivatives, check_method, step_jacobians
 
 Loss = Callable[..., Any]
@@ -149,17 +150,16 @@ def derivatives_along(
 def _close_the_loop(
     model: Model, x0: Array, policy: Policy, count: int, vector: ParameterVector, method: str
 ) -> tuple[list[StepDerivatives], list[Feedback], Array]:
-    found: list[StepDerivatives] = []
+    """The motion first, then the derivatives of all its steps at once."""
     feedback: list[Feedback] = []
-    x, inputs = x0, np.empty((count, model.nu))
+    x, xs, inputs = x0, np.empty((count, model.nx)), np.empty((count, model.nu))
     for k in range(count):
-        t = k * model.time_step
+        t, xs[k] = k * model.time_step, x
         inputs[k], by_x, by_parameters = differentiate_policy(policy, x, t, model.nu)
         active = active_parameters(policy, t)
         feedback.append((by_x, by_parameters[:, active].copy(), active))
-        found.append(step_jacobians(model, vector, x, inputs[k], method))
-        x = found[-1].x_next
-    return found, feedback, inputs
+        x = advance(model.double, x, inputs[k])
+    return derivatives_along(model, x0, inputs, vector=vector, method=method, xs=xs), feedback, inputs
 
 
 @dataclass(frozen=True, eq=False)

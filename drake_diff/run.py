@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff.arrays import Array, frozen
-from drake_diff.certificate import Certificate, certify_jacobian
+from drake_diff.certificate import Certificate, certify_jacobian_of_many
 from drake_diff.certify import certify
 from drake_diff.collocation import solve_collocation
 from drake_diff.contact_sequence import solve_through_jumps
@@ -172,13 +172,9 @@ class Run:
     def _certify_equations(self, jacobian: Any, xs: Array, us: Array) -> tuple[Certificate, ...]:
         """Certificates, at some knots, of the Jacobian that the solver gets against Drake's own equations."""
         model, equations = self.problem.model, EquationsOfMotion(self.problem.model)
-
-        def f(z: Array) -> Array:
-            return equations(z[: model.nx], z[model.nx :])
-
         return tuple(
-            certify_jacobian(
-                f,
+            certify_jacobian_of_many(
+                equations.values,
                 np.concatenate([xs[k], us[k]]),
                 jacobian,
                 rows=tuple(f"d({name})/dt" for name in model.state_names),

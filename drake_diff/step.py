@@ -38,7 +38,7 @@ def set_state(twin: Twin, x: Any) -> None:
 
     Raises SimulationError where a float is not finite: Drake would end the process with SystemExit.
     """
-    if np.asarray(x).dtype == float and not np.all(np.isfinite(x)):
+    if not _is_finite(np.asarray(x)):
         raise SimulationError(f"a state is not finite: {x}")
     twin.plant.SetPositionsAndVelocities(twin.context, x)
 
@@ -50,7 +50,7 @@ def advance(twin: Twin, x: Any, u: Any) -> Any:
     """
     plant, context = twin.plant, twin.context
     set_state(twin, x)
-    if np.asarray(u).dtype == float and not np.all(np.isfinite(u)):
+    if not _is_finite(np.asarray(u)):
         raise SimulationError(f"an input is not finite: {u}")
     plant.get_actuation_input_port().FixValue(context, u)
     if twin.forces:
@@ -60,6 +60,11 @@ def advance(twin: Twin, x: Any, u: Any) -> Any:
         x_next = np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())
     except (RuntimeError, SystemExit) as error:  # SystemExit: a condition in Drake, such as a stiffness above 0
         raise SimulationError(f"Drake cannot take this step: {error}") from error
-    if x_next.dtype == float and not np.all(np.isfinite(x_next)):
+    if not _is_finite(x_next):
         raise SimulationError(f"the step leads to {x_next}, which is not finite, from x = {x}, u = {u}")
     return x_next
+
+
+def _is_finite(numbers: Any) -> bool:
+    """Of an array of floats; AutoDiffXd are taken as they are."""
+    return numbers.dtype != float or bool(np.isfinite(numbers).all())

@@ -13,6 +13,7 @@ What is not in the tree shows in the comparison with Drake.
 
 from dataclasses import dataclass, replace
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -32,7 +33,10 @@ Z = ca.DM([0, 0, 1])
 
 @dataclass(frozen=True, eq=False)
 class PlantFunctions:
-    """x' of a knot (nx,), its Jacobian, and of a knot and weights (nx,) the upper triangle of d^2 (weights' x')."""
+    """x' of a knot (nx,), its Jacobian, and the upper triangle of d^2 (weights' x').
+
+    The last is of a knot, weights (nx,) and the Jacobian there, which a solver has by then: a third of the work.
+    """
 
     function: Any
     jacobian: Any
@@ -40,7 +44,21 @@ class PlantFunctions:
 
 
 def symbolic_plant(model: Model) -> PlantFunctions | str:
-    """The equations of motion as SX functions, or why there are none; compared with Drake's plant at two states."""
+    """The equations of motion as SX functions, or why there are none; compared with Drake's plant at two states.
+
+    Made once, for the model's own parameters: what is made while it has others is not kept.
+    """
+    if model.has_other_parameters:
+        return _compared(model)
+    if model not in _KNOWN:
+        _KNOWN[model] = _compared(model)
+    return _KNOWN[model]
+
+
+_KNOWN: WeakKeyDictionary[Model, PlantFunctions | str] = WeakKeyDictionary()
+
+
+def _compared(model: Model) -> PlantFunctions | str:
     tree = tree_for(model)
     if tree is None:
         found = tree_of(model)
@@ -68,19 +86,24 @@ def _functions(tree: TreeDynamics, model: Model, actuation: Any) -> PlantFunctio
         return motion + ca.DM(tree.stiffness) * (q - ca.DM(tree.rest)) + ca.DM(tree.damping) * v
 
     solved = ca.ldl_solve(actuation @ u - residual(ca.SX.zeros(n)), *factors)
-    r, qva = residual(a), ca.vertcat(q, v, a)
+    r = residual(a)
     rows = [ca.gradient(r[i], knot).T for i in range(n)]  # backwards: a fifth shorter than CasADi's own choice
     slopes = ca.Function("slopes", [knot, a], [ca.vertcat(*rows)])
-    curves = ca.Function("curves", [knot, a, mu], [ca.hessian(ca.dot(mu, r), qva)[0]])
+    slope = ca.gradient(ca.dot(mu, r), ca.vertcat(q, v, a))  # of mu' r, linear in a, whose factor is of q alone
+    curves = ca.Function("curves", [knot, a, mu], [ca.jacobian(slope, q), ca.jacobian(slope[n : 2 * n], v)])
     by_knot = -ca.ldl_solve(slopes(knot, solved) - ca.horzcat(ca.SX(n, 2 * n), actuation), *factors)
-    H = -curves(knot, solved, ca.ldl_solve(weights[n:], *factors))
-    S = ca.vertcat(H[: 2 * n, 2 * n :] @ by_knot, ca.SX(model.nu, width))
-    hessian = ca.diagcat(H[: 2 * n, : 2 * n], ca.SX(model.nu, model.nu)) + S + S.T
     identity = ca.horzcat(ca.SX(n, n), ca.SX.eye(n), ca.SX(n, model.nu))
+    jacobian = ca.Function("jacobian", [knot], [ca.vertcat(identity, by_knot)])
+    rows = ca.SX.sym("rows", jacobian.sparsity_out(0))
+    by_q, by_v = curves(knot, solved, ca.ldl_solve(weights[n:], *factors))
+    qv, aq = by_q[n : 2 * n, :].T, by_q[2 * n :, :]
+    S = ca.vertcat(aq.T @ rows[n:, :], ca.SX(n + model.nu, width))
+    H = ca.blockcat([[by_q[:n, :], qv], [qv.T, by_v]])
+    hessian = -(ca.diagcat(H, ca.SX(model.nu, model.nu)) + S + S.T)
     return PlantFunctions(
         ca.Function("plant", [knot], [ca.vertcat(v, solved)]),
-        ca.Function("jacobian", [knot], [ca.vertcat(identity, by_knot)]),
-        ca.Function("hessian", [knot, weights], [ca.triu(hessian)]),
+        jacobian,
+        ca.Function("hessian", [knot, weights, rows], [ca.triu(hessian)]),
     )
 
 

@@ -42,6 +42,8 @@ class TangentSpace:
 
     def minus(self, x1: Array, x0: Array) -> Array:
         """(size,): the tangent vector at `x0` that leads to `x1`."""
+        if not self.quaternions:
+            return x1 - x0
         parts = [
             _turn_between(x1[start:stop], x0[start:stop]) if is_quaternion else x1[start:stop] - x0[start:stop]
             for start, stop, is_quaternion in self._blocks()
@@ -77,6 +79,8 @@ class TangentSpace:
 
     def jacobian(self, x: Array, x_next: Array, by_x: Array, *others: Array) -> Array:
         """(size, size + ...): a step's Jacobians by x (nx, nx), by u, ... (nx, n) side by side, of tangents."""
+        if not self.quaternions:
+            return np.hstack([by_x, *others])
         return np.asarray(self.derivative_of_minus(x_next) @ np.hstack([by_x @ self.derivative_of_plus(x), *others]))
 
     def _blocks(self) -> list[tuple[int, int, bool]]:

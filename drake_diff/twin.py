@@ -47,6 +47,10 @@ class Twin:
         return labelled(actuators(self.plant))
 
     @cached_property
+    def _workspace(self) -> Any:
+        return MultibodyForces_[self.scalar](self.plant)
+
+    @cached_property
     def _moving_joints(self) -> list[tuple[slice, Any]]:
         moving = [joint for joint in joints(self.plant) if joint.num_velocities()]
         return [(slice(j.velocity_start(), j.velocity_start() + j.num_velocities()), j) for j in moving]
@@ -75,9 +79,8 @@ class Twin:
 
     def inverse_dynamics(self, acceleration: Any) -> Any:
         """(nv,) M a + bias less gravity, springs, damping and added forces, at the context's state."""
-        forces = MultibodyForces_[self.scalar](self.plant)
-        self.plant.CalcForceElementsContribution(self.context, forces)
-        needed = self.plant.CalcInverseDynamics(self.context, acceleration, forces)
+        self.plant.CalcForceElementsContribution(self.context, self._workspace)  # which overwrites it
+        needed = self.plant.CalcInverseDynamics(self.context, acceleration, self._workspace)
         return needed - self.added_force() if self.forces else needed  # AutoDiffXd's `forces` are a copy: not writable
 
     @property

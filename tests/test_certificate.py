@@ -8,6 +8,8 @@ import pytest
 from conftest import random_state
 
 import drake_diff as dd
+from drake_diff.certificate import certify_jacobian_of_many
+from drake_diff.finite_difference import sweep_of
 
 
 def smooth(n, seed=0):
@@ -30,6 +32,33 @@ def test_a_right_jacobian_agrees_and_one_entry_1_percent_off_is_caught(n):
         assert certificate.verdict == "disagree"
         assert (certificate.worst.row, certificate.worst.column) == (f"f[{i}]", f"x[{j}]")
         assert certificate.count("agree") == n * n - 1
+
+
+def test_all_points_in_one_call_give_the_same_certificate():
+    f, jacobian = smooth(5)
+    x, calls = np.random.default_rng(1).standard_normal(5), []
+
+    def many(points):
+        calls.append(len(points))
+        return np.array([f(p) for p in points])
+
+    wrong = jacobian(x)
+    wrong[2, 3] *= 1.01
+    for claimed, verdict in ((jacobian, "agree"), (wrong, "disagree")):
+        one, together = dd.certify_jacobian(f, x, claimed), certify_jacobian_of_many(many, x, claimed)
+        assert one.verdict == together.verdict == verdict
+        assert np.array_equal(one.codes, together.codes)
+        assert np.array_equal(one.difference, together.difference)
+    assert calls == [1 + 13 * 2 * 5] * 2
+
+
+@pytest.mark.parametrize("minus", [np.subtract, lambda a, b: a - b])
+def test_a_sweep_of_a_parabola_in_closed_form(minus):
+    """f = [3 x + x^2, y]: forward quotients 3 + h and 1, backward 3 - h and 1."""
+    sweep = sweep_of(lambda d: np.stack([3 * d[:, 0] + d[:, 0] ** 2, d[:, 1]], axis=1), 2, (0.5, 0.25), minus=minus)
+    assert sweep.centre == pytest.approx([0, 0], abs=0)
+    assert sweep.forward == pytest.approx(np.array([[[3.5, 0], [0, 1]], [[3.25, 0], [0, 1]]]), abs=1e-15)
+    assert sweep.backward == pytest.approx(np.array([[[2.5, 0], [0, 1]], [[2.75, 0], [0, 1]]]), abs=1e-15)
 
 
 CHAIN = """<link name="l{i}"><inertial><origin xyz="0 0 -0.1"/><mass value="{m}"/>

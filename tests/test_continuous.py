@@ -19,6 +19,18 @@ def test_kellys_cart_pole(load):
     assert f(np.array([0.1, 0.7, -0.3, 1.1]), np.array([2.0])) == pytest.approx(expected, abs=1e-11)
 
 
+def test_many_knots_at_once_and_those_that_are_no_numbers(load):
+    """A33 for the second; a search may try what is not finite, a caller of one knot is told."""
+    f = EquationsOfMotion(load("cart_pole.urdf"))
+    knots = np.array([[0.0, 0.0, 0.0, 0.0, 1.3], [0.1, 0.7, -0.3, 1.1, 2.0], [0.0, np.nan, 0.0, 0.0, 0.0]])
+    found = f.values(knots)
+    assert found[0] == pytest.approx([0, 0, 1.3, -1.3 / 0.5], abs=1e-12)  # at rest: u / m1 and -u / (l m1)
+    assert found[1] == pytest.approx([-0.3, 1.1, 3.172075726216, -17.491825696946], abs=1e-11)
+    assert np.isnan(found[2]).all()
+    with pytest.raises(dd.SimulationError, match="not finite"):
+        f(knots[2, :4], knots[2, 4:])
+
+
 @pytest.mark.parametrize(("q", "w", "u"), [(0.7, -1.2, 0.3), (-2.0, 3.0, -1.0)])
 def test_the_damped_pendulum(load, q, w, u):
     f = EquationsOfMotion(load("pendulum.urdf"))

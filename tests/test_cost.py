@@ -30,6 +30,13 @@ def test_a_quadratic_costs_gradient_is_that_of_autodiff_through_it():
     assert np.concatenate([by_x, by_u]) == pytest.approx(autodiff.derivatives(), rel=1e-12)
 
 
+def test_a_quadratic_cost_along_a_motion():
+    cost = dd.QuadraticCost(Q=[[3.0]], R=[[5.0]], x_ref=[1.0], u_ref=[7.0])
+    xs, us = np.array([[2.0], [1.0], [-1.0]]), np.array([[7.0], [8.0], [5.0]])
+    assert cost.along(xs, us) == pytest.approx([3.0, 5.0, 12.0 + 20.0], rel=1e-15)
+    assert dd.QuadraticCost().along(xs, us) == pytest.approx([0.0, 0.0, 0.0], abs=0)
+
+
 def test_a_cost_to_gos_derivatives_are_those_of_autodiff_through_it():
     random = np.random.default_rng(1)
     cost = CostToGo(random.random(3), random.standard_normal(3), random_weight(random, 3))

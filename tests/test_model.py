@@ -77,6 +77,12 @@ def test_joint_and_actuator_facts_are_in_the_contract(load):
     assert c.actuators[0].kp is None
 
 
+def test_the_contract_is_the_models_own_whatever_was_set_when_it_was_first_asked_for(load):
+    model = load("cart_pole.urdf")
+    dd.differentiate_step(model, np.zeros(4), [0.0], parameters={"pole.mass": 3.3})
+    assert [body.mass for body in model.contract.bodies] == [1.0, 0.3]
+
+
 def test_a_ground_plane_can_be_added_with_its_friction(load):
     c = load("projectile.sdf", ground=0.3).contract
     assert [(g.body, g.shape, g.friction) for g in c.geometries] == [("world", "HalfSpace", 0.3)]

@@ -8,7 +8,8 @@ from conftest import MODELS, Plant, contact_properties
 
 import drake_diff as dd
 from drake_diff.continuous import EquationsOfMotion
-from drake_diff.rollout import drift
+from drake_diff.rollout import Meter, drift
+from drake_diff.step import set_state
 
 
 @pytest.fixture
@@ -26,6 +27,16 @@ def test_symplectic_euler_conserves_a_modified_energy(oscillator):
     x, v = motion.xs.T
     modified = v**2 + 25 * x**2 - 0.01 * 25 * x * v
     assert np.abs(modified / modified[0] - 1).max() < 1e-11
+
+
+def test_a_motion_of_no_steps_is_a_state(oscillator):
+    """As a closed loop leaves that ends before its first step: k x^2 / 2 with k = 25 N/m of 1 kg and w = 5 1/s."""
+    meter = Meter(oscillator)
+    set_state(oscillator.double, np.array([0.2, 0.0]))
+    meter.measure_state(np.array([0.2, 0.0]))
+    motion = meter.result(np.array([[0.2, 0.0]]), np.zeros((0, 1)))
+    assert motion.energy == pytest.approx(25 * oscillator.double.plant.CalcTotalMass(meter.context) * 0.02, rel=1e-12)
+    assert [len(motion.efforts), len(motion.contacts), *motion.work, *motion.penetration] == [0, 0, 0.0, 0.0]
 
 
 def test_oscillating_energy_is_no_drift(oscillator):

@@ -3,6 +3,7 @@
 import math
 import signal
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ from test_ilqr import A30, lqr
 from test_solution import MODELS, block
 
 import drake_diff as dd
+from drake_diff.nonlinear_program import Limits
 from drake_diff.shooting import RolloutCost, ShootingVariables, state_sensitivities
+from drake_diff.shooting_program import solve_shooting
 from drake_diff.solution import Status
 
 SOLVERS = ("ipopt", "snopt")
@@ -42,6 +45,32 @@ def test_the_sensitivities_of_a_block_are_the_closed_form():
     position = np.concatenate([[count * h], h**2 * (count - np.arange(count)) / mass])
     velocity = np.concatenate([[1.0], np.full(count, h / mass)])
     assert pytest.approx(np.array([position, velocity]), rel=1e-12) == S
+
+
+def grown(running_cost, most):
+    """Bytes that `most` iterations of a swing-up leave behind in Python, over those that 20 do; and how many rows."""
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.2)
+    problem = dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=10, running_cost=running_cost)
+    xs, us = np.zeros((11, 4)), 0.5 * np.random.default_rng(0).standard_normal((10, 1))
+    kept, rows = [], []
+    for count in (most, 20, most):  # the first fills what is kept of a model, and the interpreter's caches
+        if rows:
+            tracemalloc.start()
+        found = solve_shooting(problem, xs, us, solver="snopt", limits=Limits(count, 1e3, 1e-30), report=None)
+        rows.append(len(found[0].iterations))
+        kept.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+    return kept[2] - kept[1], rows[2] - rows[1]
+
+
+def test_memory_is_flat_in_iterations():
+    """A row of five numbers is 250 bytes, Drake 1.51 leaves some 400 more; one motion's derivatives are above 5000."""
+    growth, rows = grown(EFFORT, 100)
+    assert rows > 50
+    assert growth < 2000 * rows
+    seen = []
+    growth, rows = grown(lambda x, u: (seen.append(np.array(x)), u @ u)[1], 30)
+    assert growth > 2000 * rows > 0
 
 
 @pytest.mark.parametrize("optimize", [("controls",), ("initial_state",), ("controls", "initial_state")])

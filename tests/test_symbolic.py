@@ -20,8 +20,12 @@ import drake_diff as dd
 from drake_diff import symbolic_tree
 from drake_diff.continuous import EquationsOfMotion
 from drake_diff.dynamics import Dynamics, plant_dynamics
+from drake_diff.knot_functions import SymbolicPlant
+from drake_diff.nonlinear_program import Limits
 from drake_diff.symbolic import trace
 from drake_diff.symbolic_tree import PlantFunctions, symbolic_plant
+from drake_diff.transcription import ProblemTranscription
+from drake_diff.transcription_program import TranscribedProgram
 
 EXACT = "symbolic, exact Hessian"
 FORMS = {
@@ -117,7 +121,49 @@ def test_a_plants_expression_and_its_derivative_are_drakes(name):
         assert function(at).full().ravel() == pytest.approx(value, abs=1e-9 * max(1, np.abs(value).max()))
         assert jacobian(at).full() == pytest.approx(rows, abs=1e-9 * max(1, np.abs(rows).max()))
         curves = by_casadi(at).full()
-        assert plant.hessian(at, weights).full() == pytest.approx(curves, abs=1e-9 * max(1, np.abs(curves).max()))
+        assert plant.hessian(at, weights, jacobian(at)).full() == pytest.approx(
+            curves, abs=1e-9 * max(1, np.abs(curves).max())
+        )
+
+
+def test_a_programs_hessian_takes_the_jacobian_of_its_own_knots():
+    """Against central differences, good to 1e-6 of the largest entry, and asked for in an order that no solver has."""
+    model = random_tree(1)
+    problem = dd.Problem(model, x0=np.zeros(model.nx), x_goal=np.full(model.nx, 0.1), num_steps=2)
+    transcription = ProblemTranscription(problem, "hermite_simpson")
+    program = TranscribedProgram(transcription.task, transcription.mesh, transcription.functions)
+    made, random = program.derivatives(exact=True), np.random.default_rng(2)
+    weights = random.standard_normal(program.num_defects)
+
+    def slope(z):
+        return weights @ made["jac_g"](z, [])[1].full()
+
+    for z in random.uniform(-1, 1, (2, len(program.lower))):
+        wanted = np.triu(np.array([(slope(z + e) - slope(z - e)) / 2e-6 for e in 1e-6 * np.eye(len(z))]).T)
+        made["jac_g"](z + 1, [])
+        found = made["hess_lag"](z, [], 0.0, weights).full()
+        assert found == pytest.approx(wanted, abs=1e-6 * np.abs(wanted).max())
+
+
+def test_a_solve_computes_each_jacobian_once(monkeypatch):
+    """The solver asks for Jacobian and Hessian at each iterate: as many as iterates, and the two it asks ahead."""
+    model, calls = model_named("acrobot.xml"), []
+    compute = SymbolicPlant._compute
+
+    def counted(self, count):
+        evaluate = compute(self, count)
+        return lambda knots: (calls.append(count), evaluate(knots))[1]
+
+    monkeypatch.setattr(SymbolicPlant, "_compute", counted)
+    cost = dd.QuadraticCost(Q=np.eye(4), R=np.eye(1))
+    problem = dd.Problem(model, x0=[0.5, 0, 0, 0], running_cost=cost, num_steps=10)
+    motion = ProblemTranscription(problem, "hermite_simpson").solve(
+        np.zeros((11, 4)), np.zeros((11, 1)), limits=Limits(100, 10.0, 1e-8), report=None
+    )
+    assert motion.success
+    assert motion.derivatives == EXACT
+    assert set(calls) == {21}
+    assert len(motion.iterations) <= len(calls) <= len(motion.iterations) + 2
 
 
 @pytest.mark.parametrize("left_out", ["damping", "stiffness", "reflected", "mass", "gravity"])

@@ -12,7 +12,7 @@ from drake_diff.certificate import Certificate, certify_displacement
 from drake_diff.engines.engine import Engine, Precision
 from drake_diff.engines.motion import EngineMotion
 from drake_diff.exceptions import NotOfferedError
-from drake_diff.finite_difference import differences
+from drake_diff.finite_difference import differences, one_by_one
 from drake_diff.tangent import TangentSpace
 
 # Steps of differences for engines without derivatives: where rounding and truncation are both small.
@@ -62,7 +62,7 @@ def jacobian_at(
         gap = np.abs(jacobian - quotients()).max() / np.abs(jacobian).max()
         return JacobianAt(state, frozen(jacobian), found.method, AGREES if gap <= SINGLE else "undecided", None)
     certificate = certify_displacement(
-        step,
+        one_by_one(step),
         jacobian,
         rows=space.names,
         columns=(*space.names, *names),

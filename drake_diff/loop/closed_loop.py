@@ -131,14 +131,13 @@ class _Run:
                 except SimulationError as error:
                     self._end(k, f"the plant could not be stepped: {error}")
                     break
-                meter.measure_state()
                 meter.measure_step(x, after)
                 xs.append(after)
                 us.append(u)
             if self.ended:
                 break
         set_state(self.model.double, xs[-1])
-        meter.measure_state()
+        meter.measure_state(xs[-1])
         return self._told(meter.result(np.array(xs), np.array(us).reshape(len(us), self.model.nu)))
 
     def _decide(self, k: int, x: Array) -> Array | None:

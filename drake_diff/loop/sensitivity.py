@@ -15,8 +15,10 @@ from drake_diff.arrays import Array
 from drake_diff.loop.estimator import Hold
 from drake_diff.loop.perturbation import PERTURBATIONS, parameters_of
 from drake_diff.loop.trial import Task
+from drake_diff.model import Model
 from drake_diff.parameters import applied, select
-from drake_diff.step_derivatives import differentiate_step
+from drake_diff.rollout_gradient import derivatives_along
+from drake_diff.step_derivatives import StepDerivatives
 from drake_diff.tangent import tangent_space
 
 UNIFORM = 1 / np.sqrt(3)  # the standard deviation of U of level 1
@@ -95,15 +97,16 @@ class Sensitivity:
         inertia, others = list(self.parameters["inertia"]), [n for q in FACTORS[1:] for n in self.parameters[q]]
         groups = [inertia, others] if inertia else [others]
         with applied(select(task.setup.model, task.setup.parameters)) as model:
-            for k, u in enumerate(us):
-                steps = [differentiate_step(model, xs[k], u, parameters=names) for names in groups]
-                found = self.space.jacobian(xs[k], xs[k + 1], steps[0].A, steps[0].B, *(step.C for step in steps))
-                A, B, C = np.split(found, [size, size + task.model.nu], axis=1)
-                K = self._gain(xs[k], k * h)
-                loop = A + B @ K
-                start, noise = loop @ start, np.hstack([loop @ noise, B @ K])
-                factor = loop @ factor + B * u
-                by_parameter = C if by_parameter is None else loop @ by_parameter + C
+            along = [_along(model, xs[:-1], us, names) for names in groups]
+        for k, u in enumerate(us):
+            steps = [found[k] for found in along]
+            found = self.space.jacobian(xs[k], xs[k + 1], steps[0].A, steps[0].B, *(step.C for step in steps))
+            A, B, C = np.split(found, [size, size + task.model.nu], axis=1)
+            K = self._gain(xs[k], k * h)
+            loop = A + B @ K
+            start, noise = loop @ start, np.hstack([loop @ noise, B @ K])
+            factor = loop @ factor + B * u
+            by_parameter = C if by_parameter is None else loop @ by_parameter + C
         return start, np.zeros((size, 0)) if by_parameter is None else by_parameter, noise, factor
 
     def _gain(self, x: Array, t: float) -> Array:
@@ -113,3 +116,10 @@ class Sensitivity:
             ahead, behind = (np.asarray(self.task.policy(self.space.plus(x, d), t), dtype=float) for d in (e, -e))
             columns.append((ahead - behind) / (2 * DIFFERENCE))
         return np.array(columns).T.reshape(self.task.model.nu, self.space.size)
+
+
+def _along(model: Model, xs: Array, us: Array, names: list[str]) -> list[StepDerivatives]:
+    """The derivatives, by the parameters `names` too, of the steps from each of xs (N, nx) under us (N, nu)."""
+    vector = select(model, names)
+    with applied(vector) as set_model:
+        return derivatives_along(set_model, xs[0], us, vector=vector, xs=xs)
