@@ -25,6 +25,11 @@ QUANTITIES = ("friction", "stiffness", "relaxation_time", "dissipation")  # whos
 _NAMES = ("coulomb_friction", "point_contact_stiffness", "relaxation_time", "hunt_crossley_dissipation")  # Drake's
 
 
+def of_contact_alone(vector: ParameterVector) -> bool:
+    """Whether all the vector's quantities are QUANTITIES."""
+    return all(p.kind.quantity in QUANTITIES for p in vector.parameters)
+
+
 @dataclass(frozen=True, eq=False)
 class Material:
     """Of P pairs; `sides` (P, 2, 4) is that of the sphere and of the other, in the order of QUANTITIES."""

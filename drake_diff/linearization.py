@@ -7,10 +7,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_diff.analytic import analytic_jacobians, analytic_of
 from drake_diff.arrays import Array, finite_array, frozen
+from drake_diff.contact_material import of_contact_alone
 from drake_diff.exceptions import ShapeError
 from drake_diff.implicit import Steps, implicit_jacobians, take_steps
 from drake_diff.model import Model
-from drake_diff.parameters import select
+from drake_diff.parameters import ParameterVector, select
 from drake_diff.step_derivatives import (
     CERTIFIED,
     StepDerivatives,
@@ -62,22 +63,30 @@ class SmoothJacobians:
 
 
 def smooth_jacobians(
-    model: Model, x0: Array, us: Array, method: str, xs: Array | None = None, x_next: Array | None = None
+    model: Model,
+    x0: Array,
+    us: Array,
+    method: str,
+    xs: Array | None = None,
+    x_next: Array | None = None,
+    vector: ParameterVector | None = None,
 ) -> SmoothJacobians | None:
     """The Jacobians of the steps from `x0` under `us` (N, nu), or from each of xs (N, nx), all in one call.
 
-    None where they cannot be had so. What `method` "auto" takes is settled by the first.
+    None where they cannot be had so, as by parameters other than of contact. What `method` "auto" takes is settled by
+    the first. `vector` is applied to `model`.
     """
-    if method in ("auto", "analytic"):
+    vector = vector or select(model, ())
+    if method in ("auto", "analytic") and of_contact_alone(vector):
         analytic = analytic_of(model)
         if not isinstance(analytic, str):
             steps = take_steps(model, x0, us, xs, x_next)
-            known = analytic_jacobians(model, analytic, select(model, ()), steps)
+            known = analytic_jacobians(model, analytic, vector, steps)
             return _checked(model, SmoothJacobians(steps, *known, "analytic", CERTIFIED))
-        if implicit_reason(model) is None:
-            step_jacobians(model, select(model, ()), x0, us[0], "auto")
+        if not vector.parameters and implicit_reason(model) is None:
+            step_jacobians(model, vector, x0, us[0], "auto")
     reason = implicit_reason(model) if method in ("auto", "analytic") else "asked for"
-    if method in ("autodiff", "finite_difference") or reason is None:
+    if method in ("autodiff", "finite_difference") or reason is None or vector.parameters:
         return None
     steps = take_steps(model, x0, us, xs, x_next)
     found = implicit_jacobians(model, steps)
@@ -86,23 +95,28 @@ def smooth_jacobians(
 
 def _checked(model: Model, found: SmoothJacobians) -> SmoothJacobians:
     smooth = found.jacobians if found.smooth.all() else found.jacobians[found.smooth]
-    check_derivatives(model, smooth.reshape(-1, model.nx + model.nu))
+    check_derivatives(model, smooth.reshape(-1, smooth.shape[2]))
     return found
 
 
-def smooth_steps(model: Model, x0: Array, us: Array, method: str, xs: Array | None = None) -> list[StepDerivatives]:
+def smooth_steps(
+    model: Model, x0: Array, us: Array, method: str, xs: Array | None, vector: ParameterVector
+) -> list[StepDerivatives]:
     """The derivatives of the steps from `x0` under `us` (N, nu), or from each of xs (N, nx), all in one call.
 
-    Empty where they cannot be. A step that is not smooth is differentiated on its own.
+    Empty where they cannot be. A step that is not smooth is differentiated on its own. `vector` is applied to `model`.
     """
-    found = smooth_jacobians(model, x0, us, method, xs)
+    found = smooth_jacobians(model, x0, us, method, xs, vector=vector)
     if found is None:
         return []
-    vector, nx, steps = select(model, ()), model.nx, found.steps
-    none, how = frozen(np.zeros((nx, 0))), (found.method, found.reason)
+    nx, end, steps = model.nx, model.nx + model.nu, found.steps
+    names, sources, how = vector.names, (found.method,) * len(vector.names), (found.method, found.reason)
+
+    def known(k: int) -> StepDerivatives:
+        A, B, C = (frozen(columns) for columns in np.split(found.jacobians[k], [nx, end], axis=1))
+        return StepDerivatives(frozen(steps.ends[k]), A, B, C, names, sources, *how)
+
     return [
-        StepDerivatives(frozen(steps.ends[k]), frozen(j[:, :nx]), frozen(j[:, nx:]), none, (), (), *how)
-        if found.smooth[k]
-        else step_jacobians(model, vector, steps.starts[k], us[k], method)
-        for k, j in enumerate(found.jacobians)
+        known(k) if smooth else step_jacobians(model, vector, steps.starts[k], us[k], method)
+        for k, smooth in enumerate(found.smooth)
     ]

@@ -137,10 +137,8 @@ def derivatives_along(
 
     Given xs (N, nx), those of the steps from each of them.
     """
-    found: list[StepDerivatives] = []
     vector = vector or select(model, ())
-    if not vector.parameters:
-        found = smooth_steps(model, x0, us, method, xs)
+    found = smooth_steps(model, x0, us, method, xs, vector)
     for k in range(len(found), len(us)):
         x = (found[-1].x_next if found else x0) if xs is None else xs[k]
         found.append(step_jacobians(model, vector, x, us[k], method))

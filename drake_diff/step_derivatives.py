@@ -12,7 +12,7 @@ from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
 from drake_diff.analytic import analytic_jacobian, analytic_of
 from drake_diff.arrays import Array, frozen
 from drake_diff.autodiff import gradient_rows
-from drake_diff.contact_material import QUANTITIES
+from drake_diff.contact_material import of_contact_alone
 from drake_diff.exceptions import GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.finite_difference import differences, plateau
 from drake_diff.implicit import NotSmoothError, implicit_jacobian
@@ -141,7 +141,7 @@ def _by_analytic(model: Model, vector: ParameterVector, x: Array, u: Array, x_ne
 
 def _analytic(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array | str:
     """The Jacobian by Pinocchio, or why it cannot be had so."""
-    if any(p.kind.quantity not in QUANTITIES for p in vector.parameters):
+    if not of_contact_alone(vector):
         return "derivatives by parameters other than of contact are asked for"
     return analytic_jacobian(model, vector, x, u, x_next)
 
