@@ -7,7 +7,6 @@ is a state that inputs move, and on the rotations' tangent space the gradient wo
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_diff.analytic import analytic_of
 from drake_diff.arrays import Array
@@ -66,37 +65,36 @@ def jacobians_along(problem: Problem, motion: Motion) -> Array:
     return np.concatenate([A, B], axis=2)
 
 
-def dynamics_curvature_along(problem: Problem, motion: Motion, v: Array) -> tuple[Array, NDArray[np.bool_]] | None:
-    """(N, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx), and at which knots (N,) it is known.
+def dynamics_curvature_along(problem: Problem, motion: Motion, v: Array) -> Array | None:
+    """(N, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx); None where not all steps are smooth.
 
-    By differences of the Jacobians along every state; in its inputs alone a smooth step is linear. It is known where
-    the step is smooth. None where the Jacobians are not to be had in one call.
+    By differences of the Jacobians along every state: in its inputs alone a smooth step is linear. None also where
+    Jacobians are not to be had in one call. Raises what `linearize` raises.
     """
     model, xs, us = problem.model, motion.xs[:-1], _off_bounds(problem, motion.us)
-    found = smooth_jacobians(model, xs[0], us, "auto", xs, motion.ends)
-    if found is None or not found.smooth.any():
+    here = smooth_jacobians(model, xs[0], us, "auto", xs, motion.ends)
+    if here is None or not here.smooth.all():
         return None
-    nx, known, curvature = model.nx, found.smooth, np.zeros((len(us), model.nx + model.nu, model.nx + model.nu))
-    for j in range(nx):
+    curvature = np.zeros((len(us), model.nx + model.nu, model.nx + model.nu))
+    for j in range(model.nx):
         moved = np.array(xs)
         moved[:, j] += DIFFERENCE_STEP * np.maximum(1.0, np.abs(xs[:, j]))
         near = _nearby_jacobians(model, moved, us)
         if near is None:
             return None
-        change = (near[0] - found.jacobians) / (moved - xs)[:, j, None, None]
-        curvature[:, :, j] = np.einsum("kij,ki->kj", change, v)
-        known = known & near[1]
-    curvature[:, :nx, nx:] = curvature[:, nx:, :nx].swapaxes(1, 2)
-    return (curvature + curvature.swapaxes(1, 2)) / 2, known
+        slopes = (near - here.jacobians) / (moved - xs)[:, j, None, None]
+        curvature[:, :, j] = np.einsum("kij,ki->kj", slopes, v)
+    curvature[:, : model.nx, model.nx :] = curvature[:, model.nx :, : model.nx].swapaxes(1, 2)
+    return (curvature + curvature.swapaxes(1, 2)) / 2
 
 
-def _nearby_jacobians(model: Model, xs: Array, us: Array) -> tuple[Array, NDArray[np.bool_]] | None:
-    """(N, nx, nx + nu) of the steps from xs (N, nx) near smooth ones, and which (N,) are: all, where none is taken."""
+def _nearby_jacobians(model: Model, xs: Array, us: Array) -> Array | None:
+    """(N, nx, nx + nu) of the steps from xs (N, nx) beside smooth ones; None where one that was taken is not smooth."""
     analytic = analytic_of(model)
     if not isinstance(analytic, str):
-        return analytic.differentiate(xs, us)[0], np.ones(len(us), dtype=bool)
+        return analytic.differentiate(xs, us)[0]  # no step is taken
     found = smooth_jacobians(model, xs[0], us, "auto", xs)
-    return None if found is None else (found.jacobians, found.smooth)
+    return found.jacobians if found is not None and found.smooth.all() else None
 
 
 def _off_bounds(problem: Problem, us: Array) -> Array:

@@ -198,9 +198,8 @@ class _Search:
         model = expand(self.problem, new, self.jacobians, self.constraints)
         self.curvature.update(model, np.hstack([new.xs[:-1] - old.xs[:-1], new.us - old.us]))
         if self.gains[1] > SLOW * self.gains[0]:
-            found = dynamics_curvature_along(self.problem, new, multipliers(model))
-            if found is not None:
-                self.curvature.replace(*found)
+            M = dynamics_curvature_along(self.problem, new, multipliers(model))
+            self.curvature.M = self.curvature.M if M is None else M
         self.expanded = new
         return model
 

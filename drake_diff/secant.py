@@ -7,7 +7,6 @@ simulation, and stays 0 where the dynamics are linear.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_diff.arrays import Array
 from drake_diff.riccati import LinearQuadratic
@@ -36,10 +35,6 @@ class DynamicsCurvature:
         r, divisor = r[safe], divisor[safe]
         self.M[safe] += r[:, :, None] * r[:, None, :] / divisor[:, None, None]
         self._F = problem.F
-
-    def replace(self, M: Array, known: NDArray[np.bool_]) -> None:
-        """Take M (N, n + m, n + m) over at the knots (N,) where it is known otherwise."""
-        self.M[known] = M[known]
 
 
 def multipliers(problem: LinearQuadratic) -> Array:
