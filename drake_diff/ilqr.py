@@ -3,7 +3,8 @@
 Li and Todorov, "Iterative linear quadratic regulator design for nonlinear biological movement systems", 2004, and
 the feasibility-driven form of Mastalli et al., "Crocoddyl", 2020: the guess need not be a rollout, and a step of size a
 leaves 1 - a of each gap between step(x_k, u_k) and x_(k+1). A hard goal, waypoints, state bounds and constraints are
-augmented Lagrangians, and the dynamics' second derivatives, which iLQR leaves out, are learned on the way (`secant`).
+augmented Lagrangians, and the dynamics' second derivatives, which iLQR leaves out, are learned on the way (`secant`),
+or taken by differences of the Jacobians where a smooth motion converges slowly.
 """
 
 import math
@@ -126,7 +127,7 @@ def _promise_at_most(solve: _Solve, models: Sequence[LinearQuadratic], limit: fl
     found = False
     for model in models:
         policy = solve(model, 0.0) or solve(model, SMALLEST_REGULARIZATION)
-        if policy is not None and abs(policy.expected) > limit:
+        if policy is not None and not abs(policy.expected) <= limit:
             return False
         found = found or policy is not None
     return found

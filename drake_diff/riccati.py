@@ -5,6 +5,7 @@ dx_(k+1) = F_k z_k + f_k and lower_k <= du_k <= upper_k. The gaps f_k are those 
 the boxes those of Tassa, Mansard and Todorov, "Control-limited differential dynamic programming", 2014.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,20 +68,20 @@ def solve_riccati(problem: LinearQuadratic, regularization: float) -> Policy | N
     The recursion is that of [dx; 1], so that V = [[P, s], [s', c]] is all that remains to be paid and
     K = [feedback, feedforward] all that is done, in the fewest products: NumPy's calls are what a sweep's time goes to.
     """
-    n, (count, m) = problem.num_states + 1, problem.lower.shape
+    w, (count, m) = problem.num_states + 1, problem.lower.shape
     F, H, V = _with_a_one(problem)
-    Q, K, free = np.empty_like(H), np.empty((count, m, n)), np.ones((count, m), dtype=bool)
+    Q, K, free = np.empty_like(H), np.empty((count, m, w)), np.ones((count, m), dtype=bool)
     bounded = (np.isfinite(problem.lower) | np.isfinite(problem.upper)).any(axis=1)
     ridge = regularization * np.eye(m)
     try:
         for k in range(count - 1, -1, -1):
             Q_k = F[k].T.dot(V[k + 1].dot(F[k]), out=Q[k])
             Q_k += H[k]
-            Q_uu, Q_ux = Q_k[n:, n:], Q_k[n:, :n]
+            Q_uu, Q_ux = Q_k[w:, w:], Q_k[w:, :w]
             K_k = _gains(Q_uu + ridge, Q_ux)
             if bounded[k]:
                 K_k, free[k] = _within(Q_uu + ridge, Q_ux, K_k, problem.lower[k], problem.upper[k])
-            W = Q_k[:n, :n] + K_k.T.dot(Q_uu.dot(K_k) + Q_ux) + Q_ux.T.dot(K_k)
+            W = Q_k[:w, :w] + K_k.T.dot(Q_uu.dot(K_k) + Q_ux) + Q_ux.T.dot(K_k)
             np.add(W, W.T, out=V[k])
             V[k] *= 0.5
             K[k] = K_k
@@ -88,10 +89,12 @@ def solve_riccati(problem: LinearQuadratic, regularization: float) -> Policy | N
         start, left = _best_start(problem, P[0], s[0], regularization)
     except np.linalg.LinAlgError:
         return None
-    q_u, d = Q[:, n:, n - 1], K[:, :, -1]
+    q_u, d = Q[:, w:, w - 1], K[:, :, -1]
     slope = float(np.sum(q_u * d) + s[0] @ start)
-    curvature = float(np.einsum("ki,kij,kj->", d, Q[:, n:, n:], d) + start @ P[0] @ start)
+    curvature = float(np.einsum("ki,kij,kj->", d, Q[:, w:, w:], d) + start @ P[0] @ start)
     gradient = float(np.abs(q_u[free]).max(initial=left))
+    if not math.isfinite(slope + curvature):  # NaN passes for positive definite
+        return None
     return Policy(start, d, K[:, :, :-1], s, P, slope, curvature, gradient)
 
 
