@@ -66,14 +66,14 @@ def jacobians_along(problem: Problem, motion: Motion) -> Array:
 
 
 def dynamics_curvature_along(problem: Problem, motion: Motion, v: Array) -> Array | None:
-    """(N, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx); None where not all steps are smooth.
+    """(N, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx); None where contact or a limit acts.
 
     By differences of the Jacobians along every state: in its inputs alone a smooth step is linear. None also where
     Jacobians are not to be had in one call. Raises what `linearize` raises.
     """
     model, xs, us = problem.model, motion.xs[:-1], _off_bounds(problem, motion.us)
     here = smooth_jacobians(model, xs[0], us, "auto", xs, motion.ends)
-    if here is None or not here.smooth.all():
+    if here is None or here.steps.touching.any() or not here.smooth.all():
         return None
     curvature = np.zeros((len(us), model.nx + model.nu, model.nx + model.nu))
     for j in range(model.nx):

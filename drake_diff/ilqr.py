@@ -46,7 +46,7 @@ ROUNDING = 1e-13
 LEFT_OVER = 3e-2
 BESIDE = 1e-14  # of a bound: an input that is no further from it is on it
 # Of what a step gained: where the next one gains more, the search converges slowly, for want of the right curvature.
-SLOW = 1 / 4
+SLOW = 1 / 2
 
 _Solve = Callable[[LinearQuadratic, float], Policy | None]
 
