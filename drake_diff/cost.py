@@ -55,7 +55,7 @@ class QuadraticCost:
 
     def along(self, xs: Array, us: Array) -> Array:
         """(K,) the costs of xs (K, nx) and us (K, nu)."""
-        total = np.zeros(len(xs))
+        total = 0.0 * xs[:, 0]  # NaN where that is
         for weight, z, reference in ((self.Q, xs, self.x_ref), (self.R, us, self.u_ref)):
             if weight is not None:
                 d = z if reference is None else z - reference

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drake_diff.analytic import analytic_of
 from drake_diff.arrays import Array
 from drake_diff.augmented_lagrangian import AugmentedLagrangian
 from drake_diff.cost import (
@@ -17,9 +18,13 @@ from drake_diff.cost import (
     final_cost_hessian,
     running_cost_hessian,
 )
-from drake_diff.linearization import linearize
+from drake_diff.linearization import linearize, smooth_jacobians
+from drake_diff.model import Model
 from drake_diff.problem import Problem
 from drake_diff.riccati import LinearQuadratic
+
+# Of a state, or of 1: Jacobians are known to 1e-12, so that this leaves 1e-6 of their derivative.
+DIFFERENCE_STEP = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +39,11 @@ class Motion:
     def point(self) -> tuple[Array, Array]:
         """xs and us."""
         return self.xs, self.us
+
+    @property
+    def ends(self) -> Array:
+        """(N, nx): where the steps lead."""
+        return self.xs[1:] + self.gaps
 
     @property
     def is_rollout(self) -> bool:
@@ -51,10 +61,46 @@ def jacobians_along(problem: Problem, motion: Motion) -> Array:
     Those of an input on a bound are from inside it: a bound is often the actuator's limit, at which Drake's derivative
     is 0, as beyond it, while a minimization needs to know what leaving the bound would do.
     """
-    us, lower, upper = motion.us, problem.bounds.u_lower, problem.bounds.u_upper
-    inside = np.where(us == upper, np.nextafter(us, lower), np.where(us == lower, np.nextafter(us, upper), us))
-    A, B, _ = linearize(problem.model, motion.xs, inside, x_next=motion.xs[1:] + motion.gaps)
+    A, B, _ = linearize(problem.model, motion.xs, _off_bounds(problem, motion.us), x_next=motion.ends)
     return np.concatenate([A, B], axis=2)
+
+
+def dynamics_curvature_along(problem: Problem, motion: Motion, v: Array) -> Array | None:
+    """(N, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx); None where contact or a limit acts.
+
+    By differences of the Jacobians along every state: in its inputs alone a smooth step is linear. None also where
+    Jacobians are not to be had in one call. Raises what `linearize` raises.
+    """
+    model, xs, us = problem.model, motion.xs[:-1], _off_bounds(problem, motion.us)
+    here = smooth_jacobians(model, xs[0], us, "auto", xs, motion.ends)
+    if here is None or here.steps.touching.any() or not here.smooth.all():
+        return None
+    curvature = np.zeros((len(us), model.nx + model.nu, model.nx + model.nu))
+    for j in range(model.nx):
+        moved = np.array(xs)
+        moved[:, j] += DIFFERENCE_STEP * np.maximum(1.0, np.abs(xs[:, j]))
+        near = _nearby_jacobians(model, moved, us)
+        if near is None:
+            return None
+        slopes = (near - here.jacobians) / (moved - xs)[:, j, None, None]
+        curvature[:, :, j] = np.einsum("kij,ki->kj", slopes, v)
+    curvature[:, : model.nx, model.nx :] = curvature[:, model.nx :, : model.nx].swapaxes(1, 2)
+    return (curvature + curvature.swapaxes(1, 2)) / 2
+
+
+def _nearby_jacobians(model: Model, xs: Array, us: Array) -> Array | None:
+    """(N, nx, nx + nu) of the steps from xs (N, nx) beside smooth ones; None where one that was taken is not smooth."""
+    analytic = analytic_of(model)
+    if not isinstance(analytic, str):
+        return analytic.differentiate(xs, us)[0]  # no step is taken
+    found = smooth_jacobians(model, xs[0], us, "auto", xs)
+    return found.jacobians if found is not None and found.smooth.all() else None
+
+
+def _off_bounds(problem: Problem, us: Array) -> Array:
+    """`us` with those on a bound moved inside it by rounding."""
+    lower, upper = problem.bounds.u_lower, problem.bounds.u_upper
+    return np.where(us == upper, np.nextafter(us, lower), np.where(us == lower, np.nextafter(us, upper), us))
 
 
 def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: AugmentedLagrangian) -> LinearQuadratic:

@@ -3,14 +3,16 @@
 Li and Todorov, "Iterative linear quadratic regulator design for nonlinear biological movement systems", 2004, and
 the feasibility-driven form of Mastalli et al., "Crocoddyl", 2020: the guess need not be a rollout, and a step of size a
 leaves 1 - a of each gap between step(x_k, u_k) and x_(k+1). A hard goal, waypoints, state bounds and constraints are
-augmented Lagrangians, and the dynamics' second derivatives, which iLQR leaves out, are learned on the way (`secant`).
+augmented Lagrangians, and the dynamics' second derivatives, which iLQR leaves out, are learned on the way (`secant`),
+or taken by differences of the Jacobians where a smooth motion converges slowly.
 """
 
 import math
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -18,7 +20,7 @@ from drake_diff.arrays import Array
 from drake_diff.augmented_lagrangian import GROWTH, LARGEST_PENALTY, AugmentedLagrangian
 from drake_diff.cost import CostToGo
 from drake_diff.exceptions import InputError, SimulationError
-from drake_diff.expansion import Motion, expand, jacobians_along
+from drake_diff.expansion import Motion, dynamics_curvature_along, expand, jacobians_along
 from drake_diff.nonlinear_program import (
     FEASIBILITY_TOLERANCE,
     Iteration,
@@ -30,7 +32,7 @@ from drake_diff.nonlinear_program import (
 )
 from drake_diff.problem import Problem
 from drake_diff.riccati import LinearQuadratic, Policy, slope_along, solve_riccati
-from drake_diff.secant import DynamicsCurvature
+from drake_diff.secant import DynamicsCurvature, multipliers
 from drake_diff.step import advance
 from drake_diff.tangent import tangent_space
 
@@ -42,6 +44,11 @@ CUT_BACK, SHORT = 1 / 8, 1 / 32  # two such steps: the model reaches too far; se
 ROUNDING = 1e-13
 # Of what the next update of the multipliers changes in the augmented cost: what a minimization before it may leave.
 LEFT_OVER = 3e-2
+BESIDE = 1e-14  # of a bound: an input that is no further from it is on it
+# Of what a step gained: where the next one gains more, the search converges slowly, for want of the right curvature.
+SLOW = 1 / 2
+
+_Solve = Callable[[LinearQuadratic, float], Policy | None]
 
 
 def check_problem(problem: Problem) -> None:
@@ -106,19 +113,24 @@ def costs_to_go(problem: Problem, xs: Array, us: Array) -> tuple[CostToGo, ...]:
     return tuple(CostToGo(*part) for part in parts)
 
 
-def _best_policy(models: Iterable[LinearQuadratic], regularization: float) -> Policy | None:
+def _best_policy(solve: _Solve, models: Sequence[LinearQuadratic], regularization: float) -> Policy | None:
     """The policy of the first of the models whose Hessians allow one."""
     for model in models:
-        policy = solve_riccati(model, regularization)
+        policy = solve(model, regularization)
         if policy is not None and policy.expected >= 0:
             return policy
     return None
 
 
-def _promise(models: Iterable[LinearQuadratic]) -> float:
-    """The largest decrease that any of the models promises, regularized as little as it allows."""
-    policies = (solve_riccati(m, 0.0) or solve_riccati(m, SMALLEST_REGULARIZATION) for m in models)
-    return max((abs(policy.expected) for policy in policies if policy is not None), default=math.inf)
+def _promise_at_most(solve: _Solve, models: Sequence[LinearQuadratic], limit: float) -> bool:
+    """Whether no model, regularized as little as it allows, promises more than `limit`, and one of them that much."""
+    found = False
+    for model in models:
+        policy = solve(model, 0.0) or solve(model, SMALLEST_REGULARIZATION)
+        if policy is not None and not abs(policy.expected) <= limit:
+            return False
+        found = found or policy is not None
+    return found
 
 
 class _Search:
@@ -127,6 +139,8 @@ class _Search:
     ):
         self.problem, self.limits, self.report, self.patience = problem, limits, report, patience
         self.constraints = AugmentedLagrangian(problem)
+        lower, upper = problem.bounds.u_lower, problem.bounds.u_upper
+        self.inner = lower * (1 + BESIDE * np.sign(lower)), upper * (1 - BESIDE * np.sign(upper))
         self.start = time.monotonic()
         self.motion = self._take_in(xs, us)
         self.expanded, self.curvature = self.motion, DynamicsCurvature()
@@ -135,6 +149,7 @@ class _Search:
         self.jacobians: Array | None = None
         self.gap_weight = 0.0
         self.regularization = 0.0
+        self.gains = math.inf, math.inf  # of the merit, by the last two steps of this minimization
         self.stalled = False
         self.rows = [Iteration(0, self.cost, self._infeasibility(), math.nan, math.nan)]
 
@@ -153,6 +168,7 @@ class _Search:
             if final and exhausted:
                 return Outcome.INFEASIBLE if stands else Outcome.INACCURATE
             self.constraints.update(*self.motion.point)
+            self.gains = math.inf, math.inf
             final = reached or exhausted
             if not final:
                 self.constraints.penalty *= GROWTH
@@ -182,6 +198,9 @@ class _Search:
             self.jacobians = jacobians_along(self.problem, new)
         model = expand(self.problem, new, self.jacobians, self.constraints)
         self.curvature.update(model, np.hstack([new.xs[:-1] - old.xs[:-1], new.us - old.us]))
+        if self.gains[1] > SLOW * self.gains[0]:
+            M = dynamics_curvature_along(self.problem, new, multipliers(model))
+            self.curvature.M = self.curvature.M if M is None else M
         self.expanded = new
         return model
 
@@ -192,18 +211,22 @@ class _Search:
         left_over = self.limits.tolerance**2 * scale
         if not final:
             left_over = max(left_over, LEFT_OVER * self.constraints.unrest(*self.motion.point))
-        curved = replace(model, hessians=model.hessians + self.curvature.M)
-        promise = _promise((curved, model)) if self.motion.is_rollout else math.inf
-        if promise <= left_over:
+        models = replace(model, hessians=model.hessians + self.curvature.M), model
+        solve = cache(solve_riccati)  # no policy is sought twice
+
+        def is_reached(limit: float) -> bool:
+            return self.motion.is_rollout and _promise_at_most(solve, models, limit)
+
+        if is_reached(left_over):
             return Outcome.SOLVED
         if len(self.rows) > self.limits.max_iterations:
             return Outcome.ITERATION_LIMIT
         while self.regularization <= LARGEST_REGULARIZATION:
-            policy = _best_policy((curved, model), self.regularization)
+            policy = _best_policy(solve, models, self.regularization)
             if policy is not None and self._search_along(model, policy):
                 self.regularization = self._tightened() if self._is_cut_back() else self._relaxed()
                 return None
-            if promise <= ROUNDING * scale:
+            if is_reached(ROUNDING * scale):
                 return Outcome.SOLVED  # what is left to gain is less than the cost's rounding
             if self.motion.is_rollout and policy is not None and policy.expected <= ROUNDING * scale:
                 break  # no step that can be told from none: the cost has a kink or a jump here, as contact makes them
@@ -239,6 +262,7 @@ class _Search:
                 continue  # too long a step: a shorter one is tried next
             if found <= merit + SUFFICIENT_DECREASE * size * slope:
                 self.motion, self.cost = motion, cost
+                self.gains = self.gains[1], merit - found
                 self._record(policy.gradient, size)
                 return True
         return False
@@ -249,9 +273,9 @@ class _Search:
         xs, us = np.empty_like(old.xs), np.empty_like(old.us)
         gaps = (1 - size) * old.gaps
         xs[0] = self._inside_start(old.xs[0] + size * policy.start)
-        for k in range(len(us)):
-            du = size * policy.feedforward[k] + policy.feedback[k] @ (xs[k] - old.xs[k])
-            us[k] = self._inside(old.us[k] + du)
+        wanted = old.us + size * policy.feedforward
+        for k, feedback in enumerate(policy.feedback):
+            us[k] = self._inside(wanted[k] + feedback.dot(xs[k] - old.xs[k]))
             xs[k + 1] = advance(twin, xs[k], us[k]) - gaps[k]
         return Motion(xs, us, gaps)
 
@@ -272,11 +296,8 @@ class _Search:
 
     def _inside(self, us: Array) -> Array:
         """`us` (..., nu) within its bounds, and on a bound where rounding alone parts it from one."""
-        bounds = self.problem.bounds
-        us = np.clip(us, bounds.u_lower, bounds.u_upper)
-        for bound in (bounds.u_lower, bounds.u_upper):
-            us = np.where(np.abs(us - bound) <= 1e-14 * np.abs(us), bound, us)
-        return us
+        bounds, (lowest, highest) = self.problem.bounds, self.inner
+        return np.where(us <= lowest, bounds.u_lower, np.where(us >= highest, bounds.u_upper, us))
 
     def _inside_start(self, x: Array) -> Array:
         bounds = self.problem.bounds

@@ -150,13 +150,19 @@ class Problem:
         """
         total = 0.0 if self.final_cost is None else float(self.final_cost(xs[-1]))
         if self.running_cost is not None:
-            rates = [float(self.running_cost(x, u)) for x, u in zip(xs, inputs, strict=False)]
+            rates = self._rates(xs[: len(inputs)], inputs)
             if len(inputs) == len(xs):
                 rates[0], rates[-1] = rates[0] / 2, rates[-1] / 2
-            total += self.model.time_step * sum(rates)
+            total += self.model.time_step * float(np.sum(rates))
         if self.trajectory_cost is not None:
             total += float(self.trajectory_cost(xs, inputs))
         return total
+
+    def _rates(self, xs: Array, us: Array) -> Array:
+        """(N,): the running cost of xs (N, nx), us (N, nu)."""
+        if isinstance(self.running_cost, QuadraticCost):
+            return self.running_cost.along(xs, us)
+        return np.array([float(self.running_cost(x, u)) for x, u in zip(xs, us, strict=True)])
 
     def _check_parameters(self) -> None:
         vector, given = self.parameters, self.parameter_bounds or {}

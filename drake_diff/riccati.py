@@ -5,6 +5,7 @@ dx_(k+1) = F_k z_k + f_k and lower_k <= du_k <= upper_k. The gaps f_k are those 
 the boxes those of Tassa, Mansard and Todorov, "Control-limited differential dynamic programming", 2014.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,49 +63,67 @@ class Policy:
 
 
 def solve_riccati(problem: LinearQuadratic, regularization: float) -> Policy | None:
-    """The best policy, `regularization` added to the inputs' Hessian; None where that is not positive definite."""
-    n, (count, m) = problem.num_states, problem.lower.shape
-    s, P = problem.final_gradient, problem.final_hessian
-    feedforward, feedback = np.zeros((count, m)), np.zeros((count, m, n))
-    gradients, hessians = np.tile(s, (count + 1, 1)), np.tile(P, (count + 1, 1, 1))
-    slope = curvature = gradient = 0.0
+    """The best policy, `regularization` added to the inputs' Hessian; None where that is not positive definite.
+
+    The recursion is that of [dx; 1], so that V = [[P, s], [s', c]] is all that remains to be paid and
+    K = [feedback, feedforward] all that is done, in the fewest products: NumPy's calls are what a sweep's time goes to.
+    """
+    w, (count, m) = problem.num_states + 1, problem.lower.shape
+    F, H, V = _with_a_one(problem)
+    Q, K, free = np.empty_like(H), np.empty((count, m, w)), np.ones((count, m), dtype=bool)
+    bounded = (np.isfinite(problem.lower) | np.isfinite(problem.upper)).any(axis=1)
     ridge = regularization * np.eye(m)
     try:
         for k in range(count - 1, -1, -1):
-            F = problem.F[k]
-            PF = P @ F
-            q = problem.gradients[k] + F.T @ s + PF.T @ problem.gaps[k]
-            Q = problem.hessians[k] + F.T @ PF
-            q_u, Q_uu, Q_ux = q[n:], Q[n:, n:], Q[n:, :n]
-            d, K, left = _best_input(Q_uu + ridge, q_u, Q_ux, problem.lower[k], problem.upper[k])
-            Qd = Q_uu @ d
-            slope += float(q_u @ d)
-            curvature += float(d @ Qd)
-            gradient = max(gradient, left)
-            s = q[:n] + K.T @ (Qd + q_u) + Q_ux.T @ d
-            KQ = K.T @ Q_ux
-            P = Q[:n, :n] + K.T @ Q_uu @ K + KQ + KQ.T
-            P = (P + P.T) / 2
-            feedforward[k], feedback[k] = d, K
-            gradients[k], hessians[k] = s, P
-        start, left = _best_start(problem, P, s, regularization)
+            Q_k = F[k].T.dot(V[k + 1].dot(F[k]), out=Q[k])
+            Q_k += H[k]
+            Q_uu, Q_ux = Q_k[w:, w:], Q_k[w:, :w]
+            K_k = _gains(Q_uu + ridge, Q_ux)
+            if bounded[k]:
+                K_k, free[k] = _within(Q_uu + ridge, Q_ux, K_k, problem.lower[k], problem.upper[k])
+            W = Q_k[:w, :w] + K_k.T.dot(Q_uu.dot(K_k) + Q_ux) + Q_ux.T.dot(K_k)
+            np.add(W, W.T, out=V[k])
+            V[k] *= 0.5
+            K[k] = K_k
+        P, s = V[:, :-1, :-1], V[:, :-1, -1]
+        start, left = _best_start(problem, P[0], s[0], regularization)
     except np.linalg.LinAlgError:
         return None
-    slope += float(s @ start)
-    curvature += float(start @ P @ start)
-    return Policy(start, feedforward, feedback, gradients, hessians, slope, curvature, max(gradient, left))
+    q_u, d = Q[:, w:, w - 1], K[:, :, -1]
+    slope = float(np.sum(q_u * d) + s[0] @ start)
+    curvature = float(np.einsum("ki,kij,kj->", d, Q[:, w:, w:], d) + start @ P[0] @ start)
+    gradient = float(np.abs(q_u[free]).max(initial=left))
+    if not math.isfinite(slope + curvature):  # NaN passes for positive definite
+        return None
+    return Policy(start, d, K[:, :, :-1], s, P, slope, curvature, gradient)
 
 
-def _best_input(hessian: Array, q_u: Array, Q_ux: Array, lower: Array, upper: Array) -> tuple[Array, Array, float]:
-    """(step (m,), feedback (m, n), largest |q_u| of an input that no bound holds)."""
-    gains = _gains(hessian, q_u, Q_ux)
-    d, K = gains[:, 0], gains[:, 1:]
+def _with_a_one(problem: LinearQuadratic) -> tuple[Array, Array, Array]:
+    """(F (N, n+1, n+1+m), H (N, n+1+m, n+1+m), V (N+1, n+1, n+1)) of [dx; 1; du], of V the last alone."""
+    n, (count, m) = problem.num_states, problem.lower.shape
+    where = np.r_[:n, n + 1 : n + 1 + m]  # of [dx; du]
+    F, H = np.zeros((count, n + 1, n + 1 + m)), np.zeros((count, n + 1 + m, n + 1 + m))
+    F[:, :n, where], F[:, :n, n], F[:, n, n] = problem.F, problem.gaps, 1.0
+    H[:, where[:, None], where] = problem.hessians
+    H[:, n, where] = H[:, where, n] = problem.gradients
+    V = np.zeros((count + 1, n + 1, n + 1))
+    V[-1, :n, :n] = problem.final_hessian
+    V[-1, n, :n] = V[-1, :n, n] = problem.final_gradient
+    return F, H, V
+
+
+def _within(
+    hessian: Array, Q_ux: Array, K: Array, lower: Array, upper: Array
+) -> tuple[Array, NDArray[np.bool_] | bool]:
+    """(K (m, n+1), which inputs (m,) no bound holds): `K` itself where its feedforward leaves no bound."""
+    d = K[:, -1]
     if (d >= lower).all() and (d <= upper).all():
-        return d, K, float(np.abs(q_u).max(initial=0.0))
-    d, free = minimize_in_box(hessian, q_u, lower, upper)
+        return K, True
+    d, free = minimize_in_box(hessian, Q_ux[:, -1], lower, upper)
     K = np.zeros_like(Q_ux)
-    K[free] = _gains(hessian[np.ix_(free, free)], q_u[free], Q_ux[free])[:, 1:]
-    return d, K, float(np.abs(q_u[free]).max(initial=0.0))
+    K[free] = _gains(hessian[np.ix_(free, free)], Q_ux[free])
+    K[:, -1] = d
+    return K, free
 
 
 def _best_start(problem: LinearQuadratic, P: Array, s: Array, regularization: float) -> tuple[Array, float]:
@@ -119,14 +138,14 @@ def _best_start(problem: LinearQuadratic, P: Array, s: Array, regularization: fl
     return start, float(np.abs(s[moves[free]]).max(initial=0.0))
 
 
-def _gains(hessian: Array, q_u: Array, Q_ux: Array) -> Array:
-    """(m, 1 + n): -hessian^-1 [q_u, Q_ux]; raises LinAlgError where the Hessian is not positive definite."""
+def _gains(hessian: Array, Q_ux: Array) -> Array:
+    """(m, n+1): -hessian^-1 Q_ux; raises LinAlgError where the Hessian is not positive definite."""
     if len(hessian) == 1:
         if not hessian[0, 0] > 0:
             raise np.linalg.LinAlgError
-        return np.concatenate([q_u[:, None], Q_ux], axis=1) / -hessian[0, 0]
+        return Q_ux / -hessian[0, 0]
     np.linalg.cholesky(hessian)
-    return -np.linalg.solve(hessian, np.concatenate([q_u[:, None], Q_ux], axis=1))
+    return -np.linalg.solve(hessian, Q_ux)
 
 
 def minimize_in_box(hessian: Array, gradient: Array, lower: Array, upper: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -3,7 +3,7 @@
 iLQR leaves out sum_i v_i d2 f_i / d z2, v being the multipliers of the dynamics, and crawls where that is large beside
 the cost's curvature. For each knot a symmetric matrix M_k that stands for it is corrected by symmetric rank one (SR1;
 Nocedal and Wright, "Numerical Optimization", 2006, section 6.2) so that M_k dz = (F_k(new) - F_k(old))' v. It costs no
-simulation, and stays 0 where the dynamics are linear.
+simulation, and stays 0 where the dynamics are linear. Where more is known of M_k, it is set.
 """
 
 import numpy as np

@@ -145,3 +145,15 @@ def test_a_cost_without_a_usable_gradient_is_refused(cost, words):
 def test_a_cost_that_is_no_scalar_is_refused():
     with pytest.raises(dd.InputError, match="expected one scalar, got 2 values"):
         differentiate_final_cost(lambda x: x, np.ones(2))
+
+
+def test_a_quadratic_cost_along_a_motion_is_the_sum_of_its_calls():
+    """1e-14 relative: products of two and three numbers."""
+    random = np.random.default_rng(0)
+    xs, us = random.standard_normal((5, 3)), random.standard_normal((5, 2))
+    xs[3, 0] = np.nan
+    Q, R, x_ref, u_ref = np.diag([1.0, 0, 2]), np.array([[2.0, 0.5], [0.5, 1.0]]), np.ones(3), -np.ones(2)
+    for parts in ({"Q": Q}, {"R": R, "u_ref": u_ref}, {"Q": Q, "R": R, "x_ref": x_ref}, {}):
+        cost = dd.QuadraticCost(**parts)
+        expected = [cost(x, u) for x, u in zip(xs, us, strict=True)]
+        np.testing.assert_allclose(cost.along(xs, us), expected, rtol=1e-14)
