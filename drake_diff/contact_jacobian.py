@@ -150,7 +150,7 @@ def contact_jacobians(
         by_material = _by_material(contacts, impulse, weight, diagonal[at], speeds, change.part(touch.pair))
         right = np.concatenate([right, _sum(at, by_material, count)], axis=2)
     left = A - _sum(at, J @ impulse.by_velocity() @ np.swapaxes(J, -1, -2), count)
-    jacobians, _ = analytic.assemble(native, np.linalg.solve(left, right), v_next)
+    jacobians, _ = analytic.assemble(native, np.asarray(np.linalg.solve(left, right), dtype=float), v_next)
     solved = _is_solved(momentum[:, 0] - push, momentum[:, 1], push, diagonal)
     return jacobians, solved & ~analytic.at_a_limit(steps)
 

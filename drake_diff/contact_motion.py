@@ -36,7 +36,7 @@ def topology_of(description: Description) -> Topology:
     moves, before, turns = np.zeros((nv, nv)), np.zeros((nv, nv)), np.ones(nv)
     bodies = {"world": np.zeros(nv)}
     for link in description.links:
-        own = list(_dofs(link))
+        own = np.array(list(_dofs(link)), dtype=np.intp)
         above = np.flatnonzero(bodies[link.parent])
         moves[np.ix_(above, own)] = before[np.ix_(own, above)] = before[np.ix_(own, own)] = 1.0
         if len(own) > 1:

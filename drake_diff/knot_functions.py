@@ -106,10 +106,10 @@ class SymbolicPlant(Symbolic):
     def _compute(self, count: int) -> Values:
         found = np.empty((count, self._jacobian.nnz_out(0)))
         buffer, evaluate = _mapped(self._jacobian, count).buffer()
-        buffer.set_res(0, memoryview(found))
+        buffer.set_res(0, found.data)
 
         def nonzeros(knots: Array) -> Array:
-            buffer.set_arg(0, memoryview(knots))
+            buffer.set_arg(0, knots.data)
             evaluate()
             return found
 

@@ -71,7 +71,7 @@ def solve_riccati(problem: LinearQuadratic, regularization: float) -> Policy | N
     w, (count, m) = problem.num_states + 1, problem.lower.shape
     F, H, V = _with_a_one(problem)
     Q, K, free = np.empty_like(H), np.empty((count, m, w)), np.ones((count, m), dtype=bool)
-    bounded = (np.isfinite(problem.lower) | np.isfinite(problem.upper)).any(axis=1)
+    bounded = np.asarray((np.isfinite(problem.lower) | np.isfinite(problem.upper)).any(axis=1))
     ridge = regularization * np.eye(m)
     try:
         for k in range(count - 1, -1, -1):
@@ -145,7 +145,7 @@ def _gains(hessian: Array, Q_ux: Array) -> Array:
             raise np.linalg.LinAlgError
         return Q_ux / -hessian[0, 0]
     np.linalg.cholesky(hessian)
-    return -np.linalg.solve(hessian, Q_ux)
+    return np.asarray(-np.linalg.solve(hessian, Q_ux), dtype=float)
 
 
 def minimize_in_box(hessian: Array, gradient: Array, lower: Array, upper: Array) -> tuple[Array, NDArray[np.bool_]]:
