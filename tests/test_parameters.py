@@ -490,7 +490,7 @@ def test_a_pressed_ball_by_stiffness_radius_and_mass(approximation, ours, ground
 
 
 @pytest.mark.parametrize("approximation", ["lagged", "similar", "sap"])
-@pytest.mark.parametrize(("ours", "ground"), [(1e4, 1e4), (2000.0, 6000.0)])
+@pytest.mark.parametrize(("ours", "ground"), [pytest.param(1e4, 1e4, marks=pytest.mark.slow), (2000.0, 6000.0)])
 def test_static_penetration_by_stiffness_and_mass(approximation, ours, ground):
     """A15: depth m g / k, so by k -m g / k^2, by m g / k, by the radius nothing: the ball is lifted by it."""
     extra = {"dissipation": 20.0, "relaxation_time": 0.1}

@@ -171,6 +171,7 @@ def again():
 """
 
 
+@pytest.mark.slow
 def test_every_module_of_public_names_can_be_the_first():
     """Drake stays loaded in between: what counts are our modules."""
     code = """

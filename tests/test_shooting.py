@@ -63,6 +63,7 @@ def grown(running_cost, most):
     return kept[2] - kept[1], rows[2] - rows[1]
 
 
+@pytest.mark.slow
 def test_memory_is_flat_in_iterations():
     """A row of five numbers is 250 bytes, Drake 1.51 leaves some 400 more; one motion's derivatives are above 5000."""
     growth, rows = grown(EFFORT, 100)
