@@ -127,6 +127,8 @@ def analytic_jacobians(
 
     The vector is applied to `model`, and may be of contact alone. Where N is 1 the double twin stands at the step.
     """
+    if not steps.touching.any() and not vector.parameters:
+        return analytic(steps)
     size = (len(steps.starts), model.nx, model.nx + model.nu + len(vector.values))
     jacobians, known = np.zeros(size), np.zeros(size[0], dtype=bool)
     free, touching = np.flatnonzero(~steps.touching), np.flatnonzero(steps.touching)

@@ -130,14 +130,13 @@ def contact_jacobians(
     velocities = analytic.pushed(native, steps.us, momentum[:, 0] / h)
 
     point, normal, phi = contacts.displacement()
-    before = contacts.velocity_change(native.v[at], point) @ touch.normal[:, :, None]
     by_motion = impulse.by_state(
         StateChange(
             velocity=contacts.velocity_change(v_next[at], point),
             normal=normal,
             phi=phi,
             weight=contacts.weight_change(weight, diagonal[at], diagonal_change(S, inertia, form.topology)[at], point),
-            before=before[..., 0] + (normal @ (native.v[at][:, None, :] @ J)[:, 0, :, None])[..., 0],
+            before=_approach_change(impulse, contacts, native.v[at], point, normal),
         )
     )
     right = A @ velocities
@@ -153,6 +152,16 @@ def contact_jacobians(
     jacobians, _ = analytic.assemble(native, np.asarray(np.linalg.solve(left, right), dtype=float), v_next)
     solved = _is_solved(momentum[:, 0] - push, momentum[:, 1], push, diagonal)
     return jacobians, solved & ~analytic.at_a_limit(steps)
+
+
+def _approach_change(
+    impulse: Impulse | HuntCrossleyImpulse, contacts: Contacts, v: Array, point: Array, normal: Array
+) -> Array:
+    """(M, nv) the change of the normal velocity before the step, 0 where the law does not know it."""
+    if isinstance(impulse, Impulse):
+        return np.zeros(v.shape)
+    along = contacts.velocity_change(v, point) @ contacts.touch.normal[:, :, None]
+    return np.asarray((along + normal @ np.swapaxes(v[:, None, :] @ contacts.jacobian, -1, -2))[..., 0])
 
 
 def _by_material(

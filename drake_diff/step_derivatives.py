@@ -15,7 +15,7 @@ from drake_diff.autodiff import gradient_rows
 from drake_diff.contact_material import of_contact_alone
 from drake_diff.exceptions import GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.finite_difference import differences, plateau
-from drake_diff.implicit import NotSmoothError, implicit_jacobian
+from drake_diff.implicit import NotSmoothError, form_of, implicit_jacobian
 from drake_diff.model import Model
 from drake_diff.parameters import Parameters, ParameterVector, applied, select, write_autodiff
 from drake_diff.step import advance, check_point
@@ -32,6 +32,8 @@ SAME_JACOBIAN = 1e-10
 # Implicit is 0.9 to 2 times as fast as autodiff; a choice at the break-even would change from run to run.
 TIMED_CALLS, MUCH_SLOWER = 3, 3.0
 OF_ONE_KIND = ("analytic", "finite_difference")  # methods whose columns by parameters are such, too
+# Below so many degrees of freedom AutoDiffXd takes a step with contact in less time than NumPy's calls for one take.
+CONTACT_SIZE = 8
 CERTIFIED = "equal to autodiff, as certified on this model"
 
 
@@ -66,7 +68,8 @@ def differentiate_step(
     - "implicit": from the equation of a smooth step, two to three times as fast from five joints on; autodiff where
       contact or a constraint acts;
     - "finite_difference": central differences of the double step;
-    - "auto": analytic where Pinocchio is installed and the model and step allow it, else implicit where it was measured
+    - "auto": analytic where Pinocchio is installed and the model and step allow it (of a single step with contact from
+      eight degrees of freedom on, below which autodiff is faster, or where parameters are asked for), else implicit where it was measured
       to be equal to autodiff and not much slower here, else autodiff, and differences where Drake refuses AutoDiffXd.
 
     `method` and `reason` of the result say what it was. Raises GradientError where the AutoDiffXd step is not the
@@ -125,6 +128,8 @@ def _by_implicit(model: Model, vector: ParameterVector, x: Array, u: Array, x_ne
 
 def _by_choice(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
     """What is exact and fastest on this model."""
+    if model.nv < CONTACT_SIZE and not vector.parameters and form_of(model).can_touch and model.double.touches():
+        return _without_analytic(model, vector, x, u, x_next)
     jacobian = _analytic(model, vector, x, u, x_next)
     if isinstance(jacobian, str):
         return _without_analytic(model, vector, x, u, x_next)
@@ -240,8 +245,7 @@ def check_parity(model: Model, autodiff: Array, double: Array) -> None:
 
 def check_derivatives(model: Model, jacobian: Array) -> None:
     """Refuse a derivative by x or u that is not finite or implausibly large, and by a parameter that is not finite."""
-    # Then no entry is larger, and none NaN. Not by `vdot`, for which BLAS starts threads that slow down what follows.
-    if np.einsum("ij,ij->", jacobian, jacobian) <= MAGNITUDE_BOUND**2:
+    if np.min(jacobian, initial=0.0) >= -MAGNITUDE_BOUND and np.max(jacobian, initial=0.0) <= MAGNITUDE_BOUND:
         return
     bound = np.full(jacobian.shape[1], MAGNITUDE_BOUND)
     bound[model.nx + model.nu :] = np.finfo(float).max  # its size is a matter of the parameter's unit

@@ -86,7 +86,7 @@ def _walker(tmp_path, **options):
 
 def _by_both(model, x, u):
     """The Jacobians [A, B] by contact's own equation and by AutoDiffXd."""
-    ours = dd.differentiate_step(model, x, u)
+    ours = dd.differentiate_step(model, x, u, method="analytic")
     exact = dd.differentiate_step(model, x, u, method="autodiff")
     return ours, np.hstack([ours.A, ours.B]), np.hstack([exact.A, exact.B])
 
@@ -203,7 +203,7 @@ def test_a_sticking_balls_step_in_closed_form(tmp_path):
     k, soft, z = 1e4 * 3e4 / 4e4, h + 0.05, 0.1 - 1e-3
     m_x, m_z = 0.5, 0.2
     R_n, R_t = 1 / (h * k * soft), 1e-3 * np.hypot(1 / m_x, 1 / m_z) / 3
-    d = dd.differentiate_step(model, [0.0, z, 1e-4, -0.02])
+    d = dd.differentiate_step(model, [0.0, z, 1e-4, -0.02], method="analytic")
     assert d.method == "analytic", d.reason
     to_x, to_z = R_t * m_x / (1 + R_t * m_x), R_n * m_z / (1 + R_n * m_z)
     by_phi = -1 / (soft * (1 + R_n * m_z))
@@ -267,14 +267,26 @@ def test_values_of_the_material_that_are_given_are_those_of_the_derivative(tmp_p
     assert ours.method == "analytic"
     assert exact.method == "autodiff"
     np.testing.assert_allclose(ours.A, exact.A, atol=1e-10)
-    assert not np.allclose(ours.A, dd.differentiate_step(model, x).A)
+    assert not np.allclose(ours.A, dd.differentiate_step(model, x, method="analytic").A)
+
+
+def test_what_is_taken_for_a_single_step_with_contact_follows_the_models_size(tmp_path):
+    small, x = _puck(tmp_path), [0.0, 0.1 - 1e-3, 1.0, -0.02]
+    assert dd.differentiate_step(small, x).method == "autodiff"
+    assert dd.differentiate_step(small, x, parameters=["z.friction"]).method == "analytic"
+    assert set(dd.linearize(small, [x], np.zeros((1, 0)))[2]) == {"analytic"}
+    large = _walker(tmp_path)
+    ((x, u),) = _touching_states(large, 1, seed=3)
+    assert dd.differentiate_step(large, x, u).method == "analytic"
 
 
 def test_given_values_are_not_kept(tmp_path):
     x, given = [0.0, 0.1 - 1e-3, 1.0, -0.02], {"z.friction": 0.9}
     first = _puck(tmp_path)
     dd.differentiate_step(first, x, parameters=given)
-    np.testing.assert_array_equal(dd.differentiate_step(first, x).A, dd.differentiate_step(_puck(tmp_path), x).A)
+    found, other = (dd.differentiate_step(m, x, method="analytic") for m in (first, _puck(tmp_path)))
+    assert found.method == "analytic"
+    np.testing.assert_array_equal(found.A, other.A)
 
 
 def _laws(count, seed):
@@ -355,7 +367,7 @@ def test_another_law_is_found_out(tmp_path, monkeypatch):
     """A wrong constant moves v' off the solution, or, where it hardly does, the Jacobian off AutoDiffXd's."""
     x = [0.0, 0.1 - 1e-3, 1e-4, -0.02]
     monkeypatch.setattr(friction_cone, "SIGMA", 1.1e-3)
-    d = dd.differentiate_step(_puck(tmp_path), x)
+    d = dd.differentiate_step(_puck(tmp_path), x, method="analytic")
     assert d.method == "autodiff"
     assert analytic.SAME_JACOBIAN == 1e-9
 
@@ -366,8 +378,8 @@ def test_a_joint_limit_beside_contact_is_refused(tmp_path):
         "up", "prismatic", "x", "z", "0 0 1"
     )
     model = _load(tmp_path, _collision("ground", SHAPES["ground"]), links + joints)
-    free = dd.differentiate_step(model, [0.0, 0.099, 0.5, 0.0])
-    assert free.method == "analytic", dd.differentiate_step(model, [0.0, 0.099, 0.5, 0.0], method="analytic").reason
+    free = dd.differentiate_step(model, [0.0, 0.099, 0.5, 0.0], method="analytic")
+    assert free.method == "analytic", free.reason
     held = dd.differentiate_step(model, [0.0095, 0.099, 0.5, 0.0], method="analytic")
     assert held.method == "autodiff"
     assert "something else acts beside contact" in held.reason
