@@ -68,9 +68,10 @@ def differentiate_step(
     - "implicit": from the equation of a smooth step, two to three times as fast from five joints on; autodiff where
       contact or a constraint acts;
     - "finite_difference": central differences of the double step;
-    - "auto": analytic where Pinocchio is installed and the model and step allow it (of a single step with contact from
-      eight degrees of freedom on, below which autodiff is faster, or where parameters are asked for), else implicit where it was measured
-      to be equal to autodiff and not much slower here, else autodiff, and differences where Drake refuses AutoDiffXd.
+    - "auto": analytic where Pinocchio is installed and the model and step allow it (a single step with contact from
+      eight degrees of freedom on, below which autodiff is faster, or where parameters are asked for), else implicit
+      where it was measured to be equal to autodiff and not much slower here, else autodiff, and differences where
+      Drake refuses AutoDiffXd.
 
     `method` and `reason` of the result say what it was. Raises GradientError where the AutoDiffXd step is not the
     double step, or a derivative is not finite or beyond 1e8; SimulationError where Drake cannot take the step.
