@@ -135,14 +135,15 @@ def analytic_jacobians(
     if len(free):
         jacobians[free, :, : model.nx + model.nu], known[free] = analytic(steps.part(free))
     if len(touching):
-        found = _with_contact(model, vector, analytic, steps.part(touching))
+        stands = len(steps.starts) == 1
+        found = _with_contact(model, vector, analytic, steps.part(touching), stands)
         if not isinstance(found, str):
             jacobians[touching], known[touching] = found
     return jacobians, known
 
 
 def _with_contact(
-    model: Model, vector: ParameterVector, analytic: Analytic, steps: Steps
+    model: Model, vector: ParameterVector, analytic: Analytic, steps: Steps, stands: bool
 ) -> tuple[Array, NDArray[np.bool_]] | str:
     form = contact_form(model, analytic)
     if isinstance(form, str):
@@ -152,7 +153,7 @@ def _with_contact(
         return left
     material = material_of(model, form)
     change = material_change(form.pairs, material, vector, model.double) if vector.parameters else None
-    poses = place(model, form, steps.starts)
+    poses = place(model, form, steps.starts, stands=stands)
     jacobians, known = contact_jacobians(form, analytic, steps, poses, material, change)
     for k in np.flatnonzero(known)[:left]:
         try:

@@ -94,15 +94,15 @@ def material_of(model: Model, form: ContactForm) -> Material:
 _OWN: WeakKeyDictionary[Model, Material] = WeakKeyDictionary()
 
 
-def place(model: Model, form: ContactForm, xs: Array) -> Array:
-    """(N, bodies, 3, 4) the poses of the bodies of the pairs at xs (N, nx), the only one of which the context is at.
+def place(model: Model, form: ContactForm, xs: Array, *, stands: bool) -> Array:
+    """(N, bodies, 3, 4) the poses of the bodies of the pairs at xs (N, nx), the context being left at the last.
 
-    Of several the double context is left at the last.
+    Where it `stands` there, as at the one state of a single step, what Drake has computed in it is kept.
     """
     plant, context = model.plant, model.double.context
     poses = np.empty((len(xs), len(form.pairs.bodies), 3, 4))
     for k, x in enumerate(xs):
-        if len(xs) > 1:
+        if not stands:
             set_state(model.double, x)
         for i, body in enumerate(form.pairs.bodies):
             poses[k, i] = plant.EvalBodyPoseInWorld(context, body).GetAsMatrix34()

@@ -147,6 +147,25 @@ def test_many_steps_in_one_call_are_the_same(tmp_path):
         np.testing.assert_allclose(B[k], one.B, rtol=0, atol=1e-9 * size)
 
 
+def test_one_step_of_many_that_touches_is_placed_where_it_is(tmp_path):
+    model = _puck(tmp_path)
+    xs = np.array([[0.0, 0.4, 1.0, 0.0], [0.3, 0.099, 0.5, -0.1], [0.0, 0.6, 1.0, 0.0]])
+    A, _, methods = dd.linearize(model, xs, np.zeros((3, 0)))
+    assert methods == ("analytic",) * 3
+    np.testing.assert_allclose(A[1], dd.differentiate_step(model, xs[1], method="autodiff").A, atol=1e-9)
+
+
+def test_what_rests_on_a_fixed_sphere(tmp_path):
+    """The sphere's side may be the one that does not move."""
+    post = _sphere("post", "0 0 0.2", 0.2)
+    links = _link("x", mass=0.3) + _link("z", _collision("plate", SHAPES["box"]), 0.2)
+    joints = _joint("along", "prismatic", "world", "x", "1 0 0") + _joint("up", "prismatic", "x", "z", "0 0 1")
+    model = _load(tmp_path, post, links + joints)
+    for x in ([0.05, 0.499, 0.3, -0.1], [0.21, 0.45, -0.2, 0.1]):  # on its face, and at its edge
+        _agree(model, x, np.zeros(0))
+        assert _contacts(model)
+
+
 @pytest.mark.parametrize("other", ["box", "capsule", "ball"])
 def test_spheres_meet_moving_shapes(tmp_path, other):
     """Faces, edges, corners and insides of a shape on a body that moves; two free bodies, off the origin."""
