@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_diff.analytic_step import Analytic
+from drake_diff.analytic_step import Analytic, Native
 from drake_diff.arrays import Array
 from drake_diff.contact_material import Material, MaterialChange, read_material
 from drake_diff.contact_motion import Contacts, Topology, Weight, diagonal_change, mass_matrix, topology_of
@@ -109,82 +109,110 @@ def place(model: Model, form: ContactForm, xs: Array, *, stands: bool) -> Array:
     return poses
 
 
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """N steps with M contacts at Drake's own solution."""
+
+    native: Native
+    v_next: Array  # (N, nv)
+    A: Array  # (N, nv, nv)
+    contacts: Contacts
+    speeds: tuple[Array, Array]  # v and v' (M, nv) of each contact's state
+    diagonal: Array  # (M, nv) of A
+    diagonal_change: Array  # (M, nv, nv)
+    weight: Weight
+    impulse: Impulse | HuntCrossleyImpulse
+    push: Array  # (N, nv) sum_c J_c' g_c
+    gained: Array  # (N, nv) A (v' - v*)
+
+    def total(self, of_contacts: Array) -> Array:
+        """(N, ...) the sums of what each contact adds (M, ...)."""
+        return _sum(self.contacts.touch.state, of_contacts, len(self.v_next))
+
+
 def contact_jacobians(
     form: ContactForm, analytic: Analytic, steps: Steps, poses: Array, material: Material, change: MaterialChange | None
 ) -> tuple[Array, NDArray[np.bool_]]:
     """(N, nx, nx + nu + np) of steps from states with the bodies at `poses`, and which (N,) are as Drake took them."""
-    c, h, count = analytic.coordinates, analytic.time_step, len(steps.starts)
-    native, v_next = analytic.into_native(steps.starts[:, : c.nq], steps.starts[:, c.nq :]), steps.ends[:, c.nq :]
+    at, nv = _at_the_solution(form, analytic, steps, poses, material), analytic.coordinates.nv
+    right = at.A @ analytic.pushed(at.native, steps.us, at.gained / analytic.time_step)
+    right[:, :, :nv] += at.total(_by_motion(at))
+    if isinstance(at.impulse, HuntCrossleyImpulse):
+        J, normal = at.contacts.jacobian, at.contacts.touch.normal[..., None]
+        by_v = (J @ at.impulse.by_before()[..., None]) @ np.swapaxes(J @ normal, -1, -2)
+        right[:, :, nv : 2 * nv] += at.total(by_v)
+    if change is not None:
+        right = np.concatenate([right, at.total(_by_material(at, change.part(at.contacts.touch.pair)))], axis=2)
+    J = at.contacts.jacobian
+    left = at.A - at.total(J @ at.impulse.by_velocity() @ np.swapaxes(J, -1, -2))
+    velocities = np.asarray(np.linalg.solve(left, right), dtype=float)
+    jacobians, _ = analytic.assemble(at.native, velocities, at.v_next)
+    return jacobians, _is_solved(at) & ~analytic.at_a_limit(steps)
+
+
+def _at_the_solution(form: ContactForm, analytic: Analytic, steps: Steps, poses: Array, material: Material) -> Solved:
+    nq = analytic.coordinates.nq
+    native, v_next = analytic.into_native(steps.starts[:, :nq], steps.starts[:, nq:]), steps.ends[:, nq:]
     S, inertia, v_star = analytic.motions(native, steps.us)
     A = mass_matrix(S, inertia, form.topology) + form.armature
-    diagonal = np.einsum("kii->ki", A)
-    touch = form.pairs.touching(poses)
-    at = touch.state
-    contacts = _contacts(form, touch, S, material)
-    J = contacts.jacobian
-    weight = contacts.weight(diagonal[at])
-    impulse = _law(form, contacts, material, weight, native.v[at], v_next[at]).solve()
-    force = impulse.impulse
-    push = _sum(at, (J @ force[..., None])[..., 0], count)
-    momentum = (A @ np.stack([v_next - v_star, v_next], axis=-1)).swapaxes(-1, -2)  # gained, and had
-    velocities = analytic.pushed(native, steps.us, momentum[:, 0] / h)
+    contacts = _contacts(form, form.pairs.touching(poses), S, material)
+    state = contacts.touch.state
+    diagonal, speeds = np.einsum("kii->ki", A)[state], (native.v[state], v_next[state])
+    weight = contacts.weight(diagonal)
+    impulse = _law(form, contacts, material, weight, *speeds).solve()
+    return Solved(
+        native=native,
+        v_next=v_next,
+        A=A,
+        contacts=contacts,
+        speeds=speeds,
+        diagonal=diagonal,
+        diagonal_change=diagonal_change(S, inertia, form.topology)[state],
+        weight=weight,
+        impulse=impulse,
+        push=_sum(state, (contacts.jacobian @ impulse.impulse[..., None])[..., 0], len(v_next)),
+        gained=(A @ (v_next - v_star)[..., None])[..., 0],
+    )
 
+
+def _by_motion(at: Solved) -> Array:
+    """(M, nv, nv) the change of J' g with the degrees of freedom, v' being fixed."""
+    contacts, (v, v_next) = at.contacts, at.speeds
     point, normal, phi = contacts.displacement()
-    by_motion = impulse.by_state(
+    changed = at.impulse.by_state(
         StateChange(
-            velocity=contacts.velocity_change(v_next[at], point),
+            velocity=contacts.velocity_change(v_next, point),
             normal=normal,
             phi=phi,
-            weight=contacts.weight_change(weight, diagonal[at], diagonal_change(S, inertia, form.topology)[at], point),
-            before=_approach_change(impulse, contacts, native.v[at], point, normal),
+            weight=contacts.weight_change(at.weight, at.diagonal, at.diagonal_change, point),
+            before=_approach_change(at, v, point, normal),
         )
     )
-    right = A @ velocities
-    right[:, :, : c.nv] += _sum(at, contacts.force_change(force, point) + J @ np.swapaxes(by_motion, -1, -2), count)
-    if isinstance(impulse, HuntCrossleyImpulse):
-        by_v = (J @ impulse.by_before()[..., None]) @ np.swapaxes(J @ touch.normal[..., None], -1, -2)
-        right[:, :, c.nv : 2 * c.nv] += _sum(at, by_v, count)
-    if change is not None:
-        speeds = native.v[at], v_next[at]
-        by_material = _by_material(contacts, impulse, weight, diagonal[at], speeds, change.part(touch.pair))
-        right = np.concatenate([right, _sum(at, by_material, count)], axis=2)
-    left = A - _sum(at, J @ impulse.by_velocity() @ np.swapaxes(J, -1, -2), count)
-    jacobians, _ = analytic.assemble(native, np.asarray(np.linalg.solve(left, right), dtype=float), v_next)
-    solved = _is_solved(momentum[:, 0] - push, momentum[:, 1], push, diagonal)
-    return jacobians, solved & ~analytic.at_a_limit(steps)
+    return contacts.force_change(at.impulse.impulse, point) + contacts.jacobian @ np.swapaxes(changed, -1, -2)
 
 
-def _approach_change(
-    impulse: Impulse | HuntCrossleyImpulse, contacts: Contacts, v: Array, point: Array, normal: Array
-) -> Array:
+def _approach_change(at: Solved, v: Array, point: Array, normal: Array) -> Array:
     """(M, nv) the change of the normal velocity before the step, 0 where the law does not know it."""
-    if isinstance(impulse, Impulse):
+    if isinstance(at.impulse, Impulse):
         return np.zeros(v.shape)
-    along = contacts.velocity_change(v, point) @ contacts.touch.normal[:, :, None]
-    return np.asarray((along + normal @ np.swapaxes(v[:, None, :] @ contacts.jacobian, -1, -2))[..., 0])
+    along = at.contacts.velocity_change(v, point) @ at.contacts.touch.normal[:, :, None]
+    return np.asarray((along + normal @ np.swapaxes(v[:, None, :] @ at.contacts.jacobian, -1, -2))[..., 0])
 
 
-def _by_material(
-    contacts: Contacts,
-    impulse: Impulse | HuntCrossleyImpulse,
-    weight: Weight,
-    diagonal: Array,
-    speeds: tuple[Array, Array],
-    change: MaterialChange,
-) -> Array:
+def _by_material(at: Solved, change: MaterialChange) -> Array:
     """(M, nv, np) the change of J' g by parameters: through the law, and through where on the normal p is."""
-    touch, nothing = contacts.touch, np.zeros((*change.friction.shape, 3))
+    contacts, touch, nothing = at.contacts, at.contacts.touch, np.zeros((*change.friction.shape, 3))
     point = -(touch.phi[:, None] * change.other_part)[..., None] * touch.normal[:, None]
-    before, after = (contacts.velocity_change(v, point, moves=False) for v in speeds)
+    before, after = (contacts.velocity_change(v, point, moves=False) for v in at.speeds)
     moved = StateChange(
         velocity=after,
         normal=nothing,
         phi=nothing[..., 0],
-        weight=contacts.weight_change(weight, diagonal, None, point),
+        weight=contacts.weight_change(at.weight, at.diagonal, None, point),
         before=(before @ touch.normal[:, :, None])[..., 0],
     )
-    changed = np.swapaxes(impulse.by_material(change) + impulse.by_state(moved), -1, -2)
-    return np.asarray(contacts.force_change(impulse.impulse, point, moves=False) + contacts.jacobian @ changed)
+    changed = np.swapaxes(at.impulse.by_material(change) + at.impulse.by_state(moved), -1, -2)
+    return np.asarray(contacts.force_change(at.impulse.impulse, point, moves=False) + contacts.jacobian @ changed)
 
 
 def _law(
@@ -236,7 +264,9 @@ def _sum(at: Indices, of_contacts: Array, count: int) -> Array:
     return total
 
 
-def _is_solved(missing: Array, momentum: Array, push: Array, diagonal: Array) -> NDArray[np.bool_]:
-    """(N,) whether the impulse that is missing (N, nv) is what Drake's solver leaves, in the norm that it ends by."""
-    left, had, given = (np.sqrt((part * part / diagonal).sum(axis=1)) for part in (missing, momentum, push))
+def _is_solved(at: Solved) -> NDArray[np.bool_]:
+    """(N,) whether the impulse that is missing is what Drake's solver leaves, in the norm that it ends by."""
+    diagonal = np.einsum("kii->ki", at.A)
+    momentum = (at.A @ at.v_next[..., None])[..., 0]
+    left, had, given = (np.sqrt((p * p / diagonal).sum(axis=1)) for p in (at.gained - at.push, momentum, at.push))
     return np.asarray(left <= OPTIMALITY * np.maximum(had, given) + ROUNDING)
