@@ -146,7 +146,7 @@ class Analytic:
         c, h, Q = self.coordinates, self.time_step, at.Q
         by_q, by_v, inverse, native = solved
         into, out, out_v = turn_derivatives(c, at.Q, at.v, native)
-        Q_t = np.swapaxes(Q, -1, -2)
+        Q_t = Q.swapaxes(-1, -2)
         by_motion = Q_t @ (by_q @ Q + by_v @ into - inverse * self.stiffness) + out
         by_velocity = Q_t @ (by_v @ Q - inverse * self.damping) + out_v
         found = h * np.concatenate([by_motion, by_velocity, Q_t @ self._by_input(inverse, clipped)], axis=2)
@@ -179,12 +179,12 @@ class Analytic:
             inertias.append([carried[j].matrix() for j in joints])
             accelerations.append(np.array(data.ddq))
         S = np.frombuffer(b"".join(motions)).reshape(*at.v.shape, 6)
-        Q_t, native = np.swapaxes(at.Q, -1, -2), np.array(accelerations)
+        Q_t, native = at.Q.swapaxes(-1, -2), np.array(accelerations)
         return Q_t @ S, np.array(inertias)[:, self.joint_of], self._v_next(at, native)
 
     def _v_next(self, at: Native, native: Array) -> Array:
         """(N, nv) v' by Pinocchio's accelerations (N, nv)."""
-        a = (np.swapaxes(at.Q, -1, -2) @ native[..., None])[..., 0] + turning(self.coordinates, at.v)
+        a = (at.Q.swapaxes(-1, -2) @ native[..., None])[..., 0] + turning(self.coordinates, at.v)
         return np.asarray(at.v + self.time_step * a)
 
     def pushed(self, at: Native, us: Array, push: Array) -> Array:
@@ -195,7 +195,7 @@ class Analytic:
         solved = self._accelerate(at.q_native, at.v_native, (at.Q @ force[..., None])[..., 0])
         velocities, _ = self._velocities(at, solved, clipped)
         by_turn = solved[2] @ turn_change(c, at.Q, force)  # a fixed force is another one in Pinocchio's frames
-        velocities[:, :, : c.nv] += self.time_step * np.swapaxes(at.Q, -1, -2) @ by_turn
+        velocities[:, :, : c.nv] += self.time_step * at.Q.swapaxes(-1, -2) @ by_turn
         return velocities
 
 

@@ -144,7 +144,7 @@ def contact_jacobians(
     if change is not None:
         right = np.concatenate([right, at.total(_by_material(at, change.part(at.contacts.touch.pair)))], axis=2)
     J = at.contacts.jacobian
-    left = at.A - at.total(J @ at.impulse.by_velocity() @ np.swapaxes(J, -1, -2))
+    left = at.A - at.total(J @ at.impulse.by_velocity() @ J.swapaxes(-1, -2))
     velocities = np.asarray(np.linalg.solve(left, right), dtype=float)
     jacobians, _ = analytic.assemble(at.native, velocities, at.v_next)
     return jacobians, _is_solved(at) & ~analytic.at_a_limit(steps)
@@ -188,7 +188,7 @@ def _by_motion(at: Solved) -> Array:
             before=_approach_change(at, v, point, normal),
         )
     )
-    return contacts.force_change(at.impulse.impulse, point) + contacts.jacobian @ np.swapaxes(changed, -1, -2)
+    return contacts.force_change(at.impulse.impulse, point) + contacts.jacobian @ changed.swapaxes(-1, -2)
 
 
 def _approach_change(at: Solved, v: Array, point: Array, normal: Array) -> Array:

@@ -54,9 +54,9 @@ def _dofs(link: Link) -> Iterator[int]:
 
 def mass_matrix(S: Array, inertia: Array, topology: Topology) -> Array:
     """(N, nv, nv) M_jk = S_k' I_j S_j where k moves j, 0 where neither moves the other; I_j is what j carries."""
-    lower = np.swapaxes(inertia @ S[..., None], -1, -2)[..., 0, :] @ np.swapaxes(S, -1, -2)
+    lower = np.swapaxes(inertia @ S[..., None], -1, -2)[..., 0, :] @ S.swapaxes(-1, -2)
     above = topology.before.T * (1 - topology.before)
-    return np.asarray(topology.before * lower + above * np.swapaxes(lower, -1, -2))
+    return np.asarray(topology.before * lower + above * lower.swapaxes(-1, -2))
 
 
 def diagonal_change(S: Array, inertia: Array, topology: Topology) -> Array:
@@ -106,7 +106,7 @@ class Contacts:
     def weight(self, diagonal: Array) -> Weight:
         """With the diagonal (M, nv) of A."""
         J = self.jacobian
-        W = np.swapaxes(J, -1, -2) @ (J / diagonal[..., None])
+        W = J.swapaxes(-1, -2) @ (J / diagonal[..., None])
         size = np.sqrt((W * W).sum(axis=(1, 2)))
         return Weight(size / 3, W / (3 * size)[:, None, None])
 
@@ -136,10 +136,10 @@ class Contacts:
     def force_change(self, force: Array, point: Array, moves: bool = True) -> Array:
         """(M, nv, K) the change of J' f for fixed f (M, 3), of K changes of p (M, K, 3) as above."""
         twisted = cross(force[:, None, :], self.angular)  # f x a
-        found = twisted @ np.swapaxes(point, -1, -2)
+        found = twisted @ point.swapaxes(-1, -2)
         if moves:
-            across = twisted @ np.swapaxes(self.at_point, -1, -2)  # (f x a_k) . L_j = -a_k . (f x L_j)
-            found = found + self.moves.T * (np.swapaxes(across, -1, -2) - across)
+            across = twisted @ self.at_point.swapaxes(-1, -2)  # (f x a_k) . L_j = -a_k . (f x L_j)
+            found = found + self.moves.T * (across.swapaxes(-1, -2) - across)
         return np.asarray(self.side[..., None] * found)
 
     def weight_change(self, weight: Weight, diagonal: Array, by_motion: Array | None, point: Array) -> Array:

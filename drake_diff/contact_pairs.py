@@ -65,7 +65,7 @@ class ContactPairs:
             curvature = _curvature(normal, outside, length)
         phi = length - self.rounding[pair] - self.radius[pair]
         normal = (turned @ normal[:, :, None])[..., 0]
-        curvature = turned @ curvature @ np.swapaxes(turned, -1, -2)
+        curvature = turned @ curvature @ turned.swapaxes(-1, -2)
         return Touches(state, pair, center[state, pair], phi, normal, curvature)
 
     def _with_inside(self, local: Array, outside: Array, length: Array, pair: Indices) -> tuple[Array, Array, Array]:

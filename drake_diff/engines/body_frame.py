@@ -21,9 +21,8 @@ def native_positions(coordinates: Coordinates, q: Array) -> Array:
 
 def turn(coordinates: Coordinates, q: Array) -> Array:
     """Q (..., nv, nv)."""
-    Q = np.zeros((*q.shape[:-1], coordinates.nv, coordinates.nv))
-    for _, j in coordinates.single:
-        Q[..., j, j] = 1.0
+    Q = np.empty((*q.shape[:-1], coordinates.nv, coordinates.nv))
+    Q[:] = coordinates.single_as_is
     for i, j in coordinates.free:
         R_t = np.swapaxes(rotation(q[..., i : i + 4]), -1, -2)
         Q[..., j : j + 3, j + 3 : j + 6] = Q[..., j + 3 : j + 6, j : j + 3] = R_t
@@ -54,7 +53,7 @@ def turn_derivatives(coordinates: Coordinates, Q: Array, v: Array, native: Array
     out, out_v = np.zeros((2, *v.shape, coordinates.nv))
     for _, j in coordinates.free:
         about, move = slice(j, j + 3), slice(j + 3, j + 6)
-        R = np.swapaxes(Q[..., about, move], -1, -2)
+        R = Q[..., about, move].swapaxes(-1, -2)
         out[..., about, about] = -skew((R @ native[..., move, None])[..., 0])
         out[..., move, about] = -skew((R @ native[..., about, None])[..., 0])
         out_v[..., move, about], out_v[..., move, move] = -skew(v[..., move]), skew(v[..., about])

@@ -6,6 +6,7 @@ N is the identity but for a free body, where v = (w, v_o) in world and the quate
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -19,22 +20,37 @@ class Coordinates:
     free: tuple[tuple[int, int], ...]  # (start in q, start in v)
     single: tuple[tuple[int, int], ...]  # (index in q, index in v)
 
-    @property
+    @cached_property
     def nq(self) -> int:
         return 7 * len(self.free) + len(self.single)
 
-    @property
+    @cached_property
     def nv(self) -> int:
         return 6 * len(self.free) + len(self.single)
 
+    @cached_property
+    def moves_as_is(self) -> Array:
+        """(nq, nv): 1 where an entry of v moves one of q, but for the quaternions."""
+        N = np.zeros((self.nq, self.nv))
+        for i, j in self.single:
+            N[i, j] = 1.0
+        for i, j in self.free:
+            N[i + 4 : i + 7, j + 3 : j + 6] = _ONE
+        return N
+
+    @cached_property
+    def single_as_is(self) -> Array:
+        """(nv, nv) the identity but for free bodies, where it is 0."""
+        own = np.zeros(self.nv)
+        own[[j for _, j in self.single]] = 1.0
+        return np.diag(own)
+
     def rate(self, q: Array) -> Array:
         """N (..., nq, nv) with dq/dt = N v, at q (..., nq)."""
-        N = np.zeros((*q.shape[:-1], self.nq, self.nv))
-        for i, j in self.single:
-            N[..., i, j] = 1.0
+        N = np.empty((*q.shape[:-1], self.nq, self.nv))
+        N[:] = self.moves_as_is
         for i, j in self.free:
             N[..., i : i + 4, j : j + 3] = 0.5 * _times_from_left(q[..., i : i + 4])
-            N[..., i + 4 : i + 7, j + 3 : j + 6] = np.eye(3)
         return N
 
     def rate_by_position(self, v: Array) -> Array:
@@ -49,14 +65,12 @@ class Coordinates:
 
         W N = 1, and W q = 0 for a norm.
         """
-        W = np.zeros((*q.shape[:-1], self.nv, self.nq))
-        for j, i in ((j, i) for i, j in self.single):
-            W[..., j, i] = 1.0
+        W = np.empty((*q.shape[:-1], self.nv, self.nq))
+        W[:] = self.moves_as_is.T
         for i, j in self.free:
             quaternion = q[..., i : i + 4]
             norm = (quaternion**2).sum(axis=-1)[..., None, None]
             W[..., j : j + 3, i : i + 4] = 2 * np.swapaxes(_times_from_left(quaternion), -1, -2) / norm
-            W[..., j + 3 : j + 6, i + 4 : i + 7] = np.eye(3)
         return W
 
 
@@ -104,7 +118,7 @@ def rotation(quaternion: Array) -> Array:
     """(..., 3, 3) of a quaternion (w, x, y, z) (..., 4) of any norm."""
     vector = skew(quaternion[..., 1:])
     scale = 2 / (quaternion * quaternion).sum(axis=-1)[..., None, None]
-    return np.asarray(np.eye(3) + scale * (quaternion[..., :1, None] * vector + vector @ vector))
+    return np.asarray(_ONE + scale * (quaternion[..., :1, None] * vector + vector @ vector))
 
 
 def _times_from_left(q: Array) -> Array:
@@ -118,12 +132,12 @@ def _left_product(w: Array) -> Array:
 
 
 # Matrices whose entries are linear in a vector: row i holds the matrix of the vector's entry i, flattened.
-_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
+_ONE, _NEXT, _LAST = np.eye(3), np.array([1, 2, 0]), np.array([2, 0, 1])
 _CROSS = np.array(
     [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]],
     dtype=float,
 )
 _PRODUCT = np.zeros((3, 4, 4))
-_PRODUCT[:, 0, 1:], _PRODUCT[:, 1:, 0], _PRODUCT[:, 1:, 1:] = -np.eye(3), np.eye(3), _CROSS
+_PRODUCT[:, 0, 1:], _PRODUCT[:, 1:, 0], _PRODUCT[:, 1:, 1:] = -_ONE, _ONE, _CROSS
 _SKEW, _LEFT_PRODUCT = _CROSS.reshape(3, 9), _PRODUCT.reshape(3, 16)
 _TIMES_FROM_LEFT = np.transpose(_PRODUCT, (2, 1, 0)).reshape(4, 12)
