@@ -15,7 +15,7 @@ from drake_diff.autodiff import gradient_rows
 from drake_diff.contact_material import of_contact_alone
 from drake_diff.exceptions import GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.finite_difference import differences, plateau
-from drake_diff.implicit import NotSmoothError, form_of, implicit_jacobian
+from drake_diff.implicit import NotSmoothError, implicit_jacobian
 from drake_diff.model import Model
 from drake_diff.parameters import Parameters, ParameterVector, applied, select, write_autodiff
 from drake_diff.step import advance, check_point
@@ -129,12 +129,16 @@ def _by_implicit(model: Model, vector: ParameterVector, x: Array, u: Array, x_ne
 
 def _by_choice(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
     """What is exact and fastest on this model."""
-    if model.nv < CONTACT_SIZE and not vector.parameters and form_of(model).can_touch and model.double.touches():
+    if model.nv < CONTACT_SIZE and not vector.parameters and _touches(model):
         return _without_analytic(model, vector, x, u, x_next)
     jacobian = _analytic(model, vector, x, u, x_next)
     if isinstance(jacobian, str):
         return _without_analytic(model, vector, x, u, x_next)
     return jacobian, "analytic", CERTIFIED
+
+
+def _touches(model: Model) -> bool:
+    return model.contract.contact.collision_pairs > 0 and model.double.touches()
 
 
 def _by_analytic(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
