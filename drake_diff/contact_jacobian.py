@@ -21,8 +21,8 @@ from drake_diff.arrays import Array
 from drake_diff.contact_material import Material, MaterialChange, read_material
 from drake_diff.contact_motion import Contacts, Topology, Weight, diagonal_change, mass_matrix, topology_of
 from drake_diff.contact_pairs import ContactPairs, Indices, Touches, read_pairs
+from drake_diff.cross_product import cross
 from drake_diff.engines.description import describe_tree
-from drake_diff.engines.euler import cross
 from drake_diff.friction_cone import Cone, Impulse, StateChange
 from drake_diff.hunt_crossley import HuntCrossley, HuntCrossleyImpulse
 from drake_diff.implicit import Steps

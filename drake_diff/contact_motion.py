@@ -16,8 +16,8 @@ import numpy as np
 
 from drake_diff.arrays import Array
 from drake_diff.contact_pairs import Touches
+from drake_diff.cross_product import cross
 from drake_diff.engines.description import Description, Link
-from drake_diff.engines.euler import cross
 
 
 @dataclass(frozen=True, eq=False)

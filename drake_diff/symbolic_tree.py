@@ -20,6 +20,7 @@ import numpy as np
 
 from drake_diff.arrays import Array
 from drake_diff.continuous import EquationsOfMotion
+from drake_diff.cross_product import skew
 from drake_diff.implicit import tree_for
 from drake_diff.model import Model
 from drake_diff.step import set_state
@@ -129,7 +130,7 @@ def _links(tree: TreeDynamics, model: Model) -> list[_Link]:
         R, p = frames[parent] if above else (np.eye(3), np.zeros(3))
         m, origin = tree.mass[k], tree.origin[k]
         moment = tree.moment[k] - m * origin
-        h, o = _hat(tree.moment[k]), _hat(origin)
+        h, o = skew(tree.moment[k]), skew(origin)
         inertia = tree.inertia[k] + o @ h + h @ o - m * o @ o
         parts = (R.T @ frames[k][0], R.T @ (frames[k][1] - p), turn.T @ moment, turn.T @ inertia @ turn)
         rotation, offset, moment, inertia = (ca.DM(np.where(np.abs(a) < ROUNDED, 0.0, a)) for a in parts)
@@ -240,7 +241,3 @@ def _with_z(axis: Array) -> Array:
     first = first - (first @ axis) * axis
     first /= np.linalg.norm(first)
     return np.column_stack([first, np.cross(axis, first), axis])
-
-
-def _hat(w: Array) -> Array:
-    return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])

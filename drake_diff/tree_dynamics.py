@@ -30,6 +30,7 @@ from pydrake.multibody.tree import (
 )
 
 from drake_diff.arrays import Array
+from drake_diff.cross_product import cross, skew
 from drake_diff.model import Model
 from drake_diff.plant_elements import actuators, instances, joints
 
@@ -85,11 +86,11 @@ class TreeDynamics:
         A = carried @ added
         A[..., 3:] -= self.gravity
         Q = _times(_cross(A - added), S) + _times(cross_parent, P)
-        cross = _cross(V)
+        motion_cross = _cross(V)
         momentum = _times(inertia, V)
-        force_cross = -np.swapaxes(cross, -1, -2)
+        force_cross = -np.swapaxes(motion_cross, -1, -2)
         force = _times(inertia, A) + _times(force_cross, momentum)
-        B = force_cross @ inertia - inertia @ cross + _cross_of_force(momentum)
+        B = force_cross @ inertia - inertia @ motion_cross + _cross_of_force(momentum)
         shape, up = inertia.shape, carried.T
         inertia_c = (up @ inertia.reshape(*shape[:2], 36)).reshape(shape)
         B_c = (up @ B.reshape(*shape[:2], 36)).reshape(shape)
@@ -115,7 +116,7 @@ class TreeDynamics:
         """(N, n, 6) the motion of each joint at unit speed."""
         axis = _times(poses[..., :3], self.axis)
         through = _times(poses[..., :3], self.origin) + poses[..., 3]
-        turn = np.concatenate([axis, _cross3(through, axis)], axis=-1)
+        turn = np.concatenate([axis, cross(through, axis)], axis=-1)
         slide = np.concatenate([np.zeros_like(axis), axis], axis=-1)
         return np.where(self.hinge[:, None], turn, slide)
 
@@ -123,7 +124,7 @@ class TreeDynamics:
         """(N, n, 6, 6) the spatial inertia of what each joint's child carries by welds, about the world's origin."""
         R, p, m = poses[..., :3], poses[..., 3], self.mass[:, None, None]
         moment = _times(R, self.moment)
-        p_hat, moment_hat = _hat(p), _hat(moment)
+        p_hat, moment_hat = skew(p), skew(moment)
         about_origin = R @ self.inertia @ np.swapaxes(R, -1, -2)
         about_origin -= p_hat @ moment_hat + moment_hat @ p_hat + m * (p_hat @ p_hat)
         coupling = moment_hat + m * p_hat
@@ -140,34 +141,19 @@ def _times(matrices: Array, vectors: Array) -> Array:
     return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 
-def _cross3(a: Array, b: Array) -> Array:
-    return _times(_hat(a), b)
-
-
-_LEVI_CIVITA = np.zeros((3, 9))  # w -> hat(w), flattened
-for _row, _column, _entry, _sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 2, 0, -1)):
-    _LEVI_CIVITA[_entry, 3 * _row + _column] = _sign
-    _LEVI_CIVITA[_entry, 3 * _column + _row] = -_sign
-
-
-def _hat(w: Array) -> Array:
-    """(..., 3, 3) with hat(w) x = w x x."""
-    return np.asarray((w @ _LEVI_CIVITA).reshape(*w.shape[:-1], 3, 3))
-
-
 def _cross(motion: Array) -> Array:
     """(..., 6, 6): the motion cross product with [w; l], [w^ 0; l^ w^]."""
     matrix = np.zeros((*motion.shape, 6))
-    matrix[..., :3, :3] = matrix[..., 3:, 3:] = _hat(motion[..., :3])
-    matrix[..., 3:, :3] = _hat(motion[..., 3:])
+    matrix[..., :3, :3] = matrix[..., 3:, 3:] = skew(motion[..., :3])
+    matrix[..., 3:, :3] = skew(motion[..., 3:])
     return matrix
 
 
 def _cross_of_force(force: Array) -> Array:
     """(..., 6, 6): m -> m x* f for a fixed force f = [n; l], [-n^ -l^; -l^ 0]."""
     matrix = np.zeros((*force.shape, 6))
-    linear = -_hat(force[..., 3:])
-    matrix[..., :3, :3] = -_hat(force[..., :3])
+    linear = -skew(force[..., 3:])
+    matrix[..., :3, :3] = -skew(force[..., :3])
     matrix[..., :3, 3:] = matrix[..., 3:, :3] = linear
     return matrix
 

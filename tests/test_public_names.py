@@ -31,19 +31,19 @@ save_gradient_panel save_robustness smooth smooth_step softened solve step trans
 violation_between_nodes
 """.split()
 ORDER = """
-lazy exceptions arrays autodiff whole_file plant_elements model_file contact_geometry contract added_forces twin model
-soft_contact read_contract tangent inertia parameter_kinds contact_parameters parameters parameter_coordinates step
-finite_difference tree_dynamics engines.engine engines.euler engines.description engines.body_frame
-engines.pinocchio_model implicit contact_pairs contact_material friction_cone hunt_crossley contact_motion
-analytic_step contact_jacobian analytic step_derivatives linearization smoothing policy contact quantities
-mode_changes certificate rollout rollout_gradient refinement certify continuous cost bounds constraint problem replay
-dynamics nonlinear_program transcription_scheme optimal_control transcribed symbolic symbolic_tree knot_functions
-transcription_program ipopt transcription solution mathematical_program collocation shooting shooting_program riccati
-secant augmented_lagrangian expansion ilqr contact_sequence goal_restoration continuation verdict run solver
-mcap_messages mcap_read mcap_log mcap_recover trace_read trace_motion trace_solve trace page html_parts meshcat_scene
-meshcat_view report_data report record_parts record record_schema record_file certification_record named_files
-provenance problem_record plan_file record_sections metrics invariants failures events evidence rerun verification
-verify runs view sampling certification audit_place audit_contact audit engines.closed_form
+lazy exceptions arrays cross_product autodiff whole_file plant_elements model_file contact_geometry contract
+added_forces twin model soft_contact read_contract tangent inertia parameter_kinds contact_parameters parameters
+parameter_coordinates step finite_difference tree_dynamics engines.engine engines.euler engines.description
+engines.body_frame engines.pinocchio_model implicit contact_pairs contact_material friction_cone hunt_crossley
+contact_motion analytic_step contact_jacobian analytic step_derivatives linearization smoothing policy contact
+quantities mode_changes certificate rollout rollout_gradient refinement certify continuous cost bounds constraint
+problem replay dynamics nonlinear_program transcription_scheme optimal_control transcribed symbolic symbolic_tree
+knot_functions transcription_program ipopt transcription solution mathematical_program collocation shooting
+shooting_program riccati secant augmented_lagrangian expansion ilqr contact_sequence goal_restoration continuation
+verdict run solver mcap_messages mcap_read mcap_log mcap_recover trace_read trace_motion trace_solve trace page
+html_parts meshcat_scene meshcat_view report_data report record_parts record record_schema record_file
+certification_record named_files provenance problem_record plan_file record_sections metrics invariants failures events
+evidence rerun verification verify runs view sampling certification audit_place audit_contact audit engines.closed_form
 engines.closed_form_contact engines.numpy_engine engines.drake_engine engines.pinocchio_engine engines.urdf
 engines.casadi_engine engines.mjcf engines.mujoco_coordinates engines.mujoco_contract engines.mujoco_model
 engines.mujoco_engine engines.mjx_engine engines.quiet engines.rigid_links engines.centers engines.newton_contract

@@ -7,7 +7,8 @@ With R its orientation, v_native = Q v and a small motion is Q d, Q = [[0, R'], 
 import numpy as np
 
 from drake_diff.arrays import Array
-from drake_diff.engines.euler import Coordinates, cross, rotation, skew
+from drake_diff.cross_product import cross, skew
+from drake_diff.engines.euler import Coordinates, rotation
 
 
 def native_positions(coordinates: Coordinates, q: Array) -> Array:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_diff.arrays import Array
-from drake_diff.engines.euler import Coordinates, rotation, skew
+from drake_diff.cross_product import skew
+from drake_diff.engines.euler import Coordinates, rotation
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from drake_diff.arrays import Array
+from drake_diff.cross_product import skew
 
 
 @dataclass(frozen=True)
@@ -104,16 +105,6 @@ def exponential_turn(quaternion: Array, angle: Array) -> Array:
     return np.asarray(np.cos(half) * quaternion + _times_from_left(quaternion) @ vector)
 
 
-def skew(w: Array) -> Array:
-    """(..., 3, 3) with skew(w) x = w x x, at w (..., 3)."""
-    return np.asarray((w @ _SKEW).reshape(*w.shape[:-1], 3, 3))
-
-
-def cross(a: Array, b: Array) -> Array:
-    """a x b of vectors (..., 3), broadcast."""
-    return np.asarray(a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1))
-
-
 def rotation(quaternion: Array) -> Array:
     """(..., 3, 3) of a quaternion (w, x, y, z) (..., 4) of any norm."""
     vector = skew(quaternion[..., 1:])
@@ -132,12 +123,8 @@ def _left_product(w: Array) -> Array:
 
 
 # Matrices whose entries are linear in a vector: row i holds the matrix of the vector's entry i, flattened.
-_ONE, _NEXT, _LAST = np.eye(3), np.array([1, 2, 0]), np.array([2, 0, 1])
-_CROSS = np.array(
-    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]],
-    dtype=float,
-)
+_ONE = np.eye(3)
 _PRODUCT = np.zeros((3, 4, 4))
-_PRODUCT[:, 0, 1:], _PRODUCT[:, 1:, 0], _PRODUCT[:, 1:, 1:] = -_ONE, _ONE, _CROSS
-_SKEW, _LEFT_PRODUCT = _CROSS.reshape(3, 9), _PRODUCT.reshape(3, 16)
+_PRODUCT[:, 0, 1:], _PRODUCT[:, 1:, 0], _PRODUCT[:, 1:, 1:] = -_ONE, _ONE, skew(_ONE)
+_LEFT_PRODUCT = _PRODUCT.reshape(3, 16)
 _TIMES_FROM_LEFT = np.transpose(_PRODUCT, (2, 1, 0)).reshape(4, 12)

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from drake_diff.arrays import Array
+from drake_diff.cross_product import skew
 from drake_diff.engines.description import Description
-from drake_diff.engines.euler import rotation, skew
+from drake_diff.engines.euler import rotation
 from drake_diff.exceptions import InputError
 
 KINDS = {0: "quaternion_floating", 1: "ball", 2: "prismatic", 3: "revolute"}  # mjtJoint
