@@ -1,19 +1,17 @@
-"""What many tests need: the models of this repository, and small plants built by hand."""
+"""Fixtures of several test modules."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.geometry import AddContactMaterial, HalfSpace, ProximityProperties, Sphere
-from pydrake.math import RigidTransform
-from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlantConfig
-from pydrake.multibody.tree import PrismaticJoint, SpatialInertia
-from pydrake.systems.framework import DiagramBuilder
 
-import drake_diff as dd
+pytest.register_assert_rewrite("helpers")  # before any of them is imported
 
-MODELS = Path(__file__).parent.parent / "models"
+from helpers.browser import CHROMIUM, DRIVER, FLAGS  # noqa: E402
+from helpers.loops import CART, H  # noqa: E402
+from helpers.models import MODELS  # noqa: E402
+
+import drake_diff as dd  # noqa: E402
 
 for public in dd.__all__:  # a module that is first loaded while a test has patched another would keep the patch
     getattr(dd, public)
@@ -39,6 +37,30 @@ def write_urdf(tmp_path):
         return dd.load_model(path, time_step=time_step)
 
     return write
+
+
+@pytest.fixture
+def two_spheres(tmp_path):
+    """Both spheres with masses and a damping of our own."""
+
+    def build(*, pusher=1.0, ball=0.5, damping=0.5, time_step=0.02):
+        text = (MODELS / "two_spheres.sdf").read_text()
+        for old, new in (("<mass>1<", pusher), ("<mass>0.5<", ball), ("<damping>0.5<", damping)):
+            assert text.count(old) == 1
+            text = text.replace(old, f"{old.split('>')[0]}>{new}<")
+        path = tmp_path / "two_spheres.sdf"
+        path.write_text(text)
+        return dd.load_model(path, time_step=time_step)
+
+    return build
+
+
+@pytest.fixture(scope="module")
+def cart(tmp_path_factory):
+    """A double integrator: v+ = v + h u / 2, x+ = x + h v+."""
+    path = tmp_path_factory.mktemp("models") / "cart.urdf"
+    path.write_text(CART)
+    return dd.load_model(path, time_step=H)
 
 
 @pytest.fixture
@@ -72,74 +94,6 @@ BLOCK = """<robot name="block">
 </robot>"""
 
 
-def contact_properties(stiffness, dissipation=0.0, friction=0.0, relaxation_time=None):
-    properties = ProximityProperties()
-    AddContactMaterial(
-        dissipation=float(dissipation),
-        point_stiffness=float(stiffness),
-        friction=CoulombFriction(float(friction), float(friction)),
-        properties=properties,
-    )
-    if relaxation_time is not None:
-        properties.AddProperty("material", "relaxation_time", float(relaxation_time))
-    return properties
-
-
-def add_slide(plant, name, parent, body, axis):
-    """A prismatic joint along a world axis."""
-    direction = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1]}[axis]
-    return plant.AddJoint(PrismaticJoint(name, parent, body.body_frame(), direction))
-
-
-class Plant:
-    """A plant under construction, for what no file format says."""
-
-    def __init__(self, time_step, approximation="sap", contact_model="point", *, sampled=False, gravity=9.81):
-        self.builder = DiagramBuilder()
-        config = MultibodyPlantConfig(
-            time_step=time_step,
-            contact_model=contact_model,
-            discrete_contact_approximation=approximation,
-            use_sampled_output_ports=sampled,
-        )
-        self.plant, self.scene_graph = AddMultibodyPlant(config, self.builder)
-        self.plant.mutable_gravity_field().set_gravity_vector([0, 0, -gravity])
-
-    def ball(self, name, mass, radius, properties, *axes):
-        """A ball on prismatic joints along `axes` (x, y, z), one after the other; free where there are none."""
-        parent = self.plant.world_frame()
-        for axis in axes[:-1]:
-            link = self.plant.AddRigidBody(f"{name}_{axis}", SpatialInertia.Zero())
-            add_slide(self.plant, f"{name}_{axis}", parent, link, axis)
-            parent = link.body_frame()
-        body = self.plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(mass, radius))
-        if axes:
-            add_slide(self.plant, f"{name}_{axes[-1]}", parent, body, axes[-1])
-        self.plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(radius), name, properties)
-        return body
-
-    def ground(self, properties):
-        self.plant.RegisterCollisionGeometry(
-            self.plant.world_body(), RigidTransform(), HalfSpace(), "ground", properties
-        )
-
-    def shape(self, body, shape, properties, pose=None):
-        self.plant.RegisterCollisionGeometry(body, pose or RigidTransform(), shape, f"{body.name()}_shape", properties)
-
-    def model(self):
-        self.plant.Finalize()
-        return dd.model_from_diagram(self.builder.Build())
-
-
-def random_state(model, random, size=1.0):
-    """A state with unit quaternions."""
-    x = size * random.standard_normal(model.nx)
-    if model.state_names[0].endswith("_qw"):
-        x[:4] = random.standard_normal(4)
-        x[:4] /= np.linalg.norm(x[:4])
-    return x
-
-
 @pytest.fixture(scope="module")
 def pushed(tmp_path_factory):
     """A cart-pole pushed for 10 steps, its pole not driven: the model, its motion, and a folder with its trace."""
@@ -153,3 +107,21 @@ def pushed(tmp_path_factory):
     folder.mkdir()
     write_trace(folder / "trace.mcap", solution, {})
     return model, motion, folder
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed (the test extra has it)")
+    from selenium.webdriver.chrome.service import Service
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in [*FLAGS.split(), f"--user-data-dir={tmp_path_factory.mktemp('profile')}"]:
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=Service(DRIVER))
+    driver.execute_cdp_cmd("Network.enable", {})
+    offline = {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
+    driver.execute_cdp_cmd("Network.emulateNetworkConditions", offline)
+    yield driver
+    driver.quit()

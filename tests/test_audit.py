@@ -2,11 +2,10 @@
 
 import time
 import warnings
-from importlib.metadata import files
 
 import numpy as np
 import pytest
-from conftest import MODELS, Plant, add_slide, contact_properties
+from helpers.models import MODELS, Plant, add_slide, contact_properties, robot_file
 from pydrake.geometry import (
     AddCompliantHydroelasticProperties,
     AddRigidHydroelasticProperties,
@@ -88,7 +87,7 @@ def test_the_models_of_this_repository_are_clean(load, name):
 
 @pytest.mark.filterwarnings("ignore::drake_diff.ModelWarning")
 def test_findings_are_sorted_worst_first_and_readable():
-    model = dd.load_model(robot("panda.urdf"), time_step=0.005, weld_base="panda_link0", ground=0.5)
+    model = dd.load_model(robot_file("panda.urdf"), time_step=0.005, weld_base="panda_link0", ground=0.5)
     findings = audit(model)
     assert {f.severity for f in findings} == set(SEVERITIES)
     order = [(SEVERITIES.index(f.severity), f.subject, f.code) for f in findings]
@@ -538,10 +537,6 @@ def test_a_pair_without_a_distance_is_named_as_not_measured():
 # Real robots
 
 
-def robot(name):
-    return next(f.locate() for f in files("example-robot-data") if str(f).endswith("/" + name))
-
-
 @pytest.mark.parametrize(
     ("name", "base", "refused"),
     [
@@ -557,7 +552,7 @@ def robot(name):
 def test_a_real_robot_is_audited_quickly_and_its_boxes_are_named(name, base, refused):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", dd.ModelWarning)
-        model = dd.load_model(robot(name), time_step=0.005, weld_base=base, ground=0.5)
+        model = dd.load_model(robot_file(name), time_step=0.005, weld_base=base, ground=0.5)
     start = time.perf_counter()
     findings = audit(model)
     assert time.perf_counter() - start < 2.0

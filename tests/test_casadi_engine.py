@@ -6,7 +6,9 @@ import warnings
 
 import numpy as np
 import pytest
-from conftest import Plant
+from helpers.contracts import different
+from helpers.engines import HERE, ROBOTS, G, assert_free_steps_agree, engine_of, needs
+from helpers.models import Plant, robot
 from pydrake.geometry import Role
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import (
@@ -16,8 +18,6 @@ from pydrake.multibody.tree import (
     RevoluteJoint,
     SpatialInertia,
 )
-from test_contract_match import different
-from test_engines import HERE, ROBOTS, G, assert_free_steps_agree, engine_of, needs, robot
 
 import drake_diff as dd
 from drake_diff.engines.closed_form import DoublePendulum, Pendulum

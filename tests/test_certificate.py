@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import random_state
+from helpers.models import random_state
 
 import drake_diff as dd
 from drake_diff.certificate import certify_jacobian_of_many

@@ -5,8 +5,8 @@ import warnings
 
 import numpy as np
 import pytest
-from conftest import MODELS
-from test_model import robot
+from helpers.models import MODELS, robot_file
+from helpers.plants import offset_pendulum
 from typer.testing import CliRunner
 
 import drake_diff as dd
@@ -32,7 +32,7 @@ def test_every_model_here_is_certified_at_every_sampled_state(load, name):
 def test_real_robots_are_certified(name, base):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", dd.ModelWarning)
-        model = dd.load_model(robot(name), time_step=0.005, weld_base=base)
+        model = dd.load_model(robot_file(name), time_step=0.005, weld_base=base)
     assert dd.certify_model(model, states=20).verdict == "pass"
 
 
@@ -69,7 +69,6 @@ def test_a_model_that_cannot_touch_is_sampled_in_free_motion(load):
 
 def test_a_wrong_derivative_fails_the_model(load, monkeypatch):
     monkeypatch.setattr("drake_diff.parameter_kinds.IDENTITY_OFFSET", 0.0)
-    from test_silent_faults import offset_pendulum
 
     record = dd.certify_model(offset_pendulum(), states=4, parameters=("second.offset",))
     assert record.verdict == "fail"

@@ -7,14 +7,13 @@ import subprocess
 import sys
 import time
 from importlib import metadata
-from pathlib import Path
 
 import pytest
+from helpers.models import ROOT
 
 import drake_diff as dd
 from drake_diff import cli
 
-ROOT = Path(__file__).parent.parent
 PENDULUM = f"""
 import numpy as np
 import drake_diff as dd

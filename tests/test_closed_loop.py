@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from conftest import MODELS
+from helpers.loops import MASS, H
+from helpers.models import MODELS
 
 import drake_diff as dd
 from drake_diff.loop.actuator import Actuator
@@ -11,23 +12,6 @@ from drake_diff.loop.estimator import Predictor
 from drake_diff.loop.fallback import Fallback
 from drake_diff.loop.sensor import Sensor
 from drake_diff.tangent import tangent_space
-
-H = 0.01
-BLOCK = """<robot name="cart"><link name="cart"><inertial><mass value="2"/>
-  <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
-  <joint name="slide" type="prismatic"><parent link="world"/><child link="cart"/><axis xyz="1 0 0"/>
-  <limit effort="1000"/></joint>
-  <transmission><type>transmission_interface/SimpleTransmission</type><joint name="slide">
-  <hardwareInterface>EffortJointInterface</hardwareInterface></joint><actuator name="motor"/></transmission></robot>"""
-MASS = 2.0
-
-
-@pytest.fixture(scope="module")
-def cart(tmp_path_factory):
-    """A double integrator: v+ = v + h u / 2, x+ = x + h v+."""
-    path = tmp_path_factory.mktemp("models") / "cart.urdf"
-    path.write_text(BLOCK)
-    return dd.load_model(path, time_step=H)
 
 
 def gain(kp, kd):

@@ -6,7 +6,8 @@ import signal
 
 import numpy as np
 import pytest
-from test_solution import MODELS, block
+from helpers.models import MODELS
+from helpers.plants import block
 
 import drake_diff as dd
 from drake_diff.nonlinear_program import NlpResult, Outcome

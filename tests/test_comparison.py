@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_contract_match import arms
-from test_engines import engine_of, needs
+from helpers.contracts import arms
+from helpers.engines import Doctored, engine_of, needs
 
 import drake_diff as dd
 from drake_diff.engines.compared import JACOBIAN_TOLERANCE, STEP_TOLERANCE
@@ -18,18 +18,6 @@ G = 9.81
 
 def by_name(comparison):
     return {e.engine: e for e in comparison.engines}
-
-
-class Doctored:
-    """An engine with something of it changed."""
-
-    def __init__(self, engine, **changes):
-        self._engine = engine
-        for name, value in changes.items():
-            setattr(self, name, value)
-
-    def __getattr__(self, name):
-        return getattr(self._engine, name)
 
 
 def test_a_free_model_is_the_same_in_every_engine(load):

@@ -6,9 +6,8 @@ from hashlib import sha256
 
 import numpy as np
 import pytest
-from conftest import MODELS
-from test_comparison import Doctored
-from test_engines import engine_of, needs
+from helpers.engines import Doctored, engine_of, needs
+from helpers.models import MODELS
 from typer.testing import CliRunner
 
 import drake_diff as dd

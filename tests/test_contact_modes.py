@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import Plant, contact_properties
+from helpers.models import Plant, contact_properties
 from pydrake.geometry import AddCompliantHydroelasticProperties, AddRigidHydroelasticProperties, Box
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import SpatialInertia

@@ -4,7 +4,7 @@ import signal
 
 import numpy as np
 import pytest
-from test_continuation import push, two_spheres  # noqa: F401  (a fixture)
+from helpers.problems import push
 
 import drake_diff as dd
 from drake_diff.contact_sequence import MARGIN, beginnings
@@ -46,7 +46,7 @@ def test_a_distance_has_its_slope_and_opens_by_the_least_motion(load, name, x):
     )
 
 
-def test_beginnings_are_where_a_distance_turns_negative(two_spheres):  # noqa: F811
+def test_beginnings_are_where_a_distance_turns_negative(two_spheres):
     """Gaps 0.1, -0.01, 0.02, 0.01, -0.02, -0.03: touches begin at knots 1 and 4; nothing acts on the last state."""
     gaps = np.array([0.1, -0.01, 0.02, 0.01, -0.02, 0.05, -0.03])
     problem = push(two_spheres(), gap=0.1, goal=1.0, num_steps=6)
@@ -73,7 +73,7 @@ def test_beginnings_are_where_a_distance_turns_negative(two_spheres):  # noqa: F
         (0.55, 1.1, {"damping": 0.2, "pusher": 1.7, "time_step": 0.025}),
     ],
 )
-def test_pushes_converge(two_spheres, gap, goal, fields):  # noqa: F811
+def test_pushes_converge(two_spheres, gap, goal, fields):
     model = two_spheres(**fields)
     problem = push(model, gap=gap, goal=goal, num_steps=round(1 / model.time_step))
     solution = dd.solve(problem)
@@ -82,7 +82,7 @@ def test_pushes_converge(two_spheres, gap, goal, fields):  # noqa: F811
 
 
 @pytest.fixture
-def elastic(two_spheres, monkeypatch, tmp_path):  # noqa: F811
+def elastic(two_spheres, monkeypatch, tmp_path):
     """Spheres that rebound: steps of 0.02 s do not resolve it, and every touch is a large jump."""
 
     def build(**fields):
@@ -141,14 +141,14 @@ def test_ctrl_c_ends_the_search_under_holds(elastic):
 
 
 @pytest.mark.parametrize("goal", [0.3, -1.0])
-def test_a_goal_that_no_contact_reaches_is_no_success(two_spheres, goal):  # noqa: F811
+def test_a_goal_that_no_contact_reaches_is_no_success(two_spheres, goal):
     """The ball at 0.6 m can only be pushed away from the pusher."""
     solution = dd.solve(push(two_spheres(), gap=0.4, goal=goal), method="ilqr", continuation="auto", max_iterations=60)
     assert not solution.success
     assert solution.goal_error > 0.25
 
 
-def test_restoration_keeps_bounds_and_looks_at_the_clock(two_spheres):  # noqa: F811
+def test_restoration_keeps_bounds_and_looks_at_the_clock(two_spheres):
     """The ball needs more than 1 m/s on its way to 1.2 m: no step towards the goal may take it there."""
     model = two_spheres(damping=0)
     us = np.full((50, 1), 2.0)

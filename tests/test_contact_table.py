@@ -8,9 +8,9 @@ from math import cos, exp, log, radians, sin, sqrt
 
 import numpy as np
 import pytest
+from helpers.engines import needs
 from hypothesis import given
 from hypothesis import strategies as st
-from test_engines import needs
 
 import drake_diff as dd
 from drake_diff.engines.contact_cases import (

@@ -2,40 +2,15 @@
 
 import math
 import signal
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.problems import FREE, push
 
 import drake_diff as dd
 from drake_diff.continuation import default_schedule
 from drake_diff.goal_restoration import restore_goal
 from drake_diff.solution import Status
-
-ROOT = Path(__file__).parent.parent
-FREE = math.nan
-
-
-@pytest.fixture
-def two_spheres(tmp_path):
-    """Both spheres with masses and a damping of our own."""
-
-    def build(*, pusher=1.0, ball=0.5, damping=0.5, time_step=0.02):
-        text = (ROOT / "models" / "two_spheres.sdf").read_text()
-        for old, new in (("<mass>1<", pusher), ("<mass>0.5<", ball), ("<damping>0.5<", damping)):
-            assert text.count(old) == 1
-            text = text.replace(old, f"{old.split('>')[0]}>{new}<")
-        path = tmp_path / "two_spheres.sdf"
-        path.write_text(text)
-        return dd.load_model(path, time_step=time_step)
-
-    return build
-
-
-def push(model, *, gap, goal, num_steps=50, **more):
-    given = {"x_goal": [FREE, goal, FREE, FREE]} | more
-    effort = dd.QuadraticCost(Q=np.zeros((4, 4)), R=[[1e-3]])
-    return dd.Problem(model, x0=[0, 0.2 + gap, 0, 0], num_steps=num_steps, running_cost=effort, **given)
 
 
 def test_a_push_from_a_distance_arrives_and_keeps_momentum(two_spheres):

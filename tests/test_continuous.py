@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from conftest import MODELS, random_state
+from helpers.models import MODELS, random_state
+from helpers.plants import pd_pendulum
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
-from test_silent_faults import pd_pendulum
 
 import drake_diff as dd
 from drake_diff.continuous import ContinuousSystem, EquationsOfMotion

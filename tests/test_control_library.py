@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_engines import engine_of
+from helpers.engines import engine_of
 
 import drake_diff as dd
 

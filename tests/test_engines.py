@@ -2,14 +2,23 @@
 
 import subprocess
 import sys
-import warnings
 from importlib.metadata import files
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from conftest import Plant, contact_properties, random_state
-from pydrake.geometry import Convex
+from helpers.engines import (
+    HAND,
+    HERE,
+    ROBOTS,
+    G,
+    assert_free_bodies_differ_by_the_exponential,
+    assert_free_steps_agree,
+    engine_of,
+    on_tangent,
+)
+from helpers.forward_formula import free_box
+from helpers.models import Plant, contact_properties, random_state, robot
+from helpers.plants import block_on_rails, pd_pendulum, tetrahedron_on_ground
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
@@ -18,7 +27,6 @@ from pydrake.multibody.tree import (
     SpatialInertia,
     UniversalJoint,
 )
-from test_silent_faults import pd_pendulum
 
 import drake_diff as dd
 from drake_diff.engines.closed_form import BY_MODEL, CartPole, DoublePendulum, MassSpringDamper, Pendulum, Projectile
@@ -26,59 +34,6 @@ from drake_diff.engines.closed_form_contact import SlidingBlock, SphereOnGround
 from drake_diff.engines.numpy_engine import NumpyEngine
 from drake_diff.engines.quiet import without_lines
 from drake_diff.tangent import tangent_space
-
-HAND = ["pendulum.urdf", "double_pendulum.urdf", "cart_pole.urdf", "mass_spring_damper.sdf", "projectile.sdf"]
-HERE = [*HAND, "acrobot.xml"]
-ROBOTS = ["panda.urdf", "ur5_robot.urdf", "solo12.urdf", "double_pendulum_continuous.urdf"]
-WELDED = {"double_pendulum_continuous.urdf": "base_link"}
-MIMIC = '<mimic joint="panda_finger_joint1"/>'
-G = 9.81
-
-
-def needs(engine):
-    """Skip, saying what is missing, where the engine is not installed."""
-    modules = {
-        "mujoco": ["mujoco"],
-        "pinocchio": ["pinocchio"],
-        "casadi": ["adam", "liecasadi"],
-        "mjx": ["mujoco", "mujoco.mjx", "jax"],
-    }.get(engine, [])
-    if any(find_spec(module) is None for module in modules):
-        pytest.skip(f"{engine} is not installed: pip install 'drake-diff[{'mjx' if engine == 'mjx' else 'engines'}]'")
-
-
-def engine_of(name, model, **options):
-    needs(name)
-    return dd.load_engine(name, model, **options)
-
-
-def robot(name, tmp_path):
-    """A robot of example-robot-data, but for what no other engine has: that one finger mimics the other, which is a
-    coupler in Drake, and that continuous joints have limits 0 and 0, which Drake keeps."""
-    path = next(f.locate() for f in files("example-robot-data") if str(f).endswith("/" + name))
-    lines = path.read_text().splitlines()
-    copy = tmp_path / name
-    copy.write_text("\n".join(line for line in lines if line.strip() not in ('lower="0"', 'upper="0"', MIMIC)))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", dd.ModelWarning)  # meshes of visuals are skipped
-        return dd.load_model(copy, time_step=0.001, weld_base=WELDED.get(name))
-
-
-def free_state(model, random):
-    """A random state inside the limits, free bodies high up."""
-    x = random_state(model, random)
-    lower, upper = model.plant.GetPositionLowerLimits(), model.plant.GetPositionUpperLimits()
-    for i in np.flatnonzero(np.isfinite(lower) & np.isfinite(upper)):
-        x[i] = random.uniform(0.75 * lower[i] + 0.25 * upper[i], 0.25 * lower[i] + 0.75 * upper[i])
-    if model.nq > model.nv:
-        x[6] += 5.0
-    return x
-
-
-def on_tangent(model, A, x, x_next):
-    space = tangent_space(model)
-    return space.derivative_of_minus(x_next) @ A @ space.derivative_of_plus(x)
-
 
 # ---- hand calculations -------------------------------------------------------------------------------------------
 
@@ -204,20 +159,6 @@ def test_hand_jacobians_are_those_of_the_hand_steps(form):
 # ---- free motion, engine against engine ---------------------------------------------------------------------------
 
 
-def assert_free_steps_agree(model, name, step, jacobian, *, states=5):
-    """One step and its Jacobian (on the tangent space) to these tolerances, relative to the largest entry."""
-    drake, other, random = dd.load_engine("drake", model), engine_of(name, model), np.random.default_rng(2)
-    for _ in range(states):
-        x, u = free_state(model, random), random.standard_normal(model.nu)
-        a, b = drake.step(x, u), other.step(x, u)
-        np.testing.assert_allclose(b, a, rtol=0, atol=step * max(1, abs(a).max()))
-        one, two = drake.differentiate_step(x, u), other.differentiate_step(x, u)
-        A, A2 = on_tangent(model, one.A, x, a), on_tangent(model, two.A, x, b)
-        np.testing.assert_allclose(A2, A, rtol=0, atol=jacobian * max(1, abs(A).max()))
-        np.testing.assert_allclose(two.B, one.B, rtol=0, atol=jacobian * max(1, abs(one.B).max(initial=0)))
-        np.testing.assert_allclose(other.energy(x), drake.energy(x), rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.parametrize("file", HAND)
 def test_the_hand_calculation_is_drake(load, file):
     assert_free_steps_agree(load(file), "numpy", 1e-13, 1e-12)  # a few roundings
@@ -250,41 +191,9 @@ def test_mujoco_differs_on_free_bodies_by_the_quaternions_exponential_alone(load
     assert_free_bodies_differ_by_the_exponential(model, "mujoco")
 
 
-def assert_free_bodies_differ_by_the_exponential(model, name, *, states=3):
-    """From Drake's step, in an engine that has MuJoCo's."""
-    drake, mujoco, random = dd.load_engine("drake", model), engine_of(name, model), np.random.default_rng(3)
-    from drake_diff.engines.mujoco_engine import exponential_gap
-
-    space = tangent_space(model)
-
-    def with_gap(x, u):
-        a = np.array(drake.step(x, u))
-        a[:4] = a[:4] / np.linalg.norm(a[:4]) + exponential_gap(x, a, model.time_step, 0, model.nq)
-        return a
-
-    for _ in range(states):
-        x, u = free_state(model, random), random.standard_normal(model.nu)
-        a, b = with_gap(x, u), mujoco.step(x, u)
-        assert np.abs(b[:4] - drake.step(x, u)[:4]).max() > 1e-8  # there is something to explain
-        np.testing.assert_allclose(b, a, rtol=0, atol=1e-12 * abs(a).max())
-        one, two = drake.differentiate_step(x, u), mujoco.differentiate_step(x, u)
-        A, A2 = on_tangent(model, one.A, x, drake.step(x, u)), on_tangent(model, two.A, x, b)
-        # The turn's own rows, by differences of Drake's step and the gap: good to 1e-9.
-        for i in range(len(A)):
-            e = 1e-6 * np.eye(len(A))[i]
-            ends = [space.minus(with_gap(space.plus(x, d), u), b)[:3] for d in (e, -e)]
-            np.testing.assert_allclose(A2[:3, i], (ends[0] - ends[1]) / 2e-6, rtol=0, atol=1e-8)
-
-
-def free_box(time_step=0.01):
-    plant = Plant(time_step)
-    plant.plant.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(1.0, 0.1, 0.2, 0.3))
-    return plant.model()
-
-
 @pytest.mark.parametrize("name", ["pinocchio", "mujoco", "mjx"])
 def test_a_swapped_quaternion_or_velocity_frame_is_found(load, monkeypatch, name):
-    model = free_box()
+    model = free_box(mass=1.0)
     drake, other = dd.load_engine("drake", model), engine_of(name, model)
     assert [line.quantity for line in dd.match_contracts(drake, other) if line.verdict == "different"] == (
         [] if name == "pinocchio" else ["integrator"]
@@ -337,15 +246,6 @@ def test_mujoco_rests_as_deep_as_drake_a15(load, file):
     assert mujoco.status == "ok"
     assert mujoco.contact_depth(x) == pytest.approx(weight * G / points / 1e4, rel=1e-9)  # settled for 5 s
     assert dd.load_engine("drake", model).contact_depth(x) == pytest.approx(mujoco.contact_depth(x), rel=1e-9)
-
-
-def block_on_rails(time_step=0.01, friction=0.5, gravity=(0, 0, -G)):
-    """A ball on an x and a z rail, which slides like a block, and its state where it rests."""
-    plant = Plant(time_step, "lagged")
-    plant.ball("ball", 1.0, 0.1, contact_properties(2e4, 10, friction), "x", "z")
-    plant.ground(contact_properties(2e4, 10, friction))
-    plant.plant.mutable_gravity_field().set_gravity_vector(gravity)
-    return plant.model(), np.array([0, 0.1 + gravity[2] / 1e4, 0, 0])
 
 
 def test_mujoco_slides_to_a_stop_a20_and_its_jacobians_are_its_steps():
@@ -487,15 +387,6 @@ def test_a_weld_at_a_distance_is_drakes(name):
     plant.plant.AddJoint(RevoluteJoint("hinge", plant.plant.world_frame(), arm.body_frame(), [0, 1, 0]))
     plant.plant.WeldFrames(arm.body_frame(), end.body_frame(), RigidTransform(RollPitchYaw(0.3, 0.2, 0.1), [0.1, 0, 1]))
     assert_free_steps_agree(plant.model(), name, 1e-12, 1e-10)  # MuJoCo's Jacobian is of differences
-
-
-def tetrahedron_on_ground(tmp_path):
-    (tmp_path / "t.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
-    plant = Plant(0.01)
-    body = plant.plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
-    plant.shape(body, Convex(str(tmp_path / "t.obj")), contact_properties(1e4))
-    plant.ground(contact_properties(1e4))
-    return plant.model()
 
 
 def test_geometry_that_mujoco_is_not_given_is_named(tmp_path):

@@ -4,10 +4,10 @@ import dataclasses
 import json
 import math
 from hashlib import sha256
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.models import MODELS
 
 import drake_diff as dd
 from drake_diff.evidence import begin
@@ -15,8 +15,6 @@ from drake_diff.mcap_read import read_mcap
 from drake_diff.meshcat_scene import scene_of
 from drake_diff.meshcat_view import write_replay
 from drake_diff.trace_read import read_trace
-
-MODELS = Path(__file__).parent.parent / "models"
 
 
 @pytest.fixture(scope="module")

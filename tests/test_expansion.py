@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from test_continuation import two_spheres  # noqa: F401  (a fixture)
-from test_ilqr import craft, pendulum, tilted
+from helpers.plants import craft, tilted
+from helpers.problems import pendulum
 
 import drake_diff as dd
 from drake_diff import analytic
@@ -65,7 +65,7 @@ def test_of_a_floating_body_with_wheels_by_differences():
     assert np.abs(found[:, : model.nx, model.nx :]).max() > 1e-3  # the inputs' part with the states is seen
 
 
-def test_it_is_refused_where_spheres_touch(two_spheres):  # noqa: F811
+def test_it_is_refused_where_spheres_touch(two_spheres):
     """And is had of the same model where they are apart."""
     cost = dd.QuadraticCost(R=[[1.0]])
     for gap, touches in ((0.1, False), (-0.001, True)):

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_contract_match import arms
-from test_engines import engine_of, needs, robot
+from helpers.contracts import arms
+from helpers.engines import engine_of, needs
+from helpers.models import robot
 from typer.testing import CliRunner
 
 import drake_diff as dd

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_report import browser as browser  # a fixture
-from test_report import browsing
+from helpers.browser import browsing
 from typer.testing import CliRunner
 
 import drake_diff as dd

@@ -7,10 +7,9 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import RevoluteJoint, SpatialInertia
-from pydrake.systems.framework import DiagramBuilder
-from test_solution import MODELS, block
+from helpers.models import MODELS
+from helpers.plants import block, craft, tilted
+from helpers.problems import A30, OTHERS, lqr, pendulum, riccati
 
 import drake_diff as dd
 from drake_diff.augmented_lagrangian import AugmentedLagrangian
@@ -21,35 +20,6 @@ from drake_diff.riccati import minimize_in_box, solve_riccati
 from drake_diff.solution import Status
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
-
-SOFT = {
-    "running_cost": dd.QuadraticCost(Q=np.diag([0.1, 0.01]), R=[[0.1]], x_ref=[np.pi, 0]),
-    "final_cost": dd.QuadraticCost(Q=np.diag([50, 5]), x_ref=[np.pi, 0]),
-}
-
-
-def lqr(h, count, Q, R, Qf, **fields):
-    """The running cost is a rate: weights divided by h give sums without h."""
-    costs = {"running_cost": dd.QuadraticCost(Q=Q / h, R=[[R / h]]), "final_cost": dd.QuadraticCost(Q=Qf)}
-    return dd.Problem(block(time_step=h), **{"x0": [1, 0], "num_steps": count, **costs, **fields})
-
-
-def riccati(h, count, Q, R, Qf):
-    """(P0, gains K_0 ... K_N-1) of the double integrator as symplectic Euler steps it."""
-    A, B = np.array([[1, h], [0, 1]]), np.array([[h**2], [h]])
-    P, gains = np.array(Qf, dtype=float), []
-    for _ in range(count):
-        gains.append(np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A))
-        P = Q + A.T @ P @ (A - B @ gains[-1])
-    return P, gains[::-1]
-
-
-A30 = (0.1, 20, np.eye(2), 0.1, 10 * np.eye(2))
-OTHERS = [
-    A30,
-    (0.05, 33, np.diag([3.0, 0.5]), 0.7, np.diag([2.0, 0.1])),
-    (0.2, 7, np.array([[2.0, 0.5], [0.5, 1.0]]), 3.0, np.array([[4.0, -1.0], [-1.0, 9.0]])),
-]
 
 
 @pytest.mark.parametrize("case", OTHERS)
@@ -113,11 +83,6 @@ def pendulum_gradient(us):
         A = np.array([[1 - h * c, h * s], [-c, s]])
         slope = 2 * h * np.array([0.1, 0.01]) * (xs[k] - [np.pi, 0]) + A.T @ slope
     return gradient
-
-
-def pendulum(**changes):
-    fields = {"x0": [0, 0], "num_steps": 100, **SOFT, **changes}
-    return dd.Problem(dd.load_model(MODELS / "pendulum.urdf", time_step=0.02), **fields)
 
 
 def test_a_swing_up_without_bounds_leaves_no_slope():
@@ -358,27 +323,6 @@ def test_cart_pole_swing_up_from_rest():
     again = dd.solve(problem, method="ilqr", initial_guess=solution)
     assert again.success, again.message
     assert len(again.iterations) < 12  # a good guess is not left
-
-
-def craft():
-    """A hull floating without gravity, turned by three reaction wheels."""
-    builder = DiagramBuilder()
-    config = MultibodyPlantConfig(time_step=0.05, use_sampled_output_ports=False, discrete_contact_approximation="sap")
-    plant, _ = AddMultibodyPlant(config, builder)
-    plant.mutable_gravity_field().set_gravity_vector([0, 0, 0])
-    hull = plant.AddRigidBody("hull", SpatialInertia.SolidBoxWithMass(10, 0.3, 0.4, 0.5))
-    for i, axis in enumerate(np.eye(3)):
-        wheel = plant.AddRigidBody(f"wheel_{i}", SpatialInertia.SolidSphereWithMass(1, 0.2))
-        joint = plant.AddJoint(RevoluteJoint(f"axle_{i}", hull.body_frame(), wheel.body_frame(), axis))
-        plant.AddJointActuator(f"motor_{i}", joint)
-    plant.Finalize()
-    return dd.model_from_diagram(builder.Build())
-
-
-def tilted(model, angle=1.5):
-    x0 = np.array(model.default_state)
-    x0[:4] = [np.cos(angle / 2), *(np.sin(angle / 2) * np.array([1, 2, 3]) / np.sqrt(14))]
-    return x0
 
 
 def test_a_floating_body_is_turned_upright_and_stopped():

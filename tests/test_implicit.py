@@ -6,26 +6,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import MODELS, Plant, add_slide, contact_properties, random_state
+from helpers.models import MODELS, Plant, add_slide, contact_properties, random_state, robot_file
+from helpers.plants import POINT, floating, in_the_air, limited_pendulum, springs_and_motors
 from pydrake.common.value import Value
 from pydrake.geometry import Box
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from pydrake.multibody.tree import (
-    FixedOffsetFrame,
     PdControllerGains,
-    PrismaticSpring,
     QuaternionFloatingJoint,
-    RevoluteJoint,
-    RevoluteSpring,
-    RotationalInertia,
     RpyFloatingJoint,
     SpatialInertia,
     UniversalJoint,
 )
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
-from test_model import robot
 
 import drake_diff as dd
 
@@ -61,16 +56,6 @@ def same_by_both(model, x, u=(), parameters=None, expected="implicit"):
     return found["implicit"]
 
 
-def in_the_air(model, x):
-    """Free bodies a metre up, and what slides three metres off whatever it could touch."""
-    if model.state_names[0].endswith("_qw"):
-        x[6] = 1.0
-    apart = {"two_spheres": "slide_x", "box_push": "bx_x", "hopper": "z_x"}
-    if model.name in apart:
-        x[model.state_names.index(apart[model.name])] = 3.0
-    return x
-
-
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("seed", range(3))
 def test_every_model_of_this_repository(load, name, seed):
@@ -93,7 +78,7 @@ def test_every_contact_approximation(load, approximation):
 )
 def test_real_robots(tmp_path, name, base):
     """Panda without the coupling of its fingers, which is a constraint, and without their boxes, which touch."""
-    text = Path(robot(name)).read_text()
+    text = Path(robot_file(name)).read_text()
     path = tmp_path / name
     path.write_text(re.sub(r"(?s)<mimic.*?/>|<(collision|visual).*?</\1>", "", text))
     with warnings.catch_warnings():
@@ -112,27 +97,10 @@ def test_real_robots(tmp_path, name, base):
 def test_a_real_robot_with_coupled_fingers_is_handed_over():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", dd.ModelWarning)
-        model = dd.load_model(robot("panda.urdf"), time_step=0.005, weld_base="panda_link0")
+        model = dd.load_model(robot_file("panda.urdf"), time_step=0.005, weld_base="panda_link0")
     d = dd.differentiate_step(model, model.default_state, np.zeros(model.nu))
     assert d.method != "implicit"
     assert dd.step(model, model.default_state, np.zeros(model.nu)) == pytest.approx(d.x_next, abs=0)
-
-
-def floating(joint_type, seed):
-    """A free body with a sprung arm on it, so that the base is pushed around."""
-    made, random = Plant(0.01), np.random.default_rng(seed)
-    plant = made.plant
-    inertia = RotationalInertia(0.2, 0.3, 0.25, 0.01, -0.02, 0.015)
-    base = plant.AddRigidBody("base", SpatialInertia.MakeFromCentralInertia(2.0, np.array([0.1, 0, 0.05]), inertia))
-    arm = plant.AddRigidBody("arm", SpatialInertia.MakeFromCentralInertia(0.7, np.array([0, 0, -0.3]), inertia))
-    if joint_type is not None:
-        plant.AddJoint(joint_type("free", plant.world_frame(), base.body_frame()))
-    pose = RigidTransform(random.standard_normal(3))
-    frame = plant.AddFrame(FixedOffsetFrame("mount", base.body_frame(), pose))
-    hinge = plant.AddJoint(RevoluteJoint("hinge", frame, arm.body_frame(), [0.0, 0.6, 0.8], 0.3))
-    plant.AddForceElement(RevoluteSpring(hinge, 0.4, 5.0))
-    plant.AddJointActuator("motor", hinge)
-    return made.model()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -158,35 +126,6 @@ def test_a_quaternion_that_is_not_of_unit_norm():
     same_by_both(model, x, [0.2])
 
 
-def springs_and_motors(*, limit=np.inf, kp=(0.0, 0.0, 0.0), gear=1.0, damping=0.2):
-    """A sprung cart, a sprung pole on it and a pole on that, all driven, PD-controlled where a gain is given."""
-    made = Plant(0.01)
-    plant = made.plant
-    cart = plant.AddRigidBody("cart", SpatialInertia.SolidSphereWithMass(1.5, 0.1))
-    joints = [add_slide(plant, "rail", plant.world_frame(), cart, "x")]
-    plant.AddForceElement(PrismaticSpring(joints[0], 0.2, 30.0))
-    parent = cart
-    for i in range(2):
-        inertia = SpatialInertia.SolidCapsuleWithMass(0.8, 0.05, 0.4, [0, 0, 1]).Shift([0, 0, 0.3])
-        pole = plant.AddRigidBody(f"pole{i}", inertia)
-        frame = plant.AddFrame(FixedOffsetFrame(f"m{i}", parent.body_frame(), RigidTransform([0, 0, -0.6 * i])))
-        joints.append(plant.AddJoint(RevoluteJoint(f"hinge{i}", frame, pole.body_frame(), [0, 1, 0])))
-        plant.AddForceElement(RevoluteSpring(joints[-1], 0.3 * i, 4.0 + i))
-        parent = pole
-    for i, joint in enumerate(joints):
-        joint.set_default_damping_vector([damping * (i + 1)])
-        joint.set_default_positions([0.1 * i])
-        motor = plant.AddJointActuator(f"motor{i}", joint, limit)
-        motor.set_default_gear_ratio(gear)
-        motor.set_default_rotor_inertia(0.01)
-        if kp[i]:
-            motor.set_controller_gains(PdControllerGains(p=kp[i], d=0.1 * kp[i]))
-    return made.model()
-
-
-POINT = [0.3, 0.5, -0.4, 0.2, -0.7, 1.1], [0.4, -0.3, 0.2]
-
-
 @pytest.mark.parametrize("damping", [0.0, 0.2, 50.0])
 @pytest.mark.parametrize("gear", [1.0, -12.0])
 def test_springs_damping_and_reflected_inertia(damping, gear):
@@ -209,16 +148,6 @@ def test_efforts_at_their_limits(kp, u):
     assert saturated.any()
     assert np.all(np.abs(d.B).max(axis=0)[saturated] == 0)
     assert np.all(np.abs(d.B).max(axis=0)[~saturated] > 0)
-
-
-def limited_pendulum(lower=-1.0, upper=1.0):
-    made = Plant(0.01)
-    inertia = SpatialInertia.SolidCapsuleWithMass(1.0, 0.05, 0.4, [0, 0, 1]).Shift([0, 0, 0.3])
-    pole = made.plant.AddRigidBody("pole", inertia)
-    hinge = made.plant.AddJoint(RevoluteJoint("hinge", made.plant.world_frame(), pole.body_frame(), [0, 1, 0]))
-    hinge.set_position_limits([lower], [upper])
-    made.plant.AddJointActuator("motor", hinge)
-    return made.model()
 
 
 @pytest.mark.parametrize("q", [0.0, 0.5, -0.6])

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import MODELS, random_state
+from helpers.engines import ROBOTS, G, free_state
+from helpers.models import MODELS, random_state, robot
+from helpers.plants import POINT, floating, in_the_air, limited_pendulum, springs_and_motors
 from pydrake.multibody.tree import RpyFloatingJoint
-from test_engines import ROBOTS, G, free_state, robot
-from test_implicit import POINT, floating, in_the_air, limited_pendulum, springs_and_motors
 
 import drake_diff as dd
 from drake_diff.analytic import _FOUND, analytic_of, build_analytic, certified

@@ -8,23 +8,22 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import MODELS, Plant, contact_properties, random_state
-from pydrake.geometry import Box, Cylinder
-from pydrake.math import RigidTransform
-from pydrake.multibody.tree import SpatialInertia
-from test_contract_match import arms, different
-from test_engines import (
+from helpers.contracts import arms, different
+from helpers.engines import (
     HERE,
     G,
     assert_free_bodies_differ_by_the_exponential,
     assert_free_steps_agree,
-    block_on_rails,
     engine_of,
-    free_box,
     needs,
     on_tangent,
-    robot,
 )
+from helpers.forward_formula import free_box
+from helpers.models import MODELS, Plant, contact_properties, random_state, robot
+from helpers.plants import block_on_rails
+from pydrake.geometry import Box, Cylinder
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import SpatialInertia
 
 import drake_diff as dd
 from drake_diff.engines.closed_form import MassSpringDamper
@@ -93,7 +92,7 @@ def test_mjx_differs_on_a_projectile_by_the_quaternions_exponential_alone(load):
 
 
 def test_a_turn_from_rest_has_its_derivative_and_says_that_mjx_has_it_not():
-    model = free_box()
+    model = free_box(mass=1.0)
     engine, x = engine_of("mjx", model), model.default_state
     x[4:7] = [1, 2, 3]
     found = engine.differentiate_step(x, [])
@@ -110,7 +109,7 @@ def test_a_turn_from_rest_has_its_derivative_and_says_that_mjx_has_it_not():
 
 def test_mjx_still_loses_the_turn_from_rest(monkeypatch):
     """When this fails, `_put_turns_back` can go."""
-    model = free_box()
+    model = free_box(mass=1.0)
     engine, x = engine_of("mjx", model), model.default_state
     monkeypatch.setattr(type(engine), "_put_turns_back", lambda *_: "")
     A = on_tangent(model, engine.differentiate_step(x, []).A, x, engine.step(x, []))

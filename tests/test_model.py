@@ -3,11 +3,10 @@
 import json
 import math
 import warnings
-from importlib.metadata import files
 
 import numpy as np
 import pytest
-from conftest import MODELS, Plant, add_slide, contact_properties
+from helpers.models import MODELS, Plant, add_slide, contact_properties, robot_file
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.planning import RobotDiagramBuilder
@@ -257,17 +256,13 @@ def test_a_diagram_without_an_autodiff_form_is_differenced_and_says_so():
         dd.differentiate_step(model, [0.0, 0.0], [3.0], method="autodiff")
 
 
-def robot(name):
-    return next(f.locate() for f in files("example-robot-data") if str(f).endswith("/" + name))
-
-
 @pytest.mark.parametrize(
     ("name", "base", "size"),
     [("panda.urdf", "panda_link0", 18), ("ur5_robot.urdf", None, 12), ("solo12.urdf", None, 37)],
 )
 def test_a_real_robot_loads_steps_and_is_certified(name, base, size):
     with pytest.warns(dd.ModelWarning, match=r"(?s)meshes skipped.*(stl|dae)"):
-        model = dd.load_model(robot(name), time_step=0.005, weld_base=base)
+        model = dd.load_model(robot_file(name), time_step=0.005, weld_base=base)
     assert model.nx == size
     lower, upper = model.plant.GetPositionLowerLimits(), model.plant.GetPositionUpperLimits()
     random = np.random.default_rng(0)

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from conftest import MODELS
+from helpers.models import MODELS
+from helpers.plants import block
+from helpers.problems import A30, OTHERS, lqr, riccati
 from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
-from test_ilqr import A30, OTHERS, lqr, riccati
-from test_solution import block
 
 import drake_diff as dd
 from drake_diff.loop.controllers import tracking

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from helpers.models import MODELS
+from helpers.plants import block
+from helpers.problems import A30, lqr
 from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
-from test_ilqr import A30, lqr
-from test_solution import MODELS, block
 
 import drake_diff as dd
 from drake_diff.shooting_program import SegmentedMotion

@@ -9,13 +9,14 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import MODELS, Plant, contact_properties
-from forward_formula import formula, free_box, turned
+from helpers.contracts import CHANGES, arms, different
+from helpers.engines import free_state, on_tangent
+from helpers.forward_formula import formula, free_box, turned
+from helpers.models import MODELS, Plant, contact_properties, robot
+from helpers.plants import block_on_rails, tetrahedron_on_ground
 from pydrake.geometry import Box, Capsule, Cylinder
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import SpatialInertia
-from test_contract_match import CHANGES, arms, different
-from test_engines import block_on_rails, free_state, on_tangent, robot, tetrahedron_on_ground
 
 import drake_diff as dd
 from drake_diff.tangent import tangent_space

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from conftest import Plant, add_slide, contact_properties
+from helpers.models import Plant, add_slide, contact_properties
 from pydrake.geometry import HalfSpace, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import RevoluteJoint, RotationalInertia, SpatialInertia

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from conftest import MODELS, Plant, add_slide, contact_properties, random_state
+from helpers.models import MODELS, Plant, add_slide, contact_properties, random_state
 from pydrake.geometry import (
     AddCompliantHydroelasticProperties,
     AddRigidHydroelasticProperties,

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from conftest import Plant, add_slide
+from helpers.models import Plant, add_slide
 from pydrake.multibody.tree import RevoluteJoint, SpatialInertia, UnitInertia
 from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 

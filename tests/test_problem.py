@@ -2,15 +2,14 @@
 
 import dataclasses
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.models import MODELS
 
 import drake_diff as dd
 from drake_diff.cost import differentiate_cost, final_cost_hessian, running_cost_hessian
 
-MODELS = Path(__file__).parent.parent / "models"
 R = dd.QuadraticCost(R=[[1.0]])
 
 

@@ -5,14 +5,14 @@ import sys
 
 import numpy as np
 import pytest
-import test_contract_match
-from conftest import MODELS, Plant, contact_properties
-from forward_formula import formula, free_box, turned
+from helpers.contracts import CHANGES, PLAIN, arms, different
+from helpers.engines import free_state
+from helpers.forward_formula import formula, free_box, turned
+from helpers.models import MODELS, Plant, contact_properties, robot
+from helpers.plants import block_on_rails, tetrahedron_on_ground
 from pydrake.geometry import Box, Capsule, Cylinder
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import SpatialInertia
-from test_contract_match import CHANGES, arms, different
-from test_engines import block_on_rails, free_state, robot, tetrahedron_on_ground
 
 import drake_diff as dd
 
@@ -111,7 +111,7 @@ def test_each_step_depends_on_its_arguments_alone(load):
 
 @pytest.mark.parametrize("change", sorted(CHANGES.keys() - {"armature", "gear"}))
 def test_a_change_is_found_and_named(tmp_path, monkeypatch, change):
-    monkeypatch.setitem(test_contract_match.PLAIN, "rotor", 0.0)  # Bullet has no armature, as is tested below
+    monkeypatch.setitem(PLAIN, "rotor", 0.0)  # Bullet has no armature, as is tested below
     changes, must, may, words = CHANGES[change]
     reference = dd.load_engine("drake", arms(tmp_path))
     own = different(reference, bullet(arms(tmp_path)))

@@ -1,41 +1,14 @@
 """Task quantities against closed forms, against Drake's own Jacobians, and against differences."""
 
-from importlib.metadata import files
-
 import numpy as np
 import pytest
-from conftest import Plant, add_slide, contact_properties, random_state
-from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
-from pydrake.geometry import (
-    AddCompliantHydroelasticProperties,
-    AddRigidHydroelasticProperties,
-    Box,
-    CollisionFilterDeclaration,
-    GeometrySet,
-    HalfSpace,
-    Sphere,
-)
+from helpers.derivatives import differentiate
+from helpers.models import Plant, add_slide, contact_properties, random_state, ur5
+from helpers.plants import box_on_the_ground, craft
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.tree import FixedOffsetFrame, JacobianWrtVariable, SpatialInertia
-from test_ilqr import craft
 
 import drake_diff as dd
-
-
-def asset(name):
-    return next(f.locate() for f in files("example-robot-data") if str(f).endswith("/" + name))
-
-
-def ur5():
-    with pytest.warns(dd.ModelWarning):  # meshes skipped
-        return dd.load_model(asset("ur5_robot.urdf"), time_step=0.02)
-
-
-def differentiate(function, x, u=None):
-    """(values, Jacobian by x, or by x and u)."""
-    z = InitializeAutoDiff(x if u is None else np.concatenate([x, u])).ravel()
-    result = function(z) if u is None else function(z[: len(x)], z[len(x) :])
-    return ExtractValue(result).ravel(), ExtractGradient(result)
 
 
 def differences(function, x, step=1e-6):
@@ -162,29 +135,6 @@ def test_frames_of_two_instances_are_told_apart():
     assert between(x) == pytest.approx([1, 0, -2], abs=1e-15)
     with pytest.raises(dd.UnknownNameError, match="left::arm, left::hand, right::arm, right::hand, world"):
         dd.frame_position(model, "hand")
-
-
-def box_on_the_ground(kind="spheres", *, pusher=False):
-    """A box of 2 kg on the ground, by four corner spheres or by hydroelastic contact."""
-    plant = Plant(0.01, contact_model="point" if kind == "spheres" else "hydroelastic")
-    ground, skin = contact_properties(2e4), contact_properties(2e4)
-    if kind == "hydroelastic":
-        AddRigidHydroelasticProperties(ground)
-        AddCompliantHydroelasticProperties(0.05, 1e6, skin)
-    plant.plant.RegisterCollisionGeometry(plant.plant.world_body(), RigidTransform(), HalfSpace(), "ground", ground)
-    box = plant.plant.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(2, 0.2, 0.2, 0.2))
-    rail = add_slide(plant.plant, "rail", plant.plant.world_frame(), box, "z")
-    if pusher:
-        plant.plant.AddJointActuator("press", rail)
-    if kind == "spheres":
-        for i, (a, b) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
-            pose = RigidTransform([0.09 * a, 0.09 * b, -0.09])
-            plant.plant.RegisterCollisionGeometry(box, pose, Sphere(0.01), f"corner_{i}", skin)
-        body = GeometrySet(plant.plant.GetCollisionGeometriesForBody(box))
-        plant.scene_graph.collision_filter_manager().Apply(CollisionFilterDeclaration().ExcludeWithin(body))
-    else:
-        plant.plant.RegisterCollisionGeometry(box, RigidTransform(), Box(0.2, 0.2, 0.2), "skin", skin)
-    return plant.model()
 
 
 @pytest.mark.parametrize("kind", ["spheres", "hydroelastic"])

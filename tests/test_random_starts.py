@@ -3,14 +3,12 @@
 The referee is the textbook's equations written out here, integrated between the knots; it knows nothing of Drake.
 """
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from helpers.models import MODELS
 
 import drake_diff as dd
 
-MODELS = Path(__file__).parent.parent / "models"
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 COUNT, H = 100, 0.02
 TRIALS, ENOUGH = 100, 99

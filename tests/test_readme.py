@@ -3,9 +3,8 @@
 import re
 import subprocess
 import sys
-from pathlib import Path
 
-ROOT = Path(__file__).parent.parent
+from helpers.models import ROOT
 
 
 def test_the_readmes_code_prints_the_readmes_output(tmp_path):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.models import MODELS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import BaseModel, JsonValue, ValidationError
@@ -24,7 +25,6 @@ from drake_diff.record_file import parse_record
 from drake_diff.record_parts import Metric
 from drake_diff.record_schema import generated_schema, published_schema
 
-MODELS = Path(__file__).parent.parent / "models"
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**60), 2**60) | NUMBERS | st.text(max_size=8),

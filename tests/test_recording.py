@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import MODELS
+from helpers.contracts import arms
+from helpers.engines import engine_of, needs
+from helpers.models import MODELS
 from pydrake.math import RollPitchYaw
-from test_contract_match import arms
-from test_engines import engine_of, needs
 from typer.testing import CliRunner
 
 import drake_diff as dd

@@ -9,7 +9,7 @@ import functools
 
 import numpy as np
 import pytest
-from conftest import MODELS
+from helpers.models import MODELS
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.controllers import (

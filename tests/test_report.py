@@ -1,6 +1,5 @@
 """What people look at: replay.html, report.html and the live view, in a real browser where there is one."""
 
-import base64
 import dataclasses
 import json
 import shutil
@@ -8,11 +7,11 @@ import signal
 import subprocess
 import sys
 import urllib.request
-from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.browser import browsing, errors, move_slider, open_page, view_of
+from helpers.models import MODELS
 
 import drake_diff as dd
 from drake_diff.meshcat_scene import ARROW_PART, scene_of
@@ -20,16 +19,7 @@ from drake_diff.meshcat_view import frames_of
 from drake_diff.report_data import report_data
 from drake_diff.view import scene_of_run, serve
 
-MODELS = Path(__file__).parent.parent / "models"
 HOSTILE = "<script>alert(1)</script>"
-CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-browsing = pytest.mark.skipif(
-    not (CHROMIUM and DRIVER), reason="no browser installed (apt-get install chromium chromium-driver)"
-)
-FLAGS = (
-    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
-    "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader"
-)
 
 
 @pytest.fixture(scope="module")
@@ -83,64 +73,6 @@ def runs(swing_up, thrown, collocated, tmp_path_factory):
     for name, solution in found.items():
         dd.save(solution, folder / name)
     return folder
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed (the test extra has it)")
-    from selenium.webdriver.chrome.service import Service
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for flag in [*FLAGS.split(), f"--user-data-dir={tmp_path_factory.mktemp('profile')}"]:
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=Service(DRIVER))
-    driver.execute_cdp_cmd("Network.enable", {})
-    offline = {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
-    driver.execute_cdp_cmd("Network.emulateNetworkConditions", offline)
-    yield driver
-    driver.quit()
-
-
-def open_page(browser, page, *, size=(1440, 900), scheme="light"):
-    """Load `page` from the disk and wait until its animation is there; nothing may have gone wrong."""
-    from selenium.webdriver.support.ui import WebDriverWait
-
-    screen = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": size[0] < 600}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
-    media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
-    browser.get_log("browser")
-    browser.get(page.as_uri())
-    ready = (
-        "document.documentElement.dataset.ready === 'yes'" if page.name == "report.html" else "viewer.animator.duration"
-    )
-    WebDriverWait(browser, 30).until(lambda b: b.execute_script(f"return Boolean({ready})"))
-
-
-def errors(browser):
-    """What the console complains of; SwiftShader's remarks on its own speed are none of ours."""
-    return [entry["message"] for entry in browser.get_log("browser") if "GPU stall" not in entry["message"]]
-
-
-def move_slider(browser, part):
-    browser.execute_script(
-        "const s = document.getElementById('time');s.value = arguments[0] * s.max; s.dispatchEvent(new Event('input'))",
-        part,
-    )
-    browser.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
-
-
-def view_of(browser):
-    """The 3D view's pixels, as it was last drawn."""
-    import matplotlib.image
-
-    url = browser.execute_script(
-        "const v = (document.getElementById('view') || {contentWindow: window}).contentWindow.viewer;"
-        "v.render(); return v.renderer.domElement.toDataURL('image/png')"
-    )
-    return matplotlib.image.imread(BytesIO(base64.b64decode(url.split(",")[1])))[..., :3]
 
 
 def cursors(browser):

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import MODELS
-from test_closed_loop import BLOCK, MASS, H
+from helpers.loops import MASS, STEPS, H, plan, pushed_and_stopped
+from helpers.models import MODELS
 
 import drake_diff as dd
 from drake_diff.loop.perturbation import PERTURBATIONS, Setup, parameters_of, perturbed
@@ -15,26 +15,10 @@ from drake_diff.loop.statistics import margin, success_rate
 from drake_diff.loop.trial import Task, run_trial
 from drake_diff.parameters import list_parameters
 
-STEPS = 40
 A, B = np.array([[1.0, H], [0.0, 1.0]]), np.array([[H * H], [H]]) / MASS  # v+ = v + h u / m, x+ = x + h v+
 K = np.array([[-300.0, -40.0]])  # u = K x
 PHI = A + B @ K
 SPREAD = 1 / np.sqrt(3)  # the standard deviation of a number that is uniform in [-1, 1]
-
-
-@pytest.fixture(scope="module")
-def cart(tmp_path_factory):
-    path = tmp_path_factory.mktemp("models") / "cart.urdf"
-    path.write_text(BLOCK)
-    return dd.load_model(path, time_step=H)
-
-
-def plan(model, us, x0, x_goal=None):
-    """The motion of `us`, as if it had been solved for."""
-    xs = dd.rollout(model, x0, us).xs
-    cost = dd.QuadraticCost(R=np.eye(model.nu)) if model.nu else dd.QuadraticCost(Q=np.eye(model.nx))
-    problem = dd.Problem(model, x0=x0, num_steps=len(us), x_goal=x_goal, running_cost=cost)
-    return dd.Solution(problem, "given", "none", dd.Status.CONVERGED, "", xs=xs, us=np.array(us))
 
 
 def regulated(model, steps=STEPS):
@@ -48,12 +32,6 @@ def regulated(model, steps=STEPS):
 
 def feedback(plan, model, xs, us):
     return lambda x, t: K @ x
-
-
-def pushed_and_stopped(model, factor=1.0):
-    """Half the time forward, half the time back: from rest at 0 to rest at 50 (N/2)^2 h^2 = 2 m, `factor` 1."""
-    us = factor * 100.0 * np.repeat([[1.0], [-1.0]], STEPS // 2, axis=0)
-    return plan(model, us, [0.0, 0.0], [100 / MASS * (STEPS // 2 * H) ** 2, 0.0])
 
 
 # ---- rates and margins

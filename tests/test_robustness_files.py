@@ -9,11 +9,9 @@ from hashlib import sha256
 
 import numpy as np
 import pytest
-from conftest import MODELS
-from test_closed_loop import BLOCK, H
-from test_report import browser as browser
-from test_report import browsing, errors, move_slider, open_page, view_of
-from test_robustness import plan, pushed_and_stopped
+from helpers.browser import browsing, errors, move_slider, open_page, view_of
+from helpers.loops import CART, H, plan, pushed_and_stopped
+from helpers.models import MODELS
 from typer.testing import CliRunner
 
 import drake_diff as dd
@@ -52,13 +50,6 @@ def result(run):
 def saved(result, run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("robustness") / "tried"
     return folder, dd.save_robustness(result, folder, run)
-
-
-@pytest.fixture(scope="module")
-def cart(tmp_path_factory):
-    path = tmp_path_factory.mktemp("models") / "cart.urdf"
-    path.write_text(BLOCK)
-    return dd.load_model(path, time_step=H)
 
 
 def test_the_record_has_every_number_and_its_own_hash(result, saved, run):
@@ -338,7 +329,7 @@ def test_plants_with_contact_finer_steps_and_no_inputs_are_kept(thrown, tmp_path
 
 
 def test_names_are_escaped(tmp_path):
-    text = BLOCK.replace('name="cart"', 'name="&lt;script&gt;alert(1)"').replace(
+    text = CART.replace('name="cart"', 'name="&lt;script&gt;alert(1)"').replace(
         'link="cart"', 'link="&lt;script&gt;alert(1)"'
     )
     path = tmp_path / "evil.urdf"

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from conftest import MODELS, Plant, contact_properties
+from helpers.models import MODELS, Plant, contact_properties
 
 import drake_diff as dd
 from drake_diff.continuous import EquationsOfMotion

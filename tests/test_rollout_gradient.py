@@ -5,7 +5,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from conftest import Plant, contact_properties
+from helpers.models import Plant, contact_properties
 
 import drake_diff as dd
 from drake_diff.rollout_gradient import derivatives_along

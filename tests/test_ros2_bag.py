@@ -1,7 +1,6 @@
 """The exported bag: read back by another library than the one that wrote it, number for number."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ import drake_diff as dd
 from drake_diff.ros2_bag import export_ros2
 
 pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
-MODELS = Path(__file__).parent.parent / "models"
 
 
 @pytest.fixture(scope="module")

@@ -9,14 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.models import MODELS, ROOT
 
 import drake_diff as dd
 from drake_diff.cli_runs import plain
 from drake_diff.evidence import begin, save_failure, seal
 from drake_diff.runs import compare_runs, list_runs
-
-ROOT = Path(__file__).parent.parent
-MODELS = ROOT / "models"
 
 
 def solve(**changes):

@@ -7,8 +7,9 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from test_ilqr import A30, lqr
-from test_solution import MODELS, block
+from helpers.models import MODELS
+from helpers.plants import block
+from helpers.problems import A30, lqr
 
 import drake_diff as dd
 from drake_diff.nonlinear_program import Limits

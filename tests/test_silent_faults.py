@@ -2,22 +2,13 @@
 
 import numpy as np
 import pytest
-from conftest import MODELS, Plant, contact_properties
-from pydrake.geometry import AddCompliantHydroelasticProperties, Box, Cylinder, Sphere
-from pydrake.math import RigidTransform
-from pydrake.multibody.tree import FixedOffsetFrame, PdControllerGains, RevoluteJoint, SpatialInertia, UnitInertia
+from helpers.models import MODELS
+from helpers.plants import offset_pendulum, pair, pd_pendulum
+from pydrake.geometry import Box, Cylinder, Sphere
+from pydrake.multibody.tree import PdControllerGains
 
 import drake_diff as dd
 from drake_diff.plant_elements import actuators
-
-
-def pd_pendulum():
-    plant = Plant(0.01)
-    body = plant.plant.AddRigidBody("pole", SpatialInertia(1.0, [0, 0, -0.5], UnitInertia(0.25, 0.25, 0.0)))
-    joint = RevoluteJoint("hinge", plant.plant.world_frame(), body.body_frame(), [0, 1, 0])
-    actuator = plant.plant.AddJointActuator("motor", plant.plant.AddJoint(joint))
-    actuator.set_controller_gains(PdControllerGains(p=20.0, d=3.0))
-    return plant.model()
 
 
 def test_pd_gains_reach_the_autodiff_twin():
@@ -39,18 +30,6 @@ def test_dropped_pd_gains_are_caught_by_the_parity_gate():
         dd.differentiate_step(model, [0.7, -1.2], [0.3])
 
 
-def offset_pendulum():
-    """Two hinges, the second's frame on its parent being a FixedOffsetFrame whose pose is the identity."""
-    plant = Plant(0.01)
-    inertia = SpatialInertia.SolidSphereWithMass(1.0, 0.1)
-    upper = plant.plant.AddRigidBody("upper", inertia)
-    lower = plant.plant.AddRigidBody("lower", SpatialInertia(1.0, [0, 0, -0.3], UnitInertia(0.09, 0.09, 0.0)))
-    plant.plant.AddJoint(RevoluteJoint("first", plant.plant.world_frame(), upper.body_frame(), [0, 1, 0]))
-    frame = plant.plant.AddFrame(FixedOffsetFrame("offset", upper.body_frame(), RigidTransform()))
-    plant.plant.AddJoint(RevoluteJoint("second", frame, lower.body_frame(), [0, 1, 0]))
-    return plant.model()
-
-
 def certify_offset():
     return dd.certify(offset_pendulum(), [0.3, 0.4, 0.5, 0.6], parameters=("second.offset",))
 
@@ -67,22 +46,6 @@ def test_the_derivative_that_drake_drops_at_an_identity_offset_is_caught(monkeyp
     assert certificate.worst.derivative == 0.0
     with pytest.raises(dd.CertificateError, match=r"second\.offset"):
         certificate.require()
-
-
-def pair(upper, lower, *, hydroelastic, height):
-    """A free body of shape `upper` at `height` over a fixed one whose top is z = 0."""
-    plant = Plant(0.01, "sap", "hydroelastic_with_fallback" if hydroelastic else "point")
-    body = plant.plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
-    properties = [contact_properties(1e4, friction=0.5) for _ in range(2)]
-    if hydroelastic:
-        for p in properties:
-            AddCompliantHydroelasticProperties(0.02, 1e7, p)
-    plant.shape(body, upper, properties[0])
-    plant.shape(plant.plant.world_body(), lower, properties[1], RigidTransform([0, 0, -0.1]))
-    model = plant.model()
-    x = model.default_state
-    x[6], x[12] = height, -0.1
-    return model, x
 
 
 def refuses(model, x):

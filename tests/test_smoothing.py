@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from conftest import Plant, contact_properties
+from helpers.models import Plant, contact_properties
 
 import drake_diff as dd
 from drake_diff.smoothing import Barrier, Gaussian, smooth, smooth_step

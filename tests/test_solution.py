@@ -3,39 +3,17 @@
 import dataclasses
 import functools
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import PrismaticJoint, SpatialInertia
-from pydrake.systems.framework import DiagramBuilder
+from helpers.models import MODELS
+from helpers.plants import block
 
 import drake_diff as dd
 
-MODELS = Path(__file__).parent.parent / "models"
 METHODS = ("collocation", "shooting", "ilqr")
 N, H = 10, 0.1
 MOVED = 1e-3
-
-
-def block(*, mass=1.0, time_step=H, effort=math.inf, blocks=1, actuated=1, couple=False):
-    """Blocks side by side on rails, x_k along its rail; the first `actuated` of them are pushed."""
-    builder = DiagramBuilder()
-    config = MultibodyPlantConfig(
-        time_step=time_step, use_sampled_output_ports=False, discrete_contact_approximation="sap"
-    )
-    plant, _ = AddMultibodyPlant(config, builder)
-    rails = []
-    for i in range(blocks):
-        body = plant.AddRigidBody(f"block_{i}", SpatialInertia.SolidBoxWithMass(mass, 0.1, 0.1, 0.1))
-        rails.append(plant.AddJoint(PrismaticJoint(f"rail_{i}", plant.world_frame(), body.body_frame(), [1, 0, 0])))
-    for i in range(actuated):
-        plant.AddJointActuator(f"push_{i}", rails[i], effort)
-    if couple:
-        plant.AddCouplerConstraint(rails[0], rails[1], 2.0)
-    plant.Finalize()
-    return dd.model_from_diagram(builder.Build())
 
 
 @functools.cache

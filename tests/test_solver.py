@@ -5,11 +5,11 @@ import math
 import signal
 import sys
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
-from test_silent_faults import pd_pendulum
+from helpers.models import MODELS, Plant, contact_properties
+from helpers.plants import pd_pendulum
 
 import drake_diff as dd
 from drake_diff.nonlinear_program import NlpResult, Outcome
@@ -17,7 +17,6 @@ from drake_diff.rollout_gradient import derivatives_along
 from drake_diff.run import Run
 from drake_diff.solution import Status
 
-MODELS = Path(__file__).parent.parent / "models"
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
@@ -342,7 +341,6 @@ def test_pd_control_is_left_to_the_discrete_methods():
 
 def test_collocation_through_the_ground_is_not_verified(tmp_path):
     """A ball on a vertical rail, pulled from above the ground to below it: collocation knows no ground."""
-    from conftest import Plant, contact_properties
 
     plant = Plant(0.05)
     plant.ball("ball", 1.0, 0.1, contact_properties(1e4), "z")

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from conftest import Plant, contact_properties, random_state
+from helpers.models import Plant, contact_properties, random_state
 
 import drake_diff as dd
 

@@ -7,14 +7,11 @@ import casadi as ca
 import numpy as np
 import pydrake.math
 import pytest
-from conftest import random_state
+from helpers.models import MODELS, random_state, robot_file
+from helpers.plants import floating, random_tree
+from helpers.transcription import BLOCK, move, own_derivatives, solved
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.multibody.tree import QuaternionFloatingJoint
-from test_implicit import floating
-from test_model import robot
-from test_solution import MODELS
-from test_transcription import BLOCK, move, own_derivatives, solved
-from test_tree_dynamics import random_tree
 
 import drake_diff as dd
 from drake_diff import symbolic_tree
@@ -97,7 +94,7 @@ def model_named(name):
     if name.startswith("tree"):
         return random_tree(int(name[-1]))
     if name.endswith("robot.urdf"):
-        return dd.load_model(robot(name), time_step=0.01)
+        return dd.load_model(robot_file(name), time_step=0.01)
     return dd.load_model(MODELS / name, time_step=0.01)
 
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from conftest import random_state
+from helpers.models import random_state
 
 import drake_diff as dd
 from drake_diff.tangent import tangent_space

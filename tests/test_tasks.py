@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from test_quantities import box_on_the_ground, differentiate, ur5
-from test_solution import MODELS
+from helpers.derivatives import differentiate
+from helpers.models import MODELS, ur5
+from helpers.plants import box_on_the_ground
 
 import drake_diff as dd
 

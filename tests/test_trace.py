@@ -6,10 +6,10 @@ import json
 import random
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.models import MODELS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -19,8 +19,6 @@ import drake_diff as dd
 from drake_diff.nonlinear_program import Iteration
 from drake_diff.solution import Solution
 from drake_diff.trace import write_trace
-
-MODELS = Path(__file__).parent.parent / "models"
 
 
 def pendulum(folder=MODELS, name="pendulum.urdf", **options):

@@ -7,16 +7,15 @@ import dataclasses
 import itertools
 import math
 import time
-import types
 
 import casadi as ca
 import numpy as np
 import pytest
-from conftest import random_state
+from helpers.models import MODELS, random_state
+from helpers.plants import block, floating
+from helpers.transcription import BLOCK, effort, heavy_pendulum, move, own_derivatives, push, unit_inputs
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.multibody.tree import QuaternionFloatingJoint
-from test_implicit import floating
-from test_solution import MODELS, block
 
 import drake_diff as dd
 from drake_diff.continuous import EquationsOfMotion
@@ -31,32 +30,8 @@ SCHEMES = ("trapezoid", "hermite_simpson")
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
-def effort(x, u):
-    return u[0] ** 2
-
-
 def half_effort(x, u):
     return 0.5 * u[0] ** 2
-
-
-def push(x, u):
-    return np.array([x[1], u[0]])
-
-
-BLOCK = Dynamics(push, 2, 1)
-
-
-def solved(dynamics, **options):
-    motion = transcribe_and_solve(dynamics, **options)
-    assert motion.outcome in (Outcome.SOLVED, Outcome.INACCURATE), motion.message
-    assert motion.defect < 1e-8
-    return motion
-
-
-def move(count=10, dynamics=BLOCK, **changes):
-    return solved(
-        dynamics, count=count, **{"x0": [0, 0], "x_goal": [1, 0], "horizon": 1.0, "running_cost": effort} | changes
-    )
 
 
 # ------------------------------------------------------------------------------ exact discrete optima
@@ -128,10 +103,6 @@ def test_b04_the_simple_pendulum_with_a_free_final_time(scheme, count, optimum):
         assert np.abs(motion.us).max() == pytest.approx(2.968, abs=5e-3)
 
 
-def heavy_pendulum(damping, **bounds):
-    return Dynamics(lambda x, u: np.array([x[1], -9.81 * np.sin(x[0]) - damping * x[1] + u[0]]), 2, 1, **bounds)
-
-
 @pytest.mark.parametrize(
     ("scheme", "errors", "orders"),
     [
@@ -173,10 +144,6 @@ def test_b06_the_double_integrator_in_minimum_time(scheme, count):
     half = count // 2
     assert motion.us[:half, 0] == pytest.approx(1, abs=1e-5)
     assert motion.us[half + 1 :, 0] == pytest.approx(-1, abs=1e-5)
-
-
-def unit_inputs(most=1.0):
-    return dd.Bounds(u_lower=[-most], u_upper=[most])
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -514,11 +481,6 @@ def test_the_programs_derivatives_are_differences(scheme, horizon, form):
 
         hessian = made["hess_lag"](z, [], sigma, weights).full()
         assert hessian == pytest.approx(np.triu(differences(slope)), abs=1e-6)
-
-
-def own_derivatives(dynamics):
-    """The same dynamics as an object, of which there is no expression."""
-    return types.SimpleNamespace(values=dynamics.values, linearize=dynamics.linearize)
 
 
 def test_every_knot_is_evaluated_and_linearized_once_an_iterate():

@@ -7,7 +7,7 @@ import signal
 
 import numpy as np
 import pytest
-from test_transcription import BLOCK, effort, heavy_pendulum, move, own_derivatives, unit_inputs
+from helpers.transcription import BLOCK, effort, heavy_pendulum, move, own_derivatives, unit_inputs
 
 import drake_diff as dd
 from drake_diff.dynamics import Dynamics

@@ -2,23 +2,16 @@
 
 import numpy as np
 import pytest
-from conftest import Plant
+from helpers.models import Plant, robot_file
+from helpers.plants import pd_pendulum, random_tree
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
-from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import (
-    FixedOffsetFrame,
     LinearSpringDamper,
     MultibodyForces_,
     PrismaticJoint,
-    PrismaticSpring,
     RevoluteJoint,
-    RevoluteSpring,
     SpatialInertia,
-    UnitInertia,
-    WeldJoint,
 )
-from test_model import robot
-from test_silent_faults import pd_pendulum
 
 import drake_diff as dd
 from drake_diff.implicit import form_of, implicit_jacobians, take_steps
@@ -43,42 +36,6 @@ def by_drake(model, x, a):
     tau = twin.plant.CalcInverseDynamics(twin.context, np.array([AutoDiffXd(z) for z in a]), forces).reshape(-1, 1)
     model.plant.SetPositionsAndVelocities(model.double.context, x)
     return ExtractValue(tau).ravel(), ExtractGradient(tau), model.plant.CalcMassMatrix(model.double.context)
-
-
-def random_tree(seed, joints=6):
-    """A branching tree of hinges and slides with offset frames, welds, springs, damping and geared rotors."""
-    random, made = np.random.default_rng(seed), Plant(0.01)
-    plant = made.plant
-
-    def body(name):
-        com = random.uniform(-0.3, 0.3, 3)
-        unit = UnitInertia.SolidEllipsoid(*random.uniform(0.1, 0.4, 3)).ShiftFromCenterOfMass(com)
-        return plant.AddRigidBody(name, SpatialInertia(random.uniform(0.5, 3.0), com, unit))
-
-    def frame(parent, name):
-        pose = RigidTransform(RollPitchYaw(random.uniform(-2, 2, 3)), random.uniform(-0.5, 0.5, 3))
-        return plant.AddFrame(FixedOffsetFrame(name, parent.body_frame(), pose))
-
-    bodies = [plant.world_body()]
-    for i in range(joints):
-        parent, child = bodies[random.integers(len(bodies))], body(f"b{i}")
-        axis, damping = random.standard_normal(3), random.uniform(0, 1)
-        kind = RevoluteJoint if random.random() < 0.6 else PrismaticJoint
-        on_parent, on_child = frame(parent, f"p{i}"), frame(child, f"c{i}")
-        joint = plant.AddJoint(kind(f"j{i}", on_parent, on_child, axis / np.linalg.norm(axis), damping=damping))
-        spring = RevoluteSpring if kind is RevoluteJoint else PrismaticSpring
-        if random.random() < 0.5:
-            plant.AddForceElement(spring(joint, random.uniform(-1, 1), random.uniform(1, 20)))
-        if random.random() < 0.5:
-            actuator = plant.AddJointActuator(f"m{i}", joint)
-            actuator.set_default_rotor_inertia(random.uniform(0.01, 0.1))
-            actuator.set_default_gear_ratio(random.uniform(1, 5))
-        bodies.append(child)
-        if random.random() < 0.4:
-            welded = body(f"w{i}")
-            plant.AddJoint(WeldJoint(f"weld{i}", frame(child, f"q{i}"), frame(welded, f"r{i}"), RigidTransform()))
-            bodies.append(welded)
-    return made.model()
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -210,7 +167,7 @@ def test_a_whole_rollout_in_one_call_is_the_one_by_autodiff(load, name):
 def test_in_a_rollout_through_a_joint_limit_the_steps_at_it_are_autodiffs():
     """The UR5 falls from rest until a joint stops it."""
     with pytest.warns(dd.ModelWarning):
-        model = dd.load_model(robot("ur5_robot.urdf"), time_step=0.01)
+        model = dd.load_model(robot_file("ur5_robot.urdf"), time_step=0.01)
     x0 = model.default_state
     upper = model.plant.GetPositionUpperLimits()
     x0[2], x0[model.nq + 2] = upper[2] - 0.02, 3.0  # runs into its limit

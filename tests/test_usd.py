@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from test_contract_match import arms
-from test_engines import engine_of
+from helpers.contracts import arms
+from helpers.engines import engine_of
 
 import drake_diff as dd
 from drake_diff.engines.description import describe

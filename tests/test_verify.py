@@ -13,14 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.models import MODELS, ROOT
 
 import drake_diff as dd
 import drake_diff.evidence as evidence
 from drake_diff.evidence import begin, seal
 from drake_diff.record import EvidenceRecord
 
-ROOT = Path(__file__).parent.parent
-MODELS = ROOT / "models"
 FILES = ("plan.npz", "record.json", "record.schema.json", "replay.html", "trace.mcap")
 EVIL = """<robot name="&lt;script&gt;alert(1)&lt;/script&gt;"><link name="[red]a[/]"><inertial><mass value="1"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from conftest import Plant, contact_properties
+from helpers.models import Plant, contact_properties
+from helpers.plants import offset_pendulum, pair, pd_pendulum
 from pydrake.geometry import AddCompliantHydroelasticProperties, Box, Capsule, Cylinder, HalfSpace, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import LeafSystem
-from test_silent_faults import offset_pendulum, pair, pd_pendulum
 
 import drake_diff as dd
 

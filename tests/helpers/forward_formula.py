@@ -1,16 +1,16 @@
 """The step of engines that only go forward, in double precision, by Drake's mass matrix and bias."""
 
 import numpy as np
-from conftest import Plant
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.multibody.tree import SpatialInertia
 
 import drake_diff as dd
+from helpers.models import Plant
 
 
-def free_box(center=(0.0, 0.0, 0.0), time_step=0.01):
+def free_box(center=(0.0, 0.0, 0.0), time_step=0.01, *, mass=2.0):
     plant = Plant(time_step)
-    about_origin = SpatialInertia.SolidBoxWithMass(2.0, 0.1, 0.2, 0.3).Shift(-np.array(center))
+    about_origin = SpatialInertia.SolidBoxWithMass(mass, 0.1, 0.2, 0.3).Shift(-np.array(center))
     plant.plant.AddRigidBody("box", about_origin)
     return plant.model()
 

@@ -1,0 +1,56 @@
+"""What a page shows in a real browser: whether there is one, and how tests use it."""
+
+import base64
+import shutil
+from io import BytesIO
+
+import pytest
+
+CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+browsing = pytest.mark.skipif(
+    not (CHROMIUM and DRIVER), reason="no browser installed (apt-get install chromium chromium-driver)"
+)
+FLAGS = (
+    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
+    "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader"
+)
+
+
+def open_page(browser, page, *, size=(1440, 900), scheme="light"):
+    """Load `page` from the disk and wait until its animation is there; nothing may have gone wrong."""
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    screen = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": size[0] < 600}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+    browser.get_log("browser")
+    browser.get(page.as_uri())
+    ready = (
+        "document.documentElement.dataset.ready === 'yes'" if page.name == "report.html" else "viewer.animator.duration"
+    )
+    WebDriverWait(browser, 30).until(lambda b: b.execute_script(f"return Boolean({ready})"))
+
+
+def errors(browser):
+    """What the console complains of; SwiftShader's remarks on its own speed are none of ours."""
+    return [entry["message"] for entry in browser.get_log("browser") if "GPU stall" not in entry["message"]]
+
+
+def move_slider(browser, part):
+    browser.execute_script(
+        "const s = document.getElementById('time');s.value = arguments[0] * s.max; s.dispatchEvent(new Event('input'))",
+        part,
+    )
+    browser.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
+
+
+def view_of(browser):
+    """The 3D view's pixels, as it was last drawn."""
+    import matplotlib.image
+
+    url = browser.execute_script(
+        "const v = (document.getElementById('view') || {contentWindow: window}).contentWindow.viewer;"
+        "v.render(); return v.renderer.domElement.toDataURL('image/png')"
+    )
+    return matplotlib.image.imread(BytesIO(base64.b64decode(url.split(",")[1])))[..., :3]

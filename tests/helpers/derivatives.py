@@ -1,0 +1,11 @@
+"""Derivatives of functions by AutoDiffXd."""
+
+import numpy as np
+from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
+
+
+def differentiate(function, x, u=None):
+    """(values, Jacobian by x, or by x and u)."""
+    z = InitializeAutoDiff(x if u is None else np.concatenate([x, u])).ravel()
+    result = function(z) if u is None else function(z[: len(x)], z[len(x) :])
+    return ExtractValue(result).ravel(), ExtractGradient(result)

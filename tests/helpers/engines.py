@@ -1,0 +1,100 @@
+"""Engines beside Drake: which are installed, the models they all have, and steps that must agree."""
+
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+from drake_diff.tangent import tangent_space
+from helpers.models import random_state
+
+HAND = ["pendulum.urdf", "double_pendulum.urdf", "cart_pole.urdf", "mass_spring_damper.sdf", "projectile.sdf"]
+HERE = [*HAND, "acrobot.xml"]
+ROBOTS = ["panda.urdf", "ur5_robot.urdf", "solo12.urdf", "double_pendulum_continuous.urdf"]
+G = 9.81
+
+
+def needs(engine):
+    """Skip, saying what is missing, where the engine is not installed."""
+    modules = {
+        "mujoco": ["mujoco"],
+        "pinocchio": ["pinocchio"],
+        "casadi": ["adam", "liecasadi"],
+        "mjx": ["mujoco", "mujoco.mjx", "jax"],
+    }.get(engine, [])
+    if any(find_spec(module) is None for module in modules):
+        pytest.skip(f"{engine} is not installed: pip install 'drake-diff[{'mjx' if engine == 'mjx' else 'engines'}]'")
+
+
+def engine_of(name, model, **options):
+    needs(name)
+    return dd.load_engine(name, model, **options)
+
+
+class Doctored:
+    """An engine with something of it changed."""
+
+    def __init__(self, engine, **changes):
+        self._engine = engine
+        for name, value in changes.items():
+            setattr(self, name, value)
+
+    def __getattr__(self, name):
+        return getattr(self._engine, name)
+
+
+def free_state(model, random):
+    """A random state inside the limits, free bodies high up."""
+    x = random_state(model, random)
+    lower, upper = model.plant.GetPositionLowerLimits(), model.plant.GetPositionUpperLimits()
+    for i in np.flatnonzero(np.isfinite(lower) & np.isfinite(upper)):
+        x[i] = random.uniform(0.75 * lower[i] + 0.25 * upper[i], 0.25 * lower[i] + 0.75 * upper[i])
+    if model.nq > model.nv:
+        x[6] += 5.0
+    return x
+
+
+def on_tangent(model, A, x, x_next):
+    space = tangent_space(model)
+    return space.derivative_of_minus(x_next) @ A @ space.derivative_of_plus(x)
+
+
+def assert_free_steps_agree(model, name, step, jacobian, *, states=5):
+    """One step and its Jacobian (on the tangent space) to these tolerances, relative to the largest entry."""
+    drake, other, random = dd.load_engine("drake", model), engine_of(name, model), np.random.default_rng(2)
+    for _ in range(states):
+        x, u = free_state(model, random), random.standard_normal(model.nu)
+        a, b = drake.step(x, u), other.step(x, u)
+        np.testing.assert_allclose(b, a, rtol=0, atol=step * max(1, abs(a).max()))
+        one, two = drake.differentiate_step(x, u), other.differentiate_step(x, u)
+        A, A2 = on_tangent(model, one.A, x, a), on_tangent(model, two.A, x, b)
+        np.testing.assert_allclose(A2, A, rtol=0, atol=jacobian * max(1, abs(A).max()))
+        np.testing.assert_allclose(two.B, one.B, rtol=0, atol=jacobian * max(1, abs(one.B).max(initial=0)))
+        np.testing.assert_allclose(other.energy(x), drake.energy(x), rtol=1e-12, atol=1e-12)
+
+
+def assert_free_bodies_differ_by_the_exponential(model, name, *, states=3):
+    """From Drake's step, in an engine that has MuJoCo's."""
+    drake, mujoco, random = dd.load_engine("drake", model), engine_of(name, model), np.random.default_rng(3)
+    from drake_diff.engines.mujoco_engine import exponential_gap
+
+    space = tangent_space(model)
+
+    def with_gap(x, u):
+        a = np.array(drake.step(x, u))
+        a[:4] = a[:4] / np.linalg.norm(a[:4]) + exponential_gap(x, a, model.time_step, 0, model.nq)
+        return a
+
+    for _ in range(states):
+        x, u = free_state(model, random), random.standard_normal(model.nu)
+        a, b = with_gap(x, u), mujoco.step(x, u)
+        assert np.abs(b[:4] - drake.step(x, u)[:4]).max() > 1e-8  # there is something to explain
+        np.testing.assert_allclose(b, a, rtol=0, atol=1e-12 * abs(a).max())
+        one, two = drake.differentiate_step(x, u), mujoco.differentiate_step(x, u)
+        A, A2 = on_tangent(model, one.A, x, drake.step(x, u)), on_tangent(model, two.A, x, b)
+        # The turn's own rows, by differences of Drake's step and the gap: good to 1e-9.
+        for i in range(len(A)):
+            e = 1e-6 * np.eye(len(A))[i]
+            ends = [space.minus(with_gap(space.plus(x, d), u), b)[:3] for d in (e, -e)]
+            np.testing.assert_allclose(A2[:3, i], (ends[0] - ends[1]) / 2e-6, rtol=0, atol=1e-8)

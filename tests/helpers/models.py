@@ -1,0 +1,111 @@
+"""What many tests load or build: the models of this repository, robots, and plants under construction."""
+
+import warnings
+from importlib.metadata import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.geometry import AddContactMaterial, HalfSpace, ProximityProperties, Sphere
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlantConfig
+from pydrake.multibody.tree import PrismaticJoint, SpatialInertia
+from pydrake.systems.framework import DiagramBuilder
+
+import drake_diff as dd
+
+ROOT = Path(__file__).parents[2]
+MODELS = ROOT / "models"
+
+
+def robot_file(name):
+    """Where example-robot-data has it."""
+    return next(f.locate() for f in files("example-robot-data") if str(f).endswith("/" + name))
+
+
+def contact_properties(stiffness, dissipation=0.0, friction=0.0, relaxation_time=None):
+    properties = ProximityProperties()
+    AddContactMaterial(
+        dissipation=float(dissipation),
+        point_stiffness=float(stiffness),
+        friction=CoulombFriction(float(friction), float(friction)),
+        properties=properties,
+    )
+    if relaxation_time is not None:
+        properties.AddProperty("material", "relaxation_time", float(relaxation_time))
+    return properties
+
+
+def add_slide(plant, name, parent, body, axis):
+    """A prismatic joint along a world axis."""
+    direction = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1]}[axis]
+    return plant.AddJoint(PrismaticJoint(name, parent, body.body_frame(), direction))
+
+
+class Plant:
+    """A plant under construction, for what no file format says."""
+
+    def __init__(self, time_step, approximation="sap", contact_model="point", *, sampled=False, gravity=9.81):
+        self.builder = DiagramBuilder()
+        config = MultibodyPlantConfig(
+            time_step=time_step,
+            contact_model=contact_model,
+            discrete_contact_approximation=approximation,
+            use_sampled_output_ports=sampled,
+        )
+        self.plant, self.scene_graph = AddMultibodyPlant(config, self.builder)
+        self.plant.mutable_gravity_field().set_gravity_vector([0, 0, -gravity])
+
+    def ball(self, name, mass, radius, properties, *axes):
+        """A ball on prismatic joints along `axes` (x, y, z), one after the other; free where there are none."""
+        parent = self.plant.world_frame()
+        for axis in axes[:-1]:
+            link = self.plant.AddRigidBody(f"{name}_{axis}", SpatialInertia.Zero())
+            add_slide(self.plant, f"{name}_{axis}", parent, link, axis)
+            parent = link.body_frame()
+        body = self.plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(mass, radius))
+        if axes:
+            add_slide(self.plant, f"{name}_{axes[-1]}", parent, body, axes[-1])
+        self.plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(radius), name, properties)
+        return body
+
+    def ground(self, properties):
+        self.plant.RegisterCollisionGeometry(
+            self.plant.world_body(), RigidTransform(), HalfSpace(), "ground", properties
+        )
+
+    def shape(self, body, shape, properties, pose=None):
+        self.plant.RegisterCollisionGeometry(body, pose or RigidTransform(), shape, f"{body.name()}_shape", properties)
+
+    def model(self):
+        self.plant.Finalize()
+        return dd.model_from_diagram(self.builder.Build())
+
+
+def random_state(model, random, size=1.0):
+    """A state with unit quaternions."""
+    x = size * random.standard_normal(model.nx)
+    if model.state_names[0].endswith("_qw"):
+        x[:4] = random.standard_normal(4)
+        x[:4] /= np.linalg.norm(x[:4])
+    return x
+
+
+WELDED = {"double_pendulum_continuous.urdf": "base_link"}
+MIMIC = '<mimic joint="panda_finger_joint1"/>'
+
+
+def robot(name, tmp_path):
+    """A robot of example-robot-data, but for what no other engine has: that one finger mimics the other, which is a
+    coupler in Drake, and that continuous joints have limits 0 and 0, which Drake keeps."""
+    lines = robot_file(name).read_text().splitlines()
+    copy = tmp_path / name
+    copy.write_text("\n".join(line for line in lines if line.strip() not in ('lower="0"', 'upper="0"', MIMIC)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dd.ModelWarning)  # meshes of visuals are skipped
+        return dd.load_model(copy, time_step=0.001, weld_base=WELDED.get(name))
+
+
+def ur5():
+    with pytest.warns(dd.ModelWarning):  # meshes skipped
+        return dd.load_model(robot_file("ur5_robot.urdf"), time_step=0.02)
