@@ -1,8 +1,5 @@
 """Trajectory optimization on Drake with gradients that are checked before they are used."""
 
-import sys as _sys
+import lazy_loader as _lazy
 
-from drake_diff import lazy as _lazy
-
-__all__ = tuple(_lazy.PLACES)
-_sys.modules[__name__].__class__ = _lazy.Package
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

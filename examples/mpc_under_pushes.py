@@ -20,27 +20,27 @@ MOTOR = """<transmission><type>transmission_interface/SimpleTransmission</type><
 POSE = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])  # [rad] the arm's usual one, elbow up
 
 
-def cart_pole() -> tuple[dd.MPC, dd.Problem, dd.Loop, int]:
+def cart_pole() -> tuple[dd.loop.MPC, dd.Problem, dd.loop.Loop, int]:
     """(controller, problem, loop, steps): pushed on its way up and when it stands."""
     model = dd.load_model(CART_POLE, time_step=0.02)
     problem = dd.Problem(
         model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=100, running_cost=dd.QuadraticCost(R=[[1.0]])
     )
-    pushes = [dd.Push("pole", [1.5, 0, 0], 0.8), dd.Push("pole", [-0.5, 0, 0], 2.6)]
-    loop = dd.Loop(pushes=pushes, latency_budget=model.time_step)
-    return dd.MPC(problem, horizon=30, max_iterations=2), problem, loop, 300
+    pushes = [dd.loop.Push("pole", [1.5, 0, 0], 0.8), dd.loop.Push("pole", [-0.5, 0, 0], 2.6)]
+    loop = dd.loop.Loop(pushes=pushes, latency_budget=model.time_step)
+    return dd.loop.MPC(problem, horizon=30, max_iterations=2), problem, loop, 300
 
 
-def panda(path: Path) -> tuple[dd.MPC, dd.Problem, dd.Loop, int]:
+def panda(path: Path) -> tuple[dd.loop.MPC, dd.Problem, dd.loop.Loop, int]:
     """The same of an arm of seven joints that turns 0.3 rad about its base, pushed at its hand on the way."""
     model = dd.load_model(path, time_step=0.02, weld_base="panda_link0")
     goal = np.concatenate([POSE, np.zeros(7)])
     x0 = goal - 0.3 * np.eye(14)[0]
     cost = dd.QuadraticCost(Q=np.diag([1.0] * 7 + [0.1] * 7), R=1e-6 * np.eye(7), x_ref=goal)
     problem = dd.Problem(model, x0=x0, x_goal=goal, num_steps=50, running_cost=cost)
-    loop = dd.Loop(pushes=[dd.Push("panda_hand", [2.0, 2.0, 0.0], 0.4)], latency_budget=model.time_step)
+    loop = dd.loop.Loop(pushes=[dd.loop.Push("panda_hand", [2.0, 2.0, 0.0], 0.4)], latency_budget=model.time_step)
     guess = np.linspace(x0, goal, 51), np.tile(holding(model, goal), (50, 1))
-    return dd.MPC(problem, horizon=10, plan=guess, max_iterations=1), problem, loop, 100
+    return dd.loop.MPC(problem, horizon=10, plan=guess, max_iterations=1), problem, loop, 100
 
 
 def holding(model: dd.Model, x: np.ndarray) -> np.ndarray:
@@ -61,7 +61,7 @@ def panda_file(folder: Path) -> Path:
     return folder / path.name
 
 
-def told(name: str, run: dd.ClosedLoop, problem: dd.Problem) -> str:
+def told(name: str, run: dd.loop.ClosedLoop, problem: dd.Problem) -> str:
     """Where it ended and what the controller took, against its period."""
     period, error = problem.model.time_step, np.abs(problem.goal_error(run.motion.xs[-1])).max()
     median, most, worst = np.percentile(run.latencies, [50, 95, 100])
@@ -77,9 +77,9 @@ def told(name: str, run: dd.ClosedLoop, problem: dd.Problem) -> str:
     )
 
 
-def run(case: tuple[dd.MPC, dd.Problem, dd.Loop, int]) -> dd.ClosedLoop:
+def run(case: tuple[dd.loop.MPC, dd.Problem, dd.loop.Loop, int]) -> dd.loop.ClosedLoop:
     controller, problem, loop, steps = case
-    return dd.closed_loop(problem.model, controller, problem.x0, steps, loop)
+    return dd.loop.closed_loop(problem.model, controller, problem.x0, steps, loop)
 
 
 def main() -> None:

@@ -47,7 +47,7 @@ def loss_and_gradient(
     model: dd.Model, parameters: np.ndarray, starts: np.ndarray, num_steps: int
 ) -> tuple[float, np.ndarray]:
     """The mean over rollouts from `starts` (m, 4) of the loss, and its gradient by the parameters (97,)."""
-    policy = dd.ParametricPolicy(network, parameters)
+    policy = dd.motion.ParametricPolicy(network, parameters)
     found = [dd.differentiate_rollout(model, x0, None, loss, policy=policy, num_steps=num_steps) for x0 in starts]
     return float(np.mean([g.loss for g in found])), np.mean([g.policy for g in found], axis=0)
 
@@ -69,7 +69,7 @@ def train(model: dd.Model, parameters: np.ndarray, starts: np.ndarray) -> np.nda
 
 def survivors(model: dd.Model, parameters: np.ndarray, starts: np.ndarray, seconds: float = 5.0) -> int:
     """From how many of `starts` (m, 4) the pole stays up and the cart on its rail for that long."""
-    policy, steps = dd.ParametricPolicy(network, parameters), round(seconds / TIME_STEP)
+    policy, steps = dd.motion.ParametricPolicy(network, parameters), round(seconds / TIME_STEP)
     motions = [dd.rollout(model, x0, policy=policy, num_steps=steps).xs for x0 in starts]
     return sum(bool(np.all(np.abs(xs - UPRIGHT)[:, :2] < LIMITS)) for xs in motions)
 

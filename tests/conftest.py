@@ -67,7 +67,7 @@ def cart(tmp_path_factory):
 def without_pinocchio(monkeypatch):
     """As where it is not installed, for models loaded from here on."""
     monkeypatch.setitem(sys.modules, "pinocchio", None)
-    monkeypatch.delitem(sys.modules, "drake_diff.engines.pinocchio_model", raising=False)
+    monkeypatch.delitem(sys.modules, "drake_diff.mechanics.pinocchio_tree", raising=False)
 
 
 @pytest.fixture(scope="session")
@@ -97,7 +97,7 @@ BLOCK = """<robot name="block">
 @pytest.fixture(scope="module")
 def pushed(tmp_path_factory):
     """A cart-pole pushed for 10 steps, its pole not driven: the model, its motion, and a folder with its trace."""
-    from drake_diff.trace import write_trace
+    from drake_diff.artifact.trace import write_trace
 
     model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
     problem = dd.Problem(model, x0=[0, 0.3, 0, 0], num_steps=10, final_cost=lambda x: x[0] ** 2)

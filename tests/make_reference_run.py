@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import drake_diff as dd
-from drake_diff.evidence import seal
+from drake_diff.artifact.save import seal
 
 DIRECTORY = Path("artifacts/pendulum_swing_up")
 

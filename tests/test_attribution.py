@@ -5,11 +5,11 @@ import pytest
 from helpers.contracts import arms
 from helpers.engines import engine_of
 
-import drake_diff as dd
-from drake_diff.engines.attribution import SCHEMES, Terms, attribute, euler
-from drake_diff.engines.description import describe
-from drake_diff.engines.euler import Coordinates, exponential_turn, rotation
-from drake_diff.engines.mjcf import mjcf
+from drake_diff.comparison.attribution import SCHEMES, Terms, attribute, euler
+from drake_diff.engines.mujoco.mjcf import mjcf
+from drake_diff.exceptions import NotOfferedError
+from drake_diff.mechanics.coordinates import Coordinates, exponential_turn, rotation
+from drake_diff.mechanics.description import describe
 
 H, M, D, K = 0.01, 2.0, 3.0, 50.0
 
@@ -148,7 +148,7 @@ class Doctored:
 
     def mass_matrix(self, q):
         if not self.offers:
-            raise dd.NotOfferedError("none")
+            raise NotOfferedError("none")
         return self.engine.mass_matrix(q)
 
 

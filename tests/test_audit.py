@@ -25,8 +25,9 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
 import drake_diff as dd
-from drake_diff.audit import SEVERITIES, Finding, audit
-from drake_diff.plant_elements import actuators, joints
+from drake_diff.certificates.audit import SEVERITIES, Finding, audit
+from drake_diff.exceptions import ModelWarning, NonFiniteError, ShapeError, SimulationError
+from drake_diff.model.plant import actuators, joints
 
 
 def codes(findings, *severities):
@@ -85,7 +86,7 @@ def test_the_models_of_this_repository_are_clean(load, name):
     assert codes(findings, "error", "warning") == set()
 
 
-@pytest.mark.filterwarnings("ignore::drake_diff.ModelWarning")
+@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 def test_findings_are_sorted_worst_first_and_readable():
     model = dd.load_model(robot_file("panda.urdf"), time_step=0.005, weld_base="panda_link0", ground=0.5)
     findings = audit(model)
@@ -100,11 +101,11 @@ def test_findings_are_sorted_worst_first_and_readable():
 
 def test_a_bad_point_is_refused(load):
     model = load("pendulum.urdf")
-    with pytest.raises(dd.ShapeError, match=r"x: expected shape \(2,\)"):
+    with pytest.raises(ShapeError, match=r"x: expected shape \(2,\)"):
         audit(model, [0.0])
-    with pytest.raises(dd.ShapeError, match=r"u: expected shape \(1,\)"):
+    with pytest.raises(ShapeError, match=r"u: expected shape \(1,\)"):
         audit(model, [0.0, 0.0], [1.0, 2.0])
-    with pytest.raises(dd.NonFiniteError, match=r"x\[1\]"):
+    with pytest.raises(NonFiniteError, match=r"x\[1\]"):
         audit(model, [0.0, np.nan])
 
 
@@ -140,7 +141,7 @@ def test_a_box_above_a_tilted_half_space_is_refused_without_touching():
     assert "The AutoDiffXd step throws at x over such shapes: Penetration queries" in found.message
     for route in ("corner_spheres", "hydroelastic", "differences", "CollisionFilterDeclaration"):
         assert route in found.remedy
-    with pytest.raises(dd.SimulationError, match="Penetration queries"):
+    with pytest.raises(SimulationError, match="Penetration queries"):
         dd.differentiate_step(model, x, method="autodiff")
 
 
@@ -197,7 +198,7 @@ def test_hydroelastic_contact_alone_without_properties_is_refused():
     step = only(audit(model, x), "no_step")
     assert step.severity == "error"
     assert "two rigid objects" in step.message
-    with pytest.raises(dd.SimulationError, match="two rigid objects"):
+    with pytest.raises(SimulationError, match="two rigid objects"):
         dd.step(model, x)
 
 
@@ -206,7 +207,7 @@ def test_with_fallback_a_pair_without_properties_is_judged_as_point_contact():
     for compliance in ((None, None), ("compliant", None), ("rigid", "rigid")):
         model, x = pair(Ellipsoid(0.1, 0.1, 0.1), Box(1, 1, 0.2), 0.095, compliance=compliance, **fallback)
         assert only(audit(model, x), "pair_refused").severity == "error"
-        with pytest.raises(dd.SimulationError):
+        with pytest.raises(SimulationError):
             dd.differentiate_step(model, x, method="autodiff")
     model, x = pair(Ellipsoid(0.1, 0.1, 0.1), Box(1, 1, 0.2), 0.095, compliance=("compliant",) * 2, **fallback)
     assert "pair_refused" not in codes(audit(model, x))
@@ -214,7 +215,7 @@ def test_with_fallback_a_pair_without_properties_is_judged_as_point_contact():
 
 
 def test_a_pair_that_the_table_takes_but_drake_refuses_is_still_found(monkeypatch):
-    monkeypatch.setattr("drake_diff.audit_place.autodiff_supports", lambda *_: True)
+    monkeypatch.setattr("drake_diff.certificates.audit_place.autodiff_supports", lambda *_: True)
     found = only(audit(*pair(Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), 0.0995)), "autodiff_refused")
     assert (found.severity, found.subject) == ("error", "step")
     assert "Penetration queries between shapes 'Box' and 'Box'" in found.message
@@ -382,7 +383,7 @@ def test_a_limit_below_the_effort_that_holds_the_pose_is_a_warning():
     assert "saturated_effort" not in codes(audit(block(limit=10.0).model()))
 
 
-@pytest.mark.filterwarnings("ignore::drake_diff.ModelWarning")
+@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 def test_an_actuator_that_drake_leaves_out_for_a_limit_of_zero_is_an_error(write_urdf):
     model = write_urdf(limit=0)
     assert model.nu == 0
@@ -413,7 +414,7 @@ def test_a_refused_gradient_is_an_error():
 
 
 def test_a_gradient_beyond_any_plausible_size_is_an_error(load, monkeypatch):
-    monkeypatch.setattr("drake_diff.step_derivatives.MAGNITUDE_BOUND", 1e-3)
+    monkeypatch.setattr("drake_diff.derivatives.step.MAGNITUDE_BOUND", 1e-3)
     found = only(audit(load("pendulum.urdf")), "gradient_refused")
     assert "expected a finite number of at most" in found.message
 
@@ -551,7 +552,7 @@ def test_a_pair_without_a_distance_is_named_as_not_measured():
 )
 def test_a_real_robot_is_audited_quickly_and_its_boxes_are_named(name, base, refused):
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", dd.ModelWarning)
+        warnings.simplefilter("ignore", ModelWarning)
         model = dd.load_model(robot_file(name), time_step=0.005, weld_base=base, ground=0.5)
     start = time.perf_counter()
     findings = audit(model)

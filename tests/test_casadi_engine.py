@@ -21,9 +21,10 @@ from pydrake.multibody.tree import (
 
 import drake_diff as dd
 from drake_diff.engines.closed_form import DoublePendulum, Pendulum
-from drake_diff.engines.description import describe
-from drake_diff.engines.numpy_engine import NumpyEngine
+from drake_diff.engines.numpy import NumpyEngine
 from drake_diff.engines.urdf import inertial_urdf, urdf
+from drake_diff.exceptions import ModelError, ModelWarning
+from drake_diff.mechanics.description import describe
 
 TURN = RigidTransform(RollPitchYaw(0.3, -0.4, 0.5), [0.1, -0.2, 0.3])
 BOX = SpatialInertia.SolidBoxWithMass(1.3, 0.1, 0.2, 0.3)
@@ -70,7 +71,7 @@ def test_casadi_is_drake_on_robots(tmp_path, name):
 def test_casadi_is_drake_where_every_frame_is_turned(free):
     model = turned(free=free)
     assert_free_steps_agree(model, "casadi", 1e-12, 1e-12)
-    lines = dd.match_contracts(dd.load_engine("drake", model), engine_of("casadi", model))
+    lines = dd.engines.match_contracts(dd.engines.load_engine("drake", model), engine_of("casadi", model))
     assert not [str(line) for line in lines if line.verdict == "different"]
     mapped = {line.quantity for line in lines if line.verdict == "mapped"}
     assert mapped == {"derivative convention"} | ({"state of a free body"} if free else set())
@@ -86,7 +87,7 @@ def test_casadi_is_drake_with_two_free_bodies_and_an_arm_on_the_world():
     plant.plant.WeldFrames(plant.plant.world_frame(), post.body_frame(), TURN)
     model = plant.model()
     assert_free_steps_agree(model, "casadi", 1e-12, 1e-12)
-    lines = dd.match_contracts(dd.load_engine("drake", model), engine_of("casadi", model))
+    lines = dd.engines.match_contracts(dd.engines.load_engine("drake", model), engine_of("casadi", model))
     assert not [str(line) for line in lines if line.verdict == "different"]
 
 
@@ -112,17 +113,17 @@ def test_gravity_is_drakes_and_not_adams_own(load):
 
 @pytest.mark.parametrize("wrong", [lambda real, q: real(q[[3, 0, 1, 2]]), lambda real, q: real(q).T])
 def test_a_swapped_quaternion_or_a_transposed_rotation_is_found(monkeypatch, wrong):
-    from drake_diff.engines import casadi_engine
+    from drake_diff.engines import casadi as casadi_engine
 
     real = casadi_engine.rotation
     monkeypatch.setattr(casadi_engine, "rotation", lambda q: wrong(real, q))
     model = turned(free=True)
-    found = different(dd.load_engine("drake", model), engine_of("casadi", model))
+    found = different(dd.engines.load_engine("drake", model), engine_of("casadi", model))
     assert set(found) & {"M(q)", "bias(q, v)"}
 
 
 def test_a_velocity_in_another_frame_is_found(monkeypatch):
-    from drake_diff.engines import casadi_engine
+    from drake_diff.engines import casadi as casadi_engine
 
     model, algorithms = turned(free=True), casadi_engine.RBDAlgorithms
 
@@ -134,13 +135,13 @@ def test_a_velocity_in_another_frame_is_found(monkeypatch):
             return super()._convert_to_arraylike(*arguments)
 
     monkeypatch.setattr(casadi_engine, "RBDAlgorithms", InTheBody)
-    found = different(dd.load_engine("drake", model), engine_of("casadi", model))
+    found = different(dd.engines.load_engine("drake", model), engine_of("casadi", model))
     assert {"M(q)", "bias(q, v)"} <= found.keys()
 
 
 def test_adams_own_slide_is_still_wrong(monkeypatch):
     """When this fails, `_Joint` can go."""
-    from drake_diff.engines import casadi_engine
+    from drake_diff.engines import casadi as casadi_engine
 
     monkeypatch.delattr(casadi_engine._Joint, "motion_subspace")
     with pytest.raises(RuntimeError, match="12x1"):
@@ -152,7 +153,7 @@ def test_a_free_body_of_another_body_is_refused():
     base, top = (plant.plant.AddRigidBody(name, BOX) for name in ("base", "top"))
     add_joint(plant.plant, RevoluteJoint, "hinge", plant.plant.world_frame(), base, [0, 0, 1])
     plant.plant.AddJoint(QuaternionFloatingJoint("lifted", base.body_frame(), top.body_frame()))
-    with pytest.raises(dd.ModelError, match="lifted"):
+    with pytest.raises(ModelError, match="lifted"):
         engine_of("casadi", plant.model())
 
 
@@ -162,15 +163,15 @@ def test_casadi_falls_through_the_ground_and_says_so(load):
     x[6] = 0.05
     assert engine.step(x, [])[12] == pytest.approx(-G * 0.01)
     assert engine.contact_depth(x) == 0
-    assert "no contact" in different(dd.load_engine("drake", model), engine)["contact law"]
+    assert "no contact" in different(dd.engines.load_engine("drake", model), engine)["contact law"]
 
 
 @pytest.mark.parametrize("module", ["adam", "liecasadi"])
 def test_a_missing_adam_is_named_with_its_extra(module):
     code = f"""import sys; sys.modules[{module!r}] = None
 import drake_diff as dd
-try: dd.load_engine("casadi", None)
-except dd.MissingDependencyError as error: print(error)"""
+try: dd.engines.load_engine("casadi", None)
+except MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "pip install 'drake-diff[engines]'" in done.stdout
     assert module in done.stdout
@@ -183,25 +184,29 @@ def read_back(model, tmp_path):
     path = tmp_path / "written.urdf"
     path.write_text(urdf(describe(model)))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", dd.ModelWarning)  # Drake makes a floating joint one of its own
+        warnings.simplefilter("ignore", ModelWarning)  # Drake makes a floating joint one of its own
         return dd.load_model(path, time_step=model.time_step)
 
 
 @pytest.mark.parametrize("file", ["cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "projectile.sdf"])
 def test_drake_reads_the_same_model_from_the_urdf(load, tmp_path, file):
-    found = different(*(dd.load_engine("drake", m) for m in (load(file), read_back(load(file), tmp_path))))
+    found = different(*(dd.engines.load_engine("drake", m) for m in (load(file), read_back(load(file), tmp_path))))
     assert all(quantity == "effort limits" and "1e+10" in detail for quantity, detail in found.items())
 
 
 @pytest.mark.parametrize("name", ["ur5_robot.urdf", "solo12.urdf"])
 def test_drake_reads_the_same_robot_from_the_urdf(tmp_path, name):
     model = robot(name, tmp_path)
-    assert not different(dd.load_engine("drake", model), dd.load_engine("drake", read_back(model, tmp_path)))
+    assert not different(
+        dd.engines.load_engine("drake", model), dd.engines.load_engine("drake", read_back(model, tmp_path))
+    )
 
 
 def test_drake_reads_turned_frames_from_the_urdf(tmp_path):
     model = turned(free=False)
-    found = different(dd.load_engine("drake", model), dd.load_engine("drake", read_back(model, tmp_path)))
+    found = different(
+        dd.engines.load_engine("drake", model), dd.engines.load_engine("drake", read_back(model, tmp_path))
+    )
     assert found.keys() == {"position limits"}  # a slide without limits has them, far away
     assert "1e+10" in found["position limits"]
 
@@ -211,7 +216,7 @@ def test_pinocchio_reads_the_same_model_from_the_urdf(tmp_path):
     import pinocchio as pin
 
     model, random = robot("ur5_robot.urdf", tmp_path), np.random.default_rng(6)
-    read, drake = pin.buildModelFromXML(urdf(describe(model))), dd.load_engine("drake", model)
+    read, drake = pin.buildModelFromXML(urdf(describe(model))), dd.engines.load_engine("drake", model)
     assert list(read.names)[1:] == [joint.name for joint in drake.contract.joints]
     for _ in range(3):
         q, v = random.uniform(-1, 1, (2, model.nq))

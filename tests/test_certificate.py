@@ -8,8 +8,9 @@ import pytest
 from helpers.models import random_state
 
 import drake_diff as dd
-from drake_diff.certificate import certify_jacobian_of_many
-from drake_diff.finite_difference import sweep_of
+from drake_diff._base.differences import sweep_of
+from drake_diff.certificates.certificate import certify_jacobian_of_many
+from drake_diff.exceptions import CertificateError, GradientError, ShapeError
 
 
 def smooth(n, seed=0):
@@ -24,11 +25,11 @@ def test_a_right_jacobian_agrees_and_one_entry_1_percent_off_is_caught(n):
     f, jacobian = smooth(n)
     x = np.random.default_rng(1).standard_normal(n)
     right = jacobian(x)
-    dd.certify_jacobian(f, x, right).require()
+    dd.certificates.certify_jacobian(f, x, right).require()
     for i, j in [(0, 0), (n - 1, n // 2), (n // 3, n - 1)]:
         wrong = right.copy()
         wrong[i, j] *= 1.01
-        certificate = dd.certify_jacobian(f, x, wrong)
+        certificate = dd.certificates.certify_jacobian(f, x, wrong)
         assert certificate.verdict == "disagree"
         assert (certificate.worst.row, certificate.worst.column) == (f"f[{i}]", f"x[{j}]")
         assert certificate.count("agree") == n * n - 1
@@ -45,7 +46,7 @@ def test_all_points_in_one_call_give_the_same_certificate():
     wrong = jacobian(x)
     wrong[2, 3] *= 1.01
     for claimed, verdict in ((jacobian, "agree"), (wrong, "disagree")):
-        one, together = dd.certify_jacobian(f, x, claimed), certify_jacobian_of_many(many, x, claimed)
+        one, together = dd.certificates.certify_jacobian(f, x, claimed), certify_jacobian_of_many(many, x, claimed)
         assert one.verdict == together.verdict == verdict
         assert np.array_equal(one.codes, together.codes)
         assert np.array_equal(one.difference, together.difference)
@@ -86,12 +87,14 @@ def test_one_entry_of_a_step_1_percent_off_is_caught(tmp_path, nx):
     assert certificate.verdict == "disagree"
     assert certificate.worst.row == model.state_names[row]
     assert certificate.worst.column == model.state_names[column]
-    with pytest.raises(dd.CertificateError, match=model.state_names[row]):
+    with pytest.raises(CertificateError, match=model.state_names[row]):
         certificate.require()
 
 
 def verdict(f, derivative, x=0.0, **options):
-    return dd.certify_jacobian(f, [x], [[derivative]] if np.isscalar(derivative) else derivative, **options).verdict
+    return dd.certificates.certify_jacobian(
+        f, [x], [[derivative]] if np.isscalar(derivative) else derivative, **options
+    ).verdict
 
 
 @pytest.mark.parametrize("claimed", [0.0, 1.0, -1.0])
@@ -122,9 +125,9 @@ def test_pure_noise_is_not_passed():
 
 def test_a_large_offset_that_hides_the_derivative_is_undecided():
     """Next to 1e15 the rounding of the value is 0.1: no step resolves a slope of 1."""
-    certificate = dd.certify_jacobian(lambda x: 1e15 + x, [0.0], [[1.0]])
+    certificate = dd.certificates.certify_jacobian(lambda x: 1e15 + x, [0.0], [[1.0]])
     assert certificate.verdict == "undecided"
-    with pytest.raises(dd.CertificateError, match="undecided"):
+    with pytest.raises(CertificateError, match="undecided"):
         certificate.require()
 
 
@@ -136,19 +139,19 @@ def test_what_a_solver_leaves_unsolved_is_no_jump():
 
 
 def test_a_derivative_that_is_not_finite_is_refused():
-    with pytest.raises(dd.GradientError, match="not finite"):
-        dd.certify_jacobian(np.sin, [0.0], [[np.nan]])
+    with pytest.raises(GradientError, match="not finite"):
+        dd.certificates.certify_jacobian(np.sin, [0.0], [[np.nan]])
 
 
 def test_a_derivative_of_the_wrong_shape_is_refused():
-    with pytest.raises(dd.ShapeError, match="derivative"):
-        dd.certify_jacobian(lambda x: np.ones(2), [0.0], [[1.0]], rows=("a", "b"))
+    with pytest.raises(ShapeError, match="derivative"):
+        dd.certificates.certify_jacobian(lambda x: np.ones(2), [0.0], [[1.0]], rows=("a", "b"))
 
 
 def test_nothing_but_agree_passes_require():
     for claimed, f in ((0.0, np.abs), (2.0, np.sin)):
-        with pytest.raises(dd.CertificateError, match="derivative"):
-            dd.certify_jacobian(f, [0.0], [[claimed]]).require()
+        with pytest.raises(CertificateError, match="derivative"):
+            dd.certificates.certify_jacobian(f, [0.0], [[claimed]]).require()
 
 
 SMOOTH = ("pendulum.urdf", "cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "mass_spring_damper.sdf")
@@ -206,7 +209,7 @@ def test_a_smooth_rollout_is_certified_and_a_wrong_loss_gradient_is_not(load, mo
         g = original(*args, **options)
         return dataclasses.replace(g, us=g.us * np.where(np.arange(20) == 7, 1.01, 1.0)[:, None])
 
-    monkeypatch.setattr(sys.modules["drake_diff.certify"], "differentiate_rollout", one_percent_off)
+    monkeypatch.setattr(sys.modules["drake_diff.certificates.certify"], "differentiate_rollout", one_percent_off)
     wrong = dd.certify_rollout(model, np.zeros(4), us, loss)
     assert wrong.verdict == "disagree"
     assert wrong.worst.column == "force[7]"
@@ -220,6 +223,6 @@ def test_a_rollout_that_starts_at_touchdown_is_refused(load):
 
 
 def test_the_printed_certificate_names_the_worst_entry_and_both_numbers():
-    text = str(dd.certify_jacobian(np.sin, [0.0], [[1.01]], rows=("y",), columns=("x",)))
+    text = str(dd.certificates.certify_jacobian(np.sin, [0.0], [[1.01]], rows=("y",), columns=("x",)))
     assert "disagree" in text
     assert "d y / d x: derivative 1.01, differences 1" in text

@@ -10,10 +10,11 @@ from helpers.plants import offset_pendulum
 from typer.testing import CliRunner
 
 import drake_diff as dd
-from drake_diff.cli import app
-from drake_diff.contact import penetration
-from drake_diff.sampling import sample_states
-from drake_diff.step import set_state
+from drake_diff.cli.main import app
+from drake_diff.exceptions import InputError, ModelWarning
+from drake_diff.model.contact import penetration
+from drake_diff.model.sampling import sample_states
+from drake_diff.model.step import set_state
 
 NAMES = sorted(path.name for path in MODELS.iterdir())
 
@@ -21,7 +22,7 @@ NAMES = sorted(path.name for path in MODELS.iterdir())
 @pytest.mark.parametrize("name", NAMES)
 def test_every_model_here_is_certified_at_every_sampled_state(load, name):
     """Eight models of 20 states, contact among them: the good states of the zoo."""
-    record = dd.certify_model(load(name, time_step=0.005), states=20, seed=3)
+    record = dd.record.certify_model(load(name, time_step=0.005), states=20, seed=3)
     assert record.verdict == "pass", [s for s in record.states if s.verdict != "agree"]
     assert len(record.states) == 20
 
@@ -31,9 +32,9 @@ def test_every_model_here_is_certified_at_every_sampled_state(load, name):
 )
 def test_real_robots_are_certified(name, base):
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", dd.ModelWarning)
+        warnings.simplefilter("ignore", ModelWarning)
         model = dd.load_model(robot_file(name), time_step=0.005, weld_base=base)
-    assert dd.certify_model(model, states=20).verdict == "pass"
+    assert dd.record.certify_model(model, states=20).verdict == "pass"
 
 
 @pytest.mark.parametrize("name", ["sphere_on_ground.sdf", "sliding_block.sdf"])
@@ -68,17 +69,17 @@ def test_a_model_that_cannot_touch_is_sampled_in_free_motion(load):
 
 
 def test_a_wrong_derivative_fails_the_model(load, monkeypatch):
-    monkeypatch.setattr("drake_diff.parameter_kinds.IDENTITY_OFFSET", 0.0)
+    monkeypatch.setattr("drake_diff.model.parameter_kinds.IDENTITY_OFFSET", 0.0)
 
-    record = dd.certify_model(offset_pendulum(), states=4, parameters=("second.offset",))
+    record = dd.record.certify_model(offset_pendulum(), states=4, parameters=("second.offset",))
     assert record.verdict == "fail"
     assert {state.verdict for state in record.states} == {"disagree"}
     assert "second.offset" in record.states[0].gradient.worst
 
 
 def test_a_refused_derivative_is_told_and_fails(load, monkeypatch):
-    monkeypatch.setattr("drake_diff.step_derivatives.MAGNITUDE_BOUND", 1e-3)
-    record = dd.certify_model(load("pendulum.urdf"), states=2)
+    monkeypatch.setattr("drake_diff.derivatives.step.MAGNITUDE_BOUND", 1e-3)
+    record = dd.record.certify_model(load("pendulum.urdf"), states=2)
     assert record.verdict == "fail"
     assert record.states[0].verdict == "refused"
     assert "expected a finite number of at most" in record.states[0].refusal
@@ -94,8 +95,8 @@ def test_a_refused_derivative_is_told_and_fails(load, monkeypatch):
     ],
 )
 def test_bad_options_are_named_and_leave_no_file(load, tmp_path, options, words):
-    with pytest.raises(dd.InputError, match=words):
-        dd.certify_model(load("pendulum.urdf"), directory=tmp_path / "out", **options)
+    with pytest.raises(InputError, match=words):
+        dd.record.certify_model(load("pendulum.urdf"), directory=tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
 
 
@@ -103,19 +104,19 @@ def test_the_record_is_written_and_says_incomplete_until_it_is_not(load, tmp_pat
     def killed(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("drake_diff.certification.sample_states", killed)
+    monkeypatch.setattr("drake_diff.record.certification.sample_states", killed)
     with pytest.raises(KeyboardInterrupt):
-        dd.certify_model(load("pendulum.urdf"), directory=tmp_path)
+        dd.record.certify_model(load("pendulum.urdf"), directory=tmp_path)
     assert json.loads((tmp_path / "certification.json").read_text())["verdict"] == "incomplete"
     monkeypatch.undo()
-    record = dd.certify_model(load("pendulum.urdf"), states=3, directory=tmp_path)
-    written = dd.CertificationRecord.model_validate_json((tmp_path / "certification.json").read_text())
+    record = dd.record.certify_model(load("pendulum.urdf"), states=3, directory=tmp_path)
+    written = dd.record.CertificationRecord.model_validate_json((tmp_path / "certification.json").read_text())
     assert written == record
     assert written.verdict == "pass"
 
 
 def test_the_same_seed_gives_the_same_record_wall_clock_apart(load):
-    records = [dd.certify_model(load("sphere_on_ground.sdf"), states=4, seed=2) for _ in range(2)]
+    records = [dd.record.certify_model(load("sphere_on_ground.sdf"), states=4, seed=2) for _ in range(2)]
     plain = [json.loads(record.to_json()) for record in records]
     for fields in plain:
         del fields["wall_clock"]
@@ -133,7 +134,7 @@ def test_the_command_prints_a_table_writes_the_artifact_and_exits_with_0(tmp_pat
 
 
 def test_the_command_exits_with_1_where_a_state_fails(tmp_path, monkeypatch):
-    monkeypatch.setattr("drake_diff.step_derivatives.MAGNITUDE_BOUND", 1e-3)
+    monkeypatch.setattr("drake_diff.derivatives.step.MAGNITUDE_BOUND", 1e-3)
     result = CliRunner().invoke(
         app, ["certify", str(MODELS / "pendulum.urdf"), "--states", "2", "--out", str(tmp_path / "run")]
     )

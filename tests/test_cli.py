@@ -12,7 +12,7 @@ import pytest
 from helpers.models import ROOT
 
 import drake_diff as dd
-from drake_diff import cli
+from drake_diff.cli import main as cli
 
 PENDULUM = f"""
 import numpy as np
@@ -36,7 +36,7 @@ def script(folder, *, num_steps=40, limit=30.0, options=None):
 
 
 def drake_diff(*words, cwd):
-    command = [sys.executable, "-m", "drake_diff.cli", *map(str, words)]
+    command = [sys.executable, "-m", "drake_diff.cli.main", *map(str, words)]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
 
 
@@ -147,7 +147,7 @@ def test_a_killed_run_never_looks_finished(tmp_path, delay):
 
 
 def start(path, cwd):
-    command = [sys.executable, "-m", "drake_diff.cli", "run", str(path)]
+    command = [sys.executable, "-m", "drake_diff.cli.main", "run", str(path)]
     return subprocess.Popen(command, cwd=cwd, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 

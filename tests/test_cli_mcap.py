@@ -8,11 +8,12 @@ import pytest
 from typer.testing import CliRunner
 
 import drake_diff as dd
-from drake_diff.cli import app
-from drake_diff.mcap_log import Channel, write_mcap
-from drake_diff.mcap_messages import TYPES
-from drake_diff.solution import Solution
-from drake_diff.trace import write_trace
+from drake_diff.artifact.trace import write_trace
+from drake_diff.cli.main import app
+from drake_diff.exceptions import InputError
+from drake_diff.logs.messages import TYPES
+from drake_diff.logs.write import Channel, write_mcap
+from drake_diff.optimize.solution import Solution
 
 STATE = TYPES["State"]
 
@@ -61,7 +62,7 @@ def test_recover_says_how_much_and_what_stopped_it(file):
     file.write_bytes(whole[: len(whole) // 2])
     done = drake_diff("mcap", "recover", file, file.with_name("b.mcap"))
     assert done.exit_code == 0
-    log = dd.read_mcap(file.with_name("b.mcap"))
+    log = dd.logs.read_mcap(file.with_name("b.mcap"))
     count = len(log.messages["/state"])
     assert 0 < count < 3000
     assert f"{count} messages and 2 attachments to" in done.stdout
@@ -71,7 +72,7 @@ def test_recover_says_how_much_and_what_stopped_it(file):
 
 
 def test_a_missing_file_is_a_usage_error_in_one_line(tmp_path):
-    command = [sys.executable, "-m", "drake_diff.cli", "mcap", "info", "missing.mcap"]
+    command = [sys.executable, "-m", "drake_diff.cli.main", "mcap", "info", "missing.mcap"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
     assert done.stderr.startswith("drake-diff: ArtifactError: missing.mcap")
@@ -92,4 +93,4 @@ def test_export_writes_a_bag_beside_the_run_and_wants_to_be_told_the_format(tmp_
     assert done.exit_code == 0
     assert "/joint_states 6" in done.stdout
     assert sorted(p.name for p in (tmp_path / "run_ros2").iterdir()) == ["metadata.yaml", "run_ros2.mcap"]
-    assert isinstance(drake_diff("export", tmp_path / "run").exception, dd.InputError)
+    assert isinstance(drake_diff("export", tmp_path / "run").exception, InputError)

@@ -6,12 +6,10 @@ from helpers.loops import MASS, H
 from helpers.models import MODELS
 
 import drake_diff as dd
-from drake_diff.loop.actuator import Actuator
-from drake_diff.loop.closed_loop import Loop, Push, closed_loop
-from drake_diff.loop.estimator import Predictor
-from drake_diff.loop.fallback import Fallback
-from drake_diff.loop.sensor import Sensor
-from drake_diff.tangent import tangent_space
+from drake_diff.exceptions import InputError
+from drake_diff.loop.parts import Actuator, Fallback, Predictor, Sensor
+from drake_diff.loop.run import Loop, Push, closed_loop
+from drake_diff.model.tangent import tangent_space
 
 
 def gain(kp, kd):
@@ -231,7 +229,7 @@ def test_latency_is_measured_and_changes_nothing(cart):
     ],
 )
 def test_bad_numbers_are_named(make, said):
-    with pytest.raises(dd.InputError, match=said):
+    with pytest.raises(InputError, match=said):
         make()
 
 
@@ -243,7 +241,7 @@ def test_bad_runs_are_named(cart):
         (Loop(pushes=[Push("cart", [0, 0, 1.0], -0.1)]), "Push.at"),
         (Loop(substeps=0), "Loop.substeps"),
     ):
-        with pytest.raises(dd.InputError, match=said):
+        with pytest.raises(InputError, match=said):
             closed_loop(cart, gain(1, 1), [0.0, 0.0], 5, loop)
 
 

@@ -10,8 +10,9 @@ from helpers.models import MODELS
 from helpers.plants import block
 
 import drake_diff as dd
-from drake_diff.nonlinear_program import NlpResult, Outcome
-from drake_diff.solution import Status
+from drake_diff.exceptions import InputError, ModelError
+from drake_diff.optimize.program import NlpResult, Outcome
+from drake_diff.optimize.solution import Status
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
@@ -123,13 +124,13 @@ def test_the_masked_out_entries_of_the_initial_state_stay():
 def test_a_coupled_model_is_refused():
     model = block(blocks=2, actuated=1, couple=True)
     problem = dd.Problem(model, x0=np.zeros(4), num_steps=5, running_cost=EFFORT, x_goal=[1, 0.5, 0, 0])
-    with pytest.raises(dd.ModelError, match=r"constraints have no continuous form; use method='shooting'"):
+    with pytest.raises(ModelError, match=r"constraints have no continuous form; use method='shooting'"):
         collocate(problem)
 
 
 def test_nothing_to_control_is_refused():
     problem = move(optimize=("initial_state",))
-    with pytest.raises(dd.InputError, match=r'optimize: expected "controls" .* got \[\'initial_state\'\]'):
+    with pytest.raises(InputError, match=r'optimize: expected "controls" .* got \[\'initial_state\'\]'):
         collocate(problem)
 
 
@@ -147,7 +148,7 @@ def test_a_collocation_solver_that_lies_is_not_believed(monkeypatch):
     def liar(problem, xs, us, **options):
         return NlpResult(us.ravel(), Outcome.SOLVED, "all is well", ()), xs, us, us[-1]
 
-    monkeypatch.setattr("drake_diff.run.solve_collocation", liar)
+    monkeypatch.setattr("drake_diff.optimize.solve.solve_collocation", liar)
     solution = collocate(swing_up(), solver="snopt")
     assert solution.status is Status.CONVERGED_NOT_VERIFIED
     assert "defect" in solution.message
@@ -157,7 +158,7 @@ def test_a_collocation_solver_that_lies_is_not_believed(monkeypatch):
 @pytest.mark.parametrize(("row", "column"), [(2, 1), (2, 3), (3, 1), (3, 3), (2, 4), (3, 4)])
 def test_a_derivative_that_is_one_percent_off_is_named(row, column, monkeypatch):
     """Every entry of [A B] of the accelerations that is not zero by itself, the guess being a moving one."""
-    from drake_diff.continuous import EquationsOfMotion
+    from drake_diff.model.equations import EquationsOfMotion
 
     honest = EquationsOfMotion.autodiff
 
@@ -184,7 +185,7 @@ def test_an_expressions_derivative_that_is_one_percent_off_is_named(row, column,
     """The same of the expressions that CasADi gets."""
     import casadi as ca
 
-    from drake_diff import knot_functions
+    from drake_diff.optimize.transcription import expressions as knot_functions
 
     honest = knot_functions.symbolic_plant
 
@@ -205,7 +206,7 @@ def test_an_expressions_derivative_that_is_one_percent_off_is_named(row, column,
 
 
 def test_ctrl_c_ends_it_with_a_motion(monkeypatch):
-    monkeypatch.setattr("drake_diff.nonlinear_program.REPORT_PERIOD", 0.0)
+    monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
     before = signal.getsignal(signal.SIGINT)
     for solver in ("ipopt", "snopt"):
         solution = collocate(swing_up(), solver=solver, progress=lambda line: signal.raise_signal(signal.SIGINT))

@@ -8,10 +8,18 @@ from helpers.contracts import arms
 from helpers.engines import Doctored, engine_of, needs
 
 import drake_diff as dd
-from drake_diff.engines.compared import JACOBIAN_TOLERANCE, STEP_TOLERANCE
-from drake_diff.engines.comparison import default_engines
+from drake_diff.comparison.compare import default_engines
+from drake_diff.comparison.result import JACOBIAN_TOLERANCE, STEP_TOLERANCE
 from drake_diff.engines.load import load_spec
-from drake_diff.tangent import tangent_space
+from drake_diff.exceptions import (
+    InputError,
+    MissingDependencyError,
+    NotOfferedError,
+    ShapeError,
+    SimulationError,
+    UnknownNameError,
+)
+from drake_diff.model.tangent import tangent_space
 
 G = 9.81
 
@@ -121,7 +129,7 @@ def test_without_derivatives_differences_of_the_steps_are_compared(load):
     drake = engine_of("drake", model)
 
     def none(x, u):
-        raise dd.NotOfferedError("forward only")
+        raise NotOfferedError("forward only")
 
     e = by_name(dd.compare(model, (Doctored(drake, name="blind", differentiate_step=none),), num_steps=10))["blind"]
     assert (e.verdict, e.gradient, e.rollout_jacobian, e.seconds_per_jacobian) == ("same", "none", None, None)
@@ -136,7 +144,7 @@ def test_an_engine_that_breaks_off_is_told_with_the_time(load):
 
     def breaks(x, u):
         if x[1] < -0.5:
-            raise dd.SimulationError("the solver gave up")
+            raise SimulationError("the solver gave up")
         return drake.step(x, u)
 
     e = by_name(dd.compare(model, (Doctored(drake, name="weak", step=breaks),), x0=x0, num_steps=100))["weak"]
@@ -152,7 +160,7 @@ def test_missing_and_impossible_engines_are_listed_with_the_reason(load, monkeyp
     monkeypatch.setitem(loading.ENGINES, "absent", ("absent_engine", "AbsentEngine"))
 
     def missing(module):
-        raise dd.MissingDependencyError("needs it: pip install 'drake-diff[absent]'")
+        raise MissingDependencyError("needs it: pip install 'drake-diff[absent]'")
 
     real = loading.import_module
     monkeypatch.setattr(loading, "import_module", lambda m: missing(m) if "absent" in m else real(m))
@@ -178,8 +186,8 @@ def test_tools_that_are_no_engines_are_told_of_and_not_pretended(load):
     assert "no part in dynamics" in told["opencv"]
     assert "no part in dynamics" in told["gtsam"]
     assert "export-model" in told["isaaclab"]
-    with pytest.raises(dd.MissingDependencyError, match="poles and LQR"):
-        dd.load_engine("control", load("pendulum.urdf"))
+    with pytest.raises(MissingDependencyError, match="poles and LQR"):
+        dd.engines.load_engine("control", load("pendulum.urdf"))
 
 
 def test_by_default_every_engine_is_asked(load):
@@ -190,13 +198,13 @@ def test_by_default_every_engine_is_asked(load):
 
 def test_bad_input_is_named(load):
     model = load("pendulum.urdf")
-    with pytest.raises(dd.UnknownNameError, match="mujoco"):
+    with pytest.raises(UnknownNameError, match="mujoco"):
         dd.compare(model, ("bullet",))
-    with pytest.raises(dd.InputError, match="drake:CONTACT"):
+    with pytest.raises(InputError, match="drake:CONTACT"):
         load_spec("mujoco:lagged", model)
-    with pytest.raises(dd.ShapeError):
+    with pytest.raises(ShapeError):
         dd.compare(model, (), x0=np.zeros(3))
-    with pytest.raises(dd.InputError):
+    with pytest.raises(InputError):
         dd.compare(model, (), us=np.zeros((5, 2)))
 
 

@@ -11,12 +11,12 @@ from helpers.models import MODELS
 from typer.testing import CliRunner
 
 import drake_diff as dd
-from drake_diff.cli import app
-from drake_diff.engines import comparison_trace
-from drake_diff.engines.comparison_files import begin_comparison, record_of
-from drake_diff.engines.comparison_page import comparison_data
-from drake_diff.engines.comparison_words import sentence_of, verdict_of
-from drake_diff.record import own_sha256
+from drake_diff.cli.main import app
+from drake_diff.comparison import files as comparison_trace
+from drake_diff.comparison.files import begin_comparison, record_of
+from drake_diff.comparison.page import comparison_data
+from drake_diff.comparison.result import sentence_of, verdict_of
+from drake_diff.record.run_record import own_sha256
 
 
 @pytest.fixture(scope="module")
@@ -32,13 +32,13 @@ def ball():
 @pytest.fixture(scope="module")
 def saved(ball, tmp_path_factory):
     folder = tmp_path_factory.mktemp("comparison")
-    return folder, dd.save_comparison(ball, folder)
+    return folder, dd.comparison.save_comparison(ball, folder)
 
 
 def test_the_record_has_every_number_and_its_own_hash(ball, saved):
     folder, record = saved
     fields = json.loads((folder / "comparison.json").read_text())
-    assert dd.ComparisonRecord.model_validate(fields) == record
+    assert dd.comparison.ComparisonRecord.model_validate(fields) == record
     assert own_sha256(fields) == fields["record_sha256"]
     for file in record.files:
         assert sha256((folder / file.path).read_bytes()).hexdigest() == file.sha256
@@ -53,14 +53,14 @@ def test_the_record_has_every_number_and_its_own_hash(ball, saved):
 
 
 def test_the_record_is_the_same_but_for_the_times(ball, saved, tmp_path):
-    again = dd.save_comparison(ball, tmp_path / saved[0].name)
+    again = dd.comparison.save_comparison(ball, tmp_path / saved[0].name)
     apart = {"wall_clock": None, "record_sha256": "", "files": []}
     assert again.model_copy(update=apart) == saved[1].model_copy(update=apart)
     assert (tmp_path / saved[0].name / "trace.mcap").read_bytes() == (saved[0] / "trace.mcap").read_bytes()
 
 
 def test_the_trace_has_every_engines_motion(ball, saved):
-    log = dd.read_mcap(saved[0] / "trace.mcap")
+    log = dd.logs.read_mcap(saved[0] / "trace.mcap")
     topics = [t for t in log.messages if t.endswith("/state")]
     assert topics == ["/0_drake_sap_autodiff/state", "/1_drake_lagged_autodiff/state", "/2_pinocchio/state"]
     for topic, e in zip(topics, ball.engines, strict=True):
@@ -120,7 +120,7 @@ def test_a_gradient_that_is_not_its_own_steps_is_warned_of(load):
 def test_names_of_engines_are_escaped(load, tmp_path):
     model = load("pendulum.urdf")
     engine = Doctored(engine_of("drake", model), name="<script>alert(1)</script>")
-    dd.save_comparison(dd.compare(model, (engine,), num_steps=5), tmp_path)
+    dd.comparison.save_comparison(dd.compare(model, (engine,), num_steps=5), tmp_path)
     page = (tmp_path / "comparison.html").read_text()
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert" in page
@@ -129,14 +129,14 @@ def test_names_of_engines_are_escaped(load, tmp_path):
 def test_what_is_begun_and_not_ended_says_so(ball, tmp_path, monkeypatch):
     begin_comparison(tmp_path, ball.model)
     assert json.loads((tmp_path / "comparison.json").read_text())["verdict"] == "incomplete"
-    dd.save_comparison(ball, tmp_path)
+    dd.comparison.save_comparison(ball, tmp_path)
 
     def fails(*_):
         raise OSError("no space left")
 
     monkeypatch.setattr(comparison_trace, "write_comparison_trace", fails)
     with pytest.raises(OSError, match="no space"):
-        dd.save_comparison(ball, tmp_path)
+        dd.comparison.save_comparison(ball, tmp_path)
     assert json.loads((tmp_path / "comparison.json").read_text())["verdict"] == "incomplete"
     assert not (tmp_path / "comparison.html").exists()
 
@@ -152,7 +152,7 @@ def test_the_command(tmp_path):
 
 
 def test_the_command_fails_where_the_engines_do_not_agree(tmp_path, monkeypatch):
-    from drake_diff.engines.pinocchio_engine import PinocchioEngine
+    from drake_diff.engines.pinocchio import PinocchioEngine
 
     needs("pinocchio")
     right = PinocchioEngine.step

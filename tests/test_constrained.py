@@ -9,9 +9,10 @@ from helpers.plants import block
 from helpers.problems import A30, lqr
 
 import drake_diff as dd
-from drake_diff.augmented_lagrangian import AugmentedLagrangian
-from drake_diff.solution import Status
-from drake_diff.verdict import complaints_about
+from drake_diff.exceptions import InputError
+from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
+from drake_diff.optimize.judge import complaints_about
+from drake_diff.optimize.solution import Status
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 METHODS = {
@@ -226,5 +227,5 @@ def test_a_motion_that_breaks_a_constraint_is_told(knot):
 
 @pytest.mark.parametrize("method", ["ilqr", "shooting"])
 def test_a_free_horizon_is_for_collocation(method):
-    with pytest.raises(dd.InputError, match="horizon: expected none for discrete steps"):
+    with pytest.raises(InputError, match="horizon: expected none for discrete steps"):
         dd.solve(move(horizon=(0.5, 2)), method=method)

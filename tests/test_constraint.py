@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
-from drake_diff.constraint import Constraint
+from drake_diff.exceptions import GradientError, InputError, ShapeError
+from drake_diff.optimize.problem.constraint import Constraint
 
 
 def test_values_and_jacobian_are_those_of_the_formula():
@@ -36,7 +37,7 @@ def test_it_holds_at_these_knots_of_three_steps(knots, takes_input, given, expec
 
 @pytest.mark.parametrize("knots", [4, [-5], [], 1.5, ["a"], [[1]]])
 def test_knots_that_are_none_are_refused(knots):
-    with pytest.raises(dd.InputError, match="expected whole numbers from -4 to 3"):
+    with pytest.raises(InputError, match="expected whole numbers from -4 to 3"):
         Constraint(lambda x: x[0], upper=1, knots=knots).at_knots(3, True)
 
 
@@ -51,7 +52,7 @@ def test_knots_that_are_none_are_refused(knots):
     ],
 )
 def test_bounds_that_cannot_be_kept_are_refused(fields, match):
-    with pytest.raises(dd.InputError, match=match):
+    with pytest.raises(InputError, match=match):
         Constraint(lambda x: x[0], **fields)
 
 
@@ -69,13 +70,13 @@ def pendulum(**fields):
     ],
 )
 def test_a_problem_refuses_a_function_that_is_no_constraint(function, match):
-    with pytest.raises(dd.InputError, match=match):
+    with pytest.raises(InputError, match=match):
         pendulum(constraints=Constraint(function, upper=[1, 1]))
 
 
 def test_a_lost_derivative_is_an_error():
     c = Constraint(lambda x: float(getattr(x[0], "value", lambda: x[0])()), upper=1).resolved(np.zeros(1), np.zeros(0))
-    with pytest.raises(dd.GradientError, match="lost its derivatives"):
+    with pytest.raises(GradientError, match="lost its derivatives"):
         c.differentiate(np.zeros(1), np.zeros(0))
 
 
@@ -86,12 +87,12 @@ def test_waypoints_and_horizon_are_checked():
     np.testing.assert_array_equal([side[10] for side in limits], [[1, 0]] * 2)
     assert np.isinf(limits[0][5, 1])
     for knot in (0, 10, 1.0, -1):
-        with pytest.raises(dd.InputError, match="from 1 to 9"):
+        with pytest.raises(InputError, match="from 1 to 9"):
             pendulum(waypoints={knot: [0, 0]})
-    with pytest.raises(dd.ShapeError):
+    with pytest.raises(ShapeError):
         pendulum(waypoints={3: [0]})
     for horizon in (1.0, (2, 1), (0, 1), (1,)):
-        with pytest.raises(dd.InputError, match="horizon"):
+        with pytest.raises(InputError, match="horizon"):
             pendulum(horizon=horizon)
 
 

@@ -27,8 +27,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import SpatialInertia
 
 import drake_diff as dd
-from drake_diff.contact import contacts_of_the_step
-from drake_diff.contact_geometry import ROUTES, autodiff_supports, replace_collision_geometry
+from drake_diff.exceptions import InputError, ModelError, SimulationError, UnknownNameError
+from drake_diff.model.contact import contacts_of_the_step
+from drake_diff.model.load_file import ROUTES, autodiff_supports, replace_collision_geometry
 
 MASS, SIZE = 2.0, (0.3, 0.2, 0.1)  # [kg], [m]
 BOX_STIFFNESS, GROUND_STIFFNESS = 2e4, 1e4  # [N/m]
@@ -102,7 +103,7 @@ def check_the_derivative(model, x, tolerance):
 def test_a_box_on_the_ground_is_refused_as_it_is():
     model = box_on_ground("differences")
     x = sliding(model, (0.02, -0.03), 0.052)
-    with pytest.raises(dd.SimulationError, match="Penetration queries between shapes"):
+    with pytest.raises(SimulationError, match="Penetration queries between shapes"):
         dd.differentiate_step(model, x, method="autodiff")
     assert dd.differentiate_step(model, x).method == "finite_difference"
 
@@ -348,7 +349,7 @@ def test_a_modulus_without_a_compliance_type_is_kept():
 def test_hydroelastic_in_a_plant_with_point_contact_is_an_error():
     plant = Plant(0.005)
     add_body(plant, Box(*SIZE))
-    with pytest.raises(dd.InputError, match="contact_model: expected hydroelastic or hydroelastic_with_fallback"):
+    with pytest.raises(InputError, match="contact_model: expected hydroelastic or hydroelastic_with_fallback"):
         replaced(plant, "hydroelastic")
 
 
@@ -365,7 +366,7 @@ def test_differences_changes_nothing():
 
 
 def test_an_unknown_route_lists_those_that_exist():
-    with pytest.raises(dd.UnknownNameError) as error:
+    with pytest.raises(UnknownNameError) as error:
         replaced(Plant(0.005), "spheres")
     assert all(route in str(error.value) for route in ROUTES)
 
@@ -375,7 +376,7 @@ def test_a_finalized_plant_is_an_error(route):
     plant = Plant(0.005)
     add_body(plant, Box(*SIZE))
     plant.plant.Finalize()
-    with pytest.raises(dd.ModelError, match="is finalized"):
+    with pytest.raises(ModelError, match="is finalized"):
         replaced(plant, route)
 
 
@@ -385,7 +386,7 @@ def test_a_name_that_is_taken_is_an_error():
     plant.plant.RegisterCollisionGeometry(
         body, RigidTransform(), Sphere(0.1), "box_shape_corner_0", contact_properties(1e4)
     )
-    with pytest.raises(dd.ModelError, match="Drake refuses the route 'corner_spheres'"):
+    with pytest.raises(ModelError, match="Drake refuses the route 'corner_spheres'"):
         replaced(plant)
 
 
@@ -403,7 +404,7 @@ def step_throws(a, b, contact_model, *, half_space="rigid", twin="autodiff"):
     x[:7] = [*RollPitchYaw(0.3, 0.2, 0.1).ToQuaternion().wxyz(), 0.05, 0.03, 0.08]
     try:
         dd.differentiate_step(model, x, method="autodiff") if twin == "autodiff" else dd.step(model, x)
-    except dd.SimulationError as error:
+    except SimulationError as error:
         if not re.search("are not supported|that is not allowed", str(error)):
             raise  # something other than the pair
         return True
@@ -439,5 +440,5 @@ def test_a_compliant_half_space_meets_no_compliant_body(shapes, kind):
 
 
 def test_an_unknown_contact_model_is_an_error(shapes):
-    with pytest.raises(dd.UnknownNameError, match="hydroelastic_with_fallback"):
+    with pytest.raises(UnknownNameError, match="hydroelastic_with_fallback"):
         autodiff_supports(shapes["Box"], shapes["Box"], "soft")

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
-from drake_diff import analytic, friction_cone
-from drake_diff.contact_material import MaterialChange
-from drake_diff.contact_pairs import read_pairs
-from drake_diff.friction_cone import Cone, Impulse, StateChange
-from drake_diff.hunt_crossley import HuntCrossley
-from drake_diff.step import set_state
+from drake_diff.derivatives import analytic
+from drake_diff.derivatives.contact import laws as friction_cone
+from drake_diff.derivatives.contact.laws import Cone, HuntCrossley, Impulse, StateChange
+from drake_diff.derivatives.contact.material import MaterialChange
+from drake_diff.derivatives.contact.pairs import read_pairs
+from drake_diff.model.step import set_state
 
 pytest.importorskip("pinocchio")
 

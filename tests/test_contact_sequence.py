@@ -7,12 +7,11 @@ import pytest
 from helpers.problems import push
 
 import drake_diff as dd
-from drake_diff.contact_sequence import MARGIN, beginnings
-from drake_diff.goal_restoration import restore_goal
-from drake_diff.shooting import ShootingVariables, state_sensitivities
-from drake_diff.soft_contact import separations
-from drake_diff.solution import Status
-from drake_diff.step import set_state
+from drake_diff.model.soft_contact import separations
+from drake_diff.model.step import set_state
+from drake_diff.optimize.ilqr.through_contact import MARGIN, beginnings, restore_goal
+from drake_diff.optimize.shooting import ShootingVariables, state_sensitivities
+from drake_diff.optimize.solution import Status
 
 
 def separation(model, x):

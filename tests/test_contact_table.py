@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import drake_diff as dd
-from drake_diff.engines.contact_cases import (
+from drake_diff.exceptions import GradientError, InputError, NotOfferedError, SimulationError, UnknownNameError
+from drake_diff.studies.contact_cases import (
     ContactCase,
     contact_cases,
     hunt_crossley_restitution,
@@ -24,9 +25,8 @@ from drake_diff.engines.contact_cases import (
     stopping_distance,
     stopping_staircase,
 )
-from drake_diff.engines.contact_laws import impact, impact_gradients, law_of
-from drake_diff.engines.contact_table import TOLERANCES, contact_table, rebound_height
-from drake_diff.engines.contact_words import as_json, lines_of
+from drake_diff.studies.contact_comparison import TOLERANCES, as_json, contact_table, lines_of, rebound_height
+from drake_diff.studies.contact_laws import impact, impact_gradients, law_of
 
 G = 9.81
 DRAKES = ["drake (sap, autodiff)", "drake (similar, autodiff)", "drake (lagged, autodiff)"]
@@ -238,7 +238,7 @@ def doctored(case, engine="drake", contact=None, **changes):
     def load(model):
         scaled = {name: getattr(case, name) * factor for name, factor in changes.items()}
         options = {"contact": contact} if contact else {}
-        return dd.load_engine(engine, model.changed(**scaled), **options)
+        return dd.engines.load_engine(engine, model.changed(**scaled), **options)
 
     return load
 
@@ -308,7 +308,7 @@ class Other:
 def test_wrong_zero_and_missing_gradients_are_told():
     def scaled(factor):
         def load(model):
-            drake = dd.load_engine("drake", model, contact="lagged")
+            drake = dd.engines.load_engine("drake", model, contact="lagged")
 
             def differentiate(x, u):
                 found = drake.differentiate_step(x, u)
@@ -320,15 +320,15 @@ def test_wrong_zero_and_missing_gradients_are_told():
 
     def blind(model):
         def none(x, u):
-            raise dd.NotOfferedError("forward only")
+            raise NotOfferedError("forward only")
 
-        return Other(dd.load_engine("drake", model, contact="lagged"), differentiate_step=none)
+        return Other(dd.engines.load_engine("drake", model, contact="lagged"), differentiate_step=none)
 
     def infinite(model):
         def differentiate(x, u):
-            raise dd.GradientError("it is not finite")
+            raise GradientError("it is not finite")
 
-        return Other(dd.load_engine("drake", model, contact="lagged"), differentiate_step=differentiate)
+        return Other(dd.engines.load_engine("drake", model, contact="lagged"), differentiate_step=differentiate)
 
     slide = (CASES["slide"],)
     assert contact_table((scaled(1.0),), slide).rows[0].gradient_verdict == "right"
@@ -343,7 +343,7 @@ def test_wrong_zero_and_missing_gradients_are_told():
 def test_an_engine_of_an_unknown_law_is_judged_by_the_rigid_answer_alone():
     def unknown(approximation):
         def load(model):
-            drake = dd.load_engine("drake", model, contact=approximation)
+            drake = dd.engines.load_engine("drake", model, contact=approximation)
             return Other(drake, contract=replace(drake.contract, contact_law="springs of its own"))
 
         return load
@@ -357,11 +357,11 @@ def test_an_engine_of_an_unknown_law_is_judged_by_the_rigid_answer_alone():
 
 def test_an_engine_that_breaks_off_says_so():
     def weak(model):
-        drake = dd.load_engine("drake", model)
+        drake = dd.engines.load_engine("drake", model)
 
         def step(x, u):
             if x[2] > 1:
-                raise dd.SimulationError("the solver gave up")
+                raise SimulationError("the solver gave up")
             return drake.step(x, u)
 
         return Other(drake, step=step)
@@ -372,15 +372,15 @@ def test_an_engine_that_breaks_off_says_so():
 
 
 def test_bad_input_is_named(found):
-    with pytest.raises(dd.UnknownNameError, match="slide of mujoco"):
+    with pytest.raises(UnknownNameError, match="slide of mujoco"):
         found.row("fly", "mujoco")
-    with pytest.raises(dd.UnknownNameError, match="mujoco"):
+    with pytest.raises(UnknownNameError, match="mujoco"):
         contact_table(("bullet-proof",))
-    with pytest.raises(dd.InputError, match="slope"):
+    with pytest.raises(InputError, match="slope"):
         ContactCase("slide", 0.01, 10, slope=2.0)
-    with pytest.raises(dd.InputError, match="height"):
+    with pytest.raises(InputError, match="height"):
         ContactCase("bounce", 0.01, 10)
-    with pytest.raises(dd.InputError, match="stiffness"):
+    with pytest.raises(InputError, match="stiffness"):
         ContactCase("rest", 0.01, 10, stiffness=-1.0)
 
 
@@ -412,7 +412,9 @@ def test_sentences_and_json(found):
 
 def test_the_command_prints_the_table_and_writes_json(tmp_path):
     words = ["contact-table", "--engines", "drake:lagged", "--out", str(tmp_path / "table.json")]
-    done = subprocess.run([sys.executable, "-m", "drake_diff.cli", *words], capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-m", "drake_diff.cli.main", *words], capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 0, done.stderr
     for word in ("damped bounce", "own law's", "wrong", LAGGED):
         assert word in done.stdout

@@ -8,9 +8,9 @@ import pytest
 from helpers.problems import FREE, push
 
 import drake_diff as dd
-from drake_diff.continuation import default_schedule
-from drake_diff.goal_restoration import restore_goal
-from drake_diff.solution import Status
+from drake_diff.exceptions import InputError
+from drake_diff.optimize.ilqr.through_contact import default_schedule, restore_goal
+from drake_diff.optimize.solution import Status
 
 
 def test_a_push_from_a_distance_arrives_and_keeps_momentum(two_spheres):
@@ -47,7 +47,7 @@ def test_before_touching_the_push_is_the_closed_form_of_least_effort(two_spheres
 def test_the_stages_are_logged_and_the_last_is_the_true_plant(two_spheres):
     lines = []
     problem = push(two_spheres(damping=0), gap=0.4, goal=0.8)
-    given = [dd.SoftContact(0.15, 100.0), dd.SoftContact(0.05, 150.0)]
+    given = [dd.model.SoftContact(0.15, 100.0), dd.model.SoftContact(0.05, 150.0)]
     solution = dd.solve(problem, method="ilqr", continuation=given, max_iterations=100, progress=lines.append)
     logs = solution.options["continuation"]
     assert [log["number"] for log in logs] == [1, 2, 3]
@@ -93,7 +93,7 @@ def test_blindness_names_what_stays_apart(two_spheres):
 def test_a_stage_that_is_refused_is_told_and_the_schedule_goes_on(two_spheres):
     """h^2 k / m = 1e9: the first stage throws the ball out of every number."""
     problem = push(two_spheres(damping=0), gap=0.4, goal=1.0)
-    given = [dd.SoftContact(1.0, 1e12), *default_schedule(problem)]
+    given = [dd.model.SoftContact(1.0, 1e12), *default_schedule(problem)]
     solution = dd.solve(problem, continuation=given, max_iterations=100)
     first, *rest = solution.options["continuation"]
     assert first["status"] != "solved"
@@ -123,17 +123,17 @@ def test_ctrl_c_ends_all_stages(two_spheres):
     assert signal.getsignal(signal.SIGINT) is before
 
 
-@pytest.mark.parametrize("wrong", ["soft", 0.1, [], [0.1], (dd.SoftContact(0.1, 1.0), None)])
+@pytest.mark.parametrize("wrong", ["soft", 0.1, [], [0.1], (dd.model.SoftContact(0.1, 1.0), None)])
 def test_a_schedule_that_is_none_is_refused(two_spheres, wrong):
-    with pytest.raises(dd.InputError, match="continuation"):
+    with pytest.raises(InputError, match="continuation"):
         dd.solve(push(two_spheres(), gap=0.4, goal=1.0), continuation=wrong)
 
 
 def test_only_ilqr_takes_a_continuation(two_spheres, load):
-    with pytest.raises(dd.InputError, match='method="ilqr" takes it'):
+    with pytest.raises(InputError, match='method="ilqr" takes it'):
         dd.solve(push(two_spheres(), gap=0.4, goal=1.0), method="shooting", continuation="auto")
     pendulum = load("pendulum.urdf")
-    with pytest.raises(dd.InputError, match="may collide"):
+    with pytest.raises(InputError, match="may collide"):
         dd.solve(dd.Problem(pendulum, x0=[0, 0], num_steps=5, x_goal=[1, 0]), continuation="auto")
 
 

@@ -8,8 +8,8 @@ from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoD
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-import drake_diff as dd
-from drake_diff.continuous import ContinuousSystem, EquationsOfMotion
+from drake_diff.exceptions import ModelError, SimulationError
+from drake_diff.model.equations import ContinuousSystem, EquationsOfMotion
 
 
 def test_kellys_cart_pole(load):
@@ -27,7 +27,7 @@ def test_many_knots_at_once_and_those_that_are_no_numbers(load):
     assert found[0] == pytest.approx([0, 0, 1.3, -1.3 / 0.5], abs=1e-12)  # at rest: u / m1 and -u / (l m1)
     assert found[1] == pytest.approx([-0.3, 1.1, 3.172075726216, -17.491825696946], abs=1e-11)
     assert np.isnan(found[2]).all()
-    with pytest.raises(dd.SimulationError, match="not finite"):
+    with pytest.raises(SimulationError, match="not finite"):
         f(knots[2, :4], knots[2, 4:])
 
 
@@ -71,5 +71,5 @@ def test_it_is_a_drake_system_with_an_autodiff_twin(load):
 
 
 def test_pd_control_has_no_continuous_form():
-    with pytest.raises(dd.ModelError, match="PD-controlled"):
+    with pytest.raises(ModelError, match="PD-controlled"):
         EquationsOfMotion(pd_pendulum())

@@ -11,9 +11,10 @@ from helpers.models import MODELS
 
 import drake_diff as dd
 from drake_diff.engines.closed_form import CartPole, DoublePendulum, MassSpringDamper, Pendulum
-from drake_diff.engines.description import describe
-from drake_diff.engines.mjcf import mjcf
-from drake_diff.engines.numpy_engine import NumpyEngine
+from drake_diff.engines.mujoco.mjcf import mjcf
+from drake_diff.engines.numpy import NumpyEngine
+from drake_diff.exceptions import InputError, ModelError, NotOfferedError
+from drake_diff.mechanics.description import describe
 
 MJX = pytest.param("mjx", marks=pytest.mark.slow)  # JAX compiles for seconds
 ENGINES = ["drake", "mujoco", MJX, "pinocchio", "casadi"]
@@ -23,7 +24,7 @@ ENGINES = ["drake", "mujoco", MJX, "pinocchio", "casadi"]
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_change_is_found_and_named(tmp_path, name, change):
     changes, must, may, words = CHANGES[change]
-    reference = dd.load_engine("drake", arms(tmp_path))
+    reference = dd.engines.load_engine("drake", arms(tmp_path))
     own = different(reference, engine_of(name, arms(tmp_path)))
     assert own.keys() <= {"limit law", "solver tolerance"}  # what no other engine can have as Drake has it
     found = different(reference, engine_of(name, arms(tmp_path, **changes)))
@@ -34,7 +35,7 @@ def test_a_change_is_found_and_named(tmp_path, name, change):
 
 @pytest.mark.parametrize("name", ENGINES)
 def test_the_same_model_is_the_same_in_every_engine(tmp_path, name):
-    lines = dd.match_contracts(dd.load_engine("drake", arms(tmp_path)), engine_of(name, arms(tmp_path)))
+    lines = dd.engines.match_contracts(dd.engines.load_engine("drake", arms(tmp_path)), engine_of(name, arms(tmp_path)))
     assert len({line.quantity for line in lines}) == len(lines) == 25
     assert all(str(line).startswith(line.verdict) for line in lines)
     assert {line.quantity for line in lines if line.verdict == "mapped"} <= {"derivative convention"}
@@ -57,33 +58,33 @@ HAND = {
 @pytest.mark.parametrize("change", HAND)
 def test_a_change_of_a_hand_calculation_is_found_and_named(load, change):
     file, form, quantities = HAND[change]
-    drake = dd.load_engine("drake", load(file))
-    own = different(drake, dd.load_engine("numpy", load(file)))
+    drake = dd.engines.load_engine("drake", load(file))
+    own = different(drake, dd.engines.load_engine("numpy", load(file)))
     assert own.keys() <= {"limit law", "solver tolerance"}
     assert different(drake, NumpyEngine(form, time_step=0.01)).keys() - own.keys() == quantities
 
 
 def test_another_time_step_of_a_hand_calculation_is_found(load):
-    drake = dd.load_engine("drake", load("pendulum.urdf"))
+    drake = dd.engines.load_engine("drake", load("pendulum.urdf"))
     assert different(drake, NumpyEngine(Pendulum(), time_step=0.005)).keys() == {"time step"}
 
 
 def test_other_names_of_joints_are_found(load):
-    drake = dd.load_engine("drake", load("double_pendulum.urdf"))
+    drake = dd.engines.load_engine("drake", load("double_pendulum.urdf"))
     swapped = replace(DoublePendulum(), joint_names=("elbow", "shoulder"))
     assert "joint order and names" in different(drake, NumpyEngine(swapped, time_step=0.01))
     assert "no joint has the same name" in different(drake, NumpyEngine(Pendulum(), time_step=0.01))["mass"]
 
 
 def test_other_joint_types_are_not_compared_further(load):
-    drake = dd.load_engine("drake", load("pendulum.urdf"))
+    drake = dd.engines.load_engine("drake", load("pendulum.urdf"))
     found = different(drake, NumpyEngine(MassSpringDamper(joint_names=("hinge",)), time_step=0.01))
     assert "not comparable" in found["M(q)"]
     assert "revolute" in found["joint types"]
 
 
 def test_a_stiffness_that_is_each_engines_own_default_is_not_called_equal(load):
-    drake = dd.load_engine("drake", load("sphere_on_ground.sdf"))
+    drake = dd.engines.load_engine("drake", load("sphere_on_ground.sdf"))
 
     def without_stiffness(**changes):
         contacts = tuple(replace(pair, stiffness=None) for pair in drake.contract.contacts)
@@ -107,13 +108,13 @@ def own_mjcf(tmp_path, model, *edits):
 
 def test_a_users_own_mjcf_is_mapped_by_name_and_its_gear_is_found(tmp_path):
     model = arms(tmp_path)
-    drake = dd.load_engine("drake", model)
+    drake = dd.engines.load_engine("drake", model)
     found = different(
         drake, own_mjcf(tmp_path, model, ('joint="left_joint_2" gear="1"', 'joint="left_joint_2" gear="2"'))
     )
     assert {"actuator mapping"} == found.keys() - {"limit law", "solver tolerance", "effort limits"}
     assert "'left_joint_2': 2.0" in found["actuator mapping"]
-    with pytest.raises(dd.InputError, match="left_joint_2"):
+    with pytest.raises(InputError, match="left_joint_2"):
         own_mjcf(
             tmp_path,
             model,
@@ -129,7 +130,7 @@ def test_a_users_own_mjcf_is_mapped_by_name_and_its_gear_is_found(tmp_path):
 ])  # fmt: skip
 def test_the_integrators_step_is_drakes_exactly_where_the_contract_says_so(tmp_path, old, new, said):
     model = arms(tmp_path)
-    drake, mujoco = dd.load_engine("drake", model), own_mjcf(tmp_path, model, (old, new))
+    drake, mujoco = dd.engines.load_engine("drake", model), own_mjcf(tmp_path, model, (old, new))
     found = different(drake, mujoco)
     assert (said is None and "integrator" not in found) or said in found["integrator"]
     x, u = np.linspace(-0.5, 0.6, 8), np.linspace(-1, 1, 4)
@@ -143,12 +144,12 @@ def test_the_integrators_step_is_drakes_exactly_where_the_contract_says_so(tmp_p
     ("<contact", '<equality><joint joint1="left_joint_1"/></equality><contact', "equality constraints"),
 ])  # fmt: skip
 def test_an_mjcf_with_what_the_contract_does_not_know_is_refused(tmp_path, old, new, said):
-    with pytest.raises(dd.ModelError, match=said):
+    with pytest.raises(ModelError, match=said):
         own_mjcf(tmp_path, arms(tmp_path), (old, new))
 
 
 def test_an_mjcf_that_mujoco_does_not_read_is_refused(tmp_path):
-    with pytest.raises(dd.ModelError, match="own"):
+    with pytest.raises(ModelError, match="own"):
         own_mjcf(tmp_path, arms(tmp_path), ("<option", "<opinion"))
 
 
@@ -159,8 +160,8 @@ def test_another_order_inside_mujoco_is_mapped(tmp_path, name):
     engine_of(name, needed)
     path = tmp_path / "turned.xml"
     path.write_text(mjcf(describe(turned), turned.time_step))
-    engine, drake = dd.load_engine(name, needed, path=path), dd.load_engine("drake", needed)
-    lines = {line.quantity: line for line in dd.match_contracts(drake, engine)}
+    engine, drake = dd.engines.load_engine(name, needed, path=path), dd.engines.load_engine("drake", needed)
+    lines = {line.quantity: line for line in dd.engines.match_contracts(drake, engine)}
     assert lines["joint order and names"].verdict == "mapped"
     assert lines["M(q)"].verdict == lines["bias(q, v)"].verdict == lines["actuator mapping"].verdict == "equal"
     x, u = np.linspace(-0.5, 0.6, 8), np.linspace(-1, 1, 4)
@@ -178,9 +179,11 @@ def test_other_friction_and_stiffness_are_found(tmp_path):
     ):
         path = tmp_path / "ball.sdf"
         path.write_text((MODELS / "sphere_on_ground.sdf").read_text().replace(old, new, 1))
-        found = different(dd.load_engine("drake", needed), engine_of("mujoco", dd.load_model(path, time_step=0.01)))
+        found = different(
+            dd.engines.load_engine("drake", needed), engine_of("mujoco", dd.load_model(path, time_step=0.01))
+        )
         assert word in found["contact pairs"]
-    same = different(dd.load_engine("drake", needed), engine_of("mujoco", needed))
+    same = different(dd.engines.load_engine("drake", needed), engine_of("mujoco", needed))
     assert same.keys() == {"contact law", "solver tolerance", "integrator"}
 
 
@@ -194,10 +197,10 @@ class Other:
 
 def test_what_an_engine_does_not_compute_is_not_called_equal(load):
     def none(q):
-        raise dd.NotOfferedError("no mass matrix here")
+        raise NotOfferedError("no mass matrix here")
 
     drake = engine_of("drake", load("pendulum.urdf"))
-    lines = {line.quantity: line for line in dd.match_contracts(drake, Other(drake, none))}
+    lines = {line.quantity: line for line in dd.engines.match_contracts(drake, Other(drake, none))}
     assert lines["M(q)"].verdict == "different"
     assert "no mass matrix here" in lines["M(q)"].detail
     assert lines["bias(q, v)"].verdict == "equal"
@@ -209,7 +212,7 @@ def test_single_precision_is_allowed_its_rounding_and_no_more(load, precision, v
     joint = drake.contract.joints[0]
     for factor, expected in ((1 + 1e-7, verdict), (1 + 1e-4, "different")):
         other = Other(drake, precision=precision, joints=(replace(joint, mass=joint.mass * factor),))
-        lines = {line.quantity: line.verdict for line in dd.match_contracts(drake, other)}
+        lines = {line.quantity: line.verdict for line in dd.engines.match_contracts(drake, other)}
         assert lines["mass"] == expected
         assert lines["scalar type"] == ("equal" if precision == "float64" else "different")
 
@@ -217,6 +220,6 @@ def test_single_precision_is_allowed_its_rounding_and_no_more(load, precision, v
 def test_the_convention_of_derivatives_is_a_line(load):
     drake = engine_of("drake", load("pendulum.urdf"))
     for told, verdict in (("by every entry of x and u", "equal"), ("by small turns", "mapped"), ("none", "different")):
-        lines = {line.quantity: line for line in dd.match_contracts(drake, Other(drake, derivatives=told))}
+        lines = {line.quantity: line for line in dd.engines.match_contracts(drake, Other(drake, derivatives=told))}
         assert lines["derivative convention"].verdict == verdict
     assert "offers no derivatives" in lines["derivative convention"].reason

@@ -5,7 +5,8 @@ import pytest
 from pydrake.autodiffutils import InitializeAutoDiff
 
 import drake_diff as dd
-from drake_diff.cost import (
+from drake_diff.exceptions import GradientError, InputError
+from drake_diff.optimize.problem.cost import (
     CostToGo,
     differentiate_cost,
     differentiate_final_cost,
@@ -123,7 +124,7 @@ def test_a_semidefinite_weight_is_allowed():
     ],
 )
 def test_a_bad_weight_or_reference_is_named(fields, words):
-    with pytest.raises(dd.InputError, match=words):
+    with pytest.raises(InputError, match=words):
         dd.QuadraticCost(**fields)
 
 
@@ -138,12 +139,12 @@ def test_a_bad_weight_or_reference_is_named(fields, words):
     ],
 )
 def test_a_cost_without_a_usable_gradient_is_refused(cost, words):
-    with pytest.raises(dd.GradientError, match=words):
+    with pytest.raises(GradientError, match=words):
         differentiate_cost(cost, np.array([1.0]), np.array([1.0]))
 
 
 def test_a_cost_that_is_no_scalar_is_refused():
-    with pytest.raises(dd.InputError, match="expected one scalar, got 2 values"):
+    with pytest.raises(InputError, match="expected one scalar, got 2 values"):
         differentiate_final_cost(lambda x: x, np.ones(2))
 
 

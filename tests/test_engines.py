@@ -29,11 +29,27 @@ from pydrake.multibody.tree import (
 )
 
 import drake_diff as dd
-from drake_diff.engines.closed_form import BY_MODEL, CartPole, DoublePendulum, MassSpringDamper, Pendulum, Projectile
-from drake_diff.engines.closed_form_contact import SlidingBlock, SphereOnGround
-from drake_diff.engines.numpy_engine import NumpyEngine
+from drake_diff.engines.closed_form import (
+    BY_MODEL,
+    CartPole,
+    DoublePendulum,
+    MassSpringDamper,
+    Pendulum,
+    Projectile,
+    SlidingBlock,
+    SphereOnGround,
+)
+from drake_diff.engines.numpy import NumpyEngine
 from drake_diff.engines.quiet import without_lines
-from drake_diff.tangent import tangent_space
+from drake_diff.exceptions import (
+    ModelError,
+    ModelWarning,
+    NonFiniteError,
+    ShapeError,
+    SimulationError,
+    UnknownNameError,
+)
+from drake_diff.model.tangent import tangent_space
 
 # ---- hand calculations -------------------------------------------------------------------------------------------
 
@@ -194,16 +210,18 @@ def test_mujoco_differs_on_free_bodies_by_the_quaternions_exponential_alone(load
 @pytest.mark.parametrize("name", ["pinocchio", "mujoco", "mjx"])
 def test_a_swapped_quaternion_or_velocity_frame_is_found(load, monkeypatch, name):
     model = free_box(mass=1.0)
-    drake, other = dd.load_engine("drake", model), engine_of(name, model)
-    assert [line.quantity for line in dd.match_contracts(drake, other) if line.verdict == "different"] == (
+    drake, other = dd.engines.load_engine("drake", model), engine_of(name, model)
+    assert [line.quantity for line in dd.engines.match_contracts(drake, other) if line.verdict == "different"] == (
         [] if name == "pinocchio" else ["integrator"]
     )
-    module = sys.modules[f"drake_diff.engines.{'body_frame' if name == 'pinocchio' else 'mujoco_coordinates'}"]
+    module = sys.modules[
+        f"drake_diff.{'mechanics.coordinates' if name == 'pinocchio' else 'engines.mujoco.coordinates'}"
+    ]
     real = module.rotation
     wrong = {"quaternion order": lambda q: real(np.roll(q, 1)), "velocity frame": lambda q: np.eye(3)}
     for swapped in wrong.values():
         monkeypatch.setattr(module, "rotation", swapped)
-        found = [line.quantity for line in dd.match_contracts(drake, other) if line.verdict == "different"]
+        found = [line.quantity for line in dd.engines.match_contracts(drake, other) if line.verdict == "different"]
         assert set(found) & {"M(q)", "bias(q, v)"}
 
 
@@ -213,7 +231,7 @@ def test_a_swapped_quaternion_or_velocity_frame_is_found(load, monkeypatch, name
 @pytest.mark.parametrize("contact", ["sap", "similar", "lagged"])
 @pytest.mark.parametrize("method", ["autodiff", "implicit", "finite_difference"])
 def test_drake_is_the_hand_calculation_in_every_variant(load, contact, method):
-    drake = dd.load_engine("drake", load("pendulum.urdf"), contact=contact, method=method)
+    drake = dd.engines.load_engine("drake", load("pendulum.urdf"), contact=contact, method=method)
     hand = NumpyEngine(Pendulum(), time_step=0.01)
     one, two = (engine.differentiate_step([0.7, -1.2], [0.3]) for engine in (drake, hand))
     assert one.method == method
@@ -226,7 +244,7 @@ def test_the_hand_calculation_of_landing_is_drake(contact, relaxation):
     plant = Plant(0.005, contact)
     plant.ball("ball", 1.0, 0.1, contact_properties(1e4, relaxation_time=relaxation / 2), "z")
     plant.ground(contact_properties(1e4, relaxation_time=relaxation / 2))
-    drake = dd.load_engine("drake", plant.model())
+    drake = dd.engines.load_engine("drake", plant.model())
     hand = NumpyEngine(SphereOnGround(stiffness=5000, relaxation_time=relaxation), time_step=0.005)
     for x in ([0.097, -0.2], [0.0995, -1.0], [0.2, 0.1]):
         np.testing.assert_allclose(hand.step(x, []), drake.step(x, []), rtol=1e-7, atol=1e-9)  # SAP stops at 1e-6
@@ -245,7 +263,7 @@ def test_mujoco_rests_as_deep_as_drake_a15(load, file):
         x = mujoco.step(x, [])
     assert mujoco.status == "ok"
     assert mujoco.contact_depth(x) == pytest.approx(weight * G / points / 1e4, rel=1e-9)  # settled for 5 s
-    assert dd.load_engine("drake", model).contact_depth(x) == pytest.approx(mujoco.contact_depth(x), rel=1e-9)
+    assert dd.engines.load_engine("drake", model).contact_depth(x) == pytest.approx(mujoco.contact_depth(x), rel=1e-9)
 
 
 def test_mujoco_slides_to_a_stop_a20_and_its_jacobians_are_its_steps():
@@ -315,7 +333,9 @@ def test_pinocchio_falls_through_the_ground_and_says_so(load):
     x[6] = 0.05
     assert pinocchio.step(x, [])[12] == pytest.approx(-G * 0.01)
     assert pinocchio.contact_depth(x) == 0
-    lines = {line.quantity: line for line in dd.match_contracts(dd.load_engine("drake", model), pinocchio)}
+    lines = {
+        line.quantity: line for line in dd.engines.match_contracts(dd.engines.load_engine("drake", model), pinocchio)
+    }
     assert lines["contact law"].verdict == "different"
     assert "no contact" in lines["contact law"].detail
 
@@ -323,7 +343,7 @@ def test_pinocchio_falls_through_the_ground_and_says_so(load):
 def test_effort_limits_cut_and_the_derivative_is_zero_there(load):
     model = load("cart_pole.urdf")
     x, u = [0.1, 0.4, 0.2, -0.3], [25.0]
-    drake = dd.load_engine("drake", model)
+    drake = dd.engines.load_engine("drake", model)
     for name in ("numpy", "pinocchio", "casadi", "mujoco"):
         engine = engine_of(name, model)
         np.testing.assert_allclose(engine.step(x, u), drake.step(x, u), atol=1e-12)
@@ -333,28 +353,28 @@ def test_effort_limits_cut_and_the_derivative_is_zero_there(load):
 @pytest.mark.parametrize("name", ["numpy", "drake", "pinocchio", "casadi", "mujoco", "mjx"])
 def test_bad_input_is_named(load, name):
     engine = engine_of(name, load("pendulum.urdf"))
-    with pytest.raises(dd.ShapeError, match="x"):
+    with pytest.raises(ShapeError, match="x"):
         engine.step([0.0], [0.0])
-    with pytest.raises(dd.NonFiniteError, match="u"):
+    with pytest.raises(NonFiniteError, match="u"):
         engine.differentiate_step([0.0, 0.0], [np.nan])
 
 
 def test_what_mujoco_cannot_step_is_an_error(load, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a MUJOCO_LOG.TXT where it is
     engine = engine_of("mujoco", load("pendulum.urdf"))
-    with pytest.raises(dd.SimulationError, match="MuJoCo"):
+    with pytest.raises(SimulationError, match="MuJoCo"):
         engine.step([0.0, 1e300], [0.0])
 
 
 def test_what_no_other_engine_has_is_named(load, tmp_path):
-    with pytest.raises(dd.UnknownNameError, match="mujoco"):
-        dd.load_engine("bullet", load("pendulum.urdf"))
-    with pytest.raises(dd.ModelError, match="cart_pole"):
-        dd.load_engine("numpy", load("acrobot.xml"))
+    with pytest.raises(UnknownNameError, match="mujoco"):
+        dd.engines.load_engine("bullet", load("pendulum.urdf"))
+    with pytest.raises(ModelError, match="cart_pole"):
+        dd.engines.load_engine("numpy", load("acrobot.xml"))
     path = next(f.locate() for f in files("example-robot-data") if str(f).endswith("/panda.urdf"))
-    with pytest.warns(dd.ModelWarning):
+    with pytest.warns(ModelWarning):
         panda = dd.load_model(path, time_step=0.001)
-    with pytest.raises(dd.ModelError, match="1 constraints"):
+    with pytest.raises(ModelError, match="1 constraints"):
         engine_of("pinocchio", panda)
 
 
@@ -372,9 +392,11 @@ def test_a_free_body_by_frames_of_its_own_is_drakes_in_pinocchio_and_refused_by_
     assert_free_steps_agree(model, "pinocchio", 1e-12, 1e-12)
     assert not any(
         line.verdict == "different"
-        for line in dd.match_contracts(dd.load_engine("drake", model), dd.load_engine("pinocchio", model))
+        for line in dd.engines.match_contracts(
+            dd.engines.load_engine("drake", model), dd.engines.load_engine("pinocchio", model)
+        )
     )
-    with pytest.raises(dd.ModelError, match="free"):
+    with pytest.raises(ModelError, match="free"):
         engine_of("mujoco", model)
 
 
@@ -391,7 +413,7 @@ def test_a_weld_at_a_distance_is_drakes(name):
 
 def test_geometry_that_mujoco_is_not_given_is_named(tmp_path):
     model = tetrahedron_on_ground(tmp_path)
-    lines = dd.match_contracts(dd.load_engine("drake", model), engine_of("mujoco", model))
+    lines = dd.engines.match_contracts(dd.engines.load_engine("drake", model), engine_of("mujoco", model))
     detail = next(line.detail for line in lines if line.quantity == "contact pairs" and line.verdict == "different")
     assert "body_shape" in detail
 
@@ -422,7 +444,7 @@ def refused(kind):
 @pytest.mark.parametrize("name", ["pinocchio", "casadi", "mujoco", "mjx"])
 def test_a_model_that_other_engines_would_simulate_otherwise_is_refused(name, kind):
     model = refused(kind)
-    with pytest.raises(dd.ModelError, match=kind):
+    with pytest.raises(ModelError, match=kind):
         engine_of(name, model)
 
 
@@ -430,8 +452,8 @@ def test_a_model_that_other_engines_would_simulate_otherwise_is_refused(name, ki
 def test_a_missing_engine_is_named_with_its_extra(name, module):
     code = f"""import sys; sys.modules[{module!r}] = None
 import drake_diff as dd
-try: dd.load_engine({name!r}, None)
-except dd.MissingDependencyError as error: print(error)"""
+try: dd.engines.load_engine({name!r}, None)
+except MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "pip install 'drake-diff[engines]'" in done.stdout
 

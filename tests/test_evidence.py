@@ -10,11 +10,12 @@ import pytest
 from helpers.models import MODELS
 
 import drake_diff as dd
-from drake_diff.evidence import begin
-from drake_diff.mcap_read import read_mcap
-from drake_diff.meshcat_scene import scene_of
-from drake_diff.meshcat_view import write_replay
-from drake_diff.trace_read import read_trace
+from drake_diff.artifact.save import begin
+from drake_diff.artifact.trace_read import read_trace
+from drake_diff.exceptions import ArtifactError
+from drake_diff.logs.read import read_mcap
+from drake_diff.pages.meshcat import write_replay
+from drake_diff.pages.scene import scene_of
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +119,7 @@ def test_a_save_that_breaks_leaves_a_record_that_says_incomplete(swing_up, tmp_p
     def broken(*args, **kwargs):
         raise OSError("disk full")
 
-    monkeypatch.setattr("drake_diff.meshcat_view.write_whole", broken)
+    monkeypatch.setattr("drake_diff.pages.meshcat.write_whole", broken)
     with pytest.raises(OSError, match="disk full"):
         dd.save(swing_up, tmp_path / "run")
     assert dd.load_record(tmp_path / "run").state == "incomplete"
@@ -147,12 +148,12 @@ def test_a_record_that_was_edited_out_of_its_schema_is_refused(run, tmp_path):
     text = (run / "record.json").read_text()
     for old, new in (('"verdict": "pass"', '"verdict": "great"'), ('"schema_version"', '"schema"'), ("{", "")):
         (tmp_path / "record.json").write_text(text.replace(old, new))
-        with pytest.raises(dd.ArtifactError, match=r"record\.json"):
+        with pytest.raises(ArtifactError, match=r"record\.json"):
             dd.load_record(tmp_path)
 
 
 def test_a_directory_without_a_record_is_refused(tmp_path):
-    with pytest.raises(dd.ArtifactError, match="no such record"):
+    with pytest.raises(ArtifactError, match="no such record"):
         dd.load_record(tmp_path)
 
 

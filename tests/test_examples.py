@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
+from drake_diff.exceptions import ModelWarning
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -123,7 +124,7 @@ def test_the_cart_pole_stands_again_after_pushes_and_how_fast_is_told():
 def test_the_panda_arrives_although_it_is_pushed(tmp_path):
     module = example("mpc_under_pushes")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", dd.ModelWarning)  # meshes of visuals are skipped
+        warnings.simplefilter("ignore", ModelWarning)  # meshes of visuals are skipped
         case = module.panda(module.panda_file(tmp_path))
     run, problem = module.run(case), case[1]
     change = np.abs(np.diff(run.motion.xs[:, 7:], axis=0)).max(axis=1)

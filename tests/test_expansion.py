@@ -6,9 +6,9 @@ from helpers.plants import craft, tilted
 from helpers.problems import pendulum
 
 import drake_diff as dd
-from drake_diff import analytic
+from drake_diff.derivatives import analytic
 from drake_diff.exceptions import ModelError
-from drake_diff.expansion import Motion, dynamics_curvature_along
+from drake_diff.optimize.ilqr.expansion import Motion, dynamics_curvature_along
 
 
 def motion_of(problem, us):

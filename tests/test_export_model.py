@@ -13,16 +13,17 @@ from helpers.models import robot
 from typer.testing import CliRunner
 
 import drake_diff as dd
-from drake_diff.cli import app
-from drake_diff.engines import export, read_back, small_models
+from drake_diff.cli.main import app
 from drake_diff.engines.closed_form import BY_MODEL
-from drake_diff.engines.description import describe
-from drake_diff.engines.export import export_model
 from drake_diff.engines.motion import move
-from drake_diff.engines.read_back import complaints, written
-from drake_diff.engines.small_models import check_small_models
 from drake_diff.engines.urdf import urdf
-from drake_diff.sampling import sample_states
+from drake_diff.exceptions import CertificateError, InputError, ModelError, ModelWarning, UnknownNameError
+from drake_diff.export import export, read_back, small_models
+from drake_diff.export.export import export_model
+from drake_diff.export.read_back import complaints, written
+from drake_diff.export.small_models import check_small_models
+from drake_diff.mechanics.description import describe
+from drake_diff.model.sampling import sample_states
 
 FILES = {"contract.json", "initial_states.csv", "inputs.csv", "README.md"}
 MODEL_FILE = {
@@ -41,7 +42,7 @@ def test_the_written_file_steps_as_the_hand_calculation_does(load, tmp_path, tar
     files = export_model(load("pendulum.urdf"), tmp_path / "out", target=target, states=3)
     assert {f.name for f in files} == {f.name for f in (tmp_path / "out").iterdir()} == FILES | {MODEL_FILE[target]}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", dd.ModelWarning)  # of what is other engines' alone
+        warnings.simplefilter("ignore", ModelWarning)  # of what is other engines' alone
         model = dd.load_model(tmp_path / "out" / MODEL_FILE[target], time_step=0.01)
     x = dd.step(model, [0.7, -1.2], [0.3])
     np.testing.assert_allclose(x, [0.686908411253, -1.309158874737], atol=1e-11)  # as many digits as are known
@@ -87,7 +88,7 @@ def test_the_other_side_s_motion_comes_back_and_is_the_same(load, tmp_path):
     samples = [[repr(float(n)) for n in (0.01 * k, *x, *u)] for k, x in enumerate(motion.xs)]
     (out / "run.csv").write_text("\n".join([header, *map(",".join, samples)]))
     (out / "run.contract.json").write_text('{"engine": "theirs", "time step": 0.01, "gravity": [0, 0, -9.81]}')
-    e = dd.compare(model, (), recordings=(dd.read_recording(out / "run.csv", model),)).engines[-1]
+    e = dd.compare(model, (), recordings=(dd.comparison.read_recording(out / "run.csv", model),)).engines[-1]
     assert (e.engine, e.verdict, len(e.step_gaps)) == ("theirs", "same", 30)
 
 
@@ -104,7 +105,7 @@ def test_shapes_come_back_where_they_were(load, tmp_path, form):
         model, path = load(name), tmp_path / f"model.{form}"
         path.write_text(written(form, describe(model), model.time_step))
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", dd.ModelWarning)  # gravity and time step, which Drake takes as options
+            warnings.simplefilter("ignore", ModelWarning)  # gravity and time step, which Drake takes as options
             theirs = engine_of("drake", dd.load_model(path, time_step=model.time_step))
         ours, depths, random = engine_of("drake", model), [], np.random.default_rng(0)
         for _ in range(20):
@@ -176,29 +177,29 @@ def wrong_file(form):
 def test_nothing_is_exported_where_a_small_model_is_wrong(load, tmp_path, monkeypatch, fault, named):
     needs("mujoco")
     fault(monkeypatch)
-    with pytest.raises(dd.CertificateError, match=f"nothing is exported: the check {named}"):
+    with pytest.raises(CertificateError, match=f"nothing is exported: the check {named}"):
         export_model(load("cart_pole.urdf"), tmp_path / "out", target="gazebo")
     assert not (tmp_path / "out").exists()
 
 
 def test_what_a_format_cannot_say_is_refused(load, tmp_path, monkeypatch):
     model = load("mass_spring_damper.sdf")
-    with pytest.raises(dd.ModelError, match=r"urdf does not hold this model; read by drake, springs: .*50, 0\.1"):
+    with pytest.raises(ModelError, match=r"urdf does not hold this model; read by drake, springs: .*50, 0\.1"):
         export_model(model, tmp_path / "out", target="isaaclab")
     assert not (tmp_path / "out").exists()
     export_model(model, tmp_path / "out", target="gazebo")  # SDF has springs
     monkeypatch.setattr(read_back, "find_spec", lambda name: None)
-    with pytest.raises(dd.ModelError, match="MuJoCo is not installed"):  # and Drake reads no springs in MJCF
+    with pytest.raises(ModelError, match="MuJoCo is not installed"):  # and Drake reads no springs in MJCF
         export_model(model, tmp_path / "mjcf", target="mjcf")
 
 
 def test_bad_input_is_named(load, tmp_path):
     model = load("pendulum.urdf")
-    with pytest.raises(dd.UnknownNameError, match="gazebo"):
+    with pytest.raises(UnknownNameError, match="gazebo"):
         export_model(model, tmp_path / "out", target="unity")
-    with pytest.raises(dd.InputError, match="does not exist"):
+    with pytest.raises(InputError, match="does not exist"):
         export_model(model, tmp_path, target="sdf")
-    with pytest.raises(dd.InputError, match="states"):
+    with pytest.raises(InputError, match="states"):
         export_model(model, tmp_path / "out", target="sdf", states=0)
 
 

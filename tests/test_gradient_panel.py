@@ -11,10 +11,10 @@ from helpers.browser import browsing
 from typer.testing import CliRunner
 
 import drake_diff as dd
-from drake_diff.cli import app
-from drake_diff.gradient_descent import descend
-from drake_diff.gradient_estimate import ORDERS, GradientCase, truth_of
-from drake_diff.gradient_panel_cases import CASES, bounce, double_integrator, double_pendulum, push, wall
+from drake_diff.cli.main import app
+from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.studies.gradient_cases import CASES, bounce, double_integrator, double_pendulum, push, wall
+from drake_diff.studies.gradient_estimates import ORDERS, GradientCase, descend, truth_of
 
 A, X, SIGMA = 1.5, 0.3, 0.5
 
@@ -60,7 +60,7 @@ VARIANCES = {
 @pytest.mark.parametrize("case", [QUADRATIC, STEP, ABSOLUTE], ids=lambda c: c.name)
 def test_variance_and_bias_are_those_of_the_closed_forms(case):
     """Of 20000 samples in all a variance is known to 3 % or so (their kurtosis is below 20)."""
-    panel = dd.gradient_panel([case], samples=2000, seeds=10, budget=50)
+    panel = dd.studies.gradient_panel([case], samples=2000, seeds=10, budget=50)
     found = panel.case(case.name)
     first, zeroth = (found.at(order, SIGMA) for order in ("first", "zeroth"))
     for q, expected in zip((first, zeroth), VARIANCES[case.name], strict=True):
@@ -80,7 +80,7 @@ def test_variance_and_bias_are_those_of_the_closed_forms(case):
 def test_the_variance_of_zeroth_order_at_a_kink():
     """f = |x| at 0: |w| w / sigma^2 has the mean 0 and the variance 3."""
     case = replace(ABSOLUTE, start=[0.0])
-    found = dd.gradient_panel([case], samples=2000, seeds=10, budget=50).case("absolute")
+    found = dd.studies.gradient_panel([case], samples=2000, seeds=10, budget=50).case("absolute")
     assert 2000 * found.at("zeroth", SIGMA).trace == pytest.approx(3, rel=0.1)
     assert 2000 * found.at("first", SIGMA).trace == pytest.approx(1, rel=0.1)
     assert found.at("first", SIGMA).cosine is None
@@ -88,14 +88,14 @@ def test_the_variance_of_zeroth_order_at_a_kink():
 
 def test_estimates_spread_as_their_variances_say():
     """The variance of 300 estimates is known to 10 %."""
-    found = dd.gradient_panel([QUADRATIC], samples=20, seeds=300, budget=50).case("quadratic")
+    found = dd.studies.gradient_panel([QUADRATIC], samples=20, seeds=300, budget=50).case("quadratic")
     for order in ("first", "zeroth"):
         q = found.at(order, SIGMA)
         assert np.var([e.gradient[0] for e in q.estimates], ddof=1) == pytest.approx(q.trace, rel=0.3)
 
 
 def test_equal_evaluations_count_every_call():
-    found = dd.gradient_panel([QUADRATIC], samples=20, seeds=3, budget=50).case("quadratic")
+    found = dd.studies.gradient_panel([QUADRATIC], samples=20, seeds=3, budget=50).case("quadratic")
     for order, functions, derivatives in (("point", 0, 1), ("first", 0, 20), ("zeroth", 21, 0), ("blend", 21, 20)):
         q = found.at(order, SIGMA)
         assert {(e.functions, e.derivatives) for e in q.estimates} == {(functions, derivatives)}
@@ -108,7 +108,7 @@ def test_a_doubled_derivative_is_called_biased(case):
     """Above and below the refusal: the same case with its own derivative shows no bias."""
     wrong = replace(case, derivative=lambda x: 2 * case.derivative(x))
     for doctored in (case, wrong):
-        found = dd.gradient_panel([doctored], samples=50, seeds=4, sigmas=[0.2], budget=25).case(case.name)
+        found = dd.studies.gradient_panel([doctored], samples=50, seeds=4, sigmas=[0.2], budget=25).case(case.name)
         assert found.at("first", 0.2).biased == found.at("point", 0.2).biased == (doctored is wrong)
         assert any(s.startswith("first order is biased") for s in found.verdict) == (doctored is wrong)
         assert not found.at("zeroth", 0.2).biased
@@ -131,7 +131,7 @@ def test_a_mass_on_a_slide_has_the_closed_form_of_its_recursion():
     assert case.derivative(z) == pytest.approx(gradient, rel=1e-9)
     unit = np.eye(2)  # differences of a quadratic are exact
     H = [[by_hand(a + b) - by_hand(a) - by_hand(b) + by_hand(0 * a) for a in unit] for b in unit]
-    found = dd.gradient_panel([case], samples=200, seeds=2, sigmas=[0.5], budget=25).case(case.name)
+    found = dd.studies.gradient_panel([case], samples=200, seeds=2, sigmas=[0.5], budget=25).case(case.name)
     assert 200 * found.at("first", 0.5).trace == pytest.approx(0.25 * np.sum(np.square(H)), rel=0.2)
     assert found.at("zeroth", 0.5).trace > 5 * found.at("first", 0.5).trace
     assert found.least_error(0.5) == "first"
@@ -152,13 +152,13 @@ def test_the_wall_has_the_bias_of_its_jumps(theta, value, gradient, bias):
     case = replace(wall(sigmas=(0.05,)), start=[theta])
     truth = truth_of(case, case.start, 0.05, 2)
     assert (truth.value, truth.gradient[0]) == pytest.approx((value, gradient), rel=1e-8)
-    q = dd.gradient_panel([case], ["first"], samples=1000, seeds=10, budget=50).case("wall").at("first", 0.05)
+    q = dd.studies.gradient_panel([case], ["first"], samples=1000, seeds=10, budget=50).case("wall").at("first", 0.05)
     assert abs(q.bias[0] - bias) < 5 * q.bias_error[0] + 1e-9
     assert q.biased == (abs(bias) > 1e-3)
 
 
 def test_over_the_wall_only_zeroth_order_finds_the_way():
-    panel = dd.gradient_panel(["wall"], samples=100, seeds=10)
+    panel = dd.studies.gradient_panel(["wall"], samples=100, seeds=10)
     found = panel.case("wall")
     assert all(found.at("first", sigma).biased for sigma in found.sigmas)
     assert not any(found.at("zeroth", sigma).biased for sigma in found.sigmas)
@@ -189,7 +189,7 @@ def test_a_push_below_friction_has_no_derivative_to_follow():
 
 def qualities(case, sigma, samples, seeds):
     """The traces of first and zeroth order alone."""
-    found = dd.gradient_panel(
+    found = dd.studies.gradient_panel(
         [case], ["first", "zeroth"], [sigma], samples=samples, seeds=seeds, reference_samples=50, budget=21
     )
     return [found.cases[0].at(order, sigma).trace for order in ("first", "zeroth")]
@@ -211,7 +211,9 @@ def test_on_stiff_ground_the_jumps_of_the_step_turn_the_sign_of_first_order():
     f = np.array([case.f(case.start + a) for a in w])
     weights = np.exp(-((w / sigma) ** 2) / 2)
     gradient = np.sum(weights * f * w) / np.sum(weights) / sigma**2
-    found = dd.gradient_panel([case], sigmas=[sigma], samples=20, seeds=3, budget=21, reference_samples=300).cases[0]
+    found = dd.studies.gradient_panel(
+        [case], sigmas=[sigma], samples=20, seeds=3, budget=21, reference_samples=300
+    ).cases[0]
     assert abs(found.truths[0].gradient[0] - gradient) < 5 * found.truths[0].error[0]
     first, zeroth = found.at("first", sigma), found.at("zeroth", sigma)
     assert (first.biased, first.cosine) == (True, -1)
@@ -248,10 +250,14 @@ def test_a_descent_that_leaves_the_numbers_says_so_and_has_not_arrived():
 
 def test_the_same_seeds_give_the_same_bytes(tmp_path):
     for name in "ab":
-        dd.save_gradient_panel(dd.gradient_panel([wall(), QUADRATIC], sigmas=[0.2], seeds=3), tmp_path / name)
+        dd.studies.save_gradient_panel(
+            dd.studies.gradient_panel([wall(), QUADRATIC], sigmas=[0.2], seeds=3), tmp_path / name
+        )
     for file in ("gradient_panel.json", "gradient_panel.csv", "gradient_panel.html"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
-    one, other = (dd.gradient_panel([QUADRATIC], seeds=2).case("quadratic").at("zeroth", SIGMA) for _ in range(2))
+    one, other = (
+        dd.studies.gradient_panel([QUADRATIC], seeds=2).case("quadratic").at("zeroth", SIGMA) for _ in range(2)
+    )
     assert one.estimates[0].gradient != one.estimates[1].gradient
     assert one.estimates[1].gradient == other.estimates[1].gradient
 
@@ -274,7 +280,7 @@ def test_the_command_writes_table_numbers_and_page(tmp_path):
 
 @browsing
 def test_the_page_needs_no_motion_to_draw_its_plots(tmp_path, browser):
-    dd.save_gradient_panel(dd.gradient_panel([wall()], seeds=2), tmp_path)
+    dd.studies.save_gradient_panel(dd.studies.gradient_panel([wall()], seeds=2), tmp_path)
     browser.get_log("browser")
     browser.get((tmp_path / "gradient_panel.html").as_uri())
     assert browser.execute_script("return document.documentElement.dataset.ready") == "yes"
@@ -300,18 +306,18 @@ def test_the_page_needs_no_motion_to_draw_its_plots(tmp_path, browser):
     ],
 )
 def test_bad_input_is_refused(changes, message):
-    with pytest.raises(dd.InputError, match=message):
-        dd.gradient_panel(**({"cases": [QUADRATIC]} | changes))
+    with pytest.raises(InputError, match=message):
+        dd.studies.gradient_panel(**({"cases": [QUADRATIC]} | changes))
 
 
 @pytest.mark.parametrize(
     "changes", [{"start": [np.nan]}, {"start": 1.0}, {"sigmas": ()}, {"rate": 0.0}, {"goal": float("nan")}]
 )
 def test_a_case_that_cannot_be_is_refused(changes):
-    with pytest.raises(dd.InputError, match=f"quadratic.{next(iter(changes))}"):
+    with pytest.raises(InputError, match=f"quadratic.{next(iter(changes))}"):
         replace(QUADRATIC, **changes)
 
 
 def test_an_unknown_case_of_a_panel_is_named():
-    with pytest.raises(dd.UnknownNameError, match="quadratic"):
-        dd.gradient_panel([QUADRATIC], seeds=1).case("cubic")
+    with pytest.raises(UnknownNameError, match="quadratic"):
+        dd.studies.gradient_panel([QUADRATIC], seeds=1).case("cubic")

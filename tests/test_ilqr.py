@@ -12,12 +12,13 @@ from helpers.plants import block, craft, tilted
 from helpers.problems import A30, OTHERS, lqr, pendulum, riccati
 
 import drake_diff as dd
-from drake_diff.augmented_lagrangian import AugmentedLagrangian
-from drake_diff.expansion import Motion, expand, jacobians_along
-from drake_diff.ilqr import _Search, costs_to_go, solve_ilqr
-from drake_diff.nonlinear_program import Limits, Outcome
-from drake_diff.riccati import minimize_in_box, solve_riccati
-from drake_diff.solution import Status
+from drake_diff.exceptions import InputError
+from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
+from drake_diff.optimize.ilqr.expansion import Motion, expand, jacobians_along
+from drake_diff.optimize.ilqr.ilqr import _Search, costs_to_go, solve_ilqr
+from drake_diff.optimize.ilqr.riccati import minimize_in_box, solve_riccati
+from drake_diff.optimize.program import Limits, Outcome
+from drake_diff.optimize.solution import Status
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
@@ -133,7 +134,7 @@ def test_a_function_is_optimized_like_the_quadratic_cost_it_is():
     ],
 )
 def test_what_ilqr_cannot_keep_is_refused(changes, words):
-    with pytest.raises(dd.InputError, match=words):
+    with pytest.raises(InputError, match=words):
         dd.solve(pendulum(**changes), method="ilqr")
 
 
@@ -469,7 +470,7 @@ def test_no_riccati_problem_is_solved_twice(monkeypatch):
         seen.append((problem, regularization))
         return solve_riccati(problem, regularization)
 
-    monkeypatch.setattr("drake_diff.ilqr.solve_riccati", noted)
+    monkeypatch.setattr("drake_diff.optimize.ilqr.ilqr.solve_riccati", noted)
     solution = dd.solve(pendulum(num_steps=40), method="ilqr")
     assert solution.success, solution.message
     assert len(seen) >= len(solution.iterations) - 1
@@ -554,5 +555,5 @@ def test_a_cost_without_a_best_input_has_no_cost_to_go():
     """-1e4 u^2, which no QuadraticCost and no difference of gradients lets through: put in below those."""
     problem = lqr(*A30)
     object.__setattr__(problem.running_cost, "R", np.array([[-1e4]]))
-    with pytest.raises(dd.InputError, match="curvature"):
+    with pytest.raises(InputError, match="curvature"):
         costs_to_go(problem, np.zeros((21, 2)), np.zeros((20, 1)))

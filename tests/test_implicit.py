@@ -23,6 +23,7 @@ from pydrake.multibody.tree import (
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 import drake_diff as dd
+from drake_diff.exceptions import ModelError, ModelWarning, SimulationError
 
 NAMES = sorted(path.name for path in MODELS.iterdir())
 SAME = 1e-10  # two exact derivatives of one smooth step differ by rounding
@@ -82,7 +83,7 @@ def test_real_robots(tmp_path, name, base):
     path = tmp_path / name
     path.write_text(re.sub(r"(?s)<mimic.*?/>|<(collision|visual).*?</\1>", "", text))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", dd.ModelWarning)
+        warnings.simplefilter("ignore", ModelWarning)
         model = dd.load_model(path, time_step=0.005, weld_base=base)
     lower, upper = model.plant.GetPositionLowerLimits(), model.plant.GetPositionUpperLimits()
     random = np.random.default_rng(0)
@@ -96,7 +97,7 @@ def test_real_robots(tmp_path, name, base):
 
 def test_a_real_robot_with_coupled_fingers_is_handed_over():
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", dd.ModelWarning)
+        warnings.simplefilter("ignore", ModelWarning)
         model = dd.load_model(robot_file("panda.urdf"), time_step=0.005, weld_base="panda_link0")
     d = dd.differentiate_step(model, model.default_state, np.zeros(model.nu))
     assert d.method != "implicit"
@@ -291,7 +292,7 @@ def test_a_box_in_the_air_that_autodiff_refuses_on_a_broad_phase_hit(ground):
     try:
         dd.differentiate_step(model, x, method="autodiff")
         refused = False
-    except (dd.SimulationError, dd.ModelError):
+    except (SimulationError, ModelError):
         refused = True
     names = exact_parameters(model)
     d = dd.differentiate_step(model, x, parameters=names, method="implicit")

@@ -10,8 +10,9 @@ from helpers.plants import POINT, floating, in_the_air, limited_pendulum, spring
 from pydrake.multibody.tree import RpyFloatingJoint
 
 import drake_diff as dd
-from drake_diff.analytic import _FOUND, analytic_of, build_analytic, certified
-from drake_diff.parameters import applied, select
+from drake_diff.derivatives.analytic import _FOUND, analytic_of, build_analytic, certified
+from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.model.parameters import applied, select
 
 NAMES = sorted(path.name for path in MODELS.iterdir())
 SAME = 1e-9  # of the largest entry, as the gate has it: one derivative in two orders of operations
@@ -247,9 +248,9 @@ def test_without_pinocchio_the_others_serve(load, without_pinocchio):
     ],
 )
 def test_bad_input_is_named(load, xs, us, wanted):
-    with pytest.raises(dd.InputError, match=wanted):
+    with pytest.raises(InputError, match=wanted):
         dd.linearize(load("pendulum.urdf"), xs, us)
-    with pytest.raises(dd.UnknownNameError, match="analytic"):
+    with pytest.raises(UnknownNameError, match="analytic"):
         dd.linearize(load("pendulum.urdf"), np.zeros((2, 2)), np.zeros((2, 1)), "guess")
 
 

@@ -16,10 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
-from drake_diff.mcap_log import CHUNK_SIZE, Channel, write_mcap
-from drake_diff.mcap_messages import MESSAGES, TYPES
-from drake_diff.mcap_read import read_mcap
-from drake_diff.mcap_recover import recover_mcap
+from drake_diff.logs.messages import MESSAGES, TYPES
+from drake_diff.logs.read import read_mcap, recover_mcap
+from drake_diff.logs.write import CHUNK_SIZE, Channel, write_mcap
 
 STATE = TYPES["State"].cls
 

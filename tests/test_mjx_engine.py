@@ -27,10 +27,11 @@ from pydrake.multibody.tree import SpatialInertia
 
 import drake_diff as dd
 from drake_diff.engines.closed_form import MassSpringDamper
-from drake_diff.engines.description import describe
-from drake_diff.engines.mjcf import mjcf
-from drake_diff.engines.numpy_engine import NumpyEngine
-from drake_diff.tangent import tangent_space
+from drake_diff.engines.mujoco.mjcf import mjcf
+from drake_diff.engines.numpy import NumpyEngine
+from drake_diff.exceptions import GradientError, ModelError, SimulationError
+from drake_diff.mechanics.description import describe
+from drake_diff.model.tangent import tangent_space
 
 pytestmark = pytest.mark.slow
 
@@ -97,7 +98,7 @@ def test_a_turn_from_rest_has_its_derivative_and_says_that_mjx_has_it_not():
     x[4:7] = [1, 2, 3]
     found = engine.differentiate_step(x, [])
     assert found.method == "jax.jacfwd, turns from rest by hand"
-    drake = dd.load_engine("drake", model)
+    drake = dd.engines.load_engine("drake", model)
     A, A2 = (on_tangent(model, e.differentiate_step(x, []).A, x, e.step(x, [])) for e in (drake, engine))
     np.testing.assert_allclose(A2, A, rtol=0, atol=1e-14)  # rounding
     np.testing.assert_allclose(A2[:3, 6:9], 0.01 * np.eye(3), rtol=0, atol=1e-14)  # by hand: the turn is h w
@@ -151,7 +152,7 @@ def test_sliding_and_sticking_have_the_steps_jacobian_and_not_slipping_at_all_ha
         assert_jacobian_is_that_of_the_step(engine, model, x, [])
     x[2] = 0.0
     np.testing.assert_allclose(engine.step(x, []), mujoco.step(x, []), rtol=0, atol=1e-12)
-    with pytest.raises(dd.GradientError, match="not finite"):  # d sqrt(0) in the line search of elliptic cones
+    with pytest.raises(GradientError, match="not finite"):  # d sqrt(0) in the line search of elliptic cones
         engine.differentiate_step(x, [])
 
 
@@ -168,7 +169,7 @@ def test_a_pair_that_is_apart_takes_the_derivative_of_one_that_slides(load):
     engine, x = engine_of("mjx", model), model.default_state
     x[6], x[10] = 0.05 - 2 * G / 4e4, 1.0  # four corners slide, four are apart
     np.testing.assert_allclose(engine.step(x, []), engine_of("mujoco", model).step(x, []), rtol=0, atol=1e-12)
-    with pytest.raises(dd.GradientError, match="not finite"):
+    with pytest.raises(GradientError, match="not finite"):
         engine.differentiate_step(x, [])
 
 
@@ -188,7 +189,7 @@ def test_mjx_still_cannot_have_limits_with_elliptic_cones_and_no_contact(load):
     import jax
     from mujoco import mjx
 
-    from drake_diff.engines.mujoco_model import mujoco_model
+    from drake_diff.engines.mujoco.engine import mujoco_model
 
     _, compiled = mujoco_model(describe(load("cart_pole.urdf")), 0.01, None)
     model = mjx.put_model(compiled)
@@ -201,7 +202,7 @@ def test_mjx_still_cannot_have_limits_with_elliptic_cones_and_no_contact(load):
 
 def test_the_contract_is_that_of_mjxs_own_model(tmp_path):
     model = arms(tmp_path)
-    engine, drake = engine_of("mjx", model), dd.load_engine("drake", model)
+    engine, drake = engine_of("mjx", model), dd.engines.load_engine("drake", model)
     own = different(drake, engine)
     import jax
 
@@ -216,14 +217,14 @@ def test_the_contract_is_that_of_mjxs_own_model(tmp_path):
 ])  # fmt: skip
 def test_the_integrator_is_named(tmp_path, new, said):
     model = arms(tmp_path)
-    found = different(dd.load_engine("drake", model), own_mjcf(tmp_path, model, ('"Euler"', f'"{new}"')))
+    found = different(dd.engines.load_engine("drake", model), own_mjcf(tmp_path, model, ('"Euler"', f'"{new}"')))
     assert (said is None and "integrator" not in found) or said in found["integrator"]
 
 
 def test_an_integrator_and_a_cone_that_mjx_has_not_are_refused(tmp_path):
-    with pytest.raises(dd.ModelError, match="IMPLICIT"):
+    with pytest.raises(ModelError, match="IMPLICIT"):
         own_mjcf(tmp_path, arms(tmp_path), ('"Euler"', '"implicit"'))
-    with pytest.raises(dd.ModelError, match="condim=1"):
+    with pytest.raises(ModelError, match="condim=1"):
         own_mjcf(tmp_path, block_on_rails()[0], ('condim="3"', 'condim="1"'))
 
 
@@ -232,7 +233,7 @@ def test_a_pair_that_mjx_has_no_collision_for_is_refused_by_name():
     for name, shape in (("crate", Box(0.1, 0.2, 0.3)), ("can", Cylinder(0.1, 0.2))):
         body = plant.plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(1.0, 0.1))
         plant.shape(body, shape, contact_properties(1e4), RigidTransform())
-    with pytest.raises(dd.ModelError, match=r"CYLINDER.*BOX"):
+    with pytest.raises(ModelError, match=r"CYLINDER.*BOX"):
         engine_of("mjx", plant.model())
 
 
@@ -241,22 +242,22 @@ def test_other_friction_and_stiffness_are_found(tmp_path):
     path = tmp_path / "ball.sdf"
     text = (MODELS / "sphere_on_ground.sdf").read_text()
     path.write_text(text.replace("mu_dynamic>0.5", "mu_dynamic>0.4", 1))
-    found = different(dd.load_engine("drake", needed), engine_of("mjx", dd.load_model(path, time_step=0.01)))
+    found = different(dd.engines.load_engine("drake", needed), engine_of("mjx", dd.load_model(path, time_step=0.01)))
     assert "0.444" in found["contact pairs"]
-    same = different(dd.load_engine("drake", needed), engine_of("mjx", needed))
+    same = different(dd.engines.load_engine("drake", needed), engine_of("mjx", needed))
     assert same.keys() == {"contact law", "solver tolerance", "integrator"}
 
 
 def test_effort_limits_cut_and_the_derivative_is_zero_there(load):
     model = load("cart_pole.urdf")
     engine, x, u = engine_of("mjx", model), [0.1, 0.4, 0.2, -0.3], [25.0]
-    np.testing.assert_allclose(engine.step(x, u), dd.load_engine("drake", model).step(x, u), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(engine.step(x, u), dd.engines.load_engine("drake", model).step(x, u), rtol=0, atol=1e-12)
     assert np.abs(engine.differentiate_step(x, u).B).max() == 0
 
 
 def test_what_mjx_cannot_step_is_an_error(load):
     engine = engine_of("mjx", load("mass_spring_damper.sdf"))
-    with pytest.raises(dd.SimulationError, match="MJX"):
+    with pytest.raises(SimulationError, match="MJX"):
         engine.step([0.0, 1e308], [0.0])
 
 
@@ -264,7 +265,7 @@ def test_what_mjx_cannot_step_is_an_error(load):
 def test_a_missing_mjx_is_named_with_its_extra(module):
     code = f"""import sys; sys.modules[{module!r}] = None
 import drake_diff as dd
-try: dd.load_engine("mjx", None)
-except dd.MissingDependencyError as error: print(error)"""
+try: dd.engines.load_engine("mjx", None)
+except MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "pip install 'drake-diff[mjx]'" in done.stdout

@@ -8,9 +8,10 @@ from helpers.problems import A30, OTHERS, lqr, riccati
 from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 
 import drake_diff as dd
-from drake_diff.loop.controllers import tracking
-from drake_diff.replay import missed_goal, regulator_weights
-from drake_diff.step import advance
+from drake_diff.exceptions import GradientError, InputError, SimulationError
+from drake_diff.loop.run import tracking
+from drake_diff.model.step import advance
+from drake_diff.optimize.replay import missed_goal, regulator_weights
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
@@ -35,7 +36,7 @@ def swung():
 def test_it_is_the_remaining_horizons_lqr_whatever_its_own_horizon(case, horizon):
     """From states far from any plan; 1e-9 of an input of about 5: the sums of a few dozen rounded terms."""
     problem, gains = lqr(*case), riccati(*case)[1]
-    mpc = dd.MPC(problem, horizon=horizon, plan=straight(problem))
+    mpc = dd.loop.MPC(problem, horizon=horizon, plan=straight(problem))
     random = np.random.default_rng(0)
     for k, K in enumerate(gains):
         x = random.standard_normal(2)
@@ -49,7 +50,7 @@ def test_with_the_infinite_cost_to_go_as_its_final_cost_it_is_lqr_for_ever(horiz
     A, B = np.array([[1, h], [0, 1]]), np.array([[h**2], [h]])
     K, P = DiscreteTimeLinearQuadraticRegulator(A, B, Q, np.array([[R]]))
     problem = lqr(h, count, Q, R, P)
-    mpc = dd.MPC(problem, horizon=horizon, plan=straight(problem))
+    mpc = dd.loop.MPC(problem, horizon=horizon, plan=straight(problem))
     for k in (0, 3, count - 1, count, count + 1, 5 * count):
         x = np.array([1.0, -0.3 * k])
         assert mpc(x, k * h) == pytest.approx(-K @ x, abs=1e-9 * (1 + k))
@@ -58,7 +59,7 @@ def test_with_the_infinite_cost_to_go_as_its_final_cost_it_is_lqr_for_ever(horiz
 def test_after_the_end_the_goal_is_stayed_at_by_lqr():
     problem = dd.Problem(block(time_step=0.1), x0=[1, 0], x_goal=[0, 0], num_steps=20, running_cost=EFFORT)
     plan = dd.solve(problem, method="ilqr")
-    mpc = dd.MPC(problem, horizon=5, plan=plan)
+    mpc = dd.loop.MPC(problem, horizon=5, plan=plan)
     A, B = np.array([[1, 0.1], [0, 1]]), np.array([[0.01], [0.1]])
     K, _ = DiscreteTimeLinearQuadraticRegulator(A, B, *regulator_weights(plan.plan, plan.us)[:2])
     for k in (20, 21, 90):
@@ -69,23 +70,23 @@ def test_a_goal_that_gravity_pulls_away_from_is_stayed_at_by_the_input_that_hold
     """m g l sin q = 9.81 / 2 N m holds the pendulum of 1 kg and 0.5 m level; 1e-6 is LQR's own check."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     problem = dd.Problem(model, x0=[0, 0], x_goal=[np.pi / 2, 0], num_steps=50, running_cost=EFFORT)
-    mpc = dd.MPC(problem, horizon=20)
+    mpc = dd.loop.MPC(problem, horizon=20)
     assert mpc([np.pi / 2, 0], 10.0) == pytest.approx(9.81 / 2, abs=1e-6)
     bounds = dd.Bounds(u_lower=[-4.0], u_upper=[4.0])
     weak = dd.Problem(model, x0=[0, 0], x_goal=[np.pi / 2, 0], num_steps=50, running_cost=EFFORT, bounds=bounds)
-    with pytest.raises(dd.InputError, match=r"held by u = \[4\.9"):
-        dd.MPC(weak, horizon=20, plan=(np.zeros((51, 2)), np.zeros((50, 1))))
+    with pytest.raises(InputError, match=r"held by u = \[4\.9"):
+        dd.loop.MPC(weak, horizon=20, plan=(np.zeros((51, 2)), np.zeros((50, 1))))
 
 
 def test_the_pushed_cart_pole_ends_upright(swung):
     """One push on the way that open loop does not survive, one when it stands; both within |u| <= 20."""
-    problem, pushes = swung.problem, [dd.Push("pole", [1.5, 0, 0], 0.8), dd.Push("pole", [-0.5, 0, 0], 2.6)]
+    problem, pushes = swung.problem, [dd.loop.Push("pole", [1.5, 0, 0], 0.8), dd.loop.Push("pole", [-0.5, 0, 0], 2.6)]
     runs = {}
     for name, controller in (
-        ("mpc", dd.MPC(problem, horizon=30, plan=swung, max_iterations=3)),
-        ("open loop", dd.OpenLoop(swung.us, 0.02)),
+        ("mpc", dd.loop.MPC(problem, horizon=30, plan=swung, max_iterations=3)),
+        ("open loop", dd.loop.OpenLoop(swung.us, 0.02)),
     ):
-        runs[name] = dd.closed_loop(problem.model, controller, problem.x0, 300, dd.Loop(pushes=pushes))
+        runs[name] = dd.loop.closed_loop(problem.model, controller, problem.x0, 300, dd.loop.Loop(pushes=pushes))
     end = runs["mpc"].motion.xs[-1]
     assert np.abs(end - [1, np.pi, 0, 0]).max() < 0.02  # 3.4 s after the push, and the cart is slow to come back
     assert np.abs(runs["open loop"].motion.xs[-1] - end).max() > 1
@@ -96,18 +97,18 @@ def test_the_pushed_cart_pole_ends_upright(swung):
 
 def test_the_same_calls_give_the_same_bytes_and_start_forgets(swung):
     def run(mpc):
-        loop = dd.Loop(pushes=[dd.Push("pole", [1.0, 0, 0], 0.1)])
-        return dd.closed_loop(mpc._problem.model, mpc, np.zeros(4), 20, loop).commands.tobytes()
+        loop = dd.loop.Loop(pushes=[dd.loop.Push("pole", [1.0, 0, 0], 0.1)])
+        return dd.loop.closed_loop(mpc._problem.model, mpc, np.zeros(4), 20, loop).commands.tobytes()
 
-    first = dd.MPC(swung.problem, horizon=30, plan=swung)
-    other = dd.MPC(swing_up(), horizon=30, plan=swung)
+    first = dd.loop.MPC(swung.problem, horizon=30, plan=swung)
+    other = dd.loop.MPC(swing_up(), horizon=30, plan=swung)
     assert run(first) == run(first) == run(other)
 
 
 def test_between_two_plans_the_first_ones_inputs_are_given(swung):
     """Only steps 0, 3 and 6 look at the state, and there it is as planned: 1e-4 of 3 N is what two minima of a cost of
     59 can differ by that both leave 1e-16 of it."""
-    mpc = dd.MPC(swung.problem, horizon=30, plan=swung, replan_every=3)
+    mpc = dd.loop.MPC(swung.problem, horizon=30, plan=swung, replan_every=3)
     xs, us = mpc._reference
     given = [mpc(xs[k] + (0.1 if k % 3 else 0.0), 0.02 * k) for k in range(7)]
     np.testing.assert_allclose(np.array(given), us[:7], atol=1e-4)
@@ -115,15 +116,15 @@ def test_between_two_plans_the_first_ones_inputs_are_given(swung):
 
 
 def test_a_refused_solve_is_told_and_the_last_plan_followed(swung, monkeypatch):
-    mpc = dd.MPC(swung.problem, horizon=30, plan=swung)
+    mpc = dd.loop.MPC(swung.problem, horizon=30, plan=swung)
     x1 = advance(swung.problem.model.double, np.zeros(4), mpc(np.zeros(4), 0.0))
     planned = np.array(mpc._us)
     with monkeypatch.context() as patch:
 
         def refuse(*_, **__):
-            raise dd.GradientError("this far and no further")
+            raise GradientError("this far and no further")
 
-        patch.setattr("drake_diff.expansion.linearize", refuse)
+        patch.setattr("drake_diff.optimize.ilqr.expansion.linearize", refuse)
         for k in (1, 2, 35):
             command = mpc(x1, 0.02 * k)
             assert mpc.status == "the last plan is followed further: GradientError: this far and no further"
@@ -136,18 +137,18 @@ def test_a_refused_solve_is_told_and_the_last_plan_followed(swung, monkeypatch):
 
 def test_a_loop_logs_the_steps_whose_solve_failed(swung, monkeypatch):
     """Steps 4 to 6 by the shifted plan, which unperturbed is what would be planned: the motion is the same."""
-    mpc = dd.MPC(swung.problem, horizon=30, plan=swung)
-    undisturbed = dd.closed_loop(swung.problem.model, mpc, np.zeros(4), 10)
+    mpc = dd.loop.MPC(swung.problem, horizon=30, plan=swung)
+    undisturbed = dd.loop.closed_loop(swung.problem.model, mpc, np.zeros(4), 10)
     original, calls = mpc._ahead, []
 
     def refusing(x, k):
         calls.append(k)
         if 4 <= k <= 6:
-            raise dd.SimulationError("no")
+            raise SimulationError("no")
         return original(x, k)
 
     monkeypatch.setattr(mpc, "_ahead", refusing)
-    found = dd.closed_loop(swung.problem.model, mpc, np.zeros(4), 10)
+    found = dd.loop.closed_loop(swung.problem.model, mpc, np.zeros(4), 10)
     told = "the last plan is followed further: SimulationError: no"
     assert found.controller_status == ("ok",) * 4 + (told,) * 3 + ("ok",) * 3
     assert calls == list(range(10))
@@ -156,15 +157,15 @@ def test_a_loop_logs_the_steps_whose_solve_failed(swung, monkeypatch):
 
 
 def test_too_few_iterations_are_told(swung):
-    mpc = dd.MPC(swung.problem, horizon=30, plan=swung, max_iterations=1)
+    mpc = dd.loop.MPC(swung.problem, horizon=30, plan=swung, max_iterations=1)
     mpc(np.array([0.3, 0.5, 0, 0]), 0.0)
     assert mpc.status == "iLQR: iteration limit after 1 steps"
 
 
 def test_ctrl_c_is_no_bad_solve(swung, monkeypatch):
-    from drake_diff.nonlinear_program import NlpResult, Outcome
+    from drake_diff.optimize.program import NlpResult, Outcome
 
-    mpc = dd.MPC(swung.problem, horizon=30, plan=swung)
+    mpc = dd.loop.MPC(swung.problem, horizon=30, plan=swung)
     interrupted = NlpResult(np.zeros(30), Outcome.INTERRUPTED, "", ())
     monkeypatch.setattr("drake_diff.loop.mpc.solve_ilqr", lambda *_, **__: (interrupted, None, None))
     with pytest.raises(KeyboardInterrupt):
@@ -190,17 +191,17 @@ def test_ctrl_c_is_no_bad_solve(swung, monkeypatch):
 def test_what_it_cannot_do_is_refused_at_once(changes, options, said):
     fields = {"x0": [1, 0], "x_goal": [0, 0], "num_steps": 20, "running_cost": EFFORT, **changes}
     problem = dd.Problem(block(time_step=0.1), **fields)
-    with pytest.raises(dd.InputError, match=said):
-        dd.MPC(problem, **{"horizon": 5, "plan": straight(problem), **options})
+    with pytest.raises(InputError, match=said):
+        dd.loop.MPC(problem, **{"horizon": 5, "plan": straight(problem), **options})
 
 
 def test_an_open_loop_holds_its_last_input():
-    controller = dd.OpenLoop([[1.0], [2.0], [3.0]], 0.1)
+    controller = dd.loop.OpenLoop([[1.0], [2.0], [3.0]], 0.1)
     assert [controller(None, t)[0] for t in (0.0, 0.1, 0.1999, 0.2, 9.0)] == [1, 2, 3, 3, 3]
-    with pytest.raises(dd.InputError, match="0 steps"):
-        dd.OpenLoop(np.zeros((0, 1)), 0.1)
-    with pytest.raises(dd.InputError, match="time_step"):
-        dd.OpenLoop([[1.0]], 0.0)
+    with pytest.raises(InputError, match="0 steps"):
+        dd.loop.OpenLoop(np.zeros((0, 1)), 0.1)
+    with pytest.raises(InputError, match="time_step"):
+        dd.loop.OpenLoop([[1.0]], 0.0)
 
 
 def test_tracking_is_the_regulator_of_the_replays_within_bounds(swung):
@@ -216,5 +217,5 @@ def test_tracking_is_the_regulator_of_the_replays_within_bounds(swung):
 def test_a_collocated_plan_is_tracked_where_the_steps_are_short_enough(swung, parts, arrives):
     """Arrival as the package judges it: within 5 % of each state's range."""
     model = swung.plan.model_at(parts)
-    end = dd.closed_loop(model, tracking(swung, parts), swung.xs[0], 100 * parts).motion.xs[-1]
+    end = dd.loop.closed_loop(model, tracking(swung, parts), swung.xs[0], 100 * parts).motion.xs[-1]
     assert (not list(missed_goal(swung.plan, swung.problem.goal_error(end)))) == arrives

@@ -8,9 +8,10 @@ from helpers.problems import A30, lqr
 from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 
 import drake_diff as dd
-from drake_diff.shooting_program import SegmentedMotion
-from drake_diff.solution import Status
-from drake_diff.verdict import complaints_about
+from drake_diff.exceptions import InputError
+from drake_diff.optimize.judge import complaints_about
+from drake_diff.optimize.shooting import SegmentedMotion
+from drake_diff.optimize.solution import Status
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 SOLVERS = ("ipopt", "snopt")
@@ -186,5 +187,5 @@ def test_a_goal_that_nothing_moves_is_found_before_it_runs():
     ],
 )
 def test_segments_that_cannot_be_are_refused(changes, options, words):
-    with pytest.raises(dd.InputError, match=words):
+    with pytest.raises(InputError, match=words):
         dd.solve(pendulum(**changes), **{"method": "shooting", **options})

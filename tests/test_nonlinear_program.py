@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver
 
-import drake_diff as dd
-from drake_diff.mathematical_program import _ipopt_rows, _snopt_rows, solve_program
-from drake_diff.nonlinear_program import Limits, Outcome, Report, Watch
+from drake_diff.exceptions import GradientError, MissingDependencyError, SimulationError, UnknownNameError
+from drake_diff.optimize.drake_program import _ipopt_rows, _snopt_rows, solve_program
+from drake_diff.optimize.program import Limits, Outcome, Report, Watch
 
 SOLVERS = ("ipopt", "snopt")
 UNLIMITED = Limits(max_iterations=500, time_limit=math.inf, tolerance=1e-8)
@@ -87,7 +87,7 @@ def test_the_time_limit_ends_it_at_the_best_point_so_far(solver):
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_the_best_point_is_a_feasible_one_where_there_is_one(solver, monkeypatch):
     """Ctrl-C a few evaluations in: the guess is feasible, and no infeasible point may win by its lower cost."""
-    monkeypatch.setattr("drake_diff.nonlinear_program.REPORT_PERIOD", 0.0)
+    monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
     p = program(lambda z: z[0] + z[1], constraint=lambda z: z[0] ** 2 + z[1] ** 2, lower=2, upper=2)
     lines = []
 
@@ -104,7 +104,7 @@ def test_the_best_point_is_a_feasible_one_where_there_is_one(solver, monkeypatch
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_ctrl_c_puts_the_former_handler_back(solver, monkeypatch):
-    monkeypatch.setattr("drake_diff.nonlinear_program.REPORT_PERIOD", 0.0)
+    monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
 
     def mine(*_):
         raise AssertionError("the former handler must not hear of it")
@@ -137,7 +137,8 @@ def test_a_solve_works_outside_the_main_thread(solver):
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize(
-    ("error", "outcome"), [(dd.SimulationError, Outcome.DIVERGED), (dd.GradientError, Outcome.NO_GRADIENT)]
+    ("error", "outcome"),
+    [(SimulationError, Outcome.DIVERGED), (GradientError, Outcome.NO_GRADIENT)],
 )
 def test_a_refusal_inside_the_callback_is_told_in_its_own_words(solver, error, outcome):
     def cost(z):
@@ -217,14 +218,14 @@ def test_text_without_a_table_gives_no_rows(reader):
 
 
 def test_an_unknown_solver_is_named():
-    with pytest.raises(dd.UnknownNameError, match="solver: expected one of ipopt, snopt, got 'gurobi'"):
+    with pytest.raises(UnknownNameError, match="solver: expected one of ipopt, snopt, got 'gurobi'"):
         run(program(bowl), solver="gurobi")
 
 
 @pytest.mark.parametrize(("solver", "engine"), [("ipopt", IpoptSolver), ("snopt", SnoptSolver)])
 def test_a_solver_that_this_drake_lacks_is_named(solver, engine, monkeypatch):
     monkeypatch.setattr(engine, "available", lambda self: False)
-    with pytest.raises(dd.MissingDependencyError, match=f"the solver {solver} is not in this Drake"):
+    with pytest.raises(MissingDependencyError, match=f"the solver {solver} is not in this Drake"):
         run(program(bowl), solver=solver)
 
 
@@ -252,6 +253,6 @@ def test_the_clock_and_ctrl_c_end_a_solve_and_the_end_is_reported(monkeypatch):
     interrupted.interrupted.set()
     assert [w.look_up() for w in (going, late, interrupted)] == [False, True, True]
     assert [w.stopped_by for w in (going, late, interrupted)] == [None, Outcome.TIME_LIMIT, Outcome.INTERRUPTED]
-    monkeypatch.setattr("drake_diff.nonlinear_program.REPORT_PERIOD", 0.0)
+    monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
     assert going.look_up()
     assert going.stopped_by is None

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
-from drake_diff.loop.statistics import success_rate
+from drake_diff._base.statistics import success_rate
+from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
 from drake_diff.panels.panel_file import expand, load_panel
 from drake_diff.panels.trial_row import row_of
 
@@ -88,7 +89,7 @@ def column(directory, name):
 
 
 def start(path, out, *words):
-    command = [sys.executable, "-m", "drake_diff.cli", "panel", str(path), "--out", str(out), *map(str, words)]
+    command = [sys.executable, "-m", "drake_diff.cli.main", "panel", str(path), "--out", str(out), *map(str, words)]
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
     )
@@ -135,7 +136,7 @@ def thousand(tmp_path_factory):
     (folder / "trials.py").write_text(FUNCTIONS)
     path = folder / "panel.toml"
     path.write_text(PANEL.format(function="cheap", seeds=100, seconds=0.002, methods='["ilqr", "b,c"]'))
-    dd.run_panel(path, out=folder / "one", workers=1)
+    dd.panels.run_panel(path, out=folder / "one", workers=1)
     assert len(logged(path)) == 1000
     return path
 
@@ -144,7 +145,7 @@ def thousand(tmp_path_factory):
 @pytest.mark.parametrize("workers", [2, 4])
 def test_a_thousand_trials_give_the_same_bytes_whatever_the_number_of_workers(thousand, workers):
     out = thousand.parent / f"with_{workers}"
-    dd.run_panel(thousand, out=out, workers=workers)
+    dd.panels.run_panel(thousand, out=out, workers=workers)
     assert files(out) == files(thousand.parent / "one")
 
 
@@ -177,15 +178,15 @@ def test_a_thousand_trials_killed_three_times_at_random_give_the_same_bytes(thou
 def test_one_and_two_workers_give_the_same_bytes(write, tmp_path):
     path = write("cheap", seeds=3)
     for workers in (1, 2):
-        dd.run_panel(path, out=tmp_path / str(workers), workers=workers)
+        dd.panels.run_panel(path, out=tmp_path / str(workers), workers=workers)
     assert files(tmp_path / "1") == files(tmp_path / "2")
 
 
 def test_a_finished_panel_is_read_and_written_again_to_the_same_bytes_without_any_evaluation(write, tmp_path):
     path = write("cheap")
-    dd.run_panel(path, out=tmp_path / "out", workers=1)
+    dd.panels.run_panel(path, out=tmp_path / "out", workers=1)
     before, begun = files(tmp_path / "out"), logged(path)
-    table = dd.run_panel(path, out=tmp_path / "out", workers=1)
+    table = dd.panels.run_panel(path, out=tmp_path / "out", workers=1)
     assert files(tmp_path / "out") == before
     assert logged(path) == begun
     assert list(table.rows[0]) == ["id", "method", "level", "repeat", "seed", "success", "cost", "also"]
@@ -204,12 +205,12 @@ def test_global_generators_start_from_the_trials_own_seed():
 
 
 def test_a_worker_that_dies_loses_only_its_trial_which_is_evaluated_once_more(write, tmp_path):
-    table = dd.run_panel(write("dies_once"), out=tmp_path / "out", workers=2)
+    table = dd.panels.run_panel(write("dies_once"), out=tmp_path / "out", workers=2)
     assert [row["cost"] for row in table.rows] == [0.5, 1, 2, 4, 8]
 
 
 def test_a_trial_whose_worker_dies_twice_is_a_row_that_says_so(write, tmp_path):
-    table = dd.run_panel(write("dies"), out=tmp_path / "out", workers=1)
+    table = dd.panels.run_panel(write("dies"), out=tmp_path / "out", workers=1)
     assert table.errors == 1
     assert table.rows[2]["error"].startswith("WorkerDied: ")
     assert [row["cost"] for row in table.rows if "cost" in row] == [0.5, 1, 4, 8]
@@ -256,23 +257,23 @@ def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(write, tmp_path):
 
 def test_a_torn_last_line_is_dropped_and_its_trial_evaluated_again(write, tmp_path):
     path, out = write("cheap"), tmp_path / "out"
-    dd.run_panel(path, out=out, workers=1)
+    dd.panels.run_panel(path, out=out, workers=1)
     before, whole = files(out), (out / "trials.jsonl").read_bytes()
     for cut in (1, 30, len(whole.split(b"\n")[-2])):  # also one that lacks nothing but its end
         (out / "trials.jsonl").write_bytes(whole[:-cut])
         begun = len(logged(path))
-        dd.run_panel(path, out=out, workers=1)
+        dd.panels.run_panel(path, out=out, workers=1)
         assert len(logged(path)) == begun + 1
         assert (out / "trials.jsonl").read_bytes() == whole
         assert files(out) == before
     (out / "trials.jsonl").write_bytes(whole[:20])  # of the first line, which says what the panel is
-    dd.run_panel(path, out=out, workers=1)
+    dd.panels.run_panel(path, out=out, workers=1)
     assert files(out) == before
 
 
 def test_a_changed_byte_in_any_line_is_refused(write, tmp_path):
     path, out = write("cheap"), tmp_path / "out"
-    dd.run_panel(path, out=out, workers=1)
+    dd.panels.run_panel(path, out=out, workers=1)
     whole = (out / "trials.jsonl").read_bytes()
     drawn = random.Random(0)
     for place in drawn.sample(range(len(whole) - 1), 40):
@@ -280,49 +281,49 @@ def test_a_changed_byte_in_any_line_is_refused(write, tmp_path):
         if whole[place : place + 1] == b"\n":
             continue
         (out / "trials.jsonl").write_bytes(changed)
-        with pytest.raises(dd.ArtifactError, match=r"trials\.jsonl"):
-            dd.run_panel(path, out=out, workers=1)
+        with pytest.raises(ArtifactError, match=r"trials\.jsonl"):
+            dd.panels.run_panel(path, out=out, workers=1)
         assert (out / "trials.jsonl").read_bytes() == changed
 
 
 def test_a_line_twice_is_refused(write, tmp_path):
     path, out = write("cheap"), tmp_path / "out"
-    dd.run_panel(path, out=out, workers=1)
+    dd.panels.run_panel(path, out=out, workers=1)
     lines = (out / "trials.jsonl").read_bytes().splitlines(keepends=True)
     (out / "trials.jsonl").write_bytes(b"".join([*lines, lines[1]]))
-    with pytest.raises(dd.ArtifactError, match=r"line 7: trial .* stands there twice"):
-        dd.run_panel(path, out=out, workers=1)
+    with pytest.raises(ArtifactError, match=r"line 7: trial .* stands there twice"):
+        dd.panels.run_panel(path, out=out, workers=1)
 
 
 def test_another_panels_journal_is_refused_and_so_is_one_of_its_lines(write, tmp_path):
-    dd.run_panel(write("cheap"), out=tmp_path / "out", workers=1)
-    dd.run_panel(write("cheap", methods='["other"]'), out=tmp_path / "other", workers=1)
-    with pytest.raises(dd.ArtifactError, match="another panel: its sha256: expected "):
-        dd.run_panel(write("cheap"), out=tmp_path / "other", workers=1)
+    dd.panels.run_panel(write("cheap"), out=tmp_path / "out", workers=1)
+    dd.panels.run_panel(write("cheap", methods='["other"]'), out=tmp_path / "other", workers=1)
+    with pytest.raises(ArtifactError, match="another panel: its sha256: expected "):
+        dd.panels.run_panel(write("cheap"), out=tmp_path / "other", workers=1)
     foreign = (tmp_path / "other" / "trials.jsonl").read_bytes().splitlines(keepends=True)[1]
     with open(tmp_path / "out" / "trials.jsonl", "ab") as file:
         file.write(foreign)
-    with pytest.raises(dd.ArtifactError, match="line 7 is damaged or another panel's"):
-        dd.run_panel(write("cheap"), out=tmp_path / "out", workers=1)
+    with pytest.raises(ArtifactError, match="line 7 is damaged or another panel's"):
+        dd.panels.run_panel(write("cheap"), out=tmp_path / "out", workers=1)
 
 
 def test_a_comment_changes_no_panel_but_another_function_does(write, tmp_path):
     path, out = write("cheap"), tmp_path / "out"
-    dd.run_panel(path, out=out, workers=1)
+    dd.panels.run_panel(path, out=out, workers=1)
     path.write_text("# said in passing\n" + path.read_text())
-    dd.run_panel(path, out=out, workers=1)
+    dd.panels.run_panel(path, out=out, workers=1)
     with open(tmp_path / "trials.py", "a") as file:
         file.write("# changed\n")
-    with pytest.raises(dd.ArtifactError, match="its function_sha256"):
-        dd.run_panel(path, out=out, workers=1)
+    with pytest.raises(ArtifactError, match="its function_sha256"):
+        dd.panels.run_panel(path, out=out, workers=1)
 
 
 def test_two_at_once_on_one_directory_are_refused(write, tmp_path):
     path, out = write("cheap", seconds=60), tmp_path / "out"
     process = start(path, out, "--workers", 1)
     wait_for(lambda: len(logged(path)) == 1)
-    with pytest.raises(dd.ArtifactError, match="another process is at work"):
-        dd.run_panel(path, out=out, workers=1)
+    with pytest.raises(ArtifactError, match="another process is at work"):
+        dd.panels.run_panel(path, out=out, workers=1)
     process.kill()
     process.communicate()
 
@@ -361,7 +362,7 @@ def test_the_summary_of_a_cell_by_hand(tmp_path):
         "def f(trial):\n    k = trial['repeat']\n    return {'cost': [1, 2, 6][k], 'success': k > 0}\n"
     )
     (tmp_path / "p.toml").write_text('evaluate = "trials.py:f"\nseeds = 3\n[[cells]]\nmethod = "a"\n')
-    cell = dd.run_panel(tmp_path / "p.toml", out=tmp_path / "out", workers=1).summary["cells"][0]
+    cell = dd.panels.run_panel(tmp_path / "p.toml", out=tmp_path / "out", workers=1).summary["cells"][0]
     # (4 + 1 + 9) / 2 = 7 is the variance of 1, 2, 6
     assert cell["numbers"] == {"cost": {"count": 3, "mean": 3.0, "std": math.sqrt(7), "min": 1.0, "max": 6.0}}
     assert (cell["success"]["count"], cell["success"]["rate"]) == (2, 2 / 3)
@@ -427,8 +428,8 @@ def test_cells_stand_beside_the_axes(tmp_path):
 def test_a_file_that_cannot_be_right_is_refused_before_anything_is_written(tmp_path, text, message):
     path = tmp_path / "p.toml"
     path.write_text(text)
-    with pytest.raises(dd.InputError, match=message):
-        dd.run_panel(path, out=tmp_path / "out", workers=1)
+    with pytest.raises(InputError, match=message):
+        dd.panels.run_panel(path, out=tmp_path / "out", workers=1)
     assert not (tmp_path / "out").exists()
 
 
@@ -438,11 +439,11 @@ def test_bad_options_are_refused(write, tmp_path):
         ({"engine": "dask"}, "engine: expected one of local, ray, got 'dask'"),
         ({"address": "host:1"}, 'address: expected none for engine="local"'),
     ]:
-        with pytest.raises(dd.InputError, match=message):
-            dd.run_panel(write(), out=tmp_path / "out", **options)
+        with pytest.raises(InputError, match=message):
+            dd.panels.run_panel(write(), out=tmp_path / "out", **options)
 
 
 def test_without_ray_its_extra_is_named(write, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(dd.MissingDependencyError, match=r"pip install 'drake-diff\[cluster\]'"):
-        dd.run_panel(write(), out=tmp_path / "out", engine="ray")
+    with pytest.raises(MissingDependencyError, match=r"pip install 'drake-diff\[cluster\]'"):
+        dd.panels.run_panel(write(), out=tmp_path / "out", engine="ray")

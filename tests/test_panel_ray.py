@@ -48,7 +48,7 @@ def kill(finished, count, errors):
         print("of", len(pids), "workers one is killed after", finished, "trials")
 
 if __name__ == "__main__":
-    dd.run_panel("panel.toml", out="ray", workers=2, engine="ray", progress=kill)
+    dd.panels.run_panel("panel.toml", out="ray", workers=2, engine="ray", progress=kill)
 """
 
 
@@ -69,7 +69,7 @@ def write(tmp_path):
 
 
 def panel(folder, *words):
-    command = [sys.executable, "-m", "drake_diff.cli", "panel", "panel.toml", *words]
+    command = [sys.executable, "-m", "drake_diff.cli.main", "panel", "panel.toml", *words]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=240)
 
 

@@ -10,8 +10,8 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.tree import RevoluteJoint, RotationalInertia, SpatialInertia
 
 import drake_diff as dd
-from drake_diff.inertia import from_log_cholesky, room_of_inertia, to_log_cholesky
-from drake_diff.solution import Status
+from drake_diff.model.parameters import from_log_cholesky, room_of_inertia, to_log_cholesky
+from drake_diff.optimize.solution import Status
 
 G = 9.81
 SEEDS = range(20)

@@ -9,8 +9,9 @@ from pydrake.multibody.tree import RevoluteJoint, SpatialInertia, UnitInertia
 from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 
 import drake_diff as dd
-from drake_diff.policy import LQR, PD, TVLQR, ParametricPolicy, differentiate_policy, policy_parameters
-from drake_diff.tangent import tangent_space
+from drake_diff.exceptions import GradientError, InputError, NonFiniteError, ShapeError
+from drake_diff.model.tangent import tangent_space
+from drake_diff.motion.policy import LQR, PD, TVLQR, ParametricPolicy, differentiate_policy, policy_parameters
 
 # A30: the discrete double integrator with h = 0.1, Q = I, R = 0.1.
 Q, R = np.eye(2), np.array([[0.1]])
@@ -124,9 +125,9 @@ def test_lqr_spends_its_cost_to_go(write_urdf):
 
 
 def test_lqr_refuses_what_is_no_fixed_point(load, write_urdf):
-    with pytest.raises(dd.InputError, match="fixed point"):
+    with pytest.raises(InputError, match="fixed point"):
         LQR(load("pendulum.urdf"), [0.3, 0.0], [0.0], Q, R)
-    with pytest.raises(dd.InputError, match="fixed point"):
+    with pytest.raises(InputError, match="fixed point"):
         LQR(write_urdf(), [0.0, 1e-3], [0.0], Q, R)
     held = LQR(load("pendulum.urdf"), [0.3, 0.0], [9.81 * 0.5 * math.sin(0.3)], Q, R)  # the torque that holds it
     assert held([0.3, 0.0], 0.0) == pytest.approx([9.81 * 0.5 * math.sin(0.3)])
@@ -135,19 +136,19 @@ def test_lqr_refuses_what_is_no_fixed_point(load, write_urdf):
 def test_lqr_refuses_weights_it_cannot_use(write_urdf):
     model = write_urdf()
     for weights in [(Q, [[0.0]]), (Q, [[-1.0]]), (-Q, R), ([[1, 2], [0, 1]], R)]:
-        with pytest.raises(dd.InputError, match=r"positive|symmetric"):
+        with pytest.raises(InputError, match=r"positive|symmetric"):
             LQR(model, [0, 0], [0], *weights)
-    with pytest.raises(dd.ShapeError):
+    with pytest.raises(ShapeError):
         LQR(model, [0, 0], [0], np.eye(3), R)
-    with pytest.raises(dd.ShapeError, match="x_ref"):
+    with pytest.raises(ShapeError, match="x_ref"):
         LQR(model, [0, 0, 0], [0], Q, R)
-    with pytest.raises(dd.InputError, match="Q that sees all of it"):  # where Drake ends the process
+    with pytest.raises(InputError, match="Q that sees all of it"):  # where Drake ends the process
         LQR(model, [0, 0], [0], np.zeros((2, 2)), R)
 
 
 def test_lqr_of_what_cannot_be_stabilized_is_an_error_not_the_end_of_the_process():
     model = floating_arm()
-    with pytest.raises(dd.InputError, match="stabilize"):
+    with pytest.raises(InputError, match="stabilize"):
         LQR(model, model.default_state, [0.0], np.eye(14), np.eye(1))
 
 
@@ -229,13 +230,13 @@ def tangent_differences(f, size):
 
 def test_tvlqr_refuses_arrays_that_do_not_fit(write_urdf):
     model = write_urdf()
-    with pytest.raises(dd.ShapeError, match="xs"):
+    with pytest.raises(ShapeError, match="xs"):
         TVLQR(model, np.zeros((5, 2)), np.zeros((5, 1)), Q, R)
-    with pytest.raises(dd.ShapeError, match="us"):
+    with pytest.raises(ShapeError, match="us"):
         TVLQR(model, np.zeros((6, 2)), np.zeros((5, 2)), Q, R)
-    with pytest.raises(dd.InputError, match="at least one step"):
+    with pytest.raises(InputError, match="at least one step"):
         TVLQR(model, np.zeros((1, 2)), np.zeros((0, 1)), Q, R)
-    with pytest.raises(dd.InputError, match="Qf"):
+    with pytest.raises(InputError, match="Qf"):
         TVLQR(model, np.zeros((6, 2)), np.zeros((5, 1)), Q, R, -Q)
 
 
@@ -288,11 +289,11 @@ def test_pd_holds_the_default_state_where_no_reference_is_given(load):
 def test_pd_refuses_gains_and_references_that_do_not_fit(load):
     model = load("pendulum.urdf")
     for bad in ({"kp": [1.0, 2.0]}, {"kd": [[1.0]]}, {"x_ref": [0.0]}):
-        with pytest.raises(dd.ShapeError):
+        with pytest.raises(ShapeError):
             PD(model, **{"kp": 1.0, "kd": 1.0} | bad)
-    with pytest.raises(dd.NonFiniteError):
+    with pytest.raises(NonFiniteError):
         PD(model, float("nan"), 1.0)
-    with pytest.raises(dd.InputError, match="actuators"):
+    with pytest.raises(InputError, match="actuators"):
         PD(load("projectile.sdf"), 1.0, 1.0)
 
 
@@ -438,24 +439,24 @@ def into_floats(x, t):
     ],
 )
 def test_lost_derivatives_are_refused(policy):
-    with pytest.raises(dd.GradientError, match="lost its derivatives"):
+    with pytest.raises(GradientError, match="lost its derivatives"):
         differentiate_policy(policy, np.array([0.3, 0.4]), 0.0, 1)
 
 
 def test_lost_derivatives_by_the_parameters_alone_are_refused():
     function = lambda x, t, p: [getattr(p[0], "value", lambda: p[0])()]  # noqa: E731
-    with pytest.raises(dd.GradientError, match="lost its derivatives"):
+    with pytest.raises(GradientError, match="lost its derivatives"):
         differentiate_policy(ParametricPolicy(function, [1.0]), np.zeros(2), 0.0, 1)
 
 
 def test_a_random_policy_is_refused():
     random = np.random.default_rng(7)
-    with pytest.raises(dd.GradientError, match="is it random"):
+    with pytest.raises(GradientError, match="is it random"):
         differentiate_policy(lambda x, t: x[:1] + random.standard_normal(1), np.zeros(2), 0.0, 1)
 
 
 def test_a_derivative_that_is_not_finite_is_refused():
-    with pytest.raises(dd.GradientError, match="not finite"):
+    with pytest.raises(GradientError, match="not finite"):
         differentiate_policy(lambda x, t: np.sqrt(x[:1]), np.zeros(2), 0.0, 1)
 
 
@@ -466,16 +467,16 @@ def test_other_errors_of_the_policy_stay_what_they_are():
 
 def test_an_output_of_the_wrong_shape_is_refused():
     for policy in (lambda x, t: -x, lambda x, t: x[0], lambda x, t: x[:1].reshape(1, 1)):
-        with pytest.raises(dd.ShapeError, match=r"policy\(x, t\)"):
+        with pytest.raises(ShapeError, match=r"policy\(x, t\)"):
             differentiate_policy(policy, np.zeros(2), 0.0, 1)
-    with pytest.raises(dd.NonFiniteError):
+    with pytest.raises(NonFiniteError):
         differentiate_policy(lambda x, t: [np.nan], np.zeros(2), 0.0, 1)
 
 
 def test_parameters_must_be_a_flat_vector_of_numbers():
-    with pytest.raises(dd.ShapeError):
+    with pytest.raises(ShapeError):
         ParametricPolicy(network, np.zeros((2, 3)))
-    with pytest.raises(dd.NonFiniteError):
+    with pytest.raises(NonFiniteError):
         ParametricPolicy(network, [1.0, np.inf])
     parameters = np.ones(3)
     policy = ParametricPolicy(network, parameters)

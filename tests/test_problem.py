@@ -8,7 +8,8 @@ import pytest
 from helpers.models import MODELS
 
 import drake_diff as dd
-from drake_diff.cost import differentiate_cost, final_cost_hessian, running_cost_hessian
+from drake_diff.exceptions import InputError
+from drake_diff.optimize.problem.cost import differentiate_cost, final_cost_hessian, running_cost_hessian
 
 R = dd.QuadraticCost(R=[[1.0]])
 
@@ -137,7 +138,7 @@ def test_a_nan_goal_is_free(load):
     ],
 )
 def test_bad_problems_are_named(load, changes, words):
-    with pytest.raises(dd.InputError, match=words) as error:
+    with pytest.raises(InputError, match=words) as error:
         cart_pole(load, **changes)
     assert f": expected {error.value.expected}, got {error.value.got}" in str(error.value)
 
@@ -155,7 +156,7 @@ def test_bad_problems_are_named(load, changes, words):
 )
 def test_what_cannot_be_meant_is_refused_by_a_named_error(load, changes):
     """A tuple for Bounds, an input of infinity at least, no names, a goal of gaps and no cost, a complex position."""
-    with pytest.raises(dd.InputError, match=r"expected .*got"):
+    with pytest.raises(InputError, match=r"expected .*got"):
         cart_pole(load, **changes)
 
 
@@ -186,7 +187,7 @@ def test_infinity_takes_the_models_limit_away_on_one_side_only(load):
 
 
 def test_controls_without_actuators_are_refused(load):
-    with pytest.raises(dd.InputError, match="an actuated model"):
+    with pytest.raises(InputError, match="an actuated model"):
         dd.Problem(load("projectile.sdf"), x0=np.eye(13)[0], num_steps=3, final_cost=lambda x: x[4])
 
 
@@ -200,5 +201,5 @@ def test_controls_without_actuators_are_refused(load):
     ],
 )
 def test_bad_weights_are_named(Q, words):
-    with pytest.raises(dd.InputError, match=words):
+    with pytest.raises(InputError, match=words):
         dd.QuadraticCost(Q=Q)

@@ -15,6 +15,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.tree import SpatialInertia
 
 import drake_diff as dd
+from drake_diff.exceptions import NonFiniteError, NotOfferedError, ShapeError, SimulationError
 
 pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'drake-diff[forward]' (Python 3.11)")
 G = 9.81
@@ -23,7 +24,7 @@ OWN = {"limit law", "solver tolerance", "integrator", "derivative convention"}
 
 
 def bullet(model):
-    return dd.load_engine("pybullet", model)
+    return dd.engines.load_engine("pybullet", model)
 
 
 # ---- the step -------------------------------------------------------------------------------------------------------
@@ -61,7 +62,7 @@ def test_a_spinning_body_by_hand_turns_by_the_exponential_and_moves_by_its_cente
 @pytest.mark.parametrize("name", ["double_pendulum.urdf", "cart_pole.urdf", "acrobot.xml", "mass_spring_damper.sdf"])
 def test_without_damping_the_step_is_drakes(load, name):
     model = load(name)
-    drake, engine, random = dd.load_engine("drake", model), bullet(model), np.random.default_rng(0)
+    drake, engine, random = dd.engines.load_engine("drake", model), bullet(model), np.random.default_rng(0)
     damped = np.any(drake.description.by_velocity("damping"))
     assert damped == ("integrator" in different(drake, engine))
     for _ in range(3):
@@ -113,7 +114,7 @@ def test_each_step_depends_on_its_arguments_alone(load):
 def test_a_change_is_found_and_named(tmp_path, monkeypatch, change):
     monkeypatch.setitem(PLAIN, "rotor", 0.0)  # Bullet has no armature, as is tested below
     changes, must, may, words = CHANGES[change]
-    reference = dd.load_engine("drake", arms(tmp_path))
+    reference = dd.engines.load_engine("drake", arms(tmp_path))
     own = different(reference, bullet(arms(tmp_path)))
     assert own.keys() <= OWN
     found = different(reference, bullet(arms(tmp_path, **changes)))
@@ -125,7 +126,7 @@ def test_a_change_is_found_and_named(tmp_path, monkeypatch, change):
 @pytest.mark.parametrize("change", ["armature", "gear"])
 def test_armature_is_what_bullet_has_not(tmp_path, change):
     model = arms(tmp_path, **CHANGES[change][0])
-    found = different(dd.load_engine("drake", model), bullet(model))
+    found = different(dd.engines.load_engine("drake", model), bullet(model))
     assert found.keys() - OWN == {"armature", "M(q)"}
     assert "Bullet has no rotor inertia" in found["armature"]
     assert "left_joint_2" in found["armature"]
@@ -134,15 +135,15 @@ def test_armature_is_what_bullet_has_not(tmp_path, change):
 @pytest.mark.parametrize("wrong", ["quaternion order", "velocity frame", "none"])
 def test_a_swapped_quaternion_or_velocity_frame_is_found(wrong, monkeypatch):
     model = free_box((0.1, 0.2, 0.3))
-    drake, engine = dd.load_engine("drake", model), bullet(model)
-    module = sys.modules["drake_diff.engines.pybullet_engine"]
+    drake, engine = dd.engines.load_engine("drake", model), bullet(model)
+    module = sys.modules["drake_diff.engines.bullet"]
     real, x = module.rotation, np.array([0.5, 0.1, -0.7, 0.5, 1, 2, 3, 0.3, -0.4, 0.5, 1, 2, 3])
     x[:4] /= np.linalg.norm(x[:4])
     expected = formula(model, x, [], exponential=True)
     if wrong == "quaternion order":
         monkeypatch.setattr(module, "rotation", lambda q: real(np.roll(q, 1)))
     elif wrong == "velocity frame":
-        monkeypatch.setattr("drake_diff.engines.centers.rotation", lambda q: np.eye(3))
+        monkeypatch.setattr("drake_diff.mechanics.coordinates.rotation", lambda q: np.eye(3))
     found = different(drake, engine)
     assert ("M(q)" in found) == (wrong != "none")
     assert "not that of Bullet's own step" in found["bias(q, v)"]
@@ -152,10 +153,10 @@ def test_a_swapped_quaternion_or_velocity_frame_is_found(wrong, monkeypatch):
 def test_contacts_are_drakes_pairs_and_a_shape_that_is_not_built_is_named(load, tmp_path):
     for name in ("sphere_on_ground.sdf", "sliding_block.sdf", "two_spheres.sdf"):
         model = load(name)
-        found = different(dd.load_engine("drake", model), bullet(model)).keys()
+        found = different(dd.engines.load_engine("drake", model), bullet(model)).keys()
         assert found <= {*OWN, "contact law", "bias(q, v)"}, name
     model = tetrahedron_on_ground(tmp_path)
-    assert "body_shape" in different(dd.load_engine("drake", model), bullet(model))["contact pairs"]
+    assert "body_shape" in different(dd.engines.load_engine("drake", model), bullet(model))["contact pairs"]
 
 
 # ---- contact --------------------------------------------------------------------------------------------------------
@@ -193,14 +194,14 @@ def test_links_are_given_what_makes_drakes_pairs_and_the_least_squares_where_pai
     for name, k, mu in (("one", 1e4, 0.2), ("two", 3e4, 0.8)):
         plant.ball(name, 1.0, 0.1, contact_properties(k, 1, mu))
     plant.ground(contact_properties(2e4, 1, 0.5))
-    drake = dd.load_engine("drake", plant.model())
+    drake = dd.engines.load_engine("drake", plant.model())
     engine = bullet(drake.model)
     wanted = {pair.names: pair for pair in drake.contract.contacts}
     for pair in engine.contract.contacts:  # with three pairs of three links all can be had
         assert pair.stiffness == pytest.approx(wanted[pair.names].stiffness, rel=1e-12)
         assert pair.friction == pytest.approx(wanted[pair.names].friction, rel=1e-12)
     assert "contact pairs" not in different(drake, engine)
-    split = sys.modules["drake_diff.engines.bullet_contract"].split
+    split = sys.modules["drake_diff.engines.bullet"].split
     square = [(("a", "b"), 1.0), (("b", "c"), 2.0), (("c", "d"), 1.0), (("d", "a"), 1.0)]  # a + c, b + d: 3 and 2
     found = split(square)
     assert [found[x] + found[y] for (x, y), _ in square] == pytest.approx([1.25, 1.75, 1.25, 0.75], rel=1e-12)
@@ -222,28 +223,28 @@ def test_shapes_stand_where_drakes_stand(shape, height):
 
 def test_bad_input_and_what_bullet_has_not_are_named(load):
     engine = bullet(load("pendulum.urdf"))
-    with pytest.raises(dd.ShapeError, match="x"):
+    with pytest.raises(ShapeError, match="x"):
         engine.step([0.0], [0.0])
-    with pytest.raises(dd.NonFiniteError, match="u"):
+    with pytest.raises(NonFiniteError, match="u"):
         engine.step([0.0, 0.0], [np.nan])
-    with pytest.raises(dd.NotOfferedError, match="no derivatives"):
+    with pytest.raises(NotOfferedError, match="no derivatives"):
         engine.differentiate_step([0.0, 0.0], [0.0])
-    with pytest.raises(dd.NotOfferedError, match="free body"):
+    with pytest.raises(NotOfferedError, match="free body"):
         bullet(free_box()).bias([1, 0, 0, 0, 0, 0, 1], np.zeros(6))
-    with pytest.raises(dd.SimulationError, match="Bullet"):
+    with pytest.raises(SimulationError, match="Bullet"):
         bullet(load("double_pendulum.urdf")).step([0.0, 1.0, 1e200, 1e200], [0.0, 0.0])
 
 
 def test_pybullet_says_nothing_and_a_missing_one_is_named_with_its_extra():
     code = f"""import drake_diff as dd
 model = dd.load_model({str(MODELS / "pendulum.urdf")!r}, time_step=0.01)
-engine = dd.load_engine('pybullet', model)
+engine = dd.engines.load_engine('pybullet', model)
 engine.step([0, 0], [0])  # and it lives to the end"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "")
     code = """import sys; sys.modules['pybullet'] = None
 import drake_diff as dd
-try: dd.load_engine('pybullet', None)
-except dd.MissingDependencyError as error: print(error)"""
+try: dd.engines.load_engine('pybullet', None)
+except MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "pip install 'drake-diff[forward]'" in done.stdout

@@ -17,13 +17,13 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, JsonValue, ValidationError
 
 import drake_diff as dd
-from drake_diff.invariants import invariants_of
-from drake_diff.named_files import named_files
-from drake_diff.problem_record import describe_problem, rebuild_problem
-from drake_diff.record import EvidenceRecord, canonical, own_sha256
-from drake_diff.record_file import parse_record
-from drake_diff.record_parts import Metric
-from drake_diff.record_schema import generated_schema, published_schema
+from drake_diff.artifact.measures import invariants_of
+from drake_diff.artifact.sections import describe_problem, rebuild_problem
+from drake_diff.exceptions import ArtifactError
+from drake_diff.record.parts import Metric
+from drake_diff.record.provenance import named_files
+from drake_diff.record.read import generated_schema, parse_record, published_schema
+from drake_diff.record.run_record import EvidenceRecord, canonical, own_sha256
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 JSON = st.recursive(
@@ -122,7 +122,7 @@ def test_the_published_schema_is_what_pydantic_generates():
 
 def test_the_schema_is_in_the_run_and_printed_by_the_command(record):
     assert record.files["record.schema.json"].sha256 == sha256(published_schema()).hexdigest()
-    command = [sys.executable, "-m", "drake_diff.cli", "schema"]
+    command = [sys.executable, "-m", "drake_diff.cli.main", "schema"]
     assert subprocess.run(command, capture_output=True, check=True).stdout == published_schema()
 
 
@@ -173,14 +173,14 @@ def test_a_metric_whose_verdict_is_not_that_of_its_value_is_refused():
 def test_another_major_version_is_refused_by_name_and_a_later_minor_one_is_read(record):
     fields = record.model_dump(mode="json")
     for version in ("0.3.0", "2.0.0", None):
-        with pytest.raises(dd.ArtifactError, match=r"schema_version .*; this drake_diff reads 1\.x\.y"):
+        with pytest.raises(ArtifactError, match=r"schema_version .*; this drake_diff reads 1\.x\.y"):
             parse_record(Path("record.json"), {**fields, "schema_version": version})
     later = {**fields, "schema_version": "1.7.0", "weather": "fine"}
     later["metrics"] = [{**later["metrics"][0], "colour": "blue"}, *later["metrics"][1:]]
     assert parse_record(Path("record.json"), later).metrics == record.metrics
-    with pytest.raises(dd.ArtifactError, match="weather"):
+    with pytest.raises(ArtifactError, match="weather"):
         parse_record(Path("record.json"), {**fields, "weather": "fine"})
-    with pytest.raises(dd.ArtifactError, match="verdict"):
+    with pytest.raises(ArtifactError, match="verdict"):
         parse_record(Path("record.json"), {**later, "verdict": "great"})
 
 

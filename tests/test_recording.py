@@ -12,10 +12,11 @@ from pydrake.math import RollPitchYaw
 from typer.testing import CliRunner
 
 import drake_diff as dd
-from drake_diff.cli import app
-from drake_diff.engines.comparison_words import sentence_of
-from drake_diff.engines.mjcf import mjcf
+from drake_diff.cli.main import app
+from drake_diff.comparison.result import sentence_of
 from drake_diff.engines.motion import move
+from drake_diff.engines.mujoco.mjcf import mjcf
+from drake_diff.exceptions import ArtifactError, InputError, ShapeError
 
 H = 0.01
 INPUTS = 2 * np.sin(np.arange(40))[:, None]
@@ -65,10 +66,10 @@ def test_the_reference_takes_as_many_steps_as_lie_between_samples(load):
     late = dd.Recording("late", "1", late.times + 7, late.xs, late.us)
     assert compared(model, late).motion.times[0] == 0.0  # as the others' are
     for period in (1.5 * H, 0.5 * H):
-        with pytest.raises(dd.InputError, match=rf"0\.01 s, got {period:g}"):
+        with pytest.raises(InputError, match=rf"0\.01 s, got {period:g}"):
             compared(model, record(drake, [0.5, 0], INPUTS[:10], h=period))
     dropped = dd.Recording("dropped", "1", np.delete(late.times, 4), np.delete(late.xs, 4, axis=0), late.us[:-1])
-    with pytest.raises(dd.InputError, match=r"from sample 3 to 4: expected 0\.01 s throughout.* got 0\.02"):
+    with pytest.raises(InputError, match=r"from sample 3 to 4: expected 0\.01 s throughout.* got 0\.02"):
         compared(model, dropped)
 
 
@@ -87,7 +88,7 @@ def test_the_command_compares_recordings_and_saves_them(load, tmp_path):
         done = CliRunner().invoke(app, command)
         assert done.exit_code == status, done.output
     assert "as if the time step were half" in done.output
-    log = dd.read_mcap(next((tmp_path / "out").glob("*.mcap")))
+    log = dd.logs.read_mcap(next((tmp_path / "out").glob("*.mcap")))
     np.testing.assert_allclose(log.arrays("/3_other/state")["time"], 5 * H * np.arange(9))
     frames = {t.child_frame_id.split("/")[0] for _, m in log.messages["/tf"] for t in m.transforms}
     assert "2_same" in frames
@@ -194,7 +195,7 @@ def test_facts_are_lines_of_the_contract_and_nothing_else_is_known(load):
     flipped = compared(model, record(drake, [0.5, 0], INPUTS, gravity="[0, 0, 9.81]"))
     assert (flipped.verdict, [x.quantity for x in flipped.broken]) == ("other model", ["gravity"])
     for wrong in ({"gravity": "9.81"}, {"time step": "fast"}, {"precision": "half"}, {"mass": "1"}):
-        with pytest.raises(dd.InputError, match=next(iter(wrong))):
+        with pytest.raises(InputError, match=next(iter(wrong))):
             compared(model, record(drake, [0.5, 0], INPUTS, **wrong))
     rounded = record(drake, [0.5, 0], INPUTS, precision="float32")
     rounded = dd.Recording("r", "1", rounded.times, rounded.xs.astype(np.float32), INPUTS, rounded.facts)
@@ -208,11 +209,11 @@ def test_a_recording_by_hand_is_checked_too(load):
     good = record(engine_of("drake", model), model.default_state, np.zeros((3, 0)))
     bad = np.array(good.xs)
     bad[:, :4] = [0.5, 0.5, 0, 0]
-    with pytest.raises(dd.InputError, match="norm of"):
+    with pytest.raises(InputError, match="norm of"):
         compared(model, dd.Recording("r", "1", good.times, bad, good.us))
-    with pytest.raises(dd.InputError, match="sample 2"):
+    with pytest.raises(InputError, match="sample 2"):
         compared(model, dd.Recording("r", "1", np.array([0, 0.01, 0.01, 0.02]), good.xs, good.us))
-    with pytest.raises(dd.ShapeError, match=r"\(4, 13\)"):
+    with pytest.raises(ShapeError, match=r"\(4, 13\)"):
         compared(model, dd.Recording("r", "1", good.times, good.xs[:, :7], good.us))
 
 
@@ -224,10 +225,12 @@ ROWS = [[0, 0.1, 0.2, 0.3, 0.4, 1.5], [0.01, 1.1, 1.2, 1.3, 1.4, 2.5], [0.02, 2.
 
 def test_csv_columns_are_found_by_name(load, tmp_path):
     model = load("cart_pole.urdf")
-    plain = dd.read_recording(write_csv(tmp_path / "run.csv", HEADER, ROWS), model)
+    plain = dd.comparison.read_recording(write_csv(tmp_path / "run.csv", HEADER, ROWS), model)
     order = [5, 4, 0, 2, 1, 3]
     turned = [[row[i] for i in order] for row in [HEADER, *ROWS]]
-    other = dd.read_recording(write_csv(tmp_path / "turned.csv", turned[0], turned[1:]), model, name="turned")
+    other = dd.comparison.read_recording(
+        write_csv(tmp_path / "turned.csv", turned[0], turned[1:]), model, name="turned"
+    )
     for recording in (plain, other):
         np.testing.assert_array_equal(recording.times, [0, 0.01, 0.02])
         np.testing.assert_array_equal(recording.xs, [row[1:5] for row in ROWS])
@@ -235,7 +238,7 @@ def test_csv_columns_are_found_by_name(load, tmp_path):
     assert (plain.name, plain.version, other.name) == ("run", "not told", "turned")
     told = {"engine": "isaaclab", "version": "3.0.0", "time step": 0.01, "gravity": [0, 0, -9.81], "seeds": [1, 2]}
     (tmp_path / "run.contract.json").write_text(json.dumps(told))
-    plain = dd.read_recording(tmp_path / "run.csv", model)
+    plain = dd.comparison.read_recording(tmp_path / "run.csv", model)
     assert (plain.name, plain.version, plain.facts["time step"]) == ("isaaclab", "3.0.0", "0.01")
 
 
@@ -260,8 +263,8 @@ def changed(row, column, value):
     ],
 )
 def test_a_bad_csv_is_named_by_line_and_column(load, tmp_path, header, rows, match):
-    with pytest.raises(dd.InputError, match=match):
-        dd.read_recording(write_csv(tmp_path / "bad.csv", header, rows), load("cart_pole.urdf"))
+    with pytest.raises(InputError, match=match):
+        dd.comparison.read_recording(write_csv(tmp_path / "bad.csv", header, rows), load("cart_pole.urdf"))
 
 
 def test_what_is_no_recording_is_refused(load, tmp_path):
@@ -269,16 +272,20 @@ def test_what_is_no_recording_is_refused(load, tmp_path):
     (tmp_path / "empty.csv").write_text("")
     (tmp_path / "run.txt").write_text("1")
     (tmp_path / "junk.mcap").write_bytes(b"junk")
-    for name, error in (("empty.csv", dd.InputError), ("run.txt", dd.InputError), ("none.csv", dd.InputError)):
+    for name, error in (
+        ("empty.csv", InputError),
+        ("run.txt", InputError),
+        ("none.csv", InputError),
+    ):
         with pytest.raises(error, match=name):
-            dd.read_recording(tmp_path / name, model)
-    with pytest.raises(dd.ArtifactError, match=r"junk\.mcap"):
-        dd.read_recording(tmp_path / "junk.mcap", model)
+            dd.comparison.read_recording(tmp_path / name, model)
+    with pytest.raises(ArtifactError, match=r"junk\.mcap"):
+        dd.comparison.read_recording(tmp_path / "junk.mcap", model)
     write_csv(tmp_path / "run.csv", HEADER, ROWS)
     for text, match in (("{", "JSON object"), ("[]", "JSON object"), ('{"color": "red"}', "color")):
         (tmp_path / "run.contract.json").write_text(text)
-        with pytest.raises(dd.InputError, match=match):
-            dd.read_recording(tmp_path / "run.csv", model)
+        with pytest.raises(InputError, match=match):
+            dd.comparison.read_recording(tmp_path / "run.csv", model)
 
 
 # ---- MCAP of this project, and ROS 2 -----------------------------------------------------------------------------
@@ -291,22 +298,22 @@ def run(pushed):
 
 def test_our_own_trace_is_a_recording_to_the_bit(run, load):
     model, motion, folder = run
-    found = dd.read_recording(folder / "trace.mcap", model)
+    found = dd.comparison.read_recording(folder / "trace.mcap", model)
     assert found.xs.tobytes() == motion.xs.tobytes()
     assert found.us.tobytes() == motion.us.tobytes()
     assert compared(model, found).step_gaps.max() == 0
-    with pytest.raises(dd.InputError, match="names of q in /state"):
-        dd.read_recording(folder / "trace.mcap", load("pendulum.urdf"))
+    with pytest.raises(InputError, match="names of q in /state"):
+        dd.comparison.read_recording(folder / "trace.mcap", load("pendulum.urdf"))
 
 
 def test_the_exported_bag_is_a_recording_to_the_bit(run, tmp_path):
     pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
-    from drake_diff.ros2_bag import export_ros2
+    from drake_diff.artifact.ros2 import export_ros2
 
     model, motion, folder = run
     export_ros2(folder, tmp_path / "bag")
     for path in (tmp_path / "bag", tmp_path / "bag" / "bag.mcap"):
-        found = dd.read_recording(path, model)
+        found = dd.comparison.read_recording(path, model)
         assert found.xs.tobytes() == motion.xs.tobytes()
         assert found.us.tobytes() == motion.us.tobytes()
         assert compared(model, found).verdict == "same"
@@ -314,7 +321,7 @@ def test_the_exported_bag_is_a_recording_to_the_bit(run, tmp_path):
 
 def test_a_damaged_bag_is_no_recording(run, tmp_path):
     pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
-    from drake_diff.ros2_bag import export_ros2
+    from drake_diff.artifact.ros2 import export_ros2
 
     model, _, folder = run
     export_ros2(folder, tmp_path / "bag")
@@ -322,8 +329,8 @@ def test_a_damaged_bag_is_no_recording(run, tmp_path):
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) // 2])
     for path in (file, tmp_path / "bag"):
-        with pytest.raises(dd.ArtifactError):
-            dd.read_recording(path, model)
+        with pytest.raises(ArtifactError):
+            dd.comparison.read_recording(path, model)
 
 
 def bag_of(path, messages):
@@ -388,7 +395,7 @@ def ball_bag(path, parts):
 
 
 def rotation_of(x):
-    from drake_diff.engines.euler import rotation
+    from drake_diff.mechanics.coordinates import rotation
 
     return rotation(x[:4])
 
@@ -397,7 +404,7 @@ def test_odometry_s_frames_and_quaternion_are_mapped(tmp_path):
     """The twist is turned from the child frame, w goes to the front: a mistake in either leaves no step the same."""
     part = lambda t, x: ("/odom", "nav_msgs/msg/Odometry", "world", t, lambda y: odometry(y, x, rotation_of(x)))  # noqa: E731
     model, xs, path = ball_bag(tmp_path / "bag", [part])
-    found = dd.read_recording(path, model)
+    found = dd.comparison.read_recording(path, model)
     np.testing.assert_allclose(found.xs[0], BALL, atol=1e-14)  # by hand, the rotation by Drake's own
     np.testing.assert_allclose(found.xs, xs, atol=1e-14)
     np.testing.assert_allclose(found.times, H * np.arange(6), atol=1e-9)  # from 0, to the nanosecond
@@ -424,11 +431,11 @@ def test_pose_and_twist_say_their_frame(tmp_path, frame):
         return "/twist", "geometry_msgs/msg/TwistStamped", frame, t, lambda types: velocity(types, x)
 
     model, xs, path = ball_bag(tmp_path / "bag", [poses, twists])
-    np.testing.assert_allclose(dd.read_recording(path, model).xs, xs, atol=1e-14)
+    np.testing.assert_allclose(dd.comparison.read_recording(path, model).xs, xs, atol=1e-14)
     unknown = lambda t, x: (*twists(t, x)[:2], "camera", *twists(t, x)[3:])  # noqa: E731
     _, _, path = ball_bag(tmp_path / "camera", [poses, unknown])
-    with pytest.raises(dd.InputError, match=r"frame_id of TwistStamped: expected 'world'.*got 'camera'"):
-        dd.read_recording(path, model)
+    with pytest.raises(InputError, match=r"frame_id of TwistStamped: expected 'world'.*got 'camera'"):
+        dd.comparison.read_recording(path, model)
 
 
 def joints(names, position, velocity, effort):
@@ -447,8 +454,8 @@ def joints(names, position, velocity, effort):
 )
 def test_what_joint_states_lack_is_named(load, tmp_path, fields, match):
     rows = [("/joint_states", "sensor_msgs/msg/JointState", "", STAMP + k, fields) for k in (0, 10_000_000)]
-    with pytest.raises(dd.InputError, match=match):
-        dd.read_recording(bag_of(tmp_path / "bag", rows), load("cart_pole.urdf"))
+    with pytest.raises(InputError, match=match):
+        dd.comparison.read_recording(bag_of(tmp_path / "bag", rows), load("cart_pole.urdf"))
 
 
 def test_a_bag_without_what_the_model_has_is_refused(load, tmp_path):
@@ -456,8 +463,8 @@ def test_a_bag_without_what_the_model_has_is_refused(load, tmp_path):
         ("/joint_states", "sensor_msgs/msg/JointState", "", STAMP, joints(["slide"], [1.0], [1.0], [1.0])),
     ]
     path = bag_of(tmp_path / "bag", rows)
-    with pytest.raises(dd.InputError, match="topics of geometry_msgs/msg/PoseStamped"):
-        dd.read_recording(path, load("projectile.sdf"))
+    with pytest.raises(InputError, match="topics of geometry_msgs/msg/PoseStamped"):
+        dd.comparison.read_recording(path, load("projectile.sdf"))
     (tmp_path / "empty").mkdir()
-    with pytest.raises(dd.ArtifactError, match="no ROS 2 bag"):
-        dd.read_recording(Path(tmp_path / "empty"), load("projectile.sdf"))
+    with pytest.raises(ArtifactError, match="no ROS 2 bag"):
+        dd.comparison.read_recording(Path(tmp_path / "empty"), load("projectile.sdf"))

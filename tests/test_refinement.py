@@ -5,6 +5,7 @@ import pytest
 from helpers.models import Plant, contact_properties
 
 import drake_diff as dd
+from drake_diff.exceptions import CertificateError, InputError, ModelError
 
 BALL = """<sdf version="1.9"><model name="bouncer"><link name="ball"><inertial><mass>{mass}</mass>
 <inertia><ixx>1</ixx><iyy>1</iyy><izz>1</izz></inertia></inertial><collision name="skin">
@@ -47,7 +48,7 @@ def test_through_a_bounce_the_gradient_does_not_converge_and_is_called_that(boun
     assert certificate.verdict == "not_converged", str(certificate)
     assert certificate.entries[0].verdict == "not_converged"
     assert "not converged: do not optimize with this" in str(certificate)
-    with pytest.raises(dd.CertificateError, match="not converged: do not optimize with this"):
+    with pytest.raises(CertificateError, match="not converged: do not optimize with this"):
         certificate.require()
 
 
@@ -81,7 +82,7 @@ def test_stiffening_a_bounce_does_not_converge_at_a_fixed_step(bouncer):
 
 
 def test_stiffening_needs_a_stated_stiffness(load):
-    with pytest.raises(dd.InputError, match="states no point stiffness"):
+    with pytest.raises(InputError, match="states no point stiffness"):
         dd.certify_rollout(load("pendulum.urdf"), [0.1, 0], [[0.0]], height, refine_stiffness=True)
 
 
@@ -124,12 +125,12 @@ def test_inputs_and_parameters_are_refined_too(load):
 def test_a_model_with_one_time_step_cannot_be_refined():
     plant = Plant(0.01)
     plant.ball("ball", 1.0, 0.1, contact_properties(1e4), "z")
-    with pytest.raises(dd.ModelError, match="build the diagram again"):
+    with pytest.raises(ModelError, match="build the diagram again"):
         dd.certify_rollout(plant.model(), [1.0, 0.0], None, height, num_steps=3, refine=True)
 
 
 def test_the_time_step_is_not_refined_and_a_parameter_at_once(load):
-    with pytest.raises(dd.InputError, match="refine=True changes the time step"):
+    with pytest.raises(InputError, match="refine=True changes the time step"):
         dd.certify_rollout(
             load("pendulum.urdf"), [0.1, 0], [[0.0]], height, refine=True, parameters=("model.time_step",)
         )

@@ -19,8 +19,8 @@ from pydrake.systems.controllers import (
 from pydrake.trajectories import PiecewisePolynomial
 
 import drake_diff as dd
-from drake_diff.loop.controllers import tracking
-from drake_diff.replay import missed_goal, regulator_weights
+from drake_diff.loop.run import tracking
+from drake_diff.optimize.replay import missed_goal, regulator_weights
 
 NAMES = ("cart_pole", "acrobot")
 FILES = {"cart_pole": "cart_pole.urdf", "acrobot": "acrobot.xml"}
@@ -93,7 +93,7 @@ def survivors(solution, controller, level, trials):
     for seed in range(trials):
         x0 = problem.x0 + level * np.random.default_rng([seed, 7]).standard_normal(4)
         with np.errstate(all="ignore"):  # a motion that is lost may leave every number: it is not counted
-            found = dd.closed_loop(problem.model, controller, x0, problem.num_steps)
+            found = dd.loop.closed_loop(problem.model, controller, x0, problem.num_steps)
             error = problem.goal_error(found.motion.xs[-1])
         count += not found.ended and not list(missed_goal(solution.plan, error))
     return count

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
-from drake_diff.parameters import select
-from drake_diff.replay import STATE_TOLERANCE, Plan, broken_variants, held, replays
-from drake_diff.solution import Status
+from drake_diff.model.parameters import select
+from drake_diff.optimize.replay import STATE_TOLERANCE, Plan, broken_variants, held, replays
+from drake_diff.optimize.solution import Status
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 H, COUNT = 0.05, 20

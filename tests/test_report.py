@@ -14,10 +14,11 @@ from helpers.browser import browsing, errors, move_slider, open_page, view_of
 from helpers.models import MODELS
 
 import drake_diff as dd
-from drake_diff.meshcat_scene import ARROW_PART, scene_of
-from drake_diff.meshcat_view import frames_of
-from drake_diff.report_data import report_data
-from drake_diff.view import scene_of_run, serve
+from drake_diff.artifact.live import scene_of_run, serve
+from drake_diff.artifact.page import report_data
+from drake_diff.exceptions import ArtifactError, UnknownNameError
+from drake_diff.pages.meshcat import frames_of
+from drake_diff.pages.scene import ARROW_PART, scene_of
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -222,7 +223,7 @@ def test_the_trail_is_that_of_the_frame_that_was_asked_for(swing_up):
     model, times, xs = swing_up.problem.model, swing_up.times, swing_up.replay.xs
     assert np.ptp(scene_of(model, times, xs).trail[:, 2]) == pytest.approx(1.0, abs=1e-3)  # it ends 1e-8 from upright
     assert np.ptp(scene_of(model, times, xs, frame="world").trail) == 0.0
-    with pytest.raises(dd.UnknownNameError, match="frame"):
+    with pytest.raises(UnknownNameError, match="frame"):
         scene_of(model, times, xs, frame="elbow")
 
 
@@ -251,7 +252,7 @@ def test_the_live_view_is_at_loopback_only(runs):
 
 
 def test_the_command_prints_the_address_and_ends_by_ctrl_c(runs):
-    command = [sys.executable, "-m", "drake_diff.cli", "view", str(runs / "swing_up")]
+    command = [sys.executable, "-m", "drake_diff.cli.main", "view", str(runs / "swing_up")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         line = process.stdout.readline()
         process.send_signal(signal.SIGINT)
@@ -261,5 +262,5 @@ def test_the_command_prints_the_address_and_ends_by_ctrl_c(runs):
 
 
 def test_a_run_without_motion_cannot_be_viewed(runs):
-    with pytest.raises(dd.ArtifactError, match="no motion"):
+    with pytest.raises(ArtifactError, match="no motion"):
         scene_of_run(runs / "no_replay")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drake_diff.riccati import LinearQuadratic, slope_along, solve_riccati
+from drake_diff.optimize.ilqr.riccati import LinearQuadratic, slope_along, solve_riccati
 
 
 def problem(seed=0, count=6, n=3, m=2, *, gaps=1.0, free=0.0, bound=np.inf):

@@ -8,12 +8,12 @@ from helpers.loops import MASS, STEPS, H, plan, pushed_and_stopped
 from helpers.models import MODELS
 
 import drake_diff as dd
-from drake_diff.loop.perturbation import PERTURBATIONS, Setup, parameters_of, perturbed
-from drake_diff.loop.robustness import levels_of, trial_seed
-from drake_diff.loop.sensitivity import TOLD, Sensitivity
-from drake_diff.loop.statistics import margin, success_rate
-from drake_diff.loop.trial import Task, run_trial
-from drake_diff.parameters import list_parameters
+from drake_diff._base.statistics import margin, success_rate
+from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.model.parameters import list_parameters
+from drake_diff.trials.perturbation import PERTURBATIONS, Setup, parameters_of, perturbed
+from drake_diff.trials.run import TOLD, Sensitivity, levels_of, trial_seed
+from drake_diff.trials.trial import Task, run_trial
 
 A, B = np.array([[1.0, H], [0.0, 1.0]]), np.array([[H * H], [H]]) / MASS  # v+ = v + h u / m, x+ = x + h v+
 K = np.array([[-300.0, -40.0]])  # u = K x
@@ -56,7 +56,7 @@ def test_the_edges_are_where_the_score_test_is_significant():
             assert (k / n - p) ** 2 == pytest.approx(1.959963984540054**2 * p * (1 - p) / n, rel=1e-12)
     assert success_rate(20, 20).upper == 1.0
     for k, n in ((21, 20), (-1, 20), (0, 0)):
-        with pytest.raises(dd.InputError, match="successes"):
+        with pytest.raises(InputError, match="successes"):
             success_rate(k, n)
 
 
@@ -136,7 +136,7 @@ def test_each_factor_is_of_its_own_quantity(file, name, owners):
     """One factor for all of a vector, another for each owner; the world's mass is none."""
     model = dd.load_model(MODELS / file, time_step=H)
     own = {p.name: p.value for p in list_parameters(model)}
-    plain = Setup(model, model.default_state, dd.Loop(), 1.0, {})
+    plain = Setup(model, model.default_state, dd.loop.Loop(), 1.0, {})
     factors = []
     for s in draws(plain, name, 0.2, 100):
         assert set(s.parameters) == {f"{owner}.{name}" for owner in owners}
@@ -161,7 +161,7 @@ def test_steps_of_the_plant_are_cut_and_the_controller_keeps_its_period(setup):
 
 def test_contact_is_another_approximation():
     model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=H)
-    plain = Setup(model, model.default_state, dd.Loop(), 1.0, {})
+    plain = Setup(model, model.default_state, dd.loop.Loop(), 1.0, {})
     found = [s.model.contract.contact.approximation for s in draws(plain, "contact_approximation", 1, 8)]
     assert set(found) == {"similar", "lagged"}
 
@@ -184,7 +184,7 @@ def test_what_is_around_the_controller_changes(setup):
     assert np.abs(impulses.mean(axis=0)).max() < 4 * 0.3 / np.sqrt(2 * 400)
     at = np.array([b.at for b in blows]) / (0.75 * setup.duration)
     is_uniform(2 * at - 1, 1.0)
-    noisy = replace(setup, loop=dd.Loop(sensor=dd.Sensor(noise=0.3, delay=2, dropout=0.5)))
+    noisy = replace(setup, loop=dd.loop.Loop(sensor=dd.loop.Sensor(noise=0.3, delay=2, dropout=0.5)))
     assert perturbed(noisy, {"sensor_noise": 0.4}, 0).loop.sensor.noise == pytest.approx(0.5)  # variances add
     assert perturbed(noisy, {"latency": 3}, 0).loop.sensor.delay == 5
     assert perturbed(noisy, {"dropped_frames": 0.2}, 0).loop.sensor.dropout == pytest.approx(0.6)
@@ -201,26 +201,26 @@ def test_perturbations_do_not_disturb_each_other(setup):
 
 def test_unknown_names_and_levels_are_named(cart, setup):
     task = Task(pushed_and_stopped(cart).plan)
-    with pytest.raises(dd.UnknownNameError, match="initial_state"):
+    with pytest.raises(UnknownNameError, match="initial_state"):
         perturbed(setup, {"wind": 1.0}, 0)
-    with pytest.raises(dd.UnknownNameError, match="actuator_delay"):
+    with pytest.raises(UnknownNameError, match="actuator_delay"):
         levels_of(task, ["wind"])
-    with pytest.raises(dd.UnknownNameError, match="tvlqr"):
+    with pytest.raises(UnknownNameError, match="tvlqr"):
         Task(task.plan, "prayer")
     for name, level in (("mass", -0.1), ("mass", np.nan), ("mass", 1.0), ("latency", 1.5), ("time_step", 2.5)):
-        with pytest.raises(dd.InputError, match=f"level of {name}"):
+        with pytest.raises(InputError, match=f"level of {name}"):
             perturbed(setup, {name: level}, 0)
-    with np.errstate(over="ignore"), pytest.raises(dd.InputError, match="level of initial_state"):
+    with np.errstate(over="ignore"), pytest.raises(InputError, match="level of initial_state"):
         draws(setup, "initial_state", 1.7e308)
     for name in ("friction", "contact_approximation"):
-        with pytest.raises(dd.InputError, match="one that cart has something for"):
+        with pytest.raises(InputError, match="one that cart has something for"):
             levels_of(task, [name])
-        with pytest.raises(dd.InputError, match="one that cart has something for"):
+        with pytest.raises(InputError, match="one that cart has something for"):
             perturbed(setup, {name: 0.1}, 0)
     for levels in ([], [0.0], [np.inf]):
-        with pytest.raises(dd.InputError, match="levels of mass"):
+        with pytest.raises(InputError, match="levels of mass"):
             levels_of(task, {"mass": levels})
-    with pytest.raises(dd.InputError, match="trials"):
+    with pytest.raises(InputError, match="trials"):
         dd.robustness(pushed_and_stopped(cart), ["mass"], trials=0)
     assert levels_of(task, {"mass": [0.2, 0.1]}) == {"mass": (0.1, 0.2)}
     assert "friction" not in levels_of(task, None)
@@ -374,10 +374,10 @@ def test_nothing_is_predicted_of_what_no_gradient_tells(regulator):
     for name in ("latency", "push", "time_step", "dropped_frames", "friction"):
         assert sensitivity.predicted(name, 1) is None
     for loop in (
-        dd.Loop(sensor=dd.Sensor(delay=1)),
-        dd.Loop(sensor=dd.Sensor(dropout=0.1)),
-        dd.Loop(actuator=dd.Actuator(lag=0.1)),
-        dd.Loop(estimator=dd.Predictor(regulator.model, 2)),
+        dd.loop.Loop(sensor=dd.loop.Sensor(delay=1)),
+        dd.loop.Loop(sensor=dd.loop.Sensor(dropout=0.1)),
+        dd.loop.Loop(actuator=dd.loop.Actuator(lag=0.1)),
+        dd.loop.Loop(estimator=dd.loop.Predictor(regulator.model, 2)),
     ):
         unknown = Sensitivity(Task(regulator.plan, feedback, loop))
         assert all(unknown.predicted(name, 0.1) is None for name in TOLD)

@@ -15,15 +15,16 @@ from helpers.models import MODELS
 from typer.testing import CliRunner
 
 import drake_diff as dd
-from drake_diff.cli import app
-from drake_diff.loop import robustness_page
-from drake_diff.loop.panel_trial import evaluate
-from drake_diff.loop.robustness_files import begin_robustness, record_of
-from drake_diff.loop.robustness_plots import robustness_data
-from drake_diff.loop.robustness_words import verdict_of, weakest_of
-from drake_diff.loop.statistics import success_rate
-from drake_diff.record import own_sha256
-from drake_diff.verify import recalled
+from drake_diff._base.statistics import success_rate
+from drake_diff.artifact.verify import recalled
+from drake_diff.cli.main import app
+from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
+from drake_diff.record.run_record import own_sha256
+from drake_diff.trials import page as robustness_page
+from drake_diff.trials.files import begin_robustness, record_of
+from drake_diff.trials.page import robustness_data
+from drake_diff.trials.panel_trial import evaluate
+from drake_diff.trials.words import verdict_of, weakest_of
 
 LEVELS = {"mass": [0.02, 0.4], "actuator_delay": [1, 8], "time_step": [2], "sensor_bias": [0.01]}
 WORST = ["mass_0.4", "actuator_delay_1", "time_step_2", "sensor_bias_0.01"]
@@ -49,13 +50,13 @@ def result(run):
 @pytest.fixture(scope="module")
 def saved(result, run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("robustness") / "tried"
-    return folder, dd.save_robustness(result, folder, run)
+    return folder, dd.trials.save_robustness(result, folder, run)
 
 
 def test_the_record_has_every_number_and_its_own_hash(result, saved, run):
     folder, record = saved
     fields = json.loads((folder / "robustness.json").read_text())
-    assert dd.RobustnessRecord.model_validate(fields) == record
+    assert dd.trials.RobustnessRecord.model_validate(fields) == record
     assert own_sha256(fields) == fields["record_sha256"]
     for file in record.files:
         assert sha256((folder / file.path).read_bytes()).hexdigest() == file.sha256
@@ -86,7 +87,7 @@ def test_the_record_has_every_number_and_its_own_hash(result, saved, run):
 def test_everything_but_wall_clock_is_the_same_byte_for_byte(saved, run, tmp_path):
     folder, record = saved
     with recalled(run) as solution:
-        again = dd.save_robustness(
+        again = dd.trials.save_robustness(
             dd.robustness(solution, LEVELS, trials=6, controller="open_loop"), tmp_path / "tried", run
         )
     apart = {"wall_clock": None, "record_sha256": "", "files": []}
@@ -125,7 +126,7 @@ def test_it_is_the_worst_at_the_lowest_level_that_fails(result):
 
 def test_the_trace_has_all_that_the_loop_saw_and_did(result, saved):
     trial = result.worst("actuator_delay").worst
-    log, found = dd.read_mcap(saved[0] / "worst/actuator_delay_1/trace.mcap"), trial.outcome.run
+    log, found = dd.logs.read_mcap(saved[0] / "worst/actuator_delay_1/trace.mcap"), trial.outcome.run
     for topic, rows in (
         ("/state", found.motion.xs),
         ("/observation", found.observations),
@@ -238,14 +239,14 @@ def test_what_is_begun_and_not_ended_says_so(result, tmp_path, monkeypatch):
     (other / "notes.txt").write_text("keep")
     begin_robustness(tmp_path, result.task.model)
     assert json.loads((tmp_path / "robustness.json").read_text())["verdict"] == "incomplete"
-    dd.save_robustness(result, tmp_path)
+    dd.trials.save_robustness(result, tmp_path)
 
     def fails(*_):
         raise OSError("no space left")
 
     monkeypatch.setattr(robustness_page, "write_robustness_page", fails)
     with pytest.raises(OSError, match="no space"):
-        dd.save_robustness(result, tmp_path)
+        dd.trials.save_robustness(result, tmp_path)
     assert json.loads((tmp_path / "robustness.json").read_text())["verdict"] == "incomplete"
     assert not (tmp_path / "robustness.html").exists()
     begin_robustness(tmp_path, result.task.model)
@@ -258,15 +259,15 @@ def test_a_loop_of_ones_own_is_not_said_to_run_again(cart, run, tmp_path):
         pushed_and_stopped(cart),
         {"mass": [0.4]},
         trials=2,
-        loop=dd.Loop(sensor=dd.Sensor(noise=0.01), latency_budget=1),
+        loop=dd.loop.Loop(sensor=dd.loop.Sensor(noise=0.01), latency_budget=1),
     )
-    record = dd.save_robustness(result, tmp_path, run)
+    record = dd.trials.save_robustness(result, tmp_path, run)
     trial = json.loads((tmp_path / record.perturbations[0].worst / "trial.json").read_text())
     assert trial["run"] is None
     assert record.loop.sensor["noise"] == 0.01
     assert (record.loop.latency_budget_s, record.loop.latency_budget_is) == (1.0, "stated")
     assert record.loop.actuator["upper"] is None
-    with pytest.raises(dd.InputError, match="trial: run"):
+    with pytest.raises(InputError, match="trial: run"):
         evaluate(trial)
 
 
@@ -279,15 +280,15 @@ def test_a_run_that_breaks_off_at_once_and_one_with_a_fallback_are_kept(cart, tm
 
     solution = pushed_and_stopped(cart)
     result = dd.robustness(solution, {"mass": [0.1]}, trials=1, controller=made)
-    record = dd.save_robustness(result, tmp_path / "broken")
+    record = dd.trials.save_robustness(result, tmp_path / "broken")
     assert record.nominal.ended.endswith("no answer")
     assert record.perturbations[0].cells[0].labels == {"control_error": 1}
     assert record.loop.controller == "a user's function"
     assert record.run is None
-    loop = dd.Loop(fallback=dd.Fallback("stop"))
+    loop = dd.loop.Loop(fallback=dd.loop.Fallback("stop"))
     found = dd.robustness(solution, {"mass": [0.1]}, trials=1, controller=made, loop=loop)
-    dd.save_robustness(found, tmp_path / "kept")
-    log = dd.read_mcap(tmp_path / "kept/worst/mass_0.1/trace.mcap")
+    dd.trials.save_robustness(found, tmp_path / "kept")
+    log = dd.logs.read_mcap(tmp_path / "kept/worst/mass_0.1/trace.mcap")
     assert [m.kind for _, m in log.messages["/events"]] == ["fallback", "failure"]
     assert {m.code for _, m in log.messages["/controller/status"]} == {"other"}
     status = next(p for p in robustness_data(found)["plots"] if p["title"] == "controller status")
@@ -303,12 +304,12 @@ def test_what_runs_away_is_kept(cart, tmp_path, levels):
     result = dd.robustness(
         plan(cart, np.zeros((300, 1)), start, start), levels, trials=8, controller="open_loop", seed=1
     )
-    record = dd.save_robustness(result, tmp_path)
+    record = dd.trials.save_robustness(result, tmp_path)
     worst = result.cells[0].worst
     fields = json.loads((tmp_path / record.perturbations[0].worst / "trial.json").read_text())
     assert fields["label"] == worst.label
     assert (fields["goal_error"] is None) == (worst.label == "evaluation_error")
-    log = dd.read_mcap(tmp_path / record.perturbations[0].worst / "trace.mcap")
+    log = dd.logs.read_mcap(tmp_path / record.perturbations[0].worst / "trace.mcap")
     assert np.array_equal(log.arrays("/state")["q"], worst.outcome.run.motion.xs[:, :1])
     replay = (tmp_path / record.perturbations[0].worst / "replay.html").read_text()
     assert "drawn up to 1e+06 only" in replay
@@ -317,10 +318,10 @@ def test_what_runs_away_is_kept(cart, tmp_path, levels):
 def test_plants_with_contact_finer_steps_and_no_inputs_are_kept(thrown, tmp_path):
     levels = {"contact_approximation": [1], "time_step": [2], "friction": [0.4]}
     result = dd.robustness(thrown, levels, trials=2)
-    record = dd.save_robustness(result, tmp_path)
+    record = dd.trials.save_robustness(result, tmp_path)
     fields = json.loads((tmp_path / "worst/time_step_2/trial.json").read_text())
     assert (fields["plant_time_step_s"], fields["controller_period_s"]) == (0.0025, 0.005)
-    log = dd.read_mcap(tmp_path / "worst/time_step_2/trace.mcap")
+    log = dd.logs.read_mcap(tmp_path / "worst/time_step_2/trace.mcap")
     assert len(log.arrays("/state")["q"]) == len(log.arrays("/planned/state")["q"]) == 121
     assert len(log.arrays("/estimate")["q"]) == 60
     assert log.messages["/contacts"]
@@ -336,7 +337,7 @@ def test_names_are_escaped(tmp_path):
     path.write_text(text)
     model = dd.load_model(path, time_step=H)
     result = dd.robustness(plan(model, np.ones((5, 1)), [0.0, 0.0]), {"push": [0.1]}, trials=1)
-    dd.save_robustness(result, tmp_path / "out")
+    dd.trials.save_robustness(result, tmp_path / "out")
     assert "<script>alert" not in (tmp_path / "out/robustness.html").read_text()
 
 
@@ -358,14 +359,14 @@ def test_panels_call_it_by_name(run):
 @pytest.mark.parametrize(
     ("changes", "error", "said"),
     [
-        ({"seed": None}, dd.InputError, "trial: seed"),
-        ({"seed": True}, dd.InputError, "trial: seed"),
-        ({"seed": -1}, dd.InputError, "at least 0"),
-        ({"level": "much"}, dd.InputError, "trial: level"),
-        ({"level": -1.0}, dd.InputError, "level of mass"),
-        ({"perturbation": "wind"}, dd.UnknownNameError, "actuator_delay"),
-        ({"controller": "prayer"}, dd.UnknownNameError, "open_loop"),
-        ({"run": "/nowhere"}, dd.ArtifactError, "no such record"),
+        ({"seed": None}, InputError, "trial: seed"),
+        ({"seed": True}, InputError, "trial: seed"),
+        ({"seed": -1}, InputError, "at least 0"),
+        ({"level": "much"}, InputError, "trial: level"),
+        ({"level": -1.0}, InputError, "level of mass"),
+        ({"perturbation": "wind"}, UnknownNameError, "actuator_delay"),
+        ({"controller": "prayer"}, UnknownNameError, "open_loop"),
+        ({"run": "/nowhere"}, ArtifactError, "no such record"),
     ],
 )
 def test_panels_are_told_what_is_wrong(run, changes, error, said):
@@ -408,11 +409,11 @@ def test_the_command_refuses_what_it_cannot_try(run, tmp_path):
     data[len(data) // 2] ^= 1
     (broken / "plan.npz").write_bytes(bytes(data))
     found = call(broken)
-    assert isinstance(found.exception, dd.ArtifactError)
+    assert isinstance(found.exception, ArtifactError)
     assert "plan.npz" in str(found.exception)
     assert not (tmp_path / "broken_robustness").exists()
-    assert isinstance(call(tmp_path).exception, dd.ArtifactError)
+    assert isinstance(call(tmp_path).exception, ArtifactError)
     for words in (("--perturbations", "wind"), ("--controller", "prayer")):
         found = call(run, *words, "--out", tmp_path / "out")
-        assert isinstance(found.exception, dd.UnknownNameError)
+        assert isinstance(found.exception, UnknownNameError)
         assert json.loads((tmp_path / "out" / "robustness.json").read_text())["verdict"] == "incomplete"

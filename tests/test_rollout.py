@@ -7,9 +7,10 @@ import pytest
 from helpers.models import MODELS, Plant, contact_properties
 
 import drake_diff as dd
-from drake_diff.continuous import EquationsOfMotion
-from drake_diff.rollout import Meter, drift
-from drake_diff.step import set_state
+from drake_diff.exceptions import InputError, ModelError
+from drake_diff.model.equations import EquationsOfMotion
+from drake_diff.model.step import set_state
+from drake_diff.motion.rollout import Meter, drift
 
 
 @pytest.fixture
@@ -137,7 +138,7 @@ def test_the_violation_of_a_plants_constraints_is_not_called_zero():
     model = plant.model()
     motion = dd.rollout(model, [0, 0, 1, 0, 0, 0, 0, 0], num_steps=2)
     assert np.all(np.isinf(motion.constraint_violation))
-    with pytest.raises(dd.ModelError, match="constraints have no continuous form"):
+    with pytest.raises(ModelError, match="constraints have no continuous form"):
         EquationsOfMotion(model)
 
 
@@ -166,5 +167,5 @@ def test_arrays_of_a_rollout_are_read_only(load):
     ],
 )
 def test_bad_input_is_named(load, arguments, options, words):
-    with pytest.raises(dd.InputError, match=words):
+    with pytest.raises(InputError, match=words):
         dd.rollout(load("pendulum.urdf"), *arguments, **options)

@@ -8,7 +8,8 @@ import pytest
 from helpers.models import Plant, contact_properties
 
 import drake_diff as dd
-from drake_diff.rollout_gradient import derivatives_along
+from drake_diff.exceptions import GradientError, InputError
+from drake_diff.motion.gradient import derivatives_along
 
 
 def test_the_double_integrators_gradient_and_norms_have_their_closed_form(write_urdf):
@@ -141,11 +142,11 @@ def test_gradient_by_parameters_is_accumulated(write_urdf, load):
 @pytest.mark.parametrize(
     ("loss", "error", "words"),
     [
-        (lambda x: 1.0, dd.GradientError, "plain number"),
-        (lambda x: float(x[0].value()), dd.GradientError, "plain number"),
-        (lambda x: x, dd.InputError, "one scalar"),
-        (lambda: 1.0, dd.InputError, r"loss\(xs, us\) or loss\(x_final\)"),
-        (lambda x: np.log(x[0] - x[0]), dd.GradientError, "not finite"),
+        (lambda x: 1.0, GradientError, "plain number"),
+        (lambda x: float(x[0].value()), GradientError, "plain number"),
+        (lambda x: x, InputError, "one scalar"),
+        (lambda: 1.0, InputError, r"loss\(xs, us\) or loss\(x_final\)"),
+        (lambda x: np.log(x[0] - x[0]), GradientError, "not finite"),
     ],
 )
 def test_a_loss_that_carries_no_gradient_is_refused(load, loss, error, words):

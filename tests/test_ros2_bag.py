@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
-from drake_diff.ros2_bag import export_ros2
+from drake_diff.artifact.ros2 import export_ros2
+from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
 
 pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
 
@@ -47,7 +48,7 @@ def test_joint_states_are_the_trace_s_bit_for_bit(run, bag):
 
 
 def test_frames_inputs_and_diagnostics_are_the_trace_s(run, bag):
-    log = dd.read_mcap(run / "trace.mcap")
+    log = dd.logs.read_mcap(run / "trace.mcap")
     for (_, ours), (_, theirs) in zip(log.messages["/tf"], messages(bag, "/tf"), strict=True):
         for a, b in zip(ours.transforms, theirs.transforms, strict=True):
             assert (b.header.frame_id, b.child_frame_id) == ("world", a.child_frame_id)
@@ -93,19 +94,19 @@ def test_the_same_trace_gives_the_same_bag(run, bag, tmp_path):
 
 
 def test_what_exists_is_not_written_over_and_what_is_no_run_is_refused(run, bag, tmp_path):
-    with pytest.raises(dd.InputError, match="OUT: expected a directory that does not exist"):
+    with pytest.raises(InputError, match="OUT: expected a directory that does not exist"):
         export_ros2(run, bag)
-    with pytest.raises(dd.ArtifactError, match=r"trace\.mcap"):
+    with pytest.raises(ArtifactError, match=r"trace\.mcap"):
         export_ros2(tmp_path, tmp_path / "bag")
     damaged = bytearray((run / "trace.mcap").read_bytes())
     damaged[1000] ^= 1
     (tmp_path / "trace.mcap").write_bytes(damaged)
-    with pytest.raises(dd.ArtifactError, match="checksum"):
+    with pytest.raises(ArtifactError, match="checksum"):
         export_ros2(tmp_path, tmp_path / "bag")
     assert not (tmp_path / "bag").exists()
 
 
 def test_without_rosbags_it_says_what_to_install(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
-    with pytest.raises(dd.MissingDependencyError, match=r"pip install 'drake-diff\[ros2\]'"):
+    with pytest.raises(MissingDependencyError, match=r"pip install 'drake-diff\[ros2\]'"):
         export_ros2(run, tmp_path / "bag")

@@ -12,9 +12,10 @@ import pytest
 from helpers.models import MODELS, ROOT
 
 import drake_diff as dd
-from drake_diff.cli_runs import plain
-from drake_diff.evidence import begin, save_failure, seal
-from drake_diff.runs import compare_runs, list_runs
+from drake_diff.artifact.listing import compare_runs, list_runs
+from drake_diff.artifact.save import begin, save_failure, seal
+from drake_diff.cli.runs import plain
+from drake_diff.exceptions import ArtifactError
 
 
 def solve(**changes):
@@ -39,7 +40,7 @@ def runs(tmp_path_factory):
 
 
 def drake_diff(*words, cwd):
-    command = [sys.executable, "-m", "drake_diff.cli", *map(str, words)]
+    command = [sys.executable, "-m", "drake_diff.cli.main", *map(str, words)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, env=environment)
 
@@ -55,7 +56,7 @@ def test_a_line_for_each_run_with_what_its_record_says(runs):
     }
     assert lines["a"].cost == dd.load_record(runs / "a").metrics[0].value
     assert (lines["a"].status, lines["a"].model) == ("converged", "pendulum")
-    with pytest.raises(dd.ArtifactError, match="no directory"):
+    with pytest.raises(ArtifactError, match="no directory"):
         list_runs(runs / "nowhere")
 
 

@@ -12,10 +12,9 @@ from helpers.plants import block
 from helpers.problems import A30, lqr
 
 import drake_diff as dd
-from drake_diff.nonlinear_program import Limits
-from drake_diff.shooting import RolloutCost, ShootingVariables, state_sensitivities
-from drake_diff.shooting_program import solve_shooting
-from drake_diff.solution import Status
+from drake_diff.optimize.program import Limits
+from drake_diff.optimize.shooting import RolloutCost, ShootingVariables, solve_shooting, state_sensitivities
+from drake_diff.optimize.solution import Status
 
 SOLVERS = ("ipopt", "snopt")
 EFFORT = dd.QuadraticCost(R=[[1.0]])
@@ -207,7 +206,7 @@ def test_a_pendulum_too_weak_and_too_late_is_infeasible(solver):
 @pytest.mark.parametrize(("row", "column"), [(i, j) for i in range(2) for j in range(3)])
 def test_a_step_derivative_that_is_one_percent_off_is_named(row, column, monkeypatch, without_pinocchio):
     """Each entry of [A B] of the pendulum; the wrong one is used by the solver and by the certificate alike."""
-    module = sys.modules["drake_diff.step_derivatives"]
+    module = sys.modules["drake_diff.derivatives.step"]
     honest = module._autodiff
 
     def one_percent_off(*args):
@@ -227,7 +226,7 @@ def test_an_honest_derivative_lets_the_same_solve_succeed():
 
 
 def test_a_wrong_derivative_is_not_believed_by_ilqr(monkeypatch, without_pinocchio):
-    module = sys.modules["drake_diff.step_derivatives"]
+    module = sys.modules["drake_diff.derivatives.step"]
     honest = module._autodiff
     monkeypatch.setattr(module, "_autodiff", lambda *args: honest(*args) * [[1, 1, 1], [1, 1, 1.01]])
     problem = pendulum(x_goal=None, num_steps=20, final_cost=dd.QuadraticCost(Q=np.eye(2), x_ref=[1, 0]))
@@ -257,7 +256,7 @@ def test_a_goal_that_nothing_moves_may_be_reached_already():
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_ctrl_c_ends_it_with_a_motion(solver, monkeypatch):
-    monkeypatch.setattr("drake_diff.nonlinear_program.REPORT_PERIOD", 0.0)
+    monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
     before = signal.getsignal(signal.SIGINT)
     solution = shoot(pendulum(), solver=solver, progress=lambda line: signal.raise_signal(signal.SIGINT))
     assert solution.status is Status.INTERRUPTED

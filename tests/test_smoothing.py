@@ -8,7 +8,8 @@ import pytest
 from helpers.models import Plant, contact_properties
 
 import drake_diff as dd
-from drake_diff.smoothing import Barrier, Gaussian, smooth, smooth_step
+from drake_diff.exceptions import GradientError, InputError, ShapeError, UnknownNameError
+from drake_diff.motion.smoothing import Barrier, Gaussian, smooth, smooth_step
 
 SUH = (9.81, 0.06, 0.02, 0.05)  # gravity, wall, height of the wall, sigma
 SAMPLES = 25000
@@ -380,24 +381,24 @@ def one(z):
 )
 def test_bad_input_is_refused(changes, message):
     arguments = {"f": lambda z: z[0], "x": [0.0], "jacobian": one, "noise": Gaussian(0.1), "samples": 10} | changes
-    with pytest.raises(dd.InputError, match=message):
+    with pytest.raises(InputError, match=message):
         smooth(arguments.pop("f"), arguments.pop("x"), arguments.pop("jacobian"), **arguments)
 
 
 def test_an_unknown_method_has_its_own_error():
-    with pytest.raises(dd.UnknownNameError):
+    with pytest.raises(UnknownNameError):
         smooth(np.sum, [0.0], one, noise=Gaussian(1.0), method="")
 
 
 def test_zeroth_order_needs_a_derivative_where_noise_does_not_move():
-    with pytest.raises(dd.InputError, match="jacobian"):
+    with pytest.raises(InputError, match="jacobian"):
         smooth(np.sum, [0.0, 0.0], noise=Gaussian([0.1, 0.0]), method="zeroth")
 
 
 @pytest.mark.parametrize("kind", [Gaussian, Barrier])
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf, True, "1", None, [], [0.0, 0.0], [0.1, -0.1], [np.nan]])
 def test_noise_of_no_size_is_refused(kind, scale):
-    with pytest.raises(dd.InputError, match=f"{kind.__name__}.(sigma|c)"):
+    with pytest.raises(InputError, match=f"{kind.__name__}.(sigma|c)"):
         kind(scale)
 
 
@@ -411,7 +412,7 @@ def test_noise_of_no_size_is_refused(kind, scale):
     ],
 )
 def test_what_is_not_finite_is_refused(f, jacobian, message):
-    with pytest.raises(dd.GradientError, match=message):
+    with pytest.raises(GradientError, match=message):
         smooth(f, [0.0], jacobian, noise=Gaussian(0.1), samples=10)
 
 
@@ -481,16 +482,16 @@ def test_a_landing_balls_jump_is_seen_as_bias(ball_over_ground):
 
 def test_steps_that_cannot_be_smoothed_are_refused(load):
     model = load("sphere_on_ground.sdf")
-    with pytest.raises(dd.InputError, match=r"the quaternion \(ball_qw, ball_qx, ball_qy, ball_qz\)"):
+    with pytest.raises(InputError, match=r"the quaternion \(ball_qw, ball_qx, ball_qy, ball_qz\)"):
         smooth_step(model, model.default_state, noise=Gaussian(0.1))
     model = load("pendulum.urdf")
-    with pytest.raises(dd.ShapeError, match="x"):
+    with pytest.raises(ShapeError, match="x"):
         smooth_step(model, [0.0], [0.0], noise=Gaussian(0.1))
-    with pytest.raises(dd.ShapeError, match="u"):
+    with pytest.raises(ShapeError, match="u"):
         smooth_step(model, [0.0, 0.0], noise=Gaussian(0.1))
-    with pytest.raises(dd.ShapeError, match="the numbers of Gaussian"):
+    with pytest.raises(ShapeError, match="the numbers of Gaussian"):
         smooth_step(model, [0.0, 0.0], [0.0], noise=Gaussian([0.1, 0.1]))
-    with pytest.raises(dd.UnknownNameError):
+    with pytest.raises(UnknownNameError):
         smooth_step(model, [0.0, 0.0], [0.0], noise=Gaussian(0.1), method="third")
-    with pytest.raises(dd.InputError, match="a Gaussian or a Barrier"):
+    with pytest.raises(InputError, match="a Gaussian or a Barrier"):
         smooth_step(model, [0.0, 0.0], [0.0], noise=None, method="zeroth")

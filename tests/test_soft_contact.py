@@ -7,10 +7,11 @@ import pytest
 from helpers.models import Plant, contact_properties
 
 import drake_diff as dd
-from drake_diff.soft_contact import distances
-from drake_diff.step import set_state
+from drake_diff.exceptions import InputError
+from drake_diff.model.soft_contact import distances
+from drake_diff.model.step import set_state
 
-SOFT = dd.SoftContact(0.05, 200.0)
+SOFT = dd.model.SoftContact(0.05, 200.0)
 
 
 @pytest.mark.parametrize("phi", [-3.0, -0.05, 0.0, 0.02, 0.4])
@@ -32,7 +33,7 @@ def test_the_limits_are_a_spring_and_nothing():
 
 def test_one_step_of_two_spheres_is_the_closed_form(load):
     """Semi-implicit Euler: m v' = m v + h (u - c), (m + h d) v' = m v + h c, in the state before the step."""
-    soft, h = dd.softened(load("two_spheres.sdf", time_step=0.02), SOFT), 0.02
+    soft, h = dd.model.softened(load("two_spheres.sdf", time_step=0.02), SOFT), 0.02
     c = 0.05 * 200 * math.log1p(math.exp(-0.1 / 0.05))
     v = np.array([0.5 + h * (3 - c) / 1, (0.5 * 0.2 + h * c) / (0.5 + h * 0.5)])
     wanted = np.concatenate([np.array([0, 0.3]) + h * v, v])
@@ -44,7 +45,7 @@ def test_energy_is_kept_and_momentum_exchanged_at_a_distance():
     plant = Plant(0.001)
     for name in ("a", "b"):
         plant.ball(name, 1.0, 0.1, contact_properties(1e4), "x")
-    soft = dd.softened(plant.model(), dd.SoftContact(0.05, 50.0))
+    soft = dd.model.softened(plant.model(), dd.model.SoftContact(0.05, 50.0))
     r = dd.rollout(soft, [0, 1.2, 0.5, 0], num_steps=4000)
     assert r.xs[-1][2:] == pytest.approx([0, 0.5], abs=1e-4)
     assert r.xs[:, 2:].sum(axis=1) == pytest.approx(np.full(4001, 0.5), rel=1e-12)
@@ -54,32 +55,34 @@ def test_energy_is_kept_and_momentum_exchanged_at_a_distance():
 
 @pytest.mark.parametrize("x", [[0, 0.5, 1, 0.2], [0, 0.25, 1, 0.2], [0, 0.19, 1, 0.2]])
 def test_steps_are_certified_apart_and_touching(load, x):
-    soft = dd.softened(load("two_spheres.sdf", time_step=0.02), SOFT)
+    soft = dd.model.softened(load("two_spheres.sdf", time_step=0.02), SOFT)
     dd.certify(soft, x, [1.0]).require()
     dd.certify(soft.at_time_step(0.01), x, [1.0]).require()
 
 
 def test_steps_are_certified_where_normals_and_arms_turn(load):
     """A sphere beside a turning box; eight spheres of a tumbling block above the ground."""
-    box = dd.softened(load("box_push.sdf"), SOFT)
+    box = dd.model.softened(load("box_push.sdf"), SOFT)
     dd.certify(box, [0, 0, 0.3, -0.25, -0.1, 0.1, 0.2, 0.3, 0.4, 0.5], [1, 2]).require()
-    block = dd.softened(load("sliding_block.sdf"), SOFT)
+    block = dd.model.softened(load("sliding_block.sdf"), SOFT)
     q = np.array([0.9, 0.1, 0.2, 0.3])
     dd.certify(block, [*(q / np.linalg.norm(q)), 0, 0, 0.3, 0.1, 0.2, 0.3, 0.4, 0.5, -0.6]).require()
 
 
 def test_a_force_without_its_derivative_is_refused(load, monkeypatch):
     """The same law, cut off from AutoDiffXd: the certificate must see it."""
-    soft = dd.softened(load("two_spheres.sdf", time_step=0.02), SOFT)
-    honest = dd.SoftContact.normal_force
-    monkeypatch.setattr(dd.SoftContact, "normal_force", lambda s, phi: honest(s, getattr(phi, "value", lambda: phi)()))
+    soft = dd.model.softened(load("two_spheres.sdf", time_step=0.02), SOFT)
+    honest = dd.model.SoftContact.normal_force
+    monkeypatch.setattr(
+        dd.model.SoftContact, "normal_force", lambda s, phi: honest(s, getattr(phi, "value", lambda: phi)())
+    )
     assert dd.certify(soft, [0, 0.3, 1, 0.2], [1.0]).verdict == "disagree"
 
 
 def test_the_model_itself_stays_as_it_is(load):
     model = load("two_spheres.sdf", time_step=0.02)
     before = dd.step(model, [0, 0.3, 1, 0], [1.0])
-    dd.step(dd.softened(model, SOFT), [0, 0.3, 1, 0], [1.0])
+    dd.step(dd.model.softened(model, SOFT), [0, 0.3, 1, 0], [1.0])
     assert np.array_equal(dd.step(model, [0, 0.3, 1, 0], [1.0]), before)
 
 
@@ -90,10 +93,10 @@ def test_distances_are_those_between_the_surfaces(load):
 
 
 def test_what_cannot_be_softened_is_refused(load):
-    with pytest.raises(dd.InputError, match="at least one pair"):
-        dd.softened(load("pendulum.urdf"), SOFT)
-    with pytest.raises(dd.InputError, match="a SoftContact"):
-        dd.softened(load("two_spheres.sdf"), 0.1)
+    with pytest.raises(InputError, match="at least one pair"):
+        dd.model.softened(load("pendulum.urdf"), SOFT)
+    with pytest.raises(InputError, match="a SoftContact"):
+        dd.model.softened(load("two_spheres.sdf"), 0.1)
     for wrong in ((0.0, 1.0), (0.1, -1.0), (math.nan, 1.0)):
-        with pytest.raises(dd.InputError, match="above 0"):
-            dd.SoftContact(*wrong)
+        with pytest.raises(InputError, match="above 0"):
+            dd.model.SoftContact(*wrong)

@@ -10,6 +10,7 @@ from helpers.models import MODELS
 from helpers.plants import block
 
 import drake_diff as dd
+from drake_diff.exceptions import InputError
 
 METHODS = ("collocation", "shooting", "ilqr")
 N, H = 10, 0.1
@@ -208,7 +209,7 @@ def test_another_status_leaves_the_measures_as_they_were_taken(method):
 
 @pytest.mark.parametrize("name", ["xs", "us", "problem", "certificates", "cost"])
 def test_what_a_measure_may_depend_on_is_not_told(name):
-    with pytest.raises(dd.InputError, match=f"expected one of iterations, .*, got '{name}'"):
+    with pytest.raises(InputError, match=f"expected one of iterations, .*, got '{name}'"):
         solved("ilqr").told(**{name: None})
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
-from drake_diff.solution import Status
+from drake_diff.exceptions import InputError
+from drake_diff.optimize.solution import Status
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 SCHEMES = ("hermite_simpson", "trapezoid", "drake")
@@ -49,7 +50,7 @@ def test_auto_takes_collocation_where_the_horizon_is_free(load):
 @pytest.mark.parametrize("method", ["shooting", "ilqr"])
 def test_discrete_methods_refuse_a_free_horizon(load, method):
     problem = dd.Problem(load("pendulum.urdf"), x0=[0, 0], x_goal=[1, 0], num_steps=10, horizon=(1, 2))
-    with pytest.raises(dd.InputError, match='horizon: expected none for discrete steps: method="collocation" takes it'):
+    with pytest.raises(InputError, match='horizon: expected none for discrete steps: method="collocation" takes it'):
         dd.solve(problem, method=method)
 
 

@@ -12,10 +12,11 @@ from helpers.models import MODELS, Plant, contact_properties
 from helpers.plants import pd_pendulum
 
 import drake_diff as dd
-from drake_diff.nonlinear_program import NlpResult, Outcome
-from drake_diff.rollout_gradient import derivatives_along
-from drake_diff.run import Run
-from drake_diff.solution import Status
+from drake_diff.exceptions import GradientError, InputError, ModelError, ShapeError, SimulationError
+from drake_diff.motion.gradient import derivatives_along
+from drake_diff.optimize.program import NlpResult, Outcome
+from drake_diff.optimize.solution import Status
+from drake_diff.optimize.solve import Run
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
@@ -232,14 +233,14 @@ def test_a_solver_that_lies_is_not_believed(load, monkeypatch):
     def liar(problem, xs, us, **options):
         return NlpResult(us.ravel(), Outcome.SOLVED, "all is well", ()), xs, us
 
-    monkeypatch.setattr("drake_diff.run.solve_shooting", liar)
+    monkeypatch.setattr("drake_diff.optimize.solve.solve_shooting", liar)
     solution = dd.solve(swing_up(load, 20), method="shooting")
     assert solution.status is Status.CONVERGED_NOT_VERIFIED
     assert "goal error" in solution.message
 
 
 def test_a_wrong_derivative_is_named_and_keeps_a_solve_from_success(load, monkeypatch):
-    module = sys.modules["drake_diff.certify"]
+    module = sys.modules["drake_diff.certificates.certify"]
     original = module.step_jacobians
 
     def one_percent_off(*args):
@@ -253,7 +254,7 @@ def test_a_wrong_derivative_is_named_and_keeps_a_solve_from_success(load, monkey
 
 
 def test_a_refused_derivative_ends_as_no_gradient(load, monkeypatch):
-    monkeypatch.setattr("drake_diff.step_derivatives.MAGNITUDE_BOUND", 1e-3)
+    monkeypatch.setattr("drake_diff.derivatives.step.MAGNITUDE_BOUND", 1e-3)
     solution = dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]), method="shooting")
     assert solution.status is Status.NO_GRADIENT
     assert "expected a finite number of at most" in solution.message
@@ -292,7 +293,7 @@ def test_the_solvers_own_table_is_kept(load, method, solver):
 
 
 def test_progress_is_told_while_it_runs(load, monkeypatch):
-    monkeypatch.setattr("drake_diff.nonlinear_program.REPORT_PERIOD", 0.01)
+    monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.01)
     lines = []
     solution = dd.solve(swing_up(load, 100), method="shooting", progress=lines.append, max_iterations=15)
     assert solution.wall_time > 0.02
@@ -332,7 +333,7 @@ def test_auto_chooses_and_says_why(load):
 
 def test_pd_control_is_left_to_the_discrete_methods():
     problem = dd.Problem(pd_pendulum(), x0=[0.5, 0], num_steps=20, running_cost=EFFORT, x_goal=[0.2, 0])
-    with pytest.raises(dd.ModelError, match="use method='shooting'"):
+    with pytest.raises(ModelError, match="use method='shooting'"):
         dd.solve(problem, method="collocation")
     solution = dd.solve(problem)
     assert solution.method == "ilqr"
@@ -376,25 +377,25 @@ def test_collocation_through_the_ground_is_not_verified(tmp_path):
 )
 def test_bad_options_are_named_before_anything_runs(load, options, words):
     started = []
-    with pytest.raises(dd.InputError, match=words):
+    with pytest.raises(InputError, match=words):
         dd.solve(swing_up(load, 20), on_start=lambda: started.append(1), **options)
     assert not started
 
 
 def test_a_guess_of_another_length_is_named(load):
     guess = dd.solve(swing_up(load, 10), max_iterations=1)
-    with pytest.raises(dd.ShapeError, match=r"initial_guess xs: expected shape \(21, 4\), got shape \(11, 4\)"):
+    with pytest.raises(ShapeError, match=r"initial_guess xs: expected shape \(21, 4\), got shape \(11, 4\)"):
         dd.solve(swing_up(load, 20), initial_guess=guess)
 
 
 def test_only_a_problem_can_be_solved():
-    with pytest.raises(dd.InputError, match="problem: expected a Problem, got NoneType"):
+    with pytest.raises(InputError, match="problem: expected a Problem, got NoneType"):
         dd.solve(None)
 
 
 def test_collocation_needs_controls_to_optimize(load):
     problem = swing_up(load, 20, optimize="initial_state")
-    with pytest.raises(dd.InputError, match='"controls" for method="collocation"'):
+    with pytest.raises(InputError, match='"controls" for method="collocation"'):
         dd.solve(problem, method="collocation")
 
 
@@ -431,7 +432,7 @@ def test_the_callback_sees_every_iteration_and_may_end_the_solve(load):
         assert rows[-1].objective == pytest.approx(solution.cost, rel=1e-6)
         with pytest.raises(Enough):
             dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]), method=method, callback=stop_at_three)
-    with pytest.raises(dd.InputError, match="callback"):
+    with pytest.raises(InputError, match="callback"):
         dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]), callback=3)
 
 
@@ -450,7 +451,8 @@ def acrobot_swing_up(load):
 
 @pytest.mark.parametrize("solver", ["ipopt", "snopt"])
 @pytest.mark.parametrize(
-    ("error", "status"), [(dd.SimulationError, Status.DIVERGED), (dd.GradientError, Status.NO_GRADIENT)]
+    ("error", "status"),
+    [(SimulationError, Status.DIVERGED), (GradientError, Status.NO_GRADIENT)],
 )
 def test_a_step_refused_in_the_middle_of_a_solve_is_named(load, monkeypatch, solver, error, status):
     """SNOPT, in Drake, cannot be told that a step was too long, and wraps what is raised with its traceback."""
@@ -462,8 +464,10 @@ def test_a_step_refused_in_the_middle_of_a_solve_is_named(load, monkeypatch, sol
             raise error("this far and no further")
         return original(*args, **options)
 
-    monkeypatch.setattr("drake_diff.shooting.derivatives_along", refusing)
-    monkeypatch.setattr("drake_diff.shooting.ShootingVariables.attempt", lambda self, evaluate, failed: evaluate())
+    monkeypatch.setattr("drake_diff.optimize.shooting.derivatives_along", refusing)
+    monkeypatch.setattr(
+        "drake_diff.optimize.shooting.ShootingVariables.attempt", lambda self, evaluate, failed: evaluate()
+    )
     solution = dd.solve(swing_up(load, 20), method="shooting", solver=solver)
     assert solution.status is status
     assert "this far and no further" in solution.message

@@ -14,15 +14,14 @@ from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoD
 from pydrake.multibody.tree import QuaternionFloatingJoint
 
 import drake_diff as dd
-from drake_diff import symbolic_tree
-from drake_diff.continuous import EquationsOfMotion
-from drake_diff.dynamics import Dynamics, plant_dynamics
-from drake_diff.knot_functions import SymbolicPlant
-from drake_diff.nonlinear_program import Limits
-from drake_diff.symbolic import trace
-from drake_diff.symbolic_tree import PlantFunctions, symbolic_plant
-from drake_diff.transcription import ProblemTranscription
-from drake_diff.transcription_program import TranscribedProgram
+from drake_diff.mechanics import casadi_tree as symbolic_tree
+from drake_diff.mechanics.casadi_tree import PlantFunctions, symbolic_plant
+from drake_diff.model.equations import EquationsOfMotion
+from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
+from drake_diff.optimize.program import Limits
+from drake_diff.optimize.transcription.expressions import SymbolicPlant, trace
+from drake_diff.optimize.transcription.program import TranscribedProgram
+from drake_diff.optimize.transcription.solve import ProblemTranscription
 
 EXACT = "symbolic, exact Hessian"
 FORMS = {
@@ -238,7 +237,7 @@ def test_a_floating_body_goes_the_other_way():
     model = floating(QuaternionFloatingJoint, 0)
     dynamics = plant_dynamics(model)
     x = model.default_state
-    motion = dd.transcribe_and_solve(
+    motion = dd.optimize.transcribe_and_solve(
         dynamics, x0=x, count=3, horizon=0.1, running_cost=dd.QuadraticCost(R=np.eye(model.nu))
     )
     assert "quaternion_floating" in motion.derivatives
@@ -258,7 +257,7 @@ def test_a_hessian_that_is_not_finite_is_left_and_that_is_told():
 
 def test_the_block_is_exact_in_one_step():
     """A quadratic program: an exact Hessian needs one step, IPOPT's table has the start and it."""
-    motion = dd.transcribe_and_solve(
+    motion = dd.optimize.transcribe_and_solve(
         BLOCK, x0=[0, 0], x_goal=[1, 0], count=10, horizon=1.0, running_cost=lambda x, u: u[0] ** 2
     )
     assert len(motion.iterations) == 2

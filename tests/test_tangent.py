@@ -7,7 +7,7 @@ import pytest
 from helpers.models import random_state
 
 import drake_diff as dd
-from drake_diff.tangent import tangent_space
+from drake_diff.model.tangent import tangent_space
 
 
 @pytest.fixture

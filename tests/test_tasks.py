@@ -19,7 +19,7 @@ by_each_method = pytest.mark.parametrize("method", METHODS, ids=["ilqr", "single
 
 def reach(model, point, target, x0, count, axes, **fields):
     """Rest to rest, `point` = (frame, offset) at `target` at the end."""
-    tip = dd.frame_position(model, *point)
+    tip = dd.quantities.frame_position(model, *point)
     at_target = dd.Constraint(lambda x: (tip(x) - target)[axes], lower=0, upper=0, knots=-1, name="tip")
     stop = dd.Constraint(lambda x: x[model.nq :], lower=0, upper=0, knots=-1, name="rest")
     effort = dd.QuadraticCost(R=np.eye(model.nu))
@@ -48,7 +48,7 @@ def test_a_ur5s_hand_reaches_a_point_by_multiple_shooting():
     There what a joint angle would be worth, y_q of 2 h u_k + (d x_N / d u_k)' y = 0, is what the hand's place is.
     """
     model, x0 = ur5(), np.array([0, -1.2, 1.5, -1.0, -1.5, 0, 0, 0, 0, 0, 0, 0.0])
-    target = dd.frame_position(model, "tool0")(x0) + np.array([0.1, 0.2, 0.15])
+    target = dd.quantities.frame_position(model, "tool0")(x0) + np.array([0.1, 0.2, 0.15])
     tip, problem = reach(model, ("tool0",), target, x0, 25, [0, 1, 2], bounds=FAR)
     solution = dd.solve(problem, method="shooting", solver="ipopt", segments=5)
     assert solution.success, solution.message
@@ -79,7 +79,7 @@ def test_a_box_is_pressed_as_deep_as_a_contact_force_allows(method):
     Deepest is F = 30 N in each step: d_N = F / k - (F - m g) / k * (tau / (h + tau))^N.
     """
     model, count, k, limit, weight = box_on_the_ground(pusher=True), 12, 4e4, 30.0, 2 * 9.81
-    force, x0 = dd.contact_force(model, "box"), np.array([0.1 - weight / k, 0])
+    force, x0 = dd.quantities.contact_force(model, "box"), np.array([0.1 - weight / k, 0])
     problem = dd.Problem(
         model,
         x0=x0,
@@ -99,7 +99,7 @@ def test_a_box_is_pressed_as_deep_as_a_contact_force_allows(method):
 
 def test_a_constraint_of_a_force_where_nothing_touches_has_a_derivative_of_zero():
     model = box_on_the_ground(pusher=True)
-    force = dd.contact_force(model, "box")
+    force = dd.quantities.contact_force(model, "box")
     limit = dd.Constraint(lambda x, u: force(x, u)[2], upper=30.0)
     values, rows = limit.differentiate(np.array([0.5, 0.0]), np.zeros(1))
     assert values.tolist() == [0.0]

@@ -18,13 +18,14 @@ from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoD
 from pydrake.multibody.tree import QuaternionFloatingJoint
 
 import drake_diff as dd
-from drake_diff.continuous import EquationsOfMotion
-from drake_diff.dynamics import Dynamics, plant_dynamics
-from drake_diff.knot_functions import knot_functions
-from drake_diff.nonlinear_program import Limits, Outcome
-from drake_diff.transcribed import violation_between_nodes
-from drake_diff.transcription import transcribe_and_solve
-from drake_diff.transcription_program import TranscribedProgram
+from drake_diff.exceptions import GradientError, InputError
+from drake_diff.model.equations import EquationsOfMotion
+from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
+from drake_diff.optimize.program import Limits, Outcome
+from drake_diff.optimize.transcription.expressions import knot_functions
+from drake_diff.optimize.transcription.motion import violation_between_nodes
+from drake_diff.optimize.transcription.program import TranscribedProgram
+from drake_diff.optimize.transcription.solve import transcribe_and_solve
 
 SCHEMES = ("trapezoid", "hermite_simpson")
 EFFORT = dd.QuadraticCost(R=[[1.0]])
@@ -563,12 +564,12 @@ def test_dynamics_of_many_knots_are_those_of_each(form):
     ],
 )
 def test_a_function_that_is_no_dynamics_is_refused(f, message):
-    with pytest.raises(dd.InputError, match=message):
+    with pytest.raises(InputError, match=message):
         Dynamics(f, 2, 1)
 
 
 def test_dynamics_without_derivatives_are_refused():
-    with pytest.raises(dd.GradientError, match="dynamics lost its derivatives"):
+    with pytest.raises(GradientError, match="dynamics lost its derivatives"):
         Dynamics(lambda x, u: np.array([1.0, 2.0]), 2, 1)
 
 
@@ -584,7 +585,7 @@ def test_dynamics_without_derivatives_are_refused():
 )
 def test_bad_dynamics_are_named(options, message):
     sizes = {"nx": 2, "nu": 1} | options
-    with pytest.raises(dd.InputError, match=message):
+    with pytest.raises(InputError, match=message):
         Dynamics(push, **sizes)
 
 
@@ -619,12 +620,12 @@ def test_bad_dynamics_are_named(options, message):
 def test_bad_input_is_named_before_anything_runs(options, message):
     given = {"dynamics": BLOCK, "x0": [0, 0], "x_goal": [1, 0], "count": 5, "horizon": 1.0, "running_cost": effort}
     given |= options
-    with pytest.raises(dd.InputError, match=message):
+    with pytest.raises(InputError, match=message):
         transcribe_and_solve(given.pop("dynamics"), **given)
 
 
 def test_a_running_cost_without_derivatives_is_refused():
-    with pytest.raises(dd.GradientError, match="running_cost lost its derivatives"):
+    with pytest.raises(GradientError, match="running_cost lost its derivatives"):
         move(running_cost=lambda x, u: 1.0)
 
 
@@ -654,7 +655,7 @@ def test_the_time_of_kellys_cart_pole(capsys):
 def test_a_moved_node_is_no_success(row, column):
     """Block move B01: whatever the solver says, the motion is measured."""
     block = dd.Dynamics(lambda x, u: [x[1], u[0]], 2, 1)
-    found = dd.transcribe_and_solve(
+    found = dd.optimize.transcribe_and_solve(
         block, x0=[0, 0], x_goal=[1, 0], count=5, horizon=1.0, running_cost=lambda x, u: u[0] ** 2
     )
     assert found.success
@@ -670,7 +671,7 @@ def test_a_moved_node_is_no_success(row, column):
 
 def test_an_input_beyond_its_bound_is_no_success():
     block = dd.Dynamics(lambda x, u: [x[1], u[0]], 2, 1, u_lower=[-10], u_upper=[10])
-    found = dd.transcribe_and_solve(
+    found = dd.optimize.transcribe_and_solve(
         block, x0=[0, 0], x_goal=[1, 0], count=5, horizon=1.0, running_cost=lambda x, u: u[0] ** 2
     )
     assert found.success

@@ -10,8 +10,9 @@ import pytest
 from helpers.transcription import BLOCK, effort, heavy_pendulum, move, own_derivatives, unit_inputs
 
 import drake_diff as dd
-from drake_diff.dynamics import Dynamics
-from drake_diff.nonlinear_program import Limits, Outcome
+from drake_diff.exceptions import GradientError, InputError, SimulationError
+from drake_diff.optimize.problem.dynamics import Dynamics
+from drake_diff.optimize.program import Limits, Outcome
 
 CALLED = Dynamics(own_derivatives(BLOCK), 2, 1)
 TASK = {"x0": [0, 0], "x_goal": [1, 0], "count": 10, "horizon": 1.0, "running_cost": effort}
@@ -52,8 +53,8 @@ def test_a_refined_mesh_keeps_the_waypoints_place():
     ],
 )
 def test_bad_waypoints_are_named(waypoints, message):
-    with pytest.raises(dd.InputError, match=message):
-        dd.transcribe_and_solve(BLOCK, **TASK, waypoints=waypoints, bounds=dd.Bounds(x_upper=[5, np.inf]))
+    with pytest.raises(InputError, match=message):
+        dd.optimize.transcribe_and_solve(BLOCK, **TASK, waypoints=waypoints, bounds=dd.Bounds(x_upper=[5, np.inf]))
 
 
 # ------------------------------------------------------------------------------ constraints
@@ -119,8 +120,8 @@ def test_a_given_first_state_need_not_keep_a_constraint():
     ],
 )
 def test_bad_constraints_are_named(constraint, message):
-    with pytest.raises(dd.InputError, match=message):
-        dd.transcribe_and_solve(BLOCK, **TASK, constraints=constraint)
+    with pytest.raises(InputError, match=message):
+        dd.optimize.transcribe_and_solve(BLOCK, **TASK, constraints=constraint)
 
 
 # ------------------------------------------------------------------------------ what is no success
@@ -128,7 +129,7 @@ def test_bad_constraints_are_named(constraint, message):
 
 @pytest.mark.parametrize("dynamics", [BLOCK, CALLED])
 def test_a_constraint_that_cannot_be_kept_is_no_success(dynamics):
-    motion = dd.transcribe_and_solve(
+    motion = dd.optimize.transcribe_and_solve(
         dynamics, **TASK, constraints=dd.Constraint(lambda x: x[0], upper=0.5), limits=Limits(200, 9.0, 1e-9)
     )
     assert motion.outcome is not Outcome.SOLVED
@@ -164,7 +165,7 @@ def test_a_node_moved_off_its_waypoint_or_constraint_is_no_success(kind):
 
 
 def test_an_interrupt_ends_with_the_best_iterate(monkeypatch):
-    monkeypatch.setattr("drake_diff.nonlinear_program.REPORT_PERIOD", 0.0)
+    monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
     lines, former = [], signal.getsignal(signal.SIGINT)
 
     def report(line):
@@ -172,7 +173,7 @@ def test_an_interrupt_ends_with_the_best_iterate(monkeypatch):
         if len(lines) == 4:
             signal.raise_signal(signal.SIGINT)
 
-    motion = dd.transcribe_and_solve(heavy_pendulum(0.1), **SWING, report=report)
+    motion = dd.optimize.transcribe_and_solve(heavy_pendulum(0.1), **SWING, report=report)
     assert motion.outcome is Outcome.INTERRUPTED
     assert motion.message == "stopped: interrupted"
     assert not motion.success
@@ -195,15 +196,15 @@ def test_an_interrupt_within_a_called_function_too():
     pendulum = heavy_pendulum(0.1)
     own = own_derivatives(pendulum)
     own.values = values
-    motion = dd.transcribe_and_solve(Dynamics(own, 2, 1), **SWING)
+    motion = dd.optimize.transcribe_and_solve(Dynamics(own, 2, 1), **SWING)
     assert motion.outcome is Outcome.INTERRUPTED
 
 
 def test_the_iteration_table_is_the_solvers():
-    motion = dd.transcribe_and_solve(heavy_pendulum(0.1), **SWING, limits=Limits(3, math.inf, 1e-9))
+    motion = dd.optimize.transcribe_and_solve(heavy_pendulum(0.1), **SWING, limits=Limits(3, math.inf, 1e-9))
     assert motion.outcome is Outcome.ITERATION_LIMIT
     assert [row.iteration for row in motion.iterations] == [0, 1, 2, 3]
-    whole = dd.transcribe_and_solve(heavy_pendulum(0.1), **SWING)
+    whole = dd.optimize.transcribe_and_solve(heavy_pendulum(0.1), **SWING)
     assert whole.success
     assert whole.iterations[-1].objective == pytest.approx(whole.cost, rel=1e-9)
     assert whole.iterations[-1].primal_infeasibility < 1e-9
@@ -212,7 +213,8 @@ def test_the_iteration_table_is_the_solvers():
 
 
 @pytest.mark.parametrize(
-    ("error", "outcome"), [(dd.SimulationError, Outcome.DIVERGED), (dd.GradientError, Outcome.NO_GRADIENT)]
+    ("error", "outcome"),
+    [(SimulationError, Outcome.DIVERGED), (GradientError, Outcome.NO_GRADIENT)],
 )
 @pytest.mark.parametrize("at", ["values", "linearize"])
 def test_an_error_of_the_dynamics_ends_the_solve_and_is_told(error, outcome, at):
@@ -226,7 +228,7 @@ def test_an_error_of_the_dynamics_ends_the_solve_and_is_told(error, outcome, at)
         return plain(knots)
 
     setattr(own, at, failing)
-    motion = dd.transcribe_and_solve(Dynamics(own, 2, 1), **SWING)
+    motion = dd.optimize.transcribe_and_solve(Dynamics(own, 2, 1), **SWING)
     assert motion.outcome is outcome
     assert motion.message == f"{error.__name__}: here it ends"
     assert np.isfinite(motion.nodes).all()
@@ -241,22 +243,22 @@ def test_any_other_error_is_raised():
 
     own.values = failing
     with pytest.raises(ZeroDivisionError, match="mine"):
-        dd.transcribe_and_solve(Dynamics(own, 2, 1), **TASK)
+        dd.optimize.transcribe_and_solve(Dynamics(own, 2, 1), **TASK)
 
 
 def test_an_error_of_the_report_is_raised(monkeypatch):
-    monkeypatch.setattr("drake_diff.nonlinear_program.REPORT_PERIOD", 0.0)
+    monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
 
     def report(line):
         raise KeyError("yours")
 
     with pytest.raises(KeyError, match="yours"):
-        dd.transcribe_and_solve(BLOCK, **TASK, report=report)
+        dd.optimize.transcribe_and_solve(BLOCK, **TASK, report=report)
 
 
 def test_a_trial_point_out_of_the_domain_is_stepped_back_from():
     """sqrt(x) is NaN below 0, which ends no solve."""
     dynamics = Dynamics(lambda x, u: u * np.sqrt(x), 1, 1)
-    motion = dd.transcribe_and_solve(dynamics, x0=[1], x_goal=[4], count=10, horizon=1.0, running_cost=effort)
+    motion = dd.optimize.transcribe_and_solve(dynamics, x0=[1], x_goal=[4], count=10, horizon=1.0, running_cost=effort)
     assert motion.success
     assert motion.cost == pytest.approx(4, rel=1e-4)  # y = 2 sqrt(x) has y' = u, from 2 to 4: u = 2

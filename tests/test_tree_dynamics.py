@@ -14,10 +14,11 @@ from pydrake.multibody.tree import (
 )
 
 import drake_diff as dd
-from drake_diff.implicit import form_of, implicit_jacobians, take_steps
-from drake_diff.parameters import applied, select
-from drake_diff.rollout_gradient import derivatives_along
-from drake_diff.tree_dynamics import TreeDynamics, tree_of
+from drake_diff.derivatives.implicit import form_of, implicit_jacobians, take_steps
+from drake_diff.exceptions import ModelWarning
+from drake_diff.mechanics.tree import TreeDynamics, tree_of
+from drake_diff.model.parameters import applied, select
+from drake_diff.motion.gradient import derivatives_along
 
 
 def at(model, q, v, a):
@@ -141,7 +142,7 @@ def test_a_tree_that_is_not_drakes_is_not_used(monkeypatch):
         tree = real(model)
         return TreeDynamics(**{**vars(tree), "inertia": tree.inertia * 1.001})
 
-    monkeypatch.setattr("drake_diff.implicit.tree_of", wrong)
+    monkeypatch.setattr("drake_diff.mechanics.tree.tree_of", wrong)
     model = random_tree(5)
     assert form_of(model).tree is None
     x = 0.1 * np.ones(model.nx)
@@ -166,7 +167,7 @@ def test_a_whole_rollout_in_one_call_is_the_one_by_autodiff(load, name):
 
 def test_in_a_rollout_through_a_joint_limit_the_steps_at_it_are_autodiffs():
     """The UR5 falls from rest until a joint stops it."""
-    with pytest.warns(dd.ModelWarning):
+    with pytest.warns(ModelWarning):
         model = dd.load_model(robot_file("ur5_robot.urdf"), time_step=0.01)
     x0 = model.default_state
     upper = model.plant.GetPositionUpperLimits()

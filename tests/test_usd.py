@@ -5,9 +5,9 @@ import pytest
 from helpers.contracts import arms
 from helpers.engines import engine_of
 
-import drake_diff as dd
-from drake_diff.engines.description import describe
-from drake_diff.engines.export import export_model
+from drake_diff.exceptions import ModelError
+from drake_diff.export.export import export_model
+from drake_diff.mechanics.description import describe
 
 pytest.importorskip("pxr", reason="no usd-core (the extra `usd`)")
 
@@ -15,7 +15,7 @@ pytest.importorskip("pxr", reason="no usd-core (the extra `usd`)")
 def newton_of(model, tmp_path):
     newton = pytest.importorskip("newton", reason="no Newton")
     pytest.importorskip("newton_usd_schemas", reason="no newton-usd-schemas")
-    from drake_diff.engines.usd import usd
+    from drake_diff.export.usd import usd
 
     path = tmp_path / f"{model.name}.usda"  # USD keeps files by path, and does not read one again
     path.write_text(usd(describe(model)))
@@ -55,7 +55,7 @@ def test_newton_finds_the_free_ball_and_the_box(load, tmp_path):
 
 
 def test_the_armature_is_there(tmp_path):
-    from drake_diff.engines.usd import usd
+    from drake_diff.export.usd import usd
 
     text = usd(describe(arms(tmp_path)))
     assert text.count("float physxJoint:armature = 0.04") == 4
@@ -63,9 +63,9 @@ def test_the_armature_is_there(tmp_path):
 
 
 def test_what_usd_cannot_say_is_told_and_not_written(load, tmp_path):
-    from drake_diff.engines.usd import usd
+    from drake_diff.export.usd import usd
 
-    with pytest.raises(dd.ModelError, match="link pole: USD takes a mass or moment of inertia of 0"):
+    with pytest.raises(ModelError, match="link pole: USD takes a mass or moment of inertia of 0"):
         usd(describe(load("pendulum.urdf")))
     export_model(load("pendulum.urdf"), tmp_path / "out", target="isaaclab", states=2)
     assert not (tmp_path / "out" / "model.usda").exists()

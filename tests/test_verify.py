@@ -16,9 +16,10 @@ import pytest
 from helpers.models import MODELS, ROOT
 
 import drake_diff as dd
-import drake_diff.evidence as evidence
-from drake_diff.evidence import begin, seal
-from drake_diff.record import EvidenceRecord
+import drake_diff.artifact.save as evidence
+from drake_diff.artifact.save import begin, seal
+from drake_diff.exceptions import ArtifactError
+from drake_diff.record.run_record import EvidenceRecord
 
 FILES = ("plan.npz", "record.json", "record.schema.json", "replay.html", "trace.mcap")
 EVIL = """<robot name="&lt;script&gt;alert(1)&lt;/script&gt;"><link name="[red]a[/]"><inertial><mass value="1"/>
@@ -245,10 +246,10 @@ def test_a_record_whose_problem_is_none_is_broken_not_an_accident(run, copy, key
 
 
 def test_no_directory_is_an_error_and_no_record_is_broken(tmp_path):
-    with pytest.raises(dd.ArtifactError, match="run directory"):
+    with pytest.raises(ArtifactError, match="run directory"):
         dd.verify(tmp_path / "nothing")
     assert dd.verify(tmp_path).verdict == "broken"
-    with pytest.raises(dd.ArtifactError, match=r"record\.json"):
+    with pytest.raises(ArtifactError, match=r"record\.json"):
         dd.verify(tmp_path).require()
 
 
@@ -338,7 +339,7 @@ def problem():
 def test_a_run_killed_at_20_random_moments_is_never_a_false_success(tmp_path):
     rng = random.Random(1)
     (tmp_path / "task.py").write_text(SCRIPT)
-    command = [sys.executable, "-m", "drake_diff.cli", "run", str(tmp_path / "task.py")]
+    command = [sys.executable, "-m", "drake_diff.cli.main", "run", str(tmp_path / "task.py")]
     command += ["--out", str(tmp_path / "run")]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}

@@ -10,6 +10,7 @@ from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import LeafSystem
 
 import drake_diff as dd
+from drake_diff.exceptions import GradientError
 
 MU, G = 0.5, 9.81
 REST = 0.1 - G / 1e4  # [m] of the ball below
@@ -49,7 +50,7 @@ def audited(code, model, x=None, u=None, severity="error"):
 def certified(model, x, u=None, **options):
     try:
         return dd.certify(model, x, u, **options)
-    except dd.GradientError as error:
+    except GradientError as error:
         return error
 
 

@@ -1,1 +1,5 @@
-"""The same model in other simulators: each engine in a file of its own, imported when it is asked for."""
+"""engines."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

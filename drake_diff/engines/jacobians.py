@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_diff.arrays import Array, frozen
-from drake_diff.certificate import Certificate, certify_displacement
-from drake_diff.engines.engine import Engine, Precision
+from drake_diff._base.arrays import Array, frozen
+from drake_diff._base.differences import differences, one_by_one
+from drake_diff.certificates.certificate import Certificate, certify_displacement
+from drake_diff.engines.interface import Engine, Precision
 from drake_diff.engines.motion import EngineMotion
 from drake_diff.exceptions import NotOfferedError
-from drake_diff.finite_difference import differences, one_by_one
-from drake_diff.tangent import TangentSpace
+from drake_diff.model.tangent import TangentSpace
 
 # Steps of differences for engines without derivatives: where rounding and truncation are both small.
 DIFFERENCE_STEP: dict[Precision, float] = {"float64": 1e-5, "float32": 1e-2}

@@ -3,20 +3,20 @@
 from importlib import import_module
 from typing import Any
 
-from drake_diff.engines.engine import Engine
+from drake_diff.engines.interface import Engine
 from drake_diff.exceptions import InputError, MissingDependencyError, UnknownNameError
-from drake_diff.model import Model
+from drake_diff.model.model import Model
 
 ENGINES = {
-    "numpy": ("numpy_engine", "NumpyEngine"),
-    "drake": ("drake_engine", "DrakeEngine"),
-    "mujoco": ("mujoco_engine", "MujocoEngine"),
-    "mjx": ("mjx_engine", "MjxEngine"),
-    "pinocchio": ("pinocchio_engine", "PinocchioEngine"),
-    "casadi": ("casadi_engine", "CasadiEngine"),
-    "newton": ("newton_engine", "NewtonEngine"),
-    "pybullet": ("pybullet_engine", "PybulletEngine"),
-    "sapien": ("sapien_engine", "SapienEngine"),
+    "numpy": ("engines.numpy", "NumpyEngine"),
+    "drake": ("engines.drake", "DrakeEngine"),
+    "mujoco": ("engines.mujoco.engine", "MujocoEngine"),
+    "mjx": ("engines.mujoco.mjx", "MjxEngine"),
+    "pinocchio": ("engines.pinocchio", "PinocchioEngine"),
+    "casadi": ("engines.casadi", "CasadiEngine"),
+    "newton": ("engines.newton", "NewtonEngine"),
+    "pybullet": ("engines.bullet", "PybulletEngine"),
+    "sapien": ("engines.physx", "SapienEngine"),
 }
 
 # Tools that people ask for and that are no engine here, and why.
@@ -50,5 +50,5 @@ def load_engine(name: str, model: Any, **options: Any) -> Engine:
     if name not in ENGINES:
         raise UnknownNameError("engine", got=name, known=ENGINES)
     module, kind = ENGINES[name]
-    engine: Engine = getattr(import_module(f"drake_diff.engines.{module}"), kind)(model, **options)
+    engine: Engine = getattr(import_module(f"drake_diff.{module}"), kind)(model, **options)
     return engine

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff.arrays import Array, frozen
-from drake_diff.engines.engine import Engine
+from drake_diff._base.arrays import Array, frozen
+from drake_diff.engines.interface import Engine
 from drake_diff.exceptions import NotOfferedError, SimulationError
 
 BROKE_OFF = "broke off"

@@ -2,16 +2,21 @@
 
 Each link's frame stands at its joint and parallel to the world where q = 0: no joint is turned against its parent, so
 nothing goes through roll, pitch and yaw but geometry. URDF has no springs and no friction; neither is written.
+
+One tree of rigid links as URDF for Bullet: numbers to the last digit, inertias by their principal axes.
 """
 
+from collections.abc import Sequence
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from drake_diff.arrays import Array
-from drake_diff.engines.description import Description, Geometry, Link
+from drake_diff._base.arrays import Array
+from drake_diff.engines.mujoco.mjcf import principal
+from drake_diff.mechanics.coordinates import rotation
+from drake_diff.mechanics.description import Description, Geometry, Link, RigidLink
 
 KINDS = {"weld": "fixed", "prismatic": "prismatic", "quaternion_floating": "floating"}
 UNLIMITED = 1e10  # what is not limited: readers take a limit that is missing for 0, and not all can read inf
@@ -140,3 +145,84 @@ def _add_geometry(element: Element, geometry: Geometry, X: RigidTransform) -> No
     rpy: Array = RollPitchYaw(X.rotation()).vector()
     SubElement(collision, "origin", xyz=_row(X.translation()), rpy=_row(rpy))
     SubElement(SubElement(collision, "geometry"), kind.lower(), sizes)
+
+
+UNLIMITED_of_bullet_urdf = 1e10
+
+
+def bullet_urdf(links: Sequence[tuple[int, RigidLink]], geometries: Sequence[tuple[int, Geometry]]) -> str:
+    """Links, each with its place (by which its geometries and children name it); the first may be a free body.
+
+    A tree that hangs on the world gets a massless base "world". Half spaces are left to the caller.
+    """
+    root = Element("robot", name="tree")
+    if not links[0][1].free:
+        base = SubElement(root, "link", name="world")
+        _add_inertial_of_bullet_urdf(base, 0.0, np.zeros(3), np.zeros((3, 3)))
+    for number, link in links:
+        body = SubElement(root, "link", name=f"link_{number}")
+        _add_inertial_of_bullet_urdf(body, link.mass, link.center_of_mass, link.inertia)
+        for geometry in (g for owner, g in geometries if owner == number):
+            _add_shape(body, geometry)
+        if not link.free:
+            _add_joint_of_bullet_urdf(root, number, link)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _add_joint_of_bullet_urdf(root: Element, number: int, link: RigidLink) -> None:
+    limited = np.isfinite(link.joint.lower) or np.isfinite(link.joint.upper)
+    sides = (
+        np.clip([link.joint.lower, link.joint.upper], -UNLIMITED_of_bullet_urdf, UNLIMITED_of_bullet_urdf)
+        if limited
+        else [1.0, -1.0]
+    )
+    joint = SubElement(root, "joint", name=f"joint_{number}", type=link.joint.kind)
+    _place(joint, link.on_parent)
+    SubElement(joint, "parent", link="world" if link.parent < 0 else f"link_{link.parent}")
+    SubElement(joint, "child", link=f"link_{number}")
+    SubElement(joint, "axis", xyz=_row_of_bullet_urdf(link.axis))
+    SubElement(joint, "dynamics", damping=_row_of_bullet_urdf([link.joint.damping]), friction="0")
+    limit = {
+        "lower": sides[0],
+        "upper": sides[1],
+        "effort": UNLIMITED_of_bullet_urdf,
+        "velocity": UNLIMITED_of_bullet_urdf,
+    }
+    SubElement(joint, "limit", {name: _row_of_bullet_urdf([value]) for name, value in limit.items()})
+
+
+def _add_inertial_of_bullet_urdf(body: Element, mass: float, center: Array, inertia: Array) -> None:
+    moments, turn = principal(inertia)
+    inertial = SubElement(body, "inertial")
+    _place(inertial, RigidTransform(RotationMatrix(rotation(turn)), center))
+    SubElement(inertial, "mass", value=_row_of_bullet_urdf([mass]))
+    products = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
+    diagonal = {f"i{axis}{axis}": _row_of_bullet_urdf([m]) for axis, m in zip("xyz", moments, strict=True)}
+    SubElement(inertial, "inertia", {**diagonal, **products})
+
+
+def _add_shape(body: Element, geometry: Geometry) -> None:
+    shape, kind = geometry.shape, type(geometry.shape).__name__.lower()
+    collision = SubElement(body, "collision")
+    _place(collision, geometry.pose)
+    element = SubElement(SubElement(collision, "geometry"), kind)
+    if kind == "box":
+        element.set("size", _row_of_bullet_urdf([shape.width(), shape.depth(), shape.height()]))
+    else:
+        element.set("radius", _row_of_bullet_urdf([shape.radius()]))
+    if kind in ("cylinder", "capsule"):
+        element.set("length", _row_of_bullet_urdf([shape.length()]))
+
+
+def _place(element: Element, X: RigidTransform) -> None:
+    SubElement(
+        element,
+        "origin",
+        xyz=_row_of_bullet_urdf(X.translation()),
+        rpy=_row_of_bullet_urdf(RollPitchYaw(X.rotation()).vector()),
+    )
+
+
+def _row_of_bullet_urdf(values: object) -> str:
+    return " ".join(repr(float(value)) for value in np.ravel(np.asarray(values, dtype=float)))

@@ -1,1 +1,5 @@
-"""A plan or a policy on the plant as it might be: seen through sensors, late, pushed, with the wrong mass."""
+"""loop."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -11,21 +11,20 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff.arrays import Array, finite_array, positive_int
-from drake_diff.bounds import Bounds
-from drake_diff.cost import QuadraticCost
+from drake_diff._base.arrays import Array, finite_array, positive_int
+from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, InputError
-from drake_diff.ilqr import check_problem, costs_to_go, solve_ilqr
-from drake_diff.loop.closed_loop import OK
-from drake_diff.model import Model
-from drake_diff.nonlinear_program import Limits, Outcome
-from drake_diff.policy import LQR
-from drake_diff.problem import Problem
-from drake_diff.replay import Plan, held, regulator_weights
-from drake_diff.solution import Solution
-from drake_diff.solver import solve
-from drake_diff.step_derivatives import differentiate_step
-from drake_diff.tangent import tangent_space
+from drake_diff.loop.run import OK
+from drake_diff.model.model import Model
+from drake_diff.model.tangent import tangent_space
+from drake_diff.motion.policy import LQR
+from drake_diff.optimize.ilqr.ilqr import check_problem, costs_to_go, solve_ilqr
+from drake_diff.optimize.problem.cost import QuadraticCost
+from drake_diff.optimize.problem.problem import Bounds, Problem
+from drake_diff.optimize.program import Limits, Outcome
+from drake_diff.optimize.replay import Plan, held, regulator_weights
+from drake_diff.optimize.solution import Solution
+from drake_diff.optimize.solve import solve
 
 TOLERANCE = 1e-8
 PLAN_ITERATIONS = 500  # of the first plan, made once

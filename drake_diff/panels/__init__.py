@@ -1,1 +1,5 @@
-"""Many trials from one declarative file: every combination evaluated once, in one table."""
+"""panels."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -27,7 +27,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from drake_diff.exceptions import InputError
-from drake_diff.record_parts import FiniteTable
+from drake_diff.record.parts import FiniteTable
 
 # What drake_diff itself gives each trial: no axis, cell or fixed value is called so.
 OURS = ("id", "repeat", "seed")

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drake_diff.loop.statistics import success_rate
+from drake_diff._base.files import write_whole
+from drake_diff._base.statistics import success_rate
 from drake_diff.panels.panel_file import Trial, canonical
 from drake_diff.panels.trial_row import Row
-from drake_diff.whole_file import write_whole
 
 TABLE, SUMMARY = "table.csv", "summary.json"
 

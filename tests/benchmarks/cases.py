@@ -14,6 +14,7 @@ import numpy as np
 from step_derivatives import MODELS, panda_arm, robot, state
 
 import drake_diff as dd
+from drake_diff.exceptions import ModelWarning
 
 CHAINS = (5, 10, 20, 30)
 HORIZONS = (10, 100, 1000)
@@ -130,5 +131,5 @@ CASES: dict[str, Callable[[Path], Case]] = {
 def case(name: str) -> Case:
     """The model of a name in CASES, in its state."""
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore", dd.ModelWarning)  # visuals' meshes are left out
+        warnings.simplefilter("ignore", ModelWarning)  # visuals' meshes are left out
         return CASES[name](Path(folder))

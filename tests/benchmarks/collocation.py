@@ -25,8 +25,9 @@ import pydrake.common
 from step_derivatives import MODELS, panda_arm
 
 import drake_diff as dd
-from drake_diff.collocation import solve_collocation
-from drake_diff.nonlinear_program import Limits, Outcome
+from drake_diff.exceptions import ModelWarning
+from drake_diff.optimize.program import Limits, Outcome
+from drake_diff.optimize.transcription.drake import solve_collocation
 
 LIMITS = Limits(max_iterations=3000, time_limit=60.0, tolerance=1e-6)
 LONG, RUNS = 30.0, 5
@@ -57,8 +58,8 @@ def problems(folder: Path) -> dict[str, dd.Problem]:
 
 def ours(problem: dd.Problem, scheme: str) -> Row:
     start = time.process_time()
-    motion = dd.transcribe_and_solve(
-        dd.plant_dynamics(problem.model),
+    motion = dd.optimize.transcribe_and_solve(
+        dd.optimize.plant_dynamics(problem.model),
         x0=problem.x0,
         x_goal=problem.x_goal,
         count=problem.num_steps,
@@ -148,7 +149,7 @@ def table(name: str, rows: dict[str, list[Row]]) -> Iterator[str]:
 
 
 def main() -> None:
-    warnings.simplefilter("ignore", dd.ModelWarning)
+    warnings.simplefilter("ignore", ModelWarning)
     with tempfile.TemporaryDirectory() as folder:
         every = problems(Path(folder))
         for name in [n for n in every if not sys.argv[1:] or sys.argv[1] in n]:

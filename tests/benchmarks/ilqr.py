@@ -22,8 +22,9 @@ import numpy as np
 from step_derivatives import panda_arm
 
 import drake_diff as dd
-from drake_diff.ilqr import solve_ilqr
-from drake_diff.nonlinear_program import Limits
+from drake_diff.exceptions import ModelWarning
+from drake_diff.optimize.ilqr.ilqr import solve_ilqr
+from drake_diff.optimize.program import Limits
 
 MODELS = Path(__file__).parents[2] / "models"
 REPEATS = 7
@@ -53,7 +54,7 @@ def _undamped(urdf: Path, folder: Path) -> Path:
 def ours(task: dict, repeats: int = 0) -> dict:
     """The first solve, which certifies the model's derivatives, counts where it is the only one."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", dd.ModelWarning)
+        warnings.simplefilter("ignore", ModelWarning)
         model = dd.load_model(task["urdf"], time_step=task["time_step"], weld_base=task.get("base"))
 
     def cost(q: float, v: float, u: float) -> dd.QuadraticCost:

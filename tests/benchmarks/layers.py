@@ -23,8 +23,8 @@ import pydrake.systems.framework
 from cases import Case
 from peers import DrakeDiff
 
-import drake_diff.arrays
-import drake_diff.autodiff
+from drake_diff._base.arrays import finite_array, frozen
+from drake_diff._base.autodiff import gradient_rows, plain
 
 CLASSES_OF = (
     pydrake.multibody.plant,
@@ -36,10 +36,10 @@ CONVERSIONS = (
     pydrake.autodiffutils.InitializeAutoDiff,
     pydrake.autodiffutils.ExtractGradient,
     pydrake.autodiffutils.ExtractValue,
-    drake_diff.autodiff.gradient_rows,
-    drake_diff.autodiff.plain,
-    drake_diff.arrays.finite_array,
-    drake_diff.arrays.frozen,
+    gradient_rows,
+    plain,
+    finite_array,
+    frozen,
 )
 DRAKE, ARRAYS, OURS = "Drake", "conversions", "our Python"
 CALLS, REPEATS = 5, 15  # short blocks, of which a busy machine disturbs few

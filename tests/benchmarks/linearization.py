@@ -19,10 +19,11 @@ import pinocchio as pin
 from step_derivatives import panda_arm, state
 
 import drake_diff as dd
-from drake_diff.analytic import analytic_of
-from drake_diff.engines.mujoco_engine import MujocoEngine
-from drake_diff.engines.pinocchio_engine import PinocchioEngine
-from drake_diff.step import advance
+from drake_diff.derivatives.analytic import analytic_of
+from drake_diff.engines.mujoco.engine import MujocoEngine
+from drake_diff.engines.pinocchio import PinocchioEngine
+from drake_diff.exceptions import ModelWarning
+from drake_diff.model.step import advance
 
 KNOTS, BLOCKS, CALLS = 100, 40, 8
 REFERENCE = "autodiff, one step"
@@ -112,7 +113,7 @@ def measure(calls: dict[str, tuple[Callable[[], object], int]]) -> dict[str, tup
 
 
 def main() -> None:
-    warnings.simplefilter("ignore", dd.ModelWarning)
+    warnings.simplefilter("ignore", ModelWarning)
     with tempfile.TemporaryDirectory() as folder:
         model = dd.load_model(panda_arm(Path(folder)), time_step=0.005, weld_base="panda_link0")
     if isinstance(why := analytic_of(model), str):

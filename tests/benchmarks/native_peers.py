@@ -22,9 +22,9 @@ from peers import (
 )
 from timing import Block
 
-import drake_diff as dd
-from drake_diff.engines.description import describe
 from drake_diff.engines.urdf import urdf
+from drake_diff.exceptions import GradientError, MissingDependencyError, ModelError, SimulationError
+from drake_diff.mechanics.description import describe
 
 LARGEST_MJX = 7  # velocities; what has more compiles for minutes
 SMALL = 1e-6  # of mjd_transitionFD, as in its own documentation
@@ -94,7 +94,7 @@ class Mjx(Native):
 
     def __init__(self, case: Case):
         if case.model.nv > LARGEST_MJX:
-            raise dd.ModelError(f"left out: more than {LARGEST_MJX} velocities compile for minutes")
+            raise ModelError(f"left out: more than {LARGEST_MJX} velocities compile for minutes")
         super().__init__(case)
         import jax
         from mujoco import mjx
@@ -112,7 +112,7 @@ class Mjx(Native):
         with self.jax.enable_x64(True):
             found = np.asarray(function(self.peer.mjx, self.peer.data, np.concatenate([x, u])))
         if not np.all(np.isfinite(found)):
-            raise dd.GradientError("MJX's answer is not finite")
+            raise GradientError("MJX's answer is not finite")
         return found
 
     def step(self) -> np.ndarray:
@@ -143,11 +143,11 @@ class Crocoddyl(Peer):
         super().__init__(case)
         python = os.environ.get("CROCODDYL_PYTHON")
         if not python:
-            raise dd.MissingDependencyError("no $CROCODDYL_PYTHON: see crocoddyl_peer.py for its environment")
+            raise MissingDependencyError("no $CROCODDYL_PYTHON: see crocoddyl_peer.py for its environment")
         if not shutil.which(python):
-            raise dd.MissingDependencyError(f"$CROCODDYL_PYTHON: expected a Python, got {python}")
+            raise MissingDependencyError(f"$CROCODDYL_PYTHON: expected a Python, got {python}")
         if case.floats:
-            raise dd.ModelError("its side here is for joints on a fixed base alone")
+            raise ModelError("its side here is for joints on a fixed base alone")
         self.actuation = describe(case.model).actuation
         script = Path(__file__).with_name("crocoddyl_steps.py")
         self.process = subprocess.Popen([python, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -161,7 +161,7 @@ class Crocoddyl(Peer):
         self.process.stdin.flush()
         line = self.process.stdout.readline()
         if not line:
-            raise dd.SimulationError(f"{self.name} has died with exit status {self.process.wait()}")
+            raise SimulationError(f"{self.name} has died with exit status {self.process.wait()}")
         return json.loads(line)
 
     def close(self) -> None:
@@ -198,6 +198,6 @@ def peers_of(case: Case, left_out: set[str]) -> tuple[list[Peer], dict[str, str]
             continue
         try:
             found.append(kind(case))
-        except (dd.ModelError, dd.MissingDependencyError, dd.SimulationError) as error:
+        except (ModelError, MissingDependencyError, SimulationError) as error:
             missing[kind.name] = str(error)
     return found, missing

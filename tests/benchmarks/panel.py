@@ -37,7 +37,7 @@ def measure(path: Path, workers: int, out: Path) -> tuple[float, float, float, b
     """Trials per second, seconds to the first, the parent's processor milliseconds per trial, and the table."""
     times: list[float] = []
     begin, used = time.monotonic(), time.process_time()
-    dd.run_panel(path, out=out, workers=workers, progress=lambda *_: times.append(time.monotonic()))
+    dd.panels.run_panel(path, out=out, workers=workers, progress=lambda *_: times.append(time.monotonic()))
     parent = 1e3 * (time.process_time() - used) / len(times)
     return (len(times) - 1) / (times[-1] - times[0]), times[0] - begin, parent, (out / "table.csv").read_bytes()
 

@@ -13,7 +13,8 @@ from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoD
 from timing import Block, block
 
 import drake_diff as dd
-from drake_diff.tangent import tangent_space
+from drake_diff.exceptions import ModelError
+from drake_diff.model.tangent import tangent_space
 
 QUANTITIES = ("step", "step_jacobian", "linearization", "rollout_gradient")
 BASE = "Drake AutoDiffXd"
@@ -174,9 +175,9 @@ class Engine(Peer):
 
     def __init__(self, case: Case):
         super().__init__(case)
-        if not self.contact and dd.load_engine("drake", case.model).contact_depth(case.x) > 0:
-            raise dd.ModelError("it has no contact here, and falls through the ground")
-        self.peer: Any = dd.load_engine(self.engine, case.model)
+        if not self.contact and dd.engines.load_engine("drake", case.model).contact_depth(case.x) > 0:
+            raise ModelError("it has no contact here, and falls through the ground")
+        self.peer: Any = dd.engines.load_engine(self.engine, case.model)
 
     def step(self) -> np.ndarray:
         return self.peer.step(self.x, self.u)

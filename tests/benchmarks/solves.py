@@ -15,6 +15,7 @@ from suite import Missing, Row, row
 from timing import Block, block, measure, timed
 
 import drake_diff as dd
+from drake_diff.exceptions import ModelWarning
 
 SOLVES = {"kelly": "Kelly's cart-pole, 50", "panda_reach": "Panda reach"}  # the others take minutes
 QUICK_SOLVES = ("kelly",)
@@ -25,7 +26,7 @@ FDDP = "Crocoddyl FDDP"
 def solved(names: list[str], quick: bool) -> Iterator[Row | Missing]:
     """The rows of each whole solve, a key of SOLVES."""
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore", dd.ModelWarning)
+        warnings.simplefilter("ignore", ModelWarning)
         for name in names:
             print(f"{name}, solve", file=sys.stderr, flush=True)
             if name == "panda_reach":

@@ -14,7 +14,7 @@ STARTS = {
     BASE: ["-c", BASE],
     "import pydrake.multibody.plant": ["-c", "import pydrake.multibody.plant"],
     "import drake_diff": ["-c", "import drake_diff"],
-    "drake-diff --help": ["-m", "drake_diff.cli", "--help"],
+    "drake-diff --help": ["-m", "drake_diff.cli.main", "--help"],
 }
 BUDGET, QUICK_BUDGET = 15.0, 5.0  # [s]
 

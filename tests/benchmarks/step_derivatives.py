@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 import drake_diff as dd
+from drake_diff.exceptions import ModelWarning
 
 MODELS = Path(__file__).parents[2] / "models"
 METHODS = ("autodiff", "implicit", "finite_difference", "auto")
@@ -67,7 +68,7 @@ def medians(model: dd.Model) -> tuple[dict[str, float], str]:
 
 
 def main() -> None:
-    warnings.simplefilter("ignore", dd.ModelWarning)
+    warnings.simplefilter("ignore", ModelWarning)
     with tempfile.TemporaryDirectory() as folder:
         models = {
             "pendulum": MODELS / "pendulum.urdf",

@@ -10,7 +10,7 @@ from native_peers import Mjx, peers_of
 from peers import BASE, QUANTITIES, Peer
 from timing import Sample, Spread, measure, ratios, spread, timed
 
-import drake_diff as dd
+from drake_diff.exceptions import GradientError, SimulationError
 
 QUICK_MODELS = ("pendulum", "panda", "solo12", "sphere", "chain5")
 BUDGET, QUICK_BUDGET = 3.0, 1.0  # [s] of rounds for one model and quantity
@@ -83,7 +83,7 @@ def _group(case: Case, quantity: str, horizon: int, peers: list[Peer], budget: f
                 answer = peer.in_drake(quantity, found)
                 base = answer if peer.name == BASE else base
                 gaps[peer.name], able[peer.name] = _gap(answer, base), peer
-        except (dd.GradientError, dd.SimulationError) as error:
+        except (GradientError, SimulationError) as error:
             reason = str(error)
         if reason is not None:
             yield Missing(case.name, quantity, peer.name, reason)

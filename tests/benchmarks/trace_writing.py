@@ -20,14 +20,14 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
 import drake_diff as dd
-from drake_diff.mcap_log import Channel, write_mcap
-from drake_diff.mcap_messages import TYPES
-from drake_diff.plant_elements import bodies, joints
-from drake_diff.rollout import Rollout
-from drake_diff.solution import Solution
-from drake_diff.step import set_state
-from drake_diff.trace import write_trace
-from drake_diff.trace_motion import Shown, motion_channels
+from drake_diff.artifact.trace import write_trace
+from drake_diff.logs.channels import Shown, motion_channels
+from drake_diff.logs.messages import TYPES
+from drake_diff.logs.write import Channel, write_mcap
+from drake_diff.model.plant import bodies, joints
+from drake_diff.model.step import set_state
+from drake_diff.motion.rollout import Rollout
+from drake_diff.optimize.solution import Solution
 
 JOINTS, TIME_STEP, REPEATS = 30, 1e-3, 3
 CLOCK = (
@@ -155,7 +155,7 @@ def main(count: int) -> None:
     vars(solution).update(replay=motion, replays=())  # not what is measured
     trace, plain, again = folder / "trace.mcap", folder / "plain.mcap", folder / "again.mcap"
     ours = timed(write_trace, trace, solution, {})
-    log = dd.read_mcap(trace)
+    log = dd.logs.read_mcap(trace)
     channels = [Channel(topic, log.message_types[topic], rows) for topic, rows in log.messages.items()]
     rows = [(t, i, m) for i, c in enumerate(channels) for t, m in c.messages]
     rows.sort(key=lambda row: row[0])

@@ -32,7 +32,7 @@ def arms(tmp_path, *, time_step=0.002, gravity=None, **changes):
 
 
 def different(a, b):
-    return {line.quantity: line.detail for line in dd.match_contracts(a, b) if line.verdict == "different"}
+    return {line.quantity: line.detail for line in dd.engines.match_contracts(a, b) if line.verdict == "different"}
 
 
 FOLLOWS = {"M(q)", "bias(q, v)"}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
-from drake_diff.tangent import tangent_space
+from drake_diff.model.tangent import tangent_space
 from helpers.models import random_state
 
 HAND = ["pendulum.urdf", "double_pendulum.urdf", "cart_pole.urdf", "mass_spring_damper.sdf", "projectile.sdf"]
@@ -29,7 +29,7 @@ def needs(engine):
 
 def engine_of(name, model, **options):
     needs(name)
-    return dd.load_engine(name, model, **options)
+    return dd.engines.load_engine(name, model, **options)
 
 
 class Doctored:
@@ -62,7 +62,7 @@ def on_tangent(model, A, x, x_next):
 
 def assert_free_steps_agree(model, name, step, jacobian, *, states=5):
     """One step and its Jacobian (on the tangent space) to these tolerances, relative to the largest entry."""
-    drake, other, random = dd.load_engine("drake", model), engine_of(name, model), np.random.default_rng(2)
+    drake, other, random = dd.engines.load_engine("drake", model), engine_of(name, model), np.random.default_rng(2)
     for _ in range(states):
         x, u = free_state(model, random), random.standard_normal(model.nu)
         a, b = drake.step(x, u), other.step(x, u)
@@ -76,8 +76,8 @@ def assert_free_steps_agree(model, name, step, jacobian, *, states=5):
 
 def assert_free_bodies_differ_by_the_exponential(model, name, *, states=3):
     """From Drake's step, in an engine that has MuJoCo's."""
-    drake, mujoco, random = dd.load_engine("drake", model), engine_of(name, model), np.random.default_rng(3)
-    from drake_diff.engines.mujoco_engine import exponential_gap
+    drake, mujoco, random = dd.engines.load_engine("drake", model), engine_of(name, model), np.random.default_rng(3)
+    from drake_diff.engines.mujoco.engine import exponential_gap
 
     space = tangent_space(model)
 

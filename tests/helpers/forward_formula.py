@@ -17,7 +17,7 @@ def free_box(center=(0.0, 0.0, 0.0), time_step=0.01, *, mass=2.0):
 
 def formula(model, x, u, *, exponential=False):
     """One step from Drake's M and bias: explicit damping, free bodies by their centres, quaternions by their rate."""
-    drake, h, nq = dd.load_engine("drake", model), model.time_step, model.nq
+    drake, h, nq = dd.engines.load_engine("drake", model), model.time_step, model.nq
     q, v = np.asarray(x)[:nq], np.asarray(x)[nq:]
     force = drake.description.actuation @ u - drake.bias(q, v) - drake.description.by_velocity("damping") * v
     v_next = v + h * np.linalg.solve(drake.mass_matrix(q), force)

@@ -13,6 +13,7 @@ from pydrake.multibody.tree import PrismaticJoint, SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
 import drake_diff as dd
+from drake_diff.exceptions import ModelWarning
 
 ROOT = Path(__file__).parents[2]
 MODELS = ROOT / "models"
@@ -102,10 +103,10 @@ def robot(name, tmp_path):
     copy = tmp_path / name
     copy.write_text("\n".join(line for line in lines if line.strip() not in ('lower="0"', 'upper="0"', MIMIC)))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", dd.ModelWarning)  # meshes of visuals are skipped
+        warnings.simplefilter("ignore", ModelWarning)  # meshes of visuals are skipped
         return dd.load_model(copy, time_step=0.001, weld_base=WELDED.get(name))
 
 
 def ur5():
-    with pytest.warns(dd.ModelWarning):  # meshes skipped
+    with pytest.warns(ModelWarning):  # meshes skipped
         return dd.load_model(robot_file("ur5_robot.urdf"), time_step=0.02)

@@ -5,9 +5,9 @@ import types
 import numpy as np
 
 import drake_diff as dd
-from drake_diff.dynamics import Dynamics
-from drake_diff.nonlinear_program import Outcome
-from drake_diff.transcription import transcribe_and_solve
+from drake_diff.optimize.problem.dynamics import Dynamics
+from drake_diff.optimize.program import Outcome
+from drake_diff.optimize.transcription.solve import transcribe_and_solve
 
 
 def effort(x, u):

@@ -1,0 +1,76 @@
+"""AutoDiffXd in and out of NumPy: the gradient of a scalar, and the chain rule for what we differentiate ourselves."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, InitializeAutoDiff
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import GradientError, InputError
+
+# AutoDiffXd carries a whole row of derivatives with every number; this many at a time keeps memory flat.
+DIRECTIONS = 128
+
+
+def gradient_of(f: Callable[[Any], Any], z: Array) -> tuple[float, Array]:
+    """(value, gradient (n,)) of the scalar `f` at `z` (n,) by AutoDiffXd.
+
+    Raises GradientError where the result carries no derivative (float() was taken, or a constant returned) or
+    is not finite.
+    """
+    gradient = np.zeros(len(z))
+    value = 0.0
+    for start in range(0, len(z), DIRECTIONS):
+        active = slice(start, min(start + DIRECTIONS, len(z)))
+        variables = np.array([AutoDiffXd(entry) for entry in z])
+        variables[active] = InitializeAutoDiff(z[active]).ravel()
+        with np.errstate(all="ignore"):  # what is not finite is refused below, whole
+            try:
+                result = np.asarray(f(variables)).ravel()
+            except TypeError as error:
+                if "AutoDiffXd" not in str(error):
+                    raise
+                raise GradientError(f"the loss lost its derivatives: {error}") from error
+        if result.shape != (1,):
+            raise InputError("loss", got=f"{len(result)} values", expected="one scalar")
+        if not isinstance(result[0], AutoDiffXd):
+            raise GradientError(
+                "the loss lost its derivatives: it returned a plain number; write it with ordinary arithmetic and "
+                "NumPy functions of xs and us, without float() or np.asarray(..., dtype=float)"
+            )
+        value, derivatives = result[0].value(), result[0].derivatives()
+        gradient[active] = derivatives if len(derivatives) else 0.0
+    if not (np.isfinite(value) and np.all(np.isfinite(gradient))):
+        raise GradientError(f"the loss or its gradient is not finite: value {value}")
+    return value, gradient
+
+
+def gradient_rows(values: Any, width: int) -> Array:
+    """(m, width): the derivatives of `values` (m,), which Drake leaves empty where they are all constants."""
+    gradient = ExtractGradient(values.reshape(-1, 1))
+    return np.asarray(gradient) if gradient.shape[1] else np.zeros((len(values), width))
+
+
+def plain(values: Any) -> Array:
+    """The values alone of an array of floats or AutoDiffXd, of any shape."""
+    array = np.asarray(values)
+    if array.dtype != object:
+        return array.astype(float)
+    return np.array([getattr(v, "value", lambda v=v: v)() for v in array.ravel()]).reshape(array.shape)
+
+
+def chain(value: float, gradient: Array, z: Any) -> AutoDiffXd:
+    """The AutoDiffXd of a scalar of `z` (n,) whose value and gradient (n,) by z are known."""
+    return AutoDiffXd(value, gradient @ ExtractGradient(z.reshape(-1, 1)))
+
+
+def chain_rows(values: Array, jacobian: Array, z: Any) -> Any:
+    """(m,) AutoDiffXd of a function of `z` (n,) whose values (m,) and Jacobian (m, n) by z are known.
+
+    Solvers seed z with the identity, and the product with it is left out: for it BLAS starts threads, which on a busy
+    machine costs more than all the rest.
+    """
+    seed = ExtractGradient(z.reshape(-1, 1))
+    gradient = jacobian if np.array_equal(seed, np.eye(len(z))) else jacobian @ seed
+    return InitializeAutoDiff(value=values.reshape(-1, 1), gradient=gradient).ravel()

@@ -1,0 +1,1 @@
+from .verify import Verification as Verification

@@ -1,0 +1,114 @@
+"""A run's motion as a bag that `ros2 bag` reads: the trace's own channels in ROS 2's messages and encoding."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
+from drake_diff.logs.read import McapLog, read_mcap
+
+TRACE = "trace.mcap"
+BAG_VERSION = 8  # of metadata.yaml: the one that Humble and everything newer reads
+Convert = Callable[[dict[str, Any], int, Any, dict[str, Any]], Any]  # ROS types, time [ns], message, channel metadata
+
+
+def export_ros2(run: str | Path, out: str | Path) -> dict[str, int]:
+    """Write the bag directory `out` from the trace of the run directory `run`; gives messages by topic.
+
+    Times are simulated, from 0. Raises ArtifactError where the trace is missing, damaged or without joints,
+    InputError where `out` exists, MissingDependencyError without the `rosbags` package.
+    """
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise MissingDependencyError("a ROS 2 bag needs rosbags: pip install 'drake-diff[ros2]'") from error
+    source, out = Path(run) / TRACE, Path(out)
+    log = read_mcap(source)
+    missing = CONVERTED.keys() - log.messages.keys()
+    if missing:
+        raise ArtifactError(f"{source}: no channel {', '.join(sorted(missing))}")
+    if out.exists() or not out.parent.is_dir():
+        raise InputError("OUT", got=str(out), expected="a directory that does not exist, in one that does")
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Writer(out, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as bag:
+        bag.set_custom_data("written_by", "drake_diff")
+        connections = {
+            topic: bag.add_connection(topic, name, typestore=store) for topic, (name, _) in CONVERTED.items()
+        }
+        for time, topic, message in _in_order(log):
+            name, convert = CONVERTED[topic]
+            converted = convert(store.types, time, message, log.channel_metadata[topic])
+            bag.write(connections[topic], time, store.serialize_cdr(converted, name))
+    return {topic: len(log.messages[topic]) for topic in CONVERTED}
+
+
+def _in_order(log: McapLog) -> list[tuple[int, str, Any]]:
+    rows = [(time, topic, message) for topic in CONVERTED for time, message in log.messages[topic]]
+    return sorted(rows, key=lambda row: row[0])
+
+
+def _joint_state(types: dict[str, Any], time: int, message: Any, _: dict[str, Any]) -> Any:
+    """sensor_msgs/JointState; NaN for the effort of a joint that nothing drives, no efforts where none is known."""
+    joints = message.joints
+    efforts = [j.effort if j.HasField("effort") else np.nan for j in joints]
+    return types["sensor_msgs/msg/JointState"](
+        header=_header(types, time),
+        name=[j.name for j in joints],
+        position=np.array([j.position for j in joints]),
+        velocity=np.array([j.velocity for j in joints]),
+        effort=np.array(efforts if any(j.HasField("effort") for j in joints) else []),
+    )
+
+
+def _transforms(types: dict[str, Any], time: int, message: Any, _: dict[str, Any]) -> Any:
+    def pose(t: Any) -> Any:
+        p, r = t.translation, t.rotation
+        return types["geometry_msgs/msg/Transform"](
+            translation=types["geometry_msgs/msg/Vector3"](x=p.x, y=p.y, z=p.z),
+            rotation=types["geometry_msgs/msg/Quaternion"](x=r.x, y=r.y, z=r.z, w=r.w),
+        )
+
+    stamped = types["geometry_msgs/msg/TransformStamped"]
+    return types["tf2_msgs/msg/TFMessage"](
+        transforms=[
+            stamped(_header(types, time, t.parent_frame_id), t.child_frame_id, pose(t)) for t in message.transforms
+        ]
+    )
+
+
+def _input(types: dict[str, Any], _: int, message: Any, metadata: dict[str, Any]) -> Any:
+    """std_msgs/Float64MultiArray, the inputs' names as the label of its dimension."""
+    count = len(message.u)
+    dimension = types["std_msgs/msg/MultiArrayDimension"](", ".join(metadata["names"]["u"]), count, count)
+    layout = types["std_msgs/msg/MultiArrayLayout"](dim=[dimension], data_offset=0)
+    return types["std_msgs/msg/Float64MultiArray"](layout=layout, data=np.array(message.u, dtype=float))
+
+
+def _diagnostics(types: dict[str, Any], time: int, message: Any, metadata: dict[str, Any]) -> Any:
+    """diagnostic_msgs/DiagnosticArray: every number as text that reads back to the same bits, its unit beside it."""
+    units = metadata["units"]
+    pair = types["diagnostic_msgs/msg/KeyValue"]
+    values = [
+        pair(f"{field.name} [{units[field.name]}]", repr(getattr(message, field.name)))
+        for field in message.DESCRIPTOR.fields
+    ]
+    status = types["diagnostic_msgs/msg/DiagnosticStatus"](
+        level=0, name="drake_diff", message="", hardware_id="", values=values
+    )
+    return types["diagnostic_msgs/msg/DiagnosticArray"](header=_header(types, time), status=[status])
+
+
+def _header(types: dict[str, Any], time: int, frame: str = "") -> Any:
+    return types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*divmod(time, 1_000_000_000)), frame)
+
+
+CONVERTED: dict[str, tuple[str, Convert]] = {
+    "/joint_states": ("sensor_msgs/msg/JointState", _joint_state),
+    "/planned/joint_states": ("sensor_msgs/msg/JointState", _joint_state),
+    "/tf": ("tf2_msgs/msg/TFMessage", _transforms),
+    "/input": ("std_msgs/msg/Float64MultiArray", _input),
+    "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", _diagnostics),
+}

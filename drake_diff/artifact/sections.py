@@ -1,0 +1,328 @@
+"""A problem as plain numbers and names in a record, and back again: all of it but the user's own functions.
+
+The sections of a record that say what was asked, observed, commanded and differentiated.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import select
+from drake_diff.model.plant import FLOATING, joints
+from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost
+from drake_diff.optimize.problem.problem import Bounds, Problem
+from drake_diff.optimize.solution import Solution
+from drake_diff.record.parts import Quantity
+from drake_diff.record.provenance import gradient_evidence, model_input
+from drake_diff.record.run_record import (
+    ActionInterface,
+    Claim,
+    Command,
+    EvidenceRecord,
+    GradientColumn,
+    GradientEvidence,
+    Inputs,
+    Observation,
+    ObservedVariable,
+    ParameterEvidence,
+    Solver,
+)
+
+# The units of the numbers in a record's `problem` and `contract`, by their key.
+UNITS = {
+    "horizon_s": "s",
+    "time_step_s": "s",
+    "free_horizon_s": "s",
+    "x0, x_goal, x_lower, x_upper, waypoints": "those of `observation.variables`, entry by entry",
+    "u_lower, u_upper": "those of `action.commands`, entry by entry",
+    "constraints": "those of what the constraint's function returns",
+    "Q, R, rate": "cost per s and squared unit of the state or input; as a final cost without the s; rate: cost per s",
+    "time_step": "s",
+    "gravity": "m/s^2",
+    "lower, upper": "the `unit` beside them",
+    "mass": "kg",
+    "center_of_mass": "m",
+    "inertia": "kg m^2",
+    "damping": "N s/m or N m s/rad",
+    "effort_limit": "N or N m",
+    "gear_ratio": "1",
+    "rotor_inertia": "kg m^2",
+    "kp": "N/m or N m/rad",
+    "kd": "N s/m or N m s/rad",
+    "friction": "1",
+    "stiffness": "N/m",
+    "dissipation": "s/m",
+    "relaxation_time": "s",
+    "hydroelastic_modulus": "Pa",
+    "solver_relative_tolerance": "1",
+    "sap_near_rigid_threshold": "1",
+    "collision_pairs, constraints, num_steps": "1",
+}
+
+
+def describe_problem(problem: Problem) -> dict[str, Any]:
+    """The problem for a record; functions by their names."""
+    b = problem.bounds
+    return {
+        "num_steps": problem.num_steps,
+        "time_step_s": problem.model.time_step,
+        "horizon_s": problem.num_steps * problem.model.time_step,
+        "state_names": list(problem.model.state_names),
+        "input_names": list(problem.model.input_names),
+        "x0": finite_list(problem.x0),
+        "x_goal": finite_list(problem.goal),
+        "waypoints": {str(k): finite_list(x) for k, x in problem.waypoints.items()},
+        "constraints": [_constraint(problem, c) for c in problem.constraints],
+        "free_horizon_s": None if problem.horizon is None else list(problem.horizon),
+        "x_lower": finite_list(b.x_lower),
+        "x_upper": finite_list(b.x_upper),
+        "u_lower": finite_list(b.u_lower),
+        "u_upper": finite_list(b.u_upper),
+        "optimize": list(problem.optimize),
+        "parameters": [p.name for p in problem.parameters.parameters],
+        "running_cost": _cost(problem.running_cost),
+        "final_cost": _cost(problem.final_cost),
+        "trajectory_cost": _cost(problem.trajectory_cost),
+        "initial_state_free": [bool(free) for free in problem.initial_state_mask],
+    }
+
+
+def finite_list(values: Any) -> list[float | None]:
+    """Numbers for JSON; None where there is no bound or no goal (infinite, NaN)."""
+    return [float(v) if math.isfinite(v) else None for v in np.asarray(values).ravel()]
+
+
+def _constraint(problem: Problem, c: Constraint) -> dict[str, Any]:
+    knots = c.at_knots(problem.num_steps, problem.initial_state_is_given)
+    return {"name": c.label, "lower": finite_list(c.lower), "upper": finite_list(c.upper), "knots": list(knots)}
+
+
+def _cost(cost: Any) -> Any:
+    if isinstance(cost, ConstantCost):
+        return {"ConstantCost": {"rate": cost.rate}}
+    if isinstance(cost, QuadraticCost):
+        parts = {name: getattr(cost, name) for name in ("Q", "R", "x_ref", "u_ref")}
+        return {"QuadraticCost": {name: np.asarray(v).tolist() for name, v in parts.items() if v is not None}}
+    return None if cost is None else getattr(cost, "__qualname__", type(cost).__name__)
+
+
+def unknown_functions(record: EvidenceRecord) -> tuple[list[str], list[str]]:
+    """(costs, constraints) of a record's problem that are the user's functions: their code is not in it."""
+    names = ("running_cost", "final_cost", "trajectory_cost")
+    costs = [f"{name} {record.problem[name]}" for name in names if isinstance(record.problem.get(name), str)]
+    listed = record.problem.get("constraints")
+    constraints: list[Any] = listed if isinstance(listed, list) else []
+    return costs, [str(c.get("name")) for c in constraints if isinstance(c, dict)]
+
+
+def rebuild_problem(record: EvidenceRecord, model: Model, us: Array) -> Problem:
+    """The problem of a record on `model`, without the user's functions; `us` (N, nu) are the inputs of the plan."""
+    p: dict[str, Any] = dict(record.problem)
+    limits = [_numbers(p[f"{kind}_{side}"], sign) for kind in "xu" for side, sign in (("lower", -1), ("upper", 1))]
+    starts = np.array([entry.start for entry in record.parameters])
+    sides = [
+        np.array([sign * np.inf if v is None else v for v in values])
+        for sign, values in (
+            (-1, [entry.lower for entry in record.parameters]),
+            (1, [entry.upper for entry in record.parameters]),
+        )
+    ]
+    vector = select(model, p["parameters"])
+    pairs = list(zip(vector.parameters, vector.slices, strict=True))
+    mask = np.array(p["initial_state_free"], dtype=bool)
+    optimize = p["optimize"]
+    running, final = _rebuild_cost(p["running_cost"]), _rebuild_cost(p["final_cost"])
+    goal = _numbers(p["x_goal"], np.nan)
+    if running is None and final is None and np.all(np.isnan(goal)):
+        final = _nothing  # a Problem wants a cost or a goal
+    return Problem(
+        model,
+        x0=_numbers(p["x0"], np.nan),
+        num_steps=p["num_steps"],
+        running_cost=running,
+        final_cost=final,
+        x_goal=goal,
+        waypoints={int(k): _numbers(x, np.nan) for k, x in p["waypoints"].items()},
+        horizon=p["free_horizon_s"],
+        bounds=Bounds(*limits),
+        optimize=optimize,
+        initial_state_mask=mask if mask.any() else None,
+        us=None if "controls" in optimize else us,
+        parameters={parameter.name: starts[s] for parameter, s in pairs},
+        parameter_bounds={
+            parameter.name: (sides[0][s], sides[1][s]) for parameter, s in pairs if parameter.kind.quantity != "inertia"
+        },
+    )
+
+
+def _nothing(x: Any) -> Any:
+    return 0.0 * x[0]
+
+
+def _numbers(values: Any, missing: float) -> Array:
+    """(n,) numbers; where there is none `missing`, of a bound its sign times infinity."""
+    gap = missing if np.isnan(missing) else missing * np.inf
+    return np.array([gap if v is None else v for v in values], dtype=float)
+
+
+def _rebuild_cost(cost: Any) -> Any:
+    if not isinstance(cost, dict):
+        return None  # none, or the user's function
+    if "ConstantCost" in cost:
+        return ConstantCost(cost["ConstantCost"]["rate"])
+    return QuadraticCost(**cost["QuadraticCost"])
+
+
+LIMITATIONS = [
+    "of the model in simulation only: nothing here was measured on a robot",
+    "a cost is that of a local optimum at best",
+    "certificates hold at the states that they name, replays in the variants that they name",
+]
+
+GUESS = ("initial_guess", "initial_guess_sha256")
+
+
+def claim_of(problem: Problem) -> Claim:
+    """What a run of this problem says is true when its verdict is "pass"."""
+    goal = "" if np.all(np.isnan(problem.goal)) else " and ends in x_goal"
+    statement = (
+        f"{problem.model.name}, by Drake's equations, starts in x0{goal} after {problem.num_steps} intervals, and "
+        f"keeps bounds and constraints at every knot; optimized: {', '.join(problem.optimize)}"
+    )
+    return Claim(statement=statement, limitations=LIMITATIONS)
+
+
+def inputs_of(problem: Problem, solution: Solution | None) -> Inputs:
+    """What the run starts from; the guess is known once it has been made."""
+    options = {} if solution is None else solution.options
+    return Inputs(
+        model=model_input(problem.model),
+        initial_guess=str(options.get("initial_guess", "not known yet")),
+        initial_guess_sha256=options.get("initial_guess_sha256"),
+        seed=int(options["seed"]) if "seed" in options else None,
+    )
+
+
+def observation_of(problem: Problem, time_step: float) -> Observation:
+    """The state as it is observed: exactly, at every step."""
+    contract, frames = problem.model.contract, _frames(problem.model)
+    variables = [
+        ObservedVariable(name=x.name, unit=x.unit, frame=frame, uncertainty=_exact(x.unit))
+        for x, frame in zip(contract.positions + contract.velocities, frames, strict=True)
+    ]
+    clock = "simulated time, from the first state"
+    return Observation(variables=variables, clock=clock, start_s=0.0, period_s=time_step, count=problem.num_steps + 1)
+
+
+def _exact(unit: str) -> Quantity:
+    return Quantity(value=0.0, unit=unit, reason="exact simulation state: there is no sensor and no noise")
+
+
+def _frames(model: Model) -> list[str]:
+    """(nx,) the frame of each entry of the state: a floating body's is the world's, a joint's its own axes'."""
+    found = [model.contract.frame] * model.nx
+    for joint in joints(model.plant):
+        if joint.type_name() not in FLOATING:
+            own = f"axes of {joint.name()}, {joint.parent_body().name()} to {joint.child_body().name()}"
+            for start, count in (
+                (joint.position_start(), joint.num_positions()),
+                (model.nq + joint.velocity_start(), joint.num_velocities()),
+            ):
+                found[start : start + count] = [own] * count
+    return found
+
+
+def action_of(problem: Problem, time_step: float, solution: Solution | None) -> ActionInterface:
+    """How the inputs reach the plant in the replay, whatever the solver assumed between its knots."""
+    model, bounds = problem.model, problem.bounds
+    limit = None if solution is None else solution.options.get("time_limit")
+    pd = any(a.kp is not None for a in model.contract.actuators)
+    kind = "effort, held over each step" + (", added to the actuators' PD control" if pd else "")
+    lower, upper = finite_list(bounds.u_lower), finite_list(bounds.u_upper)
+    return ActionInterface(
+        command_type=kind,
+        commands=[
+            Command(name=u.name, unit=u.unit, lower=lower[i], upper=upper[i])
+            for i, u in enumerate(model.contract.inputs)
+        ],
+        update_rate=Quantity(value=1 / time_step, unit="Hz"),
+        latency_budget=Quantity(
+            value=limit,
+            unit="s",
+            reason="of the solve as a whole" if limit else "none: planned ahead in simulation, no time limit was given",
+        ),
+        safety_fallback="none: in simulation there is nothing to protect",
+    )
+
+
+def gradient_of(solution: Solution) -> GradientEvidence:
+    """What the solver differentiated, where each column came from, and how far it agrees with differences."""
+    contact = solution.problem.model.contract.contact
+    touching = f"{contact.approximation} contact, whose compliance and stiction are part of the model"
+    norms = [] if solution.gradient_norms is None else finite_list(solution.gradient_norms)
+    return GradientEvidence(
+        differentiated=list(solution.problem.optimize),
+        columns=_columns(solution),
+        smoothing="none",
+        regularization=touching if contact.collision_pairs else "none",
+        solver_tolerance=Quantity(
+            value=contact.solver_relative_tolerance, unit="1", reason="relative, of Drake's contact solver"
+        ),
+        horizon=Quantity(value=solution.horizon, unit="s"),
+        norm_definition="|d cost / d x_k| in the cost's unit per the state's, by knot k",
+        norms=norms,
+        certificates=[gradient_evidence(c) for c in solution.certificates],
+    )
+
+
+def _columns(solution: Solution) -> list[GradientColumn]:
+    """States, inputs and parameters; of the first two the source that the certificates were of."""
+    contract, vector = solution.problem.model.contract, solution.vector
+    methods = list(dict.fromkeys(c.method for c in solution.certificates)) or ["no certificate was reached"]
+    of_states = "; ".join(methods)
+    units = [p.unit for p in vector.parameters for _ in p.value]
+    coordinates = contract.positions + contract.velocities + contract.inputs
+    return [
+        *(GradientColumn(name=x.name, unit=x.unit, source=of_states) for x in coordinates),
+        *(GradientColumn(name=name, unit=units[i], source=vector.sources[i]) for i, name in enumerate(vector.names)),
+    ]
+
+
+def parameters_of(solution: Solution) -> list[ParameterEvidence]:
+    """Each entry of the parameter vector."""
+    problem, found = solution.problem, solution.vector
+    lower, upper = (finite_list(side) for side in problem.bounds_of_parameters())
+    units = [p.unit for p in found.parameters for _ in p.value]
+    return [
+        ParameterEvidence(
+            name=name,
+            unit=units[i],
+            derivative_source=found.sources[i],
+            start=float(problem.parameters.values[i]),
+            value=float(found.values[i]),
+            optimized=problem.optimizes_parameters,
+            lower=lower[i],
+            upper=upper[i],
+        )
+        for i, name in enumerate(found.names)
+    ]
+
+
+def solver_of(solution: Solution) -> Solver:
+    """What solved the problem; an option that is no finite number is null, and the guess is in `inputs`."""
+    options = {k: v.item() if isinstance(v, np.generic) else v for k, v in solution.options.items() if k not in GUESS}
+    plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in options.items()}
+    return Solver(
+        method=solution.method,
+        solver=solution.solver,
+        scheme=solution.scheme,
+        status=solution.status.value,
+        message=solution.message,
+        solver_message=solution.solver_message,
+        options=plain,
+        iterations=len(solution.iterations),
+    )

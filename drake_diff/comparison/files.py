@@ -1,0 +1,219 @@
+"""Every engine's motion in one trace.mcap.
+
+A comparison saved: its record, a trace of every engine's motion, a replay with the engines as ghosts, a page.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.files import write_whole
+from drake_diff.comparison.attribution import Attribution
+from drake_diff.comparison.record import (
+    AttributionEvidence,
+    ComparisonRecord,
+    EngineEvidence,
+    JacobianEvidence,
+    LineEvidence,
+    Numbers,
+    RefusedEvidence,
+    StateEvidence,
+    Times,
+)
+from drake_diff.comparison.result import (
+    JACOBIAN_TOLERANCE,
+    STEP_TOLERANCE,
+    Compared,
+    Comparison,
+    sentence_of,
+    slugs,
+    verdict_of,
+)
+from drake_diff.engines.motion import EngineMotion
+from drake_diff.logs.channels import Shown, input_channel, nanoseconds, state_channel, transform_channel
+from drake_diff.logs.messages import TYPES
+from drake_diff.logs.write import Channel, write_mcap
+from drake_diff.model.model import Model
+from drake_diff.record.provenance import file_evidence, gradient_evidence, model_input, provenance_of, written_now
+
+
+def write_comparison_trace(path: Path, comparison: Comparison) -> None:
+    """Write every engine's states, energy and overlap under a topic of its name, and all bodies' frames."""
+    metadata = {"model": comparison.model.name, "time_axis": "simulated", "engines": ", ".join(slugs(comparison))}
+    write_mcap(path, list(_channels(comparison)), metadata, {})
+
+
+def _channels(comparison: Comparison) -> Iterator[Channel]:
+    model, motions = comparison.model, [e.motion for e in comparison.engines]
+    names = slugs(comparison)
+    for slug, motion in zip(names, motions, strict=True):
+        shown = Shown(
+            model, float(motion.times[1] - motion.times[0]) if len(motion.times) > 1 else 0.0, motion.xs, None
+        )
+        yield state_channel(shown, f"/{slug}/state", motion.xs)
+        yield input_channel(shown, f"/{slug}/input", motion.times[:-1], motion.us)
+        kind = TYPES["Diagnostics"]
+        yield Channel(f"/{slug}/diagnostics", kind.cls, _measures(motion, kind.cls), {"units": kind.units})
+    times = motions[0].times
+    alike = {s: m for s, m in zip(names, motions, strict=True) if np.allclose(m.times, times[: len(m.times)])}
+    yield transform_channel(model, times, {f"{s}/": m.xs for s, m in alike.items()})  # not what was sampled otherwise
+
+
+def _measures(motion: EngineMotion, message: Any) -> Iterable[tuple[int, Any]]:
+    """Energy and overlap; NaN where the engine does not compute them."""
+    missing = np.full(len(motion.times), np.nan)
+    energy = missing if motion.energy is None else motion.energy
+    depth = missing if motion.depth is None else motion.depth
+    for t, e, d in zip(motion.times.tolist(), energy.tolist(), depth.tolist(), strict=True):
+        yield nanoseconds(t), message(energy_total=e, max_penetration=d)
+
+
+RECORD, TRACE, REPLAY, PAGE = "comparison.json", "trace.mcap", "replay.html", "comparison.html"
+FILES = (TRACE, REPLAY, PAGE)
+# Of ghosts: the second and further colours of the page's plots, the first being the reference's.
+COLOURS = (
+    (0.85, 0.4, 0.04), (0.06, 0.54, 0.42), (0.64, 0.22, 0.61), (0.43, 0.42, 0), (0.32, 0.38, 0.43), (0.04, 0.38, 0.72),
+)  # fmt: skip
+OPACITY = 0.35
+
+
+def begin_comparison(directory: str | Path, model: Model) -> None:
+    """Mark `directory` as a comparison under way: until it is saved its record says "incomplete"."""
+    folder = Path(directory)
+    folder.mkdir(parents=True, exist_ok=True)
+    sentence = "the comparison has begun and not ended: it is under way, or it was killed or broke off"
+    record = _record(folder.name, model, "incomplete", sentence)
+    write_whole(folder / RECORD, record.sealed().to_json().encode())
+    for name in FILES:
+        (folder / name).unlink(missing_ok=True)
+
+
+def save_comparison(comparison: Comparison, directory: str | Path) -> ComparisonRecord:
+    """Write the directory of `comparison`, comparison.json last, so that it is complete only if all it names is."""
+    from drake_diff.comparison.page import write_comparison_page  # what saves nothing need not load them
+    from drake_diff.pages.meshcat import write_replay
+
+    folder = Path(directory)
+    begin_comparison(folder, comparison.model)
+    record = record_of(comparison, folder.name)
+    write_comparison_trace(folder / TRACE, comparison)
+    write_replay(folder / REPLAY, _scene(comparison), title=f"{record.name}: {record.verdict}")
+    write_comparison_page(folder / PAGE, comparison, record, folder / REPLAY)
+    files = [file_evidence(folder / name, name) for name in FILES]
+    sealed = record.model_copy(update={"files": files}).sealed()
+    write_whole(folder / RECORD, sealed.to_json().encode())
+    return sealed
+
+
+def record_of(comparison: Comparison, name: str) -> ComparisonRecord:
+    """The record of `comparison`, but for the files."""
+    return _record(
+        name,
+        comparison.model,
+        "pass" if comparison.holds else "fail",
+        verdict_of(comparison),
+        states=[StateEvidence(name=s.name, x=s.x.tolist(), u=s.u.tolist()) for s in comparison.states],
+        engines=[_engine(e) for e in comparison.engines],
+        refused=[RefusedEvidence(engine=r.engine, reason=r.reason, installed=r.installed) for r in comparison.refused],
+        wall_clock=Times(
+            written=written_now(),
+            seconds_per_step={e.engine: e.seconds_per_step for e in comparison.engines},
+            seconds_per_jacobian={e.engine: e.seconds_per_jacobian for e in comparison.engines},
+        ),
+    )
+
+
+def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -> ComparisonRecord:
+    found: dict[str, Any] = {
+        "states": [],
+        "engines": [],
+        "refused": [],
+        "wall_clock": Times(written=written_now()),
+        **rest,
+    }
+    return ComparisonRecord(
+        name=name,
+        verdict=verdict,
+        sentence=sentence,
+        tolerances={
+            **{f"step, {precision}": value for precision, value in STEP_TOLERANCE.items()},
+            **{f"jacobian, {precision}": value for precision, value in JACOBIAN_TOLERANCE.items()},
+        },
+        model=model_input(model),
+        contract=model.contract.to_dict(),
+        time_step_s=model.time_step,
+        state_names=list(model.state_names),
+        input_names=list(model.input_names),
+        files=[],
+        provenance=provenance_of(),
+        **found,
+    )
+
+
+def _engine(e: Compared) -> EngineEvidence:
+    return EngineEvidence(
+        engine=e.engine,
+        version=e.version,
+        precision=e.precision,
+        verdict=e.verdict,
+        sentence=sentence_of(e),
+        contract=[
+            LineEvidence(quantity=x.quantity, verdict=x.verdict, detail=x.detail, reason=x.reason) for x in e.lines
+        ],
+        status=e.motion.status,
+        steps=len(e.motion.us),
+        largest_step_gap=float(max(e.step_gaps, default=0.0)),
+        first_apart_s=None if e.first_apart is None else float(e.motion.times[e.first_apart]),
+        first=_attribution(e.first),
+        largest=_attribution(e.largest),
+        final_gap=e.final_gap,
+        energy_change_J=e.motion.energy_change,
+        largest_penetration_m=None if e.motion.depth is None else float(np.max(e.motion.depth)),
+        jacobians=[
+            JacobianEvidence(
+                state=j.state,
+                method=j.method,
+                gap=float(gap),
+                jacobian=_rows(j.jacobian),
+                law=law,
+                own=j.own,
+                certificate=None if j.certificate is None else gradient_evidence(j.certificate),
+            )
+            for j, gap, law in zip(e.jacobians, e.jacobian_gaps, e.laws, strict=True)
+        ],
+        rollout_jacobian=None if e.rollout_jacobian is None else _rows(e.rollout_jacobian),
+        rollout_gap=e.rollout_gap,
+        gradient=e.gradient,
+    )
+
+
+def _attribution(a: Attribution) -> AttributionEvidence:
+    return AttributionEvidence(
+        gap=a.gap,
+        responsible=a.responsible,
+        effects=dict(a.effects),
+        schemes=[str(s) for s in a.schemes],
+        assumed=list(a.assumed),
+    )
+
+
+def _rows(matrix: Array) -> list[Numbers]:
+    return [[float(v) if np.isfinite(v) else None for v in row] for row in matrix]
+
+
+def _scene(comparison: Comparison) -> Any:
+    from pydrake.geometry import Rgba
+
+    from drake_diff.pages.scene import scene_of
+
+    reference = comparison.reference.motion
+    ghosts = {}
+    for i, (slug, e) in enumerate(zip(slugs(comparison), comparison.engines, strict=True)):
+        if i and len(e.motion.xs) == len(reference.xs):
+            ghosts[slug] = (e.motion.xs, Rgba(*COLOURS[(i - 1) % len(COLOURS)], OPACITY))
+    scene = scene_of(comparison.model, reference.times, reference.xs, ghosts=ghosts)
+    return replace(scene, ghosts=tuple(replace(ghost, framed=False) for ghost in scene.ghosts))

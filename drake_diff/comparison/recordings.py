@@ -1,0 +1,210 @@
+"""A motion that was recorded elsewhere, by an engine that cannot be loaded here.
+
+Recorded motions from files: CSV, MCAP of this project or of ROS 2, ROS 2 bags, and what is told of their engine.
+"""
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff.comparison.recordings_ros2 import is_ros2, read_ros2
+from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.logs.read import read_mcap
+from drake_diff.mechanics.description import describe
+from drake_diff.model.model import Model
+from drake_diff.model.tangent import tangent_space
+
+# What may be told of the engine, numbers as JSON: the time step [s], gravity (3,) [m/s^2], seeds.
+FACTS = (
+    "engine", "version", "precision", "time step", "integrator", "contact law", "limit law", "gravity",
+    "seeds", "reset distribution",
+)  # fmt: skip
+NORM_TOLERANCE = 1e-3  # of a quaternion's norm: float32 and five printed digits are within it, another order is not
+CLOCK_TOLERANCE = 1e-3  # of a time step: printed times and nanoseconds are within it
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """States in Drake's coordinates. `facts` is what is known of the engine's contract, by quantity."""
+
+    name: str
+    version: str
+    times: Array  # (n,) [s], increasing
+    xs: Array  # (n, nx)
+    us: Array  # (n - 1, nu), held from one time to the next
+    facts: Mapping[str, str] = field(default_factory=dict)
+
+
+def check_recording(recording: Recording, model: Model) -> None:
+    """Refuse what cannot be a motion of `model`: ShapeError, NonFiniteError, InputError, naming recording and row."""
+    subject = f"recording {recording.name}"
+    times = finite_array(f"{subject}: times", recording.times, ("n",))
+    if len(times) < 2:
+        raise InputError(f"{subject}: times", got=f"{len(times)}", expected="two or more")
+    late = np.flatnonzero(np.diff(times) <= 0)
+    if len(late):
+        k = int(late[0]) + 1
+        raise InputError(
+            f"{subject}: time of sample {k}", got=f"{times[k]} s", expected=f"more than {times[k - 1]} s before it"
+        )
+    xs = finite_array(f"{subject}: xs", recording.xs, (len(times), model.nx))
+    finite_array(f"{subject}: us", recording.us, (len(times) - 1, model.nu))
+    for start in tangent_space(model).quaternions:
+        norms = np.linalg.norm(xs[:, start : start + 4], axis=1)
+        k = int(np.argmax(np.abs(norms - 1)))
+        if abs(norms[k] - 1) > NORM_TOLERANCE:
+            names = ", ".join(model.state_names[start : start + 4])
+            raise InputError(f"{subject}: norm of ({names}) at sample {k}", got=float(norms[k]), expected="1")
+    for quantity in recording.facts:
+        if quantity not in FACTS:
+            raise UnknownNameError(f"{subject}: fact", got=quantity, known=FACTS)
+
+
+def steps_between(recording: Recording, time_step: float) -> int:
+    """How many steps of `time_step` [s] lie between samples. InputError where that is no whole number, always the same.
+
+    Both times of a sample may be off by the clock's rounding, a thousandth of a step.
+    """
+    periods = np.diff(recording.times)
+    count = max(1, round(float(periods[0]) / time_step))
+    wrong = np.flatnonzero(np.abs(periods - count * time_step) > CLOCK_TOLERANCE * time_step)
+    if len(wrong):
+        k = int(wrong[0])
+        raise InputError(
+            f"recording {recording.name}: period from sample {k} to {k + 1}",
+            got=f"{periods[k]:.9g} s",
+            expected=f"{count * time_step:g} s throughout, a whole multiple of the model's time step, {time_step:g} s",
+        )
+    return count
+
+
+def inputs_of(recording: Recording, time_step: float) -> Array:
+    """(N, nu) the recorded inputs, one for each step of `time_step` [s]."""
+    return np.repeat(recording.us, steps_between(recording, time_step), axis=0)
+
+
+Motion = tuple[Array, Array, Array]  # times (n,) [s], xs (n, nx), us (n - 1, nu)
+SUFFIXES = "a .csv file, an .mcap file or the directory of a ROS 2 bag"
+
+
+def read_recording(path: str | Path, model: Model, *, name: str | None = None) -> Recording:
+    """The motion of `model` that is recorded in `path`: a CSV or MCAP file, or the directory of a ROS 2 bag.
+
+    CSV: a header row, then a row per sample, SI units. Columns, in any order: `time`, `model.state_names`, for which
+    `position.JOINT` and `velocity.JOINT` of a joint of one degree of freedom may stand, and `model.input_names`, which
+    are held until the next sample and may be empty in the last row. MCAP of this project: the channels /state and
+    /input. ROS 2 (needs the extra `ros2`): see `recording_ros2`.
+
+    What is told of the engine stands in NAME.contract.json beside NAME.csv, NAME.mcap or the bag NAME, or in the MCAP's
+    metadata record "contract": a JSON object of some of engine, version, precision, "time step", integrator, "contact
+    law", "limit law", gravity, seeds, "reset distribution". Nothing else is known of it. `name` goes before the file's.
+
+    Raises InputError and its kin, naming file, line and column; ArtifactError of a damaged log;
+    MissingDependencyError without rosbags.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError("recording", got=f"{path}, which is not there", expected=SUFFIXES)
+    facts: Mapping[str, str] = {}
+    if path.suffix == ".csv":
+        motion = _read_csv(path, model)
+    elif path.is_dir() or (path.suffix == ".mcap" and is_ros2(path)):
+        motion, facts = read_ros2(path, model)
+    elif path.suffix == ".mcap":
+        motion, facts = _read_mcap(path, model)
+    else:
+        raise InputError("recording", got=str(path), expected=SUFFIXES)
+    facts = {**facts, **_told(path)}
+    times, xs, us = (frozen(part) for part in motion)
+    recording = Recording(
+        name or facts.get("engine", path.stem), facts.get("version", "not told"), times, xs, us, facts
+    )
+    check_recording(recording, model)
+    return recording
+
+
+def _told(path: Path) -> dict[str, str]:
+    """What stands beside the recording; numbers stay JSON."""
+    beside = path.with_name((path.name if path.is_dir() else path.stem) + ".contract.json")
+    if not beside.exists():
+        return {}
+    try:
+        told = json.loads(beside.read_text())
+    except ValueError as error:
+        raise InputError(str(beside), got=str(error), expected="a JSON object") from error
+    if not isinstance(told, dict):
+        raise InputError(str(beside), got=type(told).__name__, expected="a JSON object")
+    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in told.items()}
+
+
+def _read_csv(path: Path, model: Model) -> Motion:
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        rows = [(line, row) for line, row in enumerate(csv.reader(file), start=1) if row]
+    if not rows:
+        raise InputError(str(path), got="an empty file", expected="a header row and samples")
+    wanted = ("time", *model.state_names, *model.input_names)
+    places = _columns(path, model, rows[0][1], wanted)
+    table = np.zeros((len(rows) - 1, len(wanted)))
+    for k, (line, row) in enumerate(rows[1:]):
+        if len(row) != len(rows[0][1]):
+            raise InputError(f"{path} line {line}", got=f"{len(row)} cells", expected=f"{len(rows[0][1])}")
+        for j, (column, place) in enumerate(zip(wanted, places, strict=True)):
+            if k == len(table) - 1 and j > model.nx and not row[place].strip():
+                continue  # no step begins at the last sample
+            table[k, j] = _number(f"{path} line {line}, column {column}", row[place])
+    if np.any(np.diff(table[:, 0]) <= 0):
+        k = int(np.flatnonzero(np.diff(table[:, 0]) <= 0)[0]) + 1
+        got, before = table[k, 0], table[k - 1, 0]
+        raise InputError(f"{path} line {rows[k + 1][0]}, column time", got=got, expected=f"more than {before}")
+    return table[:, 0], table[:, 1 : model.nx + 1], table[:-1, model.nx + 1 :]
+
+
+def _number(subject: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(subject, got=repr(text), expected="a finite number")
+    return value
+
+
+def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str]) -> list[int]:
+    """Where each wanted column stands."""
+    by_joint = {}
+    for link in describe(model).moving:
+        if link.kind != "quaternion_floating":
+            by_joint[f"position.{link.joint}"] = model.state_names[link.q_start]
+            by_joint[f"velocity.{link.joint}"] = model.state_names[model.nq + link.v_start]
+    names = [by_joint.get(text.strip(), text.strip()) for text in header]
+    for given, column in zip(header, names, strict=True):
+        if column not in wanted:
+            raise UnknownNameError(f"{path} line 1, column", got=given, known=[*wanted, *by_joint])
+        if names.count(column) > 1:
+            raise InputError(f"{path} line 1, column {column}", got="twice", expected="once")
+    for column in wanted:
+        if column not in names:
+            raise InputError(f"{path} line 1, column {column}", got=f"none, of {', '.join(header)}", expected="one")
+    return [names.index(column) for column in wanted]
+
+
+def _read_mcap(path: Path, model: Model) -> tuple[Motion, Mapping[str, str]]:
+    log = read_mcap(path)
+    state, given = log.arrays("/state"), log.arrays("/input")
+    for topic, key, names in (
+        ("/state", "q", model.position_names),
+        ("/state", "v", model.velocity_names),
+        ("/input", "u", model.input_names),
+    ):
+        found: Any = log.channel_metadata[topic].get("names", {}).get(key, [])
+        if tuple(found) != names:
+            raise InputError(f"{path}: names of {key} in {topic}", got=found, expected=str(list(names)))
+    motion = state["time"], np.hstack([state["q"], state["v"]]), given["u"]
+    return motion, log.metadata.get("contract", {})

@@ -1,0 +1,175 @@
+"""Recorded motions out of ROS 2 messages, in a bag or in one MCAP file, by the time in their headers.
+
+sensor_msgs/JointState (/joint_states, or the only one): positions and velocities of joints of one degree of freedom by
+name, efforts as the inputs of the actuators that drive them. nav_msgs/Odometry: the pose and, in the child frame, the
+twist of the one free body. Or geometry_msgs/PoseStamped and TwistStamped, whose header says the frame of the twist: the
+pose's, or the body.
+
+A bag that was cut short is refused; a byte that is another is found only where the writer left a checksum, which
+rosbags does not.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
+from drake_diff.mechanics.coordinates import rotation
+from drake_diff.mechanics.description import Description, Link, describe
+from drake_diff.model.model import Model
+
+JOINTS, ODOMETRY = "sensor_msgs/msg/JointState", "nav_msgs/msg/Odometry"
+POSE, TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
+USED = (JOINTS, ODOMETRY, POSE, TWIST)
+Stamped = dict[int, Any]  # messages by time [ns]
+
+
+def is_ros2(path: Path) -> bool:
+    """Whether the messages in an MCAP file are encoded as ROS 2's; False where it is damaged, for others to say."""
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        try:
+            summary = make_reader(file).get_summary()
+        except Exception:  # as in `mcap_read`, which then names the damage
+            return False
+    return summary is not None and any(c.message_encoding == "cdr" for c in summary.channels.values())
+
+
+def read_ros2(path: Path, model: Model) -> tuple[tuple[Array, Array, Array], Mapping[str, str]]:
+    """(times (n,) from 0, xs (n, nx), us (n - 1, nu)), and the metadata record "contract" of an MCAP file.
+
+    InputError, naming message and time, where a joint, a twist or an effort is missing.
+    """
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise MissingDependencyError("a ROS 2 bag needs rosbags: pip install 'drake-diff[ros2]'") from error
+    store, found = get_typestore(Stores.ROS2_HUMBLE), _Found(str(path), describe(model))
+    raw, facts = (_bag(path), {}) if path.is_dir() else _mcap(path)
+    for topic, kind, data in raw:
+        if kind in USED:
+            message = store.deserialize_cdr(data, kind)
+            stamp = message.header.stamp
+            found.add(kind, topic, stamp.sec * 1_000_000_000 + stamp.nanosec, message)
+    return found.motion(model), facts
+
+
+def _bag(path: Path) -> Iterator[tuple[str, str, bytes]]:
+    from rosbags.rosbag2 import Reader
+
+    try:
+        with Reader(path) as reader:
+            for connection, _, data in reader.messages():
+                yield connection.topic, connection.msgtype, data
+    except Exception as error:  # a damaged bag makes readers fail in many ways
+        raise ArtifactError(f"{path} is no ROS 2 bag: {error}") from error
+
+
+def _mcap(path: Path) -> tuple[Iterator[tuple[str, str, bytes]], Mapping[str, str]]:
+    from mcap.reader import make_reader
+
+    try:
+        with path.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            rows = [(c.topic, s.name if s else "", m.data) for s, c, m in reader.iter_messages()]
+            metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
+    except Exception as error:  # a damaged file makes readers fail in many ways
+        raise ArtifactError(f"{path} is no whole MCAP file: {error}") from error
+    return iter(rows), metadata.get("contract", {})
+
+
+@dataclass(frozen=True, eq=False)
+class _Base:
+    """The free body at one time, in Drake's coordinates."""
+
+    q: Array  # (7,)
+    v: Array  # (6,)
+
+
+class _Found:
+    def __init__(self, source: str, description: Description):
+        self.source, self.description = source, description
+        self.topics: dict[str, dict[str, Stamped]] = {kind: {} for kind in USED}
+        self.singles = [x for x in description.moving if x.kind != "quaternion_floating"]
+        self.free = [x for x in description.moving if x.kind == "quaternion_floating"]
+
+    def add(self, kind: str, topic: str, time: int, message: Any) -> None:
+        self.topics[kind].setdefault(topic, {})[time] = message
+
+    def motion(self, model: Model) -> tuple[Array, Array, Array]:
+        joints = self._only(JOINTS, "/joint_states") if self.singles else {}
+        bases = self._bases()
+        stamps = sorted(joints or bases)
+        if self.singles and self.free and joints.keys() != bases.keys():
+            k = min(joints.keys() ^ bases.keys())
+            raise InputError(f"{self.source}: t = {k} ns", got="joints or base alone", expected="both at each time")
+        xs, us = np.zeros((len(stamps), model.nx)), np.zeros((max(len(stamps) - 1, 0), model.nu))
+        for k, time in enumerate(stamps):
+            for link in self.singles:
+                xs[k, link.q_start] = self._joint(joints[time], time, link.joint, "position")
+                xs[k, model.nq + link.v_start] = self._joint(joints[time], time, link.joint, "velocity")
+            for link in self.free:
+                xs[k, link.q_start : link.q_start + 7] = bases[time].q
+                xs[k, model.nq + link.v_start : model.nq + link.v_start + 6] = bases[time].v
+            for i, joint in enumerate(self.description.actuated if k < len(us) else ()):
+                us[k, i] = self._effort(joints, time, joint)
+        return np.array([time - stamps[0] for time in stamps]) / 1e9, xs, us
+
+    def _effort(self, joints: Stamped, time: int, joint: str) -> float:
+        if self.description.actuated.count(joint) > 1 or joint not in [x.joint for x in self.singles]:
+            raise InputError(f"joint {joint}", got="not driven by one actuator alone", expected="one effort, one input")
+        return self._joint(joints[time], time, joint, "effort")
+
+    def _joint(self, message: Any, time: int, joint: str, what: str) -> float:
+        names, values = list(message.name), getattr(message, what)
+        subject = f"{self.source}: JointState at {time} ns, {what} of {joint}"
+        if joint not in names or len(values) != len(names):
+            raise InputError(subject, got=f"{len(values)} of {', '.join(names)}", expected="one of each joint")
+        value = float(values[names.index(joint)])
+        if not np.isfinite(value):
+            raise InputError(subject, got=value, expected="a finite number")
+        return value
+
+    def _only(self, kind: str, preferred: str = "") -> Stamped:
+        topics = self.topics[kind]
+        if preferred in topics:
+            return topics[preferred]
+        if len(topics) != 1:
+            got = ", ".join(sorted(topics)) or "none"
+            raise InputError(f"{self.source}: topics of {kind}", got=got, expected=preferred or "one")
+        return next(iter(topics.values()))
+
+    def _bases(self) -> dict[int, _Base]:
+        if not self.free:
+            return {}
+        link = self.free[0]
+        if len(self.free) > 1 or not all(X.IsExactlyIdentity() for X in (link.on_parent, link.on_child)):
+            got = ", ".join(x.joint for x in self.free)
+            raise InputError("free bodies", got=got, expected="one, by its own frame in the world")
+        if self.topics[ODOMETRY]:
+            odometry = self._only(ODOMETRY)
+            return {t: _base(m.pose.pose, m.twist.twist, in_body=True) for t, m in odometry.items()}
+        poses, twists = self._only(POSE), self._only(TWIST)
+        if poses.keys() != twists.keys():
+            k = min(poses.keys() ^ twists.keys())
+            raise InputError(f"{self.source}: t = {k} ns", got="pose or twist alone", expected="both at each time")
+        return {t: _base(poses[t].pose, twists[t].twist, self._in_body(poses[t], twists[t], link)) for t in poses}
+
+    def _in_body(self, pose: Any, twist: Any, link: Link) -> bool:
+        frame, world = twist.header.frame_id, pose.header.frame_id
+        if frame not in (world, link.body) or world == link.body:
+            expected = f"{world!r}, the pose's, or {link.body!r}, the body"
+            raise InputError(f"{self.source}: frame_id of TwistStamped", got=repr(frame), expected=expected)
+        return bool(frame == link.body)
+
+
+def _base(pose: Any, twist: Any, in_body: bool) -> _Base:
+    p, r, w, v = pose.position, pose.orientation, twist.angular, twist.linear
+    q = np.array([r.w, r.x, r.y, r.z, p.x, p.y, p.z])
+    parts = np.array([[w.x, w.y, w.z], [v.x, v.y, v.z]])
+    return _Base(q, (parts @ rotation(q[:4]).T if in_body else parts).ravel())

@@ -1,0 +1,277 @@
+"""The Jacobian of a step with contact from its own equation, without differentiating Drake's solver.
+
+Drake's step solves A (v' - v*) = sum_c J_c' g_c(J_c v'), with A = M + h D, v* the velocity without contact and g_c the
+impulse of contact c (`friction_cone`, `hunt_crossley`). At Drake's own v' it is a smooth step under a known force
+A (v' - v*) / h, which Pinocchio differentiates (`analytic_step`); what the impulses change is solved for:
+
+    (A + sum_c J_c' G_c J_c) dv' = A dv'|_g + sum_c d(J_c' g_c)|_v',   G_c = -dg_c / d(J_c v').
+
+That v' solves the equation is checked, in the norm and to the tolerance of Drake's solver, and that no joint limit
+acts. What is left out here, as a shape that is not known, shows there.
+"""
+
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_diff._base.arrays import Array, cross
+from drake_diff.derivatives.contact.kinematics import (
+    Contacts,
+    Topology,
+    Weight,
+    diagonal_change,
+    mass_matrix,
+    topology_of,
+)
+from drake_diff.derivatives.contact.laws import Cone, HuntCrossley, HuntCrossleyImpulse, Impulse, StateChange
+from drake_diff.derivatives.contact.material import Material, MaterialChange, read_material
+from drake_diff.derivatives.contact.pairs import ContactPairs, Indices, Touches, read_pairs
+from drake_diff.derivatives.implicit import Steps
+from drake_diff.derivatives.smooth_step import Analytic, Native
+from drake_diff.mechanics.description import describe_tree
+from drake_diff.model.model import Model
+from drake_diff.model.plant import bodies, labelled
+from drake_diff.model.step import set_state
+
+# Of the momentum: Drake's solver ends at 1e-6 of it, in the same norm.
+OPTIMALITY = 2e-6
+ROUNDING = 1e-12
+# Drake's default [m/s], which it does not give back: another one shows in what it leaves unsolved.
+STICTION_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class ContactForm:
+    """What of a model with contact does not change from step to step."""
+
+    pairs: ContactPairs
+    topology: Topology
+    by_body: Array  # (bodies, nv) 1 where a degree of freedom moves the body
+    armature: Array  # (nv, nv) of reflected inertia and h D, a diagonal
+    approximation: str
+    time_step: float
+    near_rigid: float
+
+
+def contact_form(model: Model, analytic: Analytic) -> ContactForm | str:
+    """Read once; else why the form describes no step of the model with contact."""
+    if model not in _FORMS:
+        _FORMS[model] = _read(model, analytic)
+    return _FORMS[model]
+
+
+_FORMS: WeakKeyDictionary[Model, ContactForm | str] = WeakKeyDictionary()
+
+
+def _read(model: Model, analytic: Analytic) -> ContactForm | str:
+    contact = model.contract.contact
+    if contact.model != "point":
+        return f"the contact model is {contact.model}, not point"
+    if analytic.form.pd:
+        return "PD controllers act beside contact"
+    pairs = read_pairs(model)
+    if not pairs.ids:
+        return "no sphere may touch a sphere, box, capsule or half space"
+    topology = topology_of(describe_tree(model))
+    labels = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
+    return ContactForm(
+        pairs=pairs,
+        topology=topology,
+        by_body=np.array([topology.bodies[labels.get(body.index(), "world")] for body in pairs.bodies]),
+        armature=np.diag(analytic.pinocchio.armature),
+        approximation=contact.approximation,
+        time_step=model.time_step,
+        near_rigid=float(model.plant.get_sap_near_rigid_threshold()),
+    )
+
+
+def material_of(model: Model, form: ContactForm) -> Material:
+    """The model's own, read once, or with the parameters that are applied."""
+    if model.has_other_parameters:
+        return read_material(model.double, form.pairs)
+    if model not in _OWN:
+        _OWN[model] = read_material(model.double, form.pairs)
+    return _OWN[model]
+
+
+_OWN: WeakKeyDictionary[Model, Material] = WeakKeyDictionary()
+
+
+def place(model: Model, form: ContactForm, xs: Array, *, stands: bool) -> Array:
+    """(N, bodies, 3, 4) the poses of the bodies of the pairs at xs (N, nx), the context being left at the last.
+
+    Where it `stands` there, as at the one state of a single step, what Drake has computed in it is kept.
+    """
+    plant, context = model.plant, model.double.context
+    poses = np.empty((len(xs), len(form.pairs.bodies), 3, 4))
+    for k, x in enumerate(xs):
+        if not stands:
+            set_state(model.double, x)
+        for i, body in enumerate(form.pairs.bodies):
+            poses[k, i] = plant.EvalBodyPoseInWorld(context, body).GetAsMatrix34()
+    return poses
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """N steps with M contacts at Drake's own solution."""
+
+    native: Native
+    v_next: Array  # (N, nv)
+    A: Array  # (N, nv, nv)
+    contacts: Contacts
+    speeds: tuple[Array, Array]  # v and v' (M, nv) of each contact's state
+    diagonal: Array  # (M, nv) of A
+    diagonal_change: Array  # (M, nv, nv)
+    weight: Weight
+    impulse: Impulse | HuntCrossleyImpulse
+    push: Array  # (N, nv) sum_c J_c' g_c
+    gained: Array  # (N, nv) A (v' - v*)
+
+    def total(self, of_contacts: Array) -> Array:
+        """(N, ...) the sums of what each contact adds (M, ...)."""
+        return _sum(self.contacts.touch.state, of_contacts, len(self.v_next))
+
+
+def contact_jacobians(
+    form: ContactForm, analytic: Analytic, steps: Steps, poses: Array, material: Material, change: MaterialChange | None
+) -> tuple[Array, NDArray[np.bool_]]:
+    """(N, nx, nx + nu + np) of steps from states with the bodies at `poses`, and which (N,) are as Drake took them."""
+    at, nv = _at_the_solution(form, analytic, steps, poses, material), analytic.coordinates.nv
+    right = at.A @ analytic.pushed(at.native, steps.us, at.gained / analytic.time_step)
+    right[:, :, :nv] += at.total(_by_motion(at))
+    if isinstance(at.impulse, HuntCrossleyImpulse):
+        J, normal = at.contacts.jacobian, at.contacts.touch.normal[..., None]
+        by_v = (J @ at.impulse.by_before()[..., None]) @ np.swapaxes(J @ normal, -1, -2)
+        right[:, :, nv : 2 * nv] += at.total(by_v)
+    if change is not None:
+        right = np.concatenate([right, at.total(_by_material(at, change.part(at.contacts.touch.pair)))], axis=2)
+    J = at.contacts.jacobian
+    left = at.A - at.total(J @ at.impulse.by_velocity() @ J.swapaxes(-1, -2))
+    velocities = np.asarray(np.linalg.solve(left, right), dtype=float)
+    jacobians, _ = analytic.assemble(at.native, velocities, at.v_next)
+    return jacobians, _is_solved(at) & ~analytic.at_a_limit(steps)
+
+
+def _at_the_solution(form: ContactForm, analytic: Analytic, steps: Steps, poses: Array, material: Material) -> Solved:
+    nq = analytic.coordinates.nq
+    native, v_next = analytic.into_native(steps.starts[:, :nq], steps.starts[:, nq:]), steps.ends[:, nq:]
+    S, inertia, v_star = analytic.motions(native, steps.us)
+    A = mass_matrix(S, inertia, form.topology) + form.armature
+    contacts = _contacts(form, form.pairs.touching(poses), S, material)
+    state = contacts.touch.state
+    diagonal, speeds = np.einsum("kii->ki", A)[state], (native.v[state], v_next[state])
+    weight = contacts.weight(diagonal)
+    impulse = _law(form, contacts, material, weight, *speeds).solve()
+    return Solved(
+        native=native,
+        v_next=v_next,
+        A=A,
+        contacts=contacts,
+        speeds=speeds,
+        diagonal=diagonal,
+        diagonal_change=diagonal_change(S, inertia, form.topology)[state],
+        weight=weight,
+        impulse=impulse,
+        push=_sum(state, (contacts.jacobian @ impulse.impulse[..., None])[..., 0], len(v_next)),
+        gained=(A @ (v_next - v_star)[..., None])[..., 0],
+    )
+
+
+def _by_motion(at: Solved) -> Array:
+    """(M, nv, nv) the change of J' g with the degrees of freedom, v' being fixed."""
+    contacts, (v, v_next) = at.contacts, at.speeds
+    point, normal, phi = contacts.displacement()
+    changed = at.impulse.by_state(
+        StateChange(
+            velocity=contacts.velocity_change(v_next, point),
+            normal=normal,
+            phi=phi,
+            weight=contacts.weight_change(at.weight, at.diagonal, at.diagonal_change, point),
+            before=_approach_change(at, v, point, normal),
+        )
+    )
+    return contacts.force_change(at.impulse.impulse, point) + contacts.jacobian @ changed.swapaxes(-1, -2)
+
+
+def _approach_change(at: Solved, v: Array, point: Array, normal: Array) -> Array:
+    """(M, nv) the change of the normal velocity before the step, 0 where the law does not know it."""
+    if isinstance(at.impulse, Impulse):
+        return np.zeros(v.shape)
+    along = at.contacts.velocity_change(v, point) @ at.contacts.touch.normal[:, :, None]
+    return np.asarray((along + normal @ np.swapaxes(v[:, None, :] @ at.contacts.jacobian, -1, -2))[..., 0])
+
+
+def _by_material(at: Solved, change: MaterialChange) -> Array:
+    """(M, nv, np) the change of J' g by parameters: through the law, and through where on the normal p is."""
+    contacts, touch, nothing = at.contacts, at.contacts.touch, np.zeros((*change.friction.shape, 3))
+    point = -(touch.phi[:, None] * change.other_part)[..., None] * touch.normal[:, None]
+    before, after = (contacts.velocity_change(v, point, moves=False) for v in at.speeds)
+    moved = StateChange(
+        velocity=after,
+        normal=nothing,
+        phi=nothing[..., 0],
+        weight=contacts.weight_change(at.weight, at.diagonal, None, point),
+        before=(before @ touch.normal[:, :, None])[..., 0],
+    )
+    changed = np.swapaxes(at.impulse.by_material(change) + at.impulse.by_state(moved), -1, -2)
+    return np.asarray(contacts.force_change(at.impulse.impulse, point, moves=False) + contacts.jacobian @ changed)
+
+
+def _law(
+    form: ContactForm, contacts: Contacts, material: Material, weight: Weight, v: Array, v_next: Array
+) -> Cone | HuntCrossley:
+    touch, pair, J = contacts.touch, contacts.touch.pair, contacts.jacobian
+    before, after = ((u[:, None, :] @ J)[:, 0] for u in (v, v_next))
+    friction, stiffness, h = material.friction[pair], material.stiffness[pair], form.time_step
+    if form.approximation == "sap":
+        time = material.time[pair]
+        return Cone(after, touch.normal, touch.phi, weight.value, friction, stiffness, time, h, form.near_rigid)
+    return HuntCrossley(
+        velocity=after,
+        before=(before * touch.normal).sum(axis=-1),
+        normal=touch.normal,
+        phi=touch.phi,
+        weight=weight.value,
+        friction=friction,
+        stiffness=stiffness,
+        dissipation=material.dissipation[pair],
+        time_step=h,
+        stiction_tolerance=STICTION_TOLERANCE,
+        lagged=form.approximation == "lagged",
+    )
+
+
+def _contacts(form: ContactForm, touch: Touches, S: Array, material: Material) -> Contacts:
+    own, part = S[touch.state], material.other_part[touch.pair]
+    linear, angular = own[..., :3], own[..., 3:]
+    reach = form.pairs.radius[touch.pair] + part * touch.phi
+    point = touch.center - reach[:, None] * touch.normal
+    return Contacts(
+        touch=touch,
+        moves=form.topology.moves,
+        sphere=form.by_body[form.pairs.sphere_body[touch.pair]],
+        other=form.by_body[form.pairs.other_body[touch.pair]],
+        angular=angular,
+        point=point,
+        at_point=linear + cross(angular, point[:, None, :]),
+        reach=reach,
+        other_part=part,
+    )
+
+
+def _sum(at: Indices, of_contacts: Array, count: int) -> Array:
+    """(N, ...) of contributions (M, ...) of contacts, each of one of N = `count` states."""
+    total = np.zeros((count, *of_contacts.shape[1:]))
+    np.add.at(total, at, of_contacts)
+    return total
+
+
+def _is_solved(at: Solved) -> NDArray[np.bool_]:
+    """(N,) whether the impulse that is missing is what Drake's solver leaves, in the norm that it ends by."""
+    diagonal = np.einsum("kii->ki", at.A)
+    momentum = (at.A @ at.v_next[..., None])[..., 0]
+    left, had, given = (np.sqrt((p * p / diagonal).sum(axis=1)) for p in (at.gained - at.push, momentum, at.push))
+    return np.asarray(left <= OPTIMALITY * np.maximum(had, given) + ROUNDING)

@@ -1,0 +1,136 @@
+"""Spheres that may touch other shapes, in closed form: distance, normal, and how both change as the bodies move.
+
+Drake's point contact of a sphere (centre c, radius r) with a shape has the signed distance phi = d(c) - r, d being the
+shape's own, the normal n = grad d, from the shape to the sphere, and acts at c - (r + b phi) n with
+b = k_o / (k_s + k_o), the other shape's part of the two stiffnesses. Spheres, boxes, capsules and half spaces are one
+shape: what is within R of a box, d = |e| - R where e leads from the box to c, and inside the way to the nearest face.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Box, Capsule, HalfSpace, Shape, Sphere
+
+from drake_diff._base.arrays import Array
+from drake_diff.model.model import Model
+
+Indices = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Touches:
+    """M pairs that overlap, each in one of N states; in world."""
+
+    state: Indices  # (M,)
+    pair: Indices
+    center: Array  # (M, 3) of the sphere [m]
+    phi: Array  # (M,) the signed distance, below 0 [m]
+    normal: Array  # (M, 3) from the other shape to the sphere
+    curvature: Array  # (M, 3, 3) the derivative of the normal by where the centre is in the other shape's frame
+
+
+@dataclass(frozen=True, eq=False)
+class ContactPairs:
+    """P pairs of a sphere and another shape; those without a sphere, or with a shape not known here, are left out."""
+
+    bodies: tuple[Any, ...]  # Drake's, of all shapes
+    ids: tuple[tuple[Any, Any], ...]  # of the sphere and of the other shape
+    sphere_body: Indices  # (P,) in bodies
+    other_body: Indices
+    center: Array  # (P, 3) of the sphere, in its body [m]
+    radius: Array  # (P,)
+    rotation: Array  # (P, 3, 3) of the other shape, in its body
+    position: Array  # (P, 3)
+    lower: Array  # (P, 3) the corners of the other shape's box
+    upper: Array
+    rounding: Array  # (P,) R
+
+    def touching(self, poses: Array) -> Touches:
+        """The pairs that overlap where the bodies are at `poses` (N, bodies, 3, 4)."""
+        of_sphere, of_other = poses[:, self.sphere_body], poses[:, self.other_body]
+        center = (of_sphere[..., :3] @ self.center[:, :, None])[..., 0] + of_sphere[..., 3]
+        turned = of_other[..., :3] @ self.rotation
+        origin = (of_other[..., :3] @ self.position[:, :, None])[..., 0] + of_other[..., 3]
+        local = ((center - origin)[..., None, :] @ turned)[..., 0, :]
+        outside = local - np.minimum(np.maximum(local, self.lower), self.upper)
+        length = np.sqrt((outside * outside).sum(axis=-1))
+        state, pair = np.nonzero(length < self.radius + self.rounding)  # inside the length is 0
+        length, outside, turned = length[state, pair], outside[state, pair], turned[state, pair]
+        if length.size and length.min() == 0.0:
+            length, normal, curvature = self._with_inside(local[state, pair], outside, length, pair)
+        else:
+            normal = outside / length[:, None]
+            curvature = _curvature(normal, outside, length)
+        phi = length - self.rounding[pair] - self.radius[pair]
+        normal = (turned @ normal[:, :, None])[..., 0]
+        curvature = turned @ curvature @ turned.swapaxes(-1, -2)
+        return Touches(state, pair, center[state, pair], phi, normal, curvature)
+
+    def _with_inside(self, local: Array, outside: Array, length: Array, pair: Indices) -> tuple[Array, Array, Array]:
+        """Distance from the box, normal and curvature, for centres that may be inside it, where the last is 0."""
+        within = length == 0.0
+        safe = np.where(within, 1.0, length)
+        normal = outside / safe[:, None]
+        curvature = np.where(within[:, None, None], 0.0, _curvature(normal, outside, safe))
+        ways = np.concatenate([self.upper[pair] - local, local - self.lower[pair]], axis=1)
+        face = np.argmin(ways, axis=1)
+        signed = np.concatenate([np.eye(3), -np.eye(3)])[face]
+        way = np.take_along_axis(ways, face[:, None], axis=1)[:, 0]
+        return np.where(within, -way, length), np.where(within[:, None], signed, normal), curvature
+
+
+def _curvature(normal: Array, outside: Array, length: Array) -> Array:
+    """(M, 3, 3) (P - n n') / |e|, P onto the axes along which e is not 0."""
+    across = (outside != 0.0)[:, :, None] * np.eye(3)
+    return np.asarray((across - normal[:, :, None] * normal[:, None, :]) / length[:, None, None])
+
+
+def read_pairs(model: Model) -> ContactPairs:
+    """The pairs of spheres of `model`, none where there are none."""
+    plant, inspector = model.plant, model.double.inspector
+    found: list[tuple[Any, ...]] = []
+    bodies: dict[Any, tuple[int, Any]] = {}
+    for ids in sorted(inspector.GetCollisionCandidates()) if inspector is not None else ():
+        shapes = [inspector.GetShape(i) for i in ids]
+        first = 0 if isinstance(shapes[0], Sphere) else 1
+        box = _rounded_box(shapes[1 - first])
+        if not isinstance(shapes[first], Sphere) or box is None:
+            continue
+        sphere, other = ids[first], ids[1 - first]
+        at = []
+        for i in (sphere, other):
+            body = plant.GetBodyFromFrameId(inspector.GetFrameId(i))
+            at.append(bodies.setdefault(body.index(), (len(bodies), body))[0])
+        found.append((sphere, other, at, shapes[first].radius(), *box))
+    poses = [[inspector.GetPoseInFrame(i) for i in pair[:2]] for pair in found]
+    count = len(found)
+    return ContactPairs(
+        bodies=tuple(body for _, body in bodies.values()),
+        ids=tuple((pair[0], pair[1]) for pair in found),
+        sphere_body=np.array([pair[2][0] for pair in found], dtype=np.intp),
+        other_body=np.array([pair[2][1] for pair in found], dtype=np.intp),
+        center=np.array([X.translation() for X, _ in poses]).reshape(count, 3),
+        radius=np.array([pair[3] for pair in found]),
+        rotation=np.array([X.rotation().matrix() for _, X in poses]).reshape(count, 3, 3),
+        position=np.array([X.translation() for _, X in poses]).reshape(count, 3),
+        lower=np.array([pair[4] for pair in found]).reshape(count, 3),
+        upper=np.array([pair[5] for pair in found]).reshape(count, 3),
+        rounding=np.array([pair[6] for pair in found]),
+    )
+
+
+def _rounded_box(shape: Shape) -> tuple[Array, Array, float] | None:
+    """The box's lower and upper corner and the rounding of a shape, None where it is none."""
+    if isinstance(shape, Sphere):
+        return np.zeros(3), np.zeros(3), shape.radius()
+    if isinstance(shape, Capsule):
+        half = np.array([0.0, 0.0, shape.length() / 2])
+        return -half, half, shape.radius()
+    if isinstance(shape, Box):
+        half = np.array(shape.size()) / 2
+        return -half, half, 0.0
+    if isinstance(shape, HalfSpace):
+        return np.full(3, -np.inf), np.array([np.inf, np.inf, 0.0]), 0.0
+    return None

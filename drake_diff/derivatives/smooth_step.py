@@ -1,0 +1,245 @@
+"""Smooth steps by Pinocchio's derivatives of forward dynamics.
+
+Where nothing touches and no limit acts, Drake's step of a tree is (see `implicit`)
+
+    (M + h D) a = B u + c - K q - D v - bias(q, v),   v' = v + h a,   q' = q + h N(q) v'
+
+with M the mass matrix and reflected inertia, K the stiffness of springs and of PD control (kp), D joint damping and
+what PD control adds (kd + h kp), and c what their rest positions add. As h D stands beside the reflected inertia, the
+whole step is Pinocchio's articulated-body algorithm with h D as additional armature, and its derivatives are those of
+`computeABADerivatives`. Inputs are clipped at their effort limits as Drake does; a PD controller at its limit, as
+anything that this form leaves out, shows in Drake's own step, which is not this one then.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_diff._base.arrays import Array
+from drake_diff.derivatives.implicit import Form, Steps, form_of
+from drake_diff.exceptions import ModelError
+from drake_diff.mechanics.coordinates import Coordinates, native_positions, turn, turn_change, turn_derivatives, turning
+from drake_diff.mechanics.description import Description, describe_tree
+from drake_diff.model.model import Model
+
+# What a limit or a controller at its limit changes in x' is larger; x' known to rounding alone, as x + gap, is not.
+STEP_TOLERANCE = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class Native:
+    """N states in Drake's coordinates and in Pinocchio's, Q (N, nv, nv) turning the velocities."""
+
+    q: Array  # (N, nq)
+    v: Array  # (N, nv)
+    Q: Array
+    q_native: Array
+    v_native: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Analytic:
+    """What of a model does not change from step to step."""
+
+    pinocchio: Any  # pin.Model, with h D in its armature
+    data: Any
+    derivatives: Any  # pin.computeABADerivatives
+    outputs: list[memoryview]  # where in data it leaves da/dq, da/dv, da/dforce and a: four joined are one copy
+    coordinates: Coordinates
+    form: Form
+    time_step: float
+    limit: Array  # (nu,) of the inputs that are clipped; infinite under PD control
+    stiffness: Array  # (nv,) K
+    damping: Array  # (nv,) D
+    rest: Array  # (nv,) c
+    positions: NDArray[np.intp]  # (nv,) the index in q of hinges and slides; 0 for free bodies, where K is 0
+    limits: Array  # (2, nv) lower and upper positions of hinges and slides; infinite of free bodies
+    sprung: bool  # whether any K is not 0
+    joint_of: NDArray[np.intp]  # (nv,) of each degree of freedom, less 1
+
+    def __call__(self, steps: Steps) -> tuple[Array, NDArray[np.bool_]]:
+        """(N, nx, nx + nu) of the steps, and which (N,) are smooth: those that lead where Drake's do."""
+        jacobians, x_next = self.differentiate(steps.starts, steps.us)
+        agree = np.abs(x_next - steps.ends) <= STEP_TOLERANCE * np.maximum(np.abs(steps.ends), 1.0)
+        return jacobians, agree.all(axis=1) & ~steps.touching
+
+    def differentiate(self, xs: Array, us: Array) -> tuple[Array, Array]:
+        """(N, nx, nx + nu) and x' (N, nx) of the steps from xs (N, nx) under us (N, nu), were they smooth."""
+        return self._free(xs, us) if self.coordinates.free else self._fixed(xs, us)
+
+    def _fixed(self, xs: Array, us: Array) -> tuple[Array, Array]:
+        """Of hinges and slides, where N(q) = 1 and Pinocchio's velocities are Drake's."""
+        n, h = self.coordinates.nv, self.time_step
+        nx, nu = 2 * n, us.shape[1]
+        q, v = xs[:, :n], xs[:, n:]
+        force, clipped = self._force(q, v, us)
+        by_q, by_v, inverse, a = self._accelerate(q, v, force)
+        jacobians = np.empty((len(xs), nx, nx + nu))
+        upper, lower = jacobians[:, :n], jacobians[:, n:]
+        np.multiply(by_q - inverse * self.stiffness if self.sprung else by_q, h, out=lower[:, :, :n])
+        np.multiply(by_v - inverse * self.damping, h, out=lower[:, :, n:nx])
+        np.multiply(self._by_input(inverse, clipped), h, out=lower[:, :, nx:])
+        diagonal = jacobians.reshape(len(xs), -1)[:, :: nx + nu + 1]  # of the first nx columns; a view
+        diagonal[:, n:] += 1.0
+        np.multiply(lower, h, out=upper)
+        diagonal[:, :n] += 1.0
+        v_next = v + h * a
+        return jacobians, np.concatenate([q + h * v_next, v_next], axis=1)
+
+    def at_a_limit(self, steps: Steps) -> NDArray[np.bool_]:
+        """(N,) whether a joint limit pushes: Drake's does where phi + 2 h phi' < 0, phi being how far it is."""
+        v_next = steps.ends[:, self.coordinates.nq :]
+        ahead = steps.starts[:, self.positions] + 2 * self.time_step * v_next
+        return np.asarray(((ahead <= self.limits[0]) | (ahead >= self.limits[1])).any(axis=1))
+
+    def _accelerate(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array, Array]:
+        """Pinocchio's da/dq, da/dv, da/dforce (each (N, nv, nv)) and a (N, nv)."""
+        model, data, derivatives, outputs = self.pinocchio, self.data, self.derivatives, self.outputs
+        rows = []
+        for q_k, v_k, force_k in zip(q, v, force, strict=True):
+            derivatives(model, data, q_k, v_k, force_k)
+            rows.append(b"".join(outputs))
+        n = v.shape[1]
+        found = np.frombuffer(b"".join(rows)).reshape(len(q), 3 * n * n + n)
+        by_q, by_v, inverse = (found[:, k * n * n : (k + 1) * n * n].reshape(len(q), n, n) for k in range(3))
+        return by_q, by_v, inverse, found[:, 3 * n * n :]
+
+    def _force(self, q: Array, v: Array, us: Array) -> tuple[Array, NDArray[np.bool_] | None]:
+        """(N, nv) B u + c - K q - D v, and which inputs (N, nu) are clipped, None where none is."""
+        clipped = np.abs(us) >= self.limit
+        some = bool(clipped.any())
+        if some:
+            us = np.clip(us, -self.limit, self.limit)
+        force = us @ self.form.actuation.T + self.rest - self.damping * v
+        if self.sprung:
+            force -= self.stiffness * q[:, self.positions]
+        return force, clipped if some else None
+
+    def _by_input(self, inverse: Array, clipped: NDArray[np.bool_] | None) -> Array:
+        """(N, nv, nu) M^-1 B, 0 for clipped inputs."""
+        columns = inverse.take(self.form.velocity, axis=2)
+        return columns if clipped is None else columns * ~clipped[:, None]
+
+    def _free(self, xs: Array, us: Array) -> tuple[Array, Array]:
+        """Jacobians and x' (N, nx) with free bodies, whose velocities Pinocchio has in their own frames."""
+        c = self.coordinates
+        q, v = xs[:, : c.nq], xs[:, c.nq :]
+        force, clipped = self._force(q, v, us)
+        native = self.into_native(q, v)
+        velocities, v_next = self._velocities(
+            native, self._accelerate(native.q_native, native.v_native, force), clipped
+        )
+        return self.assemble(native, velocities, v_next)
+
+    def into_native(self, q: Array, v: Array) -> Native:
+        """The states q (N, nq), v (N, nv) in Pinocchio's coordinates."""
+        Q = turn(self.coordinates, q)
+        return Native(q, v, Q, native_positions(self.coordinates, q), (Q @ v[..., None])[..., 0])
+
+    def _velocities(
+        self, at: Native, solved: tuple[Array, ...], clipped: NDArray[np.bool_] | None
+    ) -> tuple[Array, Array]:
+        """(N, nv, 2 nv + nu) the derivative of v' by small motion, v and u, and v' (N, nv)."""
+        c, h, Q = self.coordinates, self.time_step, at.Q
+        by_q, by_v, inverse, native = solved
+        into, out, out_v = turn_derivatives(c, at.Q, at.v, native)
+        Q_t = Q.swapaxes(-1, -2)
+        by_motion = Q_t @ (by_q @ Q + by_v @ into - inverse * self.stiffness) + out
+        by_velocity = Q_t @ (by_v @ Q - inverse * self.damping) + out_v
+        found = h * np.concatenate([by_motion, by_velocity, Q_t @ self._by_input(inverse, clipped)], axis=2)
+        found[:, :, c.nv : 2 * c.nv] += np.eye(c.nv)
+        return found, self._v_next(at, native)
+
+    def assemble(self, at: Native, velocities: Array, v_next: Array) -> tuple[Array, Array]:
+        """(N, nx, nx + nu) and x' (N, nx), from the derivative of v' by small motion, v and u, and v'."""
+        c, h = self.coordinates, self.time_step
+        lower = np.concatenate([velocities[:, :, : c.nv] @ c.motion(at.q), velocities[:, :, c.nv :]], axis=2)
+        N = c.rate(at.q)
+        upper = h * N @ lower
+        upper[:, :, : c.nq] += np.eye(c.nq) + h * c.rate_by_position(v_next)
+        q_next = at.q + h * (N @ v_next[..., None])[..., 0]
+        return np.concatenate([upper, lower], axis=1), np.concatenate([q_next, v_next], axis=1)
+
+    def motions(self, at: Native, us: Array) -> tuple[Array, Array, Array]:
+        """(N, nv, 6) the motion [linear; angular] of each degree of freedom in world, about its origin, at unit speed.
+
+        And (N, nv, 6, 6) the spatial inertia of what it carries, and v' (N, nv) were the step smooth.
+        """
+        force, _ = self._force(at.q, at.v, us)
+        data, joints = self.data, range(1, self.pinocchio.njoints)
+        motion = memoryview(data.J.T).cast("B")
+        motions, inertias, accelerations = [], [], []
+        for q, v, f in zip(at.q_native, at.v_native, force, strict=True):
+            self.derivatives(self.pinocchio, data, q, v, f)
+            motions.append(motion.tobytes())
+            carried = data.oYcrb
+            inertias.append([carried[j].matrix() for j in joints])
+            accelerations.append(np.array(data.ddq))
+        S = np.frombuffer(b"".join(motions)).reshape(*at.v.shape, 6)
+        Q_t, native = at.Q.swapaxes(-1, -2), np.array(accelerations)
+        return Q_t @ S, np.array(inertias)[:, self.joint_of], self._v_next(at, native)
+
+    def _v_next(self, at: Native, native: Array) -> Array:
+        """(N, nv) v' by Pinocchio's accelerations (N, nv)."""
+        a = (at.Q.swapaxes(-1, -2) @ native[..., None])[..., 0] + turning(self.coordinates, at.v)
+        return np.asarray(at.v + self.time_step * a)
+
+    def pushed(self, at: Native, us: Array, push: Array) -> Array:
+        """The derivative of v' as `assemble` takes it, of steps under further generalized forces `push` (N, nv)."""
+        c = self.coordinates
+        force, clipped = self._force(at.q, at.v, us)
+        force = force + push
+        solved = self._accelerate(at.q_native, at.v_native, (at.Q @ force[..., None])[..., 0])
+        velocities, _ = self._velocities(at, solved, clipped)
+        by_turn = solved[2] @ turn_change(c, at.Q, force)  # a fixed force is another one in Pinocchio's frames
+        velocities[:, :, : c.nv] += self.time_step * at.Q.swapaxes(-1, -2) @ by_turn
+        return velocities
+
+
+def build_analytic(model: Model) -> Analytic:
+    """Not certified. Raises ModelError where the plant is no such tree, MissingDependencyError without Pinocchio."""
+    form = form_of(model)
+    if form.excluded:
+        raise ModelError(form.excluded)
+    description = describe_tree(model)
+    from drake_diff.mechanics.pinocchio_tree import acceleration_derivatives, build  # here, as Pinocchio is an extra
+
+    built, _ = build(description.links, description.gravity)
+    stiffness, damping, rest = _springs(model, form, description)
+    data = built.createData()
+    built.armature = description.by_velocity("armature") + model.time_step * damping
+    positions, limits = np.zeros(model.nv, dtype=int), np.array([[-np.inf], [np.inf]]) * np.ones(model.nv)
+    for i, j in description.coordinates.single:
+        positions[j] = i
+        limits[:, j] = model.plant.GetPositionLowerLimits()[i], model.plant.GetPositionUpperLimits()[i]
+    controlled = np.array([a.has_controller() for a in form.actuators], dtype=bool)
+    return Analytic(
+        pinocchio=built,
+        data=data,
+        derivatives=acceleration_derivatives,
+        outputs=[memoryview(x).cast("B") for x in (data.ddq_dq, data.ddq_dv, data.Minv, data.ddq)],
+        coordinates=description.coordinates,
+        form=form,
+        time_step=model.time_step,
+        limit=np.where(controlled, np.inf, form.limit),
+        stiffness=stiffness,
+        damping=damping,
+        rest=rest,
+        positions=positions,
+        limits=limits,
+        sprung=bool(stiffness.any()),
+        joint_of=np.repeat(np.arange(built.njoints - 1), list(built.nvs)[1:]),
+    )
+
+
+def _springs(model: Model, form: Form, description: Description) -> tuple[Array, Array, Array]:
+    """K, D and c (each (nv,)), those of PD control included."""
+    kp, kd = form.gains()
+    stiffness, damping = description.by_velocity("stiffness"), description.by_velocity("damping")
+    rest = stiffness * description.by_velocity("rest")
+    np.add.at(stiffness, form.velocity, kp)
+    np.add.at(damping, form.velocity, kd + model.time_step * kp)
+    np.add.at(rest, form.velocity, kp * form.reference[0] + kd * form.reference[1])
+    return stiffness, damping, rest

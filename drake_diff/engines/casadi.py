@@ -1,0 +1,291 @@
+"""CasADi expressions that adam-robotics builds from URDF, in Drake's semi-implicit Euler step; CasADi's Jacobians.
+
+adam has one tree on one floating base: a plant is handed to it as one tree for each free body, that being the base, and
+one for what stands on the world, whose base does not move. adam's base is a homogeneous transform and, in its "mixed"
+representation, (v, w) in world: Drake's v = (w, v_o) swapped. Gravity is given to it (its own is 9.80665 m/s^2).
+
+Of adam 0.5.0 slides are wrong: their motion has 12 entries for 6, which `_Joint` puts right, and they move along the
+parent's axes where the joint is turned against its parent, which no joint of `urdf` is.
+"""
+
+from importlib.metadata import version
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff.engines.interface import EngineContract, StepJacobian
+from drake_diff.engines.numpy import DRAKES_STEP, EACH_CALL
+from drake_diff.engines.urdf import UNLIMITED, carried_by, inertial_urdf
+from drake_diff.exceptions import MissingDependencyError, ModelError
+from drake_diff.mechanics.coordinates import euler_acceleration, euler_jacobian, euler_step
+from drake_diff.mechanics.description import Description, Link, describe, joint_contract
+from drake_diff.mechanics.joints import JointContract
+from drake_diff.model.model import Model
+
+try:
+    from adam.casadi.casadi_like import CasadiLike, SpatialMath
+    from adam.core import RBDAlgorithms
+    from adam.model import Model as AdamModel
+    from adam.model.std_factories.std_joint import StdJoint
+    from adam.model.std_factories.std_model import URDFModelFactory
+except ImportError as error:
+    message = f"this engine needs adam-robotics ({error}): pip install 'drake-diff[engines]'"
+    raise MissingDependencyError(message) from error
+
+NO_CONTACT = "adam's dynamics have no contact here"
+
+
+class CasadiEngine:
+    """Trees of hinges, slides and free bodies; no contact and no joint limits."""
+
+    name, status, version = "casadi", "ok", version("adam-robotics")
+
+    def __init__(self, model: Model):
+        self.description = describe(model)
+        self.time_step = model.time_step
+        self.coordinates = self.description.coordinates
+        self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
+        self.damping = self.description.by_velocity("damping")
+        self.actuation, self.limits = self.description.actuation, self.description.effort_limits
+        self.gravity = self.description.gravity
+        bases: list[Link | None] = [x for x in self.description.moving if x.kind == "quaternion_floating"]
+        if carried_by(self.description, "world"):
+            bases.append(None)
+        self.trees = [_Tree(self.description, base) for base in bases]
+        self._build()
+
+    def step(self, x: ArrayLike, u: ArrayLike) -> Array:
+        x, u = self._point(x, u)
+        return euler_step(self.coordinates, self.time_step, x, self._acceleration(x, u))
+
+    def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
+        x, u = self._point(x, u)
+        acceleration = self._acceleration(x, u)
+        x_next = euler_step(self.coordinates, self.time_step, x, acceleration)
+        by = self._acceleration_derivative(x, u, acceleration)
+        jacobian = euler_jacobian(self.coordinates, self.time_step, x, x_next, by)
+        nx = self.nq + self.nv
+        return StepJacobian(frozen(jacobian[:, :nx]), frozen(jacobian[:, nx:]), "casadi")
+
+    def energy(self, x: ArrayLike) -> float:
+        x = finite_array("x", x, (self.nq + self.nv,))
+        q, v = x[: self.nq], x[self.nq :]
+        return float(v @ self.mass_matrix(q) @ v) / 2 + float(self.potential(q))
+
+    def contact_depth(self, x: ArrayLike) -> float:
+        finite_array("x", x, (self.nq + self.nv,))
+        return 0.0
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        return np.array(self.terms(finite_array("q", q, (self.nq,)), np.zeros(self.nv))[0])
+
+    def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
+        q, v = finite_array("q", q, (self.nq,)), finite_array("v", v, (self.nv,))
+        return np.array(self.terms(q, v)[1]).ravel()
+
+    def _point(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
+        return finite_array("x", x, (self.nq + self.nv,)), finite_array("u", u, (self.nu,))
+
+    def _build(self) -> None:
+        """The functions of q, v and a: M and bias; the potential energy; d (M a + bias) / dq and / dv."""
+        q, v, a = (ca.SX.sym(name, n) for name, n in (("q", self.nq), ("v", self.nv), ("a", self.nv)))
+        M, bias, potential = ca.SX(self.nv, self.nv), ca.SX(self.nv, 1), ca.SX(0)
+        for part in self.trees:
+            potential += part.potential(q, self.gravity)
+            if len(part.dofs):
+                own_M, own_bias = part.dynamics(q, v, self.gravity)
+                M[part.dofs, part.dofs], bias[part.dofs] = own_M, own_bias
+        for link in self.description.moving:
+            if link.kind != "quaternion_floating":
+                stretch = q[link.q_start] - link.rest
+                M[link.v_start, link.v_start] += link.armature
+                bias[link.v_start] += link.stiffness * stretch
+                potential += link.stiffness * stretch**2 / 2
+        needed = ca.mtimes(M, a) + bias
+        options = {"cse": True}
+        self.terms = ca.Function("terms", [q, v], [ca.densify(M), ca.densify(bias)], options)
+        self.potential = ca.Function("potential", [q], [potential], options)
+        by = [ca.densify(ca.jacobian(needed, z)) for z in (q, v)]
+        self.derivatives = ca.Function("derivatives", [q, v, a], by, options)
+
+    def _acceleration(self, x: Array, u: Array) -> Array:
+        q, v = x[: self.nq], x[self.nq :]
+        M, bias = (np.array(term) for term in self.terms(q, v))
+        force = self.actuation @ np.clip(u, -self.limits, self.limits) - bias.ravel()
+        return euler_acceleration(M, self.damping, self.time_step, v, force)
+
+    def _acceleration_derivative(self, x: Array, u: Array, acceleration: Array) -> Array:
+        """(nv, 2 nv + nu) by small motion, by v and by u."""
+        q, v = x[: self.nq], x[self.nq :]
+        by_q, by_v = (np.array(term) for term in self.derivatives(q, v, acceleration))
+        D = np.diag(self.damping)
+        effort = -self.actuation * (np.abs(u) <= self.limits)
+        residual = np.hstack([by_q @ self.coordinates.rate(q), by_v + D, effort])
+        return np.asarray(-np.linalg.solve(self.mass_matrix(q) + self.time_step * D, residual))
+
+    @property
+    def contract(self) -> EngineContract:
+        joints = {joint.name: joint for part in self.trees for joint in part.joints()}
+        return EngineContract(
+            engine=self.name,
+            joints=tuple(joints[link.joint] for link in self.description.moving),
+            native_order=tuple(joints),
+            state="homogeneous transform; velocity of a free body linear then angular, in world",
+            inputs=self.description.inputs,
+            actuation=tuple(tuple(float(b) for b in row) for row in self.actuation),
+            effort_limits=tuple(float(limit) for limit in self.limits),
+            time_step=self.time_step,
+            integrator=DRAKES_STEP,
+            gravity=tuple(float(g) for g in self.gravity),
+            contact_law="none",
+            contacts=(),
+            solver_tolerance=None,
+            limit_law="none",
+            reset=EACH_CALL,
+            derivatives="by q and v, adam's expressions differentiated by CasADi",
+            reasons={
+                "contact law": NO_CONTACT,
+                "contact pairs": NO_CONTACT,
+                "limit law": "adam's dynamics have no joint limits",
+                "solver tolerance": "nothing is solved iteratively",
+            },
+        )
+
+
+class _Tree:
+    """What one base carries, the world where `base` is None, in adam; `dofs` are its places in Drake's v."""
+
+    def __init__(self, description: Description, base: Link | None):
+        if base and base.parent != "world":
+            raise ModelError(f"joint {base.joint}: adam's floating base is one of the world, not of {base.parent}")
+        self.base, self.root = base, base.body if base else "world"
+        self.moving = [x for x in carried_by(description, self.root) if x.kind != "weld"]
+        self.moving.sort(key=lambda x: x.v_start)
+        text = inertial_urdf(description, self.root)
+        self.math = SpatialMath()
+        self.model = AdamModel.build(_Factory(text, self.math), [x.joint for x in self.moving])
+        self.positions = [x.q_start for x in self.moving]
+        at_base = [base.v_start + i for i in range(6)] if base else []
+        self.dofs = at_base + [x.v_start for x in self.moving]
+        self.links = {x.joint: x for x in self.moving}
+
+    def dynamics(self, q: Any, v: Any, gravity: Array) -> tuple[Any, Any]:
+        """M (n, n) and bias (n,) by `dofs`."""
+        n, world = len(self.moving), ca.SX.eye(6)
+        algorithms = RBDAlgorithms(self.model, self.math)  # of the "mixed" representation
+        own_q, own_v = q[self.positions], v[self.dofs[len(self.dofs) - n :]]
+        if self.base:
+            i, W = self.base.v_start, _turn(self.base)
+            world = ca.blockcat([[ca.SX(3, 3), W], [W, ca.SX(3, 3)]])  # from Drake's (w, v_o) to adam's (v, w)
+            base_v = ca.mtimes(world, v[i : i + 6])
+        else:
+            base_v = ca.SX.zeros(6)
+        H = self._base_pose(q)
+        M, _ = algorithms.crba(H, own_q if n else ca.SX.zeros(1))  # adam reads one position though there be none
+        bias = algorithms.rnea(H, own_q, base_v, own_v, np.append(gravity, np.zeros(3)))
+        into = ca.diagcat(world, ca.SX.eye(n))
+        start = 0 if self.base else 6
+        M = ca.mtimes([into.T, M.array, into])[start:, start:]
+        return M, ca.mtimes(into.T, bias.array)[start:]
+
+    def potential(self, q: Any, gravity: Array) -> Any:
+        """[J] 0 at height 0."""
+        total = ca.SX(0)
+        for name, H in self._poses(q).items():
+            link = self.model.links[name]
+            center = ca.mtimes(H, link.homogeneous().array)[:3, 3]
+            total -= link.inertial.mass.array * ca.dot(ca.DM(gravity), center)
+        return total
+
+    def _base_pose(self, q: Any) -> Any:
+        """(4, 4) of the root, which stands as the world does where q = 0."""
+        if self.base is None:
+            return ca.SX.eye(4)
+        i, X = self.base.q_start, self.base.on_parent
+        R = ca.mtimes([_turn(self.base), rotation(q[i : i + 4]), _turn(self.base).T])
+        p = X.translation() + ca.mtimes(_turn(self.base), q[i + 4 : i + 7])
+        return ca.blockcat([[R, p], [ca.SX(1, 3), ca.SX(1)]])
+
+    def _poses(self, q: Any) -> dict[str, Any]:
+        """(4, 4) of each link."""
+        poses = {self.root: self._base_pose(q)}
+        for node in list(self.model.tree)[1:]:
+            joint = node.parent_arc
+            at = CasadiLike(q[self.links[joint.name].q_start] if joint.name in self.links else ca.SX(0))
+            poses[node.name] = ca.mtimes(poses[joint.parent], joint.homogeneous(q=at).array)
+        return poses
+
+    def joints(self) -> tuple[JointContract, ...]:
+        """As adam has them."""
+        carrier = {self.root: self.base.joint if self.base else None}
+        carried: dict[str | None, list[tuple[float, Array, Array]]] = {}
+        poses = {name: np.array(ca.evalf(H)) for name, H in self._poses(self._zero()).items()}
+        for node in self.model.tree:
+            if node.parent_arc is not None:
+                joint = node.parent_arc
+                carrier[node.name] = carrier[joint.parent] if joint.type == "fixed" else joint.name
+            inertial = self.model.links[node.name].inertial
+            H = poses[node.name] @ np.array(ca.evalf(self.model.links[node.name].homogeneous().array))
+            R, inertia = H[:3, :3], np.array(ca.evalf(inertial.inertia.get_matrix().array))
+            part = (float(inertial.mass.array), H[:3, 3], R @ inertia @ R.T)
+            carried.setdefault(carrier[node.name], []).append(part)
+        found = [self._free_joint(carried)] if self.base else []
+        return (*found, *(self._single(name, poses, carried[name]) for name in self.model.actuated_joints))
+
+    def _free_joint(self, carried: dict[str | None, list[tuple[float, Array, Array]]]) -> JointContract:
+        name, nowhere = self.base.joint if self.base else "", np.zeros(3)
+        numbers = dict.fromkeys(("damping", "armature", "stiffness", "rest"), 0.0)
+        return joint_contract(
+            name=name, kind="quaternion_floating", axis=nowhere, anchor=nowhere, carried=carried[name],
+            lower=-np.inf, upper=np.inf, **numbers,
+        )  # fmt: skip
+
+    def _single(self, name: str, poses: dict[str, Array], carried: list[tuple[float, Array, Array]]) -> JointContract:
+        joint, link = self.model.joints[name], self.links[name]
+        H = poses[joint.child]
+        limits = (-np.inf, np.inf) if joint.type == "continuous" else (joint.limit.lower, joint.limit.upper)
+        return joint_contract(
+            name=name,
+            kind="prismatic" if joint.type == "prismatic" else "revolute",
+            axis=H[:3, :3] @ np.array(ca.evalf(joint.axis.array)).ravel(),
+            anchor=H[:3, 3],
+            carried=carried,
+            lower=limits[0] if limits[0] > -UNLIMITED else -np.inf,
+            upper=limits[1] if limits[1] < UNLIMITED else np.inf,
+            **{k: getattr(link, k) for k in ("damping", "armature", "stiffness", "rest")},
+        )
+
+    def _zero(self) -> Any:
+        q = ca.SX.zeros(1 + max([*self.positions, self.base.q_start + 6 if self.base else 0]))
+        if self.base:
+            q[self.base.q_start] = 1.0
+        return q
+
+
+class _Joint(StdJoint):  # type: ignore[misc]  # adam has no types
+    """With the motion that a slide has."""
+
+    def motion_subspace(self) -> Any:
+        if self.type != "prismatic":
+            return super().motion_subspace()
+        return CasadiLike(ca.vertcat(self.axis.array, ca.SX.zeros(3)))
+
+
+class _Factory(URDFModelFactory):  # type: ignore[misc]
+    def build_joint(self, joint: Any) -> _Joint:
+        return _Joint(joint, self.math)
+
+
+def rotation(quaternion: Any) -> Any:
+    """(3, 3) of a quaternion (w, x, y, z) of any norm, as an expression."""
+    s, v = quaternion[0], quaternion[1:4]
+    product = s**2 * ca.SX.eye(3) + 2 * s * ca.skew(v) + ca.mtimes(v, v.T) + ca.mtimes(ca.skew(v), ca.skew(v))
+    return product / ca.sumsqr(quaternion)
+
+
+def _turn(base: Link) -> Any:
+    """(3, 3) the frame that a free body's coordinates are in."""
+    return ca.SX(ca.DM(base.on_parent.rotation().matrix()))

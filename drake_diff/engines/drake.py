@@ -1,0 +1,85 @@
+"""Drake itself as an engine: contact approximation and source of the derivatives chosen once."""
+
+from functools import cached_property
+from importlib.metadata import version
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_diff._base.arrays import Array, finite_array
+from drake_diff.derivatives.step import check_method, differentiate_step
+from drake_diff.engines.interface import EngineContract, StepJacobian
+from drake_diff.engines.numpy import DRAKES_STATE, DRAKES_STEP, EACH_CALL
+from drake_diff.mechanics.description import Description, describe, joint_contracts
+from drake_diff.model.contact import penetration
+from drake_diff.model.model import Model
+from drake_diff.model.step import set_state, step
+
+
+class DrakeEngine:
+    """`contact` is sap, similar or lagged (None: the model's own), `method` one of `differentiate_step`'s."""
+
+    version, status = version("drake"), "ok"
+
+    def __init__(self, model: Model, *, contact: str | None = None, method: str = "autodiff"):
+        check_method(method)
+        own = model.contract.contact.approximation
+        self.model = model if contact in (None, own) else model.with_contact(str(contact))
+        self.method = method
+        self.name = f"drake ({self.model.contract.contact.approximation}, {method})"
+
+    @cached_property
+    def description(self) -> Description:
+        """What the contract is read from; ModelError where the plant has what no other engine is given."""
+        return describe(self.model)
+
+    def step(self, x: ArrayLike, u: ArrayLike) -> Array:
+        return step(self.model, x, u)
+
+    def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
+        found = differentiate_step(self.model, x, u, method=self.method)
+        return StepJacobian(found.A, found.B, found.method)
+
+    def energy(self, x: ArrayLike) -> float:
+        self._set(finite_array("x", x, (self.model.nx,)))
+        plant, context = self.model.plant, self.model.double.context
+        return float(plant.CalcKineticEnergy(context) + plant.CalcPotentialEnergy(context))
+
+    def contact_depth(self, x: ArrayLike) -> float:
+        self._set(finite_array("x", x, (self.model.nx,)))
+        return penetration(self.model)
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        self._set(np.concatenate([finite_array("q", q, (self.model.nq,)), np.zeros(self.model.nv)]))
+        return np.asarray(self.model.plant.CalcMassMatrix(self.model.double.context))
+
+    def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
+        q, v = finite_array("q", q, (self.model.nq,)), finite_array("v", v, (self.model.nv,))
+        self._set(np.concatenate([q, v]))
+        return np.asarray(self.model.double.inverse_dynamics(np.zeros(self.model.nv)) - self.model.double.damping() * v)
+
+    @property
+    def contract(self) -> EngineContract:
+        contact = self.model.contract.contact
+        moving = self.description.moving
+        return EngineContract(
+            engine=self.name,
+            joints=joint_contracts(self.description),
+            native_order=tuple(link.joint for link in moving),
+            state=DRAKES_STATE,
+            inputs=self.model.input_names,
+            actuation=tuple(tuple(float(b) for b in row) for row in self.description.actuation),
+            effort_limits=tuple(float(limit) for limit in self.description.effort_limits),
+            time_step=self.model.time_step,
+            integrator=DRAKES_STEP,
+            gravity=tuple(float(g) for g in self.description.gravity),
+            contact_law=f"{contact.model}, {contact.approximation}" if contact.collision_pairs else "none",
+            contacts=self.description.pairs,
+            solver_tolerance=contact.solver_relative_tolerance,
+            limit_law="implicit springs in the step's solver",
+            reset=EACH_CALL,
+            derivatives="by every entry of x and u",
+        )
+
+    def _set(self, x: Array) -> None:
+        set_state(self.model.double, x)

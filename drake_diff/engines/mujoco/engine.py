@@ -1,0 +1,199 @@
+"""MuJoCo models: compiled from the MJCF that is generated from Drake's plant, or from the user's own.
+
+MuJoCo, on MJCF generated from Drake's plant or on the user's own.
+
+With the integrator Euler joint damping is implicit, (M + h D) a = ..., and v' = v + h a: Drake's free step. What
+differs is a free body's quaternion, which MuJoCo turns by the exponential of h w' and Drake by its first term:
+`exponential_gap` is that difference. implicitfast is the same step here; implicit (velocity products in it), RK4 and
+Euler without eulerdamp are others, and the contract says so.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff.engines.interface import EngineContract, StepJacobian
+from drake_diff.engines.mujoco.contract import check_known, pair_index, read_contract, resting_stiffness
+from drake_diff.engines.mujoco.coordinates import MujocoCoordinates
+from drake_diff.engines.mujoco.mjcf import mjcf
+from drake_diff.exceptions import MissingDependencyError, ModelError, SimulationError
+from drake_diff.mechanics.description import Description, describe
+from drake_diff.model.model import Model
+
+try:
+    import mujoco
+except ImportError as error:
+    raise MissingDependencyError("this engine needs MuJoCo: pip install 'drake-diff[engines]'") from error
+
+__all__ = ["generated", "mujoco", "mujoco_model"]
+
+
+def mujoco_model(description: Description, time_step: float, path: str | Path | None) -> tuple[str, Any]:
+    """The MJCF, generated or read from `path`, and its MjModel; ModelError for what the contract has no line for."""
+    text = generated(description, time_step) if path is None else Path(path).read_text()
+    model = _compile(text) if path is None else _read(path)
+    flags = mujoco.mjtDisableBit
+    check_known(model, int(flags.mjDSBL_WARMSTART | flags.mjDSBL_EULERDAMP))
+    return text, model
+
+
+def generated(description: Description, time_step: float) -> str:
+    """The MJCF whose contacts have Drake's stiffness where they rest: see `mujoco_contract.resting_stiffness`."""
+    bare = _compile(mjcf(description, time_step))
+    solref = {}
+    for pair in description.pairs:
+        i = pair_index(bare, pair.names)
+        if i >= 0 and pair.stiffness:
+            s = pair.stiffness / resting_stiffness(bare, i)
+            solref[pair.names] = (-s, -2 * float(np.sqrt(s)))  # critical, where nothing else holds the pair
+    return mjcf(description, time_step, solref)
+
+
+def _compile(text: str) -> Any:
+    try:
+        return mujoco.MjModel.from_xml_string(text)
+    except ValueError as error:
+        raise ModelError(f"MuJoCo cannot take this model: {error}") from error
+
+
+def _read(path: str | Path) -> Any:
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise ModelError(f"MuJoCo cannot read {path}: {error}") from error
+
+
+# What sticks slips beyond 1e-5 m/s or so, and a larger step would leave the mode: good to 1e-9.
+DIFFERENCE_STEP = 1e-6
+# Where nothing touches: at this step and at twice it, extrapolated, truncation is far below rounding's 1e-11.
+FREE_STEP = 3e-5
+# What the two may differ by; if a contact is made between them, they differ by 1 and more.
+SAME_JACOBIAN = 1e-7
+
+
+class MujocoEngine:
+    """`path` is the user's own MJCF, with joints and actuators of the names that Drake's plant has.
+
+    `mjcf` is the text that was generated or read.
+    """
+
+    name = "mujoco"
+
+    def __init__(self, model: Model, *, path: str | Path | None = None):
+        self.description = describe(model)
+        self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
+        self.version, self.status = str(mujoco.__version__), "ok"
+        self.mjcf, self.model = mujoco_model(self.description, model.time_step, path)
+        self.data = mujoco.MjData(self.model)
+        self.native = MujocoCoordinates(self.description, self.model)
+
+    def step(self, x: ArrayLike, u: ArrayLike) -> Array:
+        self._set(*self._point(x, u))
+        mujoco.mj_step(self.model, self.data)
+        self._check(x, u)
+        return self.native.to_drake(self.data.qpos, self.data.qvel)
+
+    def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
+        x, u = self._point(x, u)
+        x_next = self.step(x, u)
+        self._set(x, u)
+        A, B, method = self._native_jacobian()
+        A, B = self.native.jacobian(x, x_next, A, B)
+        return StepJacobian(frozen(A), frozen(B), method)
+
+    def _native_jacobian(self) -> tuple[Array, Array, str]:
+        small = self._differences(DIFFERENCE_STEP)
+        near, far = self._differences(FREE_STEP), self._differences(2 * FREE_STEP)
+        A, B = ((4 * a - b) / 3 for a, b in zip(near, far, strict=True))
+        if np.abs(A - small[0]).max() <= SAME_JACOBIAN * max(1.0, float(np.abs(A).max())):
+            return A, B, "centred differences (mjd_transitionFD), extrapolated"
+        return *small, "centred differences (mjd_transitionFD)"
+
+    def _differences(self, step: float) -> tuple[Array, Array]:
+        """A (2 nv, 2 nv) and B (2 nv, nu) in MuJoCo's tangent coordinates and inputs."""
+        n = 2 * self.nv
+        A, B = np.zeros((n, n)), np.zeros((n, self.nu))
+        mujoco.mjd_transitionFD(self.model, self.data, step, True, A, B, None, None)
+        return A, B
+
+    def energy(self, x: ArrayLike) -> float:
+        self._set(finite_array("x", x, (self.nq + self.nv,)), np.zeros(self.nu))
+        mujoco.mj_forward(self.model, self.data)
+        mujoco.mj_energyPos(self.model, self.data)
+        mujoco.mj_energyVel(self.model, self.data)
+        return float(self.data.energy.sum())
+
+    def contact_depth(self, x: ArrayLike) -> float:
+        self._set(finite_array("x", x, (self.nq + self.nv,)), np.zeros(self.nu))
+        mujoco.mj_fwdPosition(self.model, self.data)
+        return max([0.0, *(-float(self.data.contact[i].dist) for i in range(self.data.ncon))])
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        q = finite_array("q", q, (self.nq,))
+        self._set(np.concatenate([q, np.zeros(self.nv)]), np.zeros(self.nu))
+        mujoco.mj_forward(self.model, self.data)
+        M = np.zeros((self.nv, self.nv))
+        for column, unit in zip(M, np.eye(self.nv), strict=True):  # M is symmetric
+            mujoco.mj_mulM(self.model, self.data, column, unit)
+        Q = self.native.turn(q)
+        return np.asarray(Q.T @ M @ Q)
+
+    def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
+        q, v = finite_array("q", q, (self.nq,)), finite_array("v", v, (self.nv,))
+        self._set(np.concatenate([q, v]), np.zeros(self.nu))
+        mujoco.mj_forward(self.model, self.data)
+        return np.asarray(self.native.turn(q).T @ (self.data.qfrc_bias - self.data.qfrc_spring))
+
+    @property
+    def contract(self) -> EngineContract:
+        self._set(np.concatenate([self.native.zero(), np.zeros(self.nv)]), np.zeros(self.nu))
+        mujoco.mj_forward(self.model, self.data)
+        derivatives = "by tangent vectors of qpos and by qvel, centred differences in C"
+        return read_contract(
+            self.model,
+            self.data,
+            self.native,
+            self.description,
+            who="MuJoCo",
+            engine=self.name,
+            derivatives=derivatives,
+        )
+
+    def _point(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
+        return finite_array("x", x, (self.nq + self.nv,)), finite_array("u", u, (self.nu,))
+
+    def _set(self, x: Array, u: Array) -> None:
+        mujoco.mj_resetData(self.model, self.data)  # which takes the warm start too
+        self.data.qpos[:], self.data.qvel[:] = self.native.to_native(x)
+        self.data.ctrl[:] = self.native.control(u)
+
+    def _check(self, x: ArrayLike, u: ArrayLike) -> None:
+        bad = [w.name for w in mujoco.mjtWarning.__members__.values() if _counts(self.data, w)]
+        if bad or not np.all(np.isfinite(self.data.qpos)):
+            raise SimulationError(f"MuJoCo cannot take this step: {bad}, from x = {np.asarray(x)}, u = {np.asarray(u)}")
+        used = int(np.max(self.data.solver_niter)) if self.data.nefc else 0
+        self.status = "ok" if used < self.model.opt.iterations else f"the solver used all of its {used} iterations"
+
+
+def exponential_gap(x: Array, x_next: Array, h: float, q_start: int = 0, w_start: int = 7) -> Array:
+    """(4,) MuJoCo's quaternion after a step less Drake's of the norm 1: exp(h w') against 1 + h w' / 2.
+
+    The one is (cos, sin) of |h w'| / 2 and the other of arctan(|h w'| / 2), about |h w'|^3 / 24 less.
+    """
+    q, turn = x[q_start : q_start + 4], h * x_next[w_start : w_start + 3] / 2
+    angle = float(np.linalg.norm(turn))
+    axis = turn / angle if angle else turn
+    difference = np.array(
+        [np.cos(angle) - np.cos(np.arctan(angle)), *(np.sin(angle) - np.sin(np.arctan(angle))) * axis]
+    )
+    w, v = difference[0], difference[1:]
+    return np.concatenate([[w * q[0] - v @ q[1:]], w * q[1:] + q[0] * v + np.cross(v, q[1:])]) / np.linalg.norm(q)
+
+
+def _counts(data: Any, warning: Any) -> bool:
+    return (
+        warning.name in ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC") and data.warning[int(warning)].number > 0
+    )

@@ -1,0 +1,180 @@
+"""MuJoCo MJX: MuJoCo's step written in JAX, on the same MJCF, in float64, differentiated forward by `jax.jacfwd`.
+
+JAX computes in float32 unless told otherwise; every call here stands in `jax.enable_x64`, and JAX's global settings
+stay as they are. What is compiled is compiled at the first call that needs it, once for models of one structure.
+
+The step is MuJoCo's, with its implicit joint damping and its turn of a free body's quaternion (`exponential_gap`). Two
+derivatives MJX does not have. Of a free body slower than 1e-8 rad/s it drops the turn, and with it the turn's
+derivative by the speed: that is put back, and the method says so. Where elliptic cones are solved and a pair does not
+slip at all, being at rest or apart, the line search takes the root of 0: NaN, which is a GradientError here.
+"""
+
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff.engines.interface import EngineContract, StepJacobian
+from drake_diff.engines.mujoco.contract import CONES, read_contract, touches
+from drake_diff.engines.mujoco.coordinates import MujocoCoordinates
+from drake_diff.engines.mujoco.engine import mujoco_model
+from drake_diff.exceptions import GradientError, MissingDependencyError, ModelError, SimulationError
+from drake_diff.mechanics.description import describe
+from drake_diff.model.model import Model
+
+try:
+    import jax
+    import jax.numpy as jnp
+    from mujoco import mjx
+except ImportError as error:
+    raise MissingDependencyError(f"this engine needs MJX ({error}): pip install 'drake-diff[mjx]'") from error
+
+PYRAMIDAL = {name: number for number, name in CONES.items()}["pyramidal"]
+# [N or N m] of M a - f, relative to f: MJX does not say whether its solver came to its end, which leaves 1e-12 or so.
+UNBALANCED = 1e-6
+STILL = 1e-8  # [rad/s] that MJX takes for 0
+RK4 = 1  # mjtIntegrator
+
+
+class MjxEngine:
+    """`path` is the user's own MJCF, with joints and actuators of the names that Drake's plant has.
+
+    `mjcf` is the text that was generated or read. ModelError where MJX cannot have it.
+    """
+
+    name = "mjx"
+
+    def __init__(self, model: Model, *, path: str | Path | None = None):
+        self.description = describe(model)
+        self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
+        self.version, self.status = version("mujoco-mjx"), "ok"
+        self.mjcf, compiled = mujoco_model(self.description, model.time_step, path)
+        if not touches(compiled):
+            compiled.opt.cone = PYRAMIDAL  # MJX cannot have limits with elliptic cones and no contact that has one
+        with jax.enable_x64(True):
+            try:
+                self.mjx = mjx.put_model(compiled, impl="jax")
+                self.data = mjx.make_data(self.mjx)
+            except NotImplementedError as error:
+                raise ModelError(f"MJX cannot take this model: {error}") from error
+        self.model = jax.tree.map(np.asarray, self.mjx)  # as it is in MJX, to be read
+        self.native = MujocoCoordinates(self.description, self.model)
+
+    def step(self, x: ArrayLike, u: ArrayLike) -> Array:
+        x, u = self._point(x, u)
+        found, unbalanced = self._run(_step, x, u)
+        if not np.all(np.isfinite(found)):
+            raise SimulationError(f"MJX cannot take this step: from x = {x}, u = {u}")
+        self.status = "ok" if unbalanced <= UNBALANCED else f"the solver left {unbalanced:.1e} of the forces unbalanced"
+        return self.native.to_drake(found[: self.nq], found[self.nq :])
+
+    def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
+        x, u = self._point(x, u)
+        x_next = self.step(x, u)
+        by, _ = self._run(_step_derivative, x, u)
+        if not np.all(np.isfinite(by)):
+            raise GradientError(f"MJX's derivative of this step is not finite: from x = {x}, u = {u}")
+        A, B = self.native.on_tangent(x, x_next, by)
+        method = "jax.jacfwd" + self._put_turns_back(x_next, A, B)
+        A, B = self.native.jacobian(x, x_next, A, B)
+        return StepJacobian(frozen(A), frozen(B), method)
+
+    def _put_turns_back(self, x_next: Array, A: Array, B: Array) -> str:
+        """In native tangent coordinates, where a body that does not turn moves by h w'; what the method adds."""
+        _, qvel = self.native.to_native(x_next)
+        starts = [j for _, j in self.native.coordinates.free]
+        still = [d for d in (self.native.dofs[j : j + 3] for j in starts) if np.all(np.abs(qvel[d]) <= STILL)]
+        if still and int(self.model.opt.integrator) == RK4:
+            raise GradientError("MJX's derivative of a turn from rest is lost, and RK4's is not put back")
+        h = float(self.model.opt.timestep)
+        for dofs in still:
+            A[dofs], B[dofs] = h * A[self.nv + dofs], h * B[self.nv + dofs]
+            A[dofs, dofs] += 1.0
+        return ", turns from rest by hand" if still else ""
+
+    def energy(self, x: ArrayLike) -> float:
+        x = finite_array("x", x, (self.nq + self.nv,))
+        terms, m = self._terms(x), self.model
+        height = m.body_mass @ (terms.xipos @ m.opt.gravity)
+        springs = 0.0
+        for j in self.native.joints:
+            if m.jnt_stiffness[j]:
+                at = int(m.jnt_qposadr[j])
+                springs += float(m.jnt_stiffness[j] * (terms.qpos[at] - m.qpos_spring[at]) ** 2) / 2
+        v = x[self.nq :]
+        return float(v @ self.mass_matrix(x[: self.nq]) @ v) / 2 - float(height) + springs
+
+    def contact_depth(self, x: ArrayLike) -> float:
+        x = finite_array("x", x, (self.nq + self.nv,))
+        if not touches(self.model):
+            return 0.0
+        return float(max(0.0, -np.min(self._run(_distances_at, x, np.zeros(self.nu)))))
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        q = finite_array("q", q, (self.nq,))
+        Q = self.native.turn(q)
+        M = self._run(_mass_at, np.concatenate([q, np.zeros(self.nv)]), np.zeros(self.nu))
+        return np.asarray(Q.T @ M @ Q)
+
+    def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
+        q, v = finite_array("q", q, (self.nq,)), finite_array("v", v, (self.nv,))
+        terms = self._terms(np.concatenate([q, v]))
+        springs = terms.qfrc_passive + self.model.dof_damping * terms.qvel
+        return np.asarray(self.native.turn(q).T @ (terms.qfrc_bias - springs))
+
+    @property
+    def contract(self) -> EngineContract:
+        terms = self._terms(np.concatenate([self.native.zero(), np.zeros(self.nv)]))
+        precision = str(self.model.qpos0.dtype)
+        return read_contract(
+            self.model, terms, self.native, self.description, who="MJX", engine=self.name, precision=precision,
+            derivatives="by tangent vectors of qpos and by qvel, jax.jacfwd",
+        )  # fmt: skip
+
+    def _point(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
+        return finite_array("x", x, (self.nq + self.nv,)), finite_array("u", u, (self.nu,))
+
+    def _terms(self, x: Array) -> Any:
+        """mjx.Data of NumPy arrays, with what depends on position and velocity alone."""
+        return self._run(_terms_at, x, np.zeros(self.nu))
+
+    def _run(self, function: Any, x: Array, u: Array) -> Any:
+        with jax.enable_x64(True):
+            native = np.concatenate([*self.native.to_native(x), self.native.control(u)])
+            return jax.tree.map(np.asarray, function(self.mjx, self.data, native))
+
+
+def _placed(m: Any, d: Any, native: Any) -> Any:
+    return d.replace(qpos=native[: m.nq], qvel=native[m.nq : m.nq + m.nv], ctrl=native[m.nq + m.nv :])
+
+
+def _stepped(m: Any, d: Any, native: Any) -> tuple[Any, Any]:
+    """(nq + nv,) after the step, and what the solver left of the forces unbalanced."""
+    d = mjx.step(m, _placed(m, d, native))
+    force = d.qfrc_smooth + d.qfrc_constraint
+    left = jnp.abs(mjx.mul_m(m, d, d.qacc) - force).max() / jnp.maximum(1.0, jnp.abs(force).max())
+    return jnp.concatenate([d.qpos, d.qvel]), left
+
+
+def _kinematics(m: Any, d: Any, native: Any) -> Any:
+    return mjx.com_pos(m, mjx.kinematics(m, _placed(m, d, native)))
+
+
+def _position_and_velocity(m: Any, d: Any, native: Any) -> Any:
+    return mjx.rne(m, mjx.passive(m, mjx.com_vel(m, _kinematics(m, d, native))))
+
+
+def _mass_matrix(m: Any, d: Any, native: Any) -> Any:
+    return mjx.full_m(m, mjx.crb(m, _kinematics(m, d, native)))
+
+
+def _distances(m: Any, d: Any, native: Any) -> Any:
+    return mjx.collision(m, _kinematics(m, d, native))._impl.contact.dist
+
+
+_terms_at, _mass_at, _distances_at = (jax.jit(f) for f in (_position_and_velocity, _mass_matrix, _distances))
+_step = jax.jit(_stepped)
+_step_derivative = jax.jit(jax.jacfwd(_stepped, argnums=2, has_aux=True))

@@ -1,0 +1,378 @@
+"""Read the contract out of PhysX (`link`: its articulation link), and what its shapes are given for their contacts.
+
+PhysX has friction by shape and makes the pair's by the mean of the two.
+
+PhysX by SAPIEN on the CPU, in single precision, on articulations built link by link from Drake's plant.
+
+With PhysX's own solver (PGS, which SAPIEN's default TGS is not: it damps in sub-steps) the step of hinges and slides is
+Drake's, joint damping implicit. A free body moves by the velocity of its centre of mass and turns by the exponential
+of h w'; the explicit w' is scaled to the angular momentum that it had. Contacts and limits are rigid. A new scene is
+built for each call, since PhysX keeps contacts from one step to the next.
+
+A free body's native state is (p, quaternion w x y z) and (v of the centre of mass, w), both in world.
+"""
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.math import RigidTransform, RotationMatrix
+
+from drake_diff._base.arrays import Array, finite_array
+from drake_diff.engines.interface import EngineContract, StepJacobian
+from drake_diff.engines.mujoco.mjcf import principal
+from drake_diff.engines.numpy import DRAKES_STEP, EACH_CALL
+from drake_diff.exceptions import MissingDependencyError, ModelError, NotOfferedError, SimulationError
+from drake_diff.mechanics.coordinates import Centers, rotation, unit, zero
+from drake_diff.mechanics.description import Geometry, RigidLink, RigidLinks, describe, joint_contract, rigid_links
+from drake_diff.mechanics.joints import JointContract, PairContract, split
+from drake_diff.model.model import Model
+
+KINDS = {"revolute_unwrapped": "revolute", "prismatic": "prismatic", "undefined": "quaternion_floating"}
+GROUPS = 32  # bits of a collision group
+Pair = tuple[str, str]
+
+
+def touching(tree: RigidLinks) -> tuple[tuple[PairContract, ...], tuple[Pair, ...]]:
+    """The pairs that PhysX can have, and those between a link and its parent, which never touch in PhysX."""
+    owner = {geometry.name: number for number, geometry in tree.geometries}
+
+    def adjacent(pair: PairContract) -> bool:
+        a, b = sorted(owner[name] for name in pair.names)
+        return a >= 0 and tree.links[b].parent == a
+
+    found = tuple(pair for pair in tree.pairs if not adjacent(pair))
+    return found, tuple(pair.names for pair in tree.pairs if adjacent(pair))
+
+
+def groups_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, tuple[int, int]]:
+    """Of each shape its own bit and those of its partners; those with the same partners share a bit. ModelError."""
+    names = sorted({name for pair in pairs for name in pair.names})
+    partners = {a: frozenset(b for pair in pairs if a in pair.names for b in pair.names if b != a) for a in names}
+    kinds = list(dict.fromkeys(partners[name] for name in names))
+    if len(kinds) > GROUPS:
+        raise ModelError(f"PhysX tells {GROUPS} groups of shapes apart, and here are {len(kinds)} with other partners")
+    bit = {name: 1 << kinds.index(partners[name]) for name in names}
+    masks = dict.fromkeys(names, 0)
+    for name in names:
+        for partner in partners[name]:
+            masks[name] |= bit[partner]
+    return {name: (bit[name], masks[name]) for name in names}
+
+
+def friction_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, float]:
+    """[1] of each shape, as near to those of the pairs as they can come; the contract shows what comes of it."""
+    given = [(pair.names, 2 * pair.friction) for pair in pairs if pair.friction is not None]
+    return {name: max(value, 0.0) for name, value in split(given).items()}
+
+
+def read_part(link: Any) -> tuple[float, Array, Array, Array]:
+    """Mass, centre of mass (3,), inertia (3, 3) about it and orientation of the body (3, 3), in world."""
+    pose, at = link.entity_pose, link.cmass_local_pose
+    body = rotation(np.array(pose.q, dtype=float))
+    R = body @ rotation(np.array(at.q, dtype=float))
+    center = np.array(pose.p, dtype=float) + body @ np.array(at.p, dtype=float)
+    return float(link.mass), center, R @ np.diag(np.array(link.inertia, dtype=float)) @ R.T, body
+
+
+def read_joint(link: Any, rigid: RigidLink) -> JointContract:
+    """Where PhysX is at Drake's q = 0; springs are those of the engine."""
+    mass, center, inertia, body = read_part(link)
+    joint, kind = link.joint, KINDS[link.joint.type]
+    single, at = kind != "quaternion_floating", link.joint.pose_in_child
+    limit = np.array(joint.limit, dtype=float).ravel() if single else np.array([-np.inf, np.inf])
+    return joint_contract(
+        name=joint.name,
+        kind=kind,
+        axis=body @ rotation(np.array(at.q, dtype=float))[:, 0] if single else np.zeros(3),
+        anchor=np.array(link.entity_pose.p, dtype=float) + body @ np.array(at.p, dtype=float),
+        carried=[(mass, center, inertia)],
+        damping=float(joint.damping) if single else 0.0,
+        armature=float(joint.armature[0]) if single else 0.0,
+        stiffness=rigid.joint.stiffness,
+        rest=rigid.joint.rest,
+        lower=float(limit[0]),
+        upper=float(limit[1]),
+    )
+
+
+try:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Failed to find system libvulkan")  # nothing is drawn here
+        import sapien
+        from sapien import physx
+except ImportError as error:
+    raise MissingDependencyError("this engine needs SAPIEN: pip install 'drake-diff[forward]'") from error
+
+UNLIMITED = 1e6  # [rad/s or m/s] instead of PhysX's 100 and 50
+# PhysX takes a mass [kg] or moment of inertia [kg m^2] of 0 for infinite: massless links and point masses get this.
+SMALLEST = 1e-9
+ITERATIONS = 100  # of the solver, instead of 10: damping of one joint is felt by the others
+NOT_OFFERED = "PhysX gives neither mass matrix nor inverse dynamics; SAPIEN's are those of Pinocchio on another model"
+
+
+@dataclass
+class World:
+    """One scene: its links in the order of the rigid links, and the articulation of each tree."""
+
+    system: Any
+    scene: Any
+    links: list[Any]
+    trees: list[Any]
+
+
+class SapienEngine:
+    """Trees of hinges, slides and free bodies; contacts of spheres, boxes, cylinders, capsules and half spaces.
+
+    `status` is "ok" after every step that is finite: PhysX does not say how well it solved.
+    """
+
+    name = "sapien (PhysX, PGS)"
+
+    def __init__(self, model: Model):
+        self.description = describe(model)
+        self.tree = rigid_links(self.description)
+        self.time_step, self.coordinates = model.time_step, self.description.coordinates
+        self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
+        self.version, self.status = str(sapien.__version__), "ok"
+        self.actuation, self.limits = self.description.actuation, self.description.effort_limits
+        self.stiffness, self.rest = (self.description.by_velocity(name) for name in ("stiffness", "rest"))
+        self.pairs, self.adjacent = touching(self.tree)
+        self.friction, self.groups = friction_by_shape(self.pairs), groups_by_shape(self.pairs)
+        centers = {x.joint.v_start: x.center_of_mass for x in self.tree.links if x.free}
+        self.centers = Centers(self.coordinates, tuple(centers[v] for _, v in self.coordinates.free))
+
+    def step(self, x: ArrayLike, u: ArrayLike) -> Array:
+        x, u = finite_array("x", x, (self.nq + self.nv,)), finite_array("u", u, (self.nu,))
+        force = self.actuation @ np.clip(u, -self.limits, self.limits)
+        world = self._world(x, force - self.stiffness * (self._single(x[: self.nq]) - self.rest))
+        world.scene.step()
+        return self._state(world, x, u)
+
+    def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
+        raise NotOfferedError("PhysX has no derivatives of its step")
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        raise NotOfferedError(NOT_OFFERED)
+
+    def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
+        raise NotOfferedError(NOT_OFFERED)
+
+    def energy(self, x: ArrayLike) -> float:
+        x = finite_array("x", x, (self.nq + self.nv,))
+        q, v = x[: self.nq], x[self.nq :]
+        world = self._world(x, np.zeros(self.nv))
+        gravity, stretch = np.array(world.system.config.gravity, dtype=float), self._single(q) - self.rest
+        total = float(stretch @ (self.stiffness * stretch)) / 2 + self.tree.anchored_energy
+        for link, rigid in zip(world.links, self.tree.links, strict=True):
+            mass, center, inertia, _ = read_part(link)
+            w, v_center = np.array(link.angular_velocity, dtype=float), np.array(link.linear_velocity, dtype=float)
+            total += mass * (v_center @ v_center / 2 - gravity @ center) + float(w @ inertia @ w) / 2
+            if not rigid.free:
+                total += float(link.joint.armature[0]) * float(v[rigid.joint.v_start]) ** 2 / 2
+        return float(total)
+
+    def contact_depth(self, x: ArrayLike) -> float:
+        """PhysX finds contacts as it steps, where the bodies are before it."""
+        world = self._world(finite_array("x", x, (self.nq + self.nv,)), np.zeros(self.nv))
+        world.scene.step()
+        points = [point for contact in world.system.get_contacts() for point in contact.points]
+        return max([0.0, *(-float(point.separation) for point in points)])
+
+    @property
+    def contract(self) -> EngineContract:
+        left_out = [*self.tree.left_out, *self.adjacent]
+        world = self._world(np.concatenate([zero(self.coordinates), np.zeros(self.nv)]), np.zeros(self.nv))
+        joints = {x.joint.v_start: read_joint(link, x) for link, x in zip(world.links, self.tree.links, strict=True)}
+        names = [joint.name for tree in world.trees for joint in tree.joints if joint.type in KINDS]
+        return EngineContract(
+            engine=self.name,
+            joints=tuple(joints[v] for v in sorted(joints)),
+            native_order=tuple(names),
+            state="position of the body's origin, quaternion w x y z after it; velocity of a free body linear of its "
+            "centre of mass then angular, in world",
+            inputs=self.description.inputs,
+            actuation=tuple(tuple(float(b) for b in row) for row in self.actuation),
+            effort_limits=tuple(float(limit) for limit in self.limits),
+            time_step=float(world.system.timestep),
+            integrator=self._integrator(),
+            gravity=tuple(float(g) for g in world.system.config.gravity),
+            contact_law="rigid, Coulomb's friction by patches" if self.pairs else "none",
+            contacts=tuple(PairContract(pair.names, self._friction(pair), None) for pair in self.pairs),
+            solver_tolerance=None,
+            limit_law="rigid",
+            reset=EACH_CALL,
+            precision="float32",
+            reasons={
+                "integrator": "PhysX moves free bodies by their centres of mass and turns them by the exponential",
+                "contact law": "PhysX's contacts are rigid",
+                "contact pairs": "PhysX's contacts have no stiffness"
+                + (f", and no contact pair of {left_out} is built" if left_out else ""),
+                "limit law": "PhysX's limits are rigid",
+                "solver tolerance": "PhysX iterates as often as it is told",
+            },
+        )
+
+    def _integrator(self) -> str:
+        if not self.coordinates.free:
+            return DRAKES_STEP
+        return (
+            "semi-implicit Euler, joint damping implicit, free bodies by v' of the centre of mass, quaternions by the "
+            "exponential of h w', w' scaled to the angular momentum before"
+        )
+
+    def _friction(self, pair: PairContract) -> float:
+        a, b = (_material(self.friction.get(name)).dynamic_friction for name in pair.names)
+        return float(a + b) / 2
+
+    def _single(self, q: Array) -> Array:
+        """(nv,) the positions of hinges and slides."""
+        found = np.zeros(self.nv)
+        for i, j in self.coordinates.single:
+            found[j] = q[i]
+        return found
+
+    def _world(self, x: Array, force: Array) -> World:
+        """A scene at `x` (nx,), with `force` (nv,) on its joints."""
+        world = self._empty()
+        world.links = self._links(world.scene)
+        world.trees = [world.links[tree.start].articulation for tree in self.tree.trees]
+        for geometry in (g for number, g in self.tree.geometries if number < 0 and g.name in self.groups):
+            body = physx.PhysxRigidStaticComponent()
+            body.attach(self._shape(geometry))
+            entity = sapien.Entity()
+            entity.add_component(body)
+            world.scene.add_entity(entity)
+        q = unit(self.coordinates, x[: self.nq])
+        v = self.centers.turn(q) @ x[self.nq :]
+        for tree, part in zip(world.trees, self.tree.trees, strict=True):
+            self._place(tree, part, q, v, force)
+        return world
+
+    def _empty(self) -> World:
+        scene, body = physx.get_scene_config(), physx.get_body_config()
+        gravity = [float(g) for g in self.description.gravity]
+        try:  # PhysX's configuration is one for the whole process, and read as a scene and a link are made
+            physx.set_scene_config(gravity=gravity, enable_tgs=False, enable_enhanced_determinism=True)
+            physx.set_body_config(solver_position_iterations=ITERATIONS, sleep_threshold=0.0)
+            system = physx.PhysxCpuSystem()
+        finally:
+            physx.set_scene_config(scene)
+            physx.set_body_config(body)
+        world = sapien.Scene([system])
+        system.timestep = self.time_step
+        return World(system, world, [], [])
+
+    def _links(self, scene: Any) -> list[Any]:
+        found: list[Any] = []
+        for i, rigid in enumerate(self.tree.links):
+            parent = found[rigid.parent] if rigid.parent >= 0 else None if rigid.free else _fixed(scene)
+            link = physx.PhysxArticulationLinkComponent(parent)
+            entity = sapien.Entity()
+            entity.add_component(link)
+            moments, turn = principal(rigid.inertia)
+            link.mass = max(rigid.mass, SMALLEST)
+            link.cmass_local_pose = sapien.Pose(rigid.center_of_mass, turn)
+            link.inertia = np.maximum(moments, SMALLEST)
+            _inert(link)
+            for geometry in (g for number, g in self.tree.geometries if number == i and g.name in self.groups):
+                link.attach(self._shape(geometry))
+            link.joint.name = link.name = rigid.joint.joint
+            if not rigid.free:
+                _set_joint(link.joint, rigid)
+            found.append(link)
+            scene.add_entity(entity)
+        return found
+
+    def _shape(self, geometry: Geometry) -> Any:
+        shape = _bare_shape(geometry, _material(self.friction.get(geometry.name)))
+        shape.set_collision_groups([*self.groups[geometry.name], 0, 0])
+        return shape
+
+    def _place(self, tree: Any, part: range, q: Array, v: Array, force: Array) -> None:
+        tree.set_solver_position_iterations(ITERATIONS)
+        tree.sleep_threshold = 0.0
+        rigid = {self.tree.links[i].joint.joint: self.tree.links[i] for i in part}
+        root = self.tree.links[part.start]
+        if root.free:
+            i, j = root.joint.q_start, root.joint.v_start
+            tree.root_pose = sapien.Pose(q[i + 4 : i + 7], q[i : i + 4])
+            tree.root_linear_velocity, tree.root_angular_velocity = v[j + 3 : j + 6], v[j : j + 3]
+        joints = [rigid[joint.name].joint for joint in tree.active_joints]
+        if joints:
+            with np.errstate(over="ignore"):  # what is beyond single precision is inf, and SimulationError
+                tree.qpos = np.array([q[x.q_start] for x in joints]).astype(np.float32)
+                tree.qvel = np.array([v[x.v_start] for x in joints]).astype(np.float32)
+                tree.qf = np.array([force[x.v_start] for x in joints]).astype(np.float32)
+
+    def _state(self, world: World, x: Array, u: Array) -> Array:
+        q, v = np.zeros(self.nq), np.zeros(self.nv)
+        for tree, part in zip(world.trees, self.tree.trees, strict=True):
+            rigid = {self.tree.links[i].joint.joint: self.tree.links[i].joint for i in part}
+            for joint, position, speed in zip(tree.active_joints, tree.qpos, tree.qvel, strict=True):
+                q[rigid[joint.name].q_start], v[rigid[joint.name].v_start] = position, speed
+            root = self.tree.links[part.start]
+            if root.free:
+                i, j = root.joint.q_start, root.joint.v_start
+                q[i : i + 4], q[i + 4 : i + 7] = tree.root_pose.q, tree.root_pose.p
+                v[j + 3 : j + 6], v[j : j + 3] = tree.root_linear_velocity, tree.root_angular_velocity
+        if not (np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
+            raise SimulationError(f"PhysX cannot take this step, from x = {x}, u = {u}")
+        return np.concatenate([q, np.linalg.solve(self.centers.turn(q), v)])
+
+
+def _fixed(scene: Any) -> Any:
+    """A new link that is fixed to the world."""
+    link = physx.PhysxArticulationLinkComponent(None)
+    entity = sapien.Entity()
+    entity.add_component(link)
+    link.mass, link.inertia = 1.0, np.ones(3)
+    link.joint.type = "fixed"
+    scene.add_entity(entity)
+    return link
+
+
+def _inert(link: Any) -> None:
+    """Without PhysX's drag and bounds."""
+    link.linear_damping = link.angular_damping = 0.0
+    link.max_linear_velocity = link.max_angular_velocity = UNLIMITED
+
+
+def _set_joint(joint: Any, rigid: RigidLink) -> None:
+    along = RigidTransform(RotationMatrix.MakeFromOneVector(rigid.axis, 0), np.zeros(3))  # PhysX's axis is x
+    joint.type = "revolute_unwrapped" if rigid.joint.kind == "revolute" else "prismatic"
+    joint.pose_in_parent, joint.pose_in_child = _pose(rigid.on_parent @ along), _pose(along)
+    joint.limit = np.array([[rigid.joint.lower, rigid.joint.upper]], dtype=np.float32)
+    joint.friction, joint.armature = 0.0, np.array([rigid.joint.armature], dtype=np.float32)
+    joint.max_velocity = UNLIMITED
+    joint.set_drive_properties(0.0, rigid.joint.damping)
+
+
+def _material(friction: float | None) -> Any:
+    """SAPIEN's own where Drake gives none."""
+    if friction is None:
+        return physx.get_default_material()
+    return physx.PhysxMaterial(friction, friction, 0.0)
+
+
+def _bare_shape(geometry: Geometry, material: Any) -> Any:
+    shape, kind, X = geometry.shape, type(geometry.shape).__name__, geometry.pose
+    if kind == "Sphere":
+        found = physx.PhysxCollisionShapeSphere(shape.radius(), material)
+    elif kind == "Box":
+        found = physx.PhysxCollisionShapeBox([shape.width() / 2, shape.depth() / 2, shape.height() / 2], material)
+    else:  # PhysX's axis is x, Drake's z
+        X = X @ RigidTransform(RotationMatrix.MakeYRotation(-np.pi / 2), np.zeros(3))
+        if kind == "HalfSpace":
+            found = physx.PhysxCollisionShapePlane(material)
+        else:
+            make = physx.PhysxCollisionShapeCylinder if kind == "Cylinder" else physx.PhysxCollisionShapeCapsule
+            found = make(shape.radius(), shape.length() / 2, material)
+    found.local_pose = _pose(X)
+    return found
+
+
+def _pose(X: RigidTransform) -> Any:
+    return sapien.Pose(X.translation(), X.rotation().ToQuaternion().wxyz())

@@ -1,0 +1,193 @@
+"""What the other side of an export has to do, in words.
+
+A model for an engine that cannot be had here: model file, contract, states to start from, and what to record.
+
+`read_recording` and `compare` take what comes back. Nothing is written unless the small models are right, and unless
+the file, read back, says what the plant does.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from drake_diff._base.arrays import positive_int
+from drake_diff.engines.drake import DrakeEngine
+from drake_diff.engines.interface import EngineContract
+from drake_diff.exceptions import CertificateError, InputError, MissingDependencyError, ModelError, UnknownNameError
+from drake_diff.export.read_back import SUFFIX, complaints, named_in, written
+from drake_diff.export.small_models import check_small_models
+from drake_diff.mechanics.description import Description, describe
+from drake_diff.model.model import Model
+from drake_diff.model.sampling import ATTEMPTS, DEPTH, EFFORT, REACH, SPEED, SampledState, sample_states
+
+README = """# {name} for {target}
+
+Written by drake_diff from Drake's plant. `{file}` has every number of its bodies and joints; `contract.json` has them
+again, with what the file cannot say (null is a limit that is none, or a value that the model does not give).
+Shapes that are not in the file, to be added by hand: {left_out}. {about_usd}
+
+## Set
+
+{settings}
+
+## Run
+
+`initial_states.csv` has {count} states (seed {seed}). From each, apply the row of `inputs.csv` with the same number,
+for the whole motion, for about a second. Start at exactly this state: no settling, no noise. Their distribution:
+{distribution}.
+
+## Record
+
+One CSV file per motion, a row per sample, SI units, all digits of the numbers:
+
+    {header}
+
+`time` in whole multiples of {h} s. A free body's quaternion is w x y z, its velocities (angular _wx _wy _wz, linear
+_vx _vy _vz, of the body frame's origin) are both expressed in the world. `position.JOINT` and `velocity.JOINT` do for
+joints of one degree of freedom. An MCAP file or bag of ROS 2 messages (sensor_msgs/JointState, nav_msgs/Odometry) does
+too. Beside `run.csv` put `run.contract.json` with what is known of the engine:
+
+    {{"engine": "...", "version": "...", "precision": "float32", "time step": {h}, "integrator": "...",
+     "contact law": "...", "limit law": "...", "gravity": {gravity}, "seeds": [...], "reset distribution": "..."}}
+
+What it does not say is reported as not told.
+
+## Compare
+
+    drake-diff compare MODEL --recording run.csv
+"""
+COMMON = """- time step {h} s, one step of the solver each; gravity {gravity} m/s^2
+- integrator: {integrator}. If yours is another, say so in the contract
+- contact: {contact_law}; friction and stiffness of each pair are in `contract.json`
+- rotor inertia (`armature`), damping and springs of the joints as in `contract.json`: check that your reader took them
+- forces on joints, no position or velocity drives; inputs: {inputs}"""
+OF_TARGET: Mapping[str, str] = {
+    "gazebo": """
+- Gazebo reads no `drake:rotor_inertia`: where `contract.json` has an armature, it is missing there
+- one physics step per update (`max_step_size` is in the file), real-time factor 0; friction of a pair is
+  2 a b / (a + b) in Drake; the file has a number where all pairs have the same""",
+    "isaaclab": """
+- `UrdfConverterCfg`: fix_base where the model hangs on the world, merge_fixed_joints False, joint_drive target type
+  none. Neither URDF nor the USD has friction and contact stiffness
+- environment parity: sim.dt = {h}, decimation = 1, render_interval = 1, gravity {gravity}, no action scale or clip
+- actuators: ImplicitActuatorCfg with stiffness 0, damping and armature of `contract.json`, effort limits as there
+- solver: TGS, 32 position and 1 velocity iterations, or say which; no contact offset, no bounce (restitution 0),
+  linear and angular damping of bodies 0, no limit of velocities
+- friction: both sides of a pair the value of `contract.json`, friction_combine_mode "average"; restitution likewise
+- reset: write_root_pose_to_sim, write_root_velocity_to_sim and write_joint_state_to_sim with exactly these states, no
+  randomization events, no observation noise; log the seed all the same, and the reset distribution. Isaac Lab 3 has
+  quaternions as x y z w, before it w x y z; the CSV has w x y z""",
+}
+
+
+def readme(
+    target: str,
+    file: str,
+    model: Model,
+    contract: EngineContract,
+    made: Mapping[str, Any],
+    left_out: Sequence[str],
+    about_usd: str,
+) -> str:
+    """README.md of an export; `made` has count, seed and distribution of the states, `left_out` names geometries."""
+    facts = {
+        "h": repr(contract.time_step),
+        "gravity": list(contract.gravity),
+        "integrator": contract.integrator,
+        "contact_law": contract.contact_law,
+        "inputs": ", ".join(contract.inputs) or "none",
+    }
+    settings = (COMMON + OF_TARGET.get(target, "")).format(**facts)
+    header = ",".join(["time", *model.state_names, *model.input_names])
+    shapes = ", ".join(left_out) or "none"
+    return README.format(
+        name=model.name, target=target, file=file, settings=settings, header=header, left_out=shapes,
+        about_usd=about_usd, **facts, **made,
+    )  # fmt: skip
+
+
+TARGETS = {"gazebo": "sdf", "isaaclab": "urdf", "urdf": "urdf", "sdf": "sdf", "mjcf": "mjcf"}  # the format of each
+DISTRIBUTION = (
+    f"positions uniform in the middle 90 % of their limits, else within {REACH:g} m or pi rad of the default; "
+    f"quaternions uniform on the sphere; velocities normal with deviation {SPEED:g}, cut at their limits; inputs "
+    f"uniform within {EFFORT:g} of their limits, of 1 N or N m without; free: without overlap, if "
+    f"one of {ATTEMPTS} tries is; contact: every other state where something can touch, {DEPTH[0]:g} to {DEPTH[1]:g} m "
+    "deep"
+)
+
+
+def export_model(model: Model, directory: str | Path, *, target: str, states: int = 20, seed: int = 0) -> list[Path]:
+    """Write `model` for `target` (gazebo, isaaclab, urdf, sdf, mjcf) to the new `directory`; gives the files.
+
+    The model file (SDF for gazebo, URDF for isaaclab, and USD where usd-core is installed and can say it),
+    contract.json (what Drake uses), initial_states.csv and inputs.csv (`states` seeded samples, and the input to hold
+    from each), README.md (what to set, what to record and how to compare).
+
+    Raises CertificateError, naming the check, where a deterministic check of the small models fails; ModelError where
+    no other engine can have the model or the format cannot say all of it; InputError for bad input. Nothing is written
+    then.
+    """
+    directory = Path(directory)
+    if target not in TARGETS:
+        raise UnknownNameError("target", got=target, known=TARGETS)
+    if directory.exists() or not directory.parent.is_dir():
+        raise InputError("directory", got=str(directory), expected="one that does not exist, in one that does")
+    samples = sample_states(model, positive_int("states", states), seed)
+    failed = [check for check in check_small_models() if not check.holds]
+    if failed:
+        raise CertificateError(f"nothing is exported: the check {failed[0].name!r} failed: {failed[0].found}")
+    form = TARGETS[target]
+    description = describe(model)
+    text = written(form, description, model.time_step)
+    missing = complaints(form, model, text)
+    if missing:
+        raise ModelError(f"nothing is exported: {form} does not hold this model; " + "; ".join(missing))
+    made_usd, about_usd = _usd(description) if target == "isaaclab" else ({}, "")
+    left_out = [g.name for g in description.geometries if named_in(form, g.name) not in text]
+    contract = DrakeEngine(model).contract
+    made = {"seed": seed, "count": states, "distribution": DISTRIBUTION}
+    files = {
+        f"model{SUFFIX[form]}": text,
+        "contract.json": json.dumps(_plain({**asdict(contract), "initial_states": made}), indent=1) + "\n",
+        "initial_states.csv": _table(["state", "kind", *model.state_names], samples, lambda s: [s.kind, *s.x]),
+        "inputs.csv": _table(["state", *model.input_names], samples, lambda s: list(s.u)),
+        "README.md": readme(target, f"model{SUFFIX[form]}", model, contract, made, left_out, about_usd),
+        **made_usd,
+    }
+    directory.mkdir()
+    for name, content in files.items():
+        (directory / name).write_text(content)
+    return [directory / name for name in files]
+
+
+def _usd(description: Description) -> tuple[dict[str, str], str]:
+    """The USD file, if one can be written, and what README.md says of it."""
+    try:
+        from drake_diff.export.usd import usd
+
+        return {"model.usda": usd(description)}, "`model.usda` is the same model in USD, in float32."
+    except (MissingDependencyError, ModelError) as error:
+        return {}, f"No USD is written: {error}. UrdfConverter makes one."
+
+
+def _table(header: list[str], samples: Iterable[SampledState], row: Any) -> str:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(header)
+    for i, sample in enumerate(samples):
+        writer.writerow([i, *(value if isinstance(value, str) else repr(float(value)) for value in row(sample))])
+    return out.getvalue()
+
+
+def _plain(value: Any) -> Any:
+    """As JSON has it: no infinity, which here is a limit that is none, and becomes null."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not isfinite(value) else value

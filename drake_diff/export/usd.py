@@ -1,0 +1,142 @@
+"""Drake's plant as USD with UsdPhysics, in the float32 that its schemas have; the frames are those of `urdf`.
+
+Angles of joints are in degrees there, and so are limits and damping. Joint damping is a drive to velocity 0, which
+PhysX takes implicitly; the armature is PhysX's own attribute.
+"""
+
+from typing import Any
+
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+
+from drake_diff.engines.mujoco.mjcf import principal
+from drake_diff.engines.urdf import poses_at_zero
+from drake_diff.exceptions import MissingDependencyError, ModelError
+from drake_diff.mechanics.description import Description, Geometry, Link
+
+try:
+    from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
+except ImportError as error:
+    raise MissingDependencyError("USD needs usd-core: pip install 'drake-diff[usd]'") from error
+
+ROOT, GROUND = "/robot", "/fixed_to_the_world"
+
+
+def usd(description: Description) -> str:
+    """The text of a .usda file. Shapes that are no sphere, box, cylinder or capsule are left out, and friction is.
+
+    ModelError where a link has no mass or moment of inertia, which USD takes for one to be computed from its shapes,
+    and where a name is none of USD's.
+    """
+    _check(description)
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
+    scene, size = UsdPhysics.Scene.Define(stage, "/physicsScene"), float(np.linalg.norm(description.gravity))
+    scene.CreateGravityDirectionAttr(_vector(description.gravity / size if size else [0, 0, -1]))
+    scene.CreateGravityMagnitudeAttr(size)
+    root = UsdGeom.Xform.Define(stage, ROOT).GetPrim()
+    stage.SetDefaultPrim(root)
+    UsdPhysics.ArticulationRootAPI.Apply(root)
+    bodies, frames = poses_at_zero(description)
+    for link in description.links:
+        _add_link(stage, link, frames[link.body], bodies[link.body])
+    for link in description.links:
+        if link.kind != "quaternion_floating":
+            axis = (bodies[link.parent] @ link.on_parent).rotation().matrix() @ link.axis
+            _add_joint(stage, link, frames[link.parent].inverse() @ frames[link.body], axis)
+    for i, geometry in enumerate(description.geometries):
+        _add_geometry(stage, i, geometry, frames[geometry.body].inverse() @ bodies[geometry.body] @ geometry.pose)
+    return str(stage.GetRootLayer().ExportToString())
+
+
+def _check(description: Description) -> None:
+    for link in description.links:
+        if link.mass <= 0 or np.any(principal(link.inertia)[0] <= 0):
+            raise ModelError(f"link {link.body}: USD takes a mass or moment of inertia of 0 for one to be computed")
+        for name in (link.body, link.joint):
+            if not Tf.IsValidIdentifier(name):
+                raise ModelError(f"{name!r} is no name that USD has")
+
+
+def _vector(values: Any) -> Any:
+    return Gf.Vec3f(*(float(value) for value in values))
+
+
+def _quaternion(wxyz: Any) -> Any:
+    return Gf.Quatf(*(float(value) for value in wxyz))
+
+
+def _place(shape: Any, X: RigidTransform) -> None:
+    w, *xyz = (float(value) for value in X.rotation().ToQuaternion().wxyz())
+    shape.AddTranslateOp().Set(Gf.Vec3d(*(float(p) for p in X.translation())))
+    shape.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, *xyz))
+
+
+def _add_link(stage: Any, link: Link, frame: RigidTransform, body: RigidTransform) -> None:
+    form = UsdGeom.Xform.Define(stage, f"{ROOT}/{link.body}")
+    _place(form, frame)
+    UsdPhysics.RigidBodyAPI.Apply(form.GetPrim())
+    X = frame.inverse() @ body
+    R = X.rotation().matrix()
+    moments, turn = principal(R @ link.inertia @ R.T)
+    mass = UsdPhysics.MassAPI.Apply(form.GetPrim())
+    mass.CreateMassAttr(link.mass)
+    mass.CreateCenterOfMassAttr(_vector(X @ link.center_of_mass))
+    mass.CreateDiagonalInertiaAttr(_vector(moments))
+    mass.CreatePrincipalAxesAttr(_quaternion(turn))
+
+
+def _add_joint(stage: Any, link: Link, at: RigidTransform, axis: Any) -> None:
+    kinds = {
+        "weld": UsdPhysics.FixedJoint,
+        "revolute": UsdPhysics.RevoluteJoint,
+        "prismatic": UsdPhysics.PrismaticJoint,
+    }
+    joint = kinds[link.kind].Define(stage, f"{ROOT}/joints/{link.joint}")
+    if link.parent != "world":
+        joint.CreateBody0Rel().SetTargets([f"{ROOT}/{link.parent}"])
+    joint.CreateBody1Rel().SetTargets([f"{ROOT}/{link.body}"])
+    joint.CreateLocalPos0Attr(_vector(at.translation()))
+    joint.CreateLocalPos1Attr(_vector([0, 0, 0]))
+    if link.kind == "weld":
+        return
+    turn = _quaternion(RotationMatrix.MakeFromOneVector(axis / np.linalg.norm(axis), 0).ToQuaternion().wxyz())
+    joint.CreateAxisAttr("X")
+    joint.CreateLocalRot0Attr(turn)
+    joint.CreateLocalRot1Attr(turn)
+    unit = 180 / np.pi if link.kind == "revolute" else 1.0
+    for limit, create in ((link.lower, joint.CreateLowerLimitAttr), (link.upper, joint.CreateUpperLimitAttr)):
+        if np.isfinite(limit):
+            create(float(limit * unit))
+    drive = UsdPhysics.DriveAPI.Apply(joint.GetPrim(), "angular" if link.kind == "revolute" else "linear")
+    drive.CreateTypeAttr("force")
+    drive.CreateDampingAttr(float(link.damping / unit))
+    drive.CreateStiffnessAttr(float(link.stiffness / unit))
+    drive.CreateTargetPositionAttr(float(link.rest * unit))
+    joint.GetPrim().AddAppliedSchema("PhysxJointAPI")
+    joint.GetPrim().CreateAttribute("physxJoint:armature", Sdf.ValueTypeNames.Float).Set(float(link.armature))
+
+
+def _add_geometry(stage: Any, number: int, geometry: Geometry, X: RigidTransform) -> None:
+    shape, kind = geometry.shape, type(geometry.shape).__name__
+    parent = GROUND if geometry.body == "world" else f"{ROOT}/{geometry.body}"
+    path = f"{parent}/collision_{number}"
+    if kind == "Sphere":
+        form = UsdGeom.Sphere.Define(stage, path)
+        form.CreateRadiusAttr(shape.radius())
+    elif kind in ("Cylinder", "Capsule"):
+        form = getattr(UsdGeom, kind).Define(stage, path)
+        form.CreateAxisAttr("Z")
+        form.CreateRadiusAttr(shape.radius())
+        form.CreateHeightAttr(shape.length())
+    elif kind == "Box":
+        form = UsdGeom.Cube.Define(stage, path)
+        form.CreateSizeAttr(1.0)
+    else:
+        return
+    _place(form, X)
+    if kind == "Box":
+        form.AddScaleOp().Set(_vector([shape.width(), shape.depth(), shape.height()]))
+    UsdPhysics.CollisionAPI.Apply(form.GetPrim())

@@ -1,0 +1,248 @@
+"""The channels of trace.mcap that show motions in simulated time: states, inputs, joints, frames, contact, energies."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import SimulationError
+from drake_diff.logs.messages import TYPES
+from drake_diff.logs.write import Channel
+from drake_diff.model.contact import ContactPoint
+from drake_diff.model.model import Model
+from drake_diff.model.plant import actuators, bodies, joints
+from drake_diff.model.step import set_state
+from drake_diff.motion.rollout import Rollout
+
+ARROW_LENGTH_PER_NEWTON = 0.02  # [m/N]
+GHOST = "planned/"  # before a body's name: its frame as planned
+
+Rows = Iterator[tuple[int, Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What is shown: a model, its states as planned, and the motion of the discrete plant where there is one."""
+
+    model: Model
+    time_step: float  # [s]
+    planned_xs: Array  # (N+1, nx)
+    motion: Rollout | None
+
+    @property
+    def xs(self) -> Array:
+        """The motion's states; none where it could not be taken."""
+        return np.zeros((0, self.model.nx)) if self.motion is None else self.motion.xs
+
+    @property
+    def us(self) -> Array:
+        """The motion's inputs; none where it could not be taken."""
+        return np.zeros((0, self.model.nu)) if self.motion is None else self.motion.us
+
+    def times(self, count: int) -> Array:
+        """The first `count` times [s]: k h."""
+        return np.asarray(self.time_step * np.arange(count), dtype=float)
+
+
+def motion_channels(shown: Shown) -> Iterator[Channel]:
+    """The motion of the discrete plant, with everything measured along it, and the planned joints and frames."""
+    yield state_channel(shown, "/state", shown.xs)
+    yield input_channel(shown, "/input", shown.times(len(shown.us)), shown.us)
+    efforts = None if shown.motion is None else shown.motion.efforts
+    yield _joint_states(shown, "/joint_states", shown.xs, efforts)
+    yield _joint_states(shown, "/planned/joint_states", shown.planned_xs, None)
+    yield _transforms(shown)
+    yield _diagnostics(shown)
+    yield _contacts(shown)
+    yield _contact_scene(shown)
+
+
+def nanoseconds(time: float) -> int:
+    """Simulated time [s] as log time [ns]."""
+    return round(float(time) * 1e9)
+
+
+def _stamp(stamp: Any, time: float) -> None:
+    """Set a protobuf Timestamp or Duration."""
+    stamp.seconds, stamp.nanos = divmod(nanoseconds(time), 1_000_000_000)
+
+
+def state_channel(shown: Shown, topic: str, xs: Array, times: Array | None = None) -> Channel:
+    """drake_diff.State of states (n, nx) at `times` (n,), k h where left out: exact, names and units as metadata."""
+    kind, model = TYPES["State"], shown.model
+    nq, contract = model.nq, model.contract
+    at = shown.times(len(xs)) if times is None else times
+    rows = (
+        (nanoseconds(t), kind.cls(time=t, q=x[:nq], v=x[nq:])) for t, x in zip(at.tolist(), xs.tolist(), strict=True)
+    )
+    units = {
+        "q": {c.name: c.unit for c in contract.positions},
+        "v": {c.name: c.unit for c in contract.velocities},
+    }
+    names = {"q": list(model.position_names), "v": list(model.velocity_names)}
+    return Channel(topic, kind.cls, rows, {"units": {"time": "s", **units}, "names": names})
+
+
+def input_channel(shown: Shown, topic: str, times: Array, us: Array) -> Channel:
+    """drake_diff.Input of inputs (n, nu) at `times` (n,) [s]."""
+    kind, model = TYPES["Input"], shown.model
+    rows = ((nanoseconds(t), kind.cls(time=t, u=u)) for t, u in zip(times.tolist(), us.tolist(), strict=True))
+    units = {c.name: c.unit for c in model.contract.inputs}
+    return Channel(topic, kind.cls, rows, {"units": {"time": "s", "u": units}, "names": {"u": list(model.input_names)}})
+
+
+def _joint_states(shown: Shown, topic: str, xs: Array, efforts: Array | None) -> Channel:
+    """foxglove.JointStates of every joint with one degree of freedom; efforts where an actuator drives it."""
+    plant = shown.model.plant
+    single = [j for j in joints(plant) if j.num_positions() == 1 and j.num_velocities() == 1]
+    driven = {a.joint().index(): i for i, a in enumerate(actuators(plant))}
+    places = [
+        (j.name(), j.position_start(), shown.model.nq + j.velocity_start(), driven.get(j.index())) for j in single
+    ]
+    units = {"position": "rad or m", "velocity": "rad/s or m/s", "effort": "N m or N"}
+    return Channel(topic, JointStates, _joint_rows(shown, places, xs, efforts), {"units": units})
+
+
+def _joint_rows(shown: Shown, places: list[tuple[str, int, int, int | None]], xs: Array, efforts: Array | None) -> Rows:
+    applied = [] if efforts is None else efforts.tolist()
+    for k, (t, x) in enumerate(zip(shown.times(len(xs)), xs.tolist(), strict=True)):
+        message = JointStates()
+        _stamp(message.timestamp, t)
+        for name, position, velocity, actuator in places:
+            state = message.joints.add(name=name, position=x[position], velocity=x[velocity])
+            if actuator is not None and k < len(applied):
+                state.effort = applied[k][actuator]
+        yield nanoseconds(t), message
+
+
+def _transforms(shown: Shown) -> Channel:
+    """foxglove.FrameTransforms of every body in the world, and of its ghost where the plan is another motion."""
+    ghost = not np.array_equal(shown.xs, shown.planned_xs)
+    motions = {"": shown.xs, **({GHOST: shown.planned_xs} if ghost else {})}
+    count = max(len(shown.xs), len(shown.planned_xs))
+    told = {"ghost": GHOST if ghost else "the motion is the plan"}
+    return transform_channel(shown.model, shown.times(count), motions, told)
+
+
+def transform_channel(
+    model: Model, times: Array, motions: Mapping[str, Array], told: Mapping[str, str] | None = None
+) -> Channel:
+    """foxglove.FrameTransforms in /tf of the bodies in `motions`, (n, nx) by what their frames' names begin with."""
+    metadata = {"units": {"translation": "m", "rotation": "1"}, **(told or {})}
+    return Channel("/tf", FrameTransforms, _transform_rows(model, times, motions), metadata)
+
+
+def _transform_rows(model: Model, times: Array, motions: Mapping[str, Array]) -> Rows:
+    plant = model.plant
+    named = [(b, f"{plant.GetModelInstanceName(b.model_instance())}::{b.name()}") for b in bodies(plant)]
+    for k, t in enumerate(times):
+        message = FrameTransforms()
+        for prefix, xs in motions.items():
+            for name, p, r in _poses(model, named, xs[k]) if k < len(xs) else []:
+                transform = message.transforms.add(parent_frame_id="world", child_frame_id=prefix + name)
+                _stamp(transform.timestamp, t)
+                transform.translation.x, transform.translation.y, transform.translation.z = p
+                rotation = transform.rotation
+                rotation.w, rotation.x, rotation.y, rotation.z = r
+        if message.transforms:
+            yield nanoseconds(t), message
+
+
+def _poses(model: Model, named: list[tuple[Any, str]], x: Array) -> list[tuple[str, list[float], list[float]]]:
+    """Name, translation [m] and quaternion of each body; none of a state without a pose (NaN, a zero quaternion)."""
+    plant, context = model.plant, model.double.context
+    try:
+        set_state(model.double, x)
+        poses = [(name, plant.EvalBodyPoseInWorld(context, body)) for body, name in named]
+    except (SimulationError, RuntimeError):
+        return []
+    return [(n, X.translation().tolist(), X.rotation().ToQuaternion().wxyz().tolist()) for n, X in poses]
+
+
+def _diagnostics(shown: Shown) -> Channel:
+    kind = TYPES["Diagnostics"]
+    rows = iter(()) if shown.motion is None else _diagnostic_rows(shown, shown.motion)
+    metadata = {"units": kind.units, "n_contacts": "of the step that begins; 0 at the last state, which begins none"}
+    return Channel("/diagnostics", kind.cls, rows, metadata)
+
+
+def _diagnostic_rows(shown: Shown, motion: Rollout) -> Rows:
+    columns = {
+        "energy_kinetic": motion.kinetic_energy,
+        "energy_potential": motion.potential_energy,
+        "energy_total": motion.energy,
+        "energy_error": motion.energy_error,
+        "work_actuators": motion.work,
+        "dissipation": motion.dissipation,
+        "max_penetration": motion.penetration,
+        "constraint_violation": motion.constraint_violation,
+        "n_contacts": np.array([*(len(c) for c in motion.contacts), 0]),
+    }
+    names, values = list(columns), [column.tolist() for column in columns.values()]
+    for t, row in zip(shown.times(len(motion.xs)), zip(*values, strict=True), strict=True):
+        yield nanoseconds(t), TYPES["Diagnostics"].cls(**dict(zip(names, row, strict=True)))
+
+
+def _steps_in_contact(shown: Shown) -> Iterator[tuple[float, tuple[ContactPoint, ...]]]:
+    contacts = () if shown.motion is None else shown.motion.contacts
+    return ((t, c) for t, c in zip(shown.times(len(contacts)), contacts, strict=True) if c)
+
+
+def _contacts(shown: Shown) -> Channel:
+    kind = TYPES["Contacts"]
+    rows = ((nanoseconds(t), kind.cls(**_contact_columns(c))) for t, c in _steps_in_contact(shown))
+    return Channel("/contacts", kind.cls, rows, {"units": kind.units})
+
+
+def _contact_columns(contacts: tuple[ContactPoint, ...]) -> dict[str, list[Any]]:
+    columns: dict[str, list[Any]] = {
+        "body_a": [c.body_a for c in contacts],
+        "body_b": [c.body_b for c in contacts],
+        "depth": [c.depth for c in contacts],
+        "slip_speed": [c.slip_speed for c in contacts],
+    }
+    for letter, vectors in (
+        ("p", [c.point for c in contacts]),
+        ("n", [c.normal for c in contacts]),
+        ("f", [c.force for c in contacts]),
+    ):
+        for i, axis in enumerate("xyz"):
+            columns[letter + axis] = [float(v[i]) for v in vectors]
+    return columns
+
+
+def _contact_scene(shown: Shown) -> Channel:
+    """foxglove.SceneUpdate: an arrow along the force at each contact, for drawing; the numbers are in /contacts."""
+    units = {"position": "m", "arrow_length": "m", "arrow_length_per_newton": f"{ARROW_LENGTH_PER_NEWTON} m/N"}
+    return Channel("/scene/contacts", SceneUpdate, _scene_rows(shown), {"units": units})
+
+
+def _scene_rows(shown: Shown) -> Rows:
+    for t, contacts in _steps_in_contact(shown):
+        message = SceneUpdate()
+        for i, contact in enumerate(contacts):
+            entity = message.entities.add(frame_id="world", id=f"contact {i}")
+            _stamp(entity.timestamp, t)
+            _stamp(entity.lifetime, shown.time_step)
+            _draw_arrow(entity.arrows.add(), contact)
+        yield nanoseconds(t), message
+
+
+def _draw_arrow(arrow: Any, contact: ContactPoint) -> None:
+    """An arrow along +x, turned onto the force by the shortest rotation."""
+    size = float(np.linalg.norm(contact.force))
+    direction = contact.force / size if size else np.array([1.0, 0.0, 0.0])
+    arrow.pose.position.x, arrow.pose.position.y, arrow.pose.position.z = contact.point
+    half = np.array([1.0 + direction[0], 0.0, -direction[2], direction[1]])  # 1 + x.d, x cross d
+    norm = float(np.linalg.norm(half))
+    w, x, y, z = half / norm if norm > 1e-9 else (0.0, 0.0, 0.0, 1.0)
+    arrow.pose.orientation.w, arrow.pose.orientation.x = w, x
+    arrow.pose.orientation.y, arrow.pose.orientation.z = y, z
+    arrow.shaft_length, arrow.shaft_diameter = size * ARROW_LENGTH_PER_NEWTON, 0.01
+    arrow.head_length, arrow.head_diameter = 0.03, 0.03
+    arrow.color.r, arrow.color.g, arrow.color.b, arrow.color.a = 0.85, 0.2, 0.1, 1.0

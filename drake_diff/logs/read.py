@@ -1,0 +1,246 @@
+"""Read an MCAP file of protobuf channels, every checksum checked first.
+
+Where the `mcap` package is needed it is imported when called: a script that reads no log need not load it.
+
+Save what can be read of an MCAP file that is cut short or damaged.
+"""
+
+import json
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import Writer
+
+from drake_diff._base.files import whole_file
+from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
+from drake_diff.logs.write import start
+
+MAGIC = b"\x89MCAP0\r\n"
+FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, CRC of the summary
+DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of all before it
+RECORD = struct.Struct("<BQ")  # opcode, length
+CRC = struct.Struct("<I")
+FOOTER_OPCODE, CHUNK, ATTACHMENT, METADATA, DATA_END_OPCODE = 0x02, 0x06, 0x09, 0x0C, 0x0F
+
+
+@dataclass(frozen=True)
+class McapLog:
+    """What a file holds: messages by topic, the channels' metadata, metadata records and attachments."""
+
+    messages: dict[str, list[tuple[int, Any]]]  # log time [ns], message
+    channel_metadata: dict[str, dict[str, Any]]
+    metadata: dict[str, dict[str, str]]
+    attachments: dict[str, bytes]
+    message_types: dict[str, Any]
+
+    def arrays(self, topic: str) -> dict[str, Any]:
+        """The fields of a channel of flat messages (ours are), bit for bit as they were written.
+
+        By name: (n,) of a number, (n, width) of numbers, a list of arrays where the widths differ, a list of texts.
+        """
+        if topic not in self.messages:
+            raise UnknownNameError("topic", got=topic, known=self.messages)
+        rows = [message for _, message in self.messages[topic]]
+        names = self.channel_metadata[topic].get("names", {})
+        return {
+            field.name: _column(field, [getattr(row, field.name) for row in rows], len(names.get(field.name, ())))
+            for field in self.message_types[topic].DESCRIPTOR.fields
+        }
+
+
+def _column(field: Any, values: list[Any], width: int) -> Any:
+    repeated = field.default_value == []  # `is_repeated` is of protobuf 6
+    if field.cpp_type in (field.CPPTYPE_STRING, field.CPPTYPE_MESSAGE):
+        return [list(value) if repeated else value for value in values]
+    kinds: dict[int, Any] = {field.CPPTYPE_INT64: np.int64, field.CPPTYPE_BOOL: np.bool_}
+    kind = kinds.get(field.cpp_type, np.float64)
+    if not repeated:
+        return np.array(values, dtype=kind)
+    lists = [np.array(value, dtype=kind) for value in values]
+    same = len({len(value) for value in lists}) == 1
+    return np.array(lists) if same else lists or np.zeros((0, width), dtype=kind)
+
+
+def read_mcap(path: str | Path) -> McapLog:
+    """Everything in an MCAP file of protobuf channels.
+
+    Raises ArtifactError, naming the file, where it is missing, cut short, or a checksum (of chunks, data section,
+    summary, attachments) does not hold, or the schema of a channel does not decode.
+    """
+    path = Path(path)
+    data = read_bytes(path)
+    log = McapLog({}, {}, {}, {}, {})
+    try:
+        _check_crcs(data)
+        _collect(data, log)
+    except Exception as error:  # a damaged file makes the reader fail in many ways; none of them is ours
+        raise ArtifactError(f"{path} is no whole MCAP file of this project: {type(error).__name__}: {error}") from error
+    return log
+
+
+def read_bytes(path: Path) -> bytes:
+    """The file's bytes. ArtifactError where it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ArtifactError(f"{path}: cannot be read: {error}") from error
+
+
+def records(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """(opcode, body) of each record of a file, from its start to the first that is not whole.
+
+    Attachments' checksums are checked: the `mcap` package skips them. ValueError where one does not hold, and at the
+    end where the last record is cut short.
+    """
+    if not data.startswith(MAGIC):
+        raise ValueError("it does not begin as an MCAP file does")
+    at = len(MAGIC)
+    while at + RECORD.size <= len(data):
+        opcode, length = RECORD.unpack_from(data, at)
+        at += RECORD.size + length
+        body = data[at - length : at]
+        if len(body) < length:
+            break
+        if opcode == ATTACHMENT and CRC.unpack(body[-4:])[0] != zlib.crc32(body[:-4]):
+            raise ValueError("the checksum of an attachment does not match")
+        yield opcode, body
+        if opcode == FOOTER_OPCODE:
+            return
+    raise ValueError("it was cut short")
+
+
+def _check_crcs(data: bytes) -> None:
+    """The checksums of the data section and of the summary; between them they cover every byte but the last magic.
+
+    The format allows a file without them, the reader does not check them, and ours always has them.
+    """
+    if len(data) < len(MAGIC) + FOOTER.size or not data.endswith(MAGIC):
+        raise ValueError("it does not end as an MCAP file does: it was cut short")
+    footer = len(data) - len(MAGIC) - FOOTER.size
+    opcode, length, summary_start, _, summary_crc = FOOTER.unpack_from(data, footer)
+    data_end = summary_start - DATA_END.size
+    if (opcode, length) != (FOOTER_OPCODE, FOOTER.size - 9) or not 0 <= data_end <= footer:
+        raise ValueError("its footer is damaged")
+    end_opcode, end_length, data_crc = DATA_END.unpack_from(data, data_end)
+    if (end_opcode, end_length) != (DATA_END_OPCODE, DATA_END.size - 9) or zlib.crc32(data[:data_end]) != data_crc:
+        raise ValueError("the checksum of its data does not match")
+    if zlib.crc32(data[summary_start : len(data) - len(MAGIC) - 4]) != summary_crc:
+        raise ValueError("the checksum of its summary does not match")
+    for _ in records(data):  # the attachments' own
+        pass
+
+
+def _collect(data: bytes, log: McapLog) -> None:
+    from mcap.reader import NonSeekingReader
+    from mcap_protobuf.decoder import DecoderFactory
+
+    decoders = DecoderFactory()
+
+    def reader() -> NonSeekingReader:
+        return NonSeekingReader(BytesIO(data), validate_crcs=True, decoder_factories=[decoders])
+
+    summary = reader().get_summary()
+    if summary is None or summary.statistics is None:
+        raise ValueError("it has no summary: it was cut short")
+    for channel in summary.channels.values():
+        decode = decoders.decoder_for(channel.message_encoding, summary.schemas[channel.schema_id])
+        if decode is None:
+            raise ValueError(f"channel {channel.topic} is encoded as {channel.message_encoding!r}, not as protobuf")
+        log.message_types[channel.topic] = type(decode(b""))
+        log.messages[channel.topic] = []
+        log.channel_metadata[channel.topic] = {key: json.loads(text) for key, text in channel.metadata.items()}
+    for _, channel, message, decoded in reader().iter_decoded_messages():
+        log.messages[channel.topic].append((message.log_time, decoded))
+    log.metadata.update({record.name: dict(record.metadata) for record in reader().iter_metadata()})
+    log.attachments.update({a.name: bytes(a.data) for a in reader().iter_attachments()})
+    counted = sum(len(messages) for messages in log.messages.values())
+    if counted != summary.statistics.message_count:
+        raise ValueError(f"it holds {counted} messages, its statistics say {summary.statistics.message_count}")
+
+
+RECOVERED = "recovered"  # the name of the metadata record that tells of it
+READERS: dict[int, Any] = {CHUNK: Chunk, ATTACHMENT: Attachment, METADATA: Metadata}
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """How much was saved, and what it stopped at ("" where the file was whole)."""
+
+    messages: int
+    attachments: int
+    stopped_at: str
+
+
+def recover_mcap(path: str | Path, out: str | Path) -> Recovered:
+    """Copy what is before the first damage in `path` to the whole file `out`, which says so in its metadata.
+
+    Chunks and attachments are copied only where their checksum holds; a metadata record has none of its own.
+    Raises ArtifactError where `path` is no MCAP file, InputError where `out` exists.
+    """
+    path, out = Path(path), Path(out)
+    if out.exists() or not out.parent.is_dir():
+        raise InputError("OUT", got=str(out), expected="a file that does not exist, in a directory that does")
+    data = read_bytes(path)
+    if not data.startswith(MAGIC):
+        raise ArtifactError(f"{path} is no MCAP file: it does not begin as one does")
+    with whole_file(out) as file:
+        copy = _Copy(start(file))
+        stopped_at = ""
+        try:
+            for record in _parsed(data):
+                copy.add(record)
+        except Exception as error:  # damage makes the reader fail in many ways; all of them end the copy
+            stopped_at = f"{type(error).__name__}: {error}"
+        copy.writer.add_metadata(
+            RECOVERED, {"from": path.name, "messages": str(copy.messages), "stopped_at": stopped_at or "the end"}
+        )
+        copy.writer.finish()
+    return Recovered(copy.messages, copy.attachments, stopped_at)
+
+
+def _parsed(data: bytes) -> Iterator[Any]:
+    """Attachments, metadata, and what is in the chunks."""
+    for opcode, body in records(data):
+        if opcode in READERS:
+            record = READERS[opcode].read(ReadDataStream(BytesIO(body)))
+            yield from breakup_chunk(record, validate_crc=True) if opcode == CHUNK else [record]
+
+
+class _Copy:
+    """Writes the records of one file into another, schemas and channels under new numbers, each once."""
+
+    def __init__(self, writer: Writer):
+        self.writer, self.messages, self.attachments = writer, 0, 0
+        self.schemas: dict[int, int] = {0: 0}
+        self.channels: dict[int, int] = {}
+
+    def add(self, record: Any) -> None:
+        if isinstance(record, Message):
+            self.writer.add_message(
+                self.channels[record.channel_id],
+                log_time=record.log_time,
+                data=record.data,
+                publish_time=record.publish_time,
+                sequence=record.sequence,
+            )
+            self.messages += 1
+        elif isinstance(record, Schema) and record.id not in self.schemas:
+            self.schemas[record.id] = self.writer.register_schema(record.name, record.encoding, record.data)
+        elif isinstance(record, Channel) and record.id not in self.channels:
+            self.channels[record.id] = self.writer.register_channel(
+                record.topic, record.message_encoding, self.schemas[record.schema_id], record.metadata
+            )
+        elif isinstance(record, Metadata):
+            self.writer.add_metadata(record.name, record.metadata)
+        elif isinstance(record, Attachment):
+            self.writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
+            self.attachments += 1

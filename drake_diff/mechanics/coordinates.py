@@ -1,0 +1,250 @@
+"""Drake's discrete step where nothing touches, written out: semi-implicit Euler with implicit joint damping.
+
+    (M(q) + h D) a = B u - bias(q, v) - D v,   v' = v + h a,   q' = q + h N(q) v'
+
+N is the identity but for a free body, where v = (w, v_o) in world and the quaternion moves by h/2 (0, w) * q.
+
+Free bodies as Pinocchio has them: a position and quaternion (x, y, z, w), and (v, w) in the body's own frame.
+
+With R its orientation, v_native = Q v and a small motion is Q d, Q = [[0, R'], [R', 0]]; dv/dt = Q' a_native +
+(0, w x v). All other joints are as in Drake.
+
+Free bodies as simulators that work at centres of mass hold them: angular velocity and that of the centre, in world.
+
+v_center = Q v, with r the place of the centre of mass from the body's origin in world and Q = [[1, 0], [-skew(r), 1]].
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, cross, skew
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Which entries of q and v belong together: free bodies, and joints of one degree of freedom."""
+
+    free: tuple[tuple[int, int], ...]  # (start in q, start in v)
+    single: tuple[tuple[int, int], ...]  # (index in q, index in v)
+
+    @cached_property
+    def nq(self) -> int:
+        return 7 * len(self.free) + len(self.single)
+
+    @cached_property
+    def nv(self) -> int:
+        return 6 * len(self.free) + len(self.single)
+
+    @cached_property
+    def moves_as_is(self) -> Array:
+        """(nq, nv): 1 where an entry of v moves one of q, but for the quaternions."""
+        N = np.zeros((self.nq, self.nv))
+        for i, j in self.single:
+            N[i, j] = 1.0
+        for i, j in self.free:
+            N[i + 4 : i + 7, j + 3 : j + 6] = _ONE
+        return N
+
+    @cached_property
+    def single_as_is(self) -> Array:
+        """(nv, nv) the identity but for free bodies, where it is 0."""
+        own = np.zeros(self.nv)
+        own[[j for _, j in self.single]] = 1.0
+        return np.diag(own)
+
+    def rate(self, q: Array) -> Array:
+        """N (..., nq, nv) with dq/dt = N v, at q (..., nq)."""
+        N = np.empty((*q.shape[:-1], self.nq, self.nv))
+        N[:] = self.moves_as_is
+        for i, j in self.free:
+            N[..., i : i + 4, j : j + 3] = 0.5 * _times_from_left(q[..., i : i + 4])
+        return N
+
+    def rate_by_position(self, v: Array) -> Array:
+        """(..., nq, nq) the derivative of N(q) v by q, which does not depend on q, at v (..., nv)."""
+        derivative = np.zeros((*v.shape[:-1], self.nq, self.nq))
+        for i, j in self.free:
+            derivative[..., i : i + 4, i : i + 4] = 0.5 * _left_product(v[..., j : j + 3])
+        return derivative
+
+    def motion(self, q: Array) -> Array:
+        """W (..., nv, nq): the small motion, in the sense of v, that a change of q (..., nq) is.
+
+        W N = 1, and W q = 0 for a norm.
+        """
+        W = np.empty((*q.shape[:-1], self.nv, self.nq))
+        W[:] = self.moves_as_is.T
+        for i, j in self.free:
+            quaternion = q[..., i : i + 4]
+            norm = (quaternion**2).sum(axis=-1)[..., None, None]
+            W[..., j : j + 3, i : i + 4] = 2 * np.swapaxes(_times_from_left(quaternion), -1, -2) / norm
+        return W
+
+
+def euler_acceleration(M: Array, D: Array, h: float, v: Array, force: Array) -> Array:
+    """(nv,) (v' - v) / h of the step, with `force` (nv,) = B u - bias and joint damping D (nv,)."""
+    return np.asarray(np.linalg.solve(M + h * np.diag(D), force - D * v))
+
+
+def euler_step(coordinates: Coordinates, h: float, x: Array, acceleration: Array) -> Array:
+    """(nx,) the state that the acceleration leads to."""
+    q, v = x[: coordinates.nq], x[coordinates.nq :]
+    v_next = v + h * acceleration
+    return np.concatenate([q + h * coordinates.rate(q) @ v_next, v_next])
+
+
+def euler_jacobian(coordinates: Coordinates, h: float, x: Array, x_next: Array, by: Array) -> Array:
+    """(nx, nx + nu) of `euler_step`, from `by` (nv, 2 nv + nu): the acceleration by small motion, by v and by u."""
+    nq, nv = coordinates.nq, coordinates.nv
+    q, v_next = x[:nq], x_next[nq:]
+    lower = h * np.hstack([by[:, :nv] @ coordinates.motion(q), by[:, nv:]])
+    lower[:, nq : nq + nv] += np.eye(nv)
+    upper = h * coordinates.rate(q) @ lower
+    upper[:, :nq] += np.eye(nq) + h * coordinates.rate_by_position(v_next)
+    return np.vstack([upper, lower])
+
+
+def exponential_turn(quaternion: Array, angle: Array) -> Array:
+    """(4,) exp(angle / 2) * q: the quaternion (w, x, y, z) turned by the vector `angle` (3,) [rad] in world."""
+    half = float(np.linalg.norm(angle)) / 2
+    vector = np.sinc(half / np.pi) * angle / 2
+    return np.asarray(np.cos(half) * quaternion + _times_from_left(quaternion) @ vector)
+
+
+def rotation(quaternion: Array) -> Array:
+    """(..., 3, 3) of a quaternion (w, x, y, z) (..., 4) of any norm."""
+    vector = skew(quaternion[..., 1:])
+    scale = 2 / (quaternion * quaternion).sum(axis=-1)[..., None, None]
+    return np.asarray(_ONE + scale * (quaternion[..., :1, None] * vector + vector @ vector))
+
+
+def _times_from_left(q: Array) -> Array:
+    """(..., 4, 3): w -> (0, w) * q."""
+    return np.asarray((q @ _TIMES_FROM_LEFT).reshape(*q.shape[:-1], 4, 3))
+
+
+def _left_product(w: Array) -> Array:
+    """(..., 4, 4): q -> (0, w) * q."""
+    return np.asarray((w @ _LEFT_PRODUCT).reshape(*w.shape[:-1], 4, 4))
+
+
+# Matrices whose entries are linear in a vector: row i holds the matrix of the vector's entry i, flattened.
+_ONE = np.eye(3)
+_PRODUCT = np.zeros((3, 4, 4))
+_PRODUCT[:, 0, 1:], _PRODUCT[:, 1:, 0], _PRODUCT[:, 1:, 1:] = -_ONE, _ONE, skew(_ONE)
+_LEFT_PRODUCT = _PRODUCT.reshape(3, 16)
+_TIMES_FROM_LEFT = np.transpose(_PRODUCT, (2, 1, 0)).reshape(4, 12)
+
+
+def native_positions(coordinates: Coordinates, q: Array) -> Array:
+    """(..., nq) of Drake's q (..., nq)."""
+    native = np.array(q)
+    for i, _ in coordinates.free:
+        quaternion = q[..., i : i + 4] / np.linalg.norm(q[..., i : i + 4], axis=-1, keepdims=True)
+        native[..., i : i + 3], native[..., i + 3 : i + 7] = q[..., i + 4 : i + 7], quaternion[..., [1, 2, 3, 0]]
+    return native
+
+
+def turn(coordinates: Coordinates, q: Array) -> Array:
+    """Q (..., nv, nv)."""
+    Q = np.empty((*q.shape[:-1], coordinates.nv, coordinates.nv))
+    Q[:] = coordinates.single_as_is
+    for i, j in coordinates.free:
+        R_t = np.swapaxes(rotation(q[..., i : i + 4]), -1, -2)
+        Q[..., j : j + 3, j + 3 : j + 6] = Q[..., j + 3 : j + 6, j : j + 3] = R_t
+    return Q
+
+
+def turning(coordinates: Coordinates, v: Array) -> Array:
+    """(..., nv) w x v of free bodies, in Drake's v (..., nv)."""
+    found = np.zeros_like(v)
+    for _, j in coordinates.free:
+        found[..., j + 3 : j + 6] = cross(v[..., j : j + 3], v[..., j + 3 : j + 6])
+    return found
+
+
+def turn_change(coordinates: Coordinates, Q: Array, v: Array) -> Array:
+    """(..., nv, nv) the derivative of Q v by small motion at fixed v (..., nv), Q being that of `turn`."""
+    change = np.zeros((*v.shape, coordinates.nv))
+    for _, j in coordinates.free:
+        about, move = slice(j, j + 3), slice(j + 3, j + 6)
+        R_t = Q[..., about, move]
+        change[..., about, about] = R_t @ skew(v[..., move])
+        change[..., move, about] = R_t @ skew(v[..., about])
+    return change
+
+
+def turn_derivatives(coordinates: Coordinates, Q: Array, v: Array, native: Array) -> tuple[Array, Array, Array]:
+    """(..., nv, nv) of Q v by small motion at fixed v; of Q' a_native + w x v by small motion, and by v."""
+    out, out_v = np.zeros((2, *v.shape, coordinates.nv))
+    for _, j in coordinates.free:
+        about, move = slice(j, j + 3), slice(j + 3, j + 6)
+        R = Q[..., about, move].swapaxes(-1, -2)
+        out[..., about, about] = -skew((R @ native[..., move, None])[..., 0])
+        out[..., move, about] = -skew((R @ native[..., about, None])[..., 0])
+        out_v[..., move, about], out_v[..., move, move] = -skew(v[..., move]), skew(v[..., about])
+    return turn_change(coordinates, Q, v), out, out_v
+
+
+@dataclass(frozen=True, eq=False)
+class Centers:
+    """`centers` (3,) in the body, of each of `coordinates.free`."""
+
+    coordinates: Coordinates
+    centers: tuple[Array, ...]
+
+    def turn(self, q: Array) -> Array:
+        """Q (nv, nv)."""
+        Q = np.eye(self.coordinates.nv)
+        for _, j, r in self._arms(q):
+            Q[j + 3 : j + 6, j : j + 3] = -skew(r)
+        return Q
+
+    def turning(self, q: Array, v: Array) -> Array:
+        """(nv,) dQ/dt v: w x (w x r)."""
+        found = np.zeros(self.coordinates.nv)
+        for _, j, r in self._arms(q):
+            w = v[j : j + 3]
+            found[j + 3 : j + 6] = np.cross(w, np.cross(w, r))
+        return found
+
+    def derivative(self, x: Array) -> Array:
+        """(nx, nx) of (q of norm 1, Q v) by (q, v)."""
+        q, v = x[: self.coordinates.nq], x[self.coordinates.nq :]
+        W, N = self.coordinates.motion(q), self.coordinates.rate(unit(self.coordinates, q))
+        return np.block([[N @ W, np.zeros((len(q), len(v)))], [self._by_motion(q, v) @ W, self.turn(q)]])
+
+    def inverse_derivative(self, x: Array) -> Array:
+        """(nx, nx) of (q, v) by (q, Q v), where q has the norm 1."""
+        q, v = x[: self.coordinates.nq], x[self.coordinates.nq :]
+        W, N, back = self.coordinates.motion(q), self.coordinates.rate(q), np.linalg.inv(self.turn(q))
+        return np.block([[N @ W, np.zeros((len(q), len(v)))], [-back @ self._by_motion(q, v) @ W, back]])
+
+    def _by_motion(self, q: Array, v: Array) -> Array:
+        """(nv, nv) of Q v by small motion at fixed v."""
+        found = np.zeros((self.coordinates.nv, self.coordinates.nv))
+        for _, j, r in self._arms(q):
+            found[j + 3 : j + 6, j : j + 3] = -skew(v[j : j + 3]) @ skew(r)
+        return found
+
+    def _arms(self, q: Array) -> list[tuple[int, int, Array]]:
+        places = zip(self.coordinates.free, self.centers, strict=True)
+        return [(i, j, rotation(q[i : i + 4]) @ c) for (i, j), c in places]
+
+
+def unit(coordinates: Coordinates, q: Array) -> Array:
+    """`q` with quaternions of the norm 1."""
+    found = np.array(q)
+    for i, _ in coordinates.free:
+        found[i : i + 4] /= np.linalg.norm(q[i : i + 4])
+    return found
+
+
+def zero(coordinates: Coordinates) -> Array:
+    """(nq,) with free bodies at the origin, unturned."""
+    q = np.zeros(coordinates.nq)
+    for i, _ in coordinates.free:
+        q[i] = 1.0
+    return q

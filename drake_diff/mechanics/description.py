@@ -1,0 +1,375 @@
+"""What other engines are built from: the tree of a finalized Drake plant, link by link, with its frames.
+
+A description without its welds, for engines that build joint by joint: each link in the frame of its own joint.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydrake.geometry import Role
+from pydrake.math import RigidTransform
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import ModelError
+from drake_diff.mechanics.coordinates import Coordinates
+from drake_diff.mechanics.joints import JointContract, PairContract
+from drake_diff.mechanics.tree import springs_of
+from drake_diff.model.model import Model
+from drake_diff.model.plant import actuators, bodies, joints, labelled
+
+MOVING = ("revolute", "prismatic", "quaternion_floating")
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """A body and the joint that carries it; poses are those of the joint's frames in the two bodies."""
+
+    body: str
+    parent: str  # "world" or another link's body
+    joint: str
+    kind: str  # weld or one of MOVING
+    on_parent: RigidTransform
+    on_child: RigidTransform
+    axis: Array  # (3,) in the frames of the joint
+    q_start: int
+    v_start: int
+    mass: float
+    center_of_mass: Array  # (3,) in the body
+    inertia: Array  # (3, 3) about it
+    damping: float
+    armature: float
+    stiffness: float
+    rest: float
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """A collision geometry."""
+
+    name: str
+    body: str
+    pose: RigidTransform
+    shape: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """A tree of hinges, slides and free bodies; `links` has every parent before its children."""
+
+    links: tuple[Link, ...]
+    gravity: Array
+    inputs: tuple[str, ...]
+    actuated: tuple[str, ...]  # the joint of each input
+    effort_limits: Array
+    geometries: tuple[Geometry, ...]
+    pairs: tuple[PairContract, ...]
+
+    @property
+    def moving(self) -> tuple[Link, ...]:
+        """The links with a degree of freedom, in the order of v."""
+        return tuple(sorted((x for x in self.links if x.kind != "weld"), key=lambda x: x.v_start))
+
+    @property
+    def coordinates(self) -> Coordinates:
+        free = tuple((x.q_start, x.v_start) for x in self.moving if x.kind == "quaternion_floating")
+        single = tuple((x.q_start, x.v_start) for x in self.moving if x.kind != "quaternion_floating")
+        return Coordinates(free, single)
+
+    def by_velocity(self, name: str) -> Array:
+        """(nv,) of a number that links have; 0 for free bodies."""
+        values = np.zeros(self.coordinates.nv)
+        for link in self.moving:
+            if link.kind != "quaternion_floating":
+                values[link.v_start] = getattr(link, name)
+        return values
+
+    @property
+    def actuation(self) -> Array:
+        """B (nv, nu)."""
+        B = np.zeros((self.coordinates.nv, len(self.inputs)))
+        starts = {link.joint: link.v_start for link in self.moving}
+        for i, joint in enumerate(self.actuated):
+            B[starts[joint], i] = 1.0
+        return B
+
+
+def describe(model: Model) -> Description:
+    """The description of `model`; ModelError, naming the element, where the plant has what no other engine is given."""
+    controlled = [f"actuator {a.name()} has PD gains" for a in actuators(model.plant) if a.has_controller()]
+    if controlled:
+        raise ModelError("no other engine is given this model: " + "; ".join(controlled))
+    return describe_tree(model)
+
+
+def describe_tree(model: Model) -> Description:
+    """As `describe`, PD control of the actuators left out."""
+    plant = model.plant
+    _check(model)
+    springs = springs_of(plant)
+    if isinstance(springs, str):
+        raise ModelError(f"no other engine is given this model: {springs}")
+    body_names = {body.index(): label for label, body in labelled(bodies(plant)).items()}
+    body_names[plant.world_body().index()] = "world"
+    joint_names = {joint.index(): label for label, joint in labelled(joints(plant)).items()}
+    rotors = dict.fromkeys(joint_names, 0.0)
+    for a in actuators(plant):
+        rotors[a.joint().index()] += a.default_rotor_inertia() * a.default_gear_ratio() ** 2
+    links = [
+        _link(j, joint_names[j.index()], body_names, rotors[j.index()], springs.get(j.index(), (0.0, 0.0)))
+        for j in joints(plant)
+    ]
+    geometries, pairs = _geometries(model, body_names)
+    return Description(
+        links=tuple(_parents_first(links)),
+        gravity=np.array(plant.gravity_field().gravity_vector()),
+        inputs=model.input_names,
+        actuated=tuple(joint_names[a.joint().index()] for a in actuators(plant)),
+        effort_limits=np.array([a.effort_limit() for a in actuators(plant)]),
+        geometries=geometries,
+        pairs=pairs,
+    )
+
+
+def _check(model: Model) -> None:
+    plant = model.plant
+    found = [f"joint {j.name()} is of type {j.type_name()}" for j in joints(plant) if j.type_name() not in _KNOWN]
+    found += [f"joint {j.name()} is locked" for j in joints(plant) if j.is_locked(model.double.context)]
+    found += [
+        f"the free body of joint {j.name()} is damped"
+        for j in joints(plant)
+        if j.type_name() == "quaternion_floating" and np.any(j.default_damping_vector())
+    ]
+    if plant.num_constraints():
+        found.append(f"{plant.num_constraints()} constraints (couplers, balls, welds, distances)")
+    if model.forces:
+        found.append("forces are added to Drake's")
+    if found:
+        raise ModelError("no other engine is given this model: " + "; ".join(found))
+
+
+_KNOWN = ("weld", *MOVING)
+
+
+def _link(joint: Any, name: str, body_names: dict[Any, str], armature: float, spring: tuple[float, float]) -> Link:
+    body, kind = joint.child_body(), joint.type_name()
+    inertia = body.default_spatial_inertia()
+    single = kind in ("revolute", "prismatic")
+    about_com = inertia.Shift(inertia.get_com()).CalcRotationalInertia().CopyToFullMatrix3()
+    axis = {"revolute": "revolute_axis", "prismatic": "translation_axis"}.get(kind)
+    on_parent = joint.frame_on_parent().GetFixedPoseInBodyFrame()
+    return Link(
+        body=body_names[body.index()],
+        parent=body_names[joint.parent_body().index()],
+        joint=name,
+        kind=kind,
+        on_parent=on_parent @ joint.X_FM() if kind == "weld" else on_parent,
+        on_child=joint.frame_on_child().GetFixedPoseInBodyFrame(),
+        axis=np.array(getattr(joint, axis)()) if axis else np.zeros(3),
+        q_start=joint.position_start() if kind != "weld" else -1,
+        v_start=joint.velocity_start() if kind != "weld" else -1,
+        mass=float(inertia.get_mass()),
+        center_of_mass=np.array(inertia.get_com()),
+        inertia=np.array(about_com),
+        damping=float(joint.default_damping_vector()[0]) if single else 0.0,
+        armature=armature,
+        stiffness=float(spring[0]),
+        rest=float(spring[1]),
+        lower=float(joint.position_lower_limits()[0]) if single else -np.inf,
+        upper=float(joint.position_upper_limits()[0]) if single else np.inf,
+    )
+
+
+def _parents_first(links: list[Link]) -> list[Link]:
+    placed, ordered, waiting = {"world"}, [], sorted(links, key=lambda link: link.v_start)
+    while waiting:
+        link = next(x for x in waiting if x.parent in placed)
+        placed.add(link.body)
+        ordered.append(link)
+        waiting.remove(link)
+    return ordered
+
+
+def _geometries(model: Model, body_names: dict[Any, str]) -> tuple[tuple[Geometry, ...], tuple[PairContract, ...]]:
+    inspector = model.double.inspector
+    if inspector is None:
+        return (), ()
+    found, names = [], {}
+    for i, geometry in enumerate(inspector.GetAllGeometryIds(Role.kProximity)):
+        body = body_names[model.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).index()]
+        names[geometry] = f"{inspector.GetName(geometry)}#{i}"
+        pose, shape = inspector.GetPoseInFrame(geometry), inspector.GetShape(geometry)
+        found.append(Geometry(names[geometry], body, pose, shape))
+    pairs = []
+    for a, b in sorted(inspector.GetCollisionCandidates(), key=lambda ids: (names[ids[0]], names[ids[1]])):
+        sides = [inspector.GetProximityProperties(g) for g in (a, b)]
+        friction, stiffness = (_combined([_material(s, what) for s in sides]) for what in ("friction", "stiffness"))
+        pairs.append(PairContract((names[a], names[b]), None if friction is None else 2 * friction, stiffness))
+    return tuple(found), tuple(pairs)
+
+
+def _material(properties: Any, what: str) -> float | None:
+    name = {"friction": "coulomb_friction", "stiffness": "point_contact_stiffness"}[what]
+    if not properties.HasProperty("material", name):
+        return None
+    value = properties.GetProperty("material", name)
+    return float(value.dynamic_friction() if what == "friction" else value)
+
+
+def _combined(sides: list[float | None]) -> float | None:
+    """a b / (a + b): Drake's rule for stiffness, and half of its rule for friction."""
+    a, b = sides
+    if a is None or b is None:
+        return None
+    return a * b / (a + b) if a + b else 0.0
+
+
+def joint_contracts(description: Description) -> tuple[JointContract, ...]:
+    """Each moving joint with what it carries by welds, in the world frame where q = 0."""
+    pose = {"world": RigidTransform()}
+    carrier: dict[str, str | None] = {"world": None}
+    carried: dict[str | None, list[tuple[float, Array, Array]]] = {}
+    frames: dict[str, RigidTransform] = {}
+    for link in description.links:
+        frames[link.joint] = pose[link.parent] @ link.on_parent
+        pose[link.body] = frames[link.joint] @ link.on_child.inverse()
+        carrier[link.body] = carrier[link.parent] if link.kind == "weld" else link.joint
+        R = pose[link.body].rotation().matrix()
+        part = (link.mass, pose[link.body] @ link.center_of_mass, R @ link.inertia @ R.T)
+        carried.setdefault(carrier[link.body], []).append(part)
+    return tuple(
+        joint_contract(
+            name=x.joint,
+            kind=x.kind,
+            axis=frames[x.joint].rotation().matrix() @ x.axis,
+            anchor=frames[x.joint].translation(),
+            carried=carried[x.joint],
+            **{k: getattr(x, k) for k in ("damping", "armature", "stiffness", "rest", "lower", "upper")},
+        )
+        for x in description.moving
+    )
+
+
+def joint_contract(
+    *, kind: str, axis: Array, anchor: Array, carried: list[tuple[float, Array, Array]], **rest: Any
+) -> JointContract:
+    """A JointContract from parts (mass, centre of mass (3,), inertia (3, 3) about it) in the world frame."""
+    mass, com, total = merged(carried)
+    i, j = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+    on_axis = anchor - axis * (axis @ anchor) if kind == "revolute" else np.zeros(3)
+    numbers = [tuple(float(n) for n in values) for values in (axis, on_axis, com, total[i, j])]
+    return JointContract(
+        kind=kind,
+        axis=numbers[0],
+        anchor=numbers[1],
+        mass=mass,
+        center_of_mass=numbers[2],
+        inertia=numbers[3],
+        **rest,
+    )
+
+
+def merged(parts: list[tuple[float, Array, Array]]) -> tuple[float, Array, Array]:
+    """Parts (mass, centre of mass (3,), inertia (3, 3) about it) as one."""
+    mass = float(sum(m for m, _, _ in parts))
+    com = sum((m * c for m, c, _ in parts), np.zeros(3)) / mass if mass else np.zeros(3)
+    total = np.zeros((3, 3))
+    for m, c, inertia in parts:
+        arm = c - com
+        total += inertia + m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return mass, com, total
+
+
+SHAPES = ("Sphere", "Box", "Cylinder", "Capsule", "HalfSpace")
+
+
+@dataclass(frozen=True, eq=False)
+class RigidLink:
+    """A moving link and what is welded to it, in the frame of its joint on it, which at q = 0 is `on_parent`."""
+
+    joint: Link
+    parent: int  # its place in `RigidLinks.links`, -1 for the world
+    on_parent: RigidTransform
+    axis: Array  # (3,) unit; zero for a free body
+    mass: float
+    center_of_mass: Array  # (3,)
+    inertia: Array  # (3, 3) about it
+
+    @property
+    def free(self) -> bool:
+        return self.joint.kind == "quaternion_floating"
+
+
+@dataclass(frozen=True, eq=False)
+class RigidLinks:
+    """`links` has every parent before its children, and one tree after the other."""
+
+    links: tuple[RigidLink, ...]
+    trees: tuple[range, ...]  # of places in `links`
+    geometries: tuple[tuple[int, Geometry], ...]  # the link's place (-1 for the world), the pose on it; SHAPES only
+    pairs: tuple[PairContract, ...]  # of these geometries
+    left_out: tuple[tuple[str, str], ...]  # the other pairs
+    anchored_energy: float  # [J] the potential energy of what is fixed to the world
+
+
+def rigid_links(description: Description) -> RigidLinks:
+    """ModelError for a free body whose joint's frames are not its own and the world's."""
+    ordered = _by_tree(description.links)
+    place = {x.body: i for i, x in enumerate(x for x in ordered if x.kind != "weld")}
+    on: dict[str, tuple[int, RigidTransform]] = {"world": (-1, RigidTransform())}
+    frames: dict[int, tuple[Link, int, RigidTransform]] = {}
+    carried: dict[int, list[tuple[float, Array, Array]]] = {-1: []}
+    for link in ordered:
+        number, pose = on[link.parent]
+        frame = pose @ link.on_parent
+        if link.kind == "weld":
+            on[link.body] = (number, frame @ link.on_child.inverse())
+        else:
+            _check_of_rigid_links(link)
+            frames[place[link.body]] = (link, number, frame)
+            on[link.body] = (place[link.body], link.on_child.inverse())
+        number, pose = on[link.body]
+        R = pose.rotation().matrix()
+        carried.setdefault(number, []).append((link.mass, pose @ link.center_of_mass, R @ link.inertia @ R.T))
+    links = tuple(_link_of_rigid_links(*frames[i], carried[i]) for i in range(len(frames)))
+    known = tuple(
+        (on[g.body][0], Geometry(g.name, g.body, on[g.body][1] @ g.pose, g.shape))
+        for g in description.geometries
+        if type(g.shape).__name__ in SHAPES
+    )
+    names = {g.name for _, g in known}
+    pairs = tuple(pair for pair in description.pairs if set(pair.names) <= names)
+    left_out = tuple(pair.names for pair in description.pairs if pair not in pairs)
+    energy = -sum(m * float(description.gravity @ c) for m, c, _ in carried[-1])
+    return RigidLinks(links, _trees(links), known, pairs, left_out, energy)
+
+
+def _by_tree(links: tuple[Link, ...]) -> list[Link]:
+    """The links of one tree after those of another; what is fixed to the world comes first."""
+    tree = {"world": -1}
+    for i, link in enumerate(links):
+        up = tree[link.parent]
+        tree[link.body] = i if up < 0 and link.kind != "weld" else up
+    return sorted(links, key=lambda link: tree[link.body])
+
+
+def _trees(links: tuple[RigidLink, ...]) -> tuple[range, ...]:
+    starts = [i for i, link in enumerate(links) if link.parent < 0]
+    return tuple(range(a, b) for a, b in zip(starts, [*starts[1:], len(links)], strict=True))
+
+
+def _check_of_rigid_links(link: Link) -> None:
+    if link.kind != "quaternion_floating":
+        return
+    if link.parent != "world" or not all(x.IsExactlyIdentity() for x in (link.on_parent, link.on_child)):
+        raise ModelError(f"joint {link.joint}: this engine's free body is one of the world, by its own frame")
+
+
+def _link_of_rigid_links(
+    link: Link, parent: int, frame: RigidTransform, carried: list[tuple[float, Array, Array]]
+) -> RigidLink:
+    mass, center_of_mass, inertia = merged(carried)
+    axis = link.axis if link.kind == "quaternion_floating" else link.axis / np.linalg.norm(link.axis)
+    return RigidLink(link, parent, frame, axis, mass, center_of_mass, inertia)

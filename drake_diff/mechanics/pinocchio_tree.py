@@ -1,0 +1,52 @@
+"""A Pinocchio model built joint by joint from Drake's plant; `body_frame` has its coordinates."""
+
+from typing import Any
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import MissingDependencyError, ModelError
+from drake_diff.mechanics.description import Link
+
+try:
+    import pinocchio as pin
+except ImportError as error:
+    raise MissingDependencyError(
+        "Pinocchio is not installed: pip install 'drake-diff[engines]', or 'drake-diff[fast]' alone"
+    ) from error
+
+acceleration_derivatives = pin.computeABADerivatives
+
+
+def build(links: tuple[Link, ...], gravity: Array) -> tuple[Any, float]:
+    """The pin.Model, and the potential energy of what is fixed to the world."""
+    model, fixed = pin.Model(), 0.0
+    model.gravity.linear = gravity
+    carrier: dict[str, tuple[int, Any]] = {"world": (0, pin.SE3.Identity())}
+    for link in links:
+        parent, pose = carrier[link.parent]
+        frame, in_frame = pose * _pose(link.on_parent), _pose(link.on_child.inverse())
+        if link.kind == "weld":
+            carrier[link.body] = (parent, frame * in_frame)
+        else:
+            carrier[link.body] = (model.addJoint(parent, _joint(link), frame, link.joint), in_frame)
+        number, pose = carrier[link.body]
+        model.appendBodyToJoint(number, pin.Inertia(link.mass, link.center_of_mass, link.inertia), pose)
+        if number == 0:
+            fixed -= link.mass * float(gravity @ pose.act(link.center_of_mass))
+    starts = [x.v_start for x in links if x.kind != "weld"]
+    if list(model.idx_vs)[1:] != starts:
+        raise ModelError(f"joints in the order of v: expected starts {starts}, got {list(model.idx_vs)[1:]}")
+    return model, fixed
+
+
+def _joint(link: Link) -> Any:
+    if link.kind == "quaternion_floating":
+        return pin.JointModelFreeFlyer()
+    kind = pin.JointModelRevoluteUnaligned if link.kind == "revolute" else pin.JointModelPrismaticUnaligned
+    return kind(link.axis / np.linalg.norm(link.axis))
+
+
+def _pose(X: RigidTransform) -> Any:
+    return pin.SE3(np.array(X.rotation().matrix()), np.array(X.translation()))

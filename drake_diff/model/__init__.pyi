@@ -1,0 +1,4 @@
+from . import quantities as quantities
+from .contract import Contract as Contract
+from .soft_contact import SoftContact as SoftContact
+from .soft_contact import softened as softened

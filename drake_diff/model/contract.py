@@ -1,0 +1,334 @@
+"""What the model promises before any optimization: names, units, frames, sizes, limits, contact, tolerances."""
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from pydrake.geometry import ProximityProperties, Role, SceneGraphInspector
+
+from drake_diff.model.plant import actuators, bodies, joints
+from drake_diff.model.twin import Twin
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One entry of q, v or u."""
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class Body:
+    """Mass [kg]; centre of mass [m] and inertia xx yy zz xy xz yz [kg m^2] about it, in the body's frame."""
+
+    name: str
+    mass: float
+    center_of_mass: tuple[float, ...]
+    inertia: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint and what holds it back: damping [N s/m or N m s/rad], implicit in Drake's step."""
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    damping: tuple[float, ...]
+    locked: bool
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """An actuator on a joint; PD gains and their target (the joint's default position) where it has them."""
+
+    name: str
+    joint: str
+    effort_limit: float
+    gear_ratio: float
+    rotor_inertia: float
+    kp: float | None
+    kd: float | None
+
+
+@dataclass(frozen=True)
+class CollisionGeometry:
+    """What can touch. `None` is not given in the model: Drake's default decides."""
+
+    name: str
+    body: str
+    shape: str
+    friction: float | None
+    stiffness: float | None  # [N/m]
+    dissipation: float | None  # Hunt-Crossley [s/m]: similar and lagged contact
+    relaxation_time: float | None  # [s]: sap contact
+    hydroelastic_modulus: float | None  # [Pa]
+
+
+@dataclass(frozen=True)
+class Contact:
+    """How contact is computed."""
+
+    model: str
+    approximation: str
+    geometry: str  # "as modelled", or the route that was taken around pairs that AutoDiffXd refuses
+    collision_pairs: int
+    solver_relative_tolerance: float
+    sap_near_rigid_threshold: float
+
+
+@dataclass(frozen=True)
+class Contract:
+    """Everything a run rests on, read from Drake; SI units; `print(contract)` is for people."""
+
+    name: str
+    source: str | None
+    time_step: float  # [s]
+    integrator: str
+    scalar_types: tuple[str, ...]
+    gravity: tuple[float, ...]  # [m/s^2], in the world frame
+    frame: str
+    positions: tuple[Coordinate, ...]
+    velocities: tuple[Coordinate, ...]
+    inputs: tuple[Coordinate, ...]
+    bodies: tuple[Body, ...]
+    joints: tuple[Joint, ...]
+    actuators: tuple[Actuator, ...]
+    geometries: tuple[CollisionGeometry, ...]
+    contact: Contact
+    constraints: int  # couplers, balls, welds, distances, tendons
+    notes: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dicts and lists for JSON: an absent limit (infinite) is None."""
+        plain: dict[str, Any] = _plain(asdict(self))
+        return plain
+
+    def __str__(self) -> str:
+        return "\n".join(_lines(self))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _lines(c: Contract) -> list[str]:
+    lines = [
+        f"{c.name}: time step {c.time_step:g} s, {c.integrator}",
+        f"  source     {c.source or 'a diagram'}; scalar types {', '.join(c.scalar_types)}",
+        f"  frame      {c.frame}; gravity {_row(c.gravity)} m/s^2",
+        f"  contact    {c.contact.model}, {c.contact.approximation}, geometry {c.contact.geometry},"
+        f" {c.contact.collision_pairs} pairs,"
+        f" solver tolerance {c.contact.solver_relative_tolerance:g} (relative)",
+    ]
+    for kind, coordinates in (("q", c.positions), ("v", c.velocities), ("u", c.inputs)):
+        for i, x in enumerate(coordinates):
+            lines.append(f"  {kind}[{i}]".ljust(13) + f"{x.name} [{x.unit}]{_limits(x)}")
+    for body in c.bodies:
+        lines.append(
+            f"  body       {body.name}: {body.mass:g} kg at {_row(body.center_of_mass)} m,"
+            f" inertia xx yy zz xy xz yz {_row(body.inertia)} kg m^2"
+        )
+    for joint in c.joints:
+        damping = f", damping {_row(joint.damping)}" if any(joint.damping) else ""
+        lines.append(
+            f"  joint      {joint.name}: {joint.type}, {joint.parent} -> {joint.child}{damping}"
+            f"{', locked' if joint.locked else ''}"
+        )
+    for a in c.actuators:
+        gains = "" if a.kp is None else f", PD kp {a.kp:g} kd {a.kd:g}"
+        limit = f", limit {a.effort_limit:g}" if math.isfinite(a.effort_limit) else ""
+        lines.append(
+            f"  actuator   {a.name} on {a.joint}{limit}, gear {a.gear_ratio:g}, rotor {a.rotor_inertia:g}{gains}"
+        )
+    for g in c.geometries:
+        lines.append(
+            f"  collision  {g.name} of {g.body}: {g.shape}, friction {_or_default(g.friction)},"
+            f" stiffness {_or_default(g.stiffness)} N/m, {_damping_of_contact(c.contact.approximation, g)}"
+        )
+    return lines + [f"  note       {note}" for note in c.notes]
+
+
+def _damping_of_contact(approximation: str, g: CollisionGeometry) -> str:
+    """What damps contact: sap knows only the relaxation time, similar and lagged only Hunt-Crossley's number."""
+    if approximation == "sap":
+        return f"relaxation time {_or_default(g.relaxation_time)} s"
+    return f"dissipation {_or_default(g.dissipation)} s/m"
+
+
+def _row(values: tuple[float, ...]) -> str:
+    return "(" + ", ".join(f"{value:g}" for value in values) + ")"
+
+
+def _limits(x: Coordinate) -> str:
+    if math.isinf(x.lower) and math.isinf(x.upper):
+        return ""
+    return f" in [{x.lower:g}, {x.upper:g}]"
+
+
+def _or_default(value: float | None) -> str:
+    return "Drake's default" if value is None else f"{value:g}"
+
+
+# Drake's SAP solver stops at this relative change of momentum and cost; pydrake cannot change it.
+SAP_RELATIVE_TOLERANCE = 1e-6
+
+_UNITS = {  # joint type: (units of q, units of v)
+    "revolute": (("rad",), ("rad/s",)),
+    "prismatic": (("m",), ("m/s",)),
+    "screw": (("rad",), ("rad/s",)),
+    "curvilinear": (("m",), ("m/s",)),
+    "universal": (("rad",) * 2, ("rad/s",) * 2),
+    "planar": (("m", "m", "rad"), ("m/s", "m/s", "rad/s")),
+    "ball_rpy": (("rad",) * 3, ("rad/s",) * 3),
+    "rpy_floating": (("rad",) * 3 + ("m",) * 3, ("rad/s",) * 3 + ("m/s",) * 3),
+    "quaternion_floating": (("1",) * 4 + ("m",) * 3, ("rad/s",) * 3 + ("m/s",) * 3),
+}
+
+
+def read_contract(
+    twin: Twin,
+    *,
+    name: str,
+    source: str | None,
+    coordinates: tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]],
+    contact_geometry: str | None,
+    notes: tuple[str, ...],
+) -> Contract:
+    """The contract of the plant in `twin`; `coordinates` are the names of q, v and u."""
+    plant = twin.plant
+    positions, velocities, inputs = coordinates
+    position_limits = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
+    velocity_limits = plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits()
+    effort_limits = plant.GetEffortLowerLimits(), plant.GetEffortUpperLimits()
+    return Contract(
+        name=name,
+        source=source,
+        time_step=plant.time_step(),
+        integrator="semi-implicit Euler; damping, PD control, limits and contact implicit",
+        scalar_types=("double", "AutoDiffXd"),
+        gravity=_floats(plant.gravity_field().gravity_vector()),
+        frame="world, z up; v of a floating body is w_WB then v_WBo, expressed in world",
+        positions=_coordinates(positions, _units(plant, 0), *position_limits),
+        velocities=_coordinates(velocities, _units(plant, 1), *velocity_limits),
+        inputs=_coordinates(inputs, _input_units(plant), *effort_limits),
+        bodies=tuple(_read_body(twin, body) for body in bodies(plant)),
+        joints=tuple(_read_joint(twin, joint) for joint in joints(plant)),
+        actuators=tuple(_read_actuator(actuator) for actuator in actuators(plant)),
+        geometries=_read_geometries(twin),
+        contact=_read_contact(twin, contact_geometry),
+        constraints=plant.num_constraints(),
+        notes=notes,
+    )
+
+
+def _coordinates(names: Any, units: Any, lower: Any, upper: Any) -> tuple[Coordinate, ...]:
+    return tuple(
+        Coordinate(name, unit, float(low), float(high))
+        for name, unit, low, high in zip(names, units, lower, upper, strict=True)
+    )
+
+
+def _units(plant: Any, which: int) -> list[str]:
+    """Units of q (which = 0) or v (which = 1), joint by joint."""
+    units = ["?"] * (plant.num_velocities() if which else plant.num_positions())
+    for joint in joints(plant):
+        start = joint.velocity_start() if which else joint.position_start()
+        for i, unit in enumerate(_UNITS.get(joint.type_name(), ((), ()))[which]):
+            units[start + i] = unit
+    return units
+
+
+def _input_units(plant: Any) -> list[str]:
+    return ["N" if a.joint().type_name() == "prismatic" else "N m" for a in actuators(plant)]
+
+
+def _read_body(twin: Twin, body: Any) -> Body:
+    inertia = body.CalcSpatialInertiaInBodyFrame(twin.context)
+    about_com = inertia.Shift(inertia.get_com()).CalcRotationalInertia()
+    return Body(
+        name=body.name(),
+        mass=float(inertia.get_mass()),
+        center_of_mass=_floats(inertia.get_com()),
+        inertia=_floats(about_com.get_moments()) + _floats(about_com.get_products()),
+    )
+
+
+def _read_joint(twin: Twin, joint: Any) -> Joint:
+    return Joint(
+        name=joint.name(),
+        type=joint.type_name(),
+        parent=joint.parent_body().name(),
+        child=joint.child_body().name(),
+        damping=_floats(joint.default_damping_vector()),
+        locked=bool(joint.is_locked(twin.context)),
+    )
+
+
+def _read_actuator(actuator: Any) -> Actuator:
+    gains = actuator.get_controller_gains() if actuator.has_controller() else None
+    return Actuator(
+        name=actuator.name(),
+        joint=actuator.joint().name(),
+        effort_limit=float(actuator.effort_limit()),
+        gear_ratio=float(actuator.default_gear_ratio()),
+        rotor_inertia=float(actuator.default_rotor_inertia()),
+        kp=float(gains.p) if gains else None,
+        kd=float(gains.d) if gains else None,
+    )
+
+
+def _read_geometries(twin: Twin) -> tuple[CollisionGeometry, ...]:
+    inspector = twin.inspector
+    if inspector is None:
+        return ()
+    ids = inspector.GetAllGeometryIds(Role.kProximity)
+    return tuple(_read_geometry(twin, inspector, geometry_id) for geometry_id in ids)
+
+
+def _read_geometry(twin: Twin, inspector: SceneGraphInspector, geometry_id: Any) -> CollisionGeometry:
+    properties = inspector.GetProximityProperties(geometry_id)
+    body = twin.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry_id))
+    friction = _property(properties, "material", "coulomb_friction")
+    return CollisionGeometry(
+        name=inspector.GetName(geometry_id),
+        body=body.name() if body is not None else "?",
+        shape=type(inspector.GetShape(geometry_id)).__name__,
+        friction=None if friction is None else float(friction.dynamic_friction()),
+        stiffness=_property(properties, "material", "point_contact_stiffness"),
+        dissipation=_property(properties, "material", "hunt_crossley_dissipation"),
+        relaxation_time=_property(properties, "material", "relaxation_time"),
+        hydroelastic_modulus=_property(properties, "hydroelastic", "hydroelastic_modulus"),
+    )
+
+
+def _property(properties: ProximityProperties, group: str, name: str) -> Any:
+    return properties.GetProperty(group, name) if properties.HasProperty(group, name) else None
+
+
+def _read_contact(twin: Twin, contact_geometry: str | None) -> Contact:
+    inspector = twin.inspector
+    return Contact(
+        model={"kPoint": "point", "kHydroelastic": "hydroelastic"}.get(
+            twin.plant.get_contact_model().name, "hydroelastic_with_fallback"
+        ),
+        approximation=twin.plant.get_discrete_contact_approximation().name.removeprefix("k").lower(),
+        geometry=contact_geometry or "as modelled",
+        collision_pairs=len(inspector.GetCollisionCandidates()) if inspector is not None else 0,
+        solver_relative_tolerance=SAP_RELATIVE_TOLERANCE,
+        sap_near_rigid_threshold=float(twin.plant.get_sap_near_rigid_threshold()),
+    )
+
+
+def _floats(values: Any) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)

@@ -1,0 +1,114 @@
+"""The plant's equations of motion in continuous time, for collocation: a Drake System made from the discrete plant.
+
+    M(q) dv/dt = B u + forces(q, v) - C(q, v) v,    dq/dt = N(q) v,
+
+with Drake's own mass matrix, force elements (gravity, springs), joint damping and bias. Contact, joint limits,
+PD control and constraints are not in it: they exist only in the discrete step. With r(q, v, dv/dt, u) the residual
+by inverse dynamics, d(dv/dt) = -M^-1 dr at fixed dv/dt, so AutoDiffXd never factors a matrix.
+"""
+
+from typing import Any
+
+import numpy as np
+from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
+from pydrake.systems.framework import BasicVector_, LeafSystem_
+from pydrake.systems.scalar_conversion import TemplateSystem
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.autodiff import gradient_rows
+from drake_diff.exceptions import ModelError
+from drake_diff.model.model import Model
+from drake_diff.model.plant import actuators
+from drake_diff.model.step import set_state
+from drake_diff.model.twin import Twin
+
+
+class EquationsOfMotion:
+    """dx/dt = f(x, u) of a model, for floats and for AutoDiffXd.
+
+    Raises ModelError where the model has PD control or constraints, which have no continuous form here.
+    """
+
+    def __init__(self, model: Model):
+        if model.pd_targets or any(a.has_controller() for a in actuators(model.plant)):
+            raise ModelError("collocation: PD-controlled actuators have no continuous form; use method='shooting'")
+        if model.plant.num_constraints():
+            raise ModelError("collocation: the model's constraints have no continuous form; use method='shooting'")
+        self.model = model
+        self.actuation = model.plant.MakeActuationMatrix()
+        self.plain_rates = model.plant.IsVelocityEqualToQDot()
+
+    def __call__(self, x: Array, u: Array) -> Array:
+        """(nx,) dx/dt at `x` (nx,), `u` (nu,); SimulationError where they are not finite."""
+        set_state(self.model.double, x)
+        return np.asarray(self.values(np.concatenate([x, u])[None])[0])
+
+    def values(self, knots: Array) -> Array:
+        """(K, nx) dx/dt at `knots` (K, nx + nu), rows [x, u]; NaN where a knot is not finite."""
+        model, twin = self.model, self.model.double
+        finite = np.isfinite(knots).all(axis=1)
+        rates, still = np.full((len(knots), model.nx), np.nan), np.zeros(model.nv)
+        rest, mass = np.zeros((len(knots), model.nv)), np.tile(np.eye(model.nv), (len(knots), 1, 1))
+        for k in np.flatnonzero(finite).tolist():
+            x = knots[k, : model.nx]
+            twin.plant.SetPositionsAndVelocities(twin.context, x)
+            rest[k] = twin.inverse_dynamics(still)
+            mass[k] = twin.plant.CalcMassMatrix(twin.context)
+            rates[k, : model.nq] = x[model.nq :] if self.plain_rates else self.q_dot(twin, x)
+        force = knots[:, model.nx :] @ self.actuation.T - rest
+        rates[finite, model.nq :] = np.linalg.solve(mass, force[..., None])[finite, :, 0]
+        return rates
+
+    def autodiff(self, x: Any, u: Any) -> Any:
+        """The same with AutoDiffXd in and out."""
+        set_state(self.model.double, ExtractValue(x).ravel())
+        acceleration, mass = self.acceleration(ExtractValue(u).ravel())
+        twin = self.model.autodiff
+        set_state(twin, x)
+        constant = np.array([AutoDiffXd(a) for a in acceleration])
+        residual = twin.inverse_dynamics(constant) - self.actuation @ u
+        return np.concatenate([self.q_dot(twin, x), acceleration - np.linalg.inv(mass) @ residual])
+
+    def jacobian(self, knot: Array) -> Array:
+        """(nx, nx + nu) at `knot` = [x; u], by AutoDiffXd."""
+        variables, nx = InitializeAutoDiff(knot).ravel(), self.model.nx
+        return gradient_rows(self.autodiff(variables[:nx], variables[nx:]), len(knot))
+
+    def q_dot(self, twin: Twin, x: Any) -> Any:
+        """(nq,) N(q) v of x (nx,), whose positions are the twin's."""
+        v = x[self.model.nq :]
+        return np.asarray(twin.plant.MapVelocityToQDot(twin.context, v)).ravel()
+
+    def acceleration(self, u: Array) -> tuple[Array, Array]:
+        """(dv/dt (nv,), M (nv, nv)) under u (nu,) in the double context's state."""
+        twin = self.model.double
+        rest = twin.inverse_dynamics(np.zeros(self.model.nv))
+        mass = twin.plant.CalcMassMatrix(twin.context)
+        return np.linalg.solve(mass, self.actuation @ u - rest), mass
+
+
+@TemplateSystem.define("ContinuousSystem_")
+def ContinuousSystem_(T):  # type: ignore[no-untyped-def]
+    class Impl(LeafSystem_[T]):  # type: ignore[misc]
+        """`EquationsOfMotion` as a Drake System with one input u and the state x = [q; v]."""
+
+        def _construct(self, equations, converter=None):  # type: ignore[no-untyped-def]
+            LeafSystem_[T].__init__(self, converter)
+            self.equations = equations
+            model = equations.model
+            self.DeclareVectorInputPort("u", BasicVector_[T](model.nu))
+            self.DeclareContinuousState(model.nq, model.nv, 0)
+
+        def _construct_copy(self, other, converter=None):  # type: ignore[no-untyped-def]
+            self._construct(other.equations, converter=converter)  # type: ignore[no-untyped-call]
+
+        def DoCalcTimeDerivatives(self, context, derivatives):  # type: ignore[no-untyped-def]
+            x = context.get_continuous_state_vector().CopyToVector()
+            u = self.get_input_port().Eval(context)
+            evaluate = self.equations if T is float else self.equations.autodiff
+            derivatives.SetFromVector(evaluate(x, u))
+
+    return Impl
+
+
+ContinuousSystem = ContinuousSystem_[None]

@@ -1,0 +1,352 @@
+"""Read a robot file into a plant: find its packages, skip the meshes that Drake cannot use and say which.
+
+Routes around the geometry pairs that Drake's AutoDiffXd step refuses, chosen before the plant is finalized.
+
+In point contact AutoDiffXd knows a sphere against a sphere, box, cylinder, capsule or half space and nothing
+else; one refused pair whose bounding boxes meet is enough for the whole step to throw.
+"""
+
+import logging
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import combinations, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
+    AddRigidHydroelasticProperties,
+    Box,
+    Capsule,
+    CollisionFilterDeclaration,
+    Convex,
+    Cylinder,
+    Ellipsoid,
+    GeometrySet,
+    HalfSpace,
+    Mesh,
+    ProximityProperties,
+    Role,
+    RoleAssign,
+    SceneGraph,
+    Shape,
+    Sphere,
+)
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import ContactModel, MultibodyPlant
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.model.plant import bodies
+
+FORMATS = (".urdf", ".sdf", ".xml", ".mjcf", ".dmd.yaml")
+USABLE_MESHES = (".obj", ".vtk", ".gltf", ".glb")
+
+
+def _is_related(record: logging.LogRecord) -> bool:
+    """Drake says of every half space that deformable bodies will not touch it: no derivative here could."""
+    return "not currently supported for deformable contact" not in record.getMessage()
+
+
+logging.getLogger("drake").addFilter(_is_related)
+
+
+def read_into(plant: MultibodyPlant, path: Path) -> tuple[str, ...]:
+    """Add the model in `path` to `plant` and return what the user should know of it, a sentence each.
+
+    Raises InputError where the file is missing or of an unknown kind, ModelError where Drake refuses it.
+    """
+    _check_is_robot_file(path)
+    parser = Parser(plant)
+    notes: list[str] = []
+    with _drake_warnings(notes):
+        try:
+            _add_packages(parser, path)
+            reduced = _without_unusable_meshes(path, notes)
+            if reduced is None:
+                parser.AddModels(str(path))
+            else:
+                parser.AddModelsFromString(reduced, path.suffix.lstrip("."))
+        except (RuntimeError, ET.ParseError, UnicodeDecodeError) as error:
+            raise ModelError(f"{path} is no robot model that Drake can read: {error}") from error
+    return tuple(notes)
+
+
+def _check_is_robot_file(path: Path) -> None:
+    if not path.is_file():
+        raise InputError("model file", got=str(path), expected="a file that exists")
+    if not path.name.endswith(FORMATS):
+        raise InputError("model file", got=str(path), expected="a name that ends in " + ", ".join(FORMATS))
+
+
+@contextmanager
+def _drake_warnings(notes: list[str]) -> Iterator[None]:
+    """Collect in `notes` what Drake's parser warns of, and keep it off the terminal."""
+
+    class Collect(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            notes.append(record.getMessage())
+
+    logger, handler = logging.getLogger("drake"), Collect(logging.WARNING)
+    propagate = logger.propagate
+    logger.addHandler(handler)
+    logger.propagate = False
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = propagate
+
+
+def _add_packages(parser: Parser, path: Path) -> None:
+    """Resolve package://NAME/ to the nearest folder called NAME above the file."""
+    packages = parser.package_map()
+    for name in sorted(set(re.findall(r"(?:package|model)://([^/\"<>\s]+)/", path.read_text(errors="replace")))):
+        folder = next((p for p in path.resolve().parents if p.name == name), None)
+        if folder is not None and not packages.Contains(name):
+            packages.Add(name, str(folder))
+
+
+def _without_unusable_meshes(path: Path, notes: list[str]) -> str | None:
+    """The file's text without the visuals and collisions whose mesh format Drake cannot use.
+
+    None where there are none, or where the format names its meshes in another way (MJCF: Drake warns itself).
+    """
+    text = path.read_text()
+    if path.suffix not in (".urdf", ".sdf") or not re.search(r"\.(dae|stl|ply|off)\b", text, re.IGNORECASE):
+        return None
+    for prefix, namespace in re.findall(r'xmlns:(\w+)="([^"]+)"', text):
+        ET.register_namespace(prefix, namespace)  # else drake:... tags come out as ns0:...
+    root = ET.fromstring(text)
+    skipped: list[str] = []
+    for parent in root.iter():
+        for kind in ("visual", "collision"):
+            for element in parent.findall(kind):
+                unusable = [uri for uri in _mesh_uris(element) if not uri.lower().endswith(USABLE_MESHES)]
+                if unusable:
+                    parent.remove(element)
+                    skipped += [f"{parent.get('name', '?')} {kind} {uri}" for uri in unusable]
+    if not skipped:
+        return None
+    for mesh in root.iter("mesh"):  # a model given as text has no folder to start relative names from
+        _make_absolute(mesh, path)
+    notes.append(f"{len(skipped)} meshes skipped, Drake uses only {' '.join(USABLE_MESHES)}: " + "; ".join(skipped))
+    return ET.tostring(root, encoding="unicode")
+
+
+def _mesh_uris(element: ET.Element) -> list[str]:
+    return [mesh.get("filename") or (mesh.findtext("uri") or "").strip() for mesh in element.iter("mesh")]
+
+
+def _make_absolute(mesh: ET.Element, path: Path) -> None:
+    uri = mesh.find("uri")
+    name = mesh.get("filename") or (uri.text if uri is not None else "") or ""
+    if name and "://" not in name and not Path(name).is_absolute():
+        absolute = (path.parent / name).resolve().as_uri()
+        if uri is not None:
+            uri.text = absolute
+        else:
+            mesh.set("filename", absolute)
+
+
+ROUTES = ("corner_spheres", "hydroelastic", "differences")
+CORNER_RADIUS = 0.05  # of a corner sphere [1], relative to the smallest edge of the box or cylinder
+SPHERES_PER_RIM = 8  # of a cylinder
+HYDROELASTIC_MODULUS = 1e7  # [Pa]
+
+MEETS_A_SPHERE = {"Sphere", "Box", "Cylinder", "Capsule", "HalfSpace"}  # in point contact under AutoDiffXd
+HYDROELASTIC_SHAPES = MEETS_A_SPHERE | {"Ellipsoid", "Convex", "Mesh"}
+CONTACT_MODELS = ("point", "hydroelastic", "hydroelastic_with_fallback")
+
+
+def replace_collision_geometry(plant: MultibodyPlant, scene_graph: SceneGraph, route: str) -> tuple[str, ...]:
+    """Change what `plant` collides with, so that AutoDiffXd can step it; a sentence for each change.
+
+    Call it when every geometry is there and before plant.Finalize(); `scene_graph` is what AddMultibodyPlant
+    returned beside the plant. Masses, inertias and what is drawn stay as they are. `route` is one of
+
+    - "corner_spheres": each box, cylinder and capsule on a body that can move becomes spheres inside it;
+    - "hydroelastic": each geometry without hydroelastic properties gets compliant ones, a half space rigid
+      ones (Drake has no contact between a compliant half space and a compliant body);
+    - "differences": nothing changes, and what AutoDiffXd refuses is differenced.
+
+    Raises UnknownNameError (no such route), InputError (hydroelastic with a plant in point contact) or
+    ModelError (the plant is finalized, or Drake refuses a change).
+    """
+    if route not in ROUTES:
+        raise UnknownNameError("route around refused contact", got=route, known=ROUTES)
+    if plant.is_finalized():
+        raise ModelError("the plant is finalized: its collision geometry can be replaced only before that")
+    try:
+        if route == "corner_spheres":
+            return _to_corner_spheres(plant, scene_graph)
+        if route == "hydroelastic":
+            return _to_hydroelastic(plant, scene_graph)
+    except RuntimeError as error:
+        raise ModelError(f"Drake refuses the route {route!r}: {error}") from error
+    return ("Pairs of geometries that AutoDiffXd refuses are differenced, by choice.",)
+
+
+def autodiff_supports(shape_a: Shape, shape_b: Shape, contact_model: str) -> bool:
+    """Whether the AutoDiffXd step takes this pair of touching shapes, as measured with Drake 1.51 and 1.58.
+
+    For the two hydroelastic models the shapes have the properties that the route "hydroelastic" gives them.
+    Raises UnknownNameError where there is no such contact model.
+    """
+    if contact_model not in CONTACT_MODELS:
+        raise UnknownNameError("contact_model", got=contact_model, known=CONTACT_MODELS)
+    shapes = {type(shape_a).__name__, type(shape_b).__name__}
+    if contact_model == "point":
+        return "Sphere" in shapes and shapes <= MEETS_A_SPHERE
+    return shapes <= HYDROELASTIC_SHAPES and shapes != {"HalfSpace"}
+
+
+def _to_corner_spheres(plant: MultibodyPlant, scene_graph: SceneGraph) -> tuple[str, ...]:
+    inspector = scene_graph.model_inspector()
+    found = _collision_geometries(plant, scene_graph)
+    welded = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
+    fixed = [int(body.index()) in welded for body, _ in found]
+    filtered = _filtered_pairs(scene_graph, found)
+    became = {geometry: [geometry] for _, geometry in found}
+    notes = []
+    for (body, geometry), stays in zip(found, fixed, strict=True):
+        shape = inspector.GetShape(geometry)
+        if isinstance(shape, Convex | Ellipsoid | Mesh):
+            notes.append(_refused(_label(scene_graph, body, geometry), shape))
+        elif not stays and isinstance(shape, Box | Capsule | Cylinder):
+            notes.append(_description(_label(scene_graph, body, geometry), shape))
+            became[geometry] = _replace(plant, scene_graph, body, geometry, shape)
+    for a, b in filtered:
+        declaration = CollisionFilterDeclaration().ExcludeBetween(GeometrySet(became[a]), GeometrySet(became[b]))
+        scene_graph.collision_filter_manager().Apply(declaration)
+    return tuple(notes)
+
+
+def _collision_geometries(plant: MultibodyPlant, scene_graph: SceneGraph) -> list[tuple[Any, Any]]:
+    """The body and the id of every rigid geometry of the plant that has the proximity role.
+
+    Not by plant.GetCollisionGeometriesForBody: its ids live in the plant's own list, which moves when it grows.
+    """
+    inspector, source = scene_graph.model_inspector(), plant.get_source_id()
+    frames = [(body, plant.GetBodyFrameIdIfExists(body.index())) for body in [plant.world_body(), *bodies(plant)]]
+    return [
+        (body, geometry)
+        for body, frame in frames
+        if frame is not None
+        for geometry in inspector.GetGeometries(frame, Role.kProximity)
+        if inspector.BelongsToSource(geometry, source) and not inspector.IsDeformableGeometry(geometry)
+    ]
+
+
+def _filtered_pairs(scene_graph: SceneGraph, found: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+    """The pairs on different bodies that a file or a user let pass through each other.
+
+    Drake keeps its filters by geometry, so spheres that are added later do not inherit them.
+    """
+    inspector = scene_graph.model_inspector()
+    pairs = [(a, b) for (body_a, a), (body_b, b) in combinations(found, 2) if body_a.index() != body_b.index()]
+    return [(a, b) for a, b in pairs if inspector.CollisionFiltered(a, b)]
+
+
+def _replace(plant: MultibodyPlant, scene_graph: SceneGraph, body: Any, geometry: Any, shape: Any) -> list[Any]:
+    """Spheres in place of a geometry, which loses its proximity role; their ids."""
+    inspector = scene_graph.model_inspector()
+    X_BG, properties = RigidTransform(inspector.GetPoseInFrame(geometry)), _properties(scene_graph, geometry)
+    name = inspector.GetName(geometry).removeprefix(f"{plant.GetModelInstanceName(body.model_instance())}::")
+    scene_graph.RemoveRole(plant.get_source_id(), geometry, Role.kProximity)
+    radius, centres = _spheres(shape)
+    return [
+        plant.RegisterCollisionGeometry(
+            body, X_BG @ RigidTransform(p_GS), Sphere(radius), f"{name}_corner_{i}", properties
+        )
+        for i, p_GS in enumerate(centres)
+    ]
+
+
+def _label(scene_graph: SceneGraph, body: Any, geometry: Any) -> str:
+    """A geometry in words; URDF files leave many of one name, which are told apart by their body."""
+    return f"{scene_graph.model_inspector().GetName(geometry)} on {body.name()}"
+
+
+def _properties(scene_graph: SceneGraph, geometry: Any) -> ProximityProperties:
+    """A copy of its proximity properties."""
+    return ProximityProperties(scene_graph.model_inspector().GetProximityProperties(geometry))
+
+
+def _spheres(shape: Any) -> tuple[float, list[Array]]:
+    """The radius [m] of the spheres inside a shape, and their centres [m] in its frame.
+
+    Each touches the surface from inside: three faces of a box, a cap and the side of a cylinder. Those of a
+    capsule are its two ends.
+    """
+    if isinstance(shape, Capsule):
+        return shape.radius(), [np.array([0, 0, z * shape.length() / 2]) for z in (-1, 1)]
+    if isinstance(shape, Box):
+        half = np.asarray(shape.size()) / 2
+        radius = CORNER_RADIUS * 2 * float(np.min(half))
+        return radius, [np.array(signs) * (half - radius) for signs in product((-1, 1), repeat=3)]
+    radius = CORNER_RADIUS * min(2 * shape.radius(), shape.length())
+    ring, height = shape.radius() - radius, shape.length() / 2 - radius
+    angles = np.arange(SPHERES_PER_RIM) * 2 * np.pi / SPHERES_PER_RIM
+    return radius, [np.array([ring * np.cos(a), ring * np.sin(a), z * height]) for z in (-1, 1) for a in angles]
+
+
+def _description(name: str, shape: Any) -> str:
+    """What became of one geometry, as a sentence."""
+    radius, centres = _spheres(shape)
+    start = f"{name}: a {type(shape).__name__.lower()} became {len(centres)} spheres of radius {radius:.4g} m"
+    stiffness = "each with the stiffness of the whole, as every contact point has its own spring"
+    if isinstance(shape, Capsule):
+        return f"{start}, its ends ({stiffness}); nothing touches between them."
+    if isinstance(shape, Box):
+        return (
+            f"{start} in its corners ({stiffness}: a face rests on 4 springs); edges and faces between them are open."
+        )
+    return f"{start} along its rims, which is approximate ({stiffness}); it rolls like a polygon."
+
+
+def _refused(name: str, shape: Any) -> str:
+    kind = type(shape).__name__
+    return (
+        f"{name}: a {kind} stays as it is, and AutoDiffXd refuses every point contact with it; "
+        "take the route hydroelastic or differences where something can touch it."
+    )
+
+
+def _to_hydroelastic(plant: MultibodyPlant, scene_graph: SceneGraph) -> tuple[str, ...]:
+    if plant.get_contact_model() == ContactModel.kPoint:
+        expected = "hydroelastic or hydroelastic_with_fallback, as the route is hydroelastic"
+        raise InputError("contact_model", got="point", expected=expected)
+    notes = []
+    for body, geometry in _collision_geometries(plant, scene_graph):
+        name, properties = _label(scene_graph, body, geometry), _properties(scene_graph, geometry)
+        if properties.HasProperty("hydroelastic", "compliance_type"):
+            notes.append(f"{name}: keeps its own hydroelastic properties.")
+            continue
+        became = _add_hydroelastic(scene_graph, geometry, properties)
+        scene_graph.AssignRole(plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
+        notes.append(f"{name}: became {became}.")
+    return tuple(notes)
+
+
+def _add_hydroelastic(scene_graph: SceneGraph, geometry: Any, properties: ProximityProperties) -> str:
+    """Add to `properties` what makes a geometry hydroelastic; in words. A modulus or hint of its own stays."""
+    box = scene_graph.model_inspector().GetObbInGeometryFrame(geometry)
+    if isinstance(scene_graph.model_inspector().GetShape(geometry), HalfSpace) or box is None:
+        AddRigidHydroelasticProperties(properties)
+        return "rigid hydroelastic, as a compliant half space has no contact with a compliant body"
+    hint = _taken(properties, "resolution_hint", float(np.min(box.half_width())))
+    modulus = _taken(properties, "hydroelastic_modulus", HYDROELASTIC_MODULUS)
+    AddCompliantHydroelasticProperties(hint, modulus, properties)
+    return f"compliant hydroelastic, modulus {modulus:.4g} Pa, resolution {hint:.4g} m"
+
+
+def _taken(properties: ProximityProperties, name: str, default: float) -> float:
+    """A hydroelastic property that a geometry has already, taken out of its properties, or the default."""
+    value = float(properties.GetPropertyOrDefault("hydroelastic", name, default))
+    properties.RemoveProperty("hydroelastic", name)
+    return value

@@ -1,0 +1,201 @@
+"""What tasks are written with: positions, rotations, velocities and contact forces as functions of the state.
+
+Each function here takes a model and names, checks them, and gives a function of x (nx,), or of x and u (nu,), of floats
+or AutoDiffXd, to use in costs and constraints:
+
+    hand = frame_position(model, "tool0")
+    Problem(..., final_cost=lambda x: 100 * np.sum((hand(x) - target) ** 2))
+    Problem(..., constraints=Constraint(lambda x: hand(x)[2], lower=0.1))
+
+Quantities are those of the model's own parameters and have no derivative by any. Where others are applied that they
+depend on (joint offsets; masses and centres of mass; for contact forces all), they are refused, and so is a Problem
+that has such parameters and uses them. A frame is named "frame", "instance::frame" where two model instances have one,
+or by its body.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.autodiffutils import AutoDiffXd
+from pydrake.multibody.tree import FrameIndex
+
+from drake_diff._base.arrays import Array, finite_array
+from drake_diff._base.autodiff import plain
+from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
+from drake_diff.model.model import Model
+from drake_diff.model.plant import bodies, labelled
+from drake_diff.model.step import advance, set_state
+from drake_diff.model.twin import Twin
+
+PLACE = frozenset({"offset"})  # the parameters that frames depend on
+BALANCE = PLACE | {"mass", "center_of_mass"}
+ORIGIN = (0.0, 0.0, 0.0)
+ROTATION_TOLERANCE = 1e-9  # of R' R = I: a goal written down with fewer digits would be another rotation
+
+OfState = Callable[[Any], Any]
+OfStateAndInput = Callable[[Any, Any], Any]
+
+
+def frame_position(model: Model, frame: str, point: ArrayLike = ORIGIN, relative_to: str = "world") -> OfState:
+    """x -> (3,) [m]: where `point` (3,), fixed in `frame`, is in the frame `relative_to`.
+
+    Raises UnknownNameError, which lists the frames that exist, and ShapeError.
+    """
+    here, base, p = _frame_index(model, frame), _frame_index(model, relative_to), finite_array("point", point, (3,))
+
+    def position(x: Any) -> Any:
+        _refuse_other(model, PLACE)
+        twin, _ = _at(model, x)
+        pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
+        return pose.translation() + pose.rotation().matrix() @ p
+
+    return position
+
+
+def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_to: str = "world") -> OfState:
+    """x -> (3,): 2 sin(angle / 2) axis of the rotation from `R_goal` (3, 3) to `frame`, both in `relative_to`.
+
+    That is twice the vector part of the quaternion of R R_goal', its scalar part not negative: 0 at the goal, there
+    the small rotation itself [rad], and smooth but at half a turn, where its axis may have either sign. Its square is
+    2 (1 - cos angle). Raises UnknownNameError, ShapeError, and InputError where R_goal is no rotation.
+    """
+    here, base, goal = _frame_index(model, frame), _frame_index(model, relative_to), _check_rotation(R_goal)
+
+    def error(x: Any) -> Any:
+        _refuse_other(model, PLACE)
+        twin, _ = _at(model, x)
+        pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
+        return 2 * _quaternion(pose.rotation().matrix() @ goal.T)[1:]
+
+    return error
+
+
+def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfState:
+    """x -> (3,) [m/s]: the velocity of `point` (3,), fixed in `frame`, in the world.
+
+    Raises UnknownNameError and ShapeError.
+    """
+    here, p = _frame_index(model, frame), finite_array("point", point, (3,))
+
+    def velocity(x: Any) -> Any:
+        _refuse_other(model, PLACE)
+        twin, _ = _at(model, x)
+        world, moving = twin.plant.world_frame(), twin.plant.get_frame(here)
+        arm = moving.CalcPose(twin.context, world).rotation().matrix() @ p
+        return moving.CalcSpatialVelocity(twin.context, world, world).Shift(arm).translational()
+
+    return velocity
+
+
+def center_of_mass(model: Model) -> OfState:
+    """x -> (3,) [m]: the centre of mass of all bodies, in the world. ModelError where they have no mass."""
+    if not float(model.plant.CalcTotalMass(model.double.context)) > 0:
+        raise ModelError("the bodies have no mass, and so no centre of mass")
+
+    def center(x: Any) -> Any:
+        _refuse_other(model, BALANCE)
+        twin, _ = _at(model, x)
+        return np.array(twin.plant.CalcCenterOfMassPositionInWorld(twin.context))
+
+    return center
+
+
+def contact_force(model: Model, body: str) -> OfStateAndInput:
+    """(x, u) -> (3,) [N]: the sum of all contact forces on `body` in the step taken from (x, u), in the world.
+
+    It needs a Constraint of (x, u), or a cost of both, and holds over the step that follows a knot. Its derivative is
+    0 where nothing touches, so that a search has to start from a motion that does. Raises UnknownNameError, which
+    lists the bodies, and, when called, what `step` does, such as SimulationError for pairs that Drake cannot do.
+    """
+    known = labelled(bodies(model.plant))
+    if body not in known:
+        raise UnknownNameError("body", got=body, known=known)
+    index = known[body].index()
+
+    def force(x: Any, u: Any) -> Any:
+        _refuse_other(model, model.other_quantities)
+        twin, (x, u) = _at(model, x, u)
+        advance(twin, x, u)
+        results = twin.plant.get_contact_results_output_port().Eval(twin.context)
+        total = np.array([twin.scalar(0.0)] * 3)
+        for i in range(results.num_point_pair_contacts()):
+            info = results.point_pair_contact_info(i)
+            total = total + _on(index, info.bodyB_index(), info.bodyA_index()) * info.contact_force()
+        for i in range(results.num_hydroelastic_contacts()):
+            patch = results.hydroelastic_contact_info(i)
+            first, second = (
+                model.plant.GetBodyFromFrameId(model.double.inspector.GetFrameId(geometry)).index()
+                for geometry in (patch.contact_surface().id_M(), patch.contact_surface().id_N())
+            )
+            total = total + _on(index, first, second) * patch.F_Ac_W().translational()
+        return total
+
+    return force
+
+
+def _on(index: Any, pushed: Any, pushing: Any) -> float:
+    """The sign of a contact's force on the body of that index; 0 where it is another's."""
+    return float(pushed == index) - float(pushing == index)
+
+
+def _refuse_other(model: Model, depends_on: frozenset[str]) -> None:
+    for quantity in sorted(model.other_quantities & depends_on):
+        raise InputError("parameters of a model whose task quantities are used", got=quantity, expected="others")
+
+
+def _at(model: Model, x: Any, *inputs: Any) -> tuple[Twin, list[Any]]:
+    """The twin for these numbers, its state set to `x`, and x and the inputs as its scalars."""
+    given = [np.asarray(array) for array in (x, *inputs)]
+    for name, array, size in zip(("x", "u"), given, (model.nx, model.nu), strict=False):
+        if array.shape != (size,):
+            raise ShapeError(name, got=array.shape, expected=(size,))
+    if all(array.dtype != object for array in given):
+        twin, numbers = model.double, [array.astype(float) for array in given]
+    else:
+        twin = model.autodiff
+        numbers = [np.array([v if isinstance(v, AutoDiffXd) else AutoDiffXd(v) for v in array]) for array in given]
+    set_state(twin, numbers[0])
+    return twin, numbers
+
+
+def _frame_index(model: Model, name: str) -> FrameIndex:
+    plant = model.plant
+    frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
+    names = [frame.name() for frame in frames]
+    known = {n: frame.index() for n, frame in zip(names, frames, strict=True) if names.count(n) == 1}
+    if name in known:
+        return known[name]
+    full = {f"{plant.GetModelInstanceName(f.model_instance())}::{f.name()}": f.index() for f in frames}
+    if name in full:
+        return full[name]
+    raise UnknownNameError("frame", got=name, known=[*known, *(n for n in full if n.split("::")[-1] not in known)])
+
+
+def _check_rotation(R: ArrayLike) -> Array:
+    rotation = finite_array("R_goal", R, (3, 3))
+    off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if off > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        got = f"R' R off by {off:.2g}, determinant {np.linalg.det(rotation):.2g}"
+        raise InputError("R_goal", got=got, expected="a rotation matrix")
+    return rotation
+
+
+def _quaternion(R: Any) -> Any:
+    """(4,) w x y z, w not negative, of a rotation matrix; divided by the largest entry (Shepperd, 1978).
+
+    4 w^2 = 1 + tr R, 4 x^2 = 1 + 2 R_xx - tr R, 4 w x = R_zy - R_yz, 4 x y = R_xy + R_yx, and so on around.
+    """
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    squares = [1 + trace, *(1 + 2 * R[i, i] - trace for i in range(3))]
+    largest = int(np.argmax(plain(squares)))
+    if largest == 0:
+        quadruple = [squares[0], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]
+    else:
+        i = largest - 1
+        j, k = (i + 1) % 3, (i + 2) % 3
+        quadruple = [R[k, j] - R[j, k], None, None, None]
+        quadruple[1 + i], quadruple[1 + j], quadruple[1 + k] = squares[largest], R[i, j] + R[j, i], R[i, k] + R[k, i]
+    quaternion = np.array(quadruple) / (2 * np.sqrt(squares[largest]))
+    return -quaternion if quaternion[0] < 0 else quaternion

@@ -1,0 +1,129 @@
+"""Seeded states of a model to try something on: in free motion, and with geometries just touching."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, frozen
+from drake_diff.exceptions import SimulationError
+from drake_diff.model.contact import penetration
+from drake_diff.model.model import Model
+from drake_diff.model.step import set_state
+from drake_diff.model.tangent import TangentSpace, tangent_space
+
+FREE, CONTACT = "free", "contact"
+ATTEMPTS = 200  # at a state of the kind that is wanted, before another kind is taken
+DEPTH = (1e-4, 1e-3)  # [m] how deep geometries of a contact state overlap
+BISECTIONS = 40
+SPEED = 0.5  # [m/s or rad/s] standard deviation, within the velocity limits
+REACH = 1.0  # [m] of a slide, or of a free body, without limits
+EFFORT = 0.2  # part of the effort limit; of 1 N or N m where there is none
+
+
+@dataclass(frozen=True, eq=False)
+class SampledState:
+    """A state x (nx,) and an input u (nu,), and whether geometries touch there."""
+
+    kind: str
+    x: Array
+    u: Array
+
+
+def sample_states(model: Model, count: int, seed: int = 0) -> list[SampledState]:
+    """`count` states, every other one touching where contact can be found; the same seed gives the same states."""
+    random = np.random.default_rng(seed)
+    touches = model.contract.contact.collision_pairs > 0
+    found: list[SampledState] = []
+    for i in range(count):
+        x = _touching(model, random) if touches and i % 2 else None
+        kind = FREE if x is None else CONTACT
+        x = _free(model, random) if x is None else x
+        found.append(SampledState(kind, frozen(x), frozen(_input(model, random))))
+    return found
+
+
+def _free(model: Model, random: np.random.Generator) -> Array:
+    """A state without overlap, where one is found; else the last one tried."""
+    for _ in range(ATTEMPTS):
+        x = _any(model, random)
+        if _depth(model, x) == 0:
+            break
+    return x
+
+
+def _touching(model: Model, random: np.random.Generator) -> Array | None:
+    """Between a free state and one with an overlap, the state where the overlap is small; None if none is found."""
+    space = tangent_space(model)
+    free = _free(model, random)
+    for _ in range(ATTEMPTS // 10):
+        inside = _sunk(model, random)
+        if _depth(model, inside) > 0:
+            x = _at_the_surface(model, space, free, inside)
+            if x is not None:
+                return x
+    return None
+
+
+def _at_the_surface(model: Model, space: TangentSpace, free: Array, inside: Array) -> Array | None:
+    way = space.minus(inside, free)
+    low, high = 0.0, 1.0
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        x = space.plus(free, middle * way)
+        depth = _depth(model, x)
+        if DEPTH[0] <= depth <= DEPTH[1]:
+            return x
+        low, high = (middle, high) if depth < DEPTH[0] else (low, middle)
+    return None
+
+
+def _sunk(model: Model, random: np.random.Generator) -> Array:
+    """Any state, free bodies pushed downwards, where the ground is."""
+    x = _any(model, random)
+    for start in _free_bodies(model):
+        x[start + 6] -= REACH * random.uniform(0, 2)
+    return x
+
+
+def _any(model: Model, random: np.random.Generator) -> Array:
+    plant, nq = model.plant, model.nq
+    x = np.array(model.default_state)
+    x[:nq] = _within(random, plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits(), x[:nq], _reach(model))
+    for start in _free_bodies(model):
+        x[start : start + 4] = random.standard_normal(4)
+        x[start : start + 4] /= np.linalg.norm(x[start : start + 4])
+        x[start + 6] += REACH
+    lowest, highest = plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits()
+    x[nq:] = np.clip(SPEED * random.standard_normal(model.nv), lowest, highest)
+    return x
+
+
+def _within(random: np.random.Generator, lower: Array, upper: Array, default: Array, reach: Array) -> Array:
+    """Between the limits, 5 % of the range apart from them; around the default where there are none."""
+    limited = np.isfinite(lower) & np.isfinite(upper)
+    middle = np.where(limited, (np.where(limited, lower, 0) + np.where(limited, upper, 0)) / 2, default)
+    half = np.where(limited, 0.45 * (np.where(limited, upper, 0) - np.where(limited, lower, 0)), reach)
+    return np.asarray(middle + half * random.uniform(-1, 1, len(middle)))
+
+
+def _reach(model: Model) -> Array:
+    units = [coordinate.unit for coordinate in model.contract.positions]
+    return np.where(np.array(units) == "rad", np.pi, REACH)
+
+
+def _free_bodies(model: Model) -> tuple[int, ...]:
+    """Where in x the seven coordinates of each free body start."""
+    return tangent_space(model).quaternions
+
+
+def _input(model: Model, random: np.random.Generator) -> Array:
+    limit = np.minimum(np.abs(model.plant.GetEffortLowerLimits()), np.abs(model.plant.GetEffortUpperLimits()))
+    return np.asarray(EFFORT * np.where(limit < 1e6, limit, 1.0) * random.uniform(-1, 1, model.nu))
+
+
+def _depth(model: Model, x: Array) -> float:
+    set_state(model.double, x)
+    try:
+        return penetration(model)
+    except SimulationError:  # Drake cannot measure these shapes: the state is tried as it is
+        return 0.0

@@ -1,0 +1,180 @@
+"""Contact that acts at a distance: a smooth force added to a plant, so that what does not touch has a gradient too.
+
+Between every two geometries that may collide, at the signed distance phi [m], there is the normal force
+
+    c(phi) = sigma k log(1 + exp(-phi / sigma)),
+
+Kurtz and Lin, "Inverse dynamics trajectory optimization for contact-implicit model predictive control", 2023, without
+their dissipation and friction. It is explicit in the state before the step; Drake's own contact, friction included,
+acts beside it. As sigma -> 0 it goes to k max(0, -phi), and apart from overlaps to nothing.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydrake.math import exp, log
+from pydrake.multibody.tree import JacobianWrtVariable
+
+from drake_diff._base.arrays import Array, positive_float
+from drake_diff.exceptions import InputError, ModelError
+from drake_diff.model.model import Model
+from drake_diff.model.twin import Twin
+
+# Nodes in [0, 1] of the integral for the potential, whose integrand is smooth there: 16 leave rounding only.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+_NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
+
+
+@dataclass(frozen=True)
+class SoftContact:
+    """The force sigma k log(1 + exp(-phi / sigma)) with sigma = `distance` [m] and k = `stiffness` [N/m].
+
+    It falls by e with each `distance` of separation. A stable step needs h^2 k below 4 times the mass that it moves.
+    Raises InputError.
+    """
+
+    distance: float
+    stiffness: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "distance", positive_float("SoftContact.distance [m]", self.distance))
+        object.__setattr__(self, "stiffness", positive_float("SoftContact.stiffness [N/m]", self.stiffness))
+
+    def normal_force(self, phi: Any) -> Any:
+        """[N] at the signed distance `phi` [m], a float or an AutoDiffXd."""
+        a = phi / self.distance
+        tail = log(1.0 + exp(-a)) if a > 0 else -a + log(1.0 + exp(a))  # neither overflows
+        return self.distance * self.stiffness * tail
+
+    def energy(self, phi: float) -> float:
+        """[J] the integral of the force from `phi` [m] to infinity."""
+        a = abs(phi) / self.distance
+        beyond = float(_WEIGHTS @ (np.log1p(np.exp(-a) * _NODES) / _NODES))
+        if phi < 0:
+            beyond = a * a / 2 + np.pi**2 / 6 - beyond
+        return self.distance**2 * self.stiffness * beyond
+
+    def force(self, plant: Any, context: Any) -> Any:
+        """(nv,) the generalized force [N or N m] in the state of `context`, of either scalar type."""
+        total = np.zeros(plant.num_velocities())
+        for pair, bodies in _pairs(plant, context):
+            total = total + self.normal_force(pair.distance) * _distance_rate(plant, context, pair, bodies)
+        return total
+
+    def potential(self, plant: Any, context: Any) -> float:
+        return sum(self.energy(float(pair.distance)) for pair, _ in _pairs(plant, context))
+
+
+def softened(model: Model, contact: SoftContact) -> Model:
+    """`model` with `contact` between all geometries that may collide, beside Drake's own, at any time step.
+
+    Its steps, rollouts, gradients and certificates are those of any model. AutoDiffXd knows the distance of a sphere
+    from a sphere, a box and a half space; where another pair may collide, steps are differenced, and say so.
+    Raises InputError where nothing may collide or no force can be added, ModelError where Drake knows no distance.
+    """
+    if not isinstance(contact, SoftContact):
+        raise InputError("contact", got=type(contact).__name__, expected="a SoftContact")
+    if not model.takes_forces:
+        raise InputError("model", got="a diagram that feeds the applied forces", expected="that input port free")
+    if not model.contract.contact.collision_pairs:
+        raise InputError("model", got="no geometries that may collide", expected="at least one pair")
+
+    def rebuild(**change: Any) -> Model:
+        return softened(model.changed(**change), contact)
+
+    soft = Model(
+        model.diagram,
+        source=model.source,
+        notes=model.notes,
+        contact_geometry=model.contact_geometry,
+        rebuild=rebuild if model.can_rebuild else None,
+        forces=(*model.forces, contact),
+    )
+    contact.force(soft.plant, soft.double.context)  # refuses what has no distance
+    return soft
+
+
+def distances(twin: Twin) -> dict[tuple[str, str], float]:
+    """The signed distance [m] of the geometries of every two bodies that may collide, in the context's state."""
+    found: dict[tuple[str, str], float] = {}
+    for pair, (a, b) in _pairs(twin.plant, twin.context):
+        names = (a.name(), b.name())
+        found[names] = min(float(pair.distance), found.get(names, np.inf))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Separation:
+    """Two bodies that may collide: their signed `distance` [m], its `gradient` (nq,), and the least motion (nq,) that
+    adds a metre to it, in the metric of the mass matrix (zero where nothing moves them apart)."""
+
+    bodies: tuple[str, str]
+    distance: float
+    gradient: Array
+    opening: Array
+
+
+def separations(twin: Twin) -> list[Separation]:
+    """Every pair of geometries that may collide, always in the same order, in the context's state."""
+    plant, context, found = twin.plant, twin.context, []
+    mass = plant.CalcMassMatrix(context)
+    to_v = np.array([plant.MapQDotToVelocity(context, e) for e in np.eye(plant.num_positions())]).T
+    for pair, (a, b) in _pairs(plant, context):
+        rate = _distance_rate(plant, context, pair, (a, b))
+        v = np.linalg.solve(mass, rate)
+        opening = plant.MapVelocityToQDot(context, v / max(rate @ v, np.finfo(float).tiny))
+        found.append(Separation((a.name(), b.name()), float(pair.distance), rate @ to_v, opening))
+    return found
+
+
+def approaches(twin: Twin) -> list[float]:
+    """[1/kg] of every pair that may collide: how fast a unit impulse between the two makes them part."""
+    plant, context, found = twin.plant, twin.context, []
+    inverse_mass = np.linalg.inv(plant.CalcMassMatrix(context))
+    for pair, bodies in _pairs(plant, context):
+        row = _distance_rate(plant, context, pair, bodies)
+        found.append(float(row @ inverse_mass @ row))
+    return found
+
+
+def smallest_half_width(twin: Twin) -> float:
+    """[m] of the bounding boxes of what may collide; 0 where nothing has one."""
+    inspector = twin.inspector
+    ids = {i for pair in inspector.GetCollisionCandidates() for i in pair}
+    boxes = [inspector.GetObbInGeometryFrame(i) for i in ids]
+    return min((float(np.min(box.half_width())) for box in boxes if box is not None), default=0.0)
+
+
+def _distance_rate(plant: Any, context: Any, pair: Any, bodies: tuple[Any, Any]) -> Any:
+    """(nv,) the derivative of the distance's rate by v."""
+    at_a = _jacobian(plant, context, bodies[0], pair.id_A, pair.p_ACa)
+    at_b = _jacobian(plant, context, bodies[1], pair.id_B, pair.p_BCb)
+    return (at_a - at_b).T @ np.asarray(pair.nhat_BA_W)
+
+
+def _pairs(plant: Any, context: Any) -> list[tuple[Any, tuple[Any, Any]]]:
+    """Drake's signed distance, and the bodies, of every two geometries that may collide."""
+    port = plant.get_geometry_query_input_port()
+    if not port.HasValue(context):
+        return []
+    query = port.Eval(context)
+    inspector, found = query.inspector(), []
+    for ids in sorted(inspector.GetCollisionCandidates(), key=lambda pair: [int(i.get_value()) for i in pair]):
+        try:
+            pair = query.ComputeSignedDistancePairClosestPoints(*ids)
+        except RuntimeError as error:
+            raise ModelError(f"soft contact: Drake does not know a distance: {error}") from error
+        bodies = [plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in (pair.id_A, pair.id_B)]
+        found.append((pair, (bodies[0], bodies[1])))
+    return found
+
+
+def _jacobian(plant: Any, context: Any, body: Any, geometry: Any, p_GC: Any) -> Any:
+    """(3, nv) the derivative by v of the velocity of the point `p_GC` of a geometry's frame, world frame."""
+    X_BG = plant.get_geometry_query_input_port().Eval(context).inspector().GetPoseInFrame(geometry)
+    p_BC = X_BG.rotation().matrix() @ np.asarray(p_GC) + X_BG.translation()
+    world = plant.world_frame()
+    return plant.CalcJacobianTranslationalVelocity(
+        context, JacobianWrtVariable.kV, body.body_frame(), p_BC.reshape(3, 1), world, world
+    )

@@ -1,0 +1,70 @@
+"""One discrete step of Drake's double plant."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_diff._base.arrays import Array, finite_array
+from drake_diff.exceptions import SimulationError
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import applied, select
+from drake_diff.model.twin import Twin
+
+
+def step(
+    model: Model, x: ArrayLike, u: ArrayLike | None = None, *, parameters: Mapping[str, Any] | None = None
+) -> Array:
+    """(nx,): the state one `model.time_step` after `x` (nx,) under the constant input `u` (nu,) [N or N m].
+
+    `u` may be left out where the model has no actuators; `parameters` maps names (see `list_parameters`) to values
+    that replace the model's own for this step. Raises ShapeError, NonFiniteError, or SimulationError
+    where Drake cannot take the step or its result is not finite.
+    """
+    point = check_point(model, x, u)
+    with applied(select(model, parameters or ())) as set_model:
+        return advance(set_model.double, *point)
+
+
+def check_point(model: Model, x: ArrayLike, u: ArrayLike | None) -> tuple[Array, Array]:
+    """`x` and `u` as finite arrays of the model's sizes."""
+    no_input = u is None and model.nu == 0
+    return finite_array("x", x, (model.nx,)), finite_array("u", [] if no_input else u, (model.nu,))
+
+
+def set_state(twin: Twin, x: Any) -> None:
+    """Put the state `x` (nx,), floats or AutoDiffXd, into the twin's context.
+
+    Raises SimulationError where a float is not finite: Drake would end the process with SystemExit.
+    """
+    if not _is_finite(np.asarray(x)):
+        raise SimulationError(f"a state is not finite: {x}")
+    twin.plant.SetPositionsAndVelocities(twin.context, x)
+
+
+def advance(twin: Twin, x: Any, u: Any) -> Any:
+    """(nx,): one step of the twin, floats or AutoDiffXd; sizes are the caller's business.
+
+    The context is left at (x, u), so that what Drake computed on the way (contacts, efforts) can be read.
+    """
+    plant, context = twin.plant, twin.context
+    set_state(twin, x)
+    if not _is_finite(np.asarray(u)):
+        raise SimulationError(f"an input is not finite: {u}")
+    plant.get_actuation_input_port().FixValue(context, u)
+    if twin.forces:
+        plant.get_applied_generalized_force_input_port().FixValue(context, twin.added_force())
+    try:
+        # value() is a view that the next step overwrites.
+        x_next = np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())
+    except (RuntimeError, SystemExit) as error:  # SystemExit: a condition in Drake, such as a stiffness above 0
+        raise SimulationError(f"Drake cannot take this step: {error}") from error
+    if not _is_finite(x_next):
+        raise SimulationError(f"the step leads to {x_next}, which is not finite, from x = {x}, u = {u}")
+    return x_next
+
+
+def _is_finite(numbers: Any) -> bool:
+    """Of an array of floats; AutoDiffXd are taken as they are."""
+    return numbers.dtype != float or bool(np.isfinite(numbers).all())

@@ -1,0 +1,159 @@
+"""One scalar type of a model: its diagram, its plant, the context that is kept and reused, and forces added to them."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from pydrake.multibody.tree import MultibodyForces_
+
+from drake_diff.model.plant import actuators, bodies, joints, labelled
+
+
+class AddedForce(Protocol):
+    """A force that acts over a step as if it were part of the model, explicit in the state before it."""
+
+    def force(self, plant: Any, context: Any) -> Any:
+        """(nv,) the generalized force [N or N m] in the state of `context`."""
+
+    def potential(self, plant: Any, context: Any) -> float:
+        """[J] what the force adds to the potential energy."""
+
+
+@dataclass
+class SpringChange:
+    """A prismatic spring with another stiffness k [N/m] and rest length l [m]: -k (q - l) + k0 (q - l0) is added."""
+
+    position: int
+    velocity: int
+    own_stiffness: float
+    own_rest: float
+    stiffness: Any
+    rest: Any
+
+    @classmethod
+    def none(cls, spring: Any) -> "SpringChange":
+        """The spring as it is."""
+        k, rest, joint = spring.stiffness(), spring.nominal_position(), spring.joint()
+        k, rest = (float(getattr(number, "value", lambda n=number: n)()) for number in (k, rest))
+        return cls(joint.position_start(), joint.velocity_start(), k, rest, k, rest)
+
+    def force(self, plant: Any, context: Any) -> Any:
+        q = plant.GetPositions(context)[self.position]
+        added = self.own_stiffness * (q - self.own_rest) - self.stiffness * (q - self.rest)
+        return np.array([added if i == self.velocity else 0.0 * added for i in range(plant.num_velocities())])
+
+    def potential(self, plant: Any, context: Any) -> float:
+        q = plant.GetPositions(context)[self.position]
+        own = self.own_stiffness * (q - self.own_rest) ** 2
+        return float(self.stiffness * (q - self.rest) ** 2 - own) / 2
+
+
+@dataclass
+class GravityChange:
+    """Gravity beyond that of the plant [m/s^2]: generalized gravity is linear in the vector g."""
+
+    added: Any  # (3,)
+
+    def force(self, plant: Any, context: Any) -> Any:
+        field = plant.mutable_gravity_field()
+        own = field.gravity_vector()
+        total = 0.0
+        for axis, amount in zip(np.eye(3), self.added, strict=True):
+            field.set_gravity_vector(axis)
+            total = total + amount * field.CalcGravityGeneralizedForces(context)
+        field.set_gravity_vector(own)
+        return total
+
+    def potential(self, plant: Any, context: Any) -> float:
+        return 0.0  # the plant's own gravity carries the value; what is added has only a derivative
+
+
+@dataclass(frozen=True, eq=False)
+class Twin:
+    """One scalar type of the model: its diagram, its plant, and one context that is kept and reused."""
+
+    scalar: Any  # float or AutoDiffXd
+    diagram: Any
+    plant: Any
+    scene_graph: Any
+    root_context: Any
+    context: Any  # the plant's, inside root_context
+    defaults: Any  # a root context that nobody touches
+    own: tuple[AddedForce, ...] = ()  # the model's own beside Drake's, which no parameter changes
+    added: dict[str, AddedForce] = field(default_factory=dict)  # by parameters that Drake has not
+
+    def body(self, label: str) -> Any:
+        return self._bodies[label]
+
+    def joint(self, label: str) -> Any:
+        return self._joints[label]
+
+    def actuator(self, label: str) -> Any:
+        return self._actuators[label]
+
+    @cached_property
+    def _bodies(self) -> dict[str, Any]:
+        return labelled(bodies(self.plant))
+
+    @cached_property
+    def _joints(self) -> dict[str, Any]:
+        return labelled(joints(self.plant))
+
+    @cached_property
+    def _actuators(self) -> dict[str, Any]:
+        return labelled(actuators(self.plant))
+
+    @cached_property
+    def _workspace(self) -> Any:
+        return MultibodyForces_[self.scalar](self.plant)
+
+    @cached_property
+    def _moving_joints(self) -> list[tuple[slice, Any]]:
+        moving = [joint for joint in joints(self.plant) if joint.num_velocities()]
+        return [(slice(j.velocity_start(), j.velocity_start() + j.num_velocities()), j) for j in moving]
+
+    def damping(self) -> Any:
+        """(nv,) the joint damping coefficients in the context [N s/m or N m s/rad]."""
+        found = np.zeros(self.plant.num_velocities()).astype(self.scalar)
+        for velocities, joint in self._moving_joints:
+            found[velocities] = joint.GetDampingVector(self.context)
+        return found
+
+    @property
+    def inspector(self) -> Any:
+        """The scene graph's inspector, with the context's own properties; None where there is no scene graph."""
+        port = self.plant.get_geometry_query_input_port()
+        return port.Eval(self.context).inspector() if port.HasValue(self.context) else None
+
+    def touches(self) -> bool:
+        """Whether the step from the context's state has any contact."""
+        contacts = self.plant.get_contact_results_output_port().Eval(self.context)
+        return bool(contacts.num_point_pair_contacts() or contacts.num_hydroelastic_contacts())
+
+    def overlaps(self) -> bool:
+        """Whether any two geometries that may collide do, in the context's state; no step is taken."""
+        return bool(self.plant.get_geometry_query_input_port().Eval(self.context).HasCollisions())
+
+    def inverse_dynamics(self, acceleration: Any) -> Any:
+        """(nv,) M a + bias less gravity, springs, damping and added forces, at the context's state."""
+        self.plant.CalcForceElementsContribution(self.context, self._workspace)  # which overwrites it
+        needed = self.plant.CalcInverseDynamics(self.context, acceleration, self._workspace)
+        return needed - self.added_force() if self.forces else needed  # AutoDiffXd's `forces` are a copy: not writable
+
+    @property
+    def forces(self) -> tuple[AddedForce, ...]:
+        """All that acts beside Drake's own forces."""
+        return (*self.own, *self.added.values())
+
+    def added_force(self) -> Any:
+        """(nv,) the generalized force of `forces` in the state of the context."""
+        return sum(force.force(self.plant, self.context) for force in self.forces)
+
+    def reset(self) -> None:
+        """Put every parameter of the context back to the model's own."""
+        self.root_context.SetTimeStateAndParametersFrom(self.defaults)
+        if self.added:
+            self.added.clear()
+            port = self.plant.get_applied_generalized_force_input_port()
+            port.FixValue(self.context, np.zeros(self.plant.num_velocities()).astype(self.scalar))

@@ -1,0 +1,234 @@
+"""The gradient of a scalar back through the steps of a rollout, with its norm at every step."""
+
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
+from drake_diff._base.autodiff import gradient_of
+from drake_diff.derivatives.linearize import smooth_steps
+from drake_diff.derivatives.step import StepDerivatives, check_method, step_jacobians
+from drake_diff.exceptions import InputError
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import Parameters, ParameterVector, applied, select
+from drake_diff.model.step import advance
+from drake_diff.motion.policy import active_parameters, differentiate_policy, policy_parameters
+from drake_diff.motion.rollout import Policy, check_inputs
+
+Loss = Callable[..., Any]
+# A policy's derivatives (nu, nx) by the state and (nu, n) by those of its parameters that act, and which they are.
+Feedback = tuple[Array, Array, slice]
+EXPLODED, VANISHED = 1e6, 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class RolloutGradient:
+    """loss and its gradient by x0 (nx,), us (N, nu), parameters (np,) and the policy's parameters (n,).
+
+    `state_gradient_norms` (N+1,) is |d loss / d x_k|, the later steps being functions of x_k: where it grows
+    without bound going back the gradient explodes, where it dies out the early inputs cannot be learned.
+    Under a policy `us` is what it chose, and `state_gradient_norms` go through the closed loop.
+    """
+
+    loss: float
+    x0: Array
+    us: Array
+    parameters: Array
+    parameter_names: tuple[str, ...]
+    parameter_sources: tuple[str, ...]  # where each column came from
+    policy: Array
+    state_gradient_norms: Array
+    spectral_radii: Array  # (N,) the largest |eigenvalue| of each step's Jacobian by the state, policy included
+    xs: Array  # (N+1, nx) the rollout itself
+    inputs: Array  # (N, nu) what was applied
+    methods: tuple[str, ...]  # where the step Jacobians came from: one name, or more where a fallback was taken
+
+    @property
+    def growth_rate(self) -> float:
+        """By which factor |d loss / d x_k| grows per step back in time: its geometric mean, 1 for a neutral motion.
+
+        NaN where either end is zero: a gradient that does not depend on a state has no rate.
+        """
+        first, last = self.state_gradient_norms[0], self.state_gradient_norms[-1]
+        if first == 0 or last == 0:
+            return float("nan")
+        return float((first / last) ** (1 / (len(self.state_gradient_norms) - 1)))
+
+    @property
+    def explodes_at(self) -> int | None:
+        """The last step k at which |d loss / d x_k| is over 1e6 times the smallest after it that is not 0."""
+        norms = np.where(self.state_gradient_norms > 0, self.state_gradient_norms, np.inf)
+        smallest_after = np.minimum.accumulate(norms[::-1])[::-1]
+        return _last(self.state_gradient_norms > EXPLODED * smallest_after)
+
+    @property
+    def vanishes_at(self) -> int | None:
+        """The last step k at which |d loss / d x_k| is below 1e-6 of the largest after it; None if there is none."""
+        largest_after = np.maximum.accumulate(self.state_gradient_norms[::-1])[::-1]
+        return _last(self.state_gradient_norms < VANISHED * largest_after)
+
+
+def differentiate_rollout(
+    model: Model,
+    x0: ArrayLike,
+    us: ArrayLike | None,
+    loss: Loss,
+    *,
+    policy: Policy | None = None,
+    parameters: Parameters = (),
+    num_steps: int | None = None,
+    method: str = "auto",
+) -> RolloutGradient:
+    """The gradient of `loss` along the rollout from `x0` (nx,) under `us` (N, nu), or under `policy` for `num_steps`.
+
+    `loss(xs, us)`, or `loss(x_final)` where it takes one argument, is a scalar written with ordinary arithmetic
+    and NumPy functions, so that AutoDiffXd flows through it; so is the policy (see `drake_diff.motion.policy`).
+    `parameters` names what to differentiate by, or maps names to values. Reverse accumulation through the step
+    Jacobians: with l_N = dloss/dx_N, g_k = dloss/du_k + B_k' l_(k+1) and l_k = dloss/dx_k + A_k' l_(k+1) + K_k' g_k,
+    K and P the policy's derivatives by state and by its own parameters, the gradients are l_0 by x0, g_k by u_k,
+    sum_k C_k' l_(k+1) by the parameters and sum_k P_k' g_k by the policy's.
+    """
+    check_method(method)
+    x0 = finite_array("x0", x0, (model.nx,))
+    if us is not None and policy is not None:
+        raise InputError("differentiate_rollout", got="us and policy", expected="one of them")
+    vector = select(model, parameters)
+    feedback: list[Feedback] = []
+    with applied(vector) as set_model:
+        if policy is None:
+            inputs = check_inputs(model, us, num_steps)
+            linearization = derivatives_along(set_model, x0, inputs, vector=vector, method=method)
+        else:
+            steps = positive_int("num_steps", num_steps)
+            linearization, feedback, inputs = _close_the_loop(set_model, x0, policy, steps, vector, method)
+    xs = np.vstack([x0, [d.x_next for d in linearization]])
+    value, by_xs, by_us = differentiate_loss(loss, xs, inputs)
+    totals = accumulate(linearization, by_xs, by_us, feedback, len(policy_parameters(policy)))
+    return RolloutGradient(
+        loss=value,
+        x0=frozen(totals.states[0]),
+        us=frozen(totals.inputs),
+        parameters=frozen(totals.parameters),
+        parameter_names=linearization[0].parameters,
+        parameter_sources=linearization[0].sources,
+        policy=frozen(totals.policy),
+        state_gradient_norms=frozen(np.linalg.norm(totals.states, axis=1)),
+        spectral_radii=frozen(_spectral_radii(linearization, feedback)),
+        xs=frozen(xs),
+        inputs=frozen(inputs),
+        methods=tuple(sorted({d.method for d in linearization})),
+    )
+
+
+def derivatives_along(
+    model: Model,
+    x0: Array,
+    us: Array,
+    *,
+    vector: ParameterVector | None = None,
+    method: str = "auto",
+    xs: Array | None = None,
+) -> list[StepDerivatives]:
+    """The step derivatives along the rollout from `x0` (nx,) under `us` (N, nu), `vector` being applied.
+
+    Given xs (N, nx), those of the steps from each of them.
+    """
+    vector = vector or select(model, ())
+    found = smooth_steps(model, x0, us, method, xs, vector)
+    for k in range(len(found), len(us)):
+        x = (found[-1].x_next if found else x0) if xs is None else xs[k]
+        found.append(step_jacobians(model, vector, x, us[k], method))
+    return found
+
+
+def _close_the_loop(
+    model: Model, x0: Array, policy: Policy, count: int, vector: ParameterVector, method: str
+) -> tuple[list[StepDerivatives], list[Feedback], Array]:
+    """The motion first, then the derivatives of all its steps at once."""
+    feedback: list[Feedback] = []
+    x, xs, inputs = x0, np.empty((count, model.nx)), np.empty((count, model.nu))
+    for k in range(count):
+        t, xs[k] = k * model.time_step, x
+        inputs[k], by_x, by_parameters = differentiate_policy(policy, x, t, model.nu)
+        active = active_parameters(policy, t)
+        feedback.append((by_x, by_parameters[:, active].copy(), active))
+        x = advance(model.double, x, inputs[k])
+    return derivatives_along(model, x0, inputs, vector=vector, method=method, xs=xs), feedback, inputs
+
+
+@dataclass(frozen=True, eq=False)
+class Totals:
+    """A loss's total gradients: by states (N+1, nx), inputs (N, nu), parameters (np,), policy parameters (n,)."""
+
+    states: Array
+    inputs: Array
+    parameters: Array
+    policy: Array
+
+
+def accumulate(
+    linearization: Sequence[StepDerivatives],
+    by_xs: Array,
+    by_us: Array,
+    feedback: Sequence[Feedback] = (),
+    num_policy_parameters: int = 0,
+) -> Totals:
+    """From a loss's partial gradients by xs (N+1, nx) and us (N, nu) to its total ones."""
+    state, inputs = np.array(by_xs), np.array(by_us)
+    parameters = np.zeros(linearization[0].C.shape[1])
+    policy = np.zeros(num_policy_parameters)
+    for k in reversed(range(len(linearization))):
+        d = linearization[k]
+        inputs[k] += d.B.T @ state[k + 1]
+        parameters += d.C.T @ state[k + 1]
+        state[k] += d.A.T @ state[k + 1]
+        if feedback:
+            by_x, by_parameters, active = feedback[k]
+            state[k] += by_x.T @ inputs[k]
+            policy[active] += by_parameters.T @ inputs[k]
+    return Totals(state, inputs, parameters, policy)
+
+
+def _last(where: NDArray[np.bool_]) -> int | None:
+    found = np.flatnonzero(where)
+    return int(found[-1]) if len(found) else None
+
+
+def _spectral_radii(linearization: Sequence[StepDerivatives], feedback: Sequence[Feedback]) -> Array:
+    closed = [d.A + d.B @ by_x for d, (by_x, _, _) in zip(linearization, feedback, strict=True)] if feedback else None
+    return np.abs(np.linalg.eigvals(np.array(closed or [d.A for d in linearization]))).max(axis=1)
+
+
+def evaluate_loss(loss: Loss, xs: Array, us: Array) -> float:
+    """`loss` at a rollout of plain numbers."""
+    return float(loss(xs[-1]) if takes_one_argument(loss) else loss(xs, us))
+
+
+def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, Array]:
+    """(value, gradient by xs (N+1, nx), gradient by us (N, nu)) of `loss` on its own, the steps apart."""
+    if takes_one_argument(loss):
+        value, gradient = gradient_of(loss, xs[-1])
+        return value, np.vstack([np.zeros_like(xs[:-1]), gradient]), np.zeros_like(us)
+    split = xs.size
+
+    def flat(z: Any) -> Any:
+        return loss(z[:split].reshape(xs.shape), z[split:].reshape(us.shape))
+
+    value, gradient = gradient_of(flat, np.concatenate([xs.ravel(), us.ravel()]))
+    return value, gradient[:split].reshape(xs.shape), gradient[split:].reshape(us.shape)
+
+
+def takes_one_argument(loss: Loss) -> bool:
+    """Whether `loss` is a function of the final state alone."""
+    required = [
+        p
+        for p in inspect.signature(loss).parameters.values()
+        if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
+    ]
+    if len(required) not in (1, 2):
+        raise InputError("loss", got=f"{len(required)} arguments", expected="loss(xs, us) or loss(x_final)")
+    return len(required) == 1

@@ -1,0 +1,290 @@
+"""Feedback inside a rollout: policies u = policy(x, t), and their derivatives by the state and by their parameters.
+
+A policy is written with ordinary arithmetic, so that AutoDiffXd flows through it. Of NumPy these take AutoDiffXd:
+tanh, sin, cos, tan, arcsin, arccos, arctan, arctan2, sinh, cosh, exp, log, sqrt, square, power, abs, maximum,
+minimum, clip, where, sum, mean, dot, @, outer, einsum, concatenate, linalg.norm; these do not: expm1, log1p,
+logaddexp, hypot, interp, heaviside, var, std, and every function of the module `math`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
+from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
+
+from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff._base.autodiff import gradient_rows
+from drake_diff.derivatives.linearize import linearize
+from drake_diff.derivatives.step import PARITY_TOLERANCE, differentiate_step
+from drake_diff.exceptions import GradientError, InputError
+from drake_diff.model.model import Model
+from drake_diff.model.plant import actuators
+from drake_diff.model.tangent import TangentSpace, tangent_space
+
+FIXED_POINT_TOLERANCE = 1e-6
+# How far x and the parameters are moved to see whether a plain number that a policy returns is a constant.
+NUDGE = 1e-6
+
+
+class Policy(Protocol):
+    """u (nu,) = policy(x, t, parameters): x (nx,), t [s]; `parameters` (n,) are the policy's own where left out.
+
+    A plain function u = policy(x, t) is a policy too, one without parameters.
+    """
+
+    @property
+    def parameters(self) -> Array:
+        """(n,) the numbers that the policy can be differentiated by and trained in."""
+        ...
+
+    def __call__(self, x: Any, t: float, parameters: Any = None) -> Any:
+        """(nu,): the input at state x (nx,) and time t [s]; floats or AutoDiffXd."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class ParametricPolicy:
+    """u = function(x, t, parameters) of any function, such as a neural network, and flat parameters (n,).
+
+    Another policy is such a function: ParametricPolicy(pd, better) is the PD law `pd` with other gains.
+    """
+
+    function: Callable[[Any, float, Any], Any]
+    parameters: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parameters", finite_array("parameters", self.parameters, ("n",)))
+
+    def __call__(self, x: Any, t: float, parameters: Any = None) -> Any:
+        return self.function(x, t, self.parameters if parameters is None else parameters)
+
+    def active(self, t: float) -> slice:
+        """The parameters that act at time t [s]: the function's own answer where it is a TVLQR, else all."""
+        active = getattr(self.function, "active", None)
+        return active(t) if active else slice(0, len(self.parameters))
+
+
+class PD:
+    """u_i = kp_i (q_ref - q) + kd_i (v_ref - v) at the joint of actuator i; parameters = [kp; kd] (2 nu,).
+
+    u is the effort at the joint [N or N m], as plant.MakeActuationMatrix() applies it, without gear ratio; Drake
+    actuates joints of one degree of freedom only. kp [N/m or N m/rad] and kd [N s/m or N m s/rad] are scalars or
+    (nu,), x_ref (nx,) the model's default state where left out. Angles are not wrapped.
+    """
+
+    def __init__(self, model: Model, kp: ArrayLike, kd: ArrayLike, x_ref: ArrayLike | None = None):
+        joints = [actuator.joint() for actuator in actuators(model.plant)]
+        if not joints:
+            raise InputError("model", got="no actuators", expected="at least one")
+        self.x_ref = finite_array("x_ref", model.default_state if x_ref is None else x_ref, (model.nx,))
+        self.kp, self.kd = _gains("kp", kp, model.nu), _gains("kd", kd, model.nu)
+        self.parameters = frozen(np.concatenate([self.kp, self.kd]))
+        self._positions = [joint.position_start() for joint in joints]
+        self._velocities = [model.nq + joint.velocity_start() for joint in joints]
+
+    def __call__(self, x: Any, t: float, parameters: Any = None) -> Any:
+        gains = self.parameters if parameters is None else parameters
+        error = self.x_ref - x
+        kp, kd = gains[: len(self.kp)], gains[len(self.kp) :]
+        return kp * error[self._positions] + kd * error[self._velocities]
+
+
+class LQR:
+    """u = u_ref - K minus(x, x_ref): the discrete-time LQR of the model's own step at a fixed point x_ref, u_ref.
+
+    K minimizes sum_k d_k' Q d_k + e_k' R e_k (no time step in it), with d = minus(x, x_ref) in the tangent space of
+    the state (nt,; nx less one for each quaternion) and e = u - u_ref. Q (nt, nt) is positive semidefinite, R
+    (nu, nu) positive definite. `gain` is K (nu, nt), `cost_to_go` P (nt, nt) with the cost d' P d, `parameters`
+    K row by row (nu * nt,). Raises InputError where step(x_ref, u_ref) is not x_ref within 1e-6, or no stabilizing
+    gain exists.
+    """
+
+    def __init__(self, model: Model, x_ref: ArrayLike, u_ref: ArrayLike, Q: ArrayLike, R: ArrayLike):
+        self.x_ref, self.u_ref = finite_array("x_ref", x_ref, (model.nx,)), finite_array("u_ref", u_ref, (model.nu,))
+        self._space = tangent_space(model)
+        Q, R = _weight("Q", Q, self._space.size), _weight("R", R, model.nu, definite=True)
+        A, B, x_next = _tangent_step(model, self._space, self.x_ref, self.u_ref, self.x_ref)
+        drift = float(np.abs(self._space.minus(x_next, self.x_ref)).max(initial=0.0))
+        if not drift <= FIXED_POINT_TOLERANCE:
+            raise InputError("x_ref, u_ref", got=f"a step that moves by {drift:.3g}", expected="a fixed point")
+        gain, cost_to_go = _regulator(A, B, Q, R)
+        self.gain, self.cost_to_go = frozen(gain), frozen(cost_to_go)
+        self.parameters = frozen(self.gain.ravel())
+
+    def __call__(self, x: Any, t: float, parameters: Any = None) -> Any:
+        gain = self.gain if parameters is None else parameters.reshape(self.gain.shape)
+        return self.u_ref - gain @ self._space.minus(x, self.x_ref)
+
+
+class TVLQR:
+    """u = us[k] - K_k minus(x, xs[k]), k = round(t / time_step) within 0..N-1: LQR along a trajectory.
+
+    `xs` (N+1, nx) and `us` (N, nu) is the trajectory, with A_k, B_k the step's Jacobians there in the tangent space
+    (nt,). From P_N = Qf (Q where left out) backward
+        K_k = (R + B' P B)^-1 B' P A,  P_k = Q + A' P (A - B K_k)   with P = P_(k+1),
+    which minimizes sum_k d_k' Q d_k + e_k' R e_k + d_N' Qf d_N (no time step in it) of the linearized motion. Q, Qf
+    (nt, nt) are positive semidefinite, R (nu, nu) positive definite. `gains` (N, nu, nt), `cost_to_go`
+    (N+1, nt, nt), `parameters` the gains flattened (N * nu * nt,).
+    """
+
+    def __init__(
+        self, model: Model, xs: ArrayLike, us: ArrayLike, Q: ArrayLike, R: ArrayLike, Qf: ArrayLike | None = None
+    ):
+        self.us = finite_array("us", us, ("N", model.nu))
+        if not len(self.us):
+            raise InputError("us", got="0 steps", expected="at least one step")
+        self.xs = finite_array("xs", xs, (len(self.us) + 1, model.nx))
+        self.time_step = model.time_step
+        self._space = tangent_space(model)
+        weights = _weight("Q", Q, self._space.size), _weight("R", R, model.nu, definite=True)
+        final = weights[0] if Qf is None else _weight("Qf", Qf, self._space.size)
+        A, B, _ = linearize(model, self.xs, self.us)
+        points = zip(self.xs[:-1], self.xs[1:], A, B, strict=True)
+        steps = [_split(self._space, self._space.jacobian(*point)) for point in points]
+        gains, cost_to_go = _riccati(steps, *weights, final)
+        self.gains, self.cost_to_go = frozen(gains), frozen(cost_to_go)
+        self.parameters = frozen(self.gains.ravel())
+
+    def __call__(self, x: Any, t: float, parameters: Any = None) -> Any:
+        k = self._index(t)
+        gain = self.gains[k] if parameters is None else parameters[self.active(t)].reshape(self.gains[k].shape)
+        return self.us[k] - gain @ self._space.minus(x, self.xs[k])
+
+    def active(self, t: float) -> slice:
+        """The parameters that act at time t [s]; the derivative by all others is zero."""
+        k, size = self._index(t), self.gains[0].size
+        return slice(k * size, (k + 1) * size)
+
+    def _index(self, t: float) -> int:
+        return min(max(round(t / self.time_step), 0), len(self.us) - 1)
+
+
+def policy_parameters(policy: Any) -> Array:
+    """(n,) the parameters of a policy; none where it is a plain function."""
+    return finite_array("policy.parameters", getattr(policy, "parameters", ()), ("n",))
+
+
+def active_parameters(policy: Any, t: float) -> slice:
+    """Which of the policy's parameters act at time t [s]: all, but where it has a method `active(t)` that says."""
+    return policy.active(t) if hasattr(policy, "active") else slice(0, len(policy_parameters(policy)))
+
+
+def differentiate_policy(policy: Any, x: Array, t: float, nu: int) -> tuple[Array, Array, Array]:
+    """(u (nu,), du/dx (nu, nx), du/dparameters (nu, n)) of `policy` at state `x` (nx,) and time `t` [s].
+
+    By AutoDiffXd; of a policy with a method `active(t)`, such as TVLQR, by those parameters alone, the others being
+    zero. A constant is a legal output. Raises ShapeError where u is not (nu,), and GradientError where the
+    derivatives were lost (float() was taken), u is another at the same point, or a derivative is not finite.
+    """
+    parameters = policy_parameters(policy)
+    u = _evaluate(policy, x, t, parameters, nu)
+    active = active_parameters(policy, t)
+    variables = InitializeAutoDiff(np.concatenate([x, parameters[active]])).ravel()
+    moved = parameters.astype(object)
+    moved[active] = variables[len(x) :]
+    result = _call_with_derivatives(policy, variables[: len(x)], t, moved)
+    plain = np.array([not isinstance(entry, AutoDiffXd) for entry in result], dtype=bool)
+    if plain.any():
+        _check_constant(policy, x, t, parameters, u, plain)
+    numbers = np.array([AutoDiffXd(entry) if lost else entry for entry, lost in zip(result, plain, strict=True)])
+    rows = gradient_rows(numbers, len(variables)) if nu else np.zeros((0, len(variables)))
+    _check(numbers, rows, u)
+    by_parameters = np.zeros((nu, len(parameters)))
+    by_parameters[:, active] = rows[:, len(x) :]
+    return u, np.array(rows[:, : len(x)]), by_parameters
+
+
+def _evaluate(policy: Any, x: Array, t: float, parameters: Array, nu: int) -> Array:
+    return finite_array("policy(x, t)", _call(policy, x.copy(), t, parameters), (nu,))
+
+
+def _call(policy: Any, x: Any, t: float, parameters: Any) -> Any:
+    return policy(x, t, parameters) if hasattr(policy, "parameters") else policy(x, t)
+
+
+def _call_with_derivatives(policy: Any, x: Any, t: float, parameters: Any) -> Any:
+    try:
+        with np.errstate(all="ignore"):  # what is not finite is refused by _check, whole
+            return np.asarray(_call(policy, x, t, parameters), dtype=object)
+    except (TypeError, AttributeError) as error:
+        if not ("AutoDiffXd" in str(error) or "dtype('O')" in str(error)):
+            raise
+        raise GradientError(
+            f"the policy lost its derivatives: {error}; write it with ordinary arithmetic and NumPy functions, "
+            "without float() and without putting results into an array of floats"
+        ) from error
+
+
+def _check_constant(policy: Any, x: Array, t: float, parameters: Array, u: Array, plain: Any) -> None:
+    """Refuse a plain number in the output that is not constant: its derivatives were thrown away."""
+    near = _evaluate(policy, x + NUDGE, t, parameters + NUDGE, len(u))
+    changed = np.flatnonzero(plain & (near != u))
+    if len(changed):
+        raise GradientError(
+            f"the policy lost its derivatives: u[{changed[0]}] is a plain number, yet it changes with the state or "
+            "the parameters (or jumps there)"
+        )
+
+
+def _check(numbers: Any, rows: Array, u: Array) -> None:
+    """Refuse derivatives of another value than the rollout's, and those that are not finite."""
+    values = ExtractValue(numbers.reshape(-1, 1)).ravel() if len(u) else u
+    if not np.all(np.abs(values - u) <= PARITY_TOLERANCE * np.maximum(1.0, np.abs(u))):
+        raise GradientError(
+            f"the policy with AutoDiffXd is not the policy with floats: u is {values} there and {u} here, at the "
+            "same x and t (is it random, or does it remember?)"
+        )
+    if not np.all(np.isfinite(rows)):
+        raise GradientError("the derivative of the policy is not finite")
+
+
+def _tangent_step(model: Model, space: TangentSpace, x: Array, u: Array, x_to: Array) -> tuple[Array, Array, Array]:
+    """(A (nt, nt), B (nt, nu), x_next): the step's Jacobians from the tangent space at `x` to the one at `x_to`."""
+    d = differentiate_step(model, x, u)
+    return (*_split(space, space.jacobian(x, x_to, d.A, d.B)), d.x_next)
+
+
+def _split(space: TangentSpace, jacobian: Array) -> tuple[Array, Array]:
+    return jacobian[:, : space.size], jacobian[:, space.size :]
+
+
+def _regulator(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:
+    try:
+        gain, cost_to_go = DiscreteTimeLinearQuadraticRegulator(A=A, B=B, Q=Q, R=R)
+    except (RuntimeError, SystemExit) as error:  # pydrake makes a failed demand of Drake's a SystemExit
+        raise InputError(
+            "LQR", got=str(error), expected="a fixed point that the inputs can stabilize, and Q that sees all of it"
+        ) from error
+    return gain, cost_to_go
+
+
+def _riccati(steps: list[tuple[Array, Array]], Q: Array, R: Array, Qf: Array) -> tuple[Array, Array]:
+    gains: list[Array] = []
+    cost_to_go = [Qf]
+    for A, B in reversed(steps):
+        P = cost_to_go[-1]
+        BP = B.T @ P
+        gain = np.asarray(np.linalg.solve(R + BP @ B, BP @ A), dtype=float)
+        before = Q + A.T @ P @ (A - B @ gain)
+        gains.append(gain)
+        cost_to_go.append((before + before.T) / 2)
+    return np.array(gains[::-1]), np.array(cost_to_go[::-1])
+
+
+def _gains(name: str, value: ArrayLike, nu: int) -> Array:
+    return finite_array(name, np.full(nu, value) if np.ndim(value) == 0 else value, (nu,))
+
+
+def _weight(name: str, value: ArrayLike, size: int, *, definite: bool = False) -> Array:
+    matrix = finite_array(name, value, (size, size))
+    scale = float(np.abs(matrix).max(initial=0.0))
+    if not np.allclose(matrix, matrix.T, rtol=0, atol=1e-12 * scale):
+        raise InputError(name, got="a matrix that is not symmetric", expected="a symmetric matrix")
+    lowest = float(np.min(np.linalg.eigvalsh(matrix), initial=np.inf))
+    if lowest <= 1e-12 * scale if definite else lowest < -1e-12 * scale:
+        kind = "definite" if definite else "semidefinite"
+        raise InputError(name, got=f"lowest eigenvalue {lowest:.3g}", expected=f"a positive {kind} matrix")
+    return matrix

@@ -1,0 +1,207 @@
+"""Many steps; energy, contact, penetration and constraint violation along them."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
+from drake_diff.exceptions import InputError
+from drake_diff.model.contact import ContactPoint, contacts_of_the_step, penetration
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import applied, select
+from drake_diff.model.step import advance, set_state
+from drake_diff.model.tangent import tangent_space
+
+Policy = Callable[[Array, float], ArrayLike]
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """N steps of the double plant and what was measured along them; arrays are read-only, SI units.
+
+    The energy balance of the discrete plant is `energy_error` = energy - energy[0] - work + dissipation: with
+    midpoint velocities work and dissipation are exact where M is constant, so that what remains is the error of
+    the time stepping, and what contact, joint limits and constraints took or gave.
+    """
+
+    times: Array  # (N+1,) [s]
+    xs: Array  # (N+1, nx)
+    us: Array  # (N, nu), as commanded
+    efforts: Array  # (N, nu), as applied: clipped at the effort limits, PD control included
+    kinetic_energy: Array  # (N+1,) [J]
+    potential_energy: Array  # (N+1,) [J], gravity and springs
+    work: Array  # (N+1,) [J], done by the actuators since the start
+    dissipation: Array  # (N+1,) [J], taken by joint damping since the start
+    penetration: Array  # (N+1,) [m], the largest overlap of two geometries
+    # (N+1,) beyond joint limits [m or rad], or of a quaternion's unit norm [1]; inf for a plant with constraints
+    # (couplers, balls, welds, distances), whose violation pydrake does not tell.
+    constraint_violation: Array
+    contacts: tuple[tuple[ContactPoint, ...], ...]  # N tuples: the contacts of each step
+
+    @property
+    def energy(self) -> Array:
+        """(N+1,) [J]: kinetic plus potential energy."""
+        return frozen(self.kinetic_energy + self.potential_energy)
+
+    @property
+    def energy_error(self) -> Array:
+        """(N+1,) [J]: energy that neither actuators nor damping account for."""
+        return frozen(self.energy - self.energy[0] - self.work + self.dissipation)
+
+    @property
+    def energy_drift(self) -> float:
+        """[J]: the lasting part of `energy_error`, its oscillation averaged out (see `drift`)."""
+        return drift(self.energy_error)
+
+    @property
+    def energy_oscillation(self) -> float:
+        """[J]: the largest distance of `energy_error` from its drift line."""
+        error = self.energy_error
+        line = self.energy_drift * np.linspace(-0.5, 0.5, len(error))
+        return float(np.abs(error - smooth_mean(error) - line).max())
+
+
+def rollout(
+    model: Model,
+    x0: ArrayLike,
+    us: ArrayLike | None = None,
+    *,
+    policy: Policy | None = None,
+    num_steps: int | None = None,
+    parameters: Mapping[str, Any] | None = None,
+) -> Rollout:
+    """Step from `x0` (nx,) under the inputs `us` (N, nu), or under `policy(x, t) -> u` for `num_steps` steps.
+
+    A model without actuators needs `num_steps` alone. `parameters` maps names (see `list_parameters`) to values
+    that replace the model's own. Raises ShapeError, NonFiniteError, InputError, or
+    SimulationError where Drake cannot take a step.
+    """
+    if us is not None and policy is not None:
+        raise InputError("rollout", got="us and policy", expected="one of them")
+    inputs = check_inputs(model, us, num_steps) if policy is None else policy
+    count = len(inputs) if policy is None else positive_int("num_steps", num_steps)  # type: ignore[arg-type]
+    with applied(select(model, parameters or ())) as set_model:
+        return _roll(set_model, x0, inputs, count)
+
+
+def check_inputs(model: Model, us: ArrayLike | None, num_steps: int | None = None) -> Array:
+    """`us` as a finite (N, nu) array; for a model without actuators `num_steps` alone will do."""
+    if us is None and model.nu == 0:
+        us = np.zeros((positive_int("num_steps", num_steps), 0))
+    checked = finite_array("us", us, ("N", model.nu))
+    if len(checked) == 0:
+        raise InputError("us", got="0 steps", expected="at least one step")
+    if num_steps is not None and num_steps != len(checked):
+        raise InputError("num_steps", got=num_steps, expected=f"{len(checked)}, the length of us")
+    return checked
+
+
+def roll_states(model: Model, x0: Array, us: Array) -> Array:
+    """(N+1, nx): the states alone, nothing measured; sizes are the caller's business."""
+    xs = np.empty((len(us) + 1, model.nx))
+    xs[0] = x0
+    for k, u in enumerate(us):
+        xs[k + 1] = advance(model.double, xs[k], u)
+    return xs
+
+
+def _roll(model: Model, x0: ArrayLike, inputs: Array | Policy, count: int) -> Rollout:
+    h, meter = model.time_step, Meter(model)
+    xs, us = np.empty((count + 1, model.nx)), np.empty((count, model.nu))
+    xs[0] = finite_array("x0", x0, (model.nx,))
+    for k in range(count):
+        us[k] = finite_array("u", inputs(xs[k].copy(), k * h), (model.nu,)) if callable(inputs) else inputs[k]
+        xs[k + 1] = advance(model.double, xs[k], us[k])
+        meter.measure_step(xs[k], xs[k + 1])
+    set_state(model.double, xs[-1])
+    meter.measure_state(xs[-1])
+    return meter.result(xs, us)
+
+
+class Meter:
+    """Reads energies, efforts and contacts from the double context, state by state, as `advance` leaves it."""
+
+    def __init__(self, model: Model):
+        self.model, self.plant, self.context = model, model.plant, model.double.context
+        inspector = model.double.inspector
+        self.can_touch = inspector is not None and bool(inspector.GetCollisionCandidates())
+        self.damping = model.double.damping()
+        self.actuation = self.plant.MakeActuationMatrix()
+        self.states: list[tuple[Array, float, float, float]] = []
+        self.ends: list[Array] = []
+        self.efforts: list[Array] = []
+        self.contacts: list[tuple[ContactPoint, ...]] = []
+
+    def measure_state(self, x: Array) -> None:
+        """Of the state `x` (nx,) in the context."""
+        kinetic = self.plant.CalcKineticEnergy(self.context)
+        potential = self.plant.CalcPotentialEnergy(self.context)
+        potential += sum(f.potential(self.plant, self.context) for f in self.model.double.forces)
+        self.states.append((x, kinetic, potential, penetration(self.model) if self.can_touch else 0.0))
+
+    def measure_step(self, x: Array, x_next: Array) -> None:
+        """Of the step from `x` to `x_next` (nx,) that was taken last, and of the state `x`."""
+        self.measure_state(x)
+        self.ends.append(x_next)
+        self.efforts.append(np.array(self.plant.get_net_actuation_output_port().Eval(self.context)))
+        self.contacts.append(contacts_of_the_step(self.model) if self.can_touch else ())
+
+    def result(self, xs: Array, us: Array) -> Rollout:
+        """The rollout with states xs (N+1, nx) and us (N, nu)."""
+        at, kinetic, potential, deepest = (np.array(column) for column in zip(*self.states, strict=True))
+        nq, h, efforts = self.model.nq, self.model.time_step, np.array(self.efforts).reshape(us.shape)
+        after = np.array(self.ends).reshape(len(us), self.model.nx)[:, nq:]
+        middle = (at[:-1, nq:] + after) / 2
+        work = h * np.einsum("ki,ki->k", middle, efforts @ self.actuation.T)
+        dissipation = h * np.einsum("ki,ki->k", middle, self.damping * after)
+        return Rollout(
+            times=frozen(self.model.time_step * np.arange(len(xs))),
+            xs=frozen(xs),
+            us=frozen(us),
+            efforts=frozen(efforts),
+            kinetic_energy=frozen(kinetic),
+            potential_energy=frozen(potential),
+            work=frozen(np.append(0.0, np.cumsum(work))),
+            dissipation=frozen(np.append(0.0, np.cumsum(dissipation))),
+            penetration=frozen(deepest),
+            constraint_violation=frozen(self._violations(at[:, :nq])),
+            contacts=tuple(self.contacts),
+        )
+
+    def _violations(self, qs: Array) -> Array:
+        """(N+1,) at the positions qs (N+1, nq)."""
+        if self.plant.num_constraints():
+            return np.full(len(qs), np.inf)  # pydrake does not tell where a coupler, ball, weld or distance should be
+        lower, upper = self.plant.GetPositionLowerLimits(), self.plant.GetPositionUpperLimits()
+        found = np.maximum(lower - qs, qs - upper).max(axis=1, initial=0.0)
+        for start in tangent_space(self.model).quaternions:
+            found = np.maximum(found, np.abs(np.linalg.norm(qs[:, start : start + 4], axis=1) - 1))
+        return np.asarray(found)
+
+
+def smooth_mean(series: Array) -> float:
+    """The mean of `series` (n,) under the weight exp(-1 / (s (1 - s))), s from 0 to 1 along it.
+
+    The weight vanishes with all its derivatives at both ends, so an oscillation of more than a few periods
+    contributes next to nothing (Das, Saiki, Sander and Yorke, "Quantitative quasiperiodicity", 2017).
+    """
+    s = (np.arange(len(series)) + 0.5) / len(series)
+    weight = np.exp(-1 / (s * (1 - s)))
+    return float(weight @ series / weight.sum())
+
+
+def drift(series: Array) -> float:
+    """How far `series` (n,) wanders from its start to its end, oscillation averaged out.
+
+    Twice the difference between the smooth means of its second and its first half: exactly the rise of a
+    straight line, next to nothing for an oscillation of many periods. Of fewer than four values, the last minus
+    the first.
+    """
+    if len(series) < 4:
+        return float(series[-1] - series[0])
+    half = len(series) // 2
+    rise = smooth_mean(series[-half:]) - smooth_mean(series[:half])
+    return rise * (len(series) - 1) / (len(series) - half)

@@ -1,0 +1,320 @@
+"""Randomized smoothing: F(x) = E[f(x + w)] and its Jacobian, from samples of f and of its derivative.
+
+Suh et al. 2022, "Do differentiable simulators give better policy gradients?", with w of density p:
+    first order   mean of df/dx(x + w)                         misses what f jumps by: its mean is then biased
+    zeroth order  mean of (f(x + w) - f(x)) s(w)^T,            unbiased for any f, of a larger variance as a rule;
+                  s = -d log p / d w                           f(x) changes no mean, for E[s] = 0, but the variance
+    blend         a * first + (1 - a) * zeroth, entry by entry, with v1 and v0 the variances of the two means,
+                  b = first - zeroth and e the standard error of b (from the differences of each sample, for both
+                  orders use the same samples):
+                      a = v0 / (v0 + v1), but at most 3 e / |b|
+The first term makes a^2 v1 + (1 - a)^2 v0 smallest. The second acts only where |b| > 3 e, that is where first order
+is biased: it keeps what first order can add to the bias, a |b|, within 3 e. It is their constraint
+a |b| <= gamma - epsilon with the distance gamma - epsilon set to 3 e, so it shrinks like 1 / sqrt(samples).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drake_diff._base.arrays import Array, array_with_gaps, finite_array, frozen, positive_float, positive_int
+from drake_diff.derivatives.step import differentiate_step
+from drake_diff.exceptions import GradientError, InputError, ShapeError, UnknownNameError
+from drake_diff.model.model import Model
+from drake_diff.model.step import advance, check_point
+from drake_diff.model.tangent import tangent_space
+
+Flags = NDArray[np.bool_]
+METHODS = ("first", "zeroth", "blend")
+# Standard errors beyond which a difference is no chance: 0.3 % of the entries of an unbiased f exceed it.
+CONFIDENCE = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussian:
+    """Independent normal noise of standard deviation `sigma`, in the units of x.
+
+    `sigma` is a number above 0, or (n,) numbers of at least 0 of which one is above 0; noise does not move a
+    coordinate of 0. Raises InputError.
+    """
+
+    sigma: ArrayLike
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sigma", _scale("Gaussian.sigma", self.sigma))
+
+    def sample(self, random: np.random.Generator, shape: tuple[int, ...]) -> Array:
+        """Noise of `shape` (..., n)."""
+        return np.asarray(np.asarray(self.sigma) * random.standard_normal(shape))
+
+    def score(self, w: ArrayLike) -> Array:
+        """(..., n): -d log p / d w = w / sigma^2 at `w` (..., n); 0 where sigma is 0."""
+        return _ratio(w, np.square(np.asarray(self.sigma)))
+
+
+@dataclass(frozen=True, eq=False)
+class Barrier:
+    """Independent noise of density c (w^2 + c)^(-3/2) / 2, `c` in the squared units of x.
+
+    This is sqrt(c / 2) times Student's t of 2 degrees of freedom. It smooths max(u, 0) to what a log barrier
+    makes of it, (u + sqrt(u^2 + c)) / 2 (Pang et al., arXiv 2206.10787). Its variance is infinite and its score
+    bounded: for an f that grows linearly F and both orders exist, and both orders have a variance, but F's own
+    estimate has none (`value_variance` then does not settle); an f that grows like |x|^2 has no F.
+    `c` is a number above 0, or (n,) numbers of at least 0 of which one is above 0; noise does not move a
+    coordinate of 0. Raises InputError.
+    """
+
+    c: ArrayLike
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "c", _scale("Barrier.c", self.c))
+
+    def sample(self, random: np.random.Generator, shape: tuple[int, ...]) -> Array:
+        """Noise of `shape` (..., n)."""
+        return np.asarray(np.sqrt(np.asarray(self.c) / 2) * random.standard_t(2, shape))
+
+    def score(self, w: ArrayLike) -> Array:
+        """(..., n): -d log p / d w = 3 w / (w^2 + c) at `w` (..., n); 0 where c is 0."""
+        w, c = np.asarray(w, dtype=float), np.asarray(self.c)
+        return np.where(c > 0, _ratio(3 * w, w * w + c), 0.0)
+
+
+Noise = Gaussian | Barrier
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """F(x) and dF/dx from `samples` samples; all variances are those of the means, not of one sample.
+
+    `value` (m,) with `value_variance` (m,); `jacobian` (m, n) with `variance` (m, n) is what `method` chose:
+    `weight` (m, n) of `first`, the rest of `zeroth`, each with its variance. `bias` (m, n) = first - zeroth is
+    the estimated bias of first order, `bias_error` its standard error, and `biased` whether |bias| > 3 bias_error:
+    True is a bias (or a wrong derivative) to 0.3 %, but False only means that these samples do not show one. Where
+    `biased`, a blend may be off by up to 3 bias_error beyond what `variance` says. `first`, `first_variance`, `bias`,
+    `bias_error` and `biased` are None where there was no derivative. A column that noise does not move has no
+    zeroth order: first order stands in `zeroth` there, with weight 1 and bias 0.
+    """
+
+    value: Array
+    value_variance: Array
+    jacobian: Array
+    variance: Array
+    weight: Array
+    zeroth: Array
+    zeroth_variance: Array
+    method: str
+    samples: int
+    seed: int
+    noise: Noise
+    first: Array | None = None
+    first_variance: Array | None = None
+    bias: Array | None = None
+    bias_error: Array | None = None
+    biased: Flags | None = None
+
+    def __str__(self) -> str:
+        rows, columns = self.jacobian.shape
+        error = float(np.sqrt(np.max(self.variance)))
+        head = f"{self.method} order" if self.method != "blend" else "blend of first and zeroth order"
+        head += f", {rows} x {columns}, {self.samples} samples of {_words(self.noise)}, seed {self.seed}"
+        if self.biased is None:
+            return f"{head}\nstandard errors up to {error:.2g}; no derivative to compare with"
+        low, high, count = np.min(self.weight), np.max(self.weight), np.count_nonzero(self.biased)
+        return (
+            f"{head}\nstandard errors up to {error:.2g}; first order is biased in {count} of {self.biased.size} "
+            f"entries, its weight is {low:.2g} to {high:.2g}"
+        )
+
+
+def smooth(
+    f: Callable[[Array], Any],
+    x: ArrayLike,
+    jacobian: Callable[[Array], Any] | None = None,
+    *,
+    noise: Noise,
+    samples: int = 1000,
+    seed: int = 0,
+    method: str = "blend",
+) -> Smoothed:
+    """F(x) = E[f(x + w)] and dF/dx at `x` (n,), for `f`: (n,) -> (m,), or a number (m = 1).
+
+    `jacobian`: (n,) -> (m, n), or (n,) where m = 1, is the derivative of f. `method` is "first", "zeroth" or
+    "blend" (see the top of this module); only "zeroth" does without `jacobian`, and only where noise moves all
+    coordinates, but where one is given all three are estimated. The same `seed` gives the same bytes.
+
+    Calls f `samples` + 1 times and `jacobian` `samples` times; keeps sums, not samples. Raises UnknownNameError,
+    InputError (shapes, fewer than 2 samples, a missing `jacobian`), GradientError where f, `jacobian` or what
+    comes of them is not finite, and what f and `jacobian` raise.
+    """
+    if method not in METHODS:
+        raise UnknownNameError("method", got=method, known=METHODS)
+    x = finite_array("x", x, ("n",))
+    moved = _moved(noise, len(x))
+    if jacobian is None and (method != "zeroth" or not moved.all()):
+        why = "a function (n,) -> (m, n): only zeroth order of coordinates that noise moves does without"
+        raise InputError("jacobian", got=None, expected=why)
+    samples, seed = _check_counts(samples, seed)
+    means, variances = _moments(f, x, jacobian, noise, moved, samples, seed)
+    (value, zeroth, *derivative), (value_variance, zeroth_variance, *derivative_variance) = means, variances
+    common: dict[str, Any] = {"method": method, "samples": samples, "seed": seed, "noise": noise}
+    common |= {"value": frozen(value), "value_variance": frozen(value_variance)}
+    common |= {"zeroth": frozen(zeroth), "zeroth_variance": frozen(zeroth_variance)}
+    if jacobian is None:
+        weight = frozen(np.zeros_like(zeroth))
+        return Smoothed(**common, jacobian=common["zeroth"], variance=common["zeroth_variance"], weight=weight)
+    first, bias = derivative
+    first_variance, bias_variance = derivative_variance
+    bias_error = np.sqrt(bias_variance)
+    weight = _weight(method, first_variance, zeroth_variance, bias, bias_error)
+    weight[:, ~moved] = 1.0
+    covariance = (first_variance + zeroth_variance - bias_variance) / 2
+    spread = weight**2 * first_variance + (1 - weight) ** 2 * zeroth_variance
+    biased = np.abs(bias) > CONFIDENCE * bias_error
+    biased.setflags(write=False)
+    return Smoothed(
+        **common,
+        jacobian=frozen(weight * first + (1 - weight) * zeroth),
+        variance=frozen(np.maximum(spread + 2 * weight * (1 - weight) * covariance, 0)),
+        weight=frozen(weight),
+        first=frozen(first),
+        first_variance=frozen(first_variance),
+        bias=frozen(bias),
+        bias_error=frozen(bias_error),
+        biased=biased,
+    )
+
+
+def smooth_step(
+    model: Model,
+    x: ArrayLike,
+    u: ArrayLike | None = None,
+    *,
+    noise: Noise,
+    samples: int = 100,
+    seed: int = 0,
+    method: str = "blend",
+) -> Smoothed:
+    """`smooth` of one step of `model`, m = nx, over z = [x; u], n = nx + nu, from `differentiate_step`.
+
+    The noise has the units of z, which differ from entry to entry: (nx + nu,) numbers say more than one. A
+    coordinate whose number is 0 is not smoothed; its columns of `zeroth` hold the first order. Raises InputError
+    where the model has a quaternion, to which no noise can be added, SimulationError where Drake cannot
+    take a step, and what `smooth` and `differentiate_step` raise.
+    """
+    x, u = check_point(model, x, u)
+    quaternions = tangent_space(model).quaternions
+    if quaternions:
+        names = ", ".join(model.state_names[quaternions[0] : quaternions[0] + 4])
+        raise InputError("model", got=f"the quaternion ({names})", expected="a state without quaternions")
+    nx = model.nx
+
+    def f(z: Array) -> Any:
+        return advance(model.double, z[:nx], z[nx:])
+
+    def jacobian(z: Array) -> Array:
+        step = differentiate_step(model, z[:nx], z[nx:])
+        return np.hstack([step.A, step.B])
+
+    free = method == "zeroth" and _moved(noise, nx + model.nu).all()
+    z = np.concatenate([x, u])
+    return smooth(f, z, None if free else jacobian, noise=noise, samples=samples, seed=seed, method=method)
+
+
+def _scale(subject: str, scale: Any) -> float | Array:
+    if not isinstance(scale, (list, tuple, np.ndarray)) or np.ndim(scale) == 0:
+        return positive_float(subject, scale)
+    array = finite_array(subject, scale, ("n",))
+    if not (np.all(array >= 0) and np.any(array > 0)):
+        raise InputError(subject, got=array, expected="numbers of at least 0, one of them above 0")
+    return array
+
+
+def _words(noise: Noise) -> str:
+    name, scale = ("sigma", noise.sigma) if isinstance(noise, Gaussian) else ("c", noise.c)
+    low, high = np.min(np.asarray(scale)), np.max(np.asarray(scale))
+    return f"{type(noise).__name__}({name} = {low:g}" + (f" to {high:g})" if high > low else ")")
+
+
+def _ratio(a: ArrayLike, b: ArrayLike) -> Array:
+    """a / b, and 0 where b is 0."""
+    a, b = np.broadcast_arrays(np.asarray(a, dtype=float), np.asarray(b, dtype=float))
+    return np.divide(a, b, out=np.zeros(a.shape), where=b > 0)
+
+
+def _moved(noise: Noise, size: int) -> Flags:
+    """(size,): which coordinates the noise moves."""
+    if not isinstance(noise, (Gaussian, Barrier)):
+        raise InputError("noise", got=repr(noise)[:80], expected="a Gaussian or a Barrier")
+    scale = np.asarray(noise.sigma if isinstance(noise, Gaussian) else noise.c)
+    if scale.ndim and scale.shape != (size,):
+        raise ShapeError(f"the numbers of {type(noise).__name__}", got=scale.shape, expected=(size,))
+    return np.array(np.broadcast_to(scale > 0, (size,)))
+
+
+def _check_counts(samples: Any, seed: Any) -> tuple[int, int]:
+    if positive_int("samples", samples) < 2:
+        raise InputError("samples", got=samples, expected="at least 2: one has no variance")
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InputError("seed", got=repr(seed), expected="a whole number of at least 0")
+    return int(samples), int(seed)
+
+
+def _moments(
+    f: Callable[[Array], Any],
+    x: Array,
+    jacobian: Callable[[Array], Any] | None,
+    noise: Noise,
+    moved: Flags,
+    samples: int,
+    seed: int,
+) -> list[list[Array]]:
+    """The means of value (m,), zeroth and, with a jacobian, first, first - zeroth (m, n); their variances (Welford)."""
+    centre = _evaluate("f", f, x.copy(), ("m",))
+    rows, size = len(centre), len(x)
+    if not (rows and size):
+        raise InputError("x and f(x)", got=f"{size} and {rows} entries", expected="at least one of each")
+    mean, squares = np.zeros(()), np.zeros(())
+    for count, w in enumerate(noise.sample(np.random.default_rng(seed), (samples, size)), start=1):
+        value = _evaluate("f", f, x + w, (rows,))
+        first = None if jacobian is None else _evaluate("jacobian", jacobian, x + w, (rows, size))
+        with np.errstate(over="ignore", invalid="ignore"):  # refused below
+            zeroth = np.outer(value - centre, noise.score(w))
+            parts = [value, zeroth.ravel()]
+            if first is not None:
+                zeroth[:, ~moved] = first[:, ~moved]
+                parts = [value, zeroth.ravel(), first.ravel(), (first - zeroth).ravel()]
+            change = np.concatenate(parts) - mean
+            mean = mean + change / count
+            squares = squares + change * change * ((count - 1) / count)
+    variance = squares / ((samples - 1) * samples)
+    if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(variance))):
+        raise GradientError("the mean or the variance of the samples is not finite: f or its derivative is too large")
+    return [[flat[:rows], *flat[rows:].reshape(-1, rows, size)] for flat in (mean, variance)]
+
+
+def _evaluate(subject: str, function: Callable[[Array], Any], point: Array, shape: tuple[int | str, ...]) -> Array:
+    """`function` at `point` as numbers of `shape`; missing leading dimensions are 1."""
+    at = point.copy()  # the function may change what it is given
+    result = function(point)
+    try:
+        result = np.array(result, ndmin=len(shape))
+        if result.dtype == object:
+            raise TypeError("objects")
+    except (TypeError, ValueError) as error:  # objects, or rows of unequal length
+        raise InputError(f"{subject}(x)", got=repr(result)[:80], expected="an array of numbers") from error
+    values = array_with_gaps(f"{subject}(x)", result, shape)
+    if not np.isfinite(values).all():
+        raise GradientError(f"{subject}({at.tolist()}) is {values.tolist()}: it must be finite wherever noise leads")
+    return values
+
+
+def _weight(method: str, first_variance: Array, zeroth_variance: Array, bias: Array, bias_error: Array) -> Array:
+    """(m, n): the weight of first order, see the top of this module; 1 where neither order varies and they agree."""
+    if method != "blend":
+        return np.full(bias.shape, float(method == "first"))
+    total, size, allowed = first_variance + zeroth_variance, np.abs(bias), CONFIDENCE * bias_error
+    least = np.divide(zeroth_variance, total, out=np.ones_like(total), where=total > 0)
+    return np.minimum(least, np.divide(allowed, size, out=np.ones_like(size), where=size > allowed))

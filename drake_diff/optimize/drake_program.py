@@ -1,0 +1,199 @@
+"""Run a MathematicalProgram with SNOPT or IPOPT, and read the solver's table."""
+
+import math
+import re
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.solvers import (
+    CommonSolverOption,
+    IpoptSolver,
+    MathematicalProgram,
+    SnoptSolver,
+    SolutionResult,
+    SolverOptions,
+)
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, UnknownNameError
+from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch, interrupt_flag
+
+SOLVERS = ("ipopt", "snopt")
+
+
+class _Stop(Exception):  # noqa: N818  (a signal, not an error)
+    """Raised in the callback to end a solve."""
+
+
+def solve_program(
+    program: MathematicalProgram, guess: Array, *, solver: str, limits: Limits, report: Report | None = None
+) -> NlpResult:
+    """Solve `program` from `guess` (n,) with "ipopt" or "snopt".
+
+    `report` gets a line of progress a few times a second. Ctrl-C ends the solve with the best iterate so far.
+    """
+    if solver not in SOLVERS:
+        raise UnknownNameError("solver", got=solver, known=SOLVERS)
+    engine = IpoptSolver() if solver == "ipopt" else SnoptSolver()
+    if not (engine.available() and engine.enabled()):
+        raise MissingDependencyError(f"the solver {solver} is not in this Drake: take another one, or Drake's wheel")
+    with tempfile.TemporaryDirectory() as folder, interrupt_flag() as interrupted:
+        print_file = Path(folder) / "log"
+        watch = Watch(limits, interrupted)
+        callback = _Callback(program, watch, report)
+        program.AddVisualizationCallback(callback, program.decision_variables())
+        try:
+            result = engine.Solve(program, guess, _options(solver, limits, print_file))
+        except (DrakeDiffError, RuntimeError, _Stop) as error:
+            outcome, message = _explain_exception(watch, error)
+            return NlpResult(watch.best_of(guess), outcome, message, _read_table(solver, print_file))
+        outcome, message = _explain(solver, result)
+        z = result.GetSolution(program.decision_variables())
+        return NlpResult(np.asarray(z), outcome, message, _read_table(solver, print_file))
+
+
+class _Callback:
+    """Called by the solver at every evaluation: reports, keeps the best iterate, raises to stop."""
+
+    def __init__(self, program: MathematicalProgram, watch: Watch, report: Report | None):
+        self.program, self.watch, self.report = program, watch, report
+        self.evaluations = 0
+
+    def __call__(self, z: Array) -> None:
+        self.evaluations += 1
+        if self.evaluations == 1:
+            self.watch.offer(z, math.inf, 0.0)  # better than none: what it costs has not been asked yet
+        if self.watch.look_up():
+            self._look(z)
+        if self.watch.stopped_by is not None:
+            raise _Stop
+
+    def _look(self, z: Array) -> None:
+        cost = sum(float(self.program.EvalBinding(binding, z)[0]) for binding in self.program.GetAllCosts())
+        violation = max((self._violation(b, z) for b in self.program.GetAllConstraints()), default=0.0)
+        self.watch.offer(z, cost, violation)
+        if self.report:
+            self.report.row(Iteration(self.evaluations, cost, violation, math.nan, math.nan), printed=False)
+            spent = f"violation {violation:9.2e}  {self.watch.elapsed:6.1f} s"
+            self.report.say(f"evaluation {self.evaluations:5d}  cost {cost:12.6g}  {spent}")
+
+    def _violation(self, binding: Any, z: Array) -> float:
+        constraint, values = binding.evaluator(), self.program.EvalBinding(binding, z)
+        return float(
+            np.max(np.maximum(constraint.lower_bound() - values, values - constraint.upper_bound()), initial=0)
+        )
+
+
+def _options(solver: str, limits: Limits, print_file: Path) -> SolverOptions:
+    options = SolverOptions()
+    options.SetOption(CommonSolverOption.kPrintFileName, str(print_file))
+    if solver == "ipopt":
+        name = IpoptSolver.id()
+        options.SetOption(name, "tol", limits.tolerance)
+        options.SetOption(name, "constr_viol_tol", limits.tolerance)
+        options.SetOption(name, "max_iter", limits.max_iterations)
+        options.SetOption(name, "file_print_level", 5)  # else the file holds no table
+    else:
+        name = SnoptSolver.id()
+        options.SetOption(name, "Major feasibility tolerance", limits.tolerance)
+        options.SetOption(name, "Major optimality tolerance", limits.tolerance)
+        options.SetOption(name, "Major iterations limit", limits.max_iterations)
+        options.SetOption(name, "Iterations limit", 1000 * limits.max_iterations)
+    return options
+
+
+def _explain_exception(watch: Watch, error: Exception) -> tuple[Outcome, str]:
+    """IPOPT hands our exceptions on, SNOPT wraps them in a RuntimeError: flags and names tell, not types."""
+    if watch.stopped_by is not None:
+        return watch.stopped_by, f"stopped: {watch.stopped_by.value}"
+    text = f"{type(error).__name__}: {error}"
+    for name, outcome in (("SimulationError", Outcome.DIVERGED), ("GradientError", Outcome.NO_GRADIENT)):
+        if name in text:
+            return outcome, text[text.rindex(name) :].strip()  # SNOPT's text holds the traceback first
+    return Outcome.FAILED, text
+
+
+_RESULTS = {
+    SolutionResult.kSolutionFound: Outcome.SOLVED,
+    SolutionResult.kIterationLimit: Outcome.ITERATION_LIMIT,
+    SolutionResult.kInfeasibleConstraints: Outcome.INFEASIBLE,
+    SolutionResult.kInfeasibleOrUnbounded: Outcome.INFEASIBLE,
+    SolutionResult.kUnbounded: Outcome.UNBOUNDED,
+}
+_SNOPT_INACCURATE = (
+    3,
+    41,
+)  # feasible or not better: "requested accuracy could not be achieved", "numerical difficulties"
+_SNOPT_INFEASIBLE = (11, 12, 13, 14, 15, 16)
+
+
+def _explain(solver: str, result: Any) -> tuple[Outcome, str]:
+    """The outcome and the solver's own words for it."""
+    outcome = _RESULTS.get(result.get_solution_result(), Outcome.FAILED)
+    details = result.get_solver_details()
+    if solver == "ipopt":
+        words = details.ConvertStatusToString()
+        if words == "Stop at acceptable point":
+            outcome = Outcome.INACCURATE
+        return outcome, f"IPOPT: {words}"
+    if details.info in _SNOPT_INACCURATE:
+        outcome = Outcome.INACCURATE
+    elif details.info in _SNOPT_INFEASIBLE:
+        outcome = Outcome.INFEASIBLE
+    return outcome, f"SNOPT info {details.info}: {result.get_solution_result().name}"
+
+
+def _read_table(solver: str, print_file: Path) -> tuple[Iteration, ...]:
+    if not print_file.is_file():
+        return ()
+    lines = print_file.read_text(errors="replace").splitlines()
+    rows = _ipopt_rows(lines) if solver == "ipopt" else _snopt_rows(lines)
+    return tuple(rows)
+
+
+_IPOPT_ROW = re.compile(
+    r"^\s*(?P<iter>\d+)(?:r|\s)\s*(?P<objective>-?\d\S+)\s+(?P<inf_pr>\S+)\s+(?P<inf_du>\S+)\s+\S+\s+\S+\s+\S+\s+\S+\s+"
+    r"(?P<alpha_pr>[\d.e+-]+)\w?\s+\d+"
+)
+
+
+def _ipopt_rows(lines: list[str]) -> Iterator[Iteration]:
+    for match in filter(None, map(_IPOPT_ROW.match, lines)):
+        yield Iteration(
+            int(match["iter"]),
+            _number(match["objective"]),
+            _number(match["inf_pr"]),
+            _number(match["inf_du"]),
+            _number(match["alpha_pr"]),
+        )
+
+
+def _snopt_rows(lines: list[str]) -> Iterator[Iteration]:
+    """Columns are read where their header stands: the first row leaves some of them blank."""
+    ends: dict[str, tuple[int, int]] = {}
+    for line in lines:
+        if "Itns" in line and "Major" in line and "Feasible" in line:
+            previous = 0
+            for match in re.finditer(r"\S+", line):
+                ends[match.group()] = (previous, match.end())
+                previous = match.end()
+        elif ends and re.match(r"^\s+\d+\s+\d+\s", line):
+            objective = next((n for n in ("MeritFunction", "Objective") if n in ends), "")
+            cell = {name: line[a:b].strip(" ()") for name, (a, b) in ends.items()}
+            yield Iteration(
+                int(cell["Major"]),
+                _number(cell.get(objective, "")),
+                _number(cell["Feasible"]),
+                _number(cell["Optimal"]),
+                _number(cell["Step"]),
+            )
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

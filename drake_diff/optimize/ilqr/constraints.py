@@ -1,0 +1,152 @@
+"""A hard goal, waypoints, state bounds and other constraints as costs: the augmented Lagrangian.
+
+(Of Hestenes, Powell and Rockafellar.) An equality c = 0 with multiplier y costs  y c + p c^2 / 2, an inequality c <= 0
+costs (max(0, y + p c)^2 - y^2) / (2 p), where p is the penalty. After each minimization y becomes y + p c, or
+max(0, y + p c). Howell, Jackson and Manchester, "ALTRO", 2019, do the same with iLQR inside. Of the Hessian only
+p J'J of the rows that push is kept (Gauss-Newton), which no constraint can make indefinite.
+"""
+
+from collections.abc import Callable
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.problem import Problem
+
+FIRST_PENALTIES = (1.0, 1e6)  # the lowest and the highest
+LARGEST_PENALTY, GROWTH = 1e9, 10.0
+SMALLEST_SLOPE = 1e-8  # of a row: below it nothing says in what unit it is to be weighed
+
+
+class AugmentedLagrangian:
+    """What must hold of a motion, as rows lower <= c <= upper, their multipliers and their common penalty.
+
+    First a row for every state coordinate at every knot, in its own unit (the bounds of x_0 are not here), then those
+    of the problem's constraints. These are divided by the largest slope |dc / d(x, u)| that they were seen to have at
+    any of their knots, so that newtons beside metres weigh as the metres do that change them. Multipliers (m,) are
+    positive at an upper bound and negative at a lower one.
+    """
+
+    def __init__(self, problem: Problem):
+        self.problem = problem
+        lower, upper = problem.state_limits()
+        lower[0], upper[0] = -np.inf, np.inf
+        self.groups = [_Rows(problem, constraint) for constraint in problem.constraints]
+        self.lower = np.concatenate([lower.ravel(), *(g.lower for g in self.groups)])
+        self.upper = np.concatenate([upper.ravel(), *(g.upper for g in self.groups)])
+        self.scale = np.ones(len(self.lower))
+        self.multipliers = np.zeros(len(self.lower))
+        self.penalty = FIRST_PENALTIES[0]
+        self.any = bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
+
+    def start(self, xs: Array, us: Array, cost: float, gaps: float) -> None:
+        """Choose scales, and a first penalty that makes the guess as wrong as it is expensive: a good one is not left.
+
+        `gaps` is the sum of the squares of what else is wrong with the guess xs (N+1, nx), us (N, nu).
+        """
+        self._choose_scales(xs, us)
+        wrong = (gaps + float(np.sum((self.scale * self._excess(xs, us)) ** 2))) / 2
+        self.penalty = float(np.clip(abs(cost) / wrong if wrong else np.inf, *FIRST_PENALTIES))
+
+    def violation(self, xs: Array, us: Array) -> float:
+        """The largest excess over a bound, or distance from the goal, in the row's own unit."""
+        return float(np.max(self._excess(xs, us), initial=0.0))
+
+    def residual(self, xs: Array, us: Array) -> float:
+        """The largest change of a multiplier by `update`, over the penalty: 0 at a KKT point."""
+        return float(np.abs(self._pushes(xs, us) - self.multipliers).max(initial=0.0)) / self.penalty
+
+    def unrest(self, xs: Array, us: Array) -> float:
+        """How far the augmented cost is from saying the same at xs, us after an `update`."""
+        return float(np.sum((self._pushes(xs, us) - self.multipliers) ** 2)) / (2 * self.penalty)
+
+    def value(self, xs: Array, us: Array) -> float:
+        """What the constraints add to the cost of xs (N+1, nx), us (N, nu)."""
+        if not self.any:
+            return 0.0
+        return float(np.sum(self._pushes(xs, us) ** 2 - self.multipliers**2)) / (2 * self.penalty)
+
+    def differentiate(self, xs: Array, us: Array) -> tuple[Array, Array]:
+        """(gradients (N+1, nx + nu), Hessians (N+1, nx + nu, nx + nu)) of `value` by each [x_k; u_k].
+
+        Raises GradientError where that of a constraint is lost or not finite.
+        """
+        pushes = self._pushes(xs, us)
+        stiffness = np.where((pushes != 0) | (self.lower == self.upper), self.penalty, 0.0)
+        (count, nx), n = xs.shape, xs.shape[1] + us.shape[1]
+        gradients, hessians = np.zeros((count, n)), np.zeros((count, n, n))
+        gradients[:, :nx] = pushes[: xs.size].reshape(xs.shape)
+        hessians[:, np.arange(nx), np.arange(nx)] = stiffness[: xs.size].reshape(xs.shape)
+        for group, rows in zip(self.groups, self._slices, strict=True):
+            jacobians = self.scale[rows].reshape(group.shape)[:, :, None] * group.jacobians(xs, us)
+            gradients[group.knots] += np.einsum("kr,kri->ki", pushes[rows].reshape(group.shape), jacobians)
+            stiff = stiffness[rows].reshape(group.shape)[:, :, None] * jacobians
+            hessians[group.knots] += np.einsum("kri,krj->kij", stiff, jacobians)
+        return gradients, hessians
+
+    def update(self, xs: Array, us: Array) -> None:
+        """Take over the multipliers that the minimum xs, us of the augmented cost tells, and look at the scales."""
+        forces = self._pushes(xs, us) * self.scale
+        self._choose_scales(xs, us)
+        self.multipliers = forces / self.scale
+
+    @cached_property
+    def _slices(self) -> list[slice]:
+        ends = np.cumsum([len(self.lower) - sum(g.size for g in self.groups), *(g.size for g in self.groups)])
+        return [slice(int(a), int(b)) for a, b in pairwise(ends)]
+
+    def _choose_scales(self, xs: Array, us: Array) -> None:
+        for group, rows in zip(self.groups, self._slices, strict=True):
+            self.scale[rows] = group.scale(xs, us)
+
+    def _values(self, xs: Array, us: Array) -> Array:
+        return np.concatenate([xs.ravel(), *(group.values(xs, us) for group in self.groups)])
+
+    def _excess(self, xs: Array, us: Array) -> Array:
+        values = self._values(xs, us)
+        return np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
+
+    def _pushes(self, xs: Array, us: Array) -> Array:
+        """(m,): y + p c of each bound that pushes, 0 elsewhere."""
+        values, weight = self._values(xs, us), self.penalty * self.scale
+        above = self.multipliers + weight * (values - self.upper)
+        below = self.multipliers + weight * (values - self.lower)
+        return np.maximum(above, 0.0) + np.minimum(below, 0.0)
+
+
+class _Rows:
+    """One constraint at all its knots: (knots, its own rows) flattened; the last motion's numbers are kept."""
+
+    def __init__(self, problem: Problem, constraint: Constraint):
+        self.constraint = constraint
+        self.knots = list(constraint.at_knots(problem.num_steps, problem.initial_state_is_given))
+        self.shape = (len(self.knots), len(constraint.lower))
+        self.size = self.shape[0] * self.shape[1]
+        self.lower, self.upper = np.tile(constraint.lower, len(self.knots)), np.tile(constraint.upper, len(self.knots))
+        self._steepest = np.zeros(self.shape[1])
+        self._kept: dict[str, tuple[bytes, Array]] = {}
+
+    def values(self, xs: Array, us: Array) -> Array:
+        """(size,)"""
+        return self._at("values", xs, us, self.constraint).ravel()
+
+    def jacobians(self, xs: Array, us: Array) -> Array:
+        """(knots, rows, nx + nu)"""
+        return self._at("jacobians", xs, us, lambda x, u: self.constraint.differentiate(x, u)[1])
+
+    def scale(self, xs: Array, us: Array) -> Array:
+        """(size,): one over the largest slope so far of each row, 1 where it has had none."""
+        slopes = np.linalg.norm(self.jacobians(xs, us), axis=2).max(axis=0)
+        self._steepest = np.maximum(self._steepest, slopes)
+        steep = self._steepest > SMALLEST_SLOPE
+        return np.tile(np.where(steep, 1 / np.where(steep, self._steepest, 1.0), 1.0), len(self.knots))
+
+    def _at(self, what: str, xs: Array, us: Array, evaluate: Callable[[Array, Array], Array]) -> Array:
+        key = xs.tobytes() + us.tobytes()
+        if self._kept.get(what, (b"", xs))[0] != key:
+            found = [evaluate(xs[k], us[min(k, len(us) - 1)]) for k in self.knots]
+            self._kept[what] = key, np.array(found)
+        return self._kept[what][1]

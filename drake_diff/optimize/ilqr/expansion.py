@@ -1,0 +1,193 @@
+"""The dynamics' second derivatives, learned from the Jacobians of successive motions.
+
+iLQR leaves out sum_i v_i d2 f_i / d z2, v being the multipliers of the dynamics, and crawls where that is large beside
+the cost's curvature. For each knot a symmetric matrix M_k that stands for it is corrected by symmetric rank one (SR1;
+Nocedal and Wright, "Numerical Optimization", 2006, section 6.2) so that M_k dz = (F_k(new) - F_k(old))' v. It costs no
+simulation, and stays 0 where the dynamics are linear. Where more is known of M_k, it is set.
+
+The linear-quadratic problem around a motion: Drake's step Jacobians and the cost's derivatives.
+
+All in Drake's own coordinates, quaternions included: the discrete step lets a quaternion's norm grow, so that the norm
+is a state that inputs move, and on the rotations' tangent space the gradient would be wrong by what is left out.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.derivatives.analytic import analytic_of
+from drake_diff.derivatives.linearize import linearize, smooth_jacobians
+from drake_diff.model.model import Model
+from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
+from drake_diff.optimize.ilqr.riccati import LinearQuadratic
+from drake_diff.optimize.problem.cost import (
+    QuadraticCost,
+    differentiate_cost,
+    differentiate_final_cost,
+    final_cost_hessian,
+    running_cost_hessian,
+)
+from drake_diff.optimize.problem.problem import Problem
+
+SMALLEST_MOVE = 1e-7  # below it rounding of the Jacobians, 1e-12, is too large a part of their difference
+SAFE_DIVISOR = 1e-6  # of |dz| |r|: SR1 is not defined where dz' r vanishes
+
+
+class DynamicsCurvature:
+    """M (N, n + m, n + m), updated once for each motion."""
+
+    def __init__(self) -> None:
+        self.M = np.zeros(0)
+        self._F = np.zeros(0)
+
+    def update(self, problem: LinearQuadratic, dz: Array) -> None:
+        """Learn from the problem around the new motion, dz (N, n + m) being how far it has moved."""
+        if not self._F.size:
+            self.M, self._F = np.zeros_like(problem.hessians), problem.F
+            return
+        v = multipliers(problem)
+        r = np.einsum("kij,ki->kj", problem.F - self._F, v) - np.einsum("kij,kj->ki", self.M, dz)
+        divisor = np.einsum("ki,ki->k", r, dz)
+        length = np.linalg.norm(dz, axis=1)
+        safe = (length > SMALLEST_MOVE) & (np.abs(divisor) > SAFE_DIVISOR * length * np.linalg.norm(r, axis=1))
+        r, divisor = r[safe], divisor[safe]
+        self.M[safe] += r[:, :, None] * r[:, None, :] / divisor[:, None, None]
+        self._F = problem.F
+
+
+def multipliers(problem: LinearQuadratic) -> Array:
+    """(N, n): v_k = d cost / d x_(k+1), all inputs as they are and all gaps kept."""
+    n, v = problem.num_states, np.empty_like(problem.gaps)
+    v[-1] = problem.final_gradient
+    for k in range(len(v) - 1, 0, -1):
+        v[k - 1] = problem.gradients[k, :n] + problem.F[k, :, :n].T @ v[k]
+    return v
+
+
+# Of a state, or of 1: Jacobians are known to 1e-12, so that this leaves 1e-6 of their derivative.
+DIFFERENCE_STEP = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """xs (N+1, nx) and us (N, nu), a rollout where the gaps (N, nx), step(x_k, u_k) - x_(k+1), are zero."""
+
+    xs: Array
+    us: Array
+    gaps: Array
+
+    @property
+    def point(self) -> tuple[Array, Array]:
+        """xs and us."""
+        return self.xs, self.us
+
+    @property
+    def ends(self) -> Array:
+        """(N, nx): where the steps lead."""
+        return self.xs[1:] + self.gaps
+
+    @property
+    def is_rollout(self) -> bool:
+        return not self.gaps.any()
+
+    @property
+    def distance(self) -> float:
+        """The sum of all |gaps|."""
+        return float(np.abs(self.gaps).sum())
+
+
+def jacobians_along(problem: Problem, motion: Motion) -> Array:
+    """(N, nx, nx + nu): [A_k, B_k]; raises GradientError or SimulationError where one, or a step, is refused.
+
+    Those of an input on a bound are from inside it: a bound is often the actuator's limit, at which Drake's derivative
+    is 0, as beyond it, while a minimization needs to know what leaving the bound would do.
+    """
+    A, B, _ = linearize(problem.model, motion.xs, _off_bounds(problem, motion.us), x_next=motion.ends)
+    return np.concatenate([A, B], axis=2)
+
+
+def dynamics_curvature_along(problem: Problem, motion: Motion, v: Array) -> Array | None:
+    """(N, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx); None where contact or a limit acts.
+
+    By differences of the Jacobians along every state: in its inputs alone a smooth step is linear. None also where
+    Jacobians are not to be had in one call. Raises what `linearize` raises.
+    """
+    model, xs, us = problem.model, motion.xs[:-1], _off_bounds(problem, motion.us)
+    here = smooth_jacobians(model, xs[0], us, "auto", xs, motion.ends)
+    if here is None or here.steps.touching.any() or not here.smooth.all():
+        return None
+    curvature = np.zeros((len(us), model.nx + model.nu, model.nx + model.nu))
+    for j in range(model.nx):
+        moved = np.array(xs)
+        moved[:, j] += DIFFERENCE_STEP * np.maximum(1.0, np.abs(xs[:, j]))
+        near = _nearby_jacobians(model, moved, us)
+        if near is None:
+            return None
+        slopes = (near - here.jacobians) / (moved - xs)[:, j, None, None]
+        curvature[:, :, j] = np.einsum("kij,ki->kj", slopes, v)
+    curvature[:, : model.nx, model.nx :] = curvature[:, model.nx :, : model.nx].swapaxes(1, 2)
+    return (curvature + curvature.swapaxes(1, 2)) / 2
+
+
+def _nearby_jacobians(model: Model, xs: Array, us: Array) -> Array | None:
+    """(N, nx, nx + nu) of the steps from xs (N, nx) beside smooth ones; None where one that was taken is not smooth."""
+    analytic = analytic_of(model)
+    if not isinstance(analytic, str):
+        return analytic.differentiate(xs, us)[0]  # no step is taken
+    found = smooth_jacobians(model, xs[0], us, "auto", xs)
+    return found.jacobians if found is not None and found.smooth.all() else None
+
+
+def _off_bounds(problem: Problem, us: Array) -> Array:
+    """`us` with those on a bound moved inside it by rounding."""
+    lower, upper = problem.bounds.u_lower, problem.bounds.u_upper
+    return np.where(us == upper, np.nextafter(us, lower), np.where(us == lower, np.nextafter(us, upper), us))
+
+
+def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: AugmentedLagrangian) -> LinearQuadratic:
+    """`problem` around `motion`, the constraints being part of its cost."""
+    model, xs, us = problem.model, motion.xs, motion.us
+    gradients, hessians = _expand_running_cost(problem, xs, us)
+    final_gradient, final_hessian = _expand_final_cost(problem, xs[-1])
+    if constraints.any:
+        gradient, curvature = constraints.differentiate(xs, us)
+        gradients += gradient[:-1]
+        hessians += curvature[:-1]
+        final_gradient = final_gradient + gradient[-1, : model.nx]
+        final_hessian = final_hessian + curvature[-1, : model.nx, : model.nx]
+    bounds, free = problem.bounds, problem.initial_state_mask
+    return LinearQuadratic(
+        F=jacobians,
+        gaps=motion.gaps,
+        gradients=gradients,
+        hessians=hessians,
+        final_gradient=final_gradient,
+        final_hessian=final_hessian,
+        lower=bounds.u_lower - us,
+        upper=bounds.u_upper - us,
+        start_lower=np.where(free, bounds.x_lower - xs[0], 0.0),
+        start_upper=np.where(free, bounds.x_upper - xs[0], 0.0),
+    )
+
+
+def _expand_running_cost(problem: Problem, xs: Array, us: Array) -> tuple[Array, Array]:
+    """(gradients (N, nx + nu), Hessians (N, nx + nu, nx + nu)) of h times the running cost."""
+    h, (nx, nu), cost = problem.model.time_step, (xs.shape[1], us.shape[1]), problem.running_cost
+    gradients, hessians = np.zeros((len(us), nx + nu)), np.zeros((len(us), nx + nu, nx + nu))
+    if isinstance(cost, QuadraticCost):
+        x_ref = np.zeros(nx) if cost.x_ref is None else cost.x_ref
+        u_ref = np.zeros(nu) if cost.u_ref is None else cost.u_ref
+        hessians[:] = h * running_cost_hessian(cost, xs[0], us[0])
+        gradients = (np.hstack([xs[:-1], us]) - np.concatenate([x_ref, u_ref])) @ hessians[0]
+    elif cost is not None:
+        for k, u in enumerate(us):
+            gradients[k] = h * np.concatenate(differentiate_cost(cost, xs[k], u)[1:])
+            hessians[k] = h * running_cost_hessian(cost, xs[k], u)
+    return gradients, hessians
+
+
+def _expand_final_cost(problem: Problem, x: Array) -> tuple[Array, Array]:
+    if problem.final_cost is None:
+        return np.zeros(len(x)), np.zeros((len(x), len(x)))
+    return differentiate_final_cost(problem.final_cost, x)[1], final_cost_hessian(problem.final_cost, x)

@@ -1,0 +1,326 @@
+"""Multiple-shooting iLQR on Drake's own steps: a Riccati sweep back, a rollout with feedback forward.
+
+Li and Todorov, "Iterative linear quadratic regulator design for nonlinear biological movement systems", 2004, and
+the feasibility-driven form of Mastalli et al., "Crocoddyl", 2020: the guess need not be a rollout, and a step of size a
+leaves 1 - a of each gap between step(x_k, u_k) and x_(k+1). A hard goal, waypoints, state bounds and constraints are
+augmented Lagrangians, and the dynamics' second derivatives, which iLQR leaves out, are learned on the way (`secant`),
+or taken by differences of the Jacobians where a smooth motion converges slowly.
+"""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import InputError, SimulationError
+from drake_diff.model.step import advance
+from drake_diff.model.tangent import tangent_space
+from drake_diff.optimize.ilqr.constraints import GROWTH, LARGEST_PENALTY, AugmentedLagrangian
+from drake_diff.optimize.ilqr.expansion import (
+    DynamicsCurvature,
+    Motion,
+    dynamics_curvature_along,
+    expand,
+    jacobians_along,
+    multipliers,
+)
+from drake_diff.optimize.ilqr.riccati import LinearQuadratic, Policy, slope_along, solve_riccati
+from drake_diff.optimize.problem.cost import CostToGo
+from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.program import (
+    FEASIBILITY_TOLERANCE,
+    Iteration,
+    Limits,
+    NlpResult,
+    Outcome,
+    Report,
+    interrupt_flag,
+)
+
+SMALLEST_REGULARIZATION, LARGEST_REGULARIZATION = 1e-8, 1e8
+SUFFICIENT_DECREASE = 1e-4
+STEP_SIZES = tuple(0.5 ** np.arange(12))
+CUT_BACK, SHORT = 1 / 8, 1 / 32  # two such steps: the model reaches too far; several: a search crawls
+# Of the cost: a promise below this is lost in the rounding of the cost's sum.
+ROUNDING = 1e-13
+# Of what the next update of the multipliers changes in the augmented cost: what a minimization before it may leave.
+LEFT_OVER = 3e-2
+BESIDE = 1e-14  # of a bound: an input that is no further from it is on it
+# Of what a step gained: where the next one gains more, the search converges slowly, for want of the right curvature.
+SLOW = 1 / 2
+
+_Solve = Callable[[LinearQuadratic, float], Policy | None]
+
+
+def check_problem(problem: Problem) -> None:
+    """Refuse what iLQR here cannot keep, naming what can."""
+    for subject in _unkept(problem):
+        raise InputError(subject, got="given", expected='none for method="ilqr"; method="shooting" takes it')
+
+
+def is_unconstrained(problem: Problem) -> bool:
+    """Whether iLQR can solve `problem` in one minimization: costs and input bounds alone, from the given x0."""
+    hard = AugmentedLagrangian(problem).any or problem.initial_state_mask.any()
+    return not hard and not list(_unkept(problem))
+
+
+def _unkept(problem: Problem) -> Iterator[str]:
+    if not problem.optimizes_controls:
+        yield "fixed controls"
+    if problem.parameters.parameters:
+        yield "parameters"
+    if problem.trajectory_cost is not None:
+        yield "trajectory_cost"
+
+
+def solve_ilqr(
+    problem: Problem,
+    xs: Array,
+    us: Array,
+    *,
+    limits: Limits,
+    report: Report | None,
+    patience: float = math.inf,
+    least_penalty: float = 0.0,
+) -> tuple[NlpResult, Array, Array]:
+    """Solve `problem` from xs (N+1, nx), us (N, nu), a rollout or not; gives (result, xs, us), result.z being us flat.
+
+    After `patience` steps in a row that are shorter than SHORT the search ends as inaccurate: it crawls along a jump;
+    before that it regularizes where steps are short, as the model reaches too far.
+    `least_penalty` is what constraints weigh from the start.
+    Raises GradientError where a derivative is refused, SimulationError where a step from the guess is.
+    """
+    search = _Search(problem, xs, us, limits, report, patience)
+    search.constraints.penalty = max(search.constraints.penalty, least_penalty)
+    with interrupt_flag() as interrupted:
+        outcome = search.run(interrupted)
+    message = f"iLQR: {outcome.value} after {len(search.rows) - 1} steps"
+    motion = search.motion
+    return NlpResult(motion.us.ravel(), outcome, message, tuple(search.rows)), motion.xs, motion.us
+
+
+def costs_to_go(problem: Problem, xs: Array, us: Array) -> tuple[CostToGo, ...]:
+    """N+1 of them: what remains to be paid of `problem` from each state of xs (N+1, nx), us (N, nu) on, best followed.
+
+    To second order in the distance from xs, without the dynamics' second derivatives; an input on a bound stays there.
+    Raises GradientError where a derivative is refused, InputError where the cost has no minimum.
+    """
+    search = _Search(problem, xs, us, Limits(1, math.inf, 1.0), None)
+    model = search._expand()
+    policy = solve_riccati(model, 0.0) or solve_riccati(model, SMALLEST_REGULARIZATION)
+    if policy is None:
+        raise InputError("running_cost", got="no positive curvature by the inputs", expected="a cost with a minimum")
+    parts = zip(search.motion.xs, policy.value_gradients, policy.value_hessians, strict=True)
+    return tuple(CostToGo(*part) for part in parts)
+
+
+def _best_policy(solve: _Solve, models: Sequence[LinearQuadratic], regularization: float) -> Policy | None:
+    """The policy of the first of the models whose Hessians allow one."""
+    for model in models:
+        policy = solve(model, regularization)
+        if policy is not None and policy.expected >= 0:
+            return policy
+    return None
+
+
+def _promise_at_most(solve: _Solve, models: Sequence[LinearQuadratic], limit: float) -> bool:
+    """Whether no model, regularized as little as it allows, promises more than `limit`, and one of them that much."""
+    found = False
+    for model in models:
+        policy = solve(model, 0.0) or solve(model, SMALLEST_REGULARIZATION)
+        if policy is not None and not abs(policy.expected) <= limit:
+            return False
+        found = found or policy is not None
+    return found
+
+
+class _Search:
+    def __init__(
+        self, problem: Problem, xs: Array, us: Array, limits: Limits, report: Report | None, patience: float = math.inf
+    ):
+        self.problem, self.limits, self.report, self.patience = problem, limits, report, patience
+        self.constraints = AugmentedLagrangian(problem)
+        lower, upper = problem.bounds.u_lower, problem.bounds.u_upper
+        self.inner = lower * (1 + BESIDE * np.sign(lower)), upper * (1 - BESIDE * np.sign(upper))
+        self.start = time.monotonic()
+        self.motion = self._take_in(xs, us)
+        self.expanded, self.curvature = self.motion, DynamicsCurvature()
+        self.cost = problem.objective(self.motion.xs, self.motion.us)
+        self.constraints.start(*self.motion.point, self.cost, float(np.sum(self.motion.gaps**2)))
+        self.jacobians: Array | None = None
+        self.gap_weight = 0.0
+        self.regularization = 0.0
+        self.gains = math.inf, math.inf  # of the merit, by the last two steps of this minimization
+        self.stalled = False
+        self.rows = [Iteration(0, self.cost, self._infeasibility(), math.nan, math.nan)]
+
+    def run(self, interrupted: threading.Event) -> Outcome:
+        """Minimize once, or, where there are constraints, again and again for better multipliers."""
+        final = not self.constraints.any
+        while True:
+            outcome = self._minimize(final, interrupted)
+            if outcome not in (Outcome.SOLVED, Outcome.INACCURATE) or not self.constraints.any or self.stalled:
+                return outcome
+            stands = self.constraints.violation(*self.motion.point) > FEASIBILITY_TOLERANCE
+            reached = not stands and self.constraints.residual(*self.motion.point) <= self.limits.tolerance
+            exhausted = self.constraints.penalty >= LARGEST_PENALTY
+            if final and reached:
+                return outcome
+            if final and exhausted:
+                return Outcome.INFEASIBLE if stands else Outcome.INACCURATE
+            self.constraints.update(*self.motion.point)
+            self.gains = math.inf, math.inf
+            final = reached or exhausted
+            if not final:
+                self.constraints.penalty *= GROWTH
+
+    def _minimize(self, final: bool, interrupted: threading.Event) -> Outcome:
+        """Take steps until little is left to gain: rounding if `final`, else a part of what the multipliers would."""
+        while True:
+            model = self._expand()
+            outcome = self._step(model, final)
+            if outcome is not None:
+                return outcome
+            if self._crawls():
+                self.stalled = True
+                return Outcome.INACCURATE
+            if interrupted.is_set():
+                return Outcome.INTERRUPTED
+            if time.monotonic() - self.start > self.limits.time_limit:
+                return Outcome.TIME_LIMIT
+
+    def _crawls(self) -> bool:
+        steps = [row.step for row in self.rows[1:]]
+        return len(steps) >= self.patience and max(steps[-int(self.patience) :]) < SHORT
+
+    def _expand(self) -> LinearQuadratic:
+        new, old = self.motion, self.expanded
+        if new is not old or self.jacobians is None:
+            self.jacobians = jacobians_along(self.problem, new)
+        model = expand(self.problem, new, self.jacobians, self.constraints)
+        self.curvature.update(model, np.hstack([new.xs[:-1] - old.xs[:-1], new.us - old.us]))
+        if self.gains[1] > SLOW * self.gains[0]:
+            M = dynamics_curvature_along(self.problem, new, multipliers(model))
+            self.curvature.M = self.curvature.M if M is None else M
+        self.expanded = new
+        return model
+
+    def _step(self, model: LinearQuadratic, final: bool) -> Outcome | None:
+        """Take one step that lowers the merit; an outcome where there is none left to take."""
+        merit = self._merit()
+        scale = 1 + abs(merit)
+        left_over = self.limits.tolerance**2 * scale
+        if not final:
+            left_over = max(left_over, LEFT_OVER * self.constraints.unrest(*self.motion.point))
+        models = replace(model, hessians=model.hessians + self.curvature.M), model
+        solve = cache(solve_riccati)  # no policy is sought twice
+
+        def is_reached(limit: float) -> bool:
+            return self.motion.is_rollout and _promise_at_most(solve, models, limit)
+
+        if is_reached(left_over):
+            return Outcome.SOLVED
+        if len(self.rows) > self.limits.max_iterations:
+            return Outcome.ITERATION_LIMIT
+        while self.regularization <= LARGEST_REGULARIZATION:
+            policy = _best_policy(solve, models, self.regularization)
+            if policy is not None and self._search_along(model, policy):
+                self.regularization = self._tightened() if self._is_cut_back() else self._relaxed()
+                return None
+            if is_reached(ROUNDING * scale):
+                return Outcome.SOLVED  # what is left to gain is less than the cost's rounding
+            if self.motion.is_rollout and policy is not None and policy.expected <= ROUNDING * scale:
+                break  # no step that can be told from none: the cost has a kink or a jump here, as contact makes them
+            self.regularization = self._tightened()
+        self.regularization = 0.0
+        return Outcome.INACCURATE
+
+    def _is_cut_back(self) -> bool:
+        return math.isfinite(self.patience) and all(row.step <= CUT_BACK for row in self.rows[-2:])
+
+    def _tightened(self) -> float:
+        return max(8 * self.regularization, SMALLEST_REGULARIZATION)
+
+    def _relaxed(self) -> float:
+        smaller = self.regularization / 8
+        return smaller if smaller > SMALLEST_REGULARIZATION else 0.0
+
+    def _search_along(self, model: LinearQuadratic, policy: Policy) -> bool:
+        """Take the largest of `STEP_SIZES` that lowers the merit enough, if there is one."""
+        slope, distance = policy.slope, self.motion.distance
+        if distance:
+            slope, curvature = slope_along(model, policy)
+            self.gap_weight = max(self.gap_weight, 2 * (slope + max(curvature, 0) / 2) / distance)
+            slope -= self.gap_weight * distance
+        merit = self._merit()
+        for size in STEP_SIZES:
+            try:
+                motion = self._roll(policy, size)
+                with np.errstate(all="ignore"):  # a merit that is not finite is no decrease
+                    cost = self.problem.objective(motion.xs, motion.us)
+                    found = self._merit_of(motion, cost)
+            except SimulationError:
+                continue  # too long a step: a shorter one is tried next
+            if found <= merit + SUFFICIENT_DECREASE * size * slope:
+                self.motion, self.cost = motion, cost
+                self.gains = self.gains[1], merit - found
+                self._record(policy.gradient, size)
+                return True
+        return False
+
+    def _roll(self, policy: Policy, size: float) -> Motion:
+        """Step from x_0 with feedback, each gap shrunk to 1 - `size` of itself."""
+        twin, old = self.problem.model.double, self.motion
+        xs, us = np.empty_like(old.xs), np.empty_like(old.us)
+        gaps = (1 - size) * old.gaps
+        xs[0] = self._inside_start(old.xs[0] + size * policy.start)
+        wanted = old.us + size * policy.feedforward
+        for k, feedback in enumerate(policy.feedback):
+            us[k] = self._inside(wanted[k] + feedback.dot(xs[k] - old.xs[k]))
+            xs[k + 1] = advance(twin, xs[k], us[k]) - gaps[k]
+        return Motion(xs, us, gaps)
+
+    def _take_in(self, xs: Array, us: Array) -> Motion:
+        """The guess, its inputs taken inside their bounds and its first state the problem's, and its gaps."""
+        free = self.problem.initial_state_mask
+        xs, us = np.array(xs), self._inside(us)
+        xs[0] = self._inside_start(np.where(free, xs[0], self.problem.x0))
+        gaps = np.empty_like(xs[1:])
+        quaternions = tangent_space(self.problem.model).quaternions
+        for k, u in enumerate(us):
+            x_next = advance(self.problem.model.double, xs[k], u)
+            for part in (slice(start, start + 4) for start in quaternions):
+                if x_next[part] @ xs[k + 1, part] < 0:  # the same rotation, further off
+                    xs[k + 1, part] *= -1
+            gaps[k] = x_next - xs[k + 1]
+        return Motion(xs, us, gaps)
+
+    def _inside(self, us: Array) -> Array:
+        """`us` (..., nu) within its bounds, and on a bound where rounding alone parts it from one."""
+        bounds, (lowest, highest) = self.problem.bounds, self.inner
+        return np.where(us <= lowest, bounds.u_lower, np.where(us >= highest, bounds.u_upper, us))
+
+    def _inside_start(self, x: Array) -> Array:
+        bounds = self.problem.bounds
+        return np.where(self.problem.initial_state_mask, np.clip(x, bounds.x_lower, bounds.x_upper), x)
+
+    def _merit(self) -> float:
+        return self._merit_of(self.motion, self.cost)
+
+    def _merit_of(self, motion: Motion, cost: float) -> float:
+        """Cost, augmented by the constraints, plus the weighted sum of all gaps."""
+        return cost + self.constraints.value(*motion.point) + self.gap_weight * motion.distance
+
+    def _infeasibility(self) -> float:
+        return max(float(np.abs(self.motion.gaps).max(initial=0.0)), self.constraints.violation(*self.motion.point))
+
+    def _record(self, gradient: float, size: float) -> None:
+        number, violation = len(self.rows), self._infeasibility()
+        self.rows.append(Iteration(number, self.cost, violation, gradient, size))
+        if self.report:
+            self.report.row(self.rows[-1])

@@ -1,0 +1,192 @@
+"""The linear-quadratic problem around a motion, with gaps and boxes, and the Riccati recursion that solves it.
+
+Minimize sum_k g_k' z_k + z_k' H_k z_k / 2 + (the same of dx_N), z_k = [dx_k; du_k], where
+dx_(k+1) = F_k z_k + f_k and lower_k <= du_k <= upper_k. The gaps f_k are those of Mastalli et al., "Crocoddyl", 2020,
+the boxes those of Tassa, Mansard and Todorov, "Control-limited differential dynamic programming", 2014.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_diff._base.arrays import Array
+
+BOX_ITERATIONS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class LinearQuadratic:
+    """N steps of n states and m inputs; dx_0 lies in [start_lower, start_upper], which is 0 where it is given."""
+
+    F: Array  # (N, n, n + m)
+    gaps: Array  # (N, n)
+    gradients: Array  # (N, n + m)
+    hessians: Array  # (N, n + m, n + m)
+    final_gradient: Array  # (n,)
+    final_hessian: Array  # (n, n)
+    lower: Array  # (N, m)
+    upper: Array  # (N, m)
+    start_lower: Array  # (n,)
+    start_upper: Array  # (n,)
+
+    @property
+    def num_states(self) -> int:
+        return len(self.final_gradient)
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """du_k = feedforward_k + feedback_k dx_k from dx_0 = start; what it promises where all gaps are 0.
+
+    What remains to be paid from knot k on is value_gradients_k' dx_k + dx_k' value_hessians_k dx_k / 2, and a constant.
+
+    `slope` and `curvature` are those of the quadratic model along the step: it changes the cost by
+    a slope + a^2 curvature / 2 at the step size a. `gradient` is the largest |d cost / d u| of an input, or
+    |d cost / d x_0|, that no bound holds.
+    """
+
+    start: Array  # (n,)
+    feedforward: Array  # (N, m)
+    feedback: Array  # (N, m, n)
+    value_gradients: Array  # (N+1, n)
+    value_hessians: Array  # (N+1, n, n)
+    slope: float
+    curvature: float
+    gradient: float
+
+    @property
+    def expected(self) -> float:
+        """The decrease that a full step promises, as a positive number."""
+        return -(self.slope + self.curvature / 2)
+
+
+def solve_riccati(problem: LinearQuadratic, regularization: float) -> Policy | None:
+    """The best policy, `regularization` added to the inputs' Hessian; None where that is not positive definite.
+
+    The recursion is that of [dx; 1], so that V = [[P, s], [s', c]] is all that remains to be paid and
+    K = [feedback, feedforward] all that is done, in the fewest products: NumPy's calls are what a sweep's time goes to.
+    """
+    w, (count, m) = problem.num_states + 1, problem.lower.shape
+    F, H, V = _with_a_one(problem)
+    Q, K, free = np.empty_like(H), np.empty((count, m, w)), np.ones((count, m), dtype=bool)
+    bounded = np.asarray((np.isfinite(problem.lower) | np.isfinite(problem.upper)).any(axis=1))
+    ridge = regularization * np.eye(m)
+    try:
+        for k in range(count - 1, -1, -1):
+            Q_k = F[k].T.dot(V[k + 1].dot(F[k]), out=Q[k])
+            Q_k += H[k]
+            Q_uu, Q_ux = Q_k[w:, w:], Q_k[w:, :w]
+            K_k = _gains(Q_uu + ridge, Q_ux)
+            if bounded[k]:
+                K_k, free[k] = _within(Q_uu + ridge, Q_ux, K_k, problem.lower[k], problem.upper[k])
+            W = Q_k[:w, :w] + K_k.T.dot(Q_uu.dot(K_k) + Q_ux) + Q_ux.T.dot(K_k)
+            np.add(W, W.T, out=V[k])
+            V[k] *= 0.5
+            K[k] = K_k
+        P, s = V[:, :-1, :-1], V[:, :-1, -1]
+        start, left = _best_start(problem, P[0], s[0], regularization)
+    except np.linalg.LinAlgError:
+        return None
+    q_u, d = Q[:, w:, w - 1], K[:, :, -1]
+    slope = float(np.sum(q_u * d) + s[0] @ start)
+    curvature = float(np.einsum("ki,kij,kj->", d, Q[:, w:, w:], d) + start @ P[0] @ start)
+    gradient = float(np.abs(q_u[free]).max(initial=left))
+    if not math.isfinite(slope + curvature):  # NaN passes for positive definite
+        return None
+    return Policy(start, d, K[:, :, :-1], s, P, slope, curvature, gradient)
+
+
+def _with_a_one(problem: LinearQuadratic) -> tuple[Array, Array, Array]:
+    """(F (N, n+1, n+1+m), H (N, n+1+m, n+1+m), V (N+1, n+1, n+1)) of [dx; 1; du], of V the last alone."""
+    n, (count, m) = problem.num_states, problem.lower.shape
+    where = np.r_[:n, n + 1 : n + 1 + m]  # of [dx; du]
+    F, H = np.zeros((count, n + 1, n + 1 + m)), np.zeros((count, n + 1 + m, n + 1 + m))
+    F[:, :n, where], F[:, :n, n], F[:, n, n] = problem.F, problem.gaps, 1.0
+    H[:, where[:, None], where] = problem.hessians
+    H[:, n, where] = H[:, where, n] = problem.gradients
+    V = np.zeros((count + 1, n + 1, n + 1))
+    V[-1, :n, :n] = problem.final_hessian
+    V[-1, n, :n] = V[-1, :n, n] = problem.final_gradient
+    return F, H, V
+
+
+def _within(
+    hessian: Array, Q_ux: Array, K: Array, lower: Array, upper: Array
+) -> tuple[Array, NDArray[np.bool_] | bool]:
+    """(K (m, n+1), which inputs (m,) no bound holds): `K` itself where its feedforward leaves no bound."""
+    d = K[:, -1]
+    if (d >= lower).all() and (d <= upper).all():
+        return K, True
+    d, free = minimize_in_box(hessian, Q_ux[:, -1], lower, upper)
+    K = np.zeros_like(Q_ux)
+    K[free] = _gains(hessian[np.ix_(free, free)], Q_ux[free])
+    K[:, -1] = d
+    return K, free
+
+
+def _best_start(problem: LinearQuadratic, P: Array, s: Array, regularization: float) -> tuple[Array, float]:
+    """(dx_0 (n,), largest |s| of an entry that no bound holds)."""
+    start = np.zeros(len(s))
+    moves = np.flatnonzero(problem.start_lower < problem.start_upper)
+    if not len(moves):
+        return start, 0.0
+    hessian = P[np.ix_(moves, moves)] + regularization * np.eye(len(moves))
+    lower, upper = problem.start_lower[moves], problem.start_upper[moves]
+    start[moves], free = minimize_in_box(hessian, s[moves], lower, upper)
+    return start, float(np.abs(s[moves[free]]).max(initial=0.0))
+
+
+def _gains(hessian: Array, Q_ux: Array) -> Array:
+    """(m, n+1): -hessian^-1 Q_ux; raises LinAlgError where the Hessian is not positive definite."""
+    if len(hessian) == 1:
+        if not hessian[0, 0] > 0:
+            raise np.linalg.LinAlgError
+        return Q_ux / -hessian[0, 0]
+    np.linalg.cholesky(hessian)
+    return np.asarray(-np.linalg.solve(hessian, Q_ux), dtype=float)
+
+
+def minimize_in_box(hessian: Array, gradient: Array, lower: Array, upper: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """(d, free): argmin of gradient' d + d' hessian d / 2 within [lower, upper], by projected Newton steps.
+
+    `free` is where d is not held by a bound. Raises LinAlgError where the Hessian is not positive definite.
+    """
+    np.linalg.cholesky(hessian)
+    d = np.clip(np.zeros_like(gradient), lower, upper)
+    free = np.ones(len(d), dtype=bool)
+    for _ in range(BOX_ITERATIONS):
+        slope = gradient + hessian @ d
+        free = ~(((d <= lower) & (slope > 0)) | ((d >= upper) & (slope < 0)))
+        if not free.any():
+            break
+        step = np.zeros_like(d)
+        step[free] = -np.linalg.solve(hessian[np.ix_(free, free)], slope[free])
+        moved = _shorten(hessian, gradient, d, step, lower, upper)
+        if np.array_equal(moved, d):
+            break
+        d = moved
+    return d, free
+
+
+def _shorten(hessian: Array, gradient: Array, d: Array, step: Array, lower: Array, upper: Array) -> Array:
+    """The projected step, halved until it lowers the value; `d` where none does."""
+    value = gradient @ d + d @ hessian @ d / 2
+    for size in 0.5 ** np.arange(20):
+        moved = np.clip(d + size * step, lower, upper)
+        if gradient @ moved + moved @ hessian @ moved / 2 < value:
+            return moved
+    return d
+
+
+def slope_along(problem: LinearQuadratic, policy: Policy) -> tuple[float, float]:
+    """(slope, curvature) of the cost along the full linear step, which closes the gaps."""
+    dx, slope, curvature = policy.start, 0.0, 0.0
+    for k in range(len(problem.F)):
+        z = np.concatenate([dx, policy.feedforward[k] + policy.feedback[k] @ dx])
+        slope += float(problem.gradients[k] @ z)
+        curvature += float(z @ problem.hessians[k] @ z)
+        dx = problem.F[k] @ z + problem.gaps[k]
+    slope += float(problem.final_gradient @ dx)
+    return slope, curvature + float(dx @ problem.final_hessian @ dx)

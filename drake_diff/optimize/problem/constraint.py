@@ -1,0 +1,125 @@
+"""A constraint of states and inputs at chosen knots: lower <= function <= upper."""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
+
+from drake_diff._base.arrays import Array, array_with_gaps, frozen
+from drake_diff._base.autodiff import gradient_rows
+from drake_diff.exceptions import GradientError, InputError
+
+FORM = "a function of x, or of x and u, in ordinary arithmetic that gives a number or numbers (m,)"
+
+
+@dataclass(frozen=True, eq=False)
+class Constraint:
+    """lower <= function(x) <= upper, or of function(x, u), at `knots`; a number or (m,) numbers, infinite where None.
+
+    `function` takes x (nx,), and u (nu,) if it has two arguments, as floats or AutoDiffXd: ordinary arithmetic and
+    NumPy functions will do. `knots` are whole numbers 0 ... N, negative ones counting from the end; None is every knot
+    but a given first one. A function of u holds at no knot N of a discrete method, which has no input there.
+    Collocation keeps a constraint of all knots at its midpoints too. `name` is how it is called where it fails.
+    """
+
+    function: Callable[..., Any]
+    lower: Any = None
+    upper: Any = None
+    knots: Any = None
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if not callable(self.function):
+            raise InputError("Constraint.function", got=type(self.function).__name__, expected=FORM)
+        if self.lower is None and self.upper is None:
+            raise InputError("Constraint", got="no lower and no upper", expected="one of them, or both")
+        sides = [np.atleast_1d(np.inf if v is None else v) for v in (self.lower, self.upper)]
+        if self.lower is None:
+            sides[0] = -sides[0]
+        lower, upper = (
+            array_with_gaps(f"Constraint.{n}", v, ("m",)) for n, v in zip(("lower", "upper"), sides, strict=True)
+        )
+        try:
+            lower, upper = np.broadcast_arrays(lower, upper)
+        except ValueError as error:
+            raise InputError("Constraint.upper", got=upper.shape, expected=f"shape {lower.shape}") from error
+        bad = np.isnan(lower) | np.isnan(upper) | (lower > upper) | (lower == np.inf) | (upper == -np.inf)
+        if bad.any():
+            got = f"[{lower[bad][0]:g}, {upper[bad][0]:g}]"
+            raise InputError(f"Constraint {self.label}", got=got, expected="lower at most upper")
+        object.__setattr__(self, "lower", frozen(lower))
+        object.__setattr__(self, "upper", frozen(upper))
+
+    @property
+    def label(self) -> str:
+        """The name, or the function's own."""
+        return self.name or str(getattr(self.function, "__qualname__", type(self.function).__name__))
+
+    @property
+    def takes_input(self) -> bool:
+        """Whether the function has an argument u."""
+        kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        parameters = inspect.signature(self.function).parameters.values()
+        return len([p for p in parameters if p.kind in kinds and p.default is p.empty]) > 1
+
+    def at_knots(self, count: int, first_is_given: bool) -> tuple[int, ...]:
+        """The knots out of 0 ... `count` at which it holds, in order; InputError where there is no such knot."""
+        last = count - 1 if self.takes_input else count
+        if self.knots is None:
+            return tuple(range(int(first_is_given and not self.takes_input), last + 1))
+        given = np.atleast_1d(np.asarray(self.knots))
+        wanted = f"whole numbers from {-last - 1} to {last}"
+        if given.ndim != 1 or not np.issubdtype(given.dtype, np.integer) or not len(given):
+            raise InputError(f"knots of constraint {self.label}", got=repr(self.knots), expected=wanted)
+        if (given > last).any() or (given < -last - 1).any():
+            raise InputError(f"knots of constraint {self.label}", got=given.tolist(), expected=wanted)
+        return tuple(sorted({int(k) % (last + 1) for k in given}))
+
+    def __call__(self, x: Any, u: Any) -> Array:
+        """(m,) the function's values at x (nx,), u (nu,)."""
+        return np.asarray(self._call(x, u), dtype=float)
+
+    def differentiate(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """(values (m,), Jacobian (m, nx + nu)); GradientError where it is lost or not finite."""
+        z = InitializeAutoDiff(np.concatenate([x, u])).ravel()
+        with np.errstate(all="ignore"):  # what is not finite is refused below
+            result = self._call(z[: len(x)], z[len(x) :])
+        values = np.array([v if isinstance(v, AutoDiffXd) else AutoDiffXd(float(v)) for v in result])
+        rows = gradient_rows(values, len(z))
+        plain = ExtractValue(values.reshape(-1, 1)).ravel()
+        if not any(isinstance(v, AutoDiffXd) for v in result):
+            raise GradientError(f"constraint {self.label} lost its derivatives: write it as {FORM}, without float()")
+        if not (np.all(np.isfinite(plain)) and np.all(np.isfinite(rows))):
+            raise GradientError(f"constraint {self.label} or its derivative is not finite at x = {x.tolist()}")
+        return plain, rows
+
+    def excess(self, x: Array, u: Array) -> float:
+        """The largest excess over a bound at x (nx,), u (nu,); inf where a value is not a number."""
+        values = self(x, u)
+        worst = np.max(np.maximum(self.lower - values, values - self.upper), initial=0.0)
+        return float("inf") if np.isnan(worst) else float(worst)
+
+    def resolved(self, x: Array, u: Array) -> "Constraint":
+        """This constraint with bounds as many as the function's values; InputError where the two do not fit."""
+        try:
+            with np.errstate(all="ignore"):
+                values = self._call(x, u)
+        except (TypeError, ValueError, IndexError, AttributeError) as error:
+            if isinstance(error, InputError):
+                raise
+            got = f"{type(error).__name__}: {error}"
+            raise InputError(f"constraint {self.label}", got=got, expected=FORM) from error
+        size = len(self.lower)
+        if size not in (1, len(values)):
+            raise InputError(f"constraint {self.label}", got=f"{len(values)} values", expected=f"{size}, as its bounds")
+        lower, upper = (np.broadcast_to(side, values.shape) for side in (self.lower, self.upper))
+        return replace(self, lower=lower, upper=upper)
+
+    def _call(self, x: Any, u: Any) -> Any:
+        result = np.asarray(self.function(x, u) if self.takes_input else self.function(x))
+        if result.ndim > 1:
+            raise InputError(f"constraint {self.label}", got=f"shape {result.shape}", expected="a number or shape (m,)")
+        return np.atleast_1d(result)

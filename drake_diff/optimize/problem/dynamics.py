@@ -1,0 +1,227 @@
+"""Dynamics x' = f(x, u) at many knots at once, with exact derivatives: a plain function, or a model's equations.
+
+A knot is a row [x, u] of (K, nx + nu). A function that also takes columns, x (nx, K) and u (nu, K), is called once for
+all knots; whether it does is tried once, against single calls.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
+
+from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
+from drake_diff._base.autodiff import gradient_rows
+from drake_diff.exceptions import GradientError, InputError, ShapeError
+from drake_diff.mechanics.tree import TreeDynamics, tree_for
+from drake_diff.model.equations import EquationsOfMotion
+from drake_diff.model.model import Model
+from drake_diff.model.step import set_state
+from drake_diff.optimize.problem.problem import Bounds, plant_limits, resolve_bounds
+
+PROBED = 3  # knots at which a function is tried before it is used
+ORDINARY = "a function of x and u in ordinary arithmetic and NumPy functions, without float()"
+
+
+class Pointwise:
+    """A function (x (nx,), u (nu,)) -> `shape`, () or (r,), in ordinary arithmetic, evaluated at many knots.
+
+    `probe` (3, nx + nu) are knots to try it at. Raises InputError or ShapeError where it is no such function.
+    """
+
+    def __init__(self, subject: str, f: Callable[[Any, Any], Any], nx: int, shape: tuple[int, ...], probe: Array):
+        if not callable(f):
+            raise InputError(subject, got=type(f).__name__, expected=ORDINARY)
+        self.subject, self.f, self.nx, self.shape = subject, f, nx, shape
+        self.rows = int(np.prod(shape))
+        self.takes_columns = False
+        try:
+            with np.errstate(all="ignore"):
+                single = self.values(probe)
+                self.linearize(probe)
+        except (TypeError, ValueError, IndexError, AttributeError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(subject, got=f"{type(error).__name__}: {error}", expected=ORDINARY) from error
+        self.takes_columns = self._agrees(probe, single)
+
+    def values(self, knots: Array) -> Array:
+        """(K, r) at `knots` (K, nx + nu)."""
+        if self.takes_columns:
+            return np.asarray(self._call(knots.T, len(knots)), dtype=float).reshape(self.rows, -1).T
+        return np.array([np.asarray(self._call(k), dtype=float).reshape(self.rows) for k in knots])
+
+    def linearize(self, knots: Array) -> tuple[Array, Array]:
+        """(K, r) and the Jacobian (K, r, nx + nu) by AutoDiffXd at `knots` (K, nx + nu).
+
+        Raises GradientError where the result carries no derivative.
+        """
+        count, width = knots.shape
+        if not self.takes_columns:
+            found = [self._rows(self._call(InitializeAutoDiff(k).ravel()), width) for k in knots]
+            return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
+        seeds = np.repeat(np.eye(width), count, axis=0)
+        columns = InitializeAutoDiff(value=knots.T.reshape(-1, 1), gradient=seeds).reshape(width, count)
+        value, rows = self._rows(self._call(columns, count), width)
+        return value.reshape(self.rows, count).T, rows.reshape(self.rows, count, width).transpose(1, 0, 2)
+
+    def _call(self, z: Any, *count: int) -> Any:
+        with np.errstate(all="ignore"):  # a solver's trial point may leave the domain; it is told by NaN
+            result = np.array(self.f(z[: self.nx], z[self.nx :]))
+        if result.shape != (*self.shape, *count) and not (self.shape == () and not count and result.shape == (1,)):
+            raise ShapeError(f"{self.subject}: its result", got=result.shape, expected=(*self.shape, *count))
+        return result
+
+    def _rows(self, result: Any, width: int) -> tuple[Array, Array]:
+        flat = result.ravel()
+        if not any(isinstance(v, AutoDiffXd) for v in flat):
+            raise GradientError(f"{self.subject} lost its derivatives: write it as {ORDINARY}")
+        full = np.array([v if isinstance(v, AutoDiffXd) else AutoDiffXd(float(v)) for v in flat])
+        return ExtractValue(full.reshape(-1, 1)).ravel(), gradient_rows(full, width)
+
+    def _agrees(self, probe: Array, single: Array) -> bool:
+        try:
+            self.takes_columns = True
+            together, _ = self.linearize(probe)
+            return bool(np.allclose(together, single, rtol=1e-12, atol=1e-12, equal_nan=True))
+        except Exception:  # whatever it is that f cannot do with columns: it need not
+            return False
+
+
+class Dynamics:
+    """x' = f(x, u) with `f` in ordinary arithmetic of x (nx,) [state units] and u (nu,), giving nx rates [per s].
+
+    AutoDiffXd must flow through `f`: no float(), no branches on the numbers. Bounds (nx,), (nu,) are infinite where
+    not given or NaN. `f` may instead be an object with its own values(knots) and linearize(knots), see `Pointwise`.
+
+    Raises InputError, ShapeError or GradientError where `f` is no such function, with what it did.
+    """
+
+    def __init__(
+        self,
+        f: Any,
+        nx: int,
+        nu: int,
+        *,
+        x_lower: Any = None,
+        x_upper: Any = None,
+        u_lower: Any = None,
+        u_upper: Any = None,
+        state_names: Sequence[str] | None = None,
+        input_names: Sequence[str] | None = None,
+    ):
+        self.nx, self.nu = positive_int("nx", nx), positive_int("nu", nu)
+        self.state_names = _names("state_names", state_names, "x", self.nx)
+        self.input_names = _names("input_names", input_names, "u", self.nu)
+        unlimited = Bounds(*(frozen(np.full(n, v)) for n in (self.nx, self.nu) for v in (-np.inf, np.inf)))
+        self.bounds = unlimited
+        self.bounds = self.limits(Bounds(x_lower, x_upper, u_lower, u_upper))
+        own = hasattr(f, "linearize")
+        self._at = f if own else Pointwise("dynamics", f, self.nx, (self.nx,), self.probe())
+
+    @property
+    def form(self) -> Any:
+        """What computes it: a `Pointwise`, a `PlantKnots`, or the caller's own object."""
+        return self._at
+
+    def __call__(self, x: Any, u: Any) -> Array:
+        """(nx,) the rates at `x` (nx,), `u` (nu,)."""
+        return np.asarray(self.values(self._knot(x, u))[0])
+
+    def derivatives(self, x: Any, u: Any) -> tuple[Array, Array, Array]:
+        """f (nx,), A = df/dx (nx, nx) and B = df/du (nx, nu) at `x` (nx,), `u` (nu,)."""
+        values, rows = self.linearize(self._knot(x, u))
+        return values[0], rows[0][:, : self.nx], rows[0][:, self.nx :]
+
+    def values(self, knots: Array) -> Array:
+        """(K, nx) the rates at `knots` (K, nx + nu), rows [x, u]."""
+        return np.asarray(self._at.values(knots))
+
+    def linearize(self, knots: Array) -> tuple[Array, Array]:
+        """(K, nx) the rates and (K, nx, nx + nu) their Jacobians [A, B] at `knots` (K, nx + nu)."""
+        values, rows = self._at.linearize(knots)
+        return values, rows
+
+    def probe(self) -> Array:
+        """(3, nx + nu) some knots within the bounds, to try a function at."""
+        b, rng = self.bounds, np.random.default_rng(0)
+        knots = rng.uniform(0.5, 1.5, (PROBED, self.nx + self.nu))
+        return np.clip(knots, np.concatenate([b.x_lower, b.u_lower]), np.concatenate([b.x_upper, b.u_upper]))
+
+    def limits(self, given: Bounds | None) -> Bounds:
+        """`given` with this dynamics' own bounds where it has none, checked."""
+        return resolve_bounds(given, vars(self.bounds), self.state_names, self.input_names)
+
+    def _knot(self, x: Any, u: Any) -> Array:
+        return np.concatenate([finite_array("x", x, (self.nx,)), finite_array("u", u, (self.nu,))])[None]
+
+
+def plant_dynamics(model: Model) -> Dynamics:
+    """A model's equations of motion as `Dynamics`, with its own limits of positions, velocities and efforts.
+
+    Raises ModelError where the model has no continuous form (PD control, constraints).
+    """
+    return Dynamics(
+        PlantKnots(model),
+        model.nx,
+        model.nu,
+        **plant_limits(model.plant),
+        state_names=model.state_names,
+        input_names=model.input_names,
+    )
+
+
+class PlantKnots:
+    """`EquationsOfMotion` at many knots: with r the residual by inverse dynamics at the solved acceleration a,
+
+    da = -M^-1 dr and dr/du = -B, so that AutoDiffXd takes one inverse dynamics by x alone; a tree of hinges and slides
+    gives dr for all knots in one call.
+    """
+
+    def __init__(self, model: Model):
+        self.equations, self.model = EquationsOfMotion(model), model
+        self.tree = tree_for(model)
+
+    def values(self, knots: Array) -> Array:
+        return self.equations.values(knots)
+
+    def linearize(self, knots: Array) -> tuple[Array, Array]:
+        if self.tree is not None:
+            return self._linearize_tree(self.tree, knots)
+        found = [self._linearize(k[: self.model.nx], k[self.model.nx :]) for k in knots]
+        return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
+
+    def _linearize_tree(self, tree: TreeDynamics, knots: Array) -> tuple[Array, Array]:
+        n, actuation = self.model.nv, self.equations.actuation
+        q, values = knots[:, :n], self.values(knots)
+        d = tree(tree.place(self.model, q), q, values[:, :n], values[:, n:])
+        by_u = np.broadcast_to(-actuation, (len(knots), *actuation.shape))
+        rows = np.zeros((len(knots), 2 * n, knots.shape[1]))
+        rows[:, :n, n : 2 * n] = np.eye(n)
+        rows[:, n:] = -np.linalg.solve(d.mass, np.concatenate([d.by_q, d.by_v, by_u], axis=2))
+        return values, rows
+
+    def _linearize(self, x: Array, u: Array) -> tuple[Array, Array]:
+        equations, model, twin = self.equations, self.model, self.model.autodiff
+        set_state(model.double, x)
+        acceleration, mass = equations.acceleration(u)
+        q_dot = equations.q_dot(model.double, x)
+        variables = InitializeAutoDiff(x).ravel()
+        set_state(twin, variables)
+        constant = np.array([AutoDiffXd(a) for a in acceleration])
+        residual = twin.inverse_dynamics(constant)
+        rows = np.zeros((model.nx, model.nx + model.nu))
+        if equations.plain_rates:
+            rows[: model.nq, model.nq : model.nx] = np.eye(model.nq)
+        else:
+            rows[: model.nq, : model.nx] = gradient_rows(equations.q_dot(twin, variables), model.nx)
+        by_knot = np.concatenate([gradient_rows(residual, model.nx), -equations.actuation], axis=1)
+        rows[model.nq :] = -np.linalg.solve(mass, by_knot)
+        return np.concatenate([q_dot, acceleration]), rows
+
+
+def _names(subject: str, given: Sequence[str] | None, letter: str, count: int) -> tuple[str, ...]:
+    names = tuple(f"{letter}{i}" for i in range(count)) if given is None else tuple(given)
+    if len(names) != count or isinstance(given, str):
+        raise InputError(subject, got=given, expected=f"{count} names")
+    return names

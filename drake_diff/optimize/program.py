@@ -1,0 +1,154 @@
+"""What is common to all solves, whoever does them: limits, progress, interrupts, the best iterate, how they end."""
+
+import enum
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+
+FEASIBILITY_TOLERANCE = 1e-5  # defect, goal and bounds, in the state's and input's own units
+REPORT_PERIOD = 0.2  # [s] between two progress reports: each costs an evaluation of every constraint
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One row of the solver's own table; NaN where it prints no such number."""
+
+    iteration: int
+    objective: float
+    primal_infeasibility: float
+    dual_infeasibility: float
+    step: float
+
+    def __str__(self) -> str:
+        columns = [f"iteration {self.iteration:5d}", f"cost {self.objective:12.6g}"]
+        columns.append(f"violation {self.primal_infeasibility:9.2e}")
+        if not math.isnan(self.dual_infeasibility):
+            columns.append(f"gradient {self.dual_infeasibility:9.2e}")
+        if not math.isnan(self.step):
+            columns.append(f"step {self.step:.3g}")
+        return "  ".join(columns)
+
+
+class Report:
+    """Where the progress of a solve goes: a `line` for people, an Iteration for `callback`."""
+
+    def __init__(self, line: Callable[[str], None] | None = None, callback: Callable[[Iteration], None] | None = None):
+        self.line, self.callback = line, callback
+
+    def row(self, row: Iteration, *, printed: bool = True) -> None:
+        """Hand on `row`, and print it."""
+        if self.callback is not None:
+            self.callback(row)
+        if printed:
+            self.say(str(row))
+
+    def say(self, text: str) -> None:
+        """Print a line of progress."""
+        if self.line is not None:
+            self.line(text)
+
+
+class Outcome(enum.Enum):
+    """How the solver says it ended."""
+
+    SOLVED = "solved"
+    ITERATION_LIMIT = "iteration limit"
+    TIME_LIMIT = "time limit"
+    INFEASIBLE = "infeasible"
+    UNBOUNDED = "unbounded"
+    INTERRUPTED = "interrupted"
+    INACCURATE = "inaccurate"
+    DIVERGED = "the simulation failed"
+    NO_GRADIENT = "a derivative was refused"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When to stop: iterations, seconds, and the tolerance on feasibility and optimality."""
+
+    max_iterations: int
+    time_limit: float
+    tolerance: float
+
+
+@dataclass(frozen=True, eq=False)
+class NlpResult:
+    """The final, or the best, values of the decision variables (n,), how they were reached, and a claim's limits."""
+
+    z: Array
+    outcome: Outcome
+    message: str
+    iterations: tuple[Iteration, ...]
+    note: str = ""  # what a claim of a minimum is limited to, if it is
+
+
+class Watch:
+    """What is kept of a solve while it runs: the best iterate, and whether Ctrl-C or the clock ends it."""
+
+    def __init__(self, limits: Limits, interrupted: threading.Event):
+        self.limits, self.interrupted = limits, interrupted
+        self.start = self.last_report = time.monotonic()
+        self.best: Array | None = None
+        self.best_merit = math.inf
+        self.stopped_by: Outcome | None = None
+
+    @property
+    def elapsed(self) -> float:
+        """[s] since the start."""
+        return time.monotonic() - self.start
+
+    def look_up(self) -> bool:
+        """Note what ends the solve, if anything does; whether a report is due."""
+        now = time.monotonic()
+        if self.interrupted.is_set():
+            self.stopped_by = Outcome.INTERRUPTED
+        elif now - self.start > self.limits.time_limit:
+            self.stopped_by = Outcome.TIME_LIMIT
+        due = now - self.last_report > REPORT_PERIOD or self.stopped_by is not None
+        self.last_report = now if due else self.last_report
+        return due
+
+    def offer(self, z: Array, cost: float, violation: float) -> None:
+        """Keep a copy of `z` (n,) if it is the best so far by cost + 1e6 * (violation beyond the tolerance)."""
+        merit = cost + 1e6 * max(0.0, violation - self.limits.tolerance)
+        if self.best is None or merit < self.best_merit:
+            self.best, self.best_merit = np.array(z), merit
+
+    def best_of(self, guess: Array) -> Array:
+        """The best iterate, the guess where there was none."""
+        return guess if self.best is None else self.best
+
+
+class _Flag(threading.Event):
+    """A handler of Ctrl-C that notes it."""
+
+    def __call__(self, *_: Any) -> None:
+        self.set()
+
+
+@contextmanager
+def interrupt_flag() -> Iterator[threading.Event]:
+    """An event that Ctrl-C sets, in the main thread, until the block ends; that of a block around it, if any."""
+    flag = _Flag()
+    if threading.current_thread() is not threading.main_thread():
+        yield flag
+        return
+    former = signal.getsignal(signal.SIGINT)
+    if isinstance(former, _Flag):
+        yield former
+        return
+    signal.signal(signal.SIGINT, flag)
+    try:
+        yield flag
+    finally:
+        signal.signal(signal.SIGINT, former)

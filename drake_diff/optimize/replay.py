@@ -1,0 +1,272 @@
+"""A plan tried again on Drake's double plant: at its step and half of it, in another contact approximation.
+
+What is true at one step size and in one approximation of contact only is a property of the numerics. So the inputs
+are rolled out as they are (open loop) and with TVLQR feedback about the plan, and each variant of the plant holds where
+one of the two reaches the goal and keeps bounds, constraints, the energy balance and the penetration limit: an
+unstable motion diverges open loop whatever is right, and feedback through contact can do harm.
+
+A discrete plan has to hold at h and at h/2. A collocated one is a motion in continuous time, whose interval need not be
+a step that the simulator can take: it has to hold at two successive ones of h, h/2, h/4, ... h/16. A user's diagram has
+one time step and one contact approximation: there is no other to try.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import GradientError, InputError, ModelError, SimulationError
+from drake_diff.model.contact import thinnest_geometry
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import ParameterVector, applied, select
+from drake_diff.model.tangent import tangent_space
+from drake_diff.motion.policy import TVLQR
+from drake_diff.motion.rollout import Policy, Rollout, rollout
+from drake_diff.optimize.problem.problem import Problem
+
+# Of a coordinate's range in the plan: how far from goal, bound or waypoint a replay may be. Discretizations differ by
+# O(h), so nothing tight can be asked of h against h/2; a plan that is wrong is wrong by the order of its range.
+STATE_TOLERANCE = 0.05
+SMALLEST_ENERGY = 1e-9  # [J] less is rounding
+ENERGY_TOLERANCE = 0.1  # of the energy that the motion exchanges: what neither actuators nor damping account for
+PENETRATION_PART = 0.25  # of the thinnest geometry's thickness: beyond half of it contact may push out the other way
+SMALLEST_PART = 0.2  # of the largest range of its kind (positions, velocities): a coordinate's own is at least that
+SMALLEST_RANGE = 1e-3
+OTHER_APPROXIMATION = {"sap": "lagged", "similar": "sap", "lagged": "sap", "tamsi": "sap"}
+FINEST = 16  # intervals are cut into at most that many steps
+EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in TVLQR, over that of the states
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """One rollout of a plan: in which variant of the plant, how controlled, and what does not hold in it."""
+
+    variant: str
+    control: str  # "open loop" or "TVLQR"
+    time_step: float  # [s]
+    approximation: str
+    motion: Rollout | None  # None where it could not be taken, `failures` saying why
+    goal_error: float  # the largest distance from the goal, free entries apart, in the state's units
+    bound_violation: float  # the largest excess of a state over a bound, in the state's units
+    energy_error: float  # [J] drift of the energy that neither actuators nor damping account for
+    penetration: float  # [m]
+    failures: tuple[str, ...]
+
+    @property
+    def holds(self) -> bool:
+        return not self.failures
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is replayed: `sample(m)` gives xs (m N + 1, nx) and us (m N, nu) held over each m-th part of an interval.
+
+    `time_step` [s] is an interval's length; `continuous` tells that the plan is a motion in continuous time.
+    """
+
+    problem: Problem
+    vector: ParameterVector
+    time_step: float
+    sample: Callable[[int], tuple[Array, Array]]
+    continuous: bool
+
+    @cached_property
+    def scale(self) -> Array:
+        """(nx,) the range of each state along the plan, see SMALLEST_PART."""
+        ranges, nq = np.ptp(self.sample(1)[0], axis=0), self.problem.model.nq
+        for kind in (slice(0, nq), slice(nq, None)):
+            least = max(SMALLEST_PART * float(np.max(ranges[kind], initial=0.0)), SMALLEST_RANGE)
+            ranges[kind] = np.maximum(ranges[kind], least)
+        return np.asarray(ranges)
+
+    @cached_property
+    def open_loop(self) -> Rollout | None:
+        """The plant's own motion under the inputs at the plan's own step; None where it cannot be taken."""
+        try:
+            xs, us = self.sample(1)
+            return rollout(self.model_at(1), xs[0], us, parameters=self.vector.to_dict())
+        except (SimulationError, ModelError, ValueError):
+            return None  # not finite, or beyond what Drake can step: recorded as missing, never as zero
+
+    def model_at(self, parts: int) -> Model:
+        """The model at the m-th part of an interval."""
+        model, h = self.problem.model, self.time_step / parts
+        return model if h == model.time_step else model.at_time_step(h)
+
+
+def held(xs: Array, us: Array) -> Callable[[int], tuple[Array, Array]]:
+    """`Plan.sample` of states xs (N+1, nx) at the ends of steps over which us (N, nu) is held."""
+
+    def sample(parts: int) -> tuple[Array, Array]:
+        at = np.arange(parts * len(us) + 1) / parts
+        between = np.array([np.interp(at, np.arange(len(xs)), column) for column in xs.T]).T
+        return between, np.repeat(us, parts, axis=0)
+
+    return sample
+
+
+def replays(plan: Plan) -> tuple[Replay, ...]:
+    """`plan` in the variants of the plant, open loop and, where there are inputs, under TVLQR."""
+    model, found = plan.problem.model, list(_replay_step(plan, 1))
+    if model.can_rebuild:  # a user's diagram is one plant: there are no variants of it to try
+        parts = 2
+        found += _replay_step(plan, parts)
+        while plan.continuous and parts < FINEST and not (_holds(found[-2:]) and _holds(found[-4:-2])):
+            parts *= 2
+            found += _replay_step(plan, parts)
+        contact = model.contract.contact
+        if contact.collision_pairs and not plan.continuous:
+            other = OTHER_APPROXIMATION[contact.approximation]
+            found += _replay_in(plan, f"with {other} contact", lambda: model.with_contact(other), 1)
+    return tuple(found)
+
+
+def _replay_step(plan: Plan, parts: int) -> list[Replay]:
+    name = f"in steps of {plan.time_step / parts:.4g} s"
+    known = plan.open_loop if parts == 1 else None
+    return _replay_in(plan, name, lambda: plan.model_at(parts), parts, known)
+
+
+def _holds(found: Sequence[Replay]) -> bool:
+    return any(r.holds for r in found)
+
+
+def broken_variants(plan: Plan, found: Sequence[Replay]) -> Iterator[str]:
+    """A clause for each variant of the plant in which the plan does not hold, whatever the control."""
+    variants = list(dict.fromkeys(r.variant for r in found))
+    if plan.continuous:
+        variants = variants[-2:] if len(variants) > 1 else []  # the two finest; one alone says nothing
+    for variant in variants:
+        tried = [r for r in found if r.variant == variant]
+        if not _holds(tried):
+            yield f"replayed {variant} it does not hold: " + "; ".join(f"{r.control}, {r.failures[0]}" for r in tried)
+
+
+def _replay_in(
+    plan: Plan, variant: str, make: Callable[[], Model], parts: int, known: Rollout | None = None
+) -> list[Replay]:
+    """Both replays in one variant of the plant; open loop, whose motion may be `known`, alone without inputs."""
+    controls = {"open loop": known, "TVLQR": None} if plan.problem.model.nu else {"open loop": known}
+    try:
+        model = make()
+        with applied(select(model, plan.vector.to_dict())) as set_model:
+            return [_replay(plan, variant, control, set_model, parts, motion) for control, motion in controls.items()]
+    except (ModelError, InputError) as error:
+        return [_missing(plan, variant, control, str(error)) for control in controls]
+
+
+def track(plan: Plan, model: Model, xs: Array, us: Array) -> Policy:
+    """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan, within the input's bounds."""
+    bounds = plan.problem.bounds
+    policy = TVLQR(model, xs, us, *regulator_weights(plan, us))
+    return lambda x, t: np.minimum(np.maximum(policy(x, t), bounds.u_lower), bounds.u_upper)
+
+
+def regulator_weights(plan: Plan, us: Array) -> tuple[Array, Array, Array]:
+    """Q (nt, nt), R (nu, nu) and Qf by Bryson's rule, one over the square of each range; a rotation's is a radian."""
+    model = plan.problem.model
+    space = tangent_space(model)
+    scale = plan.scale if space.size == model.nx else np.ones(space.size)
+    effort = np.maximum(np.max(np.abs(us), axis=0), SMALLEST_RANGE)
+    Q = np.diag(1 / scale**2)
+    return Q, EFFORT_WEIGHT * np.diag(1 / effort**2), FINAL_WEIGHT * Q
+
+
+def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, known: Rollout | None) -> Replay:
+    try:
+        motion = _roll(plan, control, model, parts) if known is None else known
+    except (SimulationError, ModelError, GradientError, ValueError) as error:
+        return _missing(plan, variant, control, str(error))
+    bounds = plan.problem.bounds
+    beyond = np.maximum(bounds.x_lower - motion.xs, motion.xs - bounds.x_upper)[1:]
+    return Replay(
+        variant=variant,
+        control=control,
+        time_step=model.time_step,
+        approximation=model.contract.contact.approximation,
+        motion=motion,
+        goal_error=float(np.max(np.abs(plan.problem.goal_error(motion.xs[-1])))),
+        bound_violation=float(np.max(beyond, initial=0.0)),
+        energy_error=motion.energy_drift,
+        penetration=float(np.max(motion.penetration)),
+        failures=tuple(_failures(plan, model, motion, parts)),
+    )
+
+
+def _roll(plan: Plan, control: str, model: Model, parts: int) -> Rollout:
+    xs, us = plan.sample(parts)
+    if control == "open loop":
+        return rollout(model, xs[0], us)
+    return rollout(model, xs[0], policy=track(plan, model, xs, us), num_steps=len(us))
+
+
+def _missing(plan: Plan, variant: str, control: str, why: str) -> Replay:
+    nothing = (float("inf"),) * 4
+    approximation = plan.problem.model.contract.contact.approximation
+    return Replay(variant, control, plan.time_step, approximation, None, *nothing, failures=(why,))
+
+
+def _failures(plan: Plan, model: Model, motion: Rollout, parts: int) -> Iterator[str]:
+    """What does not hold in a replay, a clause each."""
+    yield from missed_goal(plan, plan.problem.goal_error(motion.xs[-1]))
+    yield from left_bounds(plan, motion)
+    yield from _broken_constraints(plan, motion.xs[::parts], motion.us[::parts])
+    yield from _broken_balance(motion)
+    yield from too_deep(model, motion)
+
+
+def missed_goal(plan: Plan, distance: Array) -> Iterator[str]:
+    """Where the `distance` (nx,) from the goal is above the tolerance."""
+    missed, tolerance = np.abs(distance), STATE_TOLERANCE * plan.scale
+    if not np.all(missed <= tolerance):
+        worst = int(np.argmax(np.nan_to_num(missed / plan.scale, nan=np.inf)))
+        name = plan.problem.model.state_names[worst]
+        yield f"{name} ends {missed[worst]:.3g} from its goal, tolerance {tolerance[worst]:.3g}"
+
+
+def left_bounds(plan: Plan, motion: Rollout) -> Iterator[str]:
+    """Where a state of the motion, but the first, is beyond a bound by more than the tolerance."""
+    bounds, scale, tolerance = plan.problem.bounds, plan.scale, STATE_TOLERANCE * plan.scale
+    excess = np.maximum(np.maximum(bounds.x_lower - motion.xs, motion.xs - bounds.x_upper), 0.0)[1:]
+    if np.any(excess > tolerance):
+        k, i = divmod(int(np.argmax(excess / scale)), excess.shape[1])
+        name, when = plan.problem.model.state_names[i], motion.times[k + 1]
+        yield f"{name} is {excess[k, i]:.3g} beyond its bound at {when:.3g} s, tolerance {tolerance[i]:.3g}"
+
+
+def too_deep(model: Model, motion: Rollout) -> Iterator[str]:
+    """Where geometries overlap by more than a quarter of the thinnest."""
+    limit, geometry = thinnest_geometry(model)
+    limit *= PENETRATION_PART
+    depth = float(np.max(motion.penetration))
+    if depth > limit:
+        when = motion.times[int(np.argmax(motion.penetration))]
+        yield f"geometries overlap by {depth:.3g} m at {when:.3g} s, limit {limit:.3g} m (a quarter of {geometry})"
+
+
+def _broken_constraints(plan: Plan, xs: Array, us: Array) -> Iterator[str]:
+    """Of the constraints and waypoints, by a replay's states xs (N+1, nx) and us (N, nu) at the plan's knots."""
+    problem, ranges = plan.problem, {}
+    planned_xs, planned_us = plan.sample(1)
+    for c in problem.constraints:  # its range is that along the whole plan: at a single knot it has none
+        with np.errstate(all="ignore"):
+            values = np.array([c(x, u) for x, u in zip(planned_xs, [*planned_us, planned_us[-1]], strict=True)])
+        values = values[np.isfinite(values).all(axis=1)]
+        ranges[c.label] = max(float(np.ptp(values, axis=0).max()), SMALLEST_RANGE)
+    for name, (excess, knot) in problem.constraint_excess(xs, us).items():
+        tolerance = STATE_TOLERANCE * ranges.get(name, float(np.max(plan.scale)))
+        if not excess <= tolerance:
+            yield f"{name} is broken by {excess:.3g} at knot {knot}, tolerance {tolerance:.3g}"
+
+
+def _broken_balance(motion: Rollout) -> Iterator[str]:
+    """Energy out of nothing; a loss is none where contact or a joint limit can take it."""
+    flows = (motion.kinetic_energy, motion.potential_energy, motion.work, motion.dissipation)
+    exchanged = sum(float(np.ptp(flow)) for flow in flows)
+    tolerance = max(ENERGY_TOLERANCE * exchanged, SMALLEST_ENERGY)
+    gained = motion.energy_drift
+    taken_elsewhere = any(motion.contacts) or float(np.max(motion.constraint_violation)) > 0
+    if gained > tolerance or (gained < -tolerance and not taken_elsewhere):
+        yield f"{gained:.3g} J of energy come from nowhere, tolerance {tolerance:.3g} J"

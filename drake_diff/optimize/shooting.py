@@ -1,0 +1,376 @@
+"""A motion, or a segment of one, as a function of the variables that it is shot from, through Drake's own steps.
+
+Shooting, single or multiple: the states, costs and limits of one or more segments as one program.
+
+In multiple shooting (Bock and Plitt, "A multiple shooting algorithm for direct solution of optimal control problems",
+1984) the motion is cut into segments, the states that they start from are variables too, and that each ends where the
+next begins is a constraint: what a late input does need not be seen through all the steps before it, and a guess of
+the states counts. With as many segments as steps it is direct transcription of the discrete plant; single shooting is
+the case of one segment.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.autodiffutils import ExtractValue
+from pydrake.solvers import MathematicalProgram
+
+from drake_diff._base.arrays import Array, positive_int
+from drake_diff._base.autodiff import chain, chain_rows
+from drake_diff.derivatives.step import StepDerivatives
+from drake_diff.exceptions import InputError, SimulationError
+from drake_diff.model.parameters import ParameterCoordinates, ParameterVector, applied
+from drake_diff.motion.gradient import Totals, accumulate, derivatives_along, differentiate_loss
+from drake_diff.motion.rollout import roll_states
+from drake_diff.optimize.drake_program import solve_program
+from drake_diff.optimize.problem.cost import differentiate_cost, differentiate_final_cost
+from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.program import Limits, NlpResult, Report
+
+
+class ShootingVariables:
+    """z = [free entries of the first state; us; parameters in their coordinates] and its rollout of n steps.
+
+    `steps` are those of a segment, all where None; the first state of a later segment is free in every entry. Given
+    `around` (n+1, nx), the states are these instead of a rollout, and the steps are linearized around them. That is
+    done once for each z.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        steps: range | None = None,
+        around: Array | None = None,
+        tolerate_failure: bool = False,
+    ):
+        self.problem, self.around, self.tolerate_failure = problem, around, tolerate_failure
+        self.steps = range(problem.num_steps) if steps is None else steps
+        begins, nx = self.steps.start == 0, problem.model.nx
+        self.free = np.flatnonzero(problem.initial_state_mask) if begins else np.arange(nx)
+        self.shape = (len(self.steps), problem.model.nu)
+        self.coordinates = ParameterCoordinates(problem.parameters) if problem.optimizes_parameters else None
+        self.num_parameters = len(problem.parameters.values) if problem.optimizes_parameters else 0
+        num_inputs = self.shape[0] * self.shape[1] if problem.optimizes_controls else 0
+        self.inputs = slice(len(self.free), len(self.free) + num_inputs)  # where in z they are
+        self.size = self.inputs.stop + self.num_parameters
+        self._at: bytes | None = None
+        self._linearization: list[StepDerivatives] = []
+
+    @property
+    def is_last(self) -> bool:
+        """Whether the motion ends with these steps."""
+        return self.steps.stop == self.problem.num_steps
+
+    def pack(self, x0: Array, us: Array, parameters: Array | None = None) -> Array:
+        """z (size,) from the first state x0 (nx,), us (n, nu) and parameter values (np,), the problem's where None."""
+        inputs = us.ravel() if self.problem.optimizes_controls else np.zeros(0)
+        values = self.problem.parameters.values if parameters is None else parameters
+        coordinates = np.zeros(0) if self.coordinates is None else self.coordinates.from_values(values)
+        return np.concatenate([x0[self.free], inputs, coordinates])
+
+    def unpack(self, z: Array) -> tuple[Array, Array]:
+        """x0 (nx,) and us (n, nu) from z (size,)."""
+        x0 = np.array(self.problem.x0)
+        x0[self.free] = z[: len(self.free)]
+        if not self.problem.optimizes_controls:
+            return x0, np.array(self.problem.us[self.steps.start : self.steps.stop])
+        return x0, z[self.inputs].reshape(self.shape)
+
+    def parameters(self, z: Array) -> ParameterVector:
+        """The problem's parameters at z (size,)."""
+        if self.coordinates is None:
+            return self.problem.parameters
+        return self.problem.parameters.at(self.coordinates.to_values(z[self.inputs.stop :]))
+
+    def gradient(self, z: Array, totals: Totals) -> Array:
+        """(size,) the gradient by z from those by x0 (nx,), us (n, nu) and parameters (np,)."""
+        inputs = totals.inputs.ravel() if self.problem.optimizes_controls else np.zeros(0)
+        return np.concatenate([totals.states[0][self.free], inputs, self.pull_back(z, totals.parameters)])
+
+    def pull_back(self, z: Array, by_parameters: Array) -> Array:
+        """(..., num_parameters) the derivative by the parameters' coordinates in z."""
+        if self.coordinates is None:
+            return np.zeros((*by_parameters.shape[:-1], 0))
+        return self.coordinates.pull_back(z[self.inputs.stop :], by_parameters)
+
+    def linearization(self, z: Array) -> list[StepDerivatives]:
+        """The step derivatives along the states of z."""
+        if z.tobytes() != self._at:
+            (x0, us), vector = self.unpack(z), self.parameters(z)
+            with applied(vector) as model:
+                given = None if self.around is None else self.around[:-1]
+                self._linearization = derivatives_along(model, x0, us, vector=vector, xs=given)
+            self._at = z.tobytes()
+        return self._linearization
+
+    def attempt(self, evaluate: Callable[[], Any], failed: Any) -> Any:
+        """`evaluate()`, or `failed` (NaN) where the simulation fails and the solver takes that for too long a step."""
+        try:
+            return evaluate()
+        except SimulationError:
+            if self.tolerate_failure:
+                return failed
+            raise
+
+    def states(self, z: Array) -> Array:
+        """(n+1, nx) the states of the rollout of z, or those given."""
+        if self.around is not None:
+            return self.around
+        x0, us = self.unpack(z)
+        if z.tobytes() == self._at:
+            return np.vstack([x0, [d.x_next for d in self._linearization]])
+        with applied(self.parameters(z)) as model:
+            return roll_states(model, x0, us)
+
+
+def state_sensitivities(variables: ShootingVariables, z: Array) -> Array:
+    """(n+1, nx, size): d x_k / d z, forward: S_(k+1) = A_k S_k + B_k d u_k / d z + C_k d p / d z."""
+    linearization = variables.linearization(z)
+    nx, nu, free = variables.problem.model.nx, variables.shape[1], len(variables.free)
+    sensitivities = np.zeros((len(linearization) + 1, nx, variables.size))
+    sensitivities[0, variables.free, np.arange(free)] = 1.0
+    for k, d in enumerate(linearization):
+        sensitivities[k + 1] = d.A @ sensitivities[k]
+        if variables.problem.optimizes_controls:
+            start = variables.inputs.start + k * nu
+            sensitivities[k + 1][:, start : start + nu] += d.B
+        sensitivities[k + 1][:, variables.inputs.stop :] += variables.pull_back(z, d.C)
+    return sensitivities
+
+
+class RolloutCost:
+    """What the steps of z add to the objective, as a function of floats or AutoDiffXd, by reverse accumulation."""
+
+    def __init__(self, problem: Problem, variables: ShootingVariables):
+        self.variables, self.time_step, self.running = variables, problem.model.time_step, problem.running_cost
+        self.final = problem.final_cost if variables.is_last else None
+        self.trajectory = problem.trajectory_cost
+
+    @property
+    def any(self) -> bool:
+        """Whether there is a cost here."""
+        return any(cost is not None for cost in (self.running, self.final, self.trajectory))
+
+    def __call__(self, z: Any) -> Any:
+        if z.dtype == float:
+            return self.variables.attempt(lambda: self.value(z), np.nan)
+        at = ExtractValue(z.reshape(-1, 1)).ravel()
+        missing = np.nan, np.full(len(at), np.nan), None
+        value, gradient, _ = self.variables.attempt(lambda: self.differentiate(at), missing)
+        return chain(value, gradient, z)
+
+    def value(self, z: Array) -> float:
+        """The cost at z."""
+        xs, us = self.variables.states(z), self.variables.unpack(z)[1]
+        total = 0.0 if self.final is None else float(self.final(xs[-1]))
+        if self.running is not None:
+            total += self.time_step * sum(float(self.running(x, u)) for x, u in zip(xs, us, strict=False))
+        return total + (0.0 if self.trajectory is None else float(self.trajectory(xs, us)))
+
+    def differentiate(self, z: Array) -> tuple[float, Array, Array]:
+        """(value, gradient by z, gradients by every state (n+1, nx)) at z."""
+        linearization = self.variables.linearization(z)
+        xs, us, h = self.variables.states(z), self.variables.unpack(z)[1], self.time_step
+        by_xs, by_us, total = np.zeros_like(xs), np.zeros_like(us), 0.0
+        if self.running is not None:
+            for k, u in enumerate(us):
+                value, by_x, by_u = differentiate_cost(self.running, xs[k], u)
+                total += h * value
+                by_xs[k], by_us[k] = h * by_x, h * by_u
+        if self.final is not None:
+            value, by_xs[-1] = differentiate_final_cost(self.final, xs[-1])
+            total += value
+        if self.trajectory is not None:
+            value, added_xs, added_us = differentiate_loss(self.trajectory, xs, us)
+            total, by_xs, by_us = total + value, by_xs + added_xs, by_us + added_us
+        totals = accumulate(linearization, by_xs, by_us)
+        return total, self.variables.gradient(z, totals), totals.states
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """lower <= values(z) <= upper, m rows of a segment's z, or of more variables after it; floats or AutoDiffXd."""
+
+    variables: ShootingVariables
+    lower: Array
+    upper: Array
+    values: Callable[[Array], Array]
+    jacobian: Callable[[Array], Array]
+
+    def __call__(self, z: Any) -> Any:
+        missing = np.full(len(self.lower), np.nan)
+        if z.dtype == float:
+            return self.variables.attempt(lambda: self.values(z), missing)
+        at = ExtractValue(z.reshape(-1, 1)).ravel()
+        values, jacobian = self.variables.attempt(
+            lambda: (self.values(at), self.jacobian(at)), (missing, np.full((len(missing), len(at)), np.nan))
+        )
+        return chain_rows(values, jacobian, z)
+
+
+def limits_of_states(problem: Problem, variables: ShootingVariables) -> Rows:
+    """Bounds, waypoints and goal at the knots after the first, but not where the next segment begins."""
+    first, last = variables.steps.start, variables.steps.stop
+    lower, upper = (side[first : last + variables.is_last] for side in problem.state_limits())
+    steps, entries = np.nonzero(np.isfinite(lower) | np.isfinite(upper))
+    steps, entries = steps[steps > 0], entries[steps > 0]
+
+    def values(z: Array) -> Array:
+        return variables.states(z)[steps, entries]
+
+    def jacobian(z: Array) -> Array:
+        return state_sensitivities(variables, z)[steps, entries]
+
+    return Rows(variables, lower[steps, entries], upper[steps, entries], values, jacobian)
+
+
+def limits_of_constraints(problem: Problem, variables: ShootingVariables) -> Rows:
+    """The problem's constraints at the knots from the first on, but not where the next segment begins."""
+    first, nx, nu = variables.steps.start, problem.model.nx, problem.model.nu
+    knots = range(first, variables.steps.stop + variables.is_last)
+    given = problem.initial_state_is_given
+    here = [(k - first, c) for c in problem.constraints for k in c.at_knots(problem.num_steps, given) if k in knots]
+
+    def values(z: Array) -> Array:
+        xs, us = variables.states(z), variables.unpack(z)[1]
+        with np.errstate(all="ignore"):  # solvers know what to do with what is not finite
+            return np.concatenate([c(xs[k], us[min(k, len(us) - 1)]) for k, c in here])
+
+    def jacobian(z: Array) -> Array:
+        xs, us, sensitivities = variables.states(z), variables.unpack(z)[1], state_sensitivities(variables, z)
+        found = []
+        for k, c in here:
+            by_xu = c.differentiate(xs[k], us[min(k, len(us) - 1)])[1]
+            found.append(by_xu[:, :nx] @ sensitivities[k])
+            if k < len(us) and problem.optimizes_controls:
+                start = variables.inputs.start + k * nu
+                found[-1][:, start : start + nu] += by_xu[:, nx:]
+        return np.concatenate(found)
+
+    none = [np.zeros(0)]
+    lower, upper = (np.concatenate([getattr(c, side) for _, c in here] or none) for side in ("lower", "upper"))
+    return Rows(variables, lower, upper, values, jacobian)
+
+
+def defect(variables: ShootingVariables) -> Rows:
+    """0 = where a segment ends less where the next begins, by [z; the state that it begins from]."""
+    size, nx = variables.size, variables.problem.model.nx
+
+    def values(z: Array) -> Array:
+        return variables.states(z[:size])[-1] - z[size:]
+
+    def jacobian(z: Array) -> Array:
+        return np.hstack([state_sensitivities(variables, z[:size])[-1], -np.eye(nx)])
+
+    return Rows(variables, np.zeros(nx), np.zeros(nx), values, jacobian)
+
+
+DEFAULT_SOLVER = "snopt"
+
+
+def check_segments(problem: Problem, method: str, segments: int) -> None:
+    """Refuse a number of segments that is none, or that the method or the problem does not allow."""
+    if positive_int("segments", segments) > 1 and method != "shooting":
+        raise InputError("segments", got=segments, expected=f'1 for method="{method}"')
+    if segments > problem.num_steps:
+        raise InputError("segments", got=segments, expected=f"at most num_steps, {problem.num_steps}")
+    if segments > 1 and problem.trajectory_cost is not None:
+        raise InputError("segments", got=segments, expected="1 with a trajectory_cost, which is of the whole motion")
+
+
+def solve_shooting(
+    problem: Problem,
+    xs: Array,
+    us: Array,
+    *,
+    solver: str,
+    limits: Limits,
+    report: Report | None,
+    segments: int = 1,
+) -> tuple[NlpResult, Array, Array]:
+    """Solve `problem` from the guess xs (N+1, nx), us (N, nu); gives (result, xs, us).
+
+    Of xs only the states that segments start from count. The result's z is that of `ShootingVariables` of the whole
+    motion. Raises GradientError or SimulationError where a step or its derivative is refused.
+    """
+    # IPOPT shortens a step whose end it cannot evaluate; SNOPT, in Drake, has no way to be told.
+    motion = SegmentedMotion(problem, segments, tolerate_failure=solver == "ipopt")
+    result = solve_program(motion.program(), motion.pack(xs, us), solver=solver, limits=limits, report=report)
+    whole = replace(result, z=result.z[: motion.whole.size])
+    return whole, motion.states(result.z), motion.whole.unpack(whole.z)[1]
+
+
+def roll_segments(problem: Problem, xs: Array, us: Array, segments: int) -> Array:
+    """(N+1, nx): the rollouts under us (N, nu) of all segments, each from its own first state in xs (N+1, nx)."""
+    motion = SegmentedMotion(problem, segments)
+    return motion.states(motion.pack(xs, us))
+
+
+class SegmentedMotion:
+    """z = [that of the whole motion's ShootingVariables; the states that segments 1, 2, ... start from]."""
+
+    def __init__(self, problem: Problem, count: int, *, tolerate_failure: bool = False):
+        ends = np.linspace(0, problem.num_steps, count + 1).astype(int)
+        self.problem, self.whole = problem, ShootingVariables(problem)
+        self.segments = [
+            ShootingVariables(problem, steps=range(a, b), tolerate_failure=tolerate_failure)
+            for a, b in pairwise(ends.tolist())
+        ]
+        self.size = self.whole.size + (count - 1) * problem.model.nx
+
+    def start_of(self, number: int) -> NDArray[np.int_]:
+        """Where in z the free entries are of the state that segment `number` starts from."""
+        if number == 0:
+            return np.arange(len(self.whole.free))
+        nx = self.problem.model.nx
+        return self.whole.size + (number - 1) * nx + np.arange(nx)
+
+    def indices_of(self, number: int) -> NDArray[np.int_]:
+        """Where in z that of segment `number` is."""
+        steps, nu, places = self.segments[number].steps, self.problem.model.nu, np.arange(self.whole.size)
+        inputs = places[self.whole.inputs][steps.start * nu : steps.stop * nu]
+        return np.concatenate([self.start_of(number), inputs, places[self.whole.inputs.stop :]])
+
+    def pack(self, xs: Array, us: Array, parameters: Array | None = None) -> Array:
+        """z (size,) from xs (N+1, nx), us (N, nu) and parameter values (np,), the problem's where None."""
+        starts = [xs[segment.steps.start] for segment in self.segments[1:]]
+        return np.concatenate([self.whole.pack(xs[0], us, parameters), *starts])
+
+    def states(self, z: Array) -> Array:
+        """(N+1, nx): each segment's rollout from its own start."""
+        rolled = [segment.states(z[self.indices_of(i)]) for i, segment in enumerate(self.segments)]
+        return np.vstack([xs[:-1] for xs in rolled] + [rolled[-1][-1:]])
+
+    def program(self) -> MathematicalProgram:
+        """The program; a binding has the variables of one segment, a defect those of the next one's start too."""
+        problem, program = self.problem, MathematicalProgram()
+        z = program.NewContinuousVariables(self.size, "z")
+        program.AddBoundingBoxConstraint(*self._bounds(), z).evaluator().set_description("variables")
+        for i, segment in enumerate(self.segments):
+            own, cost = z[self.indices_of(i)], RolloutCost(problem, segment)
+            if cost.any:
+                program.AddCost(cost, vars=own)
+            for rows, description in (
+                (limits_of_states(problem, segment), "states"),
+                (limits_of_constraints(problem, segment), "constraints"),
+            ):
+                if len(rows.lower):
+                    program.AddConstraint(rows, rows.lower, rows.upper, vars=own, description=description)
+            if not segment.is_last:
+                rows, both = defect(segment), np.concatenate([own, z[self.start_of(i + 1)]])
+                program.AddConstraint(rows, rows.lower, rows.upper, vars=both, description="defect")
+        return program
+
+    def _bounds(self) -> tuple[Array, Array]:
+        b, count = self.problem.bounds, self.problem.num_steps
+        lower, upper = self.problem.state_limits()
+        lowest, highest = self.problem.bounds_of_parameters()
+        return (
+            self.pack(lower, np.tile(b.u_lower, (count, 1)), lowest),
+            self.pack(upper, np.tile(b.u_upper, (count, 1)), highest),
+        )

@@ -1,0 +1,281 @@
+"""What every solver returns, and measures that do not take its word."""
+
+import copy
+import enum
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.certificates.certificate import Certificate
+from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import ParameterVector, applied, select
+from drake_diff.model.step import advance
+from drake_diff.motion.rollout import Rollout, roll_states
+from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.program import Iteration
+from drake_diff.optimize.replay import Plan, Replay, held, replays
+from drake_diff.optimize.transcription.motion import Collocated, collocated
+
+# Between two knots the transcription is a cubic; further than this [state units] from an accurate integration
+# its motion is not the model's.
+INTEGRATION_TOLERANCE = 1e-2
+TOLD = ("status", "message", "iterations", "solver_message", "options")  # fields that no measure depends on
+
+
+class Status(enum.Enum):
+    """How a solve ended; `sentence` says what that means and what to try."""
+
+    CONVERGED = "converged"
+    CONVERGED_NOT_VERIFIED = "converged_not_verified"
+    ITERATION_LIMIT = "iteration_limit"
+    TIME_LIMIT = "time_limit"
+    INFEASIBLE = "infeasible"
+    DIVERGED = "diverged"
+    NO_GRADIENT = "no_gradient"
+    INTERRUPTED = "interrupted"
+    FAILED = "failed"
+
+    @property
+    def sentence(self) -> str:
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Status.CONVERGED: "the solver converged and every measure taken again on the plant holds",
+    Status.CONVERGED_NOT_VERIFIED: "the solver stopped at a solution, but a measure or a certificate does not hold",
+    Status.ITERATION_LIMIT: "the iteration limit came first; raise max_iterations or start from a better guess",
+    Status.TIME_LIMIT: "the time limit came first; raise time_limit or start from a better guess",
+    Status.INFEASIBLE: "the solver found no motion that keeps every bound and reaches the goal; relax a bound, "
+    "give it more steps, or start from another guess",
+    Status.DIVERGED: "the motion left every finite number; use a smaller time step or a better guess",
+    Status.NO_GRADIENT: "nothing that may change has an effect on the goal or the cost, or its derivative must not "
+    "be used; start from a guess that does",
+    Status.INTERRUPTED: "the run was interrupted; this is the best motion so far",
+    Status.FAILED: "the solver failed",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A motion xs (N+1, nx) under us (N, nu), how it was found, and what it measures on Drake's double plant.
+
+    The inputs of a discrete method (`scheme` "step") are held over each step. Those of a collocation scheme are at
+    the knots, `u_final` (nu,) at the last one, and linear in between, or, of hermite_simpson, the parabola through
+    `us_mid` (N, nu) at the midpoints. `horizon` [s] is num_steps * time_step, or what a free one came to.
+    `cost`, `defect`, `bound_violation`, `replays` and the rest are computed from xs and us, once, when they are first
+    asked for, and never taken from the solver.
+    """
+
+    problem: Problem
+    method: str
+    solver: str
+    status: Status
+    message: str
+    xs: Array
+    us: Array
+    scheme: str = "step"
+    us_mid: Array | None = None
+    u_final: Array | None = None
+    free_horizon: float | None = None  # [s] where the problem leaves it free
+    parameters: Array | None = None  # (np,) the values of `problem.parameters`; the problem's own where None
+    iterations: tuple[Iteration, ...] = ()
+    certificates: tuple[Certificate, ...] = ()
+    gradient_norms: Array | None = None  # (N+1,) |d cost / d x_k| at the solution, where the method has it
+    options: dict[str, Any] = field(default_factory=dict)
+    solver_message: str = ""
+    wall_time: float = 0.0  # [s]
+
+    def told(self, **fields: Any) -> "Solution":
+        """The same motion with other `fields` out of TOLD: its measures stay. UnknownNameError of others."""
+        for name in fields:
+            if name not in TOLD:
+                raise UnknownNameError("field to be told", got=name, known=TOLD)
+        found = copy.copy(self)
+        vars(found).update(fields)
+        return found
+
+    @property
+    def success(self) -> bool:
+        """Whether the solver converged and everything measured again holds."""
+        return self.status is Status.CONVERGED
+
+    @property
+    def vector(self) -> ParameterVector:
+        """The problem's parameters as they were found."""
+        return self.problem.parameters if self.parameters is None else self.problem.parameters.at(self.parameters)
+
+    @property
+    def horizon(self) -> float:
+        """[s] from the first state to the last."""
+        whole = self.problem.num_steps * self.problem.model.time_step
+        return whole if self.free_horizon is None else self.free_horizon
+
+    @property
+    def time_step(self) -> float:
+        """[s] from one state to the next: the model's own, to the last bit, where the horizon is not free."""
+        own = self.problem.model.time_step
+        return own if self.free_horizon is None else self.free_horizon / self.problem.num_steps
+
+    @cached_property
+    def cost(self) -> float:
+        """The objective of xs and us, as `Problem` defines it; inf where it is not finite."""
+        if not self._is_whole:
+            return float("inf")
+        total = self.problem.objective(self.xs, self.us) if self.transcribed is None else self.transcribed.cost
+        return total if np.isfinite(total) else float("inf")
+
+    @property
+    def times(self) -> Array:
+        """(N+1,) [s] of the states."""
+        return np.asarray(self.time_step * np.arange(len(self.xs)), dtype=float)
+
+    @property
+    def inputs_at_knots(self) -> Array:
+        """The inputs at the knots: (N, nu) held ones, (N+1, nu) those of collocation."""
+        return self.us if self.u_final is None else np.vstack([self.us, self.u_final])
+
+    @cached_property
+    def transcribed(self) -> Collocated | None:
+        """The motion of a collocation scheme, from xs, us, us_mid and u_final; None where they are no such motion."""
+        if self.scheme == "step" or not self._is_whole:
+            return None
+        return collocated(self.problem, self.scheme, self.xs, self.inputs_at_knots, self.us_mid, self.horizon)
+
+    @cached_property
+    def defects(self) -> Array:
+        """(N,) how far each interval is from the dynamics, as a state change, in the worst coordinate's unit.
+
+        Discrete: |x_(k+1) - step(x_k, u_k)|. Collocation: the scheme's own equations.
+        """
+        if not self._is_whole:
+            return np.full(self.problem.num_steps, np.inf)
+        if self.transcribed is not None:
+            return np.nan_to_num(self.transcribed.defects, nan=np.inf)
+        with applied(self.vector) as model:
+            return np.array([self._step_defect(model, k) for k in range(len(self.us))])
+
+    @property
+    def defect(self) -> float:
+        """The largest of `defects`."""
+        return _largest(self.defects)
+
+    @cached_property
+    def integration_errors(self) -> Array:
+        """(N,) distance of knot k+1 from an accurate integration of the dynamics from knot k.
+
+        Of a discrete method the step is the dynamics, and this is its defect.
+        """
+        return self.defects if self.transcribed is None else self.transcribed.errors
+
+    @property
+    def integration_error(self) -> float:
+        """The largest of `integration_errors`."""
+        return _largest(self.integration_errors)
+
+    @cached_property
+    def bound_violation(self) -> float:
+        """The largest excess over a bound of a state that is not given, an input, or a parameter."""
+        return max((excess for excess, _ in self.bound_excess.values()), default=0.0)
+
+    @cached_property
+    def bound_excess(self) -> dict[str, tuple[float, int]]:
+        """The largest excess over a bound and its knot, by the state's, input's or parameter's name, where above 0.
+
+        States that are given have none; collocation's midpoints count to the knot before them.
+        """
+        b, names = self.problem.bounds, self.problem.model.input_names
+        free = self.problem.initial_state_mask
+        given = np.zeros(self.xs.shape, dtype=bool)
+        given[0] = ~free
+        inside = np.clip(0.0, b.x_lower, b.x_upper)
+        sides = [(self.problem.model.state_names, np.where(given, inside, self.xs), b.x_lower, b.x_upper)]
+        sides += [(names, us, b.u_lower, b.u_upper) for us in (self.inputs_at_knots, self.us_mid) if us is not None]
+        sides.append((self.vector.names, self.vector.values[None], *self.problem.bounds_of_parameters()))
+        found: dict[str, tuple[float, int]] = {}
+        for labels, values, lower, upper in sides:
+            excess = np.where(np.isfinite(values), np.maximum(lower - values, values - upper), np.inf)
+            for i in np.flatnonzero(excess.max(axis=0, initial=0.0) > 0):
+                k = int(np.argmax(excess[:, i]))
+                found[labels[i]] = max((float(excess[k, i]), k), found.get(labels[i], (0.0, 0)))
+        return found
+
+    @cached_property
+    def constraint_excess(self) -> dict[str, tuple[float, int]]:
+        """The largest excess and its knot of each of the problem's constraints and waypoints."""
+        return self.problem.constraint_excess(self.xs, self.inputs_at_knots)
+
+    @property
+    def constraint_violation(self) -> float:
+        """The largest excess over a bound of a constraint, or distance from a waypoint, in its own unit."""
+        return max((excess for excess, _ in self.constraint_excess.values()), default=0.0)
+
+    @cached_property
+    def goal_error(self) -> float:
+        """The largest distance of the final state from the goal, free entries apart."""
+        return _largest(np.abs(self.problem.goal_error(self.xs[-1])))
+
+    @cached_property
+    def initial_state_error(self) -> float:
+        """The largest distance of xs[0] from the problem's x0, free entries apart."""
+        fixed = ~self.problem.initial_state_mask
+        return _largest(np.abs(self.xs[0] - self.problem.x0)[fixed])
+
+    @cached_property
+    def plan(self) -> Plan:
+        """What is replayed: states, and inputs held over each step, or their means over the parts of an interval."""
+        continuous = self.transcribed is not None
+        sample = held(self.xs, self.us) if self.transcribed is None else self.transcribed.sample
+        return Plan(self.problem, self.vector, self.time_step, sample, continuous)
+
+    @cached_property
+    def replay(self) -> Rollout | None:
+        """The discrete plant's own open-loop motion from xs[0]; None where it cannot be taken.
+
+        An input that changes between knots is held at its mean over each step.
+        """
+        return self.plan.open_loop
+
+    @cached_property
+    def replays(self) -> tuple[Replay, ...]:
+        """The plan in every variant of the plant (step, half step, other contact), open loop and under TVLQR."""
+        return replays(self.plan)
+
+    @cached_property
+    def half_step_error(self) -> float:
+        """How far from xs[-1] the same held inputs lead at half the time step: what a step size decided.
+
+        inf where the model cannot be built again (it came from a diagram) or stepped.
+        """
+        if self.replay is None:
+            return float("inf")
+        try:
+            finer = self.problem.model.at_time_step(self.time_step / 2)
+            with applied(select(finer, self.vector.to_dict())) as model:
+                end = roll_states(model, self.xs[0], np.repeat(self.replay.us, 2, axis=0))[-1]
+        except (ModelError, SimulationError):
+            return float("inf")
+        return _largest(np.abs(end - self.xs[-1]))
+
+    @property
+    def _is_whole(self) -> bool:
+        """Whether xs and the inputs have the problem's shapes, and all of collocation's are numbers."""
+        if self.us.shape != self.problem.us.shape or self.xs.shape != (len(self.us) + 1, self.problem.model.nx):
+            return False
+        parts = [part for part in (self.xs, self.inputs_at_knots, self.us_mid) if part is not None]
+        return self.scheme == "step" or all(bool(np.all(np.isfinite(part))) for part in parts)
+
+    def _step_defect(self, model: Model, k: int) -> float:
+        try:
+            return _largest(np.abs(self.xs[k + 1] - advance(model.double, self.xs[k], self.us[k])))
+        except SimulationError:
+            return float("inf")
+
+
+def _largest(values: Array) -> float:
+    """The largest value; inf where one is not a number, 0 where there is none."""
+    values = np.asarray(values, dtype=float)
+    return float("inf") if np.any(np.isnan(values)) else float(np.max(values, initial=0.0))

@@ -1,0 +1,369 @@
+"""Functions in ordinary arithmetic as CasADi functions, for exact second derivatives.
+
+A `Symbol` goes through a function as AutoDiffXd does: NumPy computes with arrays of it. It has no float() and no truth
+value, so that a function that branches on its numbers cannot pass for one that does not.
+
+Functions of a knot [x, u] within a CasADi program, at all their knots in one call: symbolic, or called back.
+
+Both give `values` (m, K), the nonzeros of the K Jacobians by the knot, and, where symbolic, those of the Hessians of
+weights (m, K) times values. `jacobian_at` and `hessian_at` are (rows, columns) of the nonzeros of one knot.
+"""
+
+import operator
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from drake_diff._base.arrays import Array, Indices
+from drake_diff.mechanics.casadi_tree import PlantFunctions, agrees, symbolic_plant
+from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.cost import differentiate_final_cost
+from drake_diff.optimize.problem.dynamics import Dynamics, PlantKnots, Pointwise
+from drake_diff.optimize.transcription.task import OptimalControl
+
+SAME_VALUES = 1e-10  # of the largest value at a knot: the same operations, rounded in another order
+
+
+class Symbol:
+    """A scalar SX expression as an entry of a NumPy array of objects."""
+
+    __slots__ = ("sx",)
+
+    def __init__(self, sx: Any):
+        self.sx = sx
+
+    def __neg__(self) -> "Symbol":
+        return Symbol(-self.sx)
+
+    def __pos__(self) -> "Symbol":
+        return self
+
+    def __abs__(self) -> "Symbol":
+        return Symbol(ca.fabs(self.sx))
+
+    def __bool__(self) -> bool:
+        raise TypeError("it branches on its numbers")
+
+
+def _binary(operation: Callable[[Any, Any], Any]) -> Callable[[Symbol, Any], Any]:
+    def apply(self: Symbol, other: Any) -> Any:
+        if not isinstance(other, (Symbol, int, float, np.integer, np.floating)):
+            return NotImplemented
+        return Symbol(operation(self.sx, other.sx if isinstance(other, Symbol) else float(other)))
+
+    return apply
+
+
+def _turned(operation: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    return lambda a, b: operation(b, a)
+
+
+def _unary(name: str) -> Callable[[Symbol], Symbol]:
+    return lambda self: Symbol(getattr(self.sx, name)())
+
+
+def _compare(self: Symbol, other: Any) -> bool:
+    raise TypeError("it compares its numbers")
+
+
+for _name in ("add", "sub", "mul", "truediv", "pow"):
+    setattr(Symbol, f"__{_name}__", _binary(getattr(operator, _name)))
+    setattr(Symbol, f"__r{_name}__", _binary(_turned(getattr(operator, _name))))
+for _name in ("lt", "le", "gt", "ge", "eq", "ne"):
+    setattr(Symbol, f"__{_name}__", _compare)
+for _name in (
+    *("sin", "cos", "tan", "arcsin", "arccos", "arctan", "sinh", "cosh", "tanh", "arcsinh", "arccosh", "arctanh"),
+    *("exp", "log", "log10", "sqrt", "fabs"),
+):
+    setattr(Symbol, _name, _unary(_name))
+setattr(Symbol, "arctan2", _binary(ca.atan2))  # noqa: B010  (mypy: the class has none)
+
+
+def trace(f: Callable[[Any, Any], Any], nx: int, probe: Array, wanted: Array) -> Any | str:
+    """The function (x, u) -> (m,) as an SX function of a knot [x, u], or why there is none.
+
+    It must give the values `wanted` (P, m) at the knots `probe` (P, nx + nu).
+    """
+    knot = ca.SX.sym("knot", probe.shape[1])
+    symbols = np.array([Symbol(knot[i]) for i in range(probe.shape[1])], dtype=object)
+    try:
+        with np.errstate(all="ignore"):
+            result = np.asarray(f(symbols[:nx], symbols[nx:])).ravel()
+            entries = [entry.sx if isinstance(entry, Symbol) else float(entry) for entry in result]
+    except Exception as error:  # whatever it is that f cannot do with symbols: it need not
+        return f"{type(error).__name__}: {str(error).splitlines()[0][:100] if str(error) else ''}"
+    function = ca.Function("traced", [knot], [ca.vertcat(*entries)])
+    if not agrees(function, probe, wanted, SAME_VALUES):
+        return "its symbolic form gives other values"
+    return function
+
+
+THREAD_WORTH = 500_000  # instructions of 1 to 5 ns; to start a thread costs 50 us
+Values = Callable[[Array], Array]  # knots (K, nx + nu) -> (K, m)
+Linearize = Callable[[Array], tuple[Array, Array]]  # -> (K, m), (K, m, nx + nu)
+
+
+class Symbolic:
+    """A function of which CasADi has the expression; `why_not` of a second derivative is none."""
+
+    why_not = ""
+
+    def __init__(self, function: Any):
+        self.function, self.rows, self.width = function, function.size1_out(0), function.size1_in(0)
+        self.jacobian_at = _places(self._jacobian.sparsity_out(0))
+
+    def values(self, knots: Any) -> Any:
+        return _at_all(self.function, knots)
+
+    def jacobian(self, knots: Any) -> Any:
+        return ca.vec(_at_all(self._jacobian, knots).nz[:])
+
+    def jacobian_of(self, knot: Array) -> Array:
+        """(m, nx + nu) at one `knot` (nx + nu,)."""
+        return np.asarray(self._jacobian(knot).full())
+
+    def hessian(self, knots: Any, weights: Any) -> Any:
+        return ca.vec(_at_all(self._hessian, knots, weights).nz[:])
+
+    @property
+    def hessian_at(self) -> tuple[Indices, Indices]:
+        return _places(self._hessian.sparsity_out(0))
+
+    @cached_property
+    def _jacobian(self) -> Any:
+        knot = ca.SX.sym("knot", self.width)
+        return ca.Function("jacobian", [knot], [ca.jacobian(self.function(knot), knot)])
+
+    @cached_property
+    def _hessian(self) -> Any:
+        """The upper triangle."""
+        knot, weights = ca.SX.sym("knot", self.width), ca.SX.sym("weights", self.rows)
+        hessian, _ = ca.hessian(ca.dot(weights, self.function(knot)), knot)
+        return ca.Function("hessian", [knot, weights], [ca.triu(hessian)])
+
+
+def _at_all(function: Any, knots: Any, *others: Any) -> Any:
+    return _mapped(function, knots.shape[1])(knots, *others)
+
+
+def _mapped(function: Any, count: int) -> Any:
+    """`function` of `count` columns, on as many cores as have enough to do: their threads start anew at every call."""
+    threads = min(os.cpu_count() or 1, count * function.n_instructions() // THREAD_WORTH)
+    return function.map(count, *(("thread", threads) if threads > 1 else ()))
+
+
+class SymbolicPlant(Symbolic):
+    """A plant's equations of motion, whose Hessians take the Jacobians that were computed at the same knots before."""
+
+    def __init__(self, plant: PlantFunctions):
+        self._plant = plant
+        self.error: Exception | None = None
+        self._kept: dict[int, _Callback] = {}  # by the number of knots; CasADi holds no reference to its callbacks
+        super().__init__(plant.function)
+
+    def jacobian(self, knots: Any) -> Any:
+        count = knots.shape[1]
+        if count not in self._kept:
+            self._kept[count] = _Callback(self, count, self._jacobian.nnz_out(0), self._compute(count))
+        return ca.vec(self._kept[count](knots))
+
+    def hessian(self, knots: Any, weights: Any) -> Any:
+        function = _mapped(self._hessian, knots.shape[1])
+        rows = ca.MX(function.sparsity_in(2), self.jacobian(knots))
+        return ca.vec(function(knots, weights, rows).nz[:])
+
+    @property
+    def _jacobian(self) -> Any:
+        return self._plant.jacobian
+
+    @property
+    def _hessian(self) -> Any:
+        return self._plant.hessian
+
+    def _compute(self, count: int) -> Values:
+        found = np.empty((count, self._jacobian.nnz_out(0)))
+        buffer, evaluate = _mapped(self._jacobian, count).buffer()
+        buffer.set_res(0, found.data)
+
+        def nonzeros(knots: Array) -> Array:
+            buffer.set_arg(0, knots.data)
+            evaluate()
+            return found
+
+        return nonzeros
+
+
+class Called:
+    """A function that is called back, with dense Jacobians; the first error of a call is kept, and fails the call."""
+
+    def __init__(self, why_not: str, values: Values, linearize: Linearize, rows: int, width: int):
+        self.why_not, self.rows, self.width = why_not, rows, width
+        self.evaluate, self.linearize = values, linearize
+        self.error: Exception | None = None
+        self.jacobian_at = _places(ca.Sparsity.dense(rows, width))
+        self._kept: list[Any] = []  # CasADi holds no reference to its callbacks
+
+    def values(self, knots: Any) -> Any:
+        self._kept.append(_Callback(self, knots.shape[1], self.rows, self.evaluate))
+        return self._kept[-1](knots)
+
+    def jacobian(self, knots: Any) -> Any:
+        def rows(at: Array) -> Array:
+            return self.linearize(at)[1].transpose(0, 2, 1)
+
+        self._kept.append(_Callback(self, knots.shape[1], self.rows * self.width, rows))
+        return ca.vec(self._kept[-1](knots))
+
+    def jacobian_of(self, knot: Array) -> Array:
+        """(m, nx + nu) at one `knot` (nx + nu,)."""
+        return np.asarray(self.linearize(knot[None])[1][0])
+
+
+class _Callback(ca.Callback):  # type: ignore[misc]
+    """(nx + nu, K) -> (rows, K); the last result is kept, since a solver asks twice for its first iterate's."""
+
+    def __init__(self, owner: Called | SymbolicPlant, count: int, rows: int, at_knots: Values):
+        ca.Callback.__init__(self)
+        self.owner, self.count, self.rows, self.at_knots = owner, count, rows, at_knots
+        self.last: tuple[bytes, Array] | None = None
+        self.construct("called", {})
+
+    def get_n_in(self) -> int:
+        return 1
+
+    def get_n_out(self) -> int:
+        return 1
+
+    def get_sparsity_in(self, i: int) -> Any:
+        return ca.Sparsity.dense(self.owner.width, self.count)
+
+    def get_sparsity_out(self, i: int) -> Any:
+        return ca.Sparsity.dense(self.rows, self.count)
+
+    def has_jacobian(self) -> bool:
+        return isinstance(self.owner, Called) and self.rows == self.owner.rows
+
+    def has_jac_sparsity(self, i: int, j: int) -> bool:
+        return self.has_jacobian()
+
+    def get_jac_sparsity(self, i: int, j: int, symmetric: bool) -> Any:
+        return ca.Sparsity(self._jacobian_sparsity)
+
+    def get_jacobian(self, name: str, inputs: Any, outputs: Any, options: Any) -> Any:
+        """nlpsol asks for it as it makes itself ready; the program has its own."""
+        knots, values = ca.MX.sym("knots", self.owner.width, self.count), ca.MX.sym("values", self.rows, self.count)
+        jacobian = ca.MX(self._jacobian_sparsity, self.owner.jacobian(knots))
+        return ca.Function(name, [knots, values], [jacobian], inputs, outputs, options)
+
+    @cached_property
+    def _jacobian_sparsity(self) -> Any:
+        block = ca.Sparsity.dense(self.rows, self.owner.width)
+        return ca.diagcat(*[block] * self.count)
+
+    def has_eval_buffer(self) -> bool:
+        return True
+
+    def eval_buffer(self, arguments: Any, results: Any) -> int:
+        knots = np.array(np.frombuffer(arguments[0], float)).reshape(self.count, self.owner.width)
+        key = knots.tobytes()
+        try:
+            if self.last is None or self.last[0] != key:
+                self.last = key, np.array(self.at_knots(knots)).ravel()
+        except Exception as error:  # must not go through C++; the solve raises or tells it
+            self.owner.error = self.owner.error or error
+            return 1
+        np.frombuffer(results[0], float)[:] = self.last[1]
+        return 0
+
+
+KnotFunction = Symbolic | Called
+
+
+def _places(sparsity: Any) -> tuple[Indices, Indices]:
+    return np.array(sparsity.row(), dtype=np.intp), np.array(sparsity.get_col(), dtype=np.intp)
+
+
+@dataclass(frozen=True, eq=False)
+class KnotFunctions:
+    """Those of a task; the final cost is one of the last knot, `paths` are in the order of the task's."""
+
+    dynamics: KnotFunction
+    rate: KnotFunction
+    final: KnotFunction | None
+    paths: tuple[KnotFunction, ...]
+
+    @property
+    def why_not(self) -> str:
+        """Which of them has no second derivative and why, "" where all have."""
+        named = [("dynamics", self.dynamics), ("running_cost", self.rate), ("final_cost", self.final)]
+        named += [(f"constraint {i}", path) for i, path in enumerate(self.paths)]
+        return next((f"{name}: {f.why_not}" for name, f in named if f is not None and f.why_not), "")
+
+    @property
+    def error(self) -> Exception | None:
+        """The first error that one of them raised."""
+        every = (self.dynamics, self.rate, self.final, *self.paths)
+        called = [f for f in every if isinstance(f, (Called, SymbolicPlant))]
+        return next((f.error for f in called if f.error is not None), None)
+
+
+def knot_functions(task: OptimalControl) -> KnotFunctions:
+    """The functions of `task`, each symbolic if it can be."""
+    nx, width, probe = task.dynamics.nx, task.dynamics.nx + task.dynamics.nu, task.dynamics.probe()
+
+    def choose(function: Any, values: Values, linearize: Linearize, rows: int) -> KnotFunction:
+        with np.errstate(all="ignore"):
+            found = trace(function, nx, probe, values(probe))
+        return Called(found, values, linearize, rows, width) if isinstance(found, str) else Symbolic(found)
+
+    def rate_values(knots: Array) -> Array:
+        return task.rate.values(knots)[:, None]
+
+    def rate_rows(knots: Array) -> tuple[Array, Array]:
+        values, gradients = task.rate.linearize(knots)
+        return values[:, None], gradients[:, None]
+
+    def final_values(knots: Array) -> Array:
+        return np.array([[float(task.final(knot[:nx]))] for knot in knots])
+
+    def final_rows(knots: Array) -> tuple[Array, Array]:
+        found = [differentiate_final_cost(task.final, knot[:nx]) for knot in knots]
+        rows = np.zeros((len(knots), 1, width))
+        rows[:, 0, :nx] = [gradient for _, gradient in found]
+        return np.array([[value] for value, _ in found]), rows
+
+    def path(c: Constraint) -> KnotFunction:
+        def values(knots: Array) -> Array:
+            return np.array([c(knot[:nx], knot[nx:]) for knot in knots])
+
+        def linearize(knots: Array) -> tuple[Array, Array]:
+            found = [c.differentiate(knot[:nx], knot[nx:]) for knot in knots]
+            return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
+
+        return choose(c.function if c.takes_input else lambda x, u: c.function(x), values, linearize, len(c.lower))
+
+    return KnotFunctions(
+        _dynamics(task.dynamics),
+        choose(task.rate, rate_values, rate_rows, 1),
+        choose(lambda x, u: task.final(x), final_values, final_rows, 1) if task.final_cost is not None else None,
+        tuple(path(p.constraint) for p in task.paths),
+    )
+
+
+def _dynamics(dynamics: Dynamics) -> KnotFunction:
+    form, probe = dynamics.form, dynamics.probe()
+    found: Any = "an object with derivatives of its own"
+    if isinstance(form, PlantKnots):
+        found = symbolic_plant(form.model)
+    elif isinstance(form, Pointwise):
+        found = trace(form.f, dynamics.nx, probe, form.values(probe))
+    if isinstance(found, PlantFunctions):
+        return SymbolicPlant(found)
+    if not isinstance(found, str):
+        return Symbolic(found)
+    return Called(found, dynamics.values, dynamics.linearize, dynamics.nx, dynamics.nx + dynamics.nu)

@@ -1,0 +1,211 @@
+"""What a transcription found, and measures of it that are computed from its nodes, not taken from the solver."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Outcome
+from drake_diff.optimize.transcription.scheme import interval_defects, node_weights, per_interval
+from drake_diff.optimize.transcription.task import OptimalControl, task_of
+
+SUBSTEPS = 10  # of the Runge-Kutta method that measures an interval
+DENSE = np.linspace(0, 1, 21)[1:-1]  # where bounds are looked at between two knots
+
+
+@dataclass(frozen=True)
+class Excess:
+    """The largest excess over a bound of a state and of an input between the nodes, and where the larger one is."""
+
+    state: float
+    input: float
+    where: str
+
+
+@dataclass(frozen=True, eq=False)
+class Collocated:
+    """A motion at N+1 knots: xs (N+1, nx), us (N+1, nu), at the midpoints xs_mid, us_mid (N, ...) or None; T [s].
+
+    Between knots x' and u are the scheme's polynomials.
+    """
+
+    task: OptimalControl
+    mesh: Array  # (N+1,) fractions of the horizon
+    nodes: Array  # (K, nx + nu): knots, and midpoints between them
+    horizon: float
+
+    @property
+    def infeasibility(self) -> float:
+        """The largest defect, excess over a bound or constraint, or distance from an end or waypoint at a node.
+
+        inf where something is not finite.
+        """
+        if not np.all(np.isfinite(self.nodes)):
+            return float("inf")
+        lower, upper = self.task.node_limits(self.mesh)
+        beyond = float(np.max(np.maximum(lower - self.nodes, self.nodes - upper), initial=0.0))
+        return max(self.defect, beyond, *self.task.path_excess(self.nodes, self.mesh).values())
+
+    @property
+    def times(self) -> Array:
+        """(N+1,) [s] of the knots."""
+        return self.horizon * self.mesh
+
+    @property
+    def xs(self) -> Array:
+        return self.nodes[:: self.task.scheme.nodes, : self.task.dynamics.nx]
+
+    @property
+    def us(self) -> Array:
+        return self.nodes[:: self.task.scheme.nodes, self.task.dynamics.nx :]
+
+    @property
+    def xs_mid(self) -> Array | None:
+        return None if self.task.scheme.nodes == 1 else self.nodes[1::2, : self.task.dynamics.nx]
+
+    @property
+    def us_mid(self) -> Array | None:
+        return None if self.task.scheme.nodes == 1 else self.nodes[1::2, self.task.dynamics.nx :]
+
+    def sample(self, parts: int) -> tuple[Array, Array]:
+        """xs (m N + 1, nx) at the m-th parts of each interval, and the mean inputs us (m N, nu) over each part."""
+        k, tau = np.repeat(np.arange(len(self.mesh) - 1), parts), np.tile(np.arange(parts) / parts, len(self.mesh) - 1)
+        xs = np.vstack([self._between(k, tau)[0], self.xs[-1]])
+        weights = self.task.scheme.integrated(tau + 1 / parts) - self.task.scheme.integrated(tau)
+        us = per_interval(self.nodes[:, self.task.dynamics.nx :], self.task.scheme)[k]
+        return xs, parts * np.einsum("sj,sju->su", weights, us)
+
+    @cached_property
+    def cost(self) -> float:
+        """The scheme's own quadrature of the running cost, and the final cost."""
+        weights = self.horizon * node_weights(self.mesh, self.task.scheme)
+        return float(weights @ self.task.rate.values(self.nodes)) + float(self.task.final(self.xs[-1]))
+
+    @cached_property
+    def defects(self) -> Array:
+        """(N,) how far each interval is from the scheme's equations, in the worst coordinate's unit."""
+        xs = per_interval(self.nodes[:, : self.task.dynamics.nx], self.task.scheme)
+        rates = per_interval(self._rates, self.task.scheme)
+        defects = interval_defects(self.task.scheme, self._lengths, xs, rates)
+        return np.asarray(np.max(np.abs(defects), axis=(1, 2)))
+
+    @property
+    def defect(self) -> float:
+        """The largest of `defects`; inf where one is not a number."""
+        return float(np.max(_finite(self.defects)))
+
+    @property
+    def errors(self) -> Array:
+        """(N,) distance of knot k+1 from an integration from knot k under the scheme's input; inf where it diverges.
+
+        Ten steps of the classical Runge-Kutta method, in the worst coordinate's unit.
+        """
+        return _finite(np.max(np.abs(self._integrated[:, :-1] - self.xs[1:]), axis=1))
+
+    @property
+    def cost_errors(self) -> Array:
+        """(N,) the same of the running cost's quadrature, as a part of the whole cost (of 1 where that is less)."""
+        scheme, rates = self.task.scheme, self.task.rate.values(self.nodes)
+        quadrature = self._lengths * (per_interval(rates, scheme) @ scheme.weights)
+        return _finite(np.abs(self._integrated[:, -1] - quadrature) / max(1.0, abs(self.cost)))
+
+    def at(self, times: Any) -> tuple[Array, Array]:
+        """xs (S, nx) and us (S, nu) at `times` (S,) [s] by the scheme's own polynomials."""
+        fractions = np.asarray(times, dtype=float) / self.horizon
+        k = np.clip(np.searchsorted(self.mesh, fractions, side="right") - 1, 0, len(self.mesh) - 2)
+        return self._between(k, (fractions - self.mesh[k]) / np.diff(self.mesh)[k])
+
+    @cached_property
+    def _rates(self) -> Array:
+        return self.task.dynamics.values(self.nodes)
+
+    @property
+    def _lengths(self) -> Array:
+        return self.horizon * np.diff(self.mesh)
+
+    def _between(self, k: Any, tau: Array) -> tuple[Array, Array]:
+        """xs and us in the intervals `k` (S,) at `tau` (S,) of each."""
+        scheme, nx = self.task.scheme, self.task.dynamics.nx
+        us = per_interval(self.nodes[:, nx:], scheme)[k]
+        moved = np.einsum("sj,sjx->sx", scheme.integrated(tau), per_interval(self._rates, scheme)[k])
+        return self.xs[k] + self._lengths[k, None] * moved, np.einsum("sj,sju->su", scheme.at(tau), us)
+
+    @cached_property
+    def _integrated(self) -> Array:
+        """(N, nx + 1) where each knot leads within its interval, and what that costs."""
+        task, every = self.task, np.arange(len(self.mesh) - 1)
+        dt, nx = self._lengths[:, None] / SUBSTEPS, self.task.dynamics.nx
+
+        def rate(z: Array, step: float) -> Array:
+            u = self._between(every, np.full(len(every), step / SUBSTEPS))[1]
+            knots = np.hstack([z[:, :nx], u])
+            return np.column_stack([task.dynamics.values(knots), task.rate.values(knots)])
+
+        z = np.column_stack([self.xs[:-1], np.zeros(len(every))])
+        with np.errstate(all="ignore"):
+            for i in range(SUBSTEPS):
+                k1 = rate(z, i)
+                k2 = rate(z + dt / 2 * k1, i + 0.5)
+                k3 = rate(z + dt / 2 * k2, i + 0.5)
+                z = z + dt / 6 * (k1 + 2 * k2 + 2 * k3 + rate(z + dt * k3, i + 1))
+        return z
+
+
+@dataclass(frozen=True, eq=False)
+class Transcribed(Collocated):
+    """What a solver found, and how it ended; `refinements` are (intervals, largest error) of each round."""
+
+    outcome: Outcome
+    message: str
+    iterations: tuple[Iteration, ...]
+    derivatives: str  # where the solver's came from, and why there is no Hessian where there is none
+    refinements: tuple[tuple[int, float], ...] = ()
+
+    @property
+    def success(self) -> bool:
+        """Whether the solver says that it solved it, and its equations, ends and bounds hold when measured again.
+
+        What lies between the nodes say `errors` and `violation_between_nodes`.
+        """
+        return self.outcome is Outcome.SOLVED and self.infeasibility <= FEASIBILITY_TOLERANCE
+
+
+def _finite(values: Array) -> Array:
+    """With inf for what is no number."""
+    return np.asarray(np.nan_to_num(values, nan=np.inf, posinf=np.inf))
+
+
+def violation_between_nodes(motion: Collocated) -> Excess:
+    """The largest excess over the bounds at 19 points within each interval, where the solver enforces nothing.
+
+    A cost below the optimum of the problem with its bounds goes together with an excess here.
+    """
+    task, b = motion.task, motion.task.bounds
+    k = np.repeat(np.arange(len(motion.mesh) - 1), len(DENSE))
+    tau = np.tile(DENSE, len(motion.mesh) - 1)
+    xs, us = motion._between(k, tau)
+    by_state = np.maximum(np.maximum(b.x_lower - xs, xs - b.x_upper), 0.0)
+    by_input = np.maximum(np.maximum(b.u_lower - us, us - b.u_upper), 0.0)
+    both = np.hstack([by_state, by_input])
+    at, column = np.unravel_index(int(np.argmax(both)), both.shape)
+    name = (task.dynamics.state_names + task.dynamics.input_names)[column]
+    time = motion.times[k[at]] + tau[at] * motion._lengths[k[at]]
+    where = f"{name} by {both[at, column]:.3g} at {time:.4g} s" if both[at, column] > 0 else "nowhere"
+    return Excess(float(np.max(by_state)), float(np.max(by_input)), where)
+
+
+def collocated(problem: Problem, scheme: str, xs: Array, us: Array, us_mid: Array | None, horizon: float) -> Collocated:
+    """The motion with knots xs (N+1, nx), us (N+1, nu) and midpoint inputs (N, nu), linear in between where None."""
+    task, mesh = task_of(problem, scheme), np.linspace(0, 1, len(xs))
+    knots = np.hstack([xs, us])
+    if task.scheme.nodes == 1:
+        return Collocated(task, mesh, knots, horizon)
+    rates, h = task.dynamics.values(knots), horizon / (len(xs) - 1)
+    x_mid = (xs[:-1] + xs[1:]) / 2 + h / 8 * (rates[:-1] - rates[1:])
+    u_mid = (us[:-1] + us[1:]) / 2 if us_mid is None else us_mid
+    nodes = np.empty((2 * len(xs) - 1, knots.shape[1]))
+    nodes[::2], nodes[1::2] = knots, np.hstack([x_mid, u_mid])
+    return Collocated(task, mesh, nodes, horizon)

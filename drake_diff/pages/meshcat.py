@@ -1,0 +1,217 @@
+"""A motion drawn and animated by Drake's own Meshcat: as one offline HTML page, or live."""
+
+import html
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.geometry import (
+    Box,
+    Cylinder,
+    HalfSpace,
+    Mesh,
+    Meshcat,
+    MeshcatAnimation,
+    MeshcatCone,
+    MeshcatParams,
+    Rgba,
+    Sphere,
+)
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.files import write_whole
+from drake_diff.pages.html import content_policy
+from drake_diff.pages.scene import ARROW_PART, Drawn, Poses, Push, Scene
+
+# Drake tells of the port it listens on; nobody is meant to connect to it.
+logging.getLogger("drake").addFilter(lambda record: "Meshcat listening" not in record.getMessage())
+
+FRAMES_PER_SECOND = 64.0
+REPETITIONS = 5
+RED, TRAIL = Rgba(0.85, 0.2, 0.1, 1), Rgba(0.93, 0.55, 0.1, 1)
+LINES = Rgba(0.72, 0.75, 0.79, 1)
+WORLD = "world"
+TOP, BOTTOM = [0.86, 0.89, 0.93], [0.97, 0.97, 0.98]  # of the background
+LONGEST = 3.0  # times that: where arrows are cut, impacts being a hundred times a weight
+THICKNESS = 0.003  # of the scene's size: the radius of the trail and of an arrow's shaft
+FIELD_OF_VIEW = np.deg2rad(75.0)  # Meshcat's camera, from top to bottom
+
+
+def write_replay(path: Path, scene: Scene, *, title: str = "") -> None:
+    """Write `scene` as one page that opens without a network, plays the motion a few times, and can scrub and pause it.
+
+    Contact forces are arrows, see `Scene.reference_force`; ghosts are translucent, and the trail is a line.
+    """
+    meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    draw(meshcat, scene)
+    name = f"<title>{html.escape(title)}</title>"
+    page = re.sub(r"<title>.*?</title>", lambda _: name, meshcat.StaticHtml(), count=1)
+    page = page.replace("<head>", f"<head>\n  {content_policy(page)}", 1)
+    write_whole(path, page.encode())
+
+
+def draw(meshcat: Meshcat, scene: Scene) -> None:
+    """Draw `scene` and publish its animation."""
+    slots = max((len(step) for step in scene.pushes), default=0)
+    _draw_bodies(meshcat, scene)
+    _draw_tube(meshcat, "trail", scene.trail, THICKNESS * scene.size)
+    for slot in range(slots):
+        _draw_arrow(meshcat, f"contacts/{slot}", THICKNESS * scene.size)
+    frames = frames_of(scene.times)
+    pushes = [_arrows(scene, k) for _, k in frames]
+    rate = (len(frames) - 1) / float(scene.times[-1])
+    meshcat.StartRecording(frames_per_second=rate, set_visualizations_while_recording=False)
+    for (time, k), arrows in zip(frames, pushes, strict=True):
+        _pose(meshcat, "motion", scene.poses, k, time)
+        for ghost in scene.ghosts:
+            _pose(meshcat, ghost.name, ghost.poses, k, time)
+        _place_arrows(meshcat, arrows, slots, time)
+    meshcat.StopRecording()
+    _pose(meshcat, "motion", scene.poses, 0, None)  # what is seen before play
+    for ghost in scene.ghosts:
+        _pose(meshcat, ghost.name, ghost.poses, 0, None)
+    _place_arrows(meshcat, pushes[0], slots, None)
+    animation = meshcat.get_mutable_recording()
+    animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
+    animation.set_repetitions(REPETITIONS)
+    meshcat.PublishRecording()
+    _look_at(meshcat, scene)
+    meshcat.Flush()
+
+
+def frames_of(times: Array) -> list[tuple[float, int]]:
+    """(time, index of the state) of each frame, evenly apart, the first and the last state included."""
+    steps = len(times) - 1
+    count = min(steps, max(1, int(np.ceil(times[-1] * FRAMES_PER_SECOND))))
+    return [(float(times[-1]) * k / count, round(k * steps / count)) for k in range(count + 1)]
+
+
+def _draw_bodies(meshcat: Meshcat, scene: Scene) -> None:
+    for i, drawn in enumerate(scene.shapes):
+        _draw_shape(meshcat, f"motion/{drawn.body or WORLD}/{i}", drawn, drawn.colour, scene)
+        for ghost in scene.ghosts:
+            if drawn.body in ghost.poses:
+                _draw_shape(meshcat, f"{ghost.name}/{drawn.body}/{i}", drawn, ghost.colour, scene)
+
+
+def _draw_shape(meshcat: Meshcat, path: str, drawn: Drawn, colour: Rgba, scene: Scene) -> None:
+    """Transparency is in the colour: a property set later does not reach a static page's objects."""
+    shape, pose = drawn.shape, drawn.pose
+    if isinstance(shape, HalfSpace):
+        side = 20 * scene.size
+        shape, pose = Box(side, side, 0.01), pose @ RigidTransform([0.0, 0.0, -0.005])
+    if isinstance(shape, Mesh) and colour.a() < 1:
+        meshcat.SetTriangleMesh(path, *_hull(shape), colour)  # a mesh has colours of its own, its hull has none
+    else:
+        meshcat.SetObject(path, shape, colour)
+    meshcat.SetTransform(path, pose)
+
+
+def _hull(shape: Mesh) -> tuple[Array, Any]:
+    """Vertices (3, n) and triangles (3, m) of a mesh's convex hull."""
+    hull = shape.GetConvexHull()
+    corners = [
+        [hull.element(e).vertex(0), hull.element(e).vertex(i), hull.element(e).vertex(i + 1)]
+        for e in range(hull.num_elements())
+        for i in range(1, hull.element(e).num_vertices() - 1)
+    ]
+    return np.array([hull.vertex(i) for i in range(hull.num_vertices())]).T, np.array(corners, dtype=np.int32).T
+
+
+def _draw_tube(meshcat: Meshcat, path: str, points: Array, radius: float) -> None:
+    """A line along `points` (n, 3) thick enough to be seen, which a browser's own lines are not."""
+    apart = np.append(True, np.linalg.norm(np.diff(points, axis=0), axis=1) > radius / 10)
+    points = points[apart]
+    if len(points) < 2:
+        return
+    along = np.gradient(points, axis=0)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    side = np.cross(along, np.where(np.abs(along[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]]))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    other = np.cross(along, side)
+    angles = 2 * np.pi * np.arange(6) / 6
+    rings = [points + radius * (np.cos(a) * side + np.sin(a) * other) for a in angles]
+    vertices = np.stack(rings, axis=1).reshape(-1, 3)
+    faces = []
+    for k in range(len(points) - 1):
+        for i in range(6):
+            a, b = 6 * k + i, 6 * k + (i + 1) % 6
+            faces += [[a, b, a + 6], [b, b + 6, a + 6]]
+    meshcat.SetTriangleMesh(path, vertices.T, np.array(faces, dtype=np.int32).T, TRAIL)
+
+
+def _draw_arrow(meshcat: Meshcat, path: str, radius: float) -> None:
+    """An arrow along +z from the contact point, one metre long until it is scaled."""
+    meshcat.SetObject(f"{path}/point", Sphere(2 * radius), RED)
+    meshcat.SetObject(f"{path}/shaft/unit", Cylinder(radius, 1.0), RED)
+    meshcat.SetTransform(f"{path}/shaft/unit", RigidTransform([0.0, 0.0, 0.5]))
+    meshcat.SetObject(f"{path}/tip/cone", MeshcatCone(8 * radius, 3 * radius, 3 * radius), RED)
+    meshcat.SetTransform(f"{path}/tip/cone", RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.0, 0.0, 4 * radius]))
+
+
+def _arrows(scene: Scene, k: int) -> list[tuple[Push, float]]:
+    """What pushes in the step from state k, or in that before the last state, with the lengths of the arrows [m]."""
+    if not scene.pushes:
+        return []
+    found = []
+    for push in scene.pushes[min(k, len(scene.pushes) - 1)]:
+        part = float(np.linalg.norm(push.force)) / scene.reference_force
+        if part > 0:
+            found.append((push, min(part, LONGEST) * ARROW_PART * scene.size))
+    return found
+
+
+def _place_arrows(meshcat: Meshcat, arrows: list[tuple[Push, float]], slots: int, time: float | None) -> None:
+    for slot in range(slots):
+        path, used = f"contacts/{slot}", slot < len(arrows)
+        if used:
+            push, length = arrows[slot]
+            turned = RotationMatrix.MakeFromOneVector(push.force, 2)
+            meshcat.SetTransform(path, RigidTransform(turned, push.point), time_in_recording=time)
+            meshcat.SetTransform(f"{path}/tip", RigidTransform([0.0, 0.0, length]), time_in_recording=time)
+            meshcat.SetProperty(f"{path}/shaft", "scale", [1.0, 1.0, length], time_in_recording=time)
+        meshcat.SetProperty(path, "visible", used, time_in_recording=time)
+
+
+def _pose(meshcat: Meshcat, root: str, poses: Poses, k: int, time: float | None) -> None:
+    for path, found in poses.items():
+        meshcat.SetTransform(f"{root}/{path}", found[k], time_in_recording=time)
+
+
+def _look_at(meshcat: Meshcat, scene: Scene) -> None:
+    """A camera far enough back to have all of the motion in view, and a grid to see it by."""
+    low, high = scene.box
+    centre = (low + high) / 2
+    meshcat.SetCameraPose(centre + 0.52 * scene.size / np.tan(FIELD_OF_VIEW / 2) * _direction(high - low), centre)
+    for decoration in ("/Axes", "/Grid"):
+        meshcat.SetProperty(decoration, "visible", False)
+    meshcat.SetProperty("/Background/<object>", "top_color", TOP)
+    meshcat.SetProperty("/Background/<object>", "bottom_color", BOTTOM)
+    _draw_grid(meshcat, scene)
+
+
+def _draw_grid(meshcat: Meshcat, scene: Scene) -> None:
+    """Lines a power of ten, or half of one, apart, on the ground or under the lowest point of the motion."""
+    low, high = scene.box
+    grounds = [d.pose.translation()[2] for d in scene.shapes if isinstance(d.shape, HalfSpace)]
+    below = 0.002 * scene.size
+    height = max(grounds) + below if grounds else low[2] - below
+    decade = 10.0 ** np.floor(np.log10(scene.size))
+    cell = decade / (2 if scene.size > 3 * decade else 5)
+    centre = np.round((low + high)[:2] / 2 / cell) * cell
+    reach = cell * np.ceil(0.9 * scene.size / cell)
+    at = np.arange(-reach, reach + cell / 2, cell)
+    ends = [[(a, -reach), (a, reach)] for a in at] + [[(-reach, a), (reach, a)] for a in at]
+    points = np.array([[[*(centre + end), height] for end in pair] for pair in ends])
+    meshcat.SetLineSegments("grid", points[:, 0].T, points[:, 1].T, 1.0, LINES)
+
+
+def _direction(extent: Array) -> Array:
+    """From where to look: onto the motion's plane where it has one, else at an angle."""
+    flat = extent < 0.35 * np.max(extent)
+    view = np.array([0.15, -1.0, 0.25]) if flat[1] else np.array([1.0, -0.15, 0.25]) if flat[0] else None
+    view = np.array([0.6, -0.9, 0.45]) if view is None else view
+    return view / np.linalg.norm(view)

@@ -1,0 +1,1 @@
+from .panel import run_panel as run_panel

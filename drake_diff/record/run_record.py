@@ -1,0 +1,225 @@
+"""The fields of record.json.
+
+`EvidenceRecord` has nothing to do with RFC 4998, which uses the name for archive time stamps.
+"""
+
+import json
+from hashlib import sha256
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from drake_diff.record.parts import (
+    Certified,
+    Event,
+    Failure,
+    FileEvidence,
+    FiniteTable,
+    Metric,
+    ModelInput,
+    Part,
+    Provenance,
+    Quantity,
+    WallClock,
+)
+
+SCHEMA_VERSION = "1.0.0"
+APART = ("wall_clock", "files", "record_sha256")  # of what is the same, byte for byte, in every run
+
+
+class Claim(Part):
+    """What the run says is true, and what it does not say."""
+
+    statement: str
+    limitations: list[str]
+
+
+class Inputs(Part):
+    """What the run started from, besides `problem`, which holds the initial state."""
+
+    model: ModelInput
+    initial_guess: str
+    initial_guess_sha256: str | None  # of the bytes of xs (N+1, nx), then us (N, nu), as doubles
+    seed: int | None
+    random_generator: str = "numpy.random.default_rng"
+
+
+class Solver(Part):
+    """What solved the problem, and how it says it ended."""
+
+    method: str
+    solver: str
+    scheme: str
+    status: str
+    message: str
+    solver_message: str
+    options: FiniteTable
+    iterations: int
+
+
+class ParameterEvidence(Part):
+    """One entry of the parameter vector: where it started, what was found, where its derivative came from."""
+
+    name: str
+    unit: str
+    derivative_source: str
+    start: float
+    value: float
+    optimized: bool
+    lower: float | None
+    upper: float | None
+
+
+class GradientColumn(Part):
+    """One of the variables that the motion is differentiated by, and where that column of derivatives comes from."""
+
+    name: str
+    unit: str
+    source: str
+
+
+class GradientEvidence(Part):
+    """What is differentiated, from where, and how far it agrees with differences."""
+
+    differentiated: list[str]
+    columns: list[GradientColumn]
+    smoothing: str
+    regularization: str
+    solver_tolerance: Quantity
+    horizon: Quantity
+    norm_definition: str
+    norms: list[float | None] = Field(default_factory=list)  # by knot; null where one is not finite
+    certificates: list[Certified] = Field(default_factory=list)
+
+
+class ObservedVariable(Part):
+    """One variable of the state as it is observed."""
+
+    name: str
+    unit: str
+    frame: str
+    uncertainty: Quantity
+
+
+class Observation(Part):
+    """What is observed, in which frame, and when."""
+
+    variables: list[ObservedVariable]
+    clock: str
+    start_s: float
+    period_s: float
+    count: int
+
+
+class Command(Part):
+    """One commanded input; null is no limit."""
+
+    name: str
+    unit: str
+    lower: float | None
+    upper: float | None
+
+
+class ActionInterface(Part):
+    """How the inputs reach the plant."""
+
+    command_type: str
+    commands: list[Command]
+    update_rate: Quantity
+    latency_budget: Quantity
+    safety_fallback: str
+
+
+class ReplayEvidence(Part):
+    """One replay of the plan on the plant; a measure is None where the motion could not be taken."""
+
+    variant: str
+    control: str
+    time_step_s: float
+    contact_approximation: str
+    goal_error: float | None  # the largest, in the state's units
+    bound_violation: float | None  # the same
+    energy_error_J: float | None
+    penetration_m: float | None
+    holds: bool
+    failures: list[str]
+
+
+class EvidenceRecord(Part):
+    """Everything a stranger needs to judge the run; the motion is in plan.npz and trace.mcap.
+
+    `files` are all others of the run directory. `record_sha256` is that of this record's canonical JSON (sorted keys,
+    indented by 2) with `record_sha256` empty.
+    """
+
+    schema_version: str = SCHEMA_VERSION
+    name: str
+    state: Literal["incomplete", "complete"]
+    verdict: Literal["pass", "fail", "incomplete"]
+    sentence: str
+    claim: Claim
+    inputs: Inputs
+    problem: FiniteTable
+    contract: FiniteTable
+    units: dict[str, str]  # of the numbers in `problem` and `contract`, by their key
+    solver: Solver | None = None
+    parameters: list[ParameterEvidence] = Field(default_factory=list)
+    metrics: list[Metric] = Field(default_factory=list)
+    invariants: list[Metric] = Field(default_factory=list)
+    gradient: GradientEvidence | None = None
+    observation: Observation
+    action: ActionInterface
+    events: list[Event] = Field(default_factory=list)
+    replays: list[ReplayEvidence] = Field(default_factory=list)
+    failures: list[Failure] = Field(default_factory=list)
+    provenance: Provenance
+    wall_clock: WallClock
+    files: dict[str, FileEvidence] = Field(default_factory=dict)
+    record_sha256: str = ""
+
+    @model_validator(mode="after")
+    def _passes_only_what_holds(self) -> "EvidenceRecord":
+        if (self.state == "incomplete") != (self.verdict == "incomplete"):
+            raise ValueError(f'a record that is {self.state} with the verdict "{self.verdict}"')
+        if self.verdict == "pass":
+            broken = [m.name for m in (*self.metrics, *self.invariants) if m.verdict in ("fail", "undecided")]
+            broken += [failure.code for failure in self.failures]
+            if self.solver is None or self.solver.status != "converged":
+                broken.append(f"solver status {self.solver.status if self.solver else 'missing'}")
+            if broken:
+                raise ValueError(f'a verdict "pass" with {", ".join(broken)}')
+        return self
+
+    def as_row(self) -> dict[str, str]:
+        """The textbook's view of the record: section, tool, observation, action, metric, perturbation."""
+        return {
+            "section": "differentiable physics",
+            "tool": f"drake {self.provenance.packages.get('drake', '?')}, {self.solver.method if self.solver else '-'}",
+            "observation": ", ".join(f"{x.name} [{x.unit}]" for x in self.observation.variables),
+            "action": ", ".join(f"{x.name} [{x.unit}]" for x in self.action.commands),
+            "metric": "; ".join(f"{m.name} {m.value} {m.unit}" for m in self.metrics),
+            "perturbation": "; ".join(dict.fromkeys(f"replayed {r.variant}" for r in self.replays)) or "none",
+        }
+
+    def to_json(self) -> str:
+        """The record as canonical JSON: the same record gives the same bytes."""
+        return canonical(self.model_dump(mode="json"))
+
+    def sealed(self) -> "EvidenceRecord":
+        """This record with its own hash."""
+        return self.model_copy(update={"record_sha256": own_sha256(self.model_dump(mode="json"))})
+
+
+def canonical(fields: dict[str, Any]) -> str:
+    """JSON with sorted keys: the same fields give the same text."""
+    return json.dumps(fields, sort_keys=True, indent=2, allow_nan=False) + "\n"
+
+
+def own_sha256(fields: dict[str, Any]) -> str:
+    """The hash that belongs into `record_sha256` of a record with these fields."""
+    return sha256(canonical({**fields, "record_sha256": ""}).encode()).hexdigest()
+
+
+def reproducible(fields: dict[str, Any]) -> str:
+    """The canonical JSON of a record's fields without wall-clock facts and hashes: what trace.mcap carries."""
+    return canonical({key: value for key, value in fields.items() if key not in APART})

@@ -1,0 +1,346 @@
+"""The textbook contact cases in every engine: values and gradients beside the rigid answer and the engine's own law.
+
+A contact table as a few lines per engine and as JSON.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.comparison.compare import default_engines
+from drake_diff.comparison.result import Refused
+from drake_diff.engines.closed_form import SphereOnGround
+from drake_diff.engines.interface import Engine
+from drake_diff.engines.jacobians import rollout_jacobian
+from drake_diff.engines.load import load_spec
+from drake_diff.engines.motion import EngineMotion, move
+from drake_diff.engines.numpy import NumpyEngine
+from drake_diff.exceptions import GradientError, MissingDependencyError, ModelError, SimulationError, UnknownNameError
+from drake_diff.model.model import Model
+from drake_diff.model.tangent import tangent_space
+from drake_diff.studies.contact_cases import QUANTITIES, ContactCase, Kind, contact_cases
+from drake_diff.studies.contact_laws import Answer, law_of
+
+Verdict = Literal["rigid answer", "own law's", "off", "falls through", "broke off"]
+GradientVerdict = Literal["right", "own law's", "zero", "wrong", "none", "not asked"]
+Spec = str | Callable[[Model], Engine]
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Of a value and of a gradient, relative, and why."""
+
+    value: float
+    gradient: float
+    reason: str
+
+
+TOLERANCES: Mapping[Kind, Tolerance] = {
+    "rest": Tolerance(1e-5, 1e-6, "solvers that stop at a relative 1e-6 settle to some 5e-7"),
+    "stop": Tolerance(1e-5, 1e-3, "below 1e-3 m/s regularized friction adds 1e-6 m, and 2e-4 of the gradient"),
+    "slide": Tolerance(1e-6, 1e-6, "solvers that stop at a relative 1e-6 leave some 1e-8"),
+    "hold": Tolerance(2e-6, 1e-3, "a solver that stops at a relative 1e-6, where speed and slope are as small"),
+    "roll": Tolerance(1e-5, 1e-5, "rolling slips by 5e-6 m/s where friction is regularized below 1e-4 m/s"),
+    "bounce": Tolerance(5e-3, 0.1, "h sqrt(k / m) is 0.02: 12 times its square is left, 5 times it of a gradient"),
+    "damped bounce": Tolerance(1e-2, 0.1, "when in a step it touches is chance: 0.2 h sqrt(k / m) of the speed"),
+}
+ZERO = 1e-9  # absolute, where the answer is 0
+NO_GRADIENT = 1e-6  # of the rigid one: less is none
+SINGLE, SINGLE_ZERO = 1e-3, 1e-5  # instead, for engines in float32
+FREE_FALL = 1e-3  # of the fall: nearer to it nothing has held the ball
+
+
+@dataclass(frozen=True)
+class ContactRow:
+    """One engine in one case; numbers in SI units, None where there is none."""
+
+    case: Kind
+    engine: str
+    quantity: str
+    unit: str
+    value: float
+    rigid: float
+    law: float | None
+    tolerance: float
+    verdict: Verdict
+    why: str
+    derivative: str
+    gradient: float | None
+    rigid_gradient: float
+    law_gradient: float | None
+    gradient_tolerance: float
+    gradient_verdict: GradientVerdict
+    gradient_why: str
+
+    @property
+    def rigid_gap(self) -> float:
+        """To the rigid answer: relative, absolute where that is 0."""
+        return gap(self.value, self.rigid)
+
+    @property
+    def law_gap(self) -> float | None:
+        """To its own law's."""
+        return None if self.law is None else gap(self.value, self.law)
+
+
+@dataclass(frozen=True)
+class ContactTable:
+    """All rows, case by case, and the engines that have none, with the reason."""
+
+    rows: tuple[ContactRow, ...]
+    refused: tuple[Refused, ...]
+
+    @property
+    def engines(self) -> tuple[str, ...]:
+        """Those with rows."""
+        return tuple(dict.fromkeys(row.engine for row in self.rows))
+
+    def row(self, case: str, engine: str) -> ContactRow:
+        """UnknownNameError where there is none."""
+        rows = {(str(row.case), row.engine): row for row in self.rows}
+        if (case, engine) not in rows:
+            known = [f"{a} of {b}" for a, b in rows]
+            raise UnknownNameError("row of the contact table", got=f"{case} of {engine}", known=known)
+        return rows[case, engine]
+
+    @property
+    def off(self) -> tuple[ContactRow, ...]:
+        """Rows whose value is neither the rigid answer nor known to be the engine's law's."""
+        return tuple(row for row in self.rows if row.verdict in ("off", "broke off"))
+
+
+def contact_table(engines: Sequence[Spec] | None = None, cases: Sequence[ContactCase] | None = None) -> ContactTable:
+    """Run `cases` (all of `contact_cases()`) in `engines`, and judge values and rollout gradients.
+
+    Engines are names, "drake:lagged" and the like, or functions of a Model; without any, Drake's three approximations
+    and every engine there is. Those that are missing or cannot have a case's model are in `refused`. UnknownNameError
+    for a name that no engine has.
+    """
+    rows, refused = [], {}
+    for case in contact_cases() if cases is None else cases:
+        model = case.model()
+        for spec in ("drake", *default_engines(model)) if engines is None else engines:
+            try:
+                rows.append(_row(case, model, spec))
+            except (MissingDependencyError, ModelError) as error:
+                name = spec if isinstance(spec, str) else getattr(spec, "__name__", "engine")
+                there = isinstance(error, ModelError)
+                refused[name, str(error)] = Refused(name, f"{case.kind}: {error}" if there else str(error), there)
+    return ContactTable(tuple(rows), tuple(refused.values()))
+
+
+def gap(a: float, b: float) -> float:
+    """Of `a` to `b`: relative, absolute where `b` is 0."""
+    return abs(a - b) / (abs(b) or 1.0)
+
+
+class _Run:
+    """One engine's run of one case."""
+
+    def __init__(self, case: ContactCase, model: Model, engine: Engine):
+        self.case, self.engine, self.space = case, engine, tangent_space(model)
+        self.motion = move(engine, case.x0, np.zeros((case.num_steps, 0)))
+        self.xs = self.motion.xs
+        self.no_gradient = "the engine has no derivative of a step in contact"
+
+    @cached_property
+    def jacobian(self) -> Array | None:
+        return self._product(self.motion)
+
+    def _product(self, motion: EngineMotion) -> Array | None:
+        try:
+            return rollout_jacobian(self.engine, self.space, motion)
+        except (GradientError, SimulationError) as error:
+            self.no_gradient = str(error)
+            return None
+
+    def row(self, name: str, n: int) -> Array | None:
+        """See `contact_laws.Ran`."""
+        m = self.motion
+        cut = EngineMotion(m.times[: n + 1], m.xs[: n + 1], m.us[:n], None, None, m.status)
+        found = self.jacobian if n == len(m.us) else self._product(cut)
+        return None if found is None else np.asarray(found[self._place(name)])
+
+    @property
+    def gradient(self) -> float | None:
+        top, bottom = {
+            "stop": ("x", "vx"), "hold": ("x", "vx"), "slide": ("vx", "vx"), "roll": ("vx", "vx")
+        }.get(self.case.kind, ("z", "z"))  # fmt: skip
+        row = self.row(top, len(self.motion.us))
+        return None if row is None else float(row[self._place(bottom)])
+
+    def _place(self, name: str) -> int:
+        """On the tangent space, where a turn has three coordinates and not four."""
+        return self.case.place(name) - (0 if self.case.axes else 1)
+
+    def end(self, name: str) -> float:
+        return float(self.xs[-1][self.case.place(name)])
+
+    @property
+    def falls(self) -> bool:
+        start = float(self.case.x0[self.case.place("z")])
+        return abs(self.end("z") - self.case.free_fall) <= FREE_FALL * (start - self.case.free_fall)
+
+    @property
+    def value(self) -> float:
+        kind = self.case.kind
+        if kind == "rest":
+            return self.case.radius - self.end("z")
+        return rebound_height(self.case, self.xs) if "bounce" in kind else self.end("x" if kind == "stop" else "vx")
+
+
+def rebound_height(case: ContactCase, xs: Array) -> float:
+    """[m] of a bounce `xs` (n, 2) in the case's steps; 0 where it does not leave the ground.
+
+    z + v^2 / (2 g) - h v / 2 is what semi-implicit Euler keeps in free flight (ORACLES A01): the apex of the steps.
+    """
+    up = np.flatnonzero((xs[:, 0] > case.radius) & (xs[:, 1] > 0))
+    if not len(up):
+        return 0.0
+    z, v = xs[up[0]]
+    return float(z - case.radius + v**2 / (2 * case.gravity) - case.time_step * v / 2)
+
+
+def _load(case: ContactCase, model: Model, spec: Spec) -> Engine:
+    if callable(spec):
+        return spec(model)
+    if spec != "numpy":
+        return load_spec(spec, model)
+    if case.axes != ("z",):
+        raise ModelError("there is a hand calculation of a ball on a vertical rail alone")
+    return NumpyEngine(_hand(case), time_step=model.time_step)
+
+
+def _hand(case: ContactCase) -> SphereOnGround:
+    return SphereOnGround(
+        mass=case.mass,
+        radius=case.radius,
+        stiffness=case.stiffness,
+        relaxation_time=case.relaxation_time,
+        gravity=case.gravity,
+    )
+
+
+def _row(case: ContactCase, model: Model, spec: Spec) -> ContactRow:
+    run = _Run(case, model, _load(case, model, spec))
+    engine, value, extra = run.engine, run.value, ""
+    complete = len(run.motion.us) == case.num_steps
+    if "bounce" in case.kind and complete and not run.falls:
+        value, extra = _extrapolated(case, model, spec, value)
+    law = law_of(engine.contract.contact_law, case) if complete and not run.falls else None
+    answer = law.answer(run) if law else None
+    verdict, why = _judge(run, value, answer)
+    asked = verdict not in ("falls through", "broke off")
+    gradient = run.gradient if asked else None
+    gradient_verdict, gradient_why = _judge_gradient(run, gradient, answer) if asked else ("not asked", why)
+    quantity, unit, derivative = QUANTITIES[case.kind]
+    tolerance = _tolerance(run)
+    return ContactRow(
+        case=case.kind,
+        engine=engine.name,
+        quantity=quantity,
+        unit=unit,
+        value=value,
+        rigid=case.rigid,
+        law=answer.value if answer else None,
+        tolerance=tolerance.value,
+        verdict=verdict,
+        why="; ".join(said for said in (why, extra) if said),
+        derivative=derivative,
+        gradient=gradient,
+        rigid_gradient=case.rigid_gradient,
+        law_gradient=answer.gradient if answer else None,
+        gradient_tolerance=tolerance.gradient,
+        gradient_verdict=gradient_verdict,
+        gradient_why=gradient_why,
+    )
+
+
+def _extrapolated(case: ContactCase, model: Model, spec: Spec, value: float) -> tuple[float, str]:
+    """The rebound's height as h -> 0, from h and h / 2, and what it is at h."""
+    half = replace(case, time_step=case.time_step / 2, num_steps=2 * case.num_steps)
+    finer = _load(half, model.at_time_step(half.time_step), spec)
+    motion = move(finer, half.x0, np.zeros((half.num_steps, 0)))
+    limit = 2 * rebound_height(half, motion.xs) - value
+    return limit, f"at h = {case.time_step:g} s it is {value:.4g} m"
+
+
+def _tolerance(run: _Run) -> Tolerance:
+    found = TOLERANCES[run.case.kind]
+    if run.engine.contract.precision == "float64":
+        return found
+    return Tolerance(max(found.value, SINGLE), max(found.gradient, SINGLE), "single precision")
+
+
+def _near(run: _Run, a: float, b: float, tolerance: float) -> bool:
+    zero = ZERO if run.engine.contract.precision == "float64" else SINGLE_ZERO
+    return gap(a, b) <= (tolerance if b else zero)
+
+
+def _judge(run: _Run, value: float, answer: Answer | None) -> tuple[Verdict, str]:
+    case, allowed = run.case, _tolerance(run).value
+    if len(run.motion.us) < case.num_steps:
+        return "broke off", run.motion.status
+    if run.falls:
+        return "falls through", f"no contact: it falls freely to z = {run.end('z'):.3g} m"
+    if _near(run, value, case.rigid, allowed):
+        return "rigid answer", answer.why if answer else ""
+    apart = f"{_shown(value, case.rigid, QUANTITIES[case.kind][1])} from the rigid answer"
+    if answer is None:
+        return "off", f"{apart}; its own law: {run.engine.contract.contact_law}"
+    if _near(run, value, answer.value, allowed):
+        return "own law's", f"{apart}: {answer.why}"
+    return "off", f"{apart}, and {_shown(value, answer.value, QUANTITIES[case.kind][1])} from its own law's"
+
+
+def _shown(value: float, reference: float, unit: str) -> str:
+    if reference == 0:
+        return f"{value:+.2g} {unit}"
+    return f"{100 * (value / reference - 1):+.3g} %"
+
+
+def _judge_gradient(run: _Run, gradient: float | None, answer: Answer | None) -> tuple[GradientVerdict, str]:
+    case, allowed = run.case, _tolerance(run).gradient
+    if gradient is None:
+        return "none", run.no_gradient
+    if _near(run, gradient, case.rigid_gradient, allowed):
+        return "right", ""
+    law = None if answer is None else answer.gradient
+    if answer is not None and law is not None and _near(run, gradient, law, allowed):
+        return "own law's", answer.why_gradient
+    told = f"; its own law's is {law:.4g} ({answer.why_gradient})" if answer is not None and law is not None else ""
+    if abs(gradient) <= NO_GRADIENT * abs(case.rigid_gradient):
+        return "zero", f"where the rigid one is {case.rigid_gradient:.4g}{told}"
+    return "wrong", f"the rigid one is {case.rigid_gradient:.4g}{told}"
+
+
+def lines_of(table: ContactTable, engine: str) -> tuple[str, ...]:
+    """Which values and gradients of `engine` are the rigid answer's, which its own law's, which neither, and why."""
+    rows = [row for row in table.rows if row.engine == engine]
+    values = _grouped(rows, {row.case: row.verdict for row in rows})
+    gradients = _grouped(rows, {row.case: row.gradient_verdict for row in rows})
+    reasons = [f"{row.case}: {row.why}" for row in rows if row.verdict in ("own law's", "off")]
+    reasons += [row.why for row in rows if row.verdict in ("falls through", "broke off")][:1]
+    reasons += [f"gradient of {row.case}: {row.gradient_why}" for row in rows if row.gradient_verdict in NOT_TO_TRUST]
+    reasons += [f"no gradient: {row.gradient_why}" for row in rows if row.gradient_verdict == "none"][:1]
+    return (f"values: {values}; gradients: {gradients}", *reasons)
+
+
+def as_json(table: ContactTable) -> str:
+    """Every field of every row, and the engines that have none."""
+    return json.dumps(asdict(table), indent=1, allow_nan=False)
+
+
+NOT_TO_TRUST = ("wrong", "zero")
+
+
+def _grouped(rows: list[ContactRow], verdicts: dict[str, str]) -> str:
+    kinds = list(dict.fromkeys(verdicts.values()))
+    return ", ".join(
+        f"{verdict} ({', '.join(row.case for row in rows if verdicts[row.case] == verdict)})" for verdict in kinds
+    )

@@ -1,0 +1,218 @@
+"""Robustness saved: its record, a page, a row for each trial, and the worst trials as artifacts of their own."""
+
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.files import write_whole
+from drake_diff.loop.parts import Hold
+from drake_diff.loop.run import Loop
+from drake_diff.model.model import Model
+from drake_diff.record.provenance import file_evidence, model_input, provenance_of, written_now
+from drake_diff.record.read import load_record
+from drake_diff.trials.perturbation import perturbation_named
+from drake_diff.trials.record import (
+    CellEvidence,
+    LoopEvidence,
+    Nominal,
+    PerturbationEvidence,
+    RobustnessRecord,
+    RunEvidence,
+    Times,
+)
+from drake_diff.trials.run import Cell, Robustness
+from drake_diff.trials.trial import Task
+from drake_diff.trials.trial_files import FILES as TRIAL_FILES
+from drake_diff.trials.trial_files import REPLAY, controller_name, finite, write_trial
+from drake_diff.trials.words import verdict_of, weakest_of
+
+RECORD, PAGE, TABLE, WORST = "robustness.json", "robustness.html", "trials.csv", "worst"
+PLAIN = Loop()
+
+
+def begin_robustness(directory: str | Path, model: Model) -> None:
+    """Mark `directory` as trials under way: until they are saved its record says "incomplete"."""
+    folder = Path(directory)
+    folder.mkdir(parents=True, exist_ok=True)
+    sentence = "the trials have begun and not ended: they are under way, or they were killed or broke off"
+    record = _record(folder.name, model, "incomplete", sentence)
+    write_whole(folder / RECORD, record.sealed().to_json().encode())
+    left = [folder / PAGE, folder / TABLE, *(f for f in folder.glob(f"{WORST}/*/*") if f.name in TRIAL_FILES)]
+    for path in left:  # of an earlier report; what is not ours stays
+        path.unlink(missing_ok=True)
+    for path in folder.glob(f"{WORST}/*"):
+        if path.is_dir() and not any(path.iterdir()):
+            path.rmdir()
+
+
+def save_robustness(result: Robustness, directory: str | Path, run: str | Path | None = None) -> RobustnessRecord:
+    """Write the directory of `result`, robustness.json last, so that it is complete only if all it names is.
+
+    robustness.html is the report, trials.csv has a row for each trial, and worst/NAME_LEVEL/ has, of each perturbation,
+    the worst trial at the lowest level where one fails (of all, where none does): trial.json, trace.mcap, replay.html,
+    latencies.json. All but wall-clock times are the same, byte for byte, for the same trials. `run` is the run
+    directory that the plan is from. Raises ArtifactError where there is no record in it.
+    """
+    from drake_diff.trials.page import write_robustness_page  # what saves nothing need not load it
+
+    folder, task = Path(directory), result.task
+    source = None if run is None else RunEvidence(path=str(run), record_sha256=load_record(run).record_sha256)
+    begin_robustness(folder, task.model)
+    record = record_of(result, folder.name, source)
+    again = str(run) if run is not None and _is_plain(task) else None
+    for name in result.names:
+        write_trial(folder / _place(result.worst(name)), task, result.worst(name).worst, again)
+    write_whole(folder / TABLE, _table(result).encode())
+    write_robustness_page(folder / PAGE, result, record, folder / _place(result.worst(weakest_of(result))) / REPLAY)
+    written = [PAGE, TABLE, *(f"{p.worst}/{name}" for p in record.perturbations for name in TRIAL_FILES)]
+    sealed = record.model_copy(update={"files": [file_evidence(folder / name, name) for name in written]}).sealed()
+    write_whole(folder / RECORD, sealed.to_json().encode())
+    return sealed
+
+
+def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> RobustnessRecord:
+    """The record of `result`, but for the files."""
+    task, nominal = result.task, result.task.nominal
+    return _record(
+        name,
+        task.model,
+        "pass" if result.success else "fail",
+        verdict_of(result),
+        run=run,
+        trials=result.trials,
+        seed=result.seed,
+        loop=_loop(task),
+        nominal=Nominal(
+            success=nominal.success,
+            failures=list(nominal.failures),
+            goal_error=finite(nominal.goal_error),
+            ended=nominal.run.ended,
+        ),
+        perturbations=[_perturbation(result, name) for name in result.names],
+        wall_clock=_times(result),
+    )
+
+
+def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -> RobustnessRecord:
+    nothing = dict.fromkeys(("run", "trials", "seed", "loop", "nominal"))
+    found: dict[str, Any] = {**nothing, "perturbations": [], "wall_clock": Times(written=written_now()), **rest}
+    return RobustnessRecord(
+        name=name,
+        verdict=verdict,
+        sentence=sentence,
+        model=model_input(model),
+        state_names=list(model.state_names),
+        input_names=list(model.input_names),
+        files=[],
+        provenance=provenance_of(),
+        **found,
+    )
+
+
+def _place(cell: Cell) -> str:
+    return f"{WORST}/{cell.perturbation}_{cell.level:g}"
+
+
+def _perturbation(result: Robustness, name: str) -> PerturbationEvidence:
+    kind = perturbation_named(name)
+    return PerturbationEvidence(
+        name=name,
+        unit=kind.unit,
+        meaning=kind.meaning,
+        margin=result.margins[name],
+        cells=[_cell(c) for c in result.of(name)],
+        worst=_place(result.worst(name)),
+    )
+
+
+def _cell(c: Cell) -> CellEvidence:
+    return CellEvidence(
+        level=c.level,
+        successes=c.rate.successes,
+        trials=c.rate.trials,
+        rate=c.rate.value,
+        lower_95=c.rate.lower,
+        upper_95=c.rate.upper,
+        distinct=len({e.last.tobytes() for e in c.endings}),
+        labels=dict(c.labels),
+        goal_error_median=finite(c.goal_error),
+        goal_error_worst=finite(c.worst_goal_error),
+        displacement=c.displacement,
+        predicted=c.predicted,
+        ratio=c.ratio,
+    )
+
+
+def _loop(task: Task) -> LoopEvidence:
+    loop, period = task.loop, task.loop.substeps * task.model.time_step
+    sensor, actuator = loop.sensor, loop.actuator
+    seen = {n: getattr(sensor, n) for n in ("noise", "bias", "delay", "every", "dropout")}
+    done = {n: getattr(actuator, n) for n in ("delay", "every", "lower", "upper", "strength", "lag")}
+    return LoopEvidence(
+        controller=controller_name(task),
+        period_s=period,
+        steps=len(task.us),
+        judged_by=task.judged_by,
+        sensor={key: _numbers(value) for key, value in seen.items()},
+        estimator=type(loop.estimator).__name__,
+        actuator={key: _numbers(value) for key, value in done.items()},
+        fallback=None if loop.fallback is None else loop.fallback.mode,
+        latency_budget_s=period if loop.latency_budget is None else loop.latency_budget,
+        latency_budget_is="the controller's period" if loop.latency_budget is None else "stated",
+    )
+
+
+def _numbers(value: ArrayLike) -> float | list[float | None] | None:
+    """A number or a list of them; null for no limit."""
+    if np.ndim(value) == 0:
+        return finite(float(np.asarray(value)))
+    return [finite(float(v)) for v in np.asarray(value, dtype=float)]
+
+
+def _is_plain(task: Task) -> bool:
+    """Whether a trial can be run again from what trial.json says: nothing in the loop is a user's own."""
+    own = task.loop
+    return (
+        isinstance(task.controller, str)
+        and all(
+            repr(getattr(own, name)) == repr(getattr(PLAIN, name))
+            for name in ("sensor", "actuator", "fallback", "substeps")
+        )
+        and type(own.estimator) is Hold
+        and not own.pushes
+    )
+
+
+def _times(result: Robustness) -> Times:
+    runs = [result.task.nominal.run, *(c.worst.outcome.run for c in result.cells)]
+    taken = np.concatenate([run.latencies for run in runs])
+    if not len(taken):
+        return Times(written=written_now())
+    budget = _loop(result.task).latency_budget_s
+    return Times(
+        written=written_now(),
+        latency_median_s=float(np.median(taken)),
+        latency_99_percent_s=float(np.quantile(taken, 0.99)),
+        latency_largest_s=float(np.max(taken)),
+        late=int(np.sum(taken > budget)),
+        controller_steps=len(taken),
+    )
+
+
+def _table(result: Robustness) -> str:
+    """A row for each trial: all that the rates are made of."""
+    text = io.StringIO(newline="")
+    rows = csv.writer(text, lineterminator="\n")
+    ends = [f"last {name}" for name in result.task.model.state_names]
+    rows.writerow(["perturbation", "level", "seed", "success", "label", "goal_error", *ends])
+    for c in result.cells:
+        for e in c.endings:
+            last: Array = e.last
+            told = [int(e.label is None), e.label or "", e.goal_error]
+            rows.writerow([c.perturbation, c.level, e.seed, *told, *last.tolist()])
+    return text.getvalue()

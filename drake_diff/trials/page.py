@@ -1,0 +1,261 @@
+"""The numbers that the page of a robustness report plots.
+
+The trials of a plan as one page that opens from a disk: the verdict, every rate and margin, the worst trials.
+"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.statistics import ENOUGH
+from drake_diff.pages.html import (
+    Link,
+    Mark,
+    Row,
+    escaped,
+    plots,
+    provenance,
+    section,
+    slider,
+    stage,
+    table,
+    write_page,
+)
+from drake_diff.pages.plots import Plot, line, numbers, plot
+from drake_diff.trials.perturbation import perturbed
+from drake_diff.trials.record import CellEvidence, PerturbationEvidence, RobustnessRecord
+from drake_diff.trials.run import Robustness
+from drake_diff.trials.trial import Task, Trial
+from drake_diff.trials.trial_files import planned_states
+from drake_diff.trials.words import agrees, sized, weakest_of
+
+MOST_PLOTS = 12  # of coordinates; those that end furthest from the plan
+
+
+def robustness_data(result: Robustness) -> dict[str, Any]:
+    """What the page plots; see `report_data`."""
+    trial, task = result.worst(weakest_of(result)).worst, result.task
+    found = [*_states(task, trial), *_inputs(task, trial), _status(task, trial)]
+    for name in result.names:
+        found += _levels(result, name)
+    return {"duration": task.model.time_step * len(task.us), "plots": found, "certificates": [], "verdicts": []}
+
+
+def _levels(result: Robustness, name: str) -> Iterable[Plot]:
+    cells = result.of(name)
+    levels = [c.level for c in cells]
+    place: dict[str, Any] = {"axis": "level", "levels": True, "marks": "both", "place": name}
+    rates = [
+        line("rate", [c.rate.value for c in cells]),
+        line("95 %, lower", [c.rate.lower for c in cells], dashed=True),
+        line("upper", [c.rate.upper for c in cells], dashed=True),
+    ]
+    yield plot("success", "1", levels, rates, band=True, range=[-0.03, 1.03], **place)
+    moved = [line("measured", [_number(c.displacement) for c in cells])]
+    known = any(c.predicted is not None for c in cells)
+    moved += [line("predicted", [_number(c.predicted) for c in cells], dashed=True)] if known else []
+    note = "" if known else "no gradient tells of it"
+    yield plot("displacement of the last state", "q, v", levels, moved, log=True, note=note, **place)
+    yield _last_states(result, name)
+
+
+def _last_states(result: Robustness, name: str) -> Plot:
+    """Every trial's last state in the two coordinates that spread most for what is tolerated, each level and the plan's
+    own end in a colour.
+    """
+    task, cells = result.task, result.of(name)
+    ends = [*(np.array([e.last for e in c.endings]) for c in cells), task.xs[-1:]]
+    spread = np.ptp(np.vstack(ends), axis=0) / task.plan.scale
+    i, j = sorted(np.argsort(-spread, kind="stable")[:2])
+    across = np.concatenate([end[:, i] for end in ends])
+    order = np.argsort(across, kind="stable")
+    level = np.repeat(np.arange(len(ends)), [len(end) for end in ends])[order]
+    up = np.concatenate([end[:, j] for end in ends])[order]
+    labels = [*(f"{c.level:g}" for c in cells), "the plan's"]
+    series = [line(label, np.where(level == k, up, np.nan)) for k, label in enumerate(labels)]
+    names = task.model.state_names
+    place = {"axis": names[i], "marks": "points", "place": name}
+    return plot(f"last {names[j]} over {names[i]}", "by level", across[order], series, **place)
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
+def _times(task: Task, trial: Trial) -> tuple[Array, int, Array]:
+    """Those of every step of the trial's plant, the steps in one of the controller's, and the plan at them."""
+    setup = perturbed(task.setup, trial.levels, trial.seed)
+    planned = planned_states(task, setup)
+    times = np.asarray(setup.model.time_step * np.arange(len(planned)), dtype=float)
+    return times, setup.loop.substeps, planned
+
+
+def _states(task: Task, trial: Trial) -> Iterable[Plot]:
+    """Truth, observation, estimate and plan of each coordinate."""
+    run, model = trial.outcome.run, task.model
+    times, every, planned = _times(task, trial)
+    true = _padded(run.motion.xs, len(times))
+    seen, taken = (_padded(np.repeat(rows, every, axis=0), len(times)) for rows in (run.observations, run.estimates))
+    apart = np.nanmax(np.abs(true - planned), axis=0) / task.plan.scale
+    units = [c.unit for c in (*model.contract.positions, *model.contract.velocities)]
+    for i in sorted(np.argsort(-apart, kind="stable")[:MOST_PLOTS]):
+        lines = [
+            line("true", true[:, i]),
+            line("observed", seen[:, i], held=True),
+            line("estimated", taken[:, i], held=True),
+            line("plan", planned[:, i], dashed=True),
+        ]
+        bounds = numbers([task.plan.problem.bounds.x_lower[i], task.plan.problem.bounds.x_upper[i]])
+        yield plot(model.state_names[i], units[i], times, lines, limits=bounds)
+
+
+def _inputs(task: Task, trial: Trial) -> Iterable[Plot]:
+    run, bounds = trial.outcome.run, task.plan.problem.bounds
+    times, every, _ = _times(task, trial)
+    rows = [_padded(np.repeat(u, every, axis=0), len(times)) for u in (run.commands, run.applied)]
+    planned = _padded(np.repeat(task.us, (len(times) - 1) // len(task.us), axis=0), len(times))
+    for i, c in enumerate(task.model.contract.inputs):
+        lines = [line(name, u[:, i], held=True) for name, u in zip(("command", "applied"), rows, strict=True)]
+        limits = numbers([bounds.u_lower[i], bounds.u_upper[i]])
+        yield plot(
+            f"input {c.name}",
+            c.unit,
+            times,
+            [*lines, line("plan", planned[:, i], dashed=True, held=True)],
+            limits=limits,
+        )
+
+
+def _status(task: Task, trial: Trial) -> Plot:
+    run = trial.outcome.run
+    times, every, _ = _times(task, trial)
+    ok = np.array([[float(status == "ok")] for status in run.controller_status]).reshape(-1, 1)
+    others = list(dict.fromkeys(s for s in run.controller_status if s != "ok"))
+    events = [f"{e.t:.4g} s: {e.message}" for e in run.events]
+    note = "; ".join([*others[:3], *events[:6]]) or "nothing happened"
+    values = _padded(np.repeat(ok, every, axis=0), len(times))[:, 0]
+    return plot("controller status", "1: ok", times, [line("status", values, held=True)], range=[-0.1, 1.1], note=note)
+
+
+def _padded(rows: Array, count: int) -> Array:
+    """`rows` (n, m) as (count, m), NaN below; a held row that is one short lasts to the end."""
+    rows = np.vstack([rows, rows[-1:]]) if len(rows) == count - 1 else rows[:count]
+    return np.vstack([rows, np.full((count - len(rows), rows.shape[1]), np.nan)])
+
+
+APART = ("wall_clock", "files", "record_sha256")
+MEANINGS = (
+    ("success", "the run reaches the goal (or the plan's end, where there is none) and keeps bounds and overlap"),
+    ("interval", "Wilson's, 95 %; where every trial is the same run, nothing being drawn, it says nothing"),
+    ("margin", f"the largest level up to which {ENOUGH:.0%} of the trials succeed"),
+    ("displacement", "of the last state from the unperturbed run's, root mean square over the trials"),
+    ("predicted", "the same, to first order, from the gradients along the unperturbed run, before anything is tried"),
+    ("planning error", "unperturbed it fails too"),
+    ("perception error", "with a perfect sensor it succeeds"),
+    ("control error", "with a perfect actuator it succeeds, the controller failed, or no single thing helps"),
+    ("state error", "with plant and start as planned, and no push, it succeeds"),
+    ("evaluation error", "what came out cannot be judged"),
+)
+
+
+def write_robustness_page(path: Path, result: Robustness, record: RobustnessRecord, replay: Path) -> None:
+    """Write the page of `result` with its `record` and `replay`, the page of the weakest point's worst trial."""
+    fields, view = record.model_dump(mode="json"), replay.read_text()
+    embedded = {key: value for key, value in fields.items() if key not in APART}
+    body = "\n".join(_sections(result, record, fields, view))
+    write_page(path, f"{record.name}: {record.verdict}", body, robustness_data(result), embedded, view)
+
+
+def _sections(result: Robustness, record: RobustnessRecord, fields: Mapping[str, Any], view: str) -> Iterable[str]:
+    yield (
+        f'<header><p class="pill {record.verdict}">{record.verdict}</p><h1>{escaped(record.name)}</h1>'
+        f'<p class="sentence">{escaped(record.sentence)}</p><p class="facts">{escaped(_facts(result, record))}</p>'
+        "</header>"
+    )
+    yield section("Perturbations", _overview(record))
+    trial = result.worst(weakest_of(result)).worst
+    ((name, level),) = trial.levels.items()
+    told = trial.reason or "it succeeds, and of all trials it ends furthest from the goal"
+    yield stage(view, f"The worst trial of {name} {sized(name, level)}, the plan as a ghost: {told}.")
+    for p in record.perturbations:
+        yield section(f"{p.name} [{p.unit}]", _perturbation(p) + plots(p.name))
+    yield section("Latency of the controller", _latency(record))
+    yield section("What the words mean", table(("", ""), MEANINGS))
+    yield section("Provenance", provenance(fields))
+    yield slider(robustness_data(result)["duration"])
+
+
+def _facts(result: Robustness, record: RobustnessRecord) -> str:
+    loop = record.loop
+    around = f"{loop.controller}, every {loop.period_s:.4g} s for {loop.steps} steps" if loop else ""
+    judged = f"judged by {loop.judged_by}" if loop else ""
+    return f"{result.task.model.name} · {around} · {record.trials} trials a level, seed {record.seed} · {judged}"
+
+
+def _overview(record: RobustnessRecord) -> str:
+    head = ("perturbation", "margin", "of levels", "first failing", "labels", "measured / predicted", "worst trial")
+    rows: list[Row] = []
+    for p in record.perturbations:
+        levels = ", ".join(f"{c.level:g}" for c in p.cells)
+        failing = next((c for c in p.cells if c.successes < c.trials), None)
+        first = "" if failing is None else f"{failing.level:g}: {failing.successes} of {failing.trials}"
+        ratios = [c.ratio for c in p.cells if c.ratio is not None]
+        span = f"{min(ratios):.3g} to {max(ratios):.3g}" if ratios else "not predicted"
+        kind = "fail" if p.margin == 0 else "pass" if p.margin == p.cells[-1].level else "undecided"
+        margin = Mark(kind, f"{p.margin:g} {'' if p.unit == '1' else p.unit}".strip())
+        worst = Link(f"{p.worst}/replay.html", p.worst.removeprefix("worst/"))
+        rows.append((p.name, margin, levels, first, _labels(p.cells), span, worst))
+    return table(head, rows)
+
+
+def _labels(cells: Iterable[CellEvidence]) -> str:
+    counts: dict[str, int] = {}
+    for cell in cells:
+        for label, count in cell.labels.items():
+            counts[label] = counts.get(label, 0) + count
+    return ", ".join(f"{count} {label.removesuffix('_error')}" for label, count in sorted(counts.items()))
+
+
+def _perturbation(p: PerturbationEvidence) -> str:
+    head = (
+        "level", "success", "95 % interval", "labels", "goal error, median", "worst", "displacement", "predicted",
+        "ratio",
+    )  # fmt: skip
+    rows = [
+        (
+            f"{c.level:g}",
+            Mark("pass" if c.rate >= ENOUGH else "fail", f"{c.successes} of {c.trials}"),
+            f"{c.lower_95:.3f} to {c.upper_95:.3f}",
+            _labels([c]),
+            *(_short(v) for v in (c.goal_error_median, c.goal_error_worst, c.displacement, c.predicted)),
+            Mark("pass" if agrees(c.ratio) else "undecided", _short(c.ratio)),
+        )
+        for c in p.cells
+    ]
+    same = p.cells[0].trials > 1 and all(c.distinct == 1 for c in p.cells)
+    drawn = " Nothing is drawn: every trial of a level is the same run." if same else ""
+    return f'<p class="note">{escaped(p.meaning + "." + drawn)}</p>' + table(head, rows)
+
+
+def _short(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3g}"
+
+
+def _latency(record: RobustnessRecord) -> str:
+    loop, clock = record.loop, record.wall_clock
+    if loop is None or clock.controller_steps is None:
+        return ""
+    budget = f"Budget: {1e3 * loop.latency_budget_s:.4g} ms, {loop.latency_budget_is}."
+    measured = (
+        f"Measured on this machine over {clock.controller_steps} answers, in the unperturbed run and the worst trials: "
+        f"median {_ms(clock.latency_median_s)}, 99 % within {_ms(clock.latency_99_percent_s)}, at most "
+        f"{_ms(clock.latency_largest_s)}; {clock.late} later than the budget."
+    )
+    return f'<p>{escaped(budget)}</p><p id="measured-latency">{escaped(measured)}</p>'
+
+
+def _ms(seconds: float | None) -> str:
+    return "–" if seconds is None else f"{1e3 * seconds:.3g} ms"

@@ -1,0 +1,52 @@
+"""One trial of a saved run, as the function that panels call: "drake_diff.trials.panel_trial:evaluate"."""
+
+import atexit
+from collections.abc import Mapping
+from contextlib import ExitStack
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from drake_diff.artifact.verify import recalled
+from drake_diff.exceptions import InputError
+from drake_diff.trials.perturbation import perturbation_named
+from drake_diff.trials.trial import Task, run_trial
+from drake_diff.trials.trial_files import displacement_of, finite
+
+FIELDS = {"run": str, "controller": str, "perturbation": str, "level": (int, float), "seed": int}
+_open = ExitStack()  # rebuilt models last as long as the process
+atexit.register(_open.close)
+
+
+def evaluate(trial: Mapping[str, Any]) -> dict[str, Any]:
+    """Run the plan of the run directory `trial["run"]` once and judge it; the same fields give the same row.
+
+    `trial` has run, controller ("tvlqr", "mpc", "open_loop"), perturbation, level (0: unperturbed) and seed; other
+    fields are
+    left alone, so that a trial.json will do. The row is JSON: success, label (None for a success), goal_error,
+    displacement of the last state (None where it is not finite or the run broke off), failures and ended. The run is
+    rebuilt once per process. Raises InputError, UnknownNameError, and ArtifactError where the run is damaged.
+    """
+    for name, kind in FIELDS.items():
+        value = trial.get(name)
+        if not isinstance(value, kind) or isinstance(value, bool):  # type: ignore[arg-type]
+            raise InputError(f"trial: {name}", got=repr(value), expected=f"one of the fields {', '.join(FIELDS)}")
+    name, level, seed = trial["perturbation"], trial["level"], trial["seed"]
+    perturbation_named(name)
+    if seed < 0:
+        raise InputError("trial: seed", got=seed, expected="a whole number of at least 0")
+    found = run_trial(_task(str(Path(trial["run"]).resolve()), trial["controller"]), {name: level}, seed)
+    outcome = found.outcome
+    return {
+        "success": outcome.success,
+        "label": found.label,
+        "goal_error": finite(outcome.goal_error),
+        "displacement": displacement_of(outcome),
+        "failures": list(outcome.failures),
+        "ended": outcome.run.ended,
+    }
+
+
+@cache
+def _task(run: str, controller: str) -> Task:
+    return Task(_open.enter_context(recalled(run)).plan, controller)

@@ -1,0 +1,144 @@
+"""The fields of robustness.json, and of the trial.json beside each worst trial."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from drake_diff.record.parts import FileEvidence, Label, ModelInput, Part, Provenance
+from drake_diff.record.run_record import canonical, own_sha256
+
+ROBUSTNESS_VERSION = "1.0.0"
+
+
+class RunEvidence(Part):
+    """The run directory whose plan was tried, and the hash of its record."""
+
+    path: str
+    record_sha256: str
+
+
+class CellEvidence(Part):
+    """The trials at one level; null is no finite number. Displacements are root mean squares of the last state's."""
+
+    level: float
+    successes: int
+    trials: int
+    rate: float
+    lower_95: float  # Wilson's interval
+    upper_95: float
+    distinct: int  # how many of the trials end in a state of their own: 1 where nothing is drawn
+    labels: dict[str, int]
+    goal_error_median: float | None
+    goal_error_worst: float | None
+    displacement: float | None
+    predicted: float | None
+    ratio: float | None
+
+
+class PerturbationEvidence(Part):
+    """One perturbation at all its levels; `margin` is the largest level up to which 95 % of the trials succeed."""
+
+    name: str
+    unit: str
+    meaning: str
+    margin: float
+    cells: list[CellEvidence]
+    worst: str  # the directory of its worst trial
+
+
+class EventEvidence(Part):
+    """Something that happened in a loop, at simulated time."""
+
+    t_s: float
+    kind: str
+    message: str
+
+
+class TrialEvidence(Part):
+    """One trial, with all that it takes to run it again: `loop.panel_trial.evaluate` takes it as it is.
+
+    `run` is null where the plan was not read from a run directory: the trial can be run again with it at hand alone.
+    """
+
+    run: str | None
+    controller: str
+    perturbation: str
+    level: float
+    seed: int
+    success: bool
+    label: Label | None
+    reason: str
+    failures: list[str]
+    goal_error: float | None
+    displacement: float | None
+    ended: str
+    plant_time_step_s: float
+    controller_period_s: float
+    parameters: dict[str, float | list[float]]  # of the plant, where another than the model's
+    start: list[float]
+    events: list[EventEvidence]
+
+
+class Nominal(Part):
+    """The unperturbed run."""
+
+    success: bool
+    failures: list[str]
+    goal_error: float | None
+    ended: str
+
+
+class LoopEvidence(Part):
+    """What is around the controller in every trial; numbers are for all coordinates, or one each."""
+
+    controller: str
+    period_s: float
+    steps: int
+    judged_by: str
+    sensor: dict[str, float | list[float | None] | None]
+    estimator: str
+    actuator: dict[str, float | list[float | None] | None]
+    fallback: str | None
+    latency_budget_s: float
+    latency_budget_is: Literal["stated", "the controller's period"]
+
+
+class Times(Part):
+    """What differs from run to run. Latencies are of the unperturbed run and the worst trials."""
+
+    written: str
+    latency_median_s: float | None = None
+    latency_99_percent_s: float | None = None
+    latency_largest_s: float | None = None
+    late: int | None = None
+    controller_steps: int | None = None
+
+
+class RobustnessRecord(Part):
+    """A plan under perturbations. Incomplete until everything is written."""
+
+    schema_version: str = ROBUSTNESS_VERSION
+    name: str
+    verdict: Literal["pass", "fail", "incomplete"]
+    sentence: str
+    run: RunEvidence | None
+    model: ModelInput
+    state_names: list[str]
+    input_names: list[str]
+    trials: int | None
+    seed: int | None
+    loop: LoopEvidence | None
+    nominal: Nominal | None
+    perturbations: list[PerturbationEvidence]
+    files: list[FileEvidence]
+    provenance: Provenance
+    wall_clock: Times
+    record_sha256: str = Field(default="")
+
+    def to_json(self) -> str:
+        """The record as canonical JSON: the same record gives the same bytes."""
+        return canonical(self.model_dump(mode="json"))
+
+    def sealed(self) -> "RobustnessRecord":
+        """This record with its own hash."""
+        return self.model_copy(update={"record_sha256": own_sha256(self.model_dump(mode="json"))})

@@ -1,0 +1,165 @@
+"""One run of a plan under perturbations: does it arrive, and if not, whose fault is it.
+
+The label of a failure is found by running the trial again with one thing put right at a time, in this order:
+
+    planning_error    unperturbed, it fails too
+    perception_error  with a perfect sensor it succeeds
+    control_error     with a perfect actuator it succeeds, or the controller itself failed
+    state_error       with the plant and the start as planned, and no pushes, it succeeds
+    control_error     no single thing helps: the controller is not up to all of them together
+    evaluation_error  what came out cannot be judged
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import ModelError, UnknownNameError
+from drake_diff.loop.mpc import MPC
+from drake_diff.loop.parts import Actuator, Hold, Sensor
+from drake_diff.loop.run import ClosedLoop, Controller, Loop, OpenLoop, closed_loop
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import applied, select
+from drake_diff.model.tangent import tangent_space
+from drake_diff.optimize.replay import FINEST, Plan, left_bounds, missed_goal, too_deep, track
+from drake_diff.trials.perturbation import Setup, perturbed
+
+Label = Literal["perception_error", "state_error", "planning_error", "control_error", "evaluation_error"]
+CONTROLLERS = ("tvlqr", "mpc", "open_loop")
+MPC_HORIZON = 20  # steps
+MakeController = Callable[[Plan, Model, Array, Array], Controller]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What came of one run. `failures` is empty where it succeeded."""
+
+    run: ClosedLoop
+    failures: tuple[str, ...]
+    goal_error: float  # the largest distance from the goal, or from the plan's end where there is none
+    displacement: Array  # (nt,) of the last state from the unperturbed run's
+    judged: bool
+
+    @property
+    def success(self) -> bool:
+        return not self.failures
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One run under `levels` with its `seed`; `label` says whose fault a failure is, None for a success."""
+
+    levels: Mapping[str, float]
+    seed: int
+    outcome: Outcome
+    label: Label | None
+    reason: str
+
+
+class Task:
+    """A plan to be followed: its controller, made on the plant as planned, and how a run of it is judged.
+
+    `controller` is "tvlqr", "mpc" (of 20 steps), "open_loop", or a function of (plan, model, xs (N+1, nx), us (N, nu))
+    that makes one. The controller's period is the longest of the plan's interval and its halves, quarters ... 16ths in
+    which the unperturbed run succeeds; the interval itself where it does in none, and of MPC, which plans in it.
+    """
+
+    def __init__(self, plan: Plan, controller: str | MakeController = "tvlqr", loop: Loop | None = None):
+        if isinstance(controller, str) and controller not in CONTROLLERS:
+            raise UnknownNameError("controller", got=controller, known=CONTROLLERS)
+        self.plan, self.controller, self.loop = plan, controller, loop or Loop()
+        self.judged_by = "the plan's end" if np.all(np.isnan(plan.problem.goal)) else "the goal"
+        self._use(1)
+        parts = 1
+        while not self.nominal.success and plan.continuous and controller != "mpc" and parts < FINEST:
+            parts *= 2
+            self._use(parts)
+        if not self.nominal.success:
+            self._use(1)
+
+    def _use(self, parts: int) -> None:
+        self.parts, self.model = parts, self.plan.model_at(parts)
+        self.xs, self.us = self.plan.sample(parts)
+        self.__dict__.pop("nominal", None)
+        self.__dict__.pop("setup", None)
+        with applied(select(self.model, self.plan.vector.to_dict())) as model:
+            self.policy = self._controller(model)
+
+    def _controller(self, model: Model) -> Controller:
+        if callable(self.controller):
+            return self.controller(self.plan, model, self.xs, self.us)
+        if self.controller == "tvlqr" and model.nu:
+            return track(self.plan, model, self.xs, self.us)
+        if self.controller == "mpc" and model.nu:
+            return MPC(self.plan.problem, horizon=MPC_HORIZON, plan=(self.xs, self.us))
+        return OpenLoop(self.us, model.time_step)
+
+    @cached_property
+    def setup(self) -> Setup:
+        """As planned, but for the loop. The plant is another one than the controller's, where it can be built again."""
+        model = self.model.at_time_step(self.model.time_step) if self.model.can_rebuild else self.model
+        return Setup(model, self.xs[0], self.loop, self.model.time_step * len(self.us), self.plan.vector.to_dict())
+
+    @cached_property
+    def nominal(self) -> Outcome:
+        """The unperturbed run."""
+        return self.run(self.setup, 0)
+
+    def run(self, setup: Setup, seed: int) -> Outcome:
+        """One run of `setup`, judged."""
+        with applied(select(setup.model, setup.parameters)) as model:
+            found = closed_loop(model, self.policy, setup.x0, len(self.us), setup.loop, seed=seed)
+            depth = tuple(too_deep(model, found.motion)) if not found.ended else ()
+        last = found.motion.xs[-1]
+        goal = self.plan.problem.goal_error(last) if self.judged_by == "the goal" else last - self.xs[-1]
+        failures = (
+            (found.ended,) if found.ended else (*missed_goal(self.plan, goal), *left_bounds(self.plan, found.motion))
+        )
+        nominal = self.__dict__.get("nominal")
+        reference = self.xs[-1] if nominal is None else nominal.run.motion.xs[-1]
+        return Outcome(
+            run=found,
+            failures=(*failures, *depth),
+            goal_error=float(np.max(np.abs(goal))),
+            displacement=tangent_space(self.model).minus(last, reference),
+            judged=bool(np.all(np.isfinite(goal))),
+        )
+
+
+def run_trial(task: Task, levels: Mapping[str, float], seed: int) -> Trial:
+    """One run of `task` under `levels` of perturbations by name, and where it fails, why."""
+    setup = perturbed(task.setup, levels, seed)
+    outcome = task.run(setup, seed)
+    if not outcome.judged:
+        return Trial(levels, seed, outcome, "evaluation_error", "the last state is not finite")
+    if outcome.success:
+        return Trial(levels, seed, outcome, None, "")
+    label, why = _label(task, setup, seed, outcome)
+    return Trial(levels, seed, outcome, label, f"{outcome.failures[0]}; {why}")
+
+
+def _label(task: Task, setup: Setup, seed: int, outcome: Outcome) -> tuple[Label, str]:
+    if "the controller failed" in outcome.run.ended:
+        return "control_error", "the controller itself failed"
+    if not task.nominal.success:
+        return "planning_error", f"unperturbed it fails too: {task.nominal.failures[0]}"
+    loop, planned = setup.loop, task.setup
+    seeing = replace(setup, loop=replace(loop, sensor=Sensor(), estimator=Hold()))
+    acting = replace(setup, loop=replace(loop, actuator=Actuator()))
+    around = replace(planned, loop=replace(loop, substeps=planned.loop.substeps, pushes=task.loop.pushes))
+    fixes: tuple[tuple[Label, str, Setup], ...] = (
+        ("perception_error", "with a perfect sensor it succeeds", seeing),
+        ("control_error", "with a perfect actuator it succeeds", acting),
+        ("state_error", "with plant and start as planned it succeeds", around),
+    )
+    for label, why, fixed in fixes:
+        try:
+            if task.run(fixed, seed).success:
+                return label, why
+        except ModelError as error:
+            return "evaluation_error", f"it cannot be run again: {error}"
+    return "control_error", "neither a perfect sensor nor actuator nor plant helps alone"

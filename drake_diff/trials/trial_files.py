@@ -1,0 +1,142 @@
+"""All that a loop saw and did in one trial, as trace.mcap.
+
+One trial on disk: what it was, a trace of all that the loop saw and did, a replay beside the plan, its latencies.
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.files import write_whole
+from drake_diff.logs.channels import Shown, input_channel, motion_channels, nanoseconds, state_channel
+from drake_diff.logs.messages import TYPES
+from drake_diff.logs.write import Channel, write_mcap
+from drake_diff.loop.run import OK
+from drake_diff.model.parameters import applied, select
+from drake_diff.record.run_record import canonical
+from drake_diff.trials.perturbation import Setup, perturbed
+from drake_diff.trials.record import EventEvidence, TrialEvidence
+from drake_diff.trials.trial import Outcome, Task, Trial
+
+
+def write_trial_trace(path: Path, shown: Shown, trial: Trial) -> None:
+    """Write the trace of `trial`, whose motion and plan are `shown`. Latencies differ each time and are apart."""
+    metadata = {
+        "model": shown.model.name,
+        "time_axis": "simulated",
+        "perturbation": json.dumps(dict(trial.levels), sort_keys=True),
+        "label": trial.label or "success",
+    }
+    write_mcap(path, list(_channels(shown, trial)), metadata, {})
+
+
+def _channels(shown: Shown, trial: Trial) -> Iterator[Channel]:
+    """The true motion and the plan, then what the loop saw, took it for, commanded and applied, and what happened."""
+    yield from motion_channels(shown)
+    yield state_channel(shown, "/planned/state", shown.planned_xs)
+    run = trial.outcome.run
+    seen = ~np.isnan(run.observations).any(axis=1)
+    yield state_channel(shown, "/observation", run.observations[seen], run.times[seen])
+    yield state_channel(shown, "/estimate", run.estimates, run.times)
+    yield input_channel(shown, "/command", run.times, run.commands)
+    yield input_channel(shown, "/applied", run.times, run.applied)
+    kind = TYPES["Event"]
+    statuses = [
+        kind.cls(time=t, kind="controller", code=OK if status == OK else "other", message=status)
+        for t, status in zip(run.times.tolist(), run.controller_status, strict=True)
+    ]
+    yield _events("/controller/status", statuses)
+    events = [kind.cls(time=e.t, kind=e.kind, message=e.message) for e in run.events]
+    end = shown.time_step * (len(shown.xs) - 1)
+    if trial.label is not None:
+        last = kind.cls(time=end, kind="failure", failure_label=trial.label, code=trial.label, message=trial.reason)
+        events.append(last)
+    yield _events("/events", events)
+
+
+def _events(topic: str, events: Sequence[Any]) -> Channel:
+    kind = TYPES["Event"]
+    ordered = sorted(((nanoseconds(e.time), e) for e in events), key=lambda row: row[0])
+    return Channel(topic, kind.cls, ordered, {"units": kind.units})
+
+
+TRIAL, TRACE, REPLAY, LATENCIES = "trial.json", "trace.mcap", "replay.html", "latencies.json"
+FURTHEST = 1e6  # m and rad: what runs away further is drawn there; the trace has it as it was
+FILES = (TRIAL, TRACE, REPLAY, LATENCIES)
+
+
+def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None:
+    """Write all FILES of `trial` into `folder`; `run` is the directory that its plan is from, None where there is none.
+
+    All but the latencies are the same, byte for byte, for the same trial.
+    """
+    from drake_diff.logs.channels import Shown
+    from drake_diff.pages.meshcat import write_replay
+    from drake_diff.pages.scene import BLUE, scene_of
+
+    folder.mkdir(parents=True, exist_ok=True)
+    evidence = trial_evidence(task, trial, run)
+    write_whole(folder / TRIAL, canonical(evidence.model_dump(mode="json")).encode())
+    latencies = {"budget_s": trial.outcome.run.latency_budget, "latencies_s": trial.outcome.run.latencies.tolist()}
+    write_whole(folder / LATENCIES, canonical(latencies).encode())
+    setup, motion = perturbed(task.setup, trial.levels, trial.seed), trial.outcome.run.motion
+    planned = planned_states(task, setup)
+    with applied(select(setup.model, setup.parameters)) as model:
+        write_trial_trace(folder / TRACE, Shown(model, model.time_step, planned, motion), trial)
+        xs, ghost = (np.clip(states, -FURTHEST, FURTHEST) for states in (motion.xs, planned))
+        xs = xs if len(xs) > 1 else np.repeat(xs, 2, axis=0)  # it broke off at once
+        times = np.asarray(model.time_step * np.arange(len(xs)), dtype=float)
+        contacts = motion.contacts if len(motion.contacts) == len(xs) - 1 else ()
+        scene = scene_of(model, times, xs, contacts=contacts, ghosts={"plan": (ghost[: len(xs)], BLUE)})
+        far = f", drawn up to {FURTHEST:g} only" if np.any(np.abs(motion.xs) > FURTHEST) else ""
+        title = f"{evidence.perturbation} {evidence.level:g}: {trial.label or 'success'}{far}"
+        write_replay(folder / REPLAY, scene, title=title)
+
+
+def planned_states(task: Task, setup: Setup) -> Array:
+    """(n+1, nx) of the plan at each step of the plant of `setup`."""
+    finer = round(task.model.time_step / setup.model.time_step)
+    return np.asarray(task.plan.sample(task.parts * finer)[0])
+
+
+def trial_evidence(task: Task, trial: Trial, run: str | None) -> TrialEvidence:
+    """What trial.json says."""
+    outcome, ((name, level), *_) = trial.outcome, trial.levels.items()
+    setup = perturbed(task.setup, trial.levels, trial.seed)
+    return TrialEvidence(
+        run=run,
+        controller=controller_name(task),
+        perturbation=name,
+        level=level,
+        seed=trial.seed,
+        success=outcome.success,
+        label=trial.label,
+        reason=trial.reason,
+        failures=list(outcome.failures),
+        goal_error=finite(outcome.goal_error),
+        displacement=displacement_of(outcome),
+        ended=outcome.run.ended,
+        plant_time_step_s=setup.model.time_step,
+        controller_period_s=setup.loop.substeps * setup.model.time_step,
+        parameters={key: np.asarray(value).tolist() for key, value in setup.parameters.items()},
+        start=setup.x0.tolist(),
+        events=[EventEvidence(t_s=e.t, kind=e.kind, message=e.message) for e in outcome.run.events],
+    )
+
+
+def controller_name(task: Task) -> str:
+    """What `Task` takes, or that it is none of ours."""
+    return task.controller if isinstance(task.controller, str) else "a user's function"
+
+
+def displacement_of(outcome: Outcome) -> float | None:
+    """The length of the last state's displacement; None where the run broke off or it is not finite."""
+    return None if outcome.run.ended else finite(float(np.linalg.norm(outcome.displacement)))
+
+
+def finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
