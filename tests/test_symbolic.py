@@ -14,6 +14,7 @@ from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoD
 from pydrake.multibody.tree import QuaternionFloatingJoint
 
 import drake_diff as dd
+from drake_diff._base.refusal import Refusal
 from drake_diff.mechanics import casadi_tree as symbolic_tree
 from drake_diff.mechanics.casadi_tree import PlantFunctions, symbolic_plant
 from drake_diff.model.equations import EquationsOfMotion
@@ -169,13 +170,13 @@ def test_a_plants_expression_that_leaves_something_out_is_refused(monkeypatch, l
     assert np.abs(getattr(tree, left_out)).max() > 0
     without = dataclasses.replace(tree, **{left_out: 0.9 * getattr(tree, left_out)})
     monkeypatch.setattr(symbolic_tree, "tree_for", lambda model: without)
-    assert symbolic_plant(model) == "its symbolic form differs from Drake's plant"
+    assert symbolic_plant(model) == Refusal("its symbolic form differs from Drake's plant")
 
 
 def test_a_model_that_is_no_tree_of_hinges_and_slides_has_none():
     why = symbolic_plant(floating(QuaternionFloatingJoint, 0))
-    assert isinstance(why, str)
-    assert "quaternion_floating" in why
+    assert isinstance(why, Refusal)
+    assert "quaternion_floating" in why.reason
 
 
 def test_the_context_is_left_as_it_was():

@@ -124,7 +124,7 @@ def without_gravity():
 )
 def test_what_is_no_such_tree_is_told_and_taken_by_autodiff(make, words):
     model = make()
-    assert words in tree_of(model)
+    assert words in tree_of(model).reason
     assert form_of(model).tree is None
     x = model.default_state + 0.01
     if model.nq != model.nv:

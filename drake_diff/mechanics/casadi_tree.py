@@ -13,12 +13,12 @@ What is not in the tree shows in the comparison with Drake.
 
 from dataclasses import dataclass, replace
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, skew
+from drake_diff._base.refusal import Refusal
 from drake_diff.mechanics.tree import TreeDynamics, tree_for, tree_of
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.model import Model
@@ -41,26 +41,21 @@ class PlantFunctions:
     hessian: Any
 
 
-def symbolic_plant(model: Model) -> PlantFunctions | str:
+def symbolic_plant(model: Model) -> PlantFunctions | Refusal:
     """The equations of motion as SX functions, or why there are none; compared with Drake's plant at two states.
 
     Made once, for the model's own parameters: what is made while it has others is not kept.
     """
     if model.has_other_parameters:
         return _compared(model)
-    if model not in _KNOWN:
-        _KNOWN[model] = _compared(model)
-    return _KNOWN[model]
+    return model.cache("symbolic plant", lambda: _compared(model))
 
 
-_KNOWN: WeakKeyDictionary[Model, PlantFunctions | str] = WeakKeyDictionary()
-
-
-def _compared(model: Model) -> PlantFunctions | str:
+def _compared(model: Model) -> PlantFunctions | Refusal:
     tree = tree_for(model)
     if tree is None:
         found = tree_of(model)
-        return found if isinstance(found, str) else "its tree differs from Drake's inverse dynamics"
+        return found if isinstance(found, Refusal) else Refusal("its tree differs from Drake's inverse dynamics")
     equations, random = EquationsOfMotion(model), np.random.default_rng(1)
     here = model.plant.GetPositionsAndVelocities(model.double.context)
     functions = _functions(tree, model, ca.DM(equations.actuation))
@@ -68,7 +63,7 @@ def _compared(model: Model) -> PlantFunctions | str:
     wanted = np.array([equations(row[: model.nx], row[model.nx :]) for row in probe])
     set_state(model.double, here)
     same = agrees(functions.function, probe, wanted, SAME_PLANT)
-    return functions if same else "its symbolic form differs from Drake's plant"
+    return functions if same else Refusal("its symbolic form differs from Drake's plant")
 
 
 def _functions(tree: TreeDynamics, model: Model, actuation: Any) -> PlantFunctions:

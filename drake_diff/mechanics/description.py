@@ -11,6 +11,7 @@ from pydrake.geometry import Role
 from pydrake.math import RigidTransform
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.joints import JointContract, PairContract
@@ -109,7 +110,7 @@ def describe_tree(model: Model) -> Description:
     plant = model.plant
     _check(model)
     springs = springs_of(plant)
-    if isinstance(springs, str):
+    if isinstance(springs, Refusal):
         raise ModelError(f"no other engine is given this model: {springs}")
     body_names = {body.index(): label for label, body in labelled(bodies(plant)).items()}
     body_names[plant.world_body().index()] = "world"

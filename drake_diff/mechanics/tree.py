@@ -32,6 +32,7 @@ from pydrake.multibody.tree import (
 
 from drake_diff._base.arrays import Array, cross, skew
 from drake_diff._base.autodiff import gradient_rows
+from drake_diff._base.refusal import Refusal
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators, instances, joints
 from drake_diff.model.step import set_state
@@ -160,17 +161,17 @@ def _cross_of_force(force: Array) -> Array:
     return matrix
 
 
-def tree_of(model: Model) -> TreeDynamics | str:
+def tree_of(model: Model) -> TreeDynamics | Refusal:
     """The tree of a model, or what in the model is none."""
     plant = model.plant
     if model.forces:
-        return "forces are added to Drake's"
+        return Refusal("forces are added to Drake's")
     moving = sorted((j for j in joints(plant) if j.num_velocities()), key=lambda j: j.velocity_start())
     for joint in moving:
         if joint.type_name() not in ("revolute", "prismatic"):
-            return f"{joint.name()} is of type {joint.type_name()}"
+            return Refusal(f"joint {joint.name()} is of type {joint.type_name()}")
     springs = springs_of(plant)
-    if isinstance(springs, str):
+    if isinstance(springs, Refusal):
         return springs
     carriers = {j.child_body().index(): j for j in joints(plant)}
     number = {j.index(): k for k, j in enumerate(moving)}
@@ -213,17 +214,17 @@ def _axis(joint: Any) -> Array:
     return np.asarray(joint.revolute_axis() if joint.type_name() == "revolute" else joint.translation_axis())
 
 
-def springs_of(plant: Any) -> dict[Any, tuple[float, float]] | str:
+def springs_of(plant: Any) -> dict[Any, tuple[float, float]] | Refusal:
     """Stiffness and rest position by joint, or which force element is none of gravity and these springs."""
     found: dict[Any, tuple[float, float]] = {}
     for i in range(plant.num_force_elements()):
         element = plant.get_force_element(ForceElementIndex(i))
         if isinstance(element, UniformGravityFieldElement):
             if not all(element.is_enabled(model_instance=k) for k in instances(plant)):
-                return "gravity is off for a part of the model"
+                return Refusal("gravity is off for a part of the model")
             continue
         if not isinstance(element, (RevoluteSpring, PrismaticSpring)) or element.joint().index() in found:
-            return f"force element {i} is of type {type(element).__name__}, or the second of its joint"
+            return Refusal(f"force element {i} is of type {type(element).__name__}, or the second of its joint")
         hinge = isinstance(element, RevoluteSpring)
         found[element.joint().index()] = (
             (element.default_stiffness(), element.default_nominal_angle())
@@ -276,7 +277,7 @@ def tree_for(model: Model) -> TreeDynamics | None:
 def _checked_tree(model: Model) -> TreeDynamics | None:
     """The model's tree, where it has one that gives at two states what AutoDiffXd through Drake gives."""
     tree = tree_of(model)
-    if isinstance(tree, str):
+    if isinstance(tree, Refusal):
         return None
     random, here = np.random.default_rng(0), model.plant.GetPositionsAndVelocities(model.double.context)
     states = random.standard_normal((2, model.nx))

@@ -20,6 +20,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.refusal import Refusal
 from drake_diff.mechanics.casadi_tree import PlantFunctions, agrees, symbolic_plant
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import differentiate_final_cost
@@ -360,6 +361,7 @@ def _dynamics(dynamics: Dynamics) -> KnotFunction:
     found: Any = "an object with derivatives of its own"
     if isinstance(form, PlantKnots):
         found = symbolic_plant(form.model)
+        found = found.reason if isinstance(found, Refusal) else found
     elif isinstance(form, Pointwise):
         found = trace(form.f, dynamics.nx, probe, form.values(probe))
     if isinstance(found, PlantFunctions):
