@@ -171,7 +171,7 @@ def test_a_missing_adam_is_named_with_its_extra(module):
     code = f"""import sys; sys.modules[{module!r}] = None
 import drake_diff as dd
 try: dd.engines.load_engine("casadi", None)
-except MissingDependencyError as error: print(error)"""
+except dd.exceptions.MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "pip install 'drake-diff[engines]'" in done.stdout
     assert module in done.stdout

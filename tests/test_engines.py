@@ -453,7 +453,7 @@ def test_a_missing_engine_is_named_with_its_extra(name, module):
     code = f"""import sys; sys.modules[{module!r}] = None
 import drake_diff as dd
 try: dd.engines.load_engine({name!r}, None)
-except MissingDependencyError as error: print(error)"""
+except dd.exceptions.MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "pip install 'drake-diff[engines]'" in done.stdout
 

@@ -278,6 +278,6 @@ dd.engines.load_engine('newton', model).step([0, 0], [0])"""
     code = """import sys; sys.modules['newton'] = None
 import drake_diff as dd
 try: dd.engines.load_engine('newton', None)
-except MissingDependencyError as error: print(error)"""
+except dd.exceptions.MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "pip install 'drake-diff[forward]'" in done.stdout

@@ -245,6 +245,6 @@ engine.step([0, 0], [0])  # and it lives to the end"""
     code = """import sys; sys.modules['pybullet'] = None
 import drake_diff as dd
 try: dd.engines.load_engine('pybullet', None)
-except MissingDependencyError as error: print(error)"""
+except dd.exceptions.MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "pip install 'drake-diff[forward]'" in done.stdout

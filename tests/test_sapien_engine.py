@@ -299,6 +299,6 @@ if not physx.get_scene_config().enable_tgs or physx.get_body_config().sleep_thre
     code = """import sys; sys.modules['sapien'] = None
 import drake_diff as dd
 try: dd.engines.load_engine('sapien', None)
-except MissingDependencyError as error: print(error)"""
+except dd.exceptions.MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "pip install 'drake-diff[forward]'" in done.stdout

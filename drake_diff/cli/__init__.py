@@ -1,1 +1,1 @@
-"""cli."""
+"""The command `drake-diff`: one module for each group of commands."""

@@ -1,1 +1,1 @@
-"""mechanics."""
+"""The same tree of bodies written out without Drake: in NumPy, Pinocchio and CasADi."""

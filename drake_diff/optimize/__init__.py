@@ -1,5 +1,5 @@
-"""optimize."""
+"""From a problem to a solution: collocation, shooting and iLQR, each solution measured again."""
 
-import lazy_loader as _lazy
+from drake_diff._base.lazy import attach_stub as _attach_stub
 
-__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = _attach_stub(__name__, __file__)

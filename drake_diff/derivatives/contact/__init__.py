@@ -1,1 +1,1 @@
-"""contact."""
+"""The step's own contact equation, differentiated."""

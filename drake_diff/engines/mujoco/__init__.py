@@ -1,1 +1,1 @@
-"""mujoco."""
+"""MuJoCo and MJX."""

@@ -1,1 +1,1 @@
-"""ilqr."""
+"""Iterative LQR with constraints, through contact too."""

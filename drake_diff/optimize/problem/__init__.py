@@ -1,1 +1,1 @@
-"""problem."""
+"""What is asked for: costs, constraints, bounds, dynamics."""

@@ -1,1 +1,1 @@
-"""transcription."""
+"""Collocation: a problem on a mesh of knots as a nonlinear program, solved by IPOPT or SNOPT."""

@@ -1,0 +1,20 @@
+"""Names that load their module when they are first used, one thread at a time."""
+
+from collections.abc import Callable
+from threading import RLock
+from typing import Any
+
+import lazy_loader
+
+ONE_AT_A_TIME = RLock()  # NumPy and pydrake import in circles, which fails where two threads enter one at once
+
+
+def attach_stub(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """`__getattr__`, `__dir__` and `__all__` of `package`: the names that the stub beside `file` imports."""
+    load, names, everything = lazy_loader.attach_stub(package, file)
+
+    def __getattr__(name: str) -> Any:
+        with ONE_AT_A_TIME:
+            return load(name)
+
+    return __getattr__, names, everything
