@@ -13,8 +13,8 @@ def attach_stub(package: str, file: str) -> tuple[Callable[[str], Any], Callable
     """`__getattr__`, `__dir__` and `__all__` of `package`: the names that the stub beside `file` imports."""
     load, names, everything = lazy_loader.attach_stub(package, file)
 
-    def __getattr__(name: str) -> Any:
+    def load_alone(name: str) -> Any:
         with ONE_AT_A_TIME:
             return load(name)
 
-    return __getattr__, names, everything
+    return load_alone, names, everything
