@@ -49,7 +49,7 @@ def loss_and_gradient(
     """The mean over rollouts from `starts` (m, 4) of the loss, and its gradient by the parameters (97,)."""
     policy = dd.motion.ParametricPolicy(network, parameters)
     found = [dd.differentiate_rollout(model, x0, None, loss, policy=policy, num_steps=num_steps) for x0 in starts]
-    return float(np.mean([g.loss for g in found])), np.mean([g.policy for g in found], axis=0)
+    return float(np.mean([g.loss for g in found])), np.mean([g.by_policy for g in found], axis=0)
 
 
 def train(model: dd.Model, parameters: np.ndarray, starts: np.ndarray) -> np.ndarray:

@@ -64,7 +64,7 @@ def main() -> None:
         difference = (loss(ends[0]) - loss(ends[1])) / 2e-4
         print(
             f"  {vx:.1f} {end[0]:12.6f} {gradient.xs[-1][X]:13.6f}"
-            f" {by_hand:19.12f} {gradient.x0[VX]:19.12f} {difference:19.12f}"
+            f" {by_hand:19.12f} {gradient.by_x0[VX]:19.12f} {difference:19.12f}"
         )
     print(dd.certify_rollout(model, launch(1.0), None, loss, num_steps=NUM_STEPS))
     vx = 1.0

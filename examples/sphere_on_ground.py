@@ -68,7 +68,7 @@ def main() -> None:
         restitution = (xs[-1, VZ] + GRAVITY * (0.5 - fall / GRAVITY)) / fall
         rigid = (1 + restitution) * GRAVITY / fall
         print(
-            f"  h = {time_step:8.6f} s  discrete {gradient.x0[Z]:10.4f}  rigid {rigid:8.4f}  "
+            f"  h = {time_step:8.6f} s  discrete {gradient.by_x0[Z]:10.4f}  rigid {rigid:8.4f}  "
             f"largest |dloss/dx_k| {gradient.state_gradient_norms.max():9.3g}"
         )
 

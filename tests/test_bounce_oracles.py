@@ -79,9 +79,9 @@ def test_a_resolved_collision_has_the_compliant_gradient(k, force, x2):
     us = np.full((round(T / h), 1), force)
     found = dd.differentiate_rollout(balls(h, k), z, us, lambda x: x[1])
     assert found.loss == pytest.approx(compliant_end(z, force, k), abs=0.01)
-    assert found.x0 == pytest.approx(gradient(lambda z: compliant_end(z, force, k), z), abs=0.05)
+    assert found.by_x0 == pytest.approx(gradient(lambda z: compliant_end(z, force, k), z), abs=0.05)
     by_force = (compliant_end(z, force + 1e-6, k) - compliant_end(z, force - 1e-6, k)) / 2e-6
-    assert found.us.sum() == pytest.approx(by_force, abs=0.02)
+    assert found.by_us.sum() == pytest.approx(by_force, abs=0.02)
 
 
 def test_the_same_collision_in_steps_that_do_not_resolve_it_has_another():
@@ -90,7 +90,7 @@ def test_the_same_collision_in_steps_that_do_not_resolve_it_has_another():
     us = np.full((100, 1), FORCE)
     found = dd.differentiate_rollout(balls(h, k), START, us, lambda x: x[1])
     exact = gradient(lambda z: compliant_end(z, FORCE, k), START)
-    assert np.abs(found.x0 - exact).max() > 0.2
+    assert np.abs(found.by_x0 - exact).max() > 0.2
 
 
 EPSILON = 0.01

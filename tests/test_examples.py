@@ -39,7 +39,7 @@ def test_the_projectiles_three_gradients_agree(vx):
     loss, hand_built, end = module.hand_built(vx)
     gradient = dd.differentiate_rollout(model, module.launch(vx), None, module.loss, num_steps=module.NUM_STEPS)
     assert hand_built == pytest.approx(by_hand, rel=1e-12, abs=1e-12)
-    assert gradient.x0[module.VX] == pytest.approx(by_hand, rel=1e-12, abs=1e-12)
+    assert gradient.by_x0[module.VX] == pytest.approx(by_hand, rel=1e-12, abs=1e-12)
     assert gradient.loss == pytest.approx(loss, rel=1e-12, abs=1e-12)
     assert gradient.xs[-1][[module.X, module.X + 2]] == pytest.approx(end, abs=1e-10)
     certificate = dd.certify_rollout(model, module.launch(vx), None, module.loss, num_steps=module.NUM_STEPS)

@@ -60,10 +60,10 @@ def test_the_optimal_costs_gradient_by_the_initial_state_is_twice_p0_x0(case):
         return sum(x @ Q @ x + R * u @ u for x, u in zip(xs, us, strict=False)) + xs[-1] @ Qf @ xs[-1]
 
     gradient = dd.differentiate_rollout(problem.model, problem.x0, us, loss)
-    assert gradient.x0 == pytest.approx(2 * riccati(*case)[0] @ [1, 0], rel=1e-10)
-    assert np.abs(gradient.us).max() < 1e-10
+    assert gradient.by_x0 == pytest.approx(2 * riccati(*case)[0] @ [1, 0], rel=1e-10)
+    assert np.abs(gradient.by_us).max() < 1e-10
     if case is A30:
-        assert gradient.x0 == pytest.approx([25.89696256, 5.23643035], abs=5e-9)
+        assert gradient.by_x0 == pytest.approx([25.89696256, 5.23643035], abs=5e-9)
 
 
 def pendulum_gradient(us):
@@ -353,7 +353,7 @@ def test_a_floating_bodys_optimum_has_no_slope(target):
     def loss(xs, us):
         return 0.05 * sum(running(x, u) for x, u in zip(xs, us, strict=False)) + problem.final_cost(xs[-1])
 
-    assert np.abs(dd.differentiate_rollout(model, x0, solution.us, loss).us).max() < 1e-7
+    assert np.abs(dd.differentiate_rollout(model, x0, solution.us, loss).by_us).max() < 1e-7
 
 
 def test_a_guess_with_the_other_sign_of_a_quaternion_is_the_same_guess():

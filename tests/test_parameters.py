@@ -182,8 +182,8 @@ def test_a_pushed_block_by_its_mass(write_urdf, mass, h, u, count):
     us, by_mass = np.full((count, 1), u), -u / mass**2
     x = dd.differentiate_rollout(model, [0.4, -0.2], us, lambda x: x[0], parameters=("block.mass",))
     v = dd.differentiate_rollout(model, [0.4, -0.2], us, lambda x: x[1], parameters=("block.mass",))
-    assert x.parameters == pytest.approx([h**2 * count * (count + 1) / 2 * by_mass], rel=SMOOTH)
-    assert v.parameters == pytest.approx([count * h * by_mass], rel=SMOOTH)
+    assert x.by_parameters == pytest.approx([h**2 * count * (count + 1) / 2 * by_mass], rel=SMOOTH)
+    assert v.by_parameters == pytest.approx([count * h * by_mass], rel=SMOOTH)
     assert x.parameter_sources == ("autodiff",)
 
 
@@ -315,7 +315,7 @@ def test_a_chain_of_steps_by_a_spring_is_the_derivative_of_a_power(load):
     for i in range(2):
         g = dd.differentiate_rollout(model, start, np.zeros((count, 1)), lambda x, i=i: x[i], parameters=names)
         by_stiffness = (total @ (start - [rest, 0]))[i]
-        assert g.parameters == pytest.approx([by_stiffness, (np.eye(2) - power(A, count))[i, 0]], rel=1e-9)
+        assert g.by_parameters == pytest.approx([by_stiffness, (np.eye(2) - power(A, count))[i, 0]], rel=1e-9)
 
 
 def rotation(q):
@@ -431,8 +431,8 @@ def test_a_projectile_by_gravity_and_the_time_step(load, h, count):
         )
         by_gravity = h**2 * count * (count + 1) / 2 * np.eye(3)[axis]
         by_step = v0 * count - (axis == 2) * G * h * count * (count + 1)
-        assert g.parameters[:3] == pytest.approx(by_gravity, rel=1e-9, abs=1e-12)
-        assert g.parameters[3] == pytest.approx(by_step, rel=1e-7)  # differences
+        assert g.by_parameters[:3] == pytest.approx(by_gravity, rel=1e-9, abs=1e-12)
+        assert g.by_parameters[3] == pytest.approx(by_step, rel=1e-7)  # differences
         assert g.parameter_sources == ("chain_rule",) * 3 + ("finite_difference",)
 
 
@@ -502,7 +502,7 @@ def test_static_penetration_by_stiffness_and_mass(approximation, ours, ground):
     g = dd.differentiate_rollout(model, rest, None, lambda x: 0.1 - x[0], num_steps=300, parameters=names)
     by_k = -m * G / k**2 * (ground / (ours + ground)) ** 2
     assert g.loss == pytest.approx(m * G / k, abs=1e-8)
-    assert g.parameters == pytest.approx([by_k, G / k, -1], rel=1e-5)  # 300 contact steps
+    assert g.by_parameters == pytest.approx([by_k, G / k, -1], rel=1e-5)  # 300 contact steps
 
 
 @pytest.mark.parametrize("approximation", ["lagged", "similar"])
@@ -578,7 +578,7 @@ def test_a_sphere_down_an_incline_by_friction(degrees, mu, h, count):
             model, x0, None, lambda x, i=index: x[i], num_steps=count, parameters=("ball.friction", "world.friction")
         )
         by_mu = -G * math.cos(alpha) * size
-        assert g.parameters == pytest.approx([by_mu / 2, by_mu / 2], rel=1e-6)  # mu = 2 ab / (a + b): half each
+        assert g.by_parameters == pytest.approx([by_mu / 2, by_mu / 2], rel=1e-6)  # mu = 2 ab / (a + b): half each
 
 
 @pytest.mark.parametrize(("count", "mu", "h"), [(20, 0.5, 0.01), (70, 0.3, 0.005)])
@@ -592,7 +592,7 @@ def test_the_stopping_distance_by_friction(count, mu, h):
     g = dd.differentiate_rollout(model, x0, None, lambda x: x[1], num_steps=2 * count, parameters=names)
     # What is left after n steps creeps to rest within the stiction tolerance: 2 / (100 n) of the derivative.
     assert g.loss == pytest.approx(h * (count * v0 - mu * G * h * count * (count + 1) / 2), rel=1e-3)
-    assert g.parameters.sum() == pytest.approx(-G * h**2 * count * (count + 1) / 2, rel=2e-3)
+    assert g.by_parameters.sum() == pytest.approx(-G * h**2 * count * (count + 1) / 2, rel=2e-3)
 
 
 # ------------------------------------------------------------------------------------------------------------- names
@@ -795,9 +795,9 @@ def same_motion(model, values, built, x, us):
     g = dd.differentiate_rollout(model, x, us, loss, parameters=values)
     w = dd.differentiate_rollout(built, x, us, loss, parameters=tuple(values))
     assert g.loss == pytest.approx(w.loss, rel=1e-9)
-    assert g.x0 == pytest.approx(w.x0, rel=1e-6, abs=1e-7)
-    assert g.us == pytest.approx(w.us, rel=1e-6, abs=1e-7)
-    assert g.parameters == pytest.approx(w.parameters, rel=1e-4, abs=1e-7)  # some are differences
+    assert g.by_x0 == pytest.approx(w.by_x0, rel=1e-6, abs=1e-7)
+    assert g.by_us == pytest.approx(w.by_us, rel=1e-6, abs=1e-7)
+    assert g.by_parameters == pytest.approx(w.by_parameters, rel=1e-4, abs=1e-7)  # some are differences
     assert np.array_equal(dd.step(model, x, us[0]), before)
 
 

@@ -13,7 +13,7 @@ from drake_diff.exceptions import GradientError, InputError, NonFiniteError, Sha
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import LQR, PD, TVLQR, ParametricPolicy, differentiate_policy, policy_parameters
 
-# A30: the discrete double integrator with h = 0.1, Q = I, R = 0.1.
+# The weights of the discrete double integrator with h = 0.1.
 Q, R = np.eye(2), np.array([[0.1]])
 UPRIGHT = np.array([0.0, np.pi, 0.0, 0.0])  # of the cart-pole
 
@@ -25,29 +25,9 @@ def network(x, t, p, hidden=16):
     return rest[hidden : 2 * hidden].reshape(1, hidden) @ np.tanh(w1 @ x + rest[:hidden]) + rest[2 * hidden :]
 
 
-def closed_loop_gradient(model, policy, x0, num_steps, final_weight, input_weight):
-    """(xs, gradient by x0, gradient by the parameters) of w'x_N^2 + r sum u^2 by reverse accumulation.
-
-    l_k = dloss/dx_k + K' g_k + A' l_(k+1), g_k = dloss/du_k + B' l_(k+1), gradient sum_k P_k' g_k, with K, P the
-    derivatives of the policy by x and by its parameters.
-    """
-    xs, tape = [np.asarray(x0, dtype=float)], []
-    for k in range(num_steps):
-        u, by_x, by_p = differentiate_policy(policy, xs[-1], k * model.time_step, model.nu)
-        d = dd.differentiate_step(model, xs[-1], u)
-        tape.append((u, by_x, by_p, d))
-        xs.append(d.x_next)
-    by_state, by_parameters = 2 * final_weight * xs[-1], np.zeros(len(policy_parameters(policy)))
-    for u, by_x, by_p, d in reversed(tape):
-        g = 2 * input_weight * u + d.B.T @ by_state
-        by_parameters += by_p.T @ g
-        by_state = by_x.T @ g + d.A.T @ by_state
-    return np.array(xs), by_state, by_parameters
-
-
-def closed_loop_loss(model, policy, x0, num_steps, final_weight, input_weight):
-    motion = dd.rollout(model, x0, policy=policy, num_steps=num_steps)
-    return float(final_weight @ motion.xs[-1] ** 2 + input_weight * (motion.us**2).sum())
+def closed_loop_loss(xs, us, weight=0.01):
+    """Of the end, of the way and of the inputs, so that every part of the gradient has something to pass on."""
+    return (xs[-1] ** 2).sum() + 0.1 * (xs**2).sum() + weight * (us**2).sum()
 
 
 def central_differences(f, p, size=1e-5):
@@ -55,17 +35,38 @@ def central_differences(f, p, size=1e-5):
     return np.array([(f(p + d) - f(p - d)) / (2 * d.sum()) for d in np.diag(moved)])
 
 
-def check_gradients(model, policy, x0, num_steps, final_weight, input_weight=0.01):
-    args = num_steps, np.asarray(final_weight), input_weight
-    xs, by_x0, by_parameters = closed_loop_gradient(model, policy, x0, *args)
-    assert np.array_equal(xs, dd.rollout(model, x0, policy=policy, num_steps=num_steps).xs)
-    others = central_differences(lambda z: closed_loop_loss(model, policy, z, *args), np.asarray(x0, dtype=float))
-    assert by_x0 == pytest.approx(others, rel=1e-6, abs=1e-6 * np.abs(others).max())
-    others = central_differences(
-        lambda p: closed_loop_loss(model, ParametricPolicy(policy, p), x0, *args), np.array(policy.parameters)
+def check_gradients(model, policy, x0, num_steps, parameters=(), tolerance=1e-6):
+    """`differentiate_rollout` through the closed loop against central differences of `rollout`, every input of it.
+
+    1e-6 of the largest entry is what central differences of step 1e-5 leave: 1e-10 of truncation and 1e-11 of
+    rounding, times what some thirty steps magnify.
+    """
+    x0 = np.asarray(x0, dtype=float)
+    policy_values = np.array(policy_parameters(policy))
+    model_values = {p.name: p.value[0] for p in dd.list_parameters(model) if p.name in parameters}
+
+    def loss_at(x=x0, p=policy_values, values=None):
+        values = model_values if values is None else dict(zip(model_values, values, strict=True))
+        moved = ParametricPolicy(policy, p) if len(p) else policy
+        motion = dd.rollout(model, x, policy=moved, num_steps=num_steps, parameters=values)
+        return float(closed_loop_loss(motion.xs, motion.us))
+
+    g = dd.differentiate_rollout(
+        model, x0, None, closed_loop_loss, policy=policy, num_steps=num_steps, parameters=tuple(model_values)
     )
-    assert np.abs(others).max() > 1e-3
-    assert by_parameters == pytest.approx(others, rel=1e-6, abs=1e-6 * np.abs(others).max())
+    motion = dd.rollout(model, x0, policy=policy, num_steps=num_steps)
+    assert np.array_equal(g.xs, motion.xs)
+    assert np.array_equal(g.us, motion.us)
+    assert g.loss == pytest.approx(loss_at(), rel=1e-12)
+    pairs = [(g.by_policy, central_differences(lambda p: loss_at(p=p), policy_values))] if len(policy_values) else []
+    if not tangent_space(model).quaternions:  # a quaternion off the unit sphere is no state to take a difference at
+        pairs.append((g.by_x0, central_differences(lambda x: loss_at(x=x), x0)))
+    if model_values:
+        values = np.array(list(model_values.values()))
+        pairs.append((g.by_parameters, central_differences(lambda v: loss_at(values=v), values)))
+    for found, expected in pairs:
+        assert np.abs(expected).max() > 1e-3  # zero would agree with a loop that was never closed
+        assert found == pytest.approx(expected, rel=tolerance, abs=tolerance * np.abs(expected).max())
 
 
 def riccati(A, B, Q, R, P, num_steps):
@@ -300,40 +301,41 @@ def test_pd_refuses_gains_and_references_that_do_not_fit(load):
 # --- gradients through the closed loop --------------------------------------------------------------------------------
 
 
-def test_the_gradient_by_pd_gains_is_that_of_rollouts(load):
+def test_the_gradient_through_pd_is_that_of_rollouts(load):
     model = load("pendulum.urdf")
-    check_gradients(model, PD(model, 3.0, 0.4, [1.0, 0.0]), [0.1, 0.5], 30, [1.0, 0.3])
+    check_gradients(model, PD(model, 3.0, 0.4, [1.0, 0.0]), [0.1, 0.5], 30, ("pendulum.mass", "hinge.damping"))
 
 
-def test_the_gradient_by_lqr_gains_is_that_of_rollouts(load):
+def test_the_gradient_through_lqr_is_that_of_rollouts(load):
     model = load("cart_pole.urdf", time_step=0.02)
     lqr = LQR(model, UPRIGHT, [0.0], np.eye(4), np.eye(1))
-    check_gradients(model, lqr, UPRIGHT + np.array([0.05, 0.05, 0.0, 0.1]), 30, [1.0, 1.0, 0.1, 0.1])
+    check_gradients(model, lqr, UPRIGHT + np.array([0.05, 0.05, 0.0, 0.1]), 30, ("pole.mass", "cart.mass"))
 
 
-def test_the_gradient_by_all_tvlqr_gains_is_that_of_rollouts(load):
+def test_the_gradient_through_tvlqr_is_that_of_rollouts(load):
     model = load("pendulum.urdf")
     us = 2.0 * np.ones((10, 1))
     tvlqr = TVLQR(model, dd.rollout(model, [0.0, 0.0], us).xs, us, Q, R)
-    check_gradients(model, tvlqr, [0.3, -0.2], 10, [1.0, 0.3])
+    check_gradients(model, tvlqr, [0.3, -0.2], 10, ("pendulum.mass",))
 
 
-def test_the_gradient_by_a_neural_networks_weights_is_that_of_rollouts(load):
+def test_the_gradient_through_a_neural_network_is_that_of_rollouts(load):
     model, random = load("cart_pole.urdf", time_step=0.02), np.random.default_rng(5)
     policy = ParametricPolicy(network, 0.5 * random.standard_normal(97))
-    check_gradients(model, policy, [0.1, 0.4, -0.2, 0.3], 30, [1.0, 1.0, 0.1, 0.1])
+    check_gradients(model, policy, [0.1, 0.4, -0.2, 0.3], 30, ("pole.mass",))
+
+
+def test_the_gradient_through_a_plain_function_is_that_of_rollouts(load):
+    """It has no parameters: by the initial state and the model's parameters alone."""
+    model = load("pendulum.urdf")
+    check_gradients(model, lambda x, t: [np.sin(3 * t) - 2 * x[0]], [0.3, -0.2], 20, ("pendulum.mass",))
 
 
 def test_the_gradient_by_gains_of_a_floating_robot_is_that_of_rollouts():
     model, random = floating_arm(), np.random.default_rng(6)
     x0 = tangent_space(model).plus(model.default_state, 0.3 * random.standard_normal(14))
     tvlqr = TVLQR(model, np.tile(model.default_state, (6, 1)), np.zeros((5, 1)), np.eye(14), np.eye(1))
-    args = 5, np.linspace(1, 2, 15), 0.1
-    _, _, gradient = closed_loop_gradient(model, tvlqr, x0, *args)
-    others = central_differences(
-        lambda p: closed_loop_loss(model, ParametricPolicy(tvlqr, p), x0, *args), np.array(tvlqr.parameters), 1e-4
-    )
-    assert gradient == pytest.approx(others, rel=1e-5, abs=1e-6 * np.abs(others).max())
+    check_gradients(model, tvlqr, x0, 5, tolerance=1e-5)
 
 
 # --- the derivative of a policy ---------------------------------------------------------------------------------------

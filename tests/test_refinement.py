@@ -153,7 +153,9 @@ def test_momentum_holds_of_a_gradient_that_is_wrong(stiffness):
     h, count = 1 / 100, 100
     model = two_balls(h, stiffness)
     x0 = [0.0, 0.52, 1.0, 0.0]
-    left, right = (dd.differentiate_rollout(model, x0, None, lambda x, i=i: x[i], num_steps=count).x0 for i in (0, 1))
+    left, right = (
+        dd.differentiate_rollout(model, x0, None, lambda x, i=i: x[i], num_steps=count).by_x0 for i in (0, 1)
+    )
     assert (left + right)[:2] == pytest.approx([1.0, 1.0], rel=1e-6)  # SAP's tolerance
     assert (left + right)[2:] == pytest.approx([1.0, 1.0], rel=1e-6)
     assert np.abs(right - [1, 0, 1, 0]).max() > 0.05
@@ -170,7 +172,7 @@ def test_two_balls_resolved_tend_to_the_rigid_gradient():
     gradient = dd.differentiate_rollout(two_balls(h, k), x0, None, lambda x: x[1], num_steps=count)
     half = np.pi / np.sqrt(2 * k) / 2
     # h w = 0.003, over the 1000 steps in contact.
-    assert gradient.x0 == pytest.approx([1.0, 0.0, h * count - half, half], abs=0.05)
+    assert gradient.by_x0 == pytest.approx([1.0, 0.0, h * count - half, half], abs=0.05)
 
 
 def test_horizon_diagnostics_of_a_growing_motion(load):

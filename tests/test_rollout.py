@@ -57,7 +57,7 @@ def test_the_oscillators_frequency_and_power_of_its_jacobian(oscillator, h):
     A = dd.differentiate_step(model, [0.2, 0.0], [0.0]).A
     count, angle = 100, math.acos(1 - (5 * h) ** 2 / 2)
     expected = (math.sin(count * angle) * A - math.sin((count - 1) * angle) * np.eye(2)) / math.sin(angle)
-    g = [dd.differentiate_rollout(model, [0.2, 0.0], np.zeros((count, 1)), lambda x, i=i: x[i]).x0 for i in (0, 1)]
+    g = [dd.differentiate_rollout(model, [0.2, 0.0], np.zeros((count, 1)), lambda x, i=i: x[i]).by_x0 for i in (0, 1)]
     assert np.array(g) == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 

@@ -20,8 +20,8 @@ def test_the_double_integrators_gradient_and_norms_have_their_closed_form(write_
     g = dd.differentiate_rollout(model, [0.5, -1.0], us, lambda x: x[0])
     left = count - np.arange(count)
     assert g.loss == pytest.approx(0.5 - count * h + h**2 / m * float(left @ us[:, 0]), rel=1e-12)
-    assert g.x0 == pytest.approx([1.0, count * h], rel=1e-12)
-    assert g.us[:, 0] == pytest.approx(h**2 / m * left, rel=1e-12)
+    assert g.by_x0 == pytest.approx([1.0, count * h], rel=1e-12)
+    assert g.by_us[:, 0] == pytest.approx(h**2 / m * left, rel=1e-12)
     assert g.state_gradient_norms == pytest.approx(
         [math.hypot(1, (count - k) * h) for k in range(count + 1)], rel=1e-12
     )
@@ -32,8 +32,8 @@ def test_a_loss_of_the_whole_motion_is_differentiated_too(write_urdf):
     """sum_k x_k + 3 sum_k u_k^2 on one step: x_1 = x_0 + h v_0 + h^2 u_0 / m."""
     model = write_urdf(mass=2.0, time_step=0.1)
     g = dd.differentiate_rollout(model, [0.5, -1.0], [[0.7]], lambda xs, us: xs[:, 0].sum() + 3 * (us**2).sum())
-    assert g.x0 == pytest.approx([2.0, 0.1], rel=1e-12)
-    assert g.us[0, 0] == pytest.approx(6 * 0.7 + 0.01 / 2, rel=1e-12)
+    assert g.by_x0 == pytest.approx([2.0, 0.1], rel=1e-12)
+    assert g.by_us[0, 0] == pytest.approx(6 * 0.7 + 0.01 / 2, rel=1e-12)
 
 
 def test_a_long_loss_is_differentiated_in_blocks_without_changing_it(load):
@@ -42,7 +42,7 @@ def test_a_long_loss_is_differentiated_in_blocks_without_changing_it(load):
     us = 0.1 * np.random.default_rng(1).standard_normal((150, 1))
     g = dd.differentiate_rollout(model, [0.1, 0.0], us, lambda xs, us: (xs**2).sum() + np.sin(us).sum())
     by_us = np.cos(us[-1, 0]) + 2 * float(g.xs[-1] @ dd.differentiate_step(model, g.xs[-2], us[-1]).B[:, 0])
-    assert g.us[-1, 0] == pytest.approx(by_us, rel=1e-12)
+    assert g.by_us[-1, 0] == pytest.approx(by_us, rel=1e-12)
 
 
 def test_reverse_accumulation_is_the_product_of_the_steps(load):
@@ -53,7 +53,7 @@ def test_reverse_accumulation_is_the_product_of_the_steps(load):
     for d in derivatives_along(model, x0, us):
         product = d.A @ product
     g = dd.differentiate_rollout(model, x0, us, lambda x: v @ x)
-    assert g.x0 == pytest.approx(v @ product, rel=1e-10)
+    assert g.by_x0 == pytest.approx(v @ product, rel=1e-10)
 
 
 def test_the_projectiles_jacobian_is_exact(load):
@@ -61,8 +61,8 @@ def test_the_projectiles_jacobian_is_exact(load):
     model = load("projectile.sdf")
     for i in range(3):
         g = dd.differentiate_rollout(model, model.default_state, None, lambda x, i=i: x[4 + i], num_steps=100)
-        assert g.x0[4:7] == pytest.approx(np.eye(3)[i], abs=1e-12)
-        assert g.x0[10:] == pytest.approx(np.eye(3)[i], abs=1e-12)
+        assert g.by_x0[4:7] == pytest.approx(np.eye(3)[i], abs=1e-12)
+        assert g.by_x0[10:] == pytest.approx(np.eye(3)[i], abs=1e-12)
 
 
 @pytest.mark.parametrize("masses", [(1.0, 1.0), (1.0, 2.0)])
@@ -118,7 +118,7 @@ def test_a_compliant_bounce_does_not_have_the_rigid_gradient(k, at_least):
     start = [1.001, -2.0]
     g = dd.differentiate_rollout(model, start, None, lambda x: x[0], num_steps=480)
     assert g.loss == pytest.approx(1.2, rel=0.35)  # the motion is near the rigid one's, y(T) = 1.2
-    assert np.abs(g.x0 + 1).max() > at_least  # the gradient is not
+    assert np.abs(g.by_x0 + 1).max() > at_least  # the gradient is not
     dd.certify_rollout(model, start, None, lambda x: x[0], num_steps=480).require()
 
 
@@ -136,7 +136,7 @@ def test_gradient_by_parameters_is_accumulated(write_urdf, load):
         write_urdf(mass=m, time_step=h), [0, 0], us, lambda x: x[0], parameters=("block.mass",)
     )
     assert g.parameter_names == ("block.mass",)
-    assert g.parameters == pytest.approx([-(h**2) / m**2 * sum(range(1, count + 1))], rel=1e-10)
+    assert g.by_parameters == pytest.approx([-(h**2) / m**2 * sum(range(1, count + 1))], rel=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -176,5 +176,5 @@ def test_lqr_sensitivity_of_the_optimal_cost(write_urdf):
 
     g = dd.differentiate_rollout(model, [1.0, 0.0], us, cost)
     assert g.loss == pytest.approx(12.948481280713864, rel=1e-12)
-    assert g.x0 == pytest.approx([25.89696256, 5.23643035], abs=1e-8)
-    assert np.abs(g.us).max() < 1e-12
+    assert g.by_x0 == pytest.approx([25.89696256, 5.23643035], abs=1e-8)
+    assert np.abs(g.by_us).max() < 1e-12

@@ -139,9 +139,9 @@ def _coarse(loss: Loss, m: int) -> Loss:
 
 def _flat(model: Model, x0: Array, g: RolloutGradient, shape: tuple[int, ...], m: int) -> Array:
     """[by x0 on the tangent space; by each held input; by parameters]."""
-    by_x0 = g.x0 @ tangent_space(model).derivative_of_plus(x0)
-    by_us = g.us.reshape(shape[0], m, shape[1]).sum(axis=1).ravel()
-    return np.concatenate([by_x0, by_us, g.parameters])
+    by_x0 = g.by_x0 @ tangent_space(model).derivative_of_plus(x0)
+    by_us = g.by_us.reshape(shape[0], m, shape[1]).sum(axis=1).ravel()
+    return np.concatenate([by_x0, by_us, g.by_parameters])
 
 
 def _judge(
@@ -280,8 +280,8 @@ def certify_rollout(
     def on_tangent(displacement: Array) -> tuple[Array, RolloutGradient]:
         x, inputs, values = moved(displacement)
         g = differentiate_rollout(model, x, inputs, loss, parameters=values, method=method)
-        by_x0 = g.x0 @ space.derivative_of_plus(x)
-        return np.concatenate([by_x0, g.us.ravel(), g.parameters])[None] * scale, g
+        by_x0 = g.by_x0 @ space.derivative_of_plus(x)
+        return np.concatenate([by_x0, g.by_us.ravel(), g.by_parameters])[None] * scale, g
 
     derivative, gradient = on_tangent(np.zeros(len(scale)))
     inputs = tuple(f"{name}[{k}]" for k in range(len(us)) for name in model.input_names)

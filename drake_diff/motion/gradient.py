@@ -27,24 +27,24 @@ EXPLODED, VANISHED = 1e6, 1e-6
 
 @dataclass(frozen=True, eq=False)
 class RolloutGradient:
-    """loss and its gradient by x0 (nx,), us (N, nu), parameters (np,) and the policy's parameters (n,).
+    """A loss of a rollout and its gradient; `differentiate_rollout` makes one. Arrays are read-only.
 
-    `state_gradient_norms` (N+1,) is |d loss / d x_k|, the later steps being functions of x_k: where it grows
-    without bound going back the gradient explodes, where it dies out the early inputs cannot be learned.
-    Under a policy `us` is what it chose, and `state_gradient_norms` go through the closed loop.
+    Under a policy `us` is what the policy chose, and all gradients go through the closed loop.
     """
 
     loss: float
-    x0: Array
-    us: Array
-    parameters: Array
+    by_x0: Array  # (nx,)
+    by_us: Array  # (N, nu)
+    by_parameters: Array  # (np,)
+    by_policy: Array  # (n,) by the policy's own parameters
     parameter_names: tuple[str, ...]
     parameter_sources: tuple[str, ...]  # where each column came from
-    policy: Array
+    # (N+1,) |d loss / d x_k|, the later steps being functions of x_k: where it grows without bound going back the
+    # gradient explodes, where it dies out the early inputs cannot be learned.
     state_gradient_norms: Array
     spectral_radii: Array  # (N,) the largest |eigenvalue| of each step's Jacobian by the state, policy included
-    xs: Array  # (N+1, nx) the rollout itself
-    inputs: Array  # (N, nu) what was applied
+    xs: Array  # (N+1, nx) the motion
+    us: Array  # (N, nu) the inputs that were applied
     methods: tuple[str, ...]  # where the step Jacobians came from: one name, or more where a fallback was taken
 
     @property
@@ -110,16 +110,16 @@ def differentiate_rollout(
     totals = accumulate(linearization, by_xs, by_us, feedback, len(policy_parameters(policy)))
     return RolloutGradient(
         loss=value,
-        x0=frozen(totals.states[0]),
-        us=frozen(totals.inputs),
-        parameters=frozen(totals.parameters),
+        by_x0=frozen(totals.states[0]),
+        by_us=frozen(totals.inputs),
+        by_parameters=frozen(totals.parameters),
         parameter_names=linearization[0].parameters,
         parameter_sources=linearization[0].sources,
-        policy=frozen(totals.policy),
+        by_policy=frozen(totals.policy),
         state_gradient_norms=frozen(np.linalg.norm(totals.states, axis=1)),
         spectral_radii=frozen(_spectral_radii(linearization, feedback)),
         xs=frozen(xs),
-        inputs=frozen(inputs),
+        us=frozen(inputs),
         methods=tuple(sorted({d.method for d in linearization})),
     )
 

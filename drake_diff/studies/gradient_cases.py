@@ -211,7 +211,7 @@ def _of_rollout(
 
     def derivative(z: Array) -> Array:
         found = differentiate_rollout(model, x0 + states @ z, inputs_of(z), loss)
-        return states.T @ found.x0 + (inputs.T @ found.us[:, 0] if model.nu else 0)
+        return states.T @ found.by_x0 + (inputs.T @ found.by_us[:, 0] if model.nu else 0)
 
     return f, derivative
 

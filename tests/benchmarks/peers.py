@@ -164,7 +164,9 @@ class DrakeDiff(Peer):
 
     def rollout_gradient(self, horizon: int) -> np.ndarray:
         chosen = self.ends != 0
-        return dd.differentiate_rollout(self.model, self.x, self.case.inputs(horizon), lambda x: np.sum(x[chosen])).us
+        return dd.differentiate_rollout(
+            self.model, self.x, self.case.inputs(horizon), lambda x: np.sum(x[chosen])
+        ).by_us
 
 
 class Engine(Peer):
