@@ -252,6 +252,14 @@ def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(write, tmp_path):
     assert 3 <= len(finished(out / "trials.jsonl")) < 500
 
 
+def test_a_script_needs_no_guard_around_its_panel(write, tmp_path):
+    """Workers do not import the script that started them: without `if __name__ == "__main__"` it would start again."""
+    script = tmp_path / "script.py"
+    script.write_text(f"import drake_diff as dd\nprint(dd.panels.run_panel({str(write())!r}, out='out', workers=1))\n")
+    done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.stdout.splitlines()[0] == "5 trials in 5 cells, 1 errors, in out", done.stderr
+
+
 # --- the journal ------------------------------------------------------------------------------------------------------
 
 
@@ -298,7 +306,7 @@ def test_a_line_twice_is_refused(write, tmp_path):
 def test_another_panels_journal_is_refused_and_so_is_one_of_its_lines(write, tmp_path):
     dd.panels.run_panel(write("cheap"), out=tmp_path / "out", workers=1)
     dd.panels.run_panel(write("cheap", methods='["other"]'), out=tmp_path / "other", workers=1)
-    with pytest.raises(ArtifactError, match="another panel: its sha256: expected "):
+    with pytest.raises(ArtifactError, match="another panel: sha256: expected "):
         dd.panels.run_panel(write("cheap"), out=tmp_path / "other", workers=1)
     foreign = (tmp_path / "other" / "trials.jsonl").read_bytes().splitlines(keepends=True)[1]
     with open(tmp_path / "out" / "trials.jsonl", "ab") as file:
@@ -314,7 +322,7 @@ def test_a_comment_changes_no_panel_but_another_function_does(write, tmp_path):
     dd.panels.run_panel(path, out=out, workers=1)
     with open(tmp_path / "trials.py", "a") as file:
         file.write("# changed\n")
-    with pytest.raises(ArtifactError, match="its function_sha256"):
+    with pytest.raises(ArtifactError, match="another panel: function_sha256"):
         dd.panels.run_panel(path, out=out, workers=1)
 
 
@@ -403,7 +411,10 @@ def test_cells_stand_beside_the_axes(tmp_path):
     [
         ("evaluate =", "expected a panel in TOML, got TOMLDecodeError"),
         ("[axes]\nx = [1]", "expected the fields evaluate, seed, seeds, axes, fixed, cells, got no evaluate"),
-        ('evaluate = "a:b"\ncolour = 1\nsize = 2\n[axes]\nx = [1]', "got colour, which is none of them; size, which"),
+        (
+            'evaluate = "a:b"\ncolour = 1\nsize = 2\n[axes]\nx = [1]',
+            "got colour, which is not one of them; size, which",
+        ),
         ('evaluate = "a"\n[axes]\nx = [1]', "evaluate: String should match pattern"),
         ('evaluate = "a:b"\nseeds = 0\n[axes]\nx = [1]', "seeds: Input should be greater than or equal to 1, got 0"),
         ('evaluate = "a:b"\nseeds = "3"\n[axes]\nx = [1]', "seeds: Input should be a valid integer, got '3'"),
@@ -411,8 +422,8 @@ def test_cells_stand_beside_the_axes(tmp_path):
         ('evaluate = "a:b"\n[axes]\nx = []', "axis x: expected a list of at least one value"),
         ('evaluate = "a:b"\n[axes]\nx = [nan]', "expected finite numbers"),
         ('evaluate = "a:b"\n[axes]\nx = [2026-01-01]', "axes"),
-        ('evaluate = "a:b"\n[axes]\nseed = [1]', "expected no seed, which is fixed or given by drake_diff"),
-        ('evaluate = "a:b"\n[axes]\nx = [1]\n[fixed]\nx = 1', "expected no x"),
+        ('evaluate = "a:b"\n[axes]\nseed = [1]', "axes and cells: seed cannot be used"),
+        ('evaluate = "a:b"\n[axes]\nx = [1]\n[fixed]\nx = 1', "axes and cells: x cannot be used"),
         ('evaluate = "a:b"\n[axes]\nx = [1, 1]', "expected each cell once, got x=1 twice"),
         (
             'evaluate = "no_such_module:b"\n[axes]\nx = [1]',

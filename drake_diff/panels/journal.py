@@ -1,7 +1,7 @@
-"""The journal of a panel: a line for each finished trial, on the disk before the next is taken.
+"""The journal of a panel: a line for each finished trial, on the disk before its worker gets the next.
 
-The first line says what the panel is. Each line carries a hash over what it says and over the first line, so that no
-line of another panel, and none that was changed, is taken for one of these.
+The first line says what the panel is. Each line carries a hash of itself and of the first line, so that a changed line
+and a line of another panel are noticed.
 """
 
 import fcntl
@@ -20,7 +20,7 @@ JOURNAL = "trials.jsonl"
 
 
 class Journal:
-    """An open journal: `rows`, by trial, are those that are finished."""
+    """An open journal; `rows` are those of the finished trials, by id."""
 
     def __init__(self, path: Path, file: BinaryIO, panel: Mapping[str, Any], known: Collection[str]):
         self.path, self.file = path, file
@@ -28,7 +28,7 @@ class Journal:
         self.rows = self._read(panel, known)
 
     def add(self, trial: str, row: Row) -> None:
-        """Write the row of a finished trial, onto the disk."""
+        """Write the row of a finished trial to the disk."""
         self._write(_line({"id": trial, "row": row}, self.head))
         self.rows[trial] = row
 
@@ -38,7 +38,7 @@ class Journal:
         os.fsync(self.file.fileno())
 
     def _read(self, panel: Mapping[str, Any], known: Collection[str]) -> dict[str, Row]:
-        """Read all whole lines and cut off what follows them: a line that a killed process left half written."""
+        """Read all whole lines and cut off the rest: a line that a killed process left half written."""
         whole = self.file.read().rpartition(b"\n")
         lines = whole[0].split(b"\n") if whole[1] else []
         self.file.seek(len(whole[0]) + len(whole[1]))
@@ -60,16 +60,16 @@ class Journal:
         for key in sorted({*old, *panel}):
             if old.get(key) != panel.get(key):
                 raise ArtifactError(
-                    f"{self.path} is the journal of another panel: its {key}: expected {panel.get(key)}, "
-                    f"got {old.get(key)}; give another directory, or remove it to begin again"
+                    f"{self.path} is the journal of another panel: {key}: expected {panel.get(key)}, "
+                    f"got {old.get(key)}; choose another directory, or remove this one to start over"
                 )
 
 
 @contextmanager
 def journal(directory: Path, panel: Mapping[str, Any], known: Collection[str]) -> Iterator[Journal]:
-    """The journal in `directory` of the panel that `panel` describes, whose trials are `known`; for one process alone.
+    """Open the journal in `directory` of the panel that `panel` describes, with the trials `known`.
 
-    ArtifactError where it is another panel's, where a whole line of it is damaged, or where another process has it.
+    ArtifactError where it is another panel's, where a whole line is damaged, or where another process has it open.
     """
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / JOURNAL
@@ -91,7 +91,7 @@ def _digest(content: Mapping[str, Any], head: bytes) -> str:
 
 
 def _json(content: Mapping[str, Any]) -> bytes:
-    """In the order that it has: a row's is that of the table's columns."""
+    """Keys keep their order: a row's is that of the table's columns."""
     return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
 
 
@@ -104,4 +104,4 @@ def _read_line(path: Path, number: int, line: bytes, head: bytes) -> dict[str, A
             return content
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ArtifactError(f"{path}, line {number} is damaged: {type(error).__name__}: {error}") from error
-    raise ArtifactError(f"{path}, line {number} is damaged or another panel's: its hash is not that of what it says")
+    raise ArtifactError(f"{path}, line {number} is damaged or another panel's: its hash does not fit")

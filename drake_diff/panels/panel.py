@@ -1,13 +1,12 @@
-"""A panel evaluated: from its file to its table, taken up again where it was left."""
+"""Run a panel: from its file to its table, going on where an earlier run was stopped."""
 
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 from drake_diff._base.arrays import positive_int
 from drake_diff.panels.journal import journal
-from drake_diff.panels.panel_file import Panel, expand, load_panel
+from drake_diff.panels.panel_file import expand, load_panel
 from drake_diff.panels.table import PanelTable, write_table
 from drake_diff.panels.trial_row import TrialFunction
 from drake_diff.panels.workers import check_engine, evaluate_all
@@ -25,16 +24,36 @@ def run_panel(
     address: str | None = None,
     progress: Progress | None = None,
 ) -> PanelTable:
-    """Evaluate all trials of the panel file at `path` and write `table.csv` and `summary.json` into `out`.
+    r"""Evaluate every trial of a panel file in parallel, and write the table and summary of what was found.
 
-    Each finished trial is a line of `trials.jsonl` there: after a kill the same call evaluates what is missing, and the
-    table is the same to the byte, as it is for any number of `workers` (processes; all cores where None) and for both
-    engines, "local" and "ray" (the cluster at `address` "HOST:PORT", or one of this machine). `out` is
-    artifacts/<name of the file> where not given. `progress` is called with the numbers of finished trials, of all, and
-    of errors. A script calls this below `if __name__ == "__main__":`, as every worker imports it.
+    Each finished trial is at once a line of `trials.jsonl`. After a kill or Ctrl-C the same call evaluates only what
+    is missing. Table and summary are the same to the byte as without the interruption, for any number of workers and
+    for both engines. A trial that raises is a row with the column `error`.
 
-    Raises InputError for a panel that cannot be right, ArtifactError where `out` holds another panel or a damaged
-    journal, MissingDependencyError where Ray is not there.
+    Args:
+        path: the panel, a TOML file; `drake_diff.panels.panel_file` says what stands in it.
+        out: the directory to write; artifacts/<name of the file> where None.
+        workers: how many processes; None means one for each core.
+        engine: "local" (processes of this machine) or "ray".
+        address: "HOST:PORT" of a running Ray cluster; None starts one on this machine.
+        progress: called with the numbers of finished trials, of all trials and of errors.
+
+    Returns:
+        The rows and the summary, as in `table.csv` and `summary.json`.
+
+    Raises:
+        InputError: the panel file is wrong, or its function cannot be loaded.
+        ArtifactError: `out` holds another panel or a damaged journal, or another process is writing there.
+        MissingDependencyError: Ray is asked for and not installed.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from tempfile import mkdtemp
+        >>> folder = Path(mkdtemp())
+        >>> _ = (folder / "trials.py").write_text("def square(trial): return {'cost': trial['x'] ** 2}")
+        >>> _ = (folder / "panel.toml").write_text('evaluate = "trials.py:square"\n[axes]\nx = [1, 2, 3]')
+        >>> [row["cost"] for row in dd.panels.run_panel(folder / "panel.toml", out=folder / "out", workers=1).rows]
+        [1, 4, 9]
     """
     path = Path(path)
     count = None if workers is None else positive_int("workers", workers)
@@ -43,7 +62,17 @@ def run_panel(
     trials = expand(panel)
     function = TrialFunction(panel.evaluate, str(path.resolve().parent))
     function.load()
-    made = _made(panel, function)
+    used = provenance_of()
+    # What must be the same for two trials to stand in one table.
+    made = {
+        "sha256": panel.sha256,
+        "evaluate": panel.evaluate,
+        "function_sha256": function.sha256(),
+        "fixed": panel.fixed,
+        "python": used.python,
+        "platform": used.platform,
+        **{name: used.packages.get(name) for name in ("drake", "drake-diff", "numpy")},
+    }
     directory = Path(out) if out is not None else Path("artifacts") / path.stem
     with journal(directory, made, {trial.id for trial in trials}) as book:
         errors = sum("error" in row for row in book.rows.values())
@@ -55,18 +84,3 @@ def run_panel(
                 if progress:
                     progress(len(book.rows), len(trials), errors)
         return write_table(directory, trials, book.rows, made)
-
-
-def _made(panel: Panel, function: TrialFunction) -> dict[str, Any]:
-    """What must be the same for two trials to stand in one table."""
-    used = provenance_of()
-    versions = {name: used.packages.get(name) for name in ("drake", "drake-diff", "numpy")}
-    return {
-        "sha256": panel.sha256,
-        "evaluate": panel.evaluate,
-        "function_sha256": function.sha256(),
-        "fixed": panel.fixed,
-        "python": used.python,
-        "platform": used.platform,
-        **versions,
-    }

@@ -1,17 +1,17 @@
-"""The declarative file of a panel, and the trials that it stands for.
+"""A panel file in TOML, and the trials that it stands for. It may say:
 
 evaluate = "trials.py:balance"   # a file beside this one, or "package.module:function"
 seed = 0
-seeds = 20                       # trials in each cell
+seeds = 20                       # trials of each cell
 
-[axes]                           # every combination is a cell
+[axes]                           # every combination of their values is a cell
 method = ["ilqr", "shooting"]
 level = [0.0, 0.1]
 
-[fixed]                          # what all trials share
+[fixed]                          # the same in all trials
 model = "models/pendulum.urdf"
 
-[[cells]]                        # cells beside those of the axes
+[[cells]]                        # one more cell
 method = "none"
 """
 
@@ -29,7 +29,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from drake_diff.exceptions import InputError
 from drake_diff.record.parts import FiniteTable
 
-# What drake_diff itself gives each trial: no axis, cell or fixed value is called so.
+# Names of what drake_diff itself gives each trial; an axis, cell or fixed value cannot have them.
 OURS = ("id", "repeat", "seed")
 
 
@@ -58,24 +58,26 @@ class Panel(BaseModel):
         if not self.axes and not self.cells:
             raise ValueError("expected at least one axis or one of [[cells]], got neither")
         for name in {*self.axes, *(name for cell in self.cells for name in cell)} & {*self.fixed, *OURS}:
-            raise ValueError(f"axes and cells: expected no {name}, which is fixed or given by drake_diff, got it")
+            raise ValueError(
+                f"axes and cells: {name} cannot be used: it is in [fixed], or drake_diff gives it to each trial"
+            )
         for name in self.fixed.keys() & set(OURS):
-            raise ValueError(f"fixed: expected no {name}, which drake_diff gives, got it")
+            raise ValueError(f"fixed: {name} cannot be used: drake_diff gives it to each trial")
         return self
 
     @property
     def sha256(self) -> str:
-        """The hash of what the file says; comments and the order of its tables are no part of it."""
+        """The hash of what the file says; comments and the order of its tables do not change it."""
         return sha256(canonical(self.model_dump())).hexdigest()
 
 
 @dataclass(frozen=True)
-class Trial:
-    """One trial: its `cell` (what the axes say), and `fields`, all that its function is given.
+class PanelTrial:
+    """One trial of a panel: its `cell` (its values on the axes) and `fields`, all that its function is given.
 
-    `fields` are the cell, what is fixed, `repeat` (its number within the cell, from 0) and its own `seed`, of 53 bits,
-    drawn from the panel's seed and all other fields: another value on an axis changes no other trial. `id` is the
-    start of the SHA-256 of the fields.
+    `fields` are the cell, the fixed values, `repeat` (its number within the cell, from 0) and its own `seed` of 53
+    bits, drawn from the panel's seed and all other fields, so that a new value on an axis changes no other trial.
+    `id` is the start of the SHA-256 of the fields.
     """
 
     cell: dict[str, Any]
@@ -92,7 +94,7 @@ class Trial:
 
 
 def canonical(value: Any) -> bytes:
-    """`value` as the one JSON text that it has here: sorted keys, no spaces, floats by repr, no NaN."""
+    """The same value always gives the same JSON: sorted keys, no spaces, no NaN."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
@@ -102,7 +104,7 @@ def cell_name(cell: dict[str, Any]) -> str:
 
 
 def load_panel(path: Path) -> Panel:
-    """The panel in the TOML file at `path`; InputError, naming every entry that is not right."""
+    """The panel in the TOML file at `path`; InputError names every wrong entry."""
     try:
         said = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -121,7 +123,7 @@ def _wrong(error: ValidationError) -> list[str]:
     for found in error.errors():
         place = ".".join(str(part) for part in found["loc"])
         if found["type"] == "extra_forbidden":
-            wrong.append(f"{place}, which is none of them")
+            wrong.append(f"{place}, which is not one of them")
         elif found["type"] == "missing":
             wrong.append(f"no {place}")
         else:
@@ -130,7 +132,7 @@ def _wrong(error: ValidationError) -> list[str]:
     return wrong
 
 
-def expand(panel: Panel) -> tuple[Trial, ...]:
+def expand(panel: Panel) -> tuple[PanelTrial, ...]:
     """Every trial: the axes' combinations (the last axis fastest), then the cells, each `panel.seeds` times."""
     axes: dict[str, Any] = panel.axes
     combinations = product(*axes.values()) if axes else ()
@@ -144,8 +146,8 @@ def expand(panel: Panel) -> tuple[Trial, ...]:
     return trials
 
 
-def _trial(panel: Panel, cell: dict[str, Any], repeat: int) -> Trial:
+def _trial(panel: Panel, cell: dict[str, Any], repeat: int) -> PanelTrial:
     fields = {**panel.fixed, **cell, "repeat": repeat}
     words = np.frombuffer(sha256(canonical(fields)).digest(), "<u4")
     state = np.random.SeedSequence([panel.seed, *words.tolist()]).generate_state(1, np.uint64)
-    return Trial(cell, {**fields, "seed": int(state[0]) >> 11})
+    return PanelTrial(cell, {**fields, "seed": int(state[0]) >> 11})

@@ -1,4 +1,4 @@
-"""What a panel found: a row for each trial, and a summary of each cell. No byte of it depends on who evaluated what."""
+"""What a panel found: a row for each trial and a summary of each cell, the same bytes whichever worker did what."""
 
 import csv
 import io
@@ -6,21 +6,26 @@ import json
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any
 
 from drake_diff._base.files import write_whole
 from drake_diff._base.statistics import success_rate
-from drake_diff.panels.panel_file import Trial, canonical
+from drake_diff.panels.panel_file import PanelTrial, canonical, cell_name
 from drake_diff.panels.trial_row import Row
 
 TABLE, SUMMARY = "table.csv", "summary.json"
+SHOWN_CELLS = 8  # in a repr
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PanelTable:
-    """The `rows` of a panel in its order (the trial's cell, id, repeat and seed, then what its function said) and its
-    `summary`, as in the files `table.csv` and `summary.json` of `directory`. `errors` counts the rows with an error.
+    """What `run_panel` found.
+
+    `rows` has a row for each trial, in the panel's order: its cell, id, repeat and seed, then what its function
+    returned. `summary` has the counts, means and success rates of each cell. They are what `table.csv` and
+    `summary.json` in `directory` hold.
     """
 
     directory: Path
@@ -29,23 +34,36 @@ class PanelTable:
 
     @property
     def errors(self) -> int:
+        """How many trials ended in an error."""
         return int(self.summary["errors"])
+
+    def __repr__(self) -> str:
+        cells = self.summary["cells"]
+        lines = [f"{len(self.rows)} trials in {len(cells)} cells, {self.errors} errors, in {self.directory}"]
+        for cell in cells[:SHOWN_CELLS]:
+            told = [f"success {cell['success']['rate']:.3g}"] if "success" in cell else []
+            told += [f"{name} {numbers['mean']:.4g}" for name, numbers in cell["numbers"].items()]
+            lines.append(f"  {cell_name(cell['cell'])}: {', '.join(told) or 'no numbers'}")
+        if len(cells) > SHOWN_CELLS:
+            lines.append(f"  and {len(cells) - SHOWN_CELLS} more cells")
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def write_table(
-    directory: Path, trials: Sequence[Trial], found: Mapping[str, Row], made: Mapping[str, Any]
+    directory: Path, trials: Sequence[PanelTrial], found: Mapping[str, Row], made: Mapping[str, Any]
 ) -> PanelTable:
     """Write `table.csv` and `summary.json` of all `trials` into `directory`; `made` says what the panel is."""
-    rows = tuple(_row(trial, found[trial.id]) for trial in trials)
+    rows = tuple(
+        {"id": t.id, **t.cell, "repeat": t.fields["repeat"], "seed": t.fields["seed"], **found[t.id]} for t in trials
+    )
     summary = {"panel": dict(made), **_summary(trials, found)}
     write_whole(directory / TABLE, _csv(rows, {name for row in found.values() for name in row}))
     text = json.dumps(summary, indent=1, allow_nan=False, ensure_ascii=False)
     write_whole(directory / SUMMARY, text.encode() + b"\n")
     return PanelTable(directory, rows, summary)
-
-
-def _row(trial: Trial, row: Row) -> Row:
-    return {"id": trial.id, **trial.cell, "repeat": trial.fields["repeat"], "seed": trial.fields["seed"], **row}
 
 
 def _csv(rows: Sequence[Row], answered: set[str]) -> bytes:
@@ -66,8 +84,8 @@ def _text(value: Any) -> str:
     return "" if value is None else value if isinstance(value, str) else canonical(value).decode()
 
 
-def _summary(trials: Sequence[Trial], found: Mapping[str, Row]) -> dict[str, Any]:
-    cells: dict[bytes, list[Trial]] = {}
+def _summary(trials: Sequence[PanelTrial], found: Mapping[str, Row]) -> dict[str, Any]:
+    cells: dict[bytes, list[PanelTrial]] = {}
     for trial in trials:
         cells.setdefault(canonical(trial.cell), []).append(trial)
     judged = any(isinstance(row.get("success"), bool) for row in found.values())
@@ -95,13 +113,12 @@ def _is_number(value: Any) -> bool:
 
 
 def _numbers(values: Sequence[float]) -> dict[str, Any]:
-    """Count, mean, sample standard deviation (null of one value), least and largest; exact sums, rounded once."""
+    """The sample standard deviation of one value is null; sums are exact and rounded once."""
     floats = [float(value) for value in values]
-    deviation = statistics.stdev(floats) if len(floats) > 1 else None
     return {
         "count": len(floats),
         "mean": statistics.mean(floats),
-        "std": deviation,
+        "std": statistics.stdev(floats) if len(floats) > 1 else None,
         "min": min(floats),
         "max": max(floats),
     }

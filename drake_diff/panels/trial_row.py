@@ -1,4 +1,4 @@
-"""The function that a panel names, and the row that one call of it gives."""
+"""The function that a panel file names, and the row that one call of it gives."""
 
 import importlib
 import importlib.util
@@ -17,9 +17,9 @@ from drake_diff.exceptions import InputError
 
 Row = dict[str, Any]
 Function = Callable[[dict[str, Any]], Mapping[str, Any]]
-# Of a trial whose worker process ended twice before it answered: killed, out of memory, a crash below Python.
-DIED: Row = {"error": "WorkerDied: the process that evaluated it ended before it answered, twice"}
-# A worker is one core's: libraries start no threads of their own in it.
+# A worker dies when it is killed, runs out of memory, or crashes below Python.
+DIED: Row = {"error": "WorkerDied: the process that evaluated this trial died, and so did the one that tried again"}
+# A worker has one core: its libraries start no threads of their own.
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
@@ -27,7 +27,7 @@ ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THRE
 class TrialFunction:
     """What `evaluate` names: "FILE.py:function", the file beside the panel in `directory`, or "module:function".
 
-    Relative paths in a panel start from its directory: a process that evaluates trials works there.
+    Workers run in the panel's directory, so that relative paths in a panel start from there.
     """
 
     evaluate: str
@@ -43,11 +43,11 @@ class TrialFunction:
         name = self.evaluate.rpartition(":")[2]
         function = getattr(self._module(), name, None)
         if not callable(function):
-            raise InputError("evaluate", got=f"{self.evaluate}, where there is none", expected="a function")
+            raise InputError("evaluate", got=f"{self.evaluate}, which is not one", expected="a function")
         return function
 
     def sha256(self) -> str | None:
-        """The hash of the file that the function stands in; what that imports is no part of it."""
+        """The hash of the function's file; what that file imports is not covered."""
         place = self.evaluate.rpartition(":")[0]
         path = Path(self.directory, place) if place.endswith(".py") else getattr(self._module(), "__file__", None)
         return sha256(Path(path).read_bytes()).hexdigest() if path else None
@@ -64,14 +64,14 @@ class TrialFunction:
 def _from_file(path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location("drake_diff_trials", path)
     if spec is None or spec.loader is None:
-        raise ImportError(f"{path} is no Python file")
+        raise ImportError(f"{path} is not a Python file")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
 def row_of(function: Function, fields: Mapping[str, Any]) -> Row:
-    """What `function` says of one trial: its row in JSON's types, or {"error": "Type: message"} where it raises.
+    """What `function` returns for one trial, in JSON's types, or {"error": "Type: message"} where it raises.
 
     NaN and infinity become None. The global generators of NumPy and Python start from the trial's seed.
     """

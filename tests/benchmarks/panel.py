@@ -13,8 +13,9 @@ import tempfile
 import time
 from pathlib import Path
 
+from loky import cpu_count
+
 import drake_diff as dd
-from drake_diff.panels.workers import cores
 
 ROOT = Path(__file__).parent.parent.parent
 FUNCTION = f"""
@@ -47,7 +48,7 @@ def main(seeds: int) -> None:
     (folder / "roll.py").write_text(FUNCTION)
     path = folder / "panel.toml"
     path.write_text(f'evaluate = "roll.py:roll"\nseeds = {seeds}\n[[cells]]\nmodel = "cart-pole"\n')
-    print(f"{cores()} cores for this process; load before: {os.getloadavg()[0]:.1f}")
+    print(f"{cpu_count()} cores for this process; load before: {os.getloadavg()[0]:.1f}")
     crews = (1, 2, 4)
     found = {crew: [] for crew in crews}
     for turn in range(REPEATS):
