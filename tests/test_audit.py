@@ -25,7 +25,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
 import drake_diff as dd
-from drake_diff.certificates.audit import SEVERITIES, Finding, audit
+from drake_diff.certificates.audit import SEVERITIES, Finding, Findings, audit
 from drake_diff.exceptions import ModelWarning, NonFiniteError, ShapeError, SimulationError
 from drake_diff.model.plant import actuators, joints
 
@@ -97,6 +97,14 @@ def test_findings_are_sorted_worst_first_and_readable():
         assert all(isinstance(text, str) and text for text in (f.code, f.subject, f.message, f.remedy))
     line = str(Finding("info", "a_code", "a thing", "is so", "do this"))
     assert line == "info a_code (a thing): is so\n  -> do this"
+
+
+def test_findings_print_one_below_the_other_and_html_is_escaped():
+    found = Findings([Finding("error", "a", "<b>", "m", "r"), Finding("info", "c", "d", "m", "r")])
+    assert repr(found) == str(found) == "error a (<b>): m\n  -> r\ninfo c (d): m\n  -> r"
+    assert "&lt;b&gt;" in found._repr_html_()
+    assert "<b>" not in found._repr_html_() + found[0]._repr_html_()
+    assert str(Findings()) == "nothing found"
 
 
 def test_a_bad_point_is_refused(load):

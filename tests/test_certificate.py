@@ -9,8 +9,7 @@ from helpers.models import random_state
 
 import drake_diff as dd
 from drake_diff._base.differences import sweep_of
-from drake_diff.certificates.certificate import certify_jacobian_of_many
-from drake_diff.exceptions import CertificateError, GradientError, ShapeError
+from drake_diff.exceptions import CertificateError, GradientError, ShapeError, UnknownNameError
 
 
 def smooth(n, seed=0):
@@ -46,7 +45,8 @@ def test_all_points_in_one_call_give_the_same_certificate():
     wrong = jacobian(x)
     wrong[2, 3] *= 1.01
     for claimed, verdict in ((jacobian, "agree"), (wrong, "disagree")):
-        one, together = dd.certificates.certify_jacobian(f, x, claimed), certify_jacobian_of_many(many, x, claimed)
+        one = dd.certificates.certify_jacobian(f, x, claimed)
+        together = dd.certificates.certify_jacobian(many, x, claimed, batched=True)
         assert one.verdict == together.verdict == verdict
         assert np.array_equal(one.codes, together.codes)
         assert np.array_equal(one.difference, together.difference)
@@ -148,6 +148,17 @@ def test_a_derivative_of_the_wrong_shape_is_refused():
         dd.certificates.certify_jacobian(lambda x: np.ones(2), [0.0], [[1.0]], rows=("a", "b"))
 
 
+def test_an_unknown_method_is_refused_with_the_list_of_methods(load):
+    model = load("pendulum.urdf")
+    expected = "one of analytic, auto, autodiff, finite_difference, implicit"
+    with pytest.raises(UnknownNameError, match=f"method: expected {expected}, got 'newton'"):
+        dd.certify(model, [0, 0], [0], method="newton")
+    with pytest.raises(UnknownNameError, match=expected):
+        dd.certify(model, [0, 0], [0], method="newton", derivatives=dd.differentiate_step(model, [0, 0], [0]))
+    with pytest.raises(UnknownNameError, match=expected):
+        dd.certify_rollout(model, [0, 0], np.zeros((2, 1)), lambda x: x[0], method="newton")
+
+
 def test_nothing_but_agree_passes_require():
     for claimed, f in ((0.0, np.abs), (2.0, np.sin)):
         with pytest.raises(CertificateError, match="derivative"):
@@ -226,3 +237,18 @@ def test_the_printed_certificate_names_the_worst_entry_and_both_numbers():
     text = str(dd.certificates.certify_jacobian(np.sin, [0.0], [[1.01]], rows=("y",), columns=("x",)))
     assert "disagree" in text
     assert "d y / d x: derivative 1.01, differences 1" in text
+
+
+def test_a_certificates_repr_is_short_and_its_html_is_escaped(load):
+    """The names come from models, which are untrusted text: 400 entries print in a few lines."""
+    f, jacobian = smooth(20)
+    names = [f"<i>{i}</i>" for i in range(20)]
+    certificate = dd.certificates.certify_jacobian(f, np.zeros(20), jacobian(np.zeros(20)), rows=names)
+    assert repr(certificate).startswith("Certificate of the derivative: agree (400 agree of 400 entries, given)\n")
+    assert len(repr(certificate).splitlines()) == 2
+    assert str(certificate) == repr(certificate).split(": ", 1)[1].replace("\n  ", "; ")
+    assert "&lt;i&gt;" in certificate._repr_html_()
+    assert "<i>" not in certificate._repr_html_()
+    rollout = dd.certify_rollout(load("pendulum.urdf"), [0.5, 0], np.zeros((2, 1)), lambda x: x[0], refine=True)
+    assert len(repr(rollout).splitlines()) == 3  # the verdict, the worst entry, the refinement
+    assert repr(rollout).startswith("RolloutCertificate of the rollout of ")

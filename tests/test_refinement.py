@@ -26,7 +26,7 @@ BALL = """<sdf version="1.9"><model name="bouncer"><link name="ball"><inertial><
 
 @pytest.fixture
 def bouncer(tmp_path):
-    """A ball on a vertical slide over a floor, without gravity and without dissipation: C01 in its own direction."""
+    """A ball on a vertical slide over a floor, without gravity and without dissipation."""
 
     def make(stiffness, time_step, mass=1.0):
         path = tmp_path / "bouncer.sdf"
@@ -42,7 +42,7 @@ def height(x):
 
 @pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e5])
 def test_through_a_bounce_the_gradient_does_not_converge_and_is_called_that(bouncer, stiffness):
-    """C01: a rigid ball ends at 2 r - y0 - v0 T, so d y / d y0 = -1 and d y / d v0 = -T."""
+    """A rigid ball ends at 2 r - y0 - v0 T, so d y / d y0 = -1 and d y / d v0 = -T."""
     model = bouncer(stiffness, 1 / 480)
     certificate = dd.certify_rollout(model, [1.003, -2.0], None, height, num_steps=480, refine=True)
     assert certificate.verdict == "not_converged", str(certificate)
@@ -88,7 +88,7 @@ def test_stiffening_needs_a_stated_stiffness(load):
 
 @pytest.mark.parametrize(("h", "count"), [(0.01, 100), (0.02, 37)])
 def test_the_gradient_of_a_projectile_is_the_same_at_every_step_size(load, h, count):
-    """A01: d z / d v0 = T for every h."""
+    """In free fall d z / d v0 = T for every h."""
     model = load("projectile.sdf", time_step=h)
     x0 = model.default_state
     x0[6], x0[10:] = 1.0, [2.0, 1.0, 5.0]
@@ -137,7 +137,7 @@ def test_the_time_step_is_not_refined_and_a_parameter_at_once(load):
 
 
 def two_balls(h, stiffness, masses=(1.0, 1.0)):
-    """C12: the first runs into the second, which rests, along x."""
+    """The first runs into the second, which rests, along x."""
     plant = Plant(h, "lagged", gravity=0.0)
     for name, mass in zip(("left", "right"), masses, strict=True):
         plant.ball(name, mass, 0.1, contact_properties(2 * stiffness), "x")
@@ -146,7 +146,7 @@ def two_balls(h, stiffness, masses=(1.0, 1.0)):
 
 @pytest.mark.parametrize("stiffness", [1e3, 1e5])
 def test_momentum_holds_of_a_gradient_that_is_wrong(stiffness):
-    """C12 and A28: rigid balls swap velocities, so d x2(T) / d (x1, x2, v1, v2) = (1, 0, 1, 0).
+    """Rigid balls of one mass swap velocities, so d x2(T) / d (x1, x2, v1, v2) = (1, 0, 1, 0).
 
     A discrete, compliant contact keeps the sums, by position 1 and by velocity T, and can be far from each part.
     """
@@ -175,6 +175,23 @@ def test_two_balls_resolved_tend_to_the_rigid_gradient():
     assert gradient.by_x0 == pytest.approx([1.0, 0.0, h * count - half, half], abs=0.05)
 
 
+def test_growth_rate_and_spectral_radii_of_a_block_have_their_closed_form(write_urdf):
+    """Free, |d x_N / d (x_k, v_k)| = |(1, (N - k) h)|, so that the rate over N steps is |(1, N h)|^(1/N), and the
+    eigenvalues of a step are 1. Under u = -kp x - kd v a step has the determinant 1 - h kd / m and the trace
+    2 - h^2 kp / m - h kd / m, so where they are complex its eigenvalues are of the size sqrt(1 - h kd / m)."""
+    h, m, count, kp, kd = 0.1, 2.0, 7, 30.0, 4.0
+    model = write_urdf(mass=m, time_step=h)
+    free = dd.differentiate_rollout(model, [0.5, -1.0], np.zeros((count, 1)), lambda x: x[0])
+    assert free.growth_rate == pytest.approx(np.hypot(1, count * h) ** (1 / count), rel=1e-12)
+    assert free.spectral_radii == pytest.approx(np.ones(count), rel=1e-7)  # a double eigenvalue: sqrt of rounding
+    held = dd.differentiate_rollout(
+        model, [0.5, -1.0], None, lambda x: x[0], policy=dd.PD(model, kp, kd), num_steps=count
+    )
+    assert held.spectral_radii == pytest.approx(np.full(count, np.sqrt(1 - h * kd / m)), rel=1e-12)
+    early = dd.differentiate_rollout(model, [0.5, -1.0], np.zeros((count, 1)), lambda xs, us: xs[0][0] + 0 * xs[1][0])
+    assert np.isnan(early.growth_rate)
+
+
 def test_horizon_diagnostics_of_a_growing_motion(load):
     """An inverted pendulum: |dx_N / dx_k| grows by the spectral radius of its step."""
     model = load("pendulum.urdf", time_step=0.01)
@@ -191,7 +208,7 @@ def test_horizon_diagnostics_of_a_growing_motion(load):
 
 
 def test_horizon_diagnostics_of_a_vanishing_gradient():
-    """A20: a ball that friction has stopped does not know how fast it was."""
+    """A ball that friction has stopped does not know how fast it was."""
     plant = Plant(0.01, "lagged")
     plant.ball("ball", 1.0, 0.1, contact_properties(2e4, 10.0, 0.5), "x", "z")
     plant.ground(contact_properties(2e4, 10.0, 0.5))

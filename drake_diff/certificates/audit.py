@@ -1,6 +1,7 @@
-"""The checks of an audit that are about contact: refused pairs, flat faces, cylinder axes, defaults, exact touch.
+"""Before anything runs: what in a model cannot be differentiated, or would be differentiated wrongly, and what to do.
 
-Before anything runs: what in a model cannot be differentiated, or will be differentiated wrongly, and what to do.
+`audit` runs a list of checks, each a function of a `Place` (the model at a point) that yields its findings. The checks
+of contact come after the others; every number in them was measured on the Drake that this package is tested with.
 """
 
 from collections.abc import Callable
@@ -12,7 +13,18 @@ from pydrake.multibody.plant import DiscreteContactApproximation
 from pydrake.multibody.tree import FixedOffsetFrame, WeldJoint
 
 from drake_diff._base.arrays import Array
-from drake_diff.certificates.audit_place import PARALLEL, SEVERITIES, Finding, Findings, Geometry, Pair, Place, short
+from drake_diff.certificates.audit_place import (
+    PARALLEL,
+    SEVERITIES,
+    Collider,
+    Finding,
+    Findings,
+    Found,
+    Pair,
+    Place,
+    Severity,
+    short,
+)
 from drake_diff.derivatives.step import StepDerivatives, differentiate_step
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError
 from drake_diff.model.load_file import MEETS_A_SPHERE
@@ -21,6 +33,8 @@ from drake_diff.model.parameter_kinds import IDENTITY_OFFSET
 from drake_diff.model.plant import actuators, instances, is_driven, joints
 from drake_diff.model.step import advance, check_point, set_state
 
+AT_LIMIT = 1e-6  # [m or rad] from a joint's limit
+HUGE = 1e3  # of an entry of A or B: sap's reach 14, lagged contact's 4e4
 NEARLY_PARALLEL = 1e-2  # [rad]: jumps were measured up to 1e-3 and beyond
 IN_PLANE = 1e-6  # [m] from a plane of symmetry
 ROUND = ("Sphere", "Ellipsoid", "Capsule")
@@ -38,211 +52,39 @@ _PROPERTIES = {  # name: (group, unit, the tag in <drake:proximity_properties>)
 }
 
 
-def _pair_refused(place: Place) -> Findings:
-    by_choice = place.model.contact_geometry == "differences"
-    groups: dict[tuple[str, str], list[Pair]] = {}
-    for pair in place.pairs:
-        if pair.refused:
-            groups.setdefault(pair.bodies, []).append(pair)
-    remedy = (
-        'load_model(..., contact_geometry="corner_spheres") puts spheres in place of boxes, cylinders and capsules, '
-        '"hydroelastic" gives every geometry a mesh, "differences" differences the step by choice; or filter the pair '
-        "(CollisionFilterDeclaration, or <drake:collision_filter_group> in the file) where it never touches"
-    )
-    if by_choice:
-        remedy = "nothing to do: it is differenced by choice, which needs method auto or finite_difference"
-    for bodies, pairs in groups.items():
-        yield Finding(
-            "info" if by_choice else "error", "pair_refused", " - ".join(bodies), _refusal(place, pairs), remedy
-        )
+def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) -> Findings:
+    """List what stands in the way of gradients of a model at a point, the worst first.
 
+    Args:
+        model: the model to look at; it is left as it was.
+        x: (nx,) the state [q; v], the model's default state if left out.
+        u: (nu,) [N or N m] the input, zero if left out.
 
-def _refusal(place: Place, pairs: list[Pair]) -> str:
-    sides = (dict.fromkeys(p.a.label for p in pairs), dict.fromkeys(p.b.label for p in pairs))
-    names = " against ".join(", ".join(side) for side in sides)
-    if any(pair.contact == "none" for pair in pairs):
-        why = "hydroelastic contact alone needs properties on both, one of them not rigid; the double step throws too"
-    else:
-        why = "AutoDiffXd has no point contact between these shapes, and throws as soon as their bounding boxes meet"
-    if any("HalfSpace" in (p.a.kind, p.b.kind) for p in pairs):
-        why += ", and that of a tilted half space is infinite: it throws without touching"
-    error = place.by_autodiff
-    if not isinstance(error, SimulationError):
-        return f"{names}: {why}. The AutoDiffXd step does not throw at x."
-    if any(p.a.kind.lower() in str(error).lower() and p.b.kind.lower() in str(error).lower() for p in pairs):
-        return f"{names}: {why}. The AutoDiffXd step throws at x over such shapes: {short(error)}."
-    return f"{names}: {why}. At x the AutoDiffXd step throws over another pair: {short(error)}."
+    Returns:
+        A list of `Finding`, sorted by severity; empty if there is nothing to say. It prints one below the other.
 
+    Raises:
+        ShapeError, NonFiniteError: a bad x or u. Whatever Drake refuses is a finding instead.
 
-def _aligned_faces(place: Place) -> Findings:
-    remedy = (
-        "put spheres in place of one of them (corner_spheres), or start tilted by 0.03 rad and more and `certify` the "
-        "poses in contact: near the aligned pose too (measured: up to 1e-3 rad, cylinder on cylinder up to 0.04) the "
-        "meshes' edges make the step jump"
-    )
-    for pair in place.pairs:
-        if pair.contact != "hydroelastic":
-            continue
-        angle, gap = _alignment(pair)
-        if angle is None:
-            continue
-        text = f"faces {angle:.2g} rad from parallel at x, {gap:.3g} m apart: "
-        if angle <= PARALLEL and gap <= REACH:
-            text += "the hydroelastic step jumps there, and AutoDiffXd gives a finite, plausible, wrong number"
-            yield Finding("error", "aligned_faces", pair.label, text, remedy)
-        elif angle <= NEARLY_PARALLEL:
-            text += "where they meet like this the hydroelastic step jumps"
-            yield Finding("warning", "aligned_faces", pair.label, text, remedy)
-        else:
-            text += "tilted now; where they come to lie flat the hydroelastic step jumps"
-            yield Finding("info", "aligned_faces", pair.label, text, remedy)
-
-
-def _alignment(pair: Pair) -> tuple[float | None, float]:
-    """The angle [rad] between the two nearest face normals, and the gap [m] along them; None without flat faces.
-
-    Drake's mesh of a round shape is one too, where it lies in a plane of symmetry of a box's or a cylinder's mesh.
+    Example:
+        >>> dd.audit(dd.load_model("models/pendulum.urdf", time_step=0.01))
+        info identity_frame (hinge): the frame on the parent is exactly the identity, ...
+          -> nothing to do with drake_diff; ...
     """
-    for one, other in ((pair.a, pair.b), (pair.b, pair.a)):
-        if one.kind in ROUND and other.kind in ("Box", "Cylinder") and not _in_symmetry_plane(one, other):
-            return None, np.inf
-    faces = [(n, m) for n in _normals(pair.a, pair.b) for m in _normals(pair.b, pair.a)]
-    if not faces:
-        return None, np.inf
-    angle = min(float(np.linalg.norm(np.cross(n, m))) for n, m in faces)
-    return angle, max(_gap(pair, n) for both in faces for n in both)
-
-
-def _normals(geometry: Geometry, other: Geometry) -> list[Array]:
-    """The normals of its flat faces, or of the planes that its mesh lines up with."""
-    if geometry.kind == "Box" or (geometry.kind in ("Sphere", "Ellipsoid") and other.kind in ("Box", "Cylinder")):
-        return [geometry.axis(i) for i in range(3)]
-    meshed_capsule = geometry.kind == "Capsule" and other.kind in ("Box", "Cylinder")
-    return [geometry.axis(2)] if geometry.kind in ("Cylinder", "HalfSpace") or meshed_capsule else []
-
-
-def _in_symmetry_plane(round_: Geometry, flat: Geometry) -> bool:
-    """Whether a round shape's centre is in a plane x = 0 or y = 0 (of a box: or z = 0) of the flat one's frame."""
-    offset = flat.pose.inverse() @ round_.pose.translation()
-    planes = 3 if flat.kind == "Box" else 2
-    return bool(np.min(np.abs(offset[:planes])) <= IN_PLANE)
-
-
-def _gap(pair: Pair, direction: Array) -> float:
-    """How far [m] the two boxes are apart along a direction; negative where they overlap."""
-    (low_a, high_a), (low_b, high_b) = pair.a.extent(direction), pair.b.extent(direction)
-    return max(low_a - high_b, low_b - high_a)
-
-
-def _cylinder_axis(place: Place) -> Findings:
-    for pair in place.pairs:
-        both = pair.of_kinds(Sphere, Cylinder)
-        if both is None or pair.contact != "point":
-            continue
-        offset = both[0].pose.translation() - both[1].pose.translation()
-        distance = float(np.linalg.norm(np.cross(both[1].axis(2), offset)))
-        message = f"the sphere's centre is {distance:.3g} m from the cylinder's axis"
-        remedy = "move the sphere off the axis by 1e-6 m or more, or put a box in place of the cylinder"
-        if distance < ON_AXIS:
-            message += ": where they touch AutoDiffXd is singular on it (NaN, or a plausible wrong number)"
-            yield Finding("error", "cylinder_axis", pair.label, message, remedy)
-        else:
-            message += ": exactly on it AutoDiffXd would be singular"
-            yield Finding("info", "cylinder_axis", pair.label, message, remedy)
-
-
-def _default_decides(place: Place) -> Findings:
-    groups: dict[tuple[str, ...], list[Geometry]] = {}
-    for geometry in place.geometries.values():
-        pairs = [pair for pair in place.pairs if geometry in (pair.a, pair.b)]
-        missing = tuple(
-            name
-            for name in _needed(place, geometry, {pair.contact for pair in pairs})
-            if not geometry.own.HasProperty(_PROPERTIES[name][0], name)
-        )
-        if missing:
-            groups.setdefault(missing, []).append(geometry)
-    for missing, geometries in groups.items():
-        values = ", ".join(f"{name} {_value(geometries[0], name)}" for name in missing)
-        message = f"not given, so the scene graph's default decides: {values}"
-        if "relaxation_time" in missing and _value(geometries[0], "relaxation_time") == "0.1 s":
-            message += " (with which a ball hardly bounces)"
-        tags = ", ".join(_PROPERTIES[name][2] for name in missing)
-        remedy = f"give them in <drake:proximity_properties> ({tags}) or in the geometry's ProximityProperties"
-        yield Finding("warning", "default_decides", ", ".join(g.label for g in geometries), message, remedy)
-
-
-def _needed(place: Place, geometry: Geometry, contacts: set[str]) -> list[str]:
-    """The properties that the step reads from a geometry."""
-    sap = place.model.plant.get_discrete_contact_approximation() == DiscreteContactApproximation.kSap
-    names = ["coulomb_friction", "relaxation_time" if sap else "hunt_crossley_dissipation"]
-    names += ["point_contact_stiffness"] if "point" in contacts else []
-    soft = geometry.compliance == "compliant"
-    return names + (["hydroelastic_modulus"] if "hydroelastic" in contacts and soft else [])
-
-
-def _value(geometry: Geometry, name: str) -> str:
-    """The number that Drake uses, with its unit."""
-    group, unit, _ = _PROPERTIES[name]
-    if not geometry.all.HasProperty(group, name):
-        return "(Drake's own)"
-    value = geometry.all.GetProperty(group, name)
-    return f"{value.dynamic_friction() if name == 'coulomb_friction' else value:g}{unit}"
-
-
-def _touching(place: Place) -> Findings:
-    set_state(place.model.double, place.x)
-    unmeasured = []
-    for pair in place.pairs:
-        try:
-            distance = place.query.ComputeSignedDistancePairClosestPoints(pair.a.id, pair.b.id).distance
-        except RuntimeError:  # no such distance between these shapes
-            unmeasured.append(pair.label)
-            continue
-        if abs(distance) < _touch_tolerance(pair):
-            message = f"exactly at touch (signed distance {distance:.2g} m): the derivative is that of one side"
-            remedy = "start a little apart or a little in contact, or take `smooth_step`"
-            yield Finding("warning", "touching", pair.label, message, remedy)
-    if unmeasured:
-        message = "Drake computes no distance between these, so whether they are exactly at touch is not known"
-        remedy = "compare x with x moved by 1e-6 m yourself, or put spheres in place of one (corner_spheres)"
-        yield Finding("info", "not_measured", ", ".join(unmeasured), message, remedy)
-
-
-def _touch_tolerance(pair: Pair) -> float:
-    exact = {pair.a.kind, pair.b.kind} <= MEETS_A_SPHERE and pair.of_kinds(Sphere, object) is not None
-    return TOUCH if exact or pair.of_kinds(Box, Box) else ROUGH_TOUCH
-
-
-CONTACT_CHECKS = (_pair_refused, _aligned_faces, _cylinder_axis, _default_decides, _touching)
-
-
-AT_LIMIT = 1e-6  # [m or rad] from a joint's limit
-HUGE = 1e3  # of an entry of A or B: sap's reach 14, lagged contact's 4e4
-
-
-def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) -> list[Finding]:
-    """What stands in the way of gradients of `model` at x (nx,) and u (nu,) [N or N m], the worst first.
-
-    x is the model's default state and u zero where they are left out. Raises ShapeError or NonFiniteError for a
-    bad x or u; whatever Drake refuses is a finding.
-    """
-    point = check_point(
-        model, model.default_state if x is None else x, np.zeros(model.nu) if u is None and model.nu else u
-    )
-    place = Place(model, *point)
+    x = model.default_state if x is None else x
+    place = Place(model, *check_point(model, x, np.zeros(model.nu) if u is None and model.nu else u))
     checks = _CHECKS if place.has_poses else _CHECKS_WITHOUT_POSES
-    found = [finding for check in checks for finding in check(place)]
-    return sorted(found, key=lambda f: (SEVERITIES.index(f.severity), f.subject, f.code))
+    found = (finding for check in checks for finding in check(place))
+    return Findings(sorted(found, key=lambda f: (SEVERITIES.index(f.severity), f.subject, f.code)))
 
 
-def _no_step(place: Place) -> Findings:
+def _no_step(place: Place) -> Found:
     if place.step_error is not None:
-        remedy = "choose x and u that `step` can take; where contact is named, see the finding pair_refused"
+        remedy = "choose x and u that `step` can take; if it names contact, see the finding pair_refused"
         yield Finding("error", "no_step", "step", f"the double step fails here: {short(place.step_error)}", remedy)
 
 
-def _pd_gains(place: Place) -> Findings:
+def _pd_gains(place: Place) -> Found:
     plant = place.model.plant
     for instance in instances(plant):
         with_gains = [a for a in actuators(plant) if a.model_instance() == instance and a.has_controller()]
@@ -258,7 +100,7 @@ def _pd_gains(place: Place) -> Findings:
         yield Finding("info", "pd_gains", ", ".join(a.name() for a in with_gains), message, remedy)
 
 
-def _identity_frame(place: Place) -> Findings:
+def _identity_frame(place: Place) -> Found:
     found = []
     for joint in joints(place.model.plant):
         frame = joint.frame_on_parent()
@@ -273,16 +115,33 @@ def _identity_frame(place: Place) -> Findings:
         yield Finding("info", "identity_frame", ", ".join(found), message, remedy)
 
 
-def _saturated_effort(place: Place) -> Findings:
-    remedy = "stay inside the limit (Bounds of a Problem do), or raise it in the file"
-    for note in place.model.notes:
+def _joint_limit(place: Place) -> Found:
+    plant, names = place.model.plant, place.model.position_names
+    limits = zip(plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits(), strict=True)
+    for name, q, (low, high) in zip(names, place.x[: place.model.nq], limits, strict=True):
+        if q <= low + AT_LIMIT or q >= high - AT_LIMIT:
+            message = f"{q:.9g} is at or beyond its limits [{low:g}, {high:g}]: the derivative is that of one side"
+            remedy = "start inside the limits, or use `smooth_step`, which averages over both sides"
+            yield Finding("warning", "joint_limit", name, message, remedy)
+
+
+def _saturated_effort(place: Place) -> Found:
+    model, plant, twin = place.model, place.model.plant, place.model.double
+    remedy = "stay inside the limit (the bounds of a Problem do), or raise it in the file"
+    for note in model.notes:
         if "zero effort limit" in note:
-            message = f"Drake leaves out what has an effort limit of 0, so there is no input: {note}"
+            message = f"Drake leaves out actuators with an effort limit of 0, so there is no input: {note}"
             yield Finding("error", "saturated_effort", "actuators", message, "give the joint an effort above 0")
-    if not place.model.nu:
+    if not model.nu:
         return
-    effort, hold = _net_effort(place), _effort_to_hold(place)
-    for actuator, u, now, rest in zip(actuators(place.model.plant), place.u, effort, hold, strict=True):
+    effort = place.u  # [N or N m] what the actuators apply: u with PD control, clamped; u alone if no step succeeds
+    if place.step_error is None:
+        advance(twin, place.x, place.u)
+        effort = np.array(plant.get_net_actuation_output_port().Eval(twin.context))
+    set_state(twin, np.concatenate([place.x[: model.nq], np.zeros(model.nv)]))
+    # The effort nearest to what no acceleration at rest takes.
+    hold = np.linalg.lstsq(plant.MakeActuationMatrix(), twin.inverse_dynamics(np.zeros(model.nv)), rcond=None)[0]
+    for actuator, u, now, rest in zip(actuators(plant), place.u, effort, hold, strict=True):
         limit = float(actuator.effort_limit())
         if abs(now) >= limit:
             message = f"its effort is at the limit {limit:g} (u is {u:.6g}): there the derivative by u is exactly 0"
@@ -292,26 +151,10 @@ def _saturated_effort(place: Place) -> Findings:
             yield Finding("warning", "saturated_effort", actuator.name(), message, remedy)
 
 
-def _net_effort(place: Place) -> Array:
-    """(nu,) what the actuators apply [N or N m]: u with PD control, clamped; u alone where no step can be taken."""
-    if place.step_error is not None:
-        return place.u
-    advance(place.model.double, place.x, place.u)
-    return np.array(place.model.plant.get_net_actuation_output_port().Eval(place.model.double.context))
-
-
-def _effort_to_hold(place: Place) -> Array:
-    """(nu,) the effort [N or N m] nearest to what no acceleration at rest takes."""
-    plant, twin = place.model.plant, place.model.double
-    set_state(twin, np.concatenate([place.x[: place.model.nq], np.zeros(place.model.nv)]))
-    needed = twin.inverse_dynamics(np.zeros(place.model.nv))
-    return np.asarray(np.linalg.lstsq(plant.MakeActuationMatrix(), needed, rcond=None)[0])
-
-
-def _jacobian(place: Place) -> Findings:
+def _jacobian(place: Place) -> Found:
     if place.step_error is not None:
         return
-    result = place.by_autodiff
+    result: StepDerivatives | DrakeDiffError = place.by_autodiff
     if isinstance(result, ModelError):
         remedy = "give that system a scalar conversion (TemplateSystem), take it out, or accept differences"
         yield Finding("error", "autodiff_refused", "diagram", str(result), remedy)
@@ -319,65 +162,200 @@ def _jacobian(place: Place) -> Findings:
         remedy = "leave out what it names, or accept differences (method finite_difference)"
         yield Finding("error", "autodiff_refused", "step", f"the AutoDiffXd step throws: {short(result)}", remedy)
     if isinstance(result, ModelError | SimulationError):
-        result = _by_differences(place)
+        try:
+            result = differentiate_step(place.model, place.x, place.u, method="finite_difference")
+        except (GradientError, SimulationError) as error:
+            result = error
     if isinstance(result, DrakeDiffError):
         remedy = "move x off the singular pose; `certify` shows which entry is wrong, `smooth_step` averages over it"
         yield Finding("error", "gradient_refused", "step", str(result), remedy)
-    else:
-        yield from _huge(place.model, result)
-
-
-def _by_differences(place: Place) -> StepDerivatives | DrakeDiffError:
-    try:
-        return differentiate_step(place.model, place.x, place.u, method="finite_difference")
-    except (GradientError, SimulationError) as error:
-        return error
-
-
-def _huge(model: Model, d: StepDerivatives) -> Findings:
-    jacobian = np.abs(np.hstack([d.A, d.B]))
+        return
+    jacobian = np.abs(np.hstack([result.A, result.B]))
     row, column = np.unravel_index(int(np.argmax(jacobian)), jacobian.shape)
     if jacobian[row, column] > HUGE:
-        variables, count = (*model.state_names, *model.input_names), int(np.sum(jacobian > HUGE))
-        entry = f"d {model.state_names[row]} / d {variables[column]}"
-        message = f"{entry} is {jacobian[row, column]:.3g} (by {d.method}), {count} entries are above {HUGE:g}"
+        names, count = place.model.state_names, int(np.sum(jacobian > HUGE))
+        entry = f"d {names[row]} / d {(*names, *place.model.input_names)[column]}"
+        message = f"{entry} is {jacobian[row, column]:.3g} (by {result.method}), {count} entries are above {HUGE:g}"
         remedy = (
-            "contact_approximation sap has the tamest Jacobians; else a shorter time step, softer contact or a longer "
-            "relaxation time, lighter inertia ratios, or `smooth_step`"
+            "contact_approximation sap has the tamest Jacobians; otherwise a shorter time step, softer contact or a "
+            "longer relaxation time, lighter inertia ratios, or `smooth_step`"
         )
         yield Finding("warning", "huge_jacobian", entry, message, remedy)
 
 
-def _mechanism(place: Place) -> Findings:
+def _mechanism(place: Place) -> Found:
     plant, context = place.model.plant, place.model.double.context
     if plant.num_constraints():
-        message = f"constraints in every step ({plant.num_constraints()}), which the implicit method does not know"
+        message = f"constraints in every step ({plant.num_constraints()}), which the implicit method cannot handle"
         remedy = "nothing to do: method auto takes autodiff; `certify` one state, as a few kinds have no AutoDiffXd"
         yield Finding("info", "constraints", "plant", message, remedy)
     locked = [joint.name() for joint in joints(plant) if joint.is_locked(context)]
     if locked:
         message = (
             "locked in the double context, which the AutoDiffXd twin does not know: where it would move there, the "
+            "derivative is refused"
         )
         remedy = "weld it in the plant instead (WeldFrames), or joint.Unlock(model.double.context)"
-        yield Finding("info", "locked_joint", ", ".join(locked), message + "derivative is refused", remedy)
+        yield Finding("info", "locked_joint", ", ".join(locked), message, remedy)
 
 
-def _joint_limit(place: Place) -> Findings:
-    plant, names = place.model.plant, place.model.position_names
-    limits = zip(plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits(), strict=True)
-    for name, q, (low, high) in zip(names, place.x[: place.model.nq], limits, strict=True):
-        if q <= low + AT_LIMIT or q >= high - AT_LIMIT:
-            message = f"{q:.9g} is at or beyond its limits [{low:g}, {high:g}]: the derivative is that of one side"
-            remedy = "start inside the limits, or take `smooth_step`, which averages over both sides"
-            yield Finding("warning", "joint_limit", name, message, remedy)
+def _pair_refused(place: Place) -> Found:
+    severity: Severity = "error"
+    remedy = (
+        'load_model(..., contact_geometry="corner_spheres") replaces boxes, cylinders and capsules by spheres, '
+        '"hydroelastic" gives every geometry a mesh, "differences" differences the step by choice; or filter the pair '
+        "(CollisionFilterDeclaration, or <drake:collision_filter_group> in the file) if it never touches"
+    )
+    if place.model.contact_geometry == "differences":
+        severity = "info"
+        remedy = "nothing to do: it is differenced by choice, which needs method auto or finite_difference"
+    groups: dict[tuple[str, str], list[Pair]] = {}
+    for pair in place.pairs:
+        if pair.refused:
+            groups.setdefault(pair.bodies, []).append(pair)
+    for bodies, pairs in groups.items():
+        yield Finding(severity, "pair_refused", " - ".join(bodies), _refusal(place, pairs), remedy)
 
 
-_CHECKS_WITHOUT_POSES: tuple[Callable[[Place], Findings], ...] = (_no_step, _pd_gains, _identity_frame, _joint_limit)
-_CHECKS: tuple[Callable[[Place], Findings], ...] = (
+def _refusal(place: Place, pairs: list[Pair]) -> str:
+    sides = (dict.fromkeys(p.a.label for p in pairs), dict.fromkeys(p.b.label for p in pairs))
+    names, error = " against ".join(", ".join(side) for side in sides), place.by_autodiff
+    if any(pair.contact == "none" for pair in pairs):
+        why = "hydroelastic contact alone needs properties on both, one of them not rigid; the double step throws too"
+    else:
+        why = "AutoDiffXd has no point contact between these shapes, and throws once their bounding boxes meet"
+    if any("HalfSpace" in (p.a.kind, p.b.kind) for p in pairs):
+        why += ", and that of a tilted half space is infinite: it throws without touching"
+    if not isinstance(error, SimulationError):
+        return f"{names}: {why}. The AutoDiffXd step does not throw at x."
+    if any(p.a.kind.lower() in str(error).lower() and p.b.kind.lower() in str(error).lower() for p in pairs):
+        return f"{names}: {why}. The AutoDiffXd step throws at x over such shapes: {short(error)}."
+    return f"{names}: {why}. At x the AutoDiffXd step throws over another pair: {short(error)}."
+
+
+def _aligned_faces(place: Place) -> Found:
+    remedy = (
+        "replace one of them by spheres (corner_spheres), or start tilted by 0.03 rad or more and `certify` the "
+        "poses in contact: near the aligned pose too (measured: up to 1e-3 rad, cylinder on cylinder up to 0.04) the "
+        "meshes' edges make the step jump"
+    )
+    for pair in place.pairs:
+        angle, gap = _alignment(pair) if pair.contact == "hydroelastic" else (None, np.inf)
+        if angle is None:
+            continue
+        message = f"faces {angle:.2g} rad from parallel at x, {gap:.3g} m apart: "
+        if angle <= PARALLEL and gap <= REACH:
+            message += "the hydroelastic step jumps there, and AutoDiffXd gives a finite, plausible, wrong number"
+            yield Finding("error", "aligned_faces", pair.label, message, remedy)
+        elif angle <= NEARLY_PARALLEL:
+            message += "if they meet like this the hydroelastic step jumps"
+            yield Finding("warning", "aligned_faces", pair.label, message, remedy)
+        else:
+            message += "tilted now; if they come to lie flat the hydroelastic step jumps"
+            yield Finding("info", "aligned_faces", pair.label, message, remedy)
+
+
+def _alignment(pair: Pair) -> tuple[float | None, float]:
+    """The angle [rad] between the two nearest face normals, and the gap [m] along them; None without flat faces.
+
+    The gap is negative where the boxes overlap. Drake's mesh of a round shape counts as flat too, where its centre
+    lies in a plane of symmetry of a box's mesh or in an upright one of a cylinder's.
+    """
+    for one, other in ((pair.a, pair.b), (pair.b, pair.a)):
+        if one.kind in ROUND and other.kind in ("Box", "Cylinder"):
+            offset = other.pose.inverse() @ one.pose.translation()
+            if np.min(np.abs(offset[: 3 if other.kind == "Box" else 2])) > IN_PLANE:
+                return None, np.inf
+    faces = [(n, m) for n in _normals(pair.a, pair.b) for m in _normals(pair.b, pair.a)]
+    if not faces:
+        return None, np.inf
+    gaps = []
+    for direction in (n for both in faces for n in both):
+        (low_a, high_a), (low_b, high_b) = pair.a.extent(direction), pair.b.extent(direction)
+        gaps.append(max(low_a - high_b, low_b - high_a))
+    return min(float(np.linalg.norm(np.cross(n, m))) for n, m in faces), max(gaps)
+
+
+def _normals(collider: Collider, other: Collider) -> list[Array]:
+    """The normals of its flat faces, or of the planes that its mesh lines up with."""
+    meshed = other.kind in ("Box", "Cylinder")
+    if collider.kind == "Box" or (collider.kind in ("Sphere", "Ellipsoid") and meshed):
+        return [collider.axis(i) for i in range(3)]
+    upright = collider.kind in ("Cylinder", "HalfSpace") or (collider.kind == "Capsule" and meshed)
+    return [collider.axis(2)] if upright else []
+
+
+def _cylinder_axis(place: Place) -> Found:
+    for pair in place.pairs:
+        both = pair.of_kinds(Sphere, Cylinder)
+        if both is None or pair.contact != "point":
+            continue
+        offset = both[0].pose.translation() - both[1].pose.translation()
+        distance = float(np.linalg.norm(np.cross(both[1].axis(2), offset)))
+        message = f"the sphere's centre is {distance:.3g} m from the cylinder's axis: "
+        remedy = "move the sphere off the axis by 1e-6 m or more, or replace the cylinder by a box"
+        if distance < ON_AXIS:
+            message += "if they touch AutoDiffXd is singular on it (NaN, or a plausible wrong number)"
+            yield Finding("error", "cylinder_axis", pair.label, message, remedy)
+        else:
+            message += "exactly on it AutoDiffXd would be singular"
+            yield Finding("info", "cylinder_axis", pair.label, message, remedy)
+
+
+def _default_decides(place: Place) -> Found:
+    sap = place.model.plant.get_discrete_contact_approximation() == DiscreteContactApproximation.kSap
+    groups: dict[tuple[str, ...], list[Collider]] = {}
+    for collider in place.colliders.values():
+        contacts = {pair.contact for pair in place.pairs if collider in (pair.a, pair.b)}
+        read = ["coulomb_friction", "relaxation_time" if sap else "hunt_crossley_dissipation"]  # by the step
+        read += ["point_contact_stiffness"] * ("point" in contacts)
+        read += ["hydroelastic_modulus"] * ("hydroelastic" in contacts and collider.compliance == "compliant")
+        missing = tuple(name for name in read if not collider.own.HasProperty(_PROPERTIES[name][0], name))
+        if missing:
+            groups.setdefault(missing, []).append(collider)
+    for missing, colliders in groups.items():
+        values = {name: _value(colliders[0], name) for name in missing}
+        told = ", ".join(f"{name} {value}" for name, value in values.items())
+        message = f"not given, so the scene graph's default decides: {told}"
+        if values.get("relaxation_time") == "0.1 s":
+            message += " (with which a ball hardly bounces)"
+        tags = ", ".join(_PROPERTIES[name][2] for name in missing)
+        remedy = f"give them in <drake:proximity_properties> ({tags}) or in the geometry's ProximityProperties"
+        yield Finding("warning", "default_decides", ", ".join(c.label for c in colliders), message, remedy)
+
+
+def _value(collider: Collider, name: str) -> str:
+    """The number that Drake uses, with its unit."""
+    group, unit, _ = _PROPERTIES[name]
+    if not collider.all.HasProperty(group, name):
+        return "(Drake's own)"
+    value = collider.all.GetProperty(group, name)
+    return f"{value.dynamic_friction() if name == 'coulomb_friction' else value:g}{unit}"
+
+
+def _touching(place: Place) -> Found:
+    set_state(place.model.double, place.x)
+    unmeasured = []
+    for pair in place.pairs:
+        try:
+            distance = place.query.ComputeSignedDistancePairClosestPoints(pair.a.id, pair.b.id).distance
+        except RuntimeError:  # no such distance between these shapes
+            unmeasured.append(pair.label)
+            continue
+        exact = {pair.a.kind, pair.b.kind} <= MEETS_A_SPHERE and pair.of_kinds(Sphere, object) is not None
+        if abs(distance) < (TOUCH if exact or pair.of_kinds(Box, Box) else ROUGH_TOUCH):
+            message = f"exactly at touch (signed distance {distance:.2g} m): the derivative is that of one side"
+            remedy = "start a little apart or a little in contact, or use `smooth_step`"
+            yield Finding("warning", "touching", pair.label, message, remedy)
+    if unmeasured:
+        message = "Drake computes no distance between these, so whether they are exactly at touch is not known"
+        remedy = "compare x with x moved by 1e-6 m yourself, or replace one of them by spheres (corner_spheres)"
+        yield Finding("info", "not_measured", ", ".join(unmeasured), message, remedy)
+
+
+_CHECKS_WITHOUT_POSES: tuple[Callable[[Place], Found], ...] = (_no_step, _pd_gains, _identity_frame, _joint_limit)
+_CHECKS = (
     *_CHECKS_WITHOUT_POSES,
-    *CONTACT_CHECKS,
-    _saturated_effort,
-    _jacobian,
-    _mechanism,
+    *(_pair_refused, _aligned_faces, _cylinder_axis, _default_decides, _touching),
+    *(_saturated_effort, _jacobian, _mechanism),
 )

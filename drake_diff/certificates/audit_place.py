@@ -1,8 +1,9 @@
-"""What an audit looks at: a model at a point, its geometries and their pairs; and what it says, a Finding each."""
+"""What an audit looks at (a model at a point, its colliders and their pairs) and what it says (findings)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 from typing import Any, Literal
 
 import numpy as np
@@ -22,12 +23,18 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
 PARALLEL = 1e-6  # [rad] between face normals
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Finding:
-    """Something to know before differentiating a model: `message` says what, `remedy` what to change.
+    """Something to know before a model is differentiated.
 
-    "error": it throws, or the derivative is wrong, here; "warning": it may be, or a number was not chosen;
-    "info": it is taken care of, or a limit to know. `code` is stable, for tests and records.
+    `severity` is "error" if Drake throws here or the derivative is wrong, "warning" if it may be or a number was not
+    chosen, and "info" if it is taken care of or a limit to know. `code` is a stable name of the kind of finding,
+    `subject` the part of the model, `message` says what is found and `remedy` what to change.
+
+    Example:
+        >>> dd.certificates.Finding("info", "locked_joint", "elbow", "is locked", "unlock it")
+        info locked_joint (elbow): is locked
+          -> unlock it
     """
 
     severity: Severity
@@ -39,8 +46,25 @@ class Finding:
     def __str__(self) -> str:
         return f"{self.severity} {self.code} ({self.subject}): {self.message}\n  -> {self.remedy}"
 
+    __repr__ = __str__
 
-Findings = Iterator[Finding]
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(str(self))}</pre>"
+
+
+class Findings(list[Finding]):
+    """What an audit found, the worst first: a list that prints one finding below the other."""
+
+    def __str__(self) -> str:
+        return "\n".join(map(str, self)) or "nothing found"
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(str(self))}</pre>"
+
+
+Found = Iterator[Finding]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +109,11 @@ class Place:
         return self.model.plant.get_geometry_query_input_port().Eval(self.model.double.context)
 
     @cached_property
-    def geometries(self) -> "dict[Any, Geometry]":
+    def colliders(self) -> "dict[Any, Collider]":
         """Those that can collide, by id, at x."""
         set_state(self.model.double, self.x)
         ids = {g for pair in self.candidates for g in pair}
-        return {g: _geometry(self, g) for g in sorted(ids, key=lambda g: g.get_value())}
+        return {g: _collider(self, g) for g in sorted(ids, key=lambda g: g.get_value())}
 
     @cached_property
     def candidates(self) -> list[tuple[Any, Any]]:
@@ -102,11 +126,11 @@ class Place:
     @cached_property
     def pairs(self) -> "list[Pair]":
         contact = self.model.plant.get_contact_model()
-        return [Pair(self.geometries[a], self.geometries[b], contact) for a, b in self.candidates]
+        return [Pair(self.colliders[a], self.colliders[b], contact) for a, b in self.candidates]
 
 
 @dataclass(frozen=True, eq=False)
-class Geometry:
+class Collider:
     """A collision geometry at x. `own` is what the file or the user gave it, `all` what Drake uses."""
 
     id: Any
@@ -139,11 +163,11 @@ class Geometry:
         return middle - half, middle + half
 
 
-def _geometry(place: Place, id_: Any) -> Geometry:
+def _collider(place: Place, id_: Any) -> Collider:
     inspector, own = place.query.inspector(), place.model.double.scene_graph.model_inspector()
     body = place.model.plant.GetBodyFromFrameId(inspector.GetFrameId(id_))
     shape, body_name = inspector.GetShape(id_), body.name() if body is not None else "?"
-    return Geometry(
+    return Collider(
         id=id_,
         label=f"{body_name}/{inspector.GetName(id_).split('::')[-1]} ({type(shape).__name__})",
         body=body_name,
@@ -173,8 +197,8 @@ def _compliance(place: Place, id_: Any, shape: Any) -> Literal["none", "rigid", 
 class Pair:
     """Two geometries that can collide."""
 
-    a: Geometry
-    b: Geometry
+    a: Collider
+    b: Collider
     model: Any
 
     @property
@@ -201,7 +225,7 @@ class Pair:
     def refused(self) -> bool:
         return self.contact == "none" or not autodiff_supports(self.a.shape, self.b.shape, self.contact)
 
-    def of_kinds(self, a: type, b: type) -> tuple[Geometry, Geometry] | None:
+    def of_kinds(self, a: type, b: type) -> tuple[Collider, Collider] | None:
         """The two in the order of the shapes that are asked for."""
         for one, other in ((self.a, self.b), (self.b, self.a)):
             if isinstance(one.shape, a) and isinstance(other.shape, b):

@@ -1,21 +1,14 @@
-"""Compare a derivative with differences, entry by entry: agree, disagree, discontinuous, undecided.
+"""Compare a derivative with difference quotients, entry by entry, and say whether it may be used.
 
-For every entry the function is differenced at 13 step sizes, half a decade apart. With C(h) the central quotient
-and r = sqrt(10), Richardson's D(h) = C(h/r) + (C(h/r) - C(h)) / (r^2 - 1) has an error of order h^4. Where three
-neighbouring D lie close together is a plateau; their spread is its uncertainty. An entry
-
-    agrees            where it lies on a plateau that is resolved to 1e-4 of it; an iteratively solved step
-                      is allowed 100 times its solver's tolerance, relative to the entry and the row's largest;
-    disagrees         where there are such plateaus and it lies on none, by more than ten times that allowance;
-    is discontinuous  where forward and backward quotients do not approach each other as h shrinks (a kink), or
-                      grow apart as 1/h (a jump), or where the derivative is another one 1e-9 beside the point;
-    is undecided      where the differences resolve nothing. Undecided does not pass;
-    is not converged  where it agrees, but a rollout's gradient is another one at a finer time step (`refinement`).
+The function is differenced at 13 step sizes, half a decade apart. With C(h) the central quotient and r = sqrt(10),
+Richardson's D(h) = C(h/r) + (C(h/r) - C(h)) / (r^2 - 1) has an error of order h^4. Three neighbouring D that lie close
+together are a plateau, and their spread is its uncertainty. What the verdicts mean stands in `Certificate`.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,9 +23,9 @@ RELATIVE_TOLERANCE = 1e-6
 RESOLVED = 1e-4
 # Entries below this part of their row's largest, or below NOTHING, need not be resolved, only consistent.
 NEGLIGIBLE, NOTHING = 1e-6, 1e-9
-# The derivative of what an iterative solver leaves unsolved: measured up to 60 times its tolerance, by row.
+# An iterative solver stops early, and the derivative shows it: measured up to 60 times its tolerance, by row.
 SOLVER_FACTOR = 100.0
-DOUBTFUL = 10.0  # up to so many times that, a gap may still be the solver's: undecided, which does not pass
+DOUBTFUL = 10.0  # a gap up to this many times that may still be the solver's: undecided, which does not pass
 JITTER = 1e-9
 JITTER_CHANGE = 0.1
 VERDICTS = ("agree", "undecided", "not_converged", "disagree", "discontinuous")  # from good to bad
@@ -40,7 +33,7 @@ VERDICTS = ("agree", "undecided", "not_converged", "disagree", "discontinuous") 
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry of the derivative: its own value, the differences' value, and what is left of doubt."""
+    """One entry of a derivative, the differences' value of it, and the gap that is allowed between them."""
 
     row: str
     column: str
@@ -56,9 +49,27 @@ class Entry:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Certificate:
-    """The comparison of one derivative (m, n) with differences; arrays (m, n), verdicts by index in VERDICTS."""
+    """One derivative (m, n), compared with difference quotients; `codes` (m, n) are indices into VERDICTS.
+
+    The verdict of an entry is
+
+    - "agree": it lies on a plateau that is known to 1e-4 of it. The step of an iterative solver is allowed 100 times
+      the solver's tolerance, relative to the entry and to the largest of its row;
+    - "undecided": the differences do not resolve it. Undecided does not pass;
+    - "not_converged": it agrees, but a rollout's gradient changes at a finer time step or in stiffer contact;
+    - "disagree": there are plateaus, and it misses all of them by more than ten times what is allowed;
+    - "discontinuous": forward and backward quotients do not approach each other as h shrinks (a kink), or grow apart
+      as 1/h (a jump), or the derivative is another one 1e-9 beside the point.
+
+    Example:
+        >>> certificate = dd.certificates.certify_jacobian(np.sin, [0.0], [[1.01]], rows=["y"], columns=["x"])
+        >>> certificate.verdict
+        'disagree'
+        >>> print(certificate.worst)
+        d y / d x: derivative 1.01, differences 1, tolerance ...: disagree
+    """
 
     rows: tuple[str, ...]
     columns: tuple[str, ...]
@@ -90,84 +101,93 @@ class Certificate:
 
     def entry(self, row: int, column: int) -> Entry:
         """The entry at (`row`, `column`)."""
-        at = (row, column)
-        return Entry(
-            self.rows[row],
-            self.columns[column],
-            float(self.derivative[at]),
-            float(self.difference[at]),
-            float(self.tolerance[at]),
-            VERDICTS[self.codes[at]],
+        derivative, difference, tolerance = (
+            float(values[row, column]) for values in (self.derivative, self.difference, self.tolerance)
         )
+        verdict = VERDICTS[self.codes[row, column]]
+        return Entry(self.rows[row], self.columns[column], derivative, difference, tolerance, verdict)
 
     def count(self, verdict: str) -> int:
         """How many entries have this verdict."""
         return int((self.codes == VERDICTS.index(verdict)).sum())
 
     def require(self) -> "Certificate":
-        """This certificate where every entry agrees; CertificateError, naming the worst entry, where not."""
+        """This certificate if every entry agrees; otherwise CertificateError, which names the worst entry."""
         if self.verdict != "agree":
             raise CertificateError(f"{self.subject}: {self}")
         return self
 
-    def __str__(self) -> str:
+    def _lines(self) -> list[str]:
         counts = ", ".join(f"{self.count(v)} {v}" for v in VERDICTS if self.count(v))
-        worst = f"; worst: {self.worst}" if self.codes.size else ""
-        changes = f"; contact changes nearby: {self.mode_changes[0]}" if self.mode_changes else ""
-        more = f" and {len(self.mode_changes) - 1} more" if len(self.mode_changes) > 1 else ""
-        return f"{self.verdict} ({counts} of {self.codes.size} entries, {self.method}){worst}{changes}{more}"
+        lines = [f"{self.verdict} ({counts} of {self.codes.size} entries, {self.method})"]
+        if self.codes.size:
+            lines.append(f"worst: {self.worst}")
+        if self.mode_changes:
+            more = f" and {len(self.mode_changes) - 1} more" if len(self.mode_changes) > 1 else ""
+            lines.append(f"contact changes nearby: {self.mode_changes[0]}{more}")
+        return lines
+
+    def __str__(self) -> str:
+        return "; ".join(self._lines())
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__} of {self.subject}: " + "\n  ".join(self._lines())
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def certify_jacobian(
-    f: Function,
+    f: Function | Many,
     x: ArrayLike,
     jacobian: ArrayLike | Callable[[Array], Array],
     *,
+    batched: bool = False,
     rows: Sequence[str] | None = None,
     columns: Sequence[str] | None = None,
     solver_tolerance: float = 0.0,
     method: str = "given",
     subject: str = "the derivative",
 ) -> Certificate:
-    """Certify `jacobian` (m, n), an array or a function of x, of any `f`: R^n -> R^m at `x` (n,).
+    """Certify the Jacobian of any function R^n -> R^m at a point.
 
-    `solver_tolerance` is how accurately `f` is solved, relative to max(1, |f|), where it is solved iteratively.
-    Given a function, the derivative is also taken 1e-9 beside `x`.
+    Args:
+        f: the function, (n,) -> (m,); if `batched`, (K, n) -> (K, m), and it is called once for all points.
+        x: (n,) the point.
+        jacobian: (m, n), or a function of x that gives it, which is then also asked 1e-9 beside `x`.
+        batched: whether `f` takes many points at once.
+        rows: m names of the function's values.
+        columns: n names of the variables.
+        solver_tolerance: how accurately `f` is solved, relative to max(1, |f|), if it is solved iteratively.
+        method: how the Jacobian was computed, for the record.
+        subject: what is certified, for messages.
+
+    Returns:
+        The certificate; its derivatives have the units of `f` per unit of `x`.
+
+    Raises:
+        ShapeError: the Jacobian does not have m rows and n columns.
+        GradientError: the Jacobian is not finite.
+
+    Source:
+        Richardson, "The approximate arithmetical solution by finite differences", 1911.
+
+    Example:
+        >>> dd.certificates.certify_jacobian(np.sin, [0.0], [[1.0]]).verdict
+        'agree'
+        >>> dd.certificates.certify_jacobian(np.abs, [0.0], [[0.0]]).verdict  # a kink: central differences see 0
+        'discontinuous'
     """
-    return certify_jacobian_of_many(
-        one_by_one(lambda at: np.asarray(f(at), dtype=float)),
-        x,
-        jacobian,
-        rows=rows,
-        columns=columns,
-        solver_tolerance=solver_tolerance,
-        method=method,
-        subject=subject,
-    )
-
-
-def certify_jacobian_of_many(
-    f: Many,
-    x: ArrayLike,
-    jacobian: ArrayLike | Callable[[Array], Array],
-    *,
-    rows: Sequence[str] | None = None,
-    columns: Sequence[str] | None = None,
-    solver_tolerance: float = 0.0,
-    method: str = "given",
-    subject: str = "the derivative",
-) -> Certificate:
-    """`certify_jacobian` of `f`: (K, n) -> (K, m), which is called once for all points of the differences."""
     x = finite_array("x", x, ("n",))
     scale = np.maximum(1.0, np.abs(x))
-    at_x = np.asarray(jacobian(x) if callable(jacobian) else jacobian, dtype=float)
-    beside = None
+    at_x, beside = np.asarray(jacobian(x) if callable(jacobian) else jacobian, dtype=float), None
     if callable(jacobian):
-        beside = np.asarray(jacobian(x + JITTER * scale * jitter_direction(len(x))), dtype=float)
+        beside = np.asarray(jacobian(x + JITTER * scale * jitter_direction(len(x))), dtype=float) * scale
+    many = f if batched else one_by_one(lambda at: np.asarray(f(at), dtype=float))
     return certify_displacement(
-        lambda d: f(x + scale * d),
+        lambda d: many(x + scale * d),
         at_x * scale,
-        beside=None if beside is None else beside * scale,
+        beside=beside,
         scale=scale,
         rows=tuple(rows or (f"f[{i}]" for i in range(at_x.shape[0]))),
         columns=tuple(columns or (f"x[{i}]" for i in range(len(x)))),
@@ -175,12 +195,6 @@ def certify_jacobian_of_many(
         method=method,
         subject=subject,
     )
-
-
-def jitter_direction(size: int) -> Array:
-    """(size,) entries between 0.5 and 1 of either sign, always the same ones."""
-    random = np.random.default_rng(0)
-    return random.uniform(0.5, 1.0, size) * random.choice([-1.0, 1.0], size)
 
 
 def certify_displacement(
@@ -215,16 +229,14 @@ def certify_displacement(
         reach = np.maximum(np.abs(forward), np.abs(backward)).max(axis=0, initial=0)
         jumps |= _jittery(derivative, beside, reach, solver_tolerance)
     codes[jumps] = VERDICTS.index("discontinuous")
-    return Certificate(
-        rows,
-        columns,
-        frozen(derivative / scale),
-        frozen(difference / scale),
-        frozen(tolerance / scale),
-        codes,
-        method,
-        subject,
-    )
+    a, d, t = (frozen(numbers / scale) for numbers in (derivative, difference, tolerance))
+    return Certificate(rows, columns, a, d, t, codes, method, subject)
+
+
+def jitter_direction(size: int) -> Array:
+    """(size,) entries between 0.5 and 1 of either sign, always the same ones."""
+    random = np.random.default_rng(0)
+    return random.uniform(0.5, 1.0, size) * random.choice([-1.0, 1.0], size)
 
 
 def _judge(

@@ -1,16 +1,14 @@
-"""Does a rollout's gradient converge as the time step shrinks, or as contact stiffens, and to what?
+"""Certify the derivative of a step, or of a whole rollout, before it is used.
 
-AutoDiffXd can equal differences and both be wrong about the physics: through a compliant bounce the gradient of the
-discrete motion can be 10 to 400 times that of the motion it stands for. So the gradient is taken again at h, h/2
-and h/4 (at k, 4 k and 16 k, a compliant contact being off by 1/sqrt(k)). Its error being of first order in h, two
-changes d1 and d2 of it have |d2| about |d1| / 2, and its limit is g3 + d2. An entry has
-
-    converged   where |d2| <= 0.75 |d1| and the first value is within 10 % of the limit, or both are below 1 %.
-
-Certify the derivative of a step, or of a whole rollout, before it is used.
+AutoDiffXd can equal difference quotients and both be wrong about the physics: through a compliant bounce the gradient
+of the discrete motion can be 10 to 400 times that of the motion it stands for. So a rollout's gradient may also be
+taken at h, h/2 and h/4, or at k, 4 k and 16 k of the contact stiffness (a compliant contact is off by 1/sqrt(k)). An
+error of first order in h makes two successive changes d1 and d2 of the gradient halve, |d2| about |d1| / 2, and the
+limit is g3 + d2. An entry has converged if |d2| <= 0.75 |d1| and its first value is within 10 % of the limit, or if
+both changes are below 1 %.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -33,10 +31,11 @@ from drake_diff.motion.rollout import check_inputs, roll_states
 
 REFINEMENTS = (1, 2, 4)
 STIFFENING = (1, 4, 16)
-CONTRACTION = 0.75
+CONTRACTION = 0.75  # halfway between 1/2, which first order promises, and 1, no convergence
 TRUSTED = 0.1  # how far from its limit a gradient may be, relative to it
 STILL = 1e-2  # changes below this part tell no rate
 NEGLIGIBLE = 1e-3  # entries below this part of the largest are judged by its measure
+LIMIT_REACH = 0.05  # [m or rad] a joint limit this near may hold the joint in one of the displaced steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,113 +68,15 @@ class Refinement:
         )
 
 
-def refined(
-    model: Model,
-    x0: Array,
-    us: Array,
-    loss: Loss,
-    vector: ParameterVector,
-    columns: Sequence[str],
-    method: str,
-    first: RolloutGradient,
-) -> Refinement:
-    """The gradient at h, h/2 and h/4 under the same inputs, the loss seeing the states at the same times.
-
-    `first` is the gradient at h. Raises InputError where the time step is itself a parameter, ModelError where the
-    model has but one.
-    """
-    if TIME_STEP in {p.name for p in vector.parameters}:
-        raise InputError("parameters", got=TIME_STEP, expected="others, as refine=True changes the time step")
-    values = [_flat(model, x0, first, us.shape, 1)]
-    for m in REFINEMENTS[1:]:
-        finer = model.at_time_step(model.time_step / m)
-        gradient = differentiate_rollout(
-            finer, x0, np.repeat(us, m, axis=0), _coarse(loss, m), parameters=vector.to_dict(), method=method
-        )
-        values.append(_flat(model, x0, gradient, us.shape, m))
-    return _judge("time step", tuple(model.time_step / m for m in REFINEMENTS), columns, np.array(values), model, us)
-
-
-def stiffened(
-    model: Model,
-    x0: Array,
-    us: Array,
-    loss: Loss,
-    vector: ParameterVector,
-    columns: Sequence[str],
-    method: str,
-    first: RolloutGradient,
-) -> Refinement:
-    """The gradient at k, 4 k and 16 k of every stiffness that the model states, at the model's own time step.
-
-    `first` is the gradient at k. Raises InputError where it states none.
-    """
-    stiffness = _stated_stiffness(model)
-    named = sorted(stiffness.keys() & vector.to_dict().keys())
-    if named:
-        raise InputError("parameters", got=named[0], expected="others, as refine_stiffness=True changes it")
-    if not stiffness:
-        raise InputError("refine_stiffness", got="a model that states no point stiffness", expected="one that does")
-    values = [_flat(model, x0, first, us.shape, 1)]
-    for factor in STIFFENING[1:]:
-        with applied(select(model, {name: factor * k for name, k in stiffness.items()})) as stiffer:
-            gradient = differentiate_rollout(stiffer, x0, us, loss, parameters=vector.to_dict(), method=method)
-        values.append(_flat(model, x0, gradient, us.shape, 1))
-    return _judge("stiffness, times", tuple(map(float, STIFFENING)), columns, np.array(values), model, us)
-
-
-def _stated_stiffness(model: Model) -> dict[str, float]:
-    """By body where it has one value, else by geometry."""
-    stated = {p.name: float(p.value[0]) for p in list_parameters(model) if p.kind.quantity == "stiffness"}
-    return {name: k for name, k in stated.items() if "/" not in name or f"{name.split('/')[0]}.stiffness" not in stated}
-
-
-def _coarse(loss: Loss, m: int) -> Loss:
-    """The loss of a motion with m times as many steps."""
-    if takes_one_argument(loss):
-        return loss
-    return lambda xs, us: loss(xs[::m], us[::m])
-
-
-def _flat(model: Model, x0: Array, g: RolloutGradient, shape: tuple[int, ...], m: int) -> Array:
-    """[by x0 on the tangent space; by each held input; by parameters]."""
-    by_x0 = g.by_x0 @ tangent_space(model).derivative_of_plus(x0)
-    by_us = g.by_us.reshape(shape[0], m, shape[1]).sum(axis=1).ravel()
-    return np.concatenate([by_x0, by_us, g.by_parameters])
-
-
-def _judge(
-    by: str, levels: tuple[float, ...], columns: Sequence[str], values: Array, model: Model, us: Array
-) -> Refinement:
-    first, second = values[1] - values[0], values[2] - values[1]
-    limit = values[2] + second
-    size = np.maximum(np.abs(values).max(axis=0), np.abs(limit))
-    largest = float(size.max(initial=0.0))
-    scale = np.maximum(size, NEGLIGIBLE * largest)
-    inputs = slice(tangent_space(model).size, tangent_space(model).size + us.size)
-    by_input = size[inputs].reshape(us.shape)
-    if us.size:  # one input's entries are one function of time, which may pass through zero
-        typical = np.sqrt((by_input**2).mean(axis=0))
-        scale[inputs] = np.maximum(by_input, typical).ravel()
-    contracts = np.abs(second) <= CONTRACTION * np.abs(first)
-    still = np.maximum(np.abs(first), np.abs(second)) <= STILL * scale
-    near = np.abs(values[0] - limit) <= TRUSTED * scale
-    converged = ((contracts & near) | still) & np.all(np.isfinite(values), axis=0)
-    return Refinement(by, levels, tuple(columns), frozen(values), frozen(limit), converged)
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RolloutCertificate(Certificate):
-    """The certificate of a rollout's gradient, the gradient, and whether it converges with the time step."""
+    """The certificate of a rollout's gradient, with that gradient and its refinements."""
 
     gradient: RolloutGradient = field(kw_only=True)
     refinements: tuple[Refinement, ...] = ()
 
-    def __str__(self) -> str:
-        return "; ".join([super().__str__(), *map(str, self.refinements)])
-
-
-LIMIT_REACH = 0.05  # [m or rad] a joint limit this near may hold the joint in one of the displaced steps
+    def _lines(self) -> list[str]:
+        return [*super()._lines(), *map(str, self.refinements)]
 
 
 def certify(
@@ -187,10 +88,30 @@ def certify(
     method: str = "auto",
     derivatives: StepDerivatives | None = None,
 ) -> Certificate:
-    """Compare the Jacobians of the step at (`x`, `u`) with differences of the double step, entry by entry.
+    """Compare the Jacobians of one step with differences of the double step, entry by entry.
 
-    Rows are the next state's, columns those of [x; u; parameters], both on the tangent space (a quaternion has
-    three entries). The derivative is `differentiate_step(..., method=method)`, or `derivatives` where given.
+    Args:
+        model: the model whose step it is.
+        x: (nx,) the state [q; v].
+        u: (nu,) [N or N m] the input; may be left out where the model has none.
+        parameters: names, or values by name, of the parameters to differentiate by too.
+        method: as in `differentiate_step`.
+        derivatives: what to certify, instead of what `differentiate_step` gives.
+
+    Returns:
+        The certificate: rows are the next state's, columns those of [x; u; parameters], states on the tangent space
+        (a quaternion has three entries).
+
+    Raises:
+        UnknownNameError: a method or parameter that does not exist.
+        ShapeError, NonFiniteError: a bad x or u.
+        GradientError, SimulationError: the step, or its derivative, is refused.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> certificate = dd.certify(model, [0.5, 0.0], [0.1]).require()
+        >>> certificate.verdict, certificate.derivative.shape
+        ('agree', (2, 3))
     """
     check_method(method)
     x, u = check_point(model, x, u)
@@ -213,8 +134,7 @@ def _certify_step(
     def on_tangent(at: Array, d: StepDerivatives) -> Array:
         return space.jacobian(at[: model.nx], d.x_next, d.A, d.B, d.C) * scale
 
-    d = given or step_jacobians(model, vector, x, u, method)
-    beside = None
+    d, beside = given or step_jacobians(model, vector, x, u, method), None
     if given is None and not vector.parameters:
         jittered = _move(space, model.nx, point, JITTER * scale * jitter_direction(len(scale)))
         d_beside = step_jacobians(model, vector, jittered[: model.nx], jittered[model.nx :], method)
@@ -252,12 +172,36 @@ def certify_rollout(
     refine_stiffness: bool = False,
     method: str = "auto",
 ) -> RolloutCertificate:
-    """Compare `differentiate_rollout`'s gradient by x0, us and parameters with differences of whole rollouts.
+    """Compare the gradient of a rollout's loss with differences of whole rollouts, 26 for each column.
 
-    One row, the loss; columns x0 (on the tangent space), then u[k] step by step, then the parameters. Costs 26
-    rollouts per column. `refine` takes the gradient again at h/2 and h/4, `refine_stiffness` at 4 and 16 times
-    the contact stiffness: entries that agree with differences and do not converge
-    are `not_converged`.
+    Args:
+        model: the model that is rolled out.
+        x0: (nx,) the first state.
+        us: (N, nu) [N or N m] the inputs; None where the model has none.
+        loss: a function of (xs, us) or of the last state, written so that AutoDiffXd flows through it.
+        parameters: names, or values by name, of the parameters to differentiate by too.
+        num_steps: N, where `us` is None.
+        refine: take the gradient again at h/2 and h/4, under the same inputs.
+        refine_stiffness: take it again at 4 and 16 times every contact stiffness that the model states.
+        method: as in `differentiate_step`.
+
+    Returns:
+        The certificate of one row, the loss; its columns are x0 (on the tangent space), u[k] step by step, and the
+        parameters. Entries that agree with differences and do not converge are "not_converged".
+
+    Raises:
+        InputError: the time step or a stiffness is refined and a parameter at once, or no stiffness is stated.
+        ModelError: `refine` of a model that has but one time step.
+        GradientError, SimulationError: the rollout, or its derivative, is refused.
+
+    Source:
+        Suh, Simchowitz, Zhang and Tedrake, "Do differentiable simulators give better policy gradients?", 2022.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> certificate = dd.certify_rollout(model, [0.5, 0.0], [[0.1], [0.0]], lambda x: x[0] ** 2)
+        >>> certificate.verdict, certificate.columns
+        ('agree', ('hinge_q[0]', 'hinge_w[0]', 'motor[0]', 'motor[1]'))
     """
     check_method(method)
     us = check_inputs(model, us, num_steps)
@@ -277,55 +221,105 @@ def certify_rollout(
         with applied(values) as set_model:
             return np.array([evaluate_loss(loss, roll_states(set_model, x, inputs), inputs)])
 
-    def on_tangent(displacement: Array) -> tuple[Array, RolloutGradient]:
+    def gradient_at(displacement: Array) -> RolloutGradient:
         x, inputs, values = moved(displacement)
-        g = differentiate_rollout(model, x, inputs, loss, parameters=values, method=method)
-        by_x0 = g.by_x0 @ space.derivative_of_plus(x)
-        return np.concatenate([by_x0, g.by_us.ravel(), g.by_parameters])[None] * scale, g
+        return differentiate_rollout(model, x, inputs, loss, parameters=values, method=method)
 
-    derivative, gradient = on_tangent(np.zeros(len(scale)))
+    gradient = gradient_at(np.zeros(len(scale)))
     inputs = tuple(f"{name}[{k}]" for k in range(len(us)) for name in model.input_names)
     columns = tuple(f"{name}[0]" for name in space.names) + inputs + vector.names
     refinements = []
-    for wanted, by in ((refine, refined), (refine_stiffness, stiffened)):
+    for wanted, by, levels, refined in (
+        (refine, "time step", tuple(model.time_step / m for m in REFINEMENTS), _at_finer_steps),
+        (refine_stiffness, "stiffness, times", tuple(map(float, STIFFENING)), _in_stiffer_contact),
+    ):
         if wanted:
-            refinements.append(by(model, x0, us, loss, vector, columns, method, gradient))
+            values = [_flat(space, gradient, us.shape), *refined(model, x0, us, loss, vector, method)]
+            refinements.append(_judge(by, levels, columns, np.array(values), space.size, us.shape))
     certificate = certify_displacement(
         one_by_one(f),
-        derivative,
+        _flat(space, gradient, us.shape)[None] * scale,
         rows=("loss",),
         columns=columns,
         scale=scale,
-        beside=on_tangent(JITTER * jitter_direction(len(scale)))[0],
+        beside=_flat(space, gradient_at(JITTER * jitter_direction(len(scale))), us.shape)[None] * scale,
         solver_tolerance=max(solver_tolerance(model, x, u) for x, u in zip(gradient.xs[:-1], us, strict=True)),
         method=" + ".join(dict.fromkeys((*gradient.methods, *gradient.parameter_sources))),
         subject=f"the rollout of {model.name}",
     )
-    return _with_refinements(certificate, gradient, tuple(refinements))
-
-
-def _with_refinements(
-    certificate: Certificate, gradient: RolloutGradient, refinements: tuple[Refinement, ...]
-) -> RolloutCertificate:
     codes = np.array(certificate.codes)
     for found in refinements:
         codes[0] = np.where(found.converged, codes[0], np.maximum(codes[0], VERDICTS.index("not_converged")))
     parts = {name: getattr(certificate, name) for name in Certificate.__dataclass_fields__} | {"codes": codes}
-    return RolloutCertificate(**parts, gradient=gradient, refinements=refinements)
+    return RolloutCertificate(**parts, gradient=gradient, refinements=tuple(refinements))
+
+
+def _flat(space: TangentSpace, g: RolloutGradient, shape: tuple[int, ...]) -> Array:
+    """[by x0 on the tangent space; by each of the inputs (N, nu), held over several steps; by parameters]."""
+    by_us = g.by_us.reshape(shape[0], len(g.by_us) // shape[0], shape[1]).sum(axis=1)
+    return np.concatenate([g.by_x0 @ space.derivative_of_plus(g.xs[0]), by_us.ravel(), g.by_parameters])
+
+
+def _at_finer_steps(
+    model: Model, x0: Array, us: Array, loss: Loss, vector: ParameterVector, method: str
+) -> Iterator[Array]:
+    """The gradient at h/2 and h/4 under the same inputs, the loss seeing the states at the same times."""
+    if TIME_STEP in {p.name for p in vector.parameters}:
+        raise InputError("parameters", got=TIME_STEP, expected="others, as refine=True changes the time step")
+    for m in REFINEMENTS[1:]:
+        finer, held = model.at_time_step(model.time_step / m), np.repeat(us, m, axis=0)
+        coarse = loss if takes_one_argument(loss) else lambda xs, us, m=m: loss(xs[::m], us[::m])
+        g = differentiate_rollout(finer, x0, held, coarse, parameters=vector.to_dict(), method=method)
+        yield _flat(tangent_space(model), g, us.shape)
+
+
+def _in_stiffer_contact(
+    model: Model, x0: Array, us: Array, loss: Loss, vector: ParameterVector, method: str
+) -> Iterator[Array]:
+    """The gradient at 4 and 16 times every stiffness that the model states, at the model's own time step."""
+    stated = {p.name: float(p.value[0]) for p in list_parameters(model) if p.kind.quantity == "stiffness"}
+    # By body where it has one value, else by geometry.
+    named = {name for name in stated if "/" not in name or f"{name.split('/')[0]}.stiffness" not in stated}
+    if both := sorted(named & vector.to_dict().keys()):
+        raise InputError("parameters", got=both[0], expected="others, as refine_stiffness=True changes it")
+    if not named:
+        raise InputError("refine_stiffness", got="a model that states no point stiffness", expected="one that does")
+    for factor in STIFFENING[1:]:
+        with applied(select(model, {name: factor * stated[name] for name in stated if name in named})) as stiffer:
+            g = differentiate_rollout(stiffer, x0, us, loss, parameters=vector.to_dict(), method=method)
+        yield _flat(tangent_space(model), g, us.shape)
+
+
+def _judge(
+    by: str, levels: tuple[float, ...], columns: Sequence[str], values: Array, first: int, shape: tuple[int, ...]
+) -> Refinement:
+    """Which columns of `values` (3, n) converge; from `first` on are those by the inputs, of `shape` (N, nu)."""
+    d1, d2 = np.diff(values, axis=0)
+    limit = values[2] + d2
+    size = np.maximum(np.abs(values).max(axis=0), np.abs(limit))
+    scale = np.maximum(size, NEGLIGIBLE * float(size.max(initial=0.0)))
+    inputs = slice(first, first + shape[0] * shape[1])
+    if shape[1]:  # one input's entries are one function of time, which may pass through zero
+        by_input = size[inputs].reshape(shape)
+        scale[inputs] = np.maximum(by_input, np.sqrt((by_input**2).mean(axis=0))).ravel()
+    contracts = np.abs(d2) <= CONTRACTION * np.abs(d1)
+    still = np.maximum(np.abs(d1), np.abs(d2)) <= STILL * scale
+    near = np.abs(values[0] - limit) <= TRUSTED * scale
+    converged = ((contracts & near) | still) & np.all(np.isfinite(values), axis=0)
+    return Refinement(by, levels, tuple(columns), frozen(values), frozen(limit), converged)
 
 
 def solver_tolerance(model: Model, x: Array, u: Array) -> float:
     """How accurately the step at (`x`, `u`) is solved: SAP's tolerance where it has anything to solve."""
     plant = model.plant
     advance(model.double, x, u)
-    touching = model.double.touches()
-    q = x[: model.nq]
-    reach = LIMIT_REACH + 2 * model.time_step * np.abs(x[model.nq :]).max(initial=0)
+    q, reach = x[: model.nq], LIMIT_REACH + 2 * model.time_step * np.abs(x[model.nq :]).max(initial=0)
     near_limit = np.any(q < plant.GetPositionLowerLimits() + reach) or np.any(
         q > plant.GetPositionUpperLimits() - reach
     )
     pd = any(actuator.has_controller() for actuator in actuators(plant))
-    return SAP_RELATIVE_TOLERANCE if touching or near_limit or pd or plant.num_constraints() else 0.0
+    solves = model.double.touches() or near_limit or pd or plant.num_constraints()
+    return SAP_RELATIVE_TOLERANCE if solves else 0.0
 
 
 def _scale(space: TangentSpace, x: Array) -> Array:

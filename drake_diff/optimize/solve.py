@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_float, positive_int
-from drake_diff.certificates.certificate import Certificate, certify_jacobian_of_many
+from drake_diff.certificates.certificate import Certificate, certify_jacobian
 from drake_diff.certificates.certify import certify
 from drake_diff.exceptions import DrakeDiffError, GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.model.equations import EquationsOfMotion
@@ -181,10 +181,11 @@ class Run:
         """Certificates, at some knots, of the Jacobian that the solver gets against Drake's own equations."""
         model, equations = self.problem.model, EquationsOfMotion(self.problem.model)
         return tuple(
-            certify_jacobian_of_many(
+            certify_jacobian(
                 equations.values,
                 np.concatenate([xs[k], us[k]]),
                 jacobian,
+                batched=True,
                 rows=tuple(f"d({name})/dt" for name in model.state_names),
                 columns=model.state_names + model.input_names,
                 solver_tolerance=ACCELERATION_ROUNDING,
