@@ -170,6 +170,7 @@ def test_casadi_falls_through_the_ground_and_says_so(load):
 def test_a_missing_adam_is_named_with_its_extra(module):
     code = f"""import sys; sys.modules[{module!r}] = None
 import drake_diff as dd
+from drake_diff.exceptions import MissingDependencyError
 try: dd.engines.load_engine("casadi", None)
 except dd.exceptions.MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

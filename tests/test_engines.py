@@ -452,6 +452,7 @@ def test_a_model_that_other_engines_would_simulate_otherwise_is_refused(name, ki
 def test_a_missing_engine_is_named_with_its_extra(name, module):
     code = f"""import sys; sys.modules[{module!r}] = None
 import drake_diff as dd
+from drake_diff.exceptions import MissingDependencyError
 try: dd.engines.load_engine({name!r}, None)
 except dd.exceptions.MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -265,6 +265,7 @@ def test_what_mjx_cannot_step_is_an_error(load):
 def test_a_missing_mjx_is_named_with_its_extra(module):
     code = f"""import sys; sys.modules[{module!r}] = None
 import drake_diff as dd
+from drake_diff.exceptions import MissingDependencyError
 try: dd.engines.load_engine("mjx", None)
 except dd.exceptions.MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

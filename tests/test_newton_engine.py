@@ -277,6 +277,7 @@ dd.engines.load_engine('newton', model).step([0, 0], [0])"""
     assert (done.stdout, done.stderr) == ("", "")
     code = """import sys; sys.modules['newton'] = None
 import drake_diff as dd
+from drake_diff.exceptions import MissingDependencyError
 try: dd.engines.load_engine('newton', None)
 except dd.exceptions.MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

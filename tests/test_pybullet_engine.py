@@ -244,6 +244,7 @@ engine.step([0, 0], [0])  # and it lives to the end"""
     assert (done.stdout, done.stderr) == ("", "")
     code = """import sys; sys.modules['pybullet'] = None
 import drake_diff as dd
+from drake_diff.exceptions import MissingDependencyError
 try: dd.engines.load_engine('pybullet', None)
 except dd.exceptions.MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

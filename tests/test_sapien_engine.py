@@ -298,6 +298,7 @@ if not physx.get_scene_config().enable_tgs or physx.get_body_config().sleep_thre
     assert (done.stdout, done.stderr) == ("", "")
     code = """import sys; sys.modules['sapien'] = None
 import drake_diff as dd
+from drake_diff.exceptions import MissingDependencyError
 try: dd.engines.load_engine('sapien', None)
 except dd.exceptions.MissingDependencyError as error: print(error)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

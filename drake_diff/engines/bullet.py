@@ -1,17 +1,15 @@
-"""Read the contract out of Bullet (`bullet`: pybullet's client), and what its links are given for their contacts.
-
-Bullet has friction and stiffness by link and makes those of pairs: mu = mu_a mu_b and 1/k = 1/k_a + 1/k_b.
-
-Bullet by pybullet, in double precision, on multibodies built link by link from Drake's plant.
+"""Bullet by pybullet, in double precision, on multibodies built link by link from Drake's plant.
 
 Its step is semi-implicit Euler as Drake's, but joint damping is explicit, M a = ... - D v, a free body moves by the
 velocity of its centre of mass, and its quaternion turns by the exponential of h w'. It has no armature; springs are
 Drake's forces, given with those of the actuators.
 
 A free body's native pose is that of the principal axes in its centre of mass, quaternion x y z w; its velocity is that
-of the centre of mass and angular, both in world.
+of the centre of mass and angular, both in world. Bullet has friction and stiffness by link and makes those of pairs:
+mu = mu_a mu_b and 1/k = 1/k_a + 1/k_b.
 """
 
+from collections.abc import Iterator
 from functools import partial
 from importlib.metadata import version
 from tempfile import NamedTemporaryFile
@@ -22,96 +20,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RotationMatrix
 
-from drake_diff._base.arrays import Array, finite_array
-from drake_diff.engines.interface import EngineContract, StepJacobian
-from drake_diff.engines.numpy import DRAKES_STEP, EACH_CALL
+from drake_diff._base.arrays import Array
+from drake_diff.engines.common import RigidEngine, shape_of
+from drake_diff.engines.interface import DRAKES_STEP, EngineContract, StepJacobian, limit
 from drake_diff.engines.quiet import without_lines
-from drake_diff.engines.urdf import UNLIMITED, bullet_urdf
-from drake_diff.exceptions import MissingDependencyError, NotOfferedError, SimulationError
-from drake_diff.mechanics.coordinates import Centers, rotation, unit, zero
-from drake_diff.mechanics.description import Geometry, RigidLink, RigidLinks, describe, joint_contract, rigid_links
+from drake_diff.engines.urdf import bullet_urdf
+from drake_diff.exceptions import MissingDependencyError, NotOfferedError
+from drake_diff.mechanics.coordinates import Centers, rotation, unit
+from drake_diff.mechanics.description import Geometry, RigidLink, RigidLinks, joint_contract
 from drake_diff.mechanics.joints import JointContract, PairContract, split
 from drake_diff.model.model import Model
-
-Owner = tuple[int, int]  # Bullet's body and link, -1 for its base
-KINDS = {0: "revolute", 1: "prismatic"}  # pybullet.JOINT_REVOLUTE and JOINT_PRISMATIC
-SMALLEST = 1e-30  # for 0, whose logarithm and whose inverse are needed
-
-
-def owners_of(pair: PairContract, owners: dict[str, Owner]) -> tuple[Owner, Owner]:
-    """The two links of a pair of geometries, the smaller first."""
-    a, b = sorted(owners[name] for name in pair.names)
-    return a, b
-
-
-def side_values(tree: RigidLinks, owners: dict[str, Owner]) -> dict[Owner, tuple[float | None, float | None]]:
-    """Friction and stiffness of each link that touches, as near to those of Drake's pairs as they can come.
-
-    None where no pair of the link has one. Where pairs disagree it is the least squares' solution, which the contract
-    shows.
-    """
-    pairs = [(owners_of(pair, owners), pair) for pair in tree.pairs]
-    friction = split([(x, np.log(max(pair.friction, SMALLEST))) for x, pair in pairs if pair.friction is not None])
-    compliance = split([(x, 1 / max(pair.stiffness, SMALLEST)) for x, pair in pairs if pair.stiffness is not None])
-    touching = {owner for pair in tree.pairs for owner in owners_of(pair, owners)}
-    return {
-        owner: (
-            float(np.exp(friction[owner])) if owner in friction else None,
-            1 / max(compliance[owner], SMALLEST) if owner in compliance else None,
-        )
-        for owner in touching
-    }
-
-
-def read_part(bullet: Any, place: Owner) -> tuple[float, Array, Array, Array]:
-    """Mass, centre of mass (3,), inertia (3, 3) about it and principal axes (3, 3) of a link, in world."""
-    info = bullet.getDynamicsInfo(*place)
-    state = bullet.getBasePositionAndOrientation(place[0]) if place[1] < 0 else bullet.getLinkState(*place, 0, 1)
-    R = rotation(np.array(state[1])[[3, 0, 1, 2]])
-    return float(info[0]), np.array(state[0]), R @ np.diag(info[2]) @ R.T, R
-
-
-def read_joint(bullet: Any, place: Owner, link: RigidLink) -> JointContract:
-    """Where Bullet is at Drake's q = 0; springs are those of the engine."""
-    mass, center, inertia, R = read_part(bullet, place)
-    kind, axis, anchor, damping, lower, upper = "quaternion_floating", np.zeros(3), center, 0.0, -np.inf, np.inf
-    if place[1] >= 0:
-        info = bullet.getJointInfo(*place)
-        kind, damping, axis = KINDS[info[2]], float(info[6]), R @ info[13]  # the axis is in the principal axes
-        _, above, _, turned = read_part(bullet, (place[0], info[16]))
-        anchor = above + turned @ info[14]
-        lower, upper = (float(side) for side in info[8:10]) if info[8] <= info[9] else (lower, upper)
-    return joint_contract(
-        name=link.joint.joint,
-        kind=kind,
-        axis=axis,
-        anchor=anchor,
-        carried=[(mass, center, inertia)],
-        damping=damping,
-        armature=0.0,
-        stiffness=link.joint.stiffness,
-        rest=link.joint.rest,
-        lower=lower if lower > -UNLIMITED else -np.inf,
-        upper=upper if upper < UNLIMITED else np.inf,
-    )
-
-
-def read_pairs(bullet: Any, tree: RigidLinks, owners: dict[str, Owner]) -> tuple[PairContract, ...]:
-    """Every pair of geometries whose links touch each other in Bullet: Drake's, then what comes with them."""
-    links = {owners_of(pair, owners) for pair in tree.pairs}
-    found = [pair.names for pair in tree.pairs]
-    for a in owners:
-        for b in owners:
-            both = a < b and tuple(sorted((owners[a], owners[b]))) in links
-            if both and (a, b) not in found and (b, a) not in found:
-                found.append((a, b))
-    return tuple(_pair(names, [bullet.getDynamicsInfo(*owners[name]) for name in names]) for names in found)
-
-
-def _pair(names: tuple[str, str], sides: list[Any]) -> PairContract:
-    a, b = (float(side[9]) for side in sides)
-    return PairContract(names, float(sides[0][1] * sides[1][1]), a * b / (a + b) if min(a, b) > 0 else None)
-
 
 try:
     with without_lines("pybullet build time"):
@@ -121,6 +39,9 @@ except ImportError as error:
         "this engine needs pybullet, which has wheels up to Python 3.11: pip install 'drake-diff[forward]'"
     ) from error
 
+Owner = tuple[int, int]  # Bullet's body and link, -1 for its base
+KINDS = {p.JOINT_REVOLUTE: "revolute", p.JOINT_PRISMATIC: "prismatic"}
+SMALLEST = 1e-30  # for 0, whose logarithm and whose inverse are needed
 EVERY_TIME_STEP = {"reportSolverAnalytics": 1, "warmStartingFactor": 0.0, "contactSlop": 0.0}
 # Bullet drags all bodies, clamps joints at 100 rad/s or m/s, and adds a margin to cylinders.
 INERT = {"linearDamping": 0.0, "angularDamping": 0.0, "maxJointVelocity": 1e10, "collisionMargin": 0.0}
@@ -139,29 +60,26 @@ class Client:
         return partial(getattr(p, name), physicsClientId=self.number)
 
 
-class PybulletEngine:
+class PybulletEngine(RigidEngine):
     """Trees of hinges, slides and free bodies; contacts of spheres, boxes, cylinders, capsules and half spaces."""
 
-    name = "pybullet"
+    name, version = "pybullet", version("pybullet")
 
     def __init__(self, model: Model):
-        self.description = describe(model)
-        self.tree = rigid_links(self.description)
-        self.time_step, self.coordinates = model.time_step, self.description.coordinates
-        self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
-        self.version, self.status = version("pybullet"), "ok"
-        self.actuation, self.limits = self.description.actuation, self.description.effort_limits
-        self.stiffness, self.rest = (self.description.by_velocity(name) for name in ("stiffness", "rest"))
+        super().__init__(model)
         with without_lines("argv[0]="):
             self.bullet: Any = Client()
         self.bullet.setTimeStep(model.time_step)
         self.bullet.setGravity(*(float(g) for g in self.description.gravity))
         self.bullet.setPhysicsEngineParameter(**EVERY_TIME_STEP)
-        self.places: dict[int, tuple[int, int]] = {}  # of each rigid link: Bullet's body and link
-        self.owners: dict[str, tuple[int, int]] = {}  # of each geometry
+        self.places: dict[int, Owner] = {}  # of each rigid link
+        self.owners: dict[str, Owner] = {}  # of each geometry
         for tree in self.tree.trees:
             self._build(tree)
-        self._build_world()
+        for geometry in (g for number, g in self.tree.geometries if number < 0):
+            shape = self.bullet.createCollisionShape(**_shape(geometry))
+            pose = (list(geometry.pose.translation()), list(_turn(geometry.pose.rotation().matrix())))
+            self.owners[geometry.name] = (self.bullet.createMultiBody(0, shape, -1, *pose), -1)
         self._set_contacts()
         self._find_frames()
         self.untouched = self.bullet.saveState()
@@ -169,57 +87,50 @@ class PybulletEngine:
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
         x, u = self._point(x, u)
         self._set(x)
-        q = x[: self.nq]
-        force = self.actuation @ np.clip(u, -self.limits, self.limits) - self.stiffness * (self._single(q) - self.rest)
-        for i, link in enumerate(self.tree.links):
-            if not link.free:
-                body, number = self.places[i]
-                self.bullet.setJointMotorControl2(
-                    body, number, p.TORQUE_CONTROL, force=float(force[link.joint.v_start])
-                )
+        force = self._effort(u) - self.stiffness * self._stretch(x[: self.nq])
+        for place, link in self._joints():
+            self.bullet.setJointMotorControl2(*place, p.TORQUE_CONTROL, force=float(force[link.joint.v_start]))
         islands = self.bullet.stepSimulation()
-        return self._state(x, u, islands)
+        used = max([0, *(island["numIterationsUsed"] for island in islands or ())])
+        room = int(self.bullet.getPhysicsEngineParameters()["numSolverIterations"])
+        found = self._read(x, u)
+        self.status = "ok" if used < room else f"the solver used all of its {room} iterations"
+        return found
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
         raise NotOfferedError("Bullet has no derivatives of its step")
 
     def energy(self, x: ArrayLike) -> float:
-        x = finite_array("x", x, (self.nq + self.nv,))
-        q, v = x[: self.nq], x[self.nq :]
+        x, q, v = self._state(x)
         kinetic = float(v @ self.mass_matrix(q) @ v) / 2
         self._set(x)
-        fallen = 0.0
-        for place in self.places.values():
-            mass, center, _, _ = read_part(self.bullet, place)
-            fallen += mass * float(self.description.gravity @ center)
-        stretch = self._single(q) - self.rest
-        springs = float(stretch @ (self.stiffness * stretch)) / 2
-        return kinetic - fallen + springs + self.tree.anchored_energy
+        parts = [_read_part(self.bullet, place) for place in self.places.values()]
+        fallen = sum(mass * float(self.description.gravity @ center) for mass, center, _, _ in parts)
+        return kinetic - fallen + self._spring_energy(q) + self.tree.anchored_energy
 
     def contact_depth(self, x: ArrayLike) -> float:
-        self._set(finite_array("x", x, (self.nq + self.nv,)))
+        self._set(self._state(x)[0])
         self.bullet.performCollisionDetection()
         return max([0.0, *(-float(point[8]) for point in self.bullet.getContactPoints())])
 
     def mass_matrix(self, q: ArrayLike) -> Array:
-        q = finite_array("q", q, (self.nq,))
+        q = self._positions(q)
         M, T = np.zeros((self.nv, self.nv)), self.centers.turn(q)
         for tree in self.tree.trees:
             at, body, joints = self._dofs(tree), self.places[tree.start][0], self._joint_positions(tree, q)
             # pybullet takes no empty list
             M[np.ix_(at, at)] = self.bullet.calculateMassMatrix(body, joints or [0.0])
         for (i, j), turned in zip(self.coordinates.free, self.principal, strict=True):
-            R_t = (rotation(q[i : i + 4]) @ turned).T
-            into = np.block([[R_t, np.zeros((3, 3))], [np.zeros((3, 3)), R_t]])
+            into = np.kron(np.eye(2), (rotation(q[i : i + 4]) @ turned).T)
             T[j : j + 6] = into @ T[j : j + 6]
         return np.asarray(T.T @ M @ T)
 
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
         """NotOfferedError for free bodies."""
-        q, v = finite_array("q", q, (self.nq,)), finite_array("v", v, (self.nv,))
+        q, v = self._motion(q, v)
         if self.coordinates.free:
             raise NotOfferedError(NO_BIAS)
-        needed = self.stiffness * (self._single(q) - self.rest)
+        needed = self.stiffness * self._stretch(q)
         for tree in self.tree.trees:
             at = self._dofs(tree)
             given = (self._joint_positions(tree, q), [float(v[j]) for j in at], [0.0] * len(at))
@@ -228,50 +139,40 @@ class PybulletEngine:
 
     @property
     def contract(self) -> EngineContract:
-        left_out = list(self.tree.left_out)
+        self._set(self._zero())
         order = sorted(range(len(self.tree.links)), key=lambda i: self.tree.links[i].joint.v_start)
-        self._set(np.concatenate([zero(self.coordinates), np.zeros(self.nv)]))
         parameters = self.bullet.getPhysicsEngineParameters()
-        gravity = tuple(float(parameters[f"gravityAcceleration{axis}"]) for axis in "XYZ")
         damping = sorted({self.bullet.getDynamicsInfo(*o)[8] for o in self.owners.values()})
+        law = f"springs and dampers of {damping} N s/m, implicit, by sequential impulses"
         return EngineContract(
+            **{**self._plant_fields(), "time_step": float(parameters["fixedTimeStep"])},
             engine=self.name,
-            joints=tuple(read_joint(self.bullet, self.places[i], self.tree.links[i]) for i in order),
+            joints=tuple(_read_joint(self.bullet, self.places[i], self.tree.links[i]) for i in order),
             native_order=tuple(link.joint.joint for link in self.tree.links),
             state="position of the centre of mass, quaternion x y z w of the principal axes; velocity of a free body "
             "linear of its centre of mass then angular, in world",
-            inputs=self.description.inputs,
-            actuation=tuple(tuple(float(b) for b in row) for row in self.actuation),
-            effort_limits=tuple(float(limit) for limit in self.limits),
-            time_step=float(parameters["fixedTimeStep"]),
             integrator=self._integrator(),
-            gravity=gravity,
-            contact_law=f"springs and dampers of {damping} N s/m, implicit, by sequential impulses"
-            if self.tree.pairs
-            else "none",
-            contacts=read_pairs(self.bullet, self.tree, self.owners),
-            solver_tolerance=None,
+            gravity=tuple(float(parameters[f"gravityAcceleration{axis}"]) for axis in "XYZ"),
+            contact_law=law if self.tree.pairs else "none",
+            contacts=_read_pairs(self.bullet, self.tree, self.owners),
             limit_law="beyond the limit, impulses to a velocity back of at least 0.2 (Bullet's ERP) of the way / h",
-            reset=EACH_CALL,
             reasons={
                 "armature": "Bullet has no rotor inertia",
                 "integrator": "Bullet's joint damping is explicit; its free bodies move by their centres of mass and "
                 "turn by the exponential of h w'",
                 "contact law": "Bullet's contact is a spring and a damper in the constraints of its impulses",
-                "contact pairs": f"Bullet has friction and stiffness by link, not by pair; not built: {left_out}",
+                "contact pairs": "Bullet has friction and stiffness by link, not by pair; "
+                f"not built: {list(self.tree.left_out)}",
                 "limit law": "Bullet's limits are rigid",
                 "solver tolerance": "Bullet iterates its impulses at most so often as it is told",
             },
         )
 
     def _integrator(self) -> str:
-        if not np.any(self.description.by_velocity("damping")) and not self.coordinates.free:
+        if not np.any(self.damping) and not self.coordinates.free:
             return DRAKES_STEP
         free = ", free bodies by v' of the centre of mass, quaternions by the exponential of h w'"
         return f"semi-implicit Euler, joint damping explicit{free if self.coordinates.free else ''}"
-
-    def _point(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
-        return finite_array("x", x, (self.nq + self.nv,)), finite_array("u", u, (self.nu,))
 
     def _build(self, part: range) -> None:
         links = [(i, self.tree.links[i]) for i in part]
@@ -279,8 +180,7 @@ class PybulletEngine:
         with NamedTemporaryFile("w", suffix=".urdf") as file:
             file.write(bullet_urdf(links, self.tree.geometries))
             file.flush()
-            free = links[0][1].free
-            body = self.bullet.loadURDF(file.name, useFixedBase=not free, flags=flags)
+            body = self.bullet.loadURDF(file.name, useFixedBase=not links[0][1].free, flags=flags)
         numbers = {"link_-1": -1, f"link_{part.start}": -1}
         for k in range(self.bullet.getNumJoints(body)):
             numbers[self.bullet.getJointInfo(body, k)[12].decode()] = k
@@ -290,19 +190,13 @@ class PybulletEngine:
             self.bullet.changeDynamics(*self.places[i], **INERT)
         self.owners |= {g.name: self.places[i] for i, g in self.tree.geometries if i in part}
 
-    def _build_world(self) -> None:
-        for geometry in (g for number, g in self.tree.geometries if number < 0):
-            shape = self.bullet.createCollisionShape(**_shape(geometry))
-            pose = (list(geometry.pose.translation()), list(_turn(geometry.pose.rotation().matrix())))
-            self.owners[geometry.name] = (self.bullet.createMultiBody(0, shape, -1, *pose), -1)
-
     def _set_contacts(self) -> None:
         for owner in set(self.owners.values()):
             self.bullet.setCollisionFilterGroupMask(*owner, 0, 0)
         for pair in self.tree.pairs:
-            (a, i), (b, j) = owners_of(pair, self.owners)
+            (a, i), (b, j) = _owners_of(pair, self.owners)
             self.bullet.setCollisionFilterPair(a, b, i, j, 1)
-        for owner, (friction, stiffness) in side_values(self.tree, self.owners).items():
+        for owner, (friction, stiffness) in _side_values(self.tree, self.owners).items():
             values = {**NO_OTHER_FRICTION, **({} if friction is None else {"lateralFriction": friction})}
             if stiffness is not None:
                 values |= {"contactStiffness": stiffness, "contactDamping": 0.0}
@@ -316,12 +210,14 @@ class PybulletEngine:
         self.principal = [rotation(np.array(info[4])[[3, 0, 1, 2]]) for info in found]
         self.bases = [bodies[v][0] for _, v in self.coordinates.free]
 
-    def _single(self, q: Array) -> Array:
-        """(nv,) the positions of hinges and slides."""
-        found = np.zeros(self.nv)
-        for i, j in self.coordinates.single:
-            found[j] = q[i]
-        return found
+    def _joints(self) -> Iterator[tuple[Owner, RigidLink]]:
+        """Of hinges and slides, with Bullet's places."""
+        return ((self.places[i], link) for i, link in enumerate(self.tree.links) if not link.free)
+
+    def _free(self) -> Iterator[tuple[int, int, int, Array, Array]]:
+        """Of each free body: its places in q and v, Bullet's base, the centre of mass and the principal axes."""
+        places = zip(self.coordinates.free, self.bases, self.centers.centers, self.principal, strict=True)
+        return ((i, j, base, center, turned) for (i, j), base, center, turned in places)
 
     def _dofs(self, part: range) -> list[int]:
         """Drake's places in v of a tree's velocities in Bullet's order."""
@@ -338,51 +234,105 @@ class PybulletEngine:
     def _set(self, x: Array) -> None:
         self.bullet.restoreState(self.untouched)
         q, v = unit(self.coordinates, x[: self.nq]), self.centers.turn(x[: self.nq]) @ x[self.nq :]
-        places = zip(self.coordinates.free, self.bases, self.centers.centers, self.principal, strict=True)
-        for (i, j), base, center, turned in places:
+        for i, j, base, center, turned in self._free():
             R = rotation(q[i : i + 4])
-            self.bullet.resetBasePositionAndOrientation(
-                base, list(q[i + 4 : i + 7] + R @ center), list(_turn(R @ turned))
-            )
+            position = list(q[i + 4 : i + 7] + R @ center)
+            self.bullet.resetBasePositionAndOrientation(base, position, list(_turn(R @ turned)))
             self.bullet.resetBaseVelocity(base, list(v[j + 3 : j + 6]), list(v[j : j + 3]))
-        for i, link in enumerate(self.tree.links):
-            if not link.free:
-                at = (float(q[link.joint.q_start]), float(v[link.joint.v_start]))
-                self.bullet.resetJointState(*self.places[i], *at)
+        for place, link in self._joints():
+            self.bullet.resetJointState(*place, float(q[link.joint.q_start]), float(v[link.joint.v_start]))
 
-    def _state(self, x: Array, u: Array, islands: Any) -> Array:
+    def _read(self, x: Array, u: Array) -> Array:
+        """(nx,) where Bullet is, after the step from `x` under `u`."""
         q, v = np.zeros(self.nq), np.zeros(self.nv)
-        for i, link in enumerate(self.tree.links):
-            if not link.free:
-                found = self.bullet.getJointState(*self.places[i])
-                q[link.joint.q_start], v[link.joint.v_start] = found[:2]
-        places = zip(self.coordinates.free, self.bases, self.centers.centers, self.principal, strict=True)
-        for (i, j), base, center, turned in places:
+        for place, link in self._joints():
+            q[link.joint.q_start], v[link.joint.v_start] = self.bullet.getJointState(*place)[:2]
+        for i, j, base, center, turned in self._free():
             position, turn = self.bullet.getBasePositionAndOrientation(base)
             R = rotation(np.array(turn)[[3, 0, 1, 2]]) @ turned.T
             q[i : i + 4] = RotationMatrix(R).ToQuaternion().wxyz()
             q[i : i + 4] *= np.sign(q[i : i + 4] @ x[i : i + 4])  # of the two, that which x goes on to
             q[i + 4 : i + 7] = np.array(position) - R @ center
             v[j + 3 : j + 6], v[j : j + 3] = self.bullet.getBaseVelocity(base)
-        if not (np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
-            raise SimulationError(f"Bullet cannot take this step, from x = {x}, u = {u}")
-        used = max([0, *(island["numIterationsUsed"] for island in islands or ())])
-        room = int(self.bullet.getPhysicsEngineParameters()["numSolverIterations"])
-        self.status = "ok" if used < room else f"the solver used all of its {room} iterations"
-        return np.concatenate([q, np.linalg.solve(self.centers.turn(q), v)])
+        return self._found("Bullet", q, v, x, u)
+
+
+def _owners_of(pair: PairContract, owners: dict[str, Owner]) -> tuple[Owner, Owner]:
+    """The two links of a pair of geometries, the smaller first."""
+    a, b = sorted(owners[name] for name in pair.names)
+    return a, b
+
+
+def _side_values(tree: RigidLinks, owners: dict[str, Owner]) -> dict[Owner, tuple[float | None, float | None]]:
+    """Friction and stiffness of each link that touches, as near to those of Drake's pairs as they can come.
+
+    None where no pair of the link has one. Where pairs disagree it is the least squares' solution, which the contract
+    shows.
+    """
+    pairs = [(_owners_of(pair, owners), pair) for pair in tree.pairs]
+    friction = split([(x, np.log(max(pair.friction, SMALLEST))) for x, pair in pairs if pair.friction is not None])
+    compliance = split([(x, 1 / max(pair.stiffness, SMALLEST)) for x, pair in pairs if pair.stiffness is not None])
+    return {
+        owner: (
+            float(np.exp(friction[owner])) if owner in friction else None,
+            1 / max(compliance[owner], SMALLEST) if owner in compliance else None,
+        )
+        for owner in {owner for sides, _ in pairs for owner in sides}
+    }
+
+
+def _read_part(bullet: Any, place: Owner) -> tuple[float, Array, Array, Array]:
+    """Mass, centre of mass (3,), inertia (3, 3) about it and principal axes (3, 3) of a link, in world."""
+    info = bullet.getDynamicsInfo(*place)
+    state = bullet.getBasePositionAndOrientation(place[0]) if place[1] < 0 else bullet.getLinkState(*place, 0, 1)
+    R = rotation(np.array(state[1])[[3, 0, 1, 2]])
+    return float(info[0]), np.array(state[0]), R @ np.diag(info[2]) @ R.T, R
+
+
+def _read_joint(bullet: Any, place: Owner, link: RigidLink) -> JointContract:
+    """Where Bullet is at Drake's q = 0; springs are those of the engine."""
+    mass, center, inertia, R = _read_part(bullet, place)
+    kind, axis, anchor, damping, lower, upper = "quaternion_floating", np.zeros(3), center, 0.0, -np.inf, np.inf
+    if place[1] >= 0:
+        info = bullet.getJointInfo(*place)
+        kind, damping, axis = KINDS[info[2]], float(info[6]), R @ info[13]  # the axis is in the principal axes
+        _, above, _, turned = _read_part(bullet, (place[0], info[16]))
+        anchor = above + turned @ info[14]
+        lower, upper = (limit(side) for side in info[8:10]) if info[8] <= info[9] else (lower, upper)
+    return joint_contract(
+        name=link.joint.joint, kind=kind, axis=axis, anchor=anchor, carried=[(mass, center, inertia)], damping=damping,
+        armature=0.0, stiffness=link.joint.stiffness, rest=link.joint.rest, lower=lower, upper=upper,
+    )  # fmt: skip
+
+
+def _read_pairs(bullet: Any, tree: RigidLinks, owners: dict[str, Owner]) -> tuple[PairContract, ...]:
+    """Every pair of geometries whose links touch each other in Bullet: Drake's, then what comes with them."""
+    links = {_owners_of(pair, owners) for pair in tree.pairs}
+    found = [pair.names for pair in tree.pairs]
+    for a in owners:
+        for b in owners:
+            both = a < b and tuple(sorted((owners[a], owners[b]))) in links
+            if both and (a, b) not in found and (b, a) not in found:
+                found.append((a, b))
+    return tuple(_pair(names, [bullet.getDynamicsInfo(*owners[name]) for name in names]) for names in found)
+
+
+def _pair(names: tuple[str, str], sides: list[Any]) -> PairContract:
+    a, b = (float(side[9]) for side in sides)
+    return PairContract(names, float(sides[0][1] * sides[1][1]), a * b / (a + b) if min(a, b) > 0 else None)
 
 
 def _shape(geometry: Geometry) -> dict[str, Any]:
     """Bullet's keywords."""
-    shape, kind = geometry.shape, type(geometry.shape).__name__
+    kind, sizes = shape_of(geometry)
     if kind == "HalfSpace":
         return {"shapeType": p.GEOM_PLANE, "planeNormal": [0, 0, 1]}
     if kind == "Box":
-        return {"shapeType": p.GEOM_BOX, "halfExtents": [shape.width() / 2, shape.depth() / 2, shape.height() / 2]}
+        return {"shapeType": p.GEOM_BOX, "halfExtents": [side / 2 for side in sizes["size"]]}
     if kind == "Sphere":
-        return {"shapeType": p.GEOM_SPHERE, "radius": shape.radius()}
+        return {"shapeType": p.GEOM_SPHERE, "radius": sizes["radius"][0]}
     long = p.GEOM_CYLINDER if kind == "Cylinder" else p.GEOM_CAPSULE
-    return {"shapeType": long, "radius": shape.radius(), "height": shape.length()}
+    return {"shapeType": long, "radius": sizes["radius"][0], "height": sizes["length"][0]}
 
 
 def _turn(R: Array) -> Array:

@@ -15,13 +15,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, finite_array, frozen
-from drake_diff.engines.interface import EngineContract, StepJacobian
-from drake_diff.engines.numpy import DRAKES_STEP, EACH_CALL
-from drake_diff.engines.urdf import UNLIMITED, carried_by, inertial_urdf
+from drake_diff._base.arrays import Array
+from drake_diff.engines.common import PlantEngine, euler_step_jacobian
+from drake_diff.engines.interface import EngineContract, StepJacobian, floats, limit
+from drake_diff.engines.urdf import carried_by, inertial_urdf
 from drake_diff.exceptions import MissingDependencyError, ModelError
-from drake_diff.mechanics.coordinates import euler_acceleration, euler_jacobian, euler_step
-from drake_diff.mechanics.description import Description, Link, describe, joint_contract
+from drake_diff.mechanics.coordinates import euler_acceleration, euler_step
+from drake_diff.mechanics.description import Description, Link, joint_contract
 from drake_diff.mechanics.joints import JointContract
 from drake_diff.model.model import Model
 
@@ -38,18 +38,13 @@ except ImportError as error:
 NO_CONTACT = "adam's dynamics have no contact here"
 
 
-class CasadiEngine:
+class CasadiEngine(PlantEngine):
     """Trees of hinges, slides and free bodies; no contact and no joint limits."""
 
-    name, status, version = "casadi", "ok", version("adam-robotics")
+    name, version = "casadi", version("adam-robotics")
 
     def __init__(self, model: Model):
-        self.description = describe(model)
-        self.time_step = model.time_step
-        self.coordinates = self.description.coordinates
-        self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
-        self.damping = self.description.by_velocity("damping")
-        self.actuation, self.limits = self.description.actuation, self.description.effort_limits
+        super().__init__(model)
         self.gravity = self.description.gravity
         bases: list[Link | None] = [x for x in self.description.moving if x.kind == "quaternion_floating"]
         if carried_by(self.description, "world"):
@@ -64,30 +59,22 @@ class CasadiEngine:
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
         x, u = self._point(x, u)
         acceleration = self._acceleration(x, u)
-        x_next = euler_step(self.coordinates, self.time_step, x, acceleration)
         by = self._acceleration_derivative(x, u, acceleration)
-        jacobian = euler_jacobian(self.coordinates, self.time_step, x, x_next, by)
-        nx = self.nq + self.nv
-        return StepJacobian(frozen(jacobian[:, :nx]), frozen(jacobian[:, nx:]), "casadi")
+        return euler_step_jacobian(self.coordinates, self.time_step, x, acceleration, by, "casadi")
 
     def energy(self, x: ArrayLike) -> float:
-        x = finite_array("x", x, (self.nq + self.nv,))
-        q, v = x[: self.nq], x[self.nq :]
+        _, q, v = self._state(x)
         return float(v @ self.mass_matrix(q) @ v) / 2 + float(self.potential(q))
 
     def contact_depth(self, x: ArrayLike) -> float:
-        finite_array("x", x, (self.nq + self.nv,))
+        self._state(x)
         return 0.0
 
     def mass_matrix(self, q: ArrayLike) -> Array:
-        return np.array(self.terms(finite_array("q", q, (self.nq,)), np.zeros(self.nv))[0])
+        return np.array(self.terms(self._positions(q), np.zeros(self.nv))[0])
 
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
-        q, v = finite_array("q", q, (self.nq,)), finite_array("v", v, (self.nv,))
-        return np.array(self.terms(q, v)[1]).ravel()
-
-    def _point(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
-        return finite_array("x", x, (self.nq + self.nv,)), finite_array("u", u, (self.nu,))
+        return np.array(self.terms(*self._motion(q, v))[1]).ravel()
 
     def _build(self) -> None:
         """The functions of q, v and a: M and bias; the potential energy; d (M a + bias) / dq and / dv."""
@@ -114,16 +101,14 @@ class CasadiEngine:
     def _acceleration(self, x: Array, u: Array) -> Array:
         q, v = x[: self.nq], x[self.nq :]
         M, bias = (np.array(term) for term in self.terms(q, v))
-        force = self.actuation @ np.clip(u, -self.limits, self.limits) - bias.ravel()
-        return euler_acceleration(M, self.damping, self.time_step, v, force)
+        return euler_acceleration(M, self.damping, self.time_step, v, self._effort(u) - bias.ravel())
 
     def _acceleration_derivative(self, x: Array, u: Array, acceleration: Array) -> Array:
         """(nv, 2 nv + nu) by small motion, by v and by u."""
         q, v = x[: self.nq], x[self.nq :]
         by_q, by_v = (np.array(term) for term in self.derivatives(q, v, acceleration))
         D = np.diag(self.damping)
-        effort = -self.actuation * (np.abs(u) <= self.limits)
-        residual = np.hstack([by_q @ self.coordinates.rate(q), by_v + D, effort])
+        residual = np.hstack([by_q @ self.coordinates.rate(q), by_v + D, -self._effort_by_input(u)])
         return np.asarray(-np.linalg.solve(self.mass_matrix(q) + self.time_step * D, residual))
 
     @property
@@ -134,17 +119,7 @@ class CasadiEngine:
             joints=tuple(joints[link.joint] for link in self.description.moving),
             native_order=tuple(joints),
             state="homogeneous transform; velocity of a free body linear then angular, in world",
-            inputs=self.description.inputs,
-            actuation=tuple(tuple(float(b) for b in row) for row in self.actuation),
-            effort_limits=tuple(float(limit) for limit in self.limits),
-            time_step=self.time_step,
-            integrator=DRAKES_STEP,
-            gravity=tuple(float(g) for g in self.gravity),
-            contact_law="none",
-            contacts=(),
-            solver_tolerance=None,
-            limit_law="none",
-            reset=EACH_CALL,
+            gravity=floats(self.gravity),
             derivatives="by q and v, adam's expressions differentiated by CasADi",
             reasons={
                 "contact law": NO_CONTACT,
@@ -152,6 +127,7 @@ class CasadiEngine:
                 "limit law": "adam's dynamics have no joint limits",
                 "solver tolerance": "nothing is solved iteratively",
             },
+            **self._plant_fields(),
         )
 
 
@@ -253,8 +229,8 @@ class _Tree:
             axis=H[:3, :3] @ np.array(ca.evalf(joint.axis.array)).ravel(),
             anchor=H[:3, 3],
             carried=carried,
-            lower=limits[0] if limits[0] > -UNLIMITED else -np.inf,
-            upper=limits[1] if limits[1] < UNLIMITED else np.inf,
+            lower=limit(limits[0]),
+            upper=limit(limits[1]),
             **{k: getattr(link, k) for k in ("damping", "armature", "stiffness", "rest")},
         )
 

@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, finite_array
 from drake_diff.derivatives.step import check_method, differentiate_step
-from drake_diff.engines.interface import EngineContract, StepJacobian
-from drake_diff.engines.numpy import DRAKES_STATE, DRAKES_STEP, EACH_CALL
+from drake_diff.engines.interface import EngineContract, StepJacobian, float_rows, floats
 from drake_diff.mechanics.description import Description, describe, joint_contracts
 from drake_diff.model.contact import penetration
 from drake_diff.model.model import Model
@@ -66,18 +65,15 @@ class DrakeEngine:
             engine=self.name,
             joints=joint_contracts(self.description),
             native_order=tuple(link.joint for link in moving),
-            state=DRAKES_STATE,
             inputs=self.model.input_names,
-            actuation=tuple(tuple(float(b) for b in row) for row in self.description.actuation),
-            effort_limits=tuple(float(limit) for limit in self.description.effort_limits),
+            actuation=float_rows(self.description.actuation),
+            effort_limits=floats(self.description.effort_limits),
             time_step=self.model.time_step,
-            integrator=DRAKES_STEP,
-            gravity=tuple(float(g) for g in self.description.gravity),
+            gravity=floats(self.description.gravity),
             contact_law=f"{contact.model}, {contact.approximation}" if contact.collision_pairs else "none",
             contacts=self.description.pairs,
             solver_tolerance=contact.solver_relative_tolerance,
             limit_law="implicit springs in the step's solver",
-            reset=EACH_CALL,
             derivatives="by every entry of x and u",
         )
 

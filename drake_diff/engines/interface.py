@@ -2,35 +2,40 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array
 from drake_diff.mechanics.joints import JointContract, PairContract
 
 Precision = Literal["float64", "float32"]
+DRAKES_STEP = "semi-implicit Euler, joint damping implicit, q' = q + h N(q) v'"
+DRAKES_STATE = "quaternion w x y z; velocity of a free body angular then linear, both in world"
+EACH_CALL = "each step starts from x and u alone"
+UNLIMITED = 1e10  # written for "no limit": readers take a missing limit for 0, and not all can read inf
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EngineContract:
     """What an engine uses, read out of the engine itself; SI units, in the order of the x and u that it takes."""
 
     engine: str
     joints: tuple[JointContract, ...]
     native_order: tuple[str, ...]  # of the joints inside the engine
-    state: str  # how a free body's state is held inside the engine
+    state: str = DRAKES_STATE  # how a free body's state is held inside the engine
     inputs: tuple[str, ...]
-    actuation: tuple[tuple[float, ...], ...]  # (nv, nu): generalized force per input, the gear's doing included
+    actuation: tuple[tuple[float, ...], ...]  # (nv, nu): generalized force per unit of input, gears included
     effort_limits: tuple[float, ...]  # (nu,)
     time_step: float
-    integrator: str
+    integrator: str = DRAKES_STEP
     gravity: tuple[float, ...]
-    contact_law: str
-    contacts: tuple[PairContract, ...]
-    solver_tolerance: float | None  # relative; None where nothing is solved iteratively
-    limit_law: str
-    reset: str
+    contact_law: str = "none"
+    contacts: tuple[PairContract, ...] = ()
+    solver_tolerance: float | None = None  # relative; None where nothing is solved iteratively
+    limit_law: str = "none"
+    reset: str = EACH_CALL
     precision: Precision = "float64"  # of the engine's arithmetic
     derivatives: str = "none"  # by what they are taken in the engine, before they are mapped to Drake's x and u
     # By quantity of the match: why this engine cannot have what Drake has.
@@ -46,34 +51,46 @@ class StepJacobian(NamedTuple):
 
 
 class Engine(Protocol):
-    """One model in one simulator. `x = [q; v]` and `u` are Drake's: order, quaternion (w, x, y, z), v in world.
+    """One model in one simulator, in Drake's coordinates: what `load_engine` returns and `dd.compare` takes.
 
-    Everything depends on the arguments alone, not on the calls before. What an engine does not compute raises
-    NotOfferedError, with the reason.
+    `x = [q; v]` and `u` have Drake's order, quaternions are (w, x, y, z), and velocities of free bodies are (angular,
+    linear) in the world frame. Every result depends on the arguments alone, not on earlier calls. An engine of your
+    own needs no base class: an object with these names will do.
+
+    Raises:
+        ShapeError, NonFiniteError: an argument has the wrong shape or is not finite.
+        NotOfferedError: the engine does not compute this; the message says why.
+        SimulationError: the engine cannot take the step.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> engine = dd.engines.load_engine("numpy", model)
+        >>> print(engine.step([0.0, 1.0], [0.0]).round(5))
+        [0.00996 0.99602]
     """
 
     @property
     def name(self) -> str:
-        """The engine's, with what was chosen in it."""
+        """The engine's name, with the options that were chosen."""
         ...
 
     @property
     def version(self) -> str:
-        """Of the library."""
+        """The library's version."""
         ...
 
     @property
     def contract(self) -> EngineContract:
-        """What the engine uses."""
+        """What the engine uses, read back from it."""
         ...
 
     @property
     def status(self) -> str:
-        """Of the last step: "ok", or what the engine's solver said."""
+        """How the last step went: "ok", or what the engine's solver said."""
         ...
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
-        """(nx,) one time step after `x` (nx,) under `u` (nu,). ShapeError, NonFiniteError, SimulationError."""
+        """The state (nx,) one time step after `x` (nx,) under `u` (nu,)."""
         ...
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
@@ -81,11 +98,11 @@ class Engine(Protocol):
         ...
 
     def energy(self, x: ArrayLike) -> float:
-        """[J] kinetic and potential; potential energy is 0 with all mass at height 0 and springs at rest."""
+        """Kinetic and potential energy [J]; potential energy is 0 with all mass at height 0 and springs at rest."""
         ...
 
     def contact_depth(self, x: ArrayLike) -> float:
-        """[m] the deepest overlap, 0 where nothing touches or the engine has no contact."""
+        """The deepest overlap [m], 0 where nothing touches or the engine has no contact."""
         ...
 
     def mass_matrix(self, q: ArrayLike) -> Array:
@@ -95,3 +112,18 @@ class Engine(Protocol):
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
         """(nv,) in M dv/dt + bias = B u - damping v: velocity products less gravity and springs."""
         ...
+
+
+def floats(values: Any) -> tuple[float, ...]:
+    """A vector as a contract holds it."""
+    return tuple(float(value) for value in np.ravel(values))
+
+
+def float_rows(matrix: Any) -> tuple[tuple[float, ...], ...]:
+    """A matrix as a contract holds it."""
+    return tuple(floats(row) for row in matrix)
+
+
+def limit(value: float) -> float:
+    """A limit that was read back, infinite where UNLIMITED was written for it."""
+    return float(value) if abs(value) < UNLIMITED else float(np.copysign(np.inf, value))

@@ -1,6 +1,4 @@
-"""Read the contract out of Newton's model (`m`: newton.Model, `state`: newton.State).
-
-Newton's SolverFeatherstone on the CPU, in single precision, on a model built joint by joint from Drake's plant.
+"""Newton's SolverFeatherstone on the CPU, in single precision, on a model built joint by joint from Drake's plant.
 
 Its step is semi-implicit Euler as Drake's, but joint damping is explicit, M a = ... - D v, a free body moves by the
 velocity of its centre of mass, and its quaternion has the norm 1 after the step. Isaac Lab's SolverMuJoCo is MuJoCo's
@@ -15,61 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 
-from drake_diff._base.arrays import Array, finite_array, frozen
-from drake_diff.engines.interface import EngineContract, StepJacobian
-from drake_diff.engines.numpy import DRAKES_STEP, EACH_CALL
+from drake_diff._base.arrays import Array, frozen
+from drake_diff.engines.common import RigidEngine, shape_of
+from drake_diff.engines.interface import DRAKES_STEP, UNLIMITED, EngineContract, StepJacobian, floats, limit
 from drake_diff.engines.quiet import without_lines
-from drake_diff.exceptions import MissingDependencyError, NotOfferedError, SimulationError
-from drake_diff.mechanics.coordinates import Centers, rotation, unit, zero
-from drake_diff.mechanics.description import Geometry, RigidLink, RigidLinks, describe, joint_contract, rigid_links
+from drake_diff.exceptions import MissingDependencyError, NotOfferedError
+from drake_diff.mechanics.coordinates import Centers, rotation, unit
+from drake_diff.mechanics.description import Geometry, RigidLink, RigidLinks, joint_contract
 from drake_diff.mechanics.joints import JointContract
 from drake_diff.model.model import Model
-
-KINDS = {0: "prismatic", 1: "revolute", 4: "quaternion_floating"}  # newton.JointType
-UNLIMITED = 1e10  # Newton's own
-OF_JOINTS = ("damping", "armature", "stiffness", "limit_lower", "limit_upper", "rest_q", "axis")
-
-
-def numbers(array: Any) -> Array:
-    """A warp array in double precision."""
-    return np.asarray(array.numpy(), dtype=float)
-
-
-def centers_of_mass(m: Any, state: Any) -> Array:
-    """(bodies, 3) in world."""
-    poses = zip(numbers(state.body_q), numbers(m.body_com), strict=True)
-    return np.array([pose[:3] + _matrix(pose) @ center for pose, center in poses])
-
-
-def read_joints(m: Any, state: Any, tree: RigidLinks) -> tuple[JointContract, ...]:
-    """In Drake's order, where `state` is at Drake's q = 0."""
-    values = {name: numbers(getattr(m, f"joint_{name}")) for name in OF_JOINTS}
-    centers, poses, inertias, found = centers_of_mass(m, state), numbers(state.body_q), numbers(m.body_inertia), {}
-    for i, link in enumerate(tree.links):
-        kind, R = KINDS[int(m.joint_type.numpy()[i])], _matrix(poses[i])
-        j, single = int(m.joint_qd_start.numpy()[i]), kind != "quaternion_floating"
-        rest = values["rest_q"][int(m.joint_q_start.numpy()[i])]
-        lower, upper = values["limit_lower"][j], values["limit_upper"][j]
-        found[link.joint.v_start] = joint_contract(
-            name=m.joint_label[i],
-            kind=kind,
-            axis=R @ values["axis"][j] if single else np.zeros(3),
-            anchor=poses[i, :3],
-            carried=[(float(m.body_mass.numpy()[i]), centers[i], R @ inertias[i] @ R.T)],
-            damping=float(values["damping"][j]),
-            armature=float(values["armature"][j]),
-            stiffness=float(values["stiffness"][j]),
-            rest=float(rest) if single else 0.0,
-            lower=float(lower) if lower > -UNLIMITED else -np.inf,
-            upper=float(upper) if upper < UNLIMITED else np.inf,
-        )
-    return tuple(found[start] for start in sorted(found))
-
-
-def _matrix(pose: Array) -> Array:
-    """(3, 3) of (p, quaternion x y z w)."""
-    return rotation(pose[[6, 3, 4, 5]])
-
 
 try:
     import warp as wp
@@ -82,23 +34,20 @@ except ImportError as error:
 NO_GPU = "Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 # Newton takes friction and stiffness of a contact for not given where they are 0; of this nothing is felt.
 NONE = 1e-30
+KINDS = {0: "prismatic", 1: "revolute", 4: "quaternion_floating"}  # newton.JointType
+OF_JOINTS = ("damping", "armature", "stiffness", "limit_lower", "limit_upper", "rest_q", "axis")
 
 
-class NewtonEngine:
+class NewtonEngine(RigidEngine):
     """Trees of hinges, slides and free bodies; contacts of spheres, boxes, cylinders, capsules and half spaces."""
 
-    name = "newton (SolverFeatherstone)"
+    name, version = "newton (SolverFeatherstone)", str(newton.__version__)
 
     def __init__(self, model: Model):
-        self.description = describe(model)
-        self.tree = rigid_links(self.description)
-        self.time_step, self.coordinates = model.time_step, self.description.coordinates
-        self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
-        self.version, self.status = str(newton.__version__), "ok"
+        super().__init__(model)
         with without_lines(NO_GPU):
             self.newton, self.shapes = _build(self.tree, self.description.gravity)
         self.solver = newton.solvers.SolverFeatherstone(self.newton, update_mass_matrix_interval=1)
-        self.actuation, self.limits = self.description.actuation, self.description.effort_limits
         self._find_places()
         self.laws = {tuple(sorted(self.shapes[name] for name in p.names)): p for p in self.tree.pairs}
         self.pipeline = self._pipeline()
@@ -134,80 +83,73 @@ class NewtonEngine:
         by = np.array(rows, dtype=float)[here]
         out = self.centers.inverse_derivative(x_next)
         A = out @ by[:, here] @ self.centers.derivative(x)
-        B = out @ by[:, self.nq + self.nv + self.dofs] @ (self.actuation * (np.abs(u) <= self.limits))
+        B = out @ by[:, self.nq + self.nv + self.dofs] @ self._effort_by_input(u)
         return StepJacobian(frozen(A), frozen(B), "warp tape")
 
     def energy(self, x: ArrayLike) -> float:
-        x = finite_array("x", x, (self.nq + self.nv,))
-        state, v = self._at(x[: self.nq]), x[self.nq :]
-        mass, centers = numbers(self.newton.body_mass), centers_of_mass(self.newton, state)
-        fallen = float(mass @ centers @ numbers(self.newton.gravity)[0])
-        stretch, stiffness = self._stretch(state)
+        _, q, v = self._state(x)
+        state = self._at(q)
+        fallen = float(_numbers(self.newton.body_mass) @ _centers_of_mass(self.newton, state) @ self._gravity())
+        stretch, stiffness = self._native_springs(state)
         springs = float(stretch @ (stiffness * stretch)) / 2
-        return float(v @ self.mass_matrix(x[: self.nq]) @ v) / 2 - fallen + springs + self.tree.anchored_energy
+        return float(v @ self.mass_matrix(q) @ v) / 2 - fallen + springs + self.tree.anchored_energy
 
     def contact_depth(self, x: ArrayLike) -> float:
-        x = finite_array("x", x, (self.nq + self.nv,))
-        state = self._at(x[: self.nq])
+        state = self._at(self._state(x)[1])
         contacts = self._contacts(state)
         if contacts is None:
             return 0.0
         distance = wp.zeros(contacts.rigid_contact_max, dtype=wp.float32, device="cpu")
         newton.eval_rigid_contact_kinematics(self.newton, state, contacts, out_distance=distance)
-        return max([0.0, *(-numbers(distance)[: _count(contacts)])])
+        return max([0.0, *(-_numbers(distance)[: _count(contacts)])])
 
     def mass_matrix(self, q: ArrayLike) -> Array:
-        q = finite_array("q", q, (self.nq,))
+        q = self._positions(q)
         Q = self.centers.turn(q)
         return np.asarray(Q.T @ self._mass(self._at(q)) @ Q)
 
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
-        q, v = finite_array("q", q, (self.nq,)), finite_array("v", v, (self.nv,))
+        q, v = self._motion(q, v)
         state, Q = self._given(np.concatenate([q, v]), np.zeros(self.nu))[0], self.centers.turn(q)
         gravity, velocity = (wp.zeros(self.nv, dtype=wp.float32, device="cpu") for _ in range(2))
         newton.eval_inverse_dynamics_passive(self.newton, state, gravity_force=gravity, coriolis_force=velocity)
-        stretch, stiffness = self._stretch(state)
-        needed = (numbers(gravity) + numbers(velocity))[self.dofs] + stiffness * stretch
+        stretch, stiffness = self._native_springs(state)
+        needed = (_numbers(gravity) + _numbers(velocity))[self.dofs] + stiffness * stretch
         return np.asarray(Q.T @ (needed + self._mass(state) @ self.centers.turning(q, v)))
 
     @property
     def contract(self) -> EngineContract:
-        left_out = list(self.tree.left_out)
         damper, slope = (_listed(getattr(self.newton, f"shape_material_{name}")) for name in ("kd", "kf"))
         springs, dampers = (_listed(getattr(self.newton, f"joint_limit_{name}")) for name in ("ke", "kd"))
+        law = f"explicit spring, damper of {damper} N s/m while closing, friction of {slope} N s/m up to mu N"
         return EngineContract(
+            **self._plant_fields(),
             engine=self.name,
-            joints=read_joints(self.newton, self._at(zero(self.coordinates)), self.tree),
+            joints=_read_joints(self.newton, self._at(self._zero()[: self.nq]), self.tree),
             native_order=tuple(self.newton.joint_label),
             state="position of the body's origin, quaternion x y z w after it; velocity of a free body linear of its "
             "centre of mass then angular, in world",
-            inputs=self.description.inputs,
-            actuation=tuple(tuple(float(b) for b in row) for row in self.actuation),
-            effort_limits=tuple(float(limit) for limit in self.limits),
-            time_step=self.time_step,
             integrator=self._integrator(),
-            gravity=tuple(float(g) for g in numbers(self.newton.gravity)[0]),
-            contact_law=f"explicit spring, damper of {damper} N s/m while closing, friction of {slope} N s/m up to mu N"
-            if self.pipeline
-            else "none",
+            gravity=floats(self._gravity()),
+            contact_law=law if self.pipeline else "none",
             contacts=self.tree.pairs,
-            solver_tolerance=None,
             limit_law=f"explicit springs of {springs} and dampers of {dampers} (SI) beyond the limit",
-            reset=EACH_CALL,
             derivatives="by every number of Newton's state, warp's tape backwards",
             precision="float32",
             reasons={
                 "integrator": "Newton's joint damping is explicit, and its free bodies move by their centres of mass",
                 "contact law": "Newton's SolverFeatherstone has explicit springs, dampers and viscous friction up to "
                 "Coulomb's, each with its own numbers",
-                "contact pairs": f"no contact pair of {left_out} is built" if left_out else "",
+                "contact pairs": f"no contact pair of {list(self.tree.left_out)} is built"
+                if self.tree.left_out
+                else "",
                 "limit law": "Newton's limits have their own stiffness and damping",
                 "solver tolerance": "nothing is solved iteratively",
             },
         )
 
     def _integrator(self) -> str:
-        damped = bool(np.any(numbers(self.newton.joint_damping)))
+        damped = bool(np.any(_numbers(self.newton.joint_damping)))
         if not damped and not self.coordinates.free:
             return DRAKES_STEP
         how = ["semi-implicit Euler", *["joint damping explicit"] * damped]
@@ -215,8 +157,8 @@ class NewtonEngine:
             how.append("free bodies by v' of the centre of mass, quaternions by their rate, then of norm 1")
         return ", ".join(how)
 
-    def _point(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
-        return finite_array("x", x, (self.nq + self.nv,)), finite_array("u", u, (self.nu,))
+    def _gravity(self) -> Array:
+        return np.asarray(_numbers(self.newton.gravity)[0])
 
     def _find_places(self) -> None:
         """Newton's places in Drake's order, and the centres of mass that it uses."""
@@ -228,7 +170,7 @@ class NewtonEngine:
             if link.free:
                 self.positions[q : q + 7] = at_q + np.array([6, 3, 4, 5, 0, 1, 2])
                 self.dofs[v : v + 6] = at_v + np.array([3, 4, 5, 0, 1, 2])
-                of_free[v] = numbers(self.newton.body_com)[i]
+                of_free[v] = _numbers(self.newton.body_com)[i]
             else:
                 self.positions[q], self.dofs[v] = at_q, at_v
         self.centers = Centers(self.coordinates, tuple(of_free[v] for _, v in self.coordinates.free))
@@ -242,7 +184,7 @@ class NewtonEngine:
         q = unit(self.coordinates, x[: self.nq])
         native_q, native_v, force = np.zeros(self.nq), np.zeros(self.nv), np.zeros(self.nv)
         native_q[self.positions], native_v[self.dofs] = q, self.centers.turn(q) @ x[self.nq :]
-        force[self.dofs] = self.actuation @ np.clip(u, -self.limits, self.limits)
+        force[self.dofs] = self._effort(u)
         with np.errstate(over="ignore"):  # what is beyond single precision is inf, and SimulationError after the step
             for array, values in ((state.joint_q, native_q), (state.joint_qd, native_v), (control.joint_f, force)):
                 array.assign(values.astype(np.float32))
@@ -250,26 +192,24 @@ class NewtonEngine:
         return state, control
 
     def _drakes(self, after: Any, x: ArrayLike, u: ArrayLike) -> Array:
-        q, v = numbers(after.joint_q)[self.positions], numbers(after.joint_qd)[self.dofs]
-        if not (np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
-            raise SimulationError(f"Newton cannot take this step, from x = {np.asarray(x)}, u = {np.asarray(u)}")
-        return np.concatenate([q, np.linalg.solve(self.centers.turn(q), v)])
+        q, v = _numbers(after.joint_q)[self.positions], _numbers(after.joint_qd)[self.dofs]
+        return self._found("Newton", q, v, x, u)
 
     def _mass(self, state: Any) -> Array:
         """(nv, nv) of Newton's velocities in Drake's order."""
-        blocks, M = numbers(newton.eval_mass_matrix(self.newton, state)), np.zeros((self.nv, self.nv))
+        blocks, M = _numbers(newton.eval_mass_matrix(self.newton, state)), np.zeros((self.nv, self.nv))
         starts = self.newton.joint_qd_start.numpy()
         for block, tree in zip(blocks, self.tree.trees, strict=True):
             a, b = int(starts[tree.start]), int(starts[tree.stop])
             M[a:b, a:b] = block[: b - a, : b - a]
         return M[np.ix_(self.dofs, self.dofs)]
 
-    def _stretch(self, state: Any) -> tuple[Array, Array]:
+    def _native_springs(self, state: Any) -> tuple[Array, Array]:
         """(nv,) of the springs, and their stiffness; 0 for free bodies."""
-        stretch, native = np.zeros(self.nv), numbers(state.joint_q) - numbers(self.newton.joint_rest_q)
+        stretch, native = np.zeros(self.nv), _numbers(state.joint_q) - _numbers(self.newton.joint_rest_q)
         for i, j in self.coordinates.single:
             stretch[j] = native[self.positions[i]]
-        return stretch, numbers(self.newton.joint_stiffness)[self.dofs]
+        return stretch, _numbers(self.newton.joint_stiffness)[self.dofs]
 
     def _pipeline(self) -> Any:
         if not self.laws:
@@ -308,7 +248,7 @@ def _build(tree: RigidLinks, gravity: Array) -> tuple[Any, dict[str, int]]:
 def _add_link(builder: Any, link: RigidLink) -> int:
     return int(
         builder.add_link(
-            mass=link.mass, com=_row(link.center_of_mass), inertia=wp.mat33(*_row(link.inertia)), lock_inertia=True,
+            mass=link.mass, com=floats(link.center_of_mass), inertia=wp.mat33(*floats(link.inertia)), lock_inertia=True,
             label=link.joint.body,
         )
     )  # fmt: skip
@@ -322,7 +262,7 @@ def _add_joint(builder: Any, link: RigidLink, number: int) -> int:
     lower, upper = (float(side) for side in np.clip([joint.lower, joint.upper], -UNLIMITED, UNLIMITED))
     return int(
         add(
-            link.parent, number, parent_xform=_pose(link.on_parent), axis=_row(link.axis), damping=joint.damping,
+            link.parent, number, parent_xform=_pose(link.on_parent), axis=floats(link.axis), damping=joint.damping,
             armature=joint.armature, stiffness=joint.stiffness, rest_q=joint.rest, limit_lower=lower,
             limit_upper=upper, label=joint.joint,
         )
@@ -330,30 +270,67 @@ def _add_joint(builder: Any, link: RigidLink, number: int) -> int:
 
 
 def _add_shape(builder: Any, number: int, geometry: Geometry) -> int:
-    shape, kind = geometry.shape, type(geometry.shape).__name__
+    kind, sizes = shape_of(geometry)
     place = {"body": number, "xform": _pose(geometry.pose), "label": geometry.name}
     if kind == "HalfSpace":
         return int(builder.add_shape_plane(width=0.0, length=0.0, **place))
     if kind == "Sphere":
-        return int(builder.add_shape_sphere(radius=shape.radius(), **place))
+        return int(builder.add_shape_sphere(radius=sizes["radius"][0], **place))
     if kind == "Box":
-        return int(builder.add_shape_box(hx=shape.width() / 2, hy=shape.depth() / 2, hz=shape.height() / 2, **place))
+        halves = {name: side / 2 for name, side in zip(("hx", "hy", "hz"), sizes["size"], strict=True)}
+        return int(builder.add_shape_box(**halves, **place))
     add = builder.add_shape_cylinder if kind == "Cylinder" else builder.add_shape_capsule
-    return int(add(radius=shape.radius(), half_height=shape.length() / 2, **place))
+    return int(add(radius=sizes["radius"][0], half_height=sizes["length"][0] / 2, **place))
+
+
+def _numbers(array: Any) -> Array:
+    """A warp array in double precision."""
+    return np.asarray(array.numpy(), dtype=float)
+
+
+def _centers_of_mass(m: Any, state: Any) -> Array:
+    """(bodies, 3) in world."""
+    poses = zip(_numbers(state.body_q), _numbers(m.body_com), strict=True)
+    return np.array([pose[:3] + _matrix(pose) @ center for pose, center in poses])
+
+
+def _read_joints(m: Any, state: Any, tree: RigidLinks) -> tuple[JointContract, ...]:
+    """In Drake's order, where `state` is at Drake's q = 0."""
+    values = {name: _numbers(getattr(m, f"joint_{name}")) for name in OF_JOINTS}
+    centers, poses, inertias, found = _centers_of_mass(m, state), _numbers(state.body_q), _numbers(m.body_inertia), {}
+    for i, link in enumerate(tree.links):
+        kind, R = KINDS[int(m.joint_type.numpy()[i])], _matrix(poses[i])
+        j, single = int(m.joint_qd_start.numpy()[i]), kind != "quaternion_floating"
+        rest = values["rest_q"][int(m.joint_q_start.numpy()[i])]
+        found[link.joint.v_start] = joint_contract(
+            name=m.joint_label[i],
+            kind=kind,
+            axis=R @ values["axis"][j] if single else np.zeros(3),
+            anchor=poses[i, :3],
+            carried=[(float(m.body_mass.numpy()[i]), centers[i], R @ inertias[i] @ R.T)],
+            damping=float(values["damping"][j]),
+            armature=float(values["armature"][j]),
+            stiffness=float(values["stiffness"][j]),
+            rest=float(rest) if single else 0.0,
+            lower=limit(values["limit_lower"][j]),
+            upper=limit(values["limit_upper"][j]),
+        )
+    return tuple(found[start] for start in sorted(found))
+
+
+def _matrix(pose: Array) -> Array:
+    """(3, 3) of (p, quaternion x y z w)."""
+    return rotation(pose[[6, 3, 4, 5]])
 
 
 def _listed(array: Any) -> str:
     """The different values of an array."""
-    return " or ".join(f"{value:g}" for value in sorted(set(numbers(array))))
-
-
-def _row(values: Array) -> tuple[float, ...]:
-    return tuple(float(value) for value in np.ravel(values))
+    return " or ".join(f"{value:g}" for value in sorted(set(_numbers(array))))
 
 
 def _pose(X: RigidTransform) -> Any:
     w, x, y, z = X.rotation().ToQuaternion().wxyz()
-    return wp.transform(_row(X.translation()), wp.quat(x, y, z, w))
+    return wp.transform(floats(X.translation()), wp.quat(x, y, z, w))
 
 
 def _status(contacts: Any) -> str:

@@ -1,13 +1,10 @@
-"""Read the contract out of PhysX (`link`: its articulation link), and what its shapes are given for their contacts.
-
-PhysX has friction by shape and makes the pair's by the mean of the two.
-
-PhysX by SAPIEN on the CPU, in single precision, on articulations built link by link from Drake's plant.
+"""PhysX by SAPIEN on the CPU, in single precision, on articulations built link by link from Drake's plant.
 
 With PhysX's own solver (PGS, which SAPIEN's default TGS is not: it damps in sub-steps) the step of hinges and slides is
 Drake's, joint damping implicit. A free body moves by the velocity of its centre of mass and turns by the exponential
-of h w'; the explicit w' is scaled to the angular momentum that it had. Contacts and limits are rigid. A new scene is
-built for each call, since PhysX keeps contacts from one step to the next.
+of h w'; the explicit w' is scaled to the angular momentum that it had. Contacts and limits are rigid; PhysX has
+friction by shape and makes the pair's by the mean of the two. A new scene is built for each call, since PhysX keeps
+contacts from one step to the next.
 
 A free body's native state is (p, quaternion w x y z) and (v of the centre of mass, w), both in world.
 """
@@ -20,83 +17,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_diff._base.arrays import Array, finite_array
-from drake_diff.engines.interface import EngineContract, StepJacobian
-from drake_diff.engines.mujoco.mjcf import principal
-from drake_diff.engines.numpy import DRAKES_STEP, EACH_CALL
-from drake_diff.exceptions import MissingDependencyError, ModelError, NotOfferedError, SimulationError
-from drake_diff.mechanics.coordinates import Centers, rotation, unit, zero
-from drake_diff.mechanics.description import Geometry, RigidLink, RigidLinks, describe, joint_contract, rigid_links
+from drake_diff._base.arrays import Array
+from drake_diff.engines.common import RigidEngine, principal, shape_of
+from drake_diff.engines.interface import DRAKES_STEP, EngineContract, StepJacobian, floats
+from drake_diff.exceptions import MissingDependencyError, ModelError, NotOfferedError
+from drake_diff.mechanics.coordinates import Centers, rotation, unit
+from drake_diff.mechanics.description import Geometry, RigidLink, RigidLinks, joint_contract
 from drake_diff.mechanics.joints import JointContract, PairContract, split
 from drake_diff.model.model import Model
-
-KINDS = {"revolute_unwrapped": "revolute", "prismatic": "prismatic", "undefined": "quaternion_floating"}
-GROUPS = 32  # bits of a collision group
-Pair = tuple[str, str]
-
-
-def touching(tree: RigidLinks) -> tuple[tuple[PairContract, ...], tuple[Pair, ...]]:
-    """The pairs that PhysX can have, and those between a link and its parent, which never touch in PhysX."""
-    owner = {geometry.name: number for number, geometry in tree.geometries}
-
-    def adjacent(pair: PairContract) -> bool:
-        a, b = sorted(owner[name] for name in pair.names)
-        return a >= 0 and tree.links[b].parent == a
-
-    found = tuple(pair for pair in tree.pairs if not adjacent(pair))
-    return found, tuple(pair.names for pair in tree.pairs if adjacent(pair))
-
-
-def groups_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, tuple[int, int]]:
-    """Of each shape its own bit and those of its partners; those with the same partners share a bit. ModelError."""
-    names = sorted({name for pair in pairs for name in pair.names})
-    partners = {a: frozenset(b for pair in pairs if a in pair.names for b in pair.names if b != a) for a in names}
-    kinds = list(dict.fromkeys(partners[name] for name in names))
-    if len(kinds) > GROUPS:
-        raise ModelError(f"PhysX tells {GROUPS} groups of shapes apart, and here are {len(kinds)} with other partners")
-    bit = {name: 1 << kinds.index(partners[name]) for name in names}
-    masks = dict.fromkeys(names, 0)
-    for name in names:
-        for partner in partners[name]:
-            masks[name] |= bit[partner]
-    return {name: (bit[name], masks[name]) for name in names}
-
-
-def friction_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, float]:
-    """[1] of each shape, as near to those of the pairs as they can come; the contract shows what comes of it."""
-    given = [(pair.names, 2 * pair.friction) for pair in pairs if pair.friction is not None]
-    return {name: max(value, 0.0) for name, value in split(given).items()}
-
-
-def read_part(link: Any) -> tuple[float, Array, Array, Array]:
-    """Mass, centre of mass (3,), inertia (3, 3) about it and orientation of the body (3, 3), in world."""
-    pose, at = link.entity_pose, link.cmass_local_pose
-    body = rotation(np.array(pose.q, dtype=float))
-    R = body @ rotation(np.array(at.q, dtype=float))
-    center = np.array(pose.p, dtype=float) + body @ np.array(at.p, dtype=float)
-    return float(link.mass), center, R @ np.diag(np.array(link.inertia, dtype=float)) @ R.T, body
-
-
-def read_joint(link: Any, rigid: RigidLink) -> JointContract:
-    """Where PhysX is at Drake's q = 0; springs are those of the engine."""
-    mass, center, inertia, body = read_part(link)
-    joint, kind = link.joint, KINDS[link.joint.type]
-    single, at = kind != "quaternion_floating", link.joint.pose_in_child
-    limit = np.array(joint.limit, dtype=float).ravel() if single else np.array([-np.inf, np.inf])
-    return joint_contract(
-        name=joint.name,
-        kind=kind,
-        axis=body @ rotation(np.array(at.q, dtype=float))[:, 0] if single else np.zeros(3),
-        anchor=np.array(link.entity_pose.p, dtype=float) + body @ np.array(at.p, dtype=float),
-        carried=[(mass, center, inertia)],
-        damping=float(joint.damping) if single else 0.0,
-        armature=float(joint.armature[0]) if single else 0.0,
-        stiffness=rigid.joint.stiffness,
-        rest=rigid.joint.rest,
-        lower=float(limit[0]),
-        upper=float(limit[1]),
-    )
-
 
 try:
     with warnings.catch_warnings():
@@ -106,6 +34,9 @@ try:
 except ImportError as error:
     raise MissingDependencyError("this engine needs SAPIEN: pip install 'drake-diff[forward]'") from error
 
+KINDS = {"revolute_unwrapped": "revolute", "prismatic": "prismatic", "undefined": "quaternion_floating"}
+GROUPS = 32  # bits of a collision group
+Pair = tuple[str, str]
 UNLIMITED = 1e6  # [rad/s or m/s] instead of PhysX's 100 and 50
 # PhysX takes a mass [kg] or moment of inertia [kg m^2] of 0 for infinite: massless links and point masses get this.
 SMALLEST = 1e-9
@@ -123,33 +54,26 @@ class World:
     trees: list[Any]
 
 
-class SapienEngine:
+class SapienEngine(RigidEngine):
     """Trees of hinges, slides and free bodies; contacts of spheres, boxes, cylinders, capsules and half spaces.
 
     `status` is "ok" after every step that is finite: PhysX does not say how well it solved.
     """
 
-    name = "sapien (PhysX, PGS)"
+    name, version = "sapien (PhysX, PGS)", str(sapien.__version__)
 
     def __init__(self, model: Model):
-        self.description = describe(model)
-        self.tree = rigid_links(self.description)
-        self.time_step, self.coordinates = model.time_step, self.description.coordinates
-        self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
-        self.version, self.status = str(sapien.__version__), "ok"
-        self.actuation, self.limits = self.description.actuation, self.description.effort_limits
-        self.stiffness, self.rest = (self.description.by_velocity(name) for name in ("stiffness", "rest"))
-        self.pairs, self.adjacent = touching(self.tree)
-        self.friction, self.groups = friction_by_shape(self.pairs), groups_by_shape(self.pairs)
+        super().__init__(model)
+        self.pairs, self.adjacent = _touching(self.tree)
+        self.friction, self.groups = _friction_by_shape(self.pairs), groups_by_shape(self.pairs)
         centers = {x.joint.v_start: x.center_of_mass for x in self.tree.links if x.free}
         self.centers = Centers(self.coordinates, tuple(centers[v] for _, v in self.coordinates.free))
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
-        x, u = finite_array("x", x, (self.nq + self.nv,)), finite_array("u", u, (self.nu,))
-        force = self.actuation @ np.clip(u, -self.limits, self.limits)
-        world = self._world(x, force - self.stiffness * (self._single(x[: self.nq]) - self.rest))
+        x, u = self._point(x, u)
+        world = self._world(x, self._effort(u) - self.stiffness * self._stretch(x[: self.nq]))
         world.scene.step()
-        return self._state(world, x, u)
+        return self._read(world, x, u)
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
         raise NotOfferedError("PhysX has no derivatives of its step")
@@ -161,13 +85,12 @@ class SapienEngine:
         raise NotOfferedError(NOT_OFFERED)
 
     def energy(self, x: ArrayLike) -> float:
-        x = finite_array("x", x, (self.nq + self.nv,))
-        q, v = x[: self.nq], x[self.nq :]
+        x, q, v = self._state(x)
         world = self._world(x, np.zeros(self.nv))
-        gravity, stretch = np.array(world.system.config.gravity, dtype=float), self._single(q) - self.rest
-        total = float(stretch @ (self.stiffness * stretch)) / 2 + self.tree.anchored_energy
+        gravity = np.array(world.system.config.gravity, dtype=float)
+        total = self._spring_energy(q) + self.tree.anchored_energy
         for link, rigid in zip(world.links, self.tree.links, strict=True):
-            mass, center, inertia, _ = read_part(link)
+            mass, center, inertia, _ = _read_part(link)
             w, v_center = np.array(link.angular_velocity, dtype=float), np.array(link.linear_velocity, dtype=float)
             total += mass * (v_center @ v_center / 2 - gravity @ center) + float(w @ inertia @ w) / 2
             if not rigid.free:
@@ -176,7 +99,7 @@ class SapienEngine:
 
     def contact_depth(self, x: ArrayLike) -> float:
         """PhysX finds contacts as it steps, where the bodies are before it."""
-        world = self._world(finite_array("x", x, (self.nq + self.nv,)), np.zeros(self.nv))
+        world = self._world(self._state(x)[0], np.zeros(self.nv))
         world.scene.step()
         points = [point for contact in world.system.get_contacts() for point in contact.points]
         return max([0.0, *(-float(point.separation) for point in points)])
@@ -184,26 +107,21 @@ class SapienEngine:
     @property
     def contract(self) -> EngineContract:
         left_out = [*self.tree.left_out, *self.adjacent]
-        world = self._world(np.concatenate([zero(self.coordinates), np.zeros(self.nv)]), np.zeros(self.nv))
-        joints = {x.joint.v_start: read_joint(link, x) for link, x in zip(world.links, self.tree.links, strict=True)}
+        world = self._world(self._zero(), np.zeros(self.nv))
+        joints = {x.joint.v_start: _read_joint(link, x) for link, x in zip(world.links, self.tree.links, strict=True)}
         names = [joint.name for tree in world.trees for joint in tree.joints if joint.type in KINDS]
         return EngineContract(
+            **{**self._plant_fields(), "time_step": float(world.system.timestep)},
             engine=self.name,
             joints=tuple(joints[v] for v in sorted(joints)),
             native_order=tuple(names),
             state="position of the body's origin, quaternion w x y z after it; velocity of a free body linear of its "
             "centre of mass then angular, in world",
-            inputs=self.description.inputs,
-            actuation=tuple(tuple(float(b) for b in row) for row in self.actuation),
-            effort_limits=tuple(float(limit) for limit in self.limits),
-            time_step=float(world.system.timestep),
             integrator=self._integrator(),
-            gravity=tuple(float(g) for g in world.system.config.gravity),
+            gravity=floats(world.system.config.gravity),
             contact_law="rigid, Coulomb's friction by patches" if self.pairs else "none",
             contacts=tuple(PairContract(pair.names, self._friction(pair), None) for pair in self.pairs),
-            solver_tolerance=None,
             limit_law="rigid",
-            reset=EACH_CALL,
             precision="float32",
             reasons={
                 "integrator": "PhysX moves free bodies by their centres of mass and turns them by the exponential",
@@ -226,13 +144,6 @@ class SapienEngine:
     def _friction(self, pair: PairContract) -> float:
         a, b = (_material(self.friction.get(name)).dynamic_friction for name in pair.names)
         return float(a + b) / 2
-
-    def _single(self, q: Array) -> Array:
-        """(nv,) the positions of hinges and slides."""
-        found = np.zeros(self.nv)
-        for i, j in self.coordinates.single:
-            found[j] = q[i]
-        return found
 
     def _world(self, x: Array, force: Array) -> World:
         """A scene at `x` (nx,), with `force` (nv,) on its joints."""
@@ -276,7 +187,8 @@ class SapienEngine:
             link.mass = max(rigid.mass, SMALLEST)
             link.cmass_local_pose = sapien.Pose(rigid.center_of_mass, turn)
             link.inertia = np.maximum(moments, SMALLEST)
-            _inert(link)
+            link.linear_damping = link.angular_damping = 0.0  # without PhysX's drag and bounds
+            link.max_linear_velocity = link.max_angular_velocity = UNLIMITED
             for geometry in (g for number, g in self.tree.geometries if number == i and g.name in self.groups):
                 link.attach(self._shape(geometry))
             link.joint.name = link.name = rigid.joint.joint
@@ -307,7 +219,7 @@ class SapienEngine:
                 tree.qvel = np.array([v[x.v_start] for x in joints]).astype(np.float32)
                 tree.qf = np.array([force[x.v_start] for x in joints]).astype(np.float32)
 
-    def _state(self, world: World, x: Array, u: Array) -> Array:
+    def _read(self, world: World, x: Array, u: Array) -> Array:
         q, v = np.zeros(self.nq), np.zeros(self.nv)
         for tree, part in zip(world.trees, self.tree.trees, strict=True):
             rigid = {self.tree.links[i].joint.joint: self.tree.links[i].joint for i in part}
@@ -318,9 +230,70 @@ class SapienEngine:
                 i, j = root.joint.q_start, root.joint.v_start
                 q[i : i + 4], q[i + 4 : i + 7] = tree.root_pose.q, tree.root_pose.p
                 v[j + 3 : j + 6], v[j : j + 3] = tree.root_linear_velocity, tree.root_angular_velocity
-        if not (np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
-            raise SimulationError(f"PhysX cannot take this step, from x = {x}, u = {u}")
-        return np.concatenate([q, np.linalg.solve(self.centers.turn(q), v)])
+        return self._found("PhysX", q, v, x, u)
+
+
+def _touching(tree: RigidLinks) -> tuple[tuple[PairContract, ...], tuple[Pair, ...]]:
+    """The pairs that PhysX can have, and those between a link and its parent, which never touch in PhysX."""
+    owner = {geometry.name: number for number, geometry in tree.geometries}
+
+    def adjacent(pair: PairContract) -> bool:
+        a, b = sorted(owner[name] for name in pair.names)
+        return a >= 0 and tree.links[b].parent == a
+
+    found = tuple(pair for pair in tree.pairs if not adjacent(pair))
+    return found, tuple(pair.names for pair in tree.pairs if adjacent(pair))
+
+
+def groups_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, tuple[int, int]]:
+    """Of each shape its own bit and those of its partners; those with the same partners share a bit. ModelError."""
+    names = sorted({name for pair in pairs for name in pair.names})
+    partners = {a: frozenset(b for pair in pairs if a in pair.names for b in pair.names if b != a) for a in names}
+    kinds = list(dict.fromkeys(partners[name] for name in names))
+    if len(kinds) > GROUPS:
+        raise ModelError(f"PhysX tells {GROUPS} groups of shapes apart, and here are {len(kinds)} with other partners")
+    bit = {name: 1 << kinds.index(partners[name]) for name in names}
+    masks = dict.fromkeys(names, 0)
+    for name in names:
+        for partner in partners[name]:
+            masks[name] |= bit[partner]
+    return {name: (bit[name], masks[name]) for name in names}
+
+
+def _friction_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, float]:
+    """[1] of each shape, as near to those of the pairs as they can come; the contract shows what comes of it."""
+    given = [(pair.names, 2 * pair.friction) for pair in pairs if pair.friction is not None]
+    return {name: max(value, 0.0) for name, value in split(given).items()}
+
+
+def _read_part(link: Any) -> tuple[float, Array, Array, Array]:
+    """Mass, centre of mass (3,), inertia (3, 3) about it and orientation of the body (3, 3), in world."""
+    pose, at = link.entity_pose, link.cmass_local_pose
+    body = rotation(np.array(pose.q, dtype=float))
+    R = body @ rotation(np.array(at.q, dtype=float))
+    center = np.array(pose.p, dtype=float) + body @ np.array(at.p, dtype=float)
+    return float(link.mass), center, R @ np.diag(np.array(link.inertia, dtype=float)) @ R.T, body
+
+
+def _read_joint(link: Any, rigid: RigidLink) -> JointContract:
+    """Where PhysX is at Drake's q = 0; springs are those of the engine."""
+    mass, center, inertia, body = _read_part(link)
+    joint, kind = link.joint, KINDS[link.joint.type]
+    single, at = kind != "quaternion_floating", link.joint.pose_in_child
+    limit = np.array(joint.limit, dtype=float).ravel() if single else np.array([-np.inf, np.inf])
+    return joint_contract(
+        name=joint.name,
+        kind=kind,
+        axis=body @ rotation(np.array(at.q, dtype=float))[:, 0] if single else np.zeros(3),
+        anchor=np.array(link.entity_pose.p, dtype=float) + body @ np.array(at.p, dtype=float),
+        carried=[(mass, center, inertia)],
+        damping=float(joint.damping) if single else 0.0,
+        armature=float(joint.armature[0]) if single else 0.0,
+        stiffness=rigid.joint.stiffness,
+        rest=rigid.joint.rest,
+        lower=float(limit[0]),
+        upper=float(limit[1]),
+    )
 
 
 def _fixed(scene: Any) -> Any:
@@ -332,12 +305,6 @@ def _fixed(scene: Any) -> Any:
     link.joint.type = "fixed"
     scene.add_entity(entity)
     return link
-
-
-def _inert(link: Any) -> None:
-    """Without PhysX's drag and bounds."""
-    link.linear_damping = link.angular_damping = 0.0
-    link.max_linear_velocity = link.max_angular_velocity = UNLIMITED
 
 
 def _set_joint(joint: Any, rigid: RigidLink) -> None:
@@ -358,18 +325,18 @@ def _material(friction: float | None) -> Any:
 
 
 def _bare_shape(geometry: Geometry, material: Any) -> Any:
-    shape, kind, X = geometry.shape, type(geometry.shape).__name__, geometry.pose
+    (kind, sizes), X = shape_of(geometry), geometry.pose
     if kind == "Sphere":
-        found = physx.PhysxCollisionShapeSphere(shape.radius(), material)
+        found = physx.PhysxCollisionShapeSphere(sizes["radius"][0], material)
     elif kind == "Box":
-        found = physx.PhysxCollisionShapeBox([shape.width() / 2, shape.depth() / 2, shape.height() / 2], material)
+        found = physx.PhysxCollisionShapeBox([side / 2 for side in sizes["size"]], material)
     else:  # PhysX's axis is x, Drake's z
         X = X @ RigidTransform(RotationMatrix.MakeYRotation(-np.pi / 2), np.zeros(3))
         if kind == "HalfSpace":
             found = physx.PhysxCollisionShapePlane(material)
         else:
             make = physx.PhysxCollisionShapeCylinder if kind == "Cylinder" else physx.PhysxCollisionShapeCapsule
-            found = make(shape.radius(), shape.length() / 2, material)
+            found = make(sizes["radius"][0], sizes["length"][0] / 2, material)
     found.local_pose = _pose(X)
     return found
 

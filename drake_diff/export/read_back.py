@@ -3,17 +3,16 @@
 import warnings
 from dataclasses import replace
 from importlib.util import find_spec
-from math import inf
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from drake_diff.comparison.result import LAWS
 from drake_diff.engines.contract_match import ContractLine, match_contracts
 from drake_diff.engines.drake import DrakeEngine
-from drake_diff.engines.interface import Engine, EngineContract
+from drake_diff.engines.interface import Engine, EngineContract, limit
 from drake_diff.engines.load import load_engine
 from drake_diff.engines.mujoco.mjcf import mjcf
-from drake_diff.engines.urdf import UNLIMITED, urdf
+from drake_diff.engines.urdf import urdf
 from drake_diff.exceptions import DrakeDiffError, ModelWarning
 from drake_diff.export.sdf import collision_name, sdf
 from drake_diff.mechanics.description import Description
@@ -89,9 +88,5 @@ class _Unlimited(DrakeEngine):
     @property
     def contract(self) -> EngineContract:
         own = super().contract
-        joints = [replace(j, lower=_limit(j.lower), upper=_limit(j.upper)) for j in own.joints]
-        return replace(own, joints=tuple(joints), effort_limits=tuple(_limit(x) for x in own.effort_limits))
-
-
-def _limit(value: float) -> float:
-    return value if abs(value) < UNLIMITED else inf if value > 0 else -inf
+        joints = [replace(j, lower=limit(j.lower), upper=limit(j.upper)) for j in own.joints]
+        return replace(own, joints=tuple(joints), effort_limits=tuple(limit(x) for x in own.effort_limits))

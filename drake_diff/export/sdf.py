@@ -11,7 +11,9 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from drake_diff._base.arrays import Array
-from drake_diff.engines.urdf import UNLIMITED, poses_at_zero
+from drake_diff.engines.common import row, shape_of
+from drake_diff.engines.interface import UNLIMITED
+from drake_diff.engines.urdf import poses_at_zero
 from drake_diff.mechanics.description import Description, Geometry, Link
 
 KINDS = {"weld": "fixed", "prismatic": "prismatic", "revolute": "revolute"}
@@ -25,8 +27,8 @@ def sdf(description: Description, time_step: float) -> str:
     """
     root = Element("sdf", {"version": "1.9", "xmlns:drake": "http://drake.mit.edu"})
     world = SubElement(root, "world", name="from_drake")
-    SubElement(SubElement(world, "physics", name="step", type="ode"), "max_step_size").text = _row(time_step)
-    SubElement(world, "gravity").text = _row(description.gravity)
+    SubElement(SubElement(world, "physics", name="step", type="ode"), "max_step_size").text = row(time_step)
+    SubElement(world, "gravity").text = row(description.gravity)
     model = SubElement(world, "model", name="from_drake")
     bodies, frames = poses_at_zero(description)
     links = {link.body: _add_link(model, link, frames[link.body], bodies[link.body]) for link in description.links}
@@ -51,22 +53,18 @@ def collision_name(geometry: str) -> str:
     return geometry.replace("::", "/")
 
 
-def _row(values: object) -> str:
-    return " ".join(repr(float(value)) for value in np.ravel(np.asarray(values, dtype=float)))
-
-
 def _add_link(model: Element, link: Link, frame: RigidTransform, body: RigidTransform) -> Element:
     element = SubElement(model, "link", name=link.body)
-    SubElement(element, "pose").text = _row([*frame.translation(), 0, 0, 0])
+    SubElement(element, "pose").text = row([*frame.translation(), 0, 0, 0])
     X = frame.inverse() @ body
     R = X.rotation().matrix()
     turned = R @ link.inertia @ R.T
     inertial = SubElement(element, "inertial")
-    SubElement(inertial, "pose").text = _row([*(X @ link.center_of_mass), 0, 0, 0])
-    SubElement(inertial, "mass").text = _row(link.mass)
+    SubElement(inertial, "pose").text = row([*(X @ link.center_of_mass), 0, 0, 0])
+    SubElement(inertial, "mass").text = row(link.mass)
     inertia = SubElement(inertial, "inertia")
     for a, b in ("xx", "xy", "xz", "yy", "yz", "zz"):
-        SubElement(inertia, f"i{a}{b}").text = _row(turned["xyz".index(a), "xyz".index(b)])
+        SubElement(inertia, f"i{a}{b}").text = row(turned["xyz".index(a), "xyz".index(b)])
     return element
 
 
@@ -77,41 +75,32 @@ def _add_joint(model: Element, description: Description, link: Link, turn: Array
     if link.kind == "weld":
         return
     axis = SubElement(joint, "axis")
-    SubElement(axis, "xyz").text = _row(turn @ link.axis / np.linalg.norm(link.axis))
+    SubElement(axis, "xyz").text = row(turn @ link.axis / np.linalg.norm(link.axis))
     limits = [e for e, x in zip(description.effort_limits, description.actuated, strict=True) if x == link.joint]
     limit, dynamics = SubElement(axis, "limit"), SubElement(axis, "dynamics")
     numbers = {"lower": max(link.lower, -UNLIMITED), "upper": min(link.upper, UNLIMITED)}
     for name, value in {**numbers, "effort": min([UNLIMITED, *limits]) if limits else 0.0}.items():
-        SubElement(limit, name).text = _row(value)
+        SubElement(limit, name).text = row(value)
     numbers = {"damping": link.damping, "spring_reference": link.rest, "spring_stiffness": link.stiffness}
     for name, value in numbers.items():
-        SubElement(dynamics, name).text = _row(value)
+        SubElement(dynamics, name).text = row(value)
     if link.armature:
-        SubElement(joint, "drake:rotor_inertia").text = _row(link.armature)
+        SubElement(joint, "drake:rotor_inertia").text = row(link.armature)
         SubElement(joint, "drake:gear_ratio").text = "1.0"
 
 
 def _add_geometry(link: Element, geometry: Geometry, X: RigidTransform, friction: float | None) -> None:
-    shape, kind = geometry.shape, type(geometry.shape).__name__
-    if kind == "Sphere":
-        name, sizes = "sphere", {"radius": [shape.radius()]}
-    elif kind in ("Cylinder", "Capsule"):
-        name, sizes = kind.lower(), {"radius": [shape.radius()], "length": [shape.length()]}
-    elif kind == "Box":
-        name, sizes = "box", {"size": [shape.width(), shape.depth(), shape.height()]}
-    elif kind == "Ellipsoid":
-        name, sizes = "ellipsoid", {"radii": [shape.a(), shape.b(), shape.c()]}
-    elif kind == "HalfSpace":
-        name, sizes = "plane", {"normal": [0.0, 0.0, 1.0]}
-    else:
+    kind, sizes = shape_of(geometry)
+    if not sizes:
         return
     collision = SubElement(link, "collision", name=collision_name(geometry.name))
     w, *xyz = X.rotation().ToQuaternion().wxyz()
     pose = SubElement(collision, "pose", rotation_format="quat_xyzw")
-    pose.text = _row([*X.translation(), *xyz, w])
+    pose.text = row([*X.translation(), *xyz, w])
+    name = "plane" if kind == "HalfSpace" else kind.lower()
     element = SubElement(SubElement(collision, "geometry"), name)
     for key, values in sizes.items():
-        SubElement(element, key).text = _row(values)
+        SubElement(element, key).text = row(values)
     if friction is not None:
         ode = SubElement(SubElement(SubElement(collision, "surface"), "friction"), "ode")
-        SubElement(ode, "mu").text = SubElement(ode, "mu2").text = _row(friction)
+        SubElement(ode, "mu").text = SubElement(ode, "mu2").text = row(friction)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_diff.engines.mujoco.mjcf import principal
+from drake_diff.engines.common import principal, shape_of
 from drake_diff.engines.urdf import poses_at_zero
 from drake_diff.exceptions import MissingDependencyError, ModelError
 from drake_diff.mechanics.description import Description, Geometry, Link
@@ -120,17 +120,15 @@ def _add_joint(stage: Any, link: Link, at: RigidTransform, axis: Any) -> None:
 
 
 def _add_geometry(stage: Any, number: int, geometry: Geometry, X: RigidTransform) -> None:
-    shape, kind = geometry.shape, type(geometry.shape).__name__
+    kind, sizes = shape_of(geometry)
     parent = GROUND if geometry.body == "world" else f"{ROOT}/{geometry.body}"
     path = f"{parent}/collision_{number}"
-    if kind == "Sphere":
-        form = UsdGeom.Sphere.Define(stage, path)
-        form.CreateRadiusAttr(shape.radius())
-    elif kind in ("Cylinder", "Capsule"):
+    if kind in ("Sphere", "Cylinder", "Capsule"):
         form = getattr(UsdGeom, kind).Define(stage, path)
-        form.CreateAxisAttr("Z")
-        form.CreateRadiusAttr(shape.radius())
-        form.CreateHeightAttr(shape.length())
+        form.CreateRadiusAttr(sizes["radius"][0])
+        if "length" in sizes:
+            form.CreateAxisAttr("Z")
+            form.CreateHeightAttr(sizes["length"][0])
     elif kind == "Box":
         form = UsdGeom.Cube.Define(stage, path)
         form.CreateSizeAttr(1.0)
@@ -138,5 +136,5 @@ def _add_geometry(stage: Any, number: int, geometry: Geometry, X: RigidTransform
         return
     _place(form, X)
     if kind == "Box":
-        form.AddScaleOp().Set(_vector([shape.width(), shape.depth(), shape.height()]))
+        form.AddScaleOp().Set(_vector(sizes["size"]))
     UsdPhysics.CollisionAPI.Apply(form.GetPrim())

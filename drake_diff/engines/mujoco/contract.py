@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.engines.interface import EngineContract
+from drake_diff.engines.interface import DRAKES_STEP, EngineContract, float_rows, floats, limit
 from drake_diff.engines.mujoco.coordinates import KINDS, MujocoCoordinates, name_of
-from drake_diff.engines.mujoco.mjcf import UNLIMITED
-from drake_diff.engines.numpy import DRAKES_STEP, EACH_CALL
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.description import Description, joint_contract
 from drake_diff.mechanics.joints import JointContract, PairContract
@@ -54,26 +52,25 @@ def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Descri
         "solver tolerance": "each engine's own solver: Newton's here, SAP's in Drake",
     }
     return EngineContract(
-        joints=tuple(read_joint(m, d, j) for j in native.joints),
+        joints=tuple(_read_joint(m, d, j) for j in native.joints),
         native_order=tuple(name_of(m, m.name_jntadr[j]) for j in range(m.njnt)),
         state="quaternion w x y z after the position; velocity of a free body linear in world, angular in the body",
         inputs=tuple(name_of(m, m.name_actuatoradr[i]) for i in native.actuator),
-        actuation=read_actuation(m, native.dofs, native.actuator),
-        effort_limits=tuple(read_effort_limit(m, i) for i in native.actuator),
+        actuation=_read_actuation(m, native.dofs, native.actuator),
+        effort_limits=tuple(_read_effort_limit(m, i) for i in native.actuator),
         time_step=float(m.opt.timestep),
-        integrator=read_integrator(m, bool(free)),
-        gravity=tuple(float(g) for g in m.opt.gravity),
+        integrator=_read_integrator(m, bool(free)),
+        gravity=floats(m.opt.gravity),
         contact_law=law if touches(m) else "none",
-        contacts=read_pairs(m, description.pairs),
+        contacts=_read_pairs(m, description.pairs),
         solver_tolerance=float(m.opt.tolerance),
         limit_law="soft constraint of the step's solver",
-        reset=EACH_CALL,
         reasons=reasons,
         **own,
     )
 
 
-def read_integrator(m: Any, free: bool) -> str:
+def _read_integrator(m: Any, free: bool) -> str:
     """Drake's step where it is that."""
     name, explicit = INTEGRATORS[int(m.opt.integrator)], bool(int(m.opt.disableflags) & NO_EULERDAMP)
     drakes = name == "IMPLICITFAST" or (name == "EULER" and not explicit)
@@ -88,13 +85,13 @@ def touches(m: Any) -> bool:
     return bool(m.npair or (np.any(m.geom_contype) and np.any(m.geom_conaffinity)))
 
 
-def read_joint(m: Any, d: Any, j: int) -> JointContract:
+def _read_joint(m: Any, d: Any, j: int) -> JointContract:
     """Joint `j` and what it carries, where `d` is at Drake's q = 0."""
     kind, dof, body = KINDS[int(m.jnt_type[j])], int(m.jnt_dofadr[j]), int(m.jnt_bodyid[j])
     last = j == int(m.body_jntadr[body]) + int(m.body_jntnum[body]) - 1  # only it carries the body
     carried = [_part(m, d, b) for b in range(1, m.nbody) if last and int(m.body_weldid[b]) == body]
-    single, limited = kind in ("revolute", "prismatic"), bool(m.jnt_limited[j])
-    lower, upper = (float(side) if limited else np.inf for side in m.jnt_range[j])
+    single = kind in ("revolute", "prismatic")
+    lower, upper = (limit(side) for side in m.jnt_range[j]) if m.jnt_limited[j] else (-np.inf, np.inf)
     return joint_contract(
         name=name_of(m, m.name_jntadr[j]),
         kind=kind,
@@ -105,8 +102,8 @@ def read_joint(m: Any, d: Any, j: int) -> JointContract:
         armature=float(m.dof_armature[dof]),
         stiffness=float(np.ravel(m.jnt_stiffness[j])[0]) if single else 0.0,
         rest=float(m.qpos_spring[m.jnt_qposadr[j]]) if single else 0.0,
-        lower=lower if limited and lower > -UNLIMITED else -np.inf,
-        upper=upper if limited and upper < UNLIMITED else np.inf,
+        lower=lower,
+        upper=upper,
     )
 
 
@@ -115,7 +112,7 @@ def _part(m: Any, d: Any, body: int) -> tuple[float, Array, Array]:
     return float(m.body_mass[body]), np.array(d.xipos[body]), R @ np.diag(m.body_inertia[body]) @ R.T
 
 
-def read_actuation(m: Any, dofs: Array, actuators: list[int]) -> tuple[tuple[float, ...], ...]:
+def _read_actuation(m: Any, dofs: Array, actuators: list[int]) -> tuple[tuple[float, ...], ...]:
     """B (nv, nu) in Drake's order; ModelError for an actuator that does not drive one joint by a motor's law."""
     B = np.zeros((len(dofs), len(actuators)))
     for column, i in enumerate(actuators):
@@ -123,10 +120,10 @@ def read_actuation(m: Any, dofs: Array, actuators: list[int]) -> tuple[tuple[flo
             raise ModelError(f"actuator {name_of(m, m.name_actuatoradr[i])} of the MJCF is no motor on a joint")
         row = int(np.flatnonzero(dofs == m.jnt_dofadr[m.actuator_trnid[i][0]])[0])
         B[row, column] = m.actuator_gainprm[i][0] * m.actuator_gear[i][0]
-    return tuple(tuple(float(b) for b in row) for row in B)
+    return float_rows(B)
 
 
-def read_effort_limit(m: Any, i: int) -> float:
+def _read_effort_limit(m: Any, i: int) -> float:
     """Of the input, whichever of MuJoCo's limits of control and force is reached first."""
     by_force = float(m.actuator_forcerange[i][1]) if m.actuator_forcelimited[i] else np.inf
     by_control = float(m.actuator_ctrlrange[i][1]) if m.actuator_ctrllimited[i] else np.inf
@@ -151,7 +148,7 @@ def resting_stiffness(m: Any, i: int) -> float:
     return 1 / ((1 - float(m.pair_solimp[i][1])) * inverse_mass)
 
 
-def read_pairs(m: Any, wanted: tuple[PairContract, ...]) -> tuple[PairContract, ...]:
+def _read_pairs(m: Any, wanted: tuple[PairContract, ...]) -> tuple[PairContract, ...]:
     """Those of Drake's pairs that the model has, with MuJoCo's friction and the stiffness where they rest."""
     found = []
     for pair in wanted:

@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, skew
 from drake_diff.exceptions import InputError
-from drake_diff.mechanics.coordinates import rotation
+from drake_diff.mechanics.coordinates import rotation, unit
 from drake_diff.mechanics.description import Description
 
 KINDS = {0: "quaternion_floating", 1: "ball", 2: "prismatic", 3: "revolute"}  # mjtJoint
@@ -48,7 +48,7 @@ class MujocoCoordinates:
 
     def to_native(self, x: Array) -> tuple[Array, Array]:
         """qpos (nq,) and qvel (nv,), quaternions of norm 1."""
-        q = self._unit(x[: self.nq])
+        q = unit(self.coordinates, x[: self.nq])
         qpos = np.empty(self.nq)
         qpos[self.positions] = q
         return qpos, self.turn(q) @ x[self.nq :]
@@ -63,13 +63,6 @@ class MujocoCoordinates:
         ctrl = np.empty(len(self.actuator))
         ctrl[self.actuator] = u
         return ctrl
-
-    def zero(self) -> Array:
-        """q (nq,) where Drake's contract is read."""
-        q = np.zeros(self.nq)
-        for i, _ in self.coordinates.free:
-            q[i] = 1.0
-        return q
 
     def turn(self, q: Array) -> Array:
         """Q (nv, nv) with v_native = Q v."""
@@ -90,7 +83,7 @@ class MujocoCoordinates:
     def on_tangent(self, x: Array, x_next: Array, by_native: Array) -> tuple[Array, Array]:
         """A and B for `jacobian`, from the step's derivative by qpos, qvel and ctrl, (nq + nv, nq + nv + nu)."""
         n, eye = self.nq + self.nv, np.eye(self.nv)
-        q, q_next = self._unit(x[: self.nq]), self._unit(x_next[: self.nq])
+        q, q_next = (unit(self.coordinates, state[: self.nq]) for state in (x, x_next))
         move, see = np.zeros((self.nq, self.nv)), np.zeros((self.nv, self.nq))
         move[self.positions] = self.coordinates.rate(q) @ self.turn(q).T
         see[:, self.positions] = self.turn(q_next) @ self.coordinates.motion(q_next)
@@ -105,12 +98,6 @@ class MujocoCoordinates:
             by_turn = rotation(q[i : i + 4]).T @ skew(v[j : j + 3])
             T[np.ix_(self.nv + self.dofs[j : j + 3], np.arange(j, j + 3))] = by_turn
         return T
-
-    def _unit(self, q: Array) -> Array:
-        unit = np.array(q)
-        for i, _ in self.coordinates.free:
-            unit[i : i + 4] /= np.linalg.norm(q[i : i + 4])
-        return unit
 
 
 def name_of(m: Any, address: Any) -> str:

@@ -1,6 +1,4 @@
-"""MuJoCo models: compiled from the MJCF that is generated from Drake's plant, or from the user's own.
-
-MuJoCo, on MJCF generated from Drake's plant or on the user's own.
+"""MuJoCo, on MJCF generated from Drake's plant or on the user's own.
 
 With the integrator Euler joint damping is implicit, (M + h D) a = ..., and v' = v + h a: Drake's free step. What
 differs is a free body's quaternion, which MuJoCo turns by the exponential of h w' and Drake by its first term:
@@ -14,13 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff._base.arrays import Array, frozen
+from drake_diff.engines.common import PlantEngine
 from drake_diff.engines.interface import EngineContract, StepJacobian
 from drake_diff.engines.mujoco.contract import check_known, pair_index, read_contract, resting_stiffness
 from drake_diff.engines.mujoco.coordinates import MujocoCoordinates
 from drake_diff.engines.mujoco.mjcf import mjcf
 from drake_diff.exceptions import MissingDependencyError, ModelError, SimulationError
-from drake_diff.mechanics.description import Description, describe
+from drake_diff.mechanics.description import Description
 from drake_diff.model.model import Model
 
 try:
@@ -28,44 +27,8 @@ try:
 except ImportError as error:
     raise MissingDependencyError("this engine needs MuJoCo: pip install 'drake-diff[engines]'") from error
 
-__all__ = ["generated", "mujoco", "mujoco_model"]
-
-
-def mujoco_model(description: Description, time_step: float, path: str | Path | None) -> tuple[str, Any]:
-    """The MJCF, generated or read from `path`, and its MjModel; ModelError for what the contract has no line for."""
-    text = generated(description, time_step) if path is None else Path(path).read_text()
-    model = _compile(text) if path is None else _read(path)
-    flags = mujoco.mjtDisableBit
-    check_known(model, int(flags.mjDSBL_WARMSTART | flags.mjDSBL_EULERDAMP))
-    return text, model
-
-
-def generated(description: Description, time_step: float) -> str:
-    """The MJCF whose contacts have Drake's stiffness where they rest: see `mujoco_contract.resting_stiffness`."""
-    bare = _compile(mjcf(description, time_step))
-    solref = {}
-    for pair in description.pairs:
-        i = pair_index(bare, pair.names)
-        if i >= 0 and pair.stiffness:
-            s = pair.stiffness / resting_stiffness(bare, i)
-            solref[pair.names] = (-s, -2 * float(np.sqrt(s)))  # critical, where nothing else holds the pair
-    return mjcf(description, time_step, solref)
-
-
-def _compile(text: str) -> Any:
-    try:
-        return mujoco.MjModel.from_xml_string(text)
-    except ValueError as error:
-        raise ModelError(f"MuJoCo cannot take this model: {error}") from error
-
-
-def _read(path: str | Path) -> Any:
-    try:
-        return mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise ModelError(f"MuJoCo cannot read {path}: {error}") from error
-
-
+# MuJoCo's warnings after which a step means nothing.
+BAD = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 # What sticks slips beyond 1e-5 m/s or so, and a larger step would leave the mode: good to 1e-9.
 DIFFERENCE_STEP = 1e-6
 # Where nothing touches: at this step and at twice it, extrapolated, truncation is far below rounding's 1e-11.
@@ -74,18 +37,16 @@ FREE_STEP = 3e-5
 SAME_JACOBIAN = 1e-7
 
 
-class MujocoEngine:
+class MujocoEngine(PlantEngine):
     """`path` is the user's own MJCF, with joints and actuators of the names that Drake's plant has.
 
     `mjcf` is the text that was generated or read.
     """
 
-    name = "mujoco"
+    name, version = "mujoco", str(mujoco.__version__)
 
     def __init__(self, model: Model, *, path: str | Path | None = None):
-        self.description = describe(model)
-        self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
-        self.version, self.status = str(mujoco.__version__), "ok"
+        super().__init__(model)
         self.mjcf, self.model = mujoco_model(self.description, model.time_step, path)
         self.data = mujoco.MjData(self.model)
         self.native = MujocoCoordinates(self.description, self.model)
@@ -120,19 +81,19 @@ class MujocoEngine:
         return A, B
 
     def energy(self, x: ArrayLike) -> float:
-        self._set(finite_array("x", x, (self.nq + self.nv,)), np.zeros(self.nu))
+        self._set(self._state(x)[0], np.zeros(self.nu))
         mujoco.mj_forward(self.model, self.data)
         mujoco.mj_energyPos(self.model, self.data)
         mujoco.mj_energyVel(self.model, self.data)
         return float(self.data.energy.sum())
 
     def contact_depth(self, x: ArrayLike) -> float:
-        self._set(finite_array("x", x, (self.nq + self.nv,)), np.zeros(self.nu))
+        self._set(self._state(x)[0], np.zeros(self.nu))
         mujoco.mj_fwdPosition(self.model, self.data)
         return max([0.0, *(-float(self.data.contact[i].dist) for i in range(self.data.ncon))])
 
     def mass_matrix(self, q: ArrayLike) -> Array:
-        q = finite_array("q", q, (self.nq,))
+        q = self._positions(q)
         self._set(np.concatenate([q, np.zeros(self.nv)]), np.zeros(self.nu))
         mujoco.mj_forward(self.model, self.data)
         M = np.zeros((self.nv, self.nv))
@@ -142,14 +103,14 @@ class MujocoEngine:
         return np.asarray(Q.T @ M @ Q)
 
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
-        q, v = finite_array("q", q, (self.nq,)), finite_array("v", v, (self.nv,))
+        q, v = self._motion(q, v)
         self._set(np.concatenate([q, v]), np.zeros(self.nu))
         mujoco.mj_forward(self.model, self.data)
         return np.asarray(self.native.turn(q).T @ (self.data.qfrc_bias - self.data.qfrc_spring))
 
     @property
     def contract(self) -> EngineContract:
-        self._set(np.concatenate([self.native.zero(), np.zeros(self.nv)]), np.zeros(self.nu))
+        self._set(self._zero(), np.zeros(self.nu))
         mujoco.mj_forward(self.model, self.data)
         derivatives = "by tangent vectors of qpos and by qvel, centred differences in C"
         return read_contract(
@@ -162,20 +123,55 @@ class MujocoEngine:
             derivatives=derivatives,
         )
 
-    def _point(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
-        return finite_array("x", x, (self.nq + self.nv,)), finite_array("u", u, (self.nu,))
-
     def _set(self, x: Array, u: Array) -> None:
         mujoco.mj_resetData(self.model, self.data)  # which takes the warm start too
         self.data.qpos[:], self.data.qvel[:] = self.native.to_native(x)
         self.data.ctrl[:] = self.native.control(u)
 
     def _check(self, x: ArrayLike, u: ArrayLike) -> None:
-        bad = [w.name for w in mujoco.mjtWarning.__members__.values() if _counts(self.data, w)]
+        bad = [name for name in BAD if self.data.warning[int(getattr(mujoco.mjtWarning, name))].number > 0]
         if bad or not np.all(np.isfinite(self.data.qpos)):
             raise SimulationError(f"MuJoCo cannot take this step: {bad}, from x = {np.asarray(x)}, u = {np.asarray(u)}")
         used = int(np.max(self.data.solver_niter)) if self.data.nefc else 0
         self.status = "ok" if used < self.model.opt.iterations else f"the solver used all of its {used} iterations"
+
+
+def mujoco_model(description: Description, time_step: float, path: str | Path | None) -> tuple[str, Any]:
+    """The MJCF, generated or read from `path`, and its MjModel; ModelError for what the contract has no line for."""
+    if path is None:
+        text = generated(description, time_step)
+        model = _compile(text)
+    else:
+        text, model = Path(path).read_text(), _read(path)
+    flags = mujoco.mjtDisableBit
+    check_known(model, int(flags.mjDSBL_WARMSTART | flags.mjDSBL_EULERDAMP))
+    return text, model
+
+
+def generated(description: Description, time_step: float) -> str:
+    """The MJCF whose contacts have Drake's stiffness where they rest: see `resting_stiffness`."""
+    bare = _compile(mjcf(description, time_step))
+    solref = {}
+    for pair in description.pairs:
+        i = pair_index(bare, pair.names)
+        if i >= 0 and pair.stiffness:
+            s = pair.stiffness / resting_stiffness(bare, i)
+            solref[pair.names] = (-s, -2 * float(np.sqrt(s)))  # critical, where nothing else holds the pair
+    return mjcf(description, time_step, solref)
+
+
+def _compile(text: str) -> Any:
+    try:
+        return mujoco.MjModel.from_xml_string(text)
+    except ValueError as error:
+        raise ModelError(f"MuJoCo cannot take this model: {error}") from error
+
+
+def _read(path: str | Path) -> Any:
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise ModelError(f"MuJoCo cannot read {path}: {error}") from error
 
 
 def exponential_gap(x: Array, x_next: Array, h: float, q_start: int = 0, w_start: int = 7) -> Array:
@@ -191,9 +187,3 @@ def exponential_gap(x: Array, x_next: Array, h: float, q_start: int = 0, w_start
     )
     w, v = difference[0], difference[1:]
     return np.concatenate([[w * q[0] - v @ q[1:]], w * q[1:] + q[0] * v + np.cross(v, q[1:])]) / np.linalg.norm(q)
-
-
-def _counts(data: Any, warning: Any) -> bool:
-    return (
-        warning.name in ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC") and data.warning[int(warning)].number > 0
-    )

@@ -7,7 +7,8 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 from pydrake.math import RigidTransform
 
-from drake_diff._base.arrays import Array
+from drake_diff.engines.common import principal, row, shape_of
+from drake_diff.engines.interface import UNLIMITED
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.description import Description, Geometry, Link
 
@@ -16,7 +17,6 @@ SMALLEST = 2e-15
 # Constant impedance of contacts: near enough to rigid for friction to hold, far enough for a spring to be one.
 IMPEDANCE = 0.9
 FRICTION_IMPEDANCE_RATIO = 100.0  # so that what sticks creeps little
-UNLIMITED = 1e10  # the other side of a limit that has one
 Pair = tuple[str, str]
 
 
@@ -28,11 +28,11 @@ def mjcf(description: Description, time_step: float, solref: Mapping[Pair, tuple
     """
     root = Element("mujoco", model="from_drake")
     compiler = SubElement(root, "compiler", angle="radian", fusestatic="false")
-    compiler.set("boundmass", _row([SMALLEST]))
-    compiler.set("boundinertia", _row([SMALLEST]))
+    compiler.set("boundmass", row(SMALLEST))
+    compiler.set("boundinertia", row(SMALLEST))
     options = {"timestep": time_step, "tolerance": 1e-12, "impratio": FRICTION_IMPEDANCE_RATIO}
-    option = SubElement(root, "option", {name: _row([value]) for name, value in options.items()})
-    for name, text in {"integrator": "Euler", "cone": "elliptic", "gravity": _row(description.gravity)}.items():
+    option = SubElement(root, "option", {name: row(value) for name, value in options.items()})
+    for name, text in {"integrator": "Euler", "cone": "elliptic", "gravity": row(description.gravity)}.items():
         option.set(name, text)
     SubElement(option, "flag", warmstart="disable")
     bodies = {"world": SubElement(root, "worldbody")}
@@ -45,26 +45,22 @@ def mjcf(description: Description, time_step: float, solref: Mapping[Pair, tuple
         limit = float(description.effort_limits[i])
         if np.isfinite(limit):
             motor.set("forcelimited", "true")
-            motor.set("forcerange", _row([-limit, limit]))
+            motor.set("forcerange", row([-limit, limit]))
     for pair in description.pairs:
         if set(pair.names) <= known:
             element = SubElement(contacts, "pair", geom1=pair.names[0], geom2=pair.names[1], condim="3")
-            element.set("solimp", _row([IMPEDANCE, IMPEDANCE, 0.001]))
+            element.set("solimp", row([IMPEDANCE, IMPEDANCE, 0.001]))
             if pair.friction is not None:
-                element.set("friction", _row([pair.friction] * 2 + [0.0] * 3))
+                element.set("friction", row([pair.friction] * 2 + [0.0] * 3))
             if solref and pair.names in solref:
-                element.set("solref", _row(solref[pair.names]))
+                element.set("solref", row(solref[pair.names]))
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def _row(values: object) -> str:
-    return " ".join(repr(float(value)) for value in np.ravel(np.asarray(values, dtype=float)))
-
-
 def _place(element: Element, X: RigidTransform) -> None:
-    element.set("pos", _row(X.translation()))
-    element.set("quat", _row(X.rotation().ToQuaternion().wxyz()))
+    element.set("pos", row(X.translation()))
+    element.set("quat", row(X.rotation().ToQuaternion().wxyz()))
 
 
 def _add_link(parent: Element, link: Link) -> Element:
@@ -72,9 +68,9 @@ def _add_link(parent: Element, link: Link) -> Element:
     _place(body, link.on_parent @ link.on_child.inverse())
     if link.mass > 0:
         moments, turn = principal(link.inertia)
-        inertial = SubElement(body, "inertial", mass=_row([link.mass]), diaginertia=_row(moments))
-        inertial.set("pos", _row(link.center_of_mass))
-        inertial.set("quat", _row(turn))
+        inertial = SubElement(body, "inertial", mass=row(link.mass), diaginertia=row(moments))
+        inertial.set("pos", row(link.center_of_mass))
+        inertial.set("quat", row(turn))
     if link.kind == "quaternion_floating":
         if link.parent != "world" or not all(x.IsExactlyIdentity() for x in (link.on_parent, link.on_child)):
             raise ModelError(f"joint {link.joint}: MuJoCo's free body is one of the world, by its own frame")
@@ -86,50 +82,31 @@ def _add_link(parent: Element, link: Link) -> Element:
 
 def _add_joint(body: Element, link: Link) -> None:
     joint = SubElement(body, "joint", name=link.joint, type="hinge" if link.kind == "revolute" else "slide")
-    joint.set("pos", _row(link.on_child.translation()))
-    joint.set("axis", _row(link.on_child.rotation().matrix() @ link.axis))
+    joint.set("pos", row(link.on_child.translation()))
+    joint.set("axis", row(link.on_child.rotation().matrix() @ link.axis))
     numbers = {"damping": link.damping, "armature": link.armature, "stiffness": link.stiffness, "springref": link.rest}
     for name, value in numbers.items():
-        joint.set(name, _row([value]))
+        joint.set(name, row(value))
     limited = np.isfinite(link.lower) or np.isfinite(link.upper)
     joint.set("limited", "true" if limited else "false")
     if limited:
-        joint.set("range", _row(np.clip([link.lower, link.upper], -UNLIMITED, UNLIMITED)))
-
-
-def principal(inertia: Array) -> tuple[Array, Array]:
-    """Principal moments (3,) of `inertia` (3, 3), and the quaternion (w, x, y, z) of their axes.
-
-    What rounding takes from A + B >= C, which MuJoCo checks exactly, is put back: 1e-14 of the largest at most.
-    """
-    moments, axes = np.linalg.eigh(inertia)
-    if np.array_equal(inertia, np.diag(np.diag(inertia))):
-        moments, axes = np.diag(inertia).copy(), np.eye(3)
-    axes = axes * np.sign(np.linalg.det(axes))
-    order = np.argsort(moments)
-    missing = moments[order[2]] - moments[order[1]] - moments[order[0]]
-    if 0 < missing <= 1e-14 * moments[order[2]]:
-        moments[order[0]] += 2 * missing
-    X = RigidTransform(np.vstack([np.column_stack([axes, np.zeros(3)]), [0, 0, 0, 1.0]]))
-    return moments, np.asarray(X.rotation().ToQuaternion().wxyz())
+        joint.set("range", row(np.clip([link.lower, link.upper], -UNLIMITED, UNLIMITED)))
 
 
 def _add_geometry(body: Element, geometry: Geometry) -> bool:
-    shape, kind = geometry.shape, type(geometry.shape).__name__
-    if kind == "Sphere":
-        size = [shape.radius()]
-    elif kind in ("Cylinder", "Capsule"):
-        size = [shape.radius(), shape.length() / 2]
-    elif kind == "Box":
-        size = [shape.width() / 2, shape.depth() / 2, shape.height() / 2]
-    elif kind == "Ellipsoid":
-        size = [shape.a(), shape.b(), shape.c()]
-    elif kind == "HalfSpace":
-        size = [0.0, 0.0, 1.0]
-    else:
+    kind, sizes = shape_of(geometry)
+    if not sizes:
         return False
+    if kind == "HalfSpace":
+        size = [0.0, 0.0, 1.0]
+    elif kind == "Box":
+        size = [side / 2 for side in sizes["size"]]
+    elif kind == "Ellipsoid":
+        size = sizes["radii"]
+    else:
+        size = [*sizes["radius"], *(length / 2 for length in sizes.get("length", []))]
     name = {"HalfSpace": "plane"}.get(kind, kind.lower())
-    element = SubElement(body, "geom", name=geometry.name, type=name, size=_row(size), contype="0", conaffinity="0")
+    element = SubElement(body, "geom", name=geometry.name, type=name, size=row(size), contype="0", conaffinity="0")
     element.set("mass", "0")
     _place(element, geometry.pose)
     return True

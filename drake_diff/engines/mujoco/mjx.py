@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff._base.arrays import Array, frozen
+from drake_diff.engines.common import PlantEngine
 from drake_diff.engines.interface import EngineContract, StepJacobian
 from drake_diff.engines.mujoco.contract import CONES, read_contract, touches
 from drake_diff.engines.mujoco.coordinates import MujocoCoordinates
 from drake_diff.engines.mujoco.engine import mujoco_model
 from drake_diff.exceptions import GradientError, MissingDependencyError, ModelError, SimulationError
-from drake_diff.mechanics.description import describe
 from drake_diff.model.model import Model
 
 try:
@@ -39,18 +39,16 @@ STILL = 1e-8  # [rad/s] that MJX takes for 0
 RK4 = 1  # mjtIntegrator
 
 
-class MjxEngine:
+class MjxEngine(PlantEngine):
     """`path` is the user's own MJCF, with joints and actuators of the names that Drake's plant has.
 
     `mjcf` is the text that was generated or read. ModelError where MJX cannot have it.
     """
 
-    name = "mjx"
+    name, version = "mjx", version("mujoco-mjx")
 
     def __init__(self, model: Model, *, path: str | Path | None = None):
-        self.description = describe(model)
-        self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
-        self.version, self.status = version("mujoco-mjx"), "ok"
+        super().__init__(model)
         self.mjcf, compiled = mujoco_model(self.description, model.time_step, path)
         if not touches(compiled):
             compiled.opt.cone = PYRAMIDAL  # MJX cannot have limits with elliptic cones and no contact that has one
@@ -96,7 +94,7 @@ class MjxEngine:
         return ", turns from rest by hand" if still else ""
 
     def energy(self, x: ArrayLike) -> float:
-        x = finite_array("x", x, (self.nq + self.nv,))
+        x, q, v = self._state(x)
         terms, m = self._terms(x), self.model
         height = m.body_mass @ (terms.xipos @ m.opt.gravity)
         springs = 0.0
@@ -104,38 +102,34 @@ class MjxEngine:
             if m.jnt_stiffness[j]:
                 at = int(m.jnt_qposadr[j])
                 springs += float(m.jnt_stiffness[j] * (terms.qpos[at] - m.qpos_spring[at]) ** 2) / 2
-        v = x[self.nq :]
-        return float(v @ self.mass_matrix(x[: self.nq]) @ v) / 2 - float(height) + springs
+        return float(v @ self.mass_matrix(q) @ v) / 2 - float(height) + springs
 
     def contact_depth(self, x: ArrayLike) -> float:
-        x = finite_array("x", x, (self.nq + self.nv,))
+        x, _, _ = self._state(x)
         if not touches(self.model):
             return 0.0
         return float(max(0.0, -np.min(self._run(_distances_at, x, np.zeros(self.nu)))))
 
     def mass_matrix(self, q: ArrayLike) -> Array:
-        q = finite_array("q", q, (self.nq,))
+        q = self._positions(q)
         Q = self.native.turn(q)
         M = self._run(_mass_at, np.concatenate([q, np.zeros(self.nv)]), np.zeros(self.nu))
         return np.asarray(Q.T @ M @ Q)
 
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
-        q, v = finite_array("q", q, (self.nq,)), finite_array("v", v, (self.nv,))
+        q, v = self._motion(q, v)
         terms = self._terms(np.concatenate([q, v]))
         springs = terms.qfrc_passive + self.model.dof_damping * terms.qvel
         return np.asarray(self.native.turn(q).T @ (terms.qfrc_bias - springs))
 
     @property
     def contract(self) -> EngineContract:
-        terms = self._terms(np.concatenate([self.native.zero(), np.zeros(self.nv)]))
+        terms = self._terms(self._zero())
         precision = str(self.model.qpos0.dtype)
         return read_contract(
             self.model, terms, self.native, self.description, who="MJX", engine=self.name, precision=precision,
             derivatives="by tangent vectors of qpos and by qvel, jax.jacfwd",
         )  # fmt: skip
-
-    def _point(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
-        return finite_array("x", x, (self.nq + self.nv,)), finite_array("u", u, (self.nu,))
 
     def _terms(self, x: Array) -> Any:
         """mjx.Data of NumPy arrays, with what depends on position and velocity alone."""

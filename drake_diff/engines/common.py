@@ -1,0 +1,146 @@
+"""What the engines here have in common: their arguments checked, the plant's numbers in Drake's order, its shapes."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.math import RotationMatrix
+
+from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff.engines.interface import StepJacobian, float_rows, floats
+from drake_diff.exceptions import SimulationError
+from drake_diff.mechanics.coordinates import Centers, Coordinates, euler_jacobian, euler_step, zero
+from drake_diff.mechanics.description import describe, rigid_links
+from drake_diff.model.model import Model
+
+
+class Arguments:
+    """Checks what an engine is asked about: ShapeError or NonFiniteError."""
+
+    nq: int
+    nv: int
+    nu: int
+
+    def _state(self, x: ArrayLike) -> tuple[Array, Array, Array]:
+        """x (nx,), q (nq,) and v (nv,)."""
+        x = finite_array("x", x, (self.nq + self.nv,))
+        return x, x[: self.nq], x[self.nq :]
+
+    def _point(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
+        return finite_array("x", x, (self.nq + self.nv,)), finite_array("u", u, (self.nu,))
+
+    def _positions(self, q: ArrayLike) -> Array:
+        return finite_array("q", q, (self.nq,))
+
+    def _motion(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
+        return finite_array("q", q, (self.nq,)), finite_array("v", v, (self.nv,))
+
+
+class PlantEngine(Arguments):
+    """An engine built from the description of Drake's plant, whose numbers it holds by Drake's velocities."""
+
+    def __init__(self, model: Model):
+        self.description = describe(model)
+        self.coordinates = self.description.coordinates
+        self.time_step, self.status = model.time_step, "ok"
+        self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
+        self.damping, self.armature, self.stiffness, self.rest = (
+            self.description.by_velocity(name) for name in ("damping", "armature", "stiffness", "rest")
+        )
+        self.actuation, self.limits = self.description.actuation, self.description.effort_limits
+
+    def _effort(self, u: Array) -> Array:
+        """(nv,) B u, cut at the effort limits."""
+        return np.asarray(self.actuation @ np.clip(u, -self.limits, self.limits))
+
+    def _effort_by_input(self, u: Array) -> Array:
+        """(nv, nu) the derivative of `_effort`."""
+        return np.asarray(self.actuation * (np.abs(u) <= self.limits))
+
+    def _stretch(self, q: Array) -> Array:
+        """(nv,) of the springs on hinges and slides."""
+        found = -self.rest
+        for i, j in self.coordinates.single:
+            found[j] += q[i]
+        return found
+
+    def _spring_energy(self, q: Array) -> float:
+        """[J]."""
+        stretch = self._stretch(q)
+        return float(stretch @ (self.stiffness * stretch)) / 2
+
+    def _zero(self) -> Array:
+        """x (nx,) at which contracts are read: q = 0, free bodies unturned at the origin, nothing moves."""
+        return np.concatenate([zero(self.coordinates), np.zeros(self.nv)])
+
+    def _plant_fields(self) -> dict[str, Any]:
+        """The fields of the contract that an engine takes over from Drake as they are."""
+        return {
+            "inputs": self.description.inputs,
+            "actuation": float_rows(self.actuation),
+            "effort_limits": floats(self.limits),
+            "time_step": self.time_step,
+        }
+
+
+class RigidEngine(PlantEngine):
+    """An engine built link by link, whose free bodies move by the velocity of their centres of mass.
+
+    It has trees of hinges, slides and free bodies, and contacts of spheres, boxes, cylinders, capsules and half spaces.
+    """
+
+    centers: Centers
+
+    def __init__(self, model: Model):
+        super().__init__(model)
+        self.tree = rigid_links(self.description)
+
+    def _found(self, who: str, q: Array, v: Array, x: ArrayLike, u: ArrayLike) -> Array:
+        """Drake's state (nx,) of q and the velocities of centres of mass; SimulationError where it is not finite."""
+        if not (np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
+            raise SimulationError(f"{who} cannot take this step, from x = {np.asarray(x)}, u = {np.asarray(u)}")
+        return np.concatenate([q, np.linalg.solve(self.centers.turn(q), v)])
+
+
+def euler_step_jacobian(
+    coordinates: Coordinates, h: float, x: Array, acceleration: Array, by: Array, method: str
+) -> StepJacobian:
+    """Of Drake's Euler step, from the acceleration (nv,) and its derivative (nv, 2 nv + nu) by motion, v and u."""
+    x_next = euler_step(coordinates, h, x, acceleration)
+    jacobian = euler_jacobian(coordinates, h, x, x_next, by)
+    return StepJacobian(frozen(jacobian[:, : len(x)]), frozen(jacobian[:, len(x) :]), method)
+
+
+def row(values: object) -> str:
+    """Numbers as text, to the last digit."""
+    return " ".join(repr(float(value)) for value in np.ravel(np.asarray(values, dtype=float)))
+
+
+def shape_of(geometry: Any) -> tuple[str, dict[str, list[float]]]:
+    """The kind of Drake's shape, such as "Sphere", and its sizes [m], none of those that no engine is given."""
+    shape, kind = geometry.shape, type(geometry.shape).__name__
+    if kind == "Sphere":
+        return kind, {"radius": [shape.radius()]}
+    if kind in ("Cylinder", "Capsule"):
+        return kind, {"radius": [shape.radius()], "length": [shape.length()]}
+    if kind == "Box":
+        return kind, {"size": [shape.width(), shape.depth(), shape.height()]}
+    if kind == "Ellipsoid":
+        return kind, {"radii": [shape.a(), shape.b(), shape.c()]}
+    return kind, {"normal": [0.0, 0.0, 1.0]} if kind == "HalfSpace" else {}
+
+
+def principal(inertia: Array) -> tuple[Array, Array]:
+    """Principal moments (3,) of `inertia` (3, 3), and the quaternion (w, x, y, z) of their axes.
+
+    MuJoCo checks A + B >= C exactly: what rounding takes from it, at most 1e-14 of the largest, is put back.
+    """
+    moments, axes = np.linalg.eigh(inertia)
+    if np.array_equal(inertia, np.diag(np.diag(inertia))):
+        moments, axes = np.diag(inertia).copy(), np.eye(3)
+    axes = axes * np.sign(np.linalg.det(axes))
+    order = np.argsort(moments)
+    missing = moments[order[2]] - moments[order[1]] - moments[order[0]]
+    if 0 < missing <= 1e-14 * moments[order[2]]:
+        moments[order[0]] += 2 * missing
+    return moments, np.asarray(RotationMatrix(axes).ToQuaternion().wxyz())
