@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 import drake_diff as dd
-from drake_diff.artifact.save import seal
 
 DIRECTORY = Path("artifacts/pendulum_swing_up")
 
@@ -19,5 +18,5 @@ if __name__ == "__main__":
     record = dd.save(dd.solve(problem, method="shooting"), DIRECTORY)
     for page in DIRECTORY.glob("*.html"):
         page.unlink()
-    seal(DIRECTORY, record)
+    record.write(DIRECTORY)
     print(dd.verify(DIRECTORY).require())

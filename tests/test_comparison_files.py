@@ -16,7 +16,7 @@ from drake_diff.comparison import files as comparison_trace
 from drake_diff.comparison.files import begin_comparison, record_of
 from drake_diff.comparison.page import comparison_data
 from drake_diff.comparison.result import sentence_of, verdict_of
-from drake_diff.record.run_record import own_sha256
+from drake_diff.record.sealed import own_sha256
 
 
 @pytest.fixture(scope="module")
@@ -38,11 +38,11 @@ def saved(ball, tmp_path_factory):
 def test_the_record_has_every_number_and_its_own_hash(ball, saved):
     folder, record = saved
     fields = json.loads((folder / "comparison.json").read_text())
-    assert dd.comparison.ComparisonRecord.model_validate(fields) == record
+    assert dd.record.ComparisonRecord.model_validate(fields) == record
     assert own_sha256(fields) == fields["record_sha256"]
-    for file in record.files:
+    for file in record.files.values():
         assert sha256((folder / file.path).read_bytes()).hexdigest() == file.sha256
-    assert {file.path for file in record.files} == {"trace.mcap", "replay.html", "comparison.html"}
+    assert set(record.files) == {"trace.mcap", "replay.html", "comparison.html", "comparison.schema.json"}
     for e, found in zip(ball.engines, record.engines, strict=True):
         assert (found.engine, found.verdict, found.steps) == (e.engine, e.verdict, 30)
         assert found.largest_step_gap == e.step_gaps.max()
@@ -54,7 +54,7 @@ def test_the_record_has_every_number_and_its_own_hash(ball, saved):
 
 def test_the_record_is_the_same_but_for_the_times(ball, saved, tmp_path):
     again = dd.comparison.save_comparison(ball, tmp_path / saved[0].name)
-    apart = {"wall_clock": None, "record_sha256": "", "files": []}
+    apart = {"wall_clock": None, "record_sha256": "", "files": {}}
     assert again.model_copy(update=apart) == saved[1].model_copy(update=apart)
     assert (tmp_path / saved[0].name / "trace.mcap").read_bytes() == (saved[0] / "trace.mcap").read_bytes()
 
@@ -148,7 +148,7 @@ def test_the_command(tmp_path):
     found = CliRunner().invoke(app, [*words, "--out", str(out)])
     assert found.exit_code == 0, found.output
     assert "numpy and pinocchio: the same simulation as Drake" in found.output
-    assert {p.name for p in out.iterdir()} == {"comparison.json", "trace.mcap", "replay.html", "comparison.html"}
+    assert {p.name for p in out.iterdir()} == {*dd.load_record(out).files, "comparison.json"}
 
 
 def test_the_command_fails_where_the_engines_do_not_agree(tmp_path, monkeypatch):

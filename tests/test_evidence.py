@@ -67,7 +67,7 @@ def test_the_record_says_what_the_solution_measures(run, swing_up):
 def test_the_record_knows_contract_versions_and_model_file(run):
     record = dd.load_record(run)
     model_file = MODELS / "pendulum.urdf"
-    assert record.inputs.model.file.sha256 == sha256(model_file.read_bytes()).hexdigest()
+    assert record.model.file.sha256 == sha256(model_file.read_bytes()).hexdigest()
     assert record.provenance.packages["drake"]
     assert record.contract["time_step"] == 0.02
     assert [b["mass"] for b in record.contract["bodies"]] == [1.0]

@@ -19,7 +19,7 @@ from drake_diff._base.statistics import success_rate
 from drake_diff.artifact.verify import recalled
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
-from drake_diff.record.run_record import own_sha256
+from drake_diff.record.sealed import own_sha256
 from drake_diff.trials import page as robustness_page
 from drake_diff.trials.files import begin_robustness, record_of
 from drake_diff.trials.page import robustness_data
@@ -56,12 +56,17 @@ def saved(result, run, tmp_path_factory):
 def test_the_record_has_every_number_and_its_own_hash(result, saved, run):
     folder, record = saved
     fields = json.loads((folder / "robustness.json").read_text())
-    assert dd.trials.RobustnessRecord.model_validate(fields) == record
+    assert dd.record.RobustnessRecord.model_validate(fields) == record
     assert own_sha256(fields) == fields["record_sha256"]
-    for file in record.files:
+    for file in record.files.values():
         assert sha256((folder / file.path).read_bytes()).hexdigest() == file.sha256
-    expected = {"robustness.html", "trials.csv", *(f"worst/{name}/{file}" for name in WORST for file in TRIAL_FILES)}
-    assert {file.path for file in record.files} == expected
+    expected = {
+        "robustness.schema.json",
+        "robustness.html",
+        "trials.csv",
+        *(f"worst/{name}/{file}" for name in WORST for file in TRIAL_FILES),
+    }
+    assert set(record.files) == expected
     assert {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} == {
         *expected,
         "robustness.json",
@@ -90,14 +95,14 @@ def test_everything_but_wall_clock_is_the_same_byte_for_byte(saved, run, tmp_pat
         again = dd.trials.save_robustness(
             dd.robustness(solution, LEVELS, trials=6, controller="open_loop"), tmp_path / "tried", run
         )
-    apart = {"wall_clock": None, "record_sha256": "", "files": []}
+    apart = {"wall_clock": None, "record_sha256": "", "files": {}}
     assert again.model_copy(update=apart) == record.model_copy(update=apart)
 
     def bytes_of(directory, name):
         text = (directory / name).read_text() if name == "robustness.html" else (directory / name).read_bytes()
         return re.sub(r'<p id="(measured-latency|wall-clock)".*?</p>', "", text) if isinstance(text, str) else text
 
-    for file in record.files:
+    for file in record.files.values():
         if not file.path.endswith("latencies.json"):
             assert bytes_of(tmp_path / "tried", file.path) == bytes_of(folder, file.path), file.path
 

@@ -13,7 +13,7 @@ from helpers.models import MODELS, ROOT
 
 import drake_diff as dd
 from drake_diff.artifact.listing import compare_runs, list_runs
-from drake_diff.artifact.save import begin, save_failure, seal
+from drake_diff.artifact.save import begin, save_failure
 from drake_diff.cli.runs import plain
 from drake_diff.exceptions import ArtifactError
 
@@ -82,7 +82,7 @@ def test_metrics_that_are_defined_otherwise_are_not_compared(runs, tmp_path):
     cost = record.metrics[0].model_copy(update={"unit": "J"})
     packages = {**record.provenance.packages, "drake": "0.1"}
     provenance = record.provenance.model_copy(update={"packages": packages})
-    seal(directory, record.model_copy(update={"metrics": [cost, *record.metrics[1:-1]], "provenance": provenance}))
+    record.model_copy(update={"metrics": [cost, *record.metrics[1:-1]], "provenance": provenance}).write(directory)
     found = compare_runs(runs / "a", directory)
     assert not found.comparable
     assert found.refused[0] == "cost: its unit differs: '1' and 'J'"

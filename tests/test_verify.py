@@ -17,9 +17,10 @@ from helpers.models import MODELS, ROOT
 
 import drake_diff as dd
 import drake_diff.artifact.save as evidence
-from drake_diff.artifact.save import begin, seal
+from drake_diff.artifact.listing import list_runs
+from drake_diff.artifact.save import begin
 from drake_diff.exceptions import ArtifactError
-from drake_diff.record.run_record import EvidenceRecord
+from drake_diff.record.solve import EvidenceRecord
 
 FILES = ("plan.npz", "record.json", "record.schema.json", "replay.html", "trace.mcap")
 EVIL = """<robot name="&lt;script&gt;alert(1)&lt;/script&gt;"><link name="[red]a[/]"><inertial><mass value="1"/>
@@ -144,7 +145,7 @@ def test_200_corruptions_are_found_and_the_message_names_the_file(run, other_run
 
 def test_any_flipped_bit_of_a_wall_clock_or_of_the_hash_itself_is_found(run, copy):
     text = (run / "record.json").read_bytes()
-    for key in (b'"written_utc": "', b'"record_sha256": "', b'"solve_s": '):
+    for key in (b'"written_utc": "', b'"record_sha256": "', b'"duration_s": '):
         at = text.index(key) + len(key)
         for offset in range(3):
             changed = bytearray(text)
@@ -159,7 +160,7 @@ def test_a_number_edited_and_hashed_again_is_not_what_the_trace_carries(run, cop
     record = dd.load_record(copy)
     lie = record.metrics[8].model_copy(update={"value": 1e-7})
     changed = record.model_copy(update={"metrics": [*record.metrics[:8], lie, *record.metrics[9:]]})
-    seal(copy, changed)
+    changed.write(copy)
     found = dd.verify(copy)
     assert found.verdict == "broken"
     assert any("trace.mcap: the record that it carries" in problem for problem in found.complaints)
@@ -198,7 +199,7 @@ def set_value(index, key, value):
         ("replays", set_value(2, "goal_error", 0.0), "replay in steps of 0.01 s, open loop: goal_error"),
         ("replays", lambda part: part.pop(), "number of replays"),
         ("contract", lambda part: part["bodies"][0].update(mass=2.0), "contract, bodies[0].mass: recorded 2.0"),
-        ("inputs", lambda part: part["model"]["options"].update(time_step=0.01), "contract, time_step"),
+        ("model", lambda part: part["options"].update(time_step=0.01), "contract, time_step"),
     ],
 )
 def test_a_whole_artifact_that_lies_is_found_by_running_it_again(
@@ -213,7 +214,7 @@ def test_a_whole_artifact_that_lies_is_found_by_running_it_again(
 
 def test_a_plan_of_another_run_is_found_although_all_hashes_are_right(run, other_run, copy):
     shutil.copy(other_run / "plan.npz", copy / "plan.npz")
-    seal(copy, dd.load_record(copy))
+    dd.load_record(copy).write(copy)
     found = dd.verify(copy)
     assert any("/planned/state is not what plan.npz has" in problem for problem in found.complaints)
     assert any("goal error" in problem for problem in found.complaints)
@@ -241,16 +242,92 @@ def test_an_incomplete_run_is_undecided_and_a_failed_one_is_true(solution, tmp_p
 def test_a_record_whose_problem_is_none_is_broken_not_an_accident(run, copy, key):
     record = dd.load_record(run)
     for problem in ({**record.problem, key: "?"}, {k: v for k, v in record.problem.items() if k != key}):
-        seal(copy, record.model_copy(update={"problem": problem}))
+        record.model_copy(update={"problem": problem}).write(copy)
         assert dd.verify(copy).verdict == "broken"
 
 
 def test_no_directory_is_an_error_and_no_record_is_broken(tmp_path):
-    with pytest.raises(ArtifactError, match="run directory"):
+    with pytest.raises(ArtifactError, match="got no directory"):
         dd.verify(tmp_path / "nothing")
     assert dd.verify(tmp_path).verdict == "broken"
     with pytest.raises(ArtifactError, match=r"record\.json"):
         dd.verify(tmp_path).require()
+
+
+KINDS = {"solve": "plan.npz", "comparison": "trace.mcap", "robustness": "worst/mass_0.1/trial.json"}
+KINDS["certification"] = "certification.schema.json"
+
+
+@pytest.fixture(scope="module")
+def kinds(run, solution, tmp_path_factory):
+    """A directory of each kind."""
+    folder = tmp_path_factory.mktemp("kinds")
+    model = solution.problem.model
+    shutil.copytree(run, folder / "solve")
+    dd.comparison.save_comparison(dd.compare(model, ("numpy",), num_steps=5), folder / "comparison")
+    tried = dd.robustness(solution, {"mass": [0.1]}, trials=2, controller="open_loop")
+    dd.trials.save_robustness(tried, folder / "robustness")
+    dd.record.certify_model(model, states=2, directory=folder / "certification")
+    return folder
+
+
+def test_every_kind_of_directory_is_known_read_and_listed(kinds):
+    """Comparisons and trials are not run again, and nothing says that they hold."""
+    verdicts = {kind: dd.verify(kinds / kind).verdict for kind in KINDS}
+    assert verdicts == {"solve": "holds", "comparison": "intact", "robustness": "intact", "certification": "holds"}
+    assert {kind: dd.load_record(kinds / kind).kind for kind in KINDS} == {kind: kind for kind in KINDS}
+    assert {line.name: line.kind for line in list_runs(kinds)} == {kind: kind for kind in KINDS}
+    found = dd.verify(kinds / "comparison")
+    assert str(found) == "intact: the files are as they were written; the numbers were not taken again"
+    assert "not run again: the comparison" in found.not_rerun[0]
+    with pytest.raises(ArtifactError, match="were not taken again"):
+        found.require()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_changed_directory_of_any_kind_is_refused_and_the_file_named(kinds, kind, tmp_path):
+    record = dd.load_record(kinds / kind)
+    for name in (record.FILE, KINDS[kind]):
+        for how in ("flip", "delete", "extra"):
+            directory = Path(shutil.copytree(kinds / kind, tmp_path / f"{how}_{Path(name).name}"))
+            corrupt(directory, directory, how, name, seed=1)
+            found = dd.verify(directory)
+            assert found.verdict == "broken", (name, how)
+            assert any(name in complaint for complaint in found.complaints), (name, how, found.complaints)
+    directory = Path(shutil.copytree(kinds / kind, tmp_path / "edited"))
+    corrupt(directory, directory, "number", record.FILE, seed=1)
+    assert any(f"{record.FILE}: its content does not match" in words for words in dd.verify(directory).complaints)
+
+
+def test_a_certification_that_lies_is_found_by_certifying_again(kinds, tmp_path):
+    record = dd.load_record(kinds / "certification")
+    state = record.states[0]
+    for lie, words in (
+        ({"largest": state.largest * (1 + 1e-5)}, "state 0: largest entry"),
+        ({"x": [x + 1e-3 for x in state.x]}, "states[0].x[0]"),
+        ({"gradient": state.gradient.model_copy(update={"entries": 99})}, "states[0].gradient.entries"),
+    ):
+        directory = Path(shutil.copytree(kinds / "certification", tmp_path / words[-6:]))
+        record.model_copy(update={"states": [state.model_copy(update=lie), *record.states[1:]]}).write(directory)
+        found = dd.verify(directory)
+        assert found.verdict == "broken"
+        assert any("certification.json" in complaint and words in complaint for complaint in found.complaints)
+
+
+def test_a_certification_of_a_model_that_changed_is_undecided(tmp_path):
+    path = Path(shutil.copy(MODELS / "pendulum.urdf", tmp_path))
+    dd.record.certify_model(dd.load_model(path, time_step=0.02), states=1, directory=tmp_path / "certified")
+    path.write_text(path.read_text() + "<!-- -->")
+    found = dd.verify(tmp_path / "certified")
+    assert (found.verdict, found.complaints) == ("undecided", ())
+    assert "is not what it was" in str(found)
+
+
+def test_a_pass_of_a_state_that_does_not_agree_is_no_certification(kinds):
+    fields = dd.load_record(kinds / "certification").model_dump()
+    fields["states"][0]["gradient"] = None
+    with pytest.raises(ValueError, match="does not agree"):
+        dd.record.CertificationRecord.model_validate(fields)
 
 
 def test_a_model_from_a_diagram_cannot_be_run_again(solution, tmp_path):
@@ -258,7 +335,7 @@ def test_a_model_from_a_diagram_cannot_be_run_again(solution, tmp_path):
     dd.save(swing_up(model), tmp_path / "run")
     found = dd.verify(tmp_path / "run")
     assert found.verdict == "undecided"
-    assert "not re-run: the model is a user's own diagram" in str(found)
+    assert "not run again: the model is a user's own diagram" in str(found)
 
 
 def test_a_users_constraint_is_undecided_and_a_users_cost_is_told(tmp_path):
@@ -300,7 +377,7 @@ def test_a_mesh_is_hashed_and_a_changed_one_is_not_run(tmp_path):
     (tmp_path / "tetra.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     (tmp_path / "m.urdf").write_text(EVIL.format(mesh="tetra.obj"))
     record = dd.save(swing_up(dd.load_model(tmp_path / "m.urdf", time_step=0.02)), tmp_path / "run")
-    assert [f.path for f in record.inputs.model.named] == ["tetra.obj"]
+    assert [f.path for f in record.model.named] == ["tetra.obj"]
     assert dd.verify(tmp_path / "run").require().holds
     with (tmp_path / "tetra.obj").open("a") as file:
         file.write("\n")
@@ -317,7 +394,7 @@ def test_a_script_for_a_name_and_a_mesh_that_leads_elsewhere_do_no_harm(tmp_path
     model_file.write_text(EVIL.format(mesh="../../etc/passwd"))
     record = dd.save(swing_up(dd.load_model(model_file, time_step=0.02)), tmp_path / "run")
     assert record.contract["name"] == "<script>alert(1)</script>"
-    assert record.inputs.model.named[0].sha256 is None
+    assert record.model.named[0].sha256 is None
     assert dd.verify(tmp_path / "run").holds
     assert "<script>alert" not in (tmp_path / "run" / "replay.html").read_text()
     written = [path.read_bytes() for path in (tmp_path / "run").iterdir()]

@@ -6,20 +6,25 @@ from typing import Any
 
 from drake_diff.artifact.verify import differences
 from drake_diff.exceptions import ArtifactError
-from drake_diff.record.read import RECORD, load_record
-from drake_diff.record.run_record import EvidenceRecord
+from drake_diff.record.read import kind_of
+from drake_diff.record.sealed import SealedRecord
+from drake_diff.record.solve import EvidenceRecord
 
-CONFIGURATION = ("problem", "contract", "inputs", "solver", "action", "observation")
+CONFIGURATION = ("problem", "contract", "model", "inputs", "solver", "action", "observation")
 # Of the configuration, what is no choice: where a file was, what the solver said.
 NO_CHOICE = ("contract.source", "solver.status", "solver.message", "solver.solver_message", "solver.iterations")
 
 
 @dataclass(frozen=True)
 class RunLine:
-    """One run: what its record says, unverified; `verdict` is "unreadable" where it says nothing."""
+    """One directory: what its record says, unverified; `verdict` is "unreadable" where it says nothing.
+
+    `kind` is "solve", "comparison", "robustness" or "certification"; only a solve has a status and a cost.
+    """
 
     directory: Path
     name: str
+    kind: str
     verdict: str
     status: str
     cost: float | None
@@ -51,27 +56,29 @@ class RunComparison:
 
 
 def list_runs(directory: str | Path) -> list[RunLine]:
-    """A line for each run directory in `directory`, by name. ArtifactError where there is no such directory."""
+    """A line for each directory in `directory` that has a record, by name. ArtifactError where there is no such one."""
     folder = Path(directory)
     if not folder.is_dir():
         raise ArtifactError(f"{folder}: expected a directory of runs, got no directory")
-    return [_line(path) for path in sorted(folder.iterdir()) if (path / RECORD).is_file()]
+    return [_line(path, kind) for path in sorted(folder.iterdir()) if (kind := kind_of(path))]
 
 
-def _line(path: Path) -> RunLine:
+def _line(path: Path, kind: type[SealedRecord]) -> RunLine:
     try:
-        record = load_record(path)
+        record = kind.read(path)
     except ArtifactError:
-        return RunLine(path, path.name, "unreadable", "", None, "", "")
-    cost = next((m.value for m in record.metrics if m.name == "cost"), None)
-    status = record.solver.status if record.solver else "-"
-    model = str(record.contract.get("name", ""))
-    return RunLine(path, path.name, record.verdict, status, cost, model, record.wall_clock.written_utc)
+        return RunLine(path, path.name, kind.FILE.removesuffix(".json"), "unreadable", "", None, "", "")
+    cost, status, model = None, "-", record.model.file.path if record.model.file else ""
+    if isinstance(record, EvidenceRecord):
+        cost = next((m.value for m in record.metrics if m.name == "cost"), None)
+        status = record.solver.status if record.solver else "-"
+        model = str(record.contract.get("name", ""))
+    return RunLine(path, path.name, record.kind, record.verdict, status, cost, model, record.wall_clock.written_utc)
 
 
 def compare_runs(a: str | Path, b: str | Path) -> RunComparison:
     """What differs between two run directories. ArtifactError where one has no readable record."""
-    first, second = load_record(a), load_record(b)
+    first, second = EvidenceRecord.read(a), EvidenceRecord.read(b)
     metrics, refused = _metrics(first, second)
     return RunComparison(
         configuration=_differences(first, second, CONFIGURATION, NO_CHOICE),

@@ -32,7 +32,7 @@ from drake_diff.pages.scene import (
     moving_bodies,
     shapes_of,
 )
-from drake_diff.record.read import load_record
+from drake_diff.record.solve import EvidenceRecord
 
 GHOST = "planned/"  # before the frame names of the plan's bodies
 LOOPBACK = "127.0.0.1"
@@ -53,7 +53,7 @@ def serve(directory: str | Path) -> tuple[Meshcat, tuple[str, ...]]:
 def scene_of_run(directory: str | Path) -> tuple[Scene, tuple[str, ...]]:
     """The scene in a run directory, and what of it is missing; the model's source file need not exist any more."""
     folder = Path(directory)
-    record, log = load_record(folder), read_mcap(folder / TRACE)
+    record, log = EvidenceRecord.read(folder), read_mcap(folder / TRACE)
     rows = log.messages.get("/tf", [])
     if len(rows) < 2:
         raise ArtifactError(f"{folder / TRACE} has no motion: the plant could not be stepped along the planned inputs")

@@ -24,7 +24,7 @@ from drake_diff.optimize.replay import Replay
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution
 from drake_diff.optimize.transcription.motion import violation_between_nodes
 from drake_diff.record.parts import Metric
-from drake_diff.record.run_record import ReplayEvidence
+from drake_diff.record.solve import ReplayEvidence
 
 ON_THE_PLANT = "in the open-loop replay on the discrete plant"
 NO_REPLAY = "the discrete plant could not be stepped along these inputs"

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff._base.files import write_whole
 from drake_diff.artifact.measures import invariants_of, metrics_of, replay_evidence
 from drake_diff.artifact.plan_file import PLAN, write_plan
 from drake_diff.artifact.sections import (
@@ -25,13 +24,13 @@ from drake_diff.artifact.sections import (
 from drake_diff.artifact.story import events_of, failure_of, failures_of
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
-from drake_diff.record.parts import Event, FileEvidence, WallClock
-from drake_diff.record.provenance import file_evidence, provenance_of, written_now
-from drake_diff.record.read import RECORD, SCHEMA_FILE, published_schema
-from drake_diff.record.run_record import EvidenceRecord, reproducible
+from drake_diff.record.parts import Event
+from drake_diff.record.provenance import model_input, provenance_of, written_now
+from drake_diff.record.sealed import WallClock, reproducible
+from drake_diff.record.solve import EvidenceRecord
 
 TRACE, REPLAY, REPORT = "trace.mcap", "replay.html", "report.html"
-FILES = (SCHEMA_FILE, PLAN, TRACE, REPLAY, REPORT)  # what `save` writes besides the record
+FILES = (PLAN, TRACE, REPLAY, REPORT)  # what `save` writes besides the record and its schema
 
 
 def begin(directory: str | Path, problem: Problem) -> None:
@@ -40,13 +39,8 @@ def begin(directory: str | Path, problem: Problem) -> None:
     What an earlier run left there under the names of ours is removed.
     """
     folder = Path(directory)
-    folder.mkdir(parents=True, exist_ok=True)
     sentence = "the run has begun and not ended: it is under way, or it was killed or broke off"
-    record = _record(folder.name, problem, state="incomplete", verdict="incomplete", sentence=sentence)
-    write_whole(folder / RECORD, record.sealed().to_json().encode())
-    for name in FILES:
-        for left in (folder / name, folder / f"{name}.partial"):
-            left.unlink(missing_ok=True)
+    _record(folder.name, problem, verdict="incomplete", sentence=sentence).begin(folder, FILES)
 
 
 def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
@@ -63,10 +57,9 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
     folder = Path(directory)
     begin(folder, solution.problem)
     complete = _complete(folder.name, solution)
-    write_whole(folder / SCHEMA_FILE, published_schema())
     write_plan(folder / PLAN, solution)
     fields = complete.model_dump(mode="json")
-    write_trace(folder / TRACE, solution, {RECORD: ("application/json", reproducible(fields).encode())})
+    write_trace(folder / TRACE, solution, {EvidenceRecord.FILE: ("application/json", reproducible(fields).encode())})
     motion = solution.replay
     scene = scene_of(
         solution.problem.model,
@@ -77,33 +70,18 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
     )
     write_replay(folder / REPLAY, scene, title=f"{folder.name}: {solution.status.value}")
     write_report(folder / REPORT, solution, fields, folder / REPLAY)
-    return seal(folder, complete)
+    return complete.write(folder)
 
 
 def save_failure(error: Exception, directory: str | Path, problem: Problem) -> EvidenceRecord:
     """Write the record of a run that `error` ended before there was a solution."""
     folder = Path(directory)
-    folder.mkdir(parents=True, exist_ok=True)
     failure = failure_of(error)
     event = Event(t_s=None, kind="failure", message=failure.message)
     sentence = f"the run ended with an error: {failure.message}"
     fields: dict[str, Any] = {"failures": [failure], "events": [event]}
-    record = _record(folder.name, problem, state="complete", verdict="fail", sentence=sentence, **fields)
-    write_whole(folder / SCHEMA_FILE, published_schema())
-    return seal(folder, record)
-
-
-def seal(directory: Path, record: EvidenceRecord) -> EvidenceRecord:
-    """Write `record` with the hash of every other file in `directory`, and its own; gives what was written."""
-    sealed = record.model_copy(update={"files": run_files(directory)}).sealed()
-    write_whole(directory / RECORD, sealed.to_json().encode())
-    return sealed
-
-
-def run_files(directory: Path) -> dict[str, FileEvidence]:
-    """Size and hash of every plain file below `directory` but the record, by its name there; links are left out."""
-    paths = {p.relative_to(directory).as_posix(): p for p in directory.rglob("*") if p.is_file() and not p.is_symlink()}
-    return {name: file_evidence(path, name) for name, path in sorted(paths.items()) if name != RECORD}
+    record = _record(folder.name, problem, verdict="fail", sentence=sentence, **fields)
+    return record.write(folder)
 
 
 def _complete(name: str, solution: Solution) -> EvidenceRecord:
@@ -113,7 +91,6 @@ def _complete(name: str, solution: Solution) -> EvidenceRecord:
         name,
         solution.problem,
         solution,
-        state="complete",
         verdict="fail" if failures else "pass",
         sentence=solution.message,
         solver=solver_of(solution),
@@ -133,14 +110,15 @@ def _record(name: str, problem: Problem, solution: Solution | None = None, **fie
     return EvidenceRecord(
         name=name,
         claim=claim_of(problem),
-        inputs=inputs_of(problem, solution),
+        model=model_input(problem.model),
+        inputs=inputs_of(solution),
         problem=describe_problem(problem),
         contract=problem.model.contract.to_dict(),
         units=UNITS,
         observation=observation_of(problem, time_step),
         action=action_of(problem, time_step, solution),
         provenance=provenance_of(),
-        wall_clock=WallClock(written_utc=written, solve_s=None if solution is None else solution.wall_time),
+        wall_clock=WallClock(written_utc=written, duration_s=None if solution is None else solution.wall_time),
         **fields,
     )
 

@@ -17,8 +17,8 @@ from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost
 from drake_diff.optimize.problem.problem import Bounds, Problem
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.parts import Quantity
-from drake_diff.record.provenance import gradient_evidence, model_input
-from drake_diff.record.run_record import (
+from drake_diff.record.provenance import gradient_evidence
+from drake_diff.record.solve import (
     ActionInterface,
     Claim,
     Command,
@@ -196,11 +196,10 @@ def claim_of(problem: Problem) -> Claim:
     return Claim(statement=statement, limitations=LIMITATIONS)
 
 
-def inputs_of(problem: Problem, solution: Solution | None) -> Inputs:
+def inputs_of(solution: Solution | None) -> Inputs:
     """What the run starts from; the guess is known once it has been made."""
     options = {} if solution is None else solution.options
     return Inputs(
-        model=model_input(problem.model),
         initial_guess=str(options.get("initial_guess", "not known yet")),
         initial_guess_sha256=options.get("initial_guess_sha256"),
         seed=int(options["seed"]) if "seed" in options else None,

@@ -18,9 +18,9 @@ from drake_diff.logs.messages import TYPES, MessageType
 from drake_diff.logs.write import Channel, write_mcap
 from drake_diff.model.parameters import applied
 from drake_diff.optimize.solution import Solution
+from drake_diff.record.solve import EvidenceRecord
 
 ROW_PERIOD = 1_000_000  # [ns] of log time per row of a table
-RECORD = "record.json"  # the attachment whose failures become events
 
 
 def plan_channels(solution: Solution, shown: Shown) -> Iterator[Channel]:
@@ -99,7 +99,7 @@ def event_channel(solution: Solution, shown: Shown, attachments: Mapping[str, tu
     kind, end = TYPES["Event"], shown.time_step * (len(solution.xs) - 1)
     events = list(_contact_events(shown))
     events.append(kind.cls(time=end, kind="status", code=solution.status.value, message=solution.message))
-    record = json.loads(attachments[RECORD][1]) if RECORD in attachments else {"failures": []}
+    record = json.loads(attachments[EvidenceRecord.FILE][1]) if EvidenceRecord.FILE in attachments else {"failures": []}
     for failure in record["failures"]:
         label, code, message = failure["label"], failure["code"], failure["message"]
         events.append(kind.cls(time=end, kind="failure", failure_label=label, code=code, message=message))

@@ -1,125 +1,42 @@
-"""A run again from its directory alone: the model, the problem and the plan, measured by what measured them first.
-
-The model is built from the file that trace.mcap carries, in a folder of its own. One that names other files (meshes) is
-built where it stood, and only if it and all of them are still what the record says: the artifact has their hashes, not
-their bytes.
-
-What `verify` found: which file is damaged, which number no longer holds, and what could not be run again.
-
-`verify`: is a run directory what was written, and do its numbers come out again? `recalled` takes it up again.
-"""
+"""`verify`: is a directory what was written, and do its numbers come out again? `recalled` takes a run up again."""
 
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from hashlib import sha256
+from html import escape
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.artifact.measures import invariants_of, metrics_of, replay_evidence, units_of
 from drake_diff.artifact.plan_file import PLAN, PlanArrays, read_plan
+from drake_diff.artifact.rerun import rebuilt, resolve
 from drake_diff.artifact.save import TRACE
-from drake_diff.artifact.sections import rebuild_problem, unknown_functions
-from drake_diff.artifact.trace_read import read_trace
-from drake_diff.exceptions import ArtifactError, InputError, ModelError, ModelWarning
-from drake_diff.model.load_file import FORMATS
-from drake_diff.model.model import Model, load_model
-from drake_diff.optimize.solution import Solution, Status
+from drake_diff.artifact.sections import unknown_functions
+from drake_diff.artifact.trace_read import Trace, read_trace
+from drake_diff.exceptions import ArtifactError, ModelError
+from drake_diff.optimize.solution import Solution
+from drake_diff.record.certification import CertificationRecord, CertifiedState, certify_model
 from drake_diff.record.parts import Metric
-from drake_diff.record.provenance import file_evidence, named_files, provenance_of
-from drake_diff.record.read import RECORD, parse_record, read_fields
-from drake_diff.record.run_record import EvidenceRecord, ReplayEvidence, canonical, own_sha256, reproducible
-
-
-@contextmanager
-def rebuilt(record: EvidenceRecord, attachments: dict[str, bytes]) -> Iterator[Model]:
-    """The model of a record, for as long as the block runs; `attachments` are the trace's.
-
-    Raises ModelError, saying why, where it cannot be built again, ArtifactError where the artifact is damaged.
-    """
-    given = record.inputs.model
-    if given.file is None or given.options is None:
-        raise ModelError("the model is a user's own diagram, which no artifact can hold")
-    if given.named:
-        yield _load(_source_if_unchanged(record), given.options)
-        return
-    name, data = given.file.path, attachments.get(given.file.path)
-    if data is None or sha256(data).hexdigest() != given.file.sha256:
-        raise ArtifactError(f"trace.mcap: it does not carry the model file {name} that record.json describes")
-    if Path(name).name != name or not name.endswith(FORMATS):
-        raise ArtifactError(f"record.json: {name!r} is no name of a model file")
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / name
-        path.write_bytes(data)
-        if named_files(path):
-            raise ArtifactError(f"record.json: it does not list the files that {name} names")
-        yield _load(path, given.options)
-
-
-def _source_if_unchanged(record: EvidenceRecord) -> Path:
-    """The model file where it stood; ModelError where it or a file that it names is not the recorded one."""
-    given, source = record.inputs.model, Path(str(record.contract.get("source", "")))
-    why = f"the model names other files, and {source} is not"
-    if given.file is None or not (source.name.endswith(FORMATS) and source.is_file()):
-        raise ModelError(f"{why} there")
-    if file_evidence(source, given.file.path) != given.file:
-        raise ModelError(f"{why} what it was")
-    changed = [was.path for was in given.named if was not in named_files(source)]
-    if changed:
-        raise ModelError(f"the model names {changed[0]}, which is not what it was")
-    return source
-
-
-def _load(path: Path, options: dict[str, Any]) -> Model:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ModelWarning)  # said when the model was loaded first
-            return load_model(path, **options)
-    except (InputError, TypeError) as error:
-        raise ArtifactError(f"record.json: the model's options are none: {error}") from error
-
-
-def resolve(record: EvidenceRecord, model: Model, plan: PlanArrays) -> Solution:
-    """The solution of a record, to be measured again. ArtifactError where plan and problem do not go together."""
-    solver = record.solver
-    if solver is None:
-        raise ArtifactError("record.json: it has no solver")
-    count = record.problem.get("num_steps")
-    if plan.us.shape != (count, model.nu) or plan.xs.shape != (len(plan.us) + 1, model.nx):
-        got = f"xs {plan.xs.shape}, us {plan.us.shape}"
-        raise ArtifactError(f"{PLAN}: expected {count} steps of {model.nx} states and {model.nu} inputs, got {got}")
-    try:
-        return Solution(
-            problem=rebuild_problem(record, model, plan.us),
-            method=solver.method,
-            solver=solver.solver,
-            status=Status(solver.status),
-            message=solver.message,
-            xs=plan.xs,
-            us=plan.us,
-            scheme=solver.scheme,
-            us_mid=plan.us_mid,
-            u_final=plan.u_final,
-            free_horizon=plan.free_horizon,
-            parameters=plan.parameters,
-        )
-    except (InputError, ValueError, KeyError, TypeError) as error:
-        raise ArtifactError(f"record.json: its problem is none: {error}") from error
-
+from drake_diff.record.provenance import provenance_of
+from drake_diff.record.read import KINDS, kind_of
+from drake_diff.record.sealed import SealedRecord, canonical, own_sha256, read_fields, reproducible
+from drake_diff.record.solve import EvidenceRecord, ReplayEvidence
 
 # How far a number computed again may be from the recorded one, of it or of its tolerance: BLAS and libm round
 # differently from machine to machine; and where both are next to nothing.
 RELATIVE, ABSOLUTE = 1e-6, 1e-9
+CERTIFICATES = "not run again: the gradient certificates"
+R = TypeVar("R", bound=SealedRecord)
+NOT_TAKEN = "the numbers were not taken again"
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Recomputed:
     """A recorded number and the same computed again; `holds` where they are no further apart than `allowed`."""
 
     name: str
@@ -128,36 +45,48 @@ class Comparison:
     unit: str
     allowed: float
     holds: bool
-    file: str = "record.json"
+    file: str = EvidenceRecord.FILE
 
     def __str__(self) -> str:
         words = f"{self.name}: recorded {_shown(self.recorded)} {self.unit}, again {_shown(self.again)}"
         return words if self.holds else f"{words}, allowed {self.allowed:.2g} apart"
 
 
+def _shown(value: float | None) -> str:
+    return "none" if value is None else f"{value:.9g}"
+
+
 @dataclass(frozen=True)
 class Verification:
-    """The verdict on a run directory: "holds", "broken", or "undecided" where something could not be run again.
+    """What `verify` found in a directory.
 
-    That it holds says that the record is true, not that the run was a success: that is `record.verdict`.
+    `verdict` is "holds" where every file is as it was written and every number came out again; "intact" where every
+    file is as it was written and no number was taken again; "undecided" where what the record's verdict rests on could
+    not be run again; "broken" where something is not what it was.
+
+    That a record holds says that it is true, not that the run was a success: that is `record.verdict`.
     """
 
     directory: Path
-    record: EvidenceRecord | None
+    record: SealedRecord | None
     problems: tuple[str, ...] = ()  # each names the file
-    comparisons: tuple[Comparison, ...] = ()
+    comparisons: tuple[Recomputed, ...] = ()
     not_rerun: tuple[str, ...] = ()
     undecided: tuple[str, ...] = ()  # what of `not_rerun` the record's verdict rests on
     notes: tuple[str, ...] = ()
 
     @property
-    def verdict(self) -> Literal["holds", "broken", "undecided"]:
+    def verdict(self) -> Literal["holds", "intact", "undecided", "broken"]:
+        """What can be said of the directory as a whole."""
         if self.problems or not all(c.holds for c in self.comparisons):
             return "broken"
-        return "undecided" if self.undecided else "holds"
+        if self.undecided:
+            return "undecided"
+        return "holds" if self.comparisons else "intact"
 
     @property
     def holds(self) -> bool:
+        """Whether the verdict is "holds"."""
         return self.verdict == "holds"
 
     @property
@@ -166,6 +95,16 @@ class Verification:
         broken = tuple(f"{c.file}: {c}" for c in self.comparisons if not c.holds)
         return self.problems + broken
 
+    @property
+    def sentence(self) -> str:
+        """What the verdict rests on."""
+        held = sum(c.holds for c in self.comparisons)
+        if self.verdict == "holds":
+            return f"{held} numbers are the recorded ones"
+        if self.verdict == "intact":
+            return f"the files are as they were written; {NOT_TAKEN}"
+        return "; ".join(self.complaints or self.undecided)
+
     def require(self) -> "Verification":
         """This verification where it holds; ArtifactError, with what does not, where it does not."""
         if not self.holds:
@@ -173,16 +112,175 @@ class Verification:
         return self
 
     def __str__(self) -> str:
-        if self.verdict == "holds":
-            return f"holds: {len(self.comparisons)} numbers are the recorded ones"
-        return f"{self.verdict}: " + "; ".join(self.complaints or self.undecided)
+        return f"{self.verdict}: {self.sentence}"
+
+    def __repr__(self) -> str:
+        lines = [f"Verification of {self.directory}: {self.verdict}", *(self.complaints or (self.sentence,))]
+        return "\n  ".join((*lines, *self.not_rerun, *self.notes))
+
+    def _repr_html_(self) -> str:
+        items = "".join(f"<li>{escape(line)}</li>" for line in (*self.complaints, *self.not_rerun, *self.notes))
+        return f"<div><b>{escape(str(self.directory))}: {escape(str(self))}</b><ul>{items}</ul></div>"
 
 
-def _shown(value: float | None) -> str:
-    return "none" if value is None else f"{value:.9g}"
+def verify(directory: str | Path) -> Verification:
+    """Check a directory's schema, hashes and files, then run it again from them and compare every number.
+
+    Any flipped byte, edited number, missing or extra file is found, and the message names the file. A solve is replayed
+    and measured again, a certification certified again. Comparisons and robustness trials are not run again: their
+    verdict is at best "intact". What cannot be run again (a model that came from a diagram, constraints that are a
+    user's functions) makes the verdict "undecided".
+
+    Args:
+        directory: What `save`, `save_comparison`, `save_robustness` or `certify_model` wrote.
+
+    Returns:
+        A `Verification`, with a complaint for each thing that does not hold.
+
+    Raises:
+        ArtifactError: There is no such directory.
+
+    Example:
+        >>> found = dd.verify("artifacts/pendulum_swing_up")
+        >>> found.verdict, found.complaints
+        ('holds', ())
+    """
+    folder = Path(directory)
+    if not folder.is_dir():
+        raise ArtifactError(f"{folder}: expected a directory that drake_diff wrote, got no directory")
+    kind = kind_of(folder)
+    if kind is None:
+        names = ", ".join(known.FILE for known in KINDS)
+        return Verification(folder, None, problems=(f"there is no record: none of {names}",))
+    try:
+        record, problems = _read_checked(folder, kind)
+    except ArtifactError as error:
+        return Verification(folder, None, problems=(str(error),), not_rerun=("not run again: there is no record",))
+    if problems:
+        return Verification(folder, record, problems, not_rerun=("not run again: it is damaged",))
+    if record.state == "incomplete" or (isinstance(record, EvidenceRecord) and record.solver is None):
+        why = f"not run again: {record.sentence}"
+        return Verification(folder, record, not_rerun=(why,), undecided=(why,))
+    try:
+        if isinstance(record, EvidenceRecord):
+            return _solve_again(folder, record)
+        if isinstance(record, CertificationRecord):
+            return _certify_again(folder, record)
+    except ModelError as error:
+        why, notes = f"not run again: {error}", tuple(_other_versions(record))
+        return Verification(folder, record, not_rerun=(why,), undecided=(why,), notes=notes)
+    except ArtifactError as error:
+        notes = tuple(_other_versions(record))
+        return Verification(folder, record, problems=(str(error),), not_rerun=("not run again",), notes=notes)
+    return Verification(folder, record, not_rerun=(f"not run again: the {record.kind}; {NOT_TAKEN}",))
 
 
-def compare_metrics(recorded: Sequence[Metric], again: Sequence[Metric], skip: Sequence[str]) -> Iterator[Comparison]:
+@contextmanager
+def recalled(directory: str | Path) -> Iterator[Solution]:
+    """The solution in a run directory, its model rebuilt from there, for as long as the block runs.
+
+    ArtifactError where there is none, it is damaged or it did not end; ModelError where it cannot be built again.
+    """
+    folder = Path(directory)
+    record, problems = _read_checked(folder, EvidenceRecord)
+    _refuse(folder, problems)
+    _refuse(folder, () if record.solver is not None else (f"it has no plan: {record.sentence}",))
+    plan, trace = read_plan(folder / PLAN), read_trace(folder / TRACE)
+    with rebuilt(record.model, record.contract.get("source"), trace.attachments) as model:
+        _refuse(folder, (*_odd_trace(trace, plan, record), *_odd_contract(record, model.contract.to_dict())))
+        yield resolve(record, model, plan)
+
+
+def _refuse(folder: Path, problems: Sequence[str]) -> None:
+    if problems:
+        raise ArtifactError(f"{folder}: {problems[0]}")
+
+
+def _read_checked(folder: Path, kind: type[R]) -> tuple[R, tuple[str, ...]]:
+    """The record in `folder`, and what of it and of the files beside it is damaged."""
+    try:
+        fields = read_fields(folder / kind.FILE)
+        record = kind.parse(folder / kind.FILE, fields)
+        return record, (*_damage_of_record(folder / kind.FILE, fields), *_damage_of_files(folder, record))
+    except RecursionError as error:
+        raise ArtifactError(f"{kind.FILE}: nested too deep") from error
+
+
+def _damage_of_record(path: Path, fields: dict[str, Any]) -> Iterator[str]:
+    """Whether the record is, byte for byte, what its content and its own hash say."""
+    if canonical(fields).encode() != path.read_bytes():
+        yield f"{path.name}: its bytes are not those that drake_diff writes for its content"
+    if own_sha256(fields) != fields.get("record_sha256"):
+        yield f"{path.name}: its content does not match its record_sha256: something in it was changed"
+
+
+def _damage_of_files(folder: Path, record: SealedRecord) -> Iterator[str]:
+    """Whether the directory holds the recorded files, as they were, and no others. Nothing outside it is opened."""
+    paths = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_symlink() or not p.is_dir()}
+    paths.pop(record.FILE, None)
+    for name in sorted(record.files.keys() - paths.keys()):
+        yield f"{name}: missing, {record.FILE} lists it"
+    for name, path in sorted(paths.items()):
+        described = record.files.get(name)
+        if path.is_symlink() or not path.is_file():
+            yield f"{name}: a link, or not a plain file"
+        elif described is None:
+            yield f"{name}: {record.FILE} does not list it"
+        else:
+            data = path.read_bytes()
+            if (described.path, described.bytes, described.sha256) != (name, len(data), sha256(data).hexdigest()):
+                yield f"{name}: its {len(data)} bytes are not those that {record.FILE} describes"
+
+
+def _solve_again(folder: Path, record: EvidenceRecord) -> Verification:
+    costs, constraints = unknown_functions(record)
+    plan, trace = read_plan(folder / PLAN), read_trace(folder / TRACE)
+    problems = list(_odd_trace(trace, plan, record))
+    with rebuilt(record.model, record.contract.get("source"), trace.attachments) as model:
+        problems += _odd_contract(record, model.contract.to_dict())
+        solution = resolve(record, model, plan)
+        skip = ["cost"] * bool(costs) + ["constraint violation"] * bool(constraints)
+        comparisons = [
+            *compare_metrics(record.metrics, metrics_of(solution), skip),
+            *(
+                replace(found, name=f"invariant {found.name}")
+                for found in compare_metrics(record.invariants, invariants_of(solution), ())
+            ),
+            *compare_replays(record.replays, [replay_evidence(r) for r in solution.replays], not constraints),
+            _compare_motion(trace.xs, solution),
+        ]
+    undecided = tuple(f"not run again: constraint {name} is a user's function" for name in constraints)
+    not_rerun = (*(f"not run again: {cost} is a user's function" for cost in costs), *undecided, CERTIFICATES)
+    notes = tuple(_other_versions(record))
+    return Verification(folder, record, tuple(problems), tuple(comparisons), not_rerun, undecided, notes)
+
+
+def _certify_again(folder: Path, record: CertificationRecord) -> Verification:
+    """The same states from the same seed, each certified again."""
+    with rebuilt(record.model, record.contract.get("source"), None) as model:
+        problems = _odd_contract(record, model.contract.to_dict())
+        again = certify_model(
+            model, states=len(record.states), seed=record.seed, parameters=record.parameters, method=record.method
+        )
+    comparisons: list[Recomputed] = []
+    for i, (was, now) in enumerate(zip(record.states, again.states, strict=True)):
+        found = differences(_what_is_certified(was), _what_is_certified(now), f"states[{i}]")
+        problems += [f"{record.FILE}: {key}: recorded {old}, again {new}" for key, old, new in found]
+        largest = compare_numbers(f"state {i}: largest entry", was.largest, now.largest, "")
+        comparisons.append(replace(largest, file=record.FILE))
+    notes = tuple(_other_versions(record))
+    return Verification(folder, record, tuple(problems), tuple(comparisons), notes=notes)
+
+
+def _what_is_certified(state: CertifiedState) -> dict[str, Any]:
+    """The state and its certificate, but for what is only told in words and may round to other digits."""
+    found = state.model_dump(mode="json", exclude={"refusal", "largest", "mode_changes"})
+    if found["gradient"] is not None:
+        del found["gradient"]["worst"]
+    return found
+
+
+def compare_metrics(recorded: Sequence[Metric], again: Sequence[Metric], skip: Sequence[str]) -> Iterator[Recomputed]:
     """Every recorded metric but those in `skip` with the one of its name."""
     found = {metric.name: metric for metric in again}
     for metric in recorded:
@@ -191,29 +289,29 @@ def compare_metrics(recorded: Sequence[Metric], again: Sequence[Metric], skip: S
             continue
         if other is None or (other.definition, other.unit) != (metric.definition, metric.unit):
             name = f"{metric.name} (defined otherwise in this version)"
-            yield Comparison(name, metric.value, None, metric.unit, 0.0, False)
+            yield Recomputed(name, metric.value, None, metric.unit, 0.0, False)
             continue
         compared = compare_numbers(metric.name, metric.value, other.value, metric.unit, metric.tolerance or 0.0)
         if compared.holds and other.tolerance != metric.tolerance:
             name = f"the tolerance of {metric.name}"
-            yield Comparison(name, metric.tolerance, other.tolerance, metric.unit, 0.0, False)
+            yield Recomputed(name, metric.tolerance, other.tolerance, metric.unit, 0.0, False)
         yield compared
 
 
 def compare_numbers(
     name: str, recorded: float | None, again: float | None, unit: str, scale: float = 0.0
-) -> Comparison:
+) -> Recomputed:
     """Two numbers; none and none are the same. `scale` is that of the differences that do not matter."""
     allowed = RELATIVE * max(abs(recorded or 0.0), scale) + ABSOLUTE
     holds = recorded is None and again is None
     if recorded is not None and again is not None:
         holds = abs(recorded - again) <= allowed
-    return Comparison(name, recorded, again, unit, allowed, holds)
+    return Recomputed(name, recorded, again, unit, allowed, holds)
 
 
 def compare_replays(
     recorded: Sequence[ReplayEvidence], again: Sequence[ReplayEvidence], judged: bool
-) -> Iterator[Comparison]:
+) -> Iterator[Recomputed]:
     """Every replay with the one of its variant and control; `judged` compares whether it holds too."""
     found = {(r.variant, r.control): r for r in again}
     if len(found) != len(recorded):
@@ -222,7 +320,7 @@ def compare_replays(
         name = f"replay {replay.variant}, {replay.control}"
         other = found.get((replay.variant, replay.control))
         if other is None:
-            yield Comparison(name, 1.0, None, "1", 0.0, False)
+            yield Recomputed(name, 1.0, None, "1", 0.0, False)
             continue
         for key, unit in (("goal_error", ""), ("bound_violation", ""), ("energy_error_J", "J"), ("penetration_m", "m")):
             yield compare_numbers(f"{name}: {key}", getattr(replay, key), getattr(other, key), unit)
@@ -249,116 +347,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-CERTIFICATES = "gradient certificates are not computed again"
-
-
-def verify(directory: str | Path) -> Verification:
-    """Check a run directory's schema, hashes and files, then run it again from them alone and compare every number.
-
-    Any flipped byte, edited number, missing or extra file is found, and the message names the file. What cannot be run
-    again (a model that came from a diagram, constraints that are a user's functions) makes the verdict "undecided".
-    Raises ArtifactError where there is no such directory.
-    """
-    folder = Path(directory)
-    if not folder.is_dir():
-        raise ArtifactError(f"{folder}: expected a run directory that drake_diff wrote, got no directory")
-    try:
-        fields = read_fields(folder / RECORD)
-        record = parse_record(folder / RECORD, fields)
-        problems = (*_damage_of_record(folder, fields), *_damage_of_files(folder, record))
-    except (ArtifactError, RecursionError) as error:
-        words = str(error) if isinstance(error, ArtifactError) else f"{RECORD}: nested too deep"
-        return Verification(folder, None, problems=(words,), not_rerun=("everything: there is no record",))
-    if problems:
-        return Verification(folder, record, problems, not_rerun=("everything: what is damaged is not run",))
-    if record.state == "incomplete" or record.solver is None:
-        why = f"not re-run: {record.sentence}"
-        return Verification(folder, record, not_rerun=(why,), undecided=(why,))
-    return _run_again(folder, record, fields)
-
-
-@contextmanager
-def recalled(directory: str | Path) -> Iterator[Solution]:
-    """The solution in a run directory, its model rebuilt from there, for as long as the block runs.
-
-    ArtifactError where there is none, it is damaged or it did not end; ModelError where it cannot be built again.
-    """
-    folder = Path(directory)
-    fields = read_fields(folder / RECORD)
-    record = parse_record(folder / RECORD, fields)
-    _refuse(folder, (*_damage_of_record(folder, fields), *_damage_of_files(folder, record)))
-    _refuse(folder, () if record.solver is not None else (f"it has no plan: {record.sentence}",))
-    plan, trace = read_plan(folder / PLAN), read_trace(folder / TRACE)
-    with rebuilt(record, trace.attachments) as model:
-        _refuse(folder, (*_odd_trace(trace, plan, fields), *_odd_contract(record, model.contract.to_dict())))
-        yield resolve(record, model, plan)
-
-
-def _refuse(folder: Path, problems: Sequence[str]) -> None:
-    if problems:
-        raise ArtifactError(f"{folder}: {problems[0]}")
-
-
-def _damage_of_record(folder: Path, fields: dict[str, Any]) -> Iterator[str]:
-    """Whether record.json is, byte for byte, what its content and its own hash say."""
-    if canonical(fields).encode() != (folder / RECORD).read_bytes():
-        yield f"{RECORD}: its bytes are not those that drake_diff writes for its content"
-    if own_sha256(fields) != fields.get("record_sha256"):
-        yield f"{RECORD}: its content is not that of its record_sha256: something in it was changed"
-
-
-def _damage_of_files(folder: Path, record: EvidenceRecord) -> Iterator[str]:
-    """Whether the directory holds the recorded files, as they were, and no others. Nothing outside it is opened."""
-    paths = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_symlink() or not p.is_dir()}
-    paths.pop(RECORD, None)
-    for name in sorted(record.files.keys() - paths.keys()):
-        yield f"{name}: missing, {RECORD} lists it"
-    for name, path in sorted(paths.items()):
-        described = record.files.get(name)
-        if path.is_symlink() or not path.is_file():
-            yield f"{name}: a link or no plain file"
-        elif described is None:
-            yield f"{name}: {RECORD} does not list it"
-        else:
-            data = path.read_bytes()
-            if (described.path, described.bytes, described.sha256) != (name, len(data), sha256(data).hexdigest()):
-                yield f"{name}: its {len(data)} bytes are not those that {RECORD} describes"
-
-
-def _run_again(folder: Path, record: EvidenceRecord, fields: dict[str, Any]) -> Verification:
-    costs, constraints = unknown_functions(record)
-    notes = tuple(_other_versions(record))
-    try:
-        plan, trace = read_plan(folder / PLAN), read_trace(folder / TRACE)
-        problems = list(_odd_trace(trace, plan, fields))
-        with rebuilt(record, trace.attachments) as model:
-            problems += _odd_contract(record, model.contract.to_dict())
-            solution = resolve(record, model, plan)
-            comparisons = (
-                *_compare(record, solution, costs, constraints),
-                _compare_motion(trace.xs, solution),
-            )
-    except ModelError as error:
-        why = f"not re-run: {error}"
-        return Verification(folder, record, not_rerun=(why,), undecided=(why,), notes=notes)
-    except ArtifactError as error:
-        return Verification(folder, record, problems=(str(error),), not_rerun=("everything",), notes=notes)
-    undecided = tuple(f"not re-run: constraint {name} is a user's function" for name in constraints)
-    not_rerun = (*(f"not re-run: {cost} is a user's function" for cost in costs), *undecided, CERTIFICATES)
-    return Verification(folder, record, tuple(problems), comparisons, not_rerun, undecided, notes)
-
-
-def _compare(
-    record: EvidenceRecord, solution: Solution, costs: list[str], constraints: list[str]
-) -> Iterator[Comparison]:
-    skip = ["cost"] * bool(costs) + ["constraint violation"] * bool(constraints)
-    yield from compare_metrics(record.metrics, metrics_of(solution), skip)
-    for found in compare_metrics(record.invariants, invariants_of(solution), ()):
-        yield replace(found, name=f"invariant {found.name}")
-    yield from compare_replays(record.replays, [replay_evidence(r) for r in solution.replays], not constraints)
-
-
-def _compare_motion(recorded: Array, solution: Solution) -> Comparison:
+def _compare_motion(recorded: Array, solution: Solution) -> Recomputed:
     """The motion in the trace with the plant's own."""
     motion = solution.replay
     name, unit = "/state, its largest distance from the motion run again", units_of(solution, "positions", "velocities")
@@ -372,29 +361,29 @@ def _compare_motion(recorded: Array, solution: Solution) -> Comparison:
     return replace(found, file=TRACE)
 
 
-def _odd_trace(trace: Any, plan: PlanArrays, fields: dict[str, Any]) -> Iterator[str]:
+def _odd_trace(trace: Trace, plan: PlanArrays, record: EvidenceRecord) -> Iterator[str]:
     """What in the trace is not what record.json and plan.npz have."""
-    if trace.attachments.get(RECORD) != reproducible(fields).encode():
-        yield f"{TRACE}: the record that it carries is not {RECORD}"
+    if trace.attachments.get(record.FILE) != reproducible(record.model_dump(mode="json")).encode():
+        yield f"{TRACE}: the record that it carries is not {record.FILE}"
     inputs = plan.us if plan.u_final is None else np.vstack([plan.us, plan.u_final])
     for topic, recorded, planned in (("state", trace.planned_xs, plan.xs), ("input", trace.planned_us, inputs)):
         if not np.array_equal(recorded, planned, equal_nan=True):
             yield f"{TRACE}: /planned/{topic} is not what {PLAN} has"
 
 
-def _odd_contract(record: EvidenceRecord, again: dict[str, Any]) -> list[str]:
+def _odd_contract(record: EvidenceRecord | CertificationRecord, again: dict[str, Any]) -> list[str]:
     """Where the rebuilt model is another than the recorded contract; where the file was, and notes, do not matter."""
     apart = ("source", "notes")
     recorded, rebuilt_now = (
         {key: value for key, value in contract.items() if key not in apart} for contract in (record.contract, again)
     )
     return [
-        f"{RECORD}: contract, {key}: recorded {was}, the model has {now}"
+        f"{record.FILE}: contract, {key}: recorded {was}, the model has {now}"
         for key, was, now in differences(recorded, rebuilt_now)
     ]
 
 
-def _other_versions(record: EvidenceRecord) -> Iterator[str]:
+def _other_versions(record: SealedRecord) -> Iterator[str]:
     now = provenance_of().packages
     for name in ("drake", "drake-diff", "numpy", "casadi"):
         was = record.provenance.packages.get(name)

@@ -143,7 +143,7 @@ def certify(
     Writes certification.json. Exit status 0 only where every certificate agrees.
     """
     from drake_diff.model.model import load_model
-    from drake_diff.record.certification import RECORD, certify_model
+    from drake_diff.record.certification import certify_model
 
     loaded = load_model(
         model,
@@ -160,7 +160,7 @@ def certify(
     names = tuple(parameter or ())
     record = certify_model(loaded, states=states, seed=seed, parameters=names, method=method, directory=directory)
     _print_certification(console, record)
-    console.print(f"wrote {escape(str(directory / RECORD))}")
+    console.print(f"wrote {escape(str(directory / record.FILE))}")
     raise typer.Exit(HOLDS if record.verdict == "pass" else CHECK_FAILED)
 
 
@@ -235,7 +235,9 @@ def _print_certification(console: Console, record: Any) -> None:
             for change in state.mode_changes[:3]:
                 console.print(f"    {escape(change)}")
     colour = "green" if record.verdict == "pass" else "red"
-    console.print(f"[{colour} bold]{record.verdict}[/]  {escape(record.sentence)}, {record.wall_clock.solve_s:.1f} s")
+    console.print(
+        f"[{colour} bold]{record.verdict}[/]  {escape(record.sentence)}, {record.wall_clock.duration_s:.1f} s"
+    )
 
 
 def _print_record(console: Console, record: Any, directory: Path) -> None:
@@ -260,7 +262,7 @@ def _print_record(console: Console, record: Any, directory: Path) -> None:
     verdicts = [certificate.verdict for certificate in record.gradient.certificates]
     console.print(
         f"gradients: {verdicts.count('agree')} of {len(verdicts)} certificates agree; "
-        f"{solver.method} with {solver.solver}, {solver.iterations} iterations, {record.wall_clock.solve_s:.1f} s",
+        f"{solver.method} with {solver.solver}, {solver.iterations} iterations, {record.wall_clock.duration_s:.1f} s",
         highlight=False,
     )
     console.print(f"wrote {escape(str(directory))}: record.json, {', '.join(sorted(record.files))}")

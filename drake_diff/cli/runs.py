@@ -145,8 +145,9 @@ def plain(value: Any, style: str = "") -> Text:
 def verify(run: RunDirectory) -> None:
     """Check every byte of RUN, run it again from its own files, and compare every number.
 
-    Exit status 0 only where all of it holds, that is, where the record is true; the run's own verdict is printed
-    beside it.
+    RUN is what a solve, a comparison, robustness trials or a certification wrote. Exit status 0 only where every number
+    came out again. Comparisons and robustness trials are not run again: where their files are as they were written
+    they are "intact", with exit status 1. The run's own verdict is printed beside.
     """
     from drake_diff.artifact.verify import verify as verify_run
 
@@ -156,25 +157,31 @@ def verify(run: RunDirectory) -> None:
         console.print(Text("  ").append_text(plain(complaint, "red")))
     for line in (*found.not_rerun, *found.notes):
         console.print(Text("  ").append_text(plain(line, "dim")))
-    held = sum(c.holds for c in found.comparisons)
     verdict = "unknown" if found.record is None else found.record.verdict
     console.print(
         plain(found.verdict, f"{COLOURS.get(found.verdict, 'yellow')} bold"),
-        plain(f"{run}: {held} of {len(found.comparisons)} numbers are the recorded ones; the run's verdict: {verdict}"),
+        plain(f"{run}: {_counted(found)}; the run's verdict: {verdict}"),
     )
     raise typer.Exit(0 if found.holds else 1)
 
 
+def _counted(found: Any) -> str:
+    if found.verdict == "intact":
+        return str(found.sentence)
+    held = sum(c.holds for c in found.comparisons)
+    return f"{held} of {len(found.comparisons)} numbers are the recorded ones"
+
+
 def list_all(directory: Annotated[Path, typer.Argument(help="Where the runs are.")] = Path("artifacts")) -> None:
-    """List the runs in DIRECTORY by what their records say; `verify` tells whether that is true."""
+    """List the records in DIRECTORY by what they say; `verify` tells whether that is true."""
     from drake_diff.artifact.listing import list_runs
 
-    table = _table("run", "verdict", "status", "cost", "model", "written")
+    table = _table("run", "verdict", "kind", "status", "cost", "model", "written")
     for line in list_runs(directory):
         verdict = plain(line.verdict, COLOURS.get(line.verdict, "yellow"))
-        words = (line.status, line.cost, line.model, line.written_utc)
+        words = (line.kind, line.status, line.cost, line.model, line.written_utc)
         table.add_row(plain(line.name), verdict, *(plain(word) for word in words))
-    _console_of_cli_runs().print(table)
+    wide_console().print(table)
 
 
 def compare_runs(a: RunDirectory, b: RunDirectory) -> None:
@@ -200,9 +207,9 @@ def compare_runs(a: RunDirectory, b: RunDirectory) -> None:
 
 def schema() -> None:
     """Print the JSON Schema of record.json."""
-    from drake_diff.record.read import published_schema
+    from drake_diff.record.solve import EvidenceRecord
 
-    sys.stdout.write(published_schema().decode())
+    sys.stdout.write(EvidenceRecord.published_schema().decode())
 
 
 def _console_of_cli_runs() -> Console:

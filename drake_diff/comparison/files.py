@@ -11,19 +11,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.files import write_whole
 from drake_diff.comparison.attribution import Attribution
-from drake_diff.comparison.record import (
-    AttributionEvidence,
-    ComparisonRecord,
-    EngineEvidence,
-    JacobianEvidence,
-    LineEvidence,
-    Numbers,
-    RefusedEvidence,
-    StateEvidence,
-    Times,
-)
 from drake_diff.comparison.result import (
     JACOBIAN_TOLERANCE,
     STEP_TOLERANCE,
@@ -38,7 +26,18 @@ from drake_diff.logs.channels import Shown, input_channel, nanoseconds, state_ch
 from drake_diff.logs.messages import TYPES
 from drake_diff.logs.write import Channel, write_mcap
 from drake_diff.model.model import Model
-from drake_diff.record.provenance import file_evidence, gradient_evidence, model_input, provenance_of, written_now
+from drake_diff.record.comparison import (
+    AttributionEvidence,
+    ComparisonClock,
+    ComparisonRecord,
+    EngineEvidence,
+    JacobianEvidence,
+    LineEvidence,
+    Numbers,
+    RefusedEvidence,
+    StateEvidence,
+)
+from drake_diff.record.provenance import gradient_evidence, model_input, provenance_of, written_now
 
 
 def write_comparison_trace(path: Path, comparison: Comparison) -> None:
@@ -72,7 +71,7 @@ def _measures(motion: EngineMotion, message: Any) -> Iterable[tuple[int, Any]]:
         yield nanoseconds(t), message(energy_total=e, max_penetration=d)
 
 
-RECORD, TRACE, REPLAY, PAGE = "comparison.json", "trace.mcap", "replay.html", "comparison.html"
+TRACE, REPLAY, PAGE = "trace.mcap", "replay.html", "comparison.html"
 FILES = (TRACE, REPLAY, PAGE)
 # Of ghosts: the second and further colours of the page's plots, the first being the reference's.
 COLOURS = (
@@ -84,12 +83,8 @@ OPACITY = 0.35
 def begin_comparison(directory: str | Path, model: Model) -> None:
     """Mark `directory` as a comparison under way: until it is saved its record says "incomplete"."""
     folder = Path(directory)
-    folder.mkdir(parents=True, exist_ok=True)
     sentence = "the comparison has begun and not ended: it is under way, or it was killed or broke off"
-    record = _record(folder.name, model, "incomplete", sentence)
-    write_whole(folder / RECORD, record.sealed().to_json().encode())
-    for name in FILES:
-        (folder / name).unlink(missing_ok=True)
+    _record(folder.name, model, "incomplete", sentence).begin(folder, FILES)
 
 
 def save_comparison(comparison: Comparison, directory: str | Path) -> ComparisonRecord:
@@ -103,10 +98,7 @@ def save_comparison(comparison: Comparison, directory: str | Path) -> Comparison
     write_comparison_trace(folder / TRACE, comparison)
     write_replay(folder / REPLAY, _scene(comparison), title=f"{record.name}: {record.verdict}")
     write_comparison_page(folder / PAGE, comparison, record, folder / REPLAY)
-    files = [file_evidence(folder / name, name) for name in FILES]
-    sealed = record.model_copy(update={"files": files}).sealed()
-    write_whole(folder / RECORD, sealed.to_json().encode())
-    return sealed
+    return record.write(folder)
 
 
 def record_of(comparison: Comparison, name: str) -> ComparisonRecord:
@@ -119,8 +111,8 @@ def record_of(comparison: Comparison, name: str) -> ComparisonRecord:
         states=[StateEvidence(name=s.name, x=s.x.tolist(), u=s.u.tolist()) for s in comparison.states],
         engines=[_engine(e) for e in comparison.engines],
         refused=[RefusedEvidence(engine=r.engine, reason=r.reason, installed=r.installed) for r in comparison.refused],
-        wall_clock=Times(
-            written=written_now(),
+        wall_clock=ComparisonClock(
+            written_utc=written_now(),
             seconds_per_step={e.engine: e.seconds_per_step for e in comparison.engines},
             seconds_per_jacobian={e.engine: e.seconds_per_jacobian for e in comparison.engines},
         ),
@@ -132,7 +124,7 @@ def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -
         "states": [],
         "engines": [],
         "refused": [],
-        "wall_clock": Times(written=written_now()),
+        "wall_clock": ComparisonClock(written_utc=written_now()),
         **rest,
     }
     return ComparisonRecord(
@@ -148,7 +140,6 @@ def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -
         time_step_s=model.time_step,
         state_names=list(model.state_names),
         input_names=list(model.input_names),
-        files=[],
         provenance=provenance_of(),
         **found,
     )

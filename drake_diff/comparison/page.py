@@ -8,7 +8,6 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.certificates.certificate import VERDICTS
-from drake_diff.comparison.record import ComparisonRecord, EngineEvidence
 from drake_diff.comparison.result import JACOBIAN_TOLERANCE, STEP_TOLERANCE, Compared, Comparison
 from drake_diff.engines.motion import EngineMotion
 from drake_diff.pages.html import (
@@ -24,6 +23,7 @@ from drake_diff.pages.html import (
     write_page,
 )
 from drake_diff.pages.plots import Plot, certificate_data, line, plot
+from drake_diff.record.comparison import ComparisonRecord, EngineEvidence
 
 SAME_TIME = 1e-6  # [s] clocks in single precision are within it
 MOST_PLOTS = 12  # of coordinates; those whose motions are furthest apart

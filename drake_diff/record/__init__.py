@@ -1,5 +1,5 @@
-"""The fields, the seal and the directory of every record."""
+"""Records: what a run, a comparison, robustness trials or a certification say of themselves, sealed by their hash."""
 
-from drake_diff._base.lazy import attach_stub as _attach_stub
+import lazy_loader as _lazy
 
-__getattr__, __dir__, __all__ = _attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

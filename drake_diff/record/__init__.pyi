@@ -1,3 +1,6 @@
 from .certification import CertificationRecord as CertificationRecord
 from .certification import certify_model as certify_model
-from .run_record import EvidenceRecord as EvidenceRecord
+from .comparison import ComparisonRecord as ComparisonRecord
+from .robustness import RobustnessRecord as RobustnessRecord
+from .sealed import SealedRecord as SealedRecord
+from .solve import EvidenceRecord as EvidenceRecord

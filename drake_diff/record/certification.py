@@ -1,17 +1,14 @@
-"""The fields of certification.json.
-
-Certify a whole model: its step's derivatives at seeded states, in free motion and in contact, as one record.
-"""
+"""Certify a whole model: its step's derivatives at sampled states, in free motion and in contact, as one record."""
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from drake_diff._base.arrays import positive_int
-from drake_diff._base.files import write_whole
 from drake_diff.certificates.certify import certify
 from drake_diff.derivatives.step import check_method
 from drake_diff.exceptions import GradientError, InputError, SimulationError
@@ -20,14 +17,12 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameters, select
 from drake_diff.model.sampling import SampledState, sample_states
 from drake_diff.model.step import advance
-from drake_diff.record.parts import Certified, FiniteTable, ModelInput, Part, Provenance, WallClock
+from drake_diff.record.parts import Certified, FiniteTable, Part
 from drake_diff.record.provenance import gradient_evidence, model_input, provenance_of, written_now
-from drake_diff.record.run_record import canonical
-
-CERTIFICATION_VERSION = "1.0.0"
+from drake_diff.record.sealed import SealedRecord, Verdict, WallClock
 
 
-class StateEvidence(Part):
+class CertifiedState(Part):
     """The certificate of one sampled state of a model."""
 
     kind: Literal["free", "contact"]
@@ -45,27 +40,29 @@ class StateEvidence(Part):
         return self.gradient.verdict if self.gradient else "refused"
 
 
-class CertificationRecord(Part):
-    """Certificates of a model at sampled states."""
+class CertificationRecord(SealedRecord):
+    """Certificates of a model at sampled states, and all that it takes to take them again."""
 
-    schema_version: str = CERTIFICATION_VERSION
-    name: str
-    verdict: Literal["pass", "fail", "incomplete"]
-    sentence: str
+    FILE: ClassVar[str] = "certification.json"
+
+    kind: Literal["certification"] = "certification"
     seed: int
+    method: str
     parameters: list[str]
-    model: ModelInput
     contract: FiniteTable
-    states: list[StateEvidence]
-    provenance: Provenance
-    wall_clock: WallClock
+    states: list[CertifiedState]
 
-    def to_json(self) -> str:
-        """The record as canonical JSON: the same record gives the same bytes."""
-        return canonical(self.model_dump(mode="json"))
+    @model_validator(mode="after")
+    def _passes_only_what_agrees(self) -> "CertificationRecord":
+        if self.verdict == "pass" and not (self.states and all(state.verdict == "agree" for state in self.states)):
+            raise ValueError('a verdict "pass" with a state whose certificate does not agree, or with no state at all')
+        return self
 
-
-RECORD = "certification.json"
+    def facts(self) -> dict[str, str]:
+        """How many states have which verdict."""
+        verdicts = [state.verdict for state in self.states]
+        counts = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in dict.fromkeys(verdicts))
+        return {"states": counts or "none yet", "seed": str(self.seed), "method": self.method, **super().facts()}
 
 
 def certify_model(
@@ -77,10 +74,29 @@ def certify_model(
     method: str = "auto",
     directory: str | Path | None = None,
 ) -> CertificationRecord:
-    """Certify the step at `states` sampled states, every other one in contact where the model can touch.
+    """Certify the derivatives of the step at sampled states, every other one in contact where the model can touch.
 
-    The same seed gives the same states. The record passes where every certificate agrees; given a `directory`,
-    it is written there as certification.json, which says "incomplete" until the last state is done.
+    The same seed gives the same states, so that `verify` can take the certificates again.
+
+    Args:
+        model: The model to certify.
+        states: How many states to sample.
+        seed: Seed of the states.
+        parameters: Names of parameters whose derivatives are certified too.
+        method: How the derivative is taken: "auto", "autodiff", "implicit", "analytic" or "finite_difference".
+        directory: Where to write certification.json; nothing is written without one. The record there says
+            "incomplete" until the last state is done.
+
+    Returns:
+        A `CertificationRecord`, whose verdict is "pass" only where every certificate agrees.
+
+    Raises:
+        InputError: `states`, `seed`, `parameters` or `method` is not one that can be used.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> print(dd.record.certify_model(model, states=2))
+        pendulum: pass, 2 of 2 sampled states have a certified derivative
     """
     start = time.monotonic()
     check_method(method)
@@ -88,35 +104,34 @@ def certify_model(
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise InputError("seed", got=repr(seed), expected="a whole number of at least 0")
     names = [p.name for p in select(model, parameters).parameters]
-    found: list[StateEvidence] = []
 
-    def record(verdict: Literal["pass", "fail", "incomplete"], sentence: str) -> CertificationRecord:
-        now = written_now()
-        made = CertificationRecord(
+    def record(verdict: Verdict, sentence: str, found: Sequence[CertifiedState] = ()) -> CertificationRecord:
+        return CertificationRecord(
             name=model.name,
             verdict=verdict,
             sentence=sentence,
             seed=int(seed),
+            method=method,
             parameters=names,
             model=model_input(model),
             contract=model.contract.to_dict(),
-            states=found,
+            states=list(found),
             provenance=provenance_of(),
-            wall_clock=WallClock(written_utc=now, solve_s=time.monotonic() - start),
+            wall_clock=WallClock(written_utc=written_now(), duration_s=time.monotonic() - start),
         )
-        if directory is not None:
-            Path(directory).mkdir(parents=True, exist_ok=True)
-            write_whole(Path(directory) / RECORD, made.to_json().encode())
-        return made
 
-    record("incomplete", "the run has begun and not ended: it is under way, or it was killed")
-    found += [_certify_state(model, state, parameters, method) for state in sample_states(model, states, int(seed))]
+    if directory is not None:
+        record("incomplete", "the run has begun and not ended: it is under way, or it was killed").begin(
+            Path(directory)
+        )
+    found = [_certify_state(model, state, parameters, method) for state in sample_states(model, states, int(seed))]
     agree = sum(state.verdict == "agree" for state in found)
     sentence = f"{agree} of {len(found)} sampled states have a certified derivative"
-    return record("pass" if agree == len(found) else "fail", sentence)
+    made = record("pass" if agree == len(found) else "fail", sentence, found)
+    return made.sealed() if directory is None else made.write(Path(directory))
 
 
-def _certify_state(model: Model, state: SampledState, parameters: Parameters, method: str) -> StateEvidence:
+def _certify_state(model: Model, state: SampledState, parameters: Parameters, method: str) -> CertifiedState:
     modes: dict[str, str] = {}
     point = {"kind": state.kind, "x": state.x.tolist(), "u": state.u.tolist()}
     try:
@@ -124,8 +139,8 @@ def _certify_state(model: Model, state: SampledState, parameters: Parameters, me
         modes = {" - ".join(pair): mode for pair, mode in sorted(active_modes(model).items())}
         certificate = certify(model, state.x, state.u, parameters=parameters, method=method)
     except (GradientError, SimulationError) as error:
-        return StateEvidence(**point, gradient=None, refusal=str(error), contact_modes=modes)
-    return StateEvidence(
+        return CertifiedState(**point, gradient=None, refusal=str(error), contact_modes=modes)
+    return CertifiedState(
         **point,
         gradient=gradient_evidence(certificate),
         largest=float(np.abs(certificate.derivative).max(initial=0.0)),

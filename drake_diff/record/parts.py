@@ -149,10 +149,3 @@ class ModelInput(Part):
     file: FileEvidence | None
     named: list[FileEvidence] = Field(default_factory=list)
     options: FiniteTable | None
-
-
-class WallClock(Part):
-    """What differs from run to run: everything else in the record is the same, byte for byte."""
-
-    written_utc: str
-    solve_s: float | None = None

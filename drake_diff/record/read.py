@@ -1,84 +1,43 @@
-"""The JSON Schema of record.json: a file of the package, a copy of which is in every run directory.
+"""Which record a directory holds, and how to read it."""
 
-Read record.json: of this schema's major version, also where a later minor one has fields that are not known here.
-"""
-
-import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
-
-from pydantic import ValidationError
 
 from drake_diff.exceptions import ArtifactError
-from drake_diff.record.run_record import SCHEMA_VERSION, EvidenceRecord
+from drake_diff.record.certification import CertificationRecord
+from drake_diff.record.comparison import ComparisonRecord
+from drake_diff.record.robustness import RobustnessRecord
+from drake_diff.record.sealed import SealedRecord
+from drake_diff.record.solve import EvidenceRecord
 
-SCHEMA_FILE = "record.schema.json"
-PATH = Path(__file__).parent.parent / "schema" / SCHEMA_FILE
-
-
-def published_schema() -> bytes:
-    """The schema as the package has it."""
-    return PATH.read_bytes()
+KINDS: tuple[type[SealedRecord], ...] = (EvidenceRecord, ComparisonRecord, RobustnessRecord, CertificationRecord)
 
 
-def generated_schema() -> bytes:
-    """The schema as pydantic makes it from `EvidenceRecord`; a test holds the two equal."""
-    return (json.dumps(EvidenceRecord.model_json_schema(), sort_keys=True, indent=2) + "\n").encode()
+def kind_of(directory: str | Path) -> type[SealedRecord] | None:
+    """The class of the record in `directory`, by the record's file name; None where there is none."""
+    return next((kind for kind in KINDS if (Path(directory) / kind.FILE).is_file()), None)
 
 
-RECORD = "record.json"
-
-
-def load_record(directory: str | Path) -> EvidenceRecord:
-    """The record in a run directory. ArtifactError where there is none or it does not hold to the schema.
+def load_record(directory: str | Path) -> SealedRecord:
+    """Read the record in a directory that a solve, a comparison, robustness trials or a certification wrote.
 
     It is read, not verified: see `verify`.
+
+    Args:
+        directory: The directory that holds record.json, comparison.json, robustness.json or certification.json.
+
+    Returns:
+        An `EvidenceRecord`, `ComparisonRecord`, `RobustnessRecord` or `CertificationRecord`.
+
+    Raises:
+        ArtifactError: There is no such record, or it does not follow its schema.
+
+    Example:
+        >>> record = dd.load_record("artifacts/pendulum_swing_up")
+        >>> record.kind, record.verdict, record.solver.method
+        ('solve', 'pass', 'shooting')
     """
-    path = Path(directory) / RECORD
-    return parse_record(path, read_fields(path))
-
-
-def read_fields(path: Path) -> dict[str, Any]:
-    """The JSON object in `path` as it stands there; ArtifactError where it is none."""
-    try:
-        fields = json.loads(path.read_bytes().decode("utf-8"), parse_constant=_refuse)
-    except FileNotFoundError as error:
-        raise ArtifactError(f"{path}: no such record; expected a run directory that drake_diff wrote") from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise ArtifactError(f"{path} is no JSON: {type(error).__name__}: {error}") from error
-    if not isinstance(fields, dict):
-        raise ArtifactError(f"{path}: expected a JSON object, got {type(fields).__name__}")
-    return fields
-
-
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is no number of JSON")
-
-
-def parse_record(path: Path, fields: Mapping[str, Any]) -> EvidenceRecord:
-    """The record with these fields; ArtifactError, naming `path`, where they do not hold to the schema."""
-    version = fields.get("schema_version")
-    if not isinstance(version, str) or version.split(".")[0] != SCHEMA_VERSION.split(".")[0]:
-        major = SCHEMA_VERSION.split(".")[0]
-        raise ArtifactError(f"{path}: schema_version {version!r}; this drake_diff reads {major}.x.y")
-    known = json.loads(json.dumps(fields))
-    try:
-        return EvidenceRecord.model_validate(known)
-    except ValidationError as error:
-        if version != SCHEMA_VERSION:  # another minor version: what it has more is left out
-            _drop(known, error)
-        try:
-            return EvidenceRecord.model_validate(known)
-        except ValidationError as remaining:
-            raise ArtifactError(f"{path} is no record of schema {SCHEMA_VERSION}: {remaining}") from remaining
-
-
-def _drop(fields: Any, error: ValidationError) -> None:
-    """Remove the fields that the schema does not have."""
-    for found in error.errors():
-        if found["type"] == "extra_forbidden":
-            part = fields
-            for key in found["loc"][:-1]:
-                part = part[key]
-            del part[found["loc"][-1]]
+    kind = kind_of(directory)
+    if kind is None:
+        names = ", ".join(known.FILE for known in KINDS)
+        raise ArtifactError(f"{directory}: no such record; expected a directory with one of {names}")
+    return kind.read(directory)

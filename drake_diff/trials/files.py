@@ -13,38 +13,34 @@ from drake_diff._base.files import write_whole
 from drake_diff.loop.parts import Hold
 from drake_diff.loop.run import Loop
 from drake_diff.model.model import Model
-from drake_diff.record.provenance import file_evidence, model_input, provenance_of, written_now
-from drake_diff.record.read import load_record
-from drake_diff.trials.perturbation import perturbation_named
-from drake_diff.trials.record import (
+from drake_diff.record.provenance import model_input, provenance_of, written_now
+from drake_diff.record.robustness import (
     CellEvidence,
     LoopEvidence,
     Nominal,
     PerturbationEvidence,
+    RobustnessClock,
     RobustnessRecord,
     RunEvidence,
-    Times,
 )
+from drake_diff.record.solve import EvidenceRecord
+from drake_diff.trials.perturbation import perturbation_named
 from drake_diff.trials.run import Cell, Robustness
 from drake_diff.trials.trial import Task
 from drake_diff.trials.trial_files import FILES as TRIAL_FILES
 from drake_diff.trials.trial_files import REPLAY, controller_name, finite, write_trial
 from drake_diff.trials.words import verdict_of, weakest_of
 
-RECORD, PAGE, TABLE, WORST = "robustness.json", "robustness.html", "trials.csv", "worst"
+PAGE, TABLE, WORST = "robustness.html", "trials.csv", "worst"
 PLAIN = Loop()
 
 
 def begin_robustness(directory: str | Path, model: Model) -> None:
     """Mark `directory` as trials under way: until they are saved its record says "incomplete"."""
     folder = Path(directory)
-    folder.mkdir(parents=True, exist_ok=True)
     sentence = "the trials have begun and not ended: they are under way, or they were killed or broke off"
-    record = _record(folder.name, model, "incomplete", sentence)
-    write_whole(folder / RECORD, record.sealed().to_json().encode())
-    left = [folder / PAGE, folder / TABLE, *(f for f in folder.glob(f"{WORST}/*/*") if f.name in TRIAL_FILES)]
-    for path in left:  # of an earlier report; what is not ours stays
-        path.unlink(missing_ok=True)
+    old_trials = [f.relative_to(folder).as_posix() for f in folder.glob(f"{WORST}/*/*") if f.name in TRIAL_FILES]
+    _record(folder.name, model, "incomplete", sentence).begin(folder, (PAGE, TABLE, *old_trials))
     for path in folder.glob(f"{WORST}/*"):
         if path.is_dir() and not any(path.iterdir()):
             path.rmdir()
@@ -61,7 +57,7 @@ def save_robustness(result: Robustness, directory: str | Path, run: str | Path |
     from drake_diff.trials.page import write_robustness_page  # what saves nothing need not load it
 
     folder, task = Path(directory), result.task
-    source = None if run is None else RunEvidence(path=str(run), record_sha256=load_record(run).record_sha256)
+    source = None if run is None else RunEvidence(path=str(run), record_sha256=EvidenceRecord.read(run).record_sha256)
     begin_robustness(folder, task.model)
     record = record_of(result, folder.name, source)
     again = str(run) if run is not None and _is_plain(task) else None
@@ -69,10 +65,7 @@ def save_robustness(result: Robustness, directory: str | Path, run: str | Path |
         write_trial(folder / _place(result.worst(name)), task, result.worst(name).worst, again)
     write_whole(folder / TABLE, _table(result).encode())
     write_robustness_page(folder / PAGE, result, record, folder / _place(result.worst(weakest_of(result))) / REPLAY)
-    written = [PAGE, TABLE, *(f"{p.worst}/{name}" for p in record.perturbations for name in TRIAL_FILES)]
-    sealed = record.model_copy(update={"files": [file_evidence(folder / name, name) for name in written]}).sealed()
-    write_whole(folder / RECORD, sealed.to_json().encode())
-    return sealed
+    return record.write(folder)
 
 
 def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> RobustnessRecord:
@@ -100,7 +93,12 @@ def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> 
 
 def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -> RobustnessRecord:
     nothing = dict.fromkeys(("run", "trials", "seed", "loop", "nominal"))
-    found: dict[str, Any] = {**nothing, "perturbations": [], "wall_clock": Times(written=written_now()), **rest}
+    found: dict[str, Any] = {
+        **nothing,
+        "perturbations": [],
+        "wall_clock": RobustnessClock(written_utc=written_now()),
+        **rest,
+    }
     return RobustnessRecord(
         name=name,
         verdict=verdict,
@@ -108,7 +106,6 @@ def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -
         model=model_input(model),
         state_names=list(model.state_names),
         input_names=list(model.input_names),
-        files=[],
         provenance=provenance_of(),
         **found,
     )
@@ -188,14 +185,14 @@ def _is_plain(task: Task) -> bool:
     )
 
 
-def _times(result: Robustness) -> Times:
+def _times(result: Robustness) -> RobustnessClock:
     runs = [result.task.nominal.run, *(c.worst.outcome.run for c in result.cells)]
     taken = np.concatenate([run.latencies for run in runs])
     if not len(taken):
-        return Times(written=written_now())
+        return RobustnessClock(written_utc=written_now())
     budget = _loop(result.task).latency_budget_s
-    return Times(
-        written=written_now(),
+    return RobustnessClock(
+        written_utc=written_now(),
         latency_median_s=float(np.median(taken)),
         latency_99_percent_s=float(np.quantile(taken, 0.99)),
         latency_largest_s=float(np.max(taken)),

@@ -25,8 +25,8 @@ from drake_diff.pages.html import (
     write_page,
 )
 from drake_diff.pages.plots import Plot, line, numbers, plot
+from drake_diff.record.robustness import CellEvidence, PerturbationEvidence, RobustnessRecord
 from drake_diff.trials.perturbation import perturbed
-from drake_diff.trials.record import CellEvidence, PerturbationEvidence, RobustnessRecord
 from drake_diff.trials.run import Robustness
 from drake_diff.trials.trial import Task, Trial
 from drake_diff.trials.trial_files import planned_states

@@ -17,9 +17,9 @@ from drake_diff.logs.messages import TYPES
 from drake_diff.logs.write import Channel, write_mcap
 from drake_diff.loop.run import OK
 from drake_diff.model.parameters import applied, select
-from drake_diff.record.run_record import canonical
+from drake_diff.record.robustness import EventEvidence, TrialEvidence
+from drake_diff.record.sealed import canonical
 from drake_diff.trials.perturbation import Setup, perturbed
-from drake_diff.trials.record import EventEvidence, TrialEvidence
 from drake_diff.trials.trial import Outcome, Task, Trial
 
 

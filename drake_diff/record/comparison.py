@@ -1,14 +1,13 @@
-"""The fields of comparison.json."""
+"""The fields of comparison.json: one model in several engines."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from drake_diff.record.parts import Certified, FileEvidence, FiniteTable, ModelInput, Part, Provenance
-from drake_diff.record.run_record import canonical, own_sha256
+from drake_diff.record.parts import Certified, FiniteTable, Part
+from drake_diff.record.sealed import SealedRecord, WallClock
 
-COMPARISON_VERSION = "1.0.0"
-Verdict = Literal["same", "other law", "other model", "unexplained"]
+Sameness = Literal["same", "other law", "other model", "unexplained"]
 Numbers = list[float | None]  # null: not finite
 
 
@@ -49,7 +48,7 @@ class EngineEvidence(Part):
     engine: str
     version: str
     precision: Literal["float64", "float32"]
-    verdict: Verdict
+    verdict: Sameness
     sentence: str
     contract: list[LineEvidence]
     status: str
@@ -83,23 +82,20 @@ class RefusedEvidence(Part):
     installed: bool
 
 
-class Times(Part):
-    """Seconds; they differ from run to run."""
+class ComparisonClock(WallClock):
+    """How fast each engine is, by its name."""
 
-    written: str
     seconds_per_step: dict[str, float | None] = Field(default_factory=dict)
     seconds_per_jacobian: dict[str, float | None] = Field(default_factory=dict)
 
 
-class ComparisonRecord(Part):
+class ComparisonRecord(SealedRecord):
     """One model in several engines; the first engine is the reference. Incomplete until everything is written."""
 
-    schema_version: str = COMPARISON_VERSION
-    name: str
-    verdict: Literal["pass", "fail", "incomplete"]
-    sentence: str
+    FILE: ClassVar[str] = "comparison.json"
+
+    kind: Literal["comparison"] = "comparison"
     tolerances: dict[str, float]
-    model: ModelInput
     contract: FiniteTable
     time_step_s: float
     state_names: list[str]
@@ -107,15 +103,4 @@ class ComparisonRecord(Part):
     states: list[StateEvidence]
     engines: list[EngineEvidence]
     refused: list[RefusedEvidence]
-    files: list[FileEvidence]
-    provenance: Provenance
-    wall_clock: Times
-    record_sha256: str = ""
-
-    def to_json(self) -> str:
-        """The record as canonical JSON: the same record gives the same bytes."""
-        return canonical(self.model_dump(mode="json"))
-
-    def sealed(self) -> "ComparisonRecord":
-        """This record with its own hash."""
-        return self.model_copy(update={"record_sha256": own_sha256(self.model_dump(mode="json"))})
+    wall_clock: ComparisonClock

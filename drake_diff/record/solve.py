@@ -1,11 +1,6 @@
-"""The fields of record.json.
+"""The fields of record.json: one solve, from what was asked to what was measured again."""
 
-`EvidenceRecord` has nothing to do with RFC 4998, which uses the name for archive time stamps.
-"""
-
-import json
-from hashlib import sha256
-from typing import Any, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -13,18 +8,12 @@ from drake_diff.record.parts import (
     Certified,
     Event,
     Failure,
-    FileEvidence,
     FiniteTable,
     Metric,
-    ModelInput,
     Part,
-    Provenance,
     Quantity,
-    WallClock,
 )
-
-SCHEMA_VERSION = "1.0.0"
-APART = ("wall_clock", "files", "record_sha256")  # of what is the same, byte for byte, in every run
+from drake_diff.record.sealed import SealedRecord
 
 
 class Claim(Part):
@@ -37,7 +26,6 @@ class Claim(Part):
 class Inputs(Part):
     """What the run started from, besides `problem`, which holds the initial state."""
 
-    model: ModelInput
     initial_guess: str
     initial_guess_sha256: str | None  # of the bytes of xs (N+1, nx), then us (N, nu), as doubles
     seed: int | None
@@ -145,18 +133,15 @@ class ReplayEvidence(Part):
     failures: list[str]
 
 
-class EvidenceRecord(Part):
-    """Everything a stranger needs to judge the run; the motion is in plan.npz and trace.mcap.
+class EvidenceRecord(SealedRecord):
+    """Everything a stranger needs to judge one solve; the motion is in plan.npz and trace.mcap.
 
-    `files` are all others of the run directory. `record_sha256` is that of this record's canonical JSON (sorted keys,
-    indented by 2) with `record_sha256` empty.
+    It has nothing to do with RFC 4998, which uses the name for archive time stamps.
     """
 
-    schema_version: str = SCHEMA_VERSION
-    name: str
-    state: Literal["incomplete", "complete"]
-    verdict: Literal["pass", "fail", "incomplete"]
-    sentence: str
+    FILE: ClassVar[str] = "record.json"
+
+    kind: Literal["solve"] = "solve"
     claim: Claim
     inputs: Inputs
     problem: FiniteTable
@@ -172,15 +157,9 @@ class EvidenceRecord(Part):
     events: list[Event] = Field(default_factory=list)
     replays: list[ReplayEvidence] = Field(default_factory=list)
     failures: list[Failure] = Field(default_factory=list)
-    provenance: Provenance
-    wall_clock: WallClock
-    files: dict[str, FileEvidence] = Field(default_factory=dict)
-    record_sha256: str = ""
 
     @model_validator(mode="after")
     def _passes_only_what_holds(self) -> "EvidenceRecord":
-        if (self.state == "incomplete") != (self.verdict == "incomplete"):
-            raise ValueError(f'a record that is {self.state} with the verdict "{self.verdict}"')
         if self.verdict == "pass":
             broken = [m.name for m in (*self.metrics, *self.invariants) if m.verdict in ("fail", "undecided")]
             broken += [failure.code for failure in self.failures]
@@ -201,25 +180,10 @@ class EvidenceRecord(Part):
             "perturbation": "; ".join(dict.fromkeys(f"replayed {r.variant}" for r in self.replays)) or "none",
         }
 
-    def to_json(self) -> str:
-        """The record as canonical JSON: the same record gives the same bytes."""
-        return canonical(self.model_dump(mode="json"))
-
-    def sealed(self) -> "EvidenceRecord":
-        """This record with its own hash."""
-        return self.model_copy(update={"record_sha256": own_sha256(self.model_dump(mode="json"))})
-
-
-def canonical(fields: dict[str, Any]) -> str:
-    """JSON with sorted keys: the same fields give the same text."""
-    return json.dumps(fields, sort_keys=True, indent=2, allow_nan=False) + "\n"
-
-
-def own_sha256(fields: dict[str, Any]) -> str:
-    """The hash that belongs into `record_sha256` of a record with these fields."""
-    return sha256(canonical({**fields, "record_sha256": ""}).encode()).hexdigest()
-
-
-def reproducible(fields: dict[str, Any]) -> str:
-    """The canonical JSON of a record's fields without wall-clock facts and hashes: what trace.mcap carries."""
-    return canonical({key: value for key, value in fields.items() if key not in APART})
+    def facts(self) -> dict[str, str]:
+        """What solved it, what it cost, and what fails."""
+        cost = next((m.value for m in self.metrics if m.name == "cost"), None)
+        told = {} if self.solver is None else {"solver": f"{self.solver.method}, {self.solver.status}, cost {cost}"}
+        if self.failures:
+            told["failures"] = "; ".join(f"{f.label}: {f.code}" for f in self.failures)
+        return told | super().facts()

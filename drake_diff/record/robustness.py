@@ -1,13 +1,9 @@
 """The fields of robustness.json, and of the trial.json beside each worst trial."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
-from pydantic import Field
-
-from drake_diff.record.parts import FileEvidence, Label, ModelInput, Part, Provenance
-from drake_diff.record.run_record import canonical, own_sha256
-
-ROBUSTNESS_VERSION = "1.0.0"
+from drake_diff.record.parts import Label, Part
+from drake_diff.record.sealed import SealedRecord, WallClock
 
 
 class RunEvidence(Part):
@@ -103,10 +99,9 @@ class LoopEvidence(Part):
     latency_budget_is: Literal["stated", "the controller's period"]
 
 
-class Times(Part):
-    """What differs from run to run. Latencies are of the unperturbed run and the worst trials."""
+class RobustnessClock(WallClock):
+    """How fast the controller answered, in the unperturbed run and the worst trials."""
 
-    written: str
     latency_median_s: float | None = None
     latency_99_percent_s: float | None = None
     latency_largest_s: float | None = None
@@ -114,15 +109,13 @@ class Times(Part):
     controller_steps: int | None = None
 
 
-class RobustnessRecord(Part):
+class RobustnessRecord(SealedRecord):
     """A plan under perturbations. Incomplete until everything is written."""
 
-    schema_version: str = ROBUSTNESS_VERSION
-    name: str
-    verdict: Literal["pass", "fail", "incomplete"]
-    sentence: str
+    FILE: ClassVar[str] = "robustness.json"
+
+    kind: Literal["robustness"] = "robustness"
     run: RunEvidence | None
-    model: ModelInput
     state_names: list[str]
     input_names: list[str]
     trials: int | None
@@ -130,15 +123,4 @@ class RobustnessRecord(Part):
     loop: LoopEvidence | None
     nominal: Nominal | None
     perturbations: list[PerturbationEvidence]
-    files: list[FileEvidence]
-    provenance: Provenance
-    wall_clock: Times
-    record_sha256: str = Field(default="")
-
-    def to_json(self) -> str:
-        """The record as canonical JSON: the same record gives the same bytes."""
-        return canonical(self.model_dump(mode="json"))
-
-    def sealed(self) -> "RobustnessRecord":
-        """This record with its own hash."""
-        return self.model_copy(update={"record_sha256": own_sha256(self.model_dump(mode="json"))})
+    wall_clock: RobustnessClock

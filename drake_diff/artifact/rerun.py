@@ -1,0 +1,99 @@
+"""A solution rebuilt from its run directory alone: the model, the problem and the plan.
+
+The model is built from the file that trace.mcap carries, in a folder of its own. One that names other files (meshes) is
+built where it stood, and only if it and all of them are still what the record says: the artifact has their hashes, not
+their bytes.
+"""
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from hashlib import sha256
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from drake_diff.artifact.plan_file import PLAN, PlanArrays
+from drake_diff.artifact.sections import rebuild_problem
+from drake_diff.exceptions import ArtifactError, InputError, ModelError, ModelWarning
+from drake_diff.model.load_file import FORMATS
+from drake_diff.model.model import Model, load_model
+from drake_diff.optimize.solution import Solution, Status
+from drake_diff.record.parts import ModelInput
+from drake_diff.record.provenance import file_evidence, named_files
+from drake_diff.record.solve import EvidenceRecord
+
+
+@contextmanager
+def rebuilt(given: ModelInput, source: Any, attachments: dict[str, bytes] | None) -> Iterator[Model]:
+    """The model of a record, for as long as the block runs, from the `attachments` of a trace.
+
+    Where there is no trace, or the model names other files, it is built from `source`, if all of them are unchanged.
+
+    Raises ModelError, saying why, where it cannot be built again, ArtifactError where the artifact is damaged.
+    """
+    if given.file is None or given.options is None:
+        raise ModelError("the model is a user's own diagram, which no artifact can hold")
+    if given.named or attachments is None:
+        yield _load(_source_if_unchanged(given, Path(str(source))), given.options)
+        return
+    name, data = given.file.path, attachments.get(given.file.path)
+    if data is None or sha256(data).hexdigest() != given.file.sha256:
+        raise ArtifactError(f"trace.mcap: it does not carry the model file {name} that record.json describes")
+    if Path(name).name != name or not name.endswith(FORMATS):
+        raise ArtifactError(f"record.json: {name!r} is no name of a model file")
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        path.write_bytes(data)
+        if named_files(path):
+            raise ArtifactError(f"record.json: it does not list the files that {name} names")
+        yield _load(path, given.options)
+
+
+def _source_if_unchanged(given: ModelInput, source: Path) -> Path:
+    """The model file where it stood; ModelError where it or a file that it names is not the recorded one."""
+    if given.file is None or not (source.name.endswith(FORMATS) and source.is_file()):
+        raise ModelError(f"the model's file {source} is gone, and no copy of it that would do is in the artifact")
+    if file_evidence(source, given.file.path) != given.file:
+        raise ModelError(f"the model's file {source} is not what it was")
+    changed = [was.path for was in given.named if was not in named_files(source)]
+    if changed:
+        raise ModelError(f"the model names {changed[0]}, which is not what it was")
+    return source
+
+
+def _load(path: Path, options: dict[str, Any]) -> Model:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ModelWarning)  # said when the model was loaded first
+            return load_model(path, **options)
+    except (InputError, TypeError) as error:
+        raise ArtifactError(f"record.json: the model's options are none: {error}") from error
+
+
+def resolve(record: EvidenceRecord, model: Model, plan: PlanArrays) -> Solution:
+    """The solution of a record, to be measured again. ArtifactError where plan and problem do not go together."""
+    solver = record.solver
+    if solver is None:
+        raise ArtifactError("record.json: it has no solver")
+    count = record.problem.get("num_steps")
+    if plan.us.shape != (count, model.nu) or plan.xs.shape != (len(plan.us) + 1, model.nx):
+        got = f"xs {plan.xs.shape}, us {plan.us.shape}"
+        raise ArtifactError(f"{PLAN}: expected {count} steps of {model.nx} states and {model.nu} inputs, got {got}")
+    try:
+        return Solution(
+            problem=rebuild_problem(record, model, plan.us),
+            method=solver.method,
+            solver=solver.solver,
+            status=Status(solver.status),
+            message=solver.message,
+            xs=plan.xs,
+            us=plan.us,
+            scheme=solver.scheme,
+            us_mid=plan.us_mid,
+            u_final=plan.u_final,
+            free_horizon=plan.free_horizon,
+            parameters=plan.parameters,
+        )
+    except (InputError, ValueError, KeyError, TypeError) as error:
+        raise ArtifactError(f"record.json: its problem is none: {error}") from error
