@@ -1,9 +1,12 @@
-"""Read a robot file into a plant: find its packages, skip the meshes that Drake cannot use and say which.
+"""From a robot file to a plant: read the file, and replace collision geometry that AutoDiffXd cannot step.
 
-Routes around the geometry pairs that Drake's AutoDiffXd step refuses, chosen before the plant is finalized.
+Drake's parsers do the reading. What they cannot use is left out and noted (meshes in formats that Drake does not
+know); what they refuse becomes one ModelError with the file's name, however Drake says it: as a RuntimeError, a
+ValueError, or the SystemExit of a failed condition in C++, which would end the process.
 
-In point contact AutoDiffXd knows a sphere against a sphere, box, cylinder, capsule or half space and nothing
-else; one refused pair whose bounding boxes meet is enough for the whole step to throw.
+In point contact the AutoDiffXd step takes a sphere against a sphere, box, cylinder, capsule or half space and nothing
+else. One other pair whose bounding boxes meet is enough for the whole step to throw, so there are routes around such
+pairs, chosen before the plant is finalized.
 """
 
 import logging
@@ -45,14 +48,10 @@ from drake_diff.model.plant import bodies
 
 FORMATS = (".urdf", ".sdf", ".xml", ".mjcf", ".dmd.yaml")
 USABLE_MESHES = (".obj", ".vtk", ".gltf", ".glb")
+DRAKES_REFUSALS = (RuntimeError, ValueError, SystemExit)  # SystemExit is a failed condition in Drake's C++
 
-
-def _is_related(record: logging.LogRecord) -> bool:
-    """Drake says of every half space that deformable bodies will not touch it: no derivative here could."""
-    return "not currently supported for deformable contact" not in record.getMessage()
-
-
-logging.getLogger("drake").addFilter(_is_related)
+# Drake says of every half space that deformable bodies will not touch it, which no model here has.
+logging.getLogger("drake").addFilter(lambda r: "not currently supported for deformable contact" not in r.getMessage())
 
 
 def read_into(plant: MultibodyPlant, path: Path) -> tuple[str, ...]:
@@ -60,27 +59,33 @@ def read_into(plant: MultibodyPlant, path: Path) -> tuple[str, ...]:
 
     Raises InputError where the file is missing or of an unknown kind, ModelError where Drake refuses it.
     """
-    _check_is_robot_file(path)
+    if not path.is_file():
+        got = f"a directory, {path}" if path.is_dir() else str(path)
+        raise InputError("model file", got=got, expected="a file that exists")
+    if not path.name.endswith(FORMATS):
+        raise InputError("model file", got=str(path), expected="a name that ends in " + ", ".join(FORMATS))
     parser = Parser(plant)
     notes: list[str] = []
     with _drake_warnings(notes):
         try:
-            _add_packages(parser, path)
+            # package://NAME/ is the nearest folder called NAME above the file.
+            for name in sorted(
+                set(re.findall(r"(?:package|model)://([^/\"<>\s]+)/", path.read_text(errors="replace")))
+            ):
+                folder = next((p for p in path.resolve().parents if p.name == name), None)
+                if folder is not None and not parser.package_map().Contains(name):
+                    parser.package_map().Add(name, str(folder))
             reduced = _without_unusable_meshes(path, notes)
             if reduced is None:
                 parser.AddModels(str(path))
             else:
                 parser.AddModelsFromString(reduced, path.suffix.lstrip("."))
-        except (RuntimeError, ET.ParseError, UnicodeDecodeError) as error:
-            raise ModelError(f"{path} is no robot model that Drake can read: {error}") from error
+        except UnicodeDecodeError as error:
+            got = f"byte {error.object[error.start]:#04x} at position {error.start}"
+            raise ModelError(f"{path}: expected text in UTF-8, got {got}") from error
+        except (*DRAKES_REFUSALS, ET.ParseError) as error:
+            raise ModelError(f"{path}: expected a robot model that Drake can read, got the error: {error}") from error
     return tuple(notes)
-
-
-def _check_is_robot_file(path: Path) -> None:
-    if not path.is_file():
-        raise InputError("model file", got=str(path), expected="a file that exists")
-    if not path.name.endswith(FORMATS):
-        raise InputError("model file", got=str(path), expected="a name that ends in " + ", ".join(FORMATS))
 
 
 @contextmanager
@@ -102,15 +107,6 @@ def _drake_warnings(notes: list[str]) -> Iterator[None]:
         logger.propagate = propagate
 
 
-def _add_packages(parser: Parser, path: Path) -> None:
-    """Resolve package://NAME/ to the nearest folder called NAME above the file."""
-    packages = parser.package_map()
-    for name in sorted(set(re.findall(r"(?:package|model)://([^/\"<>\s]+)/", path.read_text(errors="replace")))):
-        folder = next((p for p in path.resolve().parents if p.name == name), None)
-        if folder is not None and not packages.Contains(name):
-            packages.Add(name, str(folder))
-
-
 def _without_unusable_meshes(path: Path, notes: list[str]) -> str | None:
     """The file's text without the visuals and collisions whose mesh format Drake cannot use.
 
@@ -120,13 +116,15 @@ def _without_unusable_meshes(path: Path, notes: list[str]) -> str | None:
     if path.suffix not in (".urdf", ".sdf") or not re.search(r"\.(dae|stl|ply|off)\b", text, re.IGNORECASE):
         return None
     for prefix, namespace in re.findall(r'xmlns:(\w+)="([^"]+)"', text):
-        ET.register_namespace(prefix, namespace)  # else drake:... tags come out as ns0:...
+        if not re.fullmatch(r"ns\d+", prefix):  # such names ElementTree keeps for itself
+            ET.register_namespace(prefix, namespace)  # else drake:... tags come out as ns0:...
     root = ET.fromstring(text)
     skipped: list[str] = []
     for parent in root.iter():
         for kind in ("visual", "collision"):
             for element in parent.findall(kind):
-                unusable = [uri for uri in _mesh_uris(element) if not uri.lower().endswith(USABLE_MESHES)]
+                uris = [mesh.get("filename") or (mesh.findtext("uri") or "").strip() for mesh in element.iter("mesh")]
+                unusable = [uri for uri in uris if not uri.lower().endswith(USABLE_MESHES)]
                 if unusable:
                     parent.remove(element)
                     skipped += [f"{parent.get('name', '?')} {kind} {uri}" for uri in unusable]
@@ -136,10 +134,6 @@ def _without_unusable_meshes(path: Path, notes: list[str]) -> str | None:
         _make_absolute(mesh, path)
     notes.append(f"{len(skipped)} meshes skipped, Drake uses only {' '.join(USABLE_MESHES)}: " + "; ".join(skipped))
     return ET.tostring(root, encoding="unicode")
-
-
-def _mesh_uris(element: ET.Element) -> list[str]:
-    return [mesh.get("filename") or (mesh.findtext("uri") or "").strip() for mesh in element.iter("mesh")]
 
 
 def _make_absolute(mesh: ET.Element, path: Path) -> None:
@@ -154,13 +148,27 @@ def _make_absolute(mesh: ET.Element, path: Path) -> None:
 
 
 ROUTES = ("corner_spheres", "hydroelastic", "differences")
-CORNER_RADIUS = 0.05  # of a corner sphere [1], relative to the smallest edge of the box or cylinder
+CORNER_RADIUS = 0.05  # of a corner sphere [1], relative to the smallest edge: small enough to leave the shape its size
 SPHERES_PER_RIM = 8  # of a cylinder
-HYDROELASTIC_MODULUS = 1e7  # [Pa]
+HYDROELASTIC_MODULUS = 1e7  # [Pa], that of stiff rubber
 
 MEETS_A_SPHERE = {"Sphere", "Box", "Cylinder", "Capsule", "HalfSpace"}  # in point contact under AutoDiffXd
 HYDROELASTIC_SHAPES = MEETS_A_SPHERE | {"Ellipsoid", "Convex", "Mesh"}
 CONTACT_MODELS = ("point", "hydroelastic", "hydroelastic_with_fallback")
+
+
+def autodiff_supports(shape_a: Shape, shape_b: Shape, contact_model: str) -> bool:
+    """Whether the AutoDiffXd step takes this pair of touching shapes, as measured with Drake 1.51 and 1.58.
+
+    For the two hydroelastic models the shapes have the properties that the route "hydroelastic" gives them.
+    Raises UnknownNameError where there is no such contact model.
+    """
+    if contact_model not in CONTACT_MODELS:
+        raise UnknownNameError("contact_model", got=contact_model, known=CONTACT_MODELS)
+    shapes = {type(shape_a).__name__, type(shape_b).__name__}
+    if contact_model == "point":
+        return "Sphere" in shapes and shapes <= MEETS_A_SPHERE
+    return shapes <= HYDROELASTIC_SHAPES and shapes != {"HalfSpace"}
 
 
 def replace_collision_geometry(plant: MultibodyPlant, scene_graph: SceneGraph, route: str) -> tuple[str, ...]:
@@ -191,35 +199,27 @@ def replace_collision_geometry(plant: MultibodyPlant, scene_graph: SceneGraph, r
     return ("Pairs of geometries that AutoDiffXd refuses are differenced, by choice.",)
 
 
-def autodiff_supports(shape_a: Shape, shape_b: Shape, contact_model: str) -> bool:
-    """Whether the AutoDiffXd step takes this pair of touching shapes, as measured with Drake 1.51 and 1.58.
-
-    For the two hydroelastic models the shapes have the properties that the route "hydroelastic" gives them.
-    Raises UnknownNameError where there is no such contact model.
-    """
-    if contact_model not in CONTACT_MODELS:
-        raise UnknownNameError("contact_model", got=contact_model, known=CONTACT_MODELS)
-    shapes = {type(shape_a).__name__, type(shape_b).__name__}
-    if contact_model == "point":
-        return "Sphere" in shapes and shapes <= MEETS_A_SPHERE
-    return shapes <= HYDROELASTIC_SHAPES and shapes != {"HalfSpace"}
-
-
 def _to_corner_spheres(plant: MultibodyPlant, scene_graph: SceneGraph) -> tuple[str, ...]:
     inspector = scene_graph.model_inspector()
     found = _collision_geometries(plant, scene_graph)
     welded = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
     fixed = [int(body.index()) in welded for body, _ in found]
-    filtered = _filtered_pairs(scene_graph, found)
+    # Pairs that a file or a user lets pass through each other: Drake keeps its filters by geometry, so the spheres
+    # would not inherit them.
+    pairs = [(a, b) for (body_a, a), (body_b, b) in combinations(found, 2) if body_a.index() != body_b.index()]
+    filtered = [(a, b) for a, b in pairs if inspector.CollisionFiltered(a, b)]
     became = {geometry: [geometry] for _, geometry in found}
     notes = []
     for (body, geometry), stays in zip(found, fixed, strict=True):
-        shape = inspector.GetShape(geometry)
+        name, shape = f"{inspector.GetName(geometry)} on {body.name()}", inspector.GetShape(geometry)
         if isinstance(shape, Convex | Ellipsoid | Mesh):
-            notes.append(_refused(_label(scene_graph, body, geometry), shape))
+            notes.append(
+                f"{name}: a {type(shape).__name__} stays as it is, and AutoDiffXd refuses every point contact with it; "
+                "take the route hydroelastic or differences where something can touch it."
+            )
         elif not stays and isinstance(shape, Box | Capsule | Cylinder):
-            notes.append(_description(_label(scene_graph, body, geometry), shape))
             became[geometry] = _replace(plant, scene_graph, body, geometry, shape)
+            notes.append(_what_became(name, shape))
     for a, b in filtered:
         declaration = CollisionFilterDeclaration().ExcludeBetween(GeometrySet(became[a]), GeometrySet(became[b]))
         scene_graph.collision_filter_manager().Apply(declaration)
@@ -242,20 +242,11 @@ def _collision_geometries(plant: MultibodyPlant, scene_graph: SceneGraph) -> lis
     ]
 
 
-def _filtered_pairs(scene_graph: SceneGraph, found: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
-    """The pairs on different bodies that a file or a user let pass through each other.
-
-    Drake keeps its filters by geometry, so spheres that are added later do not inherit them.
-    """
-    inspector = scene_graph.model_inspector()
-    pairs = [(a, b) for (body_a, a), (body_b, b) in combinations(found, 2) if body_a.index() != body_b.index()]
-    return [(a, b) for a, b in pairs if inspector.CollisionFiltered(a, b)]
-
-
 def _replace(plant: MultibodyPlant, scene_graph: SceneGraph, body: Any, geometry: Any, shape: Any) -> list[Any]:
     """Spheres in place of a geometry, which loses its proximity role; their ids."""
     inspector = scene_graph.model_inspector()
-    X_BG, properties = RigidTransform(inspector.GetPoseInFrame(geometry)), _properties(scene_graph, geometry)
+    X_BG = RigidTransform(inspector.GetPoseInFrame(geometry))
+    properties = ProximityProperties(inspector.GetProximityProperties(geometry))
     name = inspector.GetName(geometry).removeprefix(f"{plant.GetModelInstanceName(body.model_instance())}::")
     scene_graph.RemoveRole(plant.get_source_id(), geometry, Role.kProximity)
     radius, centres = _spheres(shape)
@@ -265,16 +256,6 @@ def _replace(plant: MultibodyPlant, scene_graph: SceneGraph, body: Any, geometry
         )
         for i, p_GS in enumerate(centres)
     ]
-
-
-def _label(scene_graph: SceneGraph, body: Any, geometry: Any) -> str:
-    """A geometry in words; URDF files leave many of one name, which are told apart by their body."""
-    return f"{scene_graph.model_inspector().GetName(geometry)} on {body.name()}"
-
-
-def _properties(scene_graph: SceneGraph, geometry: Any) -> ProximityProperties:
-    """A copy of its proximity properties."""
-    return ProximityProperties(scene_graph.model_inspector().GetProximityProperties(geometry))
 
 
 def _spheres(shape: Any) -> tuple[float, list[Array]]:
@@ -295,8 +276,7 @@ def _spheres(shape: Any) -> tuple[float, list[Array]]:
     return radius, [np.array([ring * np.cos(a), ring * np.sin(a), z * height]) for z in (-1, 1) for a in angles]
 
 
-def _description(name: str, shape: Any) -> str:
-    """What became of one geometry, as a sentence."""
+def _what_became(name: str, shape: Any) -> str:
     radius, centres = _spheres(shape)
     start = f"{name}: a {type(shape).__name__.lower()} became {len(centres)} spheres of radius {radius:.4g} m"
     stiffness = "each with the stiffness of the whole, as every contact point has its own spring"
@@ -309,40 +289,29 @@ def _description(name: str, shape: Any) -> str:
     return f"{start} along its rims, which is approximate ({stiffness}); it rolls like a polygon."
 
 
-def _refused(name: str, shape: Any) -> str:
-    kind = type(shape).__name__
-    return (
-        f"{name}: a {kind} stays as it is, and AutoDiffXd refuses every point contact with it; "
-        "take the route hydroelastic or differences where something can touch it."
-    )
-
-
 def _to_hydroelastic(plant: MultibodyPlant, scene_graph: SceneGraph) -> tuple[str, ...]:
     if plant.get_contact_model() == ContactModel.kPoint:
         expected = "hydroelastic or hydroelastic_with_fallback, as the route is hydroelastic"
         raise InputError("contact_model", got="point", expected=expected)
-    notes = []
+    inspector, notes = scene_graph.model_inspector(), []
     for body, geometry in _collision_geometries(plant, scene_graph):
-        name, properties = _label(scene_graph, body, geometry), _properties(scene_graph, geometry)
+        name = f"{inspector.GetName(geometry)} on {body.name()}"
+        properties = ProximityProperties(inspector.GetProximityProperties(geometry))
         if properties.HasProperty("hydroelastic", "compliance_type"):
             notes.append(f"{name}: keeps its own hydroelastic properties.")
             continue
-        became = _add_hydroelastic(scene_graph, geometry, properties)
+        box = inspector.GetObbInGeometryFrame(geometry)
+        if isinstance(inspector.GetShape(geometry), HalfSpace) or box is None:
+            AddRigidHydroelasticProperties(properties)
+            became = "rigid hydroelastic, as a compliant half space has no contact with a compliant body"
+        else:  # a modulus or hint of its own stays
+            hint = _taken(properties, "resolution_hint", float(np.min(box.half_width())))
+            modulus = _taken(properties, "hydroelastic_modulus", HYDROELASTIC_MODULUS)
+            AddCompliantHydroelasticProperties(hint, modulus, properties)
+            became = f"compliant hydroelastic, modulus {modulus:.4g} Pa, resolution {hint:.4g} m"
         scene_graph.AssignRole(plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
         notes.append(f"{name}: became {became}.")
     return tuple(notes)
-
-
-def _add_hydroelastic(scene_graph: SceneGraph, geometry: Any, properties: ProximityProperties) -> str:
-    """Add to `properties` what makes a geometry hydroelastic; in words. A modulus or hint of its own stays."""
-    box = scene_graph.model_inspector().GetObbInGeometryFrame(geometry)
-    if isinstance(scene_graph.model_inspector().GetShape(geometry), HalfSpace) or box is None:
-        AddRigidHydroelasticProperties(properties)
-        return "rigid hydroelastic, as a compliant half space has no contact with a compliant body"
-    hint = _taken(properties, "resolution_hint", float(np.min(box.half_width())))
-    modulus = _taken(properties, "hydroelastic_modulus", HYDROELASTIC_MODULUS)
-    AddCompliantHydroelasticProperties(hint, modulus, properties)
-    return f"compliant hydroelastic, modulus {modulus:.4g} Pa, resolution {hint:.4g} m"
 
 
 def _taken(properties: ProximityProperties, name: str, default: float) -> float:

@@ -1,8 +1,9 @@
-"""A robot file or a user's own Drake diagram becomes a finalized discrete plant and its AutoDiffXd twin."""
+"""A robot file or a Drake diagram as a discrete plant, with its contexts and its AutoDiffXd twin."""
 
 import warnings
 from collections.abc import Callable, Hashable
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,7 +18,13 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from drake_diff._base.arrays import finite_array, positive_float
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, UnknownNameError
 from drake_diff.model.contract import Contract, read_contract
-from drake_diff.model.load_file import CONTACT_MODELS, ROUTES, read_into, replace_collision_geometry
+from drake_diff.model.load_file import (
+    CONTACT_MODELS,
+    DRAKES_REFUSALS,
+    ROUTES,
+    read_into,
+    replace_collision_geometry,
+)
 from drake_diff.model.plant import (
     actuators,
     bodies,
@@ -34,15 +41,32 @@ from drake_diff.model.twin import AddedForce, Twin
 T = TypeVar("T")
 CONTACT_APPROXIMATIONS = ("sap", "similar", "lagged")
 OTHERS_KEPT = 64  # how many rebuilt models are kept: a certificate by the time step needs 26
+NAMES_SHOWN = 12  # in repr: a robot arm's state is shown whole
 
 
 class Model:
     """A finalized discrete plant, ready to be stepped and differentiated.
 
-    `x = [q; v]` (nx,) is Drake's state of the plant and `u` (nu,) its actuation input, in SI units. Make one
-    with `load_model` or `model_from_diagram`. A Model keeps its contexts between calls and sets all of x, u and
-    parameters on each, so results do not depend on the order of calls; for the same reason one Model serves
-    one thread.
+    Make one with `load_model` or `model_from_diagram`. The state is Drake's, `x = [q; v]`, and the input `u` is the
+    plant's actuation, all in SI units. A Model keeps its contexts between calls and sets all of x, u and the
+    parameters on each call, so results do not depend on the order of calls; for the same reason one Model serves one
+    thread.
+
+    Attributes:
+        nq, nv, nx, nu: Numbers of positions, velocities, states (nq + nv) and inputs.
+        state_names, input_names: A name for each entry of x (nx,) and u (nu,).
+        time_step: [s].
+        plant, diagram: Drake's own MultibodyPlant and Diagram.
+        contract: What the model promises, to print: units, limits, masses, contact.
+        source: The file it was loaded from, or None.
+        notes: What was left out of the file, a sentence each.
+
+    Example:
+        >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
+        >>> model.nx, model.nu
+        (4, 1)
+        >>> model.state_names
+        ('slide_x', 'hinge_q', 'slide_v', 'hinge_w')
     """
 
     def __init__(
@@ -109,10 +133,24 @@ class Model:
         return self.changed(contact_approximation=approximation)
 
     def changed(self, **change: Any) -> "Model":
-        """The same model with options of `load_model` changed. ModelError where it came from a diagram."""
+        """The same model with some options of `load_model` changed; the same changes give the same Model again.
+
+        Raises:
+            ModelError: It was made from a diagram, which holds one plant only.
+            UnknownNameError: `load_model` has no such option.
+
+        Example:
+            >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+            >>> model.changed(time_step=0.002, gravity=[0, 0, -1.62]).time_step
+            0.002
+        """
         if self._rebuild is None:
             raise ModelError("a model from a diagram keeps its time step: build the diagram again with another")
-        key = frozenset(change.items())
+        # Lists and arrays have no hash; a vector is the same change however it is written.
+        vectors = {
+            k: tuple(np.ravel(v).tolist()) for k, v in change.items() if isinstance(v, (list, tuple, np.ndarray))
+        }
+        key = frozenset({**change, **vectors}.items())
         if key not in self._others:
             if len(self._others) >= OTHERS_KEPT:
                 self._others.pop(next(iter(self._others)))
@@ -166,11 +204,17 @@ class Model:
         )
 
     def cache(self, key: Hashable, make: Callable[[], T]) -> T:
-        """What `make` gave when `key` was first asked for: what is read once and holds as long as the model does."""
-        if key not in self._cache:
-            self._cache[key] = make()
-        found: T = self._cache[key]
-        return found
+        """What `make` gave when `key` was first asked for: what is read once and holds as long as the model does.
+
+        What is made while parameters are applied that are not the model's own is not kept.
+        """
+        if key in self._cache:
+            found: T = self._cache[key]
+            return found
+        made = make()
+        if not self.has_other_parameters:
+            self._cache[key] = made
+        return made
 
     def _twin(self, scalar: Any, diagram: Any, plant: Any) -> Twin:
         root, defaults = diagram.CreateDefaultContext(), diagram.CreateDefaultContext()
@@ -198,7 +242,19 @@ class Model:
         return targets
 
     def __repr__(self) -> str:
-        return f"Model({self.name!r}, nq={self.nq}, nv={self.nv}, nu={self.nu}, time_step={self.time_step:g} s)"
+        def listed(names: tuple[str, ...]) -> str:
+            return ", ".join(names[:NAMES_SHOWN]) + (", ..." if len(names) > NAMES_SHOWN else "") or "(none)"
+
+        return (
+            f"{self}\n  x ({self.nx},): {listed(self.state_names)}\n  u ({self.nu},): {listed(self.input_names)}"
+            f"\n  from {self.source or 'a diagram'}; print(model.contract) shows units, limits, masses and contact"
+        )
+
+    def __str__(self) -> str:
+        return f"Model {self.name!r}: nq={self.nq}, nv={self.nv}, nu={self.nu}, time step {self.time_step:g} s"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def load_model(
@@ -214,24 +270,41 @@ def load_model(
 ) -> Model:
     """The robot in a URDF, SDF, MJCF (.xml) or .dmd.yaml file as a discrete model.
 
-    `time_step` [s]; `contact_model` is one of point, hydroelastic, hydroelastic_with_fallback;
-    `contact_approximation` one of sap, similar, lagged (sap's Jacobians are the tamest by far).
-    `contact_geometry` is what to do about pairs of shapes that AutoDiffXd refuses (a box on the ground in point
-    contact): "corner_spheres" puts spheres in the place of boxes, cylinders and capsules that move, "hydroelastic"
-    makes all geometries compliant (with a hydroelastic `contact_model`), "differences" says that differences are
-    wanted; without it they are taken too, and `audit` calls the pair an error. `weld_base` names a link to fix to
-    the world, `ground` is the friction [1] of a half space z <= 0 to add, `gravity` [m/s^2] replaces Drake's
-    (0, 0, -9.81).
+    Args:
+        path: The robot file.
+        time_step: [s] of the discrete plant.
+        contact_model: "point", "hydroelastic" or "hydroelastic_with_fallback".
+        contact_approximation: "sap", "similar" or "lagged"; the derivatives of "sap" are the tamest by far.
+        contact_geometry: What to do about pairs of shapes that AutoDiffXd refuses, such as a box on the ground in
+            point contact. "corner_spheres" puts spheres in the place of boxes, cylinders and capsules that move;
+            "hydroelastic" makes all geometries compliant (it needs a hydroelastic `contact_model`); "differences"
+            says that differences are wanted. None takes differences too, but `audit` calls the pair an error.
+        weld_base: The link to fix to the world.
+        ground: Adds a half space z <= 0 with this friction coefficient.
+        gravity: (3,) [m/s^2], in place of Drake's (0, 0, -9.81).
 
-    Raises InputError (missing file, unknown kind, bad option) or ModelError (Drake cannot read it); what Drake
-    or we left out of the file (meshes of a format that Drake cannot use, ...) is a ModelWarning and stays in
-    `Model.notes`.
+    Returns:
+        The Model. What was left out of the file (such as meshes in formats that Drake cannot use) is a ModelWarning
+        and stays in `Model.notes`.
+
+    Raises:
+        InputError: The file is missing or of an unknown kind, or an option is wrong.
+        ModelError: Drake cannot read the file, or nothing in it can move.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> print(model)
+        Model 'pendulum': nq=1, nv=1, nu=1, time step 0.01 s
     """
     time_step = positive_float("time_step [s]", time_step)
     _check_choice("contact_model", contact_model, CONTACT_MODELS)
     _check_choice("contact_approximation", contact_approximation, CONTACT_APPROXIMATIONS)
     if contact_geometry is not None:
         _check_choice("contact_geometry", contact_geometry, ROUTES)
+    try:
+        source = Path(path)
+    except TypeError as error:
+        raise InputError("model file", got=repr(path), expected="a path") from error
     config = MultibodyPlantConfig(
         time_step=time_step,
         contact_model=contact_model,
@@ -240,23 +313,20 @@ def load_model(
     )
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(config, builder)
-    source = Path(path)
     notes = read_into(plant, source)
     if notes:
         warnings.warn("\n  ".join([f"{source.name}:", *notes]), ModelWarning, stacklevel=2)
-    if weld_base is not None:
-        plant.WeldFrames(plant.world_frame(), named("link", bodies(plant), weld_base).body_frame())
-    if ground is not None:
-        _add_ground(plant, ground)
+    _change_plant(plant, source, weld_base=weld_base, ground=ground)
     if contact_geometry is not None:
         notes += replace_collision_geometry(plant, scene_graph, contact_geometry)
     if gravity is not None:
-        plant.mutable_gravity_field().set_gravity_vector(finite_array("gravity", gravity, (3,)))
+        gravity = tuple(finite_array("gravity [m/s^2]", gravity, (3,)).tolist())
+        plant.mutable_gravity_field().set_gravity_vector(gravity)
     try:
         plant.Finalize()
         diagram = builder.Build()
-    except RuntimeError as error:
-        raise ModelError(f"{source} cannot be finalized: {error}") from error
+    except DRAKES_REFUSALS as error:
+        raise ModelError(f"{source}: expected a model that Drake can finalize, got the error: {error}") from error
 
     options: dict[str, Any] = {
         "time_step": time_step,
@@ -269,7 +339,9 @@ def load_model(
     }
 
     def rebuild(**changes: Any) -> Model:
-        return load_model(path, **{**options, **changes})
+        for option in changes.keys() - options.keys():
+            raise UnknownNameError("option of load_model", got=option, known=options)
+        return load_model(source, **{**options, **changes})
 
     model = Model(diagram, source=source, notes=notes, contact_geometry=contact_geometry, rebuild=rebuild)
     model.options = options
@@ -277,10 +349,23 @@ def load_model(
 
 
 def model_from_diagram(diagram: Diagram) -> Model:
-    """A user's own Drake diagram (a RobotDiagram, or any Diagram) with exactly one discrete plant in it.
+    """A Model of a user's own Drake diagram (a RobotDiagram, or any Diagram) with exactly one discrete plant in it.
 
-    Raises ModelError, with what to change, where the plant is continuous, not finalized, has sampled output
-    ports, or has its actuation input connected inside the diagram (drake_diff drives that input itself).
+    The plant may sit at any depth. drake_diff drives its actuation input itself, so that must not be connected.
+
+    Raises:
+        InputError: `diagram` is no Diagram.
+        ModelError: The plant is continuous, not finalized, has sampled output ports, or has its actuation input
+            connected inside the diagram; the message says what to change.
+
+    Example:
+        >>> from pydrake.planning import RobotDiagramBuilder
+        >>> builder = RobotDiagramBuilder(time_step=0.01)
+        >>> builder.plant().SetUseSampledOutputPorts(False)
+        >>> builder.parser().AddModels("models/pendulum.urdf")
+        [ModelInstanceIndex(2)]
+        >>> dd.model_from_diagram(builder.Build()).nx
+        2
     """
     if not isinstance(diagram, Diagram):
         raise InputError("diagram", got=type(diagram).__name__, expected="a pydrake Diagram")
@@ -292,16 +377,27 @@ def _check_choice(subject: str, value: str, known: tuple[str, ...]) -> None:
         raise UnknownNameError(subject, got=value, known=known)
 
 
-def _add_ground(plant: MultibodyPlant, friction: float) -> None:
-    if not (np.isfinite(friction) and friction >= 0):
-        raise InputError("ground", got=friction, expected="a friction coefficient of at least 0")
+def _change_plant(plant: MultibodyPlant, source: Path, *, weld_base: str | None, ground: float | None) -> None:
+    if weld_base is not None:
+        link = named("link", bodies(plant), weld_base)
+        try:
+            plant.WeldFrames(plant.world_frame(), link.body_frame())
+        except DRAKES_REFUSALS as error:
+            raise ModelError(
+                f"{source}: expected weld_base to be a link without a joint to its parent: {error}"
+            ) from error
+    if ground is None:
+        return
+    if isinstance(ground, bool) or not isinstance(ground, (int, float, np.number)) or not 0 <= ground < np.inf:
+        raise InputError("ground", got=repr(ground), expected="a friction coefficient of at least 0")
     properties = ProximityProperties()
-    AddContactMaterial(friction=CoulombFriction(float(friction), float(friction)), properties=properties)
+    AddContactMaterial(friction=CoulombFriction(float(ground), float(ground)), properties=properties)
     plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", properties)
 
 
 def _check_plant(model: Model) -> None:
     plant, diagram, path = model.plant, model.diagram, model.path
+    where = f"{model.source}: " if model.source else ""
     if not plant.is_finalized():
         raise ModelError("the plant is not finalized: call plant.Finalize() before building the diagram")
     if plant.time_step() == 0:
@@ -312,7 +408,7 @@ def _check_plant(model: Model) -> None:
             "plant.SetUseSampledOutputPorts(False), or set use_sampled_output_ports=False in its MultibodyPlantConfig"
         )
     if plant.num_velocities() == 0:
-        raise ModelError("the model cannot move: it has no joints and no free body")
+        raise ModelError(f"{where}the model cannot move: it has no joints and no free body")
     inputs = [plant.get_actuation_input_port()]
     inputs += [plant.get_actuation_input_port(i) for i in instances(plant) if plant.num_actuators(i)]
     if any(is_driven(diagram, path, port) for port in inputs):
