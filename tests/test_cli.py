@@ -84,7 +84,7 @@ def test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact(tm
         (("'shooting'", "'magic'"), "one of auto, collocation"),
         (("{'method'", "{'solver': 'magic', 'method'"), "one of ipopt, snopt"),
         (("pendulum.urdf", "../README.md"), ".urdf, .sdf"),
-        (("pendulum.urdf", "../tests/not_a_robot.urdf"), "no robot model"),
+        (("pendulum.urdf", "../tests/not_a_robot.urdf"), "a robot model that Drake can read"),
         (("pendulum.urdf", "projectile.sdf"), "expected"),
         (("x0=[0, 0]", "x0=[99, 0]"), "expected within [-50, 50]"),
         (("def problem", "def another"), "problem()"),

@@ -11,7 +11,7 @@ from drake_diff.model.twin import Twin
 
 
 @dataclass(frozen=True)
-class Coordinate:
+class CoordinateTerms:
     """One entry of q, v or u."""
 
     name: str
@@ -21,7 +21,7 @@ class Coordinate:
 
 
 @dataclass(frozen=True)
-class Body:
+class BodyTerms:
     """Mass [kg]; centre of mass [m] and inertia xx yy zz xy xz yz [kg m^2] about it, in the body's frame."""
 
     name: str
@@ -31,7 +31,7 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Joint:
+class JointTerms:
     """A joint and what holds it back: damping [N s/m or N m s/rad], implicit in Drake's step."""
 
     name: str
@@ -43,7 +43,7 @@ class Joint:
 
 
 @dataclass(frozen=True)
-class Actuator:
+class ActuatorTerms:
     """An actuator on a joint; PD gains and their target (the joint's default position) where it has them."""
 
     name: str
@@ -56,7 +56,7 @@ class Actuator:
 
 
 @dataclass(frozen=True)
-class CollisionGeometry:
+class GeometryTerms:
     """What can touch. `None` is not given in the model: Drake's default decides."""
 
     name: str
@@ -70,7 +70,7 @@ class CollisionGeometry:
 
 
 @dataclass(frozen=True)
-class Contact:
+class ContactTerms:
     """How contact is computed."""
 
     model: str
@@ -92,14 +92,14 @@ class Contract:
     scalar_types: tuple[str, ...]
     gravity: tuple[float, ...]  # [m/s^2], in the world frame
     frame: str
-    positions: tuple[Coordinate, ...]
-    velocities: tuple[Coordinate, ...]
-    inputs: tuple[Coordinate, ...]
-    bodies: tuple[Body, ...]
-    joints: tuple[Joint, ...]
-    actuators: tuple[Actuator, ...]
-    geometries: tuple[CollisionGeometry, ...]
-    contact: Contact
+    positions: tuple[CoordinateTerms, ...]
+    velocities: tuple[CoordinateTerms, ...]
+    inputs: tuple[CoordinateTerms, ...]
+    bodies: tuple[BodyTerms, ...]
+    joints: tuple[JointTerms, ...]
+    actuators: tuple[ActuatorTerms, ...]
+    geometries: tuple[GeometryTerms, ...]
+    contact: ContactTerms
     constraints: int  # couplers, balls, welds, distances, tendons
     notes: tuple[str, ...]
 
@@ -159,7 +159,7 @@ def _lines(c: Contract) -> list[str]:
     return lines + [f"  note       {note}" for note in c.notes]
 
 
-def _damping_of_contact(approximation: str, g: CollisionGeometry) -> str:
+def _damping_of_contact(approximation: str, g: GeometryTerms) -> str:
     """What damps contact: sap knows only the relaxation time, similar and lagged only Hunt-Crossley's number."""
     if approximation == "sap":
         return f"relaxation time {_or_default(g.relaxation_time)} s"
@@ -170,7 +170,7 @@ def _row(values: tuple[float, ...]) -> str:
     return "(" + ", ".join(f"{value:g}" for value in values) + ")"
 
 
-def _limits(x: Coordinate) -> str:
+def _limits(x: CoordinateTerms) -> str:
     if math.isinf(x.lower) and math.isinf(x.upper):
         return ""
     return f" in [{x.lower:g}, {x.upper:g}]"
@@ -232,9 +232,9 @@ def read_contract(
     )
 
 
-def _coordinates(names: Any, units: Any, lower: Any, upper: Any) -> tuple[Coordinate, ...]:
+def _coordinates(names: Any, units: Any, lower: Any, upper: Any) -> tuple[CoordinateTerms, ...]:
     return tuple(
-        Coordinate(name, unit, float(low), float(high))
+        CoordinateTerms(name, unit, float(low), float(high))
         for name, unit, low, high in zip(names, units, lower, upper, strict=True)
     )
 
@@ -253,10 +253,10 @@ def _input_units(plant: Any) -> list[str]:
     return ["N" if a.joint().type_name() == "prismatic" else "N m" for a in actuators(plant)]
 
 
-def _read_body(twin: Twin, body: Any) -> Body:
+def _read_body(twin: Twin, body: Any) -> BodyTerms:
     inertia = body.CalcSpatialInertiaInBodyFrame(twin.context)
     about_com = inertia.Shift(inertia.get_com()).CalcRotationalInertia()
-    return Body(
+    return BodyTerms(
         name=body.name(),
         mass=float(inertia.get_mass()),
         center_of_mass=_floats(inertia.get_com()),
@@ -264,8 +264,8 @@ def _read_body(twin: Twin, body: Any) -> Body:
     )
 
 
-def _read_joint(twin: Twin, joint: Any) -> Joint:
-    return Joint(
+def _read_joint(twin: Twin, joint: Any) -> JointTerms:
+    return JointTerms(
         name=joint.name(),
         type=joint.type_name(),
         parent=joint.parent_body().name(),
@@ -275,9 +275,9 @@ def _read_joint(twin: Twin, joint: Any) -> Joint:
     )
 
 
-def _read_actuator(actuator: Any) -> Actuator:
+def _read_actuator(actuator: Any) -> ActuatorTerms:
     gains = actuator.get_controller_gains() if actuator.has_controller() else None
-    return Actuator(
+    return ActuatorTerms(
         name=actuator.name(),
         joint=actuator.joint().name(),
         effort_limit=float(actuator.effort_limit()),
@@ -288,7 +288,7 @@ def _read_actuator(actuator: Any) -> Actuator:
     )
 
 
-def _read_geometries(twin: Twin) -> tuple[CollisionGeometry, ...]:
+def _read_geometries(twin: Twin) -> tuple[GeometryTerms, ...]:
     inspector = twin.inspector
     if inspector is None:
         return ()
@@ -296,11 +296,11 @@ def _read_geometries(twin: Twin) -> tuple[CollisionGeometry, ...]:
     return tuple(_read_geometry(twin, inspector, geometry_id) for geometry_id in ids)
 
 
-def _read_geometry(twin: Twin, inspector: SceneGraphInspector, geometry_id: Any) -> CollisionGeometry:
+def _read_geometry(twin: Twin, inspector: SceneGraphInspector, geometry_id: Any) -> GeometryTerms:
     properties = inspector.GetProximityProperties(geometry_id)
     body = twin.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry_id))
     friction = _property(properties, "material", "coulomb_friction")
-    return CollisionGeometry(
+    return GeometryTerms(
         name=inspector.GetName(geometry_id),
         body=body.name() if body is not None else "?",
         shape=type(inspector.GetShape(geometry_id)).__name__,
@@ -316,9 +316,9 @@ def _property(properties: ProximityProperties, group: str, name: str) -> Any:
     return properties.GetProperty(group, name) if properties.HasProperty(group, name) else None
 
 
-def _read_contact(twin: Twin, contact_geometry: str | None) -> Contact:
+def _read_contact(twin: Twin, contact_geometry: str | None) -> ContactTerms:
     inspector = twin.inspector
-    return Contact(
+    return ContactTerms(
         model={"kPoint": "point", "kHydroelastic": "hydroelastic"}.get(
             twin.plant.get_contact_model().name, "hydroelastic_with_fallback"
         ),

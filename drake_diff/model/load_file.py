@@ -84,7 +84,7 @@ def read_into(plant: MultibodyPlant, path: Path) -> tuple[str, ...]:
             got = f"byte {error.object[error.start]:#04x} at position {error.start}"
             raise ModelError(f"{path}: expected text in UTF-8, got {got}") from error
         except (*DRAKES_REFUSALS, ET.ParseError) as error:
-            raise ModelError(f"{path}: expected a robot model that Drake can read, got the error: {error}") from error
+            raise ModelError(f"{path}: expected a robot model that Drake can read; Drake says: {error}") from error
     return tuple(notes)
 
 

@@ -326,7 +326,7 @@ def load_model(
         plant.Finalize()
         diagram = builder.Build()
     except DRAKES_REFUSALS as error:
-        raise ModelError(f"{source}: expected a model that Drake can finalize, got the error: {error}") from error
+        raise ModelError(f"{source}: expected a model that Drake can finalize; Drake says: {error}") from error
 
     options: dict[str, Any] = {
         "time_step": time_step,
