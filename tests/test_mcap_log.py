@@ -103,6 +103,15 @@ def test_a_file_that_is_no_mcap_or_missing_is_refused(tmp_path):
             read_mcap(tmp_path / name)
 
 
+def test_a_logs_repr_is_short_and_its_html_is_escaped(tmp_path):
+    write_mcap(tmp_path / "a.mcap", [Channel("/<b>", STATE, states(5), {})], {}, {})
+    log = read_mcap(tmp_path / "a.mcap")
+    assert repr(log) == "McapLog: 5 messages in 1 channels, 0 attachments\n  /<b> (5)"
+    assert str(log) == "5 messages in 1 channels, 0 attachments"
+    assert "/&lt;b&gt; (5)" in log._repr_html_()
+    assert "<b>" not in log._repr_html_()
+
+
 def test_every_message_has_a_unit_for_every_number():
     for name, fields in MESSAGES.items():
         for field, ((kind, _), unit) in fields.items():

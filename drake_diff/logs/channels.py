@@ -1,4 +1,7 @@
-"""The channels of trace.mcap that show motions in simulated time: states, inputs, joints, frames, contact, energies."""
+"""The channels of trace.mcap that show a motion in simulated time: states, inputs, joints, frames, contact, energies.
+
+A channel's messages are generated while they are written, so that a long motion is never held in memory twice.
+"""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -56,7 +59,12 @@ def motion_channels(shown: Shown) -> Iterator[Channel]:
     efforts = None if shown.motion is None else shown.motion.efforts
     yield _joint_states(shown, "/joint_states", shown.xs, efforts)
     yield _joint_states(shown, "/planned/joint_states", shown.planned_xs, None)
-    yield _transforms(shown)
+    # The ghost is the plan, shown where it is another motion than the plant's own.
+    ghost = not np.array_equal(shown.xs, shown.planned_xs)
+    frames = {"": shown.xs, **({GHOST: shown.planned_xs} if ghost else {})}
+    count = max(len(shown.xs), len(shown.planned_xs))
+    told = {"ghost": GHOST if ghost else "the motion is the plan"}
+    yield transform_channel(shown.model, shown.times(count), frames, told)
     yield _diagnostics(shown)
     yield _contacts(shown)
     yield _contact_scene(shown)
@@ -73,17 +81,14 @@ def _stamp(stamp: Any, time: float) -> None:
 
 
 def state_channel(shown: Shown, topic: str, xs: Array, times: Array | None = None) -> Channel:
-    """drake_diff.State of states (n, nx) at `times` (n,), k h where left out: exact, names and units as metadata."""
+    """drake_diff.State of states (n, nx) at `times` (n,), k h if left out: exact, names and units as metadata."""
     kind, model = TYPES["State"], shown.model
-    nq, contract = model.nq, model.contract
-    at = shown.times(len(xs)) if times is None else times
+    nq, contract, at = model.nq, model.contract, shown.times(len(xs)) if times is None else times
     rows = (
         (nanoseconds(t), kind.cls(time=t, q=x[:nq], v=x[nq:])) for t, x in zip(at.tolist(), xs.tolist(), strict=True)
     )
-    units = {
-        "q": {c.name: c.unit for c in contract.positions},
-        "v": {c.name: c.unit for c in contract.velocities},
-    }
+    parts = {"q": contract.positions, "v": contract.velocities}
+    units = {part: {c.name: c.unit for c in coordinates} for part, coordinates in parts.items()}
     names = {"q": list(model.position_names), "v": list(model.velocity_names)}
     return Channel(topic, kind.cls, rows, {"units": {"time": "s", **units}, "names": names})
 
@@ -104,53 +109,44 @@ def _joint_states(shown: Shown, topic: str, xs: Array, efforts: Array | None) ->
     places = [
         (j.name(), j.position_start(), shown.model.nq + j.velocity_start(), driven.get(j.index())) for j in single
     ]
+
+    def rows() -> Rows:
+        applied = [] if efforts is None else efforts.tolist()
+        for k, (t, x) in enumerate(zip(shown.times(len(xs)), xs.tolist(), strict=True)):
+            message = JointStates()
+            _stamp(message.timestamp, t)
+            for name, position, velocity, actuator in places:
+                state = message.joints.add(name=name, position=x[position], velocity=x[velocity])
+                if actuator is not None and k < len(applied):
+                    state.effort = applied[k][actuator]
+            yield nanoseconds(t), message
+
     units = {"position": "rad or m", "velocity": "rad/s or m/s", "effort": "N m or N"}
-    return Channel(topic, JointStates, _joint_rows(shown, places, xs, efforts), {"units": units})
-
-
-def _joint_rows(shown: Shown, places: list[tuple[str, int, int, int | None]], xs: Array, efforts: Array | None) -> Rows:
-    applied = [] if efforts is None else efforts.tolist()
-    for k, (t, x) in enumerate(zip(shown.times(len(xs)), xs.tolist(), strict=True)):
-        message = JointStates()
-        _stamp(message.timestamp, t)
-        for name, position, velocity, actuator in places:
-            state = message.joints.add(name=name, position=x[position], velocity=x[velocity])
-            if actuator is not None and k < len(applied):
-                state.effort = applied[k][actuator]
-        yield nanoseconds(t), message
-
-
-def _transforms(shown: Shown) -> Channel:
-    """foxglove.FrameTransforms of every body in the world, and of its ghost where the plan is another motion."""
-    ghost = not np.array_equal(shown.xs, shown.planned_xs)
-    motions = {"": shown.xs, **({GHOST: shown.planned_xs} if ghost else {})}
-    count = max(len(shown.xs), len(shown.planned_xs))
-    told = {"ghost": GHOST if ghost else "the motion is the plan"}
-    return transform_channel(shown.model, shown.times(count), motions, told)
+    return Channel(topic, JointStates, rows(), {"units": units})
 
 
 def transform_channel(
     model: Model, times: Array, motions: Mapping[str, Array], told: Mapping[str, str] | None = None
 ) -> Channel:
     """foxglove.FrameTransforms in /tf of the bodies in `motions`, (n, nx) by what their frames' names begin with."""
-    metadata = {"units": {"translation": "m", "rotation": "1"}, **(told or {})}
-    return Channel("/tf", FrameTransforms, _transform_rows(model, times, motions), metadata)
-
-
-def _transform_rows(model: Model, times: Array, motions: Mapping[str, Array]) -> Rows:
     plant = model.plant
     named = [(b, f"{plant.GetModelInstanceName(b.model_instance())}::{b.name()}") for b in bodies(plant)]
-    for k, t in enumerate(times):
-        message = FrameTransforms()
-        for prefix, xs in motions.items():
-            for name, p, r in _poses(model, named, xs[k]) if k < len(xs) else []:
-                transform = message.transforms.add(parent_frame_id="world", child_frame_id=prefix + name)
-                _stamp(transform.timestamp, t)
-                transform.translation.x, transform.translation.y, transform.translation.z = p
-                rotation = transform.rotation
-                rotation.w, rotation.x, rotation.y, rotation.z = r
-        if message.transforms:
-            yield nanoseconds(t), message
+
+    def rows() -> Rows:
+        for k, t in enumerate(times):
+            message = FrameTransforms()
+            for prefix, xs in motions.items():
+                for name, p, r in _poses(model, named, xs[k]) if k < len(xs) else []:
+                    transform = message.transforms.add(parent_frame_id="world", child_frame_id=prefix + name)
+                    _stamp(transform.timestamp, t)
+                    transform.translation.x, transform.translation.y, transform.translation.z = p
+                    rotation = transform.rotation
+                    rotation.w, rotation.x, rotation.y, rotation.z = r
+            if message.transforms:
+                yield nanoseconds(t), message
+
+    metadata = {"units": {"translation": "m", "rotation": "1"}, **(told or {})}
+    return Channel("/tf", FrameTransforms, rows(), metadata)
 
 
 def _poses(model: Model, named: list[tuple[Any, str]], x: Array) -> list[tuple[str, list[float], list[float]]]:
@@ -165,27 +161,28 @@ def _poses(model: Model, named: list[tuple[Any, str]], x: Array) -> list[tuple[s
 
 
 def _diagnostics(shown: Shown) -> Channel:
-    kind = TYPES["Diagnostics"]
-    rows = iter(()) if shown.motion is None else _diagnostic_rows(shown, shown.motion)
+    kind, motion = TYPES["Diagnostics"], shown.motion
+
+    def rows() -> Rows:
+        if motion is None:
+            return
+        columns = {
+            "energy_kinetic": motion.kinetic_energy,
+            "energy_potential": motion.potential_energy,
+            "energy_total": motion.energy,
+            "energy_error": motion.energy_error,
+            "work_actuators": motion.work,
+            "dissipation": motion.dissipation,
+            "max_penetration": motion.penetration,
+            "constraint_violation": motion.constraint_violation,
+            "n_contacts": np.array([*(len(c) for c in motion.contacts), 0]),
+        }
+        values = zip(*(column.tolist() for column in columns.values()), strict=True)
+        for t, row in zip(shown.times(len(motion.xs)), values, strict=True):
+            yield nanoseconds(t), kind.cls(**dict(zip(columns, row, strict=True)))
+
     metadata = {"units": kind.units, "n_contacts": "of the step that begins; 0 at the last state, which begins none"}
-    return Channel("/diagnostics", kind.cls, rows, metadata)
-
-
-def _diagnostic_rows(shown: Shown, motion: Rollout) -> Rows:
-    columns = {
-        "energy_kinetic": motion.kinetic_energy,
-        "energy_potential": motion.potential_energy,
-        "energy_total": motion.energy,
-        "energy_error": motion.energy_error,
-        "work_actuators": motion.work,
-        "dissipation": motion.dissipation,
-        "max_penetration": motion.penetration,
-        "constraint_violation": motion.constraint_violation,
-        "n_contacts": np.array([*(len(c) for c in motion.contacts), 0]),
-    }
-    names, values = list(columns), [column.tolist() for column in columns.values()]
-    for t, row in zip(shown.times(len(motion.xs)), zip(*values, strict=True), strict=True):
-        yield nanoseconds(t), TYPES["Diagnostics"].cls(**dict(zip(names, row, strict=True)))
+    return Channel("/diagnostics", kind.cls, rows(), metadata)
 
 
 def _steps_in_contact(shown: Shown) -> Iterator[tuple[float, tuple[ContactPoint, ...]]]:
@@ -195,42 +192,35 @@ def _steps_in_contact(shown: Shown) -> Iterator[tuple[float, tuple[ContactPoint,
 
 def _contacts(shown: Shown) -> Channel:
     kind = TYPES["Contacts"]
-    rows = ((nanoseconds(t), kind.cls(**_contact_columns(c))) for t, c in _steps_in_contact(shown))
+
+    def columns(contacts: tuple[ContactPoint, ...]) -> dict[str, list[Any]]:
+        found: dict[str, list[Any]] = {
+            name: [getattr(c, name) for c in contacts] for name in ("body_a", "body_b", "depth", "slip_speed")
+        }
+        for vector in ("point", "normal", "force"):
+            for i, axis in enumerate("xyz"):
+                found[vector[0] + axis] = [float(getattr(c, vector)[i]) for c in contacts]
+        return found
+
+    rows = ((nanoseconds(t), kind.cls(**columns(c))) for t, c in _steps_in_contact(shown))
     return Channel("/contacts", kind.cls, rows, {"units": kind.units})
-
-
-def _contact_columns(contacts: tuple[ContactPoint, ...]) -> dict[str, list[Any]]:
-    columns: dict[str, list[Any]] = {
-        "body_a": [c.body_a for c in contacts],
-        "body_b": [c.body_b for c in contacts],
-        "depth": [c.depth for c in contacts],
-        "slip_speed": [c.slip_speed for c in contacts],
-    }
-    for letter, vectors in (
-        ("p", [c.point for c in contacts]),
-        ("n", [c.normal for c in contacts]),
-        ("f", [c.force for c in contacts]),
-    ):
-        for i, axis in enumerate("xyz"):
-            columns[letter + axis] = [float(v[i]) for v in vectors]
-    return columns
 
 
 def _contact_scene(shown: Shown) -> Channel:
     """foxglove.SceneUpdate: an arrow along the force at each contact, for drawing; the numbers are in /contacts."""
+
+    def rows() -> Rows:
+        for t, contacts in _steps_in_contact(shown):
+            message = SceneUpdate()
+            for i, contact in enumerate(contacts):
+                entity = message.entities.add(frame_id="world", id=f"contact {i}")
+                _stamp(entity.timestamp, t)
+                _stamp(entity.lifetime, shown.time_step)
+                _draw_arrow(entity.arrows.add(), contact)
+            yield nanoseconds(t), message
+
     units = {"position": "m", "arrow_length": "m", "arrow_length_per_newton": f"{ARROW_LENGTH_PER_NEWTON} m/N"}
-    return Channel("/scene/contacts", SceneUpdate, _scene_rows(shown), {"units": units})
-
-
-def _scene_rows(shown: Shown) -> Rows:
-    for t, contacts in _steps_in_contact(shown):
-        message = SceneUpdate()
-        for i, contact in enumerate(contacts):
-            entity = message.entities.add(frame_id="world", id=f"contact {i}")
-            _stamp(entity.timestamp, t)
-            _stamp(entity.lifetime, shown.time_step)
-            _draw_arrow(entity.arrows.add(), contact)
-        yield nanoseconds(t), message
+    return Channel("/scene/contacts", SceneUpdate, rows(), {"units": units})
 
 
 def _draw_arrow(arrow: Any, contact: ContactPoint) -> None:

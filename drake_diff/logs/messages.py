@@ -9,56 +9,37 @@ from google.protobuf.message_factory import GetMessageClass
 
 NUMBER, NUMBERS = ("double", False), ("double", True)
 WHOLE, FLAG, TEXT, TEXTS = ("int64", False), ("bool", False), ("string", False), ("string", True)
+ROW_PER_COLUMN = "unit of the row per unit of the column"
 
 # message: {field: (type, unit)}; field numbers are the order, so new fields go last.
 MESSAGES: dict[str, dict[str, tuple[tuple[str, bool], str]]] = {
     "State": {"time": (NUMBER, "s"), "q": (NUMBERS, "see names"), "v": (NUMBERS, "see names")},
     "Input": {"time": (NUMBER, "s"), "u": (NUMBERS, "see names")},
     "Diagnostics": {
-        "energy_kinetic": (NUMBER, "J"),
-        "energy_potential": (NUMBER, "J"),
-        "energy_total": (NUMBER, "J"),
-        "energy_error": (NUMBER, "J"),
-        "work_actuators": (NUMBER, "J"),
-        "dissipation": (NUMBER, "J"),
+        **dict.fromkeys(("energy_kinetic", "energy_potential", "energy_total", "energy_error"), (NUMBER, "J")),
+        **dict.fromkeys(("work_actuators", "dissipation"), (NUMBER, "J")),
         "max_penetration": (NUMBER, "m"),
         "constraint_violation": (NUMBER, "m, rad or 1"),
         "n_contacts": (WHOLE, "1"),
     },
     "Contacts": {
-        "body_a": (TEXTS, ""),
-        "body_b": (TEXTS, ""),
-        "px": (NUMBERS, "m"),
-        "py": (NUMBERS, "m"),
-        "pz": (NUMBERS, "m"),
-        "nx": (NUMBERS, "1"),
-        "ny": (NUMBERS, "1"),
-        "nz": (NUMBERS, "1"),
-        "fx": (NUMBERS, "N"),
-        "fy": (NUMBERS, "N"),
-        "fz": (NUMBERS, "N"),
+        **dict.fromkeys(("body_a", "body_b"), (TEXTS, "")),
+        **dict.fromkeys(("px", "py", "pz"), (NUMBERS, "m")),
+        **dict.fromkeys(("nx", "ny", "nz"), (NUMBERS, "1")),
+        **dict.fromkeys(("fx", "fy", "fz"), (NUMBERS, "N")),
         "depth": (NUMBERS, "m"),
         "slip_speed": (NUMBERS, "m/s"),
     },
     "SolverIteration": {
         "iteration": (WHOLE, "1"),
-        "objective": (NUMBER, "1"),
-        "primal_infeasibility": (NUMBER, "1"),
-        "dual_infeasibility": (NUMBER, "1"),
-        "step": (NUMBER, "1"),
+        **dict.fromkeys(("objective", "primal_infeasibility", "dual_infeasibility", "step"), (NUMBER, "1")),
     },
     "GradientCheck": {
-        "subject": (TEXT, ""),
-        "method": (TEXT, ""),
-        "verdict": (TEXT, ""),
-        "entries": (WHOLE, "1"),
-        "agreeing": (WHOLE, "1"),
+        **dict.fromkeys(("subject", "method", "verdict"), (TEXT, "")),
+        **dict.fromkeys(("entries", "agreeing"), (WHOLE, "1")),
         "cosine": (NUMBER, "1"),  # of the angle between derivative and differences, all entries in one vector
-        "worst_row": (TEXT, ""),
-        "worst_column": (TEXT, ""),
-        "worst_derivative": (NUMBER, "unit of the row per unit of the column"),
-        "worst_difference": (NUMBER, "unit of the row per unit of the column"),
-        "worst_tolerance": (NUMBER, "unit of the row per unit of the column"),
+        **dict.fromkeys(("worst_row", "worst_column"), (TEXT, "")),
+        **dict.fromkeys(("worst_derivative", "worst_difference", "worst_tolerance"), (NUMBER, ROW_PER_COLUMN)),
         "mode_changes": (TEXTS, ""),
     },
     "GradientNorm": {"step": (WHOLE, "1"), "norm": (NUMBER, "1 per state unit")},
@@ -70,12 +51,9 @@ MESSAGES: dict[str, dict[str, tuple[tuple[str, bool], str]]] = {
         "parameters": (NUMBERS, "see names"),
     },
     "Replay": {
-        "variant": (TEXT, ""),
-        "control": (TEXT, ""),
-        "approximation": (TEXT, ""),
+        **dict.fromkeys(("variant", "control", "approximation"), (TEXT, "")),
         "time_step": (NUMBER, "s"),
-        "goal_error": (NUMBER, "the state's"),
-        "bound_violation": (NUMBER, "the state's"),
+        **dict.fromkeys(("goal_error", "bound_violation"), (NUMBER, "the state's")),
         "energy_error": (NUMBER, "J"),
         "penetration": (NUMBER, "m"),
         "holds": (FLAG, "1"),
@@ -83,10 +61,7 @@ MESSAGES: dict[str, dict[str, tuple[tuple[str, bool], str]]] = {
     },
     "Event": {
         "time": (NUMBER, "s"),
-        "kind": (TEXT, ""),
-        "failure_label": (TEXT, ""),
-        "code": (TEXT, ""),
-        "message": (TEXT, ""),
+        **dict.fromkeys(("kind", "failure_label", "code", "message"), (TEXT, "")),
     },
 }
 

@@ -1,8 +1,7 @@
-"""Read an MCAP file of protobuf channels, every checksum checked first.
+"""Read MCAP files of protobuf channels: a whole one with every checksum checked, or what a damaged one still holds.
 
-Where the `mcap` package is needed it is imported when called: a script that reads no log need not load it.
-
-Save what can be read of an MCAP file that is cut short or damaged.
+The `mcap` package skips three of the format's checksums (of attachments, of the data section, of the summary), so that
+this module walks through the records itself.
 """
 
 import json
@@ -10,15 +9,18 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from html import escape
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
+from mcap.reader import NonSeekingReader
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import Writer
+from mcap_protobuf.decoder import DecoderFactory
 
 from drake_diff._base.files import whole_file
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
@@ -32,7 +34,11 @@ CRC = struct.Struct("<I")
 FOOTER_OPCODE, CHUNK, ATTACHMENT, METADATA, DATA_END_OPCODE = 0x02, 0x06, 0x09, 0x0C, 0x0F
 
 
-@dataclass(frozen=True)
+RECOVERED = "recovered"  # the name of the metadata record that a recovered file gets
+READERS: dict[int, Any] = {CHUNK: Chunk, ATTACHMENT: Attachment, METADATA: Metadata}
+
+
+@dataclass(frozen=True, repr=False)
 class McapLog:
     """What a file holds: messages by topic, the channels' metadata, metadata records and attachments."""
 
@@ -56,25 +62,38 @@ class McapLog:
             for field in self.message_types[topic].DESCRIPTOR.fields
         }
 
+    def __str__(self) -> str:
+        count = sum(len(messages) for messages in self.messages.values())
+        return f"{count} messages in {len(self.messages)} channels, {len(self.attachments)} attachments"
 
-def _column(field: Any, values: list[Any], width: int) -> Any:
-    repeated = field.default_value == []  # `is_repeated` is of protobuf 6
-    if field.cpp_type in (field.CPPTYPE_STRING, field.CPPTYPE_MESSAGE):
-        return [list(value) if repeated else value for value in values]
-    kinds: dict[int, Any] = {field.CPPTYPE_INT64: np.int64, field.CPPTYPE_BOOL: np.bool_}
-    kind = kinds.get(field.cpp_type, np.float64)
-    if not repeated:
-        return np.array(values, dtype=kind)
-    lists = [np.array(value, dtype=kind) for value in values]
-    same = len({len(value) for value in lists}) == 1
-    return np.array(lists) if same else lists or np.zeros((0, width), dtype=kind)
+    def __repr__(self) -> str:
+        topics = ", ".join(f"{topic} ({len(messages)})" for topic, messages in self.messages.items())
+        return f"McapLog: {self}\n  {topics or 'no channels'}"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def read_mcap(path: str | Path) -> McapLog:
-    """Everything in an MCAP file of protobuf channels.
+    """Read everything in an MCAP file of protobuf channels.
 
-    Raises ArtifactError, naming the file, where it is missing, cut short, or a checksum (of chunks, data section,
-    summary, attachments) does not hold, or the schema of a channel does not decode.
+    Args:
+        path: the file; of this project's runs it is trace.mcap.
+
+    Returns:
+        The log; its times are in nanoseconds of simulated time, `arrays` gives a channel's fields as arrays.
+
+    Raises:
+        ArtifactError: the file is missing, cut short, a checksum (of chunks, data section, summary, attachments)
+            does not hold, or the schema of a channel does not decode. The message names the file.
+
+    Source:
+        The format: https://mcap.dev/spec
+
+    Example:
+        >>> log = dd.logs.read_mcap("artifacts/pendulum_swing_up/trace.mcap")
+        >>> log.arrays("/state")["q"].shape[1]
+        1
     """
     path = Path(path)
     data = read_bytes(path)
@@ -85,6 +104,43 @@ def read_mcap(path: str | Path) -> McapLog:
     except Exception as error:  # a damaged file makes the reader fail in many ways; none of them is ours
         raise ArtifactError(f"{path} is no whole MCAP file of this project: {type(error).__name__}: {error}") from error
     return log
+
+
+def recover_mcap(path: str | Path, out: str | Path) -> "Recovered":
+    """Copy what is before the first damage in `path` to the whole file `out`, which says so in its metadata.
+
+    Chunks and attachments are copied only where their checksum holds; a metadata record has none of its own.
+    Raises ArtifactError if `path` is no MCAP file, InputError if `out` exists.
+    """
+    path, out = Path(path), Path(out)
+    if out.exists() or not out.parent.is_dir():
+        raise InputError("OUT", got=str(out), expected="a file that does not exist, in a directory that does")
+    data = read_bytes(path)
+    if not data.startswith(MAGIC):
+        raise ArtifactError(f"{path} is no MCAP file: it does not begin as one does")
+    with whole_file(out) as file:
+        copy, stopped_at = _Copy(start(file)), ""
+        try:
+            for opcode, body in records(data):
+                if opcode in READERS:
+                    record = READERS[opcode].read(ReadDataStream(BytesIO(body)))
+                    for part in breakup_chunk(record, validate_crc=True) if opcode == CHUNK else [record]:
+                        copy.add(part)
+        except Exception as error:  # damage makes the reader fail in many ways; all of them end the copy
+            stopped_at = f"{type(error).__name__}: {error}"
+        told = {"from": path.name, "messages": str(copy.messages), "stopped_at": stopped_at or "the end"}
+        copy.writer.add_metadata(RECOVERED, told)
+        copy.writer.finish()
+    return Recovered(copy.messages, copy.attachments, stopped_at)
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """How much was saved, and what it stopped at ("" if the file was whole)."""
+
+    messages: int
+    attachments: int
+    stopped_at: str
 
 
 def read_bytes(path: Path) -> bytes:
@@ -135,14 +191,11 @@ def _check_crcs(data: bytes) -> None:
         raise ValueError("the checksum of its data does not match")
     if zlib.crc32(data[summary_start : len(data) - len(MAGIC) - 4]) != summary_crc:
         raise ValueError("the checksum of its summary does not match")
-    for _ in records(data):  # the attachments' own
+    for _ in records(data):  # which checks those of the attachments
         pass
 
 
 def _collect(data: bytes, log: McapLog) -> None:
-    from mcap.reader import NonSeekingReader
-    from mcap_protobuf.decoder import DecoderFactory
-
     decoders = DecoderFactory()
 
     def reader() -> NonSeekingReader:
@@ -167,52 +220,17 @@ def _collect(data: bytes, log: McapLog) -> None:
         raise ValueError(f"it holds {counted} messages, its statistics say {summary.statistics.message_count}")
 
 
-RECOVERED = "recovered"  # the name of the metadata record that tells of it
-READERS: dict[int, Any] = {CHUNK: Chunk, ATTACHMENT: Attachment, METADATA: Metadata}
-
-
-@dataclass(frozen=True)
-class Recovered:
-    """How much was saved, and what it stopped at ("" where the file was whole)."""
-
-    messages: int
-    attachments: int
-    stopped_at: str
-
-
-def recover_mcap(path: str | Path, out: str | Path) -> Recovered:
-    """Copy what is before the first damage in `path` to the whole file `out`, which says so in its metadata.
-
-    Chunks and attachments are copied only where their checksum holds; a metadata record has none of its own.
-    Raises ArtifactError where `path` is no MCAP file, InputError where `out` exists.
-    """
-    path, out = Path(path), Path(out)
-    if out.exists() or not out.parent.is_dir():
-        raise InputError("OUT", got=str(out), expected="a file that does not exist, in a directory that does")
-    data = read_bytes(path)
-    if not data.startswith(MAGIC):
-        raise ArtifactError(f"{path} is no MCAP file: it does not begin as one does")
-    with whole_file(out) as file:
-        copy = _Copy(start(file))
-        stopped_at = ""
-        try:
-            for record in _parsed(data):
-                copy.add(record)
-        except Exception as error:  # damage makes the reader fail in many ways; all of them end the copy
-            stopped_at = f"{type(error).__name__}: {error}"
-        copy.writer.add_metadata(
-            RECOVERED, {"from": path.name, "messages": str(copy.messages), "stopped_at": stopped_at or "the end"}
-        )
-        copy.writer.finish()
-    return Recovered(copy.messages, copy.attachments, stopped_at)
-
-
-def _parsed(data: bytes) -> Iterator[Any]:
-    """Attachments, metadata, and what is in the chunks."""
-    for opcode, body in records(data):
-        if opcode in READERS:
-            record = READERS[opcode].read(ReadDataStream(BytesIO(body)))
-            yield from breakup_chunk(record, validate_crc=True) if opcode == CHUNK else [record]
+def _column(field: Any, values: list[Any], width: int) -> Any:
+    repeated = field.default_value == []  # `is_repeated` came with protobuf 6
+    if field.cpp_type in (field.CPPTYPE_STRING, field.CPPTYPE_MESSAGE):
+        return [list(value) if repeated else value for value in values]
+    kinds: dict[int, Any] = {field.CPPTYPE_INT64: np.int64, field.CPPTYPE_BOOL: np.bool_}
+    kind = kinds.get(field.cpp_type, np.float64)
+    if not repeated:
+        return np.array(values, dtype=kind)
+    lists = [np.array(value, dtype=kind) for value in values]
+    same = len({len(value) for value in lists}) == 1
+    return np.array(lists) if same else lists or np.zeros((0, width), dtype=kind)
 
 
 class _Copy:
@@ -225,13 +243,9 @@ class _Copy:
 
     def add(self, record: Any) -> None:
         if isinstance(record, Message):
-            self.writer.add_message(
-                self.channels[record.channel_id],
-                log_time=record.log_time,
-                data=record.data,
-                publish_time=record.publish_time,
-                sequence=record.sequence,
-            )
+            times = {"log_time": record.log_time, "publish_time": record.publish_time}
+            number = self.channels[record.channel_id]
+            self.writer.add_message(number, data=record.data, sequence=record.sequence, **times)
             self.messages += 1
         elif isinstance(record, Schema) and record.id not in self.schemas:
             self.schemas[record.id] = self.writer.register_schema(record.name, record.encoding, record.data)

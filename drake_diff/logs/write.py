@@ -33,7 +33,7 @@ def write_mcap(
 ) -> None:
     """Write `channels` to `path`; attachments are name: (media type, data).
 
-    Written chunk by chunk beside `path`, and moved into place when whole. InputError where a time decreases.
+    Written chunk by chunk beside `path`, and moved into place once it is whole. InputError if a time decreases.
     """
     with whole_file(path) as file:
         writer = start(file)
@@ -66,14 +66,8 @@ def _timed(rank: int, channel: Channel) -> Iterator[tuple[int, int, int, Any]]:
 
 
 def _register(writer: Writer, channel: Channel) -> int:
-    descriptor = channel.message_class.DESCRIPTOR
-    schema = writer.register_schema(
-        name=descriptor.full_name, encoding="protobuf", data=_descriptor_set(channel.message_class)
-    )
+    descriptors: FileDescriptorSet = build_file_descriptor_set(channel.message_class)
+    data = bytes(descriptors.SerializeToString(deterministic=True))
+    schema = writer.register_schema(name=channel.message_class.DESCRIPTOR.full_name, encoding="protobuf", data=data)
     metadata = {key: json.dumps(value, sort_keys=True) for key, value in sorted(channel.metadata.items())}
     return int(writer.register_channel(channel.topic, "protobuf", schema, metadata))
-
-
-def _descriptor_set(message_class: Any) -> bytes:
-    found: FileDescriptorSet = build_file_descriptor_set(message_class)
-    return bytes(found.SerializeToString(deterministic=True))
