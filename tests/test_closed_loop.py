@@ -202,6 +202,49 @@ def test_a_controller_that_fails_ends_the_run_or_is_replaced(cart):
     np.testing.assert_allclose(kept.motion.xs[-1, 1], 6 * H / MASS, rtol=1e-12)
 
 
+class Stubborn:
+    """Any exception of a user's code, of a call or of the start."""
+
+    def __init__(self, where):
+        self.where = where
+
+    def start(self, x0):
+        if self.where == "start":
+            raise KeyError("no such gain")
+
+    def __call__(self, x, t):
+        if self.where == "call" and t > 0.055:
+            raise KeyError("no such gain")
+        return [1.0]
+
+
+@pytest.mark.parametrize(("where", "steps"), [("start", 0), ("call", 6)])
+def test_whatever_a_controller_raises_is_its_own_failure(cart, where, steps):
+    alone = closed_loop(cart, Stubborn(where), [0.0, 0.0], 20)
+    assert alone.controller_error == "KeyError: 'no such gain'"
+    assert alone.ended == f"at t = {steps * H:.4g} s: the controller failed: KeyError: 'no such gain'"
+    assert len(alone.times) == steps
+    kept = closed_loop(cart, Stubborn(where), [0.0, 0.0], 20, Loop(fallback=Fallback("stop")))
+    assert (kept.ended, kept.controller_error) == ("", "")
+    assert kept.controller_status[6] == "the controller failed: KeyError: 'no such gain'"
+    np.testing.assert_allclose(kept.motion.xs[-1, 1], steps * H / MASS, rtol=1e-12)
+
+
+def test_ctrl_c_in_a_controller_is_no_failure_of_it(cart):
+    def interrupted(x, t):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        closed_loop(cart, interrupted, [0.0, 0.0], 20)
+
+
+def test_a_loop_is_shown_in_a_few_lines(cart):
+    shown = repr(closed_loop(cart, Stubborn("call"), [0.0, 0.0], 500))
+    assert shown.splitlines()[0] == "closed loop: 6 steps of the controller, 6 of the plant"
+    assert "broke off at t = 0.06 s: the controller failed" in shown
+    assert len(shown.splitlines()) == 4
+
+
 def test_latency_is_measured_and_changes_nothing(cart):
     import time
 

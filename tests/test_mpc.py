@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.loops import tracking
 from helpers.models import MODELS
 from helpers.plants import block
 from helpers.problems import A30, OTHERS, lqr, riccati
@@ -9,7 +10,6 @@ from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 
 import drake_diff as dd
 from drake_diff.exceptions import GradientError, InputError, SimulationError
-from drake_diff.loop.run import tracking
 from drake_diff.model.step import advance
 from drake_diff.optimize.replay import missed_goal, regulator_weights
 

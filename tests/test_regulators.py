@@ -9,6 +9,7 @@ import functools
 
 import numpy as np
 import pytest
+from helpers.loops import tracking
 from helpers.models import MODELS
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
@@ -19,7 +20,6 @@ from pydrake.systems.controllers import (
 from pydrake.trajectories import PiecewisePolynomial
 
 import drake_diff as dd
-from drake_diff.loop.run import tracking
 from drake_diff.optimize.replay import missed_goal, regulator_weights
 
 NAMES = ("cart_pole", "acrobot")

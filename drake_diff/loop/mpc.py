@@ -1,9 +1,9 @@
-"""Model predictive control: a few iLQR steps over a horizon that moves on, from the estimate, warm from the last plan.
+"""Model predictive control by a few iLQR steps over a horizon that moves on, warm-started from the last plan.
 
-The horizon ends at the problem's end at the latest, and where it ends before, it ends in the cost-to-go of the problem
-about a plan of the whole: with linear dynamics and quadratic costs the horizon's length then changes nothing. A hard
-goal cannot be kept in a few steps, so that there it is a cost: that of staying at the goal from the end on under LQR.
-After the end that is what is minimized; without a goal, the problem's own costs over the moving horizon.
+Where the horizon ends before the problem does, it ends in the problem's cost-to-go about a plan of the whole: with
+linear dynamics and quadratic costs its length then changes nothing. A hard goal cannot be kept in a few steps, so it
+becomes a cost: that of staying at the goal from the end on under LQR. After the problem's end that cost is minimized;
+without a goal, the problem's own costs over the moving horizon.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +15,6 @@ from drake_diff._base.arrays import Array, finite_array, positive_int
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, InputError
 from drake_diff.loop.run import OK
-from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import LQR
 from drake_diff.optimize.ilqr.ilqr import check_problem, costs_to_go, solve_ilqr
@@ -28,26 +27,38 @@ from drake_diff.optimize.solve import solve
 
 TOLERANCE = 1e-8
 PLAN_ITERATIONS = 500  # of the first plan, made once
-# Of the plan's mean cost a step: what being off the goal by a whole range costs in a step that stays there. As a cost
-# the goal is missed by about 0.2 % of a range where the cart-pole swings up; ten times less weight, by 1 %.
+# What one step costs that is off the goal by a whole range, in units of the plan's mean cost of a step. With it the
+# cart-pole's swing-up misses its goal by about 0.2 % of a range; with a tenth of it, by 1 %.
 STAY = 1e4
 
 
 class MPC:
-    """u (nu,) = mpc(x (nx,), t [s]): the first input of a plan over at most `horizon` steps of the problem's model.
+    """A controller, u (nu,) = mpc(x (nx,), t [s]): the first input of a plan over the next steps of a problem.
 
-    t is taken to the nearest step of the problem, whatever the period of the calls. It plans again each `replan_every`
-    steps, in at most `max_iterations` iLQR steps, and gives the plan's inputs as they are in between. `plan` is a
-    Solution or (xs (N+1, nx), us (N, nu)) to begin with; without one the problem is solved. Input bounds are kept;
-    state bounds as well as so few steps can, and one that the estimate is beyond is where the estimate is.
+    `t` is rounded to a step of the problem. Input bounds are kept; state bounds as well as a few iLQR steps can keep
+    them. `status` is "ok" where the last plan is a minimum, or else what the solver said of it; where no plan could be
+    made, the last one is followed further and `status` says why. The same calls give the same bytes, because no clock
+    is read.
 
-    `status` is "ok" where the last plan is a minimum, else what the solver said of it; where there was no plan to be
-    made, the last one is followed further and `status` says so and why. The same calls give the same bytes: no clock
-    is read. `start` forgets all but the first plan.
+    Args:
+        problem: with given x0, without waypoints, constraints or a free horizon.
+        horizon: how many steps are planned; fewer where the problem ends before.
+        plan: a Solution or (xs (N+1, nx), us (N, nu)) to start from; where None, the problem is solved.
+        replan_every: after how many steps there is a new plan.
+        max_iterations: how many iLQR steps a plan may take.
 
-    Raises InputError and its kin for a problem with waypoints, constraints, a free horizon or initial state, a goal
-    with free entries or that no input within the bounds holds, and where the plan without `plan` is not found;
-    GradientError or SimulationError where the whole cannot be planned from `plan`. Calls raise nothing of the kind.
+    Raises:
+        InputError: the problem has something that MPC cannot keep, a goal with free entries or one that no input
+            within the bounds holds, or it is not solved and no `plan` is given.
+        GradientError, SimulationError: the whole cannot be planned from `plan`.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
+        >>> cost = dd.QuadraticCost(Q=np.eye(2), R=np.eye(1))
+        >>> problem = dd.Problem(model, x0=[0.3, 0], num_steps=10, running_cost=cost)
+        >>> mpc = dd.loop.MPC(problem, horizon=5, plan=(np.zeros((11, 2)), np.zeros((10, 1))))
+        >>> mpc([0.3, 0.0], t=0.0).shape, mpc.status
+        ((1,), 'ok')
     """
 
     def __init__(
@@ -65,7 +76,7 @@ class MPC:
         self.start(problem.x0)
 
     def start(self, x0: Array) -> None:
-        """Forget everything but the first plan, whatever `x0` (nx,) is: the first call plans from its estimate."""
+        """Forget all but the first plan; the first call plans from its own estimate, whatever `x0` (nx,) is."""
         self._begin, (self._xs, self._us) = 0, self._reference
         self._fresh = True
         self.status = OK
@@ -77,7 +88,7 @@ class MPC:
         return np.array(self._input(k))
 
     def _replan(self, x: Any, k: int) -> None:
-        """From step `k` on, or the last plan moved on to it where none can be made."""
+        """Plan from step `k` on; where that fails, keep the last plan, moved on to `k`."""
         count = self._count(k)
         xs = np.array([self._state(i) for i in range(k, k + count + 1)])
         us = np.array([self._input(i) for i in range(k, k + count)])
@@ -128,13 +139,13 @@ class MPC:
         limits = replace(self._limits, max_iterations=PLAN_ITERATIONS)
         result, xs, us = solve_ilqr(self._problem, xs, us, limits=limits, report=None)
         if result.outcome not in (Outcome.SOLVED, Outcome.INACCURATE):
-            raise InputError("plan", got=result.message, expected="one from which iLQR finds a minimum")
+            raise InputError("plan", got=result.message, expected="a plan from which iLQR finds a minimum")
         return xs, us
 
 
 @dataclass(frozen=True, eq=False)
 class _Staying:
-    """How the goal `x` is stayed at, by the input `u`; `final` is what staying costs from a state near it."""
+    """Staying at the goal `x` by the input `u`; `final` is what staying costs from a state nearby."""
 
     x: Array
     u: Array
@@ -146,10 +157,12 @@ def _staying(problem: Problem, xs: Array, us: Array) -> _Staying:
     """Regulation at the goal: Bryson's weights along the plan, in the unit of its mean cost a step, and LQR's tail."""
     model, goal, bounds = problem.model, np.asarray(problem.x_goal), problem.bounds
     if np.any(np.isnan(goal)):
-        raise InputError("x_goal", got="free entries", expected="a whole state to be stayed at, or a final_cost")
-    u = _holding_input(model, goal)
+        raise InputError("x_goal", got="free entries", expected="a whole state, or a final_cost in its place")
+    # The input that comes closest to a step from the goal to itself; without contact the step is linear in it.
+    d = differentiate_step(model, goal, np.zeros(model.nu))
+    u = np.asarray(np.linalg.lstsq(d.B, goal - d.x_next, rcond=None)[0])
     if np.any(u < bounds.u_lower) or np.any(u > bounds.u_upper):
-        raise InputError("x_goal", got=f"held by u = {u}", expected="one that inputs within the bounds hold")
+        raise InputError("x_goal", got=f"held by u = {u}", expected="a state that inputs within their bounds can hold")
     plan = Plan(problem, problem.parameters, model.time_step, held(xs, us), False)
     cost = problem.objective(xs, us)
     unit = STAY * (cost if cost > 0 else 1.0) / problem.num_steps
@@ -158,12 +171,6 @@ def _staying(problem: Problem, xs: Array, us: Array) -> _Staying:
     h, Q, P = model.time_step, to_tangent.T @ Q @ to_tangent, to_tangent.T @ regulator.cost_to_go @ to_tangent
     running = QuadraticCost(Q=Q / h, R=R / h, x_ref=goal, u_ref=u)
     return _Staying(goal, u, running, QuadraticCost(Q=(P + P.T) / 2, x_ref=goal))
-
-
-def _holding_input(model: Model, goal: Array) -> Array:
-    """(nu,) the input that comes closest to a step from the goal to itself, which is linear in it without contact."""
-    d = differentiate_step(model, goal, np.zeros(model.nu))
-    return np.asarray(np.linalg.lstsq(d.B, goal - d.x_next, rcond=None)[0])
 
 
 def _without_goal(problem: Problem, stay: _Staying | None) -> Problem:
@@ -179,7 +186,9 @@ def _first_plan(problem: Problem, plan: Any) -> tuple[Array, Array]:
     if plan is None:
         plan = solve(problem)
         if not plan.success:
-            raise InputError("problem", got=f"solve: {plan.message}", expected="one that is solved, or a plan")
+            raise InputError(
+                "problem", got=f"solve: {plan.message}", expected="a problem that `solve` solves, or a plan"
+            )
     if isinstance(plan, Solution):
         plan = (plan.xs, plan.us)
     if not (isinstance(plan, (tuple, list)) and len(plan) == 2):
@@ -194,6 +203,6 @@ def _check(problem: Problem) -> None:
     check_problem(problem)
     for subject in ("horizon", "waypoints", "constraints"):
         if getattr(problem, subject):
-            raise InputError(subject, got="given", expected="none for MPC, which cannot keep it")
+            raise InputError(subject, got="given", expected="none: MPC cannot keep it")
     if not problem.initial_state_is_given:
-        raise InputError("optimize", got=list(problem.optimize), expected='"controls" for MPC')
+        raise InputError("optimize", got=list(problem.optimize), expected='("controls",) for MPC')

@@ -1,11 +1,4 @@
-"""What a controller sees of the state: noisy, biased, late, at its own rate, and at times not at all.
-
-From what a sensor gives to the state that a controller acts on: the seam where an estimator goes in.
-
-What becomes of a command: held, late, weaker, slow and limited.
-
-What a loop does where its controller cannot be followed: hold, damp or stop, until it can be again.
-"""
+"""What stands around a controller: sensor, estimator, actuator, and a fallback for where the controller fails."""
 
 from collections import deque
 from collections.abc import Callable
@@ -22,15 +15,31 @@ from drake_diff.model.step import advance
 from drake_diff.model.tangent import TangentSpace
 from drake_diff.motion.policy import PD
 
+MODES = ("hold", "damp", "stop")
 Reader = Callable[[int, Array], Array | None]
+Drive = Callable[[int, Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """y = plus(x, bias + noise N(0, 1)) of every `every`-th state, `delay` steps late, lost with probability `dropout`.
+    """Measures the state with noise and bias, at its own rate, late, and with samples lost.
 
-    `noise` (standard deviation) and `bias` are a number or (nt,), in the units of the tangent space; steps are the
-    controller's. The first state is taken to be known until a sample arrives.
+    A sample is y = plus(x, bias + noise N(0, 1)), on the tangent space of the state. The first state is taken to be
+    known until a sample arrives.
+
+    Args:
+        noise: standard deviation, a number or (nt,), in the units of the tangent space.
+        bias: a number or (nt,), in the same units.
+        delay: by how many of the controller's steps a sample is late.
+        every: a sample is taken in each `every`-th step of the controller.
+        dropout: the probability that a sample is lost, in [0, 1).
+
+    Raises:
+        InputError: a number is out of its range.
+
+    Example:
+        >>> dd.loop.Sensor(noise=0.01, delay=2).delay
+        2
     """
 
     noise: ArrayLike = 0.0
@@ -52,6 +61,7 @@ class Sensor:
         samples: list[Array | None] = []
 
         def read(k: int, x: Array) -> Array | None:
+            # Drawn in every step, so that another rate or dropout leaves the noise of the other steps as it is.
             shift, kept = noise * random.standard_normal(space.size), random.uniform() >= self.dropout
             due = k % self.every == 0 and (kept or k == 0)
             samples.append(space.plus(x, bias + shift) if due else None)
@@ -61,7 +71,7 @@ class Sensor:
 
 
 class Estimator(Protocol):
-    """One estimate a step. `start` is called before each run, so that nothing is left of the run before."""
+    """Makes one estimate a step. `start` is called before each run, so that nothing is left of the run before."""
 
     def start(self, x0: Array) -> None:
         """Forget everything; `x0` (nx,) is the state that is known to begin with."""
@@ -73,7 +83,14 @@ class Estimator(Protocol):
 
 
 class Hold:
-    """The last thing that was seen."""
+    """The estimator that takes the last sample for the state.
+
+    Example:
+        >>> hold = dd.loop.Hold()
+        >>> hold.start([1.0, 2.0])
+        >>> hold.estimate(None, None)
+        [1.0, 2.0]
+    """
 
     def start(self, x0: Array) -> None:
         self._last = x0
@@ -84,9 +101,23 @@ class Hold:
 
 
 class Predictor:
-    """The last thing seen, `delay` steps old, rolled forward through `model` under the commands since.
+    """The estimator that rolls the last sample forward through a model, under the commands since it was taken.
 
     It makes up for a known delay of the sensor, and for lost samples.
+
+    Args:
+        model: the plant as the estimator knows it.
+        delay: how many steps old a sample is when it arrives.
+
+    Raises:
+        InputError: `delay` is not a whole number of at least 0.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> loop = dd.loop.Loop(sensor=dd.loop.Sensor(delay=5), estimator=dd.loop.Predictor(model, 5))
+        >>> run = dd.loop.closed_loop(model, lambda x, t: [-5 * x[0]], x0=[0.5, 0], num_steps=20, loop=loop)
+        >>> bool(np.allclose(run.estimates, run.motion.xs[:-1]))
+        True
     """
 
     def __init__(self, model: Model, delay: int):
@@ -110,15 +141,26 @@ class Predictor:
         return x
 
 
-Drive = Callable[[int, Array], Array]
-
-
 @dataclass(frozen=True, eq=False)
 class Actuator:
-    """Every `every`-th command, `delay` steps late, clipped to `lower` and `upper`, times `strength`, through a lag.
+    """Applies commands late, at its own rate, limited, weaker, and through a lag of first order.
 
-    The lag is first order with the time constant `lag` [s]: u+ = u + (1 - exp(-H / lag)) (command - u), H the
-    controller's period. Numbers or (nu,). Nothing is applied before the first command arrives.
+    In each step of the controller, of length H, what is applied moves towards the command that has arrived:
+    u+ = u + (1 - exp(-H / lag)) (strength clip(command, lower, upper) - u). Before that, nothing is applied.
+
+    Args:
+        delay: by how many of the controller's steps a command is late.
+        every: a command is taken over in each `every`-th step of the controller.
+        lower, upper: limits of the commands, numbers or (nu,), in the units of the input.
+        strength: factor on the commands, a number or (nu,).
+        lag: time constant [s].
+
+    Raises:
+        InputError: a number is out of its range.
+
+    Example:
+        >>> dd.loop.Actuator(upper=10.0, lower=-10.0, lag=0.05).lag
+        0.05
     """
 
     delay: int = 0
@@ -153,15 +195,23 @@ class Actuator:
         return drive
 
 
-MODES = ("hold", "damp", "stop")
-
-
 @dataclass(frozen=True, eq=False)
 class Fallback:
-    """It takes over where the controller fails, or nothing was seen for more than `patience` steps.
+    """Takes over where the controller fails, or where nothing was measured for more than `patience` steps.
 
-    hold: the last command; damp: -damping v at the actuated joints [N s/m or N m s/rad], of the estimate; stop: no
-    effort.
+    Args:
+        mode: "hold" repeats the last command, "damp" applies -damping v at the actuated joints, with v from the
+            estimate, "stop" applies nothing.
+        patience: how many steps of the controller without a measurement are borne.
+        damping: of "damp", [N s/m] or [N m s/rad].
+
+    Raises:
+        UnknownNameError: there is no such mode.
+        InputError: `patience` is not a whole number of at least 0.
+
+    Example:
+        >>> dd.loop.Fallback("damp", damping=2.0).patience
+        10
     """
 
     mode: Literal["hold", "damp", "stop"] = "stop"

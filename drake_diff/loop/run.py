@@ -1,15 +1,14 @@
-"""A controller on the discrete plant: through a sensor, an estimator and an actuator, pushed, and with a fallback.
+"""A controller on the discrete plant, through sensor, estimator and actuator, under pushes, with a fallback.
 
     x_k -> sensor -> estimator -> controller -> actuator -> plant -> x_(k+1)
 
-The controller has its own period, a whole number of the plant's steps. All randomness comes from one seed. How long
-the controller takes is measured and told; what is simulated does not depend on it.
-
-Controllers that need no more than a plan: its inputs as they are, or TVLQR about it.
+The controller has its own period, a whole number of the plant's steps. All randomness comes from one seed. The time
+that the controller takes is measured, but what is simulated does not depend on it.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from html import escape
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -18,15 +17,13 @@ from numpy.typing import ArrayLike
 from pydrake.multibody.tree import JacobianWrtVariable
 
 from drake_diff._base.arrays import Array, count, finite_array, frozen, positive_float, positive_int
-from drake_diff.exceptions import DrakeDiffError, InputError, NonFiniteError, SimulationError, UnknownNameError
+from drake_diff.exceptions import InputError, NonFiniteError, SimulationError, UnknownNameError
 from drake_diff.loop.parts import Actuator, Estimator, Fallback, Hold, Sensor
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies
 from drake_diff.model.step import advance, set_state
 from drake_diff.model.tangent import tangent_space
-from drake_diff.motion.rollout import Meter, Policy, Rollout
-from drake_diff.optimize.replay import track
-from drake_diff.optimize.solution import Solution
+from drake_diff.motion.rollout import Meter, Rollout
 
 Controller = Callable[[Array, float], Any]  # u (nu,) = controller(x (nx,), t [s])
 OK = "ok"
@@ -34,11 +31,48 @@ OK = "ok"
 
 @dataclass(frozen=True, eq=False)
 class Push:
-    """A blow of `impulse` (3,) [N s] in world at the centre of mass of `body`, at time `at` [s]."""
+    """A blow at the centre of mass of a body.
+
+    Args:
+        body: the body's name.
+        impulse: (3,) [N s], in the world frame.
+        at: simulated time [s].
+
+    Example:
+        >>> dd.loop.Push("cart", impulse=[0.5, 0, 0], at=1.0).body
+        'cart'
+    """
 
     body: str
     impulse: ArrayLike
     at: float
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """What stands around a controller: by default a perfect sensor and actuator.
+
+    Args:
+        sensor: what is measured of the state.
+        estimator: makes the state that the controller is given from what was measured.
+        actuator: what becomes of the controller's commands.
+        fallback: what takes over where the controller fails; None ends the run there.
+        pushes: blows to the plant.
+        substeps: how many of the plant's steps one step of the controller takes.
+        latency_budget: [s] that the controller may take for an answer; only counted, see `ClosedLoop.late`.
+
+    Example:
+        >>> dd.loop.Loop(sensor=dd.loop.Sensor(noise=0.01), substeps=2).substeps
+        2
+    """
+
+    sensor: Sensor = field(default_factory=Sensor)
+    estimator: Estimator = field(default_factory=Hold)
+    actuator: Actuator = field(default_factory=Actuator)
+    fallback: Fallback | None = None
+    pushes: Sequence[Push] = ()
+    substeps: int = 1
+    latency_budget: float | None = None
 
 
 class LoopEvent(NamedTuple):
@@ -51,9 +85,16 @@ class LoopEvent(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
-    """What happened; arrays are read-only, rows of the controller's steps unless said otherwise.
+    """What happened in a loop: one row for each step of the controller, in read-only arrays.
 
-    `motion` is the plant's, step by step of the plant, with its measures. `ended` is "" or why the run broke off.
+    `motion` has the plant's own steps. `ended` is "" or says when and why the run broke off, and `controller_error`
+    is "" or the type and message of the controller's exception that ended it.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> run = dd.loop.closed_loop(model, lambda x, t: [-x[0] - x[1]], x0=[0.1, 0], num_steps=50)
+        >>> run.commands.shape, run.motion.xs.shape, run.ended
+        ((50, 1), (51, 2), '')
     """
 
     motion: Rollout
@@ -67,57 +108,107 @@ class ClosedLoop:
     latencies: Array  # (N,) [s] that the controller took, on this machine
     latency_budget: float | None
     ended: str
+    controller_error: str
 
     @property
     def late(self) -> int:
         """How many of the controller's answers took longer than the budget; 0 without one."""
         return 0 if self.latency_budget is None else int(np.sum(self.latencies > self.latency_budget))
 
+    def __repr__(self) -> str:
+        ok = self.controller_status.count(OK)
+        lines = [
+            f"closed loop: {len(self.times)} steps of the controller, {len(self.motion.us)} of the plant",
+            f"  controller: ok in {ok} steps, otherwise in {len(self.times) - ok}; {len(self.events)} events",
+            f"  last state: {np.array2string(self.motion.xs[-1], precision=4, threshold=20)}",
+        ]
+        return "\n".join(lines + ([f"  broke off {self.ended}"] if self.ended else []))
 
-@dataclass(frozen=True, eq=False)
-class Loop:
-    """What stands around a controller. `substeps` of the plant are taken in each step of the controller."""
-
-    sensor: Sensor = field(default_factory=Sensor)
-    estimator: Estimator = field(default_factory=Hold)
-    actuator: Actuator = field(default_factory=Actuator)
-    fallback: Fallback | None = None
-    pushes: Sequence[Push] = ()
-    substeps: int = 1
-    latency_budget: float | None = None  # [s]
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def closed_loop(
     model: Model, controller: Controller, x0: ArrayLike, num_steps: int, loop: Loop | None = None, *, seed: int = 0
 ) -> ClosedLoop:
-    """Run `controller` on the plant `model` for `num_steps` of its steps from `x0` (nx,).
+    """Simulate a controller on the plant, with all that stands around it.
 
-    A controller with an attribute `start` has it called first, with `x0`; one with an attribute `status` is asked
-    for it after each step. Raises ShapeError, NonFiniteError, InputError, UnknownNameError for bad input; a step that
-    cannot be taken, or a controller that fails without a fallback, ends the run, and `ended` says so.
+    Args:
+        model: the plant.
+        controller: u (nu,) = controller(x (nx,), t [s]). Its method `start(x0)`, where it has one, is called first;
+            its attribute `status`, where it has one, is recorded after each step.
+        x0: (nx,) the first state.
+        num_steps: how many steps of the controller.
+        loop: sensor, estimator, actuator, fallback and pushes; ideal ones where None.
+        seed: of all randomness. The same seed gives the same run.
+
+    Returns:
+        The motion, and what was measured, estimated, commanded and applied. A step that the plant cannot take, or a
+        controller that raises or answers nonsense without a fallback, ends the run: `ended` says why.
+
+    Raises:
+        ShapeError, NonFiniteError: `x0` or an impulse is not an array of the right shape of finite numbers.
+        UnknownNameError: a push names an unknown body.
+        InputError: another argument is wrong.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> loop = dd.loop.Loop(actuator=dd.loop.Actuator(upper=0.5, lower=-0.5))
+        >>> run = dd.loop.closed_loop(model, lambda x, t: [2.0], x0=[0, 0], num_steps=3, loop=loop)
+        >>> run.applied[:, 0]
+        array([0.5, 0.5, 0.5])
     """
     x0, steps = finite_array("x0", x0, (model.nx,)), positive_int("num_steps", num_steps)
-    run = _Run(model, controller, loop or Loop(), np.random.default_rng(seed))
-    return run.result(x0, steps)
+    return _LoopRun(model, controller, loop or Loop(), np.random.default_rng(seed)).result(x0, steps)
 
 
-class _Run:
+class OpenLoop:
+    """Plays inputs whatever the state is: u = us[k], k = round(t / time_step), the last one held after the end.
+
+    Args:
+        us: (N, nu) the inputs.
+        time_step: [s] between them.
+
+    Raises:
+        ShapeError, NonFiniteError, InputError: `us` is not N x nu finite numbers, N at least 1, or `time_step` not > 0.
+
+    Example:
+        >>> play = dd.loop.OpenLoop([[1.0], [2.0]], time_step=0.1)
+        >>> play([0, 0], 0.1), play([0, 0], 5.0)
+        (array([2.]), array([2.]))
+    """
+
+    def __init__(self, us: ArrayLike, time_step: float):
+        self.us, self.time_step = finite_array("us", us, ("N", "nu")), positive_float("time_step [s]", time_step)
+        if not len(self.us):
+            raise InputError("us", got="0 steps", expected="at least one step")
+
+    def __call__(self, x: Any, t: float) -> Any:
+        return self.us[min(max(round(t / self.time_step), 0), len(self.us) - 1)]
+
+
+class _LoopRun:
+    """One run under way."""
+
     def __init__(self, model: Model, controller: Controller, loop: Loop, random: np.random.Generator):
         self.model, self.controller, self.loop = model, controller, loop
         self.period = count("Loop.substeps", loop.substeps, 1) * model.time_step
         self.read = loop.sensor.start(tangent_space(model), random)
         self.drive = loop.actuator.start(model.nu, self.period)
-        self.pushes = [
-            (_step_of(p, model), _body(model, p), finite_array("impulse", p.impulse, (3,))) for p in loop.pushes
-        ]
+        self.pushes = [(*_place(p, model), finite_array("Push.impulse", p.impulse, (3,))) for p in loop.pushes]
         self.rows: list[tuple[Array, Array, Array, Array, str, float]] = []
         self.events: list[LoopEvent] = []
         self.unseen, self.in_charge, self.ended = 0, True, ""
+        self.start_error: Exception | None = None
+        self.controller_error = ""
 
     def result(self, x0: Array, num_steps: int) -> ClosedLoop:
         self.loop.estimator.start(x0)
-        if hasattr(self.controller, "start"):
-            self.controller.start(x0)
+        try:
+            if hasattr(self.controller, "start"):
+                self.controller.start(x0)
+        except Exception as error:  # as one of a call: see `_command`
+            self.start_error = error
         meter, xs = Meter(self.model), [x0]
         us: list[Array] = []
         for k in range(num_steps):
@@ -142,48 +233,48 @@ class _Run:
 
     def _decide(self, k: int, x: Array) -> Array | None:
         """What the actuator applies in step k; None where the run ends."""
-        t = k * self.period
+        fallback, t = self.loop.fallback, k * self.period
         seen = self.read(k, x)
         self.unseen = 0 if seen is not None else self.unseen + 1
         last = self.rows[-1][2] if self.rows else None
         estimate = self.loop.estimator.estimate(seen, last)
-        command, status, taken = self._command(estimate, t)
+        if fallback is not None and self.unseen > fallback.patience:
+            command, status, taken = None, f"nothing was seen for {self.unseen} steps", 0.0
+        else:
+            command, status, taken = self._command(estimate, t)
+        self._note_who_is_in_charge(command is not None, t, status)
         if command is None:
-            if self.loop.fallback is None:
+            if fallback is None:
                 self._end(k, status)
                 return None
-            command = self.loop.fallback.command(
-                self.model, estimate, np.zeros(self.model.nu) if last is None else last
-            )
-        self._change(t, status)
+            self.controller_error = ""
+            command = fallback.command(self.model, estimate, np.zeros(self.model.nu) if last is None else last)
         applied = self.drive(k, command)
         shown = np.full(self.model.nx, np.nan) if seen is None else seen
         self.rows.append((shown, estimate, command, applied, status, taken))
         return applied
 
     def _command(self, estimate: Array, t: float) -> tuple[Array | None, str, float]:
-        """The controller's answer, None with the reason where there is none to be followed; and its time [s]."""
-        fallback = self.loop.fallback
-        if fallback is not None and self.unseen > fallback.patience:
-            return None, f"nothing was seen for {self.unseen} steps", 0.0
-        start = perf_counter()
+        """The controller's answer, or None where it has none; its status; and the time that it took [s]."""
+        begin = perf_counter()
         try:
+            if self.start_error is not None:
+                raise self.start_error
             command = finite_array("the controller's command", self.controller(np.array(estimate), t), (self.model.nu,))
-        except (DrakeDiffError, ArithmeticError, np.linalg.LinAlgError) as error:
-            told = "it is not finite" if isinstance(error, NonFiniteError) else f"{type(error).__name__}: {error}"
-            return None, f"the controller failed: {told}", perf_counter() - start
-        return command, str(getattr(self.controller, "status", OK)), perf_counter() - start
+            status = str(getattr(self.controller, "status", OK))
+        except Exception as error:  # it is a user's code: whatever it raises is a failure of the controller, not ours
+            self.controller_error = f"{type(error).__name__}: {error}"
+            told = "it is not finite" if isinstance(error, NonFiniteError) else self.controller_error
+            return None, f"the controller failed: {told}", perf_counter() - begin
+        return command, status, perf_counter() - begin
 
-    def _change(self, t: float, status: str) -> None:
+    def _note_who_is_in_charge(self, controller: bool, t: float, status: str) -> None:
         """Events where the fallback takes over and where the controller recovers."""
-        followed = not status.startswith(("nothing was seen", "the controller failed"))
-        if followed != self.in_charge:
-            mode = "" if self.loop.fallback is None else self.loop.fallback.mode
-            kind, told = (
-                ("recovery", "the controller is followed again") if followed else ("fallback", f"{mode}: {status}")
-            )
-            self.events.append(LoopEvent(t, kind, told))
-        self.in_charge = followed
+        if controller and not self.in_charge:
+            self.events.append(LoopEvent(t, "recovery", "the controller is followed again"))
+        elif self.in_charge and not controller and self.loop.fallback is not None:
+            self.events.append(LoopEvent(t, "fallback", f"{self.loop.fallback.mode}: {status}"))
+        self.in_charge = controller
 
     def _end(self, k: int, why: str) -> None:
         self.ended = f"at t = {k * self.period:.4g} s: {why}"
@@ -206,15 +297,15 @@ class _Run:
         return x
 
     def _told(self, motion: Rollout) -> ClosedLoop:
-        nx, nu, count = self.model.nx, self.model.nu, len(self.rows)
+        nx, nu, steps = self.model.nx, self.model.nu, len(self.rows)
         columns = list(zip(*self.rows, strict=True)) or [()] * 6
         seen, estimates, commands, applied = (
-            frozen(np.array(column, dtype=float).reshape(count, size))
+            frozen(np.array(column, dtype=float).reshape(steps, size))
             for column, size in zip(columns, (nx, nx, nu, nu), strict=False)
         )
         return ClosedLoop(
             motion=motion,
-            times=frozen(self.period * np.arange(count)),
+            times=frozen(self.period * np.arange(steps)),
             observations=seen,
             estimates=estimates,
             commands=commands,
@@ -224,43 +315,15 @@ class _Run:
             latencies=frozen(np.array(columns[5], dtype=float)),
             latency_budget=self.loop.latency_budget,
             ended=self.ended,
+            controller_error=self.controller_error,
         )
 
 
-def _body(model: Model, push: Push) -> Any:
+def _place(push: Push, model: Model) -> tuple[int, Any]:
+    """The step of the plant at which a push comes, and the body that it hits."""
     plant = model.plant
-    if not plant.HasBodyNamed(push.body):
-        raise UnknownNameError("Push.body", got=push.body, known=tuple(b.name() for b in bodies(plant)))
-    return plant.GetBodyByName(push.body)
-
-
-def _step_of(push: Push, model: Model) -> int:
     if not (np.isfinite(push.at) and push.at >= 0):
         raise InputError("Push.at", got=push.at, expected="a time [s] of at least 0")
-    return round(push.at / model.time_step)
-
-
-class OpenLoop:
-    """u = us[k], k = round(t / time_step) within 0..N-1, whatever x is: the last input is held after the end.
-
-    `us` (N, nu), `time_step` [s].
-    """
-
-    def __init__(self, us: ArrayLike, time_step: float):
-        self.us, self.time_step = finite_array("us", us, ("N", "nu")), positive_float("time_step [s]", time_step)
-        if not len(self.us):
-            raise InputError("us", got="0 steps", expected="at least one step")
-
-    def __call__(self, x: Any, t: float) -> Any:
-        return self.us[min(max(round(t / self.time_step), 0), len(self.us) - 1)]
-
-
-def tracking(solution: Solution, parts: int = 1) -> Policy:
-    """TVLQR about `solution` in steps of a `parts`-th of its own, clipped to the problem's input bounds.
-
-    A collocated motion may need 2 to 16 parts before the plant's steps follow it. The weights are those of the
-    solution's own replays (`replay.regulator_weights`). Raises GradientError or ModelError where the plant cannot be
-    linearized along the plan or built at that time step.
-    """
-    plan = solution.plan
-    return track(plan, plan.model_at(parts), *plan.sample(positive_int("parts", parts)))
+    if not plant.HasBodyNamed(push.body):
+        raise UnknownNameError("Push.body", got=push.body, known=tuple(b.name() for b in bodies(plant)))
+    return round(push.at / model.time_step), plant.GetBodyByName(push.body)
