@@ -18,51 +18,6 @@ SAME_NUMBER: dict[Precision, float] = {"float64": 1e-9, "float32": 1e-5}
 # Below any inertia that matters: what MuJoCo gives a point mass, 2e-15 kg m^2, and rounding of zeros.
 NOTHING: dict[Precision, float] = {"float64": 1e-12, "float32": 1e-6}
 RANDOM_STATES = 5
-
-
-@dataclass(frozen=True)
-class ContractLine:
-    """One thing that two engines must share: "equal", "mapped" (and how), or "different" (and why).
-
-    `reason` is why an engine cannot have it, where it is the engine's doing; it stands in the detail too.
-    """
-
-    quantity: str
-    verdict: Verdict
-    detail: str
-    reason: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.verdict:9} {self.quantity}: {self.detail}"
-
-
-def match_contracts(a: Engine, b: Engine) -> tuple[ContractLine, ...]:
-    """A line per quantity of the contracts of `a` and `b`, M(q) and bias at random states among them.
-
-    "different" is the model's doing (a mass that is another) or the engine's (a contact law that it has not); the
-    detail gives both values, the place, and the engine's reason where it has one.
-    """
-    one, two = a.contract, b.contract
-    return (
-        _order(one, two),
-        *(_joint_line(one, two, quantity, read) for quantity, read in JOINT_NUMBERS.items()),
-        _numbers(one, two, "gravity", one.gravity, two.gravity, "[m/s^2]"),
-        _actuation(one, two),
-        _effort_limits(one, two),
-        *_dynamics(a, b, one, two),
-        _numbers(one, two, "time step", (one.time_step,), (two.time_step,), "[s]"),
-        _text(one, two, "integrator", one.integrator, two.integrator),
-        _state(one, two),
-        _limit_law(one, two),
-        _contact_law(one, two),
-        _contact_pairs(one, two),
-        _solver_tolerance(one, two),
-        _text(one, two, "reset", one.reset, two.reset),
-        _scalar_type(one, two),
-        _derivatives(one, two),
-    )
-
-
 JOINT_NUMBERS: dict[str, Callable[[JointContract], tuple[Any, ...]]] = {
     "joint types": lambda j: (j.kind,),
     "frames": lambda j: (*j.axis, *j.anchor),
@@ -76,14 +31,232 @@ JOINT_NUMBERS: dict[str, Callable[[JointContract], tuple[Any, ...]]] = {
 }
 
 
-def _coarser(one: EngineContract, two: EngineContract) -> Precision:
-    return "float32" if "float32" in (one.precision, two.precision) else "float64"
+@dataclass(frozen=True)
+class ContractLine:
+    """One thing that two engines must share, and whether they do.
+
+    Attributes:
+        quantity: what is compared, such as "mass" or "contact law".
+        verdict: "equal", "mapped" (the same in other coordinates; `detail` says how) or "different".
+        detail: the common value, or both values, their place, and the reason where there is one.
+        reason: why an engine cannot have what the other has; empty where the model itself differs.
+
+    Example:
+        >>> print(dd.engines.ContractLine("time step", "equal", "0.01 [s]"))
+        equal     time step: 0.01 [s]
+    """
+
+    quantity: str
+    verdict: Verdict
+    detail: str
+    reason: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.verdict:9} {self.quantity}: {self.detail}"
 
 
-def _same(a: Any, b: Any, precision: Precision) -> bool:
-    if isinstance(a, str) or isinstance(b, str) or not (math.isfinite(a) and math.isfinite(b)):
-        return bool(a == b)
-    return abs(a - b) <= max(NOTHING[precision], SAME_NUMBER[precision] * max(abs(a), abs(b)))
+def match_contracts(a: Engine, b: Engine) -> tuple[ContractLine, ...]:
+    """Compare what two engines simulate, quantity by quantity, before either takes a step.
+
+    M(q) and the bias forces are compared at random states, everything else as the engines report it.
+
+    Args:
+        a: one engine, from `load_engine`; its values come first in the details.
+        b: another engine on the same model.
+
+    Returns:
+        A line per quantity. A line that is "different" has no reason where the model differs (another mass), and the
+        reason where the engine cannot have what the other has (another contact law).
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> drake, hand = (dd.engines.load_engine(name, model) for name in ("drake", "numpy"))
+        >>> lines = dd.engines.match_contracts(drake, hand)
+        >>> print([line.quantity for line in lines if line.verdict == "different"])
+        []
+    """
+    match = _Match(a, b)
+    one, two = match.one, match.two
+    return (
+        match.order(),
+        *(match.joints(quantity, read) for quantity, read in JOINT_NUMBERS.items()),
+        match.numbers("gravity", one.gravity, two.gravity, "[m/s^2]"),
+        match.actuation(),
+        match.effort_limits(),
+        *match.dynamics(),
+        match.numbers("time step", (one.time_step,), (two.time_step,), "[s]"),
+        match.text("integrator", one.integrator, two.integrator),
+        match.state(),
+        match.limit_law(),
+        match.text("contact law", one.contact_law, two.contact_law),
+        match.contact_pairs(),
+        match.solver_tolerance(),
+        match.text("reset", one.reset, two.reset),
+        match.scalar_type(),
+        match.derivatives(),
+    )
+
+
+class _Match:
+    """The lines of two engines' contracts, `one` and `two`, compared in the coarser arithmetic of both."""
+
+    def __init__(self, a: Engine, b: Engine):
+        self.engines = a, b
+        self.one, self.two = self.contracts = a.contract, b.contract
+        self.precision: Precision = "float32" if "float32" in [c.precision for c in self.contracts] else "float64"
+
+    def same(self, a: Any, b: Any) -> bool:
+        if isinstance(a, str) or isinstance(b, str) or not (math.isfinite(a) and math.isfinite(b)):
+            return bool(a == b)
+        return abs(a - b) <= max(NOTHING[self.precision], SAME_NUMBER[self.precision] * max(abs(a), abs(b)))
+
+    def both(self, a: object, b: object) -> str:
+        return f"{self.one.engine}: {a}; {self.two.engine}: {b}"
+
+    def different(self, quantity: str, what: str) -> ContractLine:
+        """With the reason of the engine that has one."""
+        reason = self.one.reasons.get(quantity) or self.two.reasons.get(quantity) or ""
+        return ContractLine(quantity, "different", f"{what}; {reason}" if reason else what, reason)
+
+    def text(self, quantity: str, a: str, b: str) -> ContractLine:
+        return ContractLine(quantity, "equal", a) if a == b else self.different(quantity, self.both(a, b))
+
+    def numbers(self, quantity: str, a: tuple[Any, ...], b: tuple[Any, ...], unit: str = "") -> ContractLine:
+        if len(a) == len(b) and all(map(self.same, a, b)):
+            return ContractLine(quantity, "equal", f"{_values(a)} {unit}".strip())
+        return self.different(quantity, f"{self.both(_values(a), _values(b))} {unit}".strip())
+
+    def order(self) -> ContractLine:
+        quantity = "joint order and names"
+        a, b = (tuple(j.name for j in contract.joints) for contract in self.contracts)
+        if a != b:
+            return self.numbers(quantity, a, b)
+        inside = [contract.native_order for contract in self.contracts]
+        if inside[0] != inside[1]:
+            return ContractLine(quantity, "mapped", f"by name, from {self.both(*map(_values, inside))}")
+        return ContractLine(quantity, "equal", _values(a))
+
+    def joints(self, quantity: str, read: Callable[[JointContract], tuple[Any, ...]]) -> ContractLine:
+        """By name, so that another order is reported once and not in every line."""
+        others = {j.name: j for j in self.two.joints}
+        common = [j for j in self.one.joints if j.name in others]
+        if not common:
+            return ContractLine(quantity, "different", "no joint has the same name in both")
+        lines = {j.name: self.numbers(quantity, read(j), read(others[j.name])) for j in common}
+        wrong = {name: line for name, line in lines.items() if line.verdict == "different"}
+        if not wrong:
+            return ContractLine(quantity, "equal", "of " + ", ".join(lines))
+        detail = "; ".join(f"{name}: {line.detail}" for name, line in wrong.items())
+        return ContractLine(quantity, "different", detail, next(iter(wrong.values())).reason)
+
+    def actuation(self) -> ContractLine:
+        quantity, inputs = "actuator mapping", self.one.inputs
+        if inputs != self.two.inputs:
+            return self.numbers(quantity, inputs, self.two.inputs)
+        if not inputs:
+            return ContractLine(quantity, "equal", "no inputs")
+        a, b = _forces_by_joint(self.one), _forces_by_joint(self.two)
+        wrong = [
+            f"{self.one.engine}: {name} drives {a[name]}; {self.two.engine}: {b[name]}"
+            for name in inputs
+            if a[name].keys() != b[name].keys() or not all(self.same(gain, b[name][j]) for j, gain in a[name].items())
+        ]
+        if wrong:
+            return self.different(quantity, "; ".join(wrong))
+        return ContractLine(quantity, "equal", "; ".join(f"{name} drives {a[name]}" for name in inputs))
+
+    def effort_limits(self) -> ContractLine:
+        if not self.one.inputs and not self.two.inputs:
+            return ContractLine("effort limits", "equal", "no inputs")
+        return self.numbers("effort limits", self.one.effort_limits, self.two.effort_limits)
+
+    def dynamics(self) -> tuple[ContractLine, ContractLine]:
+        """M and bias at random states, each engine asked in Drake's coordinates."""
+        kinds = [j.kind for j in self.one.joints]
+        if kinds != [j.kind for j in self.two.joints]:
+            why = "not comparable: the joints are of other types"
+            return ContractLine("M(q)", "different", why), ContractLine("bias(q, v)", "different", why)
+        random, (a, b) = np.random.default_rng(0), self.engines
+        states = [_random_state(kinds, random) for _ in range(RANDOM_STATES)]
+        return (
+            self.term("M(q)", [(q,) for q, _ in states], a.mass_matrix, b.mass_matrix),
+            self.term("bias(q, v)", states, a.bias, b.bias),
+        )
+
+    def term(
+        self, quantity: str, states: Sequence[tuple[Array, ...]], a: Callable[..., Array], b: Callable[..., Array]
+    ) -> ContractLine:
+        worst, entry, same = 0.0, "", SAME_NUMBER[self.precision]
+        for state in states:
+            try:
+                x, y = a(*state), b(*state)
+            except NotOfferedError as error:
+                return ContractLine(quantity, "different", f"not comparable: {error}", str(error))
+            gap = np.abs(x - y) / max(float(np.abs(x).max()), NOTHING[self.precision] / same)
+            where = np.unravel_index(int(np.argmax(gap)), gap.shape)
+            if not gap[where] <= worst:
+                values = self.both(f"{x[where]:.10g}", f"{y[where]:.10g}")
+                worst, entry = float(gap[where]), f"entry {[int(i) for i in where]}, {values}"
+        within = f"to {worst:.1e} of its largest entry at {RANDOM_STATES} random states"
+        if worst <= same:
+            return ContractLine(quantity, "equal", within)
+        return ContractLine(quantity, "different", f"{within}, {entry}")
+
+    def state(self) -> ContractLine:
+        quantity, (a, b) = "state of a free body", (contract.state for contract in self.contracts)
+        if not any(j.kind == "quaternion_floating" for c in self.contracts for j in c.joints):
+            return ContractLine(quantity, "equal", "no free body")
+        return ContractLine(quantity, "equal", a) if a == b else ContractLine(quantity, "mapped", self.both(a, b))
+
+    def limit_law(self) -> ContractLine:
+        if not self.limited():
+            return ContractLine("limit law", "equal", "no joint is limited")
+        return self.text("limit law", self.one.limit_law, self.two.limit_law)
+
+    def limited(self) -> bool:
+        """Whether any joint of either is."""
+        return any(math.isfinite(side) for c in self.contracts for j in c.joints for side in (j.lower, j.upper))
+
+    def contact_pairs(self) -> ContractLine:
+        quantity = "contact pairs"
+        a, b = ({pair.names: pair for pair in c.contacts} for c in self.contracts)
+        if a.keys() != b.keys():
+            only = sorted(str(names) for names in a.keys() ^ b.keys())
+            return self.different(quantity, f"{self.both(len(a), len(b))}; only in one: {only}")
+        wrong = [
+            f"{names}: friction {x.friction} and {y.friction} [1], stiffness {x.stiffness} and {y.stiffness} [N/m]"
+            for names, x, y in ((names, a[names], b[names]) for names in a)
+            if not all(map(self.same_of_contact, (x.friction, x.stiffness), (y.friction, y.stiffness)))
+        ]
+        if wrong:
+            return self.different(quantity, "; ".join(wrong))
+        return ContractLine(quantity, "equal", f"{len(a)} pairs, friction and stiffness at rest" if a else "none")
+
+    def same_of_contact(self, a: float | None, b: float | None) -> bool:
+        """A value that neither gives is the same default only where the contact law is the same."""
+        if a is None or b is None:
+            return a is b and self.one.contact_law == self.two.contact_law
+        return self.same(a, b)
+
+    def solver_tolerance(self) -> ContractLine:
+        if not self.limited() and not any(c.contacts for c in self.contracts):
+            return ContractLine("solver tolerance", "equal", "nothing to solve: neither contact nor limits")
+        told = ("none" if c.solver_tolerance is None else f"{c.solver_tolerance:g}" for c in self.contracts)
+        return self.text("solver tolerance", *told)
+
+    def scalar_type(self) -> ContractLine:
+        a, b = (contract.precision for contract in self.contracts)
+        if a == b:
+            return ContractLine("scalar type", "equal", a)
+        return ContractLine("scalar type", "different", self.both(a, b), f"its arithmetic is {self.precision}")
+
+    def derivatives(self) -> ContractLine:
+        quantity, told = "derivative convention", [contract.derivatives for contract in self.contracts]
+        if told[0] == told[1]:
+            return ContractLine(quantity, "equal", told[0])
+        if "none" in told:
+            return ContractLine(quantity, "different", self.both(*told), "it offers no derivatives")
+        return ContractLine(quantity, "mapped", self.both(*told))
 
 
 def _values(values: tuple[Any, ...]) -> str:
@@ -91,126 +264,14 @@ def _values(values: tuple[Any, ...]) -> str:
     return shown[0] if len(shown) == 1 else "(" + ", ".join(shown) + ")"
 
 
-def _difference(one: EngineContract, two: EngineContract, quantity: str, what: str) -> ContractLine:
-    reason = one.reasons.get(quantity) or two.reasons.get(quantity) or ""
-    return ContractLine(quantity, "different", f"{what}; {reason}" if reason else what, reason)
-
-
-def _text(one: EngineContract, two: EngineContract, quantity: str, a: str, b: str) -> ContractLine:
-    if a == b:
-        return ContractLine(quantity, "equal", a)
-    return _difference(one, two, quantity, f"{one.engine}: {a}; {two.engine}: {b}")
-
-
-def _numbers(
-    one: EngineContract, two: EngineContract, quantity: str, a: tuple[Any, ...], b: tuple[Any, ...], unit: str = ""
-) -> ContractLine:
-    precision = _coarser(one, two)
-    if len(a) == len(b) and all(_same(x, y, precision) for x, y in zip(a, b, strict=True)):
-        return ContractLine(quantity, "equal", f"{_values(a)} {unit}".strip())
-    return _difference(one, two, quantity, f"{one.engine}: {_values(a)}; {two.engine}: {_values(b)} {unit}".strip())
-
-
-def _order(one: EngineContract, two: EngineContract) -> ContractLine:
-    a, b = (tuple(j.name for j in contract.joints) for contract in (one, two))
-    if a != b:
-        return _numbers(one, two, "joint order and names", a, b)
-    if one.native_order != two.native_order:
-        inside = f"{one.engine}: {_values(one.native_order)}; {two.engine}: {_values(two.native_order)}"
-        return ContractLine("joint order and names", "mapped", f"by name, from {inside}")
-    return ContractLine("joint order and names", "equal", _values(a))
-
-
-def _joint_line(
-    one: EngineContract, two: EngineContract, quantity: str, read: Callable[[JointContract], tuple[Any, ...]]
-) -> ContractLine:
-    """By name, so that another order is named once and not in every line."""
-    others = {j.name: j for j in two.joints}
-    wrong, named = [], []
-    for joint in one.joints:
-        if joint.name in others:
-            line = _numbers(one, two, quantity, read(joint), read(others[joint.name]))
-            wrong += [line] if line.verdict == "different" else []
-            named += [f"{joint.name}: {line.detail}"] if line.verdict == "different" else []
-    if wrong:
-        return ContractLine(quantity, "different", "; ".join(named), wrong[0].reason)
-    common = [j.name for j in one.joints if j.name in others]
-    if not common:
-        return ContractLine(quantity, "different", "no joint has the same name in both")
-    return ContractLine(quantity, "equal", "of " + ", ".join(common))
-
-
-def _actuation(one: EngineContract, two: EngineContract) -> ContractLine:
-    quantity = "actuator mapping"
-    if one.inputs != two.inputs:
-        return _numbers(one, two, quantity, one.inputs, two.inputs)
-    if not one.inputs:
-        return ContractLine(quantity, "equal", "no inputs")
-    a, b, precision = _by_joint(one), _by_joint(two), _coarser(one, two)
-    wrong = [
-        f"{one.engine}: {name} drives {a.get(name, {})}; {two.engine}: {b.get(name, {})}"
-        for name in one.inputs
-        if a[name].keys() != b[name].keys()
-        or not all(_same(gain, b[name][j], precision) for j, gain in a[name].items())
-    ]
-    if wrong:
-        return _difference(one, two, quantity, "; ".join(wrong))
-    return ContractLine(quantity, "equal", "; ".join(f"{name} drives {a[name]}" for name in one.inputs))
-
-
-def _by_joint(contract: EngineContract) -> dict[str, dict[str, float]]:
+def _forces_by_joint(contract: EngineContract) -> dict[str, dict[str, float]]:
     """Of each input, the generalized force per unit by joint."""
     owners = [name for j in contract.joints for name in [j.name] * (6 if j.kind == "quaternion_floating" else 1)]
     rows = list(zip(owners, contract.actuation, strict=True))
     return {name: {joint: row[i] for joint, row in rows if row[i]} for i, name in enumerate(contract.inputs)}
 
 
-def _effort_limits(one: EngineContract, two: EngineContract) -> ContractLine:
-    if not one.inputs and not two.inputs:
-        return ContractLine("effort limits", "equal", "no inputs")
-    return _numbers(one, two, "effort limits", one.effort_limits, two.effort_limits)
-
-
-def _dynamics(a: Engine, b: Engine, one: EngineContract, two: EngineContract) -> tuple[ContractLine, ContractLine]:
-    """M and bias at random states, each engine asked in Drake's coordinates."""
-    kinds = [j.kind for j in one.joints]
-    if kinds != [j.kind for j in two.joints]:
-        why = "not comparable: the joints are of other types"
-        return ContractLine("M(q)", "different", why), ContractLine("bias(q, v)", "different", why)
-    random = np.random.default_rng(0)
-    states = [random_state(kinds, random) for _ in range(RANDOM_STATES)]
-    return (
-        _term(one, two, "M(q)", [(q,) for q, _ in states], a.mass_matrix, b.mass_matrix),
-        _term(one, two, "bias(q, v)", states, a.bias, b.bias),
-    )
-
-
-def _term(
-    one: EngineContract,
-    two: EngineContract,
-    quantity: str,
-    states: Sequence[tuple[Array, ...]],
-    of_one: Callable[..., Array],
-    of_two: Callable[..., Array],
-) -> ContractLine:
-    worst, entry, precision = 0.0, "", _coarser(one, two)
-    for state in states:
-        try:
-            x, y = of_one(*state), of_two(*state)
-        except NotOfferedError as error:
-            return ContractLine(quantity, "different", f"not comparable: {error}", str(error))
-        gap = np.abs(x - y) / max(float(np.abs(x).max()), NOTHING[precision] / SAME_NUMBER[precision])
-        where = np.unravel_index(int(np.argmax(gap)), gap.shape)
-        if not gap[where] <= worst:
-            entry = f"entry {[int(i) for i in where]}, {one.engine}: {x[where]:.10g}; {two.engine}: {y[where]:.10g}"
-            worst = float(gap[where])
-    within = f"to {worst:.1e} of its largest entry at {RANDOM_STATES} random states"
-    if worst <= SAME_NUMBER[precision]:
-        return ContractLine(quantity, "equal", within)
-    return ContractLine(quantity, "different", f"{within}, {entry}")
-
-
-def random_state(kinds: list[str], random: np.random.Generator) -> tuple[Array, Array]:
+def _random_state(kinds: list[str], random: np.random.Generator) -> tuple[Array, Array]:
     """q and v of joints of these kinds, in Drake's coordinates, quaternions of norm 1."""
     q: list[float] = []
     nv = 0
@@ -223,73 +284,3 @@ def random_state(kinds: list[str], random: np.random.Generator) -> tuple[Array, 
             q.append(float(random.standard_normal()))
             nv += 1
     return np.array(q), random.standard_normal(nv)
-
-
-def _state(one: EngineContract, two: EngineContract) -> ContractLine:
-    quantity = "state of a free body"
-    if not any(j.kind == "quaternion_floating" for c in (one, two) for j in c.joints):
-        return ContractLine(quantity, "equal", "no free body")
-    if one.state == two.state:
-        return ContractLine(quantity, "equal", one.state)
-    return ContractLine(quantity, "mapped", f"{one.engine}: {one.state}; {two.engine}: {two.state}")
-
-
-def _has_limits(contract: EngineContract) -> bool:
-    return any(math.isfinite(side) for j in contract.joints for side in (j.lower, j.upper))
-
-
-def _limit_law(one: EngineContract, two: EngineContract) -> ContractLine:
-    if not (_has_limits(one) or _has_limits(two)):
-        return ContractLine("limit law", "equal", "no joint is limited")
-    return _text(one, two, "limit law", one.limit_law, two.limit_law)
-
-
-def _contact_law(one: EngineContract, two: EngineContract) -> ContractLine:
-    return _text(one, two, "contact law", one.contact_law, two.contact_law)
-
-
-def _contact_pairs(one: EngineContract, two: EngineContract) -> ContractLine:
-    quantity = "contact pairs"
-    a, b = ({pair.names: pair for pair in c.contacts} for c in (one, two))
-    if a.keys() != b.keys():
-        only = sorted(str(names) for names in a.keys() ^ b.keys())
-        return _difference(one, two, quantity, f"{one.engine}: {len(a)}; {two.engine}: {len(b)}; only in one: {only}")
-    law = one.contact_law == two.contact_law  # then a value that neither gives is the same default
-    precision = _coarser(one, two)
-    wrong = [
-        f"{names}: friction {x.friction} and {y.friction} [1], stiffness {x.stiffness} and {y.stiffness} [N/m]"
-        for names, x, y in ((names, a[names], b[names]) for names in a)
-        if not all(_same_value(m, n, law, precision) for m, n in ((x.friction, y.friction), (x.stiffness, y.stiffness)))
-    ]
-    if wrong:
-        return _difference(one, two, quantity, "; ".join(wrong))
-    return ContractLine(quantity, "equal", f"{len(a)} pairs, friction and stiffness at rest" if a else "none")
-
-
-def _same_value(a: float | None, b: float | None, same_default: bool, precision: Precision) -> bool:
-    return a is b and same_default if a is None or b is None else _same(a, b, precision)
-
-
-def _solver_tolerance(one: EngineContract, two: EngineContract) -> ContractLine:
-    quantity = "solver tolerance"
-    if not any(_has_limits(c) or c.contacts for c in (one, two)):
-        return ContractLine(quantity, "equal", "nothing to solve: neither contact nor limits")
-    a, b = ("none" if c.solver_tolerance is None else f"{c.solver_tolerance:g}" for c in (one, two))
-    return _text(one, two, quantity, a, b)
-
-
-def _scalar_type(one: EngineContract, two: EngineContract) -> ContractLine:
-    if one.precision == two.precision:
-        return ContractLine("scalar type", "equal", one.precision)
-    what = f"{one.engine}: {one.precision}; {two.engine}: {two.precision}"
-    return ContractLine("scalar type", "different", what, f"its arithmetic is {_coarser(one, two)}")
-
-
-def _derivatives(one: EngineContract, two: EngineContract) -> ContractLine:
-    quantity = "derivative convention"
-    if one.derivatives == two.derivatives:
-        return ContractLine(quantity, "equal", one.derivatives)
-    what = f"{one.engine}: {one.derivatives}; {two.engine}: {two.derivatives}"
-    if "none" in (one.derivatives, two.derivatives):
-        return ContractLine(quantity, "different", what, "it offers no derivatives")
-    return ContractLine(quantity, "mapped", what)

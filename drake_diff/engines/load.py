@@ -1,4 +1,4 @@
-"""Engines by name, imported only when asked for."""
+"""Engines by name, imported only when they are asked for."""
 
 from importlib import import_module
 from typing import Any
@@ -21,29 +21,37 @@ ENGINES = {
 
 # Tools that people ask for and that are no engine here, and why.
 ELSEWHERE = {
-    "isaaclab": "it needs an environment of its own: drake-diff export-model, then compare what it recorded",
-    "isaacsim": "it stands behind a licence prompt: drake-diff export-model, then compare what it recorded",
-    "gazebo": "it has no Python package: drake-diff export-model, then compare what it recorded",
+    "isaaclab": "it needs its own Python environment: run drake-diff export-model, record there, and compare the file",
+    "isaacsim": "it requires a licence to be accepted: run drake-diff export-model, record there, and compare the file",
+    "gazebo": "it has no Python package: run drake-diff export-model, record there, and compare the file",
     "control": "python-control has no multibody dynamics: it checks linearizations, their poles and LQR gains",
-    "opencv": "it has no part in dynamics: it works on images",
-    "gtsam": "it has no part in dynamics: it estimates from measurements",
+    "opencv": "it works on images and has no dynamics",
+    "gtsam": "it estimates from measurements and has no dynamics",
 }
 
 
-def load_spec(spec: str, model: Model) -> Engine:
-    """The engine of a name, or Drake's "drake:CONTACT" or "drake:CONTACT:METHOD", as in drake:lagged:implicit."""
-    name, *chosen = spec.split(":")
-    if chosen and (name != "drake" or len(chosen) > 2):
-        raise InputError("engine", got=spec, expected="a name, drake:CONTACT or drake:CONTACT:METHOD")
-    return load_engine(name, model, **dict(zip(("contact", "method"), chosen, strict=False)))
-
-
 def load_engine(name: str, model: Any, **options: Any) -> Engine:
-    """The engine `name`, one of ENGINES, on `model`, a Model or for numpy also a ClosedForm.
+    """Build `model` in another simulator, in Drake's coordinates.
 
-    Options: contact and method of drake, path (an MJCF of your own) of mujoco and mjx, time_step [s] of a ClosedForm.
-    Raises MissingDependencyError, with what to install, where the engine is not there, and ModelError, naming the
-    element, where it cannot have the model.
+    Args:
+        name: "numpy", "drake", "mujoco", "mjx", "pinocchio", "casadi", "newton", "pybullet" or "sapien".
+        model: the `Model`; "numpy" also takes a closed form of `engines.closed_form`.
+        **options: "drake" takes `contact` ("sap", "similar", "lagged") and `method` (of `differentiate_step`);
+            "mujoco" and "mjx" take `path`, an MJCF file of your own; a closed form needs `time_step` [s].
+
+    Returns:
+        An `Engine`: step, Jacobians, energy, mass matrix and contract of the model in that simulator.
+
+    Raises:
+        UnknownNameError: there is no engine of that name; the message lists those there are.
+        MissingDependencyError: the engine is not installed; the message says how to install it.
+        ModelError: the engine cannot have this model; the message names the element.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> hand = dd.engines.load_engine("numpy", model)
+        >>> print(round(hand.energy([np.pi, 0.0]) - hand.energy([0.0, 0.0]), 2))
+        9.81
     """
     if name in ELSEWHERE:
         raise MissingDependencyError(f"{name} is no engine here: {ELSEWHERE[name]}")
@@ -52,3 +60,11 @@ def load_engine(name: str, model: Any, **options: Any) -> Engine:
     module, kind = ENGINES[name]
     engine: Engine = getattr(import_module(f"drake_diff.{module}"), kind)(model, **options)
     return engine
+
+
+def load_spec(spec: str, model: Model) -> Engine:
+    """The engine of a name, or Drake's "drake:CONTACT" or "drake:CONTACT:METHOD", as in drake:lagged:implicit."""
+    name, *chosen = spec.split(":")
+    if chosen and (name != "drake" or len(chosen) > 2):
+        raise InputError("engine", got=spec, expected="a name, drake:CONTACT or drake:CONTACT:METHOD")
+    return load_engine(name, model, **dict(zip(("contact", "method"), chosen, strict=False)))
