@@ -1,1 +1,1 @@
-"""HTML pages, plots and Meshcat scenes of anything that moves; they know no records."""
+"""HTML pages that open from a disk: their templates, the plots on them, and motions drawn by Drake's Meshcat."""

@@ -1,150 +1,105 @@
-"""What a page of HTML may do in a browser: run the scripts that it was written with, and nothing from the network.
+"""Pages of HTML that open from a disk and ask nothing of the network: data in, `templates/*.html.j2` around it.
 
-The parts of our pages: everything that comes from a model, a file or a record is escaped here.
+Names from models, files and records are untrusted text. Templates escape whatever they print (autoescape), data for
+scripts is JSON that cannot close its script element, and only our own scripts and style sheets, from `assets/`, are
+marked as safe. The content policy of a page then lets the browser run those scripts alone, by their hashes, so that a
+script that got into the page all the same is refused.
 """
 
 import base64
-import html
-import json
 import re
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
+from functools import cache
 from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
-from urllib.parse import quote
+from typing import TYPE_CHECKING, Any
 
 from drake_diff._base.files import write_whole
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+SCRIPTS = ("uPlot.iife.min.js", "report.js")
+# Fields of a record that are not embedded: wall-clock times differ from run to run, and neither the hash of this page
+# nor the hash of the record that holds it can be in the page.
+APART = ("wall_clock", "files", "record_sha256")
 
 _SCRIPT = re.compile(r"<script(?![^>]*application/json)[^>]*>(.*?)</script>", re.DOTALL)
 
 
-def content_policy(*pages: str) -> str:
-    """The meta element that lets exactly the scripts in `pages` run, by their hashes, and lets nothing be fetched."""
-    scripts = dict.fromkeys(script for page in pages for script in _SCRIPT.findall(page) if script)
-    hashes = [base64.b64encode(sha256(script.encode()).digest()).decode() for script in scripts]
-    policy = "; ".join(
-        [
-            "default-src 'none'",
-            "script-src " + " ".join(f"'sha256-{found}'" for found in hashes),
-            "style-src 'unsafe-inline'",
-            "img-src data: blob:",
-            "connect-src data:",  # the viewer fetches its own data out of the page
-            "base-uri 'none'",
-            "form-action 'none'",
-        ]
-    )
-    return f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
-
-
-Row = Sequence[Any]
-
-
 def write_page(
-    path: Path, title: str, body: str, data: Mapping[str, Any], record: Mapping[str, Any], view: str = ""
+    path: Path, template: str, *, record: Mapping[str, Any], data: Mapping[str, Any], view: str = "", **facts: Any
 ) -> None:
-    """Write one page: `body` with plots of `data` (see `report_data`), `record` to be downloaded, the replay `view`.
+    """Render one page and write it.
 
-    A page without `view` has neither `stage` nor `slider`.
+    Args:
+        path: The file to write.
+        template: A name in `templates/`, of one that extends base.html.j2.
+        record: The record of what the page shows, as plain data. A reader can download it from the page, without the
+            fields `APART`.
+        data: What `report.js` draws: see `plots.page_data`.
+        view: The page of the replay (see `meshcat.write_replay`), shown in a frame; "" where the page has no motion.
+        facts: What else the template asks for.
+
+    Raises:
+        jinja2.UndefinedError: If the template asks for a name that is not there.
     """
-    embedded = script_json("data", data) + script_json("record", record)
-    scripts = "".join(f"<script>{asset(name)}</script>\n" for name in ("uPlot.iife.min.js", "report.js"))
-    style = asset("uPlot.min.css") + asset("report.css")
-    head = (
-        f'<meta charset="utf-8">\n{content_policy(view, scripts)}\n<meta name="viewport" content="width=device-width">'
-    )
-    page = (
-        f"{head}\n<title>{escaped(title)}</title>\n<style>{style}</style>\n</head><body>\n{body}\n{embedded}{scripts}"
-        "</body></html>\n"
-    )
-    write_whole(path, ('<!doctype html>\n<html lang="en"><head>\n' + page).encode())
+    embedded = {key: value for key, value in record.items() if key not in APART}
+    scripts = [asset(name) for name in SCRIPTS]
+    hashes = script_hashes(view, *(f"<script>{script}</script>" for script in scripts))
+    values = {"record": record, "embedded": embedded, "data": data, "view": view, "scripts": scripts, "hashes": hashes}
+    write_whole(path, render(template, **values, **facts).encode())
 
 
-def stage(view: str, caption: str) -> str:
-    """The replay with what is to be seen in it, and the plots beside it."""
-    return (
-        '<div class="stage"><section id="motion"><h2>Motion</h2>'
-        f'<iframe id="view" title="the motion in 3D" srcdoc="{html.escape(view)}"></iframe>'
-        f'<p class="note">{escaped(caption)}</p>'
-        '<img id="still" alt="the motion at the time of the slider"></section>'
-        f"<section><h2>Plots</h2>{plots('plots')}</section></div>"
-    )
+def content_policy(page: str) -> str:
+    """The meta element that lets exactly the scripts in `page` run, and lets nothing be fetched."""
+    return render("content_policy.html.j2", hashes=script_hashes(page))
+
+
+def script_hashes(*pages: str) -> list[str]:
+    """SHA-256 in base64 of every script in `pages`, as a content policy names them; JSON is no script."""
+    scripts = dict.fromkeys(script for page in pages for script in _SCRIPT.findall(page) if script)
+    return [base64.b64encode(sha256(script.encode()).digest()).decode() for script in scripts]
 
 
 def asset(name: str) -> str:
-    return files("drake_diff").joinpath("assets", name).read_text(encoding="utf-8")
+    """The text of one of our own scripts or style sheets."""
+    return files("drake_diff.pages").joinpath("assets", name).read_text(encoding="utf-8")
 
 
-def script_json(name: str, value: Any) -> str:
-    """JSON that no text in it can end early."""
-    text = json.dumps(value, sort_keys=True, allow_nan=False, separators=(",", ":"))
-    text = text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-    return f'<script type="application/json" id="{name}">{text}</script>\n'
+def render(template: str, **values: Any) -> str:
+    """A template with `values` in it, each escaped; a name that is missing is an error, not an empty place."""
+    return _environment().get_template(template).render(values)
 
 
-def slider(end: float) -> str:
-    """The time that the view and the plots follow; it stays in sight."""
-    return (
-        '<div class="controls bar"><button id="play" type="button" aria-label="play or pause">▶</button>'
-        f'<input id="time" type="range" aria-label="time" min="0" max="{end!r}" step="any" value="0">'
-        '<output id="now" for="time">0 s</output></div>'
+@cache
+def _environment() -> "Environment":
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # loaded when the first page is written
+
+    environment = Environment(
+        loader=PackageLoader("drake_diff.pages"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-
-
-class Mark(str):
-    """A text in the colour of its verdict."""
-
-    kind: str
-
-    def __new__(cls, kind: str, text: str) -> "Mark":
-        mark = super().__new__(cls, text)
-        mark.kind = kind
-        return mark
-
-
-class Link(str):
-    """A text that leads to a file beside the page."""
-
-    target: str
-
-    def __new__(cls, target: str, text: str) -> "Link":
-        link = super().__new__(cls, text)
-        link.target = target
-        return link
-
-
-def section(title: str, body: str) -> str:
-    return f"<section><h2>{escaped(title)}</h2>{body}</section>"
-
-
-def plots(place: str) -> str:
-    """Where the plots go whose `place` this is."""
-    return f'<div id="{escaped(place)}" class="plots"></div>'
-
-
-def table(head: Sequence[str], rows: Iterable[Row]) -> str:
-    top = "".join(f'<th scope="col">{escaped(name)}</th>' for name in head) if any(head) else ""
-    lines = ["<tr>" + "".join(_cell(cell) for cell in row) + "</tr>" for row in rows]
-    return f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
-
-
-def _cell(cell: Any) -> str:
-    mark = f' class="{cell.kind}"' if isinstance(cell, Mark) else ""
-    text = f'<a href="{escaped(quote(cell.target))}">{escaped(cell)}</a>' if isinstance(cell, Link) else escaped(cell)
-    return f"<td{mark}>{text}</td>"
-
-
-def escaped(value: Any) -> str:
-    return html.escape(str(value))
+    # tojson writes <, >, & and ' as \u003c and so on: no text can end the script element that it is in.
+    environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "allow_nan": False, "separators": (",", ":")}
+    environment.filters.update(short=short_number, words=in_words, phrase=phrase, shell=shlex.join)
+    environment.globals["asset"] = asset
+    return environment
 
 
 def phrase(key: str) -> str:
+    """A field's name as words."""
     return str(key).replace("_", " ")
 
 
-def short_number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.6g}"
+def short_number(value: float | None, digits: int = 6) -> str:
+    """A number with so many significant digits; a dash where there is none."""
+    return "–" if value is None else f"{value:.{digits}g}"
 
 
 def in_words(value: Any) -> str:
@@ -156,15 +111,3 @@ def in_words(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return short_number(value) if value is None or isinstance(value, float) else str(value)
-
-
-def provenance(record: Mapping[str, Any]) -> str:
-    found, clock = record["provenance"], record["wall_clock"]
-    rows = [(phrase(key), in_words(value)) for key, value in found.items() if key != "command"]
-    times = ", ".join(f"{phrase(key)} {in_words(value)}" for key, value in clock.items() if value is not None)
-    return (
-        f"<p>To reproduce:</p><pre>{escaped(shlex.join(found['command']))}</pre>"
-        + table(("", ""), rows)
-        + '<p class="controls"><button id="download" type="button">Download the record (JSON)</button></p>'
-        + f'<p id="wall-clock" class="note">Wall clock: {escaped(times)}</p>'
-    )

@@ -1,29 +1,85 @@
-"""What a page draws, as plain data for JSON: lines over time, iterations or levels, and certificates as heat maps."""
+"""What a page draws, as plain data for `report.js`: lines over time, iterations or levels, and heat maps."""
 
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from drake_diff.certificates.certificate import Certificate
+from drake_diff.certificates.certificate import VERDICTS, Certificate
 
 Plot = dict[str, Any]
 
 
-def plot(title: str, unit: str, x: Iterable[Any], series: Sequence[Plot], *, axis: str = "time", **rest: Any) -> Plot:
-    base = {"title": title, "unit": unit, "axis": axis, "x": numbers(x), "series": list(series)}
-    plain = {"log": False, "levels": False, "limits": [None, None], "note": "", "marks": "lines", "band": False}
-    return base | plain | {"place": "plots", "range": None} | rest
+def page_data(duration: float, plots: Iterable[Plot], certificates: Iterable[Certificate] = ()) -> dict[str, Any]:
+    """All that a page draws: `plots` (see `plot`) and a heat map of each of `certificates`, over `duration` [s]."""
+    return {
+        "duration": duration,
+        "plots": list(plots),
+        "certificates": [_certificate(c) for c in certificates],
+        "verdicts": list(VERDICTS),
+    }
+
+
+def plot(
+    title: str,
+    unit: str,
+    x: Iterable[Any],
+    series: Sequence[Plot],
+    *,
+    axis: str = "time",
+    place: str = "plots",
+    log: bool = False,
+    levels: bool = False,
+    limits: Sequence[float | None] = (None, None),
+    range: Sequence[float] | None = None,
+    marks: str = "lines",
+    band: bool = False,
+    note: str = "",
+) -> Plot:
+    """One plot of `series` (see `line`) over `x`.
+
+    Args:
+        title: What is plotted, as its heading.
+        unit: The unit of y.
+        x: (n,) where the series have their values.
+        series: The lines; a name shows in the legend.
+        axis: What x is: "time" [s] follows the slider, any other word is a label.
+        place: Where on the page: that of the template's macro `plots`.
+        log: Whether y has a logarithmic scale; what is not above 0 is left out.
+        levels: Whether x are the few levels of something, each a tick on a logarithmic scale.
+        limits: The lower and upper limit of y; what is beyond them is shaded.
+        range: The range of y, where it is not to follow the data.
+        marks: "lines", "points" or "both".
+        band: Whether to shade between the last two series.
+        note: A remark below the plot.
+    """
+    return {
+        "title": title,
+        "unit": unit,
+        "axis": axis,
+        "x": numbers(x),
+        "series": list(series),
+        "place": place,
+        "log": log,
+        "levels": levels,
+        "limits": list(limits),
+        "range": range,
+        "marks": marks,
+        "band": band,
+        "note": note,
+    }
 
 
 def line(name: str, y: Iterable[Any], *, dashed: bool = False, held: bool = False) -> Plot:
+    """A series of `y` (n,); `held` values are drawn as steps."""
     return {"name": name, "y": numbers(y), "dashed": dashed, "held": held}
 
 
 def numbers(values: Iterable[Any]) -> list[float | None]:
+    """`values` with eight digits, which is more than a screen shows; None where one is not finite."""
     return [float(f"{v:.8g}") if math.isfinite(v) else None for v in values]
 
 
-def certificate_data(c: Certificate) -> dict[str, Any]:
+def _certificate(c: Certificate) -> dict[str, Any]:
     return {
         "subject": c.subject,
         "method": c.method,

@@ -20,8 +20,8 @@ from drake_diff._base.arrays import positive_int
 from drake_diff._base.files import write_whole
 from drake_diff._base.statistics import Rate, success_rate
 from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.pages.html import Mark, Row, escaped, section, short_number, table, write_page
-from drake_diff.pages.plots import Plot, line, plot
+from drake_diff.pages.html import write_page
+from drake_diff.pages.plots import Plot, line, page_data, plot
 from drake_diff.studies.gradient_cases import CASES
 from drake_diff.studies.gradient_estimates import (
     ORDERS,
@@ -288,8 +288,7 @@ def save_gradient_panel(panel: GradientPanel, directory: str | Path) -> None:
     writer.writeheader()
     writer.writerows(rows)
     write_whole(folder / TABLE, text.getvalue().encode())
-    data = {"duration": 0.0, "plots": list(_plots(panel)), "certificates": [], "verdicts": []}
-    write_page(folder / PAGE, "gradient panel", "\n".join(_sections(panel)), data, record)
+    write_page(folder / PAGE, "gradient_panel.html.j2", record=record, data=page_data(0.0, _plots(panel)))
 
 
 def _plots(panel: GradientPanel) -> Iterable[Plot]:
@@ -310,48 +309,3 @@ def _loss_plot(panel: GradientPanel, found: CasePanel) -> Plot:
     note = f"smoothed by sigma = {found.sigmas[-1]:g}, mean over the seeds; above {found.case.goal:.4g} is not arrived"
     limits = [None, found.case.goal]
     return plot(f"{found.case.name}: loss", "f", x, losses, axis="evaluations", limits=limits, note=note)
-
-
-def _sections(panel: GradientPanel) -> Iterable[str]:
-    yield (
-        "<header><h1>Gradient panel</h1>"
-        '<p class="sentence">Gradients of a smoothed loss F(x) = E[f(x + w)], estimated from '
-        "derivatives (first order), values (zeroth order) or both (blend); point is the derivative without noise.</p>"
-        f'<p class="facts">{len(panel.cases)} cases · {panel.seeds} seeds of {panel.samples} samples · descents of '
-        f"{panel.budget} calls, {panel.batch} samples a step</p></header>"
-    )
-    yield section("Verdicts", "".join(_verdict(found) for found in panel.cases))
-    yield '<section><h2>Plots</h2><div id="plots" class="plots"></div></section>'
-    yield section("All numbers", _table(panel))
-    button = '<p class="controls"><button id="download" type="button">Download the record (JSON)</button></p>'
-    yield section("Record", button)
-
-
-def _verdict(found: CasePanel) -> str:
-    lines = "".join(f"<li>{escaped(sentence)}</li>" for sentence in found.verdict)
-    source = f"the truth is a {t}" if (t := found.truths[0].source) == "closed form" else f"the truth is {t}"
-    return f"<h3>{escaped(found.case.name)}</h3><p>{escaped(found.case.about)}; {escaped(source)}</p><ul>{lines}</ul>"
-
-
-def _table(panel: GradientPanel) -> str:
-    head = (
-        "case",
-        "order",
-        "sigma",
-        "variance",
-        "bias",
-        "in its errors",
-        "",
-        "cosine",
-        "mean squared error",
-        "arrived",
-    )
-    rows: list[Row] = []
-    for row in panel.rows():
-        errors = "exact" if row["bias_in_errors"] is None else f"{row['bias_in_errors']:.1f}"
-        numbers = [short_number(row[name]) for name in ("sigma", "variance", "bias")]
-        mark = Mark("fail", "biased") if row["biased"] else Mark("pass", "shows no bias")
-        cosine, error = short_number(row["cosine"]), short_number(row["mean_squared_error"])
-        arrived = "" if row["arrived"] is None else f"{row['arrived']} of {row['descents']}"
-        rows.append((row["case"], row["order"], *numbers, errors, mark, cosine, error, arrived))
-    return table(head, rows)

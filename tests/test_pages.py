@@ -1,0 +1,183 @@
+"""Pages from templates: whatever a name says, it is text; and no page says more than it was given."""
+
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+from helpers.browser import browsing, errors
+from helpers.models import MODELS
+
+import drake_diff as dd
+from drake_diff.artifact.live import scene_of_run
+from drake_diff.artifact.verify import recalled
+from drake_diff.pages import html
+from drake_diff.pages.html import render, write_page
+from drake_diff.studies.gradient_cases import wall
+
+PACKAGE = Path(dd.__file__).parent
+EVIL = "</script><script>document.title = 'evil'</script><img src=x onerror=\"document.title = 'evil'\">'"
+# What decides what is drawn where is not from a model or a file.
+OURS = ("verdict", "own", "direction", "axis", "marks", "codes", "verdicts")
+NAMED = ("seconds_per_step", "seconds_per_jacobian", "effects")  # their keys are names
+
+
+def poisoned(value, key=""):
+    """`value` with EVIL at the end of every text in it."""
+    if isinstance(value, dict):
+        return {k + EVIL if key in NAMED else k: v if k in OURS else poisoned(v, k) for k, v in value.items()}
+    if isinstance(value, list):
+        return [poisoned(v, key) for v in value]
+    return value + EVIL if isinstance(value, str) and (key, value) != ("place", "plots") else value
+
+
+def write_poisoned(path, template, *, record, data, view="", **facts):
+    kept = record.get("verdict")
+    record = poisoned(record) | ({} if kept is None else {"verdict": kept})
+    facts = {name: fact + EVIL if isinstance(fact, str) else fact for name, fact in facts.items()}
+    write_page(path, template, record=record, data=poisoned(data), view=view, **facts)
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """The path of each kind of page, with EVIL at the end of every text in its record and its plots."""
+    folder = tmp_path_factory.mktemp("pages")
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    cost = dd.QuadraticCost(R=[[1.0]])
+    solution = dd.solve(dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=cost), method="shooting")
+    with pytest.MonkeyPatch.context() as patch:
+        for room in ("artifact", "comparison", "trials"):
+            patch.setattr(f"drake_diff.{room}.page.write_page", write_poisoned)
+        patch.setattr("drake_diff.studies.gradient_study.write_page", write_poisoned)
+        dd.save(solution, folder / "run")
+        with recalled(folder / "run") as plan:
+            trials = dd.robustness(plan, {"mass": [0.02, 0.4]}, trials=2, controller="open_loop")
+            dd.trials.save_robustness(trials, folder / "trials", folder / "run")
+        dd.comparison.save_comparison(dd.compare(model, ("drake:lagged", "newton"), num_steps=5), folder / "engines")
+        dd.studies.save_gradient_panel(dd.studies.gradient_panel([wall()], seeds=2), folder / "panel")
+    found = {
+        "report": folder / "run/report.html",
+        "robustness": folder / "trials/robustness.html",
+        "comparison": folder / "engines/comparison.html",
+        "gradient_panel": folder / "panel/gradient_panel.html",
+    }
+    assert all(path.is_file() for path in found.values())
+    return found
+
+
+PAGES = ("report", "robustness", "comparison", "gradient_panel")
+
+
+def elements(page):
+    """Every element that a browser would make of `page`, the replay's own page apart."""
+    from html.parser import HTMLParser
+
+    found = []
+    parser = HTMLParser()
+    parser.handle_starttag = lambda tag, attributes: found.append((tag, dict(attributes)))
+    parser.feed(page)
+    return found
+
+
+def is_harmless(page):
+    """Two blocks of data, our two scripts, and no picture with a source or an event handler."""
+    found = elements(page)
+    scripts = [attributes for tag, attributes in found if tag == "script"]
+    pictures = [attributes for tag, attributes in found if tag == "img" and "src" in attributes]
+    return len(scripts) == 4 and not pictures and not any(a.startswith("on") for _, x in found for a in x)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_no_text_becomes_an_element(pages, name):
+    page = pages[name].read_text()
+    assert is_harmless(page)
+    assert page.count("&lt;/script&gt;&lt;script&gt;document.title") > 20  # it is there, as text
+    for place in ("data", "record"):
+        start = page.index(">", page.index(f'id="{place}"')) + 1
+        read = json.loads(page[start : page.index("</script>", start)])
+        assert json.dumps(read).count(json.dumps(EVIL)[1:-1]) > 5  # the data are whole
+
+
+def test_an_element_that_got_into_a_page_is_noticed(pages):
+    page = pages["gradient_panel"].read_text()
+    assert not is_harmless(page.replace("</header>", "</header><script>1</script>"))
+    assert not is_harmless(page.replace("</header>", "</header><img src=x>"))
+    assert not is_harmless(page.replace("<header>", "<header onclick='1'>"))
+
+
+@browsing
+@pytest.mark.parametrize("name", PAGES)
+def test_a_hostile_name_is_read_and_not_run(pages, browser, name):
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    browser.get_log("browser")
+    browser.get(pages[name].as_uri())
+    ready = "return document.documentElement.dataset.ready === 'yes'"
+    WebDriverWait(browser, 30).until(lambda b: b.execute_script(ready))
+    assert errors(browser) == []
+    assert browser.title == "gradient panel" if name == "gradient_panel" else "evil" in browser.title  # as a part of it
+    assert browser.title != "evil"
+    assert EVIL in browser.execute_script("return document.body.innerText")
+    assert browser.execute_script("return document.querySelectorAll('.plot canvas').length") > 0
+
+
+def test_a_live_view_has_no_hostile_path(pages):
+    scene, _ = scene_of_run(pages["report"].parent)
+    for path in (*scene.poses, *(shape.body for shape in scene.shapes)):
+        assert re.fullmatch(r"[A-Za-z0-9_.-]*", path)
+
+
+def test_what_a_template_asks_for_must_be_given(tmp_path):
+    from jinja2 import UndefinedError
+
+    with pytest.raises(UndefinedError, match="cases"):
+        write_page(tmp_path / "page.html", "gradient_panel.html.j2", record={}, data={})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_policy_names_each_script_once_and_no_data():
+    page = "<script>a()</script><script>a()</script><script type='application/json'>{}</script>"
+    policy = html.content_policy(page)
+    # printf 'a()' | openssl dgst -sha256 -binary | base64
+    assert re.findall("sha256-([^']+)", policy) == ["qVpDBgj7bpq5hMAcGp3AOc79J3Y1Z4HvySTwKrWDoy4="]
+    assert "default-src 'none'" in policy
+
+
+def test_only_our_own_files_are_marked_as_safe():
+    marked = {
+        (path.name, found)
+        for path in (PACKAGE / "pages/templates").iterdir()
+        for found in re.findall(r"\{\{([^}]*)\|\s*safe\s*\}\}", path.read_text())
+    }
+    assert {found.strip() for _, found in marked} == {'asset("uPlot.min.css")', 'asset("report.css")', "script"}
+    assert {name for name, _ in marked} == {"base.html.j2"}
+    for path in (PACKAGE / "pages/templates").iterdir():
+        assert len(re.findall(r"\bsafe\b|autoescape", path.read_text())) == (3 if path.name == "base.html.j2" else 0)
+
+
+def test_numbers_and_names_are_written_in_words():
+    assert render("content_policy.html.j2", hashes=[]).count("script-src;") == 1
+    assert html.in_words({"a_b": [1.0, None], "c": True}) == "a b 1, –, c yes"
+    assert html.short_number(1 / 3, 3) == "0.333"
+
+
+def test_templates_and_assets_go_into_the_wheel():
+    patterns = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())
+    patterns = patterns["tool"]["setuptools"]["package-data"]["drake_diff"]
+    for path in (*(PACKAGE / "pages/templates").iterdir(), *(PACKAGE / "pages/assets").iterdir()):
+        name = path.relative_to(PACKAGE).as_posix()
+        assert any(fnmatch(name, pattern) for pattern in patterns), name
+
+
+def test_templates_are_loaded_when_a_page_is_written():
+    code = (
+        "import sys, drake_diff as dd; dd.solve, dd.save, dd.compare, dd.robustness, dd.studies.gradient_panel;"
+        "from drake_diff.pages import html; print('jinja2' in sys.modules); html.content_policy('');"
+        "print('jinja2' in sys.modules)"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout == "False\nTrue\n"
