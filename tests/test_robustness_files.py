@@ -184,7 +184,7 @@ def test_the_page_says_and_plots_it_and_needs_no_network(result, saved):
     assert angle["series"][0]["y"] == pytest.approx(trial.outcome.run.motion.xs[:, 0], rel=1e-7)
     assert all(len(s["y"]) == len(p["x"]) for p in plots for s in p["series"])
     assert "Nothing is drawn" in page
-    assert "Budget: 20 ms, the controller&#x27;s period" in page
+    assert "Budget: 20 ms, the controller&#39;s period" in page
 
 
 @browsing
