@@ -18,8 +18,8 @@ from .artifact.verify import verify as verify
 from .certificates.audit import audit as audit
 from .certificates.certify import certify as certify
 from .certificates.certify import certify_rollout as certify_rollout
-from .comparison.compare import compare as compare
 from .comparison.recordings import Recording as Recording
+from .comparison.side_by_side import compare as compare
 from .derivatives.linearize import linearize as linearize
 from .derivatives.step import differentiate_step as differentiate_step
 from .model import quantities as quantities

@@ -15,7 +15,6 @@ from drake_diff.cli.main import app
 from drake_diff.comparison import files as comparison_trace
 from drake_diff.comparison.files import begin_comparison, record_of
 from drake_diff.comparison.page import comparison_data
-from drake_diff.comparison.result import sentence_of, verdict_of
 from drake_diff.record.sealed import own_sha256
 
 
@@ -90,14 +89,14 @@ def test_the_page_plots_every_engine_and_needs_no_network(ball, saved):
 
 def test_the_sentences_say_when_and_why(ball):
     drake, lagged, pinocchio = ball.engines
-    assert "the same for 0.2" in sentence_of(pinocchio)
-    assert "by the contact law" in sentence_of(pinocchio)
-    assert "has no contact here" in sentence_of(pinocchio)
-    assert "point, sap" in sentence_of(lagged)
-    told = verdict_of(ball)
+    assert "the same for 0.2" in pinocchio.sentence
+    assert "by the contact law" in pinocchio.sentence
+    assert "has no contact here" in pinocchio.sentence
+    assert "point, sap" in lagged.sentence
+    told = str(ball)
     assert "drake (lagged, autodiff) and pinocchio: the same model under another law" in told
     assert "contact-table" in told
-    assert "within 0.0e+00" in sentence_of(drake)
+    assert "within 0.0e+00" in drake.sentence
 
 
 def test_a_gradient_that_is_not_its_own_steps_is_warned_of(load):
@@ -109,8 +108,8 @@ def test_a_gradient_that_is_not_its_own_steps_is_warned_of(load):
         return found._replace(A=2 * found.A)
 
     found = dd.compare(model, (Doctored(drake, name="doubled", differentiate_step=doubled),), num_steps=5)
-    assert "not those of doubled" in verdict_of(found)
-    assert "its Jacobian at the start state is off by" in sentence_of(found.engines[1])
+    assert "not those of doubled" in str(found)
+    assert "its Jacobian at the start state is off by" in found.engines[1].sentence
     record = record_of(found, "x")
     assert record.verdict == "fail"
     assert record.engines[1].gradient == "not its own step's"
@@ -160,4 +159,4 @@ def test_the_command_fails_where_the_engines_do_not_agree(tmp_path, monkeypatch)
     words = ["compare", str(MODELS / "pendulum.urdf"), "--engines", "pinocchio", "--steps", "5"]
     found = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")])
     assert found.exit_code == 1
-    assert "nothing tells why" in found.output
+    assert "nothing explains why" in found.output

@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 
 import drake_diff as dd
 from drake_diff.cli.main import app
-from drake_diff.comparison.result import sentence_of
 from drake_diff.engines.motion import move
 from drake_diff.engines.mujoco.mjcf import mjcf
 from drake_diff.exceptions import ArtifactError, InputError, ShapeError
@@ -53,7 +52,7 @@ def test_a_recording_of_the_same_model_is_the_same_and_has_no_jacobians(load):
     assert e.step_gaps.max() < 1e-13
     assert (len(e.jacobians), e.rollout_jacobian, e.seconds_per_step) == (0, None, None)
     assert e.motion.energy is not None  # Drake's, of the recorded states
-    assert "Jacobian" not in sentence_of(e)
+    assert "Jacobian" not in e.sentence
 
 
 def test_the_reference_takes_as_many_steps_as_lie_between_samples(load):
@@ -136,7 +135,7 @@ def test_the_one_setting_that_is_another_is_named(tmp_path, change, as_if, term,
     e = compared(model, record(engine, x0, INPUTS, every=every, h=h))
     assert (e.verdict, e.first.as_if, e.largest.as_if) == (verdict, as_if, as_if)
     assert (e.first.responsible, e.largest.responsible) == (term, term)
-    assert as_if in sentence_of(e)
+    assert as_if in e.sentence
 
 
 def test_a_dropped_armature_is_named(tmp_path):
@@ -235,7 +234,7 @@ def test_csv_columns_are_found_by_name(load, tmp_path):
         np.testing.assert_array_equal(recording.times, [0, 0.01, 0.02])
         np.testing.assert_array_equal(recording.xs, [row[1:5] for row in ROWS])
         np.testing.assert_array_equal(recording.us, [[1.5], [2.5]])
-    assert (plain.name, plain.version, other.name) == ("run", "not told", "turned")
+    assert (plain.name, plain.version, other.name) == ("run", "(version unknown)", "turned")
     told = {"engine": "isaaclab", "version": "3.0.0", "time step": 0.01, "gravity": [0, 0, -9.81], "seeds": [1, 2]}
     (tmp_path / "run.contract.json").write_text(json.dumps(told))
     plain = dd.comparison.read_recording(tmp_path / "run.csv", model)

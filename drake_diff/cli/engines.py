@@ -50,9 +50,9 @@ def compare(
 
     Exit status 0 only where every engine is the same as Drake or differs by a law that its contract tells of.
     """
-    from drake_diff.comparison.compare import compare as compare_engines
     from drake_diff.comparison.files import PAGE, begin_comparison, save_comparison
     from drake_diff.comparison.recordings import read_recording
+    from drake_diff.comparison.side_by_side import compare as compare_engines
     from drake_diff.model.model import load_model
 
     loaded = load_model(

@@ -24,7 +24,7 @@ INTEGRATOR, CONTACT_LAW, LIMIT_LAW, UNEXPLAINED = "integrator", "contact law", "
 FITS: dict[Precision, float] = {"float64": 1e-9, "float32": 1e-4}
 
 
-class Scheme(NamedTuple):
+class EulerScheme(NamedTuple):
     """How a step is taken from its terms; the first of each is Drake's."""
 
     damping: str = "implicit"  # explicit: by v, not by v'
@@ -36,7 +36,7 @@ class Scheme(NamedTuple):
 
 
 SCHEMES = tuple(
-    Scheme(*choice) for choice in product(("implicit", "explicit"), ("v'", "v"), ("first term", "exponential"))
+    EulerScheme(*choice) for choice in product(("implicit", "explicit"), ("v'", "v"), ("first term", "exponential"))
 )
 
 
@@ -62,7 +62,7 @@ class Attribution:
     gap: float
     effects: Mapping[str, float]
     responsible: str
-    schemes: tuple[Scheme, Scheme]
+    schemes: tuple[EulerScheme, EulerScheme]
     assumed: tuple[str, ...] = ()
     as_if: str = ""
 
@@ -71,7 +71,7 @@ def attribute(
     coordinates: Coordinates, one: Engine, two: Engine, x: Array, u: Array, steps: tuple[Array, Array]
 ) -> Attribution:
     """What makes the `steps` (nx,) that `one` and `two` took from `x` (nx,) under `u` (nu,) differ."""
-    a, b, assumed = _terms_of_both(coordinates, one, two, x, u)
+    (a, b), assumed = _terms_of_both(coordinates, one, two, x, u)
     after_a, after_b = (of_norm_one(coordinates, after, x) for after in steps)
     scheme_a, scheme_b = (
         _scheme(coordinates, x, terms, after, FITS[engine.contract.precision])
@@ -91,7 +91,7 @@ def attribute(
     return Attribution(gap, ranked, next(iter(ranked)) if gap else "", (scheme_a, scheme_b), assumed)
 
 
-def euler(coordinates: Coordinates, x: Array, terms: Terms, scheme: Scheme) -> Array:
+def euler(coordinates: Coordinates, x: Array, terms: Terms, scheme: EulerScheme) -> Array:
     """(nx,) the step from `x` with these terms, quaternions of norm 1."""
     q, v, h = x[: coordinates.nq], x[coordinates.nq :], terms.time_step
     implicit = terms.damping if scheme.damping == "implicit" else np.zeros(len(v))
@@ -116,29 +116,29 @@ def of_norm_one(coordinates: Coordinates, x: Array, near: Array) -> Array:
 
 def _terms_of_both(
     coordinates: Coordinates, one: Engine, two: Engine, x: Array, u: Array
-) -> tuple[Terms, Terms, tuple[str, ...]]:
+) -> tuple[tuple[Terms, Terms], tuple[str, ...]]:
+    """The terms of both, and what was assumed of them: where one offers none it gets the other's."""
     q, v = x[: coordinates.nq], x[coordinates.nq :]
-    M, no_M = _offered(one, two, "M(q)", lambda engine: engine.mass_matrix(q), np.eye(len(v)))
-    bias, no_bias = _offered(one, two, "bias(q, v)", lambda engine: engine.bias(q, v), np.zeros(len(v)))
+    masses, no_mass = _offered((one, two), "M(q)", lambda engine: engine.mass_matrix(q), np.eye(len(v)))
+    biases, no_bias = _offered((one, two), "bias(q, v)", lambda engine: engine.bias(q, v), np.zeros(len(v)))
     a, b = (
-        Terms(M[i], bias[i], *forces(engine.contract, u), engine.contract.time_step)
-        for i, engine in enumerate((one, two))
+        Terms(M, bias, *forces(engine.contract, u), engine.contract.time_step)
+        for M, bias, engine in zip(masses, biases, (one, two), strict=True)
     )
-    return a, b, (*no_M, *no_bias)
+    return (a, b), (*no_mass, *no_bias)
 
 
 def _offered(
-    one: Engine, two: Engine, name: str, ask: Callable[[Engine], Array], otherwise: Array
+    engines: tuple[Engine, Engine], name: str, ask: Callable[[Engine], Array], otherwise: Array
 ) -> tuple[list[Array], list[str]]:
-    """What each gives; for one that gives nothing the other's."""
     found: list[Array | None] = []
-    for engine in (one, two):
+    for engine in engines:
         try:
             found.append(ask(engine))
         except NotOfferedError:
             found.append(None)
     known = next((value for value in found if value is not None), otherwise)
-    missing = [f"{name} of {e.name}" for e, value in zip((one, two), found, strict=True) if value is None]
+    missing = [f"{name} of {e.name}" for e, value in zip(engines, found, strict=True) if value is None]
     return [known if value is None else value for value in found], missing
 
 
@@ -150,7 +150,7 @@ def forces(contract: EngineContract, u: Array) -> tuple[Array, Array]:
     return actuation @ np.clip(u, -limits, limits), np.array([number for joint in damping for number in joint])
 
 
-def _scheme(coordinates: Coordinates, x: Array, terms: Terms, after: Array, fits: float) -> Scheme:
+def _scheme(coordinates: Coordinates, x: Array, terms: Terms, after: Array, fits: float) -> EulerScheme:
     """The scheme that gives the step; Drake's where none does, for then something else is at work."""
     misfits = {scheme: _size(after - euler(coordinates, x, terms, scheme)) for scheme in SCHEMES}
     best = min(misfits, key=lambda scheme: misfits[scheme])
@@ -159,10 +159,11 @@ def _scheme(coordinates: Coordinates, x: Array, terms: Terms, after: Array, fits
 
 def what_is_left(coordinates: Coordinates, one: Engine, two: Engine, x: Array, steps: tuple[Array, Array]) -> str:
     """What makes steps differ that no Euler step explains: a law that is at work at one of the states, if any."""
-    if any(_depth(engine, state) > 0 for engine in (one, two) for state in (x, *steps)):
+    states = (x, *steps)
+    if any(_depth(engine, state) > 0 for engine in (one, two) for state in states):
         return CONTACT_LAW
     singles = [j for e in (one, two) for j in zip(_singles(e.contract), coordinates.single, strict=True)]
-    if any(not j.lower <= state[i] <= j.upper for j, (i, _) in singles for state in (x, *steps)):
+    if any(not j.lower <= state[i] <= j.upper for j, (i, _) in singles for state in states):
         return LIMIT_LAW
     return UNEXPLAINED if one.contract.integrator == two.contract.integrator else INTEGRATOR
 

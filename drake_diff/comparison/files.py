@@ -1,7 +1,4 @@
-"""Every engine's motion in one trace.mcap.
-
-A comparison saved: its record, a trace of every engine's motion, a replay with the engines as ghosts, a page.
-"""
+"""A comparison saved: its record, a trace of every engine's motion, a replay with the engines as ghosts, a page."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -17,9 +14,7 @@ from drake_diff.comparison.result import (
     STEP_TOLERANCE,
     Compared,
     Comparison,
-    sentence_of,
     slugs,
-    verdict_of,
 )
 from drake_diff.engines.motion import EngineMotion
 from drake_diff.logs.channels import Shown, input_channel, nanoseconds, state_channel, transform_channel
@@ -107,7 +102,7 @@ def record_of(comparison: Comparison, name: str) -> ComparisonRecord:
         name,
         comparison.model,
         "pass" if comparison.holds else "fail",
-        verdict_of(comparison),
+        str(comparison),
         states=[StateEvidence(name=s.name, x=s.x.tolist(), u=s.u.tolist()) for s in comparison.states],
         engines=[_engine(e) for e in comparison.engines],
         refused=[RefusedEvidence(engine=r.engine, reason=r.reason, installed=r.installed) for r in comparison.refused],
@@ -151,7 +146,7 @@ def _engine(e: Compared) -> EngineEvidence:
         version=e.version,
         precision=e.precision,
         verdict=e.verdict,
-        sentence=sentence_of(e),
+        sentence=e.sentence,
         contract=[
             LineEvidence(quantity=x.quantity, verdict=x.verdict, detail=x.detail, reason=x.reason) for x in e.lines
         ],

@@ -17,7 +17,7 @@ from drake_diff.comparison.attribution import (
     SCHEMES,
     UNEXPLAINED,
     Attribution,
-    Scheme,
+    EulerScheme,
     Terms,
     euler,
     forces,
@@ -40,7 +40,7 @@ class Change(NamedTuple):
     """One change of the reference's step, and the term that it is of; numbers are factors of the reference's."""
 
     term: str
-    scheme: Scheme = SCHEMES[0]
+    scheme: EulerScheme = SCHEMES[0]
     time_step: float = 1.0
     damping: float = 1.0
     armature: float = 1.0
@@ -48,9 +48,9 @@ class Change(NamedTuple):
 
 
 CHANGES: Mapping[str, Change] = {
-    "as if joint damping were explicit": Change(INTEGRATOR, scheme=Scheme(damping="explicit")),
-    "as if positions moved with the velocity before the step": Change(INTEGRATOR, scheme=Scheme(position="v")),
-    "as if rotations were by the exponential": Change(INTEGRATOR, scheme=Scheme(turn="exponential")),
+    "as if joint damping were explicit": Change(INTEGRATOR, scheme=EulerScheme(damping="explicit")),
+    "as if positions moved with the velocity before the step": Change(INTEGRATOR, scheme=EulerScheme(position="v")),
+    "as if rotations were by the exponential": Change(INTEGRATOR, scheme=EulerScheme(turn="exponential")),
     "as if the time step were half": Change("time step", time_step=0.5),
     "as if the time step were double": Change("time step", time_step=2.0),
     "as if joint damping were 0": Change("damping", damping=0.0),
@@ -150,20 +150,15 @@ def _changed(reference: DrakeEngine, x: Array, u: Array, count: int, change: Cha
 
 
 def _terms(reference: DrakeEngine, x: Array, u: Array, change: Change) -> Terms:
-    model, description = reference.model, reference.description
+    model, armature = reference.model, reference.description.by_velocity("armature")
     q, v = x[: model.nq], x[model.nq :]
     actuation, damping = forces(reference.contract, u)
-    terms = Terms(reference.mass_matrix(q), reference.bias(q, v), actuation, damping, model.time_step)
     set_state(model.double, x)
     weight = model.plant.CalcGravityGeneralizedForces(model.double.context)
-    return _with(terms, change, np.diag(description.by_velocity("armature")), weight)
-
-
-def _with(terms: Terms, change: Change, armature: Array, weight: Array) -> Terms:
     return Terms(
-        inertia=terms.inertia - (1 - change.armature) * armature,
-        bias=terms.bias + (1 - change.gravity) * weight,
-        actuation=terms.actuation,
-        damping=change.damping * terms.damping,
-        time_step=change.time_step * terms.time_step,
+        inertia=reference.mass_matrix(q) - (1 - change.armature) * np.diag(armature),
+        bias=reference.bias(q, v) + (1 - change.gravity) * weight,
+        actuation=actuation,
+        damping=change.damping * damping,
+        time_step=change.time_step * model.time_step,
     )

@@ -1,7 +1,4 @@
-"""A motion that was recorded elsewhere, by an engine that cannot be loaded here.
-
-Recorded motions from files: CSV, MCAP of this project or of ROS 2, ROS 2 bags, and what is told of their engine.
-"""
+"""Motions recorded elsewhere, by engines that cannot be loaded here, from CSV, MCAP and ROS 2 files."""
 
 import csv
 import json
@@ -30,16 +27,34 @@ NORM_TOLERANCE = 1e-3  # of a quaternion's norm: float32 and five printed digits
 CLOCK_TOLERANCE = 1e-3  # of a time step: printed times and nanoseconds are within it
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Recording:
-    """States in Drake's coordinates. `facts` is what is known of the engine's contract, by quantity."""
+    """A motion of a model that was recorded elsewhere, for `dd.compare`.
+
+    Args:
+        name: what the engine is called.
+        version: of the engine.
+        times: (n,) [s], increasing, a whole number of the model's time steps apart.
+        xs: (n, nx) states in Drake's coordinates.
+        us: (n - 1, nu) inputs, each held until the next time.
+        facts: what is known of the engine's contract, by quantity: "precision", "time step", "integrator",
+            "contact law", "limit law", "gravity", "seeds", "reset distribution".
+
+    Example:
+        >>> fall = dd.Recording("lab", "1.0", times=[0, 0.01], xs=[[0, 0], [0, 0]], us=[[0]])
+        >>> print(fall)
+        lab 1.0: 2 samples over 0.01 s
+    """
 
     name: str
     version: str
-    times: Array  # (n,) [s], increasing
-    xs: Array  # (n, nx)
-    us: Array  # (n - 1, nu), held from one time to the next
+    times: Array
+    xs: Array
+    us: Array
     facts: Mapping[str, str] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"{self.name} {self.version}: {len(self.times)} samples over {self.times[-1] - self.times[0]:.6g} s"
 
 
 def check_recording(recording: Recording, model: Model) -> None:
@@ -95,19 +110,37 @@ SUFFIXES = "a .csv file, an .mcap file or the directory of a ROS 2 bag"
 
 
 def read_recording(path: str | Path, model: Model, *, name: str | None = None) -> Recording:
-    """The motion of `model` that is recorded in `path`: a CSV or MCAP file, or the directory of a ROS 2 bag.
+    """Read a motion of `model` from a CSV file, an MCAP file or the directory of a ROS 2 bag.
 
-    CSV: a header row, then a row per sample, SI units. Columns, in any order: `time`, `model.state_names`, for which
-    `position.JOINT` and `velocity.JOINT` of a joint of one degree of freedom may stand, and `model.input_names`, which
-    are held until the next sample and may be empty in the last row. MCAP of this project: the channels /state and
-    /input. ROS 2 (needs the extra `ros2`): see `recording_ros2`.
+    A CSV file has a header row and a row per sample. Its columns, in any order, are `time`, `model.state_names` and
+    `model.input_names`; `position.JOINT` and `velocity.JOINT` may stand for a joint of one degree of freedom. Inputs
+    are held until the next sample and may be empty in the last row. An MCAP file has the channels /state and /input
+    that this package writes, or ROS 2 messages as `recordings_ros2` describes.
 
-    What is told of the engine stands in NAME.contract.json beside NAME.csv, NAME.mcap or the bag NAME, or in the MCAP's
-    metadata record "contract": a JSON object of some of engine, version, precision, "time step", integrator, "contact
-    law", "limit law", gravity, seeds, "reset distribution". Nothing else is known of it. `name` goes before the file's.
+    What is known of the engine is a JSON object in NAME.contract.json beside the recording NAME, or the metadata
+    record "contract" of the MCAP file, with any of the facts of `Recording` and "engine" and "version".
 
-    Raises InputError and its kin, naming file, line and column; ArtifactError of a damaged log;
-    MissingDependencyError without rosbags.
+    Args:
+        path: the file or directory.
+        model: the model whose motion it is.
+        name: a name for the engine, in place of the file's.
+
+    Returns:
+        A `Recording`, for `dd.compare(model, recordings=[...])`.
+
+    Raises:
+        InputError, UnknownNameError: the recording does not fit the model; names file, line and column.
+        ArtifactError: the log is damaged.
+        MissingDependencyError: a ROS 2 bag, and rosbags is not installed.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.csv"
+        >>> head = ",".join(["time", *model.state_names, *model.input_names])
+        >>> _ = path.write_text(head + "\\n0,0,0,0\\n0.01,0,0,")
+        >>> print(dd.comparison.read_recording(path, model))
+        run (version unknown): 2 samples over 0.01 s
     """
     path = Path(path)
     if not path.exists():
@@ -124,7 +157,7 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None) -
     facts = {**facts, **_told(path)}
     times, xs, us = (frozen(part) for part in motion)
     recording = Recording(
-        name or facts.get("engine", path.stem), facts.get("version", "not told"), times, xs, us, facts
+        name or facts.get("engine", path.stem), facts.get("version", "(version unknown)"), times, xs, us, facts
     )
     check_recording(recording, model)
     return recording

@@ -12,8 +12,8 @@ from typing import Literal
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.comparison.compare import default_engines
 from drake_diff.comparison.result import Refused
+from drake_diff.comparison.side_by_side import default_engines
 from drake_diff.engines.closed_form import SphereOnGround
 from drake_diff.engines.interface import Engine
 from drake_diff.engines.jacobians import rollout_jacobian

@@ -9,20 +9,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, frozen
+from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff.comparison.attribution import CONTACT_LAW, LIMIT_LAW, Attribution, attribute, what_is_left
 from drake_diff.comparison.recorded import advanced, attribute_recorded, precision_of, told_lines
-from drake_diff.comparison.recordings import Recording, check_recording, steps_between
-from drake_diff.comparison.result import (
-    STEP_TOLERANCE,
-    Compared,
-    Comparison,
-    Probe,
-    Refused,
-    first_above,
-    probes_of,
-    task_of,
-)
+from drake_diff.comparison.recordings import Recording, check_recording, inputs_of, steps_between
+from drake_diff.comparison.result import STEP_TOLERANCE, Compared, Comparison, Probe, Refused, first_above
 from drake_diff.engines.contract_match import match_contracts
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.interface import Engine
@@ -32,7 +23,11 @@ from drake_diff.engines.motion import EngineMotion, measured, move, seconds
 from drake_diff.exceptions import MissingDependencyError, ModelError, SimulationError
 from drake_diff.mechanics.description import describe
 from drake_diff.model.model import Model
+from drake_diff.model.sampling import sample_states
 from drake_diff.model.tangent import tangent_space
+from drake_diff.motion.rollout import check_inputs
+
+DURATION, MOST_STEPS = 1.0, 500  # [s]; of a motion that is not given
 
 
 def compare(
@@ -45,19 +40,41 @@ def compare(
     num_steps: int | None = None,
     seed: int = 0,
 ) -> Comparison:
-    """Compare `engines` with Drake on `model`: names, "drake:similar" or "drake:lagged:implicit", or engines.
+    """Run the same model in several engines and report where and why they differ from Drake.
 
-    Without any, Drake's other contact approximations, where something can touch, and every engine there is.
+    Every engine runs one motion; each of its steps is compared with Drake's step from the same state, and its
+    Jacobians with Drake's and with differences of its own steps.
 
-    The motion starts at `x0` (nx,) under `us` (N, nu); a random free state, constant random inputs and one second
-    where they are not given, the same for the same `seed`; those of the first of `recordings` (see `read_recording`)
-    where there is one and no `x0`. The steps of a recording are compared with as many of the reference's as lie between
-    its samples; it has no Jacobians. Engines that are missing or cannot have the model are
-    listed in `refused`. Raises InputError for bad input, and ModelError where no engine but Drake can have the model.
+    Args:
+        model: the model; Drake with its settings is the reference.
+        engines: names for `load_engine`, "drake:similar" or "drake:lagged:implicit" for Drake with other settings, or
+            `Engine` objects. Without it: every engine there is, and Drake's other contact approximations where
+            something can touch.
+        recordings: motions recorded elsewhere, from `read_recording`. Each recorded step is compared with as many
+            steps of Drake as lie between its samples; a recording has no Jacobians.
+        x0: start (nx,); without it the first recording's, or else a random state that touches nothing.
+        us: inputs (N, nu); without them the first recording's if it also gives the start, or else one second of
+            constant random inputs.
+        num_steps: the number of steps N of a motion without `us`.
+        seed: seed of what is random.
+
+    Returns:
+        A `Comparison`: per engine a verdict, the gaps of steps and Jacobians, and the term that causes them. Engines
+        that are not installed or cannot have the model are listed in `refused`.
+
+    Raises:
+        InputError: an argument does not fit the model.
+        ModelError: no engine but Drake can have this model.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> found = dd.compare(model, ["numpy"], num_steps=5)
+        >>> print(found.engines[1].verdict, found.holds)
+        same True
     """
     for recording in recordings:
         check_recording(recording, model)
-    x0, us = task_of(model, recordings, x0, us, num_steps, seed)
+    x0, us = _task(model, recordings, x0, us, num_steps, seed)
     reference = DrakeEngine(model)
     loaded, refused = _load(model, default_engines(model) if engines is None else tuple(engines))
     panel = _Panel(model, reference, x0, us, seed)
@@ -71,6 +88,52 @@ def compare(
     return Comparison(model, x0, us, panel.probes, tuple(compared), tuple(refused))
 
 
+def default_engines(model: Model) -> tuple[str, ...]:
+    """Drake's other contact approximations, where something can touch, every other engine, and what is none."""
+    own = model.contract.contact
+    others = [a for a in ("sap", "similar", "lagged") if own.collision_pairs and a != own.approximation]
+    return (*(f"drake:{a}" for a in others), *(name for name in ENGINES if name != "drake"), *ELSEWHERE)
+
+
+def _task(
+    model: Model,
+    recordings: Sequence[Recording],
+    x0: ArrayLike | None,
+    us: ArrayLike | None,
+    num_steps: int | None,
+    seed: int,
+) -> tuple[Array, Array]:
+    """x0 (nx,) and us (N, nu), checked; without x0 those of the first recording, without any sampled ones."""
+    if recordings and x0 is None:
+        x0, us = recordings[0].xs[0], inputs_of(recordings[0], model.time_step) if us is None else us
+    sample = sample_states(model, 1, seed)[0]
+    if us is None:
+        count = num_steps or min(MOST_STEPS, max(1, round(DURATION / model.time_step)))
+        us = np.tile(sample.u, (count, 1))
+    return (sample.x if x0 is None else finite_array("x0", x0, (model.nx,))), check_inputs(model, us, num_steps)
+
+
+def _probes(model: Model, motion: EngineMotion, seed: int) -> tuple[Probe, ...]:
+    """The motion's start, a state sampled free and one touching, and the motion's deepest overlap."""
+    probes = [Probe("start", motion.xs[0], motion.us[0])]
+    probes += [Probe(sample.kind, sample.x, sample.u) for sample in sample_states(model, 2, seed + 1)]
+    if motion.depth is not None and np.max(motion.depth[:-1], initial=0.0) > 0:
+        k = int(np.argmax(motion.depth[:-1]))
+        probes.append(Probe("deepest", motion.xs[k], motion.us[k]))
+    return tuple(probes)
+
+
+def _load(model: Model, wanted: tuple[str | Engine, ...]) -> tuple[list[Engine], list[Refused]]:
+    loaded: list[Engine] = []
+    refused: list[Refused] = []
+    for engine in wanted:
+        try:
+            loaded.append(load_spec(engine, model) if isinstance(engine, str) else engine)
+        except (MissingDependencyError, ModelError) as error:
+            refused.append(Refused(str(engine), str(error), isinstance(error, ModelError)))
+    return loaded, refused
+
+
 class _Panel:
     """What is asked of each engine, and the reference's answers."""
 
@@ -79,7 +142,7 @@ class _Panel:
         self.reference, self.x0, self.us = reference, x0, us
         self.coordinates = describe(model).coordinates
         self.motion = move(reference, x0, us)
-        self.probes = probes_of(model, self.motion, seed)
+        self.probes = _probes(model, self.motion, seed)
         self.jacobians = self._jacobians(reference)
         self.product = rollout_jacobian(reference, self.space, self.motion)
 
@@ -87,18 +150,18 @@ class _Panel:
         is_reference = engine is self.reference
         motion = self.motion if is_reference else move(engine, self.x0, self.us)
         jacobians = self.jacobians if is_reference else self._jacobians(engine)
-        gaps = self._step_gaps(motion)
         product = self.product if is_reference else rollout_jacobian(engine, self.space, motion)
+        gaps, precision = self._step_gaps(motion), engine.contract.precision
         return Compared(
             engine=engine.name,
             version=engine.version,
-            precision=engine.contract.precision,
+            precision=precision,
             lines=match_contracts(self.reference, engine),
             motion=motion,
             step_gaps=gaps,
-            first=self._attribution(engine, motion, first_above(gaps, engine.contract.precision) or 0),
+            first=self._attribution(engine, motion, first_above(gaps, precision) or 0),
             largest=self._attribution(engine, motion, int(np.argmax(gaps)) if len(gaps) else 0),
-            final_gap=self._gap_at_the_end(motion.xs),
+            final_gap=self._final_gap(motion.xs),
             jacobians=jacobians,
             laws=tuple(self._law(engine, probe) for probe in self.probes),
             jacobian_gaps=frozen(
@@ -129,14 +192,7 @@ class _Panel:
             step_gaps=gaps,
             first=first,
             largest=largest,
-            final_gap=self._gap_at_the_end(motion.xs, count),
-            jacobians=(),
-            jacobian_gaps=frozen([]),
-            laws=(),
-            rollout_jacobian=None,
-            rollout_gap=None,
-            seconds_per_step=None,
-            seconds_per_jacobian=None,
+            final_gap=self._final_gap(motion.xs, count),
         )
 
     def _law(self, engine: Engine, probe: Probe) -> str:
@@ -145,7 +201,7 @@ class _Panel:
         found = what_is_left(self.coordinates, self.reference, engine, probe.x, steps)
         return found if found in (CONTACT_LAW, LIMIT_LAW) else ""
 
-    def _gap_at_the_end(self, xs: Array, count: int = 1) -> float:
+    def _final_gap(self, xs: Array, count: int = 1) -> float:
         """On the tangent space, of the last of `xs`, `count` steps apart, that the reference's motion has too."""
         ours = self.motion.xs[::count]
         k = min(len(xs), len(ours)) - 1
@@ -176,23 +232,3 @@ class _Panel:
 def _gap(reference: Array, other: Array) -> float:
     """The largest difference of entries, relative to the reference's largest."""
     return float(np.abs(other - reference).max() / np.abs(reference).max())
-
-
-def default_engines(model: Model) -> tuple[str, ...]:
-    """Drake's other contact approximations, where something can touch, every other engine, and what is none."""
-    own = model.contract.contact
-    others = [a for a in ("sap", "similar", "lagged") if own.collision_pairs and a != own.approximation]
-    return (*(f"drake:{a}" for a in others), *(name for name in ENGINES if name != "drake"), *ELSEWHERE)
-
-
-def _load(model: Model, wanted: tuple[str | Engine, ...]) -> tuple[list[Engine], list[Refused]]:
-    loaded: list[Engine] = []
-    refused: list[Refused] = []
-    for engine in wanted:
-        try:
-            loaded.append(load_spec(engine, model) if isinstance(engine, str) else engine)
-        except MissingDependencyError as error:
-            refused.append(Refused(str(engine), str(error), False))
-        except ModelError as error:
-            refused.append(Refused(str(engine), str(error), True))
-    return loaded, refused
