@@ -1,22 +1,23 @@
-"""Parameters of bodies, joints, springs and actuators: unit, how each is read and written, what differentiates it.
+"""The kinds of physical parameter: where each is found, its unit, how it is written, and what differentiates it.
 
-Three sources of a derivative: "autodiff", where Drake keeps the quantity as a parameter of its context for either
-scalar type; "chain_rule", where it enters the step as a generalized force that Drake differentiates (gravity,
-prismatic springs); "finite_difference" of the double step for all that Drake takes as plain numbers (PD gains, the
-time step; contact).
+There are three sources of a derivative:
 
-Parameters of contact, by body ("ball.friction", all its geometries) or by geometry ("ball/tip.friction").
+- "autodiff": Drake keeps the quantity in its context, for floats and for AutoDiffXd;
+- "chain_rule": it enters the step as a generalized force that Drake differentiates (gravity, prismatic springs);
+- "finite_difference" of the double step: Drake takes it as a plain number (PD gains, time step, all of contact). For
+  contact `derivatives.contact.jacobian` has it in closed form in many cases.
 
-Drake takes them as plain numbers only, so their derivative is a difference of the double step, but where
-`contact_jacobian` has it in closed form.
+Parameters of contact are named by body ("ball.friction": all its geometries) or by geometry ("ball/tip.friction").
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from operator import attrgetter
+from operator import methodcaller as get
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import Capsule, Cylinder, ProximityProperties, Role, RoleAssign, SceneGraphInspector, Sphere
+from pydrake.geometry import Capsule, Cylinder, ProximityProperties, Role, RoleAssign, Sphere
 from pydrake.math import RigidTransform_, RotationMatrix_
 from pydrake.multibody.plant import CoulombFriction
 from pydrake.multibody.tree import (
@@ -30,7 +31,6 @@ from pydrake.multibody.tree import (
     WeldJoint,
 )
 
-from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import plain
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators, bodies, joints, labelled
@@ -39,9 +39,12 @@ from drake_diff.model.twin import GravityChange, SpringChange, Twin
 # Drake drops the derivative of a frame's pose whose value is exactly the identity. A translation of this
 # length [m] changes no number in the step and keeps the derivative.
 IDENTITY_OFFSET = 1e-300
+AUTODIFF, CHAIN_RULE, DIFFERENCE = "autodiff", "chain_rule", "finite_difference"
+DAMPING = ("N s/m", "N m s/rad")
 
 Values = Any  # (n,) floats, or AutoDiffXd where the twin is of that type
-Found = Iterator[tuple[str, str, Any]]  # the element's label, the unit, the value in the model
+Elements = Callable[[Model], Mapping[str, Any]]  # what of a model has the quantity, by label
+Write = Callable[[Twin, str, Values], None]
 
 
 @dataclass(frozen=True)
@@ -50,77 +53,48 @@ class Kind:
 
     quantity: str
     source: str
-    find: Callable[[Model], Found]
-    write: Callable[[Twin, str, Values], None]
+    elements: Elements
+    unit: str | tuple[str, str]  # of two: where the element moves along a line, and else
+    read: Callable[[Any], Any]  # the value of an element in the model; None where it has none
+    write: Write
     positive: bool = False  # whether Drake takes no value below zero
     on_plant: bool = False  # whether it is set in the plant, which all contexts share
 
-
-def _find_of_bodies(unit: str, read: Callable[[Any], Any]) -> Callable[[Model], Found]:
-    def find(model: Model) -> Found:
-        for label, body in labelled(bodies(model.plant)).items():
-            yield label, unit, read(body)
-
-    return find
-
-
-def _central_inertia(body: Any) -> list[float]:
-    inertia = body.default_spatial_inertia()
-    about_com = inertia.Shift(inertia.get_com()).CalcRotationalInertia()
-    return [*about_com.get_moments(), *about_com.get_products()]
+    def find(self, model: Model) -> Iterator[tuple[str, str, Any]]:
+        """The label of every element that has the quantity, the unit, and the value in the model."""
+        for label, element in self.elements(model).items():
+            value, unit = self.read(element), self.unit
+            if isinstance(unit, tuple):
+                joint = element.joint() if hasattr(element, "joint") else element
+                unit = unit[0] if joint.type_name() == "prismatic" else unit[1]
+            if value is not None:
+                yield label, unit, value
 
 
-def _find_inertia(model: Model) -> Found:
-    for label, body in labelled(bodies(model.plant)).items():
-        if body.default_mass() > 0:  # a frame without mass has none: setting it would end the process
-            yield label, "kg m^2", _central_inertia(body)
+def _rebuildable(model: Model) -> dict[str, Any]:
+    return {"model": model} if model.can_rebuild else {}
 
 
-def _write_mass(twin: Twin, label: str, value: Values) -> None:
-    twin.body(label).SetMass(twin.context, value[0])
+def _taking_forces(model: Model) -> dict[str, Any]:
+    return {"model": model} if model.takes_forces else {}
 
 
-def _write_center_of_mass(twin: Twin, label: str, value: Values) -> None:
-    twin.body(label).SetCenterOfMassInBodyFrame(twin.context, value)
+def _bodies(model: Model) -> dict[str, Any]:
+    return labelled(bodies(model.plant))
 
 
-def _write_inertia(twin: Twin, label: str, value: Values) -> None:
-    body = twin.body(label)
-    xx, yy, zz, xy, xz, yz = np.asarray(value).astype(twin.scalar)
-    central = RotationalInertia_[twin.scalar](Ixx=xx, Iyy=yy, Izz=zz, Ixy=xy, Ixz=xz, Iyz=yz)
-    mass, com = body.get_mass(twin.context), body.CalcCenterOfMassInBodyFrame(twin.context)
-    body.SetSpatialInertiaInBodyFrame(
-        twin.context, SpatialInertia_[twin.scalar].MakeFromCentralInertia(mass, com, central)
-    )
+def _heavy_bodies(model: Model) -> dict[str, Any]:
+    """A frame without mass has no inertia: setting it would end the process."""
+    return {label: body for label, body in _bodies(model).items() if body.default_mass() > 0}
 
 
-def _find_damping(model: Model) -> Found:
-    for label, joint in labelled(joints(model.plant)).items():
-        if len(joint.default_damping_vector()) == 1:
-            yield label, _unit(joint, "N s/m", "N m s/rad"), joint.default_damping_vector()
+def _damped_joints(model: Model) -> dict[str, Any]:
+    return {k: j for k, j in labelled(joints(model.plant)).items() if len(j.default_damping_vector()) == 1}
 
 
-def _write_damping(twin: Twin, label: str, value: Values) -> None:
-    twin.joint(label).SetDampingVector(twin.context, value)
-
-
-def _find_offset(model: Model) -> Found:
-    for label, joint in labelled(joints(model.plant)).items():
-        if isinstance(joint.frame_on_parent(), FixedOffsetFrame) and not isinstance(joint, WeldJoint):
-            yield label, "m", joint.frame_on_parent().GetFixedPoseInBodyFrame().translation()
-
-
-def _write_offset(twin: Twin, label: str, value: Values) -> None:
-    frame, scalar = twin.joint(label).frame_on_parent(), twin.scalar
-    rotation = plain(frame.GetFixedPoseInBodyFrame().rotation().matrix())
-    if np.all(plain(value) == 0) and np.array_equal(rotation, np.eye(3)):
-        value = value + np.array([0.0, 0.0, IDENTITY_OFFSET])
-    pose = RigidTransform_[scalar](RotationMatrix_[scalar](rotation.astype(scalar)), np.asarray(value).astype(scalar))
-    frame.SetPoseInParentFrame(twin.context, pose)
-
-
-def _unit(joint: Any, prismatic: str, other: str) -> str:
-    return prismatic if joint.type_name() == "prismatic" else other
+def _offset_joints(model: Model) -> dict[str, Any]:
+    moving = {k: j for k, j in labelled(joints(model.plant)).items() if not isinstance(j, WeldJoint)}
+    return {label: joint for label, joint in moving.items() if isinstance(joint.frame_on_parent(), FixedOffsetFrame)}
 
 
 def _springs(plant: Any, kind: Any) -> dict[str, Any]:
@@ -132,153 +106,20 @@ def _springs(plant: Any, kind: Any) -> dict[str, Any]:
     return {label: spring for label, spring in found if names.count(label) == 1}
 
 
-def _find_revolute_spring(unit: str, read: Callable[[Any], float]) -> Callable[[Model], Found]:
-    def find(model: Model) -> Found:
-        for label, spring in _springs(model.plant, RevoluteSpring_[float]).items():
-            yield label, unit, read(spring)
-
-    return find
+def _revolute_springs(model: Model) -> dict[str, Any]:
+    return _springs(model.plant, RevoluteSpring_[float])
 
 
-def _write_revolute_spring(setter: str) -> Callable[[Twin, str, Values], None]:
-    def write(twin: Twin, label: str, value: Values) -> None:
-        getattr(_springs(twin.plant, RevoluteSpring_[twin.scalar])[label], setter)(twin.context, value[0])
-
-    return write
+def _prismatic_springs(model: Model) -> dict[str, Any]:
+    return _springs(model.plant, PrismaticSpring_[float]) if model.takes_forces else {}
 
 
-def _find_prismatic_spring(unit: str, read: Callable[[Any], float]) -> Callable[[Model], Found]:
-    def find(model: Model) -> Found:
-        if model.takes_forces:
-            for label, spring in _springs(model.plant, PrismaticSpring_[float]).items():
-                yield label, unit, read(spring)
-
-    return find
+def _actuators(model: Model) -> dict[str, Any]:
+    return labelled(actuators(model.plant))
 
 
-def _write_prismatic_spring(field: str) -> Callable[[Twin, str, Values], None]:
-    def write(twin: Twin, label: str, value: Values) -> None:
-        name = f"{label}.spring"
-        if name not in twin.added:
-            twin.added[name] = SpringChange.none(_springs(twin.plant, PrismaticSpring_[twin.scalar])[label])
-        setattr(twin.added[name], field, value[0])
-
-    return write
-
-
-def _find_of_actuators(unit: str, quantity: str) -> Callable[[Model], Found]:
-    def find(model: Model) -> Found:
-        for label, actuator in labelled(actuators(model.plant)).items():
-            yield label, unit, getattr(actuator, f"default_{quantity}")()
-
-    return find
-
-
-def _write_actuator(setter: str) -> Callable[[Twin, str, Values], None]:
-    def write(twin: Twin, label: str, value: Values) -> None:
-        getattr(twin.actuator(label), setter)(twin.context, value[0])
-
-    return write
-
-
-def _find_gain(which: str, prismatic: str, other: str) -> Callable[[Model], Found]:
-    def find(model: Model) -> Found:
-        for label, actuator in labelled(actuators(model.plant)).items():
-            if actuator.has_controller():
-                yield label, _unit(actuator.joint(), prismatic, other), getattr(actuator.get_controller_gains(), which)
-
-    return find
-
-
-def _write_gain(which: str) -> Callable[[Twin, str, Values], None]:
-    def write(twin: Twin, label: str, value: Values) -> None:
-        actuator = twin.actuator(label)
-        gains = {"p": actuator.get_controller_gains().p, "d": actuator.get_controller_gains().d}
-        gains[which] = float(value[0])
-        actuator.set_controller_gains(PdControllerGains(**gains))
-
-    return write
-
-
-def _find_time_step(model: Model) -> Found:
-    if model.can_rebuild:
-        yield "model", "s", model.time_step
-
-
-def _write_time_step(twin: Twin, label: str, value: Values) -> None:
-    """Nothing is set: a plant keeps its time step, and another model stands in (`parameters.applied`)."""
-
-
-def _find_gravity(model: Model) -> Found:
-    if model.takes_forces:
-        yield "model", "m/s^2", model.plant.gravity_field().gravity_vector()
-
-
-def _write_gravity(twin: Twin, label: str, value: Values) -> None:
-    own: Array = plain(value)
-    twin.plant.mutable_gravity_field().set_gravity_vector(own)
-    if np.asarray(value).dtype == object:  # the plant takes the number, a force carries its derivative
-        twin.added["gravity"] = GravityChange(value - own)
-
-
-# In the order of writing: what an earlier one moves along, a later one sets.
-MECHANISM_KINDS = (
-    Kind("time_step", "finite_difference", _find_time_step, _write_time_step, positive=True),
-    Kind("gravity", "chain_rule", _find_gravity, _write_gravity, on_plant=True),
-    Kind("mass", "autodiff", _find_of_bodies("kg", lambda b: b.default_mass()), _write_mass, positive=True),
-    Kind("center_of_mass", "autodiff", _find_of_bodies("m", lambda b: b.default_com()), _write_center_of_mass),
-    Kind("inertia", "autodiff", _find_inertia, _write_inertia),
-    Kind("damping", "autodiff", _find_damping, _write_damping, positive=True),
-    Kind("offset", "autodiff", _find_offset, _write_offset),
-    Kind(
-        "spring_stiffness",
-        "autodiff",
-        _find_revolute_spring("N m/rad", lambda s: s.default_stiffness()),
-        _write_revolute_spring("SetStiffness"),
-        positive=True,
-    ),
-    Kind(
-        "spring_rest_angle",
-        "autodiff",
-        _find_revolute_spring("rad", lambda s: s.default_nominal_angle()),
-        _write_revolute_spring("SetNominalAngle"),
-    ),
-    Kind(
-        "spring_stiffness",
-        "chain_rule",
-        _find_prismatic_spring("N/m", lambda s: s.stiffness()),
-        _write_prismatic_spring("stiffness"),
-        positive=True,
-    ),
-    Kind(
-        "spring_rest_length",
-        "chain_rule",
-        _find_prismatic_spring("m", lambda s: s.nominal_position()),
-        _write_prismatic_spring("rest"),
-    ),
-    Kind("gear_ratio", "autodiff", _find_of_actuators("1", "gear_ratio"), _write_actuator("SetGearRatio")),
-    Kind(
-        "rotor_inertia",
-        "autodiff",
-        _find_of_actuators("kg m^2", "rotor_inertia"),
-        _write_actuator("SetRotorInertia"),
-        positive=True,
-    ),
-    Kind("kp", "finite_difference", _find_gain("p", "N/m", "N m/rad"), _write_gain("p"), positive=True, on_plant=True),
-    Kind(
-        "kd", "finite_difference", _find_gain("d", "N s/m", "N m s/rad"), _write_gain("d"), positive=True, on_plant=True
-    ),
-)
-
-
-_PROPERTIES = {  # quantity: (group, name, unit)
-    "friction": ("material", "coulomb_friction", "1"),
-    "stiffness": ("material", "point_contact_stiffness", "N/m"),
-    "dissipation": ("material", "hunt_crossley_dissipation", "s/m"),
-    "relaxation_time": ("material", "relaxation_time", "s"),
-    "hydroelastic_modulus": ("hydroelastic", "hydroelastic_modulus", "Pa"),
-}
-_ROUND = (Sphere, Cylinder, Capsule)
+def _controlled(model: Model) -> dict[str, Any]:
+    return {label: actuator for label, actuator in _actuators(model).items() if actuator.has_controller()}
 
 
 def geometries_of(twin: Twin) -> dict[str, list[Any]]:
@@ -296,60 +137,193 @@ def geometries_of(twin: Twin) -> dict[str, list[Any]]:
     return found
 
 
-def _find(quantity: str, unit: str, read: Callable[[SceneGraphInspector, Any], float | None]) -> Kind:
-    def find(model: Model) -> Found:
-        for label, ids in geometries_of(model.double).items():
-            values = {read(model.double.inspector, i) for i in ids}
-            value = values.pop()
-            if value is not None and not values:  # of geometries that differ each has its own value
-                yield label, unit, value
-
-    write = _write_radius if quantity == "radius" else _write_property(quantity)
-    return Kind(quantity, "finite_difference", find, write, positive=True)
+def _central_inertia(body: Any) -> list[float]:
+    inertia = body.default_spatial_inertia()
+    about_com = inertia.Shift(inertia.get_com()).CalcRotationalInertia()
+    return [*about_com.get_moments(), *about_com.get_products()]
 
 
-def _read_property(quantity: str) -> Callable[[SceneGraphInspector, Any], float | None]:
-    group, name, _ = _PROPERTIES[quantity]
-
-    def read(inspector: SceneGraphInspector, geometry: Any) -> float | None:
-        properties = inspector.GetProximityProperties(geometry)
-        if not properties.HasProperty(group, name):
-            return None
-        value = properties.GetProperty(group, name)
-        return float(value.dynamic_friction() if quantity == "friction" else value)
-
-    return read
+def _write_center_of_mass(twin: Twin, label: str, value: Values) -> None:
+    twin.body(label).SetCenterOfMassInBodyFrame(twin.context, value)
 
 
-def _read_radius(inspector: SceneGraphInspector, geometry: Any) -> float | None:
-    shape = inspector.GetShape(geometry)
-    return float(shape.radius()) if isinstance(shape, _ROUND) else None
+def _write_inertia(twin: Twin, label: str, value: Values) -> None:
+    body = twin.body(label)
+    xx, yy, zz, xy, xz, yz = np.asarray(value).astype(twin.scalar)
+    central = RotationalInertia_[twin.scalar](Ixx=xx, Iyy=yy, Izz=zz, Ixy=xy, Ixz=xz, Iyz=yz)
+    mass, com = body.get_mass(twin.context), body.CalcCenterOfMassInBodyFrame(twin.context)
+    body.SetSpatialInertiaInBodyFrame(
+        twin.context, SpatialInertia_[twin.scalar].MakeFromCentralInertia(mass, com, central)
+    )
 
 
-def _write_property(quantity: str) -> Callable[[Twin, str, Values], None]:
-    group, name, _ = _PROPERTIES[quantity]
+def _write_damping(twin: Twin, label: str, value: Values) -> None:
+    twin.joint(label).SetDampingVector(twin.context, value)
+
+
+def _read_offset(joint: Any) -> Any:
+    return joint.frame_on_parent().GetFixedPoseInBodyFrame().translation()
+
+
+def _write_offset(twin: Twin, label: str, value: Values) -> None:
+    frame, scalar = twin.joint(label).frame_on_parent(), twin.scalar
+    rotation = plain(frame.GetFixedPoseInBodyFrame().rotation().matrix())
+    if np.all(plain(value) == 0) and np.array_equal(rotation, np.eye(3)):
+        value = value + np.array([0.0, 0.0, IDENTITY_OFFSET])
+    pose = RigidTransform_[scalar](RotationMatrix_[scalar](rotation.astype(scalar)), np.asarray(value).astype(scalar))
+    frame.SetPoseInParentFrame(twin.context, pose)
+
+
+def _setter(element: Callable[[Twin, str], Any], name: str) -> Write:
+    """Write a number by the method of Drake's element that is called `name`."""
 
     def write(twin: Twin, label: str, value: Values) -> None:
-        new, inspector = float(value[0]), twin.inspector
-        root = twin.scene_graph.GetMyMutableContextFromRoot(twin.root_context)
-        for geometry in geometries_of(twin)[label]:
-            properties = ProximityProperties(inspector.GetProximityProperties(geometry))
-            properties.UpdateProperty(group, name, CoulombFriction(new, new) if quantity == "friction" else new)
-            twin.scene_graph.AssignRole(root, twin.plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
+        getattr(element(twin, label), name)(twin.context, value[0])
 
     return write
 
 
-def _write_radius(twin: Twin, label: str, value: Values) -> None:
-    radius, inspector = float(value[0]), twin.inspector
-    root = twin.scene_graph.GetMyMutableContextFromRoot(twin.root_context)
-    for geometry in geometries_of(twin)[label]:
-        shape = inspector.GetShape(geometry)
-        new = Sphere(radius) if isinstance(shape, Sphere) else type(shape)(radius, shape.length())
-        twin.scene_graph.ChangeShape(root, twin.plant.get_source_id(), geometry, new)
+def _revolute_spring(twin: Twin, label: str) -> Any:
+    return _springs(twin.plant, RevoluteSpring_[twin.scalar])[label]
+
+
+def _prismatic_setter(field: str) -> Write:
+    def write(twin: Twin, label: str, value: Values) -> None:
+        name = f"{label}.spring"
+        if name not in twin.added:
+            twin.added[name] = SpringChange.none(_springs(twin.plant, PrismaticSpring_[twin.scalar])[label])
+        setattr(twin.added[name], field, value[0])
+
+    return write
+
+
+def _gain(quantity: str, which: str, unit: tuple[str, str]) -> Kind:
+    def write(twin: Twin, label: str, value: Values) -> None:
+        actuator = twin.actuator(label)
+        gains = {"p": actuator.get_controller_gains().p, "d": actuator.get_controller_gains().d}
+        gains[which] = float(value[0])
+        actuator.set_controller_gains(PdControllerGains(**gains))
+
+    def read(actuator: Any) -> float:
+        return float(getattr(actuator.get_controller_gains(), which))
+
+    return Kind(quantity, DIFFERENCE, _controlled, unit, read, write, positive=True, on_plant=True)
+
+
+def _read_gravity(model: Model) -> Any:
+    return model.plant.gravity_field().gravity_vector()
+
+
+def _write_gravity(twin: Twin, label: str, value: Values) -> None:
+    own = plain(value)
+    twin.plant.mutable_gravity_field().set_gravity_vector(own)
+    if np.asarray(value).dtype == object:  # the plant takes the number, a force carries its derivative
+        twin.added["gravity"] = GravityChange(value - own)
+
+
+# In the order of writing: what an earlier one moves along, a later one sets.
+MECHANISM_KINDS = (
+    # A plant keeps its time step, so nothing is written: another model stands in (`parameters.applied`).
+    Kind("time_step", DIFFERENCE, _rebuildable, "s", attrgetter("time_step"), lambda *_: None, positive=True),
+    Kind("gravity", CHAIN_RULE, _taking_forces, "m/s^2", _read_gravity, _write_gravity, on_plant=True),
+    Kind("mass", AUTODIFF, _bodies, "kg", get("default_mass"), _setter(Twin.body, "SetMass"), positive=True),
+    Kind("center_of_mass", AUTODIFF, _bodies, "m", get("default_com"), _write_center_of_mass),
+    Kind("inertia", AUTODIFF, _heavy_bodies, "kg m^2", _central_inertia, _write_inertia),
+    Kind("damping", AUTODIFF, _damped_joints, DAMPING, get("default_damping_vector"), _write_damping, positive=True),
+    Kind("offset", AUTODIFF, _offset_joints, "m", _read_offset, _write_offset),
+    Kind(
+        "spring_stiffness",
+        AUTODIFF,
+        _revolute_springs,
+        "N m/rad",
+        get("default_stiffness"),
+        _setter(_revolute_spring, "SetStiffness"),
+        positive=True,
+    ),
+    Kind(
+        "spring_rest_angle",
+        AUTODIFF,
+        _revolute_springs,
+        "rad",
+        get("default_nominal_angle"),
+        _setter(_revolute_spring, "SetNominalAngle"),
+    ),
+    Kind(
+        "spring_stiffness",
+        CHAIN_RULE,
+        _prismatic_springs,
+        "N/m",
+        get("stiffness"),
+        _prismatic_setter("stiffness"),
+        positive=True,
+    ),
+    Kind("spring_rest_length", CHAIN_RULE, _prismatic_springs, "m", get("nominal_position"), _prismatic_setter("rest")),
+    Kind("gear_ratio", AUTODIFF, _actuators, "1", get("default_gear_ratio"), _setter(Twin.actuator, "SetGearRatio")),
+    Kind(
+        "rotor_inertia",
+        AUTODIFF,
+        _actuators,
+        "kg m^2",
+        get("default_rotor_inertia"),
+        _setter(Twin.actuator, "SetRotorInertia"),
+        positive=True,
+    ),
+    _gain("kp", "p", ("N/m", "N m/rad")),
+    _gain("kd", "d", DAMPING),
+)
+
+
+def _contact_kind(quantity: str, unit: str, read: Callable[[Any, Any], Any], change: Callable[..., None]) -> Kind:
+    """`read(inspector, geometry)`, None where it has no value; `change(twin, geometry, value, root context)`."""
+
+    def values(model: Model) -> dict[str, set[Any]]:
+        found = geometries_of(model.double)
+        return {label: {read(model.double.inspector, i) for i in ids} for label, ids in found.items()}
+
+    def write(twin: Twin, label: str, value: Values) -> None:
+        root = twin.scene_graph.GetMyMutableContextFromRoot(twin.root_context)
+        for geometry in geometries_of(twin)[label]:
+            change(twin, geometry, float(value[0]), root)
+
+    # Of geometries that differ each has its own value, their body none.
+    return Kind(quantity, DIFFERENCE, values, unit, lambda v: v.pop() if len(v) == 1 else None, write, positive=True)
+
+
+def _of_material(group: str, name: str) -> tuple[Callable[[Any, Any], Any], Callable[..., None]]:
+    """How a proximity property is read and changed."""
+    friction = name == "coulomb_friction"  # Drake holds two coefficients; a discrete plant uses the dynamic one
+
+    def read(inspector: Any, geometry: Any) -> float | None:
+        properties = inspector.GetProximityProperties(geometry)
+        if not properties.HasProperty(group, name):
+            return None
+        value = properties.GetProperty(group, name)
+        return float(value.dynamic_friction() if friction else value)
+
+    def change(twin: Twin, geometry: Any, value: float, root: Any) -> None:
+        properties = ProximityProperties(twin.inspector.GetProximityProperties(geometry))
+        properties.UpdateProperty(group, name, CoulombFriction(value, value) if friction else value)
+        twin.scene_graph.AssignRole(root, twin.plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
+
+    return read, change
+
+
+def _read_radius(inspector: Any, geometry: Any) -> float | None:
+    shape = inspector.GetShape(geometry)
+    return float(shape.radius()) if isinstance(shape, Sphere | Cylinder | Capsule) else None
+
+
+def _change_radius(twin: Twin, geometry: Any, radius: float, root: Any) -> None:
+    shape = twin.inspector.GetShape(geometry)
+    new = Sphere(radius) if isinstance(shape, Sphere) else type(shape)(radius, shape.length())
+    twin.scene_graph.ChangeShape(root, twin.plant.get_source_id(), geometry, new)
 
 
 CONTACT_KINDS = (
-    *(_find(quantity, _PROPERTIES[quantity][2], _read_property(quantity)) for quantity in _PROPERTIES),
-    _find("radius", "m", _read_radius),
+    _contact_kind("friction", "1", *_of_material("material", "coulomb_friction")),
+    _contact_kind("stiffness", "N/m", *_of_material("material", "point_contact_stiffness")),
+    _contact_kind("dissipation", "s/m", *_of_material("material", "hunt_crossley_dissipation")),
+    _contact_kind("relaxation_time", "s", *_of_material("material", "relaxation_time")),
+    _contact_kind("hydroelastic_modulus", "Pa", *_of_material("hydroelastic", "hydroelastic_modulus")),
+    _contact_kind("radius", "m", _read_radius, _change_radius),
 )
