@@ -1,9 +1,4 @@
-"""Arrays that come from users: shape and finiteness checked once, then read-only.
-
-The cross product, of many vectors at once.
-
-Checks of the numbers that describe a loop.
-"""
+"""Arrays and numbers that come from users, checked once; cross products of many vectors at once."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -29,7 +24,7 @@ def finite_array(subject: str, values: Any, shape: Sequence[int | str]) -> Array
 
     Raises ShapeError, NonFiniteError, or InputError where `values` holds no numbers.
     """
-    array = _array(subject, values, shape)
+    array = array_with_gaps(subject, values, shape)
     if not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise NonFiniteError(subject, index=index, got=float(array[index]))
@@ -38,29 +33,29 @@ def finite_array(subject: str, values: Any, shape: Sequence[int | str]) -> Array
 
 def array_with_gaps(subject: str, values: Any, shape: Sequence[int | str]) -> Array:
     """Like `finite_array`, where NaN and infinity have a meaning (a free goal entry, no bound)."""
-    return _array(subject, values, shape)
-
-
-def _array(subject: str, values: Any, shape: Sequence[int | str]) -> Array:
     try:
         if np.iscomplexobj(values):
             raise TypeError("complex")
         array = frozen(values)
     except (TypeError, ValueError) as error:
         raise InputError(subject, got=repr(values)[:80], expected="an array of numbers") from error
-    matches = array.ndim == len(shape) and all(
-        isinstance(want, str) or have == want for have, want in zip(array.shape, shape, strict=True)
-    )
-    if not matches:
+    if array.ndim != len(shape) or any(
+        not isinstance(n, str) and n != m for m, n in zip(array.shape, shape, strict=True)
+    ):
         raise ShapeError(subject, got=array.shape, expected=tuple(shape))
     return array
 
 
+def count(subject: str, value: Any, least: int) -> int:
+    """`value` as an int of at least `least`."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise InputError(subject, got=repr(value), expected=f"a whole number of at least {least}")
+    return int(value)
+
+
 def positive_int(subject: str, value: Any) -> int:
     """`value` as an int of at least 1."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise InputError(subject, got=repr(value), expected="a whole number of at least 1")
-    return int(value)
+    return count(subject, value, 1)
 
 
 def positive_float(subject: str, value: Any) -> float:
@@ -70,6 +65,20 @@ def positive_float(subject: str, value: Any) -> float:
     if not (np.isfinite(value) and value > 0):
         raise InputError(subject, got=repr(value), expected="a finite number above 0")
     return float(value)
+
+
+def part(subject: str, value: float) -> float:
+    """`value` where it is at least 0 and less than 1."""
+    if not 0 <= value < 1:
+        raise InputError(subject, got=value, expected="a number from 0 to less than 1")
+    return float(value)
+
+
+def scale(subject: str, value: ArrayLike, size: int) -> Array:
+    """`value`, a number or (size,), as (size,)."""
+    if np.ndim(value) == 0:
+        return np.full(size, finite_array(subject, value, ()))
+    return finite_array(subject, value, (size,))
 
 
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
@@ -87,24 +96,3 @@ def skew(w: Array) -> Array:
 def cross(a: Array, b: Array) -> Array:
     """a x b of vectors (..., 3), broadcast."""
     return np.asarray(a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1))
-
-
-def count(subject: str, value: int, least: int) -> int:
-    """`value` where it is a whole number of at least `least`."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise InputError(subject, got=value, expected=f"a whole number of at least {least}")
-    return int(value)
-
-
-def part(subject: str, value: float) -> float:
-    """`value` where it is at least 0 and less than 1."""
-    if not 0 <= value < 1:
-        raise InputError(subject, got=value, expected="a number from 0 to less than 1")
-    return float(value)
-
-
-def scale(subject: str, value: ArrayLike, size: int) -> Array:
-    """`value`, a number or (size,), as (size,)."""
-    if np.ndim(value) == 0:
-        return np.full(size, finite_array(subject, value, ()))
-    return finite_array(subject, value, (size,))

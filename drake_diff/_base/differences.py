@@ -1,4 +1,4 @@
-"""Forward, backward and central differences of any function; knows no robots."""
+"""Difference quotients of any function: central, one-sided at many step sizes, and the best of a sweep."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,36 +13,20 @@ Difference = Callable[[Array, Array], Array]
 
 RATIO_SQUARED = 10.0  # of neighbouring steps of a sweep: half a decade
 SWEEP = tuple(10.0 ** (-k / 2) for k in range(4, 12))  # 1e-2 ... 3e-6
-ROUNDING = 1e-15
+ROUNDING = 1e-15  # of a value in double precision: a few units in the last place
 
 
-@dataclass(frozen=True)
-class Differences:
-    """Difference quotients (m, n) of one step size."""
-
-    step: float
-    forward: Array
-    backward: Array
-
-    @property
-    def central(self) -> Array:
-        return (self.forward + self.backward) / 2
-
-
-def differences(
+def central_differences(
     f: Function, size: int, step: float, *, at_zero: Array | None = None, minus: Difference = np.subtract
-) -> Differences:
-    """Difference quotients of `f`: R^size -> R^m around 0 with `step` in each direction.
+) -> Array:
+    """(m, n): (f(h e) - f(-h e)) / 2h of `f`: R^size -> R^m around 0, h being `step` and e each unit vector.
 
-    `f` takes the displacement, so that the caller decides how it is added; `minus(a, b)` subtracts two values
-    of `f`. With e the unit vectors: forward = (f(h e) - f(0)) / h, backward = (f(0) - f(-h e)) / h.
+    `f` takes the displacement, so that the caller decides how it is added; `minus(a, b)` subtracts two values of `f`,
+    always from f(0), so that it may be a chart of a curved space there.
     """
     centre = f(np.zeros(size)) if at_zero is None else at_zero
-    columns = [(minus(f(step * e), centre) / step, -minus(f(-step * e), centre) / step) for e in np.eye(size)]
-    rows = len(minus(centre, centre))
-    forward = np.array([c[0] for c in columns]).reshape(size, rows).T
-    backward = np.array([c[1] for c in columns]).reshape(size, rows).T
-    return Differences(step, forward, backward)
+    columns = [(minus(f(step * e), centre) - minus(f(-step * e), centre)) / (2 * step) for e in np.eye(size)]
+    return np.array(columns).reshape(size, len(minus(centre, centre))).T
 
 
 @dataclass(frozen=True)
@@ -55,7 +39,7 @@ class Sweep:
 
 
 def sweep_of(f: Many, size: int, steps: Sequence[float], *, minus: Difference = np.subtract) -> Sweep:
-    """`differences` of `f`: (K, size) -> (K, m) with each of `steps`, from one call of `f` with all displacements."""
+    """One-sided differences of `f`: (K, size) -> (K, m) around 0, from one call of `f` with all displacements."""
     h = np.array(steps)[:, None, None]
     sides = np.stack([h * np.eye(size), -h * np.eye(size)])  # (2, s, n, n)
     values = np.asarray(f(np.vstack([np.zeros((1, size)), sides.reshape(-1, size)])), dtype=float)
@@ -82,7 +66,7 @@ def plateau(f: Function, size: int, *, at_zero: Array) -> Array:
     Every entry is judged on its own: no one step suits all, where a solver leaves small changes unsolved or large
     ones change the contact. Of three neighbouring Richardson values that lie closest, the middle one.
     """
-    central = np.array([differences(f, size, h, at_zero=at_zero).central for h in SWEEP])
+    central = np.array([central_differences(f, size, h, at_zero=at_zero) for h in SWEEP])
     values = richardson(central)
     windows = np.array([values[s : s + 3] for s in range(len(values) - 2)])
     rounding = ROUNDING * np.maximum(1.0, np.abs(at_zero))[None, :, None] / np.array(SWEEP[2:-1])[:, None, None]

@@ -11,7 +11,7 @@ from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.autodiff import gradient_rows
-from drake_diff._base.differences import differences, plateau
+from drake_diff._base.differences import central_differences, plateau
 from drake_diff.derivatives.analytic import analytic_jacobian, analytic_of
 from drake_diff.derivatives.contact.material import of_contact_alone
 from drake_diff.derivatives.implicit import NotSmoothError, implicit_jacobian
@@ -271,7 +271,7 @@ def _finite_difference(model: Model, vector: ParameterVector, x: Array, u: Array
         moved = point + scale * d
         return np.asarray(advance(model.double, moved[: model.nx], moved[model.nx :]))
 
-    by_point = differences(f, len(point), DIFFERENCE_STEP, at_zero=x_next).central / scale
+    by_point = central_differences(f, len(point), DIFFERENCE_STEP, at_zero=x_next) / scale
     every = np.arange(len(vector.values))
     return np.hstack([by_point, _parameter_differences(model, vector, x, u, x_next, every)])
 

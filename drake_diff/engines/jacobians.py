@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff._base.differences import differences, one_by_one
+from drake_diff._base.differences import central_differences, one_by_one
 from drake_diff.certificates.certificate import Certificate, certify_displacement
 from drake_diff.engines.interface import Engine, Precision
 from drake_diff.engines.motion import EngineMotion
@@ -50,7 +50,7 @@ def jacobian_at(
         return engine.step(space.plus(x, d[: space.size]), u + d[space.size :])
 
     def quotients() -> Array:
-        return differences(step, size, DIFFERENCE_STEP[precision], minus=space.minus).central
+        return central_differences(step, size, DIFFERENCE_STEP[precision], minus=space.minus)
 
     try:
         found = engine.differentiate_step(x, u)

@@ -1,11 +1,4 @@
-"""Rotational inertia in coordinates in which every vector is physically possible.
-
-A rotational inertia I about the centre of mass belongs to some distribution of mass exactly where the second moment
-S = tr(I) / 2 - I is positive semidefinite. With S = L L', L lower triangular and its diagonal (e^a, e^b, e^c), the
-six numbers (a, b, c, L10, L20, L21) are free: the log-Cholesky coordinates of Rucker and Wensing, "Smooth
-parameterization of rigid-body inertia" (2022), of the part that mass and centre of mass leave.
-
-Named physical parameters as one flat vector: names, units, bounds, values, and where each derivative comes from.
+"""Named physical parameters of a model as one flat vector, and the coordinates in which solvers move them.
 
 A name is `element.quantity`, with SI units and as many entries as stand in brackets:
 
@@ -22,8 +15,6 @@ A name is `element.quantity`, with SI units and as many entries as stand in brac
 
 An element whose name two model instances share is called `instance::name`. Static friction follows the dynamic
 one, which is all that a discrete plant uses.
-
-The coordinates in which a solver moves parameters: scaled, and free of values that nothing physical can have.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -43,52 +34,6 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameter_kinds import CONTACT_KINDS, MECHANISM_KINDS, Kind
 from drake_diff.model.twin import Twin
 
-
-def matrix(inertia: Any) -> Any:
-    """(3, 3) from the six numbers xx yy zz xy xz yz."""
-    xx, yy, zz, xy, xz, yz = inertia
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-
-
-def second_moment(inertia: Array) -> Array:
-    """(3, 3) S [kg m^2] of an inertia (6,) about the centre of mass."""
-    full = matrix(inertia)
-    return np.asarray(np.trace(full) / 2 * np.eye(3) - full)
-
-
-def room_of_inertia(inertia: Array) -> float:
-    """How far [kg m^2] every entry may move at least before no mass has this inertia; negative where none has it."""
-    eigenvalues = np.linalg.eigvalsh(second_moment(inertia))
-    smallest, largest = float(eigenvalues[0]), float(np.abs(eigenvalues).max())
-    return 0.0 if abs(smallest) <= 1e-12 * largest else smallest / 3
-
-
-def to_log_cholesky(inertia: Array) -> Array:
-    """(6,) coordinates of an inertia (6,). Raises InputError for a point or a rod, which lie at infinity."""
-    if room_of_inertia(inertia) <= 0:
-        raise InputError("inertia", got=inertia, expected="one with mass off every line: a point or a rod has no such")
-    lower = np.linalg.cholesky(second_moment(inertia))
-    return np.array([*np.log(np.diag(lower)), lower[1, 0], lower[2, 0], lower[2, 1]])
-
-
-def from_log_cholesky(coordinates: Any) -> Any:
-    """(6,) xx yy zz xy xz yz of coordinates (6,), floats or AutoDiffXd."""
-    a, b, c, l10, l20, l21 = coordinates
-    zero = 0.0 * a
-    lower = np.array([[np.exp(a), zero, zero], [l10, np.exp(b), zero], [l20, l21, np.exp(c)]])
-    moment = lower @ lower.T
-    trace = moment[0, 0] + moment[1, 1] + moment[2, 2]
-    return np.array(
-        [trace - moment[0, 0], trace - moment[1, 1], trace - moment[2, 2], -moment[0, 1], -moment[0, 2], -moment[1, 2]]
-    )
-
-
-def derivative_of_from_log_cholesky(coordinates: Array) -> tuple[Array, Array]:
-    """(6,) inertia and (6, 6) its derivative by the coordinates."""
-    result = from_log_cholesky(InitializeAutoDiff(coordinates).ravel()).reshape(-1, 1)
-    return ExtractValue(result).ravel(), np.asarray(ExtractGradient(result))
-
-
 KINDS = (*MECHANISM_KINDS, *CONTACT_KINDS)
 TIME_STEP = "model.time_step"
 
@@ -105,6 +50,12 @@ class Parameter:
     derivative_source: str  # "autodiff", "chain_rule" or "finite_difference"
     kind: Kind = field(repr=False)
 
+    def __repr__(self) -> str:
+        value = ", ".join(f"{v:g}" for v in self.value)
+        value = value if len(self.value) == 1 else f"({value})"
+        least = ", at least 0" if self.lower == 0 else ""
+        return f"{self.name} = {value} {self.unit}{least}; derivative by {self.derivative_source}"
+
     @property
     def label(self) -> str:
         """The element's name."""
@@ -117,19 +68,33 @@ class Parameter:
 
 
 def list_parameters(model: Model) -> list[Parameter]:
-    """Every parameter of `model`, sorted by name."""
-    return list(model.cache("parameters", lambda: read_parameters(model)))
+    """Every physical parameter that `model` can be differentiated by, sorted by name.
 
+    Args:
+        model: The model; values are those of its file or diagram.
 
-def read_parameters(model: Model) -> tuple[Parameter, ...]:
-    """Every parameter of `model`, sorted by name, read afresh."""
-    found = []
-    for kind in KINDS:
-        for label, unit, value in kind.find(model):
-            lower = 0.0 if kind.positive else -np.inf
-            value = frozen(np.atleast_1d(value))
-            found.append(Parameter(f"{label}.{kind.quantity}", unit, value, lower, np.inf, kind.source, kind))
-    return tuple(sorted(found, key=lambda parameter: parameter.name))
+    Returns:
+        Parameters with `.name`, `.unit`, `.value` (n,), `.lower`, `.upper` and `.derivative_source`: "autodiff"
+        (through Drake's step), "chain_rule" (through a generalized force) or "finite_difference".
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> [p for p in dd.list_parameters(model) if p.label == "hinge"]
+        [hinge.damping = 0.1 N m s/rad, at least 0; derivative by autodiff]
+        >>> dd.step(model, [0.1, 0.0], [0.0], parameters={"hinge.damping": 0.0}).round(4)
+        array([ 0.0998, -0.0196])
+    """
+
+    def read() -> tuple[Parameter, ...]:
+        found = []
+        for kind in KINDS:
+            for label, unit, value in kind.find(model):
+                lower = 0.0 if kind.positive else -np.inf
+                value = frozen(np.atleast_1d(value))
+                found.append(Parameter(f"{label}.{kind.quantity}", unit, value, lower, np.inf, kind.source, kind))
+        return tuple(sorted(found, key=lambda parameter: parameter.name))
+
+    return list(model.cache("parameters", read))
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,7 +271,10 @@ def write_autodiff(vector: ParameterVector, model: Model, variables: Any) -> Non
 
 @dataclass(frozen=True, eq=False)
 class ParameterCoordinates:
-    """z (np,): a parameter over its first value's size, an inertia's log-Cholesky coordinates."""
+    """The coordinates z (np,) in which a solver moves parameters: scaled, and free of what nothing physical can have.
+
+    A parameter is divided by its first value's size; an inertia has log-Cholesky coordinates (see `to_log_cholesky`).
+    """
 
     start: ParameterVector
 
@@ -347,3 +315,56 @@ class ParameterCoordinates:
         for s in self._inertias:
             by_z[..., s] = by_values[..., s] @ derivative_of_from_log_cholesky(z[s])[1]
         return np.asarray(by_z)
+
+
+def matrix(inertia: Any) -> Any:
+    """(3, 3) from the six numbers xx yy zz xy xz yz."""
+    xx, yy, zz, xy, xz, yz = inertia
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def second_moment(inertia: Array) -> Array:
+    """(3, 3) S [kg m^2] of an inertia (6,) about the centre of mass."""
+    full = matrix(inertia)
+    return np.asarray(np.trace(full) / 2 * np.eye(3) - full)
+
+
+def room_of_inertia(inertia: Array) -> float:
+    """How far [kg m^2] every entry may move at least before no mass has this inertia; negative where none has it."""
+    eigenvalues = np.linalg.eigvalsh(second_moment(inertia))
+    smallest, largest = float(eigenvalues[0]), float(np.abs(eigenvalues).max())
+    return 0.0 if abs(smallest) <= 1e-12 * largest else smallest / 3
+
+
+def to_log_cholesky(inertia: Array) -> Array:
+    """(6,) coordinates in which every vector is a physically possible inertia, of an inertia (6,).
+
+    An inertia I about the centre of mass belongs to some distribution of mass exactly where the second moment
+    S = tr(I) / 2 - I is positive semidefinite. With S = L L', L lower triangular and its diagonal (e^a, e^b, e^c), the
+    six numbers (a, b, c, L10, L20, L21) are free: the part of the log-Cholesky coordinates of Rucker and Wensing,
+    "Smooth parameterization of rigid-body inertia" (2022), that mass and centre of mass leave.
+
+    Raises InputError for a point or a rod, which lie at infinity.
+    """
+    if room_of_inertia(inertia) <= 0:
+        raise InputError("inertia", got=inertia, expected="one with mass off every line: a point or a rod has no such")
+    lower = np.linalg.cholesky(second_moment(inertia))
+    return np.array([*np.log(np.diag(lower)), lower[1, 0], lower[2, 0], lower[2, 1]])
+
+
+def from_log_cholesky(coordinates: Any) -> Any:
+    """(6,) xx yy zz xy xz yz of coordinates (6,), floats or AutoDiffXd."""
+    a, b, c, l10, l20, l21 = coordinates
+    zero = 0.0 * a
+    lower = np.array([[np.exp(a), zero, zero], [l10, np.exp(b), zero], [l20, l21, np.exp(c)]])
+    moment = lower @ lower.T
+    trace = moment[0, 0] + moment[1, 1] + moment[2, 2]
+    return np.array(
+        [trace - moment[0, 0], trace - moment[1, 1], trace - moment[2, 2], -moment[0, 1], -moment[0, 2], -moment[1, 2]]
+    )
+
+
+def derivative_of_from_log_cholesky(coordinates: Array) -> tuple[Array, Array]:
+    """(6,) inertia and (6, 6) its derivative by the coordinates."""
+    result = from_log_cholesky(InitializeAutoDiff(coordinates).ravel()).reshape(-1, 1)
+    return ExtractValue(result).ravel(), np.asarray(ExtractGradient(result))

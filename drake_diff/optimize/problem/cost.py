@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, finite_array
 from drake_diff._base.autodiff import gradient_of
-from drake_diff._base.differences import differences
+from drake_diff._base.differences import central_differences
 from drake_diff.exceptions import InputError, ShapeError
 
 RunningCost = Callable[[Any, Any], Any]  # (x, u) -> scalar
@@ -161,6 +161,6 @@ def final_cost_hessian(cost: FinalCost, x: Array) -> Array:
 
 def _difference_hessian(gradient: Callable[[Array], Array], z: Array) -> Array:
     scale = np.maximum(1.0, np.abs(z))
-    quotient = differences(lambda d: gradient(z + scale * d), len(z), 1e-5).central / scale
+    quotient = central_differences(lambda d: gradient(z + scale * d), len(z), 1e-5) / scale
     values, vectors = np.linalg.eigh((quotient + quotient.T) / 2)
     return np.asarray((vectors * np.maximum(values, 0)) @ vectors.T)
