@@ -78,6 +78,29 @@ def test_a_plan_that_misses_what_is_asked_is_told(write_urdf, fields, clause):
     assert len(list(broken_variants(plan, replays(plan)))) == 2
 
 
+@pytest.mark.parametrize("i", range(4))
+def test_one_coordinate_off_is_refused_and_named(load, i):
+    """A cart-pole's own motion, asked to end at its own last state but for one coordinate, within one bound as well."""
+    model, us = load("cart_pole.urdf"), np.linspace(2, -1, 15)[:, None]
+    x0 = np.array([0.1, 0.5, -0.3, 1.0])
+    plan = plan_of(dd.Problem(model, x0=x0, num_steps=15, final_cost=lambda x: x[0]), us)
+    xs, tolerance = plan.sample(1)[0], STATE_TOLERANCE * plan.scale[i]
+    sign = np.sign((xs[:, i] - x0[i])[np.argmax(np.abs(xs[:, i] - x0[i]))])  # the side that it moves away to
+    for factor in (0.9, 1.1):
+        goal, limits = np.array(xs[-1]), np.full(4, sign * np.inf)
+        goal[i] += sign * factor * tolerance
+        limits[i] = sign * (np.max(sign * xs[1:, i]) - factor * tolerance)
+        side = "x_upper" if sign > 0 else "x_lower"
+        for asked, clause in (
+            ({"x_goal": goal}, f"{model.state_names[i]} ends {factor * tolerance:.3g} from its goal"),
+            ({"bounds": dd.Bounds(**{side: limits})}, f"{model.state_names[i]} is {factor * tolerance:.3g} beyond its"),
+        ):
+            problem = dd.Problem(model, x0=x0, num_steps=15, final_cost=lambda x: x[0], **asked)
+            found = by_name(replays(plan_of(problem, us)), f"in steps of {model.time_step:g} s", "open loop")
+            assert found.holds is (factor < 1), found.failures
+            assert factor < 1 or clause in found.failures[0]
+
+
 def test_the_tolerance_is_five_percent_of_the_range(write_urdf):
     us = np.full((COUNT, 1), 2.0)
     for factor, holds in ((0.9, True), (1.1, False)):

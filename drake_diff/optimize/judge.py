@@ -14,7 +14,7 @@ from drake_diff.optimize.problem.cost import differentiate_final_cost
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, NlpResult, Outcome
 from drake_diff.optimize.replay import broken_variants
-from drake_diff.optimize.shooting import ShootingVariables, state_sensitivities
+from drake_diff.optimize.shooting import ShootingVariables, final_sensitivity
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
 
 NO_EFFECT = 1e-12
@@ -22,7 +22,7 @@ NO_EFFECT = 1e-12
 
 def why_blind(problem: Problem, variables: ShootingVariables, z: Array) -> str:
     """Which part of the goal, or the final cost, nothing in z has an effect on; empty where there is none."""
-    last = state_sensitivities(variables, z)[-1]
+    last = final_sensitivity(variables, z)
     x_final = variables.states(z)[-1]
     effect = np.abs(last).max(axis=1, initial=0.0)
     wrong = np.abs(problem.goal_error(x_final)) > FEASIBILITY_TOLERANCE

@@ -9,7 +9,8 @@ the states counts. With as many segments as steps it is direct transcription of 
 the case of one segment.
 """
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -129,18 +130,31 @@ class ShootingVariables:
 
 
 def state_sensitivities(variables: ShootingVariables, z: Array) -> Array:
-    """(n+1, nx, size): d x_k / d z, forward: S_(k+1) = A_k S_k + B_k d u_k / d z + C_k d p / d z."""
-    linearization = variables.linearization(z)
-    nx, nu, free = variables.problem.model.nx, variables.shape[1], len(variables.free)
-    sensitivities = np.zeros((len(linearization) + 1, nx, variables.size))
-    sensitivities[0, variables.free, np.arange(free)] = 1.0
-    for k, d in enumerate(linearization):
-        sensitivities[k + 1] = d.A @ sensitivities[k]
+    """(n+1, nx, size): d x_k / d z for every state of the segment."""
+    sensitivities = np.empty((variables.shape[0] + 1, variables.problem.model.nx, variables.size))
+    for k, sensitivity in enumerate(_sensitivities(variables, z)):
+        sensitivities[k] = sensitivity
+    return sensitivities
+
+
+def final_sensitivity(variables: ShootingVariables, z: Array) -> Array:
+    """(nx, size): d x_n / d z, without the memory of `state_sensitivities`, which grows as n^2."""
+    (last,) = deque(_sensitivities(variables, z), maxlen=1)
+    return last
+
+
+def _sensitivities(variables: ShootingVariables, z: Array) -> Iterator[Array]:
+    """d x_k / d z for k = 0 ... n, forward: S_(k+1) = A_k S_k + B_k d u_k / d z + C_k d p / d z."""
+    sensitivity, nu = np.zeros((variables.problem.model.nx, variables.size)), variables.shape[1]
+    sensitivity[variables.free, np.arange(len(variables.free))] = 1.0
+    yield sensitivity
+    for k, d in enumerate(variables.linearization(z)):
+        sensitivity = d.A @ sensitivity
         if variables.problem.optimizes_controls:
             start = variables.inputs.start + k * nu
-            sensitivities[k + 1][:, start : start + nu] += d.B
-        sensitivities[k + 1][:, variables.inputs.stop :] += variables.pull_back(z, d.C)
-    return sensitivities
+            sensitivity[:, start : start + nu] += d.B
+        sensitivity[:, variables.inputs.stop :] += variables.pull_back(z, d.C)
+        yield sensitivity
 
 
 class RolloutCost:
@@ -265,7 +279,7 @@ def defect(variables: ShootingVariables) -> Rows:
         return variables.states(z[:size])[-1] - z[size:]
 
     def jacobian(z: Array) -> Array:
-        return np.hstack([state_sensitivities(variables, z[:size])[-1], -np.eye(nx)])
+        return np.hstack([final_sensitivity(variables, z[:size]), -np.eye(nx)])
 
     return Rows(variables, np.zeros(nx), np.zeros(nx), values, jacobian)
 

@@ -1,11 +1,4 @@
-"""The dynamics' second derivatives, learned from the Jacobians of successive motions.
-
-iLQR leaves out sum_i v_i d2 f_i / d z2, v being the multipliers of the dynamics, and crawls where that is large beside
-the cost's curvature. For each knot a symmetric matrix M_k that stands for it is corrected by symmetric rank one (SR1;
-Nocedal and Wright, "Numerical Optimization", 2006, section 6.2) so that M_k dz = (F_k(new) - F_k(old))' v. It costs no
-simulation, and stays 0 where the dynamics are linear. Where more is known of M_k, it is set.
-
-The linear-quadratic problem around a motion: Drake's step Jacobians and the cost's derivatives.
+"""The linear-quadratic problem around a motion: Drake's step Jacobians, the cost's derivatives, learned curvature.
 
 All in Drake's own coordinates, quaternions included: the discrete step lets a quaternion's norm grow, so that the norm
 is a state that inputs move, and on the rotations' tangent space the gradient would be wrong by what is left out.
@@ -30,43 +23,10 @@ from drake_diff.optimize.problem.cost import (
 )
 from drake_diff.optimize.problem.problem import Problem
 
-SMALLEST_MOVE = 1e-7  # below it rounding of the Jacobians, 1e-12, is too large a part of their difference
-SAFE_DIVISOR = 1e-6  # of |dz| |r|: SR1 is not defined where dz' r vanishes
-
-
-class DynamicsCurvature:
-    """M (N, n + m, n + m), updated once for each motion."""
-
-    def __init__(self) -> None:
-        self.M = np.zeros(0)
-        self._F = np.zeros(0)
-
-    def update(self, problem: LinearQuadratic, dz: Array) -> None:
-        """Learn from the problem around the new motion, dz (N, n + m) being how far it has moved."""
-        if not self._F.size:
-            self.M, self._F = np.zeros_like(problem.hessians), problem.F
-            return
-        v = multipliers(problem)
-        r = np.einsum("kij,ki->kj", problem.F - self._F, v) - np.einsum("kij,kj->ki", self.M, dz)
-        divisor = np.einsum("ki,ki->k", r, dz)
-        length = np.linalg.norm(dz, axis=1)
-        safe = (length > SMALLEST_MOVE) & (np.abs(divisor) > SAFE_DIVISOR * length * np.linalg.norm(r, axis=1))
-        r, divisor = r[safe], divisor[safe]
-        self.M[safe] += r[:, :, None] * r[:, None, :] / divisor[:, None, None]
-        self._F = problem.F
-
-
-def multipliers(problem: LinearQuadratic) -> Array:
-    """(N, n): v_k = d cost / d x_(k+1), all inputs as they are and all gaps kept."""
-    n, v = problem.num_states, np.empty_like(problem.gaps)
-    v[-1] = problem.final_gradient
-    for k in range(len(v) - 1, 0, -1):
-        v[k - 1] = problem.gradients[k, :n] + problem.F[k, :, :n].T @ v[k]
-    return v
-
-
 # Of a state, or of 1: Jacobians are known to 1e-12, so that this leaves 1e-6 of their derivative.
 DIFFERENCE_STEP = 1e-6
+SMALLEST_MOVE = 1e-7  # below it rounding of the Jacobians, 1e-12, is too large a part of their difference
+SAFE_DIVISOR = 1e-6  # of |dz| |r|: SR1 is not defined where dz' r vanishes
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +39,7 @@ class Motion:
 
     @property
     def point(self) -> tuple[Array, Array]:
-        """xs and us."""
+        """(xs, us)."""
         return self.xs, self.us
 
     @property
@@ -97,59 +57,14 @@ class Motion:
         return float(np.abs(self.gaps).sum())
 
 
-def jacobians_along(problem: Problem, motion: Motion) -> Array:
-    """(N, nx, nx + nu): [A_k, B_k]; raises GradientError or SimulationError where one, or a step, is refused.
-
-    Those of an input on a bound are from inside it: a bound is often the actuator's limit, at which Drake's derivative
-    is 0, as beyond it, while a minimization needs to know what leaving the bound would do.
-    """
-    A, B, _ = linearize(problem.model, motion.xs, _off_bounds(problem, motion.us), x_next=motion.ends)
-    return np.concatenate([A, B], axis=2)
-
-
-def dynamics_curvature_along(problem: Problem, motion: Motion, v: Array) -> Array | None:
-    """(N, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx); None where contact or a limit acts.
-
-    By differences of the Jacobians along every state: in its inputs alone a smooth step is linear. None also where
-    Jacobians are not to be had in one call. Raises what `linearize` raises.
-    """
-    model, xs, us = problem.model, motion.xs[:-1], _off_bounds(problem, motion.us)
-    here = smooth_jacobians(model, xs[0], us, "auto", xs, motion.ends)
-    if here is None or here.steps.touching.any() or not here.smooth.all():
-        return None
-    curvature = np.zeros((len(us), model.nx + model.nu, model.nx + model.nu))
-    for j in range(model.nx):
-        moved = np.array(xs)
-        moved[:, j] += DIFFERENCE_STEP * np.maximum(1.0, np.abs(xs[:, j]))
-        near = _nearby_jacobians(model, moved, us)
-        if near is None:
-            return None
-        slopes = (near - here.jacobians) / (moved - xs)[:, j, None, None]
-        curvature[:, :, j] = np.einsum("kij,ki->kj", slopes, v)
-    curvature[:, : model.nx, model.nx :] = curvature[:, model.nx :, : model.nx].swapaxes(1, 2)
-    return (curvature + curvature.swapaxes(1, 2)) / 2
-
-
-def _nearby_jacobians(model: Model, xs: Array, us: Array) -> Array | None:
-    """(N, nx, nx + nu) of the steps from xs (N, nx) beside smooth ones; None where one that was taken is not smooth."""
-    analytic = analytic_of(model)
-    if not isinstance(analytic, str):
-        return analytic.differentiate(xs, us)[0]  # no step is taken
-    found = smooth_jacobians(model, xs[0], us, "auto", xs)
-    return found.jacobians if found is not None and found.smooth.all() else None
-
-
-def _off_bounds(problem: Problem, us: Array) -> Array:
-    """`us` with those on a bound moved inside it by rounding."""
-    lower, upper = problem.bounds.u_lower, problem.bounds.u_upper
-    return np.where(us == upper, np.nextafter(us, lower), np.where(us == lower, np.nextafter(us, upper), us))
-
-
 def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: AugmentedLagrangian) -> LinearQuadratic:
     """`problem` around `motion`, the constraints being part of its cost."""
     model, xs, us = problem.model, motion.xs, motion.us
     gradients, hessians = _expand_running_cost(problem, xs, us)
-    final_gradient, final_hessian = _expand_final_cost(problem, xs[-1])
+    final_gradient, final_hessian = np.zeros(model.nx), np.zeros((model.nx, model.nx))
+    if problem.final_cost is not None:
+        final_gradient = differentiate_final_cost(problem.final_cost, xs[-1])[1]
+        final_hessian = final_cost_hessian(problem.final_cost, xs[-1])
     if constraints.any:
         gradient, curvature = constraints.differentiate(xs, us)
         gradients += gradient[:-1]
@@ -187,7 +102,86 @@ def _expand_running_cost(problem: Problem, xs: Array, us: Array) -> tuple[Array,
     return gradients, hessians
 
 
-def _expand_final_cost(problem: Problem, x: Array) -> tuple[Array, Array]:
-    if problem.final_cost is None:
-        return np.zeros(len(x)), np.zeros((len(x), len(x)))
-    return differentiate_final_cost(problem.final_cost, x)[1], final_cost_hessian(problem.final_cost, x)
+def jacobians_along(problem: Problem, motion: Motion) -> Array:
+    """(N, nx, nx + nu): [A_k, B_k]; raises GradientError or SimulationError where one, or a step, is refused.
+
+    Those of an input on a bound are from inside it: a bound is often the actuator's limit, at which Drake's derivative
+    is 0, as beyond it, while a minimization needs to know what leaving the bound would do.
+    """
+    A, B, _ = linearize(problem.model, motion.xs, _off_bounds(problem, motion.us), x_next=motion.ends)
+    return np.concatenate([A, B], axis=2)
+
+
+def _off_bounds(problem: Problem, us: Array) -> Array:
+    """`us` with those on a bound moved inside it by rounding."""
+    lower, upper = problem.bounds.u_lower, problem.bounds.u_upper
+    return np.where(us == upper, np.nextafter(us, lower), np.where(us == lower, np.nextafter(us, upper), us))
+
+
+def dynamics_curvature_along(problem: Problem, motion: Motion, v: Array) -> Array | None:
+    """(N, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx); None where contact or a limit acts.
+
+    By differences of the Jacobians along every state: in its inputs alone a smooth step is linear. None also where
+    Jacobians are not to be had in one call. Raises what `linearize` raises.
+    """
+    model, xs, us = problem.model, motion.xs[:-1], _off_bounds(problem, motion.us)
+    here = smooth_jacobians(model, xs[0], us, "auto", xs, motion.ends)
+    if here is None or here.steps.touching.any() or not here.smooth.all():
+        return None
+    curvature = np.zeros((len(us), model.nx + model.nu, model.nx + model.nu))
+    for j in range(model.nx):
+        moved = np.array(xs)
+        moved[:, j] += DIFFERENCE_STEP * np.maximum(1.0, np.abs(xs[:, j]))
+        near = _nearby_jacobians(model, moved, us)
+        if near is None:
+            return None
+        slopes = (near - here.jacobians) / (moved - xs)[:, j, None, None]
+        curvature[:, :, j] = np.einsum("kij,ki->kj", slopes, v)
+    curvature[:, : model.nx, model.nx :] = curvature[:, model.nx :, : model.nx].swapaxes(1, 2)
+    return (curvature + curvature.swapaxes(1, 2)) / 2
+
+
+def _nearby_jacobians(model: Model, xs: Array, us: Array) -> Array | None:
+    """(N, nx, nx + nu) of the steps from xs (N, nx) beside smooth ones; None where one that was taken is not smooth."""
+    analytic = analytic_of(model)
+    if not isinstance(analytic, str):
+        return analytic.differentiate(xs, us)[0]  # no step is taken
+    found = smooth_jacobians(model, xs[0], us, "auto", xs)
+    return found.jacobians if found is not None and found.smooth.all() else None
+
+
+class DynamicsCurvature:
+    """The dynamics' second derivatives, learned from the Jacobians of successive motions, for no simulation at all.
+
+    iLQR leaves out sum_i v_i d2 f_i / d z2, v being the multipliers of the dynamics, and crawls where that is large
+    beside the cost's curvature. M (N, n + m, n + m) stands for it: symmetric, corrected once for each motion by
+    symmetric rank one (SR1; Nocedal and Wright, "Numerical Optimization", 2006, section 6.2) so that
+    M_k dz = (F_k(new) - F_k(old))' v; it stays 0 where the dynamics are linear. If more is known of M, it is set.
+    """
+
+    def __init__(self) -> None:
+        self.M = np.zeros(0)
+        self._F = np.zeros(0)
+
+    def update(self, problem: LinearQuadratic, dz: Array) -> None:
+        """Learn from the problem around the new motion, dz (N, n + m) being how far it has moved."""
+        if not self._F.size:
+            self.M, self._F = np.zeros_like(problem.hessians), problem.F
+            return
+        v = multipliers(problem)
+        r = np.einsum("kij,ki->kj", problem.F - self._F, v) - np.einsum("kij,kj->ki", self.M, dz)
+        divisor = np.einsum("ki,ki->k", r, dz)
+        length = np.linalg.norm(dz, axis=1)
+        safe = (length > SMALLEST_MOVE) & (np.abs(divisor) > SAFE_DIVISOR * length * np.linalg.norm(r, axis=1))
+        r, divisor = r[safe], divisor[safe]
+        self.M[safe] += r[:, :, None] * r[:, None, :] / divisor[:, None, None]
+        self._F = problem.F
+
+
+def multipliers(problem: LinearQuadratic) -> Array:
+    """(N, n): v_k = d cost / d x_(k+1), all inputs as they are and all gaps kept."""
+    n, v = problem.num_states, np.empty_like(problem.gaps)
+    v[-1] = problem.final_gradient
+    for k in range(len(v) - 1, 0, -1):
+        v[k - 1] = problem.gradients[k, :n] + problem.F[k, :, :n].T @ v[k]
+    return v

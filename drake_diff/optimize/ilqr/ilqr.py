@@ -3,8 +3,8 @@
 Li and Todorov, "Iterative linear quadratic regulator design for nonlinear biological movement systems", 2004, and
 the feasibility-driven form of Mastalli et al., "Crocoddyl", 2020: the guess need not be a rollout, and a step of size a
 leaves 1 - a of each gap between step(x_k, u_k) and x_(k+1). A hard goal, waypoints, state bounds and constraints are
-augmented Lagrangians, and the dynamics' second derivatives, which iLQR leaves out, are learned on the way (`secant`),
-or taken by differences of the Jacobians where a smooth motion converges slowly.
+augmented Lagrangians (`constraints`), and the dynamics' second derivatives, which iLQR leaves out, are learned on the
+way (`expansion`), or taken by differences of the Jacobians where a smooth motion converges slowly.
 """
 
 import math
@@ -29,7 +29,7 @@ from drake_diff.optimize.ilqr.expansion import (
     jacobians_along,
     multipliers,
 )
-from drake_diff.optimize.ilqr.riccati import LinearQuadratic, Policy, slope_along, solve_riccati
+from drake_diff.optimize.ilqr.riccati import AffinePolicy, LinearQuadratic, slope_along, solve_riccati
 from drake_diff.optimize.problem.cost import CostToGo
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import (
@@ -54,7 +54,7 @@ BESIDE = 1e-14  # of a bound: an input that is no further from it is on it
 # Of what a step gained: where the next one gains more, the search converges slowly, for want of the right curvature.
 SLOW = 1 / 2
 
-_Solve = Callable[[LinearQuadratic, float], Policy | None]
+_Solve = Callable[[LinearQuadratic, float], AffinePolicy | None]
 
 
 def check_problem(problem: Problem) -> None:
@@ -90,10 +90,9 @@ def solve_ilqr(
 ) -> tuple[NlpResult, Array, Array]:
     """Solve `problem` from xs (N+1, nx), us (N, nu), a rollout or not; gives (result, xs, us), result.z being us flat.
 
-    After `patience` steps in a row that are shorter than SHORT the search ends as inaccurate: it crawls along a jump;
-    before that it regularizes where steps are short, as the model reaches too far.
-    `least_penalty` is what constraints weigh from the start.
-    Raises GradientError where a derivative is refused, SimulationError where a step from the guess is.
+    After `patience` steps in a row that are shorter than SHORT the search ends as inaccurate: it crawls along a jump.
+    Before that it regularizes where steps are short, as the model reaches too far. `least_penalty` is what constraints
+    weigh from the start. Raises GradientError if a derivative is refused, SimulationError if a step from the guess is.
     """
     search = _Search(problem, xs, us, limits, report, patience)
     search.constraints.penalty = max(search.constraints.penalty, least_penalty)
@@ -111,15 +110,18 @@ def costs_to_go(problem: Problem, xs: Array, us: Array) -> tuple[CostToGo, ...]:
     Raises GradientError where a derivative is refused, InputError where the cost has no minimum.
     """
     search = _Search(problem, xs, us, Limits(1, math.inf, 1.0), None)
-    model = search._expand()
-    policy = solve_riccati(model, 0.0) or solve_riccati(model, SMALLEST_REGULARIZATION)
+    policy = _least_regularized(solve_riccati, search._expand())
     if policy is None:
         raise InputError("running_cost", got="no positive curvature by the inputs", expected="a cost with a minimum")
     parts = zip(search.motion.xs, policy.value_gradients, policy.value_hessians, strict=True)
     return tuple(CostToGo(*part) for part in parts)
 
 
-def _best_policy(solve: _Solve, models: Sequence[LinearQuadratic], regularization: float) -> Policy | None:
+def _least_regularized(solve: _Solve, model: LinearQuadratic) -> AffinePolicy | None:
+    return solve(model, 0.0) or solve(model, SMALLEST_REGULARIZATION)
+
+
+def _best_policy(solve: _Solve, models: Sequence[LinearQuadratic], regularization: float) -> AffinePolicy | None:
     """The policy of the first of the models whose Hessians allow one."""
     for model in models:
         policy = solve(model, regularization)
@@ -132,7 +134,7 @@ def _promise_at_most(solve: _Solve, models: Sequence[LinearQuadratic], limit: fl
     """Whether no model, regularized as little as it allows, promises more than `limit`, and one of them that much."""
     found = False
     for model in models:
-        policy = solve(model, 0.0) or solve(model, SMALLEST_REGULARIZATION)
+        policy = _least_regularized(solve, model)
         if policy is not None and not abs(policy.expected) <= limit:
             return False
         found = found or policy is not None
@@ -186,17 +188,14 @@ class _Search:
             outcome = self._step(model, final)
             if outcome is not None:
                 return outcome
-            if self._crawls():
+            steps = [row.step for row in self.rows[1:]]
+            if len(steps) >= self.patience and max(steps[-int(self.patience) :]) < SHORT:  # it crawls along a jump
                 self.stalled = True
                 return Outcome.INACCURATE
             if interrupted.is_set():
                 return Outcome.INTERRUPTED
             if time.monotonic() - self.start > self.limits.time_limit:
                 return Outcome.TIME_LIMIT
-
-    def _crawls(self) -> bool:
-        steps = [row.step for row in self.rows[1:]]
-        return len(steps) >= self.patience and max(steps[-int(self.patience) :]) < SHORT
 
     def _expand(self) -> LinearQuadratic:
         new, old = self.motion, self.expanded
@@ -230,7 +229,9 @@ class _Search:
         while self.regularization <= LARGEST_REGULARIZATION:
             policy = _best_policy(solve, models, self.regularization)
             if policy is not None and self._search_along(model, policy):
-                self.regularization = self._tightened() if self._is_cut_back() else self._relaxed()
+                is_cut_back = math.isfinite(self.patience) and all(row.step <= CUT_BACK for row in self.rows[-2:])
+                relaxed = self.regularization / 8 if self.regularization / 8 > SMALLEST_REGULARIZATION else 0.0
+                self.regularization = self._tightened() if is_cut_back else relaxed
                 return None
             if is_reached(ROUNDING * scale):
                 return Outcome.SOLVED  # what is left to gain is less than the cost's rounding
@@ -240,17 +241,10 @@ class _Search:
         self.regularization = 0.0
         return Outcome.INACCURATE
 
-    def _is_cut_back(self) -> bool:
-        return math.isfinite(self.patience) and all(row.step <= CUT_BACK for row in self.rows[-2:])
-
     def _tightened(self) -> float:
         return max(8 * self.regularization, SMALLEST_REGULARIZATION)
 
-    def _relaxed(self) -> float:
-        smaller = self.regularization / 8
-        return smaller if smaller > SMALLEST_REGULARIZATION else 0.0
-
-    def _search_along(self, model: LinearQuadratic, policy: Policy) -> bool:
+    def _search_along(self, model: LinearQuadratic, policy: AffinePolicy) -> bool:
         """Take the largest of `STEP_SIZES` that lowers the merit enough, if there is one."""
         slope, distance = policy.slope, self.motion.distance
         if distance:
@@ -269,11 +263,13 @@ class _Search:
             if found <= merit + SUFFICIENT_DECREASE * size * slope:
                 self.motion, self.cost = motion, cost
                 self.gains = self.gains[1], merit - found
-                self._record(policy.gradient, size)
+                self.rows.append(Iteration(len(self.rows), cost, self._infeasibility(), policy.gradient, size))
+                if self.report:
+                    self.report.row(self.rows[-1])
                 return True
         return False
 
-    def _roll(self, policy: Policy, size: float) -> Motion:
+    def _roll(self, policy: AffinePolicy, size: float) -> Motion:
         """Step from x_0 with feedback, each gap shrunk to 1 - `size` of itself."""
         twin, old = self.problem.model.double, self.motion
         xs, us = np.empty_like(old.xs), np.empty_like(old.us)
@@ -318,9 +314,3 @@ class _Search:
 
     def _infeasibility(self) -> float:
         return max(float(np.abs(self.motion.gaps).max(initial=0.0)), self.constraints.violation(*self.motion.point))
-
-    def _record(self, gradient: float, size: float) -> None:
-        number, violation = len(self.rows), self._infeasibility()
-        self.rows.append(Iteration(number, self.cost, violation, gradient, size))
-        if self.report:
-            self.report.row(self.rows[-1])

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from drake_diff._base.arrays import Array
 
 BOX_ITERATIONS = 30
+HALVINGS = 0.5 ** np.arange(20)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +38,10 @@ class LinearQuadratic:
 
 
 @dataclass(frozen=True, eq=False)
-class Policy:
-    """du_k = feedforward_k + feedback_k dx_k from dx_0 = start; what it promises where all gaps are 0.
+class AffinePolicy:
+    """du_k = feedforward_k + feedback_k dx_k from dx_0 = start; what it promises if all gaps are 0.
 
     What remains to be paid from knot k on is value_gradients_k' dx_k + dx_k' value_hessians_k dx_k / 2, and a constant.
-
     `slope` and `curvature` are those of the quadratic model along the step: it changes the cost by
     a slope + a^2 curvature / 2 at the step size a. `gradient` is the largest |d cost / d u| of an input, or
     |d cost / d x_0|, that no bound holds.
@@ -62,7 +62,7 @@ class Policy:
         return -(self.slope + self.curvature / 2)
 
 
-def solve_riccati(problem: LinearQuadratic, regularization: float) -> Policy | None:
+def solve_riccati(problem: LinearQuadratic, regularization: float) -> AffinePolicy | None:
     """The best policy, `regularization` added to the inputs' Hessian; None where that is not positive definite.
 
     The recursion is that of [dx; 1], so that V = [[P, s], [s', c]] is all that remains to be paid and
@@ -95,7 +95,7 @@ def solve_riccati(problem: LinearQuadratic, regularization: float) -> Policy | N
     gradient = float(np.abs(q_u[free]).max(initial=left))
     if not math.isfinite(slope + curvature):  # NaN passes for positive definite
         return None
-    return Policy(start, d, K[:, :, :-1], s, P, slope, curvature, gradient)
+    return AffinePolicy(start, d, K[:, :, :-1], s, P, slope, curvature, gradient)
 
 
 def _with_a_one(problem: LinearQuadratic) -> tuple[Array, Array, Array]:
@@ -163,24 +163,18 @@ def minimize_in_box(hessian: Array, gradient: Array, lower: Array, upper: Array)
             break
         step = np.zeros_like(d)
         step[free] = -np.linalg.solve(hessian[np.ix_(free, free)], slope[free])
-        moved = _shorten(hessian, gradient, d, step, lower, upper)
-        if np.array_equal(moved, d):
+        value, before = gradient @ d + d @ hessian @ d / 2, d
+        for size in HALVINGS:  # of the projected step, until it lowers the value
+            moved = np.clip(before + size * step, lower, upper)
+            if gradient @ moved + moved @ hessian @ moved / 2 < value:
+                d = moved
+                break
+        if np.array_equal(before, d):
             break
-        d = moved
     return d, free
 
 
-def _shorten(hessian: Array, gradient: Array, d: Array, step: Array, lower: Array, upper: Array) -> Array:
-    """The projected step, halved until it lowers the value; `d` where none does."""
-    value = gradient @ d + d @ hessian @ d / 2
-    for size in 0.5 ** np.arange(20):
-        moved = np.clip(d + size * step, lower, upper)
-        if gradient @ moved + moved @ hessian @ moved / 2 < value:
-            return moved
-    return d
-
-
-def slope_along(problem: LinearQuadratic, policy: Policy) -> tuple[float, float]:
+def slope_along(problem: LinearQuadratic, policy: AffinePolicy) -> tuple[float, float]:
     """(slope, curvature) of the cost along the full linear step, which closes the gaps."""
     dx, slope, curvature = policy.start, 0.0, 0.0
     for k in range(len(problem.F)):

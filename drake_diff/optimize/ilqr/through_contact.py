@@ -1,22 +1,17 @@
-"""Minimize through contact, with the knots at which bodies begin to touch held where the search stalls at one.
+"""Trajectory optimization through contact by iLQR: stages of softer contact, then the true plant, whose step jumps.
 
-Drake makes a contact only where two bodies overlap at the start of a step, so the step jumps where they just touch, and
-the least cost often lies at a jump: there no gradient tells a minimum. Between the jumps, with every beginning of a
-touch held at its knot by rows phi >= m before it and phi <= -m at it, phi the signed distance and m a margin, the
-problem is smooth. A minimum that presses against such a row is compared with that of the sequence beyond the row, the
-touch beginning a knot earlier or later, and the search goes on there where that is cheaper.
+What does not touch has no gradient. So `solve_continuation` solves a row of problems: the same plant with a force at
+a distance added (`soft_contact`), of a shorter reach in each stage, and in the last one the true plant. A stage starts
+from the inputs of the one before and only warms up the next: it is short, and the schedule goes on if it fails.
 
-Take a motion that stopped short of its goal to it, by Newton steps on the inputs from the first contact on.
+On the true plant, contact begins only where two bodies overlap at the start of a step, so the step jumps where they
+just touch. The least cost often lies at such a jump, where no gradient tells a minimum. So `solve_through_jumps` holds
+every beginning of a touch at its knot, by rows phi >= m before it and phi <= -m at it, phi being the signed distance
+and m a margin; under these rows the problem is smooth. A minimum that presses against a row is compared with that of
+the sequence beyond it, in which the touch begins a knot earlier or later, and the search goes on where it is cheaper.
 
-A search through contact is held up where a contact begins exactly at a knot: the step jumps there, and the least
-effort would cross the jump. The inputs after it do not move it. What comes reaches the goal, near the least cost, but
-is not shown to be a minimum.
-
-Trajectory optimization through contact from a guess that does not touch, by a schedule of softer contacts.
-
-What does not touch has no gradient. So iLQR solves a row of problems: the same plant with a force at a distance added
-(`soft_contact`), of a shorter reach in each stage, and in the last one the true plant. Each stage starts from the
-inputs that the one before found, and only warms up the next: it is short, and the schedule goes on where one fails.
+A search that still stops short of its goal is taken there by `restore_goal`, by Newton steps on the inputs from the
+first contact on. What comes out reaches the goal near the least cost, but is not shown to be a minimum.
 """
 
 import math
@@ -56,7 +51,7 @@ from drake_diff.optimize.program import (
     Report,
     interrupt_flag,
 )
-from drake_diff.optimize.shooting import ShootingVariables, state_sensitivities
+from drake_diff.optimize.shooting import ShootingVariables, final_sensitivity
 
 MARGIN = 1e-5  # [m] that a held pair keeps from just touching: differences of 1e-6 then see no jump
 PRESSING = 1.01  # margins: nearer than that to just touching, a row is what holds the motion
@@ -64,244 +59,7 @@ PATIENCE, MORE_PATIENCE = 3, 10  # short steps in a row are a stall; and where n
 HOLDING = 1e6  # the least penalty of held rows: a search that may cross them sees the jump again
 BEYOND_ITERATIONS = 50  # for the minimum beyond a row, which the note then says was not found
 MOST_SEQUENCES = 30  # that are tried: beyond them the result claims its own sequence alone
-
-Found = tuple[NlpResult, Array, Array]  # as from `solve_ilqr`
-
-
-@dataclass(frozen=True)
-class Hold:
-    """A pair of bodies, numbered as in `separations`, that is `apart` at `knot`, or overlaps there."""
-
-    pair: int
-    names: tuple[str, str]
-    knot: int
-    apart: bool
-
-    def constraint(self, model: Model) -> Constraint:
-        distance = _Distance(model, self.pair)
-        sides = {"lower": MARGIN} if self.apart else {"upper": -MARGIN}
-        return Constraint(distance, knots=[self.knot], name=str(self), **sides)
-
-    def moved_beyond(self, model: Model, x: Array) -> Array:
-        """`x` (nx,) with the pair a margin beyond just touching, by the least motion."""
-        separation = _separation(model, x, self.pair)
-        wanted = -MARGIN if self.apart else MARGIN
-        x = np.array(x)
-        x[: model.nq] += (wanted - separation.distance) * separation.opening
-        return x
-
-    def __str__(self) -> str:
-        return f"{' and '.join(self.names)} {'apart' if self.apart else 'touching'} at knot {self.knot}"
-
-
-class _Distance:
-    """The signed distance [m] of a pair as a function of x, floats or AutoDiffXd."""
-
-    def __init__(self, model: Model, pair: int):
-        self.model, self.pair = model, pair
-
-    def __call__(self, x: Any) -> Any:
-        if x.dtype == float:
-            return _separation(self.model, x, self.pair).distance
-        found = _separation(self.model, ExtractValue(x.reshape(-1, 1)).ravel(), self.pair)
-        return chain(found.distance, np.pad(found.gradient, (0, self.model.nv)), x)
-
-
-def _separation(model: Model, x: Array, pair: int) -> Separation:
-    set_state(model.double, x)
-    return separations(model.double)[pair]
-
-
-def beginnings(problem: Problem, xs: Array) -> tuple[Hold, ...]:
-    """Two holds for each beginning of a touch along xs (N+1, nx): apart at the knot before it, touching at its own.
-
-    What nothing moves (the given first state) or acts on (the last) is left out.
-    """
-    distances = []
-    for x in xs[:-1]:
-        set_state(problem.model.double, x)
-        distances.append([s.distance for s in separations(problem.model.double)])
-    phi, names = np.array(distances), [s.bodies for s in separations(problem.model.double)]
-    found = list[Hold]()
-    for before, pair in np.argwhere((phi[:-1] >= 0) & (phi[1:] < 0)):
-        knots = ((int(before), True), (int(before) + 1, False))
-        found += [
-            Hold(int(pair), names[pair], k, apart) for k, apart in knots if k or not problem.initial_state_is_given
-        ]
-    return tuple(found)
-
-
-def solve_through_jumps(
-    problem: Problem, xs: Array, us: Array, *, limits: Limits, report: Report | None
-) -> tuple[NlpResult, Array, Array]:
-    """What `solve_ilqr` gives, from a search that holds beginnings of touches where it stalls at one.
-
-    Where they press, the result's note says which, and what the sequences beyond them cost. `limits` are those of all
-    sequences together. Raises as `solve_ilqr` does.
-    """
-    search = _Sequences(problem, limits, report)
-    with interrupt_flag() as interrupted:
-        result, xs, us = search.run(xs, us, interrupted)
-    return replace(result, z=us.ravel(), iterations=tuple(search.rows)), xs, us
-
-
-class _Sequences:
-    def __init__(self, problem: Problem, limits: Limits, report: Report | None):
-        self.problem, self.limits, self.report = problem, limits, report
-        self.start, self.rows = time.monotonic(), list[Iteration]()
-        self.costs = dict[tuple[Hold, ...], float]()  # of each sequence's minimum; infinite where none was found
-        self.ended = False  # by Ctrl-C or the clock
-
-    def run(self, xs: Array, us: Array, interrupted: threading.Event) -> Found:
-        """Let the search go free until it stalls, then from sequence to cheaper sequence."""
-        found, holds, stuck = self._minimize(xs, us, (), PATIENCE), tuple[Hold, ...](), False
-        while found[0].outcome is Outcome.INACCURATE and not stuck and len(self.costs) < MOST_SEQUENCES:
-            try:
-                ahead = beginnings(self.problem, found[1])
-            except ModelError as error:  # Drake knows no distance of some pair
-                ahead = ()
-                self._say(f"nothing can be held: {error}")
-            stuck, holds = ahead == holds, ahead
-            found = self._minimize(*found[1:], holds, MORE_PATIENCE if stuck else PATIENCE)
-        if found[0].outcome is Outcome.SOLVED and holds:
-            return self._improve(found, interrupted)
-        return found
-
-    def _improve(self, best: Found, interrupted: threading.Event) -> Found:
-        """Cross what holds the motion while that is cheaper."""
-        told, left = list[str](), self._pressing(best[1])
-        while left and len(self.costs) < MOST_SEQUENCES and not self._is_over(interrupted):
-            hold = left.pop()
-            cost = self.problem.objective(*best[1:])
-            other = self._beyond(hold, *best[1:])
-            if self.ended:
-                left.append(hold)
-                break
-            new = self.problem.objective(*other[1:]) if isinstance(other, tuple) else other
-            if isinstance(other, tuple) and new < cost:
-                best, told, left = other, [], self._pressing(other[1])
-            else:
-                told.append(f"{hold} (beyond: {f'cost {new:.6g}' if np.isfinite(new) else 'no minimum found'})")
-        told += [f"{hold} (beyond: not tried)" for hold in left]
-        if not told:
-            return best
-        cost = self.problem.objective(*best[1:])
-        note = f"a minimum for its own sequence of contacts, cost {cost:.6g}, held by " + "; ".join(told)
-        return replace(best[0], note=note), *best[1:]
-
-    def _beyond(self, hold: Hold, xs: Array, us: Array) -> "Found | float":
-        """The minimum of the sequence beyond `hold`; its cost alone where it is known, infinite where there is none."""
-        beyond = np.array(xs)
-        beyond[hold.knot] = hold.moved_beyond(self.problem.model, xs[hold.knot])
-        holds = beginnings(self.problem, beyond)
-        if holds in self.costs:
-            return self.costs[holds]
-        try:
-            other = self._minimize(beyond, us, holds, PATIENCE, BEYOND_ITERATIONS)
-        except (GradientError, SimulationError) as error:
-            self._say(f"refused: {error}")
-            self.costs[holds] = np.inf
-        return other if np.isfinite(self.costs[holds]) else np.inf
-
-    def _pressing(self, xs: Array) -> list[Hold]:
-        """The beginnings of touches along xs that are as near to just touching as rows let them."""
-        holds = beginnings(self.problem, xs)
-        distances = [_separation(self.problem.model, xs[h.knot], h.pair).distance for h in holds]
-        return [h for h, d in zip(holds, distances, strict=True) if abs(d) < PRESSING * MARGIN]
-
-    def _is_over(self, interrupted: threading.Event) -> bool:
-        over = time.monotonic() - self.start > self.limits.time_limit or len(self.rows) > self.limits.max_iterations
-        return over or interrupted.is_set()
-
-    def _minimize(self, xs: Array, us: Array, holds: tuple[Hold, ...], patience: int, most: float = np.inf) -> Found:
-        """One search under `holds`, of `most` iterations, within what is left of the limits."""
-        left = self.limits.time_limit - (time.monotonic() - self.start)
-        more = int(min(most, max(self.limits.max_iterations - max(len(self.rows) - 1, 0), 1)))
-        limits = replace(self.limits, time_limit=left, max_iterations=more)
-        rows = [hold.constraint(self.problem.model) for hold in holds]
-        held = replace(self.problem, constraints=(*self.problem.constraints, *rows))
-        if holds:
-            self._say("held: " + "; ".join(map(str, holds)))
-        penalty = HOLDING if holds else 0.0
-        result, xs, us = solve_ilqr(
-            held, xs, us, limits=limits, report=self.report, patience=patience, least_penalty=penalty
-        )
-        self.ended = result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT)
-        first = len(self.rows) - 1 if self.rows else 0
-        self.rows += [replace(r, iteration=first + r.iteration) for r in result.iterations[bool(self.rows) :]]
-        self.costs[holds] = self.problem.objective(xs, us) if result.outcome is Outcome.SOLVED else np.inf
-        return result, xs, us
-
-    def _say(self, text: str) -> None:
-        if self.report:
-            self.report.say(text)
-
-
-MOST_STEPS, SHORTENINGS = 20, 10
-
-
-def restore_goal(
-    problem: Problem, xs: Array, us: Array, tolerance: float, is_over: Callable[[], bool] = lambda: False
-) -> tuple[Array, Array, str]:
-    """(xs (N+1, nx), us (N, nu), what was done) nearer to the hard goal of `problem`; the same us where none is nearer.
-
-    xs is a rollout of us. Each step is the least change of the inputs from the first contact on, within their
-    bounds, halved until the miss is smaller and bounds of states, waypoints and constraints hold as before. It ends
-    early where `is_over` says so.
-    """
-    first, done = _first_contact(problem, xs, us), ""
-    for number in range(1, MOST_STEPS + 1):
-        if is_over() or _miss(problem, xs) <= tolerance:
-            break
-        try:
-            nearer = _step(problem, xs, us, first)
-        except (GradientError, SimulationError) as error:
-            return xs, us, f"{done}; then a Newton step towards the goal was refused: {error}"
-        if nearer is None:
-            break
-        xs, us = nearer
-        done = f"; then {number} Newton step{'s' * (number > 1)} on the inputs from knot {first} on, towards the goal"
-    return xs, us, done
-
-
-def _step(problem: Problem, xs: Array, us: Array, first: int) -> tuple[Array, Array] | None:
-    variables, bounds, wanted = ShootingVariables(problem), problem.bounds, ~np.isnan(problem.goal)
-    last = state_sensitivities(variables, variables.pack(xs[0], us))[-1][wanted]
-    by_inputs = last[:, len(variables.free) :].reshape(len(last), *us.shape)[:, first:].reshape(len(last), -1)
-    error = problem.goal_error(xs[-1])[wanted]
-    allowed = max(_excess(problem, xs, us), FEASIBILITY_TOLERANCE)
-    change = np.zeros_like(us)
-    change[first:] = -np.linalg.lstsq(by_inputs, error)[0].reshape(-1, us.shape[1])
-    for size in 0.5 ** np.arange(SHORTENINGS):
-        moved = np.clip(us + size * change, bounds.u_lower, bounds.u_upper)
-        rolled = roll_states(problem.model, xs[0], moved)
-        nearer = np.linalg.norm(problem.goal_error(rolled[-1])) < np.linalg.norm(error)
-        if nearer and _excess(problem, rolled, moved) <= allowed:
-            return rolled, moved
-    return None
-
-
-def _excess(problem: Problem, xs: Array, us: Array) -> float:
-    """By how much anything but the goal and the inputs is out of its bounds."""
-    bounds = problem.bounds
-    beyond = float(np.max(np.maximum(bounds.x_lower - xs, xs - bounds.x_upper)[1:], initial=0.0))
-    return max(beyond, *(excess for excess, _ in problem.constraint_excess(xs, us).values()), 0.0)
-
-
-def _miss(problem: Problem, xs: Array) -> float:
-    return float(np.abs(problem.goal_error(xs[-1])).max())
-
-
-def _first_contact(problem: Problem, xs: Array, us: Array) -> int:
-    """The first step in which anything touches; 0 where nothing does."""
-    twin = problem.model.double
-    for k, u in enumerate(us):
-        advance(twin, xs[k], u)
-        if twin.touches():
-            return k
-    return 0
-
-
+MOST_STEPS, SHORTENINGS = 20, 10  # of Newton's method towards the goal
 STAGE_ITERATIONS, STAGE_TOLERANCE = 30, 1e-4  # a stage is a guess for the next: no more than that is asked of it
 REACH = 3.0  # the first distance is this part of the gap, where the force is e^-3 = 5 % of that at touching
 SHORTER = 3.0  # each distance is this part of the one before
@@ -310,8 +68,10 @@ FASTEST = 4.0
 # h^2 k / m of the stiffest stage: at 4 the explicit force is unstable; where it is weak, true contact, which jumps,
 # does the work, and the stage is as rough as the true plant.
 LARGEST_STIFFNESS = 0.4
-JUST_TOUCHING = 2e-5  # [m], beyond the margin of `contact_sequence`; what rests on something presses further into it
+JUST_TOUCHING = 2e-5  # [m], beyond MARGIN; what rests on something presses further into it
 NUDGE = 10.0  # how many gaps the force at x0 alone would move what it acts on, were it to last
+
+Found = tuple[NlpResult, Array, Array]  # as from `solve_ilqr`
 
 
 @dataclass(frozen=True)
@@ -340,6 +100,57 @@ class StageLog:
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
+
+
+def solve_continuation(
+    problem: Problem, us: Array, stages: Sequence[SoftContact], *, limits: Limits, report: Report | None
+) -> tuple[NlpResult, Array, Array, tuple[StageLog, ...]]:
+    """Solve `problem` by iLQR through the `stages` and then on the true plant, from us (N, nu).
+
+    Gives what `solve_ilqr` gives, of the true plant, and a log for each stage. `limits.time_limit` is that of all
+    stages together; if it or Ctrl-C ends one, the rest are left out and the motion is the true plant's rollout. A
+    search that ends short of a minimum is taken to the goal by `restore_goal`, which its message says.
+    Raises GradientError or SimulationError if the true plant refuses.
+    """
+    deadline, logs, x0 = time.monotonic() + limits.time_limit, list[StageLog](), np.array(problem.x0)
+
+    def log(*entries: Any) -> None:
+        logs.append(StageLog(len(logs) + 1, *entries))
+        if report:
+            report.say(str(logs[-1]))
+
+    with interrupt_flag() as interrupted:
+        for contact in stages:
+            softer = replace(problem, model=softened(problem.model, contact))
+            iterations, tolerance = min(STAGE_ITERATIONS, limits.max_iterations), max(STAGE_TOLERANCE, limits.tolerance)
+            short = Limits(iterations, deadline - time.monotonic(), tolerance)
+            try:
+                xs = roll_states(softer.model, x0, us)
+                result, xs, us = solve_ilqr(softer, xs, us, limits=short, report=report, patience=PATIENCE)
+                x0, outcome = xs[0], result.outcome
+                log(contact.distance, contact.stiffness, *_told(softer, result, xs, us))
+            except (GradientError, SimulationError) as error:
+                outcome = Outcome.NO_GRADIENT
+                log(contact.distance, contact.stiffness, f"refused: {error}", 0, None, None, None)
+            if interrupted.is_set() or outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
+                outcome = Outcome.TIME_LIMIT if outcome is Outcome.TIME_LIMIT else Outcome.INTERRUPTED
+                xs, message = roll_states(problem.model, x0, us), f"iLQR: {outcome.value} in stage {len(logs)}"
+                return NlpResult(us.ravel(), outcome, message, ()), xs, us, tuple(logs)
+        left = replace(limits, time_limit=deadline - time.monotonic())
+        xs = roll_states(problem.model, x0, us)
+        result, xs, us = solve_through_jumps(problem, xs, us, limits=left, report=report)
+        log(None, None, *_told(problem, result, xs, us))
+        if result.outcome in (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.INFEASIBLE):
+            xs, us, done = restore_goal(
+                problem, xs, us, limits.tolerance, lambda: interrupted.is_set() or time.monotonic() > deadline
+            )
+            message, outcome = result.message + _where_it_jumps(problem, xs) + done, result.outcome
+            if outcome is Outcome.INFEASIBLE and _miss(problem, xs) <= limits.tolerance:
+                outcome = Outcome.INACCURATE  # state bounds are measured again by the verdict
+            result = replace(result, z=us.ravel(), outcome=outcome, message=message)
+            if done and report:
+                report.say(done.removeprefix("; "))
+    return result, xs, us, tuple(logs)
 
 
 def check_schedule(problem: Problem, continuation: Any) -> tuple[SoftContact, ...]:
@@ -379,46 +190,14 @@ def default_schedule(problem: Problem) -> tuple[SoftContact, ...]:
     return tuple(stages)
 
 
-def solve_continuation(
-    problem: Problem, us: Array, stages: Sequence[SoftContact], *, limits: Limits, report: Report | None
-) -> tuple[NlpResult, Array, Array, tuple[StageLog, ...]]:
-    """Solve `problem` by iLQR through the `stages` and then on the true plant, from us (N, nu).
-
-    Gives what `solve_ilqr` gives, of the true plant, and a log for each stage. `limits.time_limit` is that of all
-    stages together; where it or Ctrl-C ends one, the rest are left out and the motion is the true plant's rollout. A
-    search that ends short of a minimum is taken to the goal by `restore_goal`, which its message says.
-    Raises GradientError or SimulationError where the true plant refuses.
-    """
-    start, logs, x0 = time.monotonic(), list[StageLog](), np.array(problem.x0)
-
-    def is_over() -> bool:
-        return interrupted.is_set() or time.monotonic() - start > limits.time_limit
-
-    with interrupt_flag() as interrupted:
-        for contact in stages:
-            left = limits.time_limit - (time.monotonic() - start)
-            short = Limits(min(STAGE_ITERATIONS, limits.max_iterations), left, max(STAGE_TOLERANCE, limits.tolerance))
-            soft = replace(problem, model=softened(problem.model, contact))
-            x0, us, log, outcome = _take_stage(soft, x0, us, short, report, len(logs) + 1, contact)
-            _add(logs, log, report)
-            if interrupted.is_set() or outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
-                outcome = Outcome.TIME_LIMIT if outcome is Outcome.TIME_LIMIT else Outcome.INTERRUPTED
-                xs = roll_states(problem.model, x0, us)
-                message = f"iLQR: {outcome.value} in stage {len(logs)}"
-                return NlpResult(us.ravel(), outcome, message, ()), xs, us, tuple(logs)
-        left = limits.time_limit - (time.monotonic() - start)
-        xs = roll_states(problem.model, x0, us)
-        result, xs, us = solve_through_jumps(problem, xs, us, limits=replace(limits, time_limit=left), report=report)
-        _add(logs, _log(problem, len(logs) + 1, None, result, xs, us), report)
-        if result.outcome in (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.INFEASIBLE):
-            xs, us, done = restore_goal(problem, xs, us, limits.tolerance, is_over)
-            message, outcome = result.message + _where_it_jumps(problem, xs) + done, result.outcome
-            if outcome is Outcome.INFEASIBLE and np.abs(problem.goal_error(xs[-1])).max() <= limits.tolerance:
-                outcome = Outcome.INACCURATE  # state bounds are measured again by the verdict
-            result = replace(result, z=us.ravel(), outcome=outcome, message=message)
-            if done and report:
-                report.say(done.removeprefix("; "))
-    return result, xs, us, tuple(logs)
+def _told(
+    problem: Problem, result: NlpResult, xs: Array, us: Array
+) -> tuple[str, int, float | None, float | None, float | None]:
+    """Status, iterations, cost, goal error and gradient of a stage, for its log."""
+    last = result.iterations[-1]
+    numbers = problem.objective(xs, us), _miss(problem, xs), last.dual_infeasibility
+    cost, error, gradient = (value if math.isfinite(value) else None for value in numbers)
+    return result.outcome.value, last.iteration, cost, error, gradient
 
 
 def _where_it_jumps(problem: Problem, xs: Array) -> str:
@@ -434,30 +213,222 @@ def _where_it_jumps(problem: Problem, xs: Array) -> str:
     return ""
 
 
-def _add(logs: list[StageLog], log: StageLog, report: Report | None) -> None:
-    logs.append(log)
-    if report:
-        report.say(str(log))
+@dataclass(frozen=True)
+class ContactHold:
+    """A pair of bodies, numbered as in `separations`, that is `apart` at `knot`, or overlaps there."""
+
+    pair: int
+    names: tuple[str, str]
+    knot: int
+    apart: bool
+
+    def constraint(self, model: Model) -> Constraint:
+        """The row that holds it: the pair's signed distance [m], of floats or AutoDiffXd, at the margin or beyond."""
+
+        def distance(x: Any) -> Any:
+            if x.dtype == float:
+                return _separation(model, x, self.pair).distance
+            found = _separation(model, ExtractValue(x.reshape(-1, 1)).ravel(), self.pair)
+            return chain(found.distance, np.pad(found.gradient, (0, model.nv)), x)
+
+        sides = {"lower": MARGIN} if self.apart else {"upper": -MARGIN}
+        return Constraint(distance, knots=[self.knot], name=str(self), **sides)
+
+    def moved_beyond(self, model: Model, x: Array) -> Array:
+        """`x` (nx,) with the pair a margin beyond just touching, by the least motion."""
+        separation = _separation(model, x, self.pair)
+        wanted = -MARGIN if self.apart else MARGIN
+        x = np.array(x)
+        x[: model.nq] += (wanted - separation.distance) * separation.opening
+        return x
+
+    def __str__(self) -> str:
+        return f"{' and '.join(self.names)} {'apart' if self.apart else 'touching'} at knot {self.knot}"
 
 
-def _take_stage(
-    soft: Problem, x0: Array, us: Array, limits: Limits, report: Report | None, number: int, contact: SoftContact
-) -> tuple[Array, Array, StageLog, Outcome]:
-    """The first state and the inputs that a stage finds, those given where it is refused."""
-    try:
-        xs = roll_states(soft.model, x0, us)
-        result, xs, found = solve_ilqr(soft, xs, us, limits=limits, report=report, patience=PATIENCE)
-    except (GradientError, SimulationError) as error:
-        log = StageLog(number, contact.distance, contact.stiffness, f"refused: {error}", 0, None, None, None)
-        return x0, us, log, Outcome.NO_GRADIENT
-    return xs[0], found, _log(soft, number, contact, result, xs, found), result.outcome
+def solve_through_jumps(
+    problem: Problem, xs: Array, us: Array, *, limits: Limits, report: Report | None
+) -> tuple[NlpResult, Array, Array]:
+    """What `solve_ilqr` gives, from a search that holds beginnings of touches where it stalls at one.
+
+    Where they press, the result's note says which, and what the sequences beyond them cost. `limits` are those of all
+    sequences together. Raises as `solve_ilqr` does.
+    """
+    search = _Sequences(problem, limits, report)
+    with interrupt_flag() as interrupted:
+        result, xs, us = search.run(xs, us, interrupted)
+    return replace(result, z=us.ravel(), iterations=tuple(search.rows)), xs, us
 
 
-def _log(
-    problem: Problem, number: int, contact: SoftContact | None, result: NlpResult, xs: Array, us: Array
-) -> StageLog:
-    last = result.iterations[-1]
-    numbers = problem.objective(xs, us), float(np.abs(problem.goal_error(xs[-1])).max()), last.dual_infeasibility
-    cost, error, gradient = (value if math.isfinite(value) else None for value in numbers)
-    distance, stiffness = (None, None) if contact is None else (contact.distance, contact.stiffness)
-    return StageLog(number, distance, stiffness, result.outcome.value, last.iteration, cost, error, gradient)
+class _Sequences:
+    def __init__(self, problem: Problem, limits: Limits, report: Report | None):
+        self.problem, self.limits, self.report = problem, limits, report
+        self.deadline, self.rows = time.monotonic() + limits.time_limit, list[Iteration]()
+        self.costs = dict[tuple[ContactHold, ...], float]()  # of each sequence's minimum; infinite where none was found
+        self.ended = False  # by Ctrl-C or the clock
+
+    def run(self, xs: Array, us: Array, interrupted: threading.Event) -> Found:
+        """Let the search go free until it stalls, then from sequence to cheaper sequence."""
+        found, holds, stuck = self._minimize(xs, us, (), PATIENCE), tuple[ContactHold, ...](), False
+        while found[0].outcome is Outcome.INACCURATE and not stuck and len(self.costs) < MOST_SEQUENCES:
+            try:
+                ahead = beginnings(self.problem, found[1])
+            except ModelError as error:  # Drake knows no distance of some pair
+                ahead = ()
+                self._say(f"nothing can be held: {error}")
+            stuck, holds = ahead == holds, ahead
+            found = self._minimize(*found[1:], holds, MORE_PATIENCE if stuck else PATIENCE)
+        if found[0].outcome is Outcome.SOLVED and holds:
+            return self._improve(found, interrupted)
+        return found
+
+    def _improve(self, best: Found, interrupted: threading.Event) -> Found:
+        """Cross what holds the motion while that is cheaper."""
+        told, left = list[str](), self._pressing(best[1])
+        while left and len(self.costs) < MOST_SEQUENCES and not interrupted.is_set():
+            if time.monotonic() > self.deadline or len(self.rows) > self.limits.max_iterations:
+                break
+            hold = left.pop()
+            cost = self.problem.objective(*best[1:])
+            other = self._beyond(hold, *best[1:])
+            if self.ended:
+                left.append(hold)
+                break
+            new = self.problem.objective(*other[1:]) if isinstance(other, tuple) else other
+            if isinstance(other, tuple) and new < cost:
+                best, told, left = other, [], self._pressing(other[1])
+            else:
+                told.append(f"{hold} (beyond: {f'cost {new:.6g}' if np.isfinite(new) else 'no minimum found'})")
+        told += [f"{hold} (beyond: not tried)" for hold in left]
+        if not told:
+            return best
+        cost = self.problem.objective(*best[1:])
+        note = f"a minimum for its own sequence of contacts, cost {cost:.6g}, held by " + "; ".join(told)
+        return replace(best[0], note=note), *best[1:]
+
+    def _beyond(self, hold: ContactHold, xs: Array, us: Array) -> "Found | float":
+        """The minimum of the sequence beyond `hold`; its cost alone where it is known, infinite where there is none."""
+        beyond = np.array(xs)
+        beyond[hold.knot] = hold.moved_beyond(self.problem.model, xs[hold.knot])
+        holds = beginnings(self.problem, beyond)
+        if holds in self.costs:
+            return self.costs[holds]
+        try:
+            other = self._minimize(beyond, us, holds, PATIENCE, BEYOND_ITERATIONS)
+        except (GradientError, SimulationError) as error:
+            self._say(f"refused: {error}")
+            self.costs[holds] = np.inf
+        return other if np.isfinite(self.costs[holds]) else np.inf
+
+    def _pressing(self, xs: Array) -> list[ContactHold]:
+        """The beginnings of touches along xs that are as near to just touching as rows let them."""
+        holds = beginnings(self.problem, xs)
+        distances = [_separation(self.problem.model, xs[h.knot], h.pair).distance for h in holds]
+        return [h for h, d in zip(holds, distances, strict=True) if abs(d) < PRESSING * MARGIN]
+
+    def _minimize(
+        self, xs: Array, us: Array, holds: tuple[ContactHold, ...], patience: int, most: float = np.inf
+    ) -> Found:
+        """One search under `holds`, of `most` iterations, within what is left of the limits."""
+        more = int(min(most, max(self.limits.max_iterations - max(len(self.rows) - 1, 0), 1)))
+        limits = replace(self.limits, time_limit=self.deadline - time.monotonic(), max_iterations=more)
+        rows = [hold.constraint(self.problem.model) for hold in holds]
+        held = replace(self.problem, constraints=(*self.problem.constraints, *rows))
+        if holds:
+            self._say("held: " + "; ".join(map(str, holds)))
+        penalty, report = HOLDING if holds else 0.0, self.report
+        result, xs, us = solve_ilqr(
+            held, xs, us, limits=limits, report=report, patience=patience, least_penalty=penalty
+        )
+        self.ended = result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT)
+        first = len(self.rows) - 1 if self.rows else 0
+        self.rows += [replace(r, iteration=first + r.iteration) for r in result.iterations[bool(self.rows) :]]
+        self.costs[holds] = self.problem.objective(xs, us) if result.outcome is Outcome.SOLVED else np.inf
+        return result, xs, us
+
+    def _say(self, text: str) -> None:
+        if self.report:
+            self.report.say(text)
+
+
+def beginnings(problem: Problem, xs: Array) -> tuple[ContactHold, ...]:
+    """Two holds for each beginning of a touch along xs (N+1, nx): apart at the knot before it, touching at its own.
+
+    What nothing moves (the given first state) or acts on (the last) is left out.
+    """
+    distances = []
+    for x in xs[:-1]:
+        set_state(problem.model.double, x)
+        distances.append([s.distance for s in separations(problem.model.double)])
+    phi, names = np.array(distances), [s.bodies for s in separations(problem.model.double)]
+    found = list[ContactHold]()
+    for before, pair in np.argwhere((phi[:-1] >= 0) & (phi[1:] < 0)):
+        knots = ((int(before), True), (int(before) + 1, False))
+        found += [
+            ContactHold(int(pair), names[pair], k, apart)
+            for k, apart in knots
+            if k or not problem.initial_state_is_given
+        ]
+    return tuple(found)
+
+
+def _separation(model: Model, x: Array, pair: int) -> Separation:
+    set_state(model.double, x)
+    return separations(model.double)[pair]
+
+
+def restore_goal(
+    problem: Problem, xs: Array, us: Array, tolerance: float, is_over: Callable[[], bool] = lambda: False
+) -> tuple[Array, Array, str]:
+    """(xs (N+1, nx), us (N, nu), what was done) nearer to the hard goal of `problem`; the same us if none is nearer.
+
+    xs is a rollout of us. Each step is the least change of the inputs from the first contact on, within their
+    bounds, halved until the miss is smaller and bounds of states, waypoints and constraints hold as before. It ends
+    early if `is_over` says so.
+    """
+    first, done, twin = 0, "", problem.model.double
+    for k, u in enumerate(us):
+        advance(twin, xs[k], u)
+        if twin.touches():
+            first = k
+            break
+    for number in range(1, MOST_STEPS + 1):
+        if is_over() or _miss(problem, xs) <= tolerance:
+            break
+        try:
+            nearer = _newton_step(problem, xs, us, first)
+        except (GradientError, SimulationError) as error:
+            return xs, us, f"{done}; then a Newton step towards the goal was refused: {error}"
+        if nearer is None:
+            break
+        xs, us = nearer
+        done = f"; then {number} Newton step{'s' * (number > 1)} on the inputs from knot {first} on, towards the goal"
+    return xs, us, done
+
+
+def _newton_step(problem: Problem, xs: Array, us: Array, first: int) -> tuple[Array, Array] | None:
+    variables, bounds, wanted = ShootingVariables(problem), problem.bounds, ~np.isnan(problem.goal)
+    last = final_sensitivity(variables, variables.pack(xs[0], us))[wanted]
+    by_inputs = last[:, len(variables.free) :].reshape(len(last), *us.shape)[:, first:].reshape(len(last), -1)
+    error = problem.goal_error(xs[-1])[wanted]
+    allowed = max(_excess(problem, xs, us), FEASIBILITY_TOLERANCE)
+    change = np.zeros_like(us)
+    change[first:] = -np.linalg.lstsq(by_inputs, error)[0].reshape(-1, us.shape[1])
+    for size in 0.5 ** np.arange(SHORTENINGS):
+        moved = np.clip(us + size * change, bounds.u_lower, bounds.u_upper)
+        rolled = roll_states(problem.model, xs[0], moved)
+        nearer = np.linalg.norm(problem.goal_error(rolled[-1])) < np.linalg.norm(error)
+        if nearer and _excess(problem, rolled, moved) <= allowed:
+            return rolled, moved
+    return None
+
+
+def _excess(problem: Problem, xs: Array, us: Array) -> float:
+    """By how much anything but the goal and the inputs is out of its bounds."""
+    bounds = problem.bounds
+    beyond = float(np.max(np.maximum(bounds.x_lower - xs, xs - bounds.x_upper)[1:], initial=0.0))
+    return max(beyond, *(excess for excess, _ in problem.constraint_excess(xs, us).values()), 0.0)
+
+
+def _miss(problem: Problem, xs: Array) -> float:
+    return float(np.abs(problem.goal_error(xs[-1])).max())
