@@ -270,6 +270,60 @@ def test_a_controller_that_raises_is_a_control_error(cart):
     assert "the controller itself failed" in trial.reason
 
 
+def raising(at):
+    """Makes the plan's inputs, which raise a KeyError beyond `at` m."""
+
+    def make(plan, model, xs, us):
+        def controller(x, t):
+            if x[0] > at:
+                raise KeyError("no gain so far out")
+            return us[min(round(t / H), len(us) - 1)]
+
+        return controller
+
+    return make
+
+
+def test_trials_whose_controller_raises_are_control_errors_and_the_others_go_on(cart):
+    """A mass m (1 + U) ends at 2 / (1 + U) m: beyond 2.2 m where U < -1/11, and there the controller raises."""
+    found = dd.robustness(pushed_and_stopped(cart), {"mass": [0.2, 0.02]}, trials=40, controller=raising(2.2))
+    small, large = found.cells
+    factors = [perturbed(found.task.setup, {"mass": 0.2}, e.seed).parameters["cart.mass"].item() / MASS
+               for e in large.endings]  # fmt: skip
+    raised = [factor < 1 / 1.1 for factor in factors]
+    assert 0 < sum(raised) < 40
+    assert small.rate.successes == 40
+    assert large.controller_errors == {"KeyError: 'no gain so far out'": sum(raised)}
+    for ending, it_raised in zip(large.endings, raised, strict=True):
+        assert ("KeyError: 'no gain so far out'; the controller itself failed" in ending.reason) == it_raised
+        assert not it_raised or ending.label == "control_error"
+    told = (
+        f"In {sum(raised)} of them the controller itself failed, in {sum(raised)} with KeyError: 'no gain so far out'"
+    )
+    assert told in found.sentence
+
+
+def test_a_controller_that_raises_without_any_perturbation_fails_every_trial(cart):
+    found = dd.robustness(pushed_and_stopped(cart), {"mass": [0.1]}, trials=3, controller=raising(1.0))  # at step 20
+    assert not found.success
+    assert found.cells[0].labels == {"control_error": 3}
+    assert found.sentence.startswith("Unperturbed it fails: at t = 0.2 s: the controller failed: KeyError")
+
+
+def test_a_controller_that_raises_beside_the_motion_has_no_gradient(cart):
+    """At rest at 0 and never beyond in the unperturbed run: differences look there, and it raises."""
+    task = Task(plan(cart, np.zeros((10, 1)), [0.0, 0.0]).plan, raising(1e-9))
+    assert task.nominal.success
+    assert Sensitivity(task).predicted("initial_state", 1.0) is None
+
+
+def test_a_function_that_makes_no_controller_is_refused(cart):
+    with pytest.raises(InputError, match=r"controller: .*got KeyError: 'gains'"):
+        dd.robustness(pushed_and_stopped(cart), {"mass": [0.1]}, controller=lambda plan, model, xs, us: {}["gains"])
+    with pytest.raises(InputError, match=r"controller: .*got one that makes None"):
+        dd.robustness(pushed_and_stopped(cart), {"mass": [0.1]}, controller=lambda plan, model, xs, us: None)
+
+
 def test_where_no_single_thing_helps_the_controller_is_to_blame(cart):
     task = Task(pushed_and_stopped(cart).plan, "open_loop")
     trial = run_trial(task, {"mass": 0.4, "actuator_delay": 8}, 0)
@@ -416,24 +470,36 @@ def test_rates_margins_and_the_worst_are_of_the_trials(cart):
     assert result.worst("mass") is large
     assert result.margins == {"mass": 0.02}
     assert result.success
-    assert "95 % survive up to: mass 0.02" in str(result)
+    assert repr(result).splitlines() == [
+        "cart under open_loop, 60 trials at each level, seed 0: pass",
+        "  unperturbed: succeeds",
+        "  mass: 95 % survive up to 0.02 of 0.4",
+    ]
+    assert str(result) == result.sentence
 
 
 def test_a_plan_that_fails_has_no_success(cart):
     result = dd.robustness(pushed_and_stopped(cart, 0.8), {"mass": [0.02]}, trials=2, controller="open_loop")
     assert not result.success
     assert result.margins == {"mass": 0.0}
-    assert "unperturbed it fails" in str(result)
+    assert "Unperturbed it fails" in str(result)
 
 
-def test_mpc_is_a_controller_by_name():
-    """Of a linear plant and a quadratic cost it is TVLQR of the same cost: the same displacement, unperturbed none."""
+@pytest.mark.parametrize("by", ["name", "hand"])
+def test_mpc_is_a_controller(by):
+    """Of a linear plant and a quadratic cost it is TVLQR of the same cost: the same displacement, unperturbed none.
+
+    No gradient tells: at the same time it follows the same plan whatever it sees.
+    """
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
     cost = dd.QuadraticCost(np.eye(2), np.eye(1))
     problem = dd.Problem(model, x0=[0.3, 0.0], num_steps=15, running_cost=cost, final_cost=cost)
     solution = dd.solve(problem, method="ilqr")
-    found = dd.robustness(solution, {"initial_state": [0.01]}, trials=3, controller="mpc")
+    controller = "mpc" if by == "name" else dd.loop.MPC(problem, horizon=4, plan=solution)
+    found = dd.robustness(solution, {"initial_state": [0.01]}, trials=3, controller=controller)
     assert found.task.nominal.success
     np.testing.assert_allclose(found.task.nominal.run.motion.xs, solution.xs, atol=1e-6)
     assert found.cells[0].rate.successes == 3
     assert 0 < found.cells[0].displacement < 0.02
+    assert found.cells[0].predicted is None
+    assert f"under {'mpc' if by == 'name' else 'an MPC of the user'}, 3 trials" in repr(found)

@@ -24,7 +24,6 @@ from drake_diff.trials import page as robustness_page
 from drake_diff.trials.files import begin_robustness, record_of
 from drake_diff.trials.page import robustness_data
 from drake_diff.trials.panel_trial import evaluate
-from drake_diff.trials.words import verdict_of, weakest_of
 
 LEVELS = {"mass": [0.02, 0.4], "actuator_delay": [1, 8], "time_step": [2], "sensor_bias": [0.01]}
 WORST = ["mass_0.4", "actuator_delay_1", "time_step_2", "sensor_bias_0.01"]
@@ -159,6 +158,17 @@ def test_the_table_has_a_row_for_each_trial(result, saved):
         assert [float(r["last hinge_q"]) for r in mine] == [e.last[0] for e in c.endings]
 
 
+def test_what_a_controller_raises_stands_in_record_and_table(run, tmp_path):
+    with recalled(run) as solution:
+        found = dd.robustness(solution, {"mass": [0.02]}, trials=2, controller=lambda *_: lambda x, t: 1 / 0)
+        record = dd.trials.save_robustness(found, tmp_path / "out", run)
+    assert record.verdict == "fail"
+    assert record.perturbations[0].cells[0].controller_errors == {"ZeroDivisionError: division by zero": 2}
+    rows = list(csv.DictReader((tmp_path / "out" / "trials.csv").open()))
+    assert [row["label"] for row in rows] == ["control_error"] * 2
+    assert all("the controller failed: ZeroDivisionError: division by zero" in row["reason"] for row in rows)
+
+
 def test_the_page_says_and_plots_it_and_needs_no_network(result, saved):
     folder = saved[0]
     page, plots = (folder / "robustness.html").read_text(), robustness_data(result)["plots"]
@@ -178,7 +188,7 @@ def test_the_page_says_and_plots_it_and_needs_no_network(result, saved):
         assert [len(p) for p in points] == [6] * len(cells) + [1]
         assert sorted(points[0]) == pytest.approx(sorted(e.last[1] for e in cells[0].endings), rel=1e-7)
         assert f'id="{name}" class="plots"' in page
-    trial = result.worst(weakest_of(result)).worst
+    trial = result.worst(result.weakest).worst
     angle = next(p for p in plots if p["title"] == "hinge_q")
     assert [s["name"] for s in angle["series"]] == ["true", "observed", "estimated", "plan"]
     assert angle["series"][0]["y"] == pytest.approx(trial.outcome.run.motion.xs[:, 0], rel=1e-7)
@@ -217,23 +227,23 @@ def doctored(result, rates, **changes):
 def test_the_words_name_the_weakest_point_and_who_is_to_blame(result):
     rates = {"mass": [100, 100], "actuator_delay": [100, 90], "time_step": [100], "sensor_bias": [100]}
     # Margins, as parts of the largest usual levels: 0.4 / 0.4, 1 / 8, 2 / 4, 0.01 / 0.1.
-    assert weakest_of(doctored(result, rates)) == "sensor_bias"
+    assert doctored(result, rates).weakest == "sensor_bias"
     rates["actuator_delay"] = [94, 90]
     told = doctored(result, rates)
-    assert weakest_of(told) == "actuator_delay"
-    assert "Weakest point: actuator_delay, with no margin: at 1 steps 94 of 100 succeed" in verdict_of(told)
-    assert "Of 6 failed trials: 6 state errors." in verdict_of(told)
-    assert "they tell nothing of actuator_delay" in verdict_of(told)
+    assert told.weakest == "actuator_delay"
+    assert "Weakest point: actuator_delay, with no margin: at 1 steps 94 of 100 succeed" in told.sentence
+    assert "Of 6 failed trials: 6 state errors." in told.sentence
+    assert "they say nothing about actuator_delay" in told.sentence
 
 
 def test_the_words_say_whether_gradients_knew(result):
     rates = {"mass": [100, 50], "actuator_delay": [100, 100], "time_step": [100], "sensor_bias": [100]}
-    all_of, none_of = "in 6 of the 6 cells that they tell of; of mass in 2 of 2.", "in 0 of the 6 cells"
+    all_of, none_of = "in 6 of the 6 cells that they cover; of mass in 2 of 2.", "in 0 of the 6 cells"
     for factor, told in ((1.9, all_of), (2.1, none_of), (0.51, all_of), (0.49, none_of)):
-        assert told in verdict_of(doctored(result, rates, displacement=factor, predicted=1.0))
-    assert "No gradient predicts any of it" in verdict_of(doctored(result, rates, predicted=None))
+        assert told in doctored(result, rates, displacement=factor, predicted=1.0).sentence
+    assert "Gradients predict none of it" in doctored(result, rates, predicted=None).sentence
     perfect = doctored(result, {name: [100] * 2 for name in LEVELS})
-    assert "No trial fails" in verdict_of(perfect)
+    assert "No trial fails" in perfect.sentence
     assert record_of(perfect, "x").verdict == "pass"
     assert record_of(doctored(result, {name: [94] * 2 for name in LEVELS}), "x").verdict == "fail"
 
@@ -405,6 +415,12 @@ def test_the_command_fails_where_the_plan_does_not_survive(run, tmp_path):
     assert found.exit_code == 1
     assert "Weakest point: actuator_delay, with no margin: at 1 steps 0 of 2 succeed" in found.output
     assert "2 control" in found.output
+
+
+def test_the_command_takes_mpc(run, tmp_path):
+    found = call(run, "--trials", 1, "--perturbations", "mass", "--controller", "mpc", "--out", tmp_path / "out")
+    assert found.exit_code == 0, found.output
+    assert json.loads((tmp_path / "out" / "robustness.json").read_text())["loop"]["controller"] == "mpc"
 
 
 def test_the_command_refuses_what_it_cannot_try(run, tmp_path):

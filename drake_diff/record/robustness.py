@@ -24,6 +24,7 @@ class CellEvidence(Part):
     upper_95: float
     distinct: int  # how many of the trials end in a state of their own: 1 where nothing is drawn
     labels: dict[str, int]
+    controller_errors: dict[str, int]  # "Type: message" of what the controller raised, and in how many trials
     goal_error_median: float | None
     goal_error_worst: float | None
     displacement: float | None

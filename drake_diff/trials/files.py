@@ -28,8 +28,7 @@ from drake_diff.trials.perturbation import perturbation_named
 from drake_diff.trials.run import Cell, Robustness
 from drake_diff.trials.trial import Task
 from drake_diff.trials.trial_files import FILES as TRIAL_FILES
-from drake_diff.trials.trial_files import REPLAY, controller_name, finite, write_trial
-from drake_diff.trials.words import verdict_of, weakest_of
+from drake_diff.trials.trial_files import REPLAY, finite, write_trial
 
 PAGE, TABLE, WORST = "robustness.html", "trials.csv", "worst"
 PLAIN = Loop()
@@ -38,7 +37,7 @@ PLAIN = Loop()
 def begin_robustness(directory: str | Path, model: Model) -> None:
     """Mark `directory` as trials under way: until they are saved its record says "incomplete"."""
     folder = Path(directory)
-    sentence = "the trials have begun and not ended: they are under way, or they were killed or broke off"
+    sentence = "the trials have not ended: they are still running, or they were killed or broke off"
     old_trials = [f.relative_to(folder).as_posix() for f in folder.glob(f"{WORST}/*/*") if f.name in TRIAL_FILES]
     _record(folder.name, model, "incomplete", sentence).begin(folder, (PAGE, TABLE, *old_trials))
     for path in folder.glob(f"{WORST}/*"):
@@ -47,14 +46,34 @@ def begin_robustness(directory: str | Path, model: Model) -> None:
 
 
 def save_robustness(result: Robustness, directory: str | Path, run: str | Path | None = None) -> RobustnessRecord:
-    """Write the directory of `result`, robustness.json last, so that it is complete only if all it names is.
+    """Write the directory of a robustness result: report, every trial's row, and the worst trials in full.
 
-    robustness.html is the report, trials.csv has a row for each trial, and worst/NAME_LEVEL/ has, of each perturbation,
-    the worst trial at the lowest level where one fails (of all, where none does): trial.json, trace.mcap, replay.html,
-    latencies.json. All but wall-clock times are the same, byte for byte, for the same trials. `run` is the run
-    directory that the plan is from. Raises ArtifactError where there is no record in it.
+    robustness.html is the report, trials.csv has a row for each trial, and worst/NAME_LEVEL/ has, for each
+    perturbation, the worst trial at the lowest level where one fails (without a failure, the one furthest from the
+    goal): trial.json, trace.mcap, replay.html, latencies.json. robustness.json is written last, so that it says "pass"
+    or "fail" only once all the rest is there. The same trials give the same bytes, but for wall-clock times.
+
+    Args:
+        result: what `robustness` returned.
+        directory: where to write; it is created.
+        run: the run directory that the plan is from, if there is one: its trials can then be run again from it.
+
+    Returns:
+        The record, as in robustness.json.
+
+    Raises:
+        ArtifactError: there is no record in `run`.
+
+    Example:
+        >>> from tempfile import mkdtemp
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.02)
+        >>> cost = dd.QuadraticCost(R=[[1.0]])
+        >>> problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=cost)
+        >>> result = dd.robustness(dd.solve(problem, method="shooting"), {"mass": [0.05]}, trials=2)
+        >>> dd.trials.save_robustness(result, mkdtemp()).verdict
+        'pass'
     """
-    from drake_diff.trials.page import write_robustness_page  # what saves nothing need not load it
+    from drake_diff.trials.page import write_robustness_page  # loads the page templates: not needed before
 
     folder, task = Path(directory), result.task
     source = None if run is None else RunEvidence(path=str(run), record_sha256=EvidenceRecord.read(run).record_sha256)
@@ -64,7 +83,7 @@ def save_robustness(result: Robustness, directory: str | Path, run: str | Path |
     for name in result.names:
         write_trial(folder / _place(result.worst(name)), task, result.worst(name).worst, again)
     write_whole(folder / TABLE, _table(result).encode())
-    write_robustness_page(folder / PAGE, result, record, folder / _place(result.worst(weakest_of(result))) / REPLAY)
+    write_robustness_page(folder / PAGE, result, record, folder / _place(result.worst(result.weakest)) / REPLAY)
     return record.write(folder)
 
 
@@ -75,7 +94,7 @@ def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> 
         name,
         task.model,
         "pass" if result.success else "fail",
-        verdict_of(result),
+        result.sentence,
         run=run,
         trials=result.trials,
         seed=result.seed,
@@ -137,6 +156,7 @@ def _cell(c: Cell) -> CellEvidence:
         upper_95=c.rate.upper,
         distinct=len({e.last.tobytes() for e in c.endings}),
         labels=dict(c.labels),
+        controller_errors=dict(c.controller_errors),
         goal_error_median=finite(c.goal_error),
         goal_error_worst=finite(c.worst_goal_error),
         displacement=c.displacement,
@@ -151,7 +171,7 @@ def _loop(task: Task) -> LoopEvidence:
     seen = {n: getattr(sensor, n) for n in ("noise", "bias", "delay", "every", "dropout")}
     done = {n: getattr(actuator, n) for n in ("delay", "every", "lower", "upper", "strength", "lag")}
     return LoopEvidence(
-        controller=controller_name(task),
+        controller=task.controller_name,
         period_s=period,
         steps=len(task.us),
         judged_by=task.judged_by,
@@ -206,10 +226,10 @@ def _table(result: Robustness) -> str:
     text = io.StringIO(newline="")
     rows = csv.writer(text, lineterminator="\n")
     ends = [f"last {name}" for name in result.task.model.state_names]
-    rows.writerow(["perturbation", "level", "seed", "success", "label", "goal_error", *ends])
+    rows.writerow(["perturbation", "level", "seed", "success", "label", "reason", "goal_error", *ends])
     for c in result.cells:
         for e in c.endings:
             last: Array = e.last
-            told = [int(e.label is None), e.label or "", e.goal_error]
+            told = [int(e.label is None), e.label or "", e.reason, e.goal_error]
             rows.writerow([c.perturbation, c.level, e.seed, *told, *last.tolist()])
     return text.getvalue()

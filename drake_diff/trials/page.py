@@ -12,17 +12,16 @@ from drake_diff.pages.html import write_page
 from drake_diff.pages.plots import Plot, line, numbers, page_data, plot
 from drake_diff.record.robustness import RobustnessRecord
 from drake_diff.trials.perturbation import perturbed
-from drake_diff.trials.run import Robustness
+from drake_diff.trials.run import Robustness, agrees, sized
 from drake_diff.trials.trial import Task, Trial
 from drake_diff.trials.trial_files import planned_states
-from drake_diff.trials.words import agrees, sized, weakest_of
 
 MOST_PLOTS = 12  # of coordinates; those that end furthest from the plan
 
 
 def write_robustness_page(path: Path, result: Robustness, record: RobustnessRecord, replay: Path) -> None:
     """Write the page of `result` with its `record` and `replay`, the page of the weakest point's worst trial."""
-    trial = result.worst(weakest_of(result)).worst
+    trial = result.worst(result.weakest).worst
     ((name, level),) = trial.levels.items()
     told = trial.reason or "it succeeds, and of all trials it ends furthest from the goal"
     write_page(
@@ -40,7 +39,7 @@ def write_robustness_page(path: Path, result: Robustness, record: RobustnessReco
 
 def robustness_data(result: Robustness) -> dict[str, Any]:
     """What the page draws; see `page_data`."""
-    trial, task = result.worst(weakest_of(result)).worst, result.task
+    trial, task = result.worst(result.weakest).worst, result.task
     found = [*_states(task, trial), *_inputs(task, trial), _status(task, trial)]
     for name in result.names:
         found += _levels(result, name)

@@ -14,18 +14,17 @@ from drake_diff.trials.trial import Task, run_trial
 from drake_diff.trials.trial_files import displacement_of, finite
 
 FIELDS = {"run": str, "controller": str, "perturbation": str, "level": (int, float), "seed": int}
-_open = ExitStack()  # rebuilt models last as long as the process
+_open = ExitStack()  # keeps the models of the runs as long as the process lives
 atexit.register(_open.close)
 
 
 def evaluate(trial: Mapping[str, Any]) -> dict[str, Any]:
     """Run the plan of the run directory `trial["run"]` once and judge it; the same fields give the same row.
 
-    `trial` has run, controller ("tvlqr", "mpc", "open_loop"), perturbation, level (0: unperturbed) and seed; other
-    fields are
-    left alone, so that a trial.json will do. The row is JSON: success, label (None for a success), goal_error,
+    `trial` has run, controller ("tvlqr", "mpc", "open_loop"), perturbation, level (0: unperturbed) and seed. Other
+    fields are ignored, so that a trial.json will do. The row is JSON: success, label (None for a success), goal_error,
     displacement of the last state (None where it is not finite or the run broke off), failures and ended. The run is
-    rebuilt once per process. Raises InputError, UnknownNameError, and ArtifactError where the run is damaged.
+    read once per process. Raises InputError, UnknownNameError, and ArtifactError where the run is damaged.
     """
     for name, kind in FIELDS.items():
         value = trial.get(name)

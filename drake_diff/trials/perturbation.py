@@ -54,6 +54,11 @@ class Perturbation:
         }
         return needs.get(self.name, model.nu > 0 or self.name in ("initial_state", "push"))
 
+    def check_is_of(self, model: Model) -> None:
+        """InputError where there is nothing in `model` for it to change."""
+        if not self.is_of(model):
+            raise InputError("perturbation", got=self.name, expected=f"one that {model.name} has something for")
+
 
 def perturbed(setup: Setup, levels: Mapping[str, float], seed: int) -> Setup:
     """`setup` with the perturbations in `levels`, in the order of PERTURBATIONS. UnknownNameError, InputError."""
@@ -61,8 +66,7 @@ def perturbed(setup: Setup, levels: Mapping[str, float], seed: int) -> Setup:
         kind = perturbation_named(name)
         if not (np.isfinite(level) and level >= 0):
             raise InputError(f"level of {name}", got=level, expected="a number of at least 0")
-        if not kind.is_of(setup.model):
-            raise InputError("perturbation", got=name, expected=f"one that {setup.model.name} has something for")
+        kind.check_is_of(setup.model)
     for name, kind in PERTURBATIONS.items():
         if levels.get(name, 0) > 0:
             random = np.random.default_rng([seed, zlib.crc32(name.encode())])

@@ -1,19 +1,14 @@
-"""How far perturbations displace the last state to first order: what the gradients say before anything is tried.
+"""Does a plan survive: trials under each perturbation and level, how sure the rates are, and how far one can go.
 
-Along the unperturbed motion, with A_k, B_k, C_k the derivatives of step k by state, input and parameters on the tangent
-space and K_k that of the controller's answer by what it sees (u = -K_k x), the closed loop moves by
-
-    d_(k+1) = (A_k - B_k K_k) d_k + C_k dp + B_k K_k (-n_k)
-
-so a displacement d_0, a change dp and a noise n_k lead to a last displacement that is linear in each. What is told is
-its root mean square: sqrt(E |d_N|^2) of independent perturbations as `loop.perturbation` draws them.
-
-Does a plan survive: trials under each perturbation and level, how sure the rates are, and how far one can go.
+Before anything is tried, gradients predict how far a small perturbation displaces the last state (`Sensitivity`);
+beside the measured displacement that shows how far first order reaches.
 """
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from html import escape
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +17,7 @@ from drake_diff._base.arrays import Array, positive_int
 from drake_diff._base.statistics import Rate, margin, success_rate
 from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.exceptions import InputError
+from drake_diff.loop.mpc import MPC
 from drake_diff.loop.parts import Hold
 from drake_diff.loop.run import Loop
 from drake_diff.model.model import Model
@@ -29,22 +25,305 @@ from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.gradient import derivatives_along
 from drake_diff.optimize.solution import Solution
+from drake_diff.record.parts import Label
 from drake_diff.trials.perturbation import PERTURBATIONS, parameters_of, perturbation_named
-from drake_diff.trials.trial import Label, MakeController, Task, Trial, run_trial
+from drake_diff.trials.trial import MakeController, Task, Trial, run_trial
 
-UNIFORM = 1 / np.sqrt(3)  # the standard deviation of U of level 1
-DIFFERENCE = (
-    1e-5  # of the controller's answer by what it sees: about the cube root of rounding, central differences' best
-)
+AGREE = 2.0  # a prediction within this factor of what is measured counts as right
+UNIFORM = 1 / np.sqrt(3)  # the standard deviation of a number that is uniform in [-1, 1]
+# Step of the central differences of the controller's answer: about the cube root of rounding, which is best for them.
+DIFFERENCE = 1e-5
 FACTORS = ("inertia", "mass", "friction", "stiffness", "damping", "gravity")
 TOLD = ("initial_state", "sensor_noise", "sensor_bias", "actuator_strength", *FACTORS)
+Levels = Mapping[str, Sequence[float]]
+
+
+def robustness(
+    solution: Solution,
+    perturbations: Levels | Sequence[str] | None = None,
+    *,
+    trials: int = 100,
+    controller: str | MPC | MakeController = "tvlqr",
+    loop: Loop | None = None,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> "Robustness":
+    """Try the plan of a solution many times under each perturbation and level.
+
+    A trial succeeds where it reaches the goal (without one, the plan's end) and keeps the bounds. A failure has a
+    label that says whose fault it is. A controller that raises is such a failure: a control error.
+
+    Args:
+        solution: its motion and inputs are the plan.
+        perturbations: levels by name, or names, for their usual levels (`PERTURBATIONS` lists them). None means all
+            that the model has something for.
+        trials: how many at each level.
+        controller: "tvlqr" about the plan, "mpc" (over 20 steps), "open_loop", an `MPC` of your own, or a function
+            of (plan, model, xs (N+1, nx), us (N, nu)) that makes a controller u = controller(x, t).
+        loop: what stands around the controller in every trial, the unperturbed run included.
+        seed: of all draws. The same seed gives the same trials.
+        progress: called with a line of text after each level.
+
+    Returns:
+        Success rates with their 95 % intervals, margins, labels of failures, and displacements of the last state.
+
+    Raises:
+        UnknownNameError: no such perturbation or controller.
+        InputError: a level or another argument is wrong, or a function for `controller` makes none.
+
+    Source: Wilson's interval, J. American Statistical Association 22 (1927).
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.02)
+        >>> cost = dd.QuadraticCost(R=[[1.0]])
+        >>> problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=cost)
+        >>> result = dd.robustness(dd.solve(problem, method="shooting"), {"mass": [0.05]}, trials=5)
+        >>> result.margins
+        {'mass': 0.05}
+    """
+    count, task = positive_int("trials", trials), Task(solution.plan, controller, loop)
+    levels, sensitivity = levels_of(task, perturbations), Sensitivity(task)
+    cells = []
+    for name, values in levels.items():
+        for level in values:
+            found = [run_trial(task, {name: level}, trial_seed(seed, k)) for k in range(count)]
+            cells.append(cell_of(name, level, found, sensitivity.predicted(name, level)))
+            if progress is not None:
+                progress(f"{name} {level:g}: {cells[-1].rate.successes} of {count}")
+    return Robustness(task, tuple(cells), count, seed)
+
+
+class Ending(NamedTuple):
+    """What remains of each trial; `label` is None for a success, `reason` says why it failed, `last` is (nx,)."""
+
+    seed: int
+    label: Label | None
+    reason: str
+    goal_error: float
+    last: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """The trials of one perturbation at one level. Displacements are root mean squares of the last state's."""
+
+    perturbation: str
+    level: float
+    rate: Rate
+    labels: Mapping[str, int]  # of the failures
+    controller_errors: Mapping[str, int]  # "Type: message" of what the controller raised, and in how many trials
+    goal_error: float  # the median; inf where it is not finite
+    worst_goal_error: float
+    displacement: float | None  # measured; None where a run broke off or it is not finite
+    predicted: float | None  # from gradients, to first order; None where they say nothing
+    worst: Trial
+    endings: tuple[Ending, ...]
+
+    @property
+    def ratio(self) -> float | None:
+        """Measured displacement over predicted; None without one of them, or where none is predicted."""
+        return self.displacement / self.predicted if self.displacement is not None and self.predicted else None
+
+    @property
+    def fails(self) -> bool:
+        """Whether any trial fails."""
+        return self.rate.successes < self.rate.trials
+
+
+@dataclass(frozen=True, eq=False)
+class Robustness:
+    """What `robustness` found: a cell for each perturbation and level, and the task with its unperturbed run.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.02)
+        >>> cost = dd.QuadraticCost(R=[[1.0]])
+        >>> problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=cost)
+        >>> dd.robustness(dd.solve(problem, method="shooting"), {"mass": [0.05]}, trials=5)
+        pendulum under tvlqr, 5 trials at each level, seed 0: pass
+          unperturbed: succeeds
+          mass: 95 % survive up to 0.05 of 0.05
+    """
+
+    task: Task
+    cells: tuple[Cell, ...]
+    trials: int
+    seed: int
+
+    @property
+    def success(self) -> bool:
+        """Whether the unperturbed run succeeds, and each perturbation has a level above 0 that is survived."""
+        return self.task.nominal.success and all(value > 0 for value in self.margins.values())
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The perturbations that were tried."""
+        return tuple(dict.fromkeys(c.perturbation for c in self.cells))
+
+    @property
+    def margins(self) -> dict[str, float]:
+        """By perturbation, the largest level up to which 95 % of the trials succeed."""
+        return {name: margin([c.level for c in self.of(name)], [c.rate for c in self.of(name)]) for name in self.names}
+
+    @property
+    def weakest(self) -> str:
+        """The perturbation with the smallest margin, as a part of its largest usual level; of equals, the one that the
+        fewest trials survive.
+        """
+
+        def rank(name: str) -> tuple[float, float]:
+            rates = [c.rate.value for c in self.of(name)]
+            return self.margins[name] / perturbation_named(name).levels[-1], sum(rates) / len(rates)
+
+        return min(self.names, key=rank)
+
+    def of(self, name: str) -> list[Cell]:
+        """The cells of one perturbation, with increasing levels."""
+        return [c for c in self.cells if c.perturbation == name]
+
+    def worst(self, name: str) -> Cell:
+        """The cell whose worst trial is shown: the lowest level that fails; without one, the furthest from the goal."""
+        cells = self.of(name)
+        return next((c for c in cells if c.fails), max(cells, key=lambda c: c.worst_goal_error))
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in a paragraph: what fails first, whose fault it is, and what the gradients knew."""
+        nominal = self.task.nominal
+        first = "Unperturbed it succeeds." if nominal.success else f"Unperturbed it fails: {nominal.failures[0]}."
+        return " ".join(filter(None, (first, _weakest_point(self), _blame(self), _gradients(self))))
+
+    def __repr__(self) -> str:
+        name = self.task.controller_name
+        verdict, nominal = "pass" if self.success else "fail", self.task.nominal
+        lines = [
+            f"{self.task.model.name} under {name}, {self.trials} trials at each level, seed {self.seed}: {verdict}",
+            "  unperturbed: " + ("succeeds" if nominal.success else f"fails: {nominal.failures[0]}"),
+        ]
+        for name, value in self.margins.items():
+            most = sized(name, self.of(name)[-1].level)
+            lines.append(f"  {name}: 95 % survive up to {value:g} of {most}" if value else f"  {name}: no margin")
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return self.sentence
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
+
+
+def trial_seed(seed: int, index: int) -> int:
+    """Of the `index`-th trial: the same in every cell, so that levels are compared under the same draws."""
+    return int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
+
+
+def levels_of(task: Task, perturbations: Levels | Sequence[str] | None) -> dict[str, tuple[float, ...]]:
+    """By name the levels to try, in increasing order. UnknownNameError; InputError for what cannot be tried."""
+    if perturbations is None:
+        return {name: kind.levels for name, kind in PERTURBATIONS.items() if kind.is_of(task.model)}
+    if not isinstance(perturbations, Mapping):
+        perturbations = {name: perturbation_named(name).levels for name in perturbations}
+    for name, values in perturbations.items():
+        perturbation_named(name).check_is_of(task.model)
+        if not len(values) or not all(np.isfinite(v) and v > 0 for v in values):
+            raise InputError(f"levels of {name}", got=values, expected="numbers above 0")
+    return {name: tuple(sorted(values)) for name, values in perturbations.items()}
+
+
+def cell_of(name: str, level: float, trials: Sequence[Trial], predicted: float | None) -> Cell:
+    """What `trials` of one perturbation and level amount to."""
+
+    def distance(trial: Trial) -> float:
+        found = trial.outcome.goal_error
+        return found if np.isfinite(found) else float("inf")
+
+    endings = tuple(Ending(t.seed, t.label, t.reason, distance(t), t.outcome.run.motion.xs[-1]) for t in trials)
+    errors = [ending.goal_error for ending in endings]
+    squares = np.array([float(t.outcome.displacement @ t.outcome.displacement) for t in trials])
+    known = bool(np.all(np.isfinite(squares))) and not any(t.outcome.run.ended for t in trials)
+    raised = Counter(t.outcome.run.controller_error for t in trials if t.outcome.run.controller_error)
+    return Cell(
+        perturbation=name,
+        level=level,
+        rate=success_rate(sum(t.outcome.success for t in trials), len(trials)),
+        labels=dict(sorted(Counter(t.label for t in trials if t.label is not None).items())),
+        controller_errors=dict(sorted(raised.items())),
+        goal_error=float(np.median(errors)),
+        worst_goal_error=max(errors),
+        displacement=float(np.sqrt(np.mean(squares))) if known else None,
+        predicted=predicted,
+        worst=max(trials, key=lambda t: (not t.outcome.success, distance(t))),
+        endings=endings,
+    )
+
+
+# --- what was found, in sentences
+
+
+def agrees(ratio: float | None) -> bool:
+    """Whether a measured displacement is within a factor of AGREE of the predicted one."""
+    return ratio is not None and 1 / AGREE <= ratio <= AGREE
+
+
+def sized(name: str, level: float) -> str:
+    """A level with its unit."""
+    unit = perturbation_named(name).unit
+    return f"{level:g}" + ("" if unit == "1" else f" {unit}")
+
+
+def _weakest_point(result: Robustness) -> str:
+    if not any(c.fails for c in result.cells):
+        return f"No trial fails: each of {len(result.names)} perturbations is survived up to its largest level."
+    name = result.weakest
+    held, cell = result.margins[name], result.worst(name)
+    much = f"with a margin of {sized(name, held)}" if held else "with no margin"
+    told = f"at {sized(name, cell.level)} {cell.rate.successes} of {cell.rate.trials} succeed"
+    return f"Weakest point: {name}, {much}: {told}. What fails first: {cell.worst.reason}."
+
+
+def _blame(result: Robustness) -> str:
+    labels = sum((Counter(c.labels) for c in result.cells), Counter())
+    if not labels:
+        return ""
+    of = ", ".join(f"{count} {label.replace('_', ' ')}{'s' * (count > 1)}" for label, count in labels.most_common())
+    count = sum(labels.values())
+    told = f"Of {count} failed trial{'s' * (count > 1)}: {of}."
+    raised = sum((Counter(c.controller_errors) for c in result.cells), Counter())
+    if raised:
+        (error, most), count = raised.most_common(1)[0], sum(raised.values())
+        told += f" In {count} of them the controller itself failed, in {most} with {error}."
+    return told
+
+
+def _gradients(result: Robustness) -> str:
+    told = [c for c in result.cells if c.ratio is not None]
+    if not told:
+        return "Gradients predict none of it."
+    right = sum(agrees(c.ratio) for c in told)
+    name = result.weakest
+    known = [agrees(c.ratio) for c in result.of(name) if c.ratio is not None]
+    about = f"of {name} in {sum(known)} of {len(known)}" if known else f"they say nothing about {name}"
+    return (
+        f"Gradients predict the displacement of the last state within a factor of {AGREE:g} in {right} of the "
+        f"{len(told)} cells that they cover; {about}."
+    )
+
+
+# --- what gradients predict
 
 
 class Sensitivity:
-    """The first-order effect of perturbations on the last state of a task's unperturbed run.
+    """How far perturbations displace the last state of a task's unperturbed run, to first order.
 
-    Only of runs in an ideal loop: with a delay, a lag, lost samples, another estimator or a fallback in charge
-    `predicted` is None.
+    Along that run, with A_k, B_k, C_k the derivatives of step k by state, input and parameters on the tangent space
+    and K_k that of the controller's answer by what it sees, the closed loop moves by
+
+        d_(k+1) = (A_k + B_k K_k) d_k + C_k dp + B_k K_k n_k
+
+    so the last displacement is linear in the first one d_0, a change dp of the parameters and the noise n_k. What is
+    told is its root mean square, sqrt(E |d_N|^2), for independent perturbations as `trials.perturbation` draws them.
+
+    Known only in an ideal loop: None with a delay, a lag, lost samples, another estimator, a fallback in charge, or a
+    controller with a memory (one with `start`, as MPC), whose answer is no function of what it sees.
     """
 
     def __init__(self, task: Task):
@@ -59,20 +338,22 @@ class Sensitivity:
             and type(loop.estimator) is Hold
             and not task.nominal.run.ended
             and not any(event.kind == "fallback" for event in task.nominal.run.events)
+            and not hasattr(task.policy, "start")
         )
         self.parameters = {name: parameters_of(task.model, name) for name in FACTORS}
-        self._products: tuple[Array, Array, Array, Array] | None = None
 
     def predicted(self, name: str, level: float) -> float | None:
-        """The root mean square of the last state's displacement; None where no gradient tells."""
+        """The root mean square of the last state's displacement; None where gradients say nothing."""
         if not self.is_known or name not in TOLD or not PERTURBATIONS[name].is_of(self.task.model):
+            return None
+        if self._gains is None:
             return None
         found = float(level * np.linalg.norm(self._effect(name)))
         return found if np.isfinite(found) else None
 
     def _effect(self, name: str) -> Array:
         """(nt, .) the last state's derivative by what a perturbation of level 1 draws, times its spread."""
-        start, _, noise, factor = self._effects()
+        start, _, noise, factor = self._effects
         if name == "initial_state":
             return start
         if name == "sensor_noise":
@@ -88,20 +369,15 @@ class Sensitivity:
             for value in self.parameters[name].values():
                 width = len(np.atleast_1d(value))
                 if name == quantity:
-                    columns.append(self._effects()[1][:, at : at + width] @ np.atleast_1d(value))
+                    columns.append(self._effects[1][:, at : at + width] @ np.atleast_1d(value))
                 at += width
         return np.array(columns).T
 
+    @cached_property
     def _effects(self) -> tuple[Array, Array, Array, Array]:
         """(nt, .) of the start, the parameters, every step's noise, and a factor of each input."""
-        if self._products is None:
-            self._products = self._along()
-        return self._products
-
-    def _along(self) -> tuple[Array, Array, Array, Array]:
         task, size = self.task, self.space.size
-        run, h = task.nominal.run, task.model.time_step
-        xs, us = run.motion.xs, run.applied
+        xs, us = task.nominal.run.motion.xs, task.nominal.run.applied
         start, noise, factor = np.eye(size), np.zeros((size, 0)), np.zeros((size, task.model.nu))
         by_parameter: Array | None = None
         # The inertia apart: a mass that is changed alone takes it along, one that is set beside it does not.
@@ -109,24 +385,34 @@ class Sensitivity:
         groups = [inertia, others] if inertia else [others]
         with applied(select(task.setup.model, task.setup.parameters)) as model:
             along = [_along(model, xs[:-1], us, names) for names in groups]
-        for k, u in enumerate(us):
+        for k, (u, K) in enumerate(zip(us, self._gains or (), strict=True)):
             steps = [found[k] for found in along]
             found = self.space.jacobian(xs[k], xs[k + 1], steps[0].A, steps[0].B, *(step.C for step in steps))
             A, B, C = np.split(found, [size, size + task.model.nu], axis=1)
-            K = self._gain(xs[k], k * h)
             loop = A + B @ K
             start, noise = loop @ start, np.hstack([loop @ noise, B @ K])
             factor = loop @ factor + B * u
             by_parameter = C if by_parameter is None else loop @ by_parameter + C
         return start, np.zeros((size, 0)) if by_parameter is None else by_parameter, noise, factor
 
-    def _gain(self, x: Array, t: float) -> Array:
-        """(nu, nt) the derivative of the controller's answer by what it sees, by central differences."""
-        columns = []
-        for e in DIFFERENCE * np.eye(self.space.size):
-            ahead, behind = (np.asarray(self.task.policy(self.space.plus(x, d), t), dtype=float) for d in (e, -e))
-            columns.append((ahead - behind) / (2 * DIFFERENCE))
-        return np.array(columns).T.reshape(self.task.model.nu, self.space.size)
+    @cached_property
+    def _gains(self) -> list[Array] | None:
+        """N times (nu, nt), the derivative of the controller's answer by what it sees, by central differences.
+
+        None where it raises beside the motion, as a user's code may: then it has no derivative.
+        """
+        task, shape = self.task, (self.task.model.nu, self.space.size)
+        gains = []
+        for k, x in enumerate(task.nominal.run.motion.xs[:-1]):
+            columns = []
+            for e in DIFFERENCE * np.eye(self.space.size):
+                try:
+                    ahead, behind = (task.policy(self.space.plus(x, d), k * task.model.time_step) for d in (e, -e))
+                except Exception:
+                    return None
+                columns.append((np.asarray(ahead, dtype=float) - np.asarray(behind, dtype=float)) / (2 * DIFFERENCE))
+            gains.append(np.array(columns).T.reshape(shape))
+        return gains
 
 
 def _along(model: Model, xs: Array, us: Array, names: list[str]) -> list[StepDerivatives]:
@@ -134,148 +420,3 @@ def _along(model: Model, xs: Array, us: Array, names: list[str]) -> list[StepDer
     vector = select(model, names)
     with applied(vector) as set_model:
         return derivatives_along(set_model, xs[0], us, vector=vector, xs=xs)
-
-
-Levels = Mapping[str, Sequence[float]]
-
-
-class Ending(NamedTuple):
-    """What remains of each trial; `label` is None for a success, `last` (nx,) its last state."""
-
-    seed: int
-    label: Label | None
-    goal_error: float
-    last: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Cell:
-    """The trials of one perturbation at one level. Displacements are root mean squares of the last state's."""
-
-    perturbation: str
-    level: float
-    rate: Rate
-    labels: Mapping[str, int]  # of the failures
-    goal_error: float  # the median; inf where it is not finite
-    worst_goal_error: float
-    displacement: float | None  # measured; None where a run broke off or it is not finite
-    predicted: float | None  # from gradients, to first order; None where they do not tell
-    worst: Trial
-    endings: tuple[Ending, ...]
-
-    @property
-    def ratio(self) -> float | None:
-        """Measured displacement over predicted; None without one of them, or where none is predicted."""
-        return self.displacement / self.predicted if self.displacement is not None and self.predicted else None
-
-
-@dataclass(frozen=True, eq=False)
-class Robustness:
-    """All cells of a plan, and its unperturbed run."""
-
-    task: Task
-    cells: tuple[Cell, ...]
-    trials: int
-    seed: int
-
-    @property
-    def margins(self) -> dict[str, float]:
-        """By perturbation the largest level up to which 95 % of the trials succeed."""
-        return {name: margin([c.level for c in self.of(name)], [c.rate for c in self.of(name)]) for name in self.names}
-
-    @property
-    def success(self) -> bool:
-        """Whether the unperturbed run succeeds, and each perturbation has a level above 0 that is survived."""
-        return self.task.nominal.success and all(value > 0 for value in self.margins.values())
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The perturbations that were tried."""
-        return tuple(dict.fromkeys(c.perturbation for c in self.cells))
-
-    def of(self, name: str) -> list[Cell]:
-        """The cells of one perturbation, its levels increasing."""
-        return [c for c in self.cells if c.perturbation == name]
-
-    def worst(self, name: str) -> Cell:
-        """The cell whose worst trial is shown: the lowest level that fails, the furthest from the goal without one."""
-        cells = self.of(name)
-        failing = [c for c in cells if c.rate.successes < c.rate.trials]
-        return failing[0] if failing else max(cells, key=lambda c: c.worst_goal_error)
-
-    def __str__(self) -> str:
-        nominal = "succeeds" if self.task.nominal.success else f"fails: {self.task.nominal.failures[0]}"
-        margins = ", ".join(f"{name} {value:g}" for name, value in self.margins.items())
-        return f"unperturbed it {nominal}; 95 % survive up to: {margins}"
-
-
-def robustness(
-    solution: Solution,
-    perturbations: Levels | Sequence[str] | None = None,
-    *,
-    trials: int = 100,
-    controller: str | MakeController = "tvlqr",
-    loop: Loop | None = None,
-    seed: int = 0,
-    progress: Callable[[str], None] | None = None,
-) -> Robustness:
-    """Try the plan of `solution` `trials` times under each perturbation and level.
-
-    `perturbations` maps names to levels, or names them with their usual levels; all that the model has something for
-    where left out. `controller` is "tvlqr" about the plan, "open_loop", or a function that makes one (see `Task`);
-    `loop` is what is around it in every trial, unperturbed ones too. The same seed gives the same trials.
-    """
-    count, task = positive_int("trials", trials), Task(solution.plan, controller, loop)
-    levels, sensitivity = levels_of(task, perturbations), Sensitivity(task)
-    cells = []
-    for name, values in levels.items():
-        for level in values:
-            found = [run_trial(task, {name: level}, trial_seed(seed, k)) for k in range(count)]
-            cells.append(cell_of(name, level, found, sensitivity.predicted(name, level)))
-            if progress is not None:
-                progress(f"{name} {level:g}: {cells[-1].rate.successes} of {count}")
-    return Robustness(task, tuple(cells), count, seed)
-
-
-def trial_seed(seed: int, index: int) -> int:
-    """Of the `index`-th trial: the same in every cell, so that levels are compared under the same draws."""
-    return int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
-
-
-def levels_of(task: Task, perturbations: Levels | Sequence[str] | None) -> dict[str, tuple[float, ...]]:
-    """By name the levels to be tried, in increasing order. UnknownNameError; InputError for what cannot be tried."""
-    if perturbations is None:
-        return {name: kind.levels for name, kind in PERTURBATIONS.items() if kind.is_of(task.model)}
-    if not isinstance(perturbations, Mapping):
-        perturbations = {name: perturbation_named(name).levels for name in perturbations}
-    for name, values in perturbations.items():
-        if not perturbation_named(name).is_of(task.model):
-            raise InputError("perturbation", got=name, expected=f"one that {task.model.name} has something for")
-        if not len(values) or not all(np.isfinite(v) and v > 0 for v in values):
-            raise InputError(f"levels of {name}", got=values, expected="numbers above 0")
-    return {name: tuple(sorted(values)) for name, values in perturbations.items()}
-
-
-def cell_of(name: str, level: float, trials: Sequence[Trial], predicted: float | None) -> Cell:
-    """What `trials` of one perturbation and level amount to."""
-    endings = tuple(Ending(t.seed, t.label, _distance(t), t.outcome.run.motion.xs[-1]) for t in trials)
-    errors = [ending.goal_error for ending in endings]
-    squares = np.array([float(t.outcome.displacement @ t.outcome.displacement) for t in trials])
-    known = bool(np.all(np.isfinite(squares))) and not any(t.outcome.run.ended for t in trials)
-    return Cell(
-        perturbation=name,
-        level=level,
-        rate=success_rate(sum(t.outcome.success for t in trials), len(trials)),
-        labels=dict(sorted(Counter(t.label for t in trials if t.label is not None).items())),
-        goal_error=float(np.median(errors)),
-        worst_goal_error=max(errors),
-        displacement=float(np.sqrt(np.mean(squares))) if known else None,
-        predicted=predicted,
-        worst=max(trials, key=lambda t: (not t.outcome.success, _distance(t))),
-        endings=endings,
-    )
-
-
-def _distance(trial: Trial) -> float:
-    found = trial.outcome.goal_error
-    return found if np.isfinite(found) else float("inf")

@@ -7,18 +7,18 @@ The label of a failure is found by running the trial again with one thing put ri
     control_error     with a perfect actuator it succeeds, or the controller itself failed
     state_error       with the plant and the start as planned, and no pushes, it succeeds
     control_error     no single thing helps: the controller is not up to all of them together
-    evaluation_error  what came out cannot be judged
+    evaluation_error  the result cannot be judged
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any
 
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.exceptions import ModelError, UnknownNameError
+from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, UnknownNameError
 from drake_diff.loop.mpc import MPC
 from drake_diff.loop.parts import Actuator, Hold, Sensor
 from drake_diff.loop.run import ClosedLoop, Controller, Loop, OpenLoop, closed_loop
@@ -26,17 +26,17 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.replay import FINEST, Plan, left_bounds, missed_goal, too_deep, track
+from drake_diff.record.parts import Label
 from drake_diff.trials.perturbation import Setup, perturbed
 
-Label = Literal["perception_error", "state_error", "planning_error", "control_error", "evaluation_error"]
 CONTROLLERS = ("tvlqr", "mpc", "open_loop")
 MPC_HORIZON = 20  # steps
 MakeController = Callable[[Plan, Model, Array, Array], Controller]
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
-    """What came of one run. `failures` is empty where it succeeded."""
+class Judgement:
+    """One run, judged. `failures` is empty where it succeeded."""
 
     run: ClosedLoop
     failures: tuple[str, ...]
@@ -46,6 +46,7 @@ class Outcome:
 
     @property
     def success(self) -> bool:
+        """Whether it kept all that was asked of it."""
         return not self.failures
 
 
@@ -55,7 +56,7 @@ class Trial:
 
     levels: Mapping[str, float]
     seed: int
-    outcome: Outcome
+    outcome: Judgement
     label: Label | None
     reason: str
 
@@ -63,23 +64,29 @@ class Trial:
 class Task:
     """A plan to be followed: its controller, made on the plant as planned, and how a run of it is judged.
 
-    `controller` is "tvlqr", "mpc" (of 20 steps), "open_loop", or a function of (plan, model, xs (N+1, nx), us (N, nu))
-    that makes one. The controller's period is the longest of the plan's interval and its halves, quarters ... 16ths in
-    which the unperturbed run succeeds; the interval itself where it does in none, and of MPC, which plans in it.
+    `controller` is as `robustness` takes it. Its period is the longest of the plan's interval and its halves, quarters
+    ... 16ths in which the unperturbed run succeeds. It is the interval itself where none does, and for MPC.
     """
 
-    def __init__(self, plan: Plan, controller: str | MakeController = "tvlqr", loop: Loop | None = None):
+    def __init__(self, plan: Plan, controller: str | MPC | MakeController = "tvlqr", loop: Loop | None = None):
         if isinstance(controller, str) and controller not in CONTROLLERS:
             raise UnknownNameError("controller", got=controller, known=CONTROLLERS)
         self.plan, self.controller, self.loop = plan, controller, loop or Loop()
         self.judged_by = "the plan's end" if np.all(np.isnan(plan.problem.goal)) else "the goal"
         self._use(1)
-        parts = 1
-        while not self.nominal.success and plan.continuous and controller != "mpc" and parts < FINEST:
+        parts, can_be_finer = 1, plan.continuous and controller != "mpc" and not isinstance(controller, MPC)
+        while not self.nominal.success and can_be_finer and parts < FINEST:
             parts *= 2
             self._use(parts)
         if not self.nominal.success:
             self._use(1)
+
+    @property
+    def controller_name(self) -> str:
+        """The controller's name, or that it is a user's own."""
+        if isinstance(self.controller, str):
+            return self.controller
+        return "an MPC of the user" if isinstance(self.controller, MPC) else "a user's function"
 
     def _use(self, parts: int) -> None:
         self.parts, self.model = parts, self.plan.model_at(parts)
@@ -87,29 +94,46 @@ class Task:
         self.__dict__.pop("nominal", None)
         self.__dict__.pop("setup", None)
         with applied(select(self.model, self.plan.vector.to_dict())) as model:
-            self.policy = self._controller(model)
+            self.policy = self._policy(model)
 
-    def _controller(self, model: Model) -> Controller:
-        if callable(self.controller):
-            return self.controller(self.plan, model, self.xs, self.us)
-        if self.controller == "tvlqr" and model.nu:
+    def _policy(self, model: Model) -> Controller:
+        given = self.controller
+        if isinstance(given, MPC):
+            return given
+        if callable(given):
+            return self._made(given, model)
+        if given == "tvlqr" and model.nu:
             return track(self.plan, model, self.xs, self.us)
-        if self.controller == "mpc" and model.nu:
+        if given == "mpc" and model.nu:
             return MPC(self.plan.problem, horizon=MPC_HORIZON, plan=(self.xs, self.us))
         return OpenLoop(self.us, model.time_step)
 
+    def _made(self, make: MakeController, model: Model) -> Controller:
+        try:
+            found: Any = make(self.plan, model, self.xs, self.us)
+        except DrakeDiffError:
+            raise
+        except Exception as error:
+            got = f"{type(error).__name__}: {error}"
+            raise InputError("controller", got=got, expected="a function that makes a controller") from error
+        if not callable(found):
+            raise InputError(
+                "controller", got=f"one that makes {type(found).__name__}", expected="u = controller(x, t)"
+            )
+        return found
+
     @cached_property
     def setup(self) -> Setup:
-        """As planned, but for the loop. The plant is another one than the controller's, where it can be built again."""
+        """As planned, in this loop. The plant is not the controller's own one where it can be built again."""
         model = self.model.at_time_step(self.model.time_step) if self.model.can_rebuild else self.model
         return Setup(model, self.xs[0], self.loop, self.model.time_step * len(self.us), self.plan.vector.to_dict())
 
     @cached_property
-    def nominal(self) -> Outcome:
+    def nominal(self) -> Judgement:
         """The unperturbed run."""
         return self.run(self.setup, 0)
 
-    def run(self, setup: Setup, seed: int) -> Outcome:
+    def run(self, setup: Setup, seed: int) -> Judgement:
         """One run of `setup`, judged."""
         with applied(select(setup.model, setup.parameters)) as model:
             found = closed_loop(model, self.policy, setup.x0, len(self.us), setup.loop, seed=seed)
@@ -121,7 +145,7 @@ class Task:
         )
         nominal = self.__dict__.get("nominal")
         reference = self.xs[-1] if nominal is None else nominal.run.motion.xs[-1]
-        return Outcome(
+        return Judgement(
             run=found,
             failures=(*failures, *depth),
             goal_error=float(np.max(np.abs(goal))),
@@ -142,8 +166,8 @@ def run_trial(task: Task, levels: Mapping[str, float], seed: int) -> Trial:
     return Trial(levels, seed, outcome, label, f"{outcome.failures[0]}; {why}")
 
 
-def _label(task: Task, setup: Setup, seed: int, outcome: Outcome) -> tuple[Label, str]:
-    if "the controller failed" in outcome.run.ended:
+def _label(task: Task, setup: Setup, seed: int, outcome: Judgement) -> tuple[Label, str]:
+    if outcome.run.controller_error:
         return "control_error", "the controller itself failed"
     if not task.nominal.success:
         return "planning_error", f"unperturbed it fails too: {task.nominal.failures[0]}"
@@ -161,5 +185,5 @@ def _label(task: Task, setup: Setup, seed: int, outcome: Outcome) -> tuple[Label
             if task.run(fixed, seed).success:
                 return label, why
         except ModelError as error:
-            return "evaluation_error", f"it cannot be run again: {error}"
+            return "evaluation_error", f"it could not be run again: {error}"
     return "control_error", "neither a perfect sensor nor actuator nor plant helps alone"

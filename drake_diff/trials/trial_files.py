@@ -1,7 +1,4 @@
-"""All that a loop saw and did in one trial, as trace.mcap.
-
-One trial on disk: what it was, a trace of all that the loop saw and did, a replay beside the plan, its latencies.
-"""
+"""One trial on disk: what it was, a trace of all that the loop saw and did, a replay beside the plan, its latencies."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -20,61 +17,18 @@ from drake_diff.model.parameters import applied, select
 from drake_diff.record.robustness import EventEvidence, TrialEvidence
 from drake_diff.record.sealed import canonical
 from drake_diff.trials.perturbation import Setup, perturbed
-from drake_diff.trials.trial import Outcome, Task, Trial
-
-
-def write_trial_trace(path: Path, shown: Shown, trial: Trial) -> None:
-    """Write the trace of `trial`, whose motion and plan are `shown`. Latencies differ each time and are apart."""
-    metadata = {
-        "model": shown.model.name,
-        "time_axis": "simulated",
-        "perturbation": json.dumps(dict(trial.levels), sort_keys=True),
-        "label": trial.label or "success",
-    }
-    write_mcap(path, list(_channels(shown, trial)), metadata, {})
-
-
-def _channels(shown: Shown, trial: Trial) -> Iterator[Channel]:
-    """The true motion and the plan, then what the loop saw, took it for, commanded and applied, and what happened."""
-    yield from motion_channels(shown)
-    yield state_channel(shown, "/planned/state", shown.planned_xs)
-    run = trial.outcome.run
-    seen = ~np.isnan(run.observations).any(axis=1)
-    yield state_channel(shown, "/observation", run.observations[seen], run.times[seen])
-    yield state_channel(shown, "/estimate", run.estimates, run.times)
-    yield input_channel(shown, "/command", run.times, run.commands)
-    yield input_channel(shown, "/applied", run.times, run.applied)
-    kind = TYPES["Event"]
-    statuses = [
-        kind.cls(time=t, kind="controller", code=OK if status == OK else "other", message=status)
-        for t, status in zip(run.times.tolist(), run.controller_status, strict=True)
-    ]
-    yield _events("/controller/status", statuses)
-    events = [kind.cls(time=e.t, kind=e.kind, message=e.message) for e in run.events]
-    end = shown.time_step * (len(shown.xs) - 1)
-    if trial.label is not None:
-        last = kind.cls(time=end, kind="failure", failure_label=trial.label, code=trial.label, message=trial.reason)
-        events.append(last)
-    yield _events("/events", events)
-
-
-def _events(topic: str, events: Sequence[Any]) -> Channel:
-    kind = TYPES["Event"]
-    ordered = sorted(((nanoseconds(e.time), e) for e in events), key=lambda row: row[0])
-    return Channel(topic, kind.cls, ordered, {"units": kind.units})
-
+from drake_diff.trials.trial import Judgement, Task, Trial
 
 TRIAL, TRACE, REPLAY, LATENCIES = "trial.json", "trace.mcap", "replay.html", "latencies.json"
-FURTHEST = 1e6  # m and rad: what runs away further is drawn there; the trace has it as it was
+FURTHEST = 1e6  # m and rad: what runs away further is drawn here; the trace has it as it was
 FILES = (TRIAL, TRACE, REPLAY, LATENCIES)
 
 
 def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None:
-    """Write all FILES of `trial` into `folder`; `run` is the directory that its plan is from, None where there is none.
+    """Write all FILES of `trial` into `folder`; `run` is the run directory that its plan is from, if there is one.
 
-    All but the latencies are the same, byte for byte, for the same trial.
+    The same trial gives the same bytes, but for the latencies.
     """
-    from drake_diff.logs.channels import Shown
     from drake_diff.pages.meshcat import write_replay
     from drake_diff.pages.scene import BLUE, scene_of
 
@@ -109,7 +63,7 @@ def trial_evidence(task: Task, trial: Trial, run: str | None) -> TrialEvidence:
     setup = perturbed(task.setup, trial.levels, trial.seed)
     return TrialEvidence(
         run=run,
-        controller=controller_name(task),
+        controller=task.controller_name,
         perturbation=name,
         level=level,
         seed=trial.seed,
@@ -128,15 +82,51 @@ def trial_evidence(task: Task, trial: Trial, run: str | None) -> TrialEvidence:
     )
 
 
-def controller_name(task: Task) -> str:
-    """What `Task` takes, or that it is none of ours."""
-    return task.controller if isinstance(task.controller, str) else "a user's function"
-
-
-def displacement_of(outcome: Outcome) -> float | None:
+def displacement_of(outcome: Judgement) -> float | None:
     """The length of the last state's displacement; None where the run broke off or it is not finite."""
     return None if outcome.run.ended else finite(float(np.linalg.norm(outcome.displacement)))
 
 
 def finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
+
+
+def write_trial_trace(path: Path, shown: Shown, trial: Trial) -> None:
+    """Write the trace of `trial`; `shown` has its motion and plan. Latencies differ each time and are not in it."""
+    metadata = {
+        "model": shown.model.name,
+        "time_axis": "simulated",
+        "perturbation": json.dumps(dict(trial.levels), sort_keys=True),
+        "label": trial.label or "success",
+    }
+    write_mcap(path, list(_channels(shown, trial)), metadata, {})
+
+
+def _channels(shown: Shown, trial: Trial) -> Iterator[Channel]:
+    """The true motion and the plan, then observations, estimates, commands, what was applied, and the events."""
+    yield from motion_channels(shown)
+    yield state_channel(shown, "/planned/state", shown.planned_xs)
+    run = trial.outcome.run
+    seen = ~np.isnan(run.observations).any(axis=1)
+    yield state_channel(shown, "/observation", run.observations[seen], run.times[seen])
+    yield state_channel(shown, "/estimate", run.estimates, run.times)
+    yield input_channel(shown, "/command", run.times, run.commands)
+    yield input_channel(shown, "/applied", run.times, run.applied)
+    kind = TYPES["Event"]
+    statuses = [
+        kind.cls(time=t, kind="controller", code=OK if status == OK else "other", message=status)
+        for t, status in zip(run.times.tolist(), run.controller_status, strict=True)
+    ]
+    yield _events("/controller/status", statuses)
+    events = [kind.cls(time=e.t, kind=e.kind, message=e.message) for e in run.events]
+    end = shown.time_step * (len(shown.xs) - 1)
+    if trial.label is not None:
+        last = kind.cls(time=end, kind="failure", failure_label=trial.label, code=trial.label, message=trial.reason)
+        events.append(last)
+    yield _events("/events", events)
+
+
+def _events(topic: str, events: Sequence[Any]) -> Channel:
+    kind = TYPES["Event"]
+    ordered = sorted(((nanoseconds(e.time), e) for e in events), key=lambda row: row[0])
+    return Channel(topic, kind.cls, ordered, {"units": kind.units})
