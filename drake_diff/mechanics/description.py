@@ -17,7 +17,7 @@ from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.joints import JointContract, PairContract
 from drake_diff.mechanics.tree import springs_of
 from drake_diff.model.model import Model
-from drake_diff.model.plant import actuators, bodies, joints, labelled
+from drake_diff.model.plant import actuators, bodies, joints, labelled, proximity_property
 
 MOVING = ("revolute", "prismatic", "quaternion_floating")
 
@@ -205,23 +205,16 @@ def _geometries(model: Model, body_names: dict[Any, str]) -> tuple[tuple[Geometr
         found.append(Geometry(names[geometry], body, pose, shape))
     pairs = []
     for a, b in sorted(inspector.GetCollisionCandidates(), key=lambda ids: (names[ids[0]], names[ids[1]])):
-        sides = [inspector.GetProximityProperties(g) for g in (a, b)]
-        friction, stiffness = (_combined([_material(s, what) for s in sides]) for what in ("friction", "stiffness"))
+        friction, stiffness = (
+            _combined(*(proximity_property(inspector, g, quantity) for g in (a, b)))
+            for quantity in ("friction", "stiffness")
+        )
         pairs.append(PairContract((names[a], names[b]), None if friction is None else 2 * friction, stiffness))
     return tuple(found), tuple(pairs)
 
 
-def _material(properties: Any, what: str) -> float | None:
-    name = {"friction": "coulomb_friction", "stiffness": "point_contact_stiffness"}[what]
-    if not properties.HasProperty("material", name):
-        return None
-    value = properties.GetProperty("material", name)
-    return float(value.dynamic_friction() if what == "friction" else value)
-
-
-def _combined(sides: list[float | None]) -> float | None:
+def _combined(a: float | None, b: float | None) -> float | None:
     """a b / (a + b): Drake's rule for stiffness, and half of its rule for friction."""
-    a, b = sides
     if a is None or b is None:
         return None
     return a * b / (a + b) if a + b else 0.0

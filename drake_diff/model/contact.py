@@ -1,5 +1,6 @@
 """What touches: contact forces and modes of a step, and how deep geometries overlap in a state."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,9 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import Array, frozen
 from drake_diff.exceptions import SimulationError
 from drake_diff.model.model import Model
+from drake_diff.model.plant import proximity_property
 from drake_diff.model.step import advance, check_point
+from drake_diff.model.twin import Twin
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,53 +31,6 @@ class ContactPoint:
     slip_speed: float  # [m/s]
 
 
-def contacts_of_the_step(model: Model) -> tuple[ContactPoint, ...]:
-    """The contacts of the step that `step.advance` took last on the double twin."""
-    results = model.plant.get_contact_results_output_port().Eval(model.double.context)
-    points = [results.point_pair_contact_info(i) for i in range(results.num_point_pair_contacts())]
-    patches = [results.hydroelastic_contact_info(i) for i in range(results.num_hydroelastic_contacts())]
-    return tuple(_from_point(model, p) for p in points) + tuple(_from_patch(model, p) for p in patches)
-
-
-def _from_point(model: Model, info: Any) -> ContactPoint:
-    return _contact(
-        model,
-        [model.plant.get_body(index) for index in (info.bodyA_index(), info.bodyB_index())],
-        point=frozen(info.contact_point()),
-        normal=np.asarray(info.point_pair().nhat_BA_W),
-        force=-np.asarray(info.contact_force()),  # Drake's is on B
-        depth=float(info.point_pair().depth),
-        slip_speed=float(info.slip_speed()),
-    )
-
-
-def _contact(model: Model, bodies: list[Any], *, normal: Array, force: Array, **rest: Any) -> ContactPoint:
-    """A contact whose force is that on the body which can move, where only one of the two can."""
-    a, b = bodies
-    if model.plant.IsAnchored(a):
-        a, b, normal, force = b, a, -normal, -force
-    return ContactPoint(body_a=a.name(), body_b=b.name(), normal=frozen(normal), force=frozen(force), **rest)
-
-
-def _from_patch(model: Model, info: Any) -> ContactPoint:
-    surface = info.contact_surface()
-    inspector = model.plant.get_geometry_query_input_port().Eval(model.double.context).inspector()
-    bodies = [
-        model.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)) for geometry in (surface.id_M(), surface.id_N())
-    ]
-    force = np.asarray(info.F_Ac_W().translational())
-    size = float(np.linalg.norm(force))
-    return _contact(
-        model,
-        bodies,
-        point=frozen(surface.centroid()),
-        normal=force / size if size else np.zeros(3),
-        force=force,
-        depth=0.0,
-        slip_speed=0.0,
-    )
-
-
 Pair = tuple[str, str]  # two geometries, each as "body/geometry"
 SEPARATED, STICKING, SLIDING = "separated", "sticking", "sliding"
 # Of the friction that is possible, the part above which a pair slides. SAP sticks strictly inside the cone. The
@@ -83,62 +39,102 @@ SLIDING_PART = {"sap": 1 - 1e-3, "similar": 0.5**0.5, "lagged": 0.5**0.5}
 
 
 def contact_modes(model: Model, x: ArrayLike, u: ArrayLike | None = None) -> dict[Pair, str]:
-    """Of every pair of geometries that may collide, its mode in the step at (`x`, `u`), from Drake's own forces.
+    """The contact mode of every pair of geometries that may collide, in the step at (`x`, `u`), by Drake's own forces.
 
-    "separated": no normal force; "sticking": friction inside its cone, "sliding": at it (of sap), or a slip
-    above the stiction tolerance (of similar and lagged). Raises what `step` raises.
+    Args:
+        model: The model.
+        x: (nx,) the state before the step.
+        u: (nu,) the input; may be left out where there is none.
+
+    Returns:
+        By pair of names, each "body/geometry": "separated" without a normal force; "sticking" with friction inside its
+        cone; "sliding" with friction at the cone (sap) or a slip above the stiction tolerance (similar and lagged).
+
+    Raises:
+        ShapeError, NonFiniteError: x or u is wrong.
+        SimulationError: Drake cannot take the step.
+
+    Example:
+        >>> model = dd.load_model("models/sphere_on_ground.sdf", time_step=0.01)
+        >>> dd.contact_modes(model, model.default_state)
+        {('ball/ball', 'ground/ground'): 'sticking'}
     """
     advance(model.double, *check_point(model, x, u))
     active, inspector = active_modes(model), model.double.inspector
     if inspector is None:
         return {}
-    pairs = [_pair(model, inspector, *ids) for ids in inspector.GetCollisionCandidates()]
+    pairs = [_pair(model, *ids) for ids in inspector.GetCollisionCandidates()]
     return {pair: active.get(pair, SEPARATED) for pair in sorted(pairs)}
 
 
 def active_modes(model: Model) -> dict[Pair, str]:
     """The modes of the pairs that push each other in the step that `step.advance` took last on the double twin."""
-    results = model.plant.get_contact_results_output_port().Eval(model.double.context)
-    inspector = model.double.inspector
     found: dict[Pair, str] = {}
-    if inspector is None:
-        return found
-    for i in range(results.num_point_pair_contacts()):
-        info = results.point_pair_contact_info(i)
-        ids = (info.point_pair().id_A, info.point_pair().id_B)
-        _add_mode(found, model, inspector, ids, np.asarray(info.contact_force()), info.point_pair().nhat_BA_W)
-    for i in range(results.num_hydroelastic_contacts()):
-        hydroelastic = results.hydroelastic_contact_info(i)
-        surface = hydroelastic.contact_surface()
-        faces = range(surface.num_faces())
-        normal = np.sum([surface.area(f) * np.asarray(surface.face_normal(f)) for f in faces], axis=0)
-        force = np.asarray(hydroelastic.F_Ac_W().translational())
-        ids = (surface.id_M(), surface.id_N())
-        _add_mode(found, model, inspector, ids, force, normal / max(float(np.linalg.norm(normal)), 1e-300))
+    for a, b, force, info in contact_forces(model.double):
+        normal = _normal(info)
+        push = abs(float(force @ normal))
+        if push == 0:
+            continue
+        mu_a, mu_b = (proximity_property(model.double.inspector, geometry, "friction") or 0.0 for geometry in (a, b))
+        possible = 2 * mu_a * mu_b / (mu_a + mu_b) * push if mu_a + mu_b else 0.0  # Drake's rule for two frictions
+        tangential = float(np.linalg.norm(force - (force @ normal) * normal))
+        part = SLIDING_PART[model.contract.contact.approximation]
+        found[_pair(model, a, b)] = SLIDING if tangential >= part * possible else STICKING
     return found
 
 
-def _add_mode(found: dict[Pair, str], model: Model, inspector: Any, ids: Any, force: Array, normal: Any) -> None:
-    push = abs(float(force @ normal))
-    if push == 0:
-        return
-    mu_a, mu_b = (_friction(inspector, geometry) for geometry in ids)
-    possible = 2 * mu_a * mu_b / (mu_a + mu_b) * push if mu_a + mu_b else 0.0
-    tangential = float(np.linalg.norm(force - (force @ normal) * np.asarray(normal)))
-    part = SLIDING_PART[model.contract.contact.approximation]
-    found[_pair(model, inspector, *ids)] = SLIDING if tangential >= part * possible else STICKING
+def contacts_of_the_step(model: Model) -> tuple[ContactPoint, ...]:
+    """The contacts of the step that `step.advance` took last on the double twin."""
+    found = []
+    for a, b, force, info in contact_forces(model.double):
+        body_a, body_b, normal = body_of(model, a), body_of(model, b), _normal(info)
+        if model.plant.IsAnchored(body_a):  # the force is the one on what can move
+            body_a, body_b, normal, force = body_b, body_a, -normal, -force
+        patch = hasattr(info, "contact_surface")
+        contact = ContactPoint(
+            body_a=body_a.name(),
+            body_b=body_b.name(),
+            point=frozen(info.contact_surface().centroid() if patch else info.contact_point()),
+            normal=frozen(normal),
+            force=frozen(force),
+            depth=0.0 if patch else float(info.point_pair().depth),
+            slip_speed=0.0 if patch else float(info.slip_speed()),
+        )
+        found.append(contact)
+    return tuple(found)
 
 
-def _friction(inspector: Any, geometry: Any) -> float:
-    properties = inspector.GetProximityProperties(geometry)
-    return float(properties.GetProperty("material", "coulomb_friction").dynamic_friction())
+def contact_forces(twin: Twin) -> Iterator[tuple[Any, Any, Any, Any]]:
+    """Of each contact in the twin's last step: the geometries a and b, the force on a (3,) [N], and Drake's own result.
+
+    The force holds floats or AutoDiffXd, as the twin does.
+    """
+    results = twin.plant.get_contact_results_output_port().Eval(twin.context)
+    for i in range(results.num_point_pair_contacts()):
+        info = results.point_pair_contact_info(i)
+        yield info.point_pair().id_A, info.point_pair().id_B, -info.contact_force(), info  # Drake's is on B
+    for i in range(results.num_hydroelastic_contacts()):
+        info = results.hydroelastic_contact_info(i)
+        yield info.contact_surface().id_M(), info.contact_surface().id_N(), info.F_Ac_W().translational(), info
 
 
-def _pair(model: Model, inspector: Any, a: Any, b: Any) -> Pair:
-    names = []
-    for geometry in (a, b):
-        body = model.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
-        names.append(f"{body.name()}/{inspector.GetName(geometry).split('::')[-1]}")
+def _normal(info: Any) -> Array:
+    """(3,) from b into a; of a patch the mean over its faces, by area."""
+    if not hasattr(info, "contact_surface"):
+        return np.asarray(info.point_pair().nhat_BA_W)
+    surface = info.contact_surface()
+    faces = range(surface.num_faces())
+    normal = np.sum([surface.area(f) * np.asarray(surface.face_normal(f)) for f in faces], axis=0)
+    return np.asarray(normal / max(float(np.linalg.norm(normal)), np.finfo(float).tiny))
+
+
+def body_of(model: Model, geometry: Any) -> Any:
+    """The body that carries a geometry."""
+    return model.plant.GetBodyFromFrameId(model.double.inspector.GetFrameId(geometry))
+
+
+def _pair(model: Model, a: Any, b: Any) -> Pair:
+    names = [f"{body_of(model, g).name()}/{model.double.inspector.GetName(g).split('::')[-1]}" for g in (a, b)]
     first, second = sorted(names)
     return first, second
 
@@ -157,12 +153,8 @@ def penetration(model: Model) -> float:
 
 def thinnest_geometry(model: Model) -> tuple[float, str]:
     """(thickness [m], name) of the thinnest geometry that may collide; (inf, "nothing") where none has a size."""
-    port = model.plant.get_geometry_query_input_port()
-    found = (float("inf"), "nothing")
-    if not port.HasValue(model.double.context):
-        return found
-    inspector = port.Eval(model.double.context).inspector()
-    for geometry in {g for pair in inspector.GetCollisionCandidates() for g in pair}:
+    found, inspector = (float("inf"), "nothing"), model.double.inspector
+    for geometry in {g for pair in inspector.GetCollisionCandidates() for g in pair} if inspector else ():
         box = inspector.GetObbInGeometryFrame(geometry)
         if box is not None:  # a half space has none
             found = min(found, (2 * float(np.min(box.half_width())), str(inspector.GetName(geometry))))

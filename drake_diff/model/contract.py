@@ -2,11 +2,12 @@
 
 import math
 from dataclasses import asdict, dataclass
+from html import escape
 from typing import Any
 
-from pydrake.geometry import ProximityProperties, Role, SceneGraphInspector
+from pydrake.geometry import Role
 
-from drake_diff.model.plant import actuators, bodies, joints
+from drake_diff.model.plant import PROXIMITY, actuators, bodies, joints, proximity_property
 from drake_diff.model.twin import Twin
 
 
@@ -83,7 +84,17 @@ class ContactTerms:
 
 @dataclass(frozen=True)
 class Contract:
-    """Everything a run rests on, read from Drake; SI units; `print(contract)` is for people."""
+    """Everything a run rests on, read from Drake in SI units; `print(contract)` shows all of it.
+
+    Example:
+        >>> contract = dd.load_model("models/pendulum.urdf", time_step=0.01).contract
+        >>> contract
+        Contract of pendulum: time step 0.01 s, semi-implicit Euler; damping, PD control, limits and contact implicit
+          1 positions, 1 velocities, 1 inputs, 1 bodies, 1 joints, 0 collision geometries, 0 constraints
+          contact point, sap; print(contract) shows everything
+        >>> contract.positions[0].name, contract.positions[0].unit
+        ('hinge_q', 'rad')
+    """
 
     name: str
     source: str | None
@@ -111,6 +122,18 @@ class Contract:
     def __str__(self) -> str:
         return "\n".join(_lines(self))
 
+    def __repr__(self) -> str:
+        counts = ["positions", "velocities", "inputs", "bodies", "joints", "geometries"]
+        told = ", ".join(f"{len(getattr(self, kind))} {kind}" for kind in counts).replace("geom", "collision geom")
+        return (
+            f"Contract of {self.name}: time step {self.time_step:g} s, {self.integrator}\n"
+            f"  {told}, {self.constraints} constraints\n"
+            f"  contact {self.contact.model}, {self.contact.approximation}; print(contract) shows everything"
+        )
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(str(self))}</pre>"
+
 
 def _plain(value: Any) -> Any:
     if isinstance(value, dict):
@@ -133,7 +156,8 @@ def _lines(c: Contract) -> list[str]:
     ]
     for kind, coordinates in (("q", c.positions), ("v", c.velocities), ("u", c.inputs)):
         for i, x in enumerate(coordinates):
-            lines.append(f"  {kind}[{i}]".ljust(13) + f"{x.name} [{x.unit}]{_limits(x)}")
+            limits = "" if math.isinf(x.lower) and math.isinf(x.upper) else f" in [{x.lower:g}, {x.upper:g}]"
+            lines.append(f"  {kind}[{i}]".ljust(13) + f"{x.name} [{x.unit}]{limits}")
     for body in c.bodies:
         lines.append(
             f"  body       {body.name}: {body.mass:g} kg at {_row(body.center_of_mass)} m,"
@@ -152,28 +176,19 @@ def _lines(c: Contract) -> list[str]:
             f"  actuator   {a.name} on {a.joint}{limit}, gear {a.gear_ratio:g}, rotor {a.rotor_inertia:g}{gains}"
         )
     for g in c.geometries:
+        # sap knows only the relaxation time, similar and lagged only Hunt and Crossley's dissipation
+        damped = f"dissipation {_or_default(g.dissipation)} s/m"
+        if c.contact.approximation == "sap":
+            damped = f"relaxation time {_or_default(g.relaxation_time)} s"
         lines.append(
             f"  collision  {g.name} of {g.body}: {g.shape}, friction {_or_default(g.friction)},"
-            f" stiffness {_or_default(g.stiffness)} N/m, {_damping_of_contact(c.contact.approximation, g)}"
+            f" stiffness {_or_default(g.stiffness)} N/m, {damped}"
         )
     return lines + [f"  note       {note}" for note in c.notes]
 
 
-def _damping_of_contact(approximation: str, g: GeometryTerms) -> str:
-    """What damps contact: sap knows only the relaxation time, similar and lagged only Hunt-Crossley's number."""
-    if approximation == "sap":
-        return f"relaxation time {_or_default(g.relaxation_time)} s"
-    return f"dissipation {_or_default(g.dissipation)} s/m"
-
-
 def _row(values: tuple[float, ...]) -> str:
     return "(" + ", ".join(f"{value:g}" for value in values) + ")"
-
-
-def _limits(x: CoordinateTerms) -> str:
-    if math.isinf(x.lower) and math.isinf(x.upper):
-        return ""
-    return f" in [{x.lower:g}, {x.upper:g}]"
 
 
 def _or_default(value: float | None) -> str:
@@ -206,11 +221,19 @@ def read_contract(
     notes: tuple[str, ...],
 ) -> Contract:
     """The contract of the plant in `twin`; `coordinates` are the names of q, v and u."""
-    plant = twin.plant
+    plant, inspector = twin.plant, twin.inspector
     positions, velocities, inputs = coordinates
-    position_limits = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
-    velocity_limits = plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits()
-    effort_limits = plant.GetEffortLowerLimits(), plant.GetEffortUpperLimits()
+    efforts = ["N" if a.joint().type_name() == "prismatic" else "N m" for a in actuators(plant)]
+    contact = ContactTerms(
+        model={"kPoint": "point", "kHydroelastic": "hydroelastic"}.get(
+            plant.get_contact_model().name, "hydroelastic_with_fallback"
+        ),
+        approximation=plant.get_discrete_contact_approximation().name.removeprefix("k").lower(),
+        geometry=contact_geometry or "as modelled",
+        collision_pairs=len(inspector.GetCollisionCandidates()) if inspector is not None else 0,
+        solver_relative_tolerance=SAP_RELATIVE_TOLERANCE,
+        sap_near_rigid_threshold=float(plant.get_sap_near_rigid_threshold()),
+    )
     return Contract(
         name=name,
         source=source,
@@ -219,24 +242,24 @@ def read_contract(
         scalar_types=("double", "AutoDiffXd"),
         gravity=_floats(plant.gravity_field().gravity_vector()),
         frame="world, z up; v of a floating body is w_WB then v_WBo, expressed in world",
-        positions=_coordinates(positions, _units(plant, 0), *position_limits),
-        velocities=_coordinates(velocities, _units(plant, 1), *velocity_limits),
-        inputs=_coordinates(inputs, _input_units(plant), *effort_limits),
-        bodies=tuple(_read_body(twin, body) for body in bodies(plant)),
-        joints=tuple(_read_joint(twin, joint) for joint in joints(plant)),
-        actuators=tuple(_read_actuator(actuator) for actuator in actuators(plant)),
-        geometries=_read_geometries(twin),
-        contact=_read_contact(twin, contact_geometry),
+        positions=_terms(positions, _units(plant, 0), plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()),
+        velocities=_terms(velocities, _units(plant, 1), plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits()),
+        inputs=_terms(inputs, efforts, plant.GetEffortLowerLimits(), plant.GetEffortUpperLimits()),
+        bodies=tuple(_body(twin, body) for body in bodies(plant)),
+        joints=tuple(_joint(twin, joint) for joint in joints(plant)),
+        actuators=tuple(_actuator(actuator) for actuator in actuators(plant)),
+        geometries=tuple(_geometry(twin, id_) for id_ in inspector.GetAllGeometryIds(Role.kProximity))
+        if inspector is not None
+        else (),
+        contact=contact,
         constraints=plant.num_constraints(),
         notes=notes,
     )
 
 
-def _coordinates(names: Any, units: Any, lower: Any, upper: Any) -> tuple[CoordinateTerms, ...]:
-    return tuple(
-        CoordinateTerms(name, unit, float(low), float(high))
-        for name, unit, low, high in zip(names, units, lower, upper, strict=True)
-    )
+def _terms(names: Any, units: Any, lower: Any, upper: Any) -> tuple[CoordinateTerms, ...]:
+    rows = zip(names, units, _floats(lower), _floats(upper), strict=True)
+    return tuple(CoordinateTerms(*row) for row in rows)
 
 
 def _units(plant: Any, which: int) -> list[str]:
@@ -249,22 +272,14 @@ def _units(plant: Any, which: int) -> list[str]:
     return units
 
 
-def _input_units(plant: Any) -> list[str]:
-    return ["N" if a.joint().type_name() == "prismatic" else "N m" for a in actuators(plant)]
-
-
-def _read_body(twin: Twin, body: Any) -> BodyTerms:
+def _body(twin: Twin, body: Any) -> BodyTerms:
     inertia = body.CalcSpatialInertiaInBodyFrame(twin.context)
     about_com = inertia.Shift(inertia.get_com()).CalcRotationalInertia()
-    return BodyTerms(
-        name=body.name(),
-        mass=float(inertia.get_mass()),
-        center_of_mass=_floats(inertia.get_com()),
-        inertia=_floats(about_com.get_moments()) + _floats(about_com.get_products()),
-    )
+    six = _floats(about_com.get_moments()) + _floats(about_com.get_products())
+    return BodyTerms(body.name(), float(inertia.get_mass()), _floats(inertia.get_com()), six)
 
 
-def _read_joint(twin: Twin, joint: Any) -> JointTerms:
+def _joint(twin: Twin, joint: Any) -> JointTerms:
     return JointTerms(
         name=joint.name(),
         type=joint.type_name(),
@@ -275,7 +290,7 @@ def _read_joint(twin: Twin, joint: Any) -> JointTerms:
     )
 
 
-def _read_actuator(actuator: Any) -> ActuatorTerms:
+def _actuator(actuator: Any) -> ActuatorTerms:
     gains = actuator.get_controller_gains() if actuator.has_controller() else None
     return ActuatorTerms(
         name=actuator.name(),
@@ -288,45 +303,14 @@ def _read_actuator(actuator: Any) -> ActuatorTerms:
     )
 
 
-def _read_geometries(twin: Twin) -> tuple[GeometryTerms, ...]:
+def _geometry(twin: Twin, geometry: Any) -> GeometryTerms:
     inspector = twin.inspector
-    if inspector is None:
-        return ()
-    ids = inspector.GetAllGeometryIds(Role.kProximity)
-    return tuple(_read_geometry(twin, inspector, geometry_id) for geometry_id in ids)
-
-
-def _read_geometry(twin: Twin, inspector: SceneGraphInspector, geometry_id: Any) -> GeometryTerms:
-    properties = inspector.GetProximityProperties(geometry_id)
-    body = twin.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry_id))
-    friction = _property(properties, "material", "coulomb_friction")
+    body = twin.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
     return GeometryTerms(
-        name=inspector.GetName(geometry_id),
+        name=inspector.GetName(geometry),
         body=body.name() if body is not None else "?",
-        shape=type(inspector.GetShape(geometry_id)).__name__,
-        friction=None if friction is None else float(friction.dynamic_friction()),
-        stiffness=_property(properties, "material", "point_contact_stiffness"),
-        dissipation=_property(properties, "material", "hunt_crossley_dissipation"),
-        relaxation_time=_property(properties, "material", "relaxation_time"),
-        hydroelastic_modulus=_property(properties, "hydroelastic", "hydroelastic_modulus"),
-    )
-
-
-def _property(properties: ProximityProperties, group: str, name: str) -> Any:
-    return properties.GetProperty(group, name) if properties.HasProperty(group, name) else None
-
-
-def _read_contact(twin: Twin, contact_geometry: str | None) -> ContactTerms:
-    inspector = twin.inspector
-    return ContactTerms(
-        model={"kPoint": "point", "kHydroelastic": "hydroelastic"}.get(
-            twin.plant.get_contact_model().name, "hydroelastic_with_fallback"
-        ),
-        approximation=twin.plant.get_discrete_contact_approximation().name.removeprefix("k").lower(),
-        geometry=contact_geometry or "as modelled",
-        collision_pairs=len(inspector.GetCollisionCandidates()) if inspector is not None else 0,
-        solver_relative_tolerance=SAP_RELATIVE_TOLERANCE,
-        sap_near_rigid_threshold=float(twin.plant.get_sap_near_rigid_threshold()),
+        shape=type(inspector.GetShape(geometry)).__name__,
+        **{quantity: proximity_property(inspector, geometry, quantity) for quantity in PROXIMITY},
     )
 
 

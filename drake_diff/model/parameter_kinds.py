@@ -12,6 +12,7 @@ Parameters of contact are named by body ("ball.friction": all its geometries) or
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from operator import attrgetter
 from operator import methodcaller as get
 from typing import Any
@@ -33,7 +34,7 @@ from pydrake.multibody.tree import (
 
 from drake_diff._base.autodiff import plain
 from drake_diff.model.model import Model
-from drake_diff.model.plant import actuators, bodies, joints, labelled
+from drake_diff.model.plant import PROXIMITY, actuators, bodies, joints, labelled, proximity_property
 from drake_diff.model.twin import GravityChange, SpringChange, Twin
 
 # Drake drops the derivative of a frame's pose whose value is exactly the identity. A translation of this
@@ -289,23 +290,15 @@ def _contact_kind(quantity: str, unit: str, read: Callable[[Any, Any], Any], cha
     return Kind(quantity, DIFFERENCE, values, unit, lambda v: v.pop() if len(v) == 1 else None, write, positive=True)
 
 
-def _of_material(group: str, name: str) -> tuple[Callable[[Any, Any], Any], Callable[..., None]]:
-    """How a proximity property is read and changed."""
-    friction = name == "coulomb_friction"  # Drake holds two coefficients; a discrete plant uses the dynamic one
-
-    def read(inspector: Any, geometry: Any) -> float | None:
-        properties = inspector.GetProximityProperties(geometry)
-        if not properties.HasProperty(group, name):
-            return None
-        value = properties.GetProperty(group, name)
-        return float(value.dynamic_friction() if friction else value)
-
+def _change_property(quantity: str) -> Callable[..., None]:
     def change(twin: Twin, geometry: Any, value: float, root: Any) -> None:
         properties = ProximityProperties(twin.inspector.GetProximityProperties(geometry))
-        properties.UpdateProperty(group, name, CoulombFriction(value, value) if friction else value)
+        properties.UpdateProperty(
+            *PROXIMITY[quantity], CoulombFriction(value, value) if quantity == "friction" else value
+        )
         twin.scene_graph.AssignRole(root, twin.plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
 
-    return read, change
+    return change
 
 
 def _read_radius(inspector: Any, geometry: Any) -> float | None:
@@ -320,10 +313,9 @@ def _change_radius(twin: Twin, geometry: Any, radius: float, root: Any) -> None:
 
 
 CONTACT_KINDS = (
-    _contact_kind("friction", "1", *_of_material("material", "coulomb_friction")),
-    _contact_kind("stiffness", "N/m", *_of_material("material", "point_contact_stiffness")),
-    _contact_kind("dissipation", "s/m", *_of_material("material", "hunt_crossley_dissipation")),
-    _contact_kind("relaxation_time", "s", *_of_material("material", "relaxation_time")),
-    _contact_kind("hydroelastic_modulus", "Pa", *_of_material("hydroelastic", "hydroelastic_modulus")),
+    *(
+        _contact_kind(quantity, unit, partial(proximity_property, quantity=quantity), _change_property(quantity))
+        for quantity, unit in zip(PROXIMITY, ("1", "N/m", "s/m", "s", "Pa"), strict=True)
+    ),
     _contact_kind("radius", "m", _read_radius, _change_radius),
 )

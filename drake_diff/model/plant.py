@@ -53,6 +53,28 @@ def labelled(elements: list[Any]) -> dict[str, Any]:
     return found
 
 
+# The quantities of contact by the names that parameters have, with Drake's names for them.
+PROXIMITY = {
+    "friction": ("material", "coulomb_friction"),
+    "stiffness": ("material", "point_contact_stiffness"),
+    "dissipation": ("material", "hunt_crossley_dissipation"),
+    "relaxation_time": ("material", "relaxation_time"),
+    "hydroelastic_modulus": ("hydroelastic", "hydroelastic_modulus"),
+}
+
+
+def proximity_property(inspector: Any, geometry: Any, quantity: str) -> float | None:
+    """One of PROXIMITY of a geometry, None where the model gives none; of friction the dynamic coefficient.
+
+    A discrete plant uses no other.
+    """
+    properties = inspector.GetProximityProperties(geometry)
+    if not properties.HasProperty(*PROXIMITY[quantity]):
+        return None
+    value = properties.GetProperty(*PROXIMITY[quantity])
+    return float(value.dynamic_friction() if quantity == "friction" else value)
+
+
 def scene_graph_beside(diagram: Any, path: DiagramPath) -> Any | None:
     """The SceneGraph, of either scalar type, nearest to the plant at `path`; None where there is none."""
     for depth in reversed(range(len(path))):

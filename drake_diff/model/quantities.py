@@ -24,6 +24,7 @@ from pydrake.multibody.tree import FrameIndex
 from drake_diff._base.arrays import Array, finite_array
 from drake_diff._base.autodiff import plain
 from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
+from drake_diff.model.contact import body_of, contact_forces
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
 from drake_diff.model.step import advance, set_state
@@ -118,26 +119,13 @@ def contact_force(model: Model, body: str) -> OfStateAndInput:
         _refuse_other(model, model.other_quantities)
         twin, (x, u) = _at(model, x, u)
         advance(twin, x, u)
-        results = twin.plant.get_contact_results_output_port().Eval(twin.context)
         total = np.array([twin.scalar(0.0)] * 3)
-        for i in range(results.num_point_pair_contacts()):
-            info = results.point_pair_contact_info(i)
-            total = total + _on(index, info.bodyB_index(), info.bodyA_index()) * info.contact_force()
-        for i in range(results.num_hydroelastic_contacts()):
-            patch = results.hydroelastic_contact_info(i)
-            first, second = (
-                model.plant.GetBodyFromFrameId(model.double.inspector.GetFrameId(geometry)).index()
-                for geometry in (patch.contact_surface().id_M(), patch.contact_surface().id_N())
-            )
-            total = total + _on(index, first, second) * patch.F_Ac_W().translational()
+        for a, b, on_a, _ in contact_forces(twin):
+            sign = float(body_of(model, a).index() == index) - float(body_of(model, b).index() == index)
+            total = total + sign * on_a
         return total
 
     return force
-
-
-def _on(index: Any, pushed: Any, pushing: Any) -> float:
-    """The sign of a contact's force on the body of that index; 0 where it is another's."""
-    return float(pushed == index) - float(pushing == index)
 
 
 def _refuse_other(model: Model, depends_on: frozenset[str]) -> None:
