@@ -148,7 +148,7 @@ def test_a_mass_on_a_slide_has_the_closed_form_of_its_recursion():
     ],
 )
 def test_the_wall_has_the_bias_of_its_jumps(theta, value, gradient, bias):
-    """ORACLES C07: the digits given, and a bias of minus the jumps times the normal density at each."""
+    """F and dF/dx by SciPy's `quad`, split at the jumps; the bias is minus each jump times the density there."""
     case = replace(wall(sigmas=(0.05,)), start=[theta])
     truth = truth_of(case, case.start, 0.05, 2)
     assert (truth.value, truth.gradient[0]) == pytest.approx((value, gradient), rel=1e-8)
@@ -179,11 +179,11 @@ def test_a_push_below_friction_has_no_derivative_to_follow():
     gradient = weights @ (loss * nodes) / weights.sum() / sigma
     truth = truth_of(case, case.start, sigma, 400)
     assert abs(truth.value - value) < 5 * truth.value_error + 2e-3  # Drake's friction creeps by 1e-4 m
-    assert abs(truth.gradient[0] - gradient) < 5 * truth.error[0] + 2e-3
+    assert abs(truth.gradient[0] - gradient) < 5 * truth.standard_error[0] + 2e-3
     assert abs(case.derivative(case.start)[0]) < 1e-3 * abs(gradient)
-    assert descend(case, "zeroth", sigma, 0, budget=200, batch=10, samples=50).succeeded
+    assert descend(case, "zeroth", sigma, 0, budget=200, batch=10, samples=50).arrived
     run = descend(case, "point", sigma, 0, budget=30, batch=10, samples=50)
-    assert not run.succeeded
+    assert not run.arrived
     assert run.x == pytest.approx([2.0], abs=0.1)
 
 
@@ -214,7 +214,7 @@ def test_on_stiff_ground_the_jumps_of_the_step_turn_the_sign_of_first_order():
     found = dd.studies.gradient_panel(
         [case], sigmas=[sigma], samples=20, seeds=3, budget=21, reference_samples=300
     ).cases[0]
-    assert abs(found.truths[0].gradient[0] - gradient) < 5 * found.truths[0].error[0]
+    assert abs(found.truths[0].gradient[0] - gradient) < 5 * found.truths[0].standard_error[0]
     first, zeroth = found.at("first", sigma), found.at("zeroth", sigma)
     assert (first.biased, first.cosine) == (True, -1)
     assert (zeroth.biased, found.least_error(sigma)) == (False, "zeroth")
@@ -242,7 +242,7 @@ def test_the_derivative_of_every_case_is_that_of_its_loss(name):
 def test_a_descent_that_leaves_the_numbers_says_so_and_has_not_arrived():
     case = replace(QUADRATIC, rate=1e9, goal=1e300)
     run = descend(case, "first", SIGMA, 0, budget=2000, batch=10, samples=10)
-    assert not run.succeeded
+    assert not run.arrived
     assert run.failure.startswith("GradientError")
     assert np.isfinite(run.losses).all()
     assert len(run.losses) == len(run.evaluations) == 6

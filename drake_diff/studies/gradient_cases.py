@@ -1,6 +1,7 @@
-"""Tasks on which gradients of different orders do well and badly, after Suh et al. 2022: see `gradient_panel`.
+"""Tasks on which one order of gradient does well and another badly, after Suh et al. 2022: see `gradient_panel`.
 
-Each is small, so that a panel takes minutes. The ball has 1 kg and a radius of 0.1 m; gravity is 9.81 m/s^2.
+Each is so small that a panel of all takes minutes. The ball has a mass of 1 kg and a radius of 0.1 m; gravity is
+9.81 m/s^2.
 """
 
 from collections.abc import Callable
@@ -31,7 +32,6 @@ def double_integrator(
     model = _ball(time_step, "x", motor=True)
     half = num_steps // 2
     inputs = np.repeat(np.eye(2), half, axis=0)
-    f, derivative = _of_rollout(model, _reach_one, np.zeros((2, 2)), inputs, np.zeros(2))
     v = time_step / MASS * np.cumsum(inputs, axis=0)
     x_end, v_end = time_step * v.sum(axis=0), v[-1]
     hessian = 2 * np.outer(x_end, x_end) + 0.2 * np.outer(v_end, v_end)
@@ -41,11 +41,12 @@ def double_integrator(
         return float(value), hessian @ z - 2 * x_end
 
     best = closed_form(np.linalg.solve(hessian, 2 * x_end), max(sigmas))[0]
-    return GradientCase(
+    return _rollout_case(
+        model,
+        lambda x: (x[0] - 1) ** 2 + 0.1 * x[1] ** 2,
+        inputs=inputs,
         name="double_integrator",
         about="two forces bring a mass to a place: smooth, quadratic",
-        f=f,
-        derivative=derivative,
         start=np.zeros(2),
         sigmas=sigmas,
         rate=0.8 / float(np.trace(hessian)),
@@ -54,16 +55,15 @@ def double_integrator(
     )
 
 
-def _reach_one(x: Any) -> Any:
-    return (x[0] - 1) ** 2 + 0.1 * x[1] ** 2
-
-
 def wall(distance: float = 0.06, height: float = 0.02, sigmas: tuple[float, ...] = (0.05, 0.1, 0.2)) -> GradientCase:
     """The angle [rad] of a throw at 1 m/s, as far as it goes; a wall stops what flies below its top: f jumps there.
 
     f = -x^2 with x the place [m] where the ball comes down, or that of the wall (Suh et al., ball with wall).
     """
-    edges = _wall_edges(distance, height)
+    a = GRAVITY * distance**2 / 2
+    root, kink = np.sqrt(distance**2 - 4 * a * (a + height)), np.arcsin(GRAVITY * distance) / 2
+    # Of a period of pi: the angles [rad] at which the ball just clears the wall, and at which it just reaches it.
+    edges = np.array([*np.arctan((distance + root * np.array([-1, 1])) / (2 * a)), kink, np.pi / 2 - kink])
 
     def land(theta: Array) -> tuple[Array, Array]:
         reach = np.sin(2 * theta) / GRAVITY
@@ -88,14 +88,6 @@ def wall(distance: float = 0.06, height: float = 0.02, sigmas: tuple[float, ...]
     )
 
 
-def _wall_edges(distance: float, height: float) -> Array:
-    """(4,) angles [rad] of a period of pi, at which the ball just clears the wall or just reaches it."""
-    a = GRAVITY * distance**2 / 2
-    root, kink = np.sqrt(distance**2 - 4 * a * (a + height)), np.arcsin(GRAVITY * distance) / 2
-    clears = np.arctan((distance + root * np.array([-1, 1])) / (2 * a))
-    return np.sort([*clears, kink, np.pi / 2 - kink])
-
-
 def _smoothed_pieces(f: Callable[[Array], Array], edges: Array, x: float, sigma: float) -> tuple[float, Array]:
     """F and dF/dx = E[f(x + w) w] / sigma^2, Gauss-Legendre between `edges` (of period pi), to 10 sigma."""
     low, high = x - 10 * sigma, x + 10 * sigma
@@ -116,17 +108,13 @@ def bounce(
     stiffness: float = 1e5, time_step: float = 0.01, num_steps: int = 20, sigmas: tuple[float, ...] = (0.01, 0.03)
 ) -> GradientCase:
     """The height [m] to drop a ball from, so that at the end it is 0.15 m high; the contact has `stiffness` [N/m]."""
-    model = _ball(time_step, "z", stiffness=stiffness)
-
-    def loss(x: Any) -> Any:
-        return 100 * (x[0] - 0.15) ** 2
-
-    f, derivative = _of_rollout(model, loss, np.array([[1.0], [0.0]]), np.zeros((num_steps, 1)), np.zeros(2))
-    return GradientCase(
+    return _rollout_case(
+        _ball(time_step, "z", stiffness=stiffness),
+        lambda x: 100 * (x[0] - 0.15) ** 2,
+        states=np.array([[1.0], [0.0]]),
+        inputs=np.zeros((num_steps, 1)),
         name=f"bounce_k{stiffness:.0e}".replace("+0", ""),
         about=f"a ball dropped on ground of {stiffness:g} N/m: the stiffer, the steeper between the steps",
-        f=f,
-        derivative=derivative,
         start=np.array([0.28]),
         sigmas=sigmas,
         rate=0.001,
@@ -136,18 +124,13 @@ def bounce(
 
 def push(time_step: float = 0.02, num_steps: int = 20, sigmas: tuple[float, ...] = (0.5, 2.0)) -> GradientCase:
     """A force [N] that slides a ball by 0.3 m: friction of 0.5 holds it up to 4.9 N, the start is 2 N."""
-    model = _ball(time_step, "xz", stiffness=1e4, friction=0.5, motor=True)
-
-    def loss(x: Any) -> Any:
-        return 10 * (x[0] - 0.3) ** 2
-
-    rest = np.array([0, RADIUS - MASS * GRAVITY / 1e4, 0, 0])
-    f, derivative = _of_rollout(model, loss, np.zeros((4, 1)), np.ones((num_steps, 1)), rest)
-    return GradientCase(
+    return _rollout_case(
+        _ball(time_step, "xz", stiffness=1e4, friction=0.5, motor=True),
+        lambda x: 10 * (x[0] - 0.3) ** 2,
+        inputs=np.ones((num_steps, 1)),
+        x0=np.array([0, RADIUS - MASS * GRAVITY / 1e4, 0, 0]),  # at rest in the ground
         name="push",
         about="a force below the friction limit: the derivative there is next to 0",
-        f=f,
-        derivative=derivative,
         start=np.array([2.0]),
         sigmas=sigmas,
         rate=8.0,
@@ -164,18 +147,13 @@ def double_pendulum(
     goal: float = 0.4,
 ) -> GradientCase:
     """The angles [rad] to let a double pendulum go from, so that its tip is far to one side at the end: chaos."""
-    model = _double_pendulum(time_step)
-
-    def loss(x: Any) -> Any:
-        return 1 + (np.sin(x[0]) + np.sin(x[0] + x[1])) / 2
-
-    inputs = np.zeros((num_steps, 2))
-    f, derivative = _of_rollout(model, loss, np.eye(4, 2), inputs, np.zeros(4))
-    return GradientCase(
+    return _rollout_case(
+        _double_pendulum(time_step),
+        lambda x: 1 + (np.sin(x[0]) + np.sin(x[0] + x[1])) / 2,
+        states=np.eye(4, 2),
+        inputs=np.zeros((num_steps, 2)),
         name=f"double_pendulum_{num_steps * time_step:g}s",
         about=f"a double pendulum let go for {num_steps * time_step:g} s: derivatives grow with the horizon",
-        f=f,
-        derivative=derivative,
         start=np.array([2.0, 0.5]),
         sigmas=sigmas,
         rate=rate,
@@ -195,25 +173,30 @@ CASES: dict[str, Callable[[], GradientCase]] = {
 }
 
 
-def _of_rollout(
-    model: Model, loss: Callable[[Any], Any], states: Array, inputs: Array, x0: Array
-) -> tuple[Callable[[Array], float], Callable[[Array], Array]]:
-    """`loss` of the last state and its derivative by z (n,), from x0 + states z under the force inputs z (N,).
-
-    `states` is (nx, n), `inputs` (N, n).
-    """
+def _rollout_case(
+    model: Model,
+    loss: Callable[[Any], Any],
+    *,
+    inputs: Array,
+    states: Array | None = None,
+    x0: Array | None = None,
+    **fields: Any,
+) -> GradientCase:
+    """The case of `loss` of the last state, from x0 + states z under the force inputs z: (nx, n) and (N, n)."""
+    start = np.zeros(model.nx) if x0 is None else x0
+    moved = np.zeros((model.nx, inputs.shape[1])) if states is None else states
 
     def inputs_of(z: Array) -> Array:
         return (inputs @ z)[:, None] if model.nu else np.zeros((len(inputs), 0))
 
     def f(z: Array) -> float:
-        return float(loss(roll_states(model, x0 + states @ z, inputs_of(z))[-1]))
+        return float(loss(roll_states(model, start + moved @ z, inputs_of(z))[-1]))
 
     def derivative(z: Array) -> Array:
-        found = differentiate_rollout(model, x0 + states @ z, inputs_of(z), loss)
-        return states.T @ found.by_x0 + (inputs.T @ found.by_us[:, 0] if model.nu else 0)
+        found = differentiate_rollout(model, start + moved @ z, inputs_of(z), loss)
+        return moved.T @ found.by_x0 + (inputs.T @ found.by_us[:, 0] if model.nu else 0)
 
-    return f, derivative
+    return GradientCase(f=f, derivative=derivative, **fields)
 
 
 def _plant(time_step: float) -> tuple[DiagramBuilder, MultibodyPlant]:

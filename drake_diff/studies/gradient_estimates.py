@@ -1,9 +1,9 @@
-"""One task whose gradient is estimated, and what an estimate of each order is worth against the truth.
+"""One task whose gradient is estimated: what an estimate of each order is worth, and whether a descent with it arrives.
 
-The orders are those of `smoothing`, and "point": the derivative at x itself, without noise, which is what an optimizer
-uses that smooths nothing. The truth is the gradient of F(x) = E[f(x + w)], w normal of standard deviation sigma.
-
-Plain stochastic gradient descent with an estimate of a given order, and whether it arrives.
+Estimated is the gradient of F(x) = E[f(x + w)], w normal with standard deviation sigma. The orders are those of
+`smoothing`: "first" takes derivatives of f, "zeroth" its values, "blend" both. "point" is the derivative of f at x
+itself, without noise: what an optimizer uses that does not smooth. Cost is counted in calls of f and of its
+derivative, one each.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,18 +16,39 @@ from drake_diff.exceptions import GradientError, InputError, NonFiniteError, Sim
 from drake_diff.motion.smoothing import CONFIDENCE, METHODS, Gaussian, smooth
 
 ORDERS = ("point", *METHODS)
-# (x, sigma) -> (F, dF/dx), where it is known.
-ClosedForm = Callable[[Array, float], tuple[float, Array]]
-REFERENCE_SEED = 2**32 - 1  # of no estimate: those have the seeds 0, 1, ...
+ClosedForm = Callable[[Array, float], tuple[float, Array]]  # (x, sigma) -> (F, dF/dx)
+REFERENCE_SEED = 2**32 - 1  # of the truth; estimates have the seeds 0, 1, ...
+CHECKPOINTS = 5  # equal parts of a descent's budget after which F is measured; those calls are not counted
 
 
 @dataclass(frozen=True, eq=False)
 class GradientCase:
-    """A loss `f` of x (n,) with its `derivative` (n,), and the task of making F small by gradient descent.
+    """A loss and its derivative, and the task of making its smoothed value F small by gradient descent.
 
-    Gradients are compared at `start` (n,), where the descent begins too; it takes steps x - `rate` * gradient at the
-    largest of `sigmas` (in the units of x) and has arrived where F at that sigma is at most `goal`.
-    `closed_form`(x, sigma) gives F and its gradient where they are known. Raises InputError.
+    Gradients are compared at `start`. The descent begins there too, at the largest of `sigmas`: it takes steps
+    x - `rate` * gradient, and has arrived where F is at most `goal`.
+
+    Args:
+        name: A name for tables and plots.
+        about: What the task is, in a few words.
+        f: The loss at x (n,), a number.
+        derivative: Its derivative at x, (n,).
+        start: (n,) in the units of x.
+        sigmas: Standard deviations of the noise, in the units of x; at least one.
+        rate: The step size of the descent, in x^2 per unit of f.
+        goal: The largest F at which a descent has arrived, in the units of f.
+        closed_form: (x, sigma) -> F and its gradient (n,), where they are known. Without it the truth is sampled.
+
+    Raises:
+        InputError: If a number is not finite, or a sigma or the rate is not above 0.
+
+    Example:
+        >>> from drake_diff.studies import GradientCase
+        >>> case = GradientCase(
+        ...     "bowl", "a quadratic", lambda x: float(x @ x), lambda x: 2 * x, [1.0], (0.1, 0.3), rate=0.1, goal=0.2
+        ... )
+        >>> case
+        GradientCase('bowl': a quadratic; 1 variable, sigmas (0.1, 0.3))
     """
 
     name: str
@@ -47,39 +68,42 @@ class GradientCase:
         if not np.isfinite(self.goal):
             raise InputError(f"{self.name}.goal", got=self.goal, expected="a finite number")
 
+    def __repr__(self) -> str:
+        variables = f"{len(self.start)} variable{'s' * (len(self.start) > 1)}"
+        return f"GradientCase({self.name!r}: {self.about}; {variables}, sigmas {self.sigmas})"
+
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """F and its gradient (n,) with their standard errors, 0 of a closed form, and where they come from."""
+    """F and its gradient (n,), their standard errors (0 for a closed form), and where they come from."""
 
+    source: str
     value: float
     value_error: float
     gradient: Array
-    error: Array  # (n,)
-    source: str
+    standard_error: Array  # (n,), of the gradient
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A gradient (n,) from one seed, the variance (n,) of it, and how often f and its derivative were called."""
+    """A gradient (n,) from one seed, its variance (n,), and how often f and its derivative were called."""
 
     seed: int
     gradient: Array
     variance: Array
     functions: int
     derivatives: int
-    cosine: float | None  # to the truth, None where either is 0
+    cosine: float | None  # to the true gradient; None where either is 0
 
 
 @dataclass(frozen=True, eq=False)
 class Quality:
     """All estimates of one order at one sigma against the truth.
 
-    `variance` (n,) is that of one estimate, the mean over all seeds; `trace` its sum. `bias` (n,) is the mean of the
-    estimates minus the truth and `bias_error` (n,) its standard error, the truth's included; `biased` says whether an
-    entry is off by more than 3 of them. `mean_squared_error` is what is expected where as many calls of f and its
-    derivative are spent as there are samples, each counting one: |bias|^2 if `biased`, and the variance times the
-    calls of an estimate by the samples.
+    `variance` (n,) is that of one estimate, averaged over the seeds. `bias` (n,) is the mean of the estimates less the
+    truth; `bias_error` (n,) is its standard error, the truth's included, and `biased` says whether an entry is off by
+    more than 3 of them. `mean_squared_error` is at equal cost, as many calls as there are samples:
+    variance * calls / samples, plus |bias|^2 if `biased`.
     """
 
     order: str
@@ -94,6 +118,7 @@ class Quality:
 
     @property
     def trace(self) -> float:
+        """The sum of the variances of all entries."""
         return float(self.variance.sum())
 
     @property
@@ -104,8 +129,28 @@ class Quality:
         return float(ratio.max())
 
 
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """One descent x - rate * gradient, until its budget of calls is spent.
+
+    `losses` are F after so many `evaluations`, the first at the start, each with its `standard_errors`. Where
+    f or its derivative refused the x that the descent came to, `failure` says why, and the last loss stands for all
+    later ones.
+    """
+
+    order: str
+    sigma: float
+    seed: int
+    evaluations: tuple[int, ...]
+    losses: tuple[float, ...]
+    standard_errors: tuple[float, ...]
+    x: Array
+    arrived: bool
+    failure: str | None
+
+
 def checked_sigmas(subject: str, sigmas: Sequence[float]) -> tuple[float, ...]:
-    """Rising, above 0, at least one."""
+    """`sigmas` in rising order; InputError unless all are above 0 and there is one."""
     found = tuple(sorted(positive_float(subject, sigma) for sigma in sigmas))
     if not found:
         raise InputError(subject, got="none", expected="at least one number above 0")
@@ -113,6 +158,7 @@ def checked_sigmas(subject: str, sigmas: Sequence[float]) -> tuple[float, ...]:
 
 
 def check_orders(orders: Sequence[str]) -> tuple[str, ...]:
+    """`orders` in the order of ORDERS; UnknownNameError or InputError."""
     for order in orders:
         if order not in ORDERS:
             raise UnknownNameError("orders", got=order, known=ORDERS)
@@ -122,44 +168,30 @@ def check_orders(orders: Sequence[str]) -> tuple[str, ...]:
 
 
 def truth_of(case: GradientCase, x: Array, sigma: float, samples: int) -> Truth:
-    """The closed form, or the mean of `samples` samples of zeroth order, which no jump biases."""
+    """The closed form, or the mean of `samples` samples of zeroth order, which a jump of f does not bias."""
     if case.closed_form is not None:
         value, gradient = case.closed_form(x, sigma)
-        return Truth(float(value), 0.0, frozen(gradient), frozen(np.zeros(len(x))), "closed form")
+        return Truth("closed form", float(value), 0.0, frozen(gradient), frozen(np.zeros(len(x))))
     found = smooth(case.f, x, noise=Gaussian(sigma), samples=samples, seed=REFERENCE_SEED, method="zeroth")
-    errors = np.sqrt(found.value_variance[0]), np.sqrt(found.variance[0])
-    source = f"{samples} samples of zeroth order"
-    return Truth(float(found.value[0]), float(errors[0]), frozen(found.jacobian[0]), frozen(errors[1]), source)
-
-
-def estimate(case: GradientCase, order: str, x: Array, sigma: float, samples: int, seed: int) -> tuple[Array, Array]:
-    """The gradient (n,) at `x` and its variance (n,)."""
-    if order == "point":
-        return frozen(case.derivative(x.copy())), frozen(np.zeros(len(x)))
-    derivative = None if order == "zeroth" else case.derivative
-    found = smooth(case.f, x, derivative, noise=Gaussian(sigma), samples=samples, seed=seed, method=order)
-    return frozen(found.jacobian[0]), frozen(found.variance[0])
-
-
-def calls(order: str, samples: int) -> tuple[int, int]:
-    """How often an estimate needs f and its derivative."""
-    both = {"point": (0, 1), "first": (0, samples), "zeroth": (samples + 1, 0), "blend": (samples + 1, samples)}
-    return both[order]
+    source, value, error = f"{samples} samples of zeroth order", found.value[0], np.sqrt(found.value_variance[0])
+    return Truth(source, float(value), float(error), frozen(found.jacobian[0]), frozen(np.sqrt(found.variance[0])))
 
 
 def quality(case: GradientCase, order: str, sigma: float, truth: Truth, samples: int, seeds: int) -> Quality:
     """What `seeds` estimates of `samples` samples are worth at the case's start; "point" needs one alone."""
-    found = []
+    found, cost = [], _calls(order, samples)
     for seed in range(1 if order == "point" else seeds):
-        gradient, variance = estimate(case, order, case.start, sigma, samples, seed)
-        found.append(Estimate(seed, gradient, variance, *calls(order, samples), cosine(gradient, truth.gradient)))
+        gradient, variance = _estimate(case, order, case.start, sigma, samples, seed)
+        size = float(np.linalg.norm(gradient) * np.linalg.norm(truth.gradient))
+        cosine = float(gradient @ truth.gradient) / size if size > 0 else None
+        found.append(Estimate(seed, gradient, variance, *cost, cosine))
     variance = np.mean([e.variance for e in found], axis=0)
     bias = np.mean([e.gradient for e in found], axis=0) - truth.gradient
-    bias[np.abs(bias) <= rounding(truth)] = 0.0
-    error = np.sqrt(variance / len(found) + truth.error**2)
+    rounding = 1e-10 * (1 + float(np.abs(truth.gradient).max()))  # Drake's step and a closed form differ by so much
+    bias[np.abs(bias) <= rounding] = 0.0
+    error = np.sqrt(variance / len(found) + truth.standard_error**2)
     biased = bool(np.any(np.abs(bias) > CONFIDENCE * error))
     cosines = [e.cosine for e in found if e.cosine is not None]
-    spent = float(variance.sum()) * sum(calls(order, samples)) / samples
     return Quality(
         order=order,
         sigma=sigma,
@@ -169,40 +201,8 @@ def quality(case: GradientCase, order: str, sigma: float, truth: Truth, samples:
         bias_error=frozen(error),
         biased=biased,
         cosine=float(np.mean(cosines)) if cosines else None,
-        mean_squared_error=spent + (float(bias @ bias) if biased else 0.0),
+        mean_squared_error=float(variance.sum()) * sum(cost) / samples + (float(bias @ bias) if biased else 0.0),
     )
-
-
-def rounding(truth: Truth) -> float:
-    """Below this a difference to the truth is none: Drake's step and a closed form part by rounding."""
-    return 1e-10 * (1 + float(np.abs(truth.gradient).max()))
-
-
-def cosine(a: Array, b: Array) -> float | None:
-    size = float(np.linalg.norm(a) * np.linalg.norm(b))
-    return float(a @ b) / size if size > 0 else None
-
-
-CHECKPOINTS = 5  # after which part of the budget F is looked at; that is not counted
-
-
-@dataclass(frozen=True, eq=False)
-class Descent:
-    """x - rate * gradient until the `evaluations` are spent.
-
-    `losses` are F after so many `evaluations`, the first at the start, each with its standard error. Where f or its
-    derivative refused what the search came to, `failure` says how and the last loss stands for all later ones.
-    """
-
-    order: str
-    sigma: float
-    seed: int
-    evaluations: tuple[int, ...]
-    losses: tuple[float, ...]
-    errors: tuple[float, ...]
-    x: Array
-    succeeded: bool
-    failure: str | None
 
 
 def descend(
@@ -210,44 +210,49 @@ def descend(
 ) -> Descent:
     """Spend `budget` calls, `batch` samples a step; F is measured with `samples` samples, the same for all."""
     x, spent, step, failure = case.start, 0, 0, None
-    cost = sum(calls(order, batch))
+    cost = sum(_calls(order, batch))
     at, visited = [0], [x]
     for part in range(1, CHECKPOINTS + 1):
         while failure is None and spent + cost <= budget * part // CHECKPOINTS:
+            # A seed of its own for every step of every descent.
+            step_seed = int(np.random.SeedSequence((seed, step)).generate_state(1)[0])
             try:
-                x = _stepped(case, order, x, sigma, batch, _seed(seed, step))
+                after = x - case.rate * _estimate(case, order, x, sigma, batch, step_seed)[0]
+                if not np.isfinite(after).all():
+                    raise GradientError(f"a step from {x.tolist()} leads to {after.tolist()}")
+                x = frozen(after)
             except (GradientError, SimulationError, NonFiniteError) as error:
                 failure = f"{type(error).__name__}: {error}"
             spent, step = spent + cost, step + 1
         at.append(budget * part // CHECKPOINTS)
         visited.append(x)
-    measured = []
+    measured: list[tuple[float, float]] = []
     for point in visited:
         try:
-            measured.append(_measured(case, point, sigma, samples))
+            truth = truth_of(case, point, sigma, samples)
+            if not np.isfinite(truth.value):
+                raise GradientError(f"F({point.tolist()}) is {truth.value}")
+            measured.append((truth.value, truth.value_error))
         except (GradientError, SimulationError, NonFiniteError) as error:
+            if not measured:
+                raise  # not even F at the start is known
             failure = failure or f"{type(error).__name__}: {error}"
             measured.append(measured[-1])
     losses, errors = zip(*measured, strict=True)
-    succeeded = failure is None and losses[-1] <= case.goal
-    return Descent(order, sigma, seed, tuple(at), losses, errors, frozen(x), succeeded, failure)
+    arrived = failure is None and losses[-1] <= case.goal
+    return Descent(order, sigma, seed, tuple(at), losses, errors, frozen(x), arrived, failure)
 
 
-def _stepped(case: GradientCase, order: str, x: Array, sigma: float, batch: int, seed: int) -> Array:
-    after = x - case.rate * estimate(case, order, x, sigma, batch, seed)[0]
-    if not np.isfinite(after).all():
-        raise GradientError(f"a step from {x.tolist()} leads to {after.tolist()}")
-    return frozen(after)
+def _estimate(case: GradientCase, order: str, x: Array, sigma: float, samples: int, seed: int) -> tuple[Array, Array]:
+    """The gradient (n,) at `x` and its variance (n,)."""
+    if order == "point":
+        return frozen(case.derivative(x.copy())), frozen(np.zeros(len(x)))
+    derivative = None if order == "zeroth" else case.derivative
+    found = smooth(case.f, x, derivative, noise=Gaussian(sigma), samples=samples, seed=seed, method=order)
+    return frozen(found.jacobian[0]), frozen(found.variance[0])
 
 
-def _measured(case: GradientCase, x: Array, sigma: float, samples: int) -> tuple[float, float]:
-    """F and its standard error."""
-    truth = truth_of(case, x, sigma, samples)
-    if not np.isfinite(truth.value):
-        raise GradientError(f"F({x.tolist()}) is {truth.value}")
-    return truth.value, truth.value_error
-
-
-def _seed(seed: int, step: int) -> int:
-    """A seed of its own for every step of every descent."""
-    return int(np.random.SeedSequence((seed, step)).generate_state(1)[0])
+def _calls(order: str, samples: int) -> tuple[int, int]:
+    """How often an estimate calls f and its derivative; zeroth order subtracts f at x itself, one call more."""
+    both = {"point": (0, 1), "first": (0, samples), "zeroth": (samples + 1, 0), "blend": (samples + 1, samples)}
+    return both[order]
