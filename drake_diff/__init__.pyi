@@ -13,7 +13,7 @@ from . import record as record
 from . import studies as studies
 from . import trials as trials
 from .artifact.save import save as save
-from .artifact.trace import read_trace as read_trace
+from .artifact.trace_read import read_trace as read_trace
 from .artifact.verify import verify as verify
 from .certificates.audit import audit as audit
 from .certificates.certify import certify as certify
@@ -36,10 +36,10 @@ from .motion.policy import TVLQR as TVLQR
 from .motion.rollout import rollout as rollout
 from .motion.smoothing import smooth as smooth
 from .motion.smoothing import smooth_step as smooth_step
+from .optimize.problem.bounds import Bounds as Bounds
 from .optimize.problem.constraint import Constraint as Constraint
 from .optimize.problem.cost import QuadraticCost as QuadraticCost
 from .optimize.problem.dynamics import Dynamics as Dynamics
-from .optimize.problem.problem import Bounds as Bounds
 from .optimize.problem.problem import Problem as Problem
 from .optimize.solution import Solution as Solution
 from .optimize.solution import Status as Status

@@ -30,7 +30,7 @@ def swing_up(count=20, **changes):
 
 
 def collocate(problem, **options):
-    return dd.solve(problem, method="collocation", **options)
+    return dd.solve(problem, method="collocation", scheme="drake", **options)
 
 
 @pytest.mark.parametrize("count", [2, 4, 10, 20])

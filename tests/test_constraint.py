@@ -91,7 +91,7 @@ def test_waypoints_and_horizon_are_checked():
             pendulum(waypoints={knot: [0, 0]})
     with pytest.raises(ShapeError):
         pendulum(waypoints={3: [0]})
-    for horizon in (1.0, (2, 1), (0, 1), (1,)):
+    for horizon in (-1.0, (2, 1), (0, 1), (1,)):
         with pytest.raises(InputError, match="horizon"):
             pendulum(horizon=horizon)
 

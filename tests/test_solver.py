@@ -35,13 +35,13 @@ def swing_up(load, count, cost=EFFORT, **changes):
 @pytest.mark.parametrize("running_cost", [EFFORT, lambda x, u: u[0] ** 2])
 def test_cart_pole_swing_up_by_collocation(load, count, cost, running_cost):
     """B02, Drake's own values."""
-    solution = dd.solve(swing_up(load, count, running_cost), method="collocation")
+    solution = dd.solve(swing_up(load, count, running_cost), method="collocation", scheme="drake")
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(cost, rel=1e-8)
 
 
 def test_snopt_finds_the_same_swing_up(load):
-    solution = dd.solve(swing_up(load, 20), method="collocation", solver="snopt")
+    solution = dd.solve(swing_up(load, 20), method="collocation", scheme="drake", solver="snopt")
     assert solution.cost == pytest.approx(62.58516350539, rel=1e-8)
 
 
@@ -285,7 +285,8 @@ def test_ctrl_c_while_the_guess_is_improved_ends_the_solve(load):
     [("collocation", "ipopt"), ("collocation", "snopt"), ("shooting", "ipopt"), ("shooting", "snopt")],
 )
 def test_the_solvers_own_table_is_kept(load, method, solver):
-    rows = dd.solve(swing_up(load, 20), method=method, solver=solver).iterations
+    scheme = "drake" if (method, solver) == ("collocation", "snopt") else None
+    rows = dd.solve(swing_up(load, 20), method=method, solver=solver, scheme=scheme).iterations
     assert len(rows) > 5
     assert all(math.isfinite(row.objective) and math.isfinite(row.primal_infeasibility) for row in rows)
     assert [row.iteration for row in rows] == sorted({row.iteration for row in rows})
@@ -362,7 +363,7 @@ def test_collocation_through_the_ground_is_not_verified(tmp_path):
         ({"max_iterations": 0}, "max_iterations"),
         ({"time_limit": -1.0}, "time_limit"),
         ({"tolerance": 0.0}, "tolerance"),
-        ({"initial_guess": "good"}, r"initial_guess: expected None, \(xs, us\) or a Solution, got str"),
+        ({"initial_guess": "good"}, r"initial_guess: expected None, \(xs, us\), .* or a Solution, got str"),
         ({"initial_guess": (np.zeros((3, 4)), np.zeros((20, 1)))}, r"initial_guess xs: expected shape \(21, 4\)"),
         ({"initial_guess": (np.zeros((21, 4)), np.full((20, 1), np.nan))}, "initial_guess us"),
         ({"method": None}, "method: expected one of .*, got None"),
@@ -385,7 +386,7 @@ def test_bad_options_are_named_before_anything_runs(load, options, words):
 def test_a_guess_of_another_length_is_named(load):
     guess = dd.solve(swing_up(load, 10), max_iterations=1)
     with pytest.raises(ShapeError, match=r"initial_guess xs: expected shape \(21, 4\), got shape \(11, 4\)"):
-        dd.solve(swing_up(load, 20), initial_guess=guess)
+        dd.solve(swing_up(load, 20), method="shooting", initial_guess=guess)
 
 
 def test_only_a_problem_can_be_solved():

@@ -92,7 +92,7 @@ def judged(draft: Solution, result: NlpResult) -> Solution:
         complaints.insert(0, f"the solver could not reach its tolerance ({result.message})")
     if not np.all(np.isfinite(draft.xs)):
         return ended(draft, Status.DIVERGED, "; ".join(complaints), **fields)
-    if not complaints:
+    if not complaints and draft.problem.has_model:
         complaints += broken_variants(draft.plan, draft.replays)
     status = Status.CONVERGED_NOT_VERIFIED if complaints else Status.CONVERGED
     return ended(draft, status, "; ".join([*complaints, *[result.note] * bool(result.note)]), **fields)
@@ -110,7 +110,7 @@ def complaints_about(solution: Solution) -> Iterator[str]:
                 f"an accurate integration from knot {knot} misses the next by {solution.integration_error:.3g}, "
                 f"tolerance {INTEGRATION_TOLERANCE:g}: take a smaller time step"
             )
-        depth, knot = _deepest(solution)
+        depth, knot = _deepest(solution) if solution.problem.has_model else (0.0, 0)
         if depth > 0:
             yield f"geometries overlap by {depth:.3g} m at knot {knot}, and collocation leaves contact out"
     for certificate in solution.certificates:
@@ -121,7 +121,7 @@ def complaints_about(solution: Solution) -> Iterator[str]:
 
 def _infeasibilities(solution: Solution) -> Iterator[str]:
     """Equations, ends, bounds and constraints that do not hold, with the knots at which they do not."""
-    names, above = solution.problem.model.state_names, f"above {FEASIBILITY_TOLERANCE:g}"
+    names, above = solution.problem.state_names, f"above {FEASIBILITY_TOLERANCE:g}"
     if not solution.defect <= FEASIBILITY_TOLERANCE:
         where = _spans(np.flatnonzero(~(solution.defects <= FEASIBILITY_TOLERANCE)))
         yield f"defect {solution.defect:.3g} is {above}: the motion is not the model's after knots {where}"

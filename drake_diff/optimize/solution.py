@@ -2,13 +2,16 @@
 
 import copy
 import enum
+import html
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, Indices
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
 from drake_diff.model.model import Model
@@ -59,15 +62,38 @@ _SENTENCES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Solution:
-    """A motion xs (N+1, nx) under us (N, nu), how it was found, and what it measures on Drake's double plant.
+    """The motion that `solve` found, how it was found, and what it measures on Drake's double plant.
 
-    The inputs of a discrete method (`scheme` "step") are held over each step. Those of a collocation scheme are at
-    the knots, `u_final` (nu,) at the last one, and linear in between, or, of hermite_simpson, the parabola through
-    `us_mid` (N, nu) at the midpoints. `horizon` [s] is num_steps * time_step, or what a free one came to.
-    `cost`, `defect`, `bound_violation`, `replays` and the rest are computed from xs and us, once, when they are first
-    asked for, and never taken from the solver.
+    `cost`, `defect`, `goal_error`, `bound_violation`, `constraint_violation`, `replays` and the rest are computed from
+    the states and inputs when they are first asked for. They are never taken from the solver, and what cannot be
+    computed is infinite. `success` holds where the solver converged and all of them hold.
+
+    Attributes:
+        problem: what was asked.
+        method, solver, scheme: how it was solved; `scheme` is "step" for the discrete methods.
+        status, message: how it ended, as a `Status` and in words.
+        xs: (N+1, nx) states at the knots, in the states' units.
+        us: (N, nu) inputs, held over each step by a discrete method. Those of collocation are at the knots and
+            linear in between, or the parabola through `us_mid` (N, nu) at the midpoints (hermite_simpson).
+        u_final: (nu,) the input at the last knot, for collocation.
+        mesh: (N+1,) the knots as fractions of the horizon where the mesh was refined, else None: equal intervals.
+        free_horizon: [s] what a `horizon` of the problem came to, else None.
+        parameters: (np,) the values that were found for the problem's parameters.
+        iterations: the solver's own table.
+        certificates: of the derivatives that the solver used, at some knots of the guess and of the result.
+        gradient_norms: (N+1,) |d cost / d x_k|, where the method has it.
+        options: what was asked of the solver, and what it chose.
+        wall_time: [s] what the solve took.
+
+    Example:
+        >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+        >>> effort = dd.QuadraticCost(R=[[1.0]])
+        >>> problem = dd.Problem(block, x0=[0, 0], x_goal=[1, 0], num_steps=10, horizon=1.0, running_cost=effort)
+        >>> solution = dd.solve(problem)
+        >>> solution.status.value, round(solution.cost, 6)
+        ('converged', 12.0)
     """
 
     problem: Problem
@@ -80,14 +106,40 @@ class Solution:
     scheme: str = "step"
     us_mid: Array | None = None
     u_final: Array | None = None
-    free_horizon: float | None = None  # [s] where the problem leaves it free
-    parameters: Array | None = None  # (np,) the values of `problem.parameters`; the problem's own where None
+    mesh: Array | None = None
+    free_horizon: float | None = None
+    parameters: Array | None = None
     iterations: tuple[Iteration, ...] = ()
     certificates: tuple[Certificate, ...] = ()
-    gradient_norms: Array | None = None  # (N+1,) |d cost / d x_k| at the solution, where the method has it
+    gradient_norms: Array | None = None
     options: dict[str, Any] = field(default_factory=dict)
     solver_message: str = ""
-    wall_time: float = 0.0  # [s]
+    wall_time: float = 0.0
+
+    def __str__(self) -> str:
+        measures = f"cost {self.cost:.6g}, defect {self.defect:.2g}, goal error {self.goal_error:.2g}"
+        return f"{self.problem.name} by {self.method}: {self.status.value}, {measures}"
+
+    def __repr__(self) -> str:
+        return "\n  ".join(self._lines())
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+    def _lines(self) -> Iterator[str]:
+        how = ", ".join(name for name in (self.scheme, self.solver) if name not in ("step", ""))
+        yield f"Solution of {self.problem.name} by {self.method}{f' ({how})' if how else ''}: {self.status.value}"
+        yield self.message
+        yield f"cost {self.cost:.6g} over {self.horizon:g} s in {len(self.us)} intervals"
+        yield f"defect {self.defect:.2g}, integration error {self.integration_error:.2g}"
+        beyond = f"bound violation {self.bound_violation:.2g}, constraint violation {self.constraint_violation:.2g}"
+        yield f"goal error {self.goal_error:.2g}, {beyond}"
+        verdicts = Counter(certificate.verdict for certificate in self.certificates)
+        told = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items()) or "none"
+        yield f"{len(self.iterations)} iterations in {self.wall_time:.2g} s; certificates: {told}"
+        if "replays" in vars(self) and self.replays:  # they take time: a printed line starts none
+            holding = sum(replay.holds for replay in self.replays)
+            yield f"replays: {holding} of {len(self.replays)} hold"
 
     def told(self, **fields: Any) -> "Solution":
         """The same motion with other `fields` out of TOLD: its measures stay. UnknownNameError of others."""
@@ -111,14 +163,12 @@ class Solution:
     @property
     def horizon(self) -> float:
         """[s] from the first state to the last."""
-        whole = self.problem.num_steps * self.problem.model.time_step
-        return whole if self.free_horizon is None else self.free_horizon
+        return self.problem.start_horizon if self.free_horizon is None else self.free_horizon
 
     @property
     def time_step(self) -> float:
-        """[s] from one state to the next: the model's own, to the last bit, where the horizon is not free."""
-        own = self.problem.model.time_step
-        return own if self.free_horizon is None else self.free_horizon / self.problem.num_steps
+        """[s] between two of the problem's knots: the model's own, to the last bit, where no horizon is asked for."""
+        return self.problem.time_step if self.free_horizon is None else self.free_horizon / self.problem.num_steps
 
     @cached_property
     def cost(self) -> float:
@@ -131,7 +181,17 @@ class Solution:
     @property
     def times(self) -> Array:
         """(N+1,) [s] of the states."""
+        if self.mesh is not None:
+            return np.asarray(self.horizon * self.mesh, dtype=float)
         return np.asarray(self.time_step * np.arange(len(self.xs)), dtype=float)
+
+    @property
+    def knots(self) -> Indices:
+        """(problem.num_steps + 1,) the rows of `xs` that are the problem's own knots: all, but on a refined mesh."""
+        whole = np.arange(self.problem.num_steps + 1)
+        if self.mesh is None:
+            return whole
+        return np.argmin(np.abs(self.mesh[None] - whole[:, None] / self.problem.num_steps), axis=1)
 
     @property
     def inputs_at_knots(self) -> Array:
@@ -143,7 +203,8 @@ class Solution:
         """The motion of a collocation scheme, from xs, us, us_mid and u_final; None where they are no such motion."""
         if self.scheme == "step" or not self._is_whole:
             return None
-        return collocated(self.problem, self.scheme, self.xs, self.inputs_at_knots, self.us_mid, self.horizon)
+        mesh = np.linspace(0, 1, len(self.xs)) if self.mesh is None else self.mesh
+        return collocated(self.problem, self.scheme, self.xs, self.inputs_at_knots, self.us_mid, self.horizon, mesh)
 
     @cached_property
     def defects(self) -> Array:
@@ -152,7 +213,7 @@ class Solution:
         Discrete: |x_(k+1) - step(x_k, u_k)|. Collocation: the scheme's own equations.
         """
         if not self._is_whole:
-            return np.full(self.problem.num_steps, np.inf)
+            return np.full(self._num_intervals, np.inf)
         if self.transcribed is not None:
             return np.nan_to_num(self.transcribed.defects, nan=np.inf)
         with applied(self.vector) as model:
@@ -177,6 +238,15 @@ class Solution:
         return _largest(self.integration_errors)
 
     @cached_property
+    def integrated(self) -> Array | None:
+        """(N+1, nx) where x' = f(x, u) leads from xs[0] under the plan's input; None of a discrete method.
+
+        NaN from where the motion leaves all finite numbers. An unstable motion drifts off here whatever is right: it
+        is reported, and `integration_errors`, which start anew at each knot, decide.
+        """
+        return None if self.transcribed is None else self.transcribed.open_loop
+
+    @cached_property
     def bound_violation(self) -> float:
         """The largest excess over a bound of a state that is not given, an input, or a parameter."""
         return max((excess for excess, _ in self.bound_excess.values()), default=0.0)
@@ -187,12 +257,14 @@ class Solution:
 
         States that are given have none; collocation's midpoints count to the knot before them.
         """
-        b, names = self.problem.bounds, self.problem.model.input_names
+        b, states, names = self.problem.bounds, self.problem.state_names, self.problem.input_names
         free = self.problem.initial_state_mask
         given = np.zeros(self.xs.shape, dtype=bool)
         given[0] = ~free
         inside = np.clip(0.0, b.x_lower, b.x_upper)
-        sides = [(self.problem.model.state_names, np.where(given, inside, self.xs), b.x_lower, b.x_upper)]
+        sides = [(states, np.where(given, inside, self.xs), b.x_lower, b.x_upper)]
+        if self.transcribed is not None and not self.transcribed.task.scheme.input_is_linear:  # Drake bounds knots
+            sides += [(states, xs, b.x_lower, b.x_upper) for xs in [self.transcribed.xs_mid] if xs is not None]
         sides += [(names, us, b.u_lower, b.u_upper) for us in (self.inputs_at_knots, self.us_mid) if us is not None]
         sides.append((self.vector.names, self.vector.values[None], *self.problem.bounds_of_parameters()))
         found: dict[str, tuple[float, int]] = {}
@@ -205,8 +277,16 @@ class Solution:
 
     @cached_property
     def constraint_excess(self) -> dict[str, tuple[float, int]]:
-        """The largest excess and its knot of each of the problem's constraints and waypoints."""
-        return self.problem.constraint_excess(self.xs, self.inputs_at_knots)
+        """The largest excess and its knot of each of the problem's constraints and waypoints.
+
+        Collocation keeps constraints of all knots at its midpoints too, which count to the knot before them.
+        """
+        if self.transcribed is None:
+            return self.problem.constraint_excess(self.xs, self.inputs_at_knots)
+        nodes, every = self.transcribed.nodes, self.transcribed.task.scheme.nodes
+        xs, us = np.split(nodes, [self.problem.nx], axis=1)
+        found = self.problem.constraint_excess(xs, us, every * self.knots)
+        return {name: (excess, row // every) for name, (excess, row) in found.items()}
 
     @property
     def constraint_violation(self) -> float:
@@ -235,14 +315,18 @@ class Solution:
     def replay(self) -> Rollout | None:
         """The discrete plant's own open-loop motion from xs[0]; None where it cannot be taken.
 
-        An input that changes between knots is held at its mean over each step.
+        An input that changes between knots is held at its mean over each step. Plain dynamics have no plant to step:
+        see `integrated`.
         """
-        return self.plan.open_loop
+        return self.plan.open_loop if self.problem.has_model else None
 
     @cached_property
     def replays(self) -> tuple[Replay, ...]:
-        """The plan in every variant of the plant (step, half step, other contact), open loop and under TVLQR."""
-        return replays(self.plan)
+        """The plan in every variant of the plant (step, half step, other contact), open loop and under TVLQR.
+
+        None of plain dynamics, which have no such variants.
+        """
+        return replays(self.plan) if self.problem.has_model else ()
 
     @cached_property
     def half_step_error(self) -> float:
@@ -261,9 +345,14 @@ class Solution:
         return _largest(np.abs(end - self.xs[-1]))
 
     @property
+    def _num_intervals(self) -> int:
+        return self.problem.num_steps if self.mesh is None else len(self.mesh) - 1
+
+    @property
     def _is_whole(self) -> bool:
         """Whether xs and the inputs have the problem's shapes, and all of collocation's are numbers."""
-        if self.us.shape != self.problem.us.shape or self.xs.shape != (len(self.us) + 1, self.problem.model.nx):
+        count, nx, nu = self._num_intervals, self.problem.nx, self.problem.nu
+        if self.us.shape != (count, nu) or self.xs.shape != (count + 1, nx):
             return False
         parts = [part for part in (self.xs, self.inputs_at_knots, self.us_mid) if part is not None]
         return self.scheme == "step" or all(bool(np.all(np.isfinite(part))) for part in parts)

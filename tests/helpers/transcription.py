@@ -6,8 +6,6 @@ import numpy as np
 
 import drake_diff as dd
 from drake_diff.optimize.problem.dynamics import Dynamics
-from drake_diff.optimize.program import Outcome
-from drake_diff.optimize.transcription.solve import transcribe_and_solve
 
 
 def effort(x, u):
@@ -34,14 +32,25 @@ def heavy_pendulum(damping, **bounds):
     return Dynamics(lambda x, u: np.array([x[1], -9.81 * np.sin(x[0]) - damping * x[1] + u[0]]), 2, 1, **bounds)
 
 
-def solved(dynamics, **options):
-    motion = transcribe_and_solve(dynamics, **options)
-    assert motion.outcome in (Outcome.SOLVED, Outcome.INACCURATE), motion.message
-    assert motion.defect < 1e-8
-    return motion
+OPTIONS = (
+    *("scheme", "initial_guess", "tolerance", "max_iterations", "time_limit", "progress", "callback"),
+    *("refine", "error_tolerance", "max_num_steps"),
+)
 
 
-def move(count=10, dynamics=BLOCK, **changes):
-    return solved(
-        dynamics, count=count, **{"x0": [0, 0], "x_goal": [1, 0], "horizon": 1.0, "running_cost": effort} | changes
-    )
+def collocate(dynamics, **asked):
+    """The problem of `dynamics` with the fields and options `asked`, solved to a tolerance of 1e-9."""
+    options = {"tolerance": 1e-9, "max_iterations": 3000} | {k: asked.pop(k) for k in OPTIONS if k in asked}
+    return dd.solve(dd.Problem(dynamics, **asked), method="collocation", **options)
+
+
+def solved(dynamics, **asked):
+    solution = collocate(dynamics, **asked)
+    assert solution.status in (dd.Status.CONVERGED, dd.Status.CONVERGED_NOT_VERIFIED), solution.message
+    assert solution.defect < 1e-8
+    return solution
+
+
+def move(num_steps=10, dynamics=BLOCK, **changes):
+    rest = {"x0": [0, 0], "x_goal": [1, 0], "horizon": 1.0, "running_cost": effort}
+    return solved(dynamics, num_steps=num_steps, **rest | changes)

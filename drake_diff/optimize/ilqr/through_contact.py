@@ -121,7 +121,7 @@ def solve_continuation(
 
     with interrupt_flag() as interrupted:
         for contact in stages:
-            softer = replace(problem, model=softened(problem.model, contact))
+            softer = replace(problem, system=softened(problem.model, contact))
             iterations, tolerance = min(STAGE_ITERATIONS, limits.max_iterations), max(STAGE_TOLERANCE, limits.tolerance)
             short = Limits(iterations, deadline - time.monotonic(), tolerance)
             try:

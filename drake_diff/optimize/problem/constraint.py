@@ -11,18 +11,31 @@ from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 from drake_diff._base.arrays import Array, array_with_gaps, frozen
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff.exceptions import GradientError, InputError
+from drake_diff.optimize.problem.bounds import short
 
 FORM = "a function of x, or of x and u, in ordinary arithmetic that gives a number or numbers (m,)"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Constraint:
-    """lower <= function(x) <= upper, or of function(x, u), at `knots`; a number or (m,) numbers, infinite where None.
+    """A path constraint of a `Problem`: lower <= function(x) <= upper, or lower <= function(x, u) <= upper.
 
-    `function` takes x (nx,), and u (nu,) if it has two arguments, as floats or AutoDiffXd: ordinary arithmetic and
-    NumPy functions will do. `knots` are whole numbers 0 ... N, negative ones counting from the end; None is every knot
-    but a given first one. A function of u holds at no knot N of a discrete method, which has no input there.
-    Collocation keeps a constraint of all knots at its midpoints too. `name` is how it is called where it fails.
+    Args:
+        function: takes x (nx,), and u (nu,) if it has a second argument, and returns one number or (m,) numbers, in
+            ordinary arithmetic and NumPy functions through which AutoDiffXd can flow.
+        lower: a number or (m,) numbers, in the unit of what `function` returns; no limit where None.
+        upper: the same; one of the two must be given.
+        knots: the knots at which it holds, whole numbers 0 ... N, where negative ones count from the end. None is
+            every knot but a given first state; collocation then keeps it at its midpoints too. A discrete method has
+            no input at knot N, so that a function of u holds only up to N-1.
+        name: what it is called in messages; the function's own name where not given.
+
+    Raises:
+        InputError: no function, no limit, limits that cross or do not fit.
+
+    Example:
+        >>> dd.Constraint(lambda x: x[1], upper=1.5, name="speed")
+        Constraint speed at every knot: -inf <= f(x) <= 1.5
     """
 
     function: Callable[..., Any]
@@ -52,6 +65,11 @@ class Constraint:
             raise InputError(f"Constraint {self.label}", got=got, expected="lower at most upper")
         object.__setattr__(self, "lower", frozen(lower))
         object.__setattr__(self, "upper", frozen(upper))
+
+    def __repr__(self) -> str:
+        lower, upper = (short(side[0] if len(side) == 1 else side) for side in (self.lower, self.upper))
+        where = "every knot" if self.knots is None else f"knots {np.atleast_1d(self.knots).tolist()}"
+        return f"Constraint {self.label} at {where}: {lower} <= f({'x, u' if self.takes_input else 'x'}) <= {upper}"
 
     @property
     def label(self) -> str:

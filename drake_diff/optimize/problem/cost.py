@@ -10,17 +10,33 @@ from drake_diff._base.arrays import Array, finite_array
 from drake_diff._base.autodiff import gradient_of
 from drake_diff._base.differences import central_differences
 from drake_diff.exceptions import InputError, ShapeError
+from drake_diff.optimize.problem.bounds import short
 
 RunningCost = Callable[[Any, Any], Any]  # (x, u) -> scalar
 FinalCost = Callable[[Any], Any]  # (x) -> scalar
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class QuadraticCost:
-    """(x - x_ref)' Q (x - x_ref) + (u - u_ref)' R (u - u_ref), no half; what is not given is zero.
+    """The cost (x - x_ref)' Q (x - x_ref) + (u - u_ref)' R (u - u_ref), without a factor of one half.
 
-    Q (nx, nx), R (nu, nu), x_ref (nx,), u_ref (nu,). Q and R must be symmetric and positive semidefinite. As a
-    final cost it is called with x alone.
+    It serves as a running cost, called with x and u, and as a final cost, called with x alone. What is not given
+    is zero.
+
+    Args:
+        Q: (nx, nx) weights of the states, symmetric and positive semidefinite.
+        R: (nu, nu) weights of the inputs, symmetric and positive semidefinite.
+        x_ref: (nx,) state that costs nothing, in the states' units.
+        u_ref: (nu,) input that costs nothing, in the inputs' units.
+
+    Raises:
+        InputError: a weight is not square, not symmetric or not positive semidefinite; ShapeError and
+            NonFiniteError where a size or a number is wrong.
+
+    Example:
+        >>> cost = dd.QuadraticCost(Q=[[2.0]], R=[[1.0]], x_ref=[1.0])
+        >>> float(cost(np.array([3.0]), np.array([0.5])))
+        8.25
     """
 
     Q: Any = None
@@ -36,6 +52,10 @@ class QuadraticCost:
             if getattr(self, name) is not None:
                 size = "n" if weight is None else len(weight)
                 object.__setattr__(self, name, finite_array(name, getattr(self, name), (size,)))
+
+    def __repr__(self) -> str:
+        given = {name: value for name, value in vars(self).items() if value is not None}
+        return f"QuadraticCost({', '.join(f'{name}={short(value)}' for name, value in given.items())})"
 
     def check_sizes(self, name: str, nx: int, nu: int) -> None:
         """Raise ShapeError where a part has not the size of the states (nx,) or inputs (nu,); `name` is the cost's."""

@@ -17,7 +17,7 @@ from drake_diff.mechanics.tree import TreeDynamics, tree_for
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.model import Model
 from drake_diff.model.step import set_state
-from drake_diff.optimize.problem.problem import Bounds, plant_limits, resolve_bounds
+from drake_diff.optimize.problem.bounds import Bounds, plant_limits, resolve_bounds
 
 PROBED = 3  # knots at which a function is tried before it is used
 ORDINARY = "a function of x and u in ordinary arithmetic and NumPy functions, without float()"
@@ -89,12 +89,30 @@ class Pointwise:
 
 
 class Dynamics:
-    """x' = f(x, u) with `f` in ordinary arithmetic of x (nx,) [state units] and u (nu,), giving nx rates [per s].
+    """Plain dynamics x' = f(x, u), with exact derivatives: what a `Problem` takes where there is no model.
 
-    AutoDiffXd must flow through `f`: no float(), no branches on the numbers. Bounds (nx,), (nu,) are infinite where
-    not given or NaN. `f` may instead be an object with its own values(knots) and linearize(knots), see `Pointwise`.
+    Args:
+        f: a function of x (nx,) and u (nu,) that returns the nx rates, in the states' units per second. Write it with
+            ordinary arithmetic and NumPy functions, without float() and without branches on the numbers: AutoDiffXd
+            has to flow through it. An object with its own `values(knots)` and `linearize(knots)` will do as well,
+            with the shapes of the methods of the same names here.
+        nx: number of states.
+        nu: number of inputs.
+        x_lower, x_upper: (nx,) limits of the states; infinite where not given or NaN.
+        u_lower, u_upper: (nu,) limits of the inputs; infinite where not given or NaN.
+        state_names: nx names; x0, x1, ... where not given.
+        input_names: nu names; u0, u1, ... where not given.
 
-    Raises InputError, ShapeError or GradientError where `f` is no such function, with what it did.
+    Raises:
+        InputError: `f` is not such a function, or a limit or name does not fit; says what `f` did.
+        ShapeError: `f` does not return nx rates.
+        GradientError: the result of `f` carries no derivatives.
+
+    Example:
+        >>> block = dd.Dynamics(lambda x, u: [x[1], u[0] - 0.5 * x[1]], nx=2, nu=1, u_lower=[-5], u_upper=[5])
+        >>> f, A, B = block.derivatives([0.0, 1.0], [2.0])
+        >>> f.tolist(), A.tolist(), B.tolist()
+        ([1.0, 1.5], [[0.0, 1.0], [0.0, -0.5]], [[0.0], [1.0]])
     """
 
     def __init__(
@@ -118,6 +136,10 @@ class Dynamics:
         self.bounds = self.limits(Bounds(x_lower, x_upper, u_lower, u_upper))
         own = hasattr(f, "linearize")
         self._at = f if own else Pointwise("dynamics", f, self.nx, (self.nx,), self.probe())
+
+    def __repr__(self) -> str:
+        states, inputs = ", ".join(self.state_names), ", ".join(self.input_names)
+        return f"Dynamics of {self.nx} states ({states}) under {self.nu} inputs ({inputs})"
 
     @property
     def form(self) -> Any:
@@ -157,9 +179,21 @@ class Dynamics:
 
 
 def plant_dynamics(model: Model) -> Dynamics:
-    """A model's equations of motion as `Dynamics`, with its own limits of positions, velocities and efforts.
+    """A model's equations of motion in continuous time, with its own limits of positions, velocities and efforts.
 
-    Raises ModelError where the model has no continuous form (PD control, constraints).
+    Args:
+        model: a model without PD control and without constraints. Contact is left out.
+
+    Returns:
+        `Dynamics` of x = [q; v] (nx,) under the actuation u (nu,), in the model's units.
+
+    Raises:
+        ModelError: the model has no continuous form.
+
+    Example:
+        >>> dynamics = dd.optimize.plant_dynamics(dd.load_model("models/pendulum.urdf", time_step=0.01))
+        >>> dynamics([0.0, 1.0], [0.0]).round(3)
+        array([1. , ...])
     """
     return Dynamics(
         PlantKnots(model),

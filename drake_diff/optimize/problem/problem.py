@@ -1,126 +1,80 @@
-"""Limits of states, inputs and times: what is given, and a model's own where nothing is; states within them.
+"""What is to be optimized, checked when it is made; contains no solver."""
 
-What is to be optimized; contains no solver.
-"""
-
+import html
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, cast
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, array_with_gaps, finite_array, frozen, positive_float, positive_int
-from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
+from drake_diff._base.arrays import Array, Indices, finite_array, frozen, positive_float, positive_int
+from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import TIME_STEP, applied, select
+from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, select
+from drake_diff.optimize.problem.bounds import (
+    check_inside,
+    checked_horizon,
+    checked_state,
+    checked_waypoints,
+    plant_limits,
+    resolve_bounds,
+    short,
+)
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, FinalCost, QuadraticCost
-
-
-@dataclass(frozen=True, eq=False)
-class Bounds:
-    """Limits of states (nx,) and inputs (nu,), infinite where there is none.
-
-    The model's own limits (positions, velocities, efforts) apply to a whole array that is None and to each
-    entry that is NaN.
-    """
-
-    x_lower: Any = None
-    x_upper: Any = None
-    u_lower: Any = None
-    u_upper: Any = None
-
-
-def resolve_bounds(
-    given: Bounds | None, own: Mapping[str, Array], state_names: Sequence[str], input_names: Sequence[str]
-) -> Bounds:
-    """`given` with the limits of `own` (by the fields' names) where it has none; InputError where two cross."""
-    found = {}
-    for name, limits in own.items():
-        value = getattr(given, name, None)
-        checked = limits if value is None else array_with_gaps(name, value, limits.shape)
-        found[name] = frozen(np.where(np.isnan(checked), limits, checked))
-    for kind, names in (("x", state_names), ("u", input_names)):
-        lower, upper = found[f"{kind}_lower"], found[f"{kind}_upper"]
-        for i in np.flatnonzero((lower > upper) | (lower == np.inf) | (upper == -np.inf))[:1]:
-            got = f"[{lower[i]:g}, {upper[i]:g}]"
-            raise InputError(f"bounds of {names[i]}", got=got, expected="lower at most upper")
-    return Bounds(**found)
-
-
-def checked_state(subject: str, given: Any, bounds: Bounds | None, names: Sequence[str]) -> Array:
-    """`given` (nx,), NaN where free, within resolved `bounds` if there are any; InputError and its kin where not."""
-    state = array_with_gaps(subject, given, (len(names),))
-    if np.any(np.isinf(state)):
-        raise InputError(subject, got=state, expected="finite numbers, NaN where free")
-    if bounds is None:
-        return state
-    for i in np.flatnonzero((state < bounds.x_lower) | (state > bounds.x_upper))[:1]:
-        expected = f"within [{bounds.x_lower[i]:g}, {bounds.x_upper[i]:g}]"
-        raise InputError(f"{subject}, {names[i]}", got=float(state[i]), expected=expected)
-    return state
-
-
-def checked_waypoints(
-    given: Mapping[int, Any] | None, num_steps: int, bounds: Bounds, names: Sequence[str]
-) -> dict[int, Array]:
-    """The states (nx,) `given` at knots between the ends, in their order; InputError and its kin of anything else."""
-    found = {}
-    for knot, state in (given or {}).items():
-        if isinstance(knot, bool) or not isinstance(knot, (int, np.integer)) or not 0 < knot < num_steps:
-            expected = f"whole numbers from 1 to {num_steps - 1} (the last state's is x_goal)"
-            raise InputError("knots of waypoints", got=repr(knot), expected=expected)
-        found[int(knot)] = checked_state(f"waypoint at knot {knot}", state, bounds, names)
-    return dict(sorted(found.items()))
-
-
-def checked_horizon(given: Any, expected: str) -> tuple[float, float]:
-    """`given` as a pair of times [s], the first at most the second; InputError, `expected` in it, of anything else."""
-    if not (isinstance(given, (tuple, list)) and len(given) == 2):
-        raise InputError("horizon", got=repr(given), expected=expected)
-    lower, upper = (positive_float("horizon [s]", value) for value in given)
-    if lower > upper:
-        raise InputError("horizon", got=repr(given), expected="lower at most upper")
-    return lower, upper
-
-
-def plant_limits(plant: Any) -> dict[str, Array]:
-    """A plant's own limits, by the fields' names of `Bounds`."""
-    return {
-        "x_lower": np.concatenate([plant.GetPositionLowerLimits(), plant.GetVelocityLowerLimits()]),
-        "x_upper": np.concatenate([plant.GetPositionUpperLimits(), plant.GetVelocityUpperLimits()]),
-        "u_lower": np.asarray(plant.GetEffortLowerLimits()),
-        "u_upper": np.asarray(plant.GetEffortUpperLimits()),
-    }
-
+from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
 
 OPTIMIZABLE = ("controls", "initial_state", "parameters")
 # A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
 SMALLEST_PART = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Problem:
-    """Minimize sum_k h * running_cost(x_k, u_k) + final_cost(x_N) over `num_steps` steps of h = model.time_step.
+    """A trajectory to be optimized: minimize the time integral of running_cost(x, u), plus final_cost(x_N).
 
-    (Collocation: the transcription's quadrature of the same rate.) `x0` (nx,) is the initial state; `x_goal`
-    (nx,) a hard final equality whose NaN entries are free, and so are `waypoints`, a mapping from knots to states.
-    `bounds` hold at every state that is not given and for every input, `constraints` at their knots. With
-    `horizon` = (lower, upper) [s] the final time is free between them, `num_steps` intervals of equal length
-    (collocation); a `running_cost` of 1.0 is then the time itself. `optimize` names what may change: "controls" and/or
-    "initial_state", the latter where `initial_state_mask` (nx,) is True, x0 being the first guess there. Controls that
-    are not optimized are `us` (N, nu), zero where not given; controls that are optimized start from it.
+    On a model's discrete steps the integral is sum_k h * running_cost(x_k, u_k) with h = model.time_step; collocation
+    takes the quadrature of its scheme. Bounds hold at every state that is not given and for every input.
 
-    `parameters` names some of the model's (see `list_parameters`), or maps names to values, which hold in all steps;
-    with "parameters" in `optimize` these are where the search starts, between `parameter_bounds` (a mapping from
-    names to (lower, upper)); what cannot be negative stays above 1e-3 of its start where no bound is given, and an
-    inertia stays one that a body can have. `trajectory_cost(xs, us)` adds a cost of the whole motion, such as its
-    distance from a measured one.
+    Args:
+        system: a Model, or `Dynamics` x' = f(x, u), which only method="collocation" takes.
+        x0: (nx,) the initial state.
+        num_steps: number N of intervals, of model.time_step each where no `horizon` is given.
+        running_cost: a function (x, u) -> scalar, a QuadraticCost, or, with `horizon`, a number [per s]: with 1.0 the
+            cost is the time itself.
+        final_cost: a function x -> scalar, or a QuadraticCost.
+        x_goal: (nx,) final state, a hard equality; NaN entries are free.
+        waypoints: mapping from knots (1 ... N-1) to states (nx,), with NaN where free.
+        constraints: a `Constraint`, or several.
+        horizon: [s] time from the first state to the last, in N equal intervals, for collocation: a number, or
+            (lower, upper) for a free final time. Plain dynamics need one.
+        bounds: `Bounds`; where it says nothing, those of the model or the dynamics apply.
+        optimize: what may change: "controls", "initial_state", "parameters", or several of them.
+        initial_state_mask: (nx,) booleans, True where "initial_state" may change; x0 is its first guess there.
+        us: (N, nu) inputs where they are not optimized, their first guess where they are; 0 if not given.
+        parameters: names of model parameters (see `list_parameters`), or a mapping from names to values. They hold
+            in all steps; with "parameters" in `optimize` the search starts from them.
+        parameter_bounds: mapping from names to (lower, upper). What cannot be negative stays above 1e-3 of its start
+            where no bound is given, and an inertia stays one that a body can have.
+        trajectory_cost: a function (xs, us) -> scalar that is added to the cost, such as the distance from a
+            measured motion.
 
-    Raises InputError, ShapeError, NonFiniteError or UnknownNameError, each with expected and got.
+    Raises:
+        InputError: something does not fit; also ShapeError, NonFiniteError and UnknownNameError, all with what was
+            expected and what was given.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
+        >>> effort = dd.QuadraticCost(R=[[1.0]])
+        >>> dd.Problem(model, x0=[0, 0], num_steps=40, x_goal=[3.14, 0], running_cost=effort)
+        Problem of pendulum: 2 states, 1 input, 40 steps in 2 s
+          from x0 = [0., 0.] to x_goal = [3.14, 0.  ]
+          running cost: QuadraticCost(R=[[1.]])
+          optimize: controls
     """
 
-    model: Model
+    system: Model | Dynamics
     _: KW_ONLY
     x0: Any
     num_steps: int
@@ -129,7 +83,7 @@ class Problem:
     x_goal: Any = None
     waypoints: Any = None  # becomes a dict
     constraints: Any = ()  # becomes a tuple of Constraints
-    horizon: Any = None
+    horizon: Any = None  # becomes a pair, or stays None
     bounds: Any = None  # Bounds
     optimize: Sequence[str] = ("controls",)
     initial_state_mask: Any = None
@@ -139,32 +93,111 @@ class Problem:
     trajectory_cost: Callable[[Any, Any], Any] | None = None
 
     def __post_init__(self) -> None:
-        model = self.model
-        if not isinstance(model, Model):
-            raise InputError("model", got=type(model).__name__, expected="a Model")
-        self._set("x0", finite_array("x0", self.x0, (model.nx,)))
+        system = self.system
+        if not isinstance(system, (Model, Dynamics)):
+            raise InputError("system", got=type(system).__name__, expected="a Model or Dynamics")
+        self._set("x0", finite_array("x0", self.x0, (self.nx,)))
         self._set("num_steps", positive_int("num_steps", self.num_steps))
-        self._set("optimize", _check_optimize(model, self.optimize))
-        self._set("parameters", select(model, self.parameters))
+        self._set("optimize", _check_optimize(self.nu, self.optimize))
+        if isinstance(system, Model):
+            self._set("parameters", select(system, self.parameters))
+            own = plant_limits(system.plant)
+        else:
+            self._set("parameters", self._no_parameters())
+            own = vars(system.bounds)
         self._check_parameters()
-        if not (self.bounds is None or isinstance(self.bounds, Bounds)):
-            raise InputError("bounds", got=type(self.bounds).__name__, expected="Bounds")
-        bounds = resolve_bounds(self.bounds, plant_limits(model.plant), model.state_names, model.input_names)
+        bounds = resolve_bounds(self.bounds, own, self.state_names, self.input_names)
         self._set("bounds", bounds)
         self._set("initial_state_mask", self._check_mask())
         self._set("us", self._check_us())
-        self._check_inside("x0", self.x0, "x")
+        check_inside("x0", self.x0, bounds.x_lower, bounds.x_upper, self.state_names)
         if self.x_goal is not None:
-            self._set("x_goal", checked_state("x_goal", self.x_goal, bounds, model.state_names))
-        self._set("waypoints", checked_waypoints(self.waypoints, self.num_steps, bounds, model.state_names))
+            self._set("x_goal", checked_state("x_goal", self.x_goal, bounds, self.state_names))
+        self._set("waypoints", checked_waypoints(self.waypoints, self.num_steps, bounds, self.state_names))
         self._set("constraints", self._check_constraints())
         if self.horizon is not None:
-            self._set("horizon", checked_horizon(self.horizon, "(lower, upper) in seconds"))
+            self._set("horizon", checked_horizon(self.horizon))
+        elif not self.has_model:
+            raise InputError("horizon", got="none", expected="a number of seconds, or (lower, upper)")
         self._check_costs()
         self._check_quantities()
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        counts = ((self.nx, "state"), (self.nu, "input"), (self.num_steps, "step"))
+        sizes = ", ".join(f"{n} {word}{'s' * (n != 1)}" for n, word in counts)
+        free = self.horizon is not None and self.horizon[0] < self.horizon[1]
+        time = f"{self.horizon[0]:g} to {self.horizon[1]:g}" if free else f"{self.start_horizon:g}"
+        goal = "" if self.x_goal is None else f" to x_goal = {short(self.x_goal)}"
+        lines = [f"Problem of {self.name}: {sizes} in {time} s", f"from x0 = {short(self.x0)}{goal}"]
+        for name in ("running_cost", "final_cost", "trajectory_cost"):
+            cost = getattr(self, name)
+            if cost is not None:
+                own = isinstance(cost, (QuadraticCost, ConstantCost))
+                told = repr(cost) if own else getattr(cost, "__qualname__", type(cost).__name__)
+                lines.append(f"{name.replace('_', ' ')}: {told}")
+        if self.waypoints:
+            lines.append(f"waypoints at knots {', '.join(map(str, self.waypoints))}")
+        lines += [f"constraint: {constraint!r}" for constraint in self.constraints]
+        named = f" ({', '.join(self.parameters.names)})" if self.parameters.names else ""
+        lines.append(f"optimize: {', '.join(self.optimize)}{named}")
+        return "\n  ".join(lines)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+    @property
+    def has_model(self) -> bool:
+        """Whether this is a problem of a model, and not of plain dynamics."""
+        return isinstance(self.system, Model)
+
+    @property
+    def model(self) -> Model:
+        """The model; ModelError where the problem is one of plain dynamics."""
+        if not isinstance(self.system, Model):
+            raise ModelError("this problem is one of plain dynamics: it has no model")
+        return self.system
+
+    @cached_property
+    def dynamics(self) -> Dynamics:
+        """x' = f(x, u): the model's equations of motion, or the plain dynamics; ModelError where there are none."""
+        return plant_dynamics(self.system) if isinstance(self.system, Model) else self.system
+
+    @property
+    def name(self) -> str:
+        """What is moved: the model's name."""
+        return self.system.name if isinstance(self.system, Model) else "plain dynamics"
+
+    @property
+    def nx(self) -> int:
+        return self.system.nx
+
+    @property
+    def nu(self) -> int:
+        return self.system.nu
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        return self.system.state_names
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        return self.system.input_names
+
+    @property
+    def start_horizon(self) -> float:
+        """[s] from the first state to the last where a search begins, which a free `horizon` lets it change."""
+        if isinstance(self.system, Model):
+            whole = self.num_steps * self.system.time_step
+            return whole if self.horizon is None else float(np.clip(whole, *self.horizon))
+        return float(sum(self.horizon) / 2)
+
+    @property
+    def time_step(self) -> float:
+        """[s] the model's time step; for plain dynamics an interval of `start_horizon`."""
+        return self.system.time_step if isinstance(self.system, Model) else self.start_horizon / self.num_steps
 
     @property
     def optimizes_controls(self) -> bool:
@@ -188,7 +221,12 @@ class Problem:
     @property
     def goal(self) -> Array:
         """(nx,) the hard final state; NaN where it is free."""
-        return np.full(self.model.nx, np.nan) if self.x_goal is None else np.asarray(self.x_goal)
+        return np.full(self.nx, np.nan) if self.x_goal is None else np.asarray(self.x_goal)
+
+    @property
+    def start(self) -> Array:
+        """(nx,) the initial state; NaN where it may change."""
+        return np.where(self.initial_state_mask, np.nan, self.x0)
 
     @property
     def initial_state_is_given(self) -> bool:
@@ -197,25 +235,32 @@ class Problem:
     def state_limits(self) -> tuple[Array, Array]:
         """(lower (N+1, nx), upper (N+1, nx)): the bounds of each state, x0, waypoints and goal where they are given."""
         sides = [np.tile(side, (self.num_steps + 1, 1)) for side in (self.bounds.x_lower, self.bounds.x_upper)]
-        start = np.where(self.initial_state_mask, np.nan, self.x0)
-        for knot, wanted in {0: start, **self.waypoints, self.num_steps: self.goal}.items():
+        for knot, wanted in {0: self.start, **self.waypoints, self.num_steps: self.goal}.items():
             for side in sides:
                 side[knot] = np.where(np.isnan(wanted), side[knot], wanted)
         return sides[0], sides[1]
 
-    def constraint_excess(self, xs: Array, us: Array) -> dict[str, tuple[float, int]]:
-        """The largest excess over its bounds of each constraint and the knot it is at, at xs (N+1, nx) under us.
+    def knots_of(self, c: Constraint, *, input_at_end: bool) -> tuple[int, ...]:
+        """The knots at which `c` holds; a discrete method has no input at knot N, collocation has one at the end."""
+        return c.at_knots(self.num_steps + int(input_at_end and c.takes_input), self.initial_state_is_given)
 
-        us is (N, nu), or (N+1, nu) at the knots; waypoints are constraints here too.
+    def constraint_excess(self, xs: Array, us: Array, knots: Indices | None = None) -> dict[str, tuple[float, int]]:
+        """The largest excess over its bounds of each constraint, and the row it is at, along xs (M+1, nx) under us.
+
+        us is (M, nu), or (M+1, nu) at the knots; `knots` (N+1,) are the rows of the problem's own knots where a mesh
+        was refined, and a constraint of all knots is one of all rows. Waypoints are constraints here too.
         """
         found: dict[str, tuple[float, int]] = {}
+        where = np.arange(len(xs)) if knots is None else knots
         for c in self.constraints:
-            knots = c.at_knots(self.num_steps, self.initial_state_is_given)
-            worst = max((c.excess(xs[k], us[min(k, len(us) - 1)]), k) for k in knots)
+            rows: Any = where[list(self.knots_of(c, input_at_end=len(us) == len(xs)))]
+            if c.knots is None:
+                rows = range(rows[0], len(us) if c.takes_input else len(xs))
+            worst = max((c.excess(xs[k], us[min(k, len(us) - 1)]), int(k)) for k in rows)
             found[c.label] = max(worst, found.get(c.label, worst))
-        for k, wanted in self.waypoints.items():
-            distance = np.abs(xs[k] - wanted)[~np.isnan(wanted)]
-            found[f"waypoint at knot {k}"] = (float(np.max(distance, initial=0.0)), k)
+        for knot, wanted in self.waypoints.items():
+            distance = np.abs(xs[where[knot]] - wanted)[~np.isnan(wanted)]
+            found[f"waypoint at knot {knot}"] = (float(np.max(distance, initial=0.0)), int(where[knot]))
         return found
 
     def goal_error(self, x: Array) -> Array:
@@ -233,7 +278,7 @@ class Problem:
             rates = self._rates(xs[: len(inputs)], inputs)
             if len(inputs) == len(xs):
                 rates[0], rates[-1] = rates[0] / 2, rates[-1] / 2
-            total += self.model.time_step * float(np.sum(rates))
+            total += self.time_step * float(np.sum(rates))
         if self.trajectory_cost is not None:
             total += float(self.trajectory_cost(xs, inputs))
         return total
@@ -243,6 +288,12 @@ class Problem:
         if isinstance(self.running_cost, QuadraticCost):
             return self.running_cost.along(xs, us)
         return np.array([float(self.running_cost(x, u)) for x, u in zip(xs, us, strict=True)])
+
+    def _no_parameters(self) -> ParameterVector:
+        given = self.parameters.names if isinstance(self.parameters, ParameterVector) else self.parameters
+        if given:
+            raise InputError("parameters", got=given, expected="none for plain dynamics: only a model has some")
+        return ParameterVector(cast(Model, None), (), frozen([]))  # none of no model
 
     def _check_parameters(self) -> None:
         vector, given = self.parameters, self.parameter_bounds or {}
@@ -255,19 +306,15 @@ class Problem:
                 raise UnknownNameError("parameter_bounds", got=name, known=[p.name for p in vector.parameters])
             if name.endswith(".inertia"):
                 raise InputError(f"parameter_bounds of {name}", got="bounds", expected="none: it stays possible anyway")
-        lower, upper = self.bounds_of_parameters()
-        for i in np.flatnonzero(~((lower <= vector.values) & (vector.values <= upper))):
-            expected = f"within [{lower[i]:g}, {upper[i]:g}]"
-            raise InputError(f"parameters, {vector.names[i]}", got=float(vector.values[i]), expected=expected)
+        check_inside("parameters", vector.values, *self.bounds_of_parameters(), vector.names)
 
     def _check_mask(self) -> Array:
-        nx = self.model.nx
         free = "initial_state" in self.optimize
         if self.initial_state_mask is None:
-            return np.full(nx, free)
+            return np.full(self.nx, free)
         mask = np.asarray(self.initial_state_mask)
-        if mask.shape != (nx,):
-            raise ShapeError("initial_state_mask", got=mask.shape, expected=(nx,))
+        if mask.shape != (self.nx,):
+            raise ShapeError("initial_state_mask", got=mask.shape, expected=(self.nx,))
         if mask.dtype != bool:
             raise InputError("initial_state_mask", got=f"dtype {mask.dtype}", expected="booleans")
         if free and not mask.any():
@@ -277,30 +324,19 @@ class Problem:
         return mask
 
     def _check_us(self) -> Array:
-        shape = (self.num_steps, self.model.nu)
-        if self.us is None:
-            return frozen(np.zeros(shape))
-        us = finite_array("us", self.us, shape)
-        if not self.optimizes_controls:
-            self._check_inside("us", us, "u")
+        shape = (self.num_steps, self.nu)
+        us = frozen(np.zeros(shape)) if self.us is None else finite_array("us", self.us, shape)
+        if self.us is not None and not self.optimizes_controls:
+            check_inside("us", us, self.bounds.u_lower, self.bounds.u_upper, self.input_names)
         return us
 
-    def _check_inside(self, subject: str, values: Any, kind: str) -> None:
-        lower, upper = getattr(self.bounds, f"{kind}_lower"), getattr(self.bounds, f"{kind}_upper")
-        names = self.model.state_names if kind == "x" else self.model.input_names
-        outside = np.argwhere(np.atleast_2d((values < lower) | (values > upper)))
-        if len(outside):
-            i = int(outside[0][-1])
-            got = float(np.atleast_2d(values)[tuple(outside[0])])
-            raise InputError(f"{subject}, {names[i]}", got=got, expected=f"within [{lower[i]:g}, {upper[i]:g}]")
-
     def _check_constraints(self) -> tuple[Constraint, ...]:
-        given = (self.constraints,) if isinstance(self.constraints, Constraint) else tuple(self.constraints)
+        given = self.constraints if isinstance(self.constraints, (tuple, list)) else (self.constraints,)
         for constraint in given:
             if not isinstance(constraint, Constraint):
                 raise InputError("constraints", got=type(constraint).__name__, expected="Constraints")
-            constraint.at_knots(self.num_steps, self.initial_state_is_given)
-        return tuple(constraint.resolved(self.x0, np.zeros(self.model.nu)) for constraint in given)
+            self.knots_of(constraint, input_at_end=not self.has_model)
+        return tuple(constraint.resolved(self.x0, np.zeros(self.nu)) for constraint in given)
 
     def _check_costs(self) -> None:
         if isinstance(self.running_cost, (int, float)) and self.horizon is not None:
@@ -313,13 +349,13 @@ class Problem:
             if cost is not None and not callable(cost):
                 raise InputError(name, got=type(cost).__name__, expected="a function or a QuadraticCost")
             if isinstance(cost, QuadraticCost):
-                cost.check_sizes(name, self.model.nx, self.model.nu)
+                cost.check_sizes(name, self.nx, self.nu)
 
     def _check_quantities(self) -> None:
         """Call each function once with the parameters applied: what depends on the model's own refuses them."""
         if not self.parameters.parameters:
             return
-        x, u = self.x0, np.zeros(self.model.nu)
+        x, u = self.x0, np.zeros(self.nu)
         with applied(self.parameters), np.errstate(all="ignore"):
             for constraint in self.constraints:
                 constraint(x, u)
@@ -331,7 +367,7 @@ class Problem:
                 self.trajectory_cost(np.tile(x, (self.num_steps + 1, 1)), self.us)
 
 
-def _check_optimize(model: Model, optimize: Sequence[str]) -> tuple[str, ...]:
+def _check_optimize(nu: int, optimize: Sequence[str]) -> tuple[str, ...]:
     if not isinstance(optimize, (str, tuple, list, set, frozenset)):
         raise InputError("optimize", got=repr(optimize), expected="names out of " + ", ".join(OPTIMIZABLE))
     names = (optimize,) if isinstance(optimize, str) else tuple(optimize)
@@ -340,6 +376,6 @@ def _check_optimize(model: Model, optimize: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         if name not in OPTIMIZABLE:
             raise UnknownNameError("optimize", got=name, known=OPTIMIZABLE)
-    if "controls" in names and model.nu == 0:
+    if "controls" in names and nu == 0:
         raise InputError("optimize", got='"controls", but the model has no actuators', expected="an actuated model")
     return names

@@ -13,8 +13,6 @@ from drake_diff.optimize.problem.cost import QuadraticCost, differentiate_cost, 
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, NlpResult, Report
 
-DEFAULT_SOLVER = "ipopt"
-
 
 def solve_collocation(
     problem: Problem, xs: Array, us: Array, *, solver: str, limits: Limits, report: Report | None

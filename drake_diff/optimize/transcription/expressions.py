@@ -85,7 +85,7 @@ for _name in (
 setattr(Symbol, "arctan2", _binary(ca.atan2))  # noqa: B010  (mypy: the class has none)
 
 
-def trace(f: Callable[[Any, Any], Any], nx: int, probe: Array, wanted: Array) -> Any | str:
+def trace(f: Callable[[Any, Any], Any], nx: int, probe: Array, wanted: Array) -> Any | Refusal:
     """The function (x, u) -> (m,) as an SX function of a knot [x, u], or why there is none.
 
     It must give the values `wanted` (P, m) at the knots `probe` (P, nx + nu).
@@ -97,10 +97,10 @@ def trace(f: Callable[[Any, Any], Any], nx: int, probe: Array, wanted: Array) ->
             result = np.asarray(f(symbols[:nx], symbols[nx:])).ravel()
             entries = [entry.sx if isinstance(entry, Symbol) else float(entry) for entry in result]
     except Exception as error:  # whatever it is that f cannot do with symbols: it need not
-        return f"{type(error).__name__}: {str(error).splitlines()[0][:100] if str(error) else ''}"
+        return Refusal(f"{type(error).__name__}: {str(error).splitlines()[0][:100] if str(error) else ''}")
     function = ca.Function("traced", [knot], [ca.vertcat(*entries)])
     if not agrees(function, probe, wanted, SAME_VALUES):
-        return "its symbolic form gives other values"
+        return Refusal("its symbolic form gives other values")
     return function
 
 
@@ -320,7 +320,9 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
     def choose(function: Any, values: Values, linearize: Linearize, rows: int) -> KnotFunction:
         with np.errstate(all="ignore"):
             found = trace(function, nx, probe, values(probe))
-        return Called(found, values, linearize, rows, width) if isinstance(found, str) else Symbolic(found)
+        if isinstance(found, Refusal):
+            return Called(found.reason, values, linearize, rows, width)
+        return Symbolic(found)
 
     def rate_values(knots: Array) -> Array:
         return task.rate.values(knots)[:, None]
@@ -358,14 +360,11 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
 
 def _dynamics(dynamics: Dynamics) -> KnotFunction:
     form, probe = dynamics.form, dynamics.probe()
-    found: Any = "an object with derivatives of its own"
+    found: Any = Refusal("an object with derivatives of its own")
     if isinstance(form, PlantKnots):
         found = symbolic_plant(form.model)
-        found = found.reason if isinstance(found, Refusal) else found
     elif isinstance(form, Pointwise):
         found = trace(form.f, dynamics.nx, probe, form.values(probe))
-    if isinstance(found, PlantFunctions):
-        return SymbolicPlant(found)
-    if not isinstance(found, str):
-        return Symbolic(found)
-    return Called(found, dynamics.values, dynamics.linearize, dynamics.nx, dynamics.nx + dynamics.nu)
+    if isinstance(found, Refusal):
+        return Called(found.reason, dynamics.values, dynamics.linearize, dynamics.nx, dynamics.nx + dynamics.nu)
+    return SymbolicPlant(found) if isinstance(found, PlantFunctions) else Symbolic(found)

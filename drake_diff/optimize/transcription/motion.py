@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, Indices
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Outcome
+from drake_diff.optimize.program import Iteration, Outcome
 from drake_diff.optimize.transcription.scheme import interval_defects, node_weights, per_interval
 from drake_diff.optimize.transcription.task import OptimalControl, task_of
 
@@ -38,18 +38,6 @@ class Collocated:
     horizon: float
 
     @property
-    def infeasibility(self) -> float:
-        """The largest defect, excess over a bound or constraint, or distance from an end or waypoint at a node.
-
-        inf where something is not finite.
-        """
-        if not np.all(np.isfinite(self.nodes)):
-            return float("inf")
-        lower, upper = self.task.node_limits(self.mesh)
-        beyond = float(np.max(np.maximum(lower - self.nodes, self.nodes - upper), initial=0.0))
-        return max(self.defect, beyond, *self.task.path_excess(self.nodes, self.mesh).values())
-
-    @property
     def times(self) -> Array:
         """(N+1,) [s] of the knots."""
         return self.horizon * self.mesh
@@ -71,12 +59,25 @@ class Collocated:
         return None if self.task.scheme.nodes == 1 else self.nodes[1::2, self.task.dynamics.nx :]
 
     def sample(self, parts: int) -> tuple[Array, Array]:
-        """xs (m N + 1, nx) at the m-th parts of each interval, and the mean inputs us (m N, nu) over each part."""
-        k, tau = np.repeat(np.arange(len(self.mesh) - 1), parts), np.tile(np.arange(parts) / parts, len(self.mesh) - 1)
-        xs = np.vstack([self._between(k, tau)[0], self.xs[-1]])
-        weights = self.task.scheme.integrated(tau + 1 / parts) - self.task.scheme.integrated(tau)
-        us = per_interval(self.nodes[:, self.task.dynamics.nx :], self.task.scheme)[k]
-        return xs, parts * np.einsum("sj,sju->su", weights, us)
+        """The motion at the m-th `parts` of each of the problem's N equal intervals, whatever the mesh.
+
+        xs (m N + 1, nx), and the mean inputs us (m N, nu) over each part.
+        """
+        count, scheme = self.task.num_steps, self.task.scheme
+        inputs = per_interval(self.nodes[:, self.task.dynamics.nx :], scheme)
+        if len(self.mesh) == count + 1:
+            k, tau = np.repeat(np.arange(count), parts), np.tile(np.arange(parts) / parts, count)
+            weights = scheme.integrated(tau + 1 / parts) - scheme.integrated(tau)
+            us = parts * np.einsum("sj,sju->su", weights, inputs[k])
+        else:  # parts may end within the intervals of a refined mesh
+            ends, lengths = np.arange(parts * count + 1) / (parts * count), np.diff(self.mesh)[:, None]
+            k, tau = self._place(ends)
+            whole = lengths * np.einsum("j,nju->nu", scheme.integrated(np.ones(1))[0], inputs)
+            before = np.vstack([np.zeros(whole.shape[1]), np.cumsum(whole, axis=0)])[k]
+            within = lengths[k] * np.einsum("sj,sju->su", scheme.integrated(tau), inputs[k])
+            us = np.diff(before + within, axis=0) * (parts * count)
+            k, tau = k[:-1], tau[:-1]
+        return np.vstack([self._between(k, tau)[0], self.xs[-1]]), us
 
     @cached_property
     def cost(self) -> float:
@@ -114,9 +115,7 @@ class Collocated:
 
     def at(self, times: Any) -> tuple[Array, Array]:
         """xs (S, nx) and us (S, nu) at `times` (S,) [s] by the scheme's own polynomials."""
-        fractions = np.asarray(times, dtype=float) / self.horizon
-        k = np.clip(np.searchsorted(self.mesh, fractions, side="right") - 1, 0, len(self.mesh) - 2)
-        return self._between(k, (fractions - self.mesh[k]) / np.diff(self.mesh)[k])
+        return self._between(*self._place(np.asarray(times, dtype=float) / self.horizon))
 
     @cached_property
     def _rates(self) -> Array:
@@ -126,6 +125,11 @@ class Collocated:
     def _lengths(self) -> Array:
         return self.horizon * np.diff(self.mesh)
 
+    def _place(self, fractions: Array) -> tuple[Indices, Array]:
+        """The interval that each of `fractions` (S,) of the horizon lies in, and where in it, from 0 to 1."""
+        k = np.clip(np.searchsorted(self.mesh, fractions, side="right") - 1, 0, len(self.mesh) - 2)
+        return k, (fractions - self.mesh[k]) / np.diff(self.mesh)[k]
+
     def _between(self, k: Any, tau: Array) -> tuple[Array, Array]:
         """xs and us in the intervals `k` (S,) at `tau` (S,) of each."""
         scheme, nx = self.task.scheme, self.task.dynamics.nx
@@ -133,18 +137,31 @@ class Collocated:
         moved = np.einsum("sj,sjx->sx", scheme.integrated(tau), per_interval(self._rates, scheme)[k])
         return self.xs[k] + self._lengths[k, None] * moved, np.einsum("sj,sju->su", scheme.at(tau), us)
 
+    @property
+    def open_loop(self) -> Array:
+        """(N+1, nx) where the dynamics lead from the first state under the scheme's input; NaN once they diverge."""
+        z = np.append(self.xs[0], 0.0)[None]
+        found = [z[0]]
+        for k in range(len(self.mesh) - 1):
+            z = self._integrate(np.array([k]), z)
+            found.append(z[0])
+        return np.array(found)[:, : self.task.dynamics.nx]
+
     @cached_property
     def _integrated(self) -> Array:
         """(N, nx + 1) where each knot leads within its interval, and what that costs."""
-        task, every = self.task, np.arange(len(self.mesh) - 1)
-        dt, nx = self._lengths[:, None] / SUBSTEPS, self.task.dynamics.nx
+        every = np.arange(len(self.mesh) - 1)
+        return self._integrate(every, np.column_stack([self.xs[:-1], np.zeros(len(every))]))
+
+    def _integrate(self, k: Indices, z: Array) -> Array:
+        """(S, nx + 1) where `z` at the starts of the intervals `k` (S,) leads at their ends: states, and the cost."""
+        dynamics, rates, nx = self.task.dynamics, self.task.rate, self.task.dynamics.nx
+        dt = self._lengths[k, None] / SUBSTEPS
 
         def rate(z: Array, step: float) -> Array:
-            u = self._between(every, np.full(len(every), step / SUBSTEPS))[1]
-            knots = np.hstack([z[:, :nx], u])
-            return np.column_stack([task.dynamics.values(knots), task.rate.values(knots)])
+            knots = np.hstack([z[:, :nx], self._between(k, np.full(len(k), step / SUBSTEPS))[1]])
+            return np.column_stack([dynamics.values(knots), rates.values(knots)])
 
-        z = np.column_stack([self.xs[:-1], np.zeros(len(every))])
         with np.errstate(all="ignore"):
             for i in range(SUBSTEPS):
                 k1 = rate(z, i)
@@ -163,14 +180,7 @@ class Transcribed(Collocated):
     iterations: tuple[Iteration, ...]
     derivatives: str  # where the solver's came from, and why there is no Hessian where there is none
     refinements: tuple[tuple[int, float], ...] = ()
-
-    @property
-    def success(self) -> bool:
-        """Whether the solver says that it solved it, and its equations, ends and bounds hold when measured again.
-
-        What lies between the nodes say `errors` and `violation_between_nodes`.
-        """
-        return self.outcome is Outcome.SOLVED and self.infeasibility <= FEASIBILITY_TOLERANCE
+    note: str = ""  # what a claim of a minimum is limited to, if it is
 
 
 def _finite(values: Array) -> Array:
@@ -197,13 +207,14 @@ def violation_between_nodes(motion: Collocated) -> Excess:
     return Excess(float(np.max(by_state)), float(np.max(by_input)), where)
 
 
-def collocated(problem: Problem, scheme: str, xs: Array, us: Array, us_mid: Array | None, horizon: float) -> Collocated:
+def collocated(
+    problem: Problem, scheme: str, xs: Array, us: Array, us_mid: Array | None, horizon: float, mesh: Array
+) -> Collocated:
     """The motion with knots xs (N+1, nx), us (N+1, nu) and midpoint inputs (N, nu), linear in between where None."""
-    task, mesh = task_of(problem, scheme), np.linspace(0, 1, len(xs))
-    knots = np.hstack([xs, us])
+    task, knots = task_of(problem, scheme), np.hstack([xs, us])
     if task.scheme.nodes == 1:
         return Collocated(task, mesh, knots, horizon)
-    rates, h = task.dynamics.values(knots), horizon / (len(xs) - 1)
+    rates, h = task.dynamics.values(knots), horizon * np.diff(mesh)[:, None]
     x_mid = (xs[:-1] + xs[1:]) / 2 + h / 8 * (rates[:-1] - rates[1:])
     u_mid = (us[:-1] + us[1:]) / 2 if us_mid is None else us_mid
     nodes = np.empty((2 * len(xs) - 1, knots.shape[1]))

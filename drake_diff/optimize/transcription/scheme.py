@@ -59,6 +59,7 @@ SCHEMES = {
     "trapezoid": Scheme(2, np.array([[-1.0, 1]]), np.array([[0.5, 0.5]]), np.array([[1.0, -1], [0, 1]])),
     "drake": Scheme(2, *_SIMPSON, input_is_linear=True),
 }
+DEFAULT_SCHEME = "hermite_simpson"
 
 
 def node_fractions(mesh: Array, scheme: Scheme) -> Array:
