@@ -1,14 +1,14 @@
-"""Five models by hand: mass matrix, bias and their derivatives on paper, each readable beside its file in models/.
+"""Models by hand: mass matrix, bias and their derivatives on paper, each readable beside its file in models/.
 
-Every `residual_by_motion` is d(M(q) a + bias(q, v)) / dq at fixed a and v, every `bias_by_velocity` is d bias / dv.
-
-Two models with contact by hand: a ball that lands, a block that slides; the next velocity and its derivative.
+Every `residual_by_motion` is d(M(q) a + bias(q, v)) / dq at fixed a and v, every `bias_by_velocity` is d bias / dv. Of
+the two models with contact, a ball that lands and a block that slides, it is the next velocity and its derivative.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import cos, sin, sqrt
+from typing import ClassVar
 
 import numpy as np
 
@@ -17,9 +17,8 @@ from drake_diff.mechanics.coordinates import Coordinates, euler_acceleration
 from drake_diff.mechanics.description import joint_contract
 from drake_diff.mechanics.joints import JointContract
 
-X, Y, Z, ORIGIN, NO_INERTIA = np.eye(3)[0], np.eye(3)[1], np.eye(3)[2], np.zeros(3), np.zeros((3, 3))
+(X, Y, Z), ORIGIN, NO_INERTIA = np.eye(3), np.zeros(3), np.zeros((3, 3))
 Limits = tuple[float, float]
-FREE = (-np.inf, np.inf)
 
 
 @dataclass(frozen=True)
@@ -91,16 +90,36 @@ class ClosedForm(ABC):
         return a, np.asarray(-np.linalg.solve(M + h * np.diag(D), np.hstack(residual)), dtype=float)
 
     def _joint(
-        self, index: int, kind: str, axis: Array, anchor: Array, mass: float, com: Array, inertia: Array,
+        self, index: int, kind: str, axis: Array, anchor: Array, mass: float, com: Array, inertia: Array = NO_INERTIA,
         *, stiffness: float = 0.0, rest: float = 0.0,
     ) -> JointContract:  # fmt: skip
-        name = self.joint_names[index]
-        lower, upper = self.limits.get(name, FREE)
+        lower, upper = self.limits.get(self.joint_names[index], (-np.inf, np.inf))
         damping = 0.0 if kind == "quaternion_floating" else float(self.damping[index])
         return joint_contract(
-            name=name, kind=kind, axis=axis, anchor=anchor, carried=[(mass, com, inertia)], damping=damping,
-            armature=0.0, stiffness=stiffness, rest=rest, lower=lower, upper=upper,
+            name=self.joint_names[index], kind=kind, axis=axis, anchor=anchor, carried=[(mass, com, inertia)],
+            damping=damping, armature=0.0, stiffness=stiffness, rest=rest, lower=lower, upper=upper,
         )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Slider(ClosedForm):
+    """A body on one slide; `inertia` is that about its centre, about every axis, for the contract."""
+
+    mass: float = 1.0
+    inertia: float = 0.0
+    axis: ClassVar[Array] = X
+
+    def mass_matrix(self, q: Array) -> Array:
+        return np.array([[self.mass]])
+
+    def bias(self, q: Array, v: Array) -> Array:
+        return np.array([-self.mass * float(self.gravity_vector @ self.axis)])
+
+    def potential_energy(self, q: Array) -> float:
+        return -self.mass * float(self.gravity_vector @ self.axis) * float(q[0])
+
+    def joints(self) -> tuple[JointContract, ...]:
+        return (self._joint(0, "prismatic", self.axis, ORIGIN, self.mass, ORIGIN, self.inertia * np.eye(3)),)
 
 
 @dataclass(frozen=True)
@@ -130,7 +149,7 @@ class Projectile(ClosedForm):
 
 
 @dataclass(frozen=True)
-class MassSpringDamper(ClosedForm):
+class MassSpringDamper(Slider):
     """A block on a horizontal rail: m a = u - k (q - rest) - c v'."""
 
     joint_names: tuple[str, ...] = ("slide",)
@@ -138,12 +157,9 @@ class MassSpringDamper(ClosedForm):
     joint_damping: tuple[float, ...] = (1.5,)
     effort_limits: tuple[float, ...] = (1000.0,)
     mass: float = 2.0
+    inertia: float = 0.0033
     stiffness: float = 50.0
     rest: float = 0.1
-    inertia: float = 0.0033
-
-    def mass_matrix(self, q: Array) -> Array:
-        return np.array([[self.mass]])
 
     def bias(self, q: Array, v: Array) -> Array:
         return self.stiffness * (q - self.rest)
@@ -155,9 +171,8 @@ class MassSpringDamper(ClosedForm):
         return float(self.stiffness * (q[0] - self.rest) ** 2 / 2)
 
     def joints(self) -> tuple[JointContract, ...]:
-        inertia = self.inertia * np.eye(3)
         spring = {"stiffness": self.stiffness, "rest": self.rest}
-        return (self._joint(0, "prismatic", X, ORIGIN, self.mass, ORIGIN, inertia, **spring),)
+        return (self._joint(0, "prismatic", X, ORIGIN, self.mass, ORIGIN, self.inertia * np.eye(3), **spring),)
 
 
 @dataclass(frozen=True)
@@ -184,7 +199,7 @@ class Pendulum(ClosedForm):
         return -self.mass * self.gravity * self.length * cos(q[0])
 
     def joints(self) -> tuple[JointContract, ...]:
-        return (self._joint(0, "revolute", Y, ORIGIN, self.mass, -self.length * Z, NO_INERTIA),)
+        return (self._joint(0, "revolute", Y, ORIGIN, self.mass, -self.length * Z),)
 
 
 @dataclass(frozen=True)
@@ -274,8 +289,8 @@ class CartPole(ClosedForm):
 
     def joints(self) -> tuple[JointContract, ...]:
         return (
-            self._joint(0, "prismatic", X, ORIGIN, self.cart, ORIGIN, NO_INERTIA),
-            self._joint(1, "revolute", -Y, ORIGIN, self.bob, -self.length * Z, NO_INERTIA),
+            self._joint(0, "prismatic", X, ORIGIN, self.cart, ORIGIN),
+            self._joint(1, "revolute", -Y, ORIGIN, self.bob, -self.length * Z),
         )
 
 
@@ -290,7 +305,7 @@ BY_MODEL: dict[str, ClosedForm] = {
 
 
 @dataclass(frozen=True)
-class SphereOnGround(ClosedForm):
+class SphereOnGround(Slider):
     """A ball on a vertical slide above z = 0; q is the height of its centre, x = radius - q how deep it is.
 
     f = k (x - (h + relaxation_time) v') while x > 0 and f > 0: SAP's normal force where it is not near-rigid, and
@@ -299,19 +314,10 @@ class SphereOnGround(ClosedForm):
 
     joint_names: tuple[str, ...] = ("ball_z",)
     contact_law: str = "linear spring and relaxation time, implicit"
-    mass: float = 1.0
     radius: float = 0.1
     stiffness: float = 1e4
     relaxation_time: float = 0.0
-
-    def mass_matrix(self, q: Array) -> Array:
-        return np.array([[self.mass]])
-
-    def bias(self, q: Array, v: Array) -> Array:
-        return np.array([self.mass * self.gravity])
-
-    def potential_energy(self, q: Array) -> float:
-        return float(self.mass * self.gravity * q[0])
+    axis: ClassVar[Array] = Z
 
     def contact_depth(self, q: Array) -> float:
         return max(0.0, float(self.radius - q[0]))
@@ -331,7 +337,7 @@ class SphereOnGround(ClosedForm):
 
 
 @dataclass(frozen=True)
-class SlidingBlock(ClosedForm):
+class SlidingBlock(Slider):
     """A block down an incline whose normal force is at rest: v' = w - c v' / sqrt(v'^2 + s^2), c = mu g h cos(slope).
 
     w is the velocity without friction and s the stiction tolerance [m/s]: Drake's lagged friction.
@@ -341,7 +347,6 @@ class SlidingBlock(ClosedForm):
     input_names: tuple[str, ...] = ("push",)
     effort_limits: tuple[float, ...] = (np.inf,)
     contact_law: str = "regularized Coulomb friction, implicit, normal force at rest"
-    mass: float = 1.0
     friction: float = 0.5
     stiction_tolerance: float = 1e-4
     slope: float = 0.0  # [rad]
@@ -349,18 +354,6 @@ class SlidingBlock(ClosedForm):
     @property
     def gravity_vector(self) -> Array:
         return self.gravity * np.array([sin(self.slope), 0, -cos(self.slope)])
-
-    def mass_matrix(self, q: Array) -> Array:
-        return np.array([[self.mass]])
-
-    def bias(self, q: Array, v: Array) -> Array:
-        return np.array([-self.mass * self.gravity * sin(self.slope)])
-
-    def potential_energy(self, q: Array) -> float:
-        return float(-self.mass * self.gravity * sin(self.slope) * q[0])
-
-    def joints(self) -> tuple[JointContract, ...]:
-        return (self._joint(0, "prismatic", X, ORIGIN, self.mass, ORIGIN, NO_INERTIA),)
 
     def acceleration(self, h: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
         w = float(v[0]) + h * (self.gravity * sin(self.slope) + float(u[0]) / self.mass)
