@@ -34,38 +34,6 @@ from drake_diff.record.comparison import (
 )
 from drake_diff.record.provenance import gradient_evidence, model_input, provenance_of, written_now
 
-
-def write_comparison_trace(path: Path, comparison: Comparison) -> None:
-    """Write every engine's states, energy and overlap under a topic of its name, and all bodies' frames."""
-    metadata = {"model": comparison.model.name, "time_axis": "simulated", "engines": ", ".join(slugs(comparison))}
-    write_mcap(path, list(_channels(comparison)), metadata, {})
-
-
-def _channels(comparison: Comparison) -> Iterator[Channel]:
-    model, motions = comparison.model, [e.motion for e in comparison.engines]
-    names = slugs(comparison)
-    for slug, motion in zip(names, motions, strict=True):
-        shown = Shown(
-            model, float(motion.times[1] - motion.times[0]) if len(motion.times) > 1 else 0.0, motion.xs, None
-        )
-        yield state_channel(shown, f"/{slug}/state", motion.xs)
-        yield input_channel(shown, f"/{slug}/input", motion.times[:-1], motion.us)
-        kind = TYPES["Diagnostics"]
-        yield Channel(f"/{slug}/diagnostics", kind.cls, _measures(motion, kind.cls), {"units": kind.units})
-    times = motions[0].times
-    alike = {s: m for s, m in zip(names, motions, strict=True) if np.allclose(m.times, times[: len(m.times)])}
-    yield transform_channel(model, times, {f"{s}/": m.xs for s, m in alike.items()})  # not what was sampled otherwise
-
-
-def _measures(motion: EngineMotion, message: Any) -> Iterable[tuple[int, Any]]:
-    """Energy and overlap; NaN where the engine does not compute them."""
-    missing = np.full(len(motion.times), np.nan)
-    energy = missing if motion.energy is None else motion.energy
-    depth = missing if motion.depth is None else motion.depth
-    for t, e, d in zip(motion.times.tolist(), energy.tolist(), depth.tolist(), strict=True):
-        yield nanoseconds(t), message(energy_total=e, max_penetration=d)
-
-
 TRACE, REPLAY, PAGE = "trace.mcap", "replay.html", "comparison.html"
 FILES = (TRACE, REPLAY, PAGE)
 # Of ghosts: the second and further colours of the page's plots, the first being the reference's.
@@ -77,13 +45,31 @@ OPACITY = 0.35
 
 def begin_comparison(directory: str | Path, model: Model) -> None:
     """Mark `directory` as a comparison under way: until it is saved its record says "incomplete"."""
-    folder = Path(directory)
-    sentence = "the comparison has begun and not ended: it is under way, or it was killed or broke off"
-    _record(folder.name, model, "incomplete", sentence).begin(folder, FILES)
+    _begun(Path(directory).name, model).begin(Path(directory), FILES)
 
 
 def save_comparison(comparison: Comparison, directory: str | Path) -> ComparisonRecord:
-    """Write the directory of `comparison`, comparison.json last, so that it is complete only if all it names is."""
+    """Write a comparison as a directory: comparison.json, trace.mcap, replay.html and comparison.html.
+
+    comparison.json is written last, so that it says "incomplete" until everything that it names is there.
+
+    Args:
+        comparison: from `dd.compare`.
+        directory: where to write; an earlier comparison there is replaced.
+
+    Returns:
+        The record in comparison.json, which `dd.verify` checks against the other files.
+
+    Raises:
+        OSError: a file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> found = dd.compare(model, ["numpy"], num_steps=3)
+        >>> print(dd.comparison.save_comparison(found, tempfile.mkdtemp()).verdict)
+        pass
+    """
     from drake_diff.comparison.page import write_comparison_page  # what saves nothing need not load them
     from drake_diff.pages.meshcat import write_replay
 
@@ -98,45 +84,39 @@ def save_comparison(comparison: Comparison, directory: str | Path) -> Comparison
 
 def record_of(comparison: Comparison, name: str) -> ComparisonRecord:
     """The record of `comparison`, but for the files."""
-    return _record(
-        name,
-        comparison.model,
-        "pass" if comparison.holds else "fail",
-        str(comparison),
-        states=[StateEvidence(name=s.name, x=s.x.tolist(), u=s.u.tolist()) for s in comparison.states],
-        engines=[_engine(e) for e in comparison.engines],
-        refused=[RefusedEvidence(engine=r.engine, reason=r.reason, installed=r.installed) for r in comparison.refused],
-        wall_clock=ComparisonClock(
+    found = {
+        "verdict": "pass" if comparison.holds else "fail",
+        "sentence": str(comparison),
+        "states": [StateEvidence(name=s.name, x=s.x.tolist(), u=s.u.tolist()) for s in comparison.states],
+        "engines": [_engine(e) for e in comparison.engines],
+        "refused": [RefusedEvidence(**vars(refused)) for refused in comparison.refused],
+        "wall_clock": ComparisonClock(
             written_utc=written_now(),
             seconds_per_step={e.engine: e.seconds_per_step for e in comparison.engines},
             seconds_per_jacobian={e.engine: e.seconds_per_jacobian for e in comparison.engines},
         ),
-    )
-
-
-def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -> ComparisonRecord:
-    found: dict[str, Any] = {
-        "states": [],
-        "engines": [],
-        "refused": [],
-        "wall_clock": ComparisonClock(written_utc=written_now()),
-        **rest,
     }
+    return _begun(name, comparison.model).model_copy(update=found)
+
+
+def _begun(name: str, model: Model) -> ComparisonRecord:
+    steps = {f"step, {precision}": value for precision, value in STEP_TOLERANCE.items()}
+    jacobians = {f"jacobian, {precision}": value for precision, value in JACOBIAN_TOLERANCE.items()}
     return ComparisonRecord(
         name=name,
-        verdict=verdict,
-        sentence=sentence,
-        tolerances={
-            **{f"step, {precision}": value for precision, value in STEP_TOLERANCE.items()},
-            **{f"jacobian, {precision}": value for precision, value in JACOBIAN_TOLERANCE.items()},
-        },
+        verdict="incomplete",
+        sentence="the comparison is still running, or it was killed or failed before its end",
+        tolerances={**steps, **jacobians},
         model=model_input(model),
         contract=model.contract.to_dict(),
         time_step_s=model.time_step,
         state_names=list(model.state_names),
         input_names=list(model.input_names),
+        states=[],
+        engines=[],
+        refused=[],
         provenance=provenance_of(),
-        **found,
+        wall_clock=ComparisonClock(written_utc=written_now()),
     )
 
 
@@ -147,9 +127,7 @@ def _engine(e: Compared) -> EngineEvidence:
         precision=e.precision,
         verdict=e.verdict,
         sentence=e.sentence,
-        contract=[
-            LineEvidence(quantity=x.quantity, verdict=x.verdict, detail=x.detail, reason=x.reason) for x in e.lines
-        ],
+        contract=[LineEvidence(**vars(line)) for line in e.lines],
         status=e.motion.status,
         steps=len(e.motion.us),
         largest_step_gap=float(max(e.step_gaps, default=0.0)),
@@ -179,16 +157,41 @@ def _engine(e: Compared) -> EngineEvidence:
 
 def _attribution(a: Attribution) -> AttributionEvidence:
     return AttributionEvidence(
-        gap=a.gap,
-        responsible=a.responsible,
-        effects=dict(a.effects),
-        schemes=[str(s) for s in a.schemes],
+        gap=a.gap, responsible=a.responsible, effects=dict(a.effects), schemes=[str(s) for s in a.schemes],
         assumed=list(a.assumed),
-    )
+    )  # fmt: skip
 
 
 def _rows(matrix: Array) -> list[Numbers]:
     return [[float(v) if np.isfinite(v) else None for v in row] for row in matrix]
+
+
+def write_comparison_trace(path: Path, comparison: Comparison) -> None:
+    """Write every engine's states, energy and overlap under a topic of its name, and all bodies' frames."""
+    metadata = {"model": comparison.model.name, "time_axis": "simulated", "engines": ", ".join(slugs(comparison))}
+    write_mcap(path, list(_channels(comparison)), metadata, {})
+
+
+def _channels(comparison: Comparison) -> Iterator[Channel]:
+    model, kind = comparison.model, TYPES["Diagnostics"]
+    motions = dict(zip(slugs(comparison), (e.motion for e in comparison.engines), strict=True))
+    for slug, motion in motions.items():
+        h = float(motion.times[1] - motion.times[0]) if len(motion.times) > 1 else 0.0
+        yield state_channel(Shown(model, h, motion.xs, None), f"/{slug}/state", motion.xs)
+        yield input_channel(Shown(model, h, motion.xs, None), f"/{slug}/input", motion.times[:-1], motion.us)
+        yield Channel(f"/{slug}/diagnostics", kind.cls, _measures(motion, kind.cls), {"units": kind.units})
+    times = comparison.reference.motion.times
+    alike = {s: m for s, m in motions.items() if np.allclose(m.times, times[: len(m.times)])}
+    yield transform_channel(model, times, {f"{s}/": m.xs for s, m in alike.items()})  # not what was sampled otherwise
+
+
+def _measures(motion: EngineMotion, message: Any) -> Iterable[tuple[int, Any]]:
+    """Energy and overlap; NaN where the engine does not compute them."""
+    missing = np.full(len(motion.times), np.nan)
+    energy = missing if motion.energy is None else motion.energy
+    depth = missing if motion.depth is None else motion.depth
+    for t, e, d in zip(motion.times.tolist(), energy.tolist(), depth.tolist(), strict=True):
+        yield nanoseconds(t), message(energy_total=e, max_penetration=d)
 
 
 def _scene(comparison: Comparison) -> Any:

@@ -208,31 +208,23 @@ class _Tree:
             R, inertia = H[:3, :3], np.array(ca.evalf(inertial.inertia.get_matrix().array))
             part = (float(inertial.mass.array), H[:3, 3], R @ inertia @ R.T)
             carried.setdefault(carrier[node.name], []).append(part)
-        found = [self._free_joint(carried)] if self.base else []
-        return (*found, *(self._single(name, poses, carried[name]) for name in self.model.actuated_joints))
+        names = [*([self.base.joint] if self.base else []), *self.model.actuated_joints]
+        return tuple(self._joint(name, poses, carried[name]) for name in names)
 
-    def _free_joint(self, carried: dict[str | None, list[tuple[float, Array, Array]]]) -> JointContract:
-        name, nowhere = self.base.joint if self.base else "", np.zeros(3)
-        numbers = dict.fromkeys(("damping", "armature", "stiffness", "rest"), 0.0)
-        return joint_contract(
-            name=name, kind="quaternion_floating", axis=nowhere, anchor=nowhere, carried=carried[name],
-            lower=-np.inf, upper=np.inf, **numbers,
-        )  # fmt: skip
-
-    def _single(self, name: str, poses: dict[str, Array], carried: list[tuple[float, Array, Array]]) -> JointContract:
+    def _joint(self, name: str, poses: dict[str, Array], carried: list[tuple[float, Array, Array]]) -> JointContract:
+        if name not in self.links:
+            return joint_contract(
+                name=name, kind="quaternion_floating", axis=np.zeros(3), anchor=np.zeros(3), carried=carried,
+                damping=0.0, armature=0.0, stiffness=0.0, rest=0.0, lower=-np.inf, upper=np.inf,
+            )  # fmt: skip
         joint, link = self.model.joints[name], self.links[name]
-        H = poses[joint.child]
+        H, kind = poses[joint.child], "prismatic" if joint.type == "prismatic" else "revolute"
         limits = (-np.inf, np.inf) if joint.type == "continuous" else (joint.limit.lower, joint.limit.upper)
         return joint_contract(
-            name=name,
-            kind="prismatic" if joint.type == "prismatic" else "revolute",
-            axis=H[:3, :3] @ np.array(ca.evalf(joint.axis.array)).ravel(),
-            anchor=H[:3, 3],
-            carried=carried,
-            lower=limit(limits[0]),
-            upper=limit(limits[1]),
+            name=name, kind=kind, axis=H[:3, :3] @ np.array(ca.evalf(joint.axis.array)).ravel(), anchor=H[:3, 3],
+            carried=carried, lower=limit(limits[0]), upper=limit(limits[1]),
             **{k: getattr(link, k) for k in ("damping", "armature", "stiffness", "rest")},
-        )
+        )  # fmt: skip
 
     def _zero(self) -> Any:
         q = ca.SX.zeros(1 + max([*self.positions, self.base.q_start + 6 if self.base else 0]))

@@ -303,18 +303,12 @@ def _read_joints(m: Any, state: Any, tree: RigidLinks) -> tuple[JointContract, .
         j, single = int(m.joint_qd_start.numpy()[i]), kind != "quaternion_floating"
         rest = values["rest_q"][int(m.joint_q_start.numpy()[i])]
         found[link.joint.v_start] = joint_contract(
-            name=m.joint_label[i],
-            kind=kind,
-            axis=R @ values["axis"][j] if single else np.zeros(3),
-            anchor=poses[i, :3],
-            carried=[(float(m.body_mass.numpy()[i]), centers[i], R @ inertias[i] @ R.T)],
-            damping=float(values["damping"][j]),
-            armature=float(values["armature"][j]),
-            stiffness=float(values["stiffness"][j]),
-            rest=float(rest) if single else 0.0,
-            lower=limit(values["limit_lower"][j]),
-            upper=limit(values["limit_upper"][j]),
-        )
+            name=m.joint_label[i], kind=kind, axis=R @ values["axis"][j] if single else np.zeros(3),
+            anchor=poses[i, :3], carried=[(float(m.body_mass.numpy()[i]), centers[i], R @ inertias[i] @ R.T)],
+            damping=float(values["damping"][j]), armature=float(values["armature"][j]),
+            stiffness=float(values["stiffness"][j]), rest=float(rest) if single else 0.0,
+            lower=limit(values["limit_lower"][j]), upper=limit(values["limit_upper"][j]),
+        )  # fmt: skip
     return tuple(found[start] for start in sorted(found))
 
 

@@ -282,18 +282,12 @@ def _read_joint(link: Any, rigid: RigidLink) -> JointContract:
     single, at = kind != "quaternion_floating", link.joint.pose_in_child
     limit = np.array(joint.limit, dtype=float).ravel() if single else np.array([-np.inf, np.inf])
     return joint_contract(
-        name=joint.name,
-        kind=kind,
-        axis=body @ rotation(np.array(at.q, dtype=float))[:, 0] if single else np.zeros(3),
+        name=joint.name, kind=kind, axis=body @ rotation(np.array(at.q, dtype=float))[:, 0] if single else np.zeros(3),
         anchor=np.array(link.entity_pose.p, dtype=float) + body @ np.array(at.p, dtype=float),
-        carried=[(mass, center, inertia)],
-        damping=float(joint.damping) if single else 0.0,
-        armature=float(joint.armature[0]) if single else 0.0,
-        stiffness=rigid.joint.stiffness,
-        rest=rigid.joint.rest,
-        lower=float(limit[0]),
-        upper=float(limit[1]),
-    )
+        carried=[(mass, center, inertia)], damping=float(joint.damping) if single else 0.0,
+        armature=float(joint.armature[0]) if single else 0.0, stiffness=rigid.joint.stiffness, rest=rigid.joint.rest,
+        lower=float(limit[0]), upper=float(limit[1]),
+    )  # fmt: skip
 
 
 def _fixed(scene: Any) -> Any:

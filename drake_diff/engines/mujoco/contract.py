@@ -93,18 +93,11 @@ def _read_joint(m: Any, d: Any, j: int) -> JointContract:
     single = kind in ("revolute", "prismatic")
     lower, upper = (limit(side) for side in m.jnt_range[j]) if m.jnt_limited[j] else (-np.inf, np.inf)
     return joint_contract(
-        name=name_of(m, m.name_jntadr[j]),
-        kind=kind,
-        axis=np.array(d.xaxis[j]) if single else np.zeros(3),
-        anchor=np.array(d.xanchor[j]),
-        carried=carried,
-        damping=float(np.ravel(m.dof_damping[dof])[0]),
-        armature=float(m.dof_armature[dof]),
-        stiffness=float(np.ravel(m.jnt_stiffness[j])[0]) if single else 0.0,
-        rest=float(m.qpos_spring[m.jnt_qposadr[j]]) if single else 0.0,
-        lower=lower,
-        upper=upper,
-    )
+        name=name_of(m, m.name_jntadr[j]), kind=kind, axis=np.array(d.xaxis[j]) if single else np.zeros(3),
+        anchor=np.array(d.xanchor[j]), carried=carried, damping=float(np.ravel(m.dof_damping[dof])[0]),
+        armature=float(m.dof_armature[dof]), stiffness=float(np.ravel(m.jnt_stiffness[j])[0]) if single else 0.0,
+        rest=float(m.qpos_spring[m.jnt_qposadr[j]]) if single else 0.0, lower=lower, upper=upper,
+    )  # fmt: skip
 
 
 def _part(m: Any, d: Any, body: int) -> tuple[float, Array, Array]:
