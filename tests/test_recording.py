@@ -190,7 +190,7 @@ def test_facts_are_lines_of_the_contract_and_nothing_else_is_known(load):
     verdicts = {quantity: lines[quantity].verdict for quantity in facts}
     assert verdicts == {"time step": "equal", "gravity": "equal", "integrator": "different", "seeds": "mapped"}
     assert lines["mass"].verdict == lines["contact law"].verdict == lines["reset distribution"].verdict == "different"
-    assert lines["mass"].reason == "the recording does not tell"
+    assert lines["mass"].reason == "the recording does not say"
     flipped = compared(model, record(drake, [0.5, 0], INPUTS, gravity="[0, 0, 9.81]"))
     assert (flipped.verdict, [x.quantity for x in flipped.broken]) == ("other model", ["gravity"])
     for wrong in ({"gravity": "9.81"}, {"time step": "fast"}, {"precision": "half"}, {"mass": "1"}):

@@ -31,7 +31,7 @@ from drake_diff.engines.interface import EngineContract, Precision
 from drake_diff.exceptions import InputError
 from drake_diff.model.step import set_state
 
-NOT_TOLD = "the recording does not tell"
+NOT_TOLD = "the recording does not say"
 CLOSES = 0.01  # of the gap may be left by a change that explains it
 PRECISIONS: dict[str, Precision] = {"float64": "float64", "float32": "float32"}
 

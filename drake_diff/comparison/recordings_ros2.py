@@ -10,7 +10,6 @@ rosbags does not.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -83,14 +82,6 @@ def _mcap(path: Path) -> tuple[Iterator[tuple[str, str, bytes]], Mapping[str, st
     return iter(rows), metadata.get("contract", {})
 
 
-@dataclass(frozen=True, eq=False)
-class _Base:
-    """The free body at one time, in Drake's coordinates."""
-
-    q: Array  # (7,)
-    v: Array  # (6,)
-
-
 class _Found:
     def __init__(self, source: str, description: Description):
         self.source, self.description = source, description
@@ -114,8 +105,8 @@ class _Found:
                 xs[k, link.q_start] = self._joint(joints[time], time, link.joint, "position")
                 xs[k, model.nq + link.v_start] = self._joint(joints[time], time, link.joint, "velocity")
             for link in self.free:
-                xs[k, link.q_start : link.q_start + 7] = bases[time].q
-                xs[k, model.nq + link.v_start : model.nq + link.v_start + 6] = bases[time].v
+                xs[k, link.q_start : link.q_start + 7] = bases[time][:7]
+                xs[k, model.nq + link.v_start : model.nq + link.v_start + 6] = bases[time][7:]
             for i, joint in enumerate(self.description.actuated if k < len(us) else ()):
                 us[k, i] = self._effort(joints, time, joint)
         return np.array([time - stamps[0] for time in stamps]) / 1e9, xs, us
@@ -144,7 +135,7 @@ class _Found:
             raise InputError(f"{self.source}: topics of {kind}", got=got, expected=preferred or "one")
         return next(iter(topics.values()))
 
-    def _bases(self) -> dict[int, _Base]:
+    def _bases(self) -> dict[int, Array]:
         if not self.free:
             return {}
         link = self.free[0]
@@ -168,8 +159,9 @@ class _Found:
         return bool(frame == link.body)
 
 
-def _base(pose: Any, twist: Any, in_body: bool) -> _Base:
+def _base(pose: Any, twist: Any, in_body: bool) -> Array:
+    """(13,) q and v of the free body, in Drake's coordinates."""
     p, r, w, v = pose.position, pose.orientation, twist.angular, twist.linear
     q = np.array([r.w, r.x, r.y, r.z, p.x, p.y, p.z])
     parts = np.array([[w.x, w.y, w.z], [v.x, v.y, v.z]])
-    return _Base(q, (parts @ rotation(q[:4]).T if in_body else parts).ravel())
+    return np.concatenate([q, (parts @ rotation(q[:4]).T if in_body else parts).ravel()])

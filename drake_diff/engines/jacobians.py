@@ -1,4 +1,4 @@
-"""Engines' Jacobians on the tangent space: against another engine's, and against differences of the engine's own step.
+"""Engines' Jacobians on the tangent space, checked against differences of the engine's own steps.
 
 An engine whose Jacobian is not the derivative of its own step must not be used for gradients, whatever it agrees with.
 """
@@ -17,10 +17,9 @@ from drake_diff.model.tangent import TangentSpace
 
 # Steps of differences for engines without derivatives: where rounding and truncation are both small.
 DIFFERENCE_STEP: dict[Precision, float] = {"float64": 1e-5, "float32": 1e-2}
-# The certificate allows a hundred times what is left unsolved.
+# An engine's own derivative that is made of differences is good to 1e-8 of the row's largest entry, and the certificate
+# allows a hundred times what it is told was left unsolved.
 DIFFERENCES_LEAVE = 1e-10
-
-
 AGREES = "agree"
 SINGLE = 1e-2  # of the largest entry: as far as differences of single precision tell
 
@@ -61,6 +60,8 @@ def jacobian_at(
     if precision == "float32":
         gap = np.abs(jacobian - quotients()).max() / np.abs(jacobian).max()
         return JacobianAt(state, frozen(jacobian), found.method, AGREES if gap <= SINGLE else "undecided", None)
+    # What the engine's solver leaves unsolved of a step in contact, relative.
+    unsolved = (engine.contract.solver_tolerance or 0.0) if engine.contact_depth(x) else 0.0
     certificate = certify_displacement(
         one_by_one(step),
         jacobian,
@@ -68,21 +69,11 @@ def jacobian_at(
         columns=(*space.names, *names),
         scale=np.ones(size),
         minus=space.minus,
-        solver_tolerance=max(_unsolved(engine, x), _rounding(found.method)),
+        solver_tolerance=max(unsolved, DIFFERENCES_LEAVE if "differences" in found.method else 0.0),
         method=found.method,
         subject=f"the Jacobian of {engine.name} at the {state} state",
     )
     return JacobianAt(state, frozen(jacobian), found.method, certificate.verdict, certificate)
-
-
-def _unsolved(engine: Engine, x: Array) -> float:
-    """What the engine's solver leaves unsolved of a step in contact, relative."""
-    return (engine.contract.solver_tolerance or 0.0) if engine.contact_depth(x) else 0.0
-
-
-def _rounding(method: str) -> float:
-    """Of an engine's own derivative that is made of differences: each entry is good to 1e-8 of the row's largest."""
-    return DIFFERENCES_LEAVE if "differences" in method else 0.0
 
 
 def rollout_jacobian(engine: Engine, space: TangentSpace, motion: EngineMotion) -> Array | None:

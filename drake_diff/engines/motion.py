@@ -51,15 +51,15 @@ def move(engine: Engine, x0: Array, us: Array) -> EngineMotion:
 
 def measured(engine: Engine, times: Array, xs: Array, us: Array, status: str = "ok") -> EngineMotion:
     """The motion `xs` (n, nx) with the energies and overlaps that `engine` finds in it."""
-    energy, depth = (_where_offered(ask, xs) for ask in (engine.energy, engine.contact_depth))
+
+    def where_offered(ask: Callable[[Array], float]) -> Array | None:
+        try:
+            return frozen([ask(x) for x in xs])
+        except NotOfferedError:
+            return None
+
+    energy, depth = where_offered(engine.energy), where_offered(engine.contact_depth)
     return EngineMotion(frozen(times), frozen(xs), frozen(us), energy, depth, status)
-
-
-def _where_offered(ask: Callable[[Array], float], xs: Array) -> Array | None:
-    try:
-        return frozen(np.array([ask(x) for x in xs]))
-    except NotOfferedError:
-        return None
 
 
 def seconds(call: Callable[[], Any]) -> float | None:

@@ -50,7 +50,9 @@ class NewtonEngine(RigidEngine):
         self.solver = newton.solvers.SolverFeatherstone(self.newton, update_mass_matrix_interval=1)
         self._find_places()
         self.laws = {tuple(sorted(self.shapes[name] for name in p.names)): p for p in self.tree.pairs}
-        self.pipeline = self._pipeline()
+        pairs = wp.array(list(self.laws), dtype=wp.vec2i, device="cpu") if self.laws else None
+        options = {"broad_phase": "explicit", "shape_pairs_filtered": pairs, "requires_grad": False}
+        self.pipeline: Any = newton.CollisionPipeline(self.newton, **options) if self.laws else None
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
         before, control = self._given(*self._point(x, u))
@@ -210,14 +212,6 @@ class NewtonEngine(RigidEngine):
         for i, j in self.coordinates.single:
             stretch[j] = native[self.positions[i]]
         return stretch, _numbers(self.newton.joint_stiffness)[self.dofs]
-
-    def _pipeline(self) -> Any:
-        if not self.laws:
-            return None
-        pairs = wp.array(list(self.laws), dtype=wp.vec2i, device="cpu")
-        return newton.CollisionPipeline(
-            self.newton, broad_phase="explicit", shape_pairs_filtered=pairs, requires_grad=False
-        )
 
     def _contacts(self, state: Any) -> Any:
         """With the stiffness and friction of Drake's pair on each; what Drake does not give is Newton's own."""

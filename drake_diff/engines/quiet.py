@@ -19,14 +19,14 @@ def without_lines(*greetings: str) -> Iterator[None]:
 @contextmanager
 def _filtered(stream: int, greetings: tuple[str, ...]) -> Iterator[None]:
     """Of one file descriptor."""
-    flush()
+    _flush()
     kept = os.dup(stream)
     with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), stream)
         try:
             yield
         finally:
-            flush()
+            _flush()
             os.dup2(kept, stream)
             os.close(kept)
             file.seek(0)
@@ -35,6 +35,6 @@ def _filtered(stream: int, greetings: tuple[str, ...]) -> Iterator[None]:
                     os.write(stream, line)
 
 
-def flush() -> None:
+def _flush() -> None:
     sys.stdout.flush()
     sys.stderr.flush()

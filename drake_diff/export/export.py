@@ -1,6 +1,4 @@
-"""What the other side of an export has to do, in words.
-
-A model for an engine that cannot be had here: model file, contract, states to start from, and what to record.
+"""A model for an engine that cannot be loaded here: model file, contract, states to start from, and what to record.
 
 `read_recording` and `compare` take what comes back. Nothing is written unless the small models are right, and unless
 the file, read back, says what the plant does.
@@ -23,12 +21,12 @@ from drake_diff.export.read_back import SUFFIX, complaints, named_in, written
 from drake_diff.export.small_models import check_small_models
 from drake_diff.mechanics.description import Description, describe
 from drake_diff.model.model import Model
-from drake_diff.model.sampling import ATTEMPTS, DEPTH, EFFORT, REACH, SPEED, SampledState, sample_states
+from drake_diff.model.sampling import ATTEMPTS, DEPTH, EFFORT, REACH, SPEED, sample_states
 
 README = """# {name} for {target}
 
 Written by drake_diff from Drake's plant. `{file}` has every number of its bodies and joints; `contract.json` has them
-again, with what the file cannot say (null is a limit that is none, or a value that the model does not give).
+again, with what the file cannot say (null means no limit, or a value that the model does not give).
 Shapes that are not in the file, to be added by hand: {left_out}. {about_usd}
 
 ## Set
@@ -55,7 +53,7 @@ too. Beside `run.csv` put `run.contract.json` with what is known of the engine:
     {{"engine": "...", "version": "...", "precision": "float32", "time step": {h}, "integrator": "...",
      "contact law": "...", "limit law": "...", "gravity": {gravity}, "seeds": [...], "reset distribution": "..."}}
 
-What it does not say is reported as not told.
+What it leaves out is reported as unknown.
 
 ## Compare
 
@@ -85,7 +83,78 @@ OF_TARGET: Mapping[str, str] = {
 }
 
 
-def readme(
+TARGETS = {"gazebo": "sdf", "isaaclab": "urdf", "urdf": "urdf", "sdf": "sdf", "mjcf": "mjcf"}  # the format of each
+DISTRIBUTION = (
+    f"positions uniform in the middle 90 % of their limits, else within {REACH:g} m or pi rad of the default; "
+    f"quaternions uniform on the sphere; velocities normal with deviation {SPEED:g}, cut at their limits; inputs "
+    f"uniform within {EFFORT:g} of their limits, of 1 N or N m without; free: without overlap, if "
+    f"one of {ATTEMPTS} tries is; contact: every other state where something can touch, {DEPTH[0]:g} to {DEPTH[1]:g} m "
+    "deep"
+)
+
+
+def export_model(model: Model, directory: str | Path, *, target: str, states: int = 20, seed: int = 0) -> list[Path]:
+    """Write a model for another simulator, with what is needed to compare it with Drake afterwards.
+
+    The new directory holds the model file (and a USD file for isaaclab, where usd-core is installed), contract.json
+    (what Drake uses), initial_states.csv and inputs.csv (where to start, and the input to hold), and README.md (what
+    to set, what to record and how to compare). Nothing is written where a check fails.
+
+    Args:
+        model: the model.
+        directory: a directory that does not exist yet, in one that does.
+        target: "gazebo" (SDF), "isaaclab" (URDF), "urdf", "sdf" or "mjcf".
+        states: how many states to sample.
+        seed: seed of the states.
+
+    Returns:
+        The paths of the files that were written.
+
+    Raises:
+        UnknownNameError, InputError: an unknown target, or a directory that exists.
+        CertificateError: a deterministic check of two small models failed; names it.
+        ModelError: the format cannot say all of this model, or no other engine can have it.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> files = dd.export.export_model(model, pathlib.Path(tempfile.mkdtemp()) / "out", target="sdf", states=2)
+        >>> print([file.name for file in files])
+        ['model.sdf', 'contract.json', 'initial_states.csv', 'inputs.csv', 'README.md']
+    """
+    directory = Path(directory)
+    if target not in TARGETS:
+        raise UnknownNameError("target", got=target, known=TARGETS)
+    if directory.exists() or not directory.parent.is_dir():
+        raise InputError("directory", got=str(directory), expected="one that does not exist, in one that does")
+    samples = sample_states(model, positive_int("states", states), seed)
+    failed = [check for check in check_small_models() if not check.holds]
+    if failed:
+        raise CertificateError(f"nothing is exported: the check {failed[0].name!r} failed: {failed[0].found}")
+    form, description = TARGETS[target], describe(model)
+    text = written(form, description, model.time_step)
+    missing = complaints(form, model, text)
+    if missing:
+        raise ModelError(f"nothing is exported: {form} does not hold this model; " + "; ".join(missing))
+    made_usd, about_usd = _usd(description) if target == "isaaclab" else ({}, "")
+    left_out = [g.name for g in description.geometries if named_in(form, g.name) not in text]
+    contract = DrakeEngine(model).contract
+    made = {"seed": seed, "count": states, "distribution": DISTRIBUTION}
+    files = {
+        f"model{SUFFIX[form]}": text,
+        "contract.json": json.dumps(_plain({**asdict(contract), "initial_states": made}), indent=1) + "\n",
+        "initial_states.csv": _table(["state", "kind", *model.state_names], ([s.kind, *s.x] for s in samples)),
+        "inputs.csv": _table(["state", *model.input_names], (s.u for s in samples)),
+        "README.md": _readme(target, f"model{SUFFIX[form]}", model, contract, made, left_out, about_usd),
+        **made_usd,
+    }
+    directory.mkdir()
+    for name, content in files.items():
+        (directory / name).write_text(content)
+    return [directory / name for name in files]
+
+
+def _readme(
     target: str,
     file: str,
     model: Model,
@@ -111,60 +180,6 @@ def readme(
     )  # fmt: skip
 
 
-TARGETS = {"gazebo": "sdf", "isaaclab": "urdf", "urdf": "urdf", "sdf": "sdf", "mjcf": "mjcf"}  # the format of each
-DISTRIBUTION = (
-    f"positions uniform in the middle 90 % of their limits, else within {REACH:g} m or pi rad of the default; "
-    f"quaternions uniform on the sphere; velocities normal with deviation {SPEED:g}, cut at their limits; inputs "
-    f"uniform within {EFFORT:g} of their limits, of 1 N or N m without; free: without overlap, if "
-    f"one of {ATTEMPTS} tries is; contact: every other state where something can touch, {DEPTH[0]:g} to {DEPTH[1]:g} m "
-    "deep"
-)
-
-
-def export_model(model: Model, directory: str | Path, *, target: str, states: int = 20, seed: int = 0) -> list[Path]:
-    """Write `model` for `target` (gazebo, isaaclab, urdf, sdf, mjcf) to the new `directory`; gives the files.
-
-    The model file (SDF for gazebo, URDF for isaaclab, and USD where usd-core is installed and can say it),
-    contract.json (what Drake uses), initial_states.csv and inputs.csv (`states` seeded samples, and the input to hold
-    from each), README.md (what to set, what to record and how to compare).
-
-    Raises CertificateError, naming the check, where a deterministic check of the small models fails; ModelError where
-    no other engine can have the model or the format cannot say all of it; InputError for bad input. Nothing is written
-    then.
-    """
-    directory = Path(directory)
-    if target not in TARGETS:
-        raise UnknownNameError("target", got=target, known=TARGETS)
-    if directory.exists() or not directory.parent.is_dir():
-        raise InputError("directory", got=str(directory), expected="one that does not exist, in one that does")
-    samples = sample_states(model, positive_int("states", states), seed)
-    failed = [check for check in check_small_models() if not check.holds]
-    if failed:
-        raise CertificateError(f"nothing is exported: the check {failed[0].name!r} failed: {failed[0].found}")
-    form = TARGETS[target]
-    description = describe(model)
-    text = written(form, description, model.time_step)
-    missing = complaints(form, model, text)
-    if missing:
-        raise ModelError(f"nothing is exported: {form} does not hold this model; " + "; ".join(missing))
-    made_usd, about_usd = _usd(description) if target == "isaaclab" else ({}, "")
-    left_out = [g.name for g in description.geometries if named_in(form, g.name) not in text]
-    contract = DrakeEngine(model).contract
-    made = {"seed": seed, "count": states, "distribution": DISTRIBUTION}
-    files = {
-        f"model{SUFFIX[form]}": text,
-        "contract.json": json.dumps(_plain({**asdict(contract), "initial_states": made}), indent=1) + "\n",
-        "initial_states.csv": _table(["state", "kind", *model.state_names], samples, lambda s: [s.kind, *s.x]),
-        "inputs.csv": _table(["state", *model.input_names], samples, lambda s: list(s.u)),
-        "README.md": readme(target, f"model{SUFFIX[form]}", model, contract, made, left_out, about_usd),
-        **made_usd,
-    }
-    directory.mkdir()
-    for name, content in files.items():
-        (directory / name).write_text(content)
-    return [directory / name for name in files]
-
-
 def _usd(description: Description) -> tuple[dict[str, str], str]:
     """The USD file, if one can be written, and what README.md says of it."""
     try:
@@ -175,12 +190,12 @@ def _usd(description: Description) -> tuple[dict[str, str], str]:
         return {}, f"No USD is written: {error}. UrdfConverter makes one."
 
 
-def _table(header: list[str], samples: Iterable[SampledState], row: Any) -> str:
+def _table(header: list[str], rows: Iterable[Iterable[Any]]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(header)
-    for i, sample in enumerate(samples):
-        writer.writerow([i, *(value if isinstance(value, str) else repr(float(value)) for value in row(sample))])
+    for i, row in enumerate(rows):
+        writer.writerow([i, *(value if isinstance(value, str) else repr(float(value)) for value in row)])
     return out.getvalue()
 
 

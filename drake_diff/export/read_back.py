@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from drake_diff.comparison.result import LAWS
-from drake_diff.engines.contract_match import ContractLine, match_contracts
+from drake_diff.engines.contract_match import match_contracts
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.interface import Engine, EngineContract, limit
 from drake_diff.engines.load import load_engine
@@ -52,12 +52,9 @@ def complaints(form: str, model: Model, text: str) -> list[str]:
             except DrakeDiffError as error:
                 found.append(f"{reader} cannot read it: {error}")
             else:
-                found += [f"read by {reader}, {line.quantity}: {line.detail}" for line in lines if _counts(line)]
+                wrong = (line for line in lines if line.verdict == "different" and line.quantity not in LAWS)
+                found += [f"read by {reader}, {line.quantity}: {line.detail}" for line in wrong]
     return found
-
-
-def _counts(line: ContractLine) -> bool:
-    return line.verdict == "different" and line.quantity not in LAWS
 
 
 def _read(reader: str, model: Model, path: Path) -> Engine:
