@@ -13,7 +13,7 @@ from . import record as record
 from . import studies as studies
 from . import trials as trials
 from .artifact.save import save as save
-from .artifact.trace_read import read_trace as read_trace
+from .artifact.trace import read_trace as read_trace
 from .artifact.verify import verify as verify
 from .certificates.audit import audit as audit
 from .certificates.certify import certify as certify

@@ -97,6 +97,7 @@ BLOCK = """<robot name="block">
 @pytest.fixture(scope="module")
 def pushed(tmp_path_factory):
     """A cart-pole pushed for 10 steps, its pole not driven: the model, its motion, and a folder with its trace."""
+    from drake_diff.artifact import measure
     from drake_diff.artifact.trace import write_trace
 
     model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
@@ -105,7 +106,7 @@ def pushed(tmp_path_factory):
     solution = dd.Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", motion.xs, motion.us)
     folder = tmp_path_factory.mktemp("runs") / "run"
     folder.mkdir()
-    write_trace(folder / "trace.mcap", solution, {})
+    write_trace(folder / "trace.mcap", measure(solution), {})
     return model, motion, folder
 
 

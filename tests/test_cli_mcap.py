@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 import drake_diff as dd
+from drake_diff.artifact import measure
 from drake_diff.artifact.trace import write_trace
 from drake_diff.cli.main import app
 from drake_diff.exceptions import InputError
@@ -86,7 +87,7 @@ def test_export_writes_a_bag_beside_the_run_and_wants_to_be_told_the_format(tmp_
     xs = np.zeros((6, 2))
     write_trace(
         tmp_path / "run" / "trace.mcap",
-        Solution(problem, "shooting", "none", dd.Status.FAILED, "by hand", xs, problem.us),
+        measure(Solution(problem, "shooting", "none", dd.Status.FAILED, "by hand", xs, problem.us)),
         {},
     )
     done = drake_diff("export", "--ros2", tmp_path / "run")

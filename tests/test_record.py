@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, JsonValue, ValidationError
 
 import drake_diff as dd
-from drake_diff.artifact.measures import invariants_of
+from drake_diff.artifact import measure
 from drake_diff.artifact.sections import describe_problem, rebuild_problem
 from drake_diff.exceptions import ArtifactError
 from drake_diff.record.parts import Metric
@@ -228,7 +228,7 @@ def test_inputs_at_their_bounds_begin_and_end_in_the_events(tmp_path):
 
 def test_momentum_energy_and_the_friction_cone_of_a_falling_ball(thrown, tmp_path):
     """In flight momentum changes by m g t to rounding; semi-implicit Euler loses m g^2 h t / 2 of energy."""
-    found = {m.name: m for m in invariants_of(thrown)}
+    found = {m.name: m for m in measure(thrown).invariants}
     assert found["linear momentum error"].value < 1e-12  # N s: rounding of 1 kg * 1 m/s over some 20 steps
     assert found["angular momentum error"].value < 1e-12
     touches = next(k for k, contacts in enumerate(thrown.replay.contacts) if contacts)
@@ -257,16 +257,16 @@ def test_a_force_outside_the_friction_cone_and_momentum_from_nowhere_are_seen(th
     k = next(k for k, found in enumerate(contacts) if found)
     forced = dataclasses.replace(contacts[k][0], normal=np.array([0, 0, 1.0]), force=np.array([2.0, 0, 1.0]))
     contacts[k] = (forced,)
-    found = {m.name: m for m in invariants_of(with_replay(thrown, contacts=tuple(contacts)))}
+    found = {m.name: m for m in measure(with_replay(thrown, contacts=tuple(contacts))).invariants}
     assert found["friction-cone excess"].value == pytest.approx(1.5, rel=1e-12)
     assert found["friction-cone excess"].t_s == thrown.replay.times[k]
     xs = np.array(thrown.replay.xs)
     xs[5, 10] += 0.25  # m/s of v_x, of 1 kg
-    found = {m.name: m for m in invariants_of(with_replay(thrown, xs=xs))}
+    found = {m.name: m for m in measure(with_replay(thrown, xs=xs)).invariants}
     assert found["linear momentum error"].value == pytest.approx(0.25, rel=1e-9)
     unknown = dataclasses.replace(forced, body_b="nobody")
     contacts[k] = (unknown,)
-    found = {m.name: m for m in invariants_of(with_replay(thrown, contacts=tuple(contacts)))}
+    found = {m.name: m for m in measure(with_replay(thrown, contacts=tuple(contacts))).invariants}
     assert found["friction-cone excess"].value is None
     assert "is not one number" in found["friction-cone excess"].reason
 

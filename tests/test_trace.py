@@ -16,6 +16,7 @@ from hypothesis.extra.numpy import arrays
 from mcap.reader import make_reader
 
 import drake_diff as dd
+from drake_diff.artifact import measure
 from drake_diff.artifact.trace import write_trace
 from drake_diff.exceptions import ArtifactError
 from drake_diff.optimize.program import Iteration
@@ -51,7 +52,7 @@ def collocated():
 @pytest.fixture(scope="module")
 def trace_of_collocated(collocated, tmp_path_factory):
     path = tmp_path_factory.mktemp("trace") / "trace.mcap"
-    write_trace(path, collocated, {})
+    write_trace(path, measure(collocated), {})
     return path
 
 
@@ -65,7 +66,7 @@ def thrown(tmp_path_factory):
     motion = dd.rollout(model, x0, num_steps=60)
     solution = solution_of(problem, xs=motion.xs)
     path = tmp_path_factory.mktemp("thrown") / "trace.mcap"
-    write_trace(path, solution, {})
+    write_trace(path, measure(solution), {})
     return solution, dd.logs.read_mcap(path)
 
 
@@ -92,7 +93,7 @@ def test_parameters_that_were_found_come_back_and_move_the_frames(tmp_path, load
         parameters=["elbow.offset"],
     )
     solution = solution_of(problem, parameters=np.array([0.1, 0.0, -0.9]))
-    write_trace(tmp_path / "a.mcap", solution, {})
+    write_trace(tmp_path / "a.mcap", measure(solution), {})
     assert bits(dd.read_trace(tmp_path / "a.mcap").plan["parameters"]) == bits(solution.parameters)
     log = dd.logs.read_mcap(tmp_path / "a.mcap")
     assert log.channel_metadata["/planned/plan"]["names"]["parameters"] == [f"elbow.offset[{i}]" for i in range(3)]
@@ -119,7 +120,7 @@ def test_any_plan_round_trips_whatever_its_numbers(tmp_path_factory, data):
         "iterations": tuple(Iteration(k, *data.draw(st.tuples(*[st.floats()] * 4))) for k in range(count)),
     }
     solution = solution_of(problem, **fields)
-    write_trace(path, solution, {})
+    write_trace(path, measure(solution), {})
     trace, log = dd.read_trace(path), dd.logs.read_mcap(path)
     assert bits(trace.plan["xs"]) == bits(solution.xs)
     assert bits(trace.plan["us"]) == bits(solution.us)
@@ -149,7 +150,7 @@ def test_a_plan_whose_motion_differs_has_a_ghost_and_one_that_does_not_has_none(
     rotation = log.messages["/tf"][3][1].transforms[1].rotation
     assert abs(rotation.w * np.cos(half_angle) + rotation.y * np.sin(half_angle)) == pytest.approx(1, abs=1e-12)
     still = solution_of(pendulum())
-    write_trace(tmp_path / "a.mcap", dataclasses.replace(still, xs=still.replay.xs), {})
+    write_trace(tmp_path / "a.mcap", measure(dataclasses.replace(still, xs=still.replay.xs)), {})
     log = dd.logs.read_mcap(tmp_path / "a.mcap")
     assert {len(message.transforms) for _, message in log.messages["/tf"]} == {1}
 
@@ -178,7 +179,7 @@ def test_every_certificate_has_its_row(collocated, trace_of_collocated):
 def test_a_certificate_without_entries_and_one_that_is_zero_have_a_row_too(tmp_path):
     nothing = dd.certificates.certify_jacobian(lambda x: np.zeros(0), np.zeros(2), np.zeros((0, 2)))
     zero = dd.certificates.certify_jacobian(lambda x: np.zeros(2), np.zeros(2), np.zeros((2, 2)))
-    write_trace(tmp_path / "a.mcap", solution_of(pendulum(), certificates=(nothing, zero)), {})
+    write_trace(tmp_path / "a.mcap", measure(solution_of(pendulum(), certificates=(nothing, zero))), {})
     found = dd.logs.read_mcap(tmp_path / "a.mcap").arrays("/gradient/check")
     assert found["verdict"] == ["agree", "agree"]
     assert np.isnan(found["cosine"]).all()
@@ -189,12 +190,12 @@ def test_contact_made_and_broken_are_events_at_the_steps_where_they_happen(throw
     """The ball's lowest point starts 0.05 m above the ground: it falls for sqrt(2 * 0.05 / 9.81) = 0.101 s."""
     solution, log = thrown
     events = log.arrays("/events")
-    made = events["code"].index("contact_made")
-    assert events["message"][made] == "ball on ground"
+    made = events["kind"].index("contact_made")
+    assert events["message"][made] == "ball touches ground"
     assert events["time"][made] == pytest.approx(0.101, abs=2 * 0.005)
     in_contact = [bool(c) for c in solution.replay.contacts]
     changes = [k for k in range(60) if in_contact[k] != (k > 0 and in_contact[k - 1])]
-    contact = [kind == "contact" for kind in events["kind"]]
+    contact = [kind.startswith("contact_") for kind in events["kind"]]
     assert events["time"][contact].tolist() == solution.times[changes].tolist()
 
 
@@ -215,14 +216,14 @@ def test_arrows_start_at_the_contact_and_point_along_the_force(thrown):
 
 
 def test_failures_are_the_record_s_and_the_configuration_is_attached(tmp_path):
-    failure = {"label": "planning_error", "code": "solver_iteration_limit", "message": "too few"}
-    record = json.dumps({"failures": [failure]}).encode()
     solution = solution_of(pendulum(), options={"tolerance": float("inf"), "seed": 3})
-    write_trace(tmp_path / "a.mcap", solution, {"record.json": ("application/json", record)})
+    m = measure(solution)
+    write_trace(tmp_path / "a.mcap", m, {"record.json": ("application/json", b"{}")})
     log = dd.logs.read_mcap(tmp_path / "a.mcap")
     events = log.arrays("/events")
-    assert (events["kind"], events["failure_label"]) == (["status", "failure"], ["", "planning_error"])
-    assert events["code"] == ["iteration_limit", "solver_iteration_limit"]
+    assert events["kind"] == [e.kind for e in m.events] == ["solver_started", "solver_ended", "failure"]
+    assert (events["failure_label"][2], events["code"][2]) == ("planning_error", "solver_iteration_limit")
+    assert events["message"] == [m.events[0].message, m.events[1].message, "made by hand"]
     assert sorted(log.attachments) == ["configuration.json", "pendulum.urdf", "record.json"]
     assert json.loads(log.attachments["configuration.json"])["options"] == {"tolerance": "Infinity", "seed": 3}
 
@@ -234,7 +235,7 @@ def test_a_state_without_a_pose_has_no_frames_and_the_rest_is_there(tmp_path, lo
     )
     xs = np.tile(problem.model.default_state, (4, 1))
     xs[1, :4], xs[2, 5] = 0.0, np.nan
-    write_trace(tmp_path / "a.mcap", solution_of(problem, xs=xs), {})
+    write_trace(tmp_path / "a.mcap", measure(solution_of(problem, xs=xs)), {})
     log = dd.logs.read_mcap(tmp_path / "a.mcap")
     planned = [[t for t in m.transforms if t.child_frame_id.startswith("planned/")] for _, m in log.messages["/tf"]]
     assert [len(p) for p in planned] == [2, 0, 0, 2]  # ball and ground
@@ -266,7 +267,7 @@ def test_hostile_names_of_model_bodies_and_joints_are_only_names(tmp_path):
     for name in ("pendulum", "pole", "hinge"):
         urdf = urdf.replace(f'"{name}"', f'"{evil}../[red]{name}ü"')
     (tmp_path / "evil.urdf").write_text(urdf)
-    write_trace(tmp_path / "a.mcap", solution_of(pendulum(tmp_path, "evil.urdf")), {})
+    write_trace(tmp_path / "a.mcap", measure(solution_of(pendulum(tmp_path, "evil.urdf"))), {})
     log = dd.logs.read_mcap(tmp_path / "a.mcap")
     assert log.messages["/joint_states"][0][1].joints[0].name == "<script>alert(1)</script>../[red]hingeü"
     assert log.metadata["run"]["model"].startswith("<script>")

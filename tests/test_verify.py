@@ -168,16 +168,15 @@ def test_a_number_edited_and_hashed_again_is_not_what_the_trace_carries(run, cop
 
 
 def lying(section, change):
-    """A `_complete` that makes a whole, consistent artifact out of a record with a lie in it."""
-    honest = evidence._complete
+    """A `record_of` that makes a whole, consistent artifact out of a record with a lie in it."""
+    honest = evidence.record_of
 
-    def complete(name, solution):
-        record = honest(name, solution)
-        fields = record.model_dump()
+    def record_of(measurement, folder):
+        fields = honest(measurement, folder).model_dump()
         change(fields[section])
         return EvidenceRecord.model_validate(fields)
 
-    return complete
+    return record_of
 
 
 def set_value(index, key, value):
@@ -205,7 +204,7 @@ def set_value(index, key, value):
 def test_a_whole_artifact_that_lies_is_found_by_running_it_again(
     solution, tmp_path, monkeypatch, section, change, words
 ):
-    monkeypatch.setattr(evidence, "_complete", lying(section, change))
+    monkeypatch.setattr(evidence, "record_of", lying(section, change))
     dd.save(solution, tmp_path / "run")
     found = dd.verify(tmp_path / "run")
     assert found.verdict == "broken"

@@ -1,5 +1,5 @@
-"""The directory of one solve: written, read, run again and verified."""
+"""The directory of one solve: measure it, write it, read it, verify it, list it, show it."""
 
-from drake_diff._base.lazy import attach_stub as _attach_stub
+import lazy_loader as _lazy
 
-__getattr__, __dir__, __all__ = _attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -1,6 +1,6 @@
-"""The record of a run: what was asked, what came out, what was measured again, and with which versions.
+"""Write the directory of a solve: what was asked, what came out, what was measured again, and with which versions.
 
-A run directory is written so that record.json is complete last: a run that is killed leaves one that says so.
+record.json is complete last, so that a run that is killed leaves a record that says so.
 """
 
 from pathlib import Path
@@ -8,24 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff.artifact.measures import invariants_of, metrics_of, replay_evidence
+from drake_diff.artifact.measurement import Measurement, failure_of, measure, replay_evidence
 from drake_diff.artifact.plan_file import PLAN, write_plan
-from drake_diff.artifact.sections import (
-    UNITS,
-    action_of,
-    claim_of,
-    describe_problem,
-    gradient_of,
-    inputs_of,
-    observation_of,
-    parameters_of,
-    solver_of,
-)
-from drake_diff.artifact.story import events_of, failure_of, failures_of
+from drake_diff.artifact.sections import asked, found
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.parts import Event
-from drake_diff.record.provenance import model_input, provenance_of, written_now
+from drake_diff.record.provenance import provenance_of, written_now
 from drake_diff.record.sealed import WallClock, reproducible
 from drake_diff.record.solve import EvidenceRecord
 
@@ -40,90 +29,96 @@ def begin(directory: str | Path, problem: Problem) -> None:
     """
     folder = Path(directory)
     sentence = "the run has begun and not ended: it is under way, or it was killed or broke off"
-    _record(folder.name, problem, verdict="incomplete", sentence=sentence).begin(folder, FILES)
+    record = _record(
+        folder, WallClock(written_utc=written_now()), verdict="incomplete", sentence=sentence, **asked(problem)
+    )
+    record.begin(folder, FILES)
 
 
 def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
-    """Write the run directory of `solution`: record.json, plan.npz, trace.mcap, replay.html, report.html, the schema.
+    """Measure a solution and write its directory: record, plan, trace, replay and report.
 
-    Gives the record. Each file is written aside and moved into place, record.json last, so that at any moment the
-    record is complete only if everything it names is.
+    Each file is written aside and moved into place, record.json last, so that at any moment the record is complete
+    only if everything that it names is.
+
+    Args:
+        solution: A result of `solve`, of any status.
+        directory: Where to write record.json, record.schema.json, plan.npz, trace.mcap, replay.html and report.html.
+            It is made where there is none; files of these names are replaced.
+
+    Returns:
+        The record that was written. Its verdict is "pass" only where the solver converged and every metric keeps its
+        tolerance.
+
+    Raises:
+        OSError: A file cannot be written.
+
+    Example:
+        >>> from tempfile import mkdtemp
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
+        >>> problem = dd.Problem(model, x0=[0.1, 0], num_steps=5, running_cost=dd.QuadraticCost(R=[[1.0]]))
+        >>> record = dd.save(dd.solve(problem, method="shooting"), mkdtemp())
+        >>> record.verdict, sorted(record.files)
+        ('pass', ['plan.npz', 'record.schema.json', 'replay.html', 'report.html', 'trace.mcap'])
     """
     from drake_diff.artifact.page import write_report
     from drake_diff.artifact.trace import write_trace
-    from drake_diff.pages.meshcat import write_replay
-    from drake_diff.pages.scene import BLUE, scene_of  # what a script that saves nothing need not load
+    from drake_diff.pages.meshcat import write_replay  # what a script that saves nothing need not load
 
     folder = Path(directory)
     begin(folder, solution.problem)
-    complete = _complete(folder.name, solution)
+    measurement = measure(solution)
+    record = record_of(measurement, folder)
+    fields = record.model_dump(mode="json")
     write_plan(folder / PLAN, solution)
-    fields = complete.model_dump(mode="json")
-    write_trace(folder / TRACE, solution, {EvidenceRecord.FILE: ("application/json", reproducible(fields).encode())})
-    motion = solution.replay
-    scene = scene_of(
-        solution.problem.model,
-        solution.times,
-        _drawable(solution) if motion is None else motion.xs,
-        contacts=() if motion is None else motion.contacts,
-        ghosts={"plan": (solution.xs, BLUE)} if solution.transcribed is not None and motion is not None else None,
-    )
-    write_replay(folder / REPLAY, scene, title=f"{folder.name}: {solution.status.value}")
+    write_trace(folder / TRACE, measurement, {record.FILE: ("application/json", reproducible(fields).encode())})
+    write_replay(folder / REPLAY, _scene(measurement), title=f"{record.name}: {solution.status.value}")
     write_report(folder / REPORT, solution, fields, folder / REPLAY)
-    return complete.write(folder)
+    return record.write(folder)
 
 
 def save_failure(error: Exception, directory: str | Path, problem: Problem) -> EvidenceRecord:
     """Write the record of a run that `error` ended before there was a solution."""
-    folder = Path(directory)
-    failure = failure_of(error)
-    event = Event(t_s=None, kind="failure", message=failure.message)
-    sentence = f"the run ended with an error: {failure.message}"
-    fields: dict[str, Any] = {"failures": [failure], "events": [event]}
-    record = _record(folder.name, problem, verdict="fail", sentence=sentence, **fields)
-    return record.write(folder)
+    folder, failure = Path(directory), failure_of(error)
+    told: dict[str, Any] = {
+        "verdict": "fail",
+        "sentence": f"the run ended with an error: {failure.message}",
+        "failures": [failure],
+        "events": [Event(t_s=None, kind="failure", message=failure.message)],
+    }
+    return _record(folder, WallClock(written_utc=written_now()), **told, **asked(problem)).write(folder)
 
 
-def _complete(name: str, solution: Solution) -> EvidenceRecord:
-    metrics = metrics_of(solution)
-    failures = failures_of(solution, metrics)
+def record_of(m: Measurement, folder: Path) -> EvidenceRecord:
+    """The record of a measurement, but for the files; it has the name of `folder`."""
     return _record(
-        name,
-        solution.problem,
-        solution,
-        verdict="fail" if failures else "pass",
-        sentence=solution.message,
-        solver=solver_of(solution),
-        metrics=metrics,
-        invariants=invariants_of(solution),
-        parameters=parameters_of(solution),
-        gradient=gradient_of(solution),
-        events=events_of(solution, failures),
-        replays=[replay_evidence(r) for r in solution.replays],
-        failures=failures,
+        folder,
+        WallClock(written_utc=written_now(), duration_s=m.solution.wall_time),
+        verdict="fail" if m.failures else "pass",
+        sentence=m.solution.message,
+        metrics=m.metrics,
+        invariants=m.invariants,
+        events=m.events,
+        replays=[replay_evidence(r) for r in m.replays],
+        failures=m.failures,
+        **asked(m.solution.problem, m.solution),
+        **found(m.solution),
     )
 
 
-def _record(name: str, problem: Problem, solution: Solution | None = None, **fields: Any) -> EvidenceRecord:
-    time_step = problem.model.time_step if solution is None else solution.time_step
-    written = written_now()
-    return EvidenceRecord(
-        name=name,
-        claim=claim_of(problem),
-        model=model_input(problem.model),
-        inputs=inputs_of(solution),
-        problem=describe_problem(problem),
-        contract=problem.model.contract.to_dict(),
-        units=UNITS,
-        observation=observation_of(problem, time_step),
-        action=action_of(problem, time_step, solution),
-        provenance=provenance_of(),
-        wall_clock=WallClock(written_utc=written, duration_s=None if solution is None else solution.wall_time),
-        **fields,
-    )
+def _record(folder: Path, clock: WallClock, **fields: Any) -> EvidenceRecord:
+    return EvidenceRecord(name=folder.name, provenance=provenance_of(), wall_clock=clock, **fields)
 
 
-def _drawable(solution: Solution) -> np.ndarray:
-    """The solver's states, those that are not finite at the problem's x0: a page cannot show nothing."""
-    finite = np.all(np.isfinite(solution.xs), axis=1)
-    return np.where(finite[:, None], solution.xs, solution.problem.x0)
+def _scene(m: Measurement) -> Any:
+    """The plant's motion, beside that of a plan in continuous time; the plan alone where it could not be stepped."""
+    from drake_diff.pages.scene import BLUE, scene_of
+
+    solution, motion = m.solution, m.motion
+    if motion is None:  # a page cannot show nothing: states that are not finite are drawn at x0
+        finite = np.all(np.isfinite(solution.xs), axis=1)
+        return scene_of(
+            solution.problem.model, solution.times, np.where(finite[:, None], solution.xs, solution.problem.x0)
+        )
+    ghosts = {"plan": (solution.xs, BLUE)} if solution.transcribed is not None else None
+    return scene_of(solution.problem.model, solution.times, motion.xs, contacts=motion.contacts, ghosts=ghosts)

