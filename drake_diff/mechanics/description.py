@@ -1,25 +1,29 @@
-"""What other engines are built from: the tree of a finalized Drake plant, link by link, with its frames.
+"""The tree of a finalized Drake plant as plain numbers, link by link: what other engines are built from.
 
-A description without its welds, for engines that build joint by joint: each link in the frame of its own joint.
+`describe` reads links as Drake has them, welds included. `rigid_links` merges what is welded together, for engines and
+formulas that go joint by joint; `joint_contracts` gives the same in one frame, to compare engines by.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from pydrake.geometry import Role
 from pydrake.math import RigidTransform
+from pydrake.multibody.tree import ForceElementIndex, PrismaticSpring, RevoluteSpring, UniformGravityFieldElement
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.joints import JointContract, PairContract
-from drake_diff.mechanics.tree import springs_of
 from drake_diff.model.model import Model
-from drake_diff.model.plant import actuators, bodies, joints, labelled, proximity_property
+from drake_diff.model.plant import actuators, bodies, instances, joints, labelled, proximity_property
 
 MOVING = ("revolute", "prismatic", "quaternion_floating")
+SHAPES = ("Sphere", "Box", "Cylinder", "Capsule", "HalfSpace")
+Part = tuple[float, Array, Array]  # mass [kg], centre of mass (3,) [m], inertia (3, 3) about it [kg m^2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,34 +112,6 @@ def describe(model: Model) -> Description:
 def describe_tree(model: Model) -> Description:
     """As `describe`, PD control of the actuators left out."""
     plant = model.plant
-    _check(model)
-    springs = springs_of(plant)
-    if isinstance(springs, Refusal):
-        raise ModelError(f"no other engine is given this model: {springs}")
-    body_names = {body.index(): label for label, body in labelled(bodies(plant)).items()}
-    body_names[plant.world_body().index()] = "world"
-    joint_names = {joint.index(): label for label, joint in labelled(joints(plant)).items()}
-    rotors = dict.fromkeys(joint_names, 0.0)
-    for a in actuators(plant):
-        rotors[a.joint().index()] += a.default_rotor_inertia() * a.default_gear_ratio() ** 2
-    links = [
-        _link(j, joint_names[j.index()], body_names, rotors[j.index()], springs.get(j.index(), (0.0, 0.0)))
-        for j in joints(plant)
-    ]
-    geometries, pairs = _geometries(model, body_names)
-    return Description(
-        links=tuple(_parents_first(links)),
-        gravity=np.array(plant.gravity_field().gravity_vector()),
-        inputs=model.input_names,
-        actuated=tuple(joint_names[a.joint().index()] for a in actuators(plant)),
-        effort_limits=np.array([a.effort_limit() for a in actuators(plant)]),
-        geometries=geometries,
-        pairs=pairs,
-    )
-
-
-def _check(model: Model) -> None:
-    plant = model.plant
     found = [f"joint {j.name()} is of type {j.type_name()}" for j in joints(plant) if j.type_name() not in _KNOWN]
     found += [f"joint {j.name()} is locked" for j in joints(plant) if j.is_locked(model.double.context)]
     found += [
@@ -147,11 +123,67 @@ def _check(model: Model) -> None:
         found.append(f"{plant.num_constraints()} constraints (couplers, balls, welds, distances)")
     if model.forces:
         found.append("forces are added to Drake's")
-    if found:
-        raise ModelError("no other engine is given this model: " + "; ".join(found))
+    springs = springs_of(plant)
+    if found or isinstance(springs, Refusal):
+        raise ModelError("no other engine is given this model: " + "; ".join(found or [str(springs)]))
+    body_names, joint_names = names_of(plant)
+    geometries, pairs = _geometries(model, body_names)
+    return Description(
+        links=tuple(read_links(plant, springs)),
+        gravity=np.array(plant.gravity_field().gravity_vector()),
+        inputs=model.input_names,
+        actuated=tuple(joint_names[a.joint().index()] for a in actuators(plant)),
+        effort_limits=np.array([a.effort_limit() for a in actuators(plant)]),
+        geometries=geometries,
+        pairs=pairs,
+    )
 
 
 _KNOWN = ("weld", *MOVING)
+
+
+def names_of(plant: Any) -> tuple[dict[Any, str], dict[Any, str]]:
+    """The names of bodies and of joints by index."""
+    body_names = {body.index(): label for label, body in labelled(bodies(plant)).items()}
+    body_names[plant.world_body().index()] = "world"
+    return body_names, {joint.index(): label for label, joint in labelled(joints(plant)).items()}
+
+
+def springs_of(plant: Any) -> dict[Any, tuple[float, float]] | Refusal:
+    """Stiffness and rest position by joint; a Refusal where a force element is none of gravity and these springs."""
+    found: dict[Any, tuple[float, float]] = {}
+    for i in range(plant.num_force_elements()):
+        element = plant.get_force_element(ForceElementIndex(i))
+        if isinstance(element, UniformGravityFieldElement):
+            if not all(element.is_enabled(model_instance=k) for k in instances(plant)):
+                return Refusal("gravity is off for a part of the model")
+        elif isinstance(element, RevoluteSpring) and element.joint().index() not in found:
+            found[element.joint().index()] = element.default_stiffness(), element.default_nominal_angle()
+        elif isinstance(element, PrismaticSpring) and element.joint().index() not in found:
+            found[element.joint().index()] = element.stiffness(), element.nominal_position()
+        else:
+            return Refusal(f"force element {i} is of type {type(element).__name__}, or the second of its joint")
+    return found
+
+
+def read_links(plant: Any, springs: dict[Any, tuple[float, float]]) -> list[Link]:
+    """Every link of a plant, parents before their children."""
+    body_names, joint_names = names_of(plant)
+    rotors = dict.fromkeys(joint_names, 0.0)
+    for a in actuators(plant):
+        rotors[a.joint().index()] += a.default_rotor_inertia() * a.default_gear_ratio() ** 2
+    waiting = [
+        _link(j, joint_names[j.index()], body_names, rotors[j.index()], springs.get(j.index(), (0.0, 0.0)))
+        for j in joints(plant)
+    ]
+    waiting.sort(key=lambda link: link.v_start)
+    placed, ordered = {"world"}, []
+    while waiting:
+        link = next(x for x in waiting if x.parent in placed)
+        placed.add(link.body)
+        ordered.append(link)
+        waiting.remove(link)
+    return ordered
 
 
 def _link(joint: Any, name: str, body_names: dict[Any, str], armature: float, spring: tuple[float, float]) -> Link:
@@ -183,16 +215,6 @@ def _link(joint: Any, name: str, body_names: dict[Any, str], armature: float, sp
     )
 
 
-def _parents_first(links: list[Link]) -> list[Link]:
-    placed, ordered, waiting = {"world"}, [], sorted(links, key=lambda link: link.v_start)
-    while waiting:
-        link = next(x for x in waiting if x.parent in placed)
-        placed.add(link.body)
-        ordered.append(link)
-        waiting.remove(link)
-    return ordered
-
-
 def _geometries(model: Model, body_names: dict[Any, str]) -> tuple[tuple[Geometry, ...], tuple[PairContract, ...]]:
     inspector = model.double.inspector
     if inspector is None:
@@ -218,65 +240,6 @@ def _combined(a: float | None, b: float | None) -> float | None:
     if a is None or b is None:
         return None
     return a * b / (a + b) if a + b else 0.0
-
-
-def joint_contracts(description: Description) -> tuple[JointContract, ...]:
-    """Each moving joint with what it carries by welds, in the world frame where q = 0."""
-    pose = {"world": RigidTransform()}
-    carrier: dict[str, str | None] = {"world": None}
-    carried: dict[str | None, list[tuple[float, Array, Array]]] = {}
-    frames: dict[str, RigidTransform] = {}
-    for link in description.links:
-        frames[link.joint] = pose[link.parent] @ link.on_parent
-        pose[link.body] = frames[link.joint] @ link.on_child.inverse()
-        carrier[link.body] = carrier[link.parent] if link.kind == "weld" else link.joint
-        R = pose[link.body].rotation().matrix()
-        part = (link.mass, pose[link.body] @ link.center_of_mass, R @ link.inertia @ R.T)
-        carried.setdefault(carrier[link.body], []).append(part)
-    return tuple(
-        joint_contract(
-            name=x.joint,
-            kind=x.kind,
-            axis=frames[x.joint].rotation().matrix() @ x.axis,
-            anchor=frames[x.joint].translation(),
-            carried=carried[x.joint],
-            **{k: getattr(x, k) for k in ("damping", "armature", "stiffness", "rest", "lower", "upper")},
-        )
-        for x in description.moving
-    )
-
-
-def joint_contract(
-    *, kind: str, axis: Array, anchor: Array, carried: list[tuple[float, Array, Array]], **rest: Any
-) -> JointContract:
-    """A JointContract from parts (mass, centre of mass (3,), inertia (3, 3) about it) in the world frame."""
-    mass, com, total = merged(carried)
-    i, j = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
-    on_axis = anchor - axis * (axis @ anchor) if kind == "revolute" else np.zeros(3)
-    numbers = [tuple(float(n) for n in values) for values in (axis, on_axis, com, total[i, j])]
-    return JointContract(
-        kind=kind,
-        axis=numbers[0],
-        anchor=numbers[1],
-        mass=mass,
-        center_of_mass=numbers[2],
-        inertia=numbers[3],
-        **rest,
-    )
-
-
-def merged(parts: list[tuple[float, Array, Array]]) -> tuple[float, Array, Array]:
-    """Parts (mass, centre of mass (3,), inertia (3, 3) about it) as one."""
-    mass = float(sum(m for m, _, _ in parts))
-    com = sum((m * c for m, c, _ in parts), np.zeros(3)) / mass if mass else np.zeros(3)
-    total = np.zeros((3, 3))
-    for m, c, inertia in parts:
-        arm = c - com
-        total += inertia + m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    return mass, com, total
-
-
-SHAPES = ("Sphere", "Box", "Cylinder", "Capsule", "HalfSpace")
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,25 +272,16 @@ class RigidLinks:
 
 
 def rigid_links(description: Description) -> RigidLinks:
-    """ModelError for a free body whose joint's frames are not its own and the world's."""
-    ordered = _by_tree(description.links)
-    place = {x.body: i for i, x in enumerate(x for x in ordered if x.kind != "weld")}
-    on: dict[str, tuple[int, RigidTransform]] = {"world": (-1, RigidTransform())}
-    frames: dict[int, tuple[Link, int, RigidTransform]] = {}
-    carried: dict[int, list[tuple[float, Array, Array]]] = {-1: []}
-    for link in ordered:
-        number, pose = on[link.parent]
-        frame = pose @ link.on_parent
-        if link.kind == "weld":
-            on[link.body] = (number, frame @ link.on_child.inverse())
-        else:
-            _check_of_rigid_links(link)
-            frames[place[link.body]] = (link, number, frame)
-            on[link.body] = (place[link.body], link.on_child.inverse())
-        number, pose = on[link.body]
-        R = pose.rotation().matrix()
-        carried.setdefault(number, []).append((link.mass, pose @ link.center_of_mass, R @ link.inertia @ R.T))
-    links = tuple(_link_of_rigid_links(*frames[i], carried[i]) for i in range(len(frames)))
+    """The description without its welds.
+
+    Raises ModelError for a free body whose joint's frames are not its own and the world's.
+    """
+    for link in description.moving:
+        own = all(pose.IsExactlyIdentity() for pose in (link.on_parent, link.on_child))
+        if link.kind == "quaternion_floating" and (link.parent != "world" or not own):
+            raise ModelError(f"joint {link.joint}: this engine's free body is one of the world, by its own frame")
+    links, on, anchored = without_welds(description.links)
+    starts = [i for i, link in enumerate(links) if link.parent < 0]
     known = tuple(
         (on[g.body][0], Geometry(g.name, g.body, on[g.body][1] @ g.pose, g.shape))
         for g in description.geometries
@@ -335,35 +289,96 @@ def rigid_links(description: Description) -> RigidLinks:
     )
     names = {g.name for _, g in known}
     pairs = tuple(pair for pair in description.pairs if set(pair.names) <= names)
-    left_out = tuple(pair.names for pair in description.pairs if pair not in pairs)
-    energy = -sum(m * float(description.gravity @ c) for m, c, _ in carried[-1])
-    return RigidLinks(links, _trees(links), known, pairs, left_out, energy)
+    return RigidLinks(
+        links=links,
+        trees=tuple(range(a, b) for a, b in zip(starts, [*starts[1:], len(links)], strict=True)),
+        geometries=known,
+        pairs=pairs,
+        left_out=tuple(pair.names for pair in description.pairs if pair not in pairs),
+        anchored_energy=-sum(m * float(description.gravity @ c) for m, c, _ in anchored),
+    )
 
 
-def _by_tree(links: tuple[Link, ...]) -> list[Link]:
-    """The links of one tree after those of another; what is fixed to the world comes first."""
+def without_welds(
+    links: Sequence[Link],
+) -> tuple[tuple[RigidLink, ...], dict[str, tuple[int, RigidTransform]], list[Part]]:
+    """The moving links with what is welded to them; where each body went; what is fixed to the world, in its frame.
+
+    A body went to a place among the links (-1 for the world), with its pose there. The links of one tree come after
+    those of another.
+    """
     tree = {"world": -1}
     for i, link in enumerate(links):
         up = tree[link.parent]
         tree[link.body] = i if up < 0 and link.kind != "weld" else up
-    return sorted(links, key=lambda link: tree[link.body])
+    on: dict[str, tuple[int, RigidTransform]] = {"world": (-1, RigidTransform())}
+    moving: list[tuple[Link, int, RigidTransform]] = []
+    carried: dict[int, list[Part]] = {-1: []}
+    for link in sorted(links, key=lambda link: tree[link.body]):  # what is fixed to the world comes first
+        parent, pose = on[link.parent]
+        frame = pose @ link.on_parent
+        if link.kind == "weld":
+            on[link.body] = (parent, frame @ link.on_child.inverse())
+        else:
+            on[link.body] = (len(moving), link.on_child.inverse())
+            moving.append((link, parent, frame))
+        place, pose = on[link.body]
+        carried.setdefault(place, []).append(_moved((link.mass, link.center_of_mass, link.inertia), pose))
+    rigid = []
+    for i, (link, parent, frame) in enumerate(moving):
+        axis = link.axis if link.kind == "quaternion_floating" else link.axis / np.linalg.norm(link.axis)
+        rigid.append(RigidLink(link, parent, frame, axis, *merged(carried[i])))
+    return tuple(rigid), on, carried[-1]
 
 
-def _trees(links: tuple[RigidLink, ...]) -> tuple[range, ...]:
-    starts = [i for i, link in enumerate(links) if link.parent < 0]
-    return tuple(range(a, b) for a, b in zip(starts, [*starts[1:], len(links)], strict=True))
+def _moved(part: Part, pose: RigidTransform) -> Part:
+    """A part in the frame that its own has this pose in."""
+    mass, center_of_mass, inertia = part
+    R = pose.rotation().matrix()
+    return mass, pose @ center_of_mass, R @ inertia @ R.T
 
 
-def _check_of_rigid_links(link: Link) -> None:
-    if link.kind != "quaternion_floating":
-        return
-    if link.parent != "world" or not all(x.IsExactlyIdentity() for x in (link.on_parent, link.on_child)):
-        raise ModelError(f"joint {link.joint}: this engine's free body is one of the world, by its own frame")
+def joint_contracts(description: Description) -> tuple[JointContract, ...]:
+    """Each moving joint with what it carries by welds, in the world frame where q = 0, in the order of v."""
+    frames: list[RigidTransform] = []
+    found: dict[int, JointContract] = {}
+    for link in without_welds(description.links)[0]:
+        joint, frame = link.joint, link.on_parent if link.parent < 0 else frames[link.parent] @ link.on_parent
+        frames.append(frame)
+        found[joint.v_start] = joint_contract(
+            name=joint.joint,
+            kind=joint.kind,
+            axis=frame.rotation().matrix() @ link.axis,
+            anchor=frame.translation(),
+            carried=[_moved((link.mass, link.center_of_mass, link.inertia), frame)],
+            **{k: getattr(joint, k) for k in ("damping", "armature", "stiffness", "rest", "lower", "upper")},
+        )
+    return tuple(found[start] for start in sorted(found))
 
 
-def _link_of_rigid_links(
-    link: Link, parent: int, frame: RigidTransform, carried: list[tuple[float, Array, Array]]
-) -> RigidLink:
-    mass, center_of_mass, inertia = merged(carried)
-    axis = link.axis if link.kind == "quaternion_floating" else link.axis / np.linalg.norm(link.axis)
-    return RigidLink(link, parent, frame, axis, mass, center_of_mass, inertia)
+def joint_contract(*, kind: str, axis: Array, anchor: Array, carried: list[Part], **rest: Any) -> JointContract:
+    """A JointContract from parts (mass, centre of mass (3,), inertia (3, 3) about it) in the world frame."""
+    mass, com, total = merged(carried)
+    i, j = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+    on_axis = anchor - axis * (axis @ anchor) if kind == "revolute" else np.zeros(3)
+    numbers = [tuple(float(n) for n in values) for values in (axis, on_axis, com, total[i, j])]
+    return JointContract(
+        kind=kind,
+        axis=numbers[0],
+        anchor=numbers[1],
+        mass=mass,
+        center_of_mass=numbers[2],
+        inertia=numbers[3],
+        **rest,
+    )
+
+
+def merged(parts: list[Part]) -> Part:
+    """Parts (mass, centre of mass (3,), inertia (3, 3) about it) as one."""
+    mass = float(sum(m for m, _, _ in parts))
+    com = sum((m * c for m, c, _ in parts), np.zeros(3)) / mass if mass else np.zeros(3)
+    total = np.zeros((3, 3))
+    for m, c, inertia in parts:
+        arm = c - com
+        total += inertia + m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return mass, com, total

@@ -21,20 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
-from pydrake.math import RigidTransform
-from pydrake.multibody.tree import (
-    BodyIndex,
-    ForceElementIndex,
-    PrismaticSpring,
-    RevoluteSpring,
-    UniformGravityFieldElement,
-)
 
 from drake_diff._base.arrays import Array, cross, skew
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.refusal import Refusal
+from drake_diff.mechanics.description import read_links, springs_of, without_welds
 from drake_diff.model.model import Model
-from drake_diff.model.plant import actuators, instances, joints
+from drake_diff.model.plant import joints
 from drake_diff.model.step import set_state
 
 
@@ -162,7 +155,7 @@ def _cross_of_force(force: Array) -> Array:
 
 
 def tree_of(model: Model) -> TreeDynamics | Refusal:
-    """The tree of a model, or what in the model is none."""
+    """The tree of a model as it is read, not yet compared with Drake; a Refusal that names what in it is no tree."""
     plant = model.plant
     if model.forces:
         return Refusal("forces are added to Drake's")
@@ -173,117 +166,57 @@ def tree_of(model: Model) -> TreeDynamics | Refusal:
     springs = springs_of(plant)
     if isinstance(springs, Refusal):
         return springs
-    carriers = {j.child_body().index(): j for j in joints(plant)}
-    number = {j.index(): k for k, j in enumerate(moving)}
-    parents = [_carrier(joint.parent_body(), carriers)[0] for joint in moving]
-    n = len(moving)
-    ancestors = np.eye(n, dtype=bool)
-    for k in range(n):
-        parent = parents[k]
-        while parent is not None:
-            ancestors[k, number[parent.index()]] = True
-            parent = parents[number[parent.index()]]
-    mass, moment, inertia = _carried(plant, carriers, number, n)
-    frames = [joint.frame_on_child().GetFixedPoseInBodyFrame() for joint in moving]
-    stiffness, rest = np.zeros(n), np.zeros(n)
-    for index, (spring, q0) in springs.items():
-        stiffness[number[index]], rest[number[index]] = spring, q0
-    reflected = np.zeros(n)
-    for actuator in actuators(plant):
-        reflected[number[actuator.joint().index()]] += (
-            actuator.default_rotor_inertia() * actuator.default_gear_ratio() ** 2
-        )
+    by_tree, _, _ = without_welds(read_links(plant, springs))
+    ancestors = np.eye(len(moving), dtype=bool)
+    for link in by_tree:  # parents come first
+        if link.parent >= 0:
+            ancestors[link.joint.v_start] |= ancestors[by_tree[link.parent].joint.v_start]
+    links = sorted(by_tree, key=lambda link: link.joint.v_start)
+    frames = [link.joint.on_child for link in links]
+    turns = np.array([frame.rotation().matrix() for frame in frames])
+    mass = np.array([link.mass for link in links])
+    center = np.array([frame @ link.center_of_mass for frame, link in zip(frames, links, strict=True)])
+    to_center = skew(center)
+    central = turns @ np.array([link.inertia for link in links]) @ np.swapaxes(turns, -1, -2)
     return TreeDynamics(
         bodies=[joint.child_body() for joint in moving],
         ancestors=ancestors,
-        hinge=np.array([joint.type_name() == "revolute" for joint in moving]),
-        axis=np.array([f.rotation().matrix() @ _axis(j) for f, j in zip(frames, moving, strict=True)]),
-        origin=np.array([f.translation() for f in frames]),
+        hinge=np.array([link.joint.kind == "revolute" for link in links]),
+        axis=_times(turns, np.array([link.axis for link in links])),
+        origin=np.array([frame.translation() for frame in frames]),
         mass=mass,
-        moment=moment,
-        inertia=inertia,
+        moment=mass[:, None] * center,
+        inertia=central - mass[:, None, None] * (to_center @ to_center),
         gravity=np.array(plant.gravity_field().gravity_vector()),
-        stiffness=stiffness,
-        rest=rest,
-        damping=model.double.damping(),
-        reflected=reflected,
+        stiffness=np.array([link.joint.stiffness for link in links]),
+        rest=np.array([link.joint.rest for link in links]),
+        damping=np.array([link.joint.damping for link in links]),
+        reflected=np.array([link.joint.armature for link in links]),
     )
 
 
-def _axis(joint: Any) -> Array:
-    return np.asarray(joint.revolute_axis() if joint.type_name() == "revolute" else joint.translation_axis())
-
-
-def springs_of(plant: Any) -> dict[Any, tuple[float, float]] | Refusal:
-    """Stiffness and rest position by joint, or which force element is none of gravity and these springs."""
-    found: dict[Any, tuple[float, float]] = {}
-    for i in range(plant.num_force_elements()):
-        element = plant.get_force_element(ForceElementIndex(i))
-        if isinstance(element, UniformGravityFieldElement):
-            if not all(element.is_enabled(model_instance=k) for k in instances(plant)):
-                return Refusal("gravity is off for a part of the model")
-            continue
-        if not isinstance(element, (RevoluteSpring, PrismaticSpring)) or element.joint().index() in found:
-            return Refusal(f"force element {i} is of type {type(element).__name__}, or the second of its joint")
-        hinge = isinstance(element, RevoluteSpring)
-        found[element.joint().index()] = (
-            (element.default_stiffness(), element.default_nominal_angle())
-            if hinge
-            else (element.stiffness(), element.nominal_position())
-        )
-    return found
-
-
-def _carrier(body: Any, carriers: dict[Any, Any]) -> tuple[Any | None, RigidTransform]:
-    """The joint with a degree of freedom that carries `body` by welds, and the body's pose in that joint's child."""
-    pose = RigidTransform()
-    while body.index() in carriers:
-        joint = carriers[body.index()]
-        if joint.num_velocities():
-            return joint, pose
-        on_parent = joint.frame_on_parent().GetFixedPoseInBodyFrame()
-        pose = on_parent @ joint.frame_on_child().GetFixedPoseInBodyFrame().inverse() @ pose
-        body = joint.parent_body()
-    return None, pose
-
-
-def _carried(plant: Any, carriers: dict[Any, Any], number: dict[Any, int], n: int) -> tuple[Array, Array, Array]:
-    """Mass (n,), mass times centre of mass (n, 3) and inertia (n, 3, 3) about the child's origin, welds summed up."""
-    mass, moment, inertia = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3, 3))
-    for i in range(1, plant.num_bodies()):
-        body = plant.get_body(BodyIndex(i))
-        joint, pose = _carrier(body, carriers)
-        if joint is None:
-            continue
-        k = number[joint.index()]
-        moved = body.default_spatial_inertia().ReExpress(pose.rotation()).Shift(-pose.translation())
-        mass[k] += moved.get_mass()
-        moment[k] += moved.get_mass() * moved.get_com()
-        inertia[k] += moved.CopyToFullMatrix6()[:3, :3]
-    return mass, moment, inertia
-
-
-# `tree_dynamics` and AutoDiffXd differ by rounding.
-SAME_TREE = 1e-11
+SAME_TREE = 1e-11  # of the largest entry: these formulas and AutoDiffXd differ by rounding
 
 
 def tree_for(model: Model) -> TreeDynamics | None:
-    """The model's tree of hinges and slides, None where it is none or differs from AutoDiffXd through Drake."""
+    """The model's tree where it gives at two states what AutoDiffXd through Drake gives; None where it has no such.
+
+    It is that of the model's own parameters: while others are applied there is none.
+    """
     if model.has_other_parameters:
         return None
-    return model.cache("tree", lambda: _checked_tree(model))
 
+    def checked() -> TreeDynamics | None:
+        tree = tree_of(model)
+        if isinstance(tree, Refusal):
+            return None
+        random, here = np.random.default_rng(0), model.plant.GetPositionsAndVelocities(model.double.context)
+        states = random.standard_normal((2, model.nx))
+        same = all(_is_same(model, tree, x, random.standard_normal(model.nv)) for x in states)
+        set_state(model.double, here)
+        return tree if same else None
 
-def _checked_tree(model: Model) -> TreeDynamics | None:
-    """The model's tree, where it has one that gives at two states what AutoDiffXd through Drake gives."""
-    tree = tree_of(model)
-    if isinstance(tree, Refusal):
-        return None
-    random, here = np.random.default_rng(0), model.plant.GetPositionsAndVelocities(model.double.context)
-    states = random.standard_normal((2, model.nx))
-    same = all(_is_same(model, tree, x, random.standard_normal(model.nv)) for x in states)
-    set_state(model.double, here)
-    return tree if same else None
+    return model.cache("tree", checked)
 
 
 def _is_same(model: Model, tree: TreeDynamics, x: Array, a: Array) -> bool:
