@@ -42,28 +42,28 @@ class PlantFunctions:
 
 
 def symbolic_plant(model: Model) -> PlantFunctions | Refusal:
-    """The equations of motion as SX functions, or why there are none; compared with Drake's plant at two states.
+    """The equations of motion as SX functions, compared with Drake's plant at two states; or why there are none.
 
-    Made once, for the model's own parameters: what is made while it has others is not kept.
+    They are made once, and are those of the model's own parameters: while others are applied there are none.
     """
     if model.has_other_parameters:
-        return _compared(model)
-    return model.cache("symbolic plant", lambda: _compared(model))
+        return Refusal("parameters are applied that are not the model's own")
 
+    def compared() -> PlantFunctions | Refusal:
+        tree = tree_for(model)
+        if tree is None:
+            found = tree_of(model)
+            return found if isinstance(found, Refusal) else Refusal("its tree differs from Drake's inverse dynamics")
+        equations, random = EquationsOfMotion(model), np.random.default_rng(1)
+        here = model.plant.GetPositionsAndVelocities(model.double.context)
+        functions = _functions(tree, model, ca.DM(equations.actuation))
+        probe = random.standard_normal((2, model.nx + model.nu))
+        wanted = np.array([equations(row[: model.nx], row[model.nx :]) for row in probe])
+        set_state(model.double, here)
+        same = agrees(functions.function, probe, wanted, SAME_PLANT)
+        return functions if same else Refusal("its symbolic form differs from Drake's plant")
 
-def _compared(model: Model) -> PlantFunctions | Refusal:
-    tree = tree_for(model)
-    if tree is None:
-        found = tree_of(model)
-        return found if isinstance(found, Refusal) else Refusal("its tree differs from Drake's inverse dynamics")
-    equations, random = EquationsOfMotion(model), np.random.default_rng(1)
-    here = model.plant.GetPositionsAndVelocities(model.double.context)
-    functions = _functions(tree, model, ca.DM(equations.actuation))
-    probe = random.standard_normal((2, model.nx + model.nu))
-    wanted = np.array([equations(row[: model.nx], row[model.nx :]) for row in probe])
-    set_state(model.double, here)
-    same = agrees(functions.function, probe, wanted, SAME_PLANT)
-    return functions if same else Refusal("its symbolic form differs from Drake's plant")
+    return model.cache("symbolic plant", compared)
 
 
 def _functions(tree: TreeDynamics, model: Model, actuation: Any) -> PlantFunctions:

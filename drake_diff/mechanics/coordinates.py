@@ -1,17 +1,15 @@
-"""Drake's discrete step where nothing touches, written out: semi-implicit Euler with implicit joint damping.
+"""Coordinates of trees with free bodies: rates of q, and the coordinates that other simulators hold free bodies in.
 
-    (M(q) + h D) a = B u - bias(q, v) - D v,   v' = v + h a,   q' = q + h N(q) v'
+Drake's free body has q = (quaternion w x y z, position) and v = (w, v_o) in world, v_o the velocity of its origin. All
+other joints here have one degree of freedom and are the same everywhere. Written out here are
 
-N is the identity but for a free body, where v = (w, v_o) in world and the quaternion moves by h/2 (0, w) * q.
-
-Free bodies as Pinocchio has them: a position and quaternion (x, y, z, w), and (v, w) in the body's own frame.
-
-With R its orientation, v_native = Q v and a small motion is Q d, Q = [[0, R'], [R', 0]]; dv/dt = Q' a_native +
-(0, w x v). All other joints are as in Drake.
-
-Free bodies as simulators that work at centres of mass hold them: angular velocity and that of the centre, in world.
-
-v_center = Q v, with r the place of the centre of mass from the body's origin in world and Q = [[1, 0], [-skew(r), 1]].
+- Drake's step where nothing touches, semi-implicit Euler with implicit joint damping D (`euler_step`):
+      (M(q) + h D) a = B u - bias(q, v) - D v,   v' = v + h a,   q' = q + h N(q) v'
+  where N is the identity but for a free body, whose quaternion moves by h/2 (0, w) * q;
+- Pinocchio's free body: position and quaternion (x, y, z, w), and (v, w) in the body's own frame. With R the
+  orientation, v_native = Q v and a small motion is Q d, Q = [[0, R'], [R', 0]]; dv/dt = Q' a_native + (0, w x v);
+- free bodies at their centres of mass (`Centers`): w and the velocity of the centre, in world. With r the centre's
+  place from the origin, v_center = Q v, Q = [[1, 0], [-skew(r), 1]].
 """
 
 from dataclasses import dataclass
@@ -120,22 +118,20 @@ def rotation(quaternion: Array) -> Array:
     return np.asarray(_ONE + scale * (quaternion[..., :1, None] * vector + vector @ vector))
 
 
-def _times_from_left(q: Array) -> Array:
-    """(..., 4, 3): w -> (0, w) * q."""
-    return np.asarray((q @ _TIMES_FROM_LEFT).reshape(*q.shape[:-1], 4, 3))
+def unit(coordinates: Coordinates, q: Array) -> Array:
+    """`q` with quaternions of the norm 1."""
+    found = np.array(q)
+    for i, _ in coordinates.free:
+        found[i : i + 4] /= np.linalg.norm(q[i : i + 4])
+    return found
 
 
-def _left_product(w: Array) -> Array:
-    """(..., 4, 4): q -> (0, w) * q."""
-    return np.asarray((w @ _LEFT_PRODUCT).reshape(*w.shape[:-1], 4, 4))
-
-
-# Matrices whose entries are linear in a vector: row i holds the matrix of the vector's entry i, flattened.
-_ONE = np.eye(3)
-_PRODUCT = np.zeros((3, 4, 4))
-_PRODUCT[:, 0, 1:], _PRODUCT[:, 1:, 0], _PRODUCT[:, 1:, 1:] = -_ONE, _ONE, skew(_ONE)
-_LEFT_PRODUCT = _PRODUCT.reshape(3, 16)
-_TIMES_FROM_LEFT = np.transpose(_PRODUCT, (2, 1, 0)).reshape(4, 12)
+def zero(coordinates: Coordinates) -> Array:
+    """(nq,) with free bodies at the origin, unturned."""
+    q = np.zeros(coordinates.nq)
+    for i, _ in coordinates.free:
+        q[i] = 1.0
+    return q
 
 
 def native_positions(coordinates: Coordinates, q: Array) -> Array:
@@ -234,17 +230,19 @@ class Centers:
         return [(i, j, rotation(q[i : i + 4]) @ c) for (i, j), c in places]
 
 
-def unit(coordinates: Coordinates, q: Array) -> Array:
-    """`q` with quaternions of the norm 1."""
-    found = np.array(q)
-    for i, _ in coordinates.free:
-        found[i : i + 4] /= np.linalg.norm(q[i : i + 4])
-    return found
+def _times_from_left(q: Array) -> Array:
+    """(..., 4, 3): w -> (0, w) * q."""
+    return np.asarray((q @ _TIMES_FROM_LEFT).reshape(*q.shape[:-1], 4, 3))
 
 
-def zero(coordinates: Coordinates) -> Array:
-    """(nq,) with free bodies at the origin, unturned."""
-    q = np.zeros(coordinates.nq)
-    for i, _ in coordinates.free:
-        q[i] = 1.0
-    return q
+def _left_product(w: Array) -> Array:
+    """(..., 4, 4): q -> (0, w) * q."""
+    return np.asarray((w @ _LEFT_PRODUCT).reshape(*w.shape[:-1], 4, 4))
+
+
+# Matrices whose entries are linear in a vector: row i holds the matrix of the vector's entry i, flattened.
+_ONE = np.eye(3)
+_PRODUCT = np.zeros((3, 4, 4))
+_PRODUCT[:, 0, 1:], _PRODUCT[:, 1:, 0], _PRODUCT[:, 1:, 1:] = -_ONE, _ONE, skew(_ONE)
+_LEFT_PRODUCT = _PRODUCT.reshape(3, 16)
+_TIMES_FROM_LEFT = np.transpose(_PRODUCT, (2, 1, 0)).reshape(4, 12)
