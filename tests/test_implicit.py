@@ -361,6 +361,6 @@ def test_rollouts_by_both_methods_are_the_same(load):
         for method in ("implicit", "autodiff")
     )
     assert (a.methods, b.methods) == (("implicit",), ("autodiff",))
-    for name in ("x0", "us", "parameters"):
+    for name in ("by_x0", "by_us", "by_parameters"):
         # 60 steps, whose rounding the motion magnifies as it does the gradient itself
         assert getattr(a, name) == pytest.approx(getattr(b, name), rel=1e-8, abs=1e-8)

@@ -43,7 +43,8 @@ def check_gradients(model, policy, x0, num_steps, parameters=(), tolerance=1e-6)
     """
     x0 = np.asarray(x0, dtype=float)
     policy_values = np.array(policy_parameters(policy))
-    model_values = {p.name: p.value[0] for p in dd.list_parameters(model) if p.name in parameters}
+    known = {p.name: p.value[0] for p in dd.list_parameters(model)}
+    model_values = {name: known[name] for name in parameters}
 
     def loss_at(x=x0, p=policy_values, values=None):
         values = model_values if values is None else dict(zip(model_values, values, strict=True))
@@ -303,7 +304,7 @@ def test_pd_refuses_gains_and_references_that_do_not_fit(load):
 
 def test_the_gradient_through_pd_is_that_of_rollouts(load):
     model = load("pendulum.urdf")
-    check_gradients(model, PD(model, 3.0, 0.4, [1.0, 0.0]), [0.1, 0.5], 30, ("pendulum.mass", "hinge.damping"))
+    check_gradients(model, PD(model, 3.0, 0.4, [1.0, 0.0]), [0.1, 0.5], 30, ("pole.mass", "hinge.damping"))
 
 
 def test_the_gradient_through_lqr_is_that_of_rollouts(load):
@@ -316,7 +317,7 @@ def test_the_gradient_through_tvlqr_is_that_of_rollouts(load):
     model = load("pendulum.urdf")
     us = 2.0 * np.ones((10, 1))
     tvlqr = TVLQR(model, dd.rollout(model, [0.0, 0.0], us).xs, us, Q, R)
-    check_gradients(model, tvlqr, [0.3, -0.2], 10, ("pendulum.mass",))
+    check_gradients(model, tvlqr, [0.3, -0.2], 10, ("pole.mass",))
 
 
 def test_the_gradient_through_a_neural_network_is_that_of_rollouts(load):
@@ -328,7 +329,7 @@ def test_the_gradient_through_a_neural_network_is_that_of_rollouts(load):
 def test_the_gradient_through_a_plain_function_is_that_of_rollouts(load):
     """It has no parameters: by the initial state and the model's parameters alone."""
     model = load("pendulum.urdf")
-    check_gradients(model, lambda x, t: [np.sin(3 * t) - 2 * x[0]], [0.3, -0.2], 20, ("pendulum.mass",))
+    check_gradients(model, lambda x, t: [np.sin(3 * t) - 2 * x[0]], [0.3, -0.2], 20, ("pole.mass",))
 
 
 def test_the_gradient_by_gains_of_a_floating_robot_is_that_of_rollouts():
