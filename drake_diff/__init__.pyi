@@ -20,8 +20,8 @@ from .certificates.certify import certify as certify
 from .certificates.certify import certify_rollout as certify_rollout
 from .comparison.recordings import Recording as Recording
 from .comparison.side_by_side import compare as compare
-from .derivatives.linearize import linearize as linearize
 from .derivatives.step import differentiate_step as differentiate_step
+from .derivatives.step import linearize as linearize
 from .model import quantities as quantities
 from .model.contact import contact_modes as contact_modes
 from .model.model import Model as Model

@@ -213,7 +213,7 @@ def test_a_clock_counts_a_layer_alone(part, monkeypatch):
 
 
 def test_clocks_are_taken_off_again(part):
-    layers, derivatives = part("layers"), importlib.import_module("drake_diff.derivatives.step")
+    layers, derivatives = part("layers"), importlib.import_module("drake_diff.derivatives.sources")
     plant = layers.pydrake.multibody.plant.MultibodyPlant
     method, function = plant.EvalUniquePeriodicDiscreteUpdate, derivatives.gradient_rows
     clock = layers.Clock()

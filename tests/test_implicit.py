@@ -1,6 +1,7 @@
 """The implicit step Jacobian is that of AutoDiffXd wherever a step is smooth, and is handed over wherever it is not."""
 
 import re
+import time
 import warnings
 from pathlib import Path
 
@@ -23,7 +24,9 @@ from pydrake.multibody.tree import (
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 import drake_diff as dd
-from drake_diff.exceptions import ModelError, ModelWarning, SimulationError
+from drake_diff.derivatives import sources
+from drake_diff.derivatives.sources import METHODS
+from drake_diff.exceptions import ModelError, ModelWarning, SimulationError, UnknownNameError
 
 NAMES = sorted(path.name for path in MODELS.iterdir())
 SAME = 1e-10  # two exact derivatives of one smooth step differ by rounding
@@ -241,7 +244,8 @@ def test_a_diagram_that_applies_forces_is_handed_over(port):
     # Drake cannot convert a constant spatial force to AutoDiffXd, and says so when the step is taken.
     d = dd.differentiate_step(model, [0.0, 1.0], [3.0], method="implicit" if port == "generalized" else "auto")
     assert d.method == ("autodiff" if port == "generalized" else "finite_difference")
-    assert ("the diagram feeds applied" in d.reason) == (port == "generalized")
+    assert "the diagram feeds applied" in d.reason
+    assert ("not autodiff: " in d.reason) == (port == "spatial")
     assert d.B[1, 0] == pytest.approx(0.01 / 2, rel=1e-9)
     by_mass = dd.differentiate_step(model, [0.0, 1.0], [3.0], parameters=("block.mass",))
     assert by_mass.C[1, 0] == pytest.approx(-0.01 * 10.0 / 4, rel=1e-9)
@@ -313,12 +317,42 @@ def test_the_automatic_choice_says_what_it_took_and_why(load, without_pinocchio)
     model = load("double_pendulum.urdf")
     point = [0.4, -0.9, 1.3, -0.6], [0.25, -0.15]
     d = dd.differentiate_step(model, *point)
-    assert d.method in ("implicit", "autodiff")
-    assert "as measured on this model" in d.reason
-    assert ("equal to autodiff" in d.reason) == (d.method == "implicit")
+    assert d.method == "implicit"
+    assert "equal to autodiff, as certified on this model" in d.reason
     assert "Pinocchio is not installed: pip install" in d.reason
     again = dd.differentiate_step(model, [0.1, 0.2, 0.3, 0.4], [0.0, 1.0])
     assert (again.method, again.reason) == (d.method, d.reason)  # once and for all
+
+
+@pytest.mark.parametrize("slow", ["implicit", "autodiff"])
+def test_a_delay_changes_nothing_about_the_choice(load, without_pinocchio, monkeypatch, slow):
+    """The choice stands in records: one that went by the clock would change from machine to machine."""
+    models = [load("double_pendulum.urdf") for _ in range(2)]
+    point = [0.4, -0.9, 1.3, -0.6], [0.25, -0.15]
+    names = tuple(p.name for p in dd.list_parameters(models[0]) if p.name.endswith(".mass"))
+
+    def chosen(model):
+        d, by_parameters = dd.differentiate_step(model, *point), dd.differentiate_step(model, *point, parameters=names)
+        many = dd.linearize(model, [point[0]] * 3, [point[1]] * 3)[2]
+        return d.method, d.reason, by_parameters.method, by_parameters.reason, many
+
+    expected = chosen(models[0])
+    source = sources.Implicit if slow == "implicit" else sources.Autodiff
+    prompt, delays = source.differentiate, []
+
+    def late(self, steps):
+        delays.append(time.sleep(0.02))
+        return prompt(self, steps)
+
+    monkeypatch.setattr(source, "differentiate", late)
+    assert chosen(models[1]) == expected
+    assert delays  # it was asked
+
+
+@pytest.mark.parametrize("method", METHODS[1:])
+def test_every_method_is_named_where_one_is_unknown(load, method):
+    with pytest.raises(UnknownNameError, match=method):
+        dd.differentiate_step(load("pendulum.urdf"), [0.1, 0.0], [0.0], method="guess")
 
 
 def test_a_choice_made_without_parameters_holds_with_them(load):

@@ -8,8 +8,8 @@ import pytest
 from helpers.models import Plant, contact_properties
 
 import drake_diff as dd
+from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import GradientError, InputError
-from drake_diff.motion.gradient import derivatives_along
 
 
 def test_the_double_integrators_gradient_and_norms_have_their_closed_form(write_urdf):

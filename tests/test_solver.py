@@ -12,8 +12,8 @@ from helpers.models import MODELS, Plant, contact_properties
 from helpers.plants import pd_pendulum
 
 import drake_diff as dd
+from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import GradientError, InputError, ModelError, ShapeError, SimulationError
-from drake_diff.motion.gradient import derivatives_along
 from drake_diff.optimize.program import NlpResult, Outcome
 from drake_diff.optimize.solution import Status
 from drake_diff.optimize.solve import Run

@@ -18,7 +18,8 @@ from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.differences import one_by_one
 from drake_diff.certificates.certificate import JITTER, VERDICTS, Certificate, certify_displacement, jitter_direction
 from drake_diff.certificates.mode_changes import ModeChange, find_mode_changes
-from drake_diff.derivatives.step import StepDerivatives, check_method, step_at, step_jacobians
+from drake_diff.derivatives.sources import check_method, step_at
+from drake_diff.derivatives.step import StepDerivatives, step_jacobians
 from drake_diff.exceptions import InputError
 from drake_diff.model.contract import SAP_RELATIVE_TOLERANCE
 from drake_diff.model.model import Model

@@ -129,7 +129,7 @@ def certify(
     states: Annotated[int, typer.Option(help="How many states to sample; every other one in contact.")] = 20,
     seed: Annotated[int, typer.Option(help="The same seed gives the same states.")] = 0,
     parameter: Annotated[list[str] | None, typer.Option(help="Also certify the derivative by this one.")] = None,
-    method: Annotated[str, typer.Option(help="auto, autodiff, implicit or finite_difference")] = "auto",
+    method: Annotated[str, typer.Option(help="auto, analytic, autodiff, implicit or finite_difference")] = "auto",
     out: Annotated[Path | None, typer.Option(help="Directory; artifacts/certify_<model> where not given.")] = None,
     time_step: TimeStep = 0.01,
     contact_model: ContactModel = "point",

@@ -17,7 +17,6 @@ r(v') = 0 is checked: where it does not hold, something else acts, or the AutoDi
 
 from dataclasses import dataclass
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,12 +24,14 @@ from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import gradient_rows
-from drake_diff.exceptions import GradientError
+from drake_diff._base.refusal import Refusal
+from drake_diff.derivatives.steps import Jacobians, NotSmoothError, Steps
+from drake_diff.exceptions import DrakeDiffError
 from drake_diff.mechanics.tree import TreeDynamics, tree_for
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import ParameterVector, write_autodiff
+from drake_diff.model.parameters import write_autodiff
 from drake_diff.model.plant import actuators, is_driven, joints
-from drake_diff.model.step import advance, set_state
+from drake_diff.model.step import set_state
 
 # Rounding of the forces that balance, relative to the largest of them. What a solver leaves is larger.
 RESIDUAL_TOLERANCE = 1e-9
@@ -38,97 +39,44 @@ RESIDUAL_TOLERANCE = 1e-9
 TREE_JOINTS = 5
 
 
-class NotSmoothError(GradientError):
-    """The step is not the one that the implicit form describes."""
+class Implicit:
+    """The Jacobians of smooth steps from their own equation; parameters that are differenced have zeros."""
+
+    name = "implicit"
+
+    def differentiate(self, steps: Steps) -> Jacobians | Refusal:
+        """Those of one tree of hinges and slides in one call, others step by step."""
+        model, form = steps.model, form_of(steps.model)
+        if form.excluded:
+            return Refusal(form.excluded)
+        refused: dict[int, DrakeDiffError] = {}
+        if steps.some_touch:
+            refused = {int(k): NotSmoothError("geometries touch") for k in np.flatnonzero(steps.touching)}
+        tree = tree_for(model)
+        if tree is not None and (len(steps) > 1 or model.nv >= TREE_JOINTS):
+            values, missing = _by_tree(form, tree, steps)
+        else:
+            values, missing = np.empty((len(steps), model.nx, steps.width)), np.zeros(len(steps))
+            for k in range(len(steps)):
+                if k not in refused:
+                    missing[k] = _by_autodiff(form, steps, k, values[k])
+        for i in np.flatnonzero(~(missing <= RESIDUAL_TOLERANCE)):
+            why = f"contact, a joint limit or a constraint acts: {missing[i]:.3g} of the forces are not accounted for"
+            refused.setdefault(int(i), NotSmoothError(why))
+        return Jacobians(values, refused)
 
 
-def why_not_implicit(model: Model) -> str:
-    """What in the model the implicit form leaves out wherever it is; empty where there is nothing."""
-    plant = model.plant
-    if plant.num_constraints():
-        return "constraints act at every step"
-    for port in (plant.get_applied_generalized_force_input_port(), plant.get_applied_spatial_force_input_port()):
-        if is_driven(model.diagram, model.path, port):
-            return f"the diagram feeds {port.get_name()}"
-    if any(joint.is_locked(model.double.context) for joint in joints(plant)):
-        return "a joint is locked"
-    driven = [port for port in _desired_states(model) if is_driven(model.diagram, model.path, port)]
-    return "the diagram feeds PD targets" if driven else ""
+def takes_many(model: Model) -> bool:
+    """Whether many steps are differentiated in one call."""
+    return not form_of(model).excluded and tree_for(model) is not None
 
 
-def implicit_jacobian(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array:
-    """(nx, nx + nu + np) the derivative of the step by [x; u; parameters]; differenced parameters have zeros.
-
-    The vector is applied to `model`, whose double twin stands at the step from (x, u) to `x_next`, as
-    `step.advance` leaves it. Raises NotSmoothError where something else than smooth forces acts.
-    """
-    form = form_of(model)
-    if form.excluded:
-        raise NotSmoothError(form.excluded)
-    if form.can_touch and model.double.touches():
-        raise NotSmoothError("geometries touch")
-    if form.tree is not None and model.nv >= TREE_JOINTS and not model.has_other_parameters:
-        jacobians, missing = _by_tree(model, form, form.tree, x[None], u[None], x_next[None])
-        _check_vanishes(missing[0])
-        return np.asarray(jacobians[0])
-    return _by_autodiff(model, form, vector, x, u, x_next)
-
-
-@dataclass(frozen=True, eq=False)
-class Steps:
-    """N steps from starts (N, nx) under us (N, nu) to ends (N, nx), and where a contact acts (N,)."""
-
-    starts: Array
-    us: Array
-    ends: Array
-    touching: NDArray[np.bool_]
-
-    def part(self, which: NDArray[np.intp]) -> "Steps":
-        """Some of the steps."""
-        return Steps(self.starts[which], self.us[which], self.ends[which], self.touching[which])
-
-
-def take_steps(model: Model, x0: Array, us: Array, xs: Array | None = None, x_next: Array | None = None) -> Steps:
-    """Drake's steps from x0 (nx,) under us (N, nu), or from each of xs (N, nx).
-
-    Where the steps from xs are known to lead to `x_next` (N, nx), Drake is asked only what overlaps.
-    """
-    form = form_of(model)
-    starts, ends = np.empty((len(us), model.nx)), np.empty((len(us), model.nx))
-    touching = np.zeros(len(us), dtype=bool)
-    if xs is not None and x_next is not None:
-        for k in range(len(us) if form.can_touch else 0):
-            set_state(model.double, xs[k])
-            touching[k] = model.double.overlaps()
-        return Steps(xs, us, x_next, touching)
-    x = x0
-    for k, u in enumerate(us):
-        starts[k] = x if xs is None else xs[k]
-        x = ends[k] = advance(model.double, starts[k], u)
-        touching[k] = form.can_touch and model.double.touches()
-    return Steps(starts, us, ends, touching)
-
-
-def implicit_jacobians(model: Model, steps: Steps) -> tuple[Array, NDArray[np.bool_]] | None:
-    """(N, nx, nx + nu) of the steps, and which of them (N,) are smooth; the Jacobians of the others mean nothing.
-
-    None where there is no tree, or parameters are set: then the steps are differentiated one by one.
-    """
-    form = form_of(model)
-    if form.excluded or form.tree is None or model.has_other_parameters:
-        return None
-    jacobians, missing = _by_tree(model, form, form.tree, steps.starts, steps.us, steps.ends)
-    return jacobians, ~steps.touching & (missing <= RESIDUAL_TOLERANCE)
-
-
-def _by_tree(
-    model: Model, form: "Form", tree: TreeDynamics, xs: Array, us: Array, x_nexts: Array
-) -> tuple[Array, Array]:
+def _by_tree(form: "Form", tree: TreeDynamics, steps: Steps) -> tuple[Array, Array]:
     """(N, nx, nx + nu) the derivatives of N steps, and (N,) the force that is not accounted for, as a part."""
-    n, h, damping = model.nv, model.time_step, tree.damping
-    q, v, v_next = xs[:, :n], xs[:, n:], x_nexts[:, n:]
-    effort, free, (kp, kd) = form.effort(q, v_next, us, h)
-    d = tree(tree.place(model, q), q, v, (v_next - v) / h)
+    n, h, damping = steps.model.nv, steps.model.time_step, tree.damping
+    q, v, v_next = steps.xs[:, :n], steps.xs[:, n:], steps.x_next[:, n:]
+    effort, free, (kp, kd) = form.effort(q, v_next, steps.us, h)
+    d = tree(tree.place(steps.model, q), q, v, (v_next - v) / h)
     rest = damping * (v_next - v) - np.clip(effort, -form.limit, form.limit) @ form.actuation.T
     diagonal = np.arange(n)
     by_next = d.mass / h
@@ -144,9 +92,15 @@ def _by_tree(
     return np.concatenate([positions, velocities], axis=1), _missing(d.tau, rest)
 
 
-def _by_autodiff(model: Model, form: "Form", vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array:
+def _by_autodiff(form: "Form", steps: Steps, k: int, jacobian: Array) -> float:
+    """Step k's derivative into `jacobian` (nx, nx + nu + np); returns the force that is not accounted for.
+
+    Where some is missing nothing is written: the equation is not the step's.
+    """
+    model, vector = steps.model, steps.vector
+    x, u, v_next = steps.xs[k], steps.us[k], steps.x_next[k, model.nq :]
+    steps.stand_at(k)
     twin, nq, nx, h = model.double, model.nq, model.nx, model.time_step
-    v_next = x_next[nq:]
     change, damping = v_next - x[nq:], twin.damping()
     effort, free, (kp, kd) = form.effort(x[:nq], v_next, u, h)
     applied = form.actuation @ np.clip(effort, -form.limit, form.limit)
@@ -155,7 +109,9 @@ def _by_autodiff(model: Model, form: "Form", vector: ParameterVector, x: Array, 
     write_autodiff(vector, model, variables[nx:])
     set_state(model.autodiff, variables[:nx])
     needed = model.autodiff.inverse_dynamics(np.array([AutoDiffXd(a) for a in change / h])).reshape(-1, 1)
-    _check_vanishes(_missing(ExtractValue(needed).ravel(), damping * change - applied))
+    missing = float(_missing(ExtractValue(needed).ravel(), damping * change - applied))
+    if not missing <= RESIDUAL_TOLERANCE:
+        return missing
     rows = gradient_rows(needed, len(variables))
     if vector.parameters:
         rows = rows + gradient_rows(model.autodiff.damping() * change, len(variables))
@@ -168,7 +124,9 @@ def _by_autodiff(model: Model, form: "Form", vector: ParameterVector, x: Array, 
         by_point[:, form.position] += pressed * kp
         by_next += (pressed * (kd + h * kp)) @ form.actuation.T
     velocities = -np.linalg.solve(by_next, by_point)
-    return np.concatenate([_positions(model, v_next, velocities, len(vector.values)), velocities])
+    jacobian[:nq] = _positions(model, form, v_next, velocities, len(vector.values))
+    jacobian[nq:] = velocities
+    return missing
 
 
 def _missing(needed: Array, rest: Array) -> Array:
@@ -177,18 +135,11 @@ def _missing(needed: Array, rest: Array) -> Array:
     return np.asarray(np.abs(needed + rest).max(axis=-1) / size)
 
 
-def _check_vanishes(missing: Array) -> None:
-    if not missing <= RESIDUAL_TOLERANCE:
-        raise NotSmoothError(
-            f"contact, a joint limit or a constraint acts: {float(missing):.3g} of the forces are not accounted for"
-        )
-
-
-def _positions(model: Model, v_next: Array, velocities: Array, num_parameters: int) -> Array:
+def _positions(model: Model, form: "Form", v_next: Array, velocities: Array, num_parameters: int) -> Array:
     """(nq, nx + nu + np) the derivative of q' = q + h N(q) v'; the AutoDiffXd twin stands at the step's state."""
-    if model.plant.IsVelocityEqualToQDot():
+    if form.q_dot_is_v:
         moved = model.time_step * velocities
-        moved[form_of(model).diagonal] += 1.0
+        moved[form.diagonal] += 1.0
         return np.asarray(moved)
     own = np.eye(model.nq, velocities.shape[1])
     twin = model.autodiff
@@ -211,8 +162,7 @@ class Form:
     reference: Array  # (2, nu) the positions and velocities that PD control holds
     diagonal: tuple[Any, ...]  # the indices of that of (nv, nv)
     pd: bool
-    can_touch: bool
-    tree: TreeDynamics | None
+    q_dot_is_v: bool
 
     def effort(self, q: Array, v_next: Array, u: Array, h: float) -> tuple[Array, NDArray[np.bool_], Any]:
         """(..., nu) what the inputs are before they are clipped, whether they are free of their limits, and kp, kd."""
@@ -231,43 +181,45 @@ class Form:
         return np.array([g.p if g else 0.0 for g in gains]), np.array([g.d if g else 0.0 for g in gains])
 
 
-_FORMS: WeakKeyDictionary[Model, Form] = WeakKeyDictionary()
-
-
 def form_of(model: Model) -> Form:
-    """Read once, from the model's own parameters: while it has others, no tree is made and nothing is kept."""
-    if model in _FORMS:
-        return _FORMS[model]
+    """Read once: nothing in it changes with parameters."""
+    return model.cache("implicit form", lambda: _read_form(model))
+
+
+def _read_form(model: Model) -> Form:
     found = actuators(model.plant)
     velocity = np.array([a.joint().velocity_start() for a in found], dtype=int)
     actuation = np.zeros((model.nv, len(found)))
     actuation[velocity, np.arange(len(found))] = 1.0
-    form = Form(
-        excluded=why_not_implicit(model),
+    references = np.zeros((2, len(found)))
+    for instance, target in model.pd_targets.items():
+        driven = [i for i, a in enumerate(found) if a.model_instance() == instance]
+        references[:, driven] = np.asarray(target).reshape(2, len(driven))
+    return Form(
+        excluded=_why_excluded(model),
         actuators=found,
         velocity=velocity,
         position=np.array([a.joint().position_start() for a in found], dtype=int),
         actuation=actuation,
         limit=np.array([a.effort_limit() for a in found], dtype=float),
-        reference=_references(model, found),
+        reference=references,
         diagonal=np.diag_indices(model.nv),
         pd=any(a.has_controller() for a in found),
-        can_touch=model.contract.contact.collision_pairs > 0,
-        tree=tree_for(model),
+        q_dot_is_v=bool(model.plant.IsVelocityEqualToQDot()),
     )
-    if not model.has_other_parameters:
-        _FORMS[model] = form
-    return form
 
 
-def _references(model: Model, found: list[Any]) -> Array:
-    references = np.zeros((2, len(found)))
-    for instance, target in model.pd_targets.items():
-        driven = [i for i, a in enumerate(found) if a.model_instance() == instance]
-        references[:, driven] = np.asarray(target).reshape(2, len(driven))
-    return references
-
-
-def _desired_states(model: Model) -> list[Any]:
-    instances = {a.model_instance() for a in actuators(model.plant) if a.has_controller()}
-    return [model.plant.get_desired_state_input_port(instance) for instance in instances]
+def _why_excluded(model: Model) -> str:
+    """What in the model the form leaves out wherever it is; empty where there is nothing."""
+    plant = model.plant
+    if plant.num_constraints():
+        return "constraints act at every step"
+    for port in (plant.get_applied_generalized_force_input_port(), plant.get_applied_spatial_force_input_port()):
+        if is_driven(model.diagram, model.path, port):
+            return f"the diagram feeds {port.get_name()}"
+    if any(joint.is_locked(model.double.context) for joint in joints(plant)):
+        return "a joint is locked"
+    instances = {a.model_instance() for a in actuators(plant) if a.has_controller()}
+    targets = [plant.get_desired_state_input_port(instance) for instance in instances]
+    driven = any(is_driven(model.diagram, model.path, port) for port in targets)
+    return "the diagram feeds PD targets" if driven else ""

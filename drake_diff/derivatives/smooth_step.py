@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array
-from drake_diff.derivatives.implicit import Form, Steps, form_of
+from drake_diff.derivatives.implicit import Form, form_of
+from drake_diff.derivatives.steps import Steps
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates, native_positions, turn, turn_change, turn_derivatives, turning
 from drake_diff.mechanics.description import Description, describe_tree
@@ -40,7 +41,7 @@ class Native:
 
 
 @dataclass(frozen=True, eq=False)
-class Analytic:
+class SmoothStep:
     """What of a model does not change from step to step."""
 
     pinocchio: Any  # pin.Model, with h D in its armature
@@ -61,8 +62,8 @@ class Analytic:
 
     def __call__(self, steps: Steps) -> tuple[Array, NDArray[np.bool_]]:
         """(N, nx, nx + nu) of the steps, and which (N,) are smooth: those that lead where Drake's do."""
-        jacobians, x_next = self.differentiate(steps.starts, steps.us)
-        agree = np.abs(x_next - steps.ends) <= STEP_TOLERANCE * np.maximum(np.abs(steps.ends), 1.0)
+        jacobians, x_next = self.differentiate(steps.xs, steps.us)
+        agree = np.abs(x_next - steps.x_next) <= STEP_TOLERANCE * np.maximum(np.abs(steps.x_next), 1.0)
         return jacobians, agree.all(axis=1) & ~steps.touching
 
     def differentiate(self, xs: Array, us: Array) -> tuple[Array, Array]:
@@ -90,8 +91,8 @@ class Analytic:
 
     def at_a_limit(self, steps: Steps) -> NDArray[np.bool_]:
         """(N,) whether a joint limit pushes: Drake's does where phi + 2 h phi' < 0, phi being how far it is."""
-        v_next = steps.ends[:, self.coordinates.nq :]
-        ahead = steps.starts[:, self.positions] + 2 * self.time_step * v_next
+        v_next = steps.x_next[:, self.coordinates.nq :]
+        ahead = steps.xs[:, self.positions] + 2 * self.time_step * v_next
         return np.asarray(((ahead <= self.limits[0]) | (ahead >= self.limits[1])).any(axis=1))
 
     def _accelerate(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array, Array]:
@@ -198,7 +199,7 @@ class Analytic:
         return velocities
 
 
-def build_analytic(model: Model) -> Analytic:
+def build_analytic(model: Model) -> SmoothStep:
     """Not certified. Raises ModelError where the plant is no such tree, MissingDependencyError without Pinocchio."""
     form = form_of(model)
     if form.excluded:
@@ -215,7 +216,7 @@ def build_analytic(model: Model) -> Analytic:
         positions[j] = i
         limits[:, j] = model.plant.GetPositionLowerLimits()[i], model.plant.GetPositionUpperLimits()[i]
     controlled = np.array([a.has_controller() for a in form.actuators], dtype=bool)
-    return Analytic(
+    return SmoothStep(
         pinocchio=built,
         data=data,
         derivatives=acceleration_derivatives,

@@ -1,40 +1,23 @@
-"""The Jacobians of one discrete step, and the gates that each must pass before anyone sees it."""
+"""The Jacobians of discrete steps, and the gate that each must pass before anyone sees it."""
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
+from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, frozen
-from drake_diff._base.autodiff import gradient_rows
-from drake_diff._base.differences import central_differences, plateau
-from drake_diff.derivatives.analytic import analytic_jacobian, analytic_of
-from drake_diff.derivatives.contact.material import of_contact_alone
-from drake_diff.derivatives.implicit import NotSmoothError, implicit_jacobian
-from drake_diff.exceptions import GradientError, ModelError, SimulationError, UnknownNameError
+from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff._base.refusal import Refusal
+from drake_diff.derivatives.analytic import analytic_of
+from drake_diff.derivatives.implicit import takes_many
+from drake_diff.derivatives.sources import ANALYTIC, IMPLICIT, OF_ONE_KIND, check_method, choose
+from drake_diff.derivatives.steps import Steps, known_steps, take_step, take_steps
+from drake_diff.exceptions import GradientError, ShapeError
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import Parameters, ParameterVector, applied, select, write_autodiff
-from drake_diff.model.step import advance, check_point
+from drake_diff.model.parameters import Parameters, ParameterVector, applied, select
+from drake_diff.model.step import check_point
 
-METHODS = ("auto", "analytic", "autodiff", "implicit", "finite_difference")
-# The AutoDiffXd and the double step run the same algorithm, so they differ by rounding only.
-PARITY_TOLERANCE = 1e-9
 # Lagged contact reaches 4e4 where it is right; Drake's singular poses give 1e15 and more.
 MAGNITUDE_BOUND = 1e8
-# Cube root of the double step's rounding: where truncation and rounding of a central difference balance.
-DIFFERENCE_STEP = 1e-5
-# Two ways to the same smooth Jacobian differ by rounding, which the inverse of a mass matrix may magnify.
-SAME_JACOBIAN = 1e-10
-# Implicit is 0.9 to 2 times as fast as autodiff; a choice at the break-even would change from run to run.
-TIMED_CALLS, MUCH_SLOWER = 3, 3.0
-OF_ONE_KIND = ("analytic", "finite_difference")  # methods whose columns by parameters are such, too
-# Below so many degrees of freedom AutoDiffXd takes a step with contact in less time than NumPy's calls for one take.
-CONTACT_SIZE = 8
-CERTIFIED = "equal to autodiff, as certified on this model"
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,175 +66,95 @@ def differentiate_step(
         return step_jacobians(set_model, vector, x, u, method)
 
 
-def check_method(method: str) -> None:
-    """Refuse what is no source of a step's derivative, naming those that are."""
-    if method not in METHODS:
-        raise UnknownNameError("method", got=method, known=METHODS)
+def linearize(
+    model: Model, xs: ArrayLike, us: ArrayLike, method: str = "auto", x_next: ArrayLike | None = None
+) -> tuple[Array, Array, tuple[str, ...]]:
+    """A (N, nx, nx) and B (N, nx, nu) of the steps from each of `xs` under `us` (N, nu), and each step's method.
+
+    `xs` is (N, nx), or (N+1, nx) with a last state from which no step is taken. `method` is that of
+    `differentiate_step`, and a step that one method cannot take goes where it goes there. `x_next` (N, nx), where the
+    steps are known to lead, spares Drake's own; a step that is found to lead elsewhere is taken.
+    Raises ShapeError, NonFiniteError, UnknownNameError, and what `differentiate_step` raises.
+    """
+    check_method(method)
+    us = finite_array("us", us, ("N", model.nu))
+    xs = finite_array("xs", xs, ("N", model.nx))
+    if len(xs) - len(us) not in (0, 1):
+        raise ShapeError("xs", got=xs.shape, expected=(f"{len(us)} or {len(us) + 1}", model.nx))
+    xs, nx = xs[: len(us)], model.nx
+    ends = None if x_next is None else finite_array("x_next", x_next, (len(us), nx))
+    if not len(us):
+        return np.empty((0, nx, nx)), np.empty((0, nx, model.nu)), ()
+    vector = select(model, ())
+    steps = take_steps(model, vector, xs[0], us, xs) if ends is None else known_steps(model, vector, xs, us, ends)
+    chosen = choose(steps, method)
+    _check_derivatives(model, chosen.values)
+    return chosen.values[:, :, :nx], chosen.values[:, :, nx:], tuple(chosen.methods)
 
 
 def step_jacobians(model: Model, vector: ParameterVector, x: Array, u: Array, method: str) -> StepDerivatives:
     """`differentiate_step` on a model that the vector is applied to; sizes are the caller's business."""
-    x_next = advance(model.double, x, u)
-    jacobian, used, reason = _SOURCES[method](model, vector, x, u, x_next)
-    if vector.parameters and len(vector.differenced) and used not in OF_ONE_KIND:
-        jacobian[:, model.nx + model.nu + vector.differenced] = _parameter_differences(model, vector, x, u, x_next)
-    check_derivatives(model, jacobian)
-    nx, end = model.nx, model.nx + model.nu
-    return StepDerivatives(
-        x_next=frozen(x_next),
-        A=frozen(jacobian[:, :nx]),
-        B=frozen(jacobian[:, nx:end]),
-        C=frozen(jacobian[:, end:]),
-        parameters=vector.names,
-        sources=(used,) * len(vector.names) if used in OF_ONE_KIND else vector.sources,
-        method=used,
-        reason=reason,
-    )
+    return _derivatives_of(take_step(model, vector, x, u), method, single=True)[0]
 
 
-Source = tuple[Array, str, str]  # the Jacobian (nx, nx + nu + np), the method and why it was taken
+def derivatives_along(
+    model: Model,
+    x0: Array,
+    us: Array,
+    *,
+    vector: ParameterVector | None = None,
+    method: str = "auto",
+    xs: Array | None = None,
+) -> list[StepDerivatives]:
+    """The step derivatives along the rollout from `x0` (nx,) under `us` (N, nu), `vector` being applied.
+
+    Given xs (N, nx), those of the steps from each of them.
+    """
+    return _derivatives_of(take_steps(model, vector or select(model, ()), x0, us, xs), method)
 
 
-def _by_autodiff(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
-    return _autodiff(model, vector, x, u, x_next), "autodiff", "asked for"
-
-
-def _by_finite_difference(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
-    return _finite_difference(model, vector, x, u, x_next), "finite_difference", "asked for"
-
-
-def _by_implicit(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
-    try:
-        return implicit_jacobian(model, vector, x, u, x_next), "implicit", "asked for"
-    except NotSmoothError as error:
-        return _autodiff(model, vector, x, u, x_next), "autodiff", f"not implicit: {error}"
-
-
-def _by_choice(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
-    """What is exact and fastest on this model."""
-    if model.nv < CONTACT_SIZE and not vector.parameters and _touches(model):
-        return _without_analytic(model, vector, x, u, x_next)
-    jacobian = _analytic(model, vector, x, u, x_next)
-    if isinstance(jacobian, str):
-        return _without_analytic(model, vector, x, u, x_next)
-    return jacobian, "analytic", CERTIFIED
-
-
-def _touches(model: Model) -> bool:
-    return model.contract.contact.collision_pairs > 0 and model.double.touches()
-
-
-def _by_analytic(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
-    jacobian = _analytic(model, vector, x, u, x_next)
-    if isinstance(jacobian, str):
-        other, method, reason = _without_analytic(model, vector, x, u, x_next)
-        return other, method, f"not analytic: {jacobian}; {reason}"
-    return jacobian, "analytic", "asked for"
-
-
-def _analytic(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array | str:
-    """The Jacobian by Pinocchio, or why it cannot be had so."""
-    if not of_contact_alone(vector):
-        return "derivatives by parameters other than of contact are asked for"
-    return analytic_jacobian(model, vector, x, u, x_next)
-
-
-def _without_analytic(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Source:
-    """Implicit or autodiff as measured on the first smooth step that is met; differences where both are refused."""
-    why = "the first choice"
-    try:
-        if model not in _CHOICES or _CHOICES[model].use_implicit:
-            jacobian = implicit_jacobian(model, vector, x, u, x_next)
-            if model not in _CHOICES:
-                _CHOICES[model] = _compare(model, vector, x, u, x_next, jacobian)
-            if _CHOICES[model].use_implicit:
-                return jacobian, "implicit", _CHOICES[model].reason
-        why = _CHOICES[model].reason
-    except NotSmoothError as error:
-        why = f"not implicit: {error}"
-    except ModelError as error:
-        why = str(error)
-    try:
-        return _autodiff(model, vector, x, u, x_next), "autodiff", why
-    except (ModelError, SimulationError) as error:
-        jacobian = _finite_difference(model, vector, x, u, x_next)
-        return jacobian, "finite_difference", f"AutoDiffXd is refused: {error}"
-
-
-_SOURCES: dict[str, Callable[[Model, ParameterVector, Array, Array, Array], Source]] = {
-    "autodiff": _by_autodiff,
-    "finite_difference": _by_finite_difference,
-    "implicit": _by_implicit,
-    "analytic": _by_analytic,
-    "auto": _by_choice,
-}
-
-
-@dataclass(frozen=True)
-class _Choice:
-    use_implicit: bool
-    reason: str
-
-
-_CHOICES: WeakKeyDictionary[Model, _Choice] = WeakKeyDictionary()
-
-
-def implicit_reason(model: Model) -> str | None:
-    """Why "auto" takes implicit where it cannot take analytic; None where it does not, or met no smooth step so far."""
-    choice = _CHOICES.get(model)
-    return choice.reason if choice is not None and choice.use_implicit else None
-
-
-def _compare(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array, jacobian: Array) -> _Choice:
-    """Implicit or autodiff from now on: the one is measured against the other at this smooth step."""
-    analytic = analytic_of(model)
-    why_not = f"; not analytic: {analytic}" if isinstance(analytic, str) else ""
-    try:
-        other = _autodiff(model, vector, x, u, x_next)
-    except (ModelError, SimulationError) as error:
-        return _Choice(True, f"AutoDiffXd refuses the whole step: {error}{why_not}")
-    gap = float(np.abs(jacobian - other).max())
-    if not gap <= SAME_JACOBIAN * max(1.0, float(np.abs(other).max())):
-        return _Choice(False, f"implicit differs from autodiff by {gap:.2g} on this model{why_not}")
-
-    def seconds(f: Callable[..., Array]) -> float:
-        times = []
-        for _ in range(TIMED_CALLS):
-            start = time.perf_counter()
-            f(model, vector, x, u, x_next)
-            times.append(time.perf_counter() - start)
-        return min(times)
-
-    if seconds(implicit_jacobian) < MUCH_SLOWER * seconds(_autodiff):
-        return _Choice(True, f"equal to autodiff, and not much slower, as measured on this model{why_not}")
-    return _Choice(False, f"implicit takes {MUCH_SLOWER:g} times as long, as measured on this model{why_not}")
-
-
-def _autodiff(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array:
-    point = np.concatenate([x, u, vector.values])
-    variables = InitializeAutoDiff(point).ravel()
-    twin, end = model.autodiff, model.nx + model.nu
-    write_autodiff(vector, model, variables[end:])
-    result = advance(twin, variables[: model.nx], variables[model.nx : end])
-    check_parity(model, ExtractValue(result).ravel(), x_next)
-    return gradient_rows(result, len(point))
-
-
-def check_parity(model: Model, autodiff: Array, double: Array) -> None:
-    """Refuse a derivative whose AutoDiffXd step does not lead where the double step leads."""
-    excess = np.abs(autodiff - double) - PARITY_TOLERANCE * np.maximum(1.0, np.abs(double))
-    if not np.all(excess <= 0):  # NaN must not pass
-        worst = int(np.argmax(np.where(np.isnan(excess), np.inf, excess)))
-        raise GradientError(
-            f"the AutoDiffXd step is not the double step: {model.state_names[worst]} is {autodiff[worst]:.12g} "
-            f"there and {double[worst]:.12g} here, tolerance {PARITY_TOLERANCE:g} relative"
+def _derivatives_of(steps: Steps, method: str, *, single: bool = False) -> list[StepDerivatives]:
+    """The derivatives of steps that were taken."""
+    model, vector, chosen = steps.model, steps.vector, choose(steps, method, single=single)
+    _check_derivatives(model, chosen.values)
+    nx, end, names = model.nx, model.nx + model.nu, vector.names
+    return [
+        StepDerivatives(
+            x_next=frozen(steps.x_next[k]),
+            A=frozen(jacobian[:, :nx]),
+            B=frozen(jacobian[:, nx:end]),
+            C=frozen(jacobian[:, end:]),
+            parameters=names,
+            sources=(used,) * len(names) if used in OF_ONE_KIND else vector.sources,
+            method=used,
+            reason=reason,
         )
+        for k, (jacobian, used, reason) in enumerate(zip(chosen.values, chosen.methods, chosen.reasons, strict=True))
+    ]
 
 
-def check_derivatives(model: Model, jacobian: Array) -> None:
+def smooth_jacobians(model: Model, xs: Array, us: Array, x_next: Array | None = None) -> Array | None:
+    """(N, nx, nx + nu) of steps that are all smooth, in one call; None where one is not, or there is no such call."""
+    if isinstance(analytic_of(model), Refusal) and not takes_many(model):
+        return None
+    vector = select(model, ())
+    steps = take_steps(model, vector, xs[0], us, xs) if x_next is None else known_steps(model, vector, xs, us, x_next)
+    if steps.some_touch:
+        return None
+    found = ANALYTIC.differentiate(steps)
+    if isinstance(found, Refusal):
+        found = IMPLICIT.differentiate(steps)
+    if isinstance(found, Refusal) or found.refused:
+        return None
+    _check_derivatives(model, found.values)
+    return found.values
+
+
+def _check_derivatives(model: Model, jacobians: Array) -> None:
     """Refuse a derivative by x or u that is not finite or implausibly large, and by a parameter that is not finite."""
-    if np.min(jacobian, initial=0.0) >= -MAGNITUDE_BOUND and np.max(jacobian, initial=0.0) <= MAGNITUDE_BOUND:
+    if jacobians.min(initial=0.0) >= -MAGNITUDE_BOUND and jacobians.max(initial=0.0) <= MAGNITUDE_BOUND:
         return
+    jacobian = jacobians.reshape(-1, jacobians.shape[2])
     bound = np.full(jacobian.shape[1], MAGNITUDE_BOUND)
     bound[model.nx + model.nu :] = np.finfo(float).max  # its size is a matter of the parameter's unit
     size = np.where(np.isfinite(jacobian), np.abs(jacobian), np.inf) / bound
@@ -261,47 +164,3 @@ def check_derivatives(model: Model, jacobian: Array) -> None:
             f"the derivative of {model.state_names[row % model.nx]} by variable {column} of [x; u; parameters] is "
             f"{jacobian[row, column]:.6g}: expected a finite number of at most {MAGNITUDE_BOUND:g}"
         )
-
-
-def _finite_difference(model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array) -> Array:
-    point = np.concatenate([x, u])
-    scale = np.maximum(1.0, np.abs(point))
-
-    def f(d: Array) -> Array:
-        moved = point + scale * d
-        return np.asarray(advance(model.double, moved[: model.nx], moved[model.nx :]))
-
-    by_point = central_differences(f, len(point), DIFFERENCE_STEP, at_zero=x_next) / scale
-    every = np.arange(len(vector.values))
-    return np.hstack([by_point, _parameter_differences(model, vector, x, u, x_next, every)])
-
-
-def _parameter_differences(
-    model: Model, vector: ParameterVector, x: Array, u: Array, x_next: Array, wanted: NDArray[np.int64] | None = None
-) -> Array:
-    """(nx, n) the derivative of the double step by the `wanted` entries of the vector, else by the differenced ones."""
-    indices = vector.differenced if wanted is None else wanted
-    if not len(indices):
-        return np.zeros((model.nx, 0))
-    scale = vector.difference_scale(indices)
-
-    def f(d: Array) -> Array:
-        values = np.array(vector.values)
-        values[indices] += scale * d
-        return step_at(model, vector, x, u, values)
-
-    return plateau(f, len(indices), at_zero=x_next) / scale
-
-
-def step_at(model: Model, vector: ParameterVector, x: Array, u: Array, values: Array) -> Array:
-    """(nx,) the double step with the vector's parameters at `values` (np,); the model keeps what was applied."""
-    if np.array_equal(values, vector.values):
-        return np.asarray(advance(model.double, x, u))
-    if vector.time_step(values) != model.time_step:
-        with applied(vector.at(values)) as other:
-            return np.asarray(advance(other.double, x, u))
-    try:
-        vector.write(model.double, values)
-        return np.asarray(advance(model.double, x, u))
-    finally:
-        vector.write(model.double, vector.values)

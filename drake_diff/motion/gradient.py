@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
 from drake_diff._base.autodiff import gradient_of
-from drake_diff.derivatives.linearize import smooth_steps
-from drake_diff.derivatives.step import StepDerivatives, check_method, step_jacobians
+from drake_diff.derivatives.sources import check_method
+from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameters, ParameterVector, applied, select
@@ -122,27 +122,6 @@ def differentiate_rollout(
         us=frozen(inputs),
         methods=tuple(sorted({d.method for d in linearization})),
     )
-
-
-def derivatives_along(
-    model: Model,
-    x0: Array,
-    us: Array,
-    *,
-    vector: ParameterVector | None = None,
-    method: str = "auto",
-    xs: Array | None = None,
-) -> list[StepDerivatives]:
-    """The step derivatives along the rollout from `x0` (nx,) under `us` (N, nu), `vector` being applied.
-
-    Given xs (N, nx), those of the steps from each of them.
-    """
-    vector = vector or select(model, ())
-    found = smooth_steps(model, x0, us, method, xs, vector)
-    for k in range(len(found), len(us)):
-        x = (found[-1].x_next if found else x0) if xs is None else xs[k]
-        found.append(step_jacobians(model, vector, x, us[k], method))
-    return found
 
 
 def _close_the_loop(

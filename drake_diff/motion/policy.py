@@ -17,8 +17,8 @@ from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 
 from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.autodiff import gradient_rows
-from drake_diff.derivatives.linearize import linearize
-from drake_diff.derivatives.step import PARITY_TOLERANCE, differentiate_step
+from drake_diff.derivatives.sources import PARITY_TOLERANCE
+from drake_diff.derivatives.step import differentiate_step, linearize
 from drake_diff.exceptions import GradientError, InputError
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators

@@ -22,10 +22,10 @@ from pydrake.solvers import MathematicalProgram
 
 from drake_diff._base.arrays import Array, positive_int
 from drake_diff._base.autodiff import chain, chain_rows
-from drake_diff.derivatives.step import StepDerivatives
+from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import InputError, SimulationError
 from drake_diff.model.parameters import ParameterCoordinates, ParameterVector, applied
-from drake_diff.motion.gradient import Totals, accumulate, derivatives_along, differentiate_loss
+from drake_diff.motion.gradient import Totals, accumulate, differentiate_loss
 from drake_diff.motion.rollout import roll_states
 from drake_diff.optimize.drake_program import solve_program
 from drake_diff.optimize.problem.cost import differentiate_cost, differentiate_final_cost

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from drake_diff._base.arrays import positive_int
 from drake_diff.certificates.certify import certify
-from drake_diff.derivatives.step import check_method
+from drake_diff.derivatives.sources import check_method
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.contact import active_modes
 from drake_diff.model.model import Model

@@ -15,7 +15,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, positive_int
 from drake_diff._base.statistics import Rate, margin, success_rate
-from drake_diff.derivatives.step import StepDerivatives
+from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import InputError
 from drake_diff.loop.mpc import MPC
 from drake_diff.loop.parts import Hold
@@ -23,7 +23,6 @@ from drake_diff.loop.run import Loop
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space
-from drake_diff.motion.gradient import derivatives_along
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.parts import Label
 from drake_diff.trials.perturbation import PERTURBATIONS, parameters_of, perturbation_named

@@ -11,12 +11,11 @@ acts. What is left out here, as a shape that is not known, shows there.
 """
 
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, cross
+from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.contact.kinematics import (
     Contacts,
     Topology,
@@ -28,12 +27,11 @@ from drake_diff.derivatives.contact.kinematics import (
 from drake_diff.derivatives.contact.laws import Cone, HuntCrossley, HuntCrossleyImpulse, Impulse, StateChange
 from drake_diff.derivatives.contact.material import Material, MaterialChange, read_material
 from drake_diff.derivatives.contact.pairs import ContactPairs, Indices, Touches, read_pairs
-from drake_diff.derivatives.implicit import Steps
-from drake_diff.derivatives.smooth_step import Analytic, Native
+from drake_diff.derivatives.smooth_step import Native, SmoothStep
+from drake_diff.derivatives.steps import Flags, Steps
 from drake_diff.mechanics.description import describe_tree
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
-from drake_diff.model.step import set_state
 
 # Of the momentum: Drake's solver ends at 1e-6 of it, in the same norm.
 OPTIMALITY = 2e-6
@@ -55,32 +53,27 @@ class ContactForm:
     near_rigid: float
 
 
-def contact_form(model: Model, analytic: Analytic) -> ContactForm | str:
+def contact_form(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
     """Read once; else why the form describes no step of the model with contact."""
-    if model not in _FORMS:
-        _FORMS[model] = _read(model, analytic)
-    return _FORMS[model]
+    return model.cache("contact form", lambda: _read(model, smooth))
 
 
-_FORMS: WeakKeyDictionary[Model, ContactForm | str] = WeakKeyDictionary()
-
-
-def _read(model: Model, analytic: Analytic) -> ContactForm | str:
+def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
     contact = model.contract.contact
     if contact.model != "point":
-        return f"the contact model is {contact.model}, not point"
-    if analytic.form.pd:
-        return "PD controllers act beside contact"
+        return Refusal(f"the contact model is {contact.model}, not point")
+    if smooth.form.pd:
+        return Refusal("PD controllers act beside contact")
     pairs = read_pairs(model)
     if not pairs.ids:
-        return "no sphere may touch a sphere, box, capsule or half space"
+        return Refusal("no sphere may touch a sphere, box, capsule or half space")
     topology = topology_of(describe_tree(model))
     labels = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
     return ContactForm(
         pairs=pairs,
         topology=topology,
         by_body=np.array([topology.bodies[labels.get(body.index(), "world")] for body in pairs.bodies]),
-        armature=np.diag(analytic.pinocchio.armature),
+        armature=np.diag(smooth.pinocchio.armature),
         approximation=contact.approximation,
         time_step=model.time_step,
         near_rigid=float(model.plant.get_sap_near_rigid_threshold()),
@@ -91,24 +84,15 @@ def material_of(model: Model, form: ContactForm) -> Material:
     """The model's own, read once, or with the parameters that are applied."""
     if model.has_other_parameters:
         return read_material(model.double, form.pairs)
-    if model not in _OWN:
-        _OWN[model] = read_material(model.double, form.pairs)
-    return _OWN[model]
+    return model.cache("contact material", lambda: read_material(model.double, form.pairs))
 
 
-_OWN: WeakKeyDictionary[Model, Material] = WeakKeyDictionary()
-
-
-def place(model: Model, form: ContactForm, xs: Array, *, stands: bool) -> Array:
-    """(N, bodies, 3, 4) the poses of the bodies of the pairs at xs (N, nx), the context being left at the last.
-
-    Where it `stands` there, as at the one state of a single step, what Drake has computed in it is kept.
-    """
-    plant, context = model.plant, model.double.context
-    poses = np.empty((len(xs), len(form.pairs.bodies), 3, 4))
-    for k, x in enumerate(xs):
-        if not stands:
-            set_state(model.double, x)
+def place(form: ContactForm, steps: Steps) -> Array:
+    """(N, bodies, 3, 4) the poses of the bodies of the pairs at the steps' states; the context is left at the last."""
+    plant, context = steps.model.plant, steps.model.double.context
+    poses = np.empty((len(steps), len(form.pairs.bodies), 3, 4))
+    for k in range(len(steps)):
+        steps.stand_at(k)
         for i, body in enumerate(form.pairs.bodies):
             poses[k, i] = plant.EvalBodyPoseInWorld(context, body).GetAsMatrix34()
     return poses
@@ -136,11 +120,11 @@ class Solved:
 
 
 def contact_jacobians(
-    form: ContactForm, analytic: Analytic, steps: Steps, poses: Array, material: Material, change: MaterialChange | None
-) -> tuple[Array, NDArray[np.bool_]]:
+    form: ContactForm, smooth: SmoothStep, steps: Steps, poses: Array, material: Material, change: MaterialChange | None
+) -> tuple[Array, Flags]:
     """(N, nx, nx + nu + np) of steps from states with the bodies at `poses`, and which (N,) are as Drake took them."""
-    at, nv = _at_the_solution(form, analytic, steps, poses, material), analytic.coordinates.nv
-    right = at.A @ analytic.pushed(at.native, steps.us, at.gained / analytic.time_step)
+    at, nv = _at_the_solution(form, smooth, steps, poses, material), smooth.coordinates.nv
+    right = at.A @ smooth.pushed(at.native, steps.us, at.gained / smooth.time_step)
     right[:, :, :nv] += at.total(_by_motion(at))
     if isinstance(at.impulse, HuntCrossleyImpulse):
         J, normal = at.contacts.jacobian, at.contacts.touch.normal[..., None]
@@ -151,14 +135,14 @@ def contact_jacobians(
     J = at.contacts.jacobian
     left = at.A - at.total(J @ at.impulse.by_velocity() @ J.swapaxes(-1, -2))
     velocities = np.asarray(np.linalg.solve(left, right), dtype=float)
-    jacobians, _ = analytic.assemble(at.native, velocities, at.v_next)
-    return jacobians, _is_solved(at) & ~analytic.at_a_limit(steps)
+    jacobians, _ = smooth.assemble(at.native, velocities, at.v_next)
+    return jacobians, _is_solved(at) & ~smooth.at_a_limit(steps)
 
 
-def _at_the_solution(form: ContactForm, analytic: Analytic, steps: Steps, poses: Array, material: Material) -> Solved:
-    nq = analytic.coordinates.nq
-    native, v_next = analytic.into_native(steps.starts[:, :nq], steps.starts[:, nq:]), steps.ends[:, nq:]
-    S, inertia, v_star = analytic.motions(native, steps.us)
+def _at_the_solution(form: ContactForm, smooth: SmoothStep, steps: Steps, poses: Array, material: Material) -> Solved:
+    nq = smooth.coordinates.nq
+    native, v_next = smooth.into_native(steps.xs[:, :nq], steps.xs[:, nq:]), steps.x_next[:, nq:]
+    S, inertia, v_star = smooth.motions(native, steps.us)
     A = mass_matrix(S, inertia, form.topology) + form.armature
     contacts = _contacts(form, form.pairs.touching(poses), S, material)
     state = contacts.touch.state
@@ -269,7 +253,7 @@ def _sum(at: Indices, of_contacts: Array, count: int) -> Array:
     return total
 
 
-def _is_solved(at: Solved) -> NDArray[np.bool_]:
+def _is_solved(at: Solved) -> Flags:
     """(N,) whether the impulse that is missing is what Drake's solver leaves, in the norm that it ends by."""
     diagonal = np.einsum("kii->ki", at.A)
     momentum = (at.A @ at.v_next[..., None])[..., 0]

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of
-from drake_diff.derivatives.linearize import linearize, smooth_jacobians
+from drake_diff.derivatives.step import linearize, smooth_jacobians
 from drake_diff.model.model import Model
 from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic
@@ -125,8 +126,8 @@ def dynamics_curvature_along(problem: Problem, motion: Motion, v: Array) -> Arra
     Jacobians are not to be had in one call. Raises what `linearize` raises.
     """
     model, xs, us = problem.model, motion.xs[:-1], _off_bounds(problem, motion.us)
-    here = smooth_jacobians(model, xs[0], us, "auto", xs, motion.ends)
-    if here is None or here.steps.touching.any() or not here.smooth.all():
+    here = smooth_jacobians(model, xs, us, motion.ends)
+    if here is None:
         return None
     curvature = np.zeros((len(us), model.nx + model.nu, model.nx + model.nu))
     for j in range(model.nx):
@@ -135,7 +136,7 @@ def dynamics_curvature_along(problem: Problem, motion: Motion, v: Array) -> Arra
         near = _nearby_jacobians(model, moved, us)
         if near is None:
             return None
-        slopes = (near - here.jacobians) / (moved - xs)[:, j, None, None]
+        slopes = (near - here) / (moved - xs)[:, j, None, None]
         curvature[:, :, j] = np.einsum("kij,ki->kj", slopes, v)
     curvature[:, : model.nx, model.nx :] = curvature[:, model.nx :, : model.nx].swapaxes(1, 2)
     return (curvature + curvature.swapaxes(1, 2)) / 2
@@ -144,10 +145,9 @@ def dynamics_curvature_along(problem: Problem, motion: Motion, v: Array) -> Arra
 def _nearby_jacobians(model: Model, xs: Array, us: Array) -> Array | None:
     """(N, nx, nx + nu) of the steps from xs (N, nx) beside smooth ones; None where one that was taken is not smooth."""
     analytic = analytic_of(model)
-    if not isinstance(analytic, str):
+    if not isinstance(analytic, Refusal):
         return analytic.differentiate(xs, us)[0]  # no step is taken
-    found = smooth_jacobians(model, xs[0], us, "auto", xs)
-    return found.jacobians if found is not None and found.smooth.all() else None
+    return smooth_jacobians(model, xs, us)
 
 
 class DynamicsCurvature:

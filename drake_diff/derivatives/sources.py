@@ -1,0 +1,294 @@
+"""AutoDiffXd and differences as sources of Jacobians, and the one place that chooses among all four.
+
+The choice is by size and structure alone, so that one model, step and request give one method on every machine. What
+it goes by was measured, each source alone, on one core [us a Jacobian]:
+
+    model            joints  autodiff  implicit  analytic  differences
+    pendulum              1        41        42        20           83
+    cart-pole             2        83        54        22          142
+    double pendulum       2        78        55        22          142
+    UR5                   6       361       139        24          709
+    Solo12               18       868       479        92         1813
+
+By a parameter as well autodiff wins below five joints (72 against 128 for the pendulum, 132 against 176 for the
+cart-pole) and loses above (917 against 830 for the UR5, 1838 against 1358 for Solo12).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.autodiff import gradient_rows
+from drake_diff._base.differences import central_differences, plateau
+from drake_diff._base.refusal import Refusal
+from drake_diff.derivatives.analytic import Analytic
+from drake_diff.derivatives.implicit import TREE_JOINTS, Implicit
+from drake_diff.derivatives.steps import Jacobians, Source, Steps, take_step, take_steps
+from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError, UnknownNameError
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import ParameterVector, applied, write_autodiff
+from drake_diff.model.step import advance
+
+METHODS = ("auto", "analytic", "autodiff", "implicit", "finite_difference")
+# The AutoDiffXd and the double step run the same algorithm, so they differ by rounding only.
+PARITY_TOLERANCE = 1e-9
+# Cube root of the double step's rounding: where truncation and rounding of a central difference balance.
+DIFFERENCE_STEP = 1e-5
+# Two ways to the same smooth Jacobian differ by rounding, which the inverse of a mass matrix may magnify.
+SAME_JACOBIAN = 1e-10
+# Below so many degrees of freedom AutoDiffXd takes a step with contact in less time than NumPy's calls for one take:
+# a sphere on the ground (6) takes 460 us by autodiff and 590 us by the contact equation.
+CONTACT_SIZE = 8
+OF_ONE_KIND = ("analytic", "finite_difference")  # methods whose columns by parameters are such, too
+CHECK_ENDS = ("analytic", "implicit")  # which find out where a step does not lead where it is said to
+CERTIFIED = "equal to autodiff, as certified on this model"
+
+
+class Autodiff:
+    """AutoDiffXd through Drake's own step; parameters that are differenced have zeros."""
+
+    name = "autodiff"
+
+    def differentiate(self, steps: Steps) -> Jacobians:
+        """Step by step. Raises GradientError where the AutoDiffXd step is not the double step."""
+        values = np.empty((len(steps), steps.model.nx, steps.width))
+        refused: dict[int, DrakeDiffError] = {}
+        for k in range(len(steps)):
+            try:
+                values[k] = _by_autodiff(steps, k)
+            except SimulationError as error:
+                refused[k] = error
+        return Jacobians(values, refused)
+
+
+def _by_autodiff(steps: Steps, k: int) -> Array:
+    model, nx, end = steps.model, steps.model.nx, steps.model.nx + steps.model.nu
+    variables = InitializeAutoDiff(np.concatenate([steps.xs[k], steps.us[k], steps.vector.values])).ravel()
+    twin = model.autodiff
+    write_autodiff(steps.vector, model, variables[end:])
+    result = advance(twin, variables[:nx], variables[nx:end])
+    check_parity(model, ExtractValue(result).ravel(), steps.x_next[k])
+    return gradient_rows(result, steps.width)
+
+
+def check_parity(model: Model, autodiff: Array, double: Array) -> None:
+    """Refuse a derivative whose AutoDiffXd step does not lead where the double step leads."""
+    excess = np.abs(autodiff - double) - PARITY_TOLERANCE * np.maximum(1.0, np.abs(double))
+    if not np.all(excess <= 0):  # NaN must not pass
+        worst = int(np.argmax(np.where(np.isnan(excess), np.inf, excess)))
+        raise GradientError(
+            f"the AutoDiffXd step is not the double step: {model.state_names[worst]} is {autodiff[worst]:.12g} "
+            f"there and {double[worst]:.12g} here, tolerance {PARITY_TOLERANCE:g} relative"
+        )
+
+
+class Differences:
+    """Central differences of the double step; by parameters, where they depend least on their size."""
+
+    name = "finite_difference"
+
+    def differentiate(self, steps: Steps) -> Jacobians:
+        """Step by step."""
+        return Jacobians(np.array([_by_differences(steps, k) for k in range(len(steps))]), {})
+
+
+def _by_differences(steps: Steps, k: int) -> Array:
+    model, point = steps.model, np.concatenate([steps.xs[k], steps.us[k]])
+    scale = np.maximum(1.0, np.abs(point))
+
+    def f(d: Array) -> Array:
+        moved = point + scale * d
+        return np.asarray(advance(model.double, moved[: model.nx], moved[model.nx :]))
+
+    by_point = central_differences(f, len(point), DIFFERENCE_STEP, at_zero=steps.x_next[k]) / scale
+    return np.hstack([by_point, _parameter_differences(steps, k, np.arange(len(steps.vector.values)))])
+
+
+def _parameter_differences(steps: Steps, k: int, entries: NDArray[np.int64]) -> Array:
+    """(nx, n) the derivative of the double step by the `entries` (n,) of the vector."""
+    vector = steps.vector
+    if not len(entries):
+        return np.zeros((steps.model.nx, 0))
+    scale = vector.difference_scale(entries)
+
+    def f(d: Array) -> Array:
+        values = np.array(vector.values)
+        values[entries] += scale * d
+        return step_at(steps.model, vector, steps.xs[k], steps.us[k], values)
+
+    return plateau(f, len(entries), at_zero=steps.x_next[k]) / scale
+
+
+def step_at(model: Model, vector: ParameterVector, x: Array, u: Array, values: Array) -> Array:
+    """(nx,) the double step with the vector's parameters at `values` (np,); the model keeps what was applied."""
+    if np.array_equal(values, vector.values):
+        return np.asarray(advance(model.double, x, u))
+    if vector.time_step(values) != model.time_step:
+        with applied(vector.at(values)) as other:
+            return np.asarray(advance(other.double, x, u))
+    try:
+        vector.write(model.double, values)
+        return np.asarray(advance(model.double, x, u))
+    finally:
+        vector.write(model.double, vector.values)
+
+
+@dataclass
+class _Trial:
+    """What came of comparing implicit with autodiff on a model, at the first smooth step that was met."""
+
+    passed: str = ""
+    refusal: str = ""
+
+
+class CertifiedImplicit(Implicit):
+    """The implicit source of a model on which it was compared with autodiff."""
+
+    def differentiate(self, steps: Steps) -> Jacobians | Refusal:
+        """As by `Implicit`, where the two are equal."""
+        trial = steps.model.cache("implicit trial", _Trial)
+        if trial.refusal:
+            return Refusal(trial.refusal)
+        found = super().differentiate(steps)
+        if not isinstance(found, Refusal) and not trial.passed:
+            smooth = next((k for k in range(len(steps)) if k not in found.refused), None)
+            if smooth is not None:
+                _compare(trial, steps, smooth, found.values[smooth])
+        return Refusal(trial.refusal) if trial.refusal else found
+
+
+def _compare(trial: _Trial, steps: Steps, k: int, jacobian: Array) -> None:
+    if not steps.taken:  # the caller's ends are less exact than parity asks for
+        steps, k = take_step(steps.model, steps.vector, steps.xs[k], steps.us[k]), 0
+    try:
+        other = _by_autodiff(steps, k)
+    except (ModelError, SimulationError) as error:
+        trial.passed = f"AutoDiffXd refuses the whole step: {error}"
+        return
+    gap = float(np.abs(jacobian - other).max())
+    if gap <= SAME_JACOBIAN * max(1.0, float(np.abs(other).max())):
+        trial.passed = CERTIFIED
+    else:
+        trial.refusal = f"it differs from autodiff by {gap:.2g} on this model"
+
+
+ANALYTIC, AUTODIFF, DIFFERENCES, IMPLICIT = Analytic(), Autodiff(), Differences(), CertifiedImplicit()
+_ORDERS: dict[str, tuple[Source, ...]] = {
+    "analytic": (ANALYTIC, IMPLICIT, AUTODIFF, DIFFERENCES),
+    "autodiff": (AUTODIFF,),
+    "implicit": (Implicit(), AUTODIFF),
+    "finite_difference": (DIFFERENCES,),
+}
+SMALL_BY_PARAMETERS: tuple[Source, ...] = (ANALYTIC, AUTODIFF, IMPLICIT, DIFFERENCES)
+SMALL_IN_CONTACT: tuple[Source, ...] = (AUTODIFF, DIFFERENCES)
+NOTHING, NONE = np.empty((0, 0, 0)), np.arange(0)
+
+
+def check_method(method: str) -> None:
+    """Refuse what is no source of a step's derivative, naming those that are."""
+    if method not in METHODS:
+        raise UnknownNameError("method", got=method, known=METHODS)
+
+
+def order_of(steps: Steps, method: str, single: bool) -> tuple[Source, ...]:
+    """The sources to ask, one after the other: what is exact and fastest first, as measured above."""
+    if method != "auto":
+        return _ORDERS[method]
+    size = steps.model.nv
+    if steps.vector.parameters:
+        return SMALL_BY_PARAMETERS if size < TREE_JOINTS else _ORDERS["analytic"]
+    alone = single and size < CONTACT_SIZE and steps.some_touch
+    return SMALL_IN_CONTACT if alone else _ORDERS["analytic"]
+
+
+def choose(steps: Steps, method: str, *, single: bool = False) -> "Chosen":
+    """The Jacobians of the steps, each by the first source in order that knows it.
+
+    `single` says that one step alone was asked for. Where the steps were not taken, those that no source which finds a
+    wrong end knows are taken. Raises what the last source has against a step that none knows.
+    """
+    chosen = Chosen(steps, method)
+    for source in order_of(steps, method, single):
+        if steps.taken or source.name in CHECK_ENDS:
+            chosen.ask(source)
+            if not len(chosen.left):
+                return chosen
+    if steps.taken:
+        raise chosen.error
+    left = chosen.left
+    chosen.put(choose(take_steps(steps.model, steps.vector, steps.xs[0], steps.us[left], steps.xs[left]), method))
+    return chosen
+
+
+class Chosen:
+    """The Jacobians of N steps, as one source after another gives them."""
+
+    def __init__(self, steps: Steps, method: str):
+        self.steps, self.method = steps, method
+        self.values = NOTHING  # (N, nx, nx + nu + np)
+        self.methods = [""] * len(steps)  # the source of each step
+        self.reasons = [""] * len(steps)  # and why not another
+        self.left: NDArray[np.intp] = np.arange(len(steps))  # the steps that no source knew so far
+        self.error: DrakeDiffError = GradientError("no source was asked")
+
+    def ask(self, source: Source) -> None:
+        """Have the source differentiate what is left."""
+        steps, part = self.steps, self.steps.part(self.left)
+        try:
+            found = source.differentiate(part)
+        except ModelError as error:  # the model has no AutoDiffXd twin
+            self.error, found = error, Refusal(str(error))
+        if isinstance(found, Refusal):
+            for k in self.left:
+                self.reasons[k] += f"not {source.name}: {found}; "
+            return
+        if steps.vector.parameters and source.name not in OF_ONE_KIND:
+            _difference_the_rest(part, found)
+        self._keep(found.values)
+        if part is steps and not found.refused:  # all at once, as a single step as a rule
+            self.methods, self.left = [source.name] * len(steps), NONE
+            self.reasons = [self._reason(source, why) for why in self.reasons]
+            return
+        for i, k in enumerate(self.left):
+            why = found.refused.get(i)
+            if why is None:
+                self.methods[k], self.reasons[k] = source.name, self._reason(source, self.reasons[k])
+            else:
+                self.error = why
+                self.reasons[k] += f"not {source.name}: {why}; "
+        self.left = self.left[sorted(found.refused)]
+
+    def put(self, other: "Chosen") -> None:
+        """Take what was chosen for what is left, which is all of `other`."""
+        self._keep(other.values)
+        for i, k in enumerate(self.left):
+            self.methods[k], self.reasons[k] = other.methods[i], other.reasons[i]
+
+    def _keep(self, values: Array) -> None:
+        if len(self.left) == len(self.steps):
+            self.values = values
+        else:
+            self.values[self.left] = values
+
+    def _reason(self, source: Source, why: str) -> str:
+        """Why this source was taken, and none before it."""
+        if source.name == self.method:
+            return "asked for"
+        if source is ANALYTIC:
+            return CERTIFIED
+        if source is IMPLICIT:
+            return why + self.steps.model.cache("implicit trial", _Trial).passed
+        return why[:-2] if why else "the fastest for a model of this size"
+
+
+def _difference_the_rest(steps: Steps, found: Jacobians) -> None:
+    """Fill in the columns by parameters that Drake's AutoDiffXd does not carry."""
+    if not len(steps.vector.differenced):
+        return
+    columns = steps.model.nx + steps.model.nu + steps.vector.differenced
+    for k in range(len(steps)):
+        if k not in found.refused:
+            found.values[k][:, columns] = _parameter_differences(steps, k, steps.vector.differenced)
