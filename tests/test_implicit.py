@@ -355,6 +355,18 @@ def test_every_method_is_named_where_one_is_unknown(load, method):
         dd.differentiate_step(load("pendulum.urdf"), [0.1, 0.0], [0.0], method="guess")
 
 
+def test_a_choice_made_with_parameters_is_made_once(monkeypatch):
+    """What is certified is the equation, of any values: it was compared at every step while parameters were applied."""
+    model, calls = springs_and_motors(), []
+    compare = sources._compare
+    monkeypatch.setattr(sources, "_compare", lambda *args: calls.append(compare(*args)))
+    name = next(p.name for p in dd.list_parameters(model) if p.name.endswith(".mass"))
+    monkeypatch.setattr(sources, "TREE_JOINTS", 0)  # as of a larger model
+    for _ in range(2):
+        assert dd.differentiate_step(model, *POINT, parameters=(name,)).method == "implicit"
+    assert len(calls) == 1
+
+
 def test_a_choice_made_without_parameters_holds_with_them(load):
     """Gravity and springs act as forces of ours beside Drake's own."""
     model = load("mass_spring_damper.sdf")

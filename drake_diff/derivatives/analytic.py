@@ -81,7 +81,7 @@ def analytic_of(model: Model) -> SmoothStep | Refusal:
         except (ModelError, MissingDependencyError) as error:
             return Refusal(str(error))
 
-    return model.cache("analytic", make)
+    return model.cache("analytic", make, of_structure=True)  # parameters of contact alone may be applied
 
 
 def certified(model: Model, smooth: SmoothStep) -> SmoothStep | Refusal:
@@ -171,7 +171,7 @@ def _with_contact(smooth: SmoothStep, steps: Steps) -> tuple[Array, Flags] | Ref
     form = contact_form(model, smooth)
     if isinstance(form, Refusal):
         return form
-    trial = model.cache("contact trial", _ContactTrial)
+    trial = model.cache("contact trial", _ContactTrial, of_structure=True)
     if trial.refusal:
         return Refusal(trial.refusal)
     material = material_of(model, form)

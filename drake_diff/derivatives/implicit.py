@@ -183,7 +183,7 @@ class Form:
 
 def form_of(model: Model) -> Form:
     """Read once: nothing in it changes with parameters."""
-    return model.cache("implicit form", lambda: _read_form(model))
+    return model.cache("implicit form", lambda: _read_form(model), of_structure=True)
 
 
 def _read_form(model: Model) -> Form:

@@ -149,7 +149,7 @@ class CertifiedImplicit(Implicit):
 
     def differentiate(self, steps: Steps) -> Jacobians | Refusal:
         """As by `Implicit`, where the two are equal."""
-        trial = steps.model.cache("implicit trial", _Trial)
+        trial = steps.model.cache("implicit trial", _Trial, of_structure=True)
         if trial.refusal:
             return Refusal(trial.refusal)
         found = super().differentiate(steps)
@@ -280,7 +280,7 @@ class Chosen:
         if source is ANALYTIC:
             return CERTIFIED
         if source is IMPLICIT:
-            return why + self.steps.model.cache("implicit trial", _Trial).passed
+            return why + self.steps.model.cache("implicit trial", _Trial, of_structure=True).passed
         return why[:-2] if why else "the fastest for a model of this size"
 
 

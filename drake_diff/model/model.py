@@ -203,16 +203,17 @@ class Model:
             notes=self.notes,
         )
 
-    def cache(self, key: Hashable, make: Callable[[], T]) -> T:
+    def cache(self, key: Hashable, make: Callable[[], T], *, of_structure: bool = False) -> T:
         """What `make` gave when `key` was first asked for: what is read once and holds as long as the model does.
 
-        What is made while parameters are applied that are not the model's own is not kept.
+        What is made while parameters are applied that are not the model's own is not kept, but where it is
+        `of_structure` alone, which no parameter changes.
         """
         if key in self._cache:
             found: T = self._cache[key]
             return found
         made = make()
-        if not self.has_other_parameters:
+        if of_structure or not self.has_other_parameters:
             self._cache[key] = made
         return made
 

@@ -55,7 +55,7 @@ class ContactForm:
 
 def contact_form(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
     """Read once; else why the form describes no step of the model with contact."""
-    return model.cache("contact form", lambda: _read(model, smooth))
+    return model.cache("contact form", lambda: _read(model, smooth), of_structure=True)
 
 
 def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
