@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS
 from helpers.plants import block
-from helpers.problems import A30, lqr
+from helpers.problems import DOUBLE_INTEGRATOR, lqr
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
@@ -171,13 +171,13 @@ def test_contradictory_constraints_are_infeasible(method):
 
 
 def test_a_constraint_that_never_acts_leaves_one_full_step():
-    """A30: J* = 12.948481280713864 in one step, as without it."""
+    """J* = 12.948481280713864 in one step, as without it."""
     never = dd.Constraint(lambda x, u: u[0] + x[0], upper=1e6)
-    solution = dd.solve(lqr(*A30, constraints=never), method="ilqr")
+    solution = dd.solve(lqr(*DOUBLE_INTEGRATOR, constraints=never), method="ilqr")
     assert solution.success, solution.message
     assert len(solution.iterations) == 2
     assert solution.cost == pytest.approx(12.948481280713864, rel=1e-12)
-    assert not AugmentedLagrangian(lqr(*A30)).any
+    assert not AugmentedLagrangian(lqr(*DOUBLE_INTEGRATOR)).any
 
 
 def test_the_table_tells_the_violation_in_the_constraints_own_unit():

@@ -28,7 +28,7 @@ def source(request, monkeypatch):
 
 
 def test_of_a_pendulum_by_hand(source):
-    """Of A03's pendulum w' = s (w + h (u / I - g / l sin q)), q' = q + h w' only d2/dq2 is not 0: s h g / l sin q.
+    """Of a damped pendulum w' = s (w + h (u / I - g / l sin q)), q' = q + h w' only d2/dq2 is not 0: s h g / l sin q.
 
     1e-6 of a step is 1e-6 of the derivative.
     """

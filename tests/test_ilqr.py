@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS
 from helpers.plants import block, craft, tilted
-from helpers.problems import A30, OTHERS, lqr, pendulum, riccati
+from helpers.problems import DOUBLE_INTEGRATOR, OTHERS, lqr, pendulum, riccati
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
@@ -43,8 +43,8 @@ def test_one_step_from_any_guess_is_the_riccati_recursions_optimum(case, seed, i
 
 
 def test_the_oracles_digits():
-    """A30: J* = 12.948481280713864, u_0 = -K_0 x_0 = -2.61821518."""
-    solution = dd.solve(lqr(*A30), method="ilqr")
+    """The double integrator: J* = 12.948481280713864, u_0 = -K_0 x_0 = -2.61821518."""
+    solution = dd.solve(lqr(*DOUBLE_INTEGRATOR), method="ilqr")
     assert solution.cost == pytest.approx(12.948481280713864, rel=1e-12)
     assert solution.us[0, 0] == pytest.approx(-2.61821518, abs=5e-9)  # half of the last digit given
 
@@ -62,12 +62,12 @@ def test_the_optimal_costs_gradient_by_the_initial_state_is_twice_p0_x0(case):
     gradient = dd.differentiate_rollout(problem.model, problem.x0, us, loss)
     assert gradient.by_x0 == pytest.approx(2 * riccati(*case)[0] @ [1, 0], rel=1e-10)
     assert np.abs(gradient.by_us).max() < 1e-10
-    if case is A30:
+    if case is DOUBLE_INTEGRATOR:
         assert gradient.by_x0 == pytest.approx([25.89696256, 5.23643035], abs=5e-9)
 
 
 def pendulum_gradient(us):
-    """dJ/du (N, 1) of SOFT by the hand-made pendulum of A03: m = 1, l = 0.5, b = 0.1 implicit, h = 0.02."""
+    """dJ/du (N, 1) of SOFT by the hand-made pendulum with m = 1, l = 0.5, b = 0.1 implicit, h = 0.02."""
     h, g, length, b, inertia = 0.02, 9.81, 0.5, 0.1, 0.25
     s = 1 / (1 + h * b / inertia)
     xs = [np.zeros(2)]
@@ -117,10 +117,10 @@ def test_the_cost_falls_from_row_to_row():
 
 
 def test_a_function_is_optimized_like_the_quadratic_cost_it_is():
-    """A30 again; second derivatives by differences of 1e-5 cost digits, so it may take more than one step."""
-    h, _, Q, R, Qf = A30
+    """The same problem; second derivatives by differences of 1e-5 cost digits, so it may take more than one step."""
+    h, _, Q, R, Qf = DOUBLE_INTEGRATOR
     running = {"running_cost": lambda x, u: (x @ Q @ x + R * u[0] ** 2) / h}
-    solution = dd.solve(lqr(*A30, **running, final_cost=lambda x: x @ Qf @ x), method="ilqr")
+    solution = dd.solve(lqr(*DOUBLE_INTEGRATOR, **running, final_cost=lambda x: x @ Qf @ x), method="ilqr")
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(12.948481280713864, rel=1e-12)
 
@@ -220,7 +220,7 @@ def test_a_roll_keeps_the_rest_of_the_gaps(size):
 
 
 def test_a_hard_goal_of_the_pendulum():
-    """B33: J = 8.826541704941, to 1e-8 of it since the goal is met to 1e-8."""
+    """J = 8.826541704941 by an independent program, to 1e-8 of it since the goal is met to 1e-8."""
     solution = dd.solve(pendulum(x_goal=[np.pi, 0], running_cost=EFFORT, final_cost=None), method="ilqr")
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(8.826541704941, rel=1e-8)
@@ -229,7 +229,7 @@ def test_a_hard_goal_of_the_pendulum():
 
 
 def test_the_pendulum_of_drake_ddp():
-    """B35: 0.225845385916, by an independent program; few steps, as the dynamics' curvature is learned on the way."""
+    """0.225845385916, by an independent program; few steps, as the dynamics' curvature is learned on the way."""
     problem = dd.Problem(
         dd.load_model(MODELS / "pendulum.urdf", time_step=0.01),
         x0=[0, 0],
@@ -244,7 +244,7 @@ def test_the_pendulum_of_drake_ddp():
 
 
 def test_the_pendulum_of_irs_lqr(tmp_path):
-    """B37: dw / dt = u - sin q, h = 0.05; 1856.154405579479 at u = 0.1 and 349.490454199 at the optimum."""
+    """Theirs: dw / dt = u - sin q, h = 0.05; 1856.154405579479 at u = 0.1 and 349.490454199 at the optimum."""
     text = (MODELS / "pendulum.urdf").read_text()
     length, mass = 9.81, 9.81**-2  # so that g / l = m l^2 = 1
     for old, new in (("0 0 -0.5", f"0 0 {-length}"), ('mass value="1"', f'mass value="{mass}"'), ("0.1", "0")):
@@ -265,7 +265,7 @@ def test_the_pendulum_of_irs_lqr(tmp_path):
 
 @pytest.mark.parametrize(("count", "mass", "distance"), [(10, 1.0, 1.0), (100, 1.0, 1.0), (25, 2.5, -0.3)])
 def test_a_block_is_moved_with_the_least_effort(count, mass, distance):
-    """B01: 12 m^2 d^2 / T^3 / (1 - 1 / N^2) by symplectic Euler; a multiplier's rounding, and the goal's 1e-8."""
+    """Least effort by symplectic Euler: 12 m^2 d^2 / T^3 / (1 - 1 / N^2); rounding of a multiplier, the goal's 1e-8."""
     model = block(mass=mass, time_step=1 / count)
     problem = dd.Problem(model, x0=[0, 0], x_goal=[distance, 0], num_steps=count, running_cost=EFFORT)
     solution = dd.solve(problem, method="ilqr")
@@ -520,9 +520,9 @@ def test_a_sweep_takes_less_than_five_milliseconds():
 
 @pytest.mark.parametrize("side", [-1, 1])
 def test_an_effort_limit_is_a_bound_like_any_other(write_urdf, side):
-    """A30 from a guess at |u| = 1, where the optimum begins at it: of a plant with that limit, at which its derivative
+    """From a guess at |u| = 1, where the optimum begins at it: of a plant with that limit, at which its derivative
     is 0, and of one without, bounded. The cost's rounding, 1e-15 of 14, is 1e-7 of an input."""
-    h, count, Q, R, Qf = A30
+    h, count, Q, R, Qf = DOUBLE_INTEGRATOR
     costs = {"running_cost": dd.QuadraticCost(Q=Q / h, R=[[R / h]]), "final_cost": dd.QuadraticCost(Q=Qf)}
     at_limit, found = np.full((count, 1), -float(side)), []
     for limit in (1.0, 1e9):
@@ -538,11 +538,11 @@ def test_an_effort_limit_is_a_bound_like_any_other(write_urdf, side):
 
 
 def test_costs_to_go_are_what_the_best_inputs_from_there_cost():
-    """Of A30, about a motion that is not the optimum's: V_k(x) - V_k(y) = x' P_k x - y' P_k y."""
-    h, count, Q, R, Qf = A30
+    """Of the double integrator, about a motion that is not the optimum's: V_k(x) - V_k(y) = x' P_k x - y' P_k y."""
+    h, count, Q, R, Qf = DOUBLE_INTEGRATOR
     random = np.random.default_rng(3)
     us = random.standard_normal((count, 1))
-    problem = lqr(*A30)
+    problem = lqr(*DOUBLE_INTEGRATOR)
     found = costs_to_go(problem, dd.rollout(problem.model, problem.x0, us).xs, us)
     assert len(found) == count + 1
     for k, cost in enumerate(found):
@@ -553,7 +553,7 @@ def test_costs_to_go_are_what_the_best_inputs_from_there_cost():
 
 def test_a_cost_without_a_best_input_has_no_cost_to_go():
     """-1e4 u^2, which no QuadraticCost and no difference of gradients lets through: put in below those."""
-    problem = lqr(*A30)
+    problem = lqr(*DOUBLE_INTEGRATOR)
     object.__setattr__(problem.running_cost, "R", np.array([[-1e4]]))
     with pytest.raises(InputError, match="curvature"):
         costs_to_go(problem, np.zeros((21, 2)), np.zeros((20, 1)))

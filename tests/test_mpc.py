@@ -5,7 +5,7 @@ import pytest
 from helpers.loops import tracking
 from helpers.models import MODELS
 from helpers.plants import block
-from helpers.problems import A30, OTHERS, lqr, riccati
+from helpers.problems import DOUBLE_INTEGRATOR, OTHERS, lqr, riccati
 from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 
 import drake_diff as dd
@@ -46,7 +46,7 @@ def test_it_is_the_remaining_horizons_lqr_whatever_its_own_horizon(case, horizon
 
 @pytest.mark.parametrize("horizon", [1, 7])
 def test_with_the_infinite_cost_to_go_as_its_final_cost_it_is_lqr_for_ever(horizon):
-    h, count, Q, R, _ = A30
+    h, count, Q, R, _ = DOUBLE_INTEGRATOR
     A, B = np.array([[1, h], [0, 1]]), np.array([[h**2], [h]])
     K, P = DiscreteTimeLinearQuadraticRegulator(A, B, Q, np.array([[R]]))
     problem = lqr(h, count, Q, R, P)

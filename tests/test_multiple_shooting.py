@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS
 from helpers.plants import block
-from helpers.problems import A30, lqr
+from helpers.problems import DOUBLE_INTEGRATOR, lqr
 from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 
 import drake_diff as dd
@@ -28,7 +28,7 @@ def pendulum(**changes):
 
 @pytest.mark.parametrize(("solver", "segments"), [("ipopt", 2), ("ipopt", 7), ("snopt", 20), ("ipopt", 100)])
 def test_a_pendulum_swings_up_with_the_oracles_cost(solver, segments):
-    """B33: J = 8.826541704941; 100 segments are direct transcription. The goal is met to 1e-8."""
+    """J = 8.826541704941 by an independent program; 100 segments are direct transcription. The goal is met to 1e-8."""
     solution = shoot(pendulum(), solver=solver, segments=segments)
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(8.826541704941, rel=1e-8)
@@ -40,8 +40,8 @@ def test_a_pendulum_swings_up_with_the_oracles_cost(solver, segments):
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("segments", [1, 3, 20])
 def test_lqr_has_the_riccati_recursions_cost_from_states_that_are_no_rollout(solver, segments):
-    """A30; the cost is flat at its minimum, but for the defects, which are met to 1e-8."""
-    problem = lqr(*A30)
+    """The double integrator; the cost is flat at its minimum, but for the defects, which are met to 1e-8."""
+    problem = lqr(*DOUBLE_INTEGRATOR)
     count = problem.num_steps
     random = np.random.default_rng(0)
     guess = random.standard_normal((count + 1, 2)), random.standard_normal((count, 1))
@@ -69,7 +69,7 @@ def test_an_acrobot_swings_up_from_rest_where_one_segment_fails():
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("segments", [1, 4])
 def test_a_mass_is_chosen_together_with_the_inputs(solver, segments):
-    """B01: 12 m^2 / (1 - 1 / N^2) is least for the least mass allowed, 0.5 kg, in every segment."""
+    """The effort 12 m^2 / (1 - 1 / N^2) is least for the least mass allowed, 0.5 kg, in every segment."""
     problem = dd.Problem(
         block(time_step=0.05),
         x0=[0, 0],

@@ -145,6 +145,16 @@ BALL = """<sdf version="1.9"><model name="ball"><link name="ball"><inertial><mas
 </model></sdf>""".replace("<sdf ", '<sdf xmlns:drake="drake" ')
 
 
+def test_a_replay_prints_what_failed_and_not_its_arrays(write_urdf):
+    plan = plan_of(block(write_urdf, x_goal=[0.9, math.nan]), np.full((COUNT, 1), 2.0))
+    found = by_name(replays(plan), f"in steps of {H:g} s", "open loop")
+    assert repr(found) == f"Replay in steps of {H:g} s, open loop: {found.failures[0]}"
+    held_one = by_name(replays(plan_of(block(write_urdf, final_cost=lambda x: x[0]), np.zeros((COUNT, 1)))),
+                       f"in steps of {H:g} s", "open loop")  # fmt: skip
+    assert str(held_one) == f"in steps of {H:g} s, open loop: holds"
+    assert held_one._repr_html_() == f"<pre>Replay {held_one}</pre>"
+
+
 def test_inputs_that_cannot_be_stepped_are_missing_not_zero(write_urdf):
     problem = block(write_urdf, final_cost=lambda x: x[0])
     us = np.full((COUNT, 1), np.nan)
@@ -157,7 +167,7 @@ def test_inputs_that_cannot_be_stepped_are_missing_not_zero(write_urdf):
 
 
 def test_a_collocated_plan_is_replayed_in_finer_steps_until_two_hold(write_urdf):
-    """B01 in 4 intervals: at h = 0.25 the simulator ends h T / 2 times the mean slope elsewhere, at h/16 within 5 %."""
+    """4 intervals: at h = 0.25 the simulator ends h T / 2 times the mean slope elsewhere, at h/16 within 5 %."""
     problem = block(write_urdf, time_step=0.25, count=4, x_goal=[1, 0])
     solution = dd.solve(problem, method="collocation", scheme="hermite_simpson")
     assert solution.success, solution.message

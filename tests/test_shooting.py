@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS
 from helpers.plants import block
-from helpers.problems import A30, lqr
+from helpers.problems import DOUBLE_INTEGRATOR, lqr
 
 import drake_diff as dd
 from drake_diff.optimize.program import Limits
@@ -122,7 +122,7 @@ def test_the_last_sensitivity_is_had_without_all_the_others():
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("count", [2, 4, 10, 20])
 def test_the_block_moves_by_symplectic_eulers_optimum(solver, count):
-    """B01: 12 / (1 - 1/N^2)."""
+    """The least effort of moving 1 kg by 1 m in 1 s is 12 / (1 - 1/N^2)."""
     model = block(time_step=1 / count)
     solution = shoot(dd.Problem(model, x0=[0, 0], x_goal=[1, 0], running_cost=EFFORT, num_steps=count), solver=solver)
     assert solution.success, solution.message
@@ -131,8 +131,8 @@ def test_the_block_moves_by_symplectic_eulers_optimum(solver, count):
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_lqr_by_shooting_has_the_riccati_recursions_cost(solver):
-    """A30, from a given guess, so that iLQR does not help; 1e-12 since the cost is flat at its minimum."""
-    problem = lqr(*A30)
+    """From a given guess, so that iLQR does not help; 1e-12 since the cost is flat at its minimum."""
+    problem = lqr(*DOUBLE_INTEGRATOR)
     count = problem.num_steps
     us = 10 * np.random.default_rng(5).standard_normal((count, 1))
     solution = shoot(problem, solver=solver, initial_guess=(np.zeros((count + 1, 2)), us))

@@ -1,4 +1,4 @@
-"""The status of a solve: what the solver says, cut down to what was measured again on Drake's plant."""
+"""Judge a solve: its status is what the solver says, cut down to what was measured again on Drake's plant."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -20,8 +20,95 @@ from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
 NO_EFFECT = 1e-12
 
 
+_STATUSES = {
+    Outcome.ITERATION_LIMIT: Status.ITERATION_LIMIT,
+    Outcome.TIME_LIMIT: Status.TIME_LIMIT,
+    Outcome.INFEASIBLE: Status.INFEASIBLE,
+    Outcome.UNBOUNDED: Status.DIVERGED,
+    Outcome.INTERRUPTED: Status.INTERRUPTED,
+    Outcome.DIVERGED: Status.DIVERGED,
+    Outcome.NO_GRADIENT: Status.NO_GRADIENT,
+    Outcome.FAILED: Status.FAILED,
+}
+
+
+def judged(draft: Solution, result: NlpResult) -> Solution:
+    """The draft with the status that the solver's outcome and our own measures allow."""
+    fields = {"iterations": result.iterations, "solver_message": result.message}
+    complaints = list(complaints_about(draft))
+    if result.outcome in _STATUSES:
+        detail = "; ".join([result.message, *complaints])
+        return ended(draft, _STATUSES[result.outcome], detail, **fields)
+    if result.outcome is Outcome.INACCURATE:
+        complaints.insert(0, f"the solver could not reach its tolerance ({result.message})")
+    if not np.all(np.isfinite(draft.xs)):
+        return ended(draft, Status.DIVERGED, "; ".join(complaints), **fields)
+    if not complaints and draft.problem.has_model:
+        complaints += broken_variants(draft.plan, draft.replays)
+    status = Status.CONVERGED_NOT_VERIFIED if complaints else Status.CONVERGED
+    return ended(draft, status, "; ".join([*complaints, *[result.note] * bool(result.note)]), **fields)
+
+
+def refused(draft: Solution, error: Exception) -> Solution:
+    status = Status.NO_GRADIENT if isinstance(error, GradientError) else Status.DIVERGED
+    return ended(draft, status, str(error))
+
+
+def ended(draft: Solution, status: Status, detail: str, **fields: Any) -> Solution:
+    message = f"{status.sentence}: {detail}" if detail else status.sentence
+    return draft.told(status=status, message=message, **fields)
+
+
+def complaints_about(solution: Solution) -> Iterator[str]:
+    """What does not hold of `solution` when measured again on Drake's plant, a clause each, replays apart."""
+    yield from _infeasibilities(solution)
+    if not np.isfinite(solution.cost):
+        yield "the cost is not finite"
+    if solution.transcribed is not None and not solution.integration_error <= INTEGRATION_TOLERANCE:
+        knot = int(np.argmax(solution.integration_errors))
+        yield (
+            f"an accurate integration from knot {knot} misses the next by {solution.integration_error:.3g}, "
+            f"tolerance {INTEGRATION_TOLERANCE:g}: take a smaller time step"
+        )
+    if solution.transcribed is not None and solution.problem.has_model:
+        model, depths = solution.problem.model, []
+        for x in solution.xs:
+            set_state(model.double, x)
+            depths.append(penetration(model))
+        if max(depths) > 0:
+            knot = int(np.argmax(depths))
+            yield f"geometries overlap by {max(depths):.3g} m at knot {knot}, and collocation leaves contact out"
+    for certificate in solution.certificates:
+        if certificate.verdict != "agree":
+            yield f"a gradient certificate says {certificate.verdict}: {certificate.worst}"
+            break
+
+
+def _infeasibilities(solution: Solution) -> Iterator[str]:
+    """Equations, ends, bounds and constraints that do not hold, with the knots at which they do not."""
+    names, above = solution.problem.state_names, f"above {FEASIBILITY_TOLERANCE:g}"
+    if not solution.defect <= FEASIBILITY_TOLERANCE:
+        where = _spans(np.flatnonzero(~(solution.defects <= FEASIBILITY_TOLERANCE)))
+        yield f"defect {solution.defect:.3g} is {above}: the motion is not the model's after knots {where}"
+    if not solution.goal_error <= FEASIBILITY_TOLERANCE:
+        worst = int(np.argmax(np.nan_to_num(np.abs(solution.problem.goal_error(solution.xs[-1])), nan=np.inf)))
+        yield f"goal error {solution.goal_error:.3g} is {above}: {names[worst]} does not reach its goal"
+    for kind, excesses in (("bound", solution.bound_excess), ("constraint", solution.constraint_excess)):
+        for name, (excess, knot) in excesses.items():
+            if not excess <= FEASIBILITY_TOLERANCE:
+                yield f"{kind} violation {excess:.3g} is {above}: {name} at knot {knot}"
+    if not solution.initial_state_error <= FEASIBILITY_TOLERANCE:
+        yield f"initial state error {solution.initial_state_error:.3g} is {above}"
+
+
+def _spans(knots: Any) -> str:
+    """Whole numbers as ranges: "0-11, 14"."""
+    runs = np.split(knots, np.flatnonzero(np.diff(knots) > 1) + 1)
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs if len(run))
+
+
 def why_blind(problem: Problem, variables: ShootingVariables, z: Array) -> str:
-    """Which part of the goal, or the final cost, nothing in z has an effect on; empty where there is none."""
+    """Which part of the goal, or the final cost, no variable in z has an effect on; empty if there is none."""
     last = final_sensitivity(variables, z)
     x_final = variables.states(z)[-1]
     effect = np.abs(last).max(axis=1, initial=0.0)
@@ -57,98 +144,3 @@ def _what_is_apart(problem: Problem, xs: Array) -> str:
     head = "nothing touches" if len(apart) == len(nearest) else "some bodies never touch"
     advice = '; use method="ilqr" and continuation="auto"' if problem.optimizes_controls else ""
     return f": at knots 0-{len(xs) - 1} {head} ({told}){advice}"
-
-
-def refused(draft: Solution, error: Exception) -> Solution:
-    status = Status.NO_GRADIENT if isinstance(error, GradientError) else Status.DIVERGED
-    return ended(draft, status, str(error))
-
-
-def ended(draft: Solution, status: Status, detail: str, **fields: Any) -> Solution:
-    message = f"{status.sentence}: {detail}" if detail else status.sentence
-    return draft.told(status=status, message=message, **fields)
-
-
-_STATUSES = {
-    Outcome.ITERATION_LIMIT: Status.ITERATION_LIMIT,
-    Outcome.TIME_LIMIT: Status.TIME_LIMIT,
-    Outcome.INFEASIBLE: Status.INFEASIBLE,
-    Outcome.UNBOUNDED: Status.DIVERGED,
-    Outcome.INTERRUPTED: Status.INTERRUPTED,
-    Outcome.DIVERGED: Status.DIVERGED,
-    Outcome.NO_GRADIENT: Status.NO_GRADIENT,
-    Outcome.FAILED: Status.FAILED,
-}
-
-
-def judged(draft: Solution, result: NlpResult) -> Solution:
-    """The draft with the status that the solver's outcome and our own measures allow."""
-    fields = {"iterations": result.iterations, "solver_message": result.message}
-    complaints = list(complaints_about(draft))
-    if result.outcome in _STATUSES:
-        detail = "; ".join([result.message, *complaints])
-        return ended(draft, _STATUSES[result.outcome], detail, **fields)
-    if result.outcome is Outcome.INACCURATE:
-        complaints.insert(0, f"the solver could not reach its tolerance ({result.message})")
-    if not np.all(np.isfinite(draft.xs)):
-        return ended(draft, Status.DIVERGED, "; ".join(complaints), **fields)
-    if not complaints and draft.problem.has_model:
-        complaints += broken_variants(draft.plan, draft.replays)
-    status = Status.CONVERGED_NOT_VERIFIED if complaints else Status.CONVERGED
-    return ended(draft, status, "; ".join([*complaints, *[result.note] * bool(result.note)]), **fields)
-
-
-def complaints_about(solution: Solution) -> Iterator[str]:
-    """What does not hold of `solution` when measured again on Drake's plant, a clause each, replays apart."""
-    yield from _infeasibilities(solution)
-    if not np.isfinite(solution.cost):
-        yield "the cost is not finite"
-    if solution.transcribed is not None:
-        if not solution.integration_error <= INTEGRATION_TOLERANCE:
-            knot = int(np.argmax(solution.integration_errors))
-            yield (
-                f"an accurate integration from knot {knot} misses the next by {solution.integration_error:.3g}, "
-                f"tolerance {INTEGRATION_TOLERANCE:g}: take a smaller time step"
-            )
-        depth, knot = _deepest(solution) if solution.problem.has_model else (0.0, 0)
-        if depth > 0:
-            yield f"geometries overlap by {depth:.3g} m at knot {knot}, and collocation leaves contact out"
-    for certificate in solution.certificates:
-        if certificate.verdict != "agree":
-            yield f"a gradient certificate says {certificate.verdict}: {certificate.worst}"
-            break
-
-
-def _infeasibilities(solution: Solution) -> Iterator[str]:
-    """Equations, ends, bounds and constraints that do not hold, with the knots at which they do not."""
-    names, above = solution.problem.state_names, f"above {FEASIBILITY_TOLERANCE:g}"
-    if not solution.defect <= FEASIBILITY_TOLERANCE:
-        where = _spans(np.flatnonzero(~(solution.defects <= FEASIBILITY_TOLERANCE)))
-        yield f"defect {solution.defect:.3g} is {above}: the motion is not the model's after knots {where}"
-    if not solution.goal_error <= FEASIBILITY_TOLERANCE:
-        worst = int(np.argmax(np.nan_to_num(np.abs(solution.problem.goal_error(solution.xs[-1])), nan=np.inf)))
-        yield f"goal error {solution.goal_error:.3g} is {above}: {names[worst]} does not reach its goal"
-    for name, (excess, knot) in solution.bound_excess.items():
-        if not excess <= FEASIBILITY_TOLERANCE:
-            yield f"bound violation {excess:.3g} is {above}: {name} at knot {knot}"
-    for name, (excess, knot) in solution.constraint_excess.items():
-        if not excess <= FEASIBILITY_TOLERANCE:
-            yield f"constraint violation {excess:.3g} is {above}: {name} at knot {knot}"
-    if not solution.initial_state_error <= FEASIBILITY_TOLERANCE:
-        yield f"initial state error {solution.initial_state_error:.3g} is {above}"
-
-
-def _spans(knots: Any) -> str:
-    """Whole numbers as ranges: "0-11, 14"."""
-    runs = np.split(knots, np.flatnonzero(np.diff(knots) > 1) + 1)
-    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs if len(run))
-
-
-def _deepest(solution: Solution) -> tuple[float, int]:
-    """The largest overlap of geometries at the knots, and the knot."""
-    model = solution.problem.model
-    depths = []
-    for x in solution.xs:
-        set_state(model.double, x)
-        depths.append(penetration(model))
-    return max(depths), int(np.argmax(depths))

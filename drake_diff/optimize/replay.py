@@ -1,18 +1,19 @@
-"""A plan tried again on Drake's double plant: at its step and half of it, in another contact approximation.
+"""Replay a plan on Drake's double plant: at its own step and half of it, and in another contact approximation.
 
-What is true at one step size and in one approximation of contact only is a property of the numerics. So the inputs
-are rolled out as they are (open loop) and with TVLQR feedback about the plan, and each variant of the plant holds where
-one of the two reaches the goal and keeps bounds, constraints, the energy balance and the penetration limit: an
-unstable motion diverges open loop whatever is right, and feedback through contact can do harm.
+A motion that exists at one step size or in one approximation of contact only is an artefact of the numerics. So the
+inputs are rolled out as they are (open loop) and with TVLQR feedback about the plan, in several variants of the plant.
+A variant holds if one of the two reaches the goal and keeps bounds, constraints, the energy balance and the
+penetration limit: an unstable motion diverges open loop however right it is, and feedback through contact can do harm.
 
 A discrete plan has to hold at h and at h/2. A collocated one is a motion in continuous time, whose interval need not be
 a step that the simulator can take: it has to hold at two successive ones of h, h/2, h/4, ... h/16. A user's diagram has
-one time step and one contact approximation: there is no other to try.
+one time step and one contact approximation, so it has no other variants.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 
 import numpy as np
 
@@ -39,7 +40,7 @@ FINEST = 16  # intervals are cut into at most that many steps
 EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in TVLQR, over that of the states
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Replay:
     """One rollout of a plan: in which variant of the plant, how controlled, and what does not hold in it."""
 
@@ -56,7 +57,17 @@ class Replay:
 
     @property
     def holds(self) -> bool:
+        """Whether nothing failed."""
         return not self.failures
+
+    def __str__(self) -> str:
+        return f"{self.variant}, {self.control}: {'; '.join(self.failures) or 'holds'}"
+
+    def __repr__(self) -> str:
+        return f"Replay {self}"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +187,13 @@ def regulator_weights(plan: Plan, us: Array) -> tuple[Array, Array, Array]:
 
 def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, known: Rollout | None) -> Replay:
     try:
-        motion = _roll(plan, control, model, parts) if known is None else known
+        xs, us = plan.sample(parts)
+        if known is not None:
+            motion = known
+        elif control == "open loop":
+            motion = rollout(model, xs[0], us)
+        else:
+            motion = rollout(model, xs[0], policy=track(plan, model, xs, us), num_steps=len(us))
     except (SimulationError, ModelError, GradientError, ValueError) as error:
         return _missing(plan, variant, control, str(error))
     bounds = plan.problem.bounds
@@ -191,30 +208,20 @@ def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, kn
         bound_violation=float(np.max(beyond, initial=0.0)),
         energy_error=motion.energy_drift,
         penetration=float(np.max(motion.penetration)),
-        failures=tuple(_failures(plan, model, motion, parts)),
+        failures=(
+            *missed_goal(plan, plan.problem.goal_error(motion.xs[-1])),
+            *left_bounds(plan, motion),
+            *_broken_constraints(plan, motion.xs[::parts], motion.us[::parts]),
+            *_broken_balance(motion),
+            *too_deep(model, motion),
+        ),
     )
 
 
-def _roll(plan: Plan, control: str, model: Model, parts: int) -> Rollout:
-    xs, us = plan.sample(parts)
-    if control == "open loop":
-        return rollout(model, xs[0], us)
-    return rollout(model, xs[0], policy=track(plan, model, xs, us), num_steps=len(us))
-
-
 def _missing(plan: Plan, variant: str, control: str, why: str) -> Replay:
-    nothing = (float("inf"),) * 4
-    approximation = plan.problem.model.contract.contact.approximation
-    return Replay(variant, control, plan.time_step, approximation, None, *nothing, failures=(why,))
-
-
-def _failures(plan: Plan, model: Model, motion: Rollout, parts: int) -> Iterator[str]:
-    """What does not hold in a replay, a clause each."""
-    yield from missed_goal(plan, plan.problem.goal_error(motion.xs[-1]))
-    yield from left_bounds(plan, motion)
-    yield from _broken_constraints(plan, motion.xs[::parts], motion.us[::parts])
-    yield from _broken_balance(motion)
-    yield from too_deep(model, motion)
+    """A replay that could not be taken: its measures are infinite, never zero."""
+    inf, approximation = float("inf"), plan.problem.model.contract.contact.approximation
+    return Replay(variant, control, plan.time_step, approximation, None, inf, inf, inf, inf, failures=(why,))
 
 
 def missed_goal(plan: Plan, distance: Array) -> Iterator[str]:

@@ -8,9 +8,9 @@ import drake_diff as dd
 from helpers.models import MODELS
 from helpers.plants import block
 
-A30 = (0.1, 20, np.eye(2), 0.1, 10 * np.eye(2))
+DOUBLE_INTEGRATOR = (0.1, 20, np.eye(2), 0.1, 10 * np.eye(2))
 OTHERS = [
-    A30,
+    DOUBLE_INTEGRATOR,
     (0.05, 33, np.diag([3.0, 0.5]), 0.7, np.diag([2.0, 0.1])),
     (0.2, 7, np.array([[2.0, 0.5], [0.5, 1.0]]), 3.0, np.array([[4.0, -1.0], [-1.0, 9.0]])),
 ]
