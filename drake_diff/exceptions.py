@@ -5,7 +5,7 @@ DrakeDiffError
 │   ├── ShapeError                 an array of the wrong shape
 │   ├── NonFiniteError             NaN or infinity where a number is needed
 │   └── UnknownNameError           a joint, parameter, solver, ... that does not exist; lists those that do
-├── ModelError                     a file or diagram that is no usable robot model
+├── ModelError                     a file or diagram that cannot be used as a robot model
 ├── GradientError                  a derivative that must not be used
 ├── CertificateError               a certificate whose verdict is not "agree", or a check before an export
 ├── SimulationError                Drake could not take a step
@@ -14,6 +14,11 @@ DrakeDiffError
 └── ArtifactError                  a run directory or log that is missing, incomplete or damaged
 
 ModelWarning (UserWarning)         what was left out of a model that is used all the same
+
+Example:
+    >>> dd.step(dd.load_model("models/pendulum.urdf", time_step=0.01), [0.0], [0.0])
+    Traceback (most recent call last):
+    drake_diff.exceptions.ShapeError: x: expected shape (2,), got shape (1,)
 """
 
 from collections.abc import Iterable
@@ -25,7 +30,7 @@ class DrakeDiffError(Exception):
 
 
 class InputError(DrakeDiffError, ValueError):
-    """Bad input, found before anything ran."""
+    """Bad input, found before anything ran; `subject`, `expected` and `got` are in the message and kept."""
 
     def __init__(self, subject: str, *, got: Any, expected: str):
         super().__init__(f"{subject}: expected {expected}, got {got}")
@@ -56,7 +61,7 @@ class UnknownNameError(InputError):
 
 
 class ModelError(DrakeDiffError):
-    """A file or diagram that is no usable robot model."""
+    """A file or diagram that cannot be used as a robot model."""
 
 
 class GradientError(DrakeDiffError):

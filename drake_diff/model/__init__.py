@@ -1,4 +1,13 @@
-"""A robot file or diagram as a discrete plant: its state, inputs, parameters, contract, and one step."""
+"""A robot file or diagram as a discrete plant: its state, inputs, parameters, contract, and one step.
+
+`dd.load_model` and `dd.model_from_diagram` make a Model. Here stand the Contract that a model promises, `softened` and
+SoftContact for forces at a distance, and `quantities`, the functions of the state that costs and constraints need.
+
+Example:
+    >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+    >>> isinstance(model.contract, dd.model.Contract)
+    True
+"""
 
 from drake_diff._base.lazy import attach_stub as _attach_stub
 

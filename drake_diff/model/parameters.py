@@ -79,8 +79,8 @@ def list_parameters(model: Model) -> list[Parameter]:
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
-        >>> [p for p in dd.list_parameters(model) if p.label == "hinge"]
-        [hinge.damping = 0.1 N m s/rad, at least 0; derivative by autodiff]
+        >>> dd.list_parameters(model)[0]
+        hinge.damping = 0.1 N m s/rad, at least 0; derivative by autodiff
         >>> dd.step(model, [0.1, 0.0], [0.0], parameters={"hinge.damping": 0.0}).round(4)
         array([ 0.0998, -0.0196])
     """

@@ -1,16 +1,21 @@
-"""What tasks are written with: positions, rotations, velocities and contact forces as functions of the state.
+"""Functions of the state that tasks are written with: positions, rotations, velocities and contact forces.
 
-Each function here takes a model and names, checks them, and gives a function of x (nx,), or of x and u (nu,), of floats
-or AutoDiffXd, to use in costs and constraints:
+Each takes a model and names, checks them at once, and returns a function of x (nx,), or of x and u (nu,), for floats
+and for AutoDiffXd, to use in costs and constraints:
 
-    hand = frame_position(model, "tool0")
-    Problem(..., final_cost=lambda x: 100 * np.sum((hand(x) - target) ** 2))
-    Problem(..., constraints=Constraint(lambda x: hand(x)[2], lower=0.1))
+    hand = dd.quantities.frame_position(model, "tool0")
+    dd.Problem(..., final_cost=lambda x: 100 * np.sum((hand(x) - target) ** 2))
+    dd.Problem(..., constraints=dd.Constraint(lambda x: hand(x)[2], lower=0.1))
 
-Quantities are those of the model's own parameters and have no derivative by any. Where others are applied that they
-depend on (joint offsets; masses and centres of mass; for contact forces all), they are refused, and so is a Problem
-that has such parameters and uses them. A frame is named "frame", "instance::frame" where two model instances have one,
-or by its body.
+They belong to the model's own parameters and have no derivative by any. Where other parameters are applied that they
+depend on (joint offsets; masses and centres of mass; for contact forces all), they raise InputError, and so does a
+Problem that optimizes such parameters. A frame is named "frame", "instance::frame" where two model instances have one
+of that name, or by its body.
+
+Example:
+    >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
+    >>> cart = dd.quantities.frame_position(model, "cart")
+    >>> problem = dd.Problem(model, x0=[0, 0, 0, 0], num_steps=10, final_cost=lambda x: (cart(x)[0] - 1) ** 2)
 """
 
 from collections.abc import Callable
@@ -40,9 +45,26 @@ OfStateAndInput = Callable[[Any, Any], Any]
 
 
 def frame_position(model: Model, frame: str, point: ArrayLike = ORIGIN, relative_to: str = "world") -> OfState:
-    """x -> (3,) [m]: where `point` (3,), fixed in `frame`, is in the frame `relative_to`.
+    """Where a point that is fixed in a frame is, as a function of the state.
 
-    Raises UnknownNameError, which lists the frames that exist, and ShapeError.
+    Args:
+        model: The model.
+        frame: The frame that carries the point; a body's name will do.
+        point: (3,) [m] in `frame`.
+        relative_to: The frame that the answer is expressed in.
+
+    Returns:
+        x (nx,) -> (3,) [m].
+
+    Raises:
+        UnknownNameError: There is no such frame; the message lists those that exist.
+        ShapeError: `point` is not (3,).
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> tip = dd.quantities.frame_position(model, "pole", point=[0, 0, -0.5])
+        >>> tip([0.0, 0.0])
+        array([ 0. ,  0. , -0.5])
     """
     here, base, p = _frame_index(model, frame), _frame_index(model, relative_to), finite_array("point", point, (3,))
 
@@ -56,11 +78,30 @@ def frame_position(model: Model, frame: str, point: ArrayLike = ORIGIN, relative
 
 
 def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_to: str = "world") -> OfState:
-    """x -> (3,): 2 sin(angle / 2) axis of the rotation from `R_goal` (3, 3) to `frame`, both in `relative_to`.
+    """How far a frame is turned from a goal, as a function of the state: 2 sin(angle / 2) times the axis.
 
-    That is twice the vector part of the quaternion of R R_goal', its scalar part not negative: 0 at the goal, there
-    the small rotation itself [rad], and smooth but at half a turn, where its axis may have either sign. Its square is
-    2 (1 - cos angle). Raises UnknownNameError, ShapeError, and InputError where R_goal is no rotation.
+    That is twice the vector part of the quaternion of R R_goal', whose scalar part is taken not negative: 0 at the
+    goal, near it the small rotation itself [rad], and smooth but at half a turn, where its axis may have either sign.
+    Its square is 2 (1 - cos angle).
+
+    Args:
+        model: The model.
+        frame: The frame; a body's name will do.
+        R_goal: (3, 3) the rotation wanted, as of `relative_to`.
+        relative_to: The frame that both rotations are relative to.
+
+    Returns:
+        x (nx,) -> (3,) [rad, for small ones].
+
+    Raises:
+        UnknownNameError: There is no such frame.
+        ShapeError, InputError: R_goal is not (3, 3), or no rotation.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> error = dd.quantities.frame_rotation_error(model, "pole", np.eye(3))
+        >>> error([0.01, 0.0]).round(6)
+        array([0.  , 0.01, 0.  ])
     """
     here, base, goal = _frame_index(model, frame), _frame_index(model, relative_to), _check_rotation(R_goal)
 
@@ -74,9 +115,25 @@ def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_t
 
 
 def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfState:
-    """x -> (3,) [m/s]: the velocity of `point` (3,), fixed in `frame`, in the world.
+    """The velocity in the world of a point that is fixed in a frame, as a function of the state.
 
-    Raises UnknownNameError and ShapeError.
+    Args:
+        model: The model.
+        frame: The frame that carries the point; a body's name will do.
+        point: (3,) [m] in `frame`.
+
+    Returns:
+        x (nx,) -> (3,) [m/s].
+
+    Raises:
+        UnknownNameError: There is no such frame.
+        ShapeError: `point` is not (3,).
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> tip = dd.quantities.frame_velocity(model, "pole", point=[0, 0, -0.5])
+        >>> tip([0.0, 2.0]).round(6)
+        array([-1.,  0.,  0.])
     """
     here, p = _frame_index(model, frame), finite_array("point", point, (3,))
 
@@ -91,7 +148,19 @@ def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfSta
 
 
 def center_of_mass(model: Model) -> OfState:
-    """x -> (3,) [m]: the centre of mass of all bodies, in the world. ModelError where they have no mass."""
+    """The centre of mass of all bodies in the world, as a function of the state.
+
+    Returns:
+        x (nx,) -> (3,) [m].
+
+    Raises:
+        ModelError: The bodies have no mass.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> dd.quantities.center_of_mass(model)([0.0, 0.0])
+        array([ 0. ,  0. , -0.5])
+    """
     if not float(model.plant.CalcTotalMass(model.double.context)) > 0:
         raise ModelError("the bodies have no mass, and so no centre of mass")
 
@@ -104,11 +173,28 @@ def center_of_mass(model: Model) -> OfState:
 
 
 def contact_force(model: Model, body: str) -> OfStateAndInput:
-    """(x, u) -> (3,) [N]: the sum of all contact forces on `body` in the step taken from (x, u), in the world.
+    """The sum of all contact forces on a body, in the world, as a function of the state and the input.
 
-    It needs a Constraint of (x, u), or a cost of both, and holds over the step that follows a knot. Its derivative is
-    0 where nothing touches, so that a search has to start from a motion that does. Raises UnknownNameError, which
-    lists the bodies, and, when called, what `step` does, such as SimulationError for pairs that Drake cannot do.
+    It is the force over the step that is taken from (x, u), so it needs a Constraint of (x, u) or a cost of both. Its
+    derivative is 0 where nothing touches: a search has to start from a motion that does.
+
+    Args:
+        model: The model.
+        body: The body that is pushed.
+
+    Returns:
+        (x (nx,), u (nu,)) -> (3,) [N]. It raises what `step` raises, such as SimulationError for pairs of shapes that
+        Drake cannot do.
+
+    Raises:
+        UnknownNameError: There is no such body; the message lists those that exist.
+
+    Example:
+        >>> model = dd.load_model("models/sphere_on_ground.sdf", time_step=0.01)
+        >>> force = dd.quantities.contact_force(model, "ball")
+        >>> high = np.array([1, 0, 0, 0, 0, 0, 5, 0, 0, 0, 0, 0, 0])
+        >>> force(high, [])
+        array([0., 0., 0.])
     """
     known = labelled(bodies(model.plant))
     if body not in known:

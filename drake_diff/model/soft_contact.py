@@ -28,10 +28,25 @@ _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
 @dataclass(frozen=True)
 class SoftContact:
-    """The force sigma k log(1 + exp(-phi / sigma)) with sigma = `distance` [m] and k = `stiffness` [N/m].
+    """A smooth repulsive force between geometries, sigma k log(1 + exp(-phi / sigma)) at the signed distance phi [m].
 
-    It falls by e with each `distance` of separation. A stable step needs h^2 k below 4 times the mass that it moves.
-    Raises InputError.
+    It falls by e with each `distance` of separation and tends to the spring k max(0, -phi) as `distance` tends to 0.
+    A stable step needs h^2 k below 4 times the mass that it moves. It has no friction and no dissipation.
+
+    Args:
+        distance: sigma [m], above 0.
+        stiffness: k [N/m], above 0.
+
+    Raises:
+        InputError: One of them is not above 0.
+
+    Source:
+        Kurtz and Lin, "Inverse dynamics trajectory optimization for contact-implicit model predictive control", 2023.
+
+    Example:
+        >>> soft = dd.model.SoftContact(distance=0.01, stiffness=100.0)
+        >>> round(soft.normal_force(0.0), 6)  # sigma k log 2
+        0.693147
     """
 
     distance: float
@@ -67,11 +82,29 @@ class SoftContact:
 
 
 def softened(model: Model, contact: SoftContact) -> Model:
-    """`model` with `contact` between all geometries that may collide, beside Drake's own, at any time step.
+    """`model` with a smooth force at a distance between all geometries that may collide, beside Drake's own contact.
 
-    Its steps, rollouts, gradients and certificates are those of any model. AutoDiffXd knows the distance of a sphere
-    from a sphere, a box and a half space; where another pair may collide, steps are differenced, and say so.
-    Raises InputError where nothing may collide or no force can be added, ModelError where Drake knows no distance.
+    Its steps, rollouts, gradients and certificates are those of any model, at any time step. AutoDiffXd knows the
+    distance of a sphere from a sphere, a box and a half space; where another pair may collide, steps are differenced,
+    and say so.
+
+    Args:
+        model: The model; it stays as it is.
+        contact: The force.
+
+    Returns:
+        A Model.
+
+    Raises:
+        InputError: Nothing may collide, or no force can be added.
+        ModelError: Drake knows no distance of some pair.
+
+    Example:
+        >>> model = dd.load_model("models/sphere_on_ground.sdf", time_step=0.01)
+        >>> soft = dd.model.softened(model, dd.model.SoftContact(distance=0.05, stiffness=100.0))
+        >>> x = np.array([1, 0, 0, 0, 0, 0, 0.2, 0, 0, 0, 0, 0, 0])  # 0.1 m above the ground
+        >>> bool(dd.step(soft, x)[12] > dd.step(model, x)[12])  # it falls more slowly
+        True
     """
     if not isinstance(contact, SoftContact):
         raise InputError("contact", got=type(contact).__name__, expected="a SoftContact")

@@ -16,11 +16,28 @@ from drake_diff.model.twin import Twin
 def step(
     model: Model, x: ArrayLike, u: ArrayLike | None = None, *, parameters: Mapping[str, Any] | None = None
 ) -> Array:
-    """(nx,): the state one `model.time_step` after `x` (nx,) under the constant input `u` (nu,) [N or N m].
+    """The state one time step later, by Drake's double plant.
 
-    `u` may be left out where the model has no actuators; `parameters` maps names (see `list_parameters`) to values
-    that replace the model's own for this step. Raises ShapeError, NonFiniteError, or SimulationError
-    where Drake cannot take the step or its result is not finite.
+    Args:
+        model: The model.
+        x: (nx,) the state [q; v].
+        u: (nu,) [N or N m] the input, constant over the step; may be left out where there are no actuators.
+        parameters: Names (see `list_parameters`) and the values that replace the model's own for this step.
+
+    Returns:
+        (nx,) the next state.
+
+    Raises:
+        ShapeError, NonFiniteError: x or u is wrong.
+        UnknownNameError, InputError: A parameter does not exist, or its value is not possible.
+        SimulationError: Drake cannot take the step, or its result is not finite.
+
+    Example:
+        >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
+        >>> dd.step(model, [0, 0, 0, 0], [1.0]).round(6)
+        array([ 0.0001, -0.0002,  0.01  , -0.02  ])
+        >>> dd.step(model, [0, 0, 0, 0], [1.0], parameters={"cart.mass": 2.0}).round(6)
+        array([ 5.e-05, -1.e-04,  5.e-03, -1.e-02])
     """
     point = check_point(model, x, u)
     with applied(select(model, parameters or ())) as set_model:
