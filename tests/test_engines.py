@@ -54,11 +54,12 @@ from drake_diff.model.tangent import tangent_space
 # ---- hand calculations -------------------------------------------------------------------------------------------
 
 
-def test_pendulum_a03():
+def test_a_pendulums_step_and_jacobian_are_their_formulas():
+    """m l^2 (v' - v) = h (u - m g l sin q - b v') and q' = q + h v', with m = 1 kg, l = 0.5 m, b = 0.1 N m s."""
     engine = NumpyEngine(Pendulum(), time_step=0.01)
     x_next = engine.step([0.7, -1.2], [0.3])
     A, B, _ = engine.differentiate_step([0.7, -1.2], [0.3])
-    # The oracle's digits; the formulas of ORACLES A03 below to rounding.
+    # The formulas above by hand, to the 12 decimals written here; below the Jacobian's to rounding.
     np.testing.assert_allclose(x_next, [0.686908411253, -1.309158874737], rtol=0, atol=6e-13)
     h, gl, s = 0.01, G / 0.5, 1 / (1 + 0.01 * 0.1 / 0.25)
     c = np.cos(0.7)
@@ -66,11 +67,12 @@ def test_pendulum_a03():
     np.testing.assert_allclose(B.ravel(), [h * h * s / 0.25, h * s / 0.25], rtol=1e-14)
 
 
-def test_double_pendulum_a05():
+def test_a_double_pendulums_step_and_jacobian_are_lagranges():
+    """Two thin rods of 1 and 0.7 kg, 0.8 and 0.5 m: Lagrange's equations, evaluated to the digits written here."""
     engine = NumpyEngine(DoublePendulum(), time_step=0.005)
     x, u = [0.4, -0.9, 1.3, -0.6], [0.25, -0.15]
     M = [[0.89371745778245, 0.14535872889123], [0.14535872889123, 0.05833333333333]]
-    np.testing.assert_allclose(engine.mass_matrix(x[:2]), M, rtol=0, atol=6e-15)  # the oracle's 14 decimals
+    np.testing.assert_allclose(engine.mass_matrix(x[:2]), M, rtol=0, atol=6e-15)  # written to 14 decimals
     x_next = [0.40628355157782, -0.902092759011, 1.25671031556302, -0.41855180220094]
     np.testing.assert_allclose(engine.step(x, u), x_next, rtol=0, atol=1e-12)  # its 12
     A, B, _ = engine.differentiate_step(x, u)
@@ -84,7 +86,8 @@ def test_double_pendulum_a05():
     assert engine.energy(x) == pytest.approx(0.6523114432910162 - 10.18077388024687, rel=1e-14)
 
 
-def test_mass_spring_damper_a07():
+def test_a_mass_spring_dampers_step_and_jacobian_are_their_formulas():
+    """m (v' - v) = h (u - k (q - rest) - c v') with m = 2 kg, k = 50 N/m, rest = 0.1 m, c = 1.5 N s/m."""
     engine = NumpyEngine(MassSpringDamper(), time_step=0.01)
     np.testing.assert_allclose(engine.step([0.35, -0.4], [1]), [0.34545905707196, -0.45409429280397], rtol=1e-13)
     A, B, _ = engine.differentiate_step([0.35, -0.4], [1])
@@ -93,7 +96,8 @@ def test_mass_spring_damper_a07():
     np.testing.assert_allclose(B.ravel(), [4.96277915632754e-5, 4.96277915632754e-3], rtol=1e-14)
 
 
-def test_projectile_a01():
+def test_a_projectile_flies_a_parabola_of_steps():
+    """z_N = z_0 + v_0 h N - g h^2 N (N + 1) / 2, and d p_N / d v_0 = h N."""
     engine = NumpyEngine(Projectile(), time_step=0.01)
     x = np.array([1.0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 2, 1, 5])
     total = np.eye(13)
@@ -104,7 +108,8 @@ def test_projectile_a01():
     np.testing.assert_allclose(total[4:7, 10:13], np.eye(3), atol=1e-12)
 
 
-def test_cart_pole_a33():
+def test_a_cart_poles_acceleration_is_its_formula():
+    """(m + b) a + b l (cos q alpha - sin q w^2) = u and l alpha + cos q a + g sin q = 0; m = 1, b = 0.3, l = 0.5."""
     engine = NumpyEngine(CartPole(), time_step=1e-3)
     x = np.array([0.1, 0.7, -0.3, 1.1])
     acceleration = (engine.step(x, [2])[2:] - x[2:]) / 1e-3
@@ -113,16 +118,17 @@ def test_cart_pole_a33():
 
 @pytest.mark.parametrize(("x", "v", "v_next"), [(0.003, -0.2, -0.154711111111), (0.003, 0.4, 0.378622222222),
                                                 (0.0005, -1, -0.921377777778)])  # fmt: skip
-def test_sphere_on_ground_a12(x, v, v_next):
+def test_a_ball_in_the_ground_takes_its_implicit_spring(x, v, v_next):
+    """v' = (v - g h + h k x / m) / (1 + h^2 k / m) with k = 5000 N/m, m = 1 kg, h = 0.005 s."""
     engine = NumpyEngine(SphereOnGround(stiffness=5000), time_step=0.005)
     state = [0.1 - x, v]
-    assert engine.step(state, [])[1] == pytest.approx(v_next, rel=1e-11)  # the oracle's 12 decimals
+    assert engine.step(state, [])[1] == pytest.approx(v_next, rel=1e-11)  # written to 12 decimals
     np.testing.assert_allclose(engine.differentiate_step(state, []).A[1], [-22.2222222222222, 0.888888888888889],
                                rtol=1e-13)  # fmt: skip
     assert engine.contact_depth(state) == pytest.approx(x, rel=1e-13)
 
 
-def test_sphere_on_ground_a14_holds_and_lets_go():
+def test_a_dissipating_ground_holds_and_lets_go():
     engine = NumpyEngine(SphereOnGround(stiffness=5000, relaxation_time=0.02), time_step=0.005)
     assert engine.step([0.097, -0.2], [])[1] == pytest.approx(-0.107107692308, rel=1e-11)
     assert engine.step([0.097, 0.4], [])[1] == pytest.approx(0.35095, rel=1e-13)
@@ -133,9 +139,10 @@ def test_sphere_on_ground_a14_holds_and_lets_go():
     (0, 1, 0.9509500002712, 0.99999999943, None), (2, 0, 4.453632360759e-5, None, 2.66732351568e-5),
     (4.9, 0, 6.055159639138e-4, None, 3.20313813328e-3), (6, 0, 0.01095204452046, None, 9.996268039878e-3),
 ])  # fmt: skip
-def test_sliding_block_a18(u, v0, v, by_v0, by_u):
+def test_a_sliding_block_has_regularized_friction(u, v0, v, by_v0, by_u):
+    """v' + c v' / sqrt(v'^2 + s^2) = v + h u / m with c = mu g h, solved to the digits written here."""
     engine = NumpyEngine(SlidingBlock(), time_step=0.01)
-    assert engine.step([0, v0], [u])[1] == pytest.approx(v, rel=1e-11)  # the oracle's digits
+    assert engine.step([0, v0], [u])[1] == pytest.approx(v, rel=1e-11)
     A, B, _ = engine.differentiate_step([0, v0], [u])
     if by_v0:
         assert A[1, 1] == pytest.approx(by_v0, rel=1e-11)
@@ -143,7 +150,7 @@ def test_sliding_block_a18(u, v0, v, by_v0, by_u):
         assert B[1, 0] == pytest.approx(by_u, rel=1e-10)
 
 
-def test_a_block_stops_a20_and_slides_down_a21():
+def test_a_block_stops_on_the_flat_and_slides_down_a_slope():
     flat = NumpyEngine(SlidingBlock(), time_step=0.01)
     x, total = np.array([0.0, 1.0]), np.eye(2)
     for _ in range(200):
@@ -254,7 +261,7 @@ def test_the_hand_calculation_of_landing_is_drake(contact, relaxation):
 
 
 @pytest.mark.parametrize("file", ["sphere_on_ground.sdf", "sliding_block.sdf"])
-def test_mujoco_rests_as_deep_as_drake_a15(load, file):
+def test_mujoco_rests_as_deep_as_drake(load, file):
     model = load(file, time_step=0.005)
     mujoco, x = engine_of("mujoco", model), model.default_state
     weight, points, radius = {"sphere_on_ground.sdf": (1, 1, 0.1), "sliding_block.sdf": (2, 4, 0.05)}[file]
@@ -266,7 +273,7 @@ def test_mujoco_rests_as_deep_as_drake_a15(load, file):
     assert dd.engines.load_engine("drake", model).contact_depth(x) == pytest.approx(mujoco.contact_depth(x), rel=1e-9)
 
 
-def test_mujoco_slides_to_a_stop_a20_and_its_jacobians_are_its_steps():
+def test_mujoco_slides_to_a_stop_and_its_jacobians_are_its_steps():
     (model, (_, rest, _, _)), h, N = block_on_rails(), 0.01, 60
     mujoco = engine_of("mujoco", model)
 
@@ -299,7 +306,7 @@ def test_mujoco_creeps_on_an_incline_by_its_own_law():
     assert mujoco.contact_depth(x) == pytest.approx(G * np.cos(slope) / k, rel=1e-6)
 
 
-def test_mujoco_rolls_down_an_incline_a25():
+def test_mujoco_rolls_down_an_incline():
     slope, k, h, N = np.deg2rad(20), 1e5, 0.002, 500
     plant = Plant(h, "lagged")
     plant.ball("ball", 1.0, 0.1, contact_properties(2e5, 10, 0.6))

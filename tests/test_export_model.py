@@ -38,7 +38,7 @@ def rows_of(path):
 
 @pytest.mark.parametrize("target", list(MODEL_FILE))
 def test_the_written_file_steps_as_the_hand_calculation_does(load, tmp_path, target):
-    """A03: 1 kg at 0.5 m, damping 0.1, from the file alone."""
+    """m l^2 (v' - v) = h (u - m g l sin q - b v'): 1 kg at 0.5 m, b = 0.1 N m s, from the file alone."""
     files = export_model(load("pendulum.urdf"), tmp_path / "out", target=target, states=3)
     assert {f.name for f in files} == {f.name for f in (tmp_path / "out").iterdir()} == FILES | {MODEL_FILE[target]}
     with warnings.catch_warnings():

@@ -121,7 +121,7 @@ def test_mjx_still_loses_the_turn_from_rest(monkeypatch):
 
 
 @pytest.mark.parametrize("file", ["sphere_on_ground.sdf", "sliding_block.sdf"])
-def test_mjx_rests_as_deep_as_mujoco_and_drake_a15(load, file):
+def test_mjx_rests_as_deep_as_mujoco_and_drake(load, file):
     model = load(file, time_step=0.005)
     engine, mujoco, x = engine_of("mjx", model), engine_of("mujoco", model), model.default_state
     weight, points, radius = {"sphere_on_ground.sdf": (1, 1, 0.1), "sliding_block.sdf": (2, 4, 0.05)}[file]

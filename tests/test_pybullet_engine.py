@@ -10,12 +10,14 @@ from helpers.engines import free_state
 from helpers.forward_formula import formula, free_box, turned
 from helpers.models import MODELS, Plant, contact_properties, robot
 from helpers.plants import block_on_rails, tetrahedron_on_ground
-from pydrake.geometry import Box, Capsule, Cylinder
+from pydrake.geometry import Box, Capsule, Cylinder, HalfSpace
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import SpatialInertia
 
 import drake_diff as dd
-from drake_diff.exceptions import NonFiniteError, NotOfferedError, ShapeError, SimulationError
+from drake_diff.engines.urdf import bullet_urdf
+from drake_diff.exceptions import ModelError, NonFiniteError, NotOfferedError, ShapeError, SimulationError
+from drake_diff.mechanics.description import Geometry, describe, rigid_links
 
 pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'drake-diff[forward]' (Python 3.11)")
 G = 9.81
@@ -233,6 +235,13 @@ def test_bad_input_and_what_bullet_has_not_are_named(load):
         bullet(free_box()).bias([1, 0, 0, 0, 0, 0, 1], np.zeros(6))
     with pytest.raises(SimulationError, match="Bullet"):
         bullet(load("double_pendulum.urdf")).step([0.0, 1.0, 1e200, 1e200], [0.0, 0.0])
+
+
+def test_a_half_space_on_a_moving_link_is_refused(load):
+    links = rigid_links(describe(load("pendulum.urdf"))).links
+    half_space = Geometry("ramp", "pole", RigidTransform(), HalfSpace())
+    with pytest.raises(ModelError, match="geometry ramp: Bullet has half spaces on the world alone"):
+        bullet_urdf([(0, links[0])], [(0, half_space)])
 
 
 def test_pybullet_says_nothing_and_a_missing_one_is_named_with_its_extra():

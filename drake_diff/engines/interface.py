@@ -17,7 +17,7 @@ EACH_CALL = "each step starts from x and u alone"
 UNLIMITED = 1e10  # written for "no limit": readers take a missing limit for 0, and not all can read inf
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class EngineContract:
     """What an engine uses, read out of the engine itself; SI units, in the order of the x and u that it takes."""
 
@@ -41,6 +41,13 @@ class EngineContract:
     # By quantity of the match: why this engine cannot have what Drake has.
     reasons: Mapping[str, str] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        joints, inputs = (", ".join(names) or "none" for names in ([j.name for j in self.joints], self.inputs))
+        return (
+            f"{self.engine}, {self.precision}, {self.time_step:g} s: {self.integrator}\n"
+            f"  joints: {joints}\n  inputs: {inputs}\n  contact: {self.contact_law}; limits: {self.limit_law}"
+        )
+
 
 class StepJacobian(NamedTuple):
     """A (nx, nx) and B (nx, nu) of one step in Drake's coordinates, and where they come from."""
@@ -48,6 +55,9 @@ class StepJacobian(NamedTuple):
     A: Array
     B: Array
     method: str
+
+    def __repr__(self) -> str:
+        return f"A {self.A.shape} and B {self.B.shape} by {self.method}"
 
 
 class Engine(Protocol):

@@ -17,7 +17,7 @@ TIMED = 15  # calls whose median is told, after one that may compile
 LONGEST = 1.0  # [s] less are timed where they take so long
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class EngineMotion:
     """What one engine, or a recording, did. `status` is "ok", or what its solver said first, and when."""
 
@@ -27,6 +27,9 @@ class EngineMotion:
     energy: Array | None  # (n,) [J] kinetic and potential; None where it does not compute it
     depth: Array | None  # (n,) [m] deepest overlap
     status: str
+
+    def __repr__(self) -> str:
+        return f"{len(self.xs)} states over {self.times[-1] - self.times[0]:.6g} s: {self.status}"
 
     @property
     def energy_change(self) -> float | None:
