@@ -1,13 +1,12 @@
-"""Seven textbook contact cases with a ball of radius r on a half space, and their rigid closed forms.
+"""Seven textbook contact cases: a ball of radius r on a half space, and what rigid contact does there in closed form.
 
-On rails (x and z, or z alone) the ball cannot turn and slides like a block; on an incline gravity is turned and the
-ground is not. Where the rigid answer depends on the time step h it is that of v' = v + h a, q' = q + h v', which every
-engine here steps by: what is left of a gap is the contact law's.
+On rails (x and z, or z alone) the ball cannot turn and slides like a block. On an incline it is gravity that is turned,
+not the ground. Where the rigid answer depends on the time step h, it is that of v' = v + h a, q' = q + h v', the scheme
+of every engine here: what is left of a gap is due to the contact law.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from math import cos, exp, floor, log, radians, sin, sqrt
+from math import cos, exp, floor, radians, sin, sqrt
 from typing import Any, Literal
 
 import numpy as np
@@ -22,8 +21,8 @@ from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
 
 Kind = Literal["rest", "stop", "slide", "hold", "roll", "bounce", "damped bounce"]
-AXES: dict[Kind, tuple[str, ...]] = {"rest": ("z",), "bounce": ("z",), "damped bounce": ("z",), "roll": ()}
-RAILS = ("x", "z")  # of the others
+FALLING: tuple[Kind, ...] = ("rest", "bounce", "damped bounce")  # on a vertical rail
+RAILS = ("x", "z")  # of the others, but for "roll", where the ball is free
 QUANTITIES: dict[Kind, tuple[str, str, str]] = {  # what is measured, its unit, and the derivative looked at
     "rest": ("depth at rest", "m", "d z_N / d z_0"),
     "stop": ("stopping distance", "m", "d x_N / d v_0"),
@@ -37,7 +36,16 @@ QUANTITIES: dict[Kind, tuple[str, str, str]] = {  # what is measured, its unit, 
 
 @dataclass(frozen=True)
 class ContactCase:
-    """One case. `dissipation`, `relaxation_time` and `stiffness` are those of the pair."""
+    """One case. `stiffness`, `dissipation` and `relaxation_time` are those of the pair of ball and ground.
+
+    Raises InputError for a number that cannot be.
+
+    Example:
+        >>> from drake_diff.studies.contact_cases import ContactCase
+        >>> case = ContactCase("stop", time_step=0.01, num_steps=40, speed=1.0)
+        >>> case.rigid, case.rigid_gradient  # [m] in 20 steps that slip, and [s]
+        (0.09699..., 0.2)
+    """
 
     kind: Kind
     time_step: float  # [s]
@@ -46,8 +54,8 @@ class ContactCase:
     radius: float = 0.1  # [m]
     gravity: float = 9.81  # [m/s^2]
     stiffness: float = 1e4  # [N/m]
-    dissipation: float = 10.0  # Hunt-Crossley's, of similar and lagged [s/m]
-    relaxation_time: float = 0.02  # of sap [s]
+    dissipation: float = 10.0  # of Hunt and Crossley, in Drake's similar and lagged [s/m]
+    relaxation_time: float = 0.02  # of Drake's sap [s]
     friction: float = 0.5
     slope: float = 0.0  # [rad]
     speed: float = 0.0  # at the start, along x [m/s]
@@ -78,55 +86,72 @@ class ContactCase:
 
     @property
     def resting_depth(self) -> float:
-        """[m]"""
-        return resting_depth(self.mass, self.normal_gravity, self.stiffness)
+        """[m] m g / k: at rest the spring alone carries the weight."""
+        return self.mass * self.normal_gravity / self.stiffness
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """Of the rails; none of a free ball."""
-        return AXES.get(self.kind, RAILS)
+        """The directions of the rails; none of a free ball."""
+        return ("z",) if self.kind in FALLING else () if self.kind == "roll" else RAILS
 
     def place(self, name: str) -> int:
-        """Of x, z, vx or vz in the state."""
+        """The index of x, z, vx or vz in the state."""
         free = ("qw", "qx", "qy", "qz", "x", "y", "z", "wx", "wy", "wz", "vx", "vy", "vz")
         names = (*self.axes, *("v" + axis for axis in self.axes)) if self.axes else free
         return names.index(name)
 
     @property
     def x0(self) -> Array:
-        """(nx,) the start: touching as deep as it rests, or, of `rest` and the bounces, `height` above the ground."""
-        falls = self.kind in ("rest", "bounce", "damped bounce")
+        """(nx,) the start: touching as deep as it rests, or, where it falls, `height` above the ground."""
         x = np.zeros(2 * len(self.axes) or 13)
         if not self.axes:
             x[0] = 1.0
-        x[self.place("z")] = self.radius + (self.height if falls else -self.resting_depth)
-        if not falls:
+        x[self.place("z")] = self.radius + (self.height if self.kind in FALLING else -self.resting_depth)
+        if self.kind not in FALLING:
             x[self.place("vx")] = self.speed
         return x
 
     def model(self, contact_approximation: str = "sap") -> Model:
-        """The plant in Drake, which can be had again at another time step, approximation or field of this class."""
+        """The plant in Drake, which can be had again with another time step, approximation or field of this class."""
         return _build(self, contact_approximation)
 
     @property
     def rigid(self) -> float:
-        """The rigid answer; of `rest` that of a spring under a rigid weight."""
-        return _RIGID[self.kind](self)
+        """The rigid answer to what `QUANTITIES` names; of `rest`, the depth of a spring under a rigid weight."""
+        return self._rigid_pair[0]
 
     @property
     def rigid_gradient(self) -> float:
-        """Of the derivative that `QUANTITIES` names."""
-        return _RIGID_GRADIENT[self.kind](self)
+        """The rigid answer to the derivative that `QUANTITIES` names."""
+        return self._rigid_pair[1]
+
+    @property
+    def _rigid_pair(self) -> tuple[float, float]:
+        match self.kind:
+            case "rest":
+                return self.resting_depth, 0.0
+            case "stop":
+                return stopping_staircase(self.speed, self.friction, self.gravity, self.time_step)
+            case "slide":
+                return sliding_speed(self.speed, self.slope, self.friction, self.gravity, self.duration), 1.0
+            case "hold":
+                return 0.0, 0.0
+            case "roll":
+                return rolling_factor(1, 1) * self.slope_gravity * self.duration, rolling_factor(1, 1)
+            case _:
+                e = hunt_crossley_restitution(self.dissipation, sqrt(2 * self.gravity * self.height))
+                height, _, by_height = rebound(self.height, self.gravity, e, self.duration)
+                return height, by_height
 
     @property
     def free_fall(self) -> float:
-        """[m] how high the ball is at the end where nothing holds it (ORACLES A01)."""
+        """[m] how high the ball is at the end where nothing holds it: z_0 - g h^2 N (N + 1) / 2 in the scheme above."""
         h, N = self.time_step, self.num_steps
         return float(self.x0[self.place("z")]) - self.normal_gravity * h**2 * N * (N + 1) / 2
 
 
 def contact_cases() -> tuple[ContactCase, ...]:
-    """All seven, with parameters of ORACLES A15, A20, A21, A25 and A26; `dataclasses.replace` gives others."""
+    """All seven, with parameters at which contact laws can be told apart; `dataclasses.replace` gives others."""
     return (
         ContactCase("rest", 1e-3, 1500),
         ContactCase("stop", 0.01, 40, speed=1.0),
@@ -138,49 +163,36 @@ def contact_cases() -> tuple[ContactCase, ...]:
     )
 
 
-def resting_depth(mass: float, gravity: float, stiffness: float) -> float:
-    """[m] m g / k (ORACLES A15)."""
-    return mass * gravity / stiffness
-
-
-def stopping_distance(speed: float, friction: float, gravity: float) -> tuple[float, float]:
-    """[m] v^2 / (2 mu g), and its derivative by v [s] (ORACLES A20)."""
-    return speed**2 / (2 * friction * gravity), speed / (friction * gravity)
-
-
 def stopping_staircase(speed: float, friction: float, gravity: float, time_step: float) -> tuple[float, float]:
-    """[m] the same in steps of h: h (n v - mu g h n (n + 1) / 2), n = floor(v / (mu g h)); derivative h n [s]."""
+    """[m] v^2 / (2 mu g) in steps of h: h (n v - mu g h n (n + 1) / 2), n = floor(v / (mu g h)); derivative h n [s]."""
     n = floor(speed / (friction * gravity * time_step))
     return slid(speed, friction * gravity, time_step, n), time_step * n
 
 
 def slid(speed: float, deceleration: float, time_step: float, n: int) -> float:
-    """[m] way of `n` steps of v' = v - h a, x' = x + h v'."""
+    """[m] the way of `n` steps of v' = v - h a, x' = x + h v'."""
     return time_step * (n * speed - deceleration * time_step * n * (n + 1) / 2)
 
 
 def sliding_speed(speed: float, slope: float, friction: float, gravity: float, duration: float) -> float:
-    """[m/s] v + g (sin a - mu cos a) t; its derivative by v is 1 (ORACLES A21)."""
+    """[m/s] v + g (sin a - mu cos a) t; its derivative by v is 1."""
     return speed + gravity * (sin(slope) - friction * cos(slope)) * duration
 
 
 def rolling_factor(radius: float, effective_radius: float) -> float:
-    """1 / (1 + 0.4 (r / r_e)^2) of a solid ball: its acceleration is that times g sin a, and so much of a speed that it
-    is given without turning is left once it rolls; 5 / 7 where r_e = r (ORACLES A23, A25)."""
+    """1 / (1 + 0.4 (r / r_e)^2) for a solid ball that rolls on radius r_e: 5 / 7 where r_e = r.
+
+    Its acceleration is that times g sin a, and so much of a speed that it is given without turning is left once it
+    rolls. 0.4 m r^2 is a solid ball's inertia.
+    """
     return 1 / (1 + 0.4 * (radius / effective_radius) ** 2)
 
 
-def time_of_impact(height: float, gravity: float) -> float:
-    """[s] sqrt(2 H / g)."""
-    return sqrt(2 * height / gravity)
-
-
 def rebound(height: float, gravity: float, restitution: float, duration: float) -> tuple[float, float, float]:
-    """After a drop from H: the rebound's height e^2 H [m], and t after the start the height above the floor [m] and its
-    derivative by H.
+    """After a drop from H: the height of the rebound e^2 H [m]; at time t the height [m] and its derivative by H.
 
     With v = sqrt(2 g H) and t' = t - v / g these are e v t' - g t'^2 / 2 and (1 + e) g t' / v - e: the fall, then the
-    saltation matrix [[-e, 0], [(1 + e) g / v, -e]], then the flight (ORACLES A26).
+    saltation matrix [[-e, 0], [(1 + e) g / v, -e]] of the impact, then the flight.
     """
     v = sqrt(2 * gravity * height)
     left = duration - v / gravity
@@ -191,7 +203,7 @@ def rebound(height: float, gravity: float, restitution: float, duration: float) 
 def hunt_crossley_restitution(dissipation: float, speed: float) -> float:
     """e of f = k x (1 + d v) without gravity at impact speed v: d v (1 + e) = log((1 + d v) / (1 - e d v)).
 
-    The integral of v dv / (1 + d v) = -(k / m) x dx from touch to touch; bisected. It depends on neither k nor m.
+    The integral of v dv / (1 + d v) = -(k / m) x dx from touch to touch, bisected. It depends on neither k nor m.
     """
     s = dissipation * speed
     if s == 0:
@@ -204,50 +216,6 @@ def hunt_crossley_restitution(dissipation: float, speed: float) -> float:
     return (low + high) / 2
 
 
-def linear_restitution(damping_ratio: float) -> float:
-    """e of f = k x + c v, f >= 0, without gravity, zeta = c / (2 sqrt(k m)): 1 at 0 and exp(-2) where it is critical.
-
-    x = v sin(w t) exp(-z t) / w until f = 0: see Schwager and Poeschel, "Coefficient of restitution and linear-dashpot
-    model revisited", 2007.
-    """
-    z = damping_ratio
-    if z < 1:
-        turn = sqrt(1 - z**2)
-        return exp(-z / turn * float(np.arctan2(2 * z * turn, 2 * z**2 - 1)))
-    if z == 1:
-        return exp(-2)
-    turn = sqrt(z**2 - 1)
-    return exp(-z / turn * log((z + turn) / (z - turn)))
-
-
-def _restitution(case: ContactCase) -> float:
-    return hunt_crossley_restitution(case.dissipation, sqrt(2 * case.gravity * case.height))
-
-
-def _bounce(case: ContactCase) -> tuple[float, float, float]:
-    return rebound(case.height, case.gravity, _restitution(case), case.duration)
-
-
-_RIGID: dict[Kind, Callable[[ContactCase], float]] = {
-    "rest": lambda c: c.resting_depth,
-    "stop": lambda c: stopping_staircase(c.speed, c.friction, c.gravity, c.time_step)[0],
-    "slide": lambda c: sliding_speed(c.speed, c.slope, c.friction, c.gravity, c.duration),
-    "hold": lambda c: 0.0,
-    "roll": lambda c: rolling_factor(1, 1) * c.slope_gravity * c.duration,
-    "bounce": lambda c: _bounce(c)[0],
-    "damped bounce": lambda c: _bounce(c)[0],
-}
-_RIGID_GRADIENT: dict[Kind, Callable[[ContactCase], float]] = {
-    "rest": lambda c: 0.0,
-    "stop": lambda c: stopping_staircase(c.speed, c.friction, c.gravity, c.time_step)[1],
-    "slide": lambda c: 1.0,
-    "hold": lambda c: 0.0,
-    "roll": lambda c: rolling_factor(1, 1),
-    "bounce": lambda c: _bounce(c)[2],
-    "damped bounce": lambda c: _bounce(c)[2],
-}
-
-
 def _build(case: ContactCase, approximation: str) -> Model:
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
@@ -258,15 +226,20 @@ def _build(case: ContactCase, approximation: str) -> Model:
     )
     plant, _ = AddMultibodyPlant(config, builder)
     plant.mutable_gravity_field().set_gravity_vector([case.slope_gravity, 0, -case.normal_gravity])
-    parent = plant.world_frame()
-    for axis in case.axes[:-1]:
-        link = plant.AddRigidBody(f"ball_{axis}", SpatialInertia.Zero())
-        plant.AddJoint(PrismaticJoint(f"ball_{axis}", parent, link.body_frame(), _direction(axis)))
-        parent = link.body_frame()
     ball = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(case.mass, case.radius))
-    for axis in case.axes[-1:]:
-        plant.AddJoint(PrismaticJoint(f"ball_{axis}", parent, ball.body_frame(), _direction(axis)))
-    material = _material(case)
+    parent = plant.world_frame()
+    for axis in case.axes:
+        last = axis == case.axes[-1]
+        body = ball if last else plant.AddRigidBody(f"ball_{axis}", SpatialInertia.Zero())
+        direction = [float(axis == name) for name in "xyz"]
+        plant.AddJoint(PrismaticJoint(f"ball_{axis}", parent, body.body_frame(), direction))
+        parent = body.body_frame()
+    # Of each side: Drake adds relaxation times, halves equal stiffnesses and averages dissipations and frictions.
+    material, mu = ProximityProperties(), CoulombFriction(case.friction, case.friction)
+    AddContactMaterial(
+        dissipation=case.dissipation, point_stiffness=2 * case.stiffness, friction=mu, properties=material
+    )
+    material.AddProperty("material", "relaxation_time", case.relaxation_time / 2)
     plant.RegisterCollisionGeometry(ball, RigidTransform(), Sphere(case.radius), "ball", material)
     plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", material)
     plant.Finalize()
@@ -275,18 +248,3 @@ def _build(case: ContactCase, approximation: str) -> Model:
         return _build(replace(case, **changes), contact_approximation)
 
     return Model(builder.Build(), source=None, rebuild=rebuild)
-
-
-def _direction(axis: str) -> list[float]:
-    return [float(axis == name) for name in "xyz"]
-
-
-def _material(case: ContactCase) -> ProximityProperties:
-    """Of each side; Drake adds relaxation times, halves equal stiffnesses and averages dissipations and frictions."""
-    properties = ProximityProperties()
-    friction = CoulombFriction(case.friction, case.friction)
-    AddContactMaterial(
-        dissipation=case.dissipation, point_stiffness=2 * case.stiffness, friction=friction, properties=properties
-    )
-    properties.AddProperty("material", "relaxation_time", case.relaxation_time / 2)
-    return properties

@@ -1,7 +1,7 @@
-"""What the contact laws of Drake and MuJoCo give in the cases of `contact_cases`, by formulas of their own.
+"""What the contact laws of Drake and MuJoCo give in the cases of `contact_cases`, by formulas and not by their code.
 
-Each is a rigid answer and what the law adds to it: sliding friction is mu N in all of them, so that v_x + mu v_z is
-that of the rigid block whatever N does; what sticks creeps; a bounce is a spring and a damper's.
+Each is the rigid answer and what the law adds to it. Sliding friction is mu N in all of them, so that v_x + mu v_z is
+the rigid block's whatever N does. What should stick creeps. A bounce is that of a spring and a damper.
 """
 
 from collections.abc import Callable
@@ -18,13 +18,13 @@ from drake_diff.studies.contact_cases import RAILS, ContactCase, rolling_factor,
 
 STICTION_TOLERANCE = 1e-4  # Drake's default [m/s]
 SIGMA = 1e-3  # of SAP's friction regularization
-PIECES = 100  # of a contact's 1 / omega: Runge-Kutta's error is below 1e-9
+PIECES = 100  # of a contact's 1 / omega are one step of Runge-Kutta: its error is below 1e-9
 Force = Callable[[float, float], float]  # [N] by depth [m] and its rate [m/s], while it is above 0
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a law gives, and by which of its terms."""
+    """What a law gives in a case, and which of its terms makes it differ from the rigid answer."""
 
     value: float
     gradient: float | None
@@ -33,7 +33,7 @@ class Answer:
 
 
 class Ran(Protocol):
-    """What a law may look at in the engine's own run: how the ball moved up and down as it slid."""
+    """What a law takes from the engine's own run: how the ball moved up and down as it slid."""
 
     xs: Array
 
@@ -57,18 +57,22 @@ class Law:
 
     def answer(self, ran: Ran) -> Answer:
         """The law's own answer, given how `ran` moved along the normal."""
-        return {
-            "rest": self._rest,
-            "stop": self._stop,
-            "slide": self._slide,
-            "hold": self._hold,
-            "roll": self._roll,
-            "bounce": self._bounce,
-            "damped bounce": self._bounce,
-        }[self.case.kind](ran)
-
-    def _rest(self, ran: Ran) -> Answer:
-        return Answer(self.case.resting_depth, 0.0, "at rest the spring alone carries m g", "it forgets its start")
+        ball = self.case
+        match ball.kind:
+            case "rest":
+                return Answer(ball.resting_depth, 0.0, "at rest the spring alone carries m g", "it forgets its start")
+            case "stop":
+                return self._stop(ran)
+            case "slide":
+                return self._slide(ran)
+            case "hold":
+                return Answer(self.creep, self.creep_gradient, self.sticking, self.sticking)
+            case "roll":
+                factor = rolling_factor(ball.radius, ball.radius - ball.resting_depth / 2)
+                why = "it rolls on the point half way down the overlap, by a smaller radius"
+                return Answer(factor * ball.slope_gravity * ball.duration, factor, why, why)
+            case _:
+                return self._bounce()
 
     def _slide(self, ran: Ran) -> Answer:
         """v_x + mu v_z = v_0 + g (sin a - mu cos a) t, summed over the steps."""
@@ -95,16 +99,7 @@ class Law:
             why += f"; {self.sticking}"
         return Answer(value, gradient, why, "-mu d z / d v_0" + (", and the damper" if self.tail else ""))
 
-    def _hold(self, ran: Ran) -> Answer:
-        return Answer(self.creep, self.creep_gradient, self.sticking, self.sticking)
-
-    def _roll(self, ran: Ran) -> Answer:
-        case = self.case
-        factor = rolling_factor(case.radius, case.radius - case.resting_depth / 2)
-        why = "it rolls on the point half way down the overlap, by a smaller radius"
-        return Answer(factor * case.slope_gravity * case.duration, factor, why, why)
-
-    def _bounce(self, ran: Ran) -> Answer:
+    def _bounce(self) -> Answer:
         case, speed = self.case, sqrt(2 * self.case.gravity * self.case.height)
         left = case.duration - speed / case.gravity
         _, x, rate, free = impact(self.force, case, 0.0, speed, left)
@@ -126,8 +121,9 @@ def _slipping(case: ContactCase, xs: Array) -> int:
 
 
 def impact(force: Force, case: ContactCase, x: float, rate: float, duration: float) -> tuple[float, float, float, bool]:
-    """Time [s], depth [m] and rate [m/s] where contact that begins at `x`, `rate` ends, at most `duration` [s] later;
-    whether it has ended. m x'' = m g - f by Runge-Kutta, its last piece cut where f = 0.
+    """Where contact that begins at depth `x` [m] with `rate` [m/s] ends: time [s], depth, rate, and whether it ended.
+
+    It is followed for `duration` [s] at most: m x'' = m g - f by Runge-Kutta, the last piece cut where f = 0.
     """
 
     def acceleration(x: float, rate: float) -> float:
@@ -157,8 +153,9 @@ def impact(force: Force, case: ContactCase, x: float, rate: float, duration: flo
 def impact_gradients(force: Force, case: ContactCase) -> tuple[float, float]:
     """d z(T) / d z_0 of the drop: with the saltation matrix of touching, and without it.
 
-    A force that jumps to f_0 as depth passes 0 at speed v adds -f_0 / (m v) times the depth's change to the speed's
-    (ORACLES A26 with f- = (v, g), f+ = (v, g - f_0 / m)): a product of step Jacobians knows nothing of that.
+    A force that jumps to f_0 as the depth passes 0 at speed v adds -f_0 / (m v) times the change of the depth to that
+    of the speed: the saltation matrix I + (f+ - f-) n' / (n' f-) with f- = (v, g), f+ = (v, g - f_0 / m), n = (1, 0).
+    A product of step Jacobians knows nothing of it.
     """
     speed = sqrt(2 * case.gravity * case.height)
     left = case.duration - speed / case.gravity
@@ -175,7 +172,7 @@ def impact_gradients(force: Force, case: ContactCase) -> tuple[float, float]:
 
 
 def law_of(contact_law: str, case: ContactCase) -> Law | None:
-    """Of what an engine's contract calls its `contact_law`; None where no formula stands here."""
+    """The law that an engine's contract calls `contact_law`; None where there is no formula for it here."""
     known = {
         "point, sap": _sap,
         SphereOnGround.contact_law: _sap,
@@ -226,7 +223,7 @@ def _hunt_crossley(case: ContactCase) -> Law:
 
 
 def _block_that_holds(case: ContactCase) -> tuple[float, float]:
-    """The hand calculation's speed after the case's steps [m/s], and d x_N / d v_0 [s] (ORACLES A18)."""
+    """By the block calculated by hand: the speed after the case's steps [m/s], and d x_N / d v_0 [s]."""
     block = SlidingBlock(
         mass=case.mass,
         friction=case.friction,
