@@ -151,8 +151,9 @@ class ContactTable:
 
     def __repr__(self) -> str:
         lines = [f"  {engine}: {lines_of(self, engine)[0]}" for engine in self.engines]
-        lines += [f"  {refused.engine}: not compared" for refused in self.refused]
-        return "\n".join([f"ContactTable({len(self.rows)} rows, {len(self.off)} off)", *dict.fromkeys(lines)])
+        refused = ", ".join(dict.fromkeys(r.engine for r in self.refused))
+        lines += [f"  refused at least one case: {refused}"] if refused else []
+        return "\n".join([f"ContactTable({len(self.rows)} rows, {len(self.off)} off)", *lines])
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(repr(self))}</pre>"

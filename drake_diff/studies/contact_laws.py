@@ -108,7 +108,7 @@ class Law:
         gradient, _ = impact_gradients(self.force, case)
         _, seen = impact_gradients(self.stepped, case)
         by = "by its damper" if self.force is self.stepped else "by its damper and by the step's own, k h v"
-        missed = f"at touch the force jumps {by}; step Jacobians do not see that, and without it {seen:.3g}"
+        missed = f"at touch the force jumps {by}; products of step Jacobians miss the jump and give {seen:.3g}"
         return Answer(height, gradient, f"m z'' = -m g + {self.normal} {does}", missed)
 
 
