@@ -71,7 +71,14 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RolloutCertificate(Certificate):
-    """The certificate of a rollout's gradient, with that gradient and its refinements."""
+    """The certificate of a rollout's gradient, with that gradient and its refinements.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> certificate = dd.certify_rollout(model, [0.5, 0.0], np.zeros((20, 1)), lambda x: x[0] ** 2, refine=True)
+        >>> certificate.verdict, certificate.refinements[0].levels
+        ('agree', (0.01, 0.005, 0.0025))
+    """
 
     gradient: RolloutGradient = field(kw_only=True)
     refinements: tuple[Refinement, ...] = ()
@@ -279,7 +286,7 @@ def _in_stiffer_contact(
 ) -> Iterator[Array]:
     """The gradient at 4 and 16 times every stiffness that the model states, at the model's own time step."""
     stated = {p.name: float(p.value[0]) for p in list_parameters(model) if p.kind.quantity == "stiffness"}
-    # By body where it has one value, else by geometry.
+    # By body if all its geometries have one value, else by geometry.
     named = {name for name in stated if "/" not in name or f"{name.split('/')[0]}.stiffness" not in stated}
     if both := sorted(named & vector.to_dict().keys()):
         raise InputError("parameters", got=both[0], expected="others, as refine_stiffness=True changes it")
@@ -311,7 +318,7 @@ def _judge(
 
 
 def solver_tolerance(model: Model, x: Array, u: Array) -> float:
-    """How accurately the step at (`x`, `u`) is solved: SAP's tolerance where it has anything to solve."""
+    """How accurately the step at (`x`, `u`) is solved: SAP's tolerance if SAP has anything to solve, else 0."""
     plant = model.plant
     advance(model.double, x, u)
     q, reach = x[: model.nq], LIMIT_REACH + 2 * model.time_step * np.abs(x[model.nq :]).max(initial=0)

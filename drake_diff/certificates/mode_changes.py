@@ -11,13 +11,13 @@ from drake_diff.model.model import Model
 
 # How far, in scaled coordinates, the neighbourhood reaches.
 NEIGHBOURHOOD = 1e-4
-# A row is touched where its change departs from the derivative's by this part of the larger one.
+# A row is touched if its change departs from what the derivative predicts by this part of the larger one.
 TOUCHED = 1e-2
 
 
 @dataclass(frozen=True)
 class ModeChange:
-    """One pair's mode here and where one column is displaced, and the rows that the derivative misses there."""
+    """One pair's contact mode at the point and beside it, and the rows that the derivative misses there."""
 
     pair: Pair
     before: str
@@ -65,6 +65,7 @@ def find_mode_changes(
 
 
 def _touched(rows: tuple[str, ...], change: Array, predicted: Array) -> tuple[str, ...]:
+    """The rows whose change is not what the derivative predicts."""
     size = np.maximum(np.abs(predicted), np.abs(change))
     missed = np.abs(change - predicted) > TOUCHED * np.maximum(size, 1e-6 * size.max(initial=0.0))
     return tuple(name for name, miss in zip(rows, missed, strict=True) if miss)

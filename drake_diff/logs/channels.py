@@ -30,7 +30,7 @@ Rows = Iterator[tuple[int, Any]]
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What is shown: a model, its states as planned, and the motion of the discrete plant where there is one."""
+    """What is shown: a model, its states as planned, and the motion of the discrete plant if there is one."""
 
     model: Model
     time_step: float  # [s]
@@ -39,12 +39,12 @@ class Shown:
 
     @property
     def xs(self) -> Array:
-        """The motion's states; none where it could not be taken."""
+        """The motion's states; none if it could not be taken."""
         return np.zeros((0, self.model.nx)) if self.motion is None else self.motion.xs
 
     @property
     def us(self) -> Array:
-        """The motion's inputs; none where it could not be taken."""
+        """The motion's inputs; none if it could not be taken."""
         return np.zeros((0, self.model.nu)) if self.motion is None else self.motion.us
 
     def times(self, count: int) -> Array:
@@ -59,7 +59,7 @@ def motion_channels(shown: Shown) -> Iterator[Channel]:
     efforts = None if shown.motion is None else shown.motion.efforts
     yield _joint_states(shown, "/joint_states", shown.xs, efforts)
     yield _joint_states(shown, "/planned/joint_states", shown.planned_xs, None)
-    # The ghost is the plan, shown where it is another motion than the plant's own.
+    # The ghost is the plan, shown if it is another motion than the plant's own.
     ghost = not np.array_equal(shown.xs, shown.planned_xs)
     frames = {"": shown.xs, **({GHOST: shown.planned_xs} if ghost else {})}
     count = max(len(shown.xs), len(shown.planned_xs))

@@ -144,7 +144,7 @@ class Recovered:
 
 
 def read_bytes(path: Path) -> bytes:
-    """The file's bytes. ArtifactError where it cannot be read."""
+    """The file's bytes. ArtifactError if it cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -154,8 +154,8 @@ def read_bytes(path: Path) -> bytes:
 def records(data: bytes) -> Iterator[tuple[int, bytes]]:
     """(opcode, body) of each record of a file, from its start to the first that is not whole.
 
-    Attachments' checksums are checked: the `mcap` package skips them. ValueError where one does not hold, and at the
-    end where the last record is cut short.
+    Attachments' checksums are checked: the `mcap` package skips them. ValueError if one does not hold, and at the
+    end if the last record is cut short.
     """
     if not data.startswith(MAGIC):
         raise ValueError("it does not begin as an MCAP file does")

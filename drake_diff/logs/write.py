@@ -14,7 +14,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from drake_diff._base.files import whole_file
 from drake_diff.exceptions import InputError
 
-CHUNK_SIZE = 64 * 1024  # what is lost at most where a process is killed or a file damaged
+CHUNK_SIZE = 64 * 1024  # the most that is lost if a process is killed or a file damaged
 LIBRARY = "drake_diff"
 
 

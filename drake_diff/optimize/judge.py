@@ -50,11 +50,13 @@ def judged(draft: Solution, result: NlpResult) -> Solution:
 
 
 def refused(draft: Solution, error: Exception) -> Solution:
+    """The draft of a solve that ended because a step or its derivative was refused."""
     status = Status.NO_GRADIENT if isinstance(error, GradientError) else Status.DIVERGED
     return ended(draft, status, str(error))
 
 
 def ended(draft: Solution, status: Status, detail: str, **fields: Any) -> Solution:
+    """The draft with its final status, whose sentence and `detail` are the message."""
     message = f"{status.sentence}: {detail}" if detail else status.sentence
     return draft.told(status=status, message=message, **fields)
 
@@ -126,7 +128,7 @@ def why_blind(problem: Problem, variables: ShootingVariables, z: Array) -> str:
 
 
 def _what_is_apart(problem: Problem, xs: Array) -> str:
-    """Which bodies that may collide never touch along xs (N+1, nx), and what to do; empty where there are none."""
+    """Which bodies that may collide never touch along xs (N+1, nx), and what to do; empty if there are none."""
     model, nearest = problem.model, dict[tuple[str, str], tuple[float, int]]()
     try:
         for k, x in enumerate(xs):

@@ -48,7 +48,7 @@ class Replay:
     control: str  # "open loop" or "TVLQR"
     time_step: float  # [s]
     approximation: str
-    motion: Rollout | None  # None where it could not be taken, `failures` saying why
+    motion: Rollout | None  # None if it could not be taken, `failures` saying why
     goal_error: float  # the largest distance from the goal, free entries apart, in the state's units
     bound_violation: float  # the largest excess of a state over a bound, in the state's units
     energy_error: float  # [J] drift of the energy that neither actuators nor damping account for
@@ -94,7 +94,7 @@ class Plan:
 
     @cached_property
     def open_loop(self) -> Rollout | None:
-        """The plant's own motion under the inputs at the plan's own step; None where it cannot be taken."""
+        """The plant's own motion under the inputs at the plan's own step; None if it cannot be taken."""
         try:
             xs, us = self.sample(1)
             return rollout(self.model_at(1), xs[0], us, parameters=self.vector.to_dict())
@@ -119,7 +119,7 @@ def held(xs: Array, us: Array) -> Callable[[int], tuple[Array, Array]]:
 
 
 def replays(plan: Plan) -> tuple[Replay, ...]:
-    """`plan` in the variants of the plant, open loop and, where there are inputs, under TVLQR."""
+    """`plan` in the variants of the plant, open loop and, if there are inputs, under TVLQR."""
     model, found = plan.problem.model, list(_replay_step(plan, 1))
     if model.can_rebuild:  # a user's diagram is one plant: there are no variants of it to try
         parts = 2

@@ -371,7 +371,7 @@ def limits_of_constraints(problem: Problem, variables: ShootingVariables) -> Row
 
 
 def defect(variables: ShootingVariables) -> Rows:
-    """0 = where a segment ends less where the next begins, by [z; the state that it begins from]."""
+    """0 = the end of a segment less the start of the next, by [z; the state that the next starts from]."""
     size, nx = variables.size, variables.problem.model.nx
 
     def values(z: Array) -> Array:

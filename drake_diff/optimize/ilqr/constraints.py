@@ -1,7 +1,7 @@
 """A hard goal, waypoints, state bounds and other constraints as costs: the augmented Lagrangian.
 
-(Of Hestenes, Powell and Rockafellar.) An equality c = 0 with multiplier y costs  y c + p c^2 / 2, an inequality c <= 0
-costs (max(0, y + p c)^2 - y^2) / (2 p), where p is the penalty. After each minimization y becomes y + p c, or
+It is due to Hestenes, Powell and Rockafellar. An equality c = 0 with multiplier y costs y c + p c^2 / 2, an inequality
+c <= 0 costs (max(0, y + p c)^2 - y^2) / (2 p), where p is the penalty. After each minimization y becomes y + p c, or
 max(0, y + p c). Howell, Jackson and Manchester, "ALTRO", 2019, do the same with iLQR inside. Of the Hessian only
 p J'J of the rows that push is kept (Gauss-Newton), which no constraint can make indefinite.
 """
@@ -72,7 +72,7 @@ class AugmentedLagrangian:
     def differentiate(self, xs: Array, us: Array) -> tuple[Array, Array]:
         """(gradients (N+1, nx + nu), Hessians (N+1, nx + nu, nx + nu)) of `value` by each [x_k; u_k].
 
-        Raises GradientError where that of a constraint is lost or not finite.
+        Raises GradientError if that of a constraint is lost or not finite.
         """
         pushes = self._pushes(xs, us)
         stiffness = np.where((pushes != 0) | (self.lower == self.upper), self.penalty, 0.0)
@@ -138,7 +138,7 @@ class _Rows:
         return self._at("jacobians", xs, us, lambda x, u: self.constraint.differentiate(x, u)[1])
 
     def scale(self, xs: Array, us: Array) -> Array:
-        """(size,): one over the largest slope so far of each row, 1 where it has had none."""
+        """(size,): one over the largest slope so far of each row, 1 if it has had none."""
         slopes = np.linalg.norm(self.jacobians(xs, us), axis=2).max(axis=0)
         self._steepest = np.maximum(self._steepest, slopes)
         steep = self._steepest > SMALLEST_SLOPE

@@ -104,7 +104,7 @@ def _expand_running_cost(problem: Problem, xs: Array, us: Array) -> tuple[Array,
 
 
 def jacobians_along(problem: Problem, motion: Motion) -> Array:
-    """(N, nx, nx + nu): [A_k, B_k]; raises GradientError or SimulationError where one, or a step, is refused.
+    """(N, nx, nx + nu): [A_k, B_k]; raises GradientError or SimulationError if one, or a step, is refused.
 
     Those of an input on a bound are from inside it: a bound is often the actuator's limit, at which Drake's derivative
     is 0, as beyond it, while a minimization needs to know what leaving the bound would do.
@@ -120,9 +120,9 @@ def _off_bounds(problem: Problem, us: Array) -> Array:
 
 
 def dynamics_curvature_along(problem: Problem, motion: Motion, v: Array) -> Array | None:
-    """(N, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx); None where contact or a limit acts.
+    """(N, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx); None if contact or a limit acts.
 
-    By differences of the Jacobians along every state: in its inputs alone a smooth step is linear. None also where
+    By differences of the Jacobians along every state: in its inputs alone a smooth step is linear. None also if
     Jacobians are not to be had in one call. Raises what `linearize` raises.
     """
     model, xs, us = problem.model, motion.xs[:-1], _off_bounds(problem, motion.us)
@@ -143,7 +143,7 @@ def dynamics_curvature_along(problem: Problem, motion: Motion, v: Array) -> Arra
 
 
 def _nearby_jacobians(model: Model, xs: Array, us: Array) -> Array | None:
-    """(N, nx, nx + nu) of the steps from xs (N, nx) beside smooth ones; None where one that was taken is not smooth."""
+    """(N, nx, nx + nu) of the steps from xs (N, nx) beside smooth ones; None if one that was taken is not smooth."""
     analytic = analytic_of(model)
     if not isinstance(analytic, Refusal):
         return analytic.differentiate(xs, us)[0]  # no step is taken

@@ -104,10 +104,10 @@ def solve_ilqr(
 
 
 def costs_to_go(problem: Problem, xs: Array, us: Array) -> tuple[CostToGo, ...]:
-    """N+1 of them: what remains to be paid of `problem` from each state of xs (N+1, nx), us (N, nu) on, best followed.
+    """What remains to be paid of `problem` from each state of xs (N+1, nx) on, under the best inputs near us (N, nu).
 
     To second order in the distance from xs, without the dynamics' second derivatives; an input on a bound stays there.
-    Raises GradientError where a derivative is refused, InputError where the cost has no minimum.
+    Raises GradientError if a derivative is refused, InputError if the cost has no minimum.
     """
     search = _Search(problem, xs, us, Limits(1, math.inf, 1.0), None)
     policy = _least_regularized(solve_riccati, search._expand())
@@ -162,7 +162,7 @@ class _Search:
         self.rows = [Iteration(0, self.cost, self._infeasibility(), math.nan, math.nan)]
 
     def run(self, interrupted: threading.Event) -> Outcome:
-        """Minimize once, or, where there are constraints, again and again for better multipliers."""
+        """Minimize once; if there are constraints, again and again for better multipliers."""
         final = not self.constraints.any
         while True:
             outcome = self._minimize(final, interrupted)
@@ -210,7 +210,7 @@ class _Search:
         return model
 
     def _step(self, model: LinearQuadratic, final: bool) -> Outcome | None:
-        """Take one step that lowers the merit; an outcome where there is none left to take."""
+        """Take one step that lowers the merit; an outcome if there is none left to take."""
         merit = self._merit()
         scale = 1 + abs(merit)
         left_over = self.limits.tolerance**2 * scale

@@ -19,7 +19,7 @@ HALVINGS = 0.5 ** np.arange(20)
 
 @dataclass(frozen=True, eq=False)
 class LinearQuadratic:
-    """N steps of n states and m inputs; dx_0 lies in [start_lower, start_upper], which is 0 where it is given."""
+    """N steps of n states and m inputs; dx_0 lies in [start_lower, start_upper], which is 0 if it is given."""
 
     F: Array  # (N, n, n + m)
     gaps: Array  # (N, n)
@@ -63,7 +63,7 @@ class AffinePolicy:
 
 
 def solve_riccati(problem: LinearQuadratic, regularization: float) -> AffinePolicy | None:
-    """The best policy, `regularization` added to the inputs' Hessian; None where that is not positive definite.
+    """The best policy, `regularization` added to the inputs' Hessian; None if that is not positive definite.
 
     The recursion is that of [dx; 1], so that V = [[P, s], [s', c]] is all that remains to be paid and
     K = [feedback, feedforward] all that is done, in the fewest products: NumPy's calls are what a sweep's time goes to.
@@ -115,7 +115,7 @@ def _with_a_one(problem: LinearQuadratic) -> tuple[Array, Array, Array]:
 def _within(
     hessian: Array, Q_ux: Array, K: Array, lower: Array, upper: Array
 ) -> tuple[Array, NDArray[np.bool_] | bool]:
-    """(K (m, n+1), which inputs (m,) no bound holds): `K` itself where its feedforward leaves no bound."""
+    """(K (m, n+1), which inputs (m,) no bound holds): `K` itself if its feedforward leaves no bound."""
     d = K[:, -1]
     if (d >= lower).all() and (d <= upper).all():
         return K, True
@@ -139,7 +139,7 @@ def _best_start(problem: LinearQuadratic, P: Array, s: Array, regularization: fl
 
 
 def _gains(hessian: Array, Q_ux: Array) -> Array:
-    """(m, n+1): -hessian^-1 Q_ux; raises LinAlgError where the Hessian is not positive definite."""
+    """(m, n+1): -hessian^-1 Q_ux; raises LinAlgError if the Hessian is not positive definite."""
     if len(hessian) == 1:
         if not hessian[0, 0] > 0:
             raise np.linalg.LinAlgError
@@ -151,7 +151,7 @@ def _gains(hessian: Array, Q_ux: Array) -> Array:
 def minimize_in_box(hessian: Array, gradient: Array, lower: Array, upper: Array) -> tuple[Array, NDArray[np.bool_]]:
     """(d, free): argmin of gradient' d + d' hessian d / 2 within [lower, upper], by projected Newton steps.
 
-    `free` is where d is not held by a bound. Raises LinAlgError where the Hessian is not positive definite.
+    `free` is where d is not held by a bound. Raises LinAlgError if the Hessian is not positive definite.
     """
     np.linalg.cholesky(hessian)
     d = np.clip(np.zeros_like(gradient), lower, upper)

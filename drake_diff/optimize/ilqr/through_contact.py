@@ -168,7 +168,7 @@ def default_schedule(problem: Problem) -> tuple[SoftContact, ...]:
     """Stages from the model's sizes and masses, the problem's start and duration.
 
     The reach L is the largest gap at x0 between two bodies that may collide, or the smallest half width of what
-    collides where that is more. The distances are L/3, L/9, ..., down to 4 L / num_steps, what moves at
+    collides if that is more. The distances are L/3, L/9, ..., down to 4 L / num_steps, what moves at
     4 L / T passes in a step. The stiffness is such that the force at L alone would move the lightest of what can
     approach each other, its mass m, by 10 L in the whole time T; but no more than 0.4 m / h^2, h being the time step.
     """
@@ -201,7 +201,7 @@ def _told(
 
 
 def _where_it_jumps(problem: Problem, xs: Array) -> str:
-    """Where along xs (N+1, nx) two bodies are just touching, and what that means; empty where none are."""
+    """Where along xs (N+1, nx) two bodies are just touching, and what that means; empty if none are."""
     for k, x in enumerate(xs[:-1]):
         set_state(problem.model.double, x)
         for (a, b), distance in distances(problem.model.double).items():
@@ -264,7 +264,7 @@ class _Sequences:
     def __init__(self, problem: Problem, limits: Limits, report: Report | None):
         self.problem, self.limits, self.report = problem, limits, report
         self.deadline, self.rows = time.monotonic() + limits.time_limit, list[Iteration]()
-        self.costs = dict[tuple[ContactHold, ...], float]()  # of each sequence's minimum; infinite where none was found
+        self.costs = dict[tuple[ContactHold, ...], float]()  # of each sequence's minimum; infinite if none was found
         self.ended = False  # by Ctrl-C or the clock
 
     def run(self, xs: Array, us: Array, interrupted: threading.Event) -> Found:
@@ -307,7 +307,7 @@ class _Sequences:
         return replace(best[0], note=note), *best[1:]
 
     def _beyond(self, hold: ContactHold, xs: Array, us: Array) -> "Found | float":
-        """The minimum of the sequence beyond `hold`; its cost alone where it is known, infinite where there is none."""
+        """The minimum of the sequence beyond `hold`; its cost alone if it is known, infinite if there is none."""
         beyond = np.array(xs)
         beyond[hold.knot] = hold.moved_beyond(self.problem.model, xs[hold.knot])
         holds = beginnings(self.problem, beyond)
@@ -354,7 +354,7 @@ class _Sequences:
 def beginnings(problem: Problem, xs: Array) -> tuple[ContactHold, ...]:
     """Two holds for each beginning of a touch along xs (N+1, nx): apart at the knot before it, touching at its own.
 
-    What nothing moves (the given first state) or acts on (the last) is left out.
+    The first state is left out if it is given, as nothing moves it; so is the last, on which nothing acts.
     """
     distances = []
     for x in xs[:-1]:
