@@ -26,7 +26,7 @@ def pushed_ball(approximation, mu=MU):
 @pytest.mark.parametrize("approximation", ["sap", "similar", "lagged"])
 @pytest.mark.parametrize("mu", [0.3, 0.5])
 def test_a_push_below_the_friction_limit_sticks_and_one_above_slides(approximation, mu):
-    """A18: the limit is mu m g."""
+    """The limit is mu m g."""
     model, x = pushed_ball(approximation, mu), [0.0, REST, 0.0, 0.0]
     assert dd.contact_modes(model, x, [0.5 * mu * G]) == {PAIR: "sticking"}
     assert dd.contact_modes(model, x, [-0.5 * mu * G]) == {PAIR: "sticking"}

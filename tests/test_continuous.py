@@ -13,14 +13,18 @@ from drake_diff.model.equations import ContinuousSystem, EquationsOfMotion
 
 
 def test_kellys_cart_pole(load):
-    """A33."""
+    """M. Kelly's equations, with m1 = 1 (cart), m2 = 0.3, l = 0.5:
+
+    x'' = (l m2 sin q w^2 + u + m2 g cos q sin q) / (m1 + m2 sin^2 q),
+    q'' = -(l m2 cos q sin q w^2 + u cos q + (m1 + m2) g sin q) / (l m1 + l m2 sin^2 q).
+    """
     f = EquationsOfMotion(load("cart_pole.urdf"))
     expected = [-0.3, 1.1, 3.172075726216, -17.491825696946]
     assert f(np.array([0.1, 0.7, -0.3, 1.1]), np.array([2.0])) == pytest.approx(expected, abs=1e-11)
 
 
 def test_many_knots_at_once_and_those_that_are_no_numbers(load):
-    """A33 for the second; a search may try what is not finite, a caller of one knot is told."""
+    """The second is that of the test before; a search may try what is not finite, a caller of one knot is told."""
     f = EquationsOfMotion(load("cart_pole.urdf"))
     knots = np.array([[0.0, 0.0, 0.0, 0.0, 1.3], [0.1, 0.7, -0.3, 1.1, 2.0], [0.0, np.nan, 0.0, 0.0, 0.0]])
     found = f.values(knots)

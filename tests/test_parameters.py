@@ -1,4 +1,4 @@
-"""Derivatives by physical parameters: closed forms (ORACLES A01-A21), names, values by mapping, refusals."""
+"""Derivatives by physical parameters: closed forms, names, values by mapping, refusals."""
 
 import math
 
@@ -38,7 +38,7 @@ from drake_diff.model.parameters import (
 
 G = 9.81
 SMOOTH = 1e-9  # autodiff and the chain rule, through one step that nothing iterates on
-CONTACT = 1e-6  # ORACLES: the Jacobian of a step that SAP solves to 1e-6; differences are as accurate
+CONTACT = 1e-6  # SAP solves a step to 1e-6, and its Jacobian and differences are as accurate
 
 # What `arm` and `ball` are built with. The arm: a carriage on a sprung rail, a sprung, PD-driven pole on it.
 ARM = {
@@ -278,7 +278,7 @@ def test_a_pendulum_by_its_spring(h, q, w, u, k, rest):
 
 @pytest.mark.parametrize(("x", "v", "u", "h"), [(0.35, -0.4, 1.0, 0.01), (-0.2, 2.0, -7.0, 0.003)])
 def test_a_block_by_its_spring(load, x, v, u, h):
-    """A07: v+ = s (v + h (u - k (x - rest)) / m), s = 1 / (1 + h c / m)."""
+    """v+ = s (v + h (u - k (x - rest)) / m), s = 1 / (1 + h c / m)."""
     m, k, c, rest = 2.0, 50.0, 1.5, 0.1
     s = 1 / (1 + h * c / m)
     v_next = s * (v + h * (u - k * (x - rest)) / m)
@@ -356,7 +356,7 @@ def test_a_spinning_body_by_its_inertia(seed, central):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("offset", [(0.0, 0.0, -0.8), (0.3, 0.1, -0.5), (0.0, 0.0, 0.0)])
 def test_a_double_pendulum_by_its_link_length(seed, offset):
-    """A05 with the elbow at (ox, oy, oz) of the upper rod: M, bias and G are polynomials in ox and oz."""
+    """With the elbow at (ox, oy, oz) of the upper rod: M, bias and G are polynomials in ox and oz."""
     random, h = np.random.default_rng(seed), 0.005
     (q1, q2), (w1, w2), u = random.standard_normal((3, 2))
     m1, m2, l1, l2 = 1.0, 0.7, 0.8, 0.5
@@ -420,7 +420,7 @@ def test_a_pd_pendulum_by_its_gains(h, q, w, u, p, d):
 
 @pytest.mark.parametrize(("h", "count"), [(0.01, 100), (0.004, 37)])
 def test_a_projectile_by_gravity_and_the_time_step(load, h, count):
-    """A01: dp_N/dg = h^2 N (N + 1) / 2 I for the vector g, dz_N/dh = v0 N - |g| h N (N + 1)."""
+    """dp_N/dg = h^2 N (N + 1) / 2 I for the vector g, dz_N/dh = v0 N - |g| h N (N + 1)."""
     model = load("projectile.sdf", time_step=h)
     x0 = model.default_state
     x0[7:] = 0.0, 0.0, 0.0, 2.0, 1.0, 5.0
@@ -438,7 +438,7 @@ def test_a_projectile_by_gravity_and_the_time_step(load, h, count):
 
 @pytest.mark.parametrize(("h", "q", "w", "u"), PENDULA)
 def test_a_pendulum_by_gravity_and_the_time_step(load, h, q, w, u):
-    """A03: I (1 + h b / I) w+ = I w + h (u + m l (gz sin q - gx cos q)); by h, w+ and q+ = q + h w+."""
+    """I (1 + h b / I) w+ = I w + h (u + m l (gz sin q - gx cos q)); by h, w+ and q+ = q + h w+."""
     inertia, b, l = 0.25, 0.1, 0.5  # noqa: E741
     torque, whole = u - G * l * math.sin(q), inertia + h * b
     w_next = (inertia * w + h * torque) / whole
@@ -492,7 +492,7 @@ def test_a_pressed_ball_by_stiffness_radius_and_mass(approximation, ours, ground
 @pytest.mark.parametrize("approximation", ["lagged", "similar", "sap"])
 @pytest.mark.parametrize(("ours", "ground"), [pytest.param(1e4, 1e4, marks=pytest.mark.slow), (2000.0, 6000.0)])
 def test_static_penetration_by_stiffness_and_mass(approximation, ours, ground):
-    """A15: depth m g / k, so by k -m g / k^2, by m g / k, by the radius nothing: the ball is lifted by it."""
+    """The depth is m g / k, so by k -m g / k^2, by m g / k, by the radius nothing: the ball is lifted by it."""
     extra = {"dissipation": 20.0, "relaxation_time": 0.1}
     sides = {"stiffness": ours, **extra}, {"stiffness": ground, **extra}
     model, m = railed_ball(0.01, approximation, *sides, mass=1.5).model(), 1.5
@@ -509,11 +509,11 @@ def test_static_penetration_by_stiffness_and_mass(approximation, ours, ground):
 @pytest.mark.parametrize(("d_ball", "d_ground"), [(2.0, 2.0), (5.0, 1.0)])
 @pytest.mark.parametrize(("h", "depth", "v"), PRESSED)
 def test_a_pressed_ball_by_dissipation(approximation, d_ball, d_ground, h, depth, v):
-    """A12 with Hunt and Crossley: v+ = v - g h + h k (depth - h v+) (1 - d v+), d = (kB dA + kA dB) / (kA + kB)."""
+    """With Hunt and Crossley: v+ = v - g h + h k (depth - h v+) (1 - d v+), d = (kB dA + kA dB) / (kA + kB)."""
     k_ball, k_ground = 1e4, 3e4
     sides = {"stiffness": k_ball, "dissipation": d_ball}, {"stiffness": k_ground, "dissipation": d_ground}
     k, damping = k_ball * k_ground / (k_ball + k_ground), (k_ground * d_ball + k_ball * d_ground) / (k_ball + k_ground)
-    # a v+^2 + b v+ + c = 0 with a = -h^2 k d, the root that tends to A12's as d vanishes
+    # a v+^2 + b v+ + c = 0 with a = -h^2 k d, the root that tends to the one without dissipation as d vanishes
     a, b, c = -(h**2) * k * damping, 1 + h**2 * k + h * k * depth * damping, -(v - G * h + h * k * depth)
     v_next = -2 * c / (b + math.sqrt(b**2 - 4 * a * c))
     slope = 1 + h * k * (h * (1 - damping * v_next) + damping * (depth - h * v_next))
@@ -547,7 +547,7 @@ def test_a_pressed_ball_by_relaxation_time(t_ball, t_ground, h, depth, v):
 @pytest.mark.parametrize(("mu_ball", "mu_ground"), [(0.5, 0.5), (0.8, 0.3)])
 @pytest.mark.parametrize(("u", "v0"), [(0.0, 1.0), (2.0, 0.0), (4.9, 0.0), (-6.5, 0.3)])
 def test_lagged_friction_step_by_friction(u, v0, mu_ball, mu_ground):
-    """A18: v+ = v0 + h u - mu g h v+ / r, r = sqrt(v+^2 + eps^2): by mu -g h v+ / r / D, mu = 2 ab / (a + b)."""
+    """v+ = v0 + h u - mu g h v+ / r, r = sqrt(v+^2 + eps^2): by mu -g h v+ / r / D, mu = 2 ab / (a + b)."""
     h, k, eps = 0.01, 1e4, 1e-4
     mu = 2 * mu_ball * mu_ground / (mu_ball + mu_ground)
     sides = [{"stiffness": 2 * k, "friction": f} for f in (mu_ball, mu_ground)]
@@ -566,7 +566,7 @@ def test_lagged_friction_step_by_friction(u, v0, mu_ball, mu_ground):
 
 @pytest.mark.parametrize(("degrees", "mu", "h", "count"), [(15, 0.1, 0.005, 200), (30, 0.3, 0.002, 100)])
 def test_a_sphere_down_an_incline_by_friction(degrees, mu, h, count):
-    """A21: dv_N/dmu = -g cos(alpha) h N, dx_N/dmu = -g cos(alpha) h^2 N (N + 1) / 2 (lagged friction)."""
+    """dv_N/dmu = -g cos(alpha) h N, dx_N/dmu = -g cos(alpha) h^2 N (N + 1) / 2 (lagged friction)."""
     alpha, k = math.radians(degrees), 1e4
     extra = {"stiffness": 2 * k, "dissipation": 10.0, "friction": mu}
     made = railed_ball(h, "lagged", extra, extra, axes=("z", "x"))
@@ -583,7 +583,7 @@ def test_a_sphere_down_an_incline_by_friction(degrees, mu, h, count):
 
 @pytest.mark.parametrize(("count", "mu", "h"), [(20, 0.5, 0.01), (70, 0.3, 0.005)])
 def test_the_stopping_distance_by_friction(count, mu, h):
-    """A20: n steps until v0 - n mu g h < mu g h, d = h (n v0 - mu g h n (n + 1) / 2): by mu -g h^2 n (n + 1) / 2."""
+    """n steps until v0 - n mu g h < mu g h, d = h (n v0 - mu g h n (n + 1) / 2): by mu -g h^2 n (n + 1) / 2."""
     k, v0 = 1e4, (count + 0.5) * mu * G * h  # half a step's worth is left: far from the edge of one step more
     sides = {"stiffness": 2 * k, "dissipation": 10.0, "friction": mu}
     model = railed_ball(h, "lagged", sides, sides, axes=("z", "x")).model()
@@ -786,7 +786,7 @@ def same_motion(model, values, built, x, us):
     if any(source_of(name) == "finite_difference" and value == 0 for name, value in values.items()):
         return  # on the edge of what Drake takes: there is no derivative
     d, wanted = dd.differentiate_step(model, x, us[0], parameters=values), dd.differentiate_step(built, x, us[0])
-    assert pytest.approx(wanted.A, rel=1e-6, abs=1e-8) == d.A  # ORACLES: the Jacobian of a contact step
+    assert pytest.approx(wanted.A, rel=1e-6, abs=1e-8) == d.A  # as far as SAP solves a step
     assert pytest.approx(wanted.B, rel=1e-6, abs=1e-8) == d.B
 
     def loss(xs, us):

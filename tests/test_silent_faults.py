@@ -1,4 +1,4 @@
-"""What Drake differentiates wrongly without a word (DRAKE_FACTS), and the gate that catches each."""
+"""What Drake differentiates wrongly without a word, and the gate that catches each."""
 
 import numpy as np
 import pytest
@@ -123,7 +123,7 @@ def test_an_unknown_method_or_parameter_is_named(load):
 
 
 def test_parameter_columns_have_their_closed_form(load):
-    """A03 with s = 1 / (1 + h b / I), I = m l^2: by damping, and by mass at fixed unit inertia and centre of mass."""
+    """w+ = s (w + h (u - m g l sin q) / I), s = 1 / (1 + h b / I), I = m l^2: by damping, and by mass at fixed l."""
     h, q, w, u, b, inertia = 0.01, 0.7, -1.2, 0.3, 0.1, 0.25
     d = dd.differentiate_step(load("pendulum.urdf"), [q, w], [u], parameters=("hinge.damping", "pole.mass"))
     s = 1 / (1 + h * b / inertia)

@@ -1,4 +1,4 @@
-"""One step against closed forms (ORACLES A01-A18); rtol 1e-12 smooth, 1e-7 for what SAP solves."""
+"""One step against closed forms; to 1e-12 where it is smooth, to 1e-7 where SAP solves for contact."""
 
 import math
 
@@ -15,7 +15,7 @@ APPROXIMATIONS = ("sap", "similar", "lagged")
 
 @pytest.mark.parametrize(("h", "count"), [(0.01, 100), (0.004, 37)])
 def test_projectile_follows_symplectic_euler(load, h, count):
-    """A01: p_N = p0 + v0 N h - g h^2 N (N + 1) / 2."""
+    """p_N = p0 + v0 N h - g h^2 N (N + 1) / 2."""
     model = load("projectile.sdf", time_step=h)
     p0, v0 = np.array([0.3, -1.0, 1.0]), np.array([2.0, 1.0, 5.0])
     x0 = np.concatenate([[1, 0, 0, 0], p0, np.zeros(3), v0])
@@ -33,7 +33,7 @@ def test_projectile_error_is_first_order_with_coefficient_g_t_h_over_2(load):
 
 
 def test_projectile_by_gravity(load):
-    """A01: dz_N/dg = -h^2 N (N + 1) / 2 = -0.505; linear in g, so a difference is exact."""
+    """dz_N/dg = -h^2 N (N + 1) / 2 = -0.505; linear in g, so a difference is exact."""
     ends = []
     for g in (9.0, 10.0):
         model = load("projectile.sdf", gravity=(0, 0, -g))
@@ -42,7 +42,7 @@ def test_projectile_by_gravity(load):
 
 
 def test_projectile_by_the_time_step(load):
-    """A01: dz_N/dh = v_0 N - g h N (N + 1); quadratic in h, so a central difference is exact."""
+    """dz_N/dh = v_0 N - g h N (N + 1); quadratic in h, so a central difference is exact."""
     ends = []
     for h in (0.0099, 0.0101):
         model = load("projectile.sdf", time_step=h)
@@ -53,7 +53,10 @@ def test_projectile_by_the_time_step(load):
 
 
 def test_double_pendulum_mass_matrix(load):
-    """A05."""
+    """Uniform rods, m1 = 1, m2 = 0.7, l1 = 0.8, l2 = 0.5, at q2 = -0.9:
+
+    M11 = m1 l1^2 / 3 + m2 (l1^2 + l2^2 / 3 + l1 l2 cos q2), M12 = m2 (l2^2 / 3 + l1 l2 cos(q2) / 2), M22 = m2 l2^2 / 3.
+    """
     model = load("double_pendulum.urdf", time_step=0.005)
     dd.step(model, [0.4, -0.9, 1.3, -0.6], [0.0, 0.0])
     expected = [[0.89371745778245, 0.14535872889123], [0.14535872889123, 0.05833333333333]]
@@ -61,7 +64,7 @@ def test_double_pendulum_mass_matrix(load):
 
 
 def pendulum_step(q, w, u, h, l=0.5, b=0.1, m=1.0):  # noqa: E741
-    """A03: joint damping implicit, gravity and input explicit."""
+    """Joint damping implicit, gravity and input explicit."""
     inertia = m * l**2
     s = 1 / (1 + h * b / inertia)
     w_next = s * (w + h * (-(G / l) * math.sin(q) + u / inertia))
@@ -91,7 +94,11 @@ def test_pendulum_digits_of_the_oracle(load):
 
 
 def test_double_pendulum_step_jacobian_and_energy(load):
-    """A05 with its digits."""
+    """M (v+ - v) / h = u - bias - G, q+ = q + h v+ and its derivative.
+
+    c = m2 l1 l2 / 2, bias = (-c sin q2 (2 w1 w2 + w2^2), c sin q2 w1^2), G1 = (m1 / 2 + m2) g l1 sin q1 + G2,
+    G2 = m2 g l2 sin(q1 + q2) / 2.
+    """
     model = load("double_pendulum.urdf", time_step=0.005)
     x, u = [0.4, -0.9, 1.3, -0.6], [0.25, -0.15]
     d = dd.differentiate_step(model, x, u)
@@ -112,7 +119,7 @@ def test_double_pendulum_step_jacobian_and_energy(load):
 
 @pytest.mark.parametrize(("x", "v", "u"), [(0.35, -0.4, 1.0), (-0.2, 2.0, -7.0)])
 def test_mass_spring_damper_step_and_jacobian(load, x, v, u):
-    """A07: spring explicit, damper implicit."""
+    """Spring explicit, damper implicit."""
     h, m, k, c, rest = 0.01, 2.0, 50.0, 1.5, 0.1
     s = 1 / (1 + h * c / m)
     v_next = s * (v + h * (u - k * (x - rest)) / m)
@@ -127,7 +134,7 @@ ALL = ("pendulum.urdf", "cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml",
 
 @pytest.mark.parametrize("name", ALL)
 def test_upper_half_of_the_jacobian_follows_from_the_lower(load, name):
-    """A09 (i), (ii) where dq/dt = v: A_top = [I 0] + h A_bottom, B_top = h B_bottom, det A = det dv+/dv."""
+    """Where dq/dt = v: A_top = [I 0] + h A_bottom, B_top = h B_bottom, det A = det dv+/dv."""
     model, random = load(name), np.random.default_rng(1)
     h, n = model.time_step, model.nv
     for _ in range(5):
@@ -138,13 +145,13 @@ def test_upper_half_of_the_jacobian_follows_from_the_lower(load, name):
 
 
 def test_a_conservative_one_dof_step_preserves_area(write_urdf):
-    """A09 (iii)."""
+    """Semi-implicit Euler is symplectic: det A = 1 without damping."""
     model = write_urdf(mass=2.0)
     assert np.linalg.det(dd.differentiate_step(model, [0.3, 1.0], [0.5]).A) == pytest.approx(1, abs=1e-14)
 
 
 def ball_on_ground(h, k, approximation, relaxation_time=None, mass=1.0):
-    """A12, A14: a ball on a vertical rail; both sides of stiffness 2k, so that the pair has k."""
+    """A ball on a vertical rail; both sides of stiffness 2k, so that the pair has k."""
     plant = Plant(h, approximation)
     plant.ball("ball", mass, 0.1, contact_properties(2 * k, relaxation_time=relaxation_time), "z")
     plant.ground(contact_properties(2 * k, relaxation_time=relaxation_time and 0.0))
@@ -158,7 +165,7 @@ CONTACTS = [(0.003, -0.2), (0.003, 0.4), (0.0005, -1.0)]
 @pytest.mark.parametrize("approximation", ["lagged", "similar"])
 @pytest.mark.parametrize(("depth", "v"), CONTACTS)
 def test_point_contact_step_without_dissipation(h, k, approximation, depth, v):
-    """A12: v+ = (v - g h + h k x / m) / (1 + h^2 k / m) while that presses, else free fall."""
+    """v+ = (v - g h + h k x / m) / (1 + h^2 k / m) while that presses, else free fall."""
     model = ball_on_ground(h, k, approximation)
     pressed = (v - G * h + h * k * depth) / (1 + h**2 * k)
     touches = k * depth - h * k * pressed > 0
@@ -171,7 +178,7 @@ def test_point_contact_step_without_dissipation(h, k, approximation, depth, v):
 @pytest.mark.parametrize(("h", "k", "tau"), [(0.005, 5000.0, 0.02), (0.005, 5000.0, 0.0), (0.002, 8000.0, 0.007)])
 @pytest.mark.parametrize(("depth", "v"), CONTACTS)
 def test_sap_contact_step(h, k, tau, depth, v):
-    """A14: regularization R = 1 / (h k (h + tau)), bias x / (h + tau)."""
+    """Regularization R = 1 / (h k (h + tau)), bias x / (h + tau)."""
     model = ball_on_ground(h, k, "sap", relaxation_time=tau)
     bias, regularization = depth / (h + tau), 1 / (h * k * (h + tau))
     pressed = (v - G * h + bias / regularization) / (1 + 1 / regularization)
@@ -186,7 +193,7 @@ def test_sap_contact_step(h, k, tau, depth, v):
 @pytest.mark.parametrize("approximation", APPROXIMATIONS)
 @pytest.mark.parametrize(("k_ball", "k_ground"), [(1e4, 1e4), (2000.0, 6000.0)])
 def test_static_penetration_is_weight_over_stiffness(approximation, k_ball, k_ground):
-    """A15, after 8 s of settling; stiffnesses combine as springs in series."""
+    """It is m g / k, after 8 s of settling; stiffnesses combine as springs in series."""
     plant = Plant(0.01, approximation)
     plant.ball("ball", 1.0, 0.1, contact_properties(k_ball, dissipation=20.0, relaxation_time=0.1), "z")
     plant.ground(contact_properties(k_ground, dissipation=20.0, relaxation_time=0.1))
@@ -209,7 +216,7 @@ def newton(f, slope, x):
 
 @pytest.mark.parametrize(("u", "v0"), [(0.0, 1.0), (2.0, 0.0), (4.9, 0.0), (6.0, 0.0), (-6.5, 0.3)])
 def test_lagged_friction_step(u, v0):
-    """A18: v = v0 + h u / m - mu g h v / sqrt(v^2 + eps^2), by Newton's method here."""
+    """v = v0 + h u / m - mu g h v / sqrt(v^2 + eps^2), by Newton's method here."""
     mu, h, k, eps = 0.5, 0.01, 1e4, 1e-4
     plant = Plant(h, "lagged")
     plant.ball("ball", 1.0, 0.1, contact_properties(2 * k, friction=mu), "z", "x")

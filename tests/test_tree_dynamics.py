@@ -64,8 +64,11 @@ def test_a_pendulum_is_its_closed_form(load, q, w, a):
     assert d.mass[0, 0] == pytest.approx([0.25], rel=1e-12)
 
 
-def test_a_double_pendulum_has_a05s_mass_matrix_and_bias(load):
-    """A05: uniform rods, m1 = 1, m2 = 0.7, l1 = 0.8, l2 = 0.5."""
+def test_a_double_pendulum_of_rods_has_its_mass_matrix_and_bias(load):
+    """Uniform rods, m1 = 1, m2 = 0.7, l1 = 0.8, l2 = 0.5:
+
+    M11 = m1 l1^2 / 3 + m2 (l1^2 + l2^2 / 3 + l1 l2 cos q2), M12 = m2 (l2^2 / 3 + l1 l2 cos(q2) / 2), M22 = m2 l2^2 / 3.
+    """
     q, w = np.array([0.4, -0.9]), np.array([1.3, -0.6])
     d = at(load("double_pendulum.urdf"), q, w, [0.0, 0.0])
     assert d.mass[0] == pytest.approx(
