@@ -9,7 +9,7 @@ from drake_diff.exceptions import SimulationError
 from drake_diff.model.contact import penetration
 from drake_diff.model.model import Model
 from drake_diff.model.step import set_state
-from drake_diff.model.tangent import TangentSpace, tangent_space
+from drake_diff.model.tangent import tangent_space
 
 FREE, CONTACT = "free", "contact"
 ATTEMPTS = 200  # at a state of the kind that is wanted, before another kind is taken
@@ -56,64 +56,39 @@ def _touching(model: Model, random: np.random.Generator) -> Array | None:
     space = tangent_space(model)
     free = _free(model, random)
     for _ in range(ATTEMPTS // 10):
-        inside = _sunk(model, random)
-        if _depth(model, inside) > 0:
-            x = _at_the_surface(model, space, free, inside)
-            if x is not None:
+        inside = _any(model, random)
+        for start in space.quaternions:  # free bodies are pushed downwards, where the ground is
+            inside[start + 6] -= REACH * random.uniform(0, 2)
+        if _depth(model, inside) <= 0:
+            continue
+        way, low, high = space.minus(inside, free), 0.0, 1.0
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2
+            x = space.plus(free, middle * way)
+            depth = _depth(model, x)
+            if DEPTH[0] <= depth <= DEPTH[1]:
                 return x
+            low, high = (middle, high) if depth < DEPTH[0] else (low, middle)
     return None
-
-
-def _at_the_surface(model: Model, space: TangentSpace, free: Array, inside: Array) -> Array | None:
-    way = space.minus(inside, free)
-    low, high = 0.0, 1.0
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        x = space.plus(free, middle * way)
-        depth = _depth(model, x)
-        if DEPTH[0] <= depth <= DEPTH[1]:
-            return x
-        low, high = (middle, high) if depth < DEPTH[0] else (low, middle)
-    return None
-
-
-def _sunk(model: Model, random: np.random.Generator) -> Array:
-    """Any state, free bodies pushed downwards, where the ground is."""
-    x = _any(model, random)
-    for start in _free_bodies(model):
-        x[start + 6] -= REACH * random.uniform(0, 2)
-    return x
 
 
 def _any(model: Model, random: np.random.Generator) -> Array:
+    """A state within the limits, 5 % of the range apart from them; around the default where there are none."""
     plant, nq = model.plant, model.nq
     x = np.array(model.default_state)
-    x[:nq] = _within(random, plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits(), x[:nq], _reach(model))
-    for start in _free_bodies(model):
+    lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
+    limited = np.isfinite(lower) & np.isfinite(upper)
+    lower, upper = np.where(limited, lower, 0), np.where(limited, upper, 0)
+    reach = np.array([np.pi if coordinate.unit == "rad" else REACH for coordinate in model.contract.positions])
+    middle, half = np.where(limited, (lower + upper) / 2, x[:nq]), np.where(limited, 0.45 * (upper - lower), reach)
+    x[:nq] = middle + half * random.uniform(-1, 1, nq)
+    for start in tangent_space(model).quaternions:  # the seven coordinates of a free body start here
         x[start : start + 4] = random.standard_normal(4)
         x[start : start + 4] /= np.linalg.norm(x[start : start + 4])
         x[start + 6] += REACH
     lowest, highest = plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits()
     x[nq:] = np.clip(SPEED * random.standard_normal(model.nv), lowest, highest)
     return x
-
-
-def _within(random: np.random.Generator, lower: Array, upper: Array, default: Array, reach: Array) -> Array:
-    """Between the limits, 5 % of the range apart from them; around the default where there are none."""
-    limited = np.isfinite(lower) & np.isfinite(upper)
-    middle = np.where(limited, (np.where(limited, lower, 0) + np.where(limited, upper, 0)) / 2, default)
-    half = np.where(limited, 0.45 * (np.where(limited, upper, 0) - np.where(limited, lower, 0)), reach)
-    return np.asarray(middle + half * random.uniform(-1, 1, len(middle)))
-
-
-def _reach(model: Model) -> Array:
-    units = [coordinate.unit for coordinate in model.contract.positions]
-    return np.where(np.array(units) == "rad", np.pi, REACH)
-
-
-def _free_bodies(model: Model) -> tuple[int, ...]:
-    """Where in x the seven coordinates of each free body start."""
-    return tangent_space(model).quaternions
 
 
 def _input(model: Model, random: np.random.Generator) -> Array:

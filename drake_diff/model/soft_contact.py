@@ -139,13 +139,13 @@ def distances(twin: Twin) -> dict[tuple[str, str], float]:
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """Two bodies that may collide: their signed `distance` [m], its `gradient` (nq,), and the least motion (nq,) that
-    adds a metre to it, in the metric of the mass matrix (zero where nothing moves them apart)."""
+    """Two bodies that may collide, how far they are apart, and how they part."""
 
     bodies: tuple[str, str]
-    distance: float
-    gradient: Array
-    opening: Array
+    distance: float  # [m], signed
+    gradient: Array  # (nq,) of the distance
+    opening: Array  # (nq,) the least motion that adds a metre, in the metric of the mass matrix; 0 where there is none
+    mobility: float  # [1/kg] how fast a unit impulse between the two makes them part
 
 
 def separations(twin: Twin) -> list[Separation]:
@@ -157,17 +157,8 @@ def separations(twin: Twin) -> list[Separation]:
         rate = _distance_rate(plant, context, pair, (a, b))
         v = np.linalg.solve(mass, rate)
         opening = plant.MapVelocityToQDot(context, v / max(rate @ v, np.finfo(float).tiny))
-        found.append(Separation((a.name(), b.name()), float(pair.distance), rate @ to_v, opening))
-    return found
-
-
-def approaches(twin: Twin) -> list[float]:
-    """[1/kg] of every pair that may collide: how fast a unit impulse between the two makes them part."""
-    plant, context, found = twin.plant, twin.context, []
-    inverse_mass = np.linalg.inv(plant.CalcMassMatrix(context))
-    for pair, bodies in _pairs(plant, context):
-        row = _distance_rate(plant, context, pair, bodies)
-        found.append(float(row @ inverse_mass @ row))
+        names = (a.name(), b.name())
+        found.append(Separation(names, float(pair.distance), rate @ to_v, opening, float(rate @ v)))
     return found
 
 

@@ -8,10 +8,11 @@ With q a quaternion (w, x, y, z) and * the quaternion product,
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, Indices
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
 
@@ -30,51 +31,37 @@ class TangentSpace:
 
     def plus(self, x: Array, dx: Array) -> Array:
         """(nx,): the state `x` (nx,) moved by the tangent vector `dx` (size,)."""
-        moved, taken = np.array(x, dtype=float), 0
-        for start, stop, is_quaternion in self._blocks():
-            if is_quaternion:
-                moved[start:stop] = _turn(x[start:stop], dx[taken : taken + 3])
-                taken += 3
-            else:
-                moved[start:stop] += dx[taken : taken + stop - start]
-                taken += stop - start
+        moved, (of_x, of_d) = np.array(x, dtype=float), self._plain
+        moved[of_x] += dx[of_d]
+        for q, r in self._turns:
+            moved[q] = _turn(x[q], dx[r])
         return moved
 
     def minus(self, x1: Array, x0: Array) -> Array:
         """(size,): the tangent vector at `x0` that leads to `x1`."""
         if not self.quaternions:
             return x1 - x0
-        parts = [
-            _turn_between(x1[start:stop], x0[start:stop]) if is_quaternion else x1[start:stop] - x0[start:stop]
-            for start, stop, is_quaternion in self._blocks()
-        ]
-        return np.concatenate(parts)
+        found, (of_x, of_d) = np.empty(self.size), self._plain
+        found[of_d] = x1[of_x] - x0[of_x]
+        for q, r in self._turns:
+            between = _right_product(_conjugate(x0[q])) @ x1[q]
+            found[r] = 2 * between[1:] / between[0]
+        return found
 
     def derivative_of_plus(self, x: Array) -> Array:
         """(nx, size): d plus(x, d) / d d at d = 0."""
-        derivative, column = np.zeros((self.nx, self.size)), 0
-        for start, stop, is_quaternion in self._blocks():
-            if is_quaternion:
-                derivative[start:stop, column : column + 3] = 0.5 * _right_product(x[start:stop])[:, 1:]
-                column += 3
-            else:
-                width = stop - start
-                derivative[start:stop, column : column + width] = np.eye(width)
-                column += width
+        derivative = np.zeros((self.nx, self.size))
+        derivative[self._plain] = 1.0
+        for q, r in self._turns:
+            derivative[q, r] = 0.5 * _right_product(x[q])[:, 1:]
         return derivative
 
     def derivative_of_minus(self, x: Array) -> Array:
         """(size, nx): d minus(y, x) / d y at y = x."""
-        derivative, row = np.zeros((self.size, self.nx)), 0
-        for start, stop, is_quaternion in self._blocks():
-            if is_quaternion:
-                q = x[start:stop]
-                derivative[row : row + 3, start:stop] = 2 * _right_product(_conjugate(q))[1:] / (q @ q)
-                row += 3
-            else:
-                width = stop - start
-                derivative[row : row + width, start:stop] = np.eye(width)
-                row += width
+        derivative = np.zeros((self.size, self.nx))
+        derivative[self._plain[::-1]] = 1.0
+        for q, r in self._turns:
+            derivative[r, q] = 2 * _right_product(_conjugate(x[q]))[1:] / (x[q] @ x[q])
         return derivative
 
     def jacobian(self, x: Array, x_next: Array, by_x: Array, *others: Array) -> Array:
@@ -83,13 +70,16 @@ class TangentSpace:
             return np.hstack([by_x, *others])
         return np.asarray(self.derivative_of_minus(x_next) @ np.hstack([by_x @ self.derivative_of_plus(x), *others]))
 
-    def _blocks(self) -> list[tuple[int, int, bool]]:
-        """(start, stop, whether it is a quaternion) of each quaternion and each run between them, in order."""
-        blocks, start = [], 0
-        for q in self.quaternions:
-            blocks += [(start, q, False), (q, q + 4, True)]
-            start = q + 4
-        return [block for block in [*blocks, (start, self.nx, False)] if block[1] > block[0]]
+    @cached_property
+    def _turns(self) -> list[tuple[slice, slice]]:
+        """Where each quaternion stands in x, and its rotation vector in a tangent vector."""
+        return [(slice(q, q + 4), slice(q - k, q - k + 3)) for k, q in enumerate(self.quaternions)]
+
+    @cached_property
+    def _plain(self) -> tuple[Indices, Indices]:
+        """Where all other entries stand in x, and in a tangent vector."""
+        others = np.setdiff1d(np.arange(self.nx), [q + i for q in self.quaternions for i in range(4)])
+        return others, others - np.searchsorted(self.quaternions, others)
 
 
 def tangent_space(model: Model) -> TangentSpace:
@@ -116,8 +106,3 @@ def _right_product(q: Array) -> Array:
 def _turn(q: Array, rotation: Array) -> Array:
     turned = _right_product(q) @ np.concatenate([[1.0], rotation / 2])
     return np.asarray(turned * (np.linalg.norm(q) / np.linalg.norm(turned)))
-
-
-def _turn_between(q1: Array, q0: Array) -> Array:
-    between = _right_product(_conjugate(q0)) @ q1
-    return np.asarray(2 * between[1:] / between[0])

@@ -84,25 +84,17 @@ class Twin:
     added: dict[str, AddedForce] = field(default_factory=dict)  # by parameters that Drake has not
 
     def body(self, label: str) -> Any:
-        return self._bodies[label]
+        return self._labelled[0][label]
 
     def joint(self, label: str) -> Any:
-        return self._joints[label]
+        return self._labelled[1][label]
 
     def actuator(self, label: str) -> Any:
-        return self._actuators[label]
+        return self._labelled[2][label]
 
     @cached_property
-    def _bodies(self) -> dict[str, Any]:
-        return labelled(bodies(self.plant))
-
-    @cached_property
-    def _joints(self) -> dict[str, Any]:
-        return labelled(joints(self.plant))
-
-    @cached_property
-    def _actuators(self) -> dict[str, Any]:
-        return labelled(actuators(self.plant))
+    def _labelled(self) -> tuple[dict[str, Any], ...]:
+        return tuple(labelled(elements(self.plant)) for elements in (bodies, joints, actuators))
 
     @cached_property
     def _workspace(self) -> Any:

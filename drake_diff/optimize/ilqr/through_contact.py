@@ -31,7 +31,6 @@ from drake_diff.model.model import Model
 from drake_diff.model.soft_contact import (
     Separation,
     SoftContact,
-    approaches,
     distances,
     separations,
     smallest_half_width,
@@ -175,7 +174,7 @@ def default_schedule(problem: Problem) -> tuple[SoftContact, ...]:
     model = problem.model
     softened(model, SoftContact(1.0, 1.0))  # refuses what cannot be
     set_state(model.double, problem.x0)
-    mass = min((1 / mobility for mobility in approaches(model.double) if mobility > 0), default=math.inf)
+    mass = min((1 / pair.mobility for pair in separations(model.double) if pair.mobility > 0), default=math.inf)
     if not math.isfinite(mass):
         raise InputError("x0", got="nothing that may collide can approach", expected="a pair that can")
     reach = max(*distances(model.double).values(), smallest_half_width(model.double))
