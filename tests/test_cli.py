@@ -13,6 +13,7 @@ from helpers.models import ROOT
 
 import drake_diff as dd
 from drake_diff.cli import main as cli
+from drake_diff.derivatives.methods import METHODS
 
 PENDULUM = f"""
 import numpy as np
@@ -88,6 +89,8 @@ def test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact(tm
         (("pendulum.urdf", "projectile.sdf"), "expected"),
         (("x0=[0, 0]", "x0=[99, 0]"), "expected within [-50, 50]"),
         (("def problem", "def another"), "problem()"),
+        (("return dd.Problem", "return lambda *_, **__: dd.Problem"), "problem(): expected a Problem, got function"),
+        (("{'method'", "{'metod'"), "solve_options: expected one of"),
     ],
 )
 def test_bad_input_exits_with_2_a_named_error_and_no_artifact(tmp_path, edit, words):
@@ -158,6 +161,69 @@ def wait_until(condition, timeout=60.0):
         time.sleep(0.02)
 
 
+def exit_of(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["drake-diff", *map(str, words)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return end.value.code
+
+
+COMMANDS = (
+    "run", "audit", "certify", "compare", "export-model", "robustness", "panel", "verify", "list", "compare-runs",
+    "view", "export", "gradient-panel", "contact-table",
+)  # fmt: skip
+
+
+def test_help_tells_all_defaults_and_no_text_is_taken_for_markup(monkeypatch, capsys):
+    """Rich takes [s] or [default] in a help text for markup, and shows nothing there."""
+    monkeypatch.setenv("COLUMNS", "200")
+    shown = {}
+    for command in COMMANDS:
+        assert exit_of(monkeypatch, command, "--help") == 0
+        shown[command] = capsys.readouterr().out
+    for method in METHODS:
+        assert method in shown["certify"]
+    assert "Time step of the discrete plant, in seconds. [default: 0.01]" in shown["audit"]
+    assert "[default: (artifacts/<script>)]" in shown["run"]
+    assert "tvlqr, mpc or open_loop [default: tvlqr]" in shown["robustness"]
+    for command in ("audit", "certify", "compare", "export-model"):
+        for option in (
+            "time-step",
+            "contact-model",
+            "contact-approximation",
+            "contact-geometry",
+            "weld-base",
+            "ground",
+        ):
+            assert f"--{option}" in shown[command]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("certify", "PENDULUM", "--method", "magic"), "expected one of analytic"),
+        (("certify", "PENDULUM", "--parameters", "hinge.damping, wind"), "got 'wind'"),
+        (("compare", "PENDULUM", "--seed", "-3"), "--seed"),
+        (("compare", "PENDULUM", "--num-steps", "0"), "--num-steps"),
+        (("audit", "PENDULUM", "--time-step", "nan"), "time_step [s]: expected a finite number above 0, got nan"),
+        (("audit", "nothing.urdf"), "expected a file that exists, got nothing.urdf"),
+        (("certify", "PENDULUM", "--out", "FILE"), "is a file"),
+        (("panel", "nothing.toml"), "expected a panel in TOML"),
+        (("gradient-panel", "--cases", "magic"), "got 'magic'"),
+        (("export", "nothing"), "expected --ros2"),
+    ],
+)
+def test_bad_words_exit_with_2_and_one_sentence(tmp_path, monkeypatch, capsys, words, told):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    (tmp_path / "file").touch()
+    names = {"PENDULUM": ROOT / "models" / "pendulum.urdf", "FILE": tmp_path / "file"}
+    assert exit_of(monkeypatch, *(names.get(word, word) for word in words)) == cli.USAGE
+    shown = capsys.readouterr().err
+    assert told in shown
+    assert "Traceback" not in shown
+
+
 def test_the_version_is_that_of_the_installation(tmp_path):
     done = drake_diff("--version", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, f"drake-diff {metadata.version('drake-diff')}\n")
@@ -168,8 +234,5 @@ def test_without_an_installation_there_is_no_version(monkeypatch, capsys):
         raise metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(metadata, "version", unknown)
-    monkeypatch.setattr(sys, "argv", ["drake-diff", "--version"])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert end.value.code == cli.MISSING
+    assert exit_of(monkeypatch, "--version") == cli.MISSING
     assert "MissingDependencyError: drake-diff runs from a folder" in capsys.readouterr().err

@@ -40,7 +40,7 @@ def test_info_lists_channels_units_metadata_and_attachments_as_plain_text(file):
         "/state   drake_diff.State      3000         0   29.99",
     ]
     assert "units of /state: q ([red]hinge [rad])" in done.stdout
-    assert "run.model = <script>[bold]alert(1)[/]\\x1b[2J" in done.stdout
+    assert "run.model = <script>[bold]alert(1)[/]\ufffd[2J" in done.stdout
     assert "attached ../../etc/passwd, 1 bytes" in done.stdout
     assert "\x1b" not in done.stdout
 

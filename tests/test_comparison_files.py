@@ -158,7 +158,7 @@ def test_what_is_begun_and_not_ended_says_so(ball, tmp_path, monkeypatch):
 def test_the_command(tmp_path):
     needs("pinocchio")
     out = tmp_path / "out"
-    words = ["compare", str(MODELS / "cart_pole.urdf"), "--engines", "numpy, pinocchio", "--steps", "20"]
+    words = ["compare", str(MODELS / "cart_pole.urdf"), "--engines", "numpy, pinocchio", "--num-steps", "20"]
     found = CliRunner().invoke(app, [*words, "--out", str(out)])
     assert found.exit_code == 0, found.output
     assert "numpy and pinocchio: the same simulation as Drake" in found.output
@@ -171,7 +171,7 @@ def test_the_command_fails_where_the_engines_do_not_agree(tmp_path, monkeypatch)
     needs("pinocchio")
     right = PinocchioEngine.step
     monkeypatch.setattr(PinocchioEngine, "step", lambda self, x, u: right(self, x, u) + 1e-6)
-    words = ["compare", str(MODELS / "pendulum.urdf"), "--engines", "pinocchio", "--steps", "5"]
+    words = ["compare", str(MODELS / "pendulum.urdf"), "--engines", "pinocchio", "--num-steps", "5"]
     found = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")])
     assert found.exit_code == 1
     assert "nothing explains why" in found.output

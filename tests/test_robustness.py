@@ -220,8 +220,9 @@ def test_unknown_names_and_levels_are_named(cart, setup):
     for levels in ([], [0.0], [np.inf]):
         with pytest.raises(InputError, match="levels of mass"):
             levels_of(task, {"mass": levels})
-    with pytest.raises(InputError, match="trials"):
-        dd.robustness(pushed_and_stopped(cart), ["mass"], trials=0)
+    for options in ({"trials": 0}, {"seed": -1}):
+        with pytest.raises(InputError, match=f"{next(iter(options))}: expected a whole number"):
+            dd.robustness(pushed_and_stopped(cart), ["mass"], **options)
     assert levels_of(task, {"mass": [0.2, 0.1]}) == {"mass": (0.1, 0.2)}
     assert "friction" not in levels_of(task, None)
 

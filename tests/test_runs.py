@@ -14,7 +14,7 @@ from helpers.models import MODELS, ROOT
 import drake_diff as dd
 from drake_diff.artifact.listing import compare_runs, list_runs
 from drake_diff.artifact.save import begin, save_failure
-from drake_diff.cli.runs import plain
+from drake_diff.cli.text import plain
 from drake_diff.exceptions import ArtifactError
 
 

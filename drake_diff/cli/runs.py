@@ -1,207 +1,177 @@
-"""The commands on logs: `drake-diff mcap info | check | recover` and `drake-diff export --ros2`.
+"""Commands on runs: run, verify, list, compare-runs, schema, view, export, and `mcap info | check | recover`."""
 
-The commands about runs that were saved: verify, list, compare-runs, schema.
-
-What a record holds may be a stranger's text: it is printed without markup and without control characters.
-
-The commands to look at a run.
-"""
-
+import importlib.util
+import inspect
 import sys
 import threading
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
-from rich.text import Text
 
-from drake_diff.exceptions import ArtifactError, InputError
+from drake_diff.cli.text import RunDirectory, judged, out_option, plain, progress_line, show, table
+from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
 
-File = Annotated[Path, typer.Argument(help="An MCAP file that drake_diff wrote.")]
+LogFile = Annotated[Path, typer.Argument(metavar="FILE", help="An MCAP file that drake_diff wrote.")]
 
 mcap = typer.Typer(no_args_is_help=True, help="Look at, check and repair trace.mcap.")
 
 
 def add_commands(app: typer.Typer) -> None:
-    """The commands of this module, added to `app`."""
-    _add_log_commands(app)
-    _add_run_commands(app)
-
-
-def _add_log_commands(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.add_typer(mcap, name="mcap")
-    app.command()(export)
-
-
-@mcap.command()
-def info(file: File) -> None:
-    """List the channels of FILE with their messages and units, its metadata and its attachments."""
-    from drake_diff.logs.read import read_mcap
-
-    log, console = read_mcap(file), _console()
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in ("channel", "schema", "messages", "from [s]", "to [s]"):
-        table.add_column(escape(name), justify="left" if name in ("channel", "schema") else "right")
-    for topic, messages in log.messages.items():
-        ends = [f"{messages[i][0] / 1e9:g}" for i in (0, -1)] if messages else ["", ""]
-        schema = log.message_types[topic].DESCRIPTOR.full_name
-        table.add_row(escape(topic), escape(schema), str(len(messages)), *ends)
-    console.print(table)
-    for topic, metadata in log.channel_metadata.items():
-        console.print(f"units of {escape(topic)}: {escape(_short(metadata.get('units', {})))}")
-    for name, record in log.metadata.items():
-        for key, value in record.items():
-            console.print(f"{escape(name)}.{escape(key)} = {escape(_printable(value))}")
-    for name, data in log.attachments.items():
-        console.print(f"attached {escape(_printable(name))}, {len(data)} bytes")
-
-
-@mcap.command()
-def check(file: File) -> None:
-    """Check every checksum (chunks, data, summary, attachments) and schema of FILE. Exit status 1 where one fails."""
-    from drake_diff.logs.read import read_mcap
-
-    console = _console()
-    try:
-        log = read_mcap(file)
-    except ArtifactError as error:
-        console.print(f"[red bold]damaged[/]  {escape(_printable(str(error)))}")
-        raise typer.Exit(1) from error
-    count = sum(len(messages) for messages in log.messages.values())
-    console.print(
-        f"[green bold]whole[/]  {escape(str(file))}: {count} messages in {len(log.messages)} channels, "
-        f"{len(log.attachments)} attachments, every checksum holds"
-    )
-
-
-@mcap.command()
-def recover(file: File, out: Annotated[Path, typer.Argument(help="The file to write.")]) -> None:
-    """Copy what can be read of FILE, up to the first damage, to OUT; OUT's metadata say so."""
-    from drake_diff.logs.read import recover_mcap
-
-    done = recover_mcap(file, out)
-    stopped = f"stopped at {done.stopped_at}" if done.stopped_at else "it was whole"
-    _console().print(
-        f"{done.messages} messages and {done.attachments} attachments to {escape(str(out))}; "
-        f"{escape(_printable(stopped))}"
-    )
-
-
-def export(
-    run: Annotated[Path, typer.Argument(help="A run directory.")],
-    out: Annotated[Path | None, typer.Argument(help="Bag directory; RUN_ros2 beside RUN where not given.")] = None,
-    ros2: Annotated[bool, typer.Option("--ros2", help="A bag that `ros2 bag` reads.")] = False,
-) -> None:
-    """Write the motion in RUN for other tools."""
-    from drake_diff.artifact.ros2 import export_ros2
-
-    if not ros2:
-        raise InputError("export", got="no format", expected="--ros2")
-    folder = out or run.resolve().with_name(f"{run.resolve().name}_ros2")
-    counts = export_ros2(run, folder)
-    topics = ", ".join(f"{topic} {count}" for topic, count in counts.items())
-    _console().print(f"wrote {escape(str(folder))}: {topics}")
-
-
-def _console() -> Console:
-    return Console(soft_wrap=True, highlight=False)
-
-
-def _short(units: dict[str, Any]) -> str:
-    parts = []
-    for name, unit in units.items():
-        parts.append(f"{name} [{unit}]" if isinstance(unit, str) else f"{name} ({_short(unit)})")
-    return _printable(", ".join(parts))
-
-
-def _printable(text: str) -> str:
-    """Control characters, which could drive the terminal, as escapes."""
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-
-
-COLOURS = {"pass": "green", "holds": "green", "fail": "red", "broken": "red"}
-NOT_FOLDED = 160  # columns
-RunDirectory = Annotated[Path, typer.Argument(help="A run directory.")]
-
-
-def _add_run_commands(app: typer.Typer) -> None:
     """Add the commands of this module to `app`."""
-    app.command()(verify)
+    for command in (run, verify, compare_runs, schema, view, export):
+        app.command()(command)
     app.command("list")(list_all)
-    app.command()(compare_runs)
-    app.command()(schema)
+    mcap.command()(info)
+    mcap.command()(check)
+    mcap.command()(recover)
+    app.add_typer(mcap, name="mcap")
 
 
-def plain(value: Any, style: str = "") -> Text:
-    """`value` as text that changes nothing else on a terminal."""
-    shown = "-" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
-    return Text("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in shown), style=style)
+# --- solve and save
+
+
+def run(
+    script: Annotated[Path, typer.Argument(metavar="SCRIPT", help="A Python file with a function problem().")],
+    out: Annotated[Path | None, out_option("artifacts/<script>")] = None,
+) -> None:
+    """Solve the problem that SCRIPT defines, measure the solution again, and write the run directory.
+
+    SCRIPT may also define solve_options, a dictionary of arguments of drake_diff.solve.
+    Exit status 0 only if the solution passes every check.
+    """
+    module = _loaded(script)
+    problem, options = module.problem(), getattr(module, "solve_options", {})
+    directory = out or Path("artifacts") / script.stem
+    # Only here: a script that is missing or wrong is refused before Drake is loaded.
+    from drake_diff.artifact.save import begin, save, save_failure
+    from drake_diff.optimize.problem.problem import Problem
+    from drake_diff.optimize.solve import solve
+
+    if not isinstance(problem, Problem):
+        raise InputError("problem()", got=type(problem).__name__, expected="a Problem")
+    if not isinstance(options, dict):
+        raise InputError("solve_options", got=type(options).__name__, expected="a dictionary")
+    known = [name for name in inspect.signature(solve).parameters if name not in ("problem", "progress", "on_start")]
+    for name in options.keys() - set(known):
+        raise UnknownNameError("solve_options", got=name, known=known)
+    show(plain(script.name, "bold"), f"{problem.model!r}, {problem.num_steps} steps")
+    begun: list[Path] = []
+
+    def on_start() -> None:
+        begin(directory, problem)
+        begun.append(directory)
+
+    try:
+        with progress_line("solving") as report:
+            solution = solve(problem, progress=report, on_start=on_start, **options)
+    except Exception as error:
+        if begun:
+            save_failure(error, directory, problem)
+        raise
+    record = save(solution, directory)
+    _show_record(record)
+    show(f"wrote {directory}: record.json, {', '.join(sorted(record.files))}")
+    raise typer.Exit(0 if record.verdict == "pass" else 1)
+
+
+def _loaded(script: Path) -> ModuleType:
+    """The script as a module; its `if __name__ == "__main__"` part does not run."""
+    if not script.is_file():
+        raise InputError("SCRIPT", got=str(script), expected="a Python file that exists")
+    spec = importlib.util.spec_from_file_location("drake_diff_script", script)
+    if spec is None or spec.loader is None:
+        raise InputError("SCRIPT", got=str(script), expected="a Python file, its name ending in .py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    if not callable(getattr(module, "problem", None)):
+        raise InputError("SCRIPT", got=f"{script} without it", expected="a function problem() that returns a Problem")
+    return module
+
+
+def _show_record(record: Any) -> None:
+    solver = record.solver
+    show(judged(record.verdict), f" {solver.status}: {record.sentence}")
+    rows = table("measured again", "value", "unit", "tolerance", "")
+    for metric in record.metrics:
+        tolerance = "" if metric.tolerance is None else f"{metric.tolerance:g}"
+        shown = {"pass": plain("holds"), "info": plain("")}.get(metric.verdict, plain("does not hold", "red"))
+        rows.add_row(metric.name, plain(metric.value), metric.unit, tolerance, shown)
+    show(rows)
+    for replay in record.replays:
+        told = plain("holds") if replay.holds else plain(f"does not hold: {replay.failures[0]}", "red")
+        goal = "-" if replay.goal_error is None else f"{replay.goal_error:.3g}"
+        show(f"replayed {replay.variant}, {replay.control}: goal error {goal},", told)
+    for p in record.parameters:
+        moved = f", from {p.start:.6g}" if p.optimized else ""
+        show(f"{p.name} = {p.value:.9g} {p.unit}{moved}, derivative from {p.derivative_source}")
+    verdicts = [certificate.verdict for certificate in record.gradient.certificates]
+    show(
+        f"gradients: {verdicts.count('agree')} of {len(verdicts)} certificates agree; {solver.method} with "
+        f"{solver.solver}, {solver.iterations} iterations, {record.wall_clock.duration_s:.1f} s"
+    )
+
+
+# --- saved runs
 
 
 def verify(run: RunDirectory) -> None:
     """Check every byte of RUN, run it again from its own files, and compare every number.
 
-    RUN is what a solve, a comparison, robustness trials or a certification wrote. Exit status 0 only where every number
-    came out again. Comparisons and robustness trials are not run again: where their files are as they were written
-    they are "intact", with exit status 1. The run's own verdict is printed beside.
+    RUN is what a solve, a comparison, robustness trials or a certification wrote.
+    Exit status 0 only if every number came out again. The run's own verdict is printed too.
+    Comparisons and robustness trials are not run again: unchanged, they are "intact", with exit status 1.
     """
     from drake_diff.artifact.verify import verify as verify_run
 
-    console = _console_of_cli_runs()
     found = verify_run(run)
     for complaint in found.complaints:
-        console.print(Text("  ").append_text(plain(complaint, "red")))
+        show(plain(f"  {complaint}", "red"))
     for line in (*found.not_rerun, *found.notes):
-        console.print(Text("  ").append_text(plain(line, "dim")))
+        show(plain(f"  {line}", "dim"))
+    held = sum(c.holds for c in found.comparisons)
+    counted = f"{held} of {len(found.comparisons)} numbers are the recorded ones"
+    told = found.sentence if found.verdict == "intact" else counted
     verdict = "unknown" if found.record is None else found.record.verdict
-    console.print(
-        plain(found.verdict, f"{COLOURS.get(found.verdict, 'yellow')} bold"),
-        plain(f"{run}: {_counted(found)}; the run's verdict: {verdict}"),
-    )
+    show(judged(found.verdict), f"{run}: {told}; the run's verdict: {verdict}")
     raise typer.Exit(0 if found.holds else 1)
 
 
-def _counted(found: Any) -> str:
-    if found.verdict == "intact":
-        return str(found.sentence)
-    held = sum(c.holds for c in found.comparisons)
-    return f"{held} of {len(found.comparisons)} numbers are the recorded ones"
-
-
-def list_all(directory: Annotated[Path, typer.Argument(help="Where the runs are.")] = Path("artifacts")) -> None:
-    """List the records in DIRECTORY by what they say; `verify` tells whether that is true."""
+def list_all(
+    directory: Annotated[Path, typer.Argument(metavar="DIRECTORY", help="Where the runs are.")] = Path("artifacts"),
+) -> None:
+    """List the records in DIRECTORY and what they say; verify tells whether it is true."""
     from drake_diff.artifact.listing import list_runs
 
-    table = _table("run", "verdict", "kind", "status", "cost", "model", "written")
+    rows = table("run", "verdict", "kind", "status", "cost", "model", "written")
     for line in list_runs(directory):
-        verdict = plain(line.verdict, COLOURS.get(line.verdict, "yellow"))
         words = (line.kind, line.status, line.cost, line.model, line.written_utc)
-        table.add_row(plain(line.name), verdict, *(plain(word) for word in words))
-    wide_console().print(table)
+        rows.add_row(plain(line.name), judged(line.verdict), *(plain(word) for word in words))
+    show(rows)
 
 
-def compare_runs(a: RunDirectory, b: RunDirectory) -> None:
+def compare_runs(
+    a: Annotated[Path, typer.Argument(metavar="A", help="A run directory.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
+) -> None:
     """Show what differs between the runs A and B: configuration, versions, metrics.
 
-    Exit status 1 where a metric is defined otherwise in the two: such are not compared.
+    Exit status 1 if the two define a metric differently; such metrics are not compared.
     """
     from drake_diff.artifact.listing import compare_runs as compare
 
-    console, found = _console_of_cli_runs(), compare(a, b)
+    found = compare(a, b)
     for title in ("configuration", "versions", "metrics"):
-        rows = getattr(found, title)
-        console.print(plain(title if rows else f"{title}: no difference", "bold"))
-        table = _table("", "A", "B")
-        for row in rows:
-            table.add_row(plain(row.key), plain(row.a), plain(row.b))
-        if rows:
-            console.print(table)
+        differing = getattr(found, title)
+        show(plain(title if differing else f"{title}: no difference", "bold"))
+        rows = table("", "A", "B")
+        for row in differing:
+            rows.add_row(plain(row.key), plain(row.a), plain(row.b))
+        if differing:
+            show(rows)
     for line in found.refused:
-        console.print(plain(f"not compared: {line}", "red"))
+        show(plain(f"not compared: {line}", "red"))
     raise typer.Exit(0 if found.comparable else 1)
 
 
@@ -212,34 +182,88 @@ def schema() -> None:
     sys.stdout.write(EvidenceRecord.published_schema().decode())
 
 
-def _console_of_cli_runs() -> Console:
-    return Console(soft_wrap=True, highlight=False, markup=False)
-
-
-def wide_console() -> Console:
-    """For tables of many columns: into a file or a pipe they are not folded to a terminal's width."""
-    console = Console(soft_wrap=True, highlight=False, markup=False)
-    return console if console.is_terminal else Console(soft_wrap=True, highlight=False, markup=False, width=NOT_FOLDED)
-
-
-def _table(*columns: str) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in columns:
-        table.add_column(name, overflow="fold")
-    return table
-
-
-def view(run: Annotated[Path, typer.Argument(help="A run directory.")]) -> None:
-    """Show the motion of RUN live in a browser on this machine, until Ctrl-C."""
+def view(run: RunDirectory) -> None:
+    """Show the motion of RUN in a browser on this machine, until Ctrl-C."""
     from drake_diff.artifact.live import serve
 
-    console = Console(soft_wrap=True, highlight=False)
     try:
         meshcat, notes = serve(run)
         for note in notes:
-            console.print(f"[yellow]{escape(note)}[/]")
-        # Not by the console: interrupted after it has written, it writes what it has written once more.
+            show(plain(note, "yellow"))
+        # Not by a console: interrupted after it has written, it would write the line once more.
         typer.echo(f"{run} is at {meshcat.web_url()} (Ctrl-C ends it)")
         threading.Event().wait()
     except KeyboardInterrupt:
         typer.echo("ended")
+
+
+def export(
+    run: RunDirectory,
+    out: Annotated[
+        Path | None, typer.Argument(metavar="OUT", file_okay=False, show_default="<RUN>_ros2", help="Bag directory.")
+    ] = None,
+    ros2: Annotated[bool, typer.Option("--ros2", help="Write a bag for ROS 2.")] = False,
+) -> None:
+    """Write the motion in RUN for other tools."""
+    from drake_diff.artifact.ros2 import export_ros2
+
+    if not ros2:
+        raise InputError("export", got="no format", expected="--ros2")
+    folder = out or run.resolve().with_name(f"{run.resolve().name}_ros2")
+    counts = export_ros2(run, folder)
+    show(f"wrote {folder}: {', '.join(f'{topic} {count}' for topic, count in counts.items())}")
+
+
+# --- logs
+
+
+def info(file: LogFile) -> None:
+    """List the channels of FILE with their messages and units, its metadata and its attachments."""
+    from drake_diff.logs.read import read_mcap
+
+    log = read_mcap(file)
+    rows = table("channel", "schema", "messages", "from [s]", "to [s]", left=2)
+    for topic, messages in log.messages.items():
+        ends = [f"{messages[i][0] / 1e9:g}" for i in (0, -1)] if messages else ["", ""]
+        schema = log.message_types[topic].DESCRIPTOR.full_name
+        rows.add_row(plain(topic), plain(schema), str(len(messages)), *ends)
+    show(rows)
+    for topic, metadata in log.channel_metadata.items():
+        show(f"units of {topic}: {_units(metadata.get('units', {}))}")
+    for name, record in log.metadata.items():
+        for key, value in record.items():
+            show(f"{name}.{key} = {value}")
+    for name, data in log.attachments.items():
+        show(f"attached {name}, {len(data)} bytes")
+
+
+def _units(units: dict[str, Any]) -> str:
+    return ", ".join(f"{k} [{v}]" if isinstance(v, str) else f"{k} ({_units(v)})" for k, v in units.items())
+
+
+def check(file: LogFile) -> None:
+    """Check every checksum and schema of FILE. Exit status 1 if one fails."""
+    from drake_diff.logs.read import read_mcap
+
+    try:
+        log = read_mcap(file)
+    except ArtifactError as error:
+        show(judged("damaged"), f" {error}")
+        raise typer.Exit(1) from error
+    count = sum(len(messages) for messages in log.messages.values())
+    show(
+        plain("whole", "bold green"),
+        f" {file}: {count} messages in {len(log.messages)} channels, {len(log.attachments)} attachments, "
+        "every checksum holds",
+    )
+
+
+def recover(
+    file: LogFile, out: Annotated[Path, typer.Argument(metavar="OUT", help="The file to write.", dir_okay=False)]
+) -> None:
+    """Copy all of FILE that can be read, up to the first damage, to OUT; OUT's metadata say so."""
+    from drake_diff.logs.read import recover_mcap
+
+    done = recover_mcap(file, out)
+    stopped = f"stopped at {done.stopped_at}" if done.stopped_at else "it was whole"
+    show(f"{done.messages} messages and {done.attachments} attachments to {out}; {stopped}")

@@ -26,13 +26,13 @@ from drake_diff._base.differences import central_differences, plateau
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import Analytic
 from drake_diff.derivatives.implicit import TREE_JOINTS, Implicit
+from drake_diff.derivatives.methods import METHODS
 from drake_diff.derivatives.steps import Jacobians, Source, Steps, take_step, take_steps
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, write_autodiff
 from drake_diff.model.step import advance
 
-METHODS = ("auto", "analytic", "autodiff", "implicit", "finite_difference")
 # The AutoDiffXd and the double step run the same algorithm, so they differ by rounding only.
 PARITY_TOLERANCE = 1e-9
 # Cube root of the double step's rounding: where truncation and rounding of a central difference balance.

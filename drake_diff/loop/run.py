@@ -159,7 +159,7 @@ def closed_loop(
         array([0.5, 0.5, 0.5])
     """
     x0, steps = finite_array("x0", x0, (model.nx,)), positive_int("num_steps", num_steps)
-    return _LoopRun(model, controller, loop or Loop(), np.random.default_rng(seed)).result(x0, steps)
+    return _LoopRun(model, controller, loop or Loop(), np.random.default_rng(count("seed", seed, 0))).result(x0, steps)
 
 
 class OpenLoop:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, positive_int
+from drake_diff._base.arrays import Array, count, positive_int
 from drake_diff._base.statistics import Rate, margin, success_rate
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import InputError
@@ -80,16 +80,17 @@ def robustness(
         >>> result.margins
         {'mass': 0.05}
     """
-    count, task = positive_int("trials", trials), Task(solution.plan, controller, loop)
+    trials, seed = positive_int("trials", trials), count("seed", seed, 0)
+    task = Task(solution.plan, controller, loop)
     levels, sensitivity = levels_of(task, perturbations), Sensitivity(task)
     cells = []
     for name, values in levels.items():
         for level in values:
-            found = [run_trial(task, {name: level}, trial_seed(seed, k)) for k in range(count)]
+            found = [run_trial(task, {name: level}, trial_seed(seed, k)) for k in range(trials)]
             cells.append(cell_of(name, level, found, sensitivity.predicted(name, level)))
             if progress is not None:
-                progress(f"{name} {level:g}: {cells[-1].rate.successes} of {count}")
-    return Robustness(task, tuple(cells), count, seed)
+                progress(f"{name} {level:g}: {cells[-1].rate.successes} of {trials}")
+    return Robustness(task, tuple(cells), trials, seed)
 
 
 class Ending(NamedTuple):

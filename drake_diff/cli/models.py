@@ -1,0 +1,153 @@
+"""Commands on a model file: audit, certify, compare, export-model."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from drake_diff.cli.text import Seed, judged, names_in, names_option, out_option, plain, show, table, takes_model
+from drake_diff.derivatives.methods import METHODS
+
+GAPS = {"same": "green", "other law": "yellow", "other model": "red", "unexplained": "red"}
+FINDINGS = {"error": "bold red", "warning": "bold yellow", "info": "bold dim"}
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add the commands of this module to `app`."""
+    for command in (audit, certify, compare):
+        app.command()(takes_model(command))
+    app.command("export-model")(takes_model(export))
+
+
+def audit(model: Any, file: Path) -> None:
+    """List what in MODEL cannot be differentiated, or would be wrongly, and how to change it.
+
+    Exit status 1 if a finding is an error.
+    """
+    from drake_diff.certificates.audit import audit as audit_model
+
+    findings = audit_model(model)
+    for finding in findings:
+        show(plain(finding.severity, FINDINGS[finding.severity]), f"{finding.subject}: {finding.message}")
+        show(plain("    remedy:", "dim"), finding.remedy)
+    errors, warnings, notes = (sum(f.severity == severity for f in findings) for severity in FINDINGS)
+    show(f"{model.name}: {errors} errors, {warnings} warnings, {notes} notes")
+    raise typer.Exit(1 if errors else 0)
+
+
+def certify(
+    model: Any,
+    file: Path,
+    states: Annotated[int, typer.Option(help="How many states to sample; every second one is in contact.")] = 20,
+    seed: Seed = 0,
+    parameters: Annotated[str | None, names_option("Parameters to differentiate by too", "none")] = None,
+    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "auto",
+    out: Annotated[Path | None, out_option("artifacts/certify_<model>")] = None,
+) -> None:
+    """Compare the derivatives of MODEL's step with finite differences, entry by entry, at sampled states.
+
+    Writes certification.json. Exit status 0 only if every certificate agrees.
+    """
+    from drake_diff.record.certification import certify_model
+
+    directory = out or Path("artifacts") / f"certify_{file.stem}"
+    show(plain(file.name, "bold"), f"{model!r}, contact {model.contract.contact.model}")
+    names = tuple(names_in(parameters) or ())
+    record = certify_model(model, states=states, seed=seed, parameters=names, method=method, directory=directory)
+    _show_certification(record)
+    show(f"wrote {directory / record.FILE}")
+    raise typer.Exit(0 if record.verdict == "pass" else 1)
+
+
+def _show_certification(record: Any) -> None:
+    rows = table("state", "motion", "contacts", "entries", "largest", "from", "verdict")
+    for i, state in enumerate(record.states):
+        modes = list(state.contact_modes.values())
+        gradient, near = state.gradient, f", {len(state.mode_changes)} near" if state.mode_changes else ""
+        rows.add_row(
+            str(i),
+            state.kind,
+            ", ".join(f"{modes.count(mode)} {mode}" for mode in sorted(set(modes))),
+            str(gradient.entries) if gradient else "",
+            "" if state.largest is None else f"{state.largest:.4g}",
+            gradient.method if gradient else "",
+            plain(state.verdict + near, "green" if state.verdict == "agree" else "red"),
+        )
+    show(rows)
+    for i, state in enumerate(record.states):
+        if state.verdict != "agree":
+            show(f"state {i}: {state.refusal or state.gradient.worst}")
+            for change in state.mode_changes[:3]:
+                show(f"    {change}")
+    show(judged(record.verdict), f"{record.sentence}, {record.wall_clock.duration_s:.1f} s")
+
+
+def compare(
+    model: Any,
+    file: Path,
+    engines: Annotated[str | None, names_option("Engines, such as mujoco or drake:lagged", "all installed")] = None,
+    recording: Annotated[
+        list[Path] | None, typer.Option(help="A recorded motion to repeat: CSV, MCAP or a ROS 2 bag.")
+    ] = None,
+    num_steps: Annotated[
+        int | None, typer.Option(min=1, help="Length of the motion in steps.", show_default="one second")
+    ] = None,
+    seed: Seed = 0,
+    out: Annotated[Path | None, out_option("artifacts/compare_<model>")] = None,
+) -> None:
+    """Simulate MODEL in every engine under one contract; say which ones agree, which do not, and why.
+
+    Exit status 0 only if every engine agrees with Drake, or differs by a law that its contract states.
+    """
+    from drake_diff.comparison.files import PAGE, begin_comparison, save_comparison
+    from drake_diff.comparison.recordings import read_recording
+    from drake_diff.comparison.side_by_side import compare as compare_engines
+
+    directory = out or Path("artifacts") / f"compare_{file.stem}"
+    recordings = [read_recording(path, model) for path in recording or ()]
+    begin_comparison(directory, model)
+    found = compare_engines(model, names_in(engines), recordings=recordings, num_steps=num_steps, seed=seed)
+    record = save_comparison(found, directory)
+    _show_comparison(record)
+    show(f"wrote {directory / PAGE}")
+    raise typer.Exit(0 if record.verdict == "pass" else 1)
+
+
+def _show_comparison(record: Any) -> None:
+    rows = table(
+        "engine", "verdict", "step gap", "apart from", "Jacobian gap", "its own", "step", "Jacobian", wrap=False
+    )
+    clock = record.wall_clock
+    for i, e in enumerate(record.engines):
+        own = {"its own step's": "yes", "not its own step's": "no"}.get(e.gradient, e.gradient)
+        rows.add_row(
+            plain(e.engine),
+            plain(e.verdict, GAPS[e.verdict]) if i else plain("reference", "dim"),
+            f"{e.largest_step_gap:.1e}",
+            "" if e.first_apart_s is None else f"{e.first_apart_s:.4g} s",
+            f"{max((j.gap for j in e.jacobians), default=0.0):.1e}",
+            plain(own, "red" if own == "no" else ""),
+            *(_time(seconds[e.engine]) for seconds in (clock.seconds_per_step, clock.seconds_per_jacobian)),
+        )
+    show(rows)
+    for e in record.engines[1:]:
+        show(plain(e.engine, "bold"), e.sentence)
+    for r in record.refused:
+        show(plain(r.engine, "bold dim"), plain(f"not compared: {r.reason}", "dim"))
+    show(judged(record.verdict), record.sentence)
+
+
+def _time(seconds: float | None) -> str:
+    return "-" if seconds is None else f"{1e6 * seconds:.0f} µs"
+
+
+def export(
+    model: Any,
+    file: Path,
+    to: Annotated[str, typer.Option(help="gazebo, isaaclab, urdf, sdf or mjcf")],
+    out: Annotated[Path, typer.Option(help="A directory that does not exist yet.")],
+) -> None:
+    """Write MODEL for an engine that does not run here: model file, contract, start states, and what to record."""
+    from drake_diff.export.export import export_model
+
+    show("wrote " + ", ".join(map(str, export_model(model, out, target=to))))
