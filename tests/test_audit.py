@@ -433,7 +433,7 @@ def test_a_diagram_without_an_autodiff_form_is_an_error():
     plant.builder.AddSystem(LeafSystem()).set_name("python_only")
     found = only(audit(dd.model_from_diagram(plant.builder.Build())), "autodiff_refused")
     assert (found.severity, found.subject) == ("error", "diagram")
-    assert "no AutoDiffXd twin" in found.message
+    assert "cannot be converted to AutoDiffXd" in found.message
 
 
 def test_a_state_that_drake_cannot_place_is_an_error():

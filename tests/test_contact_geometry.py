@@ -360,7 +360,7 @@ def test_differences_changes_nothing():
     plant = Plant(0.005)
     add_body(plant, Box(*SIZE))
     assert replaced(plant, "differences") == (
-        "Pairs of geometries that AutoDiffXd refuses are differenced, by choice.",
+        "Where geometries touch that AutoDiffXd refuses, steps are differentiated by finite differences, as chosen.",
     )
     assert collision_names(plant) == ["box_shape"]
 

@@ -208,7 +208,10 @@ def test_a_place_beside_an_offset_is_refused(load, part):
     both = {"optimize": ("controls", "parameters")}
     dd.Problem(model, **fields)
     dd.Problem(model, **fields, parameters=["lower.mass"], **both)
-    with pytest.raises(InputError, match="task quantities are used: expected others, got offset"):
+    with pytest.raises(
+        InputError,
+        match=r"parameters: expected only such as the functions of dd.quantities do not depend on, got offset",
+    ):
         dd.Problem(model, **fields, parameters=["lower.mass", "elbow.offset"], **both)
     assert tip(np.zeros(4))[2] == -1.3  # and works again
 

@@ -27,7 +27,11 @@ class Rate(NamedTuple):
 def success_rate(successes: int, trials: int) -> Rate:
     """Wilson's interval (1927): (p + z^2/2n -+ z sqrt(p (1 - p)/n + z^2/4n^2)) / (1 + z^2/n), z = 1.96, p = k/n."""
     if not 0 <= successes <= trials or trials < 1:
-        raise InputError("successes", got=f"{successes} of {trials}", expected="at most all of at least one")
+        raise InputError(
+            "successes",
+            got=f"{successes} of {trials}",
+            expected="from 0 to all of the trials, of which there is at least one",
+        )
     p, n, z = successes / trials, trials, NORMAL_95
     middle, half = p + z * z / (2 * n), z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
     # Exactly 0 and 1 at the ends, where rounding would leave 1e-17.

@@ -105,7 +105,7 @@ def describe(model: Model) -> Description:
     """The description of `model`; ModelError, naming the element, where the plant has what no other engine is given."""
     controlled = [f"actuator {a.name()} has PD gains" for a in actuators(model.plant) if a.has_controller()]
     if controlled:
-        raise ModelError("no other engine is given this model: " + "; ".join(controlled))
+        raise ModelError("this model cannot be given to another engine: " + "; ".join(controlled))
     return describe_tree(model)
 
 
@@ -125,7 +125,7 @@ def describe_tree(model: Model) -> Description:
         found.append("forces are added to Drake's")
     springs = springs_of(plant)
     if found or isinstance(springs, Refusal):
-        raise ModelError("no other engine is given this model: " + "; ".join(found or [str(springs)]))
+        raise ModelError("this model cannot be given to another engine: " + "; ".join(found or [str(springs)]))
     body_names, joint_names = names_of(plant)
     geometries, pairs = _geometries(model, body_names)
     return Description(
@@ -279,7 +279,7 @@ def rigid_links(description: Description) -> RigidLinks:
     for link in description.moving:
         own = all(pose.IsExactlyIdentity() for pose in (link.on_parent, link.on_child))
         if link.kind == "quaternion_floating" and (link.parent != "world" or not own):
-            raise ModelError(f"joint {link.joint}: this engine's free body is one of the world, by its own frame")
+            raise ModelError(f"joint {link.joint}: expected a free body to be joined to the world by its own frame")
     links, on, anchored = without_welds(description.links)
     starts = [i for i, link in enumerate(links) if link.parent < 0]
     known = tuple(

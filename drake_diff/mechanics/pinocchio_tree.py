@@ -37,7 +37,7 @@ def build(links: tuple[Link, ...], gravity: Array) -> tuple[Any, float]:
             fixed -= link.mass * float(gravity @ pose.act(link.center_of_mass))
     starts = [x.v_start for x in links if x.kind != "weld"]
     if list(model.idx_vs)[1:] != starts:
-        raise ModelError(f"joints in the order of v: expected starts {starts}, got {list(model.idx_vs)[1:]}")
+        raise ModelError(f"Pinocchio's joints: expected them to start at {starts} in v, got {list(model.idx_vs)[1:]}")
     return model, fixed
 
 

@@ -186,9 +186,9 @@ def replace_collision_geometry(plant: MultibodyPlant, scene_graph: SceneGraph, r
     ModelError (the plant is finalized, or Drake refuses a change).
     """
     if route not in ROUTES:
-        raise UnknownNameError("route around refused contact", got=route, known=ROUTES)
+        raise UnknownNameError("contact_geometry", got=route, known=ROUTES)
     if plant.is_finalized():
-        raise ModelError("the plant is finalized: its collision geometry can be replaced only before that")
+        raise ModelError("the plant is finalized: its collision geometry can only be replaced before that")
     try:
         if route == "corner_spheres":
             return _to_corner_spheres(plant, scene_graph)
@@ -196,7 +196,9 @@ def replace_collision_geometry(plant: MultibodyPlant, scene_graph: SceneGraph, r
             return _to_hydroelastic(plant, scene_graph)
     except RuntimeError as error:
         raise ModelError(f"Drake refuses the route {route!r}: {error}") from error
-    return ("Pairs of geometries that AutoDiffXd refuses are differenced, by choice.",)
+    return (
+        "Where geometries touch that AutoDiffXd refuses, steps are differentiated by finite differences, as chosen.",
+    )
 
 
 def _to_corner_spheres(plant: MultibodyPlant, scene_graph: SceneGraph) -> tuple[str, ...]:

@@ -145,7 +145,7 @@ class Model:
             0.002
         """
         if self._rebuild is None:
-            raise ModelError("a model from a diagram keeps its time step: build the diagram again with another")
+            raise ModelError("a model made from a diagram cannot be changed: build the diagram again, changed")
         # Lists and arrays have no hash; a vector is the same change however it is written.
         vectors = {
             k: tuple(np.ravel(v).tolist()) for k, v in change.items() if isinstance(v, (list, tuple, np.ndarray))
@@ -183,7 +183,7 @@ class Model:
         try:
             diagram = self.diagram.ToAutoDiffXd()
         except RuntimeError as error:
-            raise ModelError(f"the model has no AutoDiffXd twin: {error}") from error
+            raise ModelError(f"the model cannot be converted to AutoDiffXd: {error}") from error
         plant = follow(diagram, self.path)
         for ours, twin in zip(actuators(self.plant), actuators(plant), strict=True):
             if ours.has_controller():
@@ -414,6 +414,6 @@ def _check_plant(model: Model) -> None:
     inputs += [plant.get_actuation_input_port(i) for i in instances(plant) if plant.num_actuators(i)]
     if any(is_driven(diagram, path, port) for port in inputs):
         raise ModelError(
-            "the plant's actuation input is connected inside the diagram, but drake_diff sets it: "
+            "the plant's actuation input is connected inside the diagram, but drake_diff has to set it: "
             "leave it free or export it"
         )

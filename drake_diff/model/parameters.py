@@ -183,14 +183,16 @@ class ParameterVector:
         if p.kind.quantity == "inertia":
             room = room_of_inertia(value)
             if room <= 0:
-                expected = "one inside what is physically possible (a point or a rod is on its edge)"
+                expected = (
+                    "an inertia that may change a little and stay possible, which that of a point or a rod may not"
+                )
                 raise InputError(p.name, got=value, expected=expected)
             return np.full(6, room)
         if p.kind.positive and not np.all(value > 0):
             raise InputError(
                 p.name,
                 got=float(value[0]),
-                expected="a value above 0, to difference on both sides (give one by a mapping)",
+                expected="a value above 0, so that differences can go both ways; give one by parameters={name: value}",
             )
         return np.array(value) if p.kind.positive else np.maximum(1.0, np.abs(value))
 
@@ -238,7 +240,7 @@ def _check_overlap(parameters: Sequence[Parameter]) -> None:
         whole = f"{p.label.rsplit('/', 1)[0]}.{p.kind.quantity}"
         if p.kind in CONTACT_KINDS and "/" in p.label and whole in names:
             raise InputError(
-                "parameters", got=f"{whole} and {p.name}", expected="one of them: the first sets the other"
+                "parameters", got=f"{whole} and {p.name}", expected="only one of them, as the first sets the second too"
             )
 
 
@@ -347,7 +349,7 @@ def to_log_cholesky(inertia: Array) -> Array:
     Raises InputError for a point or a rod, which lie at infinity.
     """
     if room_of_inertia(inertia) <= 0:
-        raise InputError("inertia", got=inertia, expected="one with mass off every line: a point or a rod has no such")
+        raise InputError("inertia", got=inertia, expected="that of a body which is neither a point nor a rod")
     lower = np.linalg.cholesky(second_moment(inertia))
     return np.array([*np.log(np.diag(lower)), lower[1, 0], lower[2, 0], lower[2, 1]])
 

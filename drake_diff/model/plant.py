@@ -90,7 +90,7 @@ def named(kind: str, elements: list[Any], name: str) -> Any:
     if not matches:
         raise UnknownNameError(kind, got=name, known=[element.name() for element in elements])
     if len(matches) > 1:
-        raise ModelError(f"{len(matches)} elements of kind {kind} are called {name!r}: names must be unique")
+        raise ModelError(f"{len(matches)} {kind}s are called {name!r}: expected one of that name")
     return matches[0]
 
 
@@ -98,7 +98,7 @@ def path_to_the_plant(diagram: Diagram) -> DiagramPath:
     """Where in `diagram` its only MultibodyPlant is; ModelError where there is none or more than one."""
     paths = _paths_to_plants(diagram, ())
     if len(paths) != 1:
-        raise ModelError(f"the diagram: expected exactly one MultibodyPlant, got {len(paths)}")
+        raise ModelError(f"diagram: expected exactly one MultibodyPlant, got {len(paths)}")
     return paths[0]
 
 

@@ -216,7 +216,9 @@ def contact_force(model: Model, body: str) -> OfStateAndInput:
 
 def _refuse_other(model: Model, depends_on: frozenset[str]) -> None:
     for quantity in sorted(model.other_quantities & depends_on):
-        raise InputError("parameters of a model whose task quantities are used", got=quantity, expected="others")
+        raise InputError(
+            "parameters", got=quantity, expected="only such as the functions of dd.quantities do not depend on"
+        )
 
 
 def _at(model: Model, x: Any, *inputs: Any) -> tuple[Twin, list[Any]]:

@@ -109,7 +109,11 @@ def softened(model: Model, contact: SoftContact) -> Model:
     if not isinstance(contact, SoftContact):
         raise InputError("contact", got=type(contact).__name__, expected="a SoftContact")
     if not model.takes_forces:
-        raise InputError("model", got="a diagram that feeds the applied forces", expected="that input port free")
+        raise InputError(
+            "model",
+            got="a diagram that sets the applied generalized forces",
+            expected="one that leaves that input port free",
+        )
     if not model.contract.contact.collision_pairs:
         raise InputError("model", got="no geometries that may collide", expected="at least one pair")
 
@@ -188,7 +192,9 @@ def _pairs(plant: Any, context: Any) -> list[tuple[Any, tuple[Any, Any]]]:
         try:
             pair = query.ComputeSignedDistancePairClosestPoints(*ids)
         except RuntimeError as error:
-            raise ModelError(f"soft contact: Drake does not know a distance: {error}") from error
+            raise ModelError(
+                f"soft contact needs the distance of every pair, and Drake cannot compute one: {error}"
+            ) from error
         bodies = [plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in (pair.id_A, pair.id_B)]
         found.append((pair, (bodies[0], bodies[1])))
     return found
