@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers.browser import browsing, errors, move_slider, open_page, view_of
 from helpers.models import MODELS
+from pydrake.planning import RobotDiagramBuilder
 
 import drake_diff as dd
 from drake_diff.artifact.live import scene_of_run, serve
@@ -241,6 +242,22 @@ def test_a_run_is_shown_from_its_directory_alone(hostile, tmp_path):
     assert notes == ()
     assert len(scene.shapes) > 0
     assert np.ptp(scene.trail, axis=0).max() > 0.1  # [m] it moves
+
+
+def test_a_run_of_a_users_own_diagram_is_shown_as_balls(tmp_path):
+    """No model file is in its trace. The ball is at the origin of the body, the hinge, which does not move."""
+    builder = RobotDiagramBuilder(time_step=0.02)
+    builder.parser().AddModels(str(MODELS / "pendulum.urdf"))
+    builder.plant().SetUseSampledOutputPorts(False)
+    builder.plant().Finalize()
+    model = dd.model_from_diagram(builder.Build())
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=10, running_cost=dd.QuadraticCost(R=[[1.0]]))
+    dd.save(dd.solve(problem, method="shooting"), tmp_path)
+    scene, notes = scene_of_run(tmp_path)
+    assert "a ball stands for each body" in notes[0]
+    assert [drawn.body for drawn in scene.shapes] == list(scene.poses)
+    assert len(scene.shapes) == 1
+    assert np.ptp(scene.trail, axis=0).max() < 1e-12
 
 
 def test_the_live_view_is_at_loopback_only(runs):

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.geometry import Meshcat, MeshcatParams, Sphere
+from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_diff._base.arrays import Array
 from drake_diff.artifact.save import TRACE
 from drake_diff.exceptions import ArtifactError, ModelError
 from drake_diff.logs.read import read_mcap
@@ -22,13 +21,13 @@ from drake_diff.model.load_file import FORMATS, read_into
 from drake_diff.pages.meshcat import draw
 from drake_diff.pages.scene import (
     BLUE,
-    GREY,
-    Drawn,
+    ContactForce,
     Ghost,
-    Push,
     Scene,
+    ball,
     body_path,
-    longest_way,
+    longest_path,
+    meshcat_path,
     moving_bodies,
     shapes_of,
 )
@@ -36,13 +35,12 @@ from drake_diff.record.solve import EvidenceRecord
 
 GHOST = "planned/"  # before the frame names of the plan's bodies
 LOOPBACK = "127.0.0.1"
-BALL = 0.05  # [m] radius of what stands for a body without geometry
 
 
 def serve(directory: str | Path) -> tuple[Meshcat, tuple[str, ...]]:
-    """A Meshcat at this machine's loopback that shows the run, and what of it could not be shown, a sentence each.
+    """A Meshcat that shows a run, for browsers on this machine alone; it serves as long as it is kept.
 
-    It serves as long as it is kept. ArtifactError where the run is damaged, or has no motion to show.
+    Also gives what could not be shown, a sentence each. ArtifactError where the run is damaged or has no motion.
     """
     scene, notes = scene_of_run(directory)
     meshcat = Meshcat(MeshcatParams(host=LOOPBACK, show_stats_plot=False))
@@ -59,32 +57,29 @@ def scene_of_run(directory: str | Path) -> tuple[Scene, tuple[str, ...]]:
         raise ArtifactError(f"{folder / TRACE} has no motion: the plant could not be stepped along the planned inputs")
     times = np.array([time for time, _ in rows]) / 1e9
     poses = _poses(message for _, message in rows)
-    motion = {name: found for name, found in poses.items() if not name.startswith(GHOST)}
-    plan = {name.removeprefix(GHOST): found for name, found in poses.items() if name.startswith(GHOST)}
-    contacts = {time: _pushes(message) for time, message in log.messages.get("/contacts", [])}
-    pushes = tuple(contacts.get(time, ()) for time, _ in rows[:-1])
+    contacts = {time: _forces(message) for time, message in log.messages.get("/contacts", [])}
     try:
-        plant, context, notes = _load(log.attachments, _text(record.contract.get("source")))
+        plant, context, notes = _load(log.attachments, record.contract.get("source"))
+        moving = {f"{plant.GetModelInstanceName(b.model_instance())}::{b.name()}": b for b in moving_bodies(plant)}
+        paths = {name: body_path(body) for name, body in moving.items()}
+        centres = {body_path(body): np.asarray(body.default_com()) for body in moving.values()}
+        shapes = tuple(shapes_of(plant, context))
     except ModelError as error:
-        notes = (f"the model cannot be loaded, a ball stands for each body: {error}",)
-        motion, plan = _renamed(motion), _renamed(plan)
-        shapes = tuple(Drawn(name, Sphere(BALL), RigidTransform(), GREY, np.zeros(3), BALL) for name in motion)
-        return Scene(shapes, times, motion, _ghosts(plan), pushes, _longest(motion)), notes
-    paths = {
-        f"{plant.GetModelInstanceName(b.model_instance())}::{b.name()}": body_path(b) for b in moving_bodies(plant)
-    }
-    moving = {paths[name]: found for name, found in motion.items() if name in paths}
-    ghost = {paths[name]: found for name, found in plan.items() if name in paths}
-    trail = longest_way(plant, moving)
-    return Scene(tuple(shapes_of(plant, context)), times, moving, _ghosts(ghost), pushes, trail), notes
-
-
-def _ghosts(plan: dict[str, list[RigidTransform]]) -> tuple[Ghost, ...]:
-    return (Ghost("plan", plan, BLUE),) if plan else ()
-
-
-def _text(value: Any) -> str | None:
-    return value if isinstance(value, str) else None
+        notes = (f"the model cannot be loaded, so a ball stands for each body: {error}",)
+        names = [name for name in poses if not name.startswith(GHOST)]
+        paths = {name: meshcat_path(i, name) for i, name in enumerate(names)}
+        centres = {path: np.zeros(3) for path in paths.values()}
+        shapes = tuple(ball(path) for path in paths.values())
+    motion = {path: poses[name] for name, path in paths.items() if name in poses}
+    plan = {path: poses[GHOST + name] for name, path in paths.items() if GHOST + name in poses}
+    return Scene(
+        shapes=shapes,
+        times=times,
+        poses=motion,
+        ghosts=(Ghost("plan", plan, BLUE),) if plan else (),
+        forces=tuple(contacts.get(time, ()) for time, _ in rows[:-1]),
+        trail=longest_path(motion, centres),
+    ), notes
 
 
 def _poses(messages: Iterator[Any]) -> dict[str, list[RigidTransform]]:
@@ -98,18 +93,18 @@ def _poses(messages: Iterator[Any]) -> dict[str, list[RigidTransform]]:
     return found
 
 
-def _pushes(message: Any) -> tuple[Push, ...]:
+def _forces(message: Any) -> tuple[ContactForce, ...]:
     points = np.array([message.px, message.py, message.pz]).T
     forces = np.array([message.fx, message.fy, message.fz]).T
-    return tuple(Push(point, force) for point, force in zip(points, forces, strict=True))
+    return tuple(ContactForce(point, force) for point, force in zip(points, forces, strict=True))
 
 
-def _load(attachments: dict[str, bytes], source: str | None) -> tuple[Any, Any, tuple[str, ...]]:
+def _load(attachments: dict[str, bytes], source: Any) -> tuple[Any, Any, tuple[str, ...]]:
     """Plant, context and notes: of the source file where it is still the one attached, else of the attachment."""
     name = next((name for name in attachments if name.endswith(FORMATS)), None)
     if name is None:
         raise ModelError("the run has no model file attached: it was made from a diagram")
-    if source is not None and Path(source).is_file() and Path(source).read_bytes() == attachments[name]:
+    if isinstance(source, str) and Path(source).is_file() and Path(source).read_bytes() == attachments[name]:
         return _plant(Path(source), ())
     suffix = next(end for end in FORMATS if name.endswith(end))
     with tempfile.TemporaryDirectory() as folder:
@@ -148,13 +143,3 @@ def _without_meshes(data: bytes, suffix: str) -> tuple[bytes, int]:
                 parent.remove(element)
                 skipped += 1
     return ET.tostring(root), skipped
-
-
-def _renamed(poses: dict[str, list[RigidTransform]]) -> dict[str, list[RigidTransform]]:
-    """By paths of Meshcat that no name can break out of."""
-    return {f"{i}_" + re.sub(r"[^A-Za-z0-9_.-]", "_", name): found for i, (name, found) in enumerate(poses.items())}
-
-
-def _longest(poses: dict[str, list[RigidTransform]]) -> Array:
-    ways = [np.array([pose.translation() for pose in found]) for found in poses.values()]
-    return max(ways, key=lambda way: float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()))

@@ -24,9 +24,9 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from drake_diff._base.arrays import Array
 from drake_diff._base.files import write_whole
 from drake_diff.pages.html import content_policy
-from drake_diff.pages.scene import ARROW_PART, Drawn, Poses, Push, Scene
+from drake_diff.pages.scene import ARROW_PART, ContactForce, Drawn, Poses, Scene
 
-# Drake tells of the port it listens on; nobody is meant to connect to it.
+# Drake prints the port that it listens on, but nobody is meant to connect to it.
 logging.getLogger("drake").addFilter(lambda record: "Meshcat listening" not in record.getMessage())
 
 FRAMES_PER_SECOND = 64.0
@@ -35,15 +35,15 @@ RED, TRAIL = Rgba(0.85, 0.2, 0.1, 1), Rgba(0.93, 0.55, 0.1, 1)
 LINES = Rgba(0.72, 0.75, 0.79, 1)
 WORLD = "world"
 TOP, BOTTOM = [0.86, 0.89, 0.93], [0.97, 0.97, 0.98]  # of the background
-LONGEST = 3.0  # times that: where arrows are cut, impacts being a hundred times a weight
+LONGEST = 3.0  # times the arrow of the reference force: longer ones are cut, as an impact is a hundred times a weight
 THICKNESS = 0.003  # of the scene's size: the radius of the trail and of an arrow's shaft
 FIELD_OF_VIEW = np.deg2rad(75.0)  # Meshcat's camera, from top to bottom
 
 
 def write_replay(path: Path, scene: Scene, *, title: str = "") -> None:
-    """Write `scene` as one page that opens without a network, plays the motion a few times, and can scrub and pause it.
+    """Write `scene` as one page that opens without a network, plays the motion, and can be paused and moved.
 
-    Contact forces are arrows, see `Scene.reference_force`; ghosts are translucent, and the trail is a line.
+    Contact forces are arrows (see `Scene.reference_force`), ghosts are translucent, and the trail is a line.
     """
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
     draw(meshcat, scene)
@@ -55,16 +55,16 @@ def write_replay(path: Path, scene: Scene, *, title: str = "") -> None:
 
 def draw(meshcat: Meshcat, scene: Scene) -> None:
     """Draw `scene` and publish its animation."""
-    slots = max((len(step) for step in scene.pushes), default=0)
+    slots = max((len(step) for step in scene.forces), default=0)  # so many arrows, of which a frame shows some
     _draw_bodies(meshcat, scene)
     _draw_tube(meshcat, "trail", scene.trail, THICKNESS * scene.size)
     for slot in range(slots):
         _draw_arrow(meshcat, f"contacts/{slot}", THICKNESS * scene.size)
     frames = frames_of(scene.times)
-    pushes = [_arrows(scene, k) for _, k in frames]
+    forces = [_arrows(scene, k) for _, k in frames]
     rate = (len(frames) - 1) / float(scene.times[-1])
     meshcat.StartRecording(frames_per_second=rate, set_visualizations_while_recording=False)
-    for (time, k), arrows in zip(frames, pushes, strict=True):
+    for (time, k), arrows in zip(frames, forces, strict=True):
         _pose(meshcat, "motion", scene.poses, k, time)
         for ghost in scene.ghosts:
             _pose(meshcat, ghost.name, ghost.poses, k, time)
@@ -73,7 +73,7 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
     _pose(meshcat, "motion", scene.poses, 0, None)  # what is seen before play
     for ghost in scene.ghosts:
         _pose(meshcat, ghost.name, ghost.poses, 0, None)
-    _place_arrows(meshcat, pushes[0], slots, None)
+    _place_arrows(meshcat, forces[0], slots, None)
     animation = meshcat.get_mutable_recording()
     animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
     animation.set_repetitions(REPETITIONS)
@@ -152,25 +152,23 @@ def _draw_arrow(meshcat: Meshcat, path: str, radius: float) -> None:
     meshcat.SetTransform(f"{path}/tip/cone", RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.0, 0.0, 4 * radius]))
 
 
-def _arrows(scene: Scene, k: int) -> list[tuple[Push, float]]:
-    """What pushes in the step from state k, or in that before the last state, with the lengths of the arrows [m]."""
-    if not scene.pushes:
-        return []
+def _arrows(scene: Scene, k: int) -> list[tuple[ContactForce, float]]:
+    """The forces in the step from state k, or in the last step, with the lengths of their arrows [m]."""
     found = []
-    for push in scene.pushes[min(k, len(scene.pushes) - 1)]:
-        part = float(np.linalg.norm(push.force)) / scene.reference_force
+    for contact in scene.forces[min(k, len(scene.forces) - 1)] if scene.forces else ():
+        part = float(np.linalg.norm(contact.force)) / scene.reference_force
         if part > 0:
-            found.append((push, min(part, LONGEST) * ARROW_PART * scene.size))
+            found.append((contact, min(part, LONGEST) * ARROW_PART * scene.size))
     return found
 
 
-def _place_arrows(meshcat: Meshcat, arrows: list[tuple[Push, float]], slots: int, time: float | None) -> None:
+def _place_arrows(meshcat: Meshcat, arrows: list[tuple[ContactForce, float]], slots: int, time: float | None) -> None:
     for slot in range(slots):
         path, used = f"contacts/{slot}", slot < len(arrows)
         if used:
-            push, length = arrows[slot]
-            turned = RotationMatrix.MakeFromOneVector(push.force, 2)
-            meshcat.SetTransform(path, RigidTransform(turned, push.point), time_in_recording=time)
+            contact, length = arrows[slot]
+            turned = RotationMatrix.MakeFromOneVector(contact.force, 2)
+            meshcat.SetTransform(path, RigidTransform(turned, contact.point), time_in_recording=time)
             meshcat.SetTransform(f"{path}/tip", RigidTransform([0.0, 0.0, length]), time_in_recording=time)
             meshcat.SetProperty(f"{path}/shaft", "scale", [1.0, 1.0, length], time_in_recording=time)
         meshcat.SetProperty(path, "visible", used, time_in_recording=time)
@@ -194,7 +192,7 @@ def _look_at(meshcat: Meshcat, scene: Scene) -> None:
 
 
 def _draw_grid(meshcat: Meshcat, scene: Scene) -> None:
-    """Lines a power of ten, or half of one, apart, on the ground or under the lowest point of the motion."""
+    """Lines on the ground, or under the lowest point of the motion, apart by half or a fifth of a power of ten."""
     low, high = scene.box
     grounds = [d.pose.translation()[2] for d in scene.shapes if isinstance(d.shape, HalfSpace)]
     below = 0.002 * scene.size

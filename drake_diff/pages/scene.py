@@ -1,4 +1,4 @@
-"""What is seen of a motion: shapes on bodies, where the bodies are over time, what pushes, and from where to look."""
+"""What is seen of a motion: shapes on bodies, where the bodies are over time, contact forces, and how large it is."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.geometry import (
     Box,
     Capsule,
@@ -31,16 +32,17 @@ from drake_diff.model.step import set_state
 
 DRAWN = (Box, Capsule, Convex, Cylinder, Ellipsoid, HalfSpace, Mesh, Sphere)
 GREY, BLUE = Rgba(0.6, 0.6, 0.62, 1), Rgba(0.15, 0.4, 0.95, 0.3)
-LOOKED_AT = 60  # poses of a motion that its bounding box is taken from
+BALL = 0.05  # [m] radius of what stands for a body without geometry
+LOOKED_AT = 60  # at most so many poses of a motion are looked at for its bounding box
 ARROW_PART = 0.2  # of the scene's size: how long the arrow of `Scene.reference_force` is
-SMALLEST_SIZE = 0.3  # [m] less is not zoomed in to
+SMALLEST_SIZE = 0.3  # [m] the camera comes no closer
 
 Poses = Mapping[str, Sequence[RigidTransform]]
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A shape on a body, or in the world where `body` is "": pose, colour, and a ball around it, centre and radius."""
+    """A shape on the body of that path, or in the world for ""; `centre` and `radius` [m] are of a ball around it."""
 
     body: str
     shape: Any
@@ -51,7 +53,7 @@ class Drawn:
 
 
 @dataclass(frozen=True)
-class Push:
+class ContactForce:
     """A contact force (3,) [N] at a point (3,) [m], in the world frame."""
 
     point: Array
@@ -60,9 +62,9 @@ class Push:
 
 @dataclass(frozen=True)
 class Ghost:
-    """Another motion of the same bodies at the same times, translucent; `name` is a path of Meshcat.
+    """Another motion of the same bodies at the same times, translucent; one that is not `framed` may leave the picture.
 
-    One that is not `framed` may leave the picture.
+    `name` is a path of Meshcat.
     """
 
     name: str
@@ -73,26 +75,26 @@ class Ghost:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A motion to be drawn: `poses` of every moving body at `times` (N+1,) [s], `pushes` of each of the N steps.
+    """A motion to be drawn: `poses` of every moving body at `times` (N+1,) [s], `forces` in each of the N steps.
 
-    `trail` (N+1, 3) [m] is the way of the point that is followed.
+    `trail` (N+1, 3) [m] is the path of the point that is followed.
     """
 
     shapes: tuple[Drawn, ...]
     times: Array
     poses: Poses
     ghosts: tuple[Ghost, ...]
-    pushes: tuple[tuple[Push, ...], ...]
+    forces: tuple[tuple[ContactForce, ...], ...]
     trail: Array
 
     @cached_property
     def box(self) -> tuple[Array, Array]:
         """The lowest and highest corner (3,) of the box that holds the motion and the framed ghosts."""
         lows, highs = [np.min(self.trail, axis=0)], [np.max(self.trail, axis=0)]
+        motions = [self.poses, *(ghost.poses for ghost in self.ghosts if ghost.framed)]
         for drawn in self.shapes:
-            for poses in (
-                motion.get(drawn.body, ()) for motion in (self.poses, *(g.poses for g in self.ghosts if g.framed))
-            ):
+            for motion in motions:
+                poses = motion.get(drawn.body, ())
                 for pose in poses[:: max(1, len(poses) // LOOKED_AT)]:
                     centre = pose @ drawn.centre
                     lows.append(centre - drawn.radius)
@@ -107,8 +109,8 @@ class Scene:
 
     @cached_property
     def reference_force(self) -> float:
-        """[N] the force of an arrow of ARROW_PART of the size: nine tenths of all contact forces are no larger."""
-        sizes = [float(np.linalg.norm(push.force)) for step in self.pushes for push in step]
+        """[N] the force whose arrow is ARROW_PART of the size: nine tenths of all contact forces are no larger."""
+        sizes = [float(np.linalg.norm(contact.force)) for step in self.forces for contact in step]
         pushing = [size for size in sizes if size > 0]
         return float(np.quantile(pushing, 0.9)) if pushing else 1.0
 
@@ -122,12 +124,25 @@ def scene_of(
     ghosts: Mapping[str, tuple[Array, Rgba]] | None = None,
     frame: str | None = None,
 ) -> Scene:
-    """The scene of the motion `xs` (N+1, nx) at `times` (N+1,), with `ghosts`: states (N+1, nx) and colour by name.
+    """The scene of a motion of `model`.
 
-    A ghost that would hide behind the motion is left out. `frame` is the name of the frame or body whose origin
-    leaves a trail; without it, the centre of mass that moves most. UnknownNameError where there is no such frame.
+    Args:
+        model: Whose bodies move.
+        times: (N+1,) [s].
+        xs: (N+1, nx) the states at those times.
+        contacts: The contacts in each of the N steps, drawn as arrows.
+        ghosts: States (N+1, nx) and colour by name; a ghost that would hide behind the motion is left out.
+        frame: The name of the frame or body whose origin leaves a trail; by default the centre of mass that moves most.
+
+    Raises:
+        UnknownNameError: If there is no such frame.
     """
     poses = poses_of(model, xs)
+    if frame is None:
+        centres = {body_path(body): np.asarray(body.default_com()) for body in moving_bodies(model.plant)}
+        trail = longest_path(poses, centres)
+    else:
+        trail = _path_of(model, xs, frame)
     return Scene(
         shapes=tuple(shapes_of(model.plant, model.double.context)),
         times=times,
@@ -137,8 +152,8 @@ def scene_of(
             for name, (ghost_xs, colour) in (ghosts or {}).items()
             if not np.array_equal(ghost_xs, xs)
         ),
-        pushes=tuple(tuple(Push(c.point, c.force) for c in step) for step in contacts),
-        trail=longest_way(model.plant, poses) if frame is None else _way_of(model, xs, frame),
+        forces=tuple(tuple(ContactForce(c.point, c.force) for c in step) for step in contacts),
+        trail=trail,
     )
 
 
@@ -158,22 +173,21 @@ def moving_bodies(plant: Any) -> list[Any]:
     return [body for body in bodies(plant) if not plant.IsAnchored(body)]
 
 
-def longest_way(plant: Any, poses: Poses) -> Array:
-    """(N+1, 3) of the centre of mass that moves most."""
-    coms = {body_path(body): body.default_com() for body in moving_bodies(plant)}
-    ways = [np.array([pose @ coms[path] for pose in found]) for path, found in poses.items()]
-    return max(ways, key=lambda way: float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()))
+def longest_path(poses: Poses, centres: Mapping[str, Array]) -> Array:
+    """(N+1, 3) the path of that of `centres`, (3,) [m] on each body, that moves most."""
+    paths = [np.array([pose @ centres[name] for pose in found]) for name, found in poses.items()]
+    return max(paths, key=lambda path: float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()))
 
 
-def _way_of(model: Model, xs: Array, name: str) -> Array:
+def _path_of(model: Model, xs: Array, name: str) -> Array:
     known = {f.name(): f for f in (model.plant.get_frame(FrameIndex(i)) for i in range(model.plant.num_frames()))}
     if name not in known:
         raise UnknownNameError("frame", got=name, known=tuple(known))
-    way = []
+    path = []
     for x in xs:
         set_state(model.double, x)
-        way.append(known[name].CalcPoseInWorld(model.double.context).translation())
-    return np.array(way)
+        path.append(known[name].CalcPoseInWorld(model.double.context).translation())
+    return np.array(path)
 
 
 def shapes_of(plant: Any, context: Any) -> list[Drawn]:
@@ -186,20 +200,17 @@ def shapes_of(plant: Any, context: Any) -> list[Drawn]:
             frame = plant.GetBodyFrameIdIfExists(body.index())
             if frame is not None:
                 shapes = _shapes_on(inspector, frame, body_path(body))
-                fixed = plant.IsAnchored(body)
-                found += [_in_world(s, plant.EvalBodyPoseInWorld(context, body)) for s in shapes] if fixed else shapes
-    if found:
-        return found
-    return [_ball(body) for body in moving_bodies(plant)]
+                if plant.IsAnchored(body):
+                    pose = plant.EvalBodyPoseInWorld(context, body)
+                    shapes = [replace(s, body="", pose=pose @ s.pose, centre=pose @ s.centre) for s in shapes]
+                found += shapes
+    return found or [ball(body_path(body), body.default_com()) for body in moving_bodies(plant)]
 
 
-def _in_world(drawn: Drawn, pose: RigidTransform) -> Drawn:
-    return replace(drawn, body="", pose=pose @ drawn.pose, centre=pose @ drawn.centre)
-
-
-def _ball(body: Any) -> Drawn:
-    com = np.asarray(body.default_com())
-    return Drawn(body_path(body), Sphere(0.05), RigidTransform(com), GREY, com, 0.05)
+def ball(path: str, centre: ArrayLike = (0.0, 0.0, 0.0)) -> Drawn:
+    """What stands for a body without geometry, at `centre` (3,) [m] on it."""
+    at = np.asarray(centre, dtype=float)
+    return Drawn(path, Sphere(BALL), RigidTransform(at), GREY, at, BALL)
 
 
 def _shapes_on(inspector: Any, frame: Any, path: str) -> list[Drawn]:
@@ -213,7 +224,7 @@ def _shapes_on(inspector: Any, frame: Any, path: str) -> list[Drawn]:
 
 
 def _drawn(inspector: Any, geometry: Any, role: Role, path: str) -> Drawn | None:
-    """A geometry as it is drawn; None where its file is no mesh that can be read, which the model's notes tell."""
+    """A geometry as it is drawn; None where its mesh cannot be read, which the model's notes tell."""
     colour, pose = GREY, inspector.GetPoseInFrame(geometry)
     if role == Role.kIllustration:
         colour = inspector.GetIllustrationProperties(geometry).GetPropertyOrDefault("phong", "diffuse", GREY)
@@ -227,5 +238,10 @@ def _drawn(inspector: Any, geometry: Any, role: Role, path: str) -> Drawn | None
 
 
 def body_path(body: Any) -> str:
+    """The path of a body in Meshcat."""
+    return meshcat_path(int(body.index()), body.name())
+
+
+def meshcat_path(index: int, name: str) -> str:
     """A path of Meshcat that no name can break out of; the index keeps it unique."""
-    return f"{int(body.index())}_" + re.sub(r"[^A-Za-z0-9_.-]", "_", body.name())
+    return f"{index}_" + re.sub(r"[^A-Za-z0-9_.-]", "_", name)
