@@ -322,3 +322,69 @@ def test_meshes_of_packages_folders_and_included_models_are_found(tmp_path):
         found = named_files(tmp_path / "robot" / name)
         assert [file.reason for file in found] == [None], name
         assert found[0].bytes in (1, 6)
+
+
+PLAN_METRICS = [
+    "cost",
+    "defect",
+    "goal error",
+    "bound violation",
+    "initial state error",
+    "constraint violation",
+    "horizon",
+]
+REPLAY_METRICS = ["replay end error", "half-step end error", "energy drift", "energy oscillation", "energy scale"]
+REPLAY_METRICS += ["penetration", "joint limit violation"]
+COLLOCATION_METRICS = ["integration error", "state excess between nodes", "input excess between nodes"]
+
+
+def test_a_record_has_exactly_these_metrics_and_invariants(record):
+    assert [m.name for m in record.metrics] == [*PLAN_METRICS, *REPLAY_METRICS]
+    collocated = measure(dd.solve(pendulum(), method="collocation"))
+    assert [m.name for m in collocated.metrics] == [*PLAN_METRICS, *COLLOCATION_METRICS, *REPLAY_METRICS]
+    names = ["free-motion energy drift", "free-motion energy oscillation", "linear momentum error"]
+    names += ["angular momentum error", "penetration", "limit violation", "friction-cone excess"]
+    assert [m.name for m in record.invariants] == [m.name for m in collocated.invariants] == names
+
+
+@pytest.mark.parametrize("coordinate", range(13))
+def test_one_coordinate_of_the_last_state_that_is_off_is_the_end_error(thrown, coordinate):
+    xs = np.array(thrown.replay.xs)
+    xs[-1, coordinate] = thrown.xs[-1, coordinate] + 0.25
+    found = {m.name: m.value for m in measure(with_replay(thrown, xs=xs)).metrics}
+    assert found["replay end error"] == pytest.approx(0.25, rel=1e-12)
+
+
+DAMPED = """<robot name="damped"><link name="l"><inertial><mass value="2"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="j" type="prismatic"><parent link="world"/><child link="l"/><axis xyz="1 0 0"/>
+<limit effort="9" lower="-99" upper="99" velocity="99"/><dynamics damping="0.5"/></joint></robot>"""
+
+
+def test_all_the_energy_that_damping_takes_is_counted(tmp_path):
+    """A mass of 2 kg on a damped, level slide: m v^2 / 2 becomes dissipation, and nothing is left over."""
+    (tmp_path / "damped.urdf").write_text(DAMPED)
+    model = dd.load_model(tmp_path / "damped.urdf", time_step=0.02)
+    problem = dd.Problem(model, x0=[0, 3.0], num_steps=200, final_cost=lambda x: x[0], optimize="initial_state")
+    motion = dd.rollout(model, [0, 3.0], num_steps=200)
+    lost = 9.0 - motion.xs[-1, 1] ** 2  # J: m / 2 is 1 kg
+    assert lost > 5
+    assert motion.dissipation[-1] == pytest.approx(lost, rel=1e-12)
+    solution = dd.Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", motion.xs, motion.us)
+    for part, drift in ((1.0, 0.0), (0.999, 1e-3)):
+        other = with_replay(solution, dissipation=part * motion.dissipation)
+        found = {m.name: m.value for m in measure(other).metrics}
+        # What is missing grows with the dissipation: its drift is between half of the end's and all of it.
+        assert 0.5 * drift * lost - 1e-12 <= abs(found["energy drift"]) <= drift * lost + 1e-12
+
+
+def test_records_print_in_a_few_lines_and_their_text_is_escaped(record):
+    lines = repr(record).splitlines()
+    assert lines[0] == "EvidenceRecord pendulum: pass"
+    assert len(lines) < 8
+    assert str(record) == f"pendulum: pass, {record.sentence}"
+    evil = record.model_copy(update={"name": "<script>", "sentence": "<b>"})
+    assert "<script>" not in evil._repr_html_()
+    assert "&lt;script&gt;" in evil._repr_html_()
+    certified = dd.record.certify_model(pendulum().model, states=2)
+    assert "states: 2 agree" in repr(certified)

@@ -1,5 +1,6 @@
 """`verify`: whatever is changed in a run directory is found, a lie in a whole one too, and nothing else is refused."""
 
+import dataclasses
 import json
 import os
 import random
@@ -17,9 +18,12 @@ from helpers.models import MODELS, ROOT
 
 import drake_diff as dd
 import drake_diff.artifact.save as evidence
+from drake_diff.artifact import measure
 from drake_diff.artifact.listing import list_runs
 from drake_diff.artifact.save import begin
+from drake_diff.artifact.trace import write_trace
 from drake_diff.exceptions import ArtifactError
+from drake_diff.record.sealed import reproducible
 from drake_diff.record.solve import EvidenceRecord
 
 FILES = ("plan.npz", "record.json", "record.schema.json", "replay.html", "trace.mcap")
@@ -209,6 +213,27 @@ def test_a_whole_artifact_that_lies_is_found_by_running_it_again(
     found = dd.verify(tmp_path / "run")
     assert found.verdict == "broken"
     assert any(words in complaint for complaint in found.complaints), found.complaints
+
+
+@pytest.mark.parametrize("row", [0, 7, 20])
+def test_a_forged_motion_in_the_trace_is_found_although_all_hashes_are_right(solution, copy, row):
+    record, measurement = dd.load_record(copy), measure(solution)
+    xs = np.array(measurement.motion.xs)
+    xs[row, 1] += 1e-3
+    forged = dataclasses.replace(measurement, motion=dataclasses.replace(measurement.motion, xs=xs))
+    attached = reproducible(record.model_dump(mode="json")).encode()
+    write_trace(copy / "trace.mcap", forged, {"record.json": ("application/json", attached)})
+    record.write(copy)
+    (complaint,) = dd.verify(copy).complaints
+    assert complaint.startswith("trace.mcap: /state, its largest distance from the motion run again: recorded 0")
+
+
+def test_a_verification_prints_what_it_found(run, copy):
+    assert repr(dd.verify(run)).splitlines()[0] == f"Verification of {run}: holds"
+    (copy / "<b>").write_text("x")
+    found = dd.verify(copy)
+    assert "<b>: record.json does not list it" in repr(found)
+    assert "<li>&lt;b&gt;: record.json" in found._repr_html_()
 
 
 def test_a_plan_of_another_run_is_found_although_all_hashes_are_right(run, other_run, copy):
