@@ -224,6 +224,44 @@ def test_collocation_keeps_plan_and_replay_apart(collocated, tmp_path):
     assert np.abs(trace.xs - trace.planned_xs).max() > 1e-3  # another integrator, open loop
 
 
+def test_plain_dynamics_are_saved_and_what_cannot_be_known_is_said(tmp_path):
+    """A block pushed by u: x'' = u, one unit in one second at least effort costs 12."""
+    block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1, state_names=["place", "speed"])
+    cost = dd.QuadraticCost(R=[[1.0]])
+    problem = dd.Problem(block, x0=[0, 0], x_goal=[1, 0], num_steps=10, horizon=1.0, running_cost=cost)
+    solution = dd.solve(problem)
+    record = dd.save(solution, tmp_path / "run")
+    assert (record.verdict, record.contract, record.model.file) == ("pass", {}, None)
+    assert sorted(record.files) == ["plan.npz", "record.schema.json", "report.html", "trace.mcap"]
+    metrics = {m.name: m.value for m in record.metrics}
+    assert metrics["cost"] == pytest.approx(12, rel=1e-6)
+    assert metrics["open-loop end error"] < 1e-6  # two integrators: a cubic, which RK is exact for
+    assert "energy drift" not in metrics
+    assert record.invariants == []
+    assert [(v.name, v.unit) for v in record.observation.variables] == [("place", "unknown"), ("speed", "unknown")]
+    trace = read_trace(tmp_path / "run" / "trace.mcap")
+    assert trace.planned_xs.tobytes() == solution.xs.tobytes()
+    assert trace.xs.shape == (0, 2)
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "there is no body to draw" in page
+    assert "plain dynamics" in page
+    found = dd.verify(tmp_path / "run")
+    assert (found.verdict, found.complaints) == ("undecided", ())
+    assert "function, which no artifact can hold" in str(found)
+
+
+def test_a_refined_mesh_comes_back_and_is_measured_at_the_problem_s_own_knots(swing_up, tmp_path):
+    solution = dd.solve(swing_up.problem, method="collocation", refine=True, error_tolerance=1e-9)
+    assert len(solution.mesh) == len(solution.xs) > 41
+    record = dd.save(solution, tmp_path / "run")
+    trace = read_trace(tmp_path / "run" / "trace.mcap")
+    assert trace.plan["mesh"].tobytes() == solution.mesh.tobytes()
+    assert trace.times.tobytes() == solution.times.tobytes()
+    assert len(trace.xs) == 41
+    assert dd.verify(tmp_path / "run").require().holds
+    assert record.problem["num_steps"] == 40
+
+
 def test_the_replay_is_one_offline_page(run):
     page = (run / "replay.html").read_text()
     assert len(page) > 2_000_000  # the viewer is inside: a wheel without it shipped once

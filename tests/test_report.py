@@ -15,6 +15,7 @@ from helpers.models import MODELS
 from pydrake.planning import RobotDiagramBuilder
 
 import drake_diff as dd
+from drake_diff.artifact import measure
 from drake_diff.artifact.live import scene_of_run, serve
 from drake_diff.artifact.page import report_data
 from drake_diff.exceptions import ArtifactError, UnknownNameError
@@ -205,7 +206,7 @@ def test_a_run_without_a_replay_does_not_claim_one(runs):
 
 
 def test_plots_hold_what_was_measured(swing_up):
-    plots = {plot["title"]: plot for plot in report_data(swing_up)["plots"]}
+    plots = {plot["title"]: plot for plot in report_data(measure(swing_up))["plots"]}
     assert plots["positions"]["series"][0]["y"] == pytest.approx(swing_up.replay.xs[:, 0], abs=1e-7)  # eight digits
     assert plots["input motor"]["limits"] == [-30.0, 30.0]
     assert plots["energy"]["series"][2]["y"] == pytest.approx(swing_up.replay.energy, rel=1e-7, abs=1e-9)

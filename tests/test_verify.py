@@ -359,7 +359,7 @@ def test_a_model_from_a_diagram_cannot_be_run_again(solution, tmp_path):
     dd.save(swing_up(model), tmp_path / "run")
     found = dd.verify(tmp_path / "run")
     assert found.verdict == "undecided"
-    assert "not run again: the model is a user's own diagram" in str(found)
+    assert "not run again: the system is a user's own diagram" in str(found)
 
 
 def test_a_users_constraint_is_undecided_and_a_users_cost_is_told(tmp_path):

@@ -7,22 +7,39 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import Any
 
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.artifact.invariants import ON_THE_PLANT, invariants_of
+from drake_diff.artifact.sections import UNKNOWN
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
-from drake_diff.motion.rollout import Rollout
+from drake_diff.model.contact import thinnest_geometry
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import ParameterVector, applied
+from drake_diff.model.plant import FLOATING, bodies, joints
+from drake_diff.model.step import set_state
+from drake_diff.motion.rollout import Rollout, drift, smooth_mean
+from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
-from drake_diff.optimize.replay import Replay
+from drake_diff.optimize.replay import PENETRATION_PART, Replay
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
 from drake_diff.optimize.transcription.motion import violation_between_nodes
-from drake_diff.record.parts import Event, Failure, Label, Metric, measured
+from drake_diff.record.parts import Event, Failure, Label, Metric
 from drake_diff.record.solve import ReplayEvidence
 
 AT_LIMIT = 1e-3  # of a limit: so close to it an input counts as there; interior points never quite reach it
+ON_THE_PLANT = "in the open-loop replay on the discrete plant"
 NO_REPLAY = "the discrete plant could not be stepped along these inputs"
+INVARIANTS = {
+    "free-motion energy drift": "J",
+    "free-motion energy oscillation": "J",
+    "linear momentum error": "N s",
+    "angular momentum error": "N m s",
+    "penetration": "m",
+    "limit violation": "",  # the positions' own
+    "friction-cone excess": "N",
+}
 FAILURES: dict[Status, tuple[Label, str]] = {
     Status.CONVERGED_NOT_VERIFIED: ("planning_error", "not_verified"),
     Status.ITERATION_LIMIT: ("planning_error", "solver_iteration_limit"),
@@ -52,7 +69,10 @@ class Measurement:
     Attributes:
         solution: The plan, and how the solver came to it.
         positions, velocities, inputs: The columns of its states and inputs.
+        times, xs, us: (N+1,), (N+1, nx), and (N, nu) or (N+1, nu): the plan at the problem's own knots.
         motion: The plant's own motion under the planned inputs; None where it could not be taken.
+        integrated: (N+1, nx) where the equations lead from the first state, for a plan in continuous time.
+        penetration_limit: [m] how deep two geometries may overlap; `thinnest` is the geometry that decides it.
         replays: The plan in every variant of the plant.
         metrics: Every measure of the plan and of its replay; those with a tolerance decide.
         invariants: What physics keeps along the replay.
@@ -64,8 +84,14 @@ class Measurement:
     positions: tuple[Column, ...]
     velocities: tuple[Column, ...]
     inputs: tuple[Column, ...]
+    times: Array
+    xs: Array
+    us: Array
     motion: Rollout | None
+    integrated: Array | None
     replays: tuple[Replay, ...]
+    penetration_limit: float
+    thinnest: str
     metrics: tuple[Metric, ...]
     invariants: tuple[Metric, ...]
     failures: tuple[Failure, ...]
@@ -111,37 +137,50 @@ def measure(solution: Solution) -> Measurement:
 
 
 def _measure(solution: Solution) -> Measurement:
-    problem = solution.problem
-    contract, bounds = problem.model.contract, problem.bounds
-    limits = (
-        np.array([bounds.x_lower, bounds.x_upper]).T.tolist(),
-        np.array([bounds.u_lower, bounds.u_upper]).T.tolist(),
-    )
-    states = [
-        Column(c.name, c.unit, *limit)
-        for c, limit in zip(contract.positions + contract.velocities, limits[0], strict=True)
-    ]
-    count = len(contract.positions)
-    positions, velocities = tuple(states[:count]), tuple(states[count:])
-    inputs = tuple(Column(c.name, c.unit, *limit) for c, limit in zip(contract.inputs, limits[1], strict=True))
-    motion = solution.replay
-    metrics = (
-        *_metrics_of_the_plan(solution, states, inputs),
-        *_metrics_of_the_replay(solution, motion, states, positions),
-    )
+    problem, motion, knots = solution.problem, solution.replay, solution.knots
+    positions, velocities, inputs = _columns(problem)
+    states = (*positions, *velocities)
+    metrics = [*_metrics_of_the_plan(solution, states, inputs)]
+    invariants: list[Metric] = []
+    limit, thinnest = math.inf, ""
+    if problem.has_model:
+        metrics += _metrics_of_the_replay(solution, motion, states, positions)
+        invariants += _invariants(solution.vector, motion, _unit(positions))
+        limit, thinnest = thinnest_geometry(problem.model)
     failures = tuple(_failures(solution, metrics))
+    us = solution.inputs_at_knots
     return Measurement(
         solution=solution,
         positions=positions,
         velocities=velocities,
         inputs=inputs,
+        times=solution.times[knots],
+        xs=solution.xs[knots],
+        us=us if len(us) == problem.num_steps else us[knots],
         motion=motion,
+        integrated=None if solution.integrated is None else solution.integrated[knots],
         replays=solution.replays,
-        metrics=metrics,
-        invariants=tuple(invariants_of(solution.vector, motion, _unit(positions), NO_REPLAY)),
+        penetration_limit=PENETRATION_PART * limit,
+        thinnest=thinnest,
+        metrics=tuple(metrics),
+        invariants=tuple(invariants),
         failures=failures,
         events=tuple(_events(solution, motion, failures)),
     )
+
+
+def _columns(problem: Problem) -> tuple[tuple[Column, ...], ...]:
+    """(positions, velocities, inputs); all states of plain dynamics are positions, and their units are not known."""
+    b = problem.bounds
+    names = (*problem.state_names, *problem.input_names)
+    units, count = [UNKNOWN] * len(names), problem.nx
+    if problem.has_model:
+        contract = problem.model.contract
+        units = [c.unit for c in contract.positions + contract.velocities + contract.inputs]
+        count = problem.model.nq
+    limits = zip(np.append(b.x_lower, b.u_lower).tolist(), np.append(b.x_upper, b.u_upper).tolist(), strict=True)
+    found = tuple(Column(name, unit, *pair) for name, unit, pair in zip(names, units, limits, strict=True))
+    return found[:count], found[count : problem.nx], found[problem.nx :]
 
 
 def _unit(columns: Sequence[Column]) -> str:
@@ -154,7 +193,7 @@ def _metrics_of_the_plan(solution: Solution, states: Sequence[Column], inputs: S
     units = [c.unit for c in (*states, *inputs)] + [p.unit for p in solution.vector.parameters]
     bounded = " or ".join(dict.fromkeys(units))
     worst = int(np.argmax(solution.defects)) if len(solution.defects) else 0
-    when = float(solution.times[worst])
+    when = float(solution.times[min(worst, len(solution.times) - 1)])
     yield measured("cost", "objective of the states and inputs as the problem defines it", solution.cost, "1")
     yield measured(
         "defect", "largest distance from the dynamics over one step", solution.defect, x, tolerance, t_s=when
@@ -175,6 +214,9 @@ def _metrics_of_the_plan(solution: Solution, states: Sequence[Column], inputs: S
     for name, value, unit in (("state", between.state, x), ("input", between.input, _unit(inputs))):
         definition = f"largest excess of the {name} over its bounds between the nodes, where no solver keeps them"
         yield measured(f"{name} excess between nodes", definition, value, unit)
+    if solution.integrated is not None and not solution.problem.has_model:
+        definition = "largest distance of the final state from where the equations lead from the first, unstable or not"
+        yield measured("open-loop end error", definition, _largest(solution.integrated[-1] - solution.xs[-1]), x)
 
 
 def _metrics_of_the_replay(
@@ -199,7 +241,7 @@ def _metrics_of_the_replay(
             yield measured(name, definition, float("inf"), unit, reason=NO_REPLAY)
         return
     values = (
-        float(np.abs(motion.xs[-1] - solution.xs[-1]).max()),
+        _largest(motion.xs[-1] - solution.xs[-1]),
         solution.half_step_error,
         motion.energy_drift,
         motion.energy_oscillation,
@@ -209,6 +251,10 @@ def _metrics_of_the_replay(
     )
     for (name, definition, unit), value in zip(measures, values, strict=True):
         yield measured(name, definition, value, unit)
+
+
+def _largest(distance: Array) -> float:
+    return float(np.abs(distance).max())
 
 
 def _failures(solution: Solution, metrics: Sequence[Metric]) -> Iterator[Failure]:
@@ -302,3 +348,161 @@ def _saturation_events(solution: Solution, motion: Rollout) -> Iterator[Event]:
                 kind="saturation_begins" if at_limit[k] else "saturation_ends",
                 message=message,
             )
+
+
+def measured(
+    name: str,
+    definition: str,
+    value: float,
+    unit: str,
+    tolerance: float | None = None,
+    *,
+    reason: str = "not finite",
+    t_s: float | None = None,
+) -> Metric:
+    """A metric that is to be at most `tolerance`, or that informs; `reason` is why where `value` is not finite."""
+    finite = math.isfinite(value)
+    return Metric(
+        name=name,
+        definition=definition,
+        unit=unit,
+        value=float(value) if finite else None,
+        reason=None if finite else reason,
+        tolerance=tolerance,
+        direction="info" if tolerance is None else "at_most",
+        verdict="info" if tolerance is None else "pass" if value <= tolerance else "fail",
+        t_s=t_s if finite else None,
+    )
+
+
+def _invariants(vector: ParameterVector, motion: Rollout | None, unit: str) -> Iterator[Metric]:
+    """Each invariant along the replay; null with a reason where it does not apply.
+
+    `vector` has the parameters' values that the motion is of, `unit` is that of the positions.
+    """
+    if motion is None:
+        for name, own in INVARIANTS.items():
+            yield measured(name, ON_THE_PLANT, np.inf, own or unit, reason=NO_REPLAY)
+        return
+    free = _free_steps(vector.model, motion)
+    yield from _energy(motion, free)
+    yield from _momentum(vector, motion, free)
+    yield _worst("penetration", f"largest overlap of two geometries {ON_THE_PLANT}", "m", motion, motion.penetration)
+    yield _worst(
+        "limit violation",
+        f"largest excess over a joint limit, or of a quaternion's norm over 1, {ON_THE_PLANT}",
+        unit,
+        motion,
+        motion.constraint_violation,
+        reason="the plant has constraints (couplers, balls, welds), whose violation pydrake does not tell",
+    )
+    yield _friction_cone(vector, motion)
+
+
+def _worst(name: str, definition: str, unit: str, motion: Rollout, values: Array, reason: str = "not finite") -> Metric:
+    worst = int(np.argmax(values))
+    when = float(motion.times[worst])
+    return measured(name, definition, float(values[worst]), unit, reason=reason, t_s=when)
+
+
+def _free_steps(model: Model, motion: Rollout) -> int:
+    """How many steps from the start there is neither contact nor a joint limit in the way."""
+    lower, upper = model.plant.GetPositionLowerLimits(), model.plant.GetPositionUpperLimits()
+    positions = motion.xs[:, : model.nq]
+    beyond = np.any((positions <= lower) | (positions >= upper), axis=1)
+    held = np.array([bool(c) for c in motion.contacts]) | beyond[1:]  # a limit is implicit: it acts before it is met
+    return int(np.argmax(held)) if held.any() else len(held)
+
+
+def _energy(motion: Rollout, free: int) -> Iterator[Metric]:
+    """Of the first, free part: what neither actuators nor damping explain, drift apart from oscillation."""
+    error = motion.energy_error[: free + 1]
+    part = f"over the {free} steps from the start without contact, {ON_THE_PLANT}"
+    names = list(INVARIANTS)[:2]
+    definitions = (
+        f"lasting part of the energy that neither actuators nor damping explain, {part}",
+        f"largest distance of that energy from its drift line, {part}",
+    )
+    lasting, swing = float("inf"), float("inf")
+    if free > 0:
+        lasting = drift(error)
+        swing = float(np.abs(error - smooth_mean(error) - lasting * np.linspace(-0.5, 0.5, len(error))).max())
+    for name, definition, value in zip(names, definitions, (lasting, swing), strict=True):
+        yield measured(name, definition, value, "J", reason="there is contact, or a limit, from the first step on")
+
+
+def _momentum(vector: ParameterVector, motion: Rollout, free: int) -> Iterator[Metric]:
+    """Of a system that nothing holds to the world: momentum less what gravity gave, and spin about the mass centre."""
+    definitions = {
+        "linear momentum error": "largest change of the linear momentum beyond gravity's, in free motion",
+        "angular momentum error": "largest change of the angular momentum about the centre of mass, in free motion",
+    }
+    reason = _why_not_conserved(vector.model, free)
+    values = (np.inf, np.inf)
+    if not reason:
+        with applied(vector) as model:
+            values = _momentum_errors(model, motion, free)
+    for (name, definition), value in zip(definitions.items(), values, strict=True):
+        yield measured(name, definition, value, INVARIANTS[name], reason=reason or "not finite")
+
+
+def _why_not_conserved(model: Model, free: int) -> str:
+    """Why momentum is not conserved in this model; empty where it is."""
+    for joint in joints(model.plant):
+        holds = model.plant.IsAnchored(joint.parent_body()) and not model.plant.IsAnchored(joint.child_body())
+        if holds and joint.type_name() not in FLOATING:
+            return f"{joint.name()} holds the model to the world, which takes up momentum"
+        if joint.type_name() in FLOATING and np.any(np.asarray(joint.default_damping_vector()) != 0):
+            return f"{joint.name()} is damped, which takes momentum away"
+    return "" if free > 0 else "there is contact, or a limit, from the first step on"
+
+
+def _momentum_errors(model: Model, motion: Rollout, free: int) -> tuple[float, float]:
+    plant, context = model.plant, model.double.context
+    linear, angular = [], []
+    moving = [body for body in bodies(plant) if not plant.IsAnchored(body)]
+    masses = np.array([body.get_mass(context) for body in moving])
+    for x in motion.xs[: free + 1]:
+        set_state(model.double, x)
+        centres = [plant.EvalBodyPoseInWorld(context, b) @ b.CalcCenterOfMassInBodyFrame(context) for b in moving]
+        centre = masses @ np.array(centres) / masses.sum()
+        momentum = plant.CalcSpatialMomentumInWorldAboutPoint(context, centre)
+        linear.append(np.asarray(momentum.translational()))
+        angular.append(np.asarray(momentum.rotational()))
+    pull = masses.sum() * np.asarray(plant.gravity_field().gravity_vector())
+    change = np.array(linear) - linear[0] - motion.times[: free + 1, None] * pull
+    return float(np.abs(change).max()), float(np.abs(np.array(angular) - angular[0]).max())
+
+
+def _friction_by_body(model: Model) -> dict[str, float]:
+    """The coefficient of each body that has one for all its geometries."""
+    found: dict[str, set[Any]] = {}
+    for geometry in model.contract.geometries:
+        found.setdefault(geometry.body, set()).add(geometry.friction)
+    return {body: values.pop() for body, values in found.items() if len(values) == 1}
+
+
+def _combined(a: float | None, b: float | None) -> float | None:
+    """Drake's coefficient for two bodies, 2 a b / (a + b); None where one is not known."""
+    if a is None or b is None:
+        return None
+    return 2 * a * b / (a + b) if a + b else 0.0
+
+
+def _friction_cone(vector: ParameterVector, motion: Rollout) -> Metric:
+    """By how much a tangential contact force is larger than friction allows."""
+    name, definition = "friction-cone excess", f"largest |f_t| - mu f_n of a contact's force {ON_THE_PLANT}"
+    if any(parameter.name.endswith(".friction") for parameter in vector.parameters):
+        return measured(name, definition, np.inf, "N", reason="friction is a parameter here, not the contract's")
+    known, worst, when = _friction_by_body(vector.model), -np.inf, 0.0
+    for time, contacts in zip(motion.times, motion.contacts, strict=False):
+        for contact in contacts:
+            mu = _combined(known.get(contact.body_a), known.get(contact.body_b))
+            if mu is None:
+                pair = f"{contact.body_a} and {contact.body_b}"
+                return measured(name, definition, np.inf, "N", reason=f"the friction between {pair} is not one number")
+            push = float(contact.force @ contact.normal)
+            excess = float(np.linalg.norm(contact.force - push * contact.normal)) - mu * push
+            if excess > worst:
+                worst, when = excess, float(time)
+    return measured(name, definition, worst, "N", reason="nothing touches", t_s=when)

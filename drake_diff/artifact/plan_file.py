@@ -13,7 +13,7 @@ from drake_diff.exceptions import ArtifactError
 from drake_diff.optimize.solution import Solution
 
 PLAN = "plan.npz"
-ARRAYS = ("xs", "us", "us_mid", "u_final", "parameters", "free_horizon")
+ARRAYS = ("xs", "us", "us_mid", "u_final", "mesh", "parameters", "free_horizon")
 REQUIRED = ("xs", "us", "parameters")
 
 
@@ -25,6 +25,7 @@ class PlanArrays:
     us: Array
     us_mid: Array | None
     u_final: Array | None
+    mesh: Array | None
     parameters: Array
     free_horizon: float | None
 
@@ -32,7 +33,7 @@ class PlanArrays:
 def write_plan(path: Path, solution: Solution) -> None:
     """Write the arrays of `solution`: the same ones give the same bytes."""
     given: dict[str, Any] = {"xs": solution.xs, "us": solution.us, "parameters": solution.vector.values}
-    given |= {name: getattr(solution, name) for name in ("us_mid", "u_final", "free_horizon")}
+    given |= {name: getattr(solution, name) for name in ("us_mid", "u_final", "mesh", "free_horizon")}
     buffer = io.BytesIO()
     arrays: dict[str, Any] = {name: np.asarray(v, dtype=float) for name, v in sorted(given.items()) if v is not None}
     np.savez(buffer, **arrays)
@@ -57,6 +58,7 @@ def read_plan(path: Path) -> PlanArrays:
         us=found["us"],
         us_mid=found.get("us_mid"),
         u_final=found.get("u_final"),
+        mesh=found.get("mesh"),
         parameters=found["parameters"],
         free_horizon=None if horizon is None else float(horizon),
     )

@@ -33,7 +33,7 @@ def rebuilt(given: ModelInput, source: Any, attachments: dict[str, bytes] | None
     Raises ModelError, saying why, where it cannot be built again, ArtifactError where the artifact is damaged.
     """
     if given.file is None or given.options is None:
-        raise ModelError("the model is a user's own diagram, which no artifact can hold")
+        raise ModelError("the system is a user's own diagram or function, which no artifact can hold")
     if given.named or attachments is None:
         yield _load(_source_if_unchanged(given, Path(str(source))), given.options)
         return
@@ -76,7 +76,7 @@ def resolve(record: EvidenceRecord, model: Model, plan: PlanArrays) -> Solution:
     solver = record.solver
     if solver is None:
         raise ArtifactError("record.json: it has no solver")
-    count = record.problem.get("num_steps")
+    count = record.problem.get("num_steps") if plan.mesh is None else len(plan.mesh) - 1
     if plan.us.shape != (count, model.nu) or plan.xs.shape != (len(plan.us) + 1, model.nx):
         got = f"xs {plan.xs.shape}, us {plan.us.shape}"
         raise ArtifactError(f"{PLAN}: expected {count} steps of {model.nx} states and {model.nu} inputs, got {got}")
@@ -92,6 +92,7 @@ def resolve(record: EvidenceRecord, model: Model, plan: PlanArrays) -> Solution:
             scheme=solver.scheme,
             us_mid=plan.us_mid,
             u_final=plan.u_final,
+            mesh=plan.mesh,
             free_horizon=plan.free_horizon,
             parameters=plan.parameters,
         )

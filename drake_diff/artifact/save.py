@@ -44,7 +44,8 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
     Args:
         solution: A result of `solve`, of any status.
         directory: Where to write record.json, record.schema.json, plan.npz, trace.mcap, replay.html and report.html.
-            It is made where there is none; files of these names are replaced.
+            It is made where there is none; files of these names are replaced. Plain dynamics have nothing to draw
+            in 3D, and so no replay.html.
 
     Returns:
         The record that was written. Its verdict is "pass" only where the solver converged and every metric keeps its
@@ -67,13 +68,16 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
 
     folder = Path(directory)
     begin(folder, solution.problem)
+    write_plan(folder / PLAN, solution)
     measurement = measure(solution)
     record = record_of(measurement, folder)
     fields = record.model_dump(mode="json")
-    write_plan(folder / PLAN, solution)
     write_trace(folder / TRACE, measurement, {record.FILE: ("application/json", reproducible(fields).encode())})
-    write_replay(folder / REPLAY, _scene(measurement), title=f"{record.name}: {solution.status.value}")
-    write_report(folder / REPORT, solution, fields, folder / REPLAY)
+    view = ""
+    if solution.problem.has_model:
+        write_replay(folder / REPLAY, _scene(measurement), title=f"{record.name}: {solution.status.value}")
+        view = (folder / REPLAY).read_text(encoding="utf-8")
+    write_report(folder / REPORT, measurement, fields, view)
     return record.write(folder)
 
 
@@ -114,11 +118,9 @@ def _scene(m: Measurement) -> Any:
     """The plant's motion, beside that of a plan in continuous time; the plan alone where it could not be stepped."""
     from drake_diff.pages.scene import BLUE, scene_of
 
-    solution, motion = m.solution, m.motion
+    model, motion = m.solution.problem.model, m.motion
     if motion is None:  # a page cannot show nothing: states that are not finite are drawn at x0
-        finite = np.all(np.isfinite(solution.xs), axis=1)
-        return scene_of(
-            solution.problem.model, solution.times, np.where(finite[:, None], solution.xs, solution.problem.x0)
-        )
-    ghosts = {"plan": (solution.xs, BLUE)} if solution.transcribed is not None else None
-    return scene_of(solution.problem.model, solution.times, motion.xs, contacts=motion.contacts, ghosts=ghosts)
+        finite = np.all(np.isfinite(m.xs), axis=1)
+        return scene_of(model, m.times, np.where(finite[:, None], m.xs, m.solution.problem.x0))
+    ghosts = {"plan": (m.xs, BLUE)} if m.solution.transcribed is not None else None
+    return scene_of(model, m.times, motion.xs, contacts=motion.contacts, ghosts=ghosts)

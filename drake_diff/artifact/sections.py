@@ -17,7 +17,7 @@ from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
-from drake_diff.record.parts import Quantity
+from drake_diff.record.parts import ModelInput, Quantity
 from drake_diff.record.provenance import gradient_evidence, model_input
 from drake_diff.record.solve import (
     ActionInterface,
@@ -69,11 +69,12 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
     """The problem for a record; functions by their names."""
     b = problem.bounds
     return {
+        "system": problem.name,
         "num_steps": problem.num_steps,
-        "time_step_s": problem.model.time_step,
-        "horizon_s": problem.num_steps * problem.model.time_step,
-        "state_names": list(problem.model.state_names),
-        "input_names": list(problem.model.input_names),
+        "time_step_s": problem.time_step,
+        "horizon_s": problem.start_horizon,
+        "state_names": list(problem.state_names),
+        "input_names": list(problem.input_names),
         "x0": finite_list(problem.x0),
         "x_goal": finite_list(problem.goal),
         "waypoints": {str(k): finite_list(x) for k, x in problem.waypoints.items()},
@@ -178,6 +179,7 @@ def _rebuild_cost(cost: Any) -> Any:
     return QuadraticCost(**cost["QuadraticCost"])
 
 
+UNKNOWN = "unknown"  # the unit of a number of plain dynamics
 LIMITATIONS = [
     "of the model in simulation only: nothing here was measured on a robot",
     "a cost is that of a local optimum at best",
@@ -189,21 +191,21 @@ GUESS = ("initial_guess", "initial_guess_sha256")
 
 def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
     """The sections that are known when a run begins; with its `solution` those that it decides are exact."""
-    time_step = problem.model.time_step if solution is None else solution.time_step
+    time_step = problem.time_step if solution is None else solution.time_step
     options = {} if solution is None else solution.options
     return {
         "claim": _claim(problem),
-        "model": model_input(problem.model),
         "inputs": Inputs(
             initial_guess=str(options.get("initial_guess", "not known yet")),
             initial_guess_sha256=options.get("initial_guess_sha256"),
             seed=int(options["seed"]) if "seed" in options else None,
         ),
         "problem": describe_problem(problem),
-        "contract": problem.model.contract.to_dict(),
+        "contract": problem.model.contract.to_dict() if problem.has_model else {},
         "units": UNITS,
         "observation": _observation(problem, time_step),
         "action": _action(problem, time_step, options.get("time_limit")),
+        "model": model_input(problem.model) if problem.has_model else ModelInput(file=None, options=None),
     }
 
 
@@ -215,8 +217,9 @@ def found(solution: Solution) -> dict[str, Any]:
 def _claim(problem: Problem) -> Claim:
     """What a run of this problem says is true when its verdict is "pass"."""
     goal = "" if np.all(np.isnan(problem.goal)) else " and ends in x_goal"
+    equations = "Drake's equations" if problem.has_model else "the given equations"
     statement = (
-        f"{problem.model.name}, by Drake's equations, starts in x0{goal} after {problem.num_steps} intervals, and "
+        f"{problem.name}, by {equations}, starts in x0{goal} after {problem.num_steps} intervals, and "
         f"keeps bounds and constraints at every knot; optimized: {', '.join(problem.optimize)}"
     )
     return Claim(statement=statement, limitations=LIMITATIONS)
@@ -224,10 +227,13 @@ def _claim(problem: Problem) -> Claim:
 
 def _observation(problem: Problem, time_step: float) -> Observation:
     """The state as it is observed: exactly, at every step."""
-    contract, frames = problem.model.contract, _frames(problem.model)
+    units, frames = [UNKNOWN] * problem.nx, ["none: plain dynamics"] * problem.nx
+    if problem.has_model:
+        contract = problem.model.contract
+        units, frames = [x.unit for x in contract.positions + contract.velocities], _frames(problem.model)
     variables = [
-        ObservedVariable(name=x.name, unit=x.unit, frame=frame, uncertainty=_exact(x.unit))
-        for x, frame in zip(contract.positions + contract.velocities, frames, strict=True)
+        ObservedVariable(name=name, unit=unit, frame=frame, uncertainty=_exact(unit))
+        for name, unit, frame in zip(problem.state_names, units, frames, strict=True)
     ]
     clock = "simulated time, from the first state"
     return Observation(variables=variables, clock=clock, start_s=0.0, period_s=time_step, count=problem.num_steps + 1)
@@ -253,15 +259,18 @@ def _frames(model: Model) -> list[str]:
 
 def _action(problem: Problem, time_step: float, limit: float | None) -> ActionInterface:
     """How the inputs reach the plant in the replay, whatever the solver assumed between its knots."""
-    model, bounds = problem.model, problem.bounds
-    pd = any(a.kp is not None for a in model.contract.actuators)
-    kind = "effort, held over each step" + (", added to the actuators' PD control" if pd else "")
+    bounds, units, kind = problem.bounds, [UNKNOWN] * problem.nu, "the input of plain dynamics: no plant takes it"
+    if problem.has_model:
+        contract = problem.model.contract
+        units, kind = [u.unit for u in contract.inputs], "effort, held over each step"
+        if any(a.kp is not None for a in contract.actuators):
+            kind += ", added to the actuators' PD control"
     lower, upper = finite_list(bounds.u_lower), finite_list(bounds.u_upper)
     return ActionInterface(
         command_type=kind,
         commands=[
-            Command(name=u.name, unit=u.unit, lower=lower[i], upper=upper[i])
-            for i, u in enumerate(model.contract.inputs)
+            Command(name=name, unit=units[i], lower=lower[i], upper=upper[i])
+            for i, name in enumerate(problem.input_names)
         ],
         update_rate=Quantity(value=1 / time_step, unit="Hz"),
         latency_budget=Quantity(
@@ -275,17 +284,21 @@ def _action(problem: Problem, time_step: float, limit: float | None) -> ActionIn
 
 def _gradient(solution: Solution) -> GradientEvidence:
     """What the solver differentiated, where each column came from, and how far it agrees with differences."""
-    contact = solution.problem.model.contract.contact
-    touching = f"{contact.approximation} contact, whose compliance and stiction are part of the model"
+    problem = solution.problem
+    regularization, tolerance = "none", Quantity(value=None, unit="1", reason="plain dynamics have no contact solver")
+    if problem.has_model:
+        contact = problem.model.contract.contact
+        if contact.collision_pairs:
+            regularization = f"{contact.approximation} contact, whose compliance and stiction are part of the model"
+        reason = "relative, of Drake's contact solver"
+        tolerance = Quantity(value=contact.solver_relative_tolerance, unit="1", reason=reason)
     norms = [] if solution.gradient_norms is None else finite_list(solution.gradient_norms)
     return GradientEvidence(
-        differentiated=list(solution.problem.optimize),
+        differentiated=list(problem.optimize),
         columns=_columns(solution),
         smoothing="none",
-        regularization=touching if contact.collision_pairs else "none",
-        solver_tolerance=Quantity(
-            value=contact.solver_relative_tolerance, unit="1", reason="relative, of Drake's contact solver"
-        ),
+        regularization=regularization,
+        solver_tolerance=tolerance,
         horizon=Quantity(value=solution.horizon, unit="s"),
         norm_definition="|d cost / d x_k| in the cost's unit per the state's, by knot k",
         norms=norms,
@@ -295,13 +308,17 @@ def _gradient(solution: Solution) -> GradientEvidence:
 
 def _columns(solution: Solution) -> list[GradientColumn]:
     """States, inputs and parameters; of the first two the source that the certificates were of."""
-    contract, vector = solution.problem.model.contract, solution.vector
+    problem, vector = solution.problem, solution.vector
     methods = list(dict.fromkeys(c.method for c in solution.certificates)) or ["no certificate was reached"]
     of_states = "; ".join(methods)
     units = [p.unit for p in vector.parameters for _ in p.value]
-    coordinates = contract.positions + contract.velocities + contract.inputs
+    names = (*problem.state_names, *problem.input_names)
+    known = [UNKNOWN] * len(names)
+    if problem.has_model:
+        contract = problem.model.contract
+        known = [c.unit for c in contract.positions + contract.velocities + contract.inputs]
     return [
-        *(GradientColumn(name=x.name, unit=x.unit, source=of_states) for x in coordinates),
+        *(GradientColumn(name=name, unit=unit, source=of_states) for name, unit in zip(names, known, strict=True)),
         *(GradientColumn(name=name, unit=units[i], source=vector.sources[i]) for i, name in enumerate(vector.names)),
     ]
 

@@ -5,6 +5,7 @@ Tables that have no simulated time are logged at 1 ms per row: wall time would m
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,22 +37,23 @@ def write_trace(path: Path, m: Measurement, attachments: Mapping[str, tuple[str,
     solution's parameters.
     """
     solution = m.solution
-    model = solution.problem.model
+    problem = solution.problem
     files = {CONFIGURATION: ("application/json", _configuration(solution)), **attachments}
-    if model.source is not None:
-        media_type = MEDIA_TYPES.get(model.source.suffix, "application/octet-stream")
-        files[model.source.name] = (media_type, model.source.read_bytes())
+    if problem.has_model and problem.model.source is not None:
+        source = problem.model.source
+        files[source.name] = (MEDIA_TYPES.get(source.suffix, "application/octet-stream"), source.read_bytes())
     metadata = {
         "status": solution.status.value,
         "method": solution.method,
-        "model": model.name,
+        "model": problem.name,
         "time_axis": "simulated; tables: 1 ms per row",
         "motion": "missing: it could not be stepped" if m.motion is None else "the discrete plant, open loop",
     }
-    shown = Shown(model, solution.time_step, solution.xs, m.motion)
-    channels = [*_solver_channels(m, shown), *_plan_channels(solution, shown), _event_channel(m)]
-    with applied(solution.vector):
-        write_mcap(path, [*motion_channels(shown), *channels], metadata, files)
+    shown = Shown(problem.model, solution.time_step, m.xs, m.motion) if problem.has_model else None
+    # The solver's tables and the plan are made before the parameters are applied: its replays use the plant too.
+    channels = [*_solver_channels(m), *_plan_channels(m), _event_channel(m)]
+    with applied(solution.vector) if shown else nullcontext():
+        write_mcap(path, [*(motion_channels(shown) if shown else _no_motion(m)), *channels], metadata, files)
 
 
 def _configuration(solution: Solution) -> bytes:
@@ -61,20 +63,29 @@ def _configuration(solution: Solution) -> bytes:
         "solver": solution.solver,
         "scheme": solution.scheme,
         "num_steps": solution.problem.num_steps,
-        "time_step_s": solution.problem.model.time_step,
+        "time_step_s": solution.problem.time_step,
         "options": json.loads(json.dumps(solution.options, default=str), parse_constant=str),
     }
     return (json.dumps(fields, sort_keys=True, indent=2, allow_nan=False) + "\n").encode()
 
 
-def _plan_channels(solution: Solution, shown: Shown) -> Iterator[Channel]:
+def _no_motion(m: Measurement) -> Iterator[Channel]:
+    """The channels of a motion on the plant, empty: plain dynamics have no plant."""
+    nothing = np.zeros((0, len(m.positions)))
+    yield state_channel("/state", nothing[:, 0], nothing, m.positions, m.velocities)
+    yield input_channel("/input", nothing[:, 0], nothing, m.inputs)
+    kind = TYPES["Diagnostics"]
+    yield Channel("/diagnostics", kind.cls, [], {"units": kind.units})
+
+
+def _plan_channels(m: Measurement) -> Iterator[Channel]:
     """All that a Solution's numbers are made of: states, inputs at knots and midpoints, horizon, parameters."""
+    solution, times = m.solution, m.solution.times
     inputs = solution.inputs_at_knots
-    yield state_channel(shown, "/planned/state", solution.xs)
-    yield input_channel(shown, "/planned/input", shown.times(len(inputs)), inputs)
+    yield state_channel("/planned/state", times, solution.xs, m.positions, m.velocities)
+    yield input_channel("/planned/input", times[: len(inputs)], inputs, m.inputs)
     if solution.us_mid is not None:
-        middles = np.asarray(solution.time_step * (np.arange(len(solution.us_mid)) + 0.5), dtype=float)
-        yield input_channel(shown, "/planned/input_mid", middles, solution.us_mid)
+        yield input_channel("/planned/input_mid", (times[:-1] + times[1:]) / 2, solution.us_mid, m.inputs)
     kind, vector = TYPES["Plan"], solution.vector
     plan = kind.cls(
         scheme=solution.scheme,
@@ -82,6 +93,7 @@ def _plan_channels(solution: Solution, shown: Shown) -> Iterator[Channel]:
         horizon=solution.horizon,
         horizon_is_free=solution.free_horizon is not None,
         parameters=vector.values.tolist(),
+        mesh=[] if solution.mesh is None else solution.mesh.tolist(),
     )
     units = [p.unit for p in vector.parameters for _ in p.value]
     metadata = {
@@ -91,7 +103,7 @@ def _plan_channels(solution: Solution, shown: Shown) -> Iterator[Channel]:
     yield Channel("/planned/plan", kind.cls, [(0, plan)], metadata)
 
 
-def _solver_channels(m: Measurement, shown: Shown) -> Iterator[Channel]:
+def _solver_channels(m: Measurement) -> Iterator[Channel]:
     """The solver's own table, a row per certificate, the gradient's norm at each step, a row per replay."""
     solution = m.solution
     kind = TYPES["SolverIteration"]
@@ -102,7 +114,7 @@ def _solver_channels(m: Measurement, shown: Shown) -> Iterator[Channel]:
     norms = [] if solution.gradient_norms is None else solution.gradient_norms.tolist()
     rows = [
         (nanoseconds(t), kind.cls(step=k, norm=norm))
-        for k, (t, norm) in enumerate(zip(shown.times(len(norms)), norms, strict=True))
+        for k, (t, norm) in enumerate(zip(solution.times[: len(norms)], norms, strict=True))
     ]
     yield Channel("/gradient/norm", kind.cls, rows, {"units": kind.units})
     kind = TYPES["Replay"]
@@ -171,6 +183,7 @@ class Trace:
     horizon: float  # [s]
     horizon_is_free: bool
     parameters: Array  # (np,) values of the problem's parameters
+    mesh: Array | None  # (N+1,) the knots as fractions of the horizon, where it was refined
     diagnostics: dict[str, Array]  # (N+1,) each, by the name of a field of drake_diff.Diagnostics
     metadata: dict[str, str]
     attachments: dict[str, bytes]
@@ -186,6 +199,7 @@ class Trace:
             "scheme": self.scheme,
             "us_mid": self.planned_us_mid,
             "u_final": final,
+            "mesh": self.mesh,
             "free_horizon": self.horizon if self.horizon_is_free else None,
             "parameters": self.parameters,
         }
@@ -212,6 +226,7 @@ def read_trace(path: str | Path) -> Trace:
         horizon=float(plan["horizon"][0]),
         horizon_is_free=bool(plan["horizon_is_free"][0]),
         parameters=frozen(plan["parameters"][0]),
+        mesh=frozen(plan["mesh"][0]) if len(plan["mesh"][0]) else None,
         diagnostics={name: frozen(values) for name, values in log.arrays("/diagnostics").items()},
         metadata=log.metadata.get("run", {}),
         attachments=log.attachments,

@@ -116,7 +116,7 @@ class Verification:
 
     def __repr__(self) -> str:
         lines = [f"Verification of {self.directory}: {self.verdict}", *(self.complaints or (self.sentence,))]
-        return "\n  ".join((*lines, *self.not_rerun, *self.notes))
+        return "\n  ".join(dict.fromkeys((*lines, *self.not_rerun, *self.notes)))
 
     def _repr_html_(self) -> str:
         items = "".join(f"<li>{escape(line)}</li>" for line in (*self.complaints, *self.not_rerun, *self.notes))

@@ -17,7 +17,7 @@ from drake_diff.comparison.result import (
     slugs,
 )
 from drake_diff.engines.motion import EngineMotion
-from drake_diff.logs.channels import Shown, input_channel, nanoseconds, state_channel, transform_channel
+from drake_diff.logs.channels import input_channel, nanoseconds, state_channel, transform_channel
 from drake_diff.logs.messages import TYPES
 from drake_diff.logs.write import Channel, write_mcap
 from drake_diff.model.model import Model
@@ -175,10 +175,10 @@ def write_comparison_trace(path: Path, comparison: Comparison) -> None:
 def _channels(comparison: Comparison) -> Iterator[Channel]:
     model, kind = comparison.model, TYPES["Diagnostics"]
     motions = dict(zip(slugs(comparison), (e.motion for e in comparison.engines), strict=True))
+    contract = model.contract
     for slug, motion in motions.items():
-        h = float(motion.times[1] - motion.times[0]) if len(motion.times) > 1 else 0.0
-        yield state_channel(Shown(model, h, motion.xs, None), f"/{slug}/state", motion.xs)
-        yield input_channel(Shown(model, h, motion.xs, None), f"/{slug}/input", motion.times[:-1], motion.us)
+        yield state_channel(f"/{slug}/state", motion.times, motion.xs, contract.positions, contract.velocities)
+        yield input_channel(f"/{slug}/input", motion.times[:-1], motion.us, contract.inputs)
         yield Channel(f"/{slug}/diagnostics", kind.cls, _measures(motion, kind.cls), {"units": kind.units})
     times = comparison.reference.motion.times
     alike = {s: m for s, m in motions.items() if np.allclose(m.times, times[: len(m.times)])}

@@ -10,7 +10,7 @@ from drake_diff._base.arrays import Array
 from drake_diff.comparison.result import Compared, Comparison
 from drake_diff.engines.motion import EngineMotion
 from drake_diff.pages.html import write_page
-from drake_diff.pages.plots import Plot, line, page_data, plot
+from drake_diff.pages.plots import Line, Plot, page_data
 from drake_diff.record.comparison import ComparisonRecord
 
 SAME_TIME = 1e-6  # [s] clocks in single precision are within it
@@ -51,20 +51,20 @@ def _gap_plots(comparison: Comparison) -> Iterable[Plot]:
     times = comparison.reference.motion.times
     steps, distances = [], []
     for e in comparison.engines[1:]:
-        steps.append(line(e.engine, _on(times, e.motion, np.append(e.step_gaps, np.nan))))
-        distances.append(line(e.engine, _on(times, e.motion, _distance(comparison, e))))
+        steps.append(Line(e.engine, _on(times, e.motion, np.append(e.step_gaps, np.nan))))
+        distances.append(Line(e.engine, _on(times, e.motion, _distance(comparison, e))))
     note = "of one step to Drake's from the same state, relative to the state; 0 is not on a log scale"
-    yield plot(
+    yield Plot(
         "gap of each step",
         "1",
         times,
-        [line("drake, the reference", np.full(len(times), np.nan)), *steps],
+        [Line("drake, the reference", np.full(len(times), np.nan)), *steps],
         log=True,
         note=note,
     )
     note = "the largest difference of a state, in its own unit"
-    first = line("drake, the reference", np.full(len(times), np.nan))
-    yield plot("distance from Drake's motion", "q, v", times, [first, *distances], log=True, note=note)
+    first = Line("drake, the reference", np.full(len(times), np.nan))
+    yield Plot("distance from Drake's motion", "q, v", times, [first, *distances], log=True, note=note)
 
 
 def _distance(comparison: Comparison, e: Compared) -> Array:
@@ -76,16 +76,16 @@ def _distance(comparison: Comparison, e: Compared) -> Array:
 def _measure_plots(comparison: Comparison) -> Iterable[Plot]:
     times = comparison.reference.motion.times
     energies = [
-        line(e.engine, _on(times, e.motion, e.motion.energy - e.motion.energy[0]))
+        Line(e.engine, _on(times, e.motion, e.motion.energy - e.motion.energy[0]))
         for e in comparison.engines
         if e.motion.energy is not None
     ]
     note = "kinetic and potential, less that at the start; inputs, damping and contact change it too"
-    yield plot("energy", "J", times, energies, note=note)
+    yield Plot("energy", "J", times, energies, note=note)
     depths = [
-        line(e.engine, _on(times, e.motion, e.motion.depth)) for e in comparison.engines if e.motion.depth is not None
+        Line(e.engine, _on(times, e.motion, e.motion.depth)) for e in comparison.engines if e.motion.depth is not None
     ]
-    yield plot("penetration", "m", times, depths, note="the deepest overlap that the engine finds")
+    yield Plot("penetration", "m", times, depths, note="the deepest overlap that the engine finds")
 
 
 def _coordinate_plots(comparison: Comparison) -> Iterable[Plot]:
@@ -98,5 +98,5 @@ def _coordinate_plots(comparison: Comparison) -> Iterable[Plot]:
         spread.append(float(np.nanmax(np.nanmax(known, axis=0) - np.nanmin(known, axis=0))))
     shown = sorted(np.argsort(spread)[::-1][:MOST_PLOTS])
     for i in shown:
-        lines = [line(e.engine, _on(times, e.motion, e.motion.xs[:, i])) for e in comparison.engines]
-        yield plot(model.state_names[i], units[i], times, lines)
+        lines = [Line(e.engine, _on(times, e.motion, e.motion.xs[:, i])) for e in comparison.engines]
+        yield Plot(model.state_names[i], units[i], times, lines)

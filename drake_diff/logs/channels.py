@@ -3,9 +3,9 @@
 A channel's messages are generated while they are written, so that a long motion is never held in memory twice.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
@@ -26,6 +26,16 @@ ARROW_LENGTH_PER_NEWTON = 0.02  # [m/N]
 GHOST = "planned/"  # before a body's name: its frame as planned
 
 Rows = Iterator[tuple[int, Any]]
+
+
+class Coordinate(Protocol):
+    """What a channel says of an entry of its states or inputs."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def unit(self) -> str: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +64,9 @@ class Shown:
 
 def motion_channels(shown: Shown) -> Iterator[Channel]:
     """The motion of the discrete plant, with everything measured along it, and the planned joints and frames."""
-    yield state_channel(shown, "/state", shown.xs)
-    yield input_channel(shown, "/input", shown.times(len(shown.us)), shown.us)
+    contract = shown.model.contract
+    yield state_channel("/state", shown.times(len(shown.xs)), shown.xs, contract.positions, contract.velocities)
+    yield input_channel("/input", shown.times(len(shown.us)), shown.us, contract.inputs)
     efforts = None if shown.motion is None else shown.motion.efforts
     yield _joint_states(shown, "/joint_states", shown.xs, efforts)
     yield _joint_states(shown, "/planned/joint_states", shown.planned_xs, None)
@@ -80,25 +91,28 @@ def _stamp(stamp: Any, time: float) -> None:
     stamp.seconds, stamp.nanos = divmod(nanoseconds(time), 1_000_000_000)
 
 
-def state_channel(shown: Shown, topic: str, xs: Array, times: Array | None = None) -> Channel:
-    """drake_diff.State of states (n, nx) at `times` (n,), k h if left out: exact, names and units as metadata."""
-    kind, model = TYPES["State"], shown.model
-    nq, contract, at = model.nq, model.contract, shown.times(len(xs)) if times is None else times
+def state_channel(
+    topic: str, times: Array, xs: Array, positions: Sequence[Coordinate], velocities: Sequence[Coordinate]
+) -> Channel:
+    """drake_diff.State of states (n, nx) at `times` (n,) [s]: exact, names and units as metadata."""
+    kind, nq, parts = TYPES["State"], len(positions), {"q": positions, "v": velocities}
     rows = (
-        (nanoseconds(t), kind.cls(time=t, q=x[:nq], v=x[nq:])) for t, x in zip(at.tolist(), xs.tolist(), strict=True)
+        (nanoseconds(t), kind.cls(time=t, q=x[:nq], v=x[nq:])) for t, x in zip(times.tolist(), xs.tolist(), strict=True)
     )
-    parts = {"q": contract.positions, "v": contract.velocities}
-    units = {part: {c.name: c.unit for c in coordinates} for part, coordinates in parts.items()}
-    names = {"q": list(model.position_names), "v": list(model.velocity_names)}
-    return Channel(topic, kind.cls, rows, {"units": {"time": "s", **units}, "names": names})
+    return Channel(topic, kind.cls, rows, _told(parts))
 
 
-def input_channel(shown: Shown, topic: str, times: Array, us: Array) -> Channel:
+def input_channel(topic: str, times: Array, us: Array, inputs: Sequence[Coordinate]) -> Channel:
     """drake_diff.Input of inputs (n, nu) at `times` (n,) [s]."""
-    kind, model = TYPES["Input"], shown.model
+    kind = TYPES["Input"]
     rows = ((nanoseconds(t), kind.cls(time=t, u=u)) for t, u in zip(times.tolist(), us.tolist(), strict=True))
-    units = {c.name: c.unit for c in model.contract.inputs}
-    return Channel(topic, kind.cls, rows, {"units": {"time": "s", "u": units}, "names": {"u": list(model.input_names)}})
+    return Channel(topic, kind.cls, rows, _told({"u": inputs}))
+
+
+def _told(parts: Mapping[str, Sequence[Coordinate]]) -> dict[str, Any]:
+    units = {part: {c.name: c.unit for c in coordinates} for part, coordinates in parts.items()}
+    names = {part: [c.name for c in coordinates] for part, coordinates in parts.items()}
+    return {"units": {"time": "s", **units}, "names": names}
 
 
 def _joint_states(shown: Shown, topic: str, xs: Array, efforts: Array | None) -> Channel:

@@ -49,6 +49,7 @@ MESSAGES: dict[str, dict[str, tuple[tuple[str, bool], str]]] = {
         "horizon": (NUMBER, "s"),
         "horizon_is_free": (FLAG, "1"),
         "parameters": (NUMBERS, "see names"),
+        "mesh": (NUMBERS, "1"),  # the knots as parts of the horizon, where they are not equally far apart
     },
     "Replay": {
         **dict.fromkeys(("variant", "control", "approximation"), (TEXT, "")),

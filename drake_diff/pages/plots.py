@@ -2,42 +2,27 @@
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from drake_diff.certificates.certificate import VERDICTS, Certificate
 
-Plot = dict[str, Any]
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A series `y` (n,) of a plot; `held` values are drawn as steps."""
+
+    name: str
+    y: Iterable[Any]
+    dashed: bool = False
+    held: bool = False
 
 
-def page_data(duration: float, plots: Iterable[Plot], certificates: Iterable[Certificate] = ()) -> dict[str, Any]:
-    """All that a page draws: `plots` (see `plot`) and a heat map of each of `certificates`, over `duration` [s]."""
-    return {
-        "duration": duration,
-        "plots": list(plots),
-        "certificates": [_certificate(c) for c in certificates],
-        "verdicts": list(VERDICTS),
-    }
+@dataclass(frozen=True, eq=False)
+class Plot:
+    """One plot of `series` over `x`.
 
-
-def plot(
-    title: str,
-    unit: str,
-    x: Iterable[Any],
-    series: Sequence[Plot],
-    *,
-    axis: str = "time",
-    place: str = "plots",
-    log: bool = False,
-    levels: bool = False,
-    limits: Sequence[float | None] = (None, None),
-    range: Sequence[float] | None = None,
-    marks: str = "lines",
-    band: bool = False,
-    note: str = "",
-) -> Plot:
-    """One plot of `series` (see `line`) over `x`.
-
-    Args:
+    Attributes:
         title: What is plotted, as its heading.
         unit: The unit of y.
         x: (n,) where the series have their values.
@@ -46,32 +31,42 @@ def plot(
         place: Where on the page: that of the template's macro `plots`.
         log: Whether y has a logarithmic scale; what is not above 0 is left out.
         levels: Whether x are the few levels of something, each a tick on a logarithmic scale.
-        limits: The lower and upper limit of y; what is beyond them is shaded.
+        limits: The lower and upper limit of y, None or infinite where there is none; what is beyond is shaded.
         range: The range of y, where it is not to follow the data.
         marks: "lines", "points" or "both".
         band: Whether to shade between the last two series.
         note: A remark below the plot.
     """
+
+    title: str
+    unit: str
+    x: Iterable[Any]
+    series: Sequence[Line]
+    axis: str = "time"
+    place: str = "plots"
+    log: bool = False
+    levels: bool = False
+    limits: Sequence[float | None] = (None, None)
+    range: Sequence[float] | None = None
+    marks: str = "lines"
+    band: bool = False
+    note: str = ""
+
+
+def page_data(duration: float, plots: Iterable[Plot], certificates: Iterable[Certificate] = ()) -> dict[str, Any]:
+    """All that a page draws, for JSON: `plots` and a heat map of each of `certificates`, over `duration` [s]."""
     return {
-        "title": title,
-        "unit": unit,
-        "axis": axis,
-        "x": numbers(x),
-        "series": list(series),
-        "place": place,
-        "log": log,
-        "levels": levels,
-        "limits": list(limits),
-        "range": range,
-        "marks": marks,
-        "band": band,
-        "note": note,
+        "duration": duration,
+        "plots": [_plot(p) for p in plots],
+        "certificates": [_certificate(c) for c in certificates],
+        "verdicts": list(VERDICTS),
     }
 
 
-def line(name: str, y: Iterable[Any], *, dashed: bool = False, held: bool = False) -> Plot:
-    """A series of `y` (n,); `held` values are drawn as steps."""
-    return {"name": name, "y": numbers(y), "dashed": dashed, "held": held}
+def _plot(p: Plot) -> dict[str, Any]:
+    limits = numbers(math.nan if limit is None else limit for limit in p.limits)
+    series = [{**vars(line), "y": numbers(line.y)} for line in p.series]
+    return {**vars(p), "x": numbers(p.x), "series": series, "limits": limits}
 
 
 def numbers(values: Iterable[Any]) -> list[float | None]:

@@ -1,6 +1,5 @@
 """What records are made of: numbers with units and verdicts, files, failures, events. None is NaN or infinite."""
 
-import math
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, model_validator
@@ -77,31 +76,6 @@ class Metric(Part):
         if value is None or self.tolerance is None:
             return False
         return value <= self.tolerance if self.direction == "at_most" else value >= self.tolerance
-
-
-def measured(
-    name: str,
-    definition: str,
-    value: float,
-    unit: str,
-    tolerance: float | None = None,
-    *,
-    reason: str = "not finite",
-    t_s: float | None = None,
-) -> Metric:
-    """A metric that is to be at most `tolerance`, or that informs; `reason` is why where `value` is not finite."""
-    finite = math.isfinite(value)
-    return Metric(
-        name=name,
-        definition=definition,
-        unit=unit,
-        value=float(value) if finite else None,
-        reason=None if finite else reason,
-        tolerance=tolerance,
-        direction="info" if tolerance is None else "at_most",
-        verdict="info" if tolerance is None else "pass" if value <= tolerance else "fail",
-        t_s=t_s if finite else None,
-    )
 
 
 class FileEvidence(Part):

@@ -183,7 +183,9 @@ class EvidenceRecord(SealedRecord):
     def facts(self) -> dict[str, str]:
         """What solved it, what it cost, and what fails."""
         cost = next((m.value for m in self.metrics if m.name == "cost"), None)
-        told = {} if self.solver is None else {"solver": f"{self.solver.method}, {self.solver.status}, cost {cost}"}
+        told = {"cost": "none" if cost is None else f"{cost:.6g}"}
+        if self.solver is not None:
+            told["solver"] = f"{self.solver.method}, {self.solver.status}"
         if self.failures:
             told["failures"] = "; ".join(f"{f.label}: {f.code}" for f in self.failures)
         return told | super().facts()

@@ -20,7 +20,7 @@ from drake_diff._base.files import write_whole
 from drake_diff._base.statistics import Rate, success_rate
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.pages.html import write_page
-from drake_diff.pages.plots import Plot, line, page_data, plot
+from drake_diff.pages.plots import Line, Plot, page_data
 from drake_diff.studies.gradient_cases import CASES
 from drake_diff.studies.gradient_estimates import (
     ORDERS,
@@ -322,14 +322,14 @@ def _fields(value: Any, *names: str) -> Json:
 def _plots(panel: GradientPanel) -> Iterable[Plot]:
     for found in panel.cases:
         name = found.case.name
-        variances = [line(o, [found.at(o, s).trace for s in found.sigmas]) for o in panel.orders]
-        biases = [line(o, [float(np.linalg.norm(found.at(o, s).bias)) for s in found.sigmas]) for o in panel.orders]
+        variances = [Line(o, [found.at(o, s).trace for s in found.sigmas]) for o in panel.orders]
+        biases = [Line(o, [float(np.linalg.norm(found.at(o, s).bias)) for s in found.sigmas]) for o in panel.orders]
         note = f"of the mean of {panel.samples} samples, summed over the entries; 0 is not on a log scale"
-        yield plot(f"{name}: variance", "f² / x²", found.sigmas, variances, axis="sigma", log=True, note=note)
+        yield Plot(f"{name}: variance", "f² / x²", found.sigmas, variances, axis="sigma", log=True, note=note)
         note = f"the mean of {panel.seeds} seeds, less the truth; a bias that is not significant is chance"
-        yield plot(f"{name}: bias", "f / x", found.sigmas, biases, axis="sigma", log=True, note=note)
+        yield Plot(f"{name}: bias", "f / x", found.sigmas, biases, axis="sigma", log=True, note=note)
         calls = found.descents[0].evaluations
-        losses = [line(o, np.mean([d.losses for d in found.descents_of(o)], axis=0)) for o in panel.orders]
+        losses = [Line(o, np.mean([d.losses for d in found.descents_of(o)], axis=0)) for o in panel.orders]
         goal = found.case.goal
         note = f"smoothed by sigma = {found.sigmas[-1]:g}, mean over the seeds; above {goal:.4g} is not arrived"
-        yield plot(f"{name}: loss", "f", calls, losses, axis="evaluations", limits=[None, goal], note=note)
+        yield Plot(f"{name}: loss", "f", calls, losses, axis="evaluations", limits=[None, goal], note=note)

@@ -9,7 +9,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.statistics import ENOUGH
 from drake_diff.pages.html import write_page
-from drake_diff.pages.plots import Plot, line, numbers, page_data, plot
+from drake_diff.pages.plots import Line, Plot, page_data
 from drake_diff.record.robustness import RobustnessRecord
 from drake_diff.trials.perturbation import perturbed
 from drake_diff.trials.run import Robustness, agrees, sized
@@ -51,16 +51,16 @@ def _levels(result: Robustness, name: str) -> Iterable[Plot]:
     levels = [c.level for c in cells]
     place: dict[str, Any] = {"axis": "level", "levels": True, "marks": "both", "place": name}
     rates = [
-        line("rate", [c.rate.value for c in cells]),
-        line("95 %, lower", [c.rate.lower for c in cells], dashed=True),
-        line("upper", [c.rate.upper for c in cells], dashed=True),
+        Line("rate", [c.rate.value for c in cells]),
+        Line("95 %, lower", [c.rate.lower for c in cells], dashed=True),
+        Line("upper", [c.rate.upper for c in cells], dashed=True),
     ]
-    yield plot("success", "1", levels, rates, band=True, range=[-0.03, 1.03], **place)
-    moved = [line("measured", [_number(c.displacement) for c in cells])]
+    yield Plot("success", "1", levels, rates, band=True, range=[-0.03, 1.03], **place)
+    moved = [Line("measured", [_number(c.displacement) for c in cells])]
     known = any(c.predicted is not None for c in cells)
-    moved += [line("predicted", [_number(c.predicted) for c in cells], dashed=True)] if known else []
+    moved += [Line("predicted", [_number(c.predicted) for c in cells], dashed=True)] if known else []
     note = "" if known else "no gradient tells of it"
-    yield plot("displacement of the last state", "q, v", levels, moved, log=True, note=note, **place)
+    yield Plot("displacement of the last state", "q, v", levels, moved, log=True, note=note, **place)
     yield _last_states(result, name)
 
 
@@ -77,10 +77,10 @@ def _last_states(result: Robustness, name: str) -> Plot:
     level = np.repeat(np.arange(len(ends)), [len(end) for end in ends])[order]
     up = np.concatenate([end[:, j] for end in ends])[order]
     labels = [*(f"{c.level:g}" for c in cells), "the plan's"]
-    series = [line(label, np.where(level == k, up, np.nan)) for k, label in enumerate(labels)]
+    series = [Line(label, np.where(level == k, up, np.nan)) for k, label in enumerate(labels)]
     names = task.model.state_names
     place = {"axis": names[i], "marks": "points", "place": name}
-    return plot(f"last {names[j]} over {names[i]}", "by level", across[order], series, **place)
+    return Plot(f"last {names[j]} over {names[i]}", "by level", across[order], series, **place)
 
 
 def _number(value: float | None) -> float:
@@ -105,13 +105,13 @@ def _states(task: Task, trial: Trial) -> Iterable[Plot]:
     units = [c.unit for c in (*model.contract.positions, *model.contract.velocities)]
     for i in sorted(np.argsort(-apart, kind="stable")[:MOST_PLOTS]):
         lines = [
-            line("true", true[:, i]),
-            line("observed", seen[:, i], held=True),
-            line("estimated", taken[:, i], held=True),
-            line("plan", planned[:, i], dashed=True),
+            Line("true", true[:, i]),
+            Line("observed", seen[:, i], held=True),
+            Line("estimated", taken[:, i], held=True),
+            Line("plan", planned[:, i], dashed=True),
         ]
-        bounds = numbers([task.plan.problem.bounds.x_lower[i], task.plan.problem.bounds.x_upper[i]])
-        yield plot(model.state_names[i], units[i], times, lines, limits=bounds)
+        bounds = (task.plan.problem.bounds.x_lower[i], task.plan.problem.bounds.x_upper[i])
+        yield Plot(model.state_names[i], units[i], times, lines, limits=bounds)
 
 
 def _inputs(task: Task, trial: Trial) -> Iterable[Plot]:
@@ -120,13 +120,13 @@ def _inputs(task: Task, trial: Trial) -> Iterable[Plot]:
     rows = [_padded(np.repeat(u, every, axis=0), len(times)) for u in (run.commands, run.applied)]
     planned = _padded(np.repeat(task.us, (len(times) - 1) // len(task.us), axis=0), len(times))
     for i, c in enumerate(task.model.contract.inputs):
-        lines = [line(name, u[:, i], held=True) for name, u in zip(("command", "applied"), rows, strict=True)]
-        limits = numbers([bounds.u_lower[i], bounds.u_upper[i]])
-        yield plot(
+        lines = [Line(name, u[:, i], held=True) for name, u in zip(("command", "applied"), rows, strict=True)]
+        limits = (bounds.u_lower[i], bounds.u_upper[i])
+        yield Plot(
             f"input {c.name}",
             c.unit,
             times,
-            [*lines, line("plan", planned[:, i], dashed=True, held=True)],
+            [*lines, Line("plan", planned[:, i], dashed=True, held=True)],
             limits=limits,
         )
 
@@ -139,7 +139,7 @@ def _status(task: Task, trial: Trial) -> Plot:
     events = [f"{e.t:.4g} s: {e.message}" for e in run.events]
     note = "; ".join([*others[:3], *events[:6]]) or "nothing happened"
     values = _padded(np.repeat(ok, every, axis=0), len(times))[:, 0]
-    return plot("controller status", "1: ok", times, [line("status", values, held=True)], range=[-0.1, 1.1], note=note)
+    return Plot("controller status", "1: ok", times, [Line("status", values, held=True)], range=[-0.1, 1.1], note=note)
 
 
 def _padded(rows: Array, count: int) -> Array:

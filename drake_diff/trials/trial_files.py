@@ -105,13 +105,14 @@ def write_trial_trace(path: Path, shown: Shown, trial: Trial) -> None:
 def _channels(shown: Shown, trial: Trial) -> Iterator[Channel]:
     """The true motion and the plan, then observations, estimates, commands, what was applied, and the events."""
     yield from motion_channels(shown)
-    yield state_channel(shown, "/planned/state", shown.planned_xs)
-    run = trial.outcome.run
+    run, contract = trial.outcome.run, shown.model.contract
+    states, planned = (contract.positions, contract.velocities), shown.planned_xs
+    yield state_channel("/planned/state", shown.times(len(planned)), planned, *states)
     seen = ~np.isnan(run.observations).any(axis=1)
-    yield state_channel(shown, "/observation", run.observations[seen], run.times[seen])
-    yield state_channel(shown, "/estimate", run.estimates, run.times)
-    yield input_channel(shown, "/command", run.times, run.commands)
-    yield input_channel(shown, "/applied", run.times, run.applied)
+    yield state_channel("/observation", run.times[seen], run.observations[seen], *states)
+    yield state_channel("/estimate", run.times, run.estimates, *states)
+    yield input_channel("/command", run.times, run.commands, contract.inputs)
+    yield input_channel("/applied", run.times, run.applied, contract.inputs)
     kind = TYPES["Event"]
     statuses = [
         kind.cls(time=t, kind="controller", code=OK if status == OK else "other", message=status)
