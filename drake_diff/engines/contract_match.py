@@ -131,9 +131,9 @@ class _Match:
         a, b = (tuple(j.name for j in contract.joints) for contract in self.contracts)
         if a != b:
             return self.numbers(quantity, a, b)
-        inside = [contract.native_order for contract in self.contracts]
+        inside = [_values(contract.native_order) for contract in self.contracts]
         if inside[0] != inside[1]:
-            return ContractLine(quantity, "mapped", f"by name, from {self.both(*map(_values, inside))}")
+            return ContractLine(quantity, "mapped", f"by name, from {self.both(*inside)}")
         return ContractLine(quantity, "equal", _values(a))
 
     def joints(self, quantity: str, read: Callable[[JointContract], tuple[Any, ...]]) -> ContractLine:

@@ -21,7 +21,6 @@ from drake_diff.mechanics.description import Description, Geometry, Link, RigidL
 
 KINDS = {"weld": "fixed", "prismatic": "prismatic", "quaternion_floating": "floating"}
 SHAPES = ("Sphere", "Box", "Cylinder")  # URDF's own; Bullet has capsules too
-Poses = dict[str, RigidTransform]
 
 
 def urdf(description: Description) -> str:
@@ -30,10 +29,9 @@ def urdf(description: Description) -> str:
     A motor's torque limit is its joint's effort; geometries that are no sphere, box or cylinder are left out.
     """
     root, elements = _tree(description, "world", description.links)
-    bodies, frames = poses_at_zero(description)
+    zero = AtZero(description)
     for geometry in (g for g in description.geometries if shape_of(g)[0] in SHAPES):
-        X = frames[geometry.body].inverse() @ bodies[geometry.body] @ geometry.pose
-        _add_collision(elements[geometry.body], geometry, X)
+        _add_collision(elements[geometry.body], geometry, zero.in_frame(geometry.body) @ geometry.pose)
     _add_motors(root, description)
     return _text(root)
 
@@ -77,40 +75,55 @@ def carried_by(description: Description, base: str) -> tuple[Link, ...]:
     return tuple(found)
 
 
-def poses_at_zero(description: Description) -> tuple[Poses, Poses]:
-    """Of each body and of its URDF link's frame in the world, where q = 0."""
-    bodies, frames = {"world": RigidTransform()}, {"world": RigidTransform()}
-    for link in description.links:
-        at = bodies[link.parent] @ link.on_parent
-        bodies[link.body] = at @ link.on_child.inverse()
-        frames[link.body] = RigidTransform(at.translation())
-    return bodies, frames
+class AtZero:
+    """Where `bodies` and the `frames` of links are in the world where q = 0: frames at the joints, parallel to it."""
+
+    def __init__(self, description: Description):
+        self.bodies, self.frames = {"world": RigidTransform()}, {"world": RigidTransform()}
+        for link in description.links:
+            at = self.bodies[link.parent] @ link.on_parent
+            self.bodies[link.body] = at @ link.on_child.inverse()
+            self.frames[link.body] = RigidTransform(at.translation())
+
+    def in_frame(self, body: str) -> RigidTransform:
+        """The pose of a body in its link's frame."""
+        return self.frames[body].inverse() @ self.bodies[body]
+
+    def in_parent(self, link: Link) -> RigidTransform:
+        """The pose of a link's frame in that of its parent."""
+        return self.frames[link.parent].inverse() @ self.frames[link.body]
+
+    def inertia(self, link: Link) -> tuple[Array, Array]:
+        """Centre of mass (3,) and inertia (3, 3) about it, in the link's frame."""
+        X = self.in_frame(link.body)
+        R = X.rotation().matrix()
+        return np.asarray(X @ link.center_of_mass), R @ link.inertia @ R.T
+
+    def axis(self, link: Link) -> Array:
+        """(3,) of its joint, of norm 1."""
+        turn = (self.bodies[link.parent] @ link.on_parent).rotation().matrix()
+        return np.asarray(turn @ link.axis / np.linalg.norm(link.axis))
 
 
 def _tree(description: Description, base: str, links: tuple[Link, ...]) -> tuple[Element, dict[str, Element]]:
     """The document of `links` on the link `base`, and its links."""
     root = Element("robot", {"name": "from_drake", "xmlns:drake": "http://drake.mit.edu"})
     elements = {name: SubElement(root, "link", name=name) for name in (base, *(x.body for x in links))}
-    bodies, frames = poses_at_zero(description)
+    zero = AtZero(description)
     for link in description.links:
         if link.body in elements:
-            X = frames[link.body].inverse() @ bodies[link.body]
-            R = X.rotation().matrix()
-            center = RigidTransform(X @ link.center_of_mass)
-            _add_inertial(elements[link.body], link.mass, center, R @ link.inertia @ R.T)
+            center, inertia = zero.inertia(link)
+            _add_inertial(elements[link.body], link.mass, RigidTransform(center), inertia)
     for link in links:
         limited = bool(np.isfinite(link.lower) or np.isfinite(link.upper))
         kind = KINDS.get(link.kind) or ("revolute" if limited else "continuous")
-        X = frames[link.parent].inverse() @ frames[link.body]
-        joint = _add_joint(root, link.joint, kind, (link.parent, link.body), X)
+        joint = _add_joint(root, link.joint, kind, (link.parent, link.body), zero.in_parent(link))
         if link.kind in ("revolute", "prismatic"):
-            turn = (bodies[link.parent] @ link.on_parent).rotation().matrix()
             effort = [
                 e for e, x in zip(description.effort_limits, description.actuated, strict=True) if x == link.joint
             ]
             sides = None if kind == "continuous" else (link.lower, link.upper)
-            axis = turn @ link.axis / np.linalg.norm(link.axis)
-            _add_freedom(joint, axis, link.damping, min([UNLIMITED, *effort]), sides)
+            _add_freedom(joint, zero.axis(link), link.damping, min([UNLIMITED, *effort]), sides)
     return root, elements
 
 

@@ -7,13 +7,11 @@ of actuators: the input of a joint has the joint's name, and an effort of 0 mean
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
-import numpy as np
 from pydrake.math import RigidTransform
 
-from drake_diff._base.arrays import Array
 from drake_diff.engines.common import row, shape_of
 from drake_diff.engines.interface import UNLIMITED
-from drake_diff.engines.urdf import poses_at_zero
+from drake_diff.engines.urdf import AtZero
 from drake_diff.mechanics.description import Description, Geometry, Link
 
 KINDS = {"weld": "fixed", "prismatic": "prismatic", "revolute": "revolute"}
@@ -30,11 +28,11 @@ def sdf(description: Description, time_step: float) -> str:
     SubElement(SubElement(world, "physics", name="step", type="ode"), "max_step_size").text = row(time_step)
     SubElement(world, "gravity").text = row(description.gravity)
     model = SubElement(world, "model", name="from_drake")
-    bodies, frames = poses_at_zero(description)
-    links = {link.body: _add_link(model, link, frames[link.body], bodies[link.body]) for link in description.links}
+    zero = AtZero(description)
+    links = {link.body: _add_link(model, link, zero) for link in description.links}
     for link in description.links:
         if link.kind != "quaternion_floating":
-            _add_joint(model, description, link, (bodies[link.parent] @ link.on_parent).rotation().matrix())
+            _add_joint(model, description, link, zero)
     frictions = {pair.friction for pair in description.pairs}
     friction = frictions.pop() if len(frictions) == 1 else None
     if any(g.body == "world" for g in description.geometries):
@@ -42,8 +40,7 @@ def sdf(description: Description, time_step: float) -> str:
         SubElement(ground, "static").text = "true"
         links["world"] = SubElement(ground, "link", name=GROUND)
     for geometry in description.geometries:
-        X = frames[geometry.body].inverse() @ bodies[geometry.body] @ geometry.pose
-        _add_geometry(links[geometry.body], geometry, X, friction)
+        _add_geometry(links[geometry.body], geometry, zero.in_frame(geometry.body) @ geometry.pose, friction)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode")
 
@@ -53,14 +50,12 @@ def collision_name(geometry: str) -> str:
     return geometry.replace("::", "/")
 
 
-def _add_link(model: Element, link: Link, frame: RigidTransform, body: RigidTransform) -> Element:
+def _add_link(model: Element, link: Link, zero: AtZero) -> Element:
     element = SubElement(model, "link", name=link.body)
-    SubElement(element, "pose").text = row([*frame.translation(), 0, 0, 0])
-    X = frame.inverse() @ body
-    R = X.rotation().matrix()
-    turned = R @ link.inertia @ R.T
+    SubElement(element, "pose").text = row([*zero.frames[link.body].translation(), 0, 0, 0])
+    center, turned = zero.inertia(link)
     inertial = SubElement(element, "inertial")
-    SubElement(inertial, "pose").text = row([*(X @ link.center_of_mass), 0, 0, 0])
+    SubElement(inertial, "pose").text = row([*center, 0, 0, 0])
     SubElement(inertial, "mass").text = row(link.mass)
     inertia = SubElement(inertial, "inertia")
     for a, b in ("xx", "xy", "xz", "yy", "yz", "zz"):
@@ -68,14 +63,14 @@ def _add_link(model: Element, link: Link, frame: RigidTransform, body: RigidTran
     return element
 
 
-def _add_joint(model: Element, description: Description, link: Link, turn: Array) -> None:
+def _add_joint(model: Element, description: Description, link: Link, zero: AtZero) -> None:
     joint = SubElement(model, "joint", name=link.joint, type=KINDS[link.kind])
     SubElement(joint, "parent").text = link.parent
     SubElement(joint, "child").text = link.body
     if link.kind == "weld":
         return
     axis = SubElement(joint, "axis")
-    SubElement(axis, "xyz").text = row(turn @ link.axis / np.linalg.norm(link.axis))
+    SubElement(axis, "xyz").text = row(zero.axis(link))
     limits = [e for e, x in zip(description.effort_limits, description.actuated, strict=True) if x == link.joint]
     limit, dynamics = SubElement(axis, "limit"), SubElement(axis, "dynamics")
     numbers = {"lower": max(link.lower, -UNLIMITED), "upper": min(link.upper, UNLIMITED)}

@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_diff.engines.common import principal, shape_of
-from drake_diff.engines.urdf import poses_at_zero
+from drake_diff.engines.urdf import AtZero
 from drake_diff.exceptions import MissingDependencyError, ModelError
 from drake_diff.mechanics.description import Description, Geometry, Link
 
@@ -39,15 +39,14 @@ def usd(description: Description) -> str:
     root = UsdGeom.Xform.Define(stage, ROOT).GetPrim()
     stage.SetDefaultPrim(root)
     UsdPhysics.ArticulationRootAPI.Apply(root)
-    bodies, frames = poses_at_zero(description)
+    zero = AtZero(description)
     for link in description.links:
-        _add_link(stage, link, frames[link.body], bodies[link.body])
+        _add_link(stage, link, zero)
     for link in description.links:
         if link.kind != "quaternion_floating":
-            axis = (bodies[link.parent] @ link.on_parent).rotation().matrix() @ link.axis
-            _add_joint(stage, link, frames[link.parent].inverse() @ frames[link.body], axis)
+            _add_joint(stage, link, zero)
     for i, geometry in enumerate(description.geometries):
-        _add_geometry(stage, i, geometry, frames[geometry.body].inverse() @ bodies[geometry.body] @ geometry.pose)
+        _add_geometry(stage, i, geometry, zero.in_frame(geometry.body) @ geometry.pose)
     return str(stage.GetRootLayer().ExportToString())
 
 
@@ -74,21 +73,20 @@ def _place(shape: Any, X: RigidTransform) -> None:
     shape.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, *xyz))
 
 
-def _add_link(stage: Any, link: Link, frame: RigidTransform, body: RigidTransform) -> None:
+def _add_link(stage: Any, link: Link, zero: AtZero) -> None:
     form = UsdGeom.Xform.Define(stage, f"{ROOT}/{link.body}")
-    _place(form, frame)
+    _place(form, zero.frames[link.body])
     UsdPhysics.RigidBodyAPI.Apply(form.GetPrim())
-    X = frame.inverse() @ body
-    R = X.rotation().matrix()
-    moments, turn = principal(R @ link.inertia @ R.T)
+    center, inertia = zero.inertia(link)
+    moments, turn = principal(inertia)
     mass = UsdPhysics.MassAPI.Apply(form.GetPrim())
     mass.CreateMassAttr(link.mass)
-    mass.CreateCenterOfMassAttr(_vector(X @ link.center_of_mass))
+    mass.CreateCenterOfMassAttr(_vector(center))
     mass.CreateDiagonalInertiaAttr(_vector(moments))
     mass.CreatePrincipalAxesAttr(_quaternion(turn))
 
 
-def _add_joint(stage: Any, link: Link, at: RigidTransform, axis: Any) -> None:
+def _add_joint(stage: Any, link: Link, zero: AtZero) -> None:
     kinds = {
         "weld": UsdPhysics.FixedJoint,
         "revolute": UsdPhysics.RevoluteJoint,
@@ -98,11 +96,11 @@ def _add_joint(stage: Any, link: Link, at: RigidTransform, axis: Any) -> None:
     if link.parent != "world":
         joint.CreateBody0Rel().SetTargets([f"{ROOT}/{link.parent}"])
     joint.CreateBody1Rel().SetTargets([f"{ROOT}/{link.body}"])
-    joint.CreateLocalPos0Attr(_vector(at.translation()))
+    joint.CreateLocalPos0Attr(_vector(zero.in_parent(link).translation()))
     joint.CreateLocalPos1Attr(_vector([0, 0, 0]))
     if link.kind == "weld":
         return
-    turn = _quaternion(RotationMatrix.MakeFromOneVector(axis / np.linalg.norm(axis), 0).ToQuaternion().wxyz())
+    turn = _quaternion(RotationMatrix.MakeFromOneVector(zero.axis(link), 0).ToQuaternion().wxyz())
     joint.CreateAxisAttr("X")
     joint.CreateLocalRot0Attr(turn)
     joint.CreateLocalRot1Attr(turn)
