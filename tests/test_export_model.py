@@ -184,7 +184,7 @@ def test_nothing_is_exported_where_a_small_model_is_wrong(load, tmp_path, monkey
 
 def test_what_a_format_cannot_say_is_refused(load, tmp_path, monkeypatch):
     model = load("mass_spring_damper.sdf")
-    with pytest.raises(ModelError, match=r"urdf does not hold this model; read by drake, springs: .*50, 0\.1"):
+    with pytest.raises(ModelError, match=r"urdf cannot represent this model; read by drake, springs: .*50, 0\.1"):
         export_model(model, tmp_path / "out", target="isaaclab")
     assert not (tmp_path / "out").exists()
     export_model(model, tmp_path / "out", target="gazebo")  # SDF has springs

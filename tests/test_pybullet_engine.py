@@ -240,7 +240,7 @@ def test_bad_input_and_what_bullet_has_not_are_named(load):
 def test_a_half_space_on_a_moving_link_is_refused(load):
     links = rigid_links(describe(load("pendulum.urdf"))).links
     half_space = Geometry("ramp", "pole", RigidTransform(), HalfSpace())
-    with pytest.raises(ModelError, match="geometry ramp: Bullet has half spaces on the world alone"):
+    with pytest.raises(ModelError, match="geometry ramp: Bullet has half spaces only on the world"):
         bullet_urdf([(0, links[0])], [(0, half_space)])
 
 

@@ -465,5 +465,5 @@ def test_a_bag_without_what_the_model_has_is_refused(load, tmp_path):
     with pytest.raises(InputError, match="topics of geometry_msgs/msg/PoseStamped"):
         dd.comparison.read_recording(path, load("projectile.sdf"))
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ArtifactError, match="no ROS 2 bag"):
+    with pytest.raises(ArtifactError, match="not a ROS 2 bag"):
         dd.comparison.read_recording(Path(tmp_path / "empty"), load("projectile.sdf"))

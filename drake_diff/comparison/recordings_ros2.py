@@ -66,7 +66,7 @@ def _bag(path: Path) -> Iterator[tuple[str, str, bytes]]:
             for connection, _, data in reader.messages():
                 yield connection.topic, connection.msgtype, data
     except Exception as error:  # a damaged bag makes readers fail in many ways
-        raise ArtifactError(f"{path} is no ROS 2 bag: {error}") from error
+        raise ArtifactError(f"{path} is not a ROS 2 bag: {error}") from error
 
 
 def _mcap(path: Path) -> tuple[Iterator[tuple[str, str, bytes]], Mapping[str, str]]:
@@ -78,7 +78,7 @@ def _mcap(path: Path) -> tuple[Iterator[tuple[str, str, bytes]], Mapping[str, st
             rows = [(c.topic, s.name if s else "", m.data) for s, c, m in reader.iter_messages()]
             metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
     except Exception as error:  # a damaged file makes readers fail in many ways
-        raise ArtifactError(f"{path} is no whole MCAP file: {error}") from error
+        raise ArtifactError(f"{path} is not a complete MCAP file: {error}") from error
     return iter(rows), metadata.get("contract", {})
 
 

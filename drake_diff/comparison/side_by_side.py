@@ -84,7 +84,7 @@ def compare(
         try:
             compared.append(panel.recorded(one) if isinstance(one, Recording) else panel.compared(one))
         except SimulationError as error:
-            refused.append(Refused(one.name, f"it cannot take a step at one of the states: {error}", True))
+            refused.append(Refused(one.name, f"it cannot take a step from one of the states: {error}", True))
     return Comparison(model, x0, us, panel.probes, tuple(compared), tuple(refused))
 
 

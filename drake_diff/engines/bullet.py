@@ -164,7 +164,7 @@ class PybulletEngine(RigidEngine):
                 "contact pairs": "Bullet has friction and stiffness by link, not by pair; "
                 f"not built: {list(self.tree.left_out)}",
                 "limit law": "Bullet's limits are rigid",
-                "solver tolerance": "Bullet iterates its impulses at most so often as it is told",
+                "solver tolerance": "Bullet runs a limited number of iterations and has no tolerance",
             },
         )
 

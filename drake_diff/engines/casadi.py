@@ -136,7 +136,7 @@ class _Tree:
 
     def __init__(self, description: Description, base: Link | None):
         if base and base.parent != "world":
-            raise ModelError(f"joint {base.joint}: adam's floating base is one of the world, not of {base.parent}")
+            raise ModelError(f"joint {base.joint}: adam's floating base must float in the world, not on {base.parent}")
         self.base, self.root = base, base.body if base else "world"
         self.moving = [x for x in carried_by(description, self.root) if x.kind != "weld"]
         self.moving.sort(key=lambda x: x.v_start)

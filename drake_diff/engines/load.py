@@ -54,7 +54,7 @@ def load_engine(name: str, model: Any, **options: Any) -> Engine:
         9.81
     """
     if name in ELSEWHERE:
-        raise MissingDependencyError(f"{name} is no engine here: {ELSEWHERE[name]}")
+        raise MissingDependencyError(f"{name} is not an engine here: {ELSEWHERE[name]}")
     if name not in ENGINES:
         raise UnknownNameError("engine", got=name, known=ENGINES)
     module, kind = ENGINES[name]

@@ -69,7 +69,7 @@ class NewtonEngine(RigidEngine):
         """
         x, u = self._point(x, u)
         if self.contact_depth(x) > 0:
-            raise NotOfferedError("Newton's tape has no derivative of where bodies touch, and here they do")
+            raise NotOfferedError("Newton's tape does not differentiate where bodies touch, and here they do")
         before, control = self._given(x, u)
         after, tape = self.newton.state(requires_grad=True), wp.Tape()
         with tape:
@@ -142,9 +142,7 @@ class NewtonEngine(RigidEngine):
                 "integrator": "Newton's joint damping is explicit, and its free bodies move by their centres of mass",
                 "contact law": "Newton's SolverFeatherstone has explicit springs, dampers and viscous friction up to "
                 "Coulomb's, each with its own numbers",
-                "contact pairs": f"no contact pair of {list(self.tree.left_out)} is built"
-                if self.tree.left_out
-                else "",
+                "contact pairs": f"contact pairs are missing: {list(self.tree.left_out)}" if self.tree.left_out else "",
                 "limit law": "Newton's limits have their own stiffness and damping",
                 "solver tolerance": "nothing is solved iteratively",
             },

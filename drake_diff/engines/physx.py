@@ -127,9 +127,9 @@ class SapienEngine(RigidEngine):
                 "integrator": "PhysX moves free bodies by their centres of mass and turns them by the exponential",
                 "contact law": "PhysX's contacts are rigid",
                 "contact pairs": "PhysX's contacts have no stiffness"
-                + (f", and no contact pair of {left_out} is built" if left_out else ""),
+                + (f", and contact pairs are missing: {left_out}" if left_out else ""),
                 "limit law": "PhysX's limits are rigid",
-                "solver tolerance": "PhysX iterates as often as it is told",
+                "solver tolerance": "PhysX runs a fixed number of iterations",
             },
         )
 
@@ -251,7 +251,7 @@ def groups_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, tuple[int, int
     partners = {a: frozenset(b for pair in pairs if a in pair.names for b in pair.names if b != a) for a in names}
     kinds = list(dict.fromkeys(partners[name] for name in names))
     if len(kinds) > GROUPS:
-        raise ModelError(f"PhysX tells {GROUPS} groups of shapes apart, and here are {len(kinds)} with other partners")
+        raise ModelError(f"PhysX can tell {GROUPS} groups of shapes apart; this model needs {len(kinds)}")
     bit = {name: 1 << kinds.index(partners[name]) for name in names}
     masks = dict.fromkeys(names, 0)
     for name in names:

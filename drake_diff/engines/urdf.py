@@ -58,7 +58,7 @@ def bullet_urdf(links: Sequence[tuple[int, RigidLink]], geometries: Sequence[tup
         _add_inertial(body, link.mass, axes, np.diag(moments))
         for geometry in (g for owner, g in geometries if owner == number):
             if shape_of(geometry)[0] == "HalfSpace":
-                raise ModelError(f"geometry {geometry.name}: Bullet has half spaces on the world alone")
+                raise ModelError(f"geometry {geometry.name}: Bullet has half spaces only on the world")
             _add_collision(body, geometry, geometry.pose)
         if not link.free:
             _add_bullet_joint(root, number, link)

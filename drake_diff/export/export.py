@@ -135,7 +135,7 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
     text = written(form, description, model.time_step)
     missing = complaints(form, model, text)
     if missing:
-        raise ModelError(f"nothing is exported: {form} does not hold this model; " + "; ".join(missing))
+        raise ModelError(f"nothing is exported: {form} cannot represent this model; " + "; ".join(missing))
     made_usd, about_usd = _usd(description) if target == "isaaclab" else ({}, "")
     left_out = [g.name for g in description.geometries if named_in(form, g.name) not in text]
     contract = DrakeEngine(model).contract

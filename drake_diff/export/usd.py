@@ -53,10 +53,12 @@ def usd(description: Description) -> str:
 def _check(description: Description) -> None:
     for link in description.links:
         if link.mass <= 0 or np.any(principal(link.inertia)[0] <= 0):
-            raise ModelError(f"link {link.body}: USD takes a mass or moment of inertia of 0 for one to be computed")
+            raise ModelError(
+                f"link {link.body}: USD cannot hold a mass or moment of inertia of 0: readers would compute one from the shapes"
+            )
         for name in (link.body, link.joint):
             if not Tf.IsValidIdentifier(name):
-                raise ModelError(f"{name!r} is no name that USD has")
+                raise ModelError(f"{name!r} is not a valid name in USD")
 
 
 def _vector(values: Any) -> Any:

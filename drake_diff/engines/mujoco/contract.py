@@ -33,7 +33,9 @@ def check_known(m: Any, flags: int) -> None:
         "disabled parts of the physics": int(m.opt.disableflags) & ~flags,
     }
     if any(found.values()):
-        raise ModelError(f"the MJCF has {', '.join(name for name, there in found.items() if there)}, and Drake has not")
+        raise ModelError(
+            f"the MJCF has {', '.join(name for name, there in found.items() if there)}, which Drake's plant does not have"
+        )
 
 
 def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Description, **own: Any) -> EngineContract:
@@ -47,9 +49,9 @@ def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Descri
         else "the MJCF asks for it",
         "contact law": f"{who}'s contact is a damped constraint on accelerations: the stiffness is Drake's "
         "where it rests, the damping critical whatever Drake's is",
-        "contact pairs": f"{who} has no contact pair of {left_out}" if left_out else "",
+        "contact pairs": f"{who} has no contact of the pairs {left_out}" if left_out else "",
         "limit law": f"{who}'s soft limits have their own stiffness and damping",
-        "solver tolerance": "each engine's own solver: Newton's here, SAP's in Drake",
+        "solver tolerance": "each engine has its own solver: Newton's method here, SAP in Drake",
     }
     return EngineContract(
         joints=tuple(_read_joint(m, d, j) for j in native.joints),
@@ -110,7 +112,7 @@ def _read_actuation(m: Any, dofs: Array, actuators: list[int]) -> tuple[tuple[fl
     B = np.zeros((len(dofs), len(actuators)))
     for column, i in enumerate(actuators):
         if int(m.actuator_trntype[i]) != JOINT_TRANSMISSION or np.any(m.actuator_biasprm[i]):
-            raise ModelError(f"actuator {name_of(m, m.name_actuatoradr[i])} of the MJCF is no motor on a joint")
+            raise ModelError(f"actuator {name_of(m, m.name_actuatoradr[i])} of the MJCF is not a motor on a joint")
         row = int(np.flatnonzero(dofs == m.jnt_dofadr[m.actuator_trnid[i][0]])[0])
         B[row, column] = m.actuator_gainprm[i][0] * m.actuator_gear[i][0]
     return float_rows(B)

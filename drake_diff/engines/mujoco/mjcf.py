@@ -73,7 +73,7 @@ def _add_link(parent: Element, link: Link) -> Element:
         inertial.set("quat", row(turn))
     if link.kind == "quaternion_floating":
         if link.parent != "world" or not all(x.IsExactlyIdentity() for x in (link.on_parent, link.on_child)):
-            raise ModelError(f"joint {link.joint}: MuJoCo's free body is one of the world, by its own frame")
+            raise ModelError(f"joint {link.joint}: a free body in MuJoCo must float in the world, by its own frame")
         SubElement(body, "freejoint", name=link.joint)
     elif link.kind != "weld":
         _add_joint(body, link)

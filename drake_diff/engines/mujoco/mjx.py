@@ -86,7 +86,9 @@ class MjxEngine(PlantEngine):
         starts = [j for _, j in self.native.coordinates.free]
         still = [d for d in (self.native.dofs[j : j + 3] for j in starts) if np.all(np.abs(qvel[d]) <= STILL)]
         if still and int(self.model.opt.integrator) == RK4:
-            raise GradientError("MJX's derivative of a turn from rest is lost, and RK4's is not put back")
+            raise GradientError(
+                "MJX loses the derivative of a rotation that starts from rest, and with RK4 it cannot be restored"
+            )
         h = float(self.model.opt.timestep)
         for dofs in still:
             A[dofs], B[dofs] = h * A[self.nv + dofs], h * B[self.nv + dofs]
