@@ -65,7 +65,7 @@ def test_the_armature_is_there(tmp_path):
 def test_what_usd_cannot_say_is_told_and_not_written(load, tmp_path):
     from drake_diff.export.usd import usd
 
-    with pytest.raises(ModelError, match="link pole: USD takes a mass or moment of inertia of 0"):
+    with pytest.raises(ModelError, match="link pole: USD cannot hold a mass or moment of inertia of 0"):
         usd(describe(load("pendulum.urdf")))
     export_model(load("pendulum.urdf"), tmp_path / "out", target="isaaclab", states=2)
     assert not (tmp_path / "out" / "model.usda").exists()

@@ -32,10 +32,9 @@ def check_known(m: Any, flags: int) -> None:
         "limits of joint forces": np.any(m.jnt_actfrclimited),
         "disabled parts of the physics": int(m.opt.disableflags) & ~flags,
     }
-    if any(found.values()):
-        raise ModelError(
-            f"the MJCF has {', '.join(name for name, there in found.items() if there)}, which Drake's plant does not have"
-        )
+    named = ", ".join(name for name, there in found.items() if there)
+    if named:
+        raise ModelError(f"the MJCF has {named}, which Drake's plant does not have")
 
 
 def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Description, **own: Any) -> EngineContract:
