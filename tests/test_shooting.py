@@ -17,6 +17,7 @@ from drake_diff.optimize.shooting import (
     RolloutCost,
     ShootingVariables,
     final_sensitivity,
+    limits_of_states,
     solve_shooting,
     state_sensitivities,
 )
@@ -105,15 +106,17 @@ def test_the_costs_gradient_is_its_central_difference_in_every_entry(optimize):
 
 def test_the_last_sensitivity_is_had_without_all_the_others():
     """Of 300 states (2,) by 300 inputs all take 301 * 2 * 300 doubles, 1.4 MB, the last alone 5 kB and a copy."""
-    problem = dd.Problem(block(time_step=0.01), x0=[0, 0], num_steps=300, final_cost=lambda x: x[0])
+    problem = dd.Problem(block(time_step=0.01), x0=[0, 0], num_steps=300, x_goal=[1, 0])
     variables = ShootingVariables(problem)
     z = variables.pack(problem.x0, np.ones((300, 1)))
     every = state_sensitivities(variables, z)
+    goal = limits_of_states(problem, variables)
     tracemalloc.start()
-    last = final_sensitivity(variables, z)
+    last, by_goal = final_sensitivity(variables, z), goal.jacobian(z)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert np.array_equal(last, every[-1])
+    assert np.array_equal(by_goal, every[-1])
     # Symplectic Euler of 1 kg: d x_N / d u_k = h^2 (N - k), d v_N / d u_k = h.
     assert last == pytest.approx(np.array([1e-4 * np.arange(300, 0, -1), np.full(300, 0.01)]), rel=1e-9)
     assert peak < every.nbytes / 10

@@ -337,7 +337,11 @@ def limits_of_states(problem: Problem, variables: ShootingVariables) -> Rows:
         return variables.states(z)[steps, entries]
 
     def jacobian(z: Array) -> Array:
-        return state_sensitivities(variables, z)[steps, entries]
+        found = np.empty((len(steps), variables.size))
+        for k, sensitivity in enumerate(_sensitivities(variables, z)):
+            here = steps == k
+            found[here] = sensitivity[entries[here]]
+        return found
 
     return Rows(variables, lower[steps, entries], upper[steps, entries], values, jacobian)
 
