@@ -395,11 +395,21 @@ def test_a_model_shows_its_states_and_inputs(load):
     assert repr(model).splitlines()[1:3] == ["  x (4,): slide_x, hinge_q, slide_v, hinge_w", "  u (1,): force"]
 
 
+def test_a_contract_prints_in_three_lines_and_in_full(load):
+    contract = load("sliding_block.sdf").contract
+    lines = repr(contract).splitlines()
+    assert len(lines) == 3
+    assert lines[0].startswith("Contract of block: time step 0.01 s")
+    assert "7 positions, 6 velocities, 0 inputs" in lines[1]
+    assert len(str(contract).splitlines()) > 20
+
+
 def test_names_from_a_file_are_escaped_in_html(tmp_path):
     (tmp_path / "r.urdf").write_text(urdf('name="j"', 'name="&lt;script&gt;"'))
-    html = dd.load_model(tmp_path / "r.urdf", time_step=0.01)._repr_html_()
-    assert "&lt;script&gt;" in html
-    assert "<script>" not in html
+    model = dd.load_model(tmp_path / "r.urdf", time_step=0.01)
+    for html in (model._repr_html_(), model.contract._repr_html_()):
+        assert "&lt;script&gt;" in html
+        assert "<script>" not in html
 
 
 def test_a_diagram_without_an_autodiff_form_is_differenced_and_says_so():

@@ -301,6 +301,12 @@ def test_a_block_by_its_spring(load, x, v, u, h):
     assert energy == pytest.approx(80.0 * (x - rest) ** 2 / 2, rel=1e-12)
 
 
+def test_a_parameter_prints_its_value_unit_range_and_source(load):
+    printed = {p.name: repr(p) for p in dd.list_parameters(load("pendulum.urdf"))}
+    assert printed["pole.mass"] == "pole.mass = 1 kg, at least 0; derivative by autodiff"
+    assert printed["model.gravity"] == "model.gravity = (0, 0, -9.81) m/s^2; derivative by chain_rule"
+
+
 def test_a_chain_of_steps_by_a_spring_is_the_derivative_of_a_power(load):
     """x_N = rest + A^N (x0 - rest): by k the sum of A^i dA/dk A^(N-1-i), by the rest length (I - A^N)."""
     h, m, k, c, rest, count = 0.01, 2.0, 50.0, 1.5, 0.1, 60

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.autodiffutils import AutoDiffXd
 from pydrake.geometry import AddContactMaterial, HalfSpace, ProximityProperties
 from pydrake.math import RigidTransform
@@ -267,7 +268,7 @@ def load_model(
     contact_geometry: str | None = None,
     weld_base: str | None = None,
     ground: float | None = None,
-    gravity: tuple[float, float, float] | None = None,
+    gravity: ArrayLike | None = None,
 ) -> Model:
     """The robot in a URDF, SDF, MJCF (.xml) or .dmd.yaml file as a discrete model.
 
