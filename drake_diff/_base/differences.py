@@ -61,10 +61,10 @@ def richardson(central: Array) -> Array:
 
 
 def plateau(f: Function, size: int, *, at_zero: Array) -> Array:
-    """(m, n) the derivative of `f` at 0 where the quotients of a sweep of steps depend least on the step.
+    """(m, n) the derivative of `f` at 0, by the step sizes at which its difference quotients depend least on the step.
 
-    Every entry is judged on its own: no one step suits all, where a solver leaves small changes unsolved or large
-    ones change the contact. Of three neighbouring Richardson values that lie closest, the middle one.
+    Each entry is judged on its own, as no one step suits all: a solver leaves small changes unsolved, and large ones
+    change the contact. It is the middle one of the three neighbouring Richardson values that lie closest together.
     """
     central = np.array([central_differences(f, size, h, at_zero=at_zero) for h in SWEEP])
     values = richardson(central)

@@ -8,7 +8,7 @@ are with zeros and ones and vanish. Derivatives of dv/dt = a(z) come from those 
 
     a_z = -M^-1 (r_z - B_z),    d^2 (w' a) = -(H_zz + H_za a_z + (H_za a_z)'),    H = d^2 (mu' r), mu = M^-1 w fixed
 
-What is not in the tree shows in the comparison with Drake.
+Whatever the tree leaves out shows in the comparison with Drake's plant, and the model is then refused.
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.model import Model
 from drake_diff.model.step import set_state
 
-SAME_PLANT = 1e-9  # of the largest rate: what a badly conditioned mass matrix may leave
+SAME_PLANT = 1e-9  # of the largest rate: rounding, as a badly conditioned mass matrix magnifies it
 ROUNDED = 1e-15  # of the frames' entries (sines of pi): zeros that would keep products alive
 Z = ca.DM([0, 0, 1])
 
@@ -131,11 +131,11 @@ def _links(tree: TreeDynamics, model: Model) -> list[_Link]:
 
 
 def _regrouped(links: list[_Link], tree: TreeDynamics) -> list[_Link]:
-    """The same motion with less to compute.
+    """The same motion with less to compute: inertia that the joint's motion does not show is put on the parent.
 
-    What of a hinged body nobody sees turn on its axis, diag(Iyy, Iyy, 0) with the mass and its moment along the axis,
-    is put on the parent (Gautier and Khalil, "Direct calculation of minimum set of inertial parameters of serial
-    robots", IEEE Transactions on Robotics and Automation 6(3), 1990).
+    Of a hinged body that is diag(Iyy, Iyy, 0), the mass, and the moment of the mass along the axis (Gautier
+    and Khalil, "Direct calculation of minimum set of inertial parameters of serial robots", IEEE Transactions on
+    Robotics and Automation 6(3), 1990).
     """
     links = list(links)
     for k in sorted(np.flatnonzero(tree.hinge).tolist(), key=lambda k: -int(tree.ancestors[k].sum())):

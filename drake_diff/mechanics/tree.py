@@ -43,7 +43,7 @@ class InverseDynamics:
 
 @dataclass(frozen=True, eq=False)
 class TreeDynamics:
-    """What of a tree does not change: n joints of one degree of freedom, each carrying what is welded to its child."""
+    """The constants of a tree: n joints of one degree of freedom, each carrying what is welded to its child."""
 
     bodies: list[Any]  # the child of each joint, in the order of the velocities
     ancestors: NDArray[np.bool_]  # (n, n): whether j carries i, or is i

@@ -58,7 +58,7 @@ class ActuatorTerms:
 
 @dataclass(frozen=True)
 class GeometryTerms:
-    """What can touch. `None` is not given in the model: Drake's default decides."""
+    """A geometry that can touch others; None where the model gives no value and Drake's default decides."""
 
     name: str
     body: str

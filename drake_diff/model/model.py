@@ -81,7 +81,7 @@ class Model:
         forces: tuple[AddedForce, ...] = (),
     ):
         self.diagram = diagram
-        self.forces = forces  # what acts beside the forces of the plant itself
+        self.forces = forces  # they act beside the plant's own
         self.source = source
         self.notes = notes
         self.contact_geometry = contact_geometry  # the route around refused pairs that the user chose
@@ -205,10 +205,10 @@ class Model:
         )
 
     def cache(self, key: Hashable, make: Callable[[], T], *, of_structure: bool = False) -> T:
-        """What `make` gave when `key` was first asked for: what is read once and holds as long as the model does.
+        """The result of `make` for `key`, made once and kept as long as the model.
 
-        What is made while parameters are applied that are not the model's own is not kept, but where it is
-        `of_structure` alone, which no parameter changes.
+        What is made while parameters are applied that are not the model's own is not kept, unless it depends on the
+        model's structure alone (`of_structure`), which no parameter changes.
         """
         if key in self._cache:
             found: T = self._cache[key]

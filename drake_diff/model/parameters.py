@@ -112,7 +112,7 @@ class ParameterVector:
 
     @cached_property
     def sources(self) -> tuple[str, ...]:
-        """Where the derivative by each entry comes from."""
+        """The source of the derivative by each entry: "autodiff", "chain_rule" or "finite_difference"."""
         return tuple(p.derivative_source for p in self.parameters for _ in p.value)
 
     @cached_property
@@ -162,7 +162,7 @@ class ParameterVector:
         return sorted(self._pairs, key=lambda pair: KINDS.index(pair[0].kind))
 
     def difference_scale(self, entries: Any = slice(None)) -> Array:
-        """By how much differences move each of the `entries`, relative to their step: never to where Drake takes none.
+        """How far differences move each of `entries`, relative to their step; never to values that Drake does not take.
 
         Raises InputError where a parameter cannot be moved to both sides.
         """

@@ -81,7 +81,7 @@ class Twin:
     context: Any  # the plant's, inside root_context
     defaults: Any  # a root context that nobody touches
     own: tuple[AddedForce, ...] = ()  # the model's own beside Drake's, which no parameter changes
-    added: dict[str, AddedForce] = field(default_factory=dict)  # by parameters that Drake has not
+    added: dict[str, AddedForce] = field(default_factory=dict)  # for parameters that Drake does not have
 
     def body(self, label: str) -> Any:
         return self._labelled[0][label]
@@ -135,7 +135,7 @@ class Twin:
 
     @property
     def forces(self) -> tuple[AddedForce, ...]:
-        """All that acts beside Drake's own forces."""
+        """All forces that act beside Drake's own."""
         return (*self.own, *self.added.values())
 
     def added_force(self) -> Any:
