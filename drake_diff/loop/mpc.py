@@ -123,18 +123,16 @@ class MPC:
         return replace(problem, x0=x, num_steps=count, us=None, running_cost=running, final_cost=final, bounds=bounds)
 
     def _state(self, k: int) -> Array:
-        """The state that the last plan has at step `k`; where it has none, the first one's, or what it ends in."""
-        if self._begin <= k < self._begin + len(self._xs):
-            return self._xs[k - self._begin]
-        xs = self._reference[0]
-        return xs[k] if k < len(xs) else xs[-1] if self._stay is None else self._stay.x
+        return self._of_plan(k, self._xs, self._reference[0], None if self._stay is None else self._stay.x)
 
     def _input(self, k: int) -> Array:
-        """The input that the last plan has at step `k`; where it has none, the first one's, or what it ends in."""
-        if self._begin <= k < self._begin + len(self._us):
-            return self._us[k - self._begin]
-        us = self._reference[1]
-        return us[k] if k < len(us) else us[-1] if self._stay is None else self._stay.u
+        return self._of_plan(k, self._us, self._reference[1], None if self._stay is None else self._stay.u)
+
+    def _of_plan(self, k: int, last: Array, first: Array, end: Array | None) -> Array:
+        """Row `k` of the last plan; where it has none, of the first one; after its end, what stays at the goal."""
+        if self._begin <= k < self._begin + len(last):
+            return last[k - self._begin]
+        return first[k] if k < len(first) else first[-1] if end is None else end
 
     def _plan_whole(self, xs: Array, us: Array) -> tuple[Array, Array]:
         limits = replace(self._limits, max_iterations=PLAN_ITERATIONS)

@@ -297,22 +297,21 @@ class _LoopRun:
         return x
 
     def _told(self, motion: Rollout) -> ClosedLoop:
-        nx, nu, steps = self.model.nx, self.model.nu, len(self.rows)
-        columns = list(zip(*self.rows, strict=True)) or [()] * 6
-        seen, estimates, commands, applied = (
-            frozen(np.array(column, dtype=float).reshape(steps, size))
-            for column, size in zip(columns, (nx, nx, nu, nu), strict=False)
-        )
+        steps, nx, nu = len(self.rows), self.model.nx, self.model.nu
+
+        def column(i: int, size: int) -> Array:
+            return frozen(np.array([row[i] for row in self.rows], dtype=float).reshape(steps, size))
+
         return ClosedLoop(
             motion=motion,
             times=frozen(self.period * np.arange(steps)),
-            observations=seen,
-            estimates=estimates,
-            commands=commands,
-            applied=applied,
-            controller_status=tuple(str(status) for status in columns[4]),
+            observations=column(0, nx),
+            estimates=column(1, nx),
+            commands=column(2, nu),
+            applied=column(3, nu),
+            controller_status=tuple(row[4] for row in self.rows),
             events=tuple(self.events),
-            latencies=frozen(np.array(columns[5], dtype=float)),
+            latencies=frozen([row[5] for row in self.rows]),
             latency_budget=self.loop.latency_budget,
             ended=self.ended,
             controller_error=self.controller_error,

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import AbstractContextManager, closing, contextmanager, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from functools import cache
 from typing import Any
 
@@ -65,7 +65,9 @@ def check_engine(engine: str, address: str | None) -> None:
 def _engine(
     function: TrialFunction, workers: int | None, engine: str, address: str | None
 ) -> AbstractContextManager[Evaluate]:
-    return _ray(function, workers, address) if engine == "ray" else _local(function, workers or loky.cpu_count())
+    if engine == "ray":
+        return _ray(function, workers, address)
+    return nullcontext(lambda trials: _local_answers(trials, function, workers or loky.cpu_count()))
 
 
 # --- what a worker does
@@ -94,11 +96,6 @@ def _accept(answer: tuple[Row | None, str]) -> Row | None:
 
 
 # --- processes of this machine
-
-
-@contextmanager
-def _local(function: TrialFunction, workers: int) -> Iterator[Evaluate]:
-    yield lambda trials: _local_answers(trials, function, workers)
 
 
 def _local_answers(trials: Sequence[PanelTrial], function: TrialFunction, workers: int) -> Answers:

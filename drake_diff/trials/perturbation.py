@@ -1,7 +1,7 @@
-"""What can be otherwise than planned: named, seeded, composable changes of the plant, its start and what is around it.
+"""Perturbations: named, seeded changes of the plant, its start and what is around the controller.
 
-A level says how large. U is uniform in [-level, level], N normal with standard deviation `level`, every number of its
-own; perturbations that are applied together do not disturb each other's randomness.
+A level says how large one is. U is uniform in [-level, level], N normal with standard deviation `level`, drawn anew for
+every number. Perturbations that are applied together do not disturb each other's draws.
 """
 
 import zlib
@@ -24,7 +24,7 @@ Random = np.random.Generator
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What is run: the plant, values of its parameters by name, the start, what is around the controller, how long."""
+    """What is run: the plant and its parameters by name, the start, what is around the controller, and how long."""
 
     model: Model
     x0: Array
@@ -35,14 +35,14 @@ class Setup:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """One kind: the unit and usual levels of its size, what it does, and of which parameters where it is theirs."""
+    """One kind of change, with the unit of its levels, the usual levels, and what it does."""
 
     name: str
     unit: str
     levels: tuple[float, ...]
     meaning: str
     apply: Callable[[Setup, float, Random], Setup]
-    quantity: str = ""  # of the parameters that it scales
+    quantity: str = ""  # whose parameters it scales, if any
 
     def is_of(self, model: Model) -> bool:
         """Whether there is anything in `model` for it to change."""
@@ -130,8 +130,15 @@ def _contact(setup: Setup, level: float, random: Random) -> Setup:
 
 def _strength(setup: Setup, level: float, random: Random) -> Setup:
     factor = 1 + random.uniform(-level, level, setup.model.nu)
-    actuator = replace(setup.loop.actuator, strength=np.asarray(setup.loop.actuator.strength) * factor)
-    return replace(setup, loop=replace(setup.loop, actuator=actuator))
+    return _with_actuator(setup, strength=np.asarray(setup.loop.actuator.strength) * factor)
+
+
+def _late(setup: Setup, level: float, random: Random) -> Setup:
+    return _with_actuator(setup, delay=setup.loop.actuator.delay + _steps("actuator_delay", level))
+
+
+def _with_actuator(setup: Setup, **changes: Any) -> Setup:
+    return replace(setup, loop=replace(setup.loop, actuator=replace(setup.loop.actuator, **changes)))
 
 
 def _push(setup: Setup, level: float, random: Random) -> Setup:
@@ -154,11 +161,6 @@ def _steps(subject: str, level: float) -> int:
     if round(level) != level:
         raise InputError(f"level of {subject}", got=level, expected="a whole number of the controller's steps")
     return round(level)
-
-
-def _late(setup: Setup, level: float, random: Random) -> Setup:
-    actuator = replace(setup.loop.actuator, delay=setup.loop.actuator.delay + _steps("actuator_delay", level))
-    return replace(setup, loop=replace(setup.loop, actuator=actuator))
 
 
 PARTS = (0.02, 0.05, 0.1, 0.2, 0.4)

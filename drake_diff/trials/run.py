@@ -129,6 +129,13 @@ class Cell:
         """Whether any trial fails."""
         return self.rate.successes < self.rate.trials
 
+    def __repr__(self) -> str:
+        level = sized(self.perturbation, self.level)
+        labels = ", ".join(f"{count} {label}" for label, count in self.labels.items())
+        return f"{self.perturbation} {level}: {self.rate.successes} of {self.rate.trials} succeed; {labels}".rstrip(
+            "; "
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Robustness:

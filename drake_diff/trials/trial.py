@@ -12,7 +12,6 @@ The label of a failure is found by running the trial again with one thing put ri
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -41,13 +40,16 @@ class Judgement:
     run: ClosedLoop
     failures: tuple[str, ...]
     goal_error: float  # the largest distance from the goal, or from the plan's end where there is none
-    displacement: Array  # (nt,) of the last state from the unperturbed run's
+    displacement: Array  # (nt,) of the last state from the unperturbed run's, whose own is from the plan's
     judged: bool
 
     @property
     def success(self) -> bool:
         """Whether it kept all that was asked of it."""
         return not self.failures
+
+    def __repr__(self) -> str:
+        return f"goal error {self.goal_error:.3g}: " + ("; ".join(self.failures) or "success")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +61,10 @@ class Trial:
     outcome: Judgement
     label: Label | None
     reason: str
+
+    def __repr__(self) -> str:
+        levels = ", ".join(f"{name} {level:g}" for name, level in self.levels.items())
+        return f"{levels}, seed {self.seed}: " + (f"{self.label}: {self.reason}" if self.label else "success")
 
 
 class Task:
@@ -78,7 +84,7 @@ class Task:
         while not self.nominal.success and can_be_finer and parts < FINEST:
             parts *= 2
             self._use(parts)
-        if not self.nominal.success:
+        if not self.nominal.success and parts > 1:
             self._use(1)
 
     @property
@@ -91,10 +97,15 @@ class Task:
     def _use(self, parts: int) -> None:
         self.parts, self.model = parts, self.plan.model_at(parts)
         self.xs, self.us = self.plan.sample(parts)
-        self.__dict__.pop("nominal", None)
-        self.__dict__.pop("setup", None)
-        with applied(select(self.model, self.plan.vector.to_dict())) as model:
+        parameters, duration = self.plan.vector.to_dict(), self.model.time_step * len(self.us)
+        with applied(select(self.model, parameters)) as model:
             self.policy = self._policy(model)
+        # The plant is not the controller's own one where it can be built again: neither then disturbs the other.
+        plant = self.model.at_time_step(self.model.time_step) if self.model.can_rebuild else self.model
+        self.setup = Setup(plant, self.xs[0], self.loop, duration, parameters)
+        self._end = self.xs[-1]
+        self.nominal = self.run(self.setup, 0)  # the unperturbed run
+        self._end = self.nominal.run.motion.xs[-1]
 
     def _policy(self, model: Model) -> Controller:
         given = self.controller
@@ -122,17 +133,6 @@ class Task:
             )
         return found
 
-    @cached_property
-    def setup(self) -> Setup:
-        """As planned, in this loop. The plant is not the controller's own one where it can be built again."""
-        model = self.model.at_time_step(self.model.time_step) if self.model.can_rebuild else self.model
-        return Setup(model, self.xs[0], self.loop, self.model.time_step * len(self.us), self.plan.vector.to_dict())
-
-    @cached_property
-    def nominal(self) -> Judgement:
-        """The unperturbed run."""
-        return self.run(self.setup, 0)
-
     def run(self, setup: Setup, seed: int) -> Judgement:
         """One run of `setup`, judged."""
         with applied(select(setup.model, setup.parameters)) as model:
@@ -143,13 +143,11 @@ class Task:
         failures = (
             (found.ended,) if found.ended else (*missed_goal(self.plan, goal), *left_bounds(self.plan, found.motion))
         )
-        nominal = self.__dict__.get("nominal")
-        reference = self.xs[-1] if nominal is None else nominal.run.motion.xs[-1]
         return Judgement(
             run=found,
             failures=(*failures, *depth),
             goal_error=float(np.max(np.abs(goal))),
-            displacement=tangent_space(self.model).minus(last, reference),
+            displacement=tangent_space(self.model).minus(last, self._end),
             judged=bool(np.all(np.isfinite(goal))),
         )
 
