@@ -298,11 +298,11 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> None:
     task_of(problem, _choose_scheme(attempt))  # raises where a cost is no function that can be differentiated
     if attempt.solver == "snopt":  # Drake's DirectCollocation gets bounds, ends and costs alone
         left_out = {
+            "dynamics": not problem.has_model,
             "waypoints": problem.waypoints,
             "constraints": problem.constraints,
             "horizon": problem.horizon,
             "refine": attempt.refinement,
-            "dynamics": not problem.has_model,
         }
         for name, value in left_out.items():
             if value:

@@ -253,9 +253,9 @@ class Problem:
         found: dict[str, tuple[float, int]] = {}
         where = np.arange(len(xs)) if knots is None else knots
         for c in self.constraints:
-            rows: Any = where[list(self.knots_of(c, input_at_end=len(us) == len(xs)))]
-            if c.knots is None:
-                rows = range(rows[0], len(us) if c.takes_input else len(xs))
+            at = self.knots_of(c, input_at_end=len(us) == len(xs))
+            every = range(at[0], len(us) if c.takes_input else len(xs))  # from 1 where the first state is given
+            rows: Any = every if c.knots is None else where[list(at)]
             worst = max((c.excess(xs[k], us[min(k, len(us) - 1)]), int(k)) for k in rows)
             found[c.label] = max(worst, found.get(c.label, worst))
         for knot, wanted in self.waypoints.items():

@@ -1,0 +1,208 @@
+"""Plain dynamics x' = f(x, u) through the one door: status, measures, certificates, artifact, what is refused."""
+
+import dataclasses
+import types
+
+import numpy as np
+import pytest
+from helpers.models import MODELS
+from helpers.transcription import BLOCK, heavy_pendulum, own_derivatives, push
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError, ModelError
+from drake_diff.optimize.judge import complaints_about
+
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+
+
+def block_move(**changes):
+    """Rest to rest over 1 m in 1 s: u = 6 - 12 t, and the integral of u^2 is 12."""
+    fields = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 10, "horizon": 1.0, "running_cost": EFFORT}
+    return dd.Problem(BLOCK, **fields | changes)
+
+
+def test_auto_solves_plain_dynamics_by_collocation():
+    solution = dd.solve(block_move())
+    assert solution.success, solution.message
+    assert (solution.method, solution.scheme) == ("collocation", "hermite_simpson")
+    assert solution.options["method_reason"] == "plain dynamics have no discrete step"
+    assert solution.cost == pytest.approx(12, rel=1e-9)
+    assert solution.inputs_at_knots[:, 0] == pytest.approx(6 - 12 * solution.times, abs=1e-6)
+    assert (solution.horizon, solution.time_step) == (1.0, 0.1)
+    assert {certificate.verdict for certificate in solution.certificates} == {"agree"}
+    assert len(solution.certificates) == 10
+
+
+def test_a_plant_as_plain_dynamics_is_solved_as_the_model_is(load):
+    model = load("pendulum.urdf", time_step=0.05)
+    asked = {"x0": [0, 0], "x_goal": [np.pi, 0], "num_steps": 40, "running_cost": EFFORT}
+    of_model = dd.solve(dd.Problem(model, **asked), method="collocation")
+    plain = dd.solve(dd.Problem(dd.optimize.plant_dynamics(model), horizon=2.0, **asked))
+    assert plain.cost == pytest.approx(of_model.cost, rel=1e-9)
+    assert plain.xs == pytest.approx(of_model.xs, abs=1e-6)
+
+
+def test_the_integrated_motion_is_the_closed_form_from_another_input():
+    """Under u = 1 from rest: x = t^2 / 2, wherever the plan says that it goes."""
+    solution = dd.solve(block_move())
+    ones = {"us": np.ones((10, 1)), "us_mid": np.ones((10, 1)), "u_final": np.ones(1)}
+    other = dataclasses.replace(solution, **ones)
+    assert other.integrated[:, 0] == pytest.approx(other.times**2 / 2, abs=1e-12)
+    assert other.integrated[:, 1] == pytest.approx(other.times, abs=1e-12)
+    assert other.integration_error > 0.1
+    assert other.replays == ()
+    assert other.replay is None
+
+
+def test_a_wrong_derivative_of_the_users_is_named_and_no_success():
+    """One percent off in dv'/du: the solver still converges, on a first derivative that is not the function's."""
+
+    def linearize(knots):
+        values, rows = BLOCK.linearize(knots)
+        return values, rows * np.array([[1, 1, 1], [1, 1, 1.01]])
+
+    wrong = dd.Dynamics(types.SimpleNamespace(values=BLOCK.values, linearize=linearize), 2, 1)
+    solution = dd.solve(dataclasses.replace(block_move(), system=wrong), max_iterations=50)
+    assert not solution.success
+    assert "d d(x1)/dt / d u0" in solution.message
+    honest = dd.Dynamics(own_derivatives(BLOCK), 2, 1)
+    assert dd.solve(dataclasses.replace(block_move(), system=honest)).success
+
+
+@pytest.mark.parametrize("method", ["shooting", "ilqr"])
+def test_discrete_methods_refuse_plain_dynamics(method):
+    with pytest.raises(InputError, match=f'problem: expected a model for method="{method}".*, got plain dynamics'):
+        dd.solve(block_move(), method=method)
+
+
+def test_a_problem_of_plain_dynamics_says_that_it_has_no_model():
+    with pytest.raises(ModelError, match="plain dynamics: it has no model"):
+        _ = block_move().model
+
+
+@pytest.mark.parametrize(
+    ("changes", "options", "match"),
+    [
+        ({}, {"solver": "snopt"}, 'solver: expected "ipopt" for scheme="hermite_simpson"'),
+        ({}, {"solver": "snopt", "scheme": "drake"}, 'dynamics: expected none for solver="snopt"'),
+        ({"system": "model", "horizon": (1, 2)}, {"solver": "snopt", "scheme": "drake"}, "horizon: expected none for"),
+        (
+            {"system": "model", "horizon": None, "waypoints": {3: [0.5, np.nan]}},
+            {"solver": "snopt", "scheme": "drake"},
+            "waypoints: expected none for",
+        ),
+        (
+            {"system": "model", "horizon": None, "constraints": dd.Constraint(lambda x: x[1], upper=9)},
+            {"solver": "snopt", "scheme": "drake"},
+            "constraints: expected none for",
+        ),
+        ({"system": "model", "horizon": None}, {"method": "shooting", "refine": True}, "refine: expected False for"),
+    ],
+)
+def test_what_a_solver_would_leave_out_is_refused(load, changes, options, match):
+    if changes.get("system") == "model":
+        changes = changes | {"system": load("pendulum.urdf", time_step=0.05)}
+    problem = dataclasses.replace(block_move(), **changes)
+    with pytest.raises(InputError, match=match):
+        dd.solve(problem, **{"method": "collocation"} | options)
+
+
+# ------------------------------------------------------------------------------ refined meshes
+
+
+def test_a_models_mesh_is_refined_and_its_plan_replayed(load, tmp_path):
+    model = load("pendulum.urdf", time_step=0.1)
+    problem = dd.Problem(
+        model,
+        x0=[0, 0],
+        x_goal=[np.pi, 0],
+        num_steps=20,
+        running_cost=EFFORT,
+        waypoints={5: [-0.1, np.nan]},
+        constraints=dd.Constraint(lambda x: x[1], upper=6.0, name="speed"),
+    )
+    coarse = dd.solve(problem, method="collocation")
+    fine = dd.solve(problem, method="collocation", refine=True, error_tolerance=1e-8)
+    assert len(fine.us) > 20
+    assert fine.integration_error <= 1e-8 < coarse.integration_error
+    assert fine.times[fine.knots] == pytest.approx(coarse.times, rel=1e-12)
+    assert fine.xs[fine.knots[5], 0] == pytest.approx(-0.1, abs=1e-8)
+    assert fine.constraint_violation < 1e-7
+    assert fine.replays[0].goal_error == pytest.approx(coarse.replays[0].goal_error, abs=0.05)
+    record = dd.save(fine, tmp_path / "run")
+    verification = dd.verify(tmp_path / "run")
+    assert verification.verdict == "undecided"  # for the constraint's function alone
+    assert verification.complaints == ()
+    assert len(verification.comparisons) > 20
+    assert record.problem["num_steps"] == 20
+    again = dd.read_trace(tmp_path / "run" / "trace.mcap").plan
+    assert np.array_equal(again["mesh"], fine.mesh)
+    assert np.array_equal(again["xs"], fine.xs)
+
+
+def test_mean_inputs_over_equal_parts_of_a_refined_mesh_are_the_polynomials():
+    """u = 6 - 12 t, whose mean over a part is its value in the middle; the mesh has no place in it."""
+    dense = dd.solve(block_move(num_steps=5))
+    mesh = np.array([0, 0.2, 0.25, 0.3, 0.4, 0.6, 0.77, 0.8, 1.0])
+    xs, us = dense.transcribed.at(mesh)
+    middles = dense.transcribed.at((mesh[1:] + mesh[:-1]) / 2)[1]
+    fine = dataclasses.replace(dense, mesh=mesh, xs=xs, us=us[:-1], u_final=us[-1], us_mid=middles)
+    assert list(complaints_about(fine)) == []
+    assert list(fine.knots) == [0, 1, 4, 5, 7, 8]
+    parts = (np.arange(15) + 0.5) / 15
+    assert fine.transcribed.sample(3)[1][:, 0] == pytest.approx(6 - 12 * parts, abs=1e-8)
+    t = np.arange(16) / 15
+    assert fine.transcribed.sample(3)[0][:, 0] == pytest.approx(3 * t**2 - 2 * t**3, abs=1e-9)
+
+
+def test_a_midpoint_beyond_a_bound_or_constraint_is_measured():
+    """There and back in one interval: what both knots keep, its middle breaks."""
+    solution = dd.solve(block_move(num_steps=1, x_goal=None, final_cost=lambda x: 100 * x[0] ** 2, x0=[0, 1.2]))
+    middle = solution.transcribed.xs_mid[0, 0]
+    assert middle > solution.xs[1, 0] + 0.05
+    limit = middle - 0.05
+    bounded = dataclasses.replace(solution.problem, bounds=dd.Bounds(x_upper=[limit, np.inf]))
+    assert dataclasses.replace(solution, problem=bounded).bound_violation == pytest.approx(0.05, rel=1e-9)
+    kept = dataclasses.replace(solution.problem, constraints=dd.Constraint(lambda x: x[0], upper=limit))
+    assert dataclasses.replace(solution, problem=kept).constraint_violation == pytest.approx(0.05, rel=1e-9)
+
+
+def test_a_solution_on_another_mesh_is_a_guess():
+    swing = {"x0": [0, 0], "x_goal": [np.pi, 0], "horizon": 2.0, "running_cost": EFFORT}
+    coarse = dd.solve(dd.Problem(heavy_pendulum(0.1), num_steps=20, **swing), scheme="trapezoid")
+    cold = dd.solve(dd.Problem(heavy_pendulum(0.1), num_steps=40, **swing))
+    warm = dd.solve(dd.Problem(heavy_pendulum(0.1), num_steps=40, **swing), initial_guess=coarse)
+    assert warm.cost == pytest.approx(cold.cost, rel=1e-8)
+    assert len(warm.iterations) <= len(cold.iterations)
+
+
+# ------------------------------------------------------------------------------ artifact
+
+
+def test_a_failed_solve_of_plain_dynamics_leaves_an_artifact_that_fails(tmp_path):
+    """1 m in 1 s from rest to rest needs an input of 4 at least."""
+    solution = dd.solve(block_move(num_steps=5, bounds=dd.Bounds(u_lower=[-3.9], u_upper=[3.9])))
+    assert not solution.success
+    assert dd.save(solution, tmp_path / "run").verdict == "fail"
+
+
+# ------------------------------------------------------------------------------ what is printed
+
+
+def test_what_is_printed_fits_on_a_screen_and_is_escaped():
+    names = ["<b>place</b>", "speed"]
+    dynamics = dd.Dynamics(push, 2, 1, state_names=names)
+    limit = dd.Constraint(lambda x: x[1], upper=2, name="<i>slow</i>")
+    problem = dataclasses.replace(block_move(), system=dynamics, constraints=limit, waypoints={5: [0.5, np.nan]})
+    solution = dd.solve(problem)
+    for value in (problem, solution, dynamics, limit, EFFORT, dd.Bounds(u_upper=np.ones(40))):
+        assert 1 <= len(repr(value).splitlines()) <= 8
+        assert max(map(len, repr(value).splitlines())) < 160
+    assert repr(solution).startswith("Solution of plain dynamics by collocation (hermite_simpson, ipopt): converged")
+    assert str(solution) == f"plain dynamics by collocation: converged, cost {solution.cost:.6g}, defect " + (
+        f"{solution.defect:.2g}, goal error {solution.goal_error:.2g}"
+    )
+    assert "<i>" in repr(problem)
+    assert "<i>" not in problem._repr_html_()
+    assert "<b>" not in solution._repr_html_()
+    assert MODELS.name not in repr(problem)
