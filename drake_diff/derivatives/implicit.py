@@ -49,20 +49,20 @@ class Implicit:
         model, form = steps.model, form_of(steps.model)
         if form.excluded:
             return Refusal(form.excluded)
-        refused: dict[int, DrakeDiffError] = {}
-        if steps.some_touch:
-            refused = {int(k): NotSmoothError("geometries touch") for k in np.flatnonzero(steps.touching)}
         tree = tree_for(model)
         if tree is not None and (len(steps) > 1 or model.nv >= TREE_JOINTS):
             values, missing = _by_tree(form, tree, steps)
         else:
             values, missing = np.empty((len(steps), model.nx, steps.width)), np.zeros(len(steps))
-            for k in range(len(steps)):
-                if k not in refused:
-                    missing[k] = _by_autodiff(form, steps, k, values[k])
-        for i in np.flatnonzero(~(missing <= RESIDUAL_TOLERANCE)):
-            why = f"contact, a joint limit or a constraint acts: {missing[i]:.3g} of the forces are not accounted for"
-            refused.setdefault(int(i), NotSmoothError(why))
+            for k, touches in enumerate(steps.touching.tolist()):
+                missing[k] = 0.0 if touches else _by_autodiff(form, steps, k, values[k])
+        refused: dict[int, DrakeDiffError] = {}
+        for k, (part, touches) in enumerate(zip(missing.tolist(), steps.touching.tolist(), strict=True)):
+            if touches:
+                refused[k] = NotSmoothError("geometries touch")
+            elif not part <= RESIDUAL_TOLERANCE:
+                why = f"contact, a joint limit or a constraint acts: {part:.3g} of the forces are not accounted for"
+                refused[k] = NotSmoothError(why)
         return Jacobians(values, refused)
 
 

@@ -1,17 +1,15 @@
 """AutoDiffXd and differences as sources of Jacobians, and the one place that chooses among all four.
 
 The choice is by size and structure alone, so that one model, step and request give one method on every machine. What
-it goes by was measured, each source alone, on one core [us a Jacobian]:
+it goes by was measured, each source alone, on one core [us a Jacobian; the last two a whole step by a mass as well]:
 
-    model            joints  autodiff  implicit  analytic  differences
-    pendulum              1        41        42        20           83
-    cart-pole             2        83        54        22          142
+    model            joints  autodiff  implicit  analytic  differences  autodiff  implicit
+    pendulum              1        41        42        20           83       221       214
+    cart-pole             2        83        54        22          142       295       259
     double pendulum       2        78        55        22          142
-    UR5                   6       361       139        24          709
+    UR5                   6       361       139        24          709       882       445
+    Panda                 9                                                  960       544
     Solo12               18       868       479        92         1813
-
-By a parameter as well autodiff wins below five joints (72 against 128 for the pendulum, 132 against 176 for the
-cart-pole) and loses above (917 against 830 for the UR5, 1838 against 1358 for Solo12).
 """
 
 from dataclasses import dataclass
@@ -25,7 +23,7 @@ from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.differences import central_differences, plateau
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import Analytic
-from drake_diff.derivatives.implicit import TREE_JOINTS, Implicit
+from drake_diff.derivatives.implicit import Implicit
 from drake_diff.derivatives.methods import METHODS
 from drake_diff.derivatives.steps import Jacobians, Source, Steps, take_step, take_steps
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError, UnknownNameError
@@ -54,24 +52,24 @@ class Autodiff:
 
     def differentiate(self, steps: Steps) -> Jacobians:
         """Step by step. Raises GradientError where the AutoDiffXd step is not the double step."""
-        values = np.empty((len(steps), steps.model.nx, steps.width))
-        refused: dict[int, DrakeDiffError] = {}
-        for k in range(len(steps)):
+        values, refused = [], {}
+        for k in range(len(steps.xs)):
             try:
-                values[k] = _by_autodiff(steps, k)
+                values.append(_by_autodiff(steps, k))
             except SimulationError as error:
+                values.append(np.zeros((steps.model.nx, steps.width)))
                 refused[k] = error
-        return Jacobians(values, refused)
+        return Jacobians(values[0][None] if len(values) == 1 else np.array(values), refused)
 
 
 def _by_autodiff(steps: Steps, k: int) -> Array:
-    model, nx, end = steps.model, steps.model.nx, steps.model.nx + steps.model.nu
-    variables = InitializeAutoDiff(np.concatenate([steps.xs[k], steps.us[k], steps.vector.values])).ravel()
-    twin = model.autodiff
-    write_autodiff(steps.vector, model, variables[end:])
-    result = advance(twin, variables[:nx], variables[nx:end])
+    model, vector = steps.model, steps.vector
+    variables = InitializeAutoDiff(np.concatenate([steps.xs[k], steps.us[k], vector.values])).ravel()
+    twin, end = model.autodiff, model.nx + model.nu
+    write_autodiff(vector, model, variables[end:])
+    result = advance(twin, variables[: model.nx], variables[model.nx : end])
     check_parity(model, ExtractValue(result).ravel(), steps.x_next[k])
-    return gradient_rows(result, steps.width)
+    return gradient_rows(result, len(variables))
 
 
 def check_parity(model: Model, autodiff: Array, double: Array) -> None:
@@ -182,9 +180,7 @@ _ORDERS: dict[str, tuple[Source, ...]] = {
     "implicit": (Implicit(), AUTODIFF),
     "finite_difference": (DIFFERENCES,),
 }
-SMALL_BY_PARAMETERS: tuple[Source, ...] = (ANALYTIC, AUTODIFF, IMPLICIT, DIFFERENCES)
 SMALL_IN_CONTACT: tuple[Source, ...] = (AUTODIFF, DIFFERENCES)
-NOTHING, NONE = np.empty((0, 0, 0)), np.arange(0)
 
 
 def check_method(method: str) -> None:
@@ -197,91 +193,69 @@ def order_of(steps: Steps, method: str, single: bool) -> tuple[Source, ...]:
     """The sources to ask, one after the other: what is exact and fastest first, as measured above."""
     if method != "auto":
         return _ORDERS[method]
-    size = steps.model.nv
-    if steps.vector.parameters:
-        return SMALL_BY_PARAMETERS if size < TREE_JOINTS else _ORDERS["analytic"]
-    alone = single and size < CONTACT_SIZE and steps.some_touch
-    return SMALL_IN_CONTACT if alone else _ORDERS["analytic"]
+    if single and steps.model.nv < CONTACT_SIZE and not steps.vector.parameters and steps.some_touch:
+        return SMALL_IN_CONTACT
+    return _ORDERS["analytic"]
 
 
-def choose(steps: Steps, method: str, *, single: bool = False) -> "Chosen":
+@dataclass(eq=False, slots=True)
+class Chosen:
+    """The Jacobians of N steps, the source of each and why it was taken."""
+
+    values: Array  # (N, nx, nx + nu + np)
+    methods: list[str]
+    reasons: list[str]
+
+
+def choose(steps: Steps, method: str, *, single: bool = False) -> Chosen:
     """The Jacobians of the steps, each by the first source in order that knows it.
 
     `single` says that one step alone was asked for. Where the steps were not taken, those that no source which finds a
     wrong end knows are taken. Raises what the last source has against a step that none knows.
     """
-    chosen = Chosen(steps, method)
-    for source in order_of(steps, method, single):
-        if steps.taken or source.name in CHECK_ENDS:
-            chosen.ask(source)
-            if not len(chosen.left):
-                return chosen
-    if steps.taken:
-        raise chosen.error
-    left = chosen.left
-    chosen.put(choose(take_steps(steps.model, steps.vector, steps.xs[0], steps.us[left], steps.xs[left]), method))
+    order = order_of(steps, method, single)
+    if not steps.taken:
+        order = tuple(source for source in order if source.name in CHECK_ENDS)
+    return _ask(order, steps, method, [""] * len(steps), None)
+
+
+def _ask(order: tuple[Source, ...], steps: Steps, method: str, whys: list[str], error: DrakeDiffError | None) -> Chosen:
+    """`whys` (N,) is what the sources before had against each step, `error` the last of it."""
+    if not order:
+        if error is not None and steps.taken:
+            raise error
+        return choose(take_steps(steps.model, steps.vector, steps.xs[0], steps.us, steps.xs), method)
+    source = order[0]
+    try:
+        found = source.differentiate(steps)
+    except ModelError as no_twin:
+        error, found = no_twin, Refusal(str(no_twin))
+    if isinstance(found, Refusal):
+        return _ask(order[1:], steps, method, [f"{why}not {source.name}: {found}; " for why in whys], error)
+    if steps.vector.parameters and source.name not in OF_ONE_KIND:
+        _difference_the_rest(steps, found)
+    chosen = Chosen(found.values, [source.name] * len(whys), [_reason(source, steps, method, why) for why in whys])
+    if found.refused:
+        left = np.array(sorted(found.refused))
+        whys = [f"{whys[k]}not {source.name}: {found.refused[k]}; " for k in left]
+        others = _ask(order[1:], steps.part(left), method, whys, found.refused[left[-1]])
+        if len(left) == len(steps):
+            return others
+        chosen.values[left] = others.values
+        for i, k in enumerate(left):
+            chosen.methods[k], chosen.reasons[k] = others.methods[i], others.reasons[i]
     return chosen
 
 
-class Chosen:
-    """The Jacobians of N steps, as one source after another gives them."""
-
-    def __init__(self, steps: Steps, method: str):
-        self.steps, self.method = steps, method
-        self.values = NOTHING  # (N, nx, nx + nu + np)
-        self.methods = [""] * len(steps)  # the source of each step
-        self.reasons = [""] * len(steps)  # and why not another
-        self.left: NDArray[np.intp] = np.arange(len(steps))  # the steps that no source knew so far
-        self.error: DrakeDiffError = GradientError("no source was asked")
-
-    def ask(self, source: Source) -> None:
-        """Have the source differentiate what is left."""
-        steps, part = self.steps, self.steps.part(self.left)
-        try:
-            found = source.differentiate(part)
-        except ModelError as error:  # the model has no AutoDiffXd twin
-            self.error, found = error, Refusal(str(error))
-        if isinstance(found, Refusal):
-            for k in self.left:
-                self.reasons[k] += f"not {source.name}: {found}; "
-            return
-        if steps.vector.parameters and source.name not in OF_ONE_KIND:
-            _difference_the_rest(part, found)
-        self._keep(found.values)
-        if part is steps and not found.refused:  # all at once, as a single step as a rule
-            self.methods, self.left = [source.name] * len(steps), NONE
-            self.reasons = [self._reason(source, why) for why in self.reasons]
-            return
-        for i, k in enumerate(self.left):
-            why = found.refused.get(i)
-            if why is None:
-                self.methods[k], self.reasons[k] = source.name, self._reason(source, self.reasons[k])
-            else:
-                self.error = why
-                self.reasons[k] += f"not {source.name}: {why}; "
-        self.left = self.left[sorted(found.refused)]
-
-    def put(self, other: "Chosen") -> None:
-        """Take what was chosen for what is left, which is all of `other`."""
-        self._keep(other.values)
-        for i, k in enumerate(self.left):
-            self.methods[k], self.reasons[k] = other.methods[i], other.reasons[i]
-
-    def _keep(self, values: Array) -> None:
-        if len(self.left) == len(self.steps):
-            self.values = values
-        else:
-            self.values[self.left] = values
-
-    def _reason(self, source: Source, why: str) -> str:
-        """Why this source was taken, and none before it."""
-        if source.name == self.method:
-            return "asked for"
-        if source is ANALYTIC:
-            return CERTIFIED
-        if source is IMPLICIT:
-            return why + self.steps.model.cache("implicit trial", _Trial, of_structure=True).passed
-        return why[:-2] if why else "the fastest for a model of this size"
+def _reason(source: Source, steps: Steps, method: str, why: str) -> str:
+    """Why this source was taken, and none before it."""
+    if source.name == method:
+        return "asked for"
+    if source is ANALYTIC:
+        return CERTIFIED
+    if source is IMPLICIT:
+        return why + steps.model.cache("implicit trial", _Trial, of_structure=True).passed
+    return why[:-2] if why else "the fastest for a model of this size"
 
 
 def _difference_the_rest(steps: Steps, found: Jacobians) -> None:

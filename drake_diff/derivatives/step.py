@@ -1,6 +1,7 @@
 """The Jacobians of discrete steps, and the gate that each must pass before anyone sees it."""
 
 from dataclasses import dataclass
+from html import escape
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,7 +10,7 @@ from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.derivatives.implicit import takes_many
-from drake_diff.derivatives.sources import ANALYTIC, IMPLICIT, OF_ONE_KIND, check_method, choose
+from drake_diff.derivatives.sources import ANALYTIC, IMPLICIT, OF_ONE_KIND, Chosen, check_method, choose
 from drake_diff.derivatives.steps import Steps, known_steps, take_step, take_steps
 from drake_diff.exceptions import GradientError, ShapeError
 from drake_diff.model.model import Model
@@ -22,42 +23,72 @@ MAGNITUDE_BOUND = 1e8
 
 @dataclass(frozen=True, eq=False)
 class StepDerivatives:
-    """x_next (nx,) = f(x, u, p) and A = df/dx (nx, nx), B = df/du (nx, nu), C = df/dp (nx, np).
+    """A step x_next = f(x, u, p) and its Jacobians; `differentiate_step` makes one. Arrays are read-only.
 
-    `method` is what A and B come from, `sources` (np,) what each column of C does.
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> dd.differentiate_step(model, [0.0, 0.0], [1.0], method="autodiff")
+        StepDerivatives: A (2, 2), B (2, 1), C (2, 0) by autodiff, asked for
     """
 
-    x_next: Array
-    A: Array
-    B: Array
-    C: Array
-    parameters: tuple[str, ...]
-    sources: tuple[str, ...]
-    method: str
-    reason: str
+    x_next: Array  # (nx,)
+    A: Array  # (nx, nx) df/dx
+    B: Array  # (nx, nu) df/du
+    C: Array  # (nx, np) df/dp
+    parameters: tuple[str, ...]  # (np,) the names of p
+    sources: tuple[str, ...]  # (np,) where each column of C comes from
+    method: str  # where A and B come from
+    reason: str  # why from there
+
+    def __repr__(self) -> str:
+        by = f"\nC by {', '.join(map(' from '.join, zip(self.parameters, self.sources, strict=True)))}"
+        shapes = ", ".join(f"{name} {getattr(self, name).shape}" for name in "ABC")
+        return f"StepDerivatives: {shapes} by {self.method}, {self.reason}{by if self.parameters else ''}"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def differentiate_step(
     model: Model, x: ArrayLike, u: ArrayLike | None = None, *, parameters: Parameters = (), method: str = "auto"
 ) -> StepDerivatives:
-    """The Jacobians of `step(model, x, u)` in Drake's coordinates x = [q; v].
+    """The Jacobians of `step(model, x, u)`, in Drake's coordinates x = [q; v].
 
-    `parameters` names what C is by, at the model's own values, or maps the names to other values. `method` is
+    Args:
+        model: The discrete model.
+        x: (nx,) the state, [m or rad] and [m/s or rad/s].
+        u: (nu,) the input [N or N m]; may be left out where the model has no actuators.
+        parameters: Names of what C is by (see `list_parameters`), at the model's own values, or a mapping of the
+            names to other values.
+        method: Where the Jacobians come from:
 
-    - "analytic": Pinocchio's derivatives, for smooth steps and steps with contact of spheres, on a model on which
-      they were certified equal to autodiff; other steps, and derivatives by or at parameters other than contact's
-      friction, stiffness, dissipation and relaxation time, are as by "auto" without it;
-    - "autodiff": AutoDiffXd through Drake's step;
-    - "implicit": from the equation of a smooth step, two to three times as fast from five joints on; autodiff where
-      contact or a constraint acts;
-    - "finite_difference": central differences of the double step;
-    - "auto": analytic where Pinocchio is installed and the model and step allow it (a single step with contact from
-      eight degrees of freedom on, below which autodiff is faster, or where parameters are asked for), else implicit
-      where it was measured to be equal to autodiff and not much slower here, else autodiff, and differences where
-      Drake refuses AutoDiffXd.
+            - "autodiff": AutoDiffXd through Drake's own step;
+            - "analytic": Pinocchio's derivatives, for smooth steps and for point contact of spheres, on a model on
+              which they were certified equal to autodiff. What they do not cover goes on as by "auto", and so do
+              derivatives by parameters other than friction, stiffness, dissipation and relaxation time;
+            - "implicit": from the equation of a smooth step; autodiff where contact or a limit acts;
+            - "finite_difference": central differences of the double step;
+            - "auto": the fastest of them that is exact here, by the model's size and what acts: analytic, else
+              implicit, else autodiff, and differences where Drake refuses AutoDiffXd. For one step in contact of
+              fewer than eight degrees of freedom autodiff comes first.
 
-    `method` and `reason` of the result say what it was. Raises GradientError where the AutoDiffXd step is not the
-    double step, or a derivative is not finite or beyond 1e8; SimulationError where Drake cannot take the step.
+    Returns:
+        `x_next` (nx,), `A` (nx, nx), `B` (nx, nu) and `C` (nx, np), with the `method` that gave them and the `reason`.
+
+    Raises:
+        GradientError: The AutoDiffXd step is not the double step, or a derivative is not finite or beyond 1e8.
+        SimulationError: Drake cannot take the step.
+        UnknownNameError: There is no such method or parameter.
+        ShapeError, NonFiniteError: x or u is not the model's.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> d = dd.differentiate_step(model, [0.0, 0.0], [0.0], parameters=("hinge.damping",))
+        >>> d.A.round(3)
+        array([[ 0.998,  0.01 ],
+               [-0.195,  0.996]])
+        >>> d.parameters, d.C.shape
+        (('hinge.damping',), (2, 1))
     """
     check_method(method)
     x, u = check_point(model, x, u)
@@ -69,12 +100,29 @@ def differentiate_step(
 def linearize(
     model: Model, xs: ArrayLike, us: ArrayLike, method: str = "auto", x_next: ArrayLike | None = None
 ) -> tuple[Array, Array, tuple[str, ...]]:
-    """A (N, nx, nx) and B (N, nx, nu) of the steps from each of `xs` under `us` (N, nu), and each step's method.
+    """The Jacobians of many steps in one call, which costs far less than one call for each.
 
-    `xs` is (N, nx), or (N+1, nx) with a last state from which no step is taken. `method` is that of
-    `differentiate_step`, and a step that one method cannot take goes where it goes there. `x_next` (N, nx), where the
-    steps are known to lead, spares Drake's own; a step that is found to lead elsewhere is taken.
-    Raises ShapeError, NonFiniteError, UnknownNameError, and what `differentiate_step` raises.
+    Args:
+        model: The discrete model.
+        xs: (N, nx) where the steps start, or (N+1, nx) with a last state from which no step is taken.
+        us: (N, nu) the inputs [N or N m].
+        method: As of `differentiate_step`; a step that one method cannot take goes where it goes there.
+        x_next: (N, nx) where the steps are known to lead, which spares Drake's own. A step that is found to lead
+            elsewhere is taken.
+
+    Returns:
+        A (N, nx, nx), B (N, nx, nu), and the method (N,) that each step's came from.
+
+    Raises:
+        ShapeError, NonFiniteError, UnknownNameError: Of what was given.
+        GradientError, SimulationError: As by `differentiate_step`.
+
+    Example:
+        >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
+        >>> motion = dd.rollout(model, [0, 0.1, 0, 0], np.zeros((20, 1)))
+        >>> A, B, methods = dd.linearize(model, motion.xs, motion.us, "autodiff")
+        >>> A.shape, B.shape, set(methods)
+        ((20, 4, 4), (20, 4, 1), {'autodiff'})
     """
     check_method(method)
     us = finite_array("us", us, ("N", model.nu))
@@ -94,7 +142,8 @@ def linearize(
 
 def step_jacobians(model: Model, vector: ParameterVector, x: Array, u: Array, method: str) -> StepDerivatives:
     """`differentiate_step` on a model that the vector is applied to; sizes are the caller's business."""
-    return _derivatives_of(take_step(model, vector, x, u), method, single=True)[0]
+    steps = take_step(model, vector, x, u)
+    return _derivatives_of(steps, choose(steps, method, single=True))[0]
 
 
 def derivatives_along(
@@ -110,26 +159,28 @@ def derivatives_along(
 
     Given xs (N, nx), those of the steps from each of them.
     """
-    return _derivatives_of(take_steps(model, vector or select(model, ()), x0, us, xs), method)
+    steps = take_steps(model, vector or select(model, ()), x0, us, xs)
+    return _derivatives_of(steps, choose(steps, method))
 
 
-def _derivatives_of(steps: Steps, method: str, *, single: bool = False) -> list[StepDerivatives]:
-    """The derivatives of steps that were taken."""
-    model, vector, chosen = steps.model, steps.vector, choose(steps, method, single=single)
+def _derivatives_of(steps: Steps, chosen: Chosen) -> list[StepDerivatives]:
+    model, vector = steps.model, steps.vector
     _check_derivatives(model, chosen.values)
     nx, end, names = model.nx, model.nx + model.nu, vector.names
     return [
         StepDerivatives(
-            x_next=frozen(steps.x_next[k]),
-            A=frozen(jacobian[:, :nx]),
-            B=frozen(jacobian[:, nx:end]),
-            C=frozen(jacobian[:, end:]),
-            parameters=names,
-            sources=(used,) * len(names) if used in OF_ONE_KIND else vector.sources,
-            method=used,
-            reason=reason,
+            frozen(x_next),
+            frozen(jacobian[:, :nx]),
+            frozen(jacobian[:, nx:end]),
+            frozen(jacobian[:, end:]),
+            names,
+            (used,) * len(names) if used in OF_ONE_KIND else vector.sources,
+            used,
+            reason,
         )
-        for k, (jacobian, used, reason) in enumerate(zip(chosen.values, chosen.methods, chosen.reasons, strict=True))
+        for x_next, jacobian, used, reason in zip(
+            steps.x_next, chosen.values, chosen.methods, chosen.reasons, strict=True
+        )
     ]
 
 

@@ -45,7 +45,7 @@ class Steps:
     @property
     def some_touch(self) -> bool:
         """Whether a contact acts in any of them."""
-        return bool(np.count_nonzero(self.touching))  # a sixth of the time of any()
+        return self.touching is not FREE and bool(np.count_nonzero(self.touching))  # a sixth of the time of any()
 
     def part(self, which: NDArray[np.intp]) -> "Steps":
         """Some of the steps."""
@@ -74,7 +74,7 @@ class Steps:
 def take_step(model: Model, vector: ParameterVector, x: Array, u: Array) -> Steps:
     """Drake's one step from x (nx,) under u (nu,)."""
     x_next = advance(model.double, x, u)
-    touches = _can_touch(model) and model.double.touches()
+    touches = model.contract.contact.collision_pairs > 0 and model.double.touches()
     return Steps(model, vector, x[None], u[None], x_next[None], TOUCHES if touches else FREE)
 
 
