@@ -17,7 +17,6 @@ from drake_diff._base.arrays import Array
 from drake_diff.engines.interface import Engine, EngineContract, Precision
 from drake_diff.exceptions import NotOfferedError
 from drake_diff.mechanics.coordinates import Coordinates, euler_acceleration, exponential_turn
-from drake_diff.mechanics.joints import JointContract
 
 INTEGRATOR, CONTACT_LAW, LIMIT_LAW, UNEXPLAINED = "integrator", "contact law", "limit law", "unexplained"
 # How well a scheme must give a step to be the engine's, relative to the state: rounding, and no force.
@@ -162,14 +161,11 @@ def what_is_left(coordinates: Coordinates, one: Engine, two: Engine, x: Array, s
     states = (x, *steps)
     if any(_depth(engine, state) > 0 for engine in (one, two) for state in states):
         return CONTACT_LAW
-    singles = [j for e in (one, two) for j in zip(_singles(e.contract), coordinates.single, strict=True)]
+    joints = ([j for j in e.contract.joints if j.kind != "quaternion_floating"] for e in (one, two))
+    singles = [pair for own in joints for pair in zip(own, coordinates.single, strict=True)]
     if any(not j.lower <= state[i] <= j.upper for j, (i, _) in singles for state in states):
         return LIMIT_LAW
     return UNEXPLAINED if one.contract.integrator == two.contract.integrator else INTEGRATOR
-
-
-def _singles(contract: EngineContract) -> list[JointContract]:
-    return [joint for joint in contract.joints if joint.kind != "quaternion_floating"]
 
 
 def _depth(engine: Engine, x: Array) -> float:

@@ -10,8 +10,7 @@ A free body's native state is (p, quaternion w x y z) and (v of the centre of ma
 """
 
 import warnings
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,8 +43,7 @@ ITERATIONS = 100  # of the solver, instead of 10: damping of one joint is felt b
 NOT_OFFERED = "PhysX gives neither mass matrix nor inverse dynamics; SAPIEN's are those of Pinocchio on another model"
 
 
-@dataclass
-class World:
+class World(NamedTuple):
     """One scene: its links in the order of the rigid links, and the articulation of each tree."""
 
     system: Any
@@ -147,34 +145,34 @@ class SapienEngine(RigidEngine):
 
     def _world(self, x: Array, force: Array) -> World:
         """A scene at `x` (nx,), with `force` (nv,) on its joints."""
-        world = self._empty()
-        world.links = self._links(world.scene)
-        world.trees = [world.links[tree.start].articulation for tree in self.tree.trees]
+        system = self._system()
+        scene = sapien.Scene([system])
+        system.timestep = self.time_step
+        links = self._links(scene)
+        trees = [links[tree.start].articulation for tree in self.tree.trees]
         for geometry in (g for number, g in self.tree.geometries if number < 0 and g.name in self.groups):
             body = physx.PhysxRigidStaticComponent()
             body.attach(self._shape(geometry))
             entity = sapien.Entity()
             entity.add_component(body)
-            world.scene.add_entity(entity)
+            scene.add_entity(entity)
         q = unit(self.coordinates, x[: self.nq])
         v = self.centers.turn(q) @ x[self.nq :]
-        for tree, part in zip(world.trees, self.tree.trees, strict=True):
+        for tree, part in zip(trees, self.tree.trees, strict=True):
             self._place(tree, part, q, v, force)
-        return world
+        return World(system, scene, links, trees)
 
-    def _empty(self) -> World:
+    def _system(self) -> Any:
+        """PhysX's configuration is one for the whole process, and read as a system and a link are made."""
         scene, body = physx.get_scene_config(), physx.get_body_config()
         gravity = [float(g) for g in self.description.gravity]
-        try:  # PhysX's configuration is one for the whole process, and read as a scene and a link are made
+        try:
             physx.set_scene_config(gravity=gravity, enable_tgs=False, enable_enhanced_determinism=True)
             physx.set_body_config(solver_position_iterations=ITERATIONS, sleep_threshold=0.0)
-            system = physx.PhysxCpuSystem()
+            return physx.PhysxCpuSystem()
         finally:
             physx.set_scene_config(scene)
             physx.set_body_config(body)
-        world = sapien.Scene([system])
-        system.timestep = self.time_step
-        return World(system, world, [], [])
 
     def _links(self, scene: Any) -> list[Any]:
         found: list[Any] = []

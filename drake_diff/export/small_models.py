@@ -1,17 +1,16 @@
 """What must hold before anything is exported: two small models, in Drake against the hand calculation, and as files."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
 
-from drake_diff._base.arrays import Array
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.numpy import NumpyEngine
 from drake_diff.export.read_back import SUFFIX, complaints, written
-from drake_diff.model.model import Model, load_model
+from drake_diff.model.model import load_model
 from drake_diff.model.tangent import tangent_space
 
 H = 0.01  # [s]
@@ -58,28 +57,20 @@ def _checks(name: str) -> Iterator[Check]:
         path = Path(folder) / "model.urdf"
         path.write_text(text)
         model = load_model(path, time_step=H)
-    x, u = np.array(state), np.array(effort)
+    x, u, space = np.array(state), np.array(effort), tangent_space(model)
     drake, hand = DrakeEngine(model), NumpyEngine(model)
-    yield _gap(f"{name}: step", lambda e: e.step(x, u), drake, hand, STEP_TOLERANCE)
-    yield _gap(f"{name}: Jacobian", lambda e: _jacobian(e, model, x, u), drake, hand, JACOBIAN_TOLERANCE)
-    yield _gap(f"{name}: energy", lambda e: np.array([e.energy(x)]), drake, hand, STEP_TOLERANCE)
+    found = {}
+    for engine in (drake, hand):
+        x_next, (A, B, _) = engine.step(x, u), engine.differentiate_step(x, u)
+        found[engine] = {
+            "step": (x_next, STEP_TOLERANCE),
+            "Jacobian": (space.jacobian(x, x_next, A, B), JACOBIAN_TOLERANCE),
+            "energy": (np.array([engine.energy(x)]), STEP_TOLERANCE),
+        }
+    for what, (right, tolerance) in found[hand].items():
+        gap = float(np.abs(found[drake][what][0] - right).max() / max(1.0, np.abs(right).max()))
+        told = f"Drake is {gap:.1e} from the hand calculation, {tolerance:g} is allowed"
+        yield Check(f"{name}: {what}", gap <= tolerance, told)
     for form in SUFFIX:
-        found = complaints(form, model, written(form, drake.description, H))
-        yield Check(f"{name}: {form} read back", not found, "; ".join(found) or "the same model")
-
-
-def _gap(
-    name: str,
-    ask: Callable[[DrakeEngine | NumpyEngine], Array],
-    drake: DrakeEngine,
-    hand: NumpyEngine,
-    tolerance: float,
-) -> Check:
-    ours, right = ask(drake), ask(hand)
-    gap = float(np.abs(ours - right).max() / max(1.0, np.abs(right).max()))
-    return Check(name, gap <= tolerance, f"Drake is {gap:.1e} from the hand calculation, {tolerance:g} is allowed")
-
-
-def _jacobian(engine: DrakeEngine | NumpyEngine, model: Model, x: Array, u: Array) -> Array:
-    found = engine.differentiate_step(x, u)
-    return tangent_space(model).jacobian(x, engine.step(x, u), found.A, found.B)
+        wrong = complaints(form, model, written(form, drake.description, H))
+        yield Check(f"{name}: {form} read back", not wrong, "; ".join(wrong) or "the same model")

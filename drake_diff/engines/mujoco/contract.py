@@ -90,7 +90,10 @@ def _read_joint(m: Any, d: Any, j: int) -> JointContract:
     """Joint `j` and what it carries, where `d` is at Drake's q = 0."""
     kind, dof, body = KINDS[int(m.jnt_type[j])], int(m.jnt_dofadr[j]), int(m.jnt_bodyid[j])
     last = j == int(m.body_jntadr[body]) + int(m.body_jntnum[body]) - 1  # only it carries the body
-    carried = [_part(m, d, b) for b in range(1, m.nbody) if last and int(m.body_weldid[b]) == body]
+    carried = []
+    for b in (b for b in range(1, m.nbody) if last and int(m.body_weldid[b]) == body):
+        R = np.array(d.ximat[b]).reshape(3, 3)
+        carried.append((float(m.body_mass[b]), np.array(d.xipos[b]), R @ np.diag(m.body_inertia[b]) @ R.T))
     single = kind in ("revolute", "prismatic")
     lower, upper = (limit(side) for side in m.jnt_range[j]) if m.jnt_limited[j] else (-np.inf, np.inf)
     return joint_contract(
@@ -99,11 +102,6 @@ def _read_joint(m: Any, d: Any, j: int) -> JointContract:
         armature=float(m.dof_armature[dof]), stiffness=float(np.ravel(m.jnt_stiffness[j])[0]) if single else 0.0,
         rest=float(m.qpos_spring[m.jnt_qposadr[j]]) if single else 0.0, lower=lower, upper=upper,
     )  # fmt: skip
-
-
-def _part(m: Any, d: Any, body: int) -> tuple[float, Array, Array]:
-    R = np.array(d.ximat[body]).reshape(3, 3)
-    return float(m.body_mass[body]), np.array(d.xipos[body]), R @ np.diag(m.body_inertia[body]) @ R.T
 
 
 def _read_actuation(m: Any, dofs: Array, actuators: list[int]) -> tuple[tuple[float, ...], ...]:
