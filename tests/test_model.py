@@ -381,6 +381,19 @@ def test_a_change_that_load_model_does_not_know_is_refused(load):
         load("pendulum.urdf").changed(friction=1.0)
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"weld_base": {}}, "link: expected one of pole, got {}"),
+        ({"gravity": [[1], [2, 3]]}, "gravity .*expected an array of numbers"),
+        ({"time_step": [0.1]}, r"time_step .*got \[0\.1\]"),
+    ],
+)
+def test_a_change_that_has_no_hash_is_refused_by_name(load, change, words):
+    with pytest.raises(InputError, match=words):
+        load("pendulum.urdf").changed(**change)
+
+
 def test_what_is_made_under_other_parameters_is_not_kept(load):
     model = load("pendulum.urdf")
     with applied(select(model, {"pole.mass": 5.0})):

@@ -147,11 +147,13 @@ class Model:
         """
         if self._rebuild is None:
             raise ModelError("a model made from a diagram cannot be changed: build the diagram again, changed")
-        # Lists and arrays have no hash; a vector is the same change however it is written.
-        vectors = {
-            k: tuple(np.ravel(v).tolist()) for k, v in change.items() if isinstance(v, (list, tuple, np.ndarray))
-        }
-        key = frozenset({**change, **vectors}.items())
+        try:  # lists and arrays have no hash; a vector is the same change however it is written
+            key = frozenset(
+                (option, tuple(np.ravel(value).tolist()) if isinstance(value, (list, tuple, np.ndarray)) else value)
+                for option, value in change.items()
+            )
+        except (TypeError, ValueError):
+            return self._rebuild(**change)  # which says what is wrong with it
         if key not in self._others:
             if len(self._others) >= OTHERS_KEPT:
                 self._others.pop(next(iter(self._others)))
