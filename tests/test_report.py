@@ -17,9 +17,10 @@ from pydrake.planning import RobotDiagramBuilder
 import drake_diff as dd
 from drake_diff.artifact import measure
 from drake_diff.artifact.live import scene_of_run, serve
-from drake_diff.artifact.page import report_data
+from drake_diff.artifact.page import plots_of
 from drake_diff.exceptions import ArtifactError, UnknownNameError
 from drake_diff.pages.meshcat import frames_of
+from drake_diff.pages.plots import page_data
 from drake_diff.pages.scene import ARROW_PART, scene_of
 
 HOSTILE = "<script>alert(1)</script>"
@@ -206,7 +207,7 @@ def test_a_run_without_a_replay_does_not_claim_one(runs):
 
 
 def test_plots_hold_what_was_measured(swing_up):
-    plots = {plot["title"]: plot for plot in report_data(measure(swing_up))["plots"]}
+    plots = {plot["title"]: plot for plot in page_data(1.0, plots_of(measure(swing_up)))["plots"]}
     assert plots["positions"]["series"][0]["y"] == pytest.approx(swing_up.replay.xs[:, 0], abs=1e-7)  # eight digits
     assert plots["input motor"]["limits"] == [-30.0, 30.0]
     assert plots["energy"]["series"][2]["y"] == pytest.approx(swing_up.replay.energy, rel=1e-7, abs=1e-9)

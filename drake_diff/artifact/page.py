@@ -1,4 +1,4 @@
-"""A run as one page that opens from a disk: what was found, the motion, plots, certificates, contract, provenance."""
+"""The pages of a run, which open from a disk: the motion in 3D, and a report with the motion, plots and numbers."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,21 +12,29 @@ from drake_diff._base.arrays import Array
 from drake_diff.artifact.measurement import Column, Measurement
 from drake_diff.motion.rollout import Rollout
 from drake_diff.pages.html import write_page
+from drake_diff.pages.meshcat import write_replay
 from drake_diff.pages.plots import Line, Plot, page_data
+from drake_diff.pages.scene import BLUE, Scene, scene_of
 
 SERIES_PER_PLOT = 6  # more lines cannot be told apart
 
 
-def write_report(path: Path, m: Measurement, record: Mapping[str, Any], view: str) -> None:
-    """Write the page of a measurement with its `record` (plain data) and `view`, the page of the replay, inside.
+def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str, Any]) -> None:
+    """Write the pages of a measurement, whose `record` is given as plain data.
 
-    The bytes are the same for the same solution, but for the paragraph of wall-clock times.
+    Plain dynamics have nothing to draw in 3D, and so no page `replay`. The bytes are the same for the same solution,
+    but for the paragraph of wall-clock times.
     """
+    plots, view = list(plots_of(m)), ""
+    if m.solution.problem.has_model:
+        scene = _scene(m)
+        write_replay(replay, scene, title=f"{record['name']}: {m.solution.status.value}")
+        view = replay.read_text(encoding="utf-8")
     write_page(
-        path,
+        report,
         "report.html.j2",
         record=record,
-        data=report_data(m),
+        data=page_data(float(m.times[-1]), plots, m.solution.certificates),
         view=view,
         cost=m.solution.cost,
         replayed=m.motion is not None,
@@ -35,12 +43,18 @@ def write_report(path: Path, m: Measurement, record: Mapping[str, Any], view: st
     )
 
 
-def report_data(m: Measurement) -> dict[str, Any]:
-    """What the report draws (see `page_data`): plots over time and over iterations, and every certificate."""
-    return page_data(float(m.times[-1]), _plots(m), m.solution.certificates)
+def _scene(m: Measurement) -> Scene:
+    """The plant's motion, beside that of a plan in continuous time; the plan alone where it could not be stepped."""
+    model, motion = m.solution.problem.model, m.motion
+    if motion is None:  # a page cannot show nothing: states that are not finite are drawn at x0
+        finite = np.all(np.isfinite(m.xs), axis=1)
+        return scene_of(model, m.times, np.where(finite[:, None], m.xs, m.solution.problem.x0))
+    ghosts = {"plan": (m.xs, BLUE)} if m.solution.transcribed is not None else None
+    return scene_of(model, m.times, motion.xs, contacts=motion.contacts, ghosts=ghosts)
 
 
-def _plots(m: Measurement) -> Iterator[Plot]:
+def plots_of(m: Measurement) -> Iterator[Plot]:
+    """What the report plots, over time and over the solver's iterations."""
     yield from _state_plots(m, "positions", 0, m.positions)
     yield from _state_plots(m, "velocities", len(m.positions), m.velocities)
     yield from _input_plots(m)

@@ -6,8 +6,6 @@ record.json is complete last, so that a run that is killed leaves a record that 
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from drake_diff.artifact.measurement import Measurement, failure_of, measure, replay_evidence
 from drake_diff.artifact.plan_file import PLAN, write_plan
 from drake_diff.artifact.sections import asked, found
@@ -62,9 +60,8 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
         >>> record.verdict, sorted(record.files)
         ('pass', ['plan.npz', 'record.schema.json', 'replay.html', 'report.html', 'trace.mcap'])
     """
-    from drake_diff.artifact.page import write_report
-    from drake_diff.artifact.trace import write_trace
-    from drake_diff.pages.meshcat import write_replay  # what a script that saves nothing need not load
+    from drake_diff.artifact.page import write_pages
+    from drake_diff.artifact.trace import write_trace  # what a script that saves nothing need not load
 
     folder = Path(directory)
     begin(folder, solution.problem)
@@ -73,11 +70,7 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
     record = record_of(measurement, folder)
     fields = record.model_dump(mode="json")
     write_trace(folder / TRACE, measurement, {record.FILE: ("application/json", reproducible(fields).encode())})
-    view = ""
-    if solution.problem.has_model:
-        write_replay(folder / REPLAY, _scene(measurement), title=f"{record.name}: {solution.status.value}")
-        view = (folder / REPLAY).read_text(encoding="utf-8")
-    write_report(folder / REPORT, measurement, fields, view)
+    write_pages(folder / REPLAY, folder / REPORT, measurement, fields)
     return record.write(folder)
 
 
@@ -112,15 +105,3 @@ def record_of(m: Measurement, folder: Path) -> EvidenceRecord:
 
 def _record(folder: Path, clock: WallClock, **fields: Any) -> EvidenceRecord:
     return EvidenceRecord(name=folder.name, provenance=provenance_of(), wall_clock=clock, **fields)
-
-
-def _scene(m: Measurement) -> Any:
-    """The plant's motion, beside that of a plan in continuous time; the plan alone where it could not be stepped."""
-    from drake_diff.pages.scene import BLUE, scene_of
-
-    model, motion = m.solution.problem.model, m.motion
-    if motion is None:  # a page cannot show nothing: states that are not finite are drawn at x0
-        finite = np.all(np.isfinite(m.xs), axis=1)
-        return scene_of(model, m.times, np.where(finite[:, None], m.xs, m.solution.problem.x0))
-    ghosts = {"plan": (m.xs, BLUE)} if m.solution.transcribed is not None else None
-    return scene_of(model, m.times, motion.xs, contacts=motion.contacts, ghosts=ghosts)

@@ -137,29 +137,27 @@ def scene_of(
     Raises:
         UnknownNameError: If there is no such frame.
     """
-    poses = poses_of(model, xs)
+    plant, drawn = model.plant, bodies(model.plant)
+    moving = [body for body in drawn if not plant.IsAnchored(body)]
+    seen = {name: states for name, (states, _) in (ghosts or {}).items() if not np.array_equal(states, xs)}
+    poses = _poses_of(model, moving, xs)
+    of_ghosts = {name: _poses_of(model, moving, states) for name, states in seen.items()}
     if frame is None:
-        centres = {body_path(body): np.asarray(body.default_com()) for body in moving_bodies(model.plant)}
-        trail = longest_path(poses, centres)
+        trail = longest_path(poses, {body_path(body): np.asarray(body.default_com()) for body in moving})
     else:
-        trail = _path_of(model, xs, frame)
+        trail = _path_of(model, poses, len(xs), frame)
     return Scene(
-        shapes=tuple(shapes_of(model.plant, model.double.context)),
+        shapes=tuple(shapes_of(plant, model.double.context, drawn)),
         times=times,
         poses=poses,
-        ghosts=tuple(
-            Ghost(name, poses_of(model, ghost_xs), colour)
-            for name, (ghost_xs, colour) in (ghosts or {}).items()
-            if not np.array_equal(ghost_xs, xs)
-        ),
+        ghosts=tuple(Ghost(name, found, (ghosts or {})[name][1]) for name, found in of_ghosts.items()),
         forces=tuple(tuple(ContactForce(c.point, c.force) for c in step) for step in contacts),
         trail=trail,
     )
 
 
-def poses_of(model: Model, xs: Array) -> dict[str, list[RigidTransform]]:
-    """Where every body that can move is in each of `xs` (N+1, nx), by its path."""
-    moving = moving_bodies(model.plant)
+def _poses_of(model: Model, moving: Sequence[Any], xs: Array) -> dict[str, list[RigidTransform]]:
+    """Where each of the bodies `moving` is in each of `xs` (N+1, nx), by its path."""
     poses: dict[str, list[RigidTransform]] = {body_path(body): [] for body in moving}
     for x in xs:
         set_state(model.double, x)
@@ -179,24 +177,24 @@ def longest_path(poses: Poses, centres: Mapping[str, Array]) -> Array:
     return max(paths, key=lambda path: float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()))
 
 
-def _path_of(model: Model, xs: Array, name: str) -> Array:
+def _path_of(model: Model, poses: Poses, count: int, name: str) -> Array:
+    """(N+1, 3) the path of a frame's origin, which is fixed to its body."""
     known = {f.name(): f for f in (model.plant.get_frame(FrameIndex(i)) for i in range(model.plant.num_frames()))}
     if name not in known:
         raise UnknownNameError("frame", got=name, known=tuple(known))
-    path = []
-    for x in xs:
-        set_state(model.double, x)
-        path.append(known[name].CalcPoseInWorld(model.double.context).translation())
-    return np.array(path)
+    body, context = known[name].body(), model.double.context
+    origin = known[name].CalcPoseInBodyFrame(context).translation()
+    fixed = model.plant.EvalBodyPoseInWorld(context, body)
+    return np.array([pose @ origin for pose in poses.get(body_path(body), [fixed] * count)])
 
 
-def shapes_of(plant: Any, context: Any) -> list[Drawn]:
-    """All that is drawn of a plant; a small ball at each centre of mass where it has no geometry at all."""
+def shapes_of(plant: Any, context: Any, drawn: Sequence[Any]) -> list[Drawn]:
+    """The shapes of the world and of the bodies `drawn`; a small ball at each centre of mass where there are none."""
     port = plant.get_geometry_query_input_port()
     found: list[Drawn] = []
     if port.HasValue(context):
         inspector = port.Eval(context).inspector()
-        for body in [plant.world_body(), *bodies(plant)]:
+        for body in [plant.world_body(), *drawn]:
             frame = plant.GetBodyFrameIdIfExists(body.index())
             if frame is not None:
                 shapes = _shapes_on(inspector, frame, body_path(body))
@@ -204,7 +202,7 @@ def shapes_of(plant: Any, context: Any) -> list[Drawn]:
                     pose = plant.EvalBodyPoseInWorld(context, body)
                     shapes = [replace(s, body="", pose=pose @ s.pose, centre=pose @ s.centre) for s in shapes]
                 found += shapes
-    return found or [ball(body_path(body), body.default_com()) for body in moving_bodies(plant)]
+    return found or [ball(body_path(body), body.default_com()) for body in drawn if not plant.IsAnchored(body)]
 
 
 def ball(path: str, centre: ArrayLike = (0.0, 0.0, 0.0)) -> Drawn:
