@@ -1,13 +1,13 @@
 """A comparison as one page that opens from a disk: the verdict, the motions, plots, tables, contracts."""
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.comparison.result import Compared, Comparison
+from drake_diff.comparison.result import Comparison
 from drake_diff.engines.motion import EngineMotion
 from drake_diff.pages.html import write_page
 from drake_diff.pages.plots import Line, Plot, page_data
@@ -37,6 +37,46 @@ def comparison_data(comparison: Comparison) -> dict[str, Any]:
     return page_data(float(comparison.reference.motion.times[-1]), plots, doubtful)
 
 
+def _gap_plots(comparison: Comparison) -> Iterator[Plot]:
+    """Against Drake: where a gap arises, and what becomes of it."""
+    ours = comparison.reference.motion
+    reference = Line("drake, the reference", np.full(len(ours.times), np.nan))  # keeps the colours of the other plots
+    steps, distances = [reference], [reference]
+    for e in comparison.engines[1:]:
+        steps.append(Line(e.engine, _on(ours.times, e.motion, np.append(e.step_gaps, np.nan))))
+        columns = [_on(e.motion.times, ours, x) for x in ours.xs.T]
+        distance = np.abs(e.motion.xs - np.array(columns).T).max(axis=1)
+        distances.append(Line(e.engine, _on(ours.times, e.motion, distance)))
+    note = "of one step to Drake's from the same state, relative to the state; 0 is not on a log scale"
+    yield Plot("gap of each step", "1", ours.times, steps, log=True, note=note)
+    note = "the largest difference of a state, in its own unit"
+    yield Plot("distance from Drake's motion", "q, v", ours.times, distances, log=True, note=note)
+
+
+def _measure_plots(comparison: Comparison) -> Iterator[Plot]:
+    """Energy and penetration, as each engine finds them."""
+    times, energies, depths = comparison.reference.motion.times, [], []
+    for e in comparison.engines:
+        if e.motion.energy is not None:
+            energies.append(Line(e.engine, _on(times, e.motion, e.motion.energy - e.motion.energy[0])))
+        if e.motion.depth is not None:
+            depths.append(Line(e.engine, _on(times, e.motion, e.motion.depth)))
+    note = "kinetic and potential, less that at the start; inputs, damping and contact change it too"
+    yield Plot("energy", "J", times, energies, note=note)
+    yield Plot("penetration", "m", times, depths, note="the deepest overlap that the engine finds")
+
+
+def _coordinate_plots(comparison: Comparison) -> Iterator[Plot]:
+    """Those coordinates whose motions are furthest apart, in the order of the state."""
+    model, times = comparison.model, comparison.reference.motion.times
+    units = [c.unit for c in (*model.contract.positions, *model.contract.velocities)]
+    found = [[_on(times, e.motion, e.motion.xs[:, i]) for e in comparison.engines] for i in range(model.nx)]
+    spread = [float(np.nanmax(np.nanmax(xs, axis=0) - np.nanmin(xs, axis=0))) for xs in found]
+    for i in sorted(np.argsort(spread)[::-1][:MOST_PLOTS]):
+        lines = [Line(e.engine, x) for e, x in zip(comparison.engines, found[i], strict=True)]
+        yield Plot(model.state_names[i], units[i], times, lines)
+
+
 def _on(times: Array, motion: EngineMotion, values: Array) -> Array:
     """`values` (n,) of a motion at `times`, NaN where it has none."""
     found = np.full(len(times), np.nan)
@@ -44,59 +84,3 @@ def _on(times: Array, motion: EngineMotion, values: Array) -> Array:
     known = (at < len(times)) & (np.abs(times[np.minimum(at, len(times) - 1)] - motion.times) < SAME_TIME)
     found[at[known]] = np.asarray(values)[known]
     return found
-
-
-def _gap_plots(comparison: Comparison) -> Iterable[Plot]:
-    """Against Drake: where a gap arises, and what becomes of it."""
-    times = comparison.reference.motion.times
-    steps, distances = [], []
-    for e in comparison.engines[1:]:
-        steps.append(Line(e.engine, _on(times, e.motion, np.append(e.step_gaps, np.nan))))
-        distances.append(Line(e.engine, _on(times, e.motion, _distance(comparison, e))))
-    note = "of one step to Drake's from the same state, relative to the state; 0 is not on a log scale"
-    yield Plot(
-        "gap of each step",
-        "1",
-        times,
-        [Line("drake, the reference", np.full(len(times), np.nan)), *steps],
-        log=True,
-        note=note,
-    )
-    note = "the largest difference of a state, in its own unit"
-    first = Line("drake, the reference", np.full(len(times), np.nan))
-    yield Plot("distance from Drake's motion", "q, v", times, [first, *distances], log=True, note=note)
-
-
-def _distance(comparison: Comparison, e: Compared) -> Array:
-    ours = comparison.reference.motion
-    columns = [_on(e.motion.times, ours, x) for x in ours.xs.T]
-    return np.asarray(np.abs(e.motion.xs - np.array(columns).T).max(axis=1))
-
-
-def _measure_plots(comparison: Comparison) -> Iterable[Plot]:
-    times = comparison.reference.motion.times
-    energies = [
-        Line(e.engine, _on(times, e.motion, e.motion.energy - e.motion.energy[0]))
-        for e in comparison.engines
-        if e.motion.energy is not None
-    ]
-    note = "kinetic and potential, less that at the start; inputs, damping and contact change it too"
-    yield Plot("energy", "J", times, energies, note=note)
-    depths = [
-        Line(e.engine, _on(times, e.motion, e.motion.depth)) for e in comparison.engines if e.motion.depth is not None
-    ]
-    yield Plot("penetration", "m", times, depths, note="the deepest overlap that the engine finds")
-
-
-def _coordinate_plots(comparison: Comparison) -> Iterable[Plot]:
-    """Those coordinates whose motions are furthest apart, in the order of the state."""
-    model, times = comparison.model, comparison.reference.motion.times
-    units = [c.unit for c in (*model.contract.positions, *model.contract.velocities)]
-    spread = []
-    for i in range(model.nx):
-        known = np.array([_on(times, e.motion, e.motion.xs[:, i]) for e in comparison.engines])
-        spread.append(float(np.nanmax(np.nanmax(known, axis=0) - np.nanmin(known, axis=0))))
-    shown = sorted(np.argsort(spread)[::-1][:MOST_PLOTS])
-    for i in shown:
-        lines = [Line(e.engine, _on(times, e.motion, e.motion.xs[:, i])) for e in comparison.engines]
-        yield Plot(model.state_names[i], units[i], times, lines)

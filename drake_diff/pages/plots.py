@@ -64,14 +64,13 @@ def page_data(duration: float, plots: Iterable[Plot], certificates: Iterable[Cer
 
 
 def _plot(p: Plot) -> dict[str, Any]:
-    limits = numbers(math.nan if limit is None else limit for limit in p.limits)
     series = [{**vars(line), "y": numbers(line.y)} for line in p.series]
-    return {**vars(p), "x": numbers(p.x), "series": series, "limits": limits}
+    return {**vars(p), "x": numbers(p.x), "series": series, "limits": numbers(p.limits)}
 
 
 def numbers(values: Iterable[Any]) -> list[float | None]:
-    """`values` with eight digits, which is more than a screen shows; None where one is not finite."""
-    return [float(f"{v:.8g}") if math.isfinite(v) else None for v in values]
+    """`values` with eight digits, more than a screen shows; None where there is none, or none that is finite."""
+    return [float(f"{v:.8g}") if v is not None and math.isfinite(v) else None for v in values]
 
 
 def _certificate(c: Certificate) -> dict[str, Any]:
