@@ -49,6 +49,11 @@ def dies(trial):
         os._exit(1)
     return {"cost": trial["level"]}
 
+def exits(trial):
+    if trial["level"] == 2:
+        raise SystemExit("enough")
+    return {"cost": trial["level"]}
+
 def fails(trial):
     if trial["level"] == 2:
         raise ValueError("no, that one not")
@@ -212,8 +217,17 @@ def test_a_worker_that_dies_loses_only_its_trial_which_is_evaluated_once_more(wr
 def test_a_trial_whose_worker_dies_twice_is_a_row_that_says_so(write, tmp_path):
     table = dd.panels.run_panel(write("dies"), out=tmp_path / "out", workers=1)
     assert table.errors == 1
+    assert repr(table).splitlines()[:2] == [
+        f"5 trials in 5 cells, 1 errors, in {tmp_path / 'out'}",
+        "  method=a level=0.5: cost 0.5",
+    ]
     assert table.rows[2]["error"].startswith("WorkerDied: ")
     assert [row["cost"] for row in table.rows if "cost" in row] == [0.5, 1, 4, 8]
+
+
+def test_a_trial_that_calls_exit_ends_itself_alone(write, tmp_path):
+    table = dd.panels.run_panel(write("exits"), out=tmp_path / "out", workers=1)
+    assert [row.get("error") for row in table.rows] == [None, None, "SystemExit: enough", None, None]
 
 
 def test_workers_end_with_their_parent_in_the_middle_of_a_trial(write, tmp_path):

@@ -82,7 +82,7 @@ def row_of(function: Function, fields: Mapping[str, Any]) -> Row:
         if not isinstance(row, Mapping):
             raise InputError("row", got=type(row).__name__, expected="a mapping of names to values")
         return {_name(key, fields): _plain(value) for key, value in row.items()}
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # sys.exit() in a trial ends that trial, not the panel
         return {"error": f"{type(error).__name__}: {error}"}
 
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array
 from drake_diff._base.files import write_whole
 from drake_diff.loop.parts import Hold
 from drake_diff.loop.run import Loop
@@ -111,13 +110,8 @@ def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> 
 
 
 def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -> RobustnessRecord:
-    nothing = dict.fromkeys(("run", "trials", "seed", "loop", "nominal"))
-    found: dict[str, Any] = {
-        **nothing,
-        "perturbations": [],
-        "wall_clock": RobustnessClock(written_utc=written_now()),
-        **rest,
-    }
+    clock = RobustnessClock(written_utc=written_now())
+    unknown: dict[str, Any] = dict.fromkeys(("run", "trials", "seed", "loop", "nominal"))
     return RobustnessRecord(
         name=name,
         verdict=verdict,
@@ -126,7 +120,7 @@ def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -
         state_names=list(model.state_names),
         input_names=list(model.input_names),
         provenance=provenance_of(),
-        **found,
+        **{**unknown, "perturbations": [], "wall_clock": clock, **rest},
     )
 
 
@@ -193,16 +187,9 @@ def _numbers(value: ArrayLike) -> float | list[float | None] | None:
 
 def _is_plain(task: Task) -> bool:
     """Whether a trial can be run again from what trial.json says: nothing in the loop is a user's own."""
-    own = task.loop
-    return (
-        isinstance(task.controller, str)
-        and all(
-            repr(getattr(own, name)) == repr(getattr(PLAIN, name))
-            for name in ("sensor", "actuator", "fallback", "substeps")
-        )
-        and type(own.estimator) is Hold
-        and not own.pushes
-    )
+    own, named = task.loop, ("sensor", "actuator", "fallback", "substeps")
+    plain = all(repr(getattr(own, name)) == repr(getattr(PLAIN, name)) for name in named)
+    return isinstance(task.controller, str) and plain and type(own.estimator) is Hold and not own.pushes
 
 
 def _times(result: Robustness) -> RobustnessClock:
@@ -229,7 +216,6 @@ def _table(result: Robustness) -> str:
     rows.writerow(["perturbation", "level", "seed", "success", "label", "reason", "goal_error", *ends])
     for c in result.cells:
         for e in c.endings:
-            last: Array = e.last
             told = [int(e.label is None), e.label or "", e.reason, e.goal_error]
-            rows.writerow([c.perturbation, c.level, e.seed, *told, *last.tolist()])
+            rows.writerow([c.perturbation, c.level, e.seed, *told, *map(float, e.last)])
     return text.getvalue()

@@ -11,7 +11,7 @@ from drake_diff.artifact.verify import recalled
 from drake_diff.exceptions import InputError
 from drake_diff.trials.perturbation import perturbation_named
 from drake_diff.trials.trial import Task, run_trial
-from drake_diff.trials.trial_files import displacement_of, finite
+from drake_diff.trials.trial_files import result_of
 
 FIELDS = {"run": str, "controller": str, "perturbation": str, "level": (int, float), "seed": int}
 _open = ExitStack()  # keeps the models of the runs as long as the process lives
@@ -34,16 +34,8 @@ def evaluate(trial: Mapping[str, Any]) -> dict[str, Any]:
     perturbation_named(name)
     if seed < 0:
         raise InputError("trial: seed", got=seed, expected="a whole number of at least 0")
-    found = run_trial(_task(str(Path(trial["run"]).resolve()), trial["controller"]), {name: level}, seed)
-    outcome = found.outcome
-    return {
-        "success": outcome.success,
-        "label": found.label,
-        "goal_error": finite(outcome.goal_error),
-        "displacement": displacement_of(outcome),
-        "failures": list(outcome.failures),
-        "ended": outcome.run.ended,
-    }
+    task = _task(str(Path(trial["run"]).resolve()), trial["controller"])
+    return result_of(run_trial(task, {name: level}, seed))
 
 
 @cache

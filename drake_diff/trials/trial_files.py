@@ -17,7 +17,7 @@ from drake_diff.model.parameters import applied, select
 from drake_diff.record.robustness import EventEvidence, TrialEvidence
 from drake_diff.record.sealed import canonical
 from drake_diff.trials.perturbation import Setup, perturbed
-from drake_diff.trials.trial import Judgement, Task, Trial
+from drake_diff.trials.trial import Task, Trial
 
 TRIAL, TRACE, REPLAY, LATENCIES = "trial.json", "trace.mcap", "replay.html", "latencies.json"
 FURTHEST = 1e6  # m and rad: what runs away further is drawn here; the trace has it as it was
@@ -59,7 +59,7 @@ def planned_states(task: Task, setup: Setup) -> Array:
 
 def trial_evidence(task: Task, trial: Trial, run: str | None) -> TrialEvidence:
     """What trial.json says."""
-    outcome, ((name, level), *_) = trial.outcome, trial.levels.items()
+    (name, level), *_ = trial.levels.items()
     setup = perturbed(task.setup, trial.levels, trial.seed)
     return TrialEvidence(
         run=run,
@@ -67,24 +67,27 @@ def trial_evidence(task: Task, trial: Trial, run: str | None) -> TrialEvidence:
         perturbation=name,
         level=level,
         seed=trial.seed,
-        success=outcome.success,
-        label=trial.label,
         reason=trial.reason,
-        failures=list(outcome.failures),
-        goal_error=finite(outcome.goal_error),
-        displacement=displacement_of(outcome),
-        ended=outcome.run.ended,
+        **result_of(trial),
         plant_time_step_s=setup.model.time_step,
         controller_period_s=setup.loop.substeps * setup.model.time_step,
         parameters={key: np.asarray(value).tolist() for key, value in setup.parameters.items()},
         start=setup.x0.tolist(),
-        events=[EventEvidence(t_s=e.t, kind=e.kind, message=e.message) for e in outcome.run.events],
+        events=[EventEvidence(t_s=e.t, kind=e.kind, message=e.message) for e in trial.outcome.run.events],
     )
 
 
-def displacement_of(outcome: Judgement) -> float | None:
-    """The length of the last state's displacement; None where the run broke off or it is not finite."""
-    return None if outcome.run.ended else finite(float(np.linalg.norm(outcome.displacement)))
+def result_of(trial: Trial) -> dict[str, Any]:
+    """What became of a trial, in JSON's types; no displacement where the run broke off or it is not finite."""
+    outcome = trial.outcome
+    return {
+        "success": outcome.success,
+        "label": trial.label,
+        "goal_error": finite(outcome.goal_error),
+        "displacement": None if outcome.run.ended else finite(float(np.linalg.norm(outcome.displacement))),
+        "failures": list(outcome.failures),
+        "ended": outcome.run.ended,
+    }
 
 
 def finite(value: float) -> float | None:
