@@ -31,7 +31,7 @@ JOINT_NUMBERS: dict[str, Callable[[JointContract], tuple[Any, ...]]] = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ContractLine:
     """One thing that two engines must share, and whether they do.
 
@@ -51,7 +51,7 @@ class ContractLine:
     detail: str
     reason: str = ""
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return f"{self.verdict:9} {self.quantity}: {self.detail}"
 
 

@@ -4,15 +4,13 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 
 
 @contextmanager
 def without_lines(*greetings: str) -> Iterator[None]:
     """Lines on stdout and stderr that begin with one of `greetings` are left out, the others come when it ends."""
-    with ExitStack() as stack:
-        for stream in (1, 2):
-            stack.enter_context(_filtered(stream, greetings))
+    with _filtered(1, greetings), _filtered(2, greetings):
         yield
 
 
