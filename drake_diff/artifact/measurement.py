@@ -6,12 +6,12 @@ Whatever a record says of a motion, `verify` computes again by the same function
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.artifact.sections import UNKNOWN
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
@@ -63,7 +63,7 @@ class Column:
 
 
 @dataclass(frozen=True, eq=False)
-class Measurement:
+class Measurement(ShowsItsRepr):
     """What a solution is on Drake's plant; `measure` makes it.
 
     Attributes:
@@ -111,9 +111,6 @@ class Measurement:
     def __repr__(self) -> str:
         lines = [f"Measurement: {self}", *(f"{f.label}: {f.message}" for f in self.failures)]
         return "\n  ".join((*lines, *(f"{m.name}: {m.value} {m.unit} ({m.verdict})" for m in self.metrics)))
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def measure(solution: Solution) -> Measurement:

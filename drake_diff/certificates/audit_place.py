@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from html import escape
 from typing import Any, Literal
 
 import numpy as np
@@ -11,6 +10,7 @@ from pydrake.geometry import HalfSpace, ProximityProperties, VolumeMesh
 from pydrake.multibody.plant import ContactModel
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.derivatives.step import StepDerivatives, differentiate_step
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError
 from drake_diff.model.load_file import autodiff_supports
@@ -24,7 +24,7 @@ PARALLEL = 1e-6  # [rad] between face normals
 
 
 @dataclass(frozen=True, repr=False)
-class Finding:
+class Finding(ShowsItsRepr):
     """Something to know before a model is differentiated.
 
     `severity` is "error" if Drake throws here or the derivative is wrong, "warning" if it may be or a number was not
@@ -48,20 +48,14 @@ class Finding:
 
     __repr__ = __str__
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(str(self))}</pre>"
 
-
-class Findings(list[Finding]):
+class Findings(list[Finding], ShowsItsRepr):
     """What an audit found, the worst first: a list that prints one finding below the other."""
 
     def __str__(self) -> str:
         return "\n".join(map(str, self)) or "nothing found"
 
     __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(str(self))}</pre>"
 
 
 Found = Iterator[Finding]

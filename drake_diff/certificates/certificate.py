@@ -8,13 +8,13 @@ together are a plateau, and their spread is its uncertainty. What the verdicts m
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from html import escape
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.differences import ROUNDING, Difference, Function, Many, one_by_one, richardson, sweep_of
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.certificates.mode_changes import ModeChange
 from drake_diff.exceptions import CertificateError, GradientError, ShapeError
 
@@ -50,7 +50,7 @@ class Entry:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Certificate:
+class Certificate(ShowsItsRepr):
     """One derivative (m, n), compared with difference quotients; `codes` (m, n) are indices into VERDICTS.
 
     The verdict of an entry is
@@ -132,9 +132,6 @@ class Certificate:
 
     def __repr__(self) -> str:
         return f"{type(self).__name__} of {self.subject}: " + "\n  ".join(self._lines())
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def certify_jacobian(

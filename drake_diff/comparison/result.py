@@ -4,12 +4,12 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from html import escape
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
+from drake_diff._base.jupyter import preformatted
 from drake_diff.comparison.attribution import Attribution
 from drake_diff.comparison.recorded import NOT_TOLD
 from drake_diff.engines.contract_match import ContractLine
@@ -237,7 +237,7 @@ class Comparison:
         return "\n".join([*lines, *(f"  {r.engine}: not compared" for r in self.refused)])
 
     def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}\n{escape(str(self))}</pre>"
+        return preformatted(f"{self!r}\n{self}")
 
     def __str__(self) -> str:
         """Which engines are the same, which are not, and whose gradients are those of their own steps."""

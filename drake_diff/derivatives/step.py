@@ -1,12 +1,12 @@
 """The Jacobians of discrete steps, and the gate that each must pass before anyone sees it."""
 
 from dataclasses import dataclass
-from html import escape
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.derivatives.implicit import takes_many
@@ -22,7 +22,7 @@ MAGNITUDE_BOUND = 1e8
 
 
 @dataclass(frozen=True, eq=False)
-class StepDerivatives:
+class StepDerivatives(ShowsItsRepr):
     """A step x_next = f(x, u, p) and its Jacobians; `differentiate_step` makes one. Arrays are read-only.
 
     Example:
@@ -44,9 +44,6 @@ class StepDerivatives:
         by = f"\nC by {', '.join(map(' from '.join, zip(self.parameters, self.sources, strict=True)))}"
         shapes = ", ".join(f"{name} {getattr(self, name).shape}" for name in "ABC")
         return f"StepDerivatives: {shapes} by {self.method}, {self.reason}{by if self.parameters else ''}"
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def differentiate_step(

@@ -9,7 +9,6 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from html import escape
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from drake_diff._base.files import whole_file
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
 from drake_diff.logs.write import start
 
@@ -39,7 +39,7 @@ READERS: dict[int, Any] = {CHUNK: Chunk, ATTACHMENT: Attachment, METADATA: Metad
 
 
 @dataclass(frozen=True, repr=False)
-class McapLog:
+class McapLog(ShowsItsRepr):
     """What a file holds: messages by topic, the channels' metadata, metadata records and attachments."""
 
     messages: dict[str, list[tuple[int, Any]]]  # log time [ns], message
@@ -69,9 +69,6 @@ class McapLog:
     def __repr__(self) -> str:
         topics = ", ".join(f"{topic} ({len(messages)})" for topic, messages in self.messages.items())
         return f"McapLog: {self}\n  {topics or 'no channels'}"
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def read_mcap(path: str | Path) -> McapLog:

@@ -8,7 +8,6 @@ that the controller takes is measured, but what is simulated does not depend on 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from html import escape
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -17,6 +16,7 @@ from numpy.typing import ArrayLike
 from pydrake.multibody.tree import JacobianWrtVariable
 
 from drake_diff._base.arrays import Array, count, finite_array, frozen, positive_float, positive_int
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import InputError, NonFiniteError, SimulationError, UnknownNameError
 from drake_diff.loop.parts import Actuator, Estimator, Fallback, Hold, Sensor
 from drake_diff.model.model import Model
@@ -84,7 +84,7 @@ class LoopEvent(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ClosedLoop:
+class ClosedLoop(ShowsItsRepr):
     """What happened in a loop: one row for each step of the controller, in read-only arrays.
 
     `motion` has the plant's own steps. `ended` is "" or says when and why the run broke off, and `controller_error`
@@ -123,9 +123,6 @@ class ClosedLoop:
             f"  last state: {np.array2string(self.motion.xs[-1], precision=4, threshold=20)}",
         ]
         return "\n".join(lines + ([f"  broke off {self.ended}"] if self.ended else []))
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def closed_loop(

@@ -2,11 +2,11 @@
 
 import math
 from dataclasses import asdict, dataclass
-from html import escape
 from typing import Any
 
 from pydrake.geometry import Role
 
+from drake_diff._base.jupyter import preformatted
 from drake_diff.model.plant import PROXIMITY, actuators, bodies, joints, proximity_property
 from drake_diff.model.twin import Twin
 
@@ -132,7 +132,7 @@ class Contract:
         )
 
     def _repr_html_(self) -> str:
-        return f"<pre>{escape(str(self))}</pre>"
+        return preformatted(str(self))
 
 
 def _plain(value: Any) -> Any:

@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Callable, Hashable
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,6 +16,7 @@ from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_diff._base.arrays import finite_array, positive_float
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, UnknownNameError
 from drake_diff.model.contract import Contract, read_contract
 from drake_diff.model.load_file import (
@@ -45,7 +45,7 @@ OTHERS_KEPT = 64  # how many rebuilt models are kept: a certificate by the time 
 NAMES_SHOWN = 12  # in repr: a robot arm's state is shown whole
 
 
-class Model:
+class Model(ShowsItsRepr):
     """A finalized discrete plant, ready to be stepped and differentiated.
 
     Make one with `load_model` or `model_from_diagram`. The state is Drake's, `x = [q; v]`, and the input `u` is the
@@ -256,9 +256,6 @@ class Model:
 
     def __str__(self) -> str:
         return f"Model {self.name!r}: nq={self.nq}, nv={self.nv}, nu={self.nu}, time step {self.time_step:g} s"
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def load_model(

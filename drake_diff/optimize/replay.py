@@ -13,11 +13,11 @@ one time step and one contact approximation, so it has no other variants.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from html import escape
 
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import GradientError, InputError, ModelError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
 from drake_diff.model.model import Model
@@ -41,7 +41,7 @@ EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in T
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Replay:
+class Replay(ShowsItsRepr):
     """One rollout of a plan: in which variant of the plant, how controlled, and what does not hold in it."""
 
     variant: str
@@ -65,9 +65,6 @@ class Replay:
 
     def __repr__(self) -> str:
         return f"Replay {self}"
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 @dataclass(frozen=True, eq=False)

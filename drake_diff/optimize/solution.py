@@ -2,7 +2,6 @@
 
 import copy
 import enum
-import html
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
 from drake_diff.model.model import Model
@@ -63,7 +63,7 @@ _SENTENCES = {
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Solution:
+class Solution(ShowsItsRepr):
     """The motion that `solve` found, how it was found, and what it measures on Drake's double plant.
 
     `cost`, `defect`, `goal_error`, `bound_violation`, `constraint_violation`, `replays` and the rest are computed from
@@ -122,9 +122,6 @@ class Solution:
 
     def __repr__(self) -> str:
         return "\n  ".join(self._lines())
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
 
     def _lines(self) -> Iterator[str]:
         how = ", ".join(name for name in (self.scheme, self.solver) if name not in ("step", ""))

@@ -6,11 +6,11 @@ import json
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Any
 
 from drake_diff._base.files import write_whole
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.statistics import success_rate
 from drake_diff.panels.panel_file import PanelTrial, canonical, cell_name
 from drake_diff.panels.trial_row import Row
@@ -20,7 +20,7 @@ SHOWN_CELLS = 8  # in a repr
 
 
 @dataclass(frozen=True, eq=False)
-class PanelTable:
+class PanelTable(ShowsItsRepr):
     """What `run_panel` found.
 
     `rows` has a row for each trial, in the panel's order: its cell, id, repeat and seed, then what its function
@@ -47,9 +47,6 @@ class PanelTable:
         if len(cells) > SHOWN_CELLS:
             lines.append(f"  and {len(cells) - SHOWN_CELLS} more cells")
         return "\n".join(lines)
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def write_table(

@@ -4,12 +4,12 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from html import escape
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.comparison.result import Refused
 from drake_diff.comparison.side_by_side import default_engines
 from drake_diff.engines.closed_form import SphereOnGround
@@ -125,7 +125,7 @@ class ContactRow:
 
 
 @dataclass(frozen=True, repr=False)
-class ContactTable:
+class ContactTable(ShowsItsRepr):
     """All rows, case by case, and the engines that have none, with the reason."""
 
     rows: tuple[ContactRow, ...]
@@ -154,9 +154,6 @@ class ContactTable:
         refused = ", ".join(dict.fromkeys(r.engine for r in self.refused))
         lines += [f"  refused at least one case: {refused}"] if refused else []
         return "\n".join([f"ContactTable({len(self.rows)} rows, {len(self.off)} off)", *lines])
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def lines_of(table: ContactTable, engine: str) -> tuple[str, ...]:

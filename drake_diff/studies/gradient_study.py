@@ -9,7 +9,6 @@ import io
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 
 from drake_diff._base.arrays import positive_int
 from drake_diff._base.files import write_whole
+from drake_diff._base.jupyter import preformatted
 from drake_diff._base.statistics import Rate, success_rate
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.pages.html import write_page
@@ -215,7 +215,7 @@ class GradientPanel:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        return f"<pre>{escape(str(self))}</pre>"
+        return preformatted(str(self))
 
 
 def save_gradient_panel(panel: GradientPanel, directory: str | Path) -> None:

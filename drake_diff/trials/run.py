@@ -8,12 +8,12 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from html import escape
 from typing import NamedTuple
 
 import numpy as np
 
 from drake_diff._base.arrays import Array, count, positive_int
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.statistics import Rate, margin, success_rate
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import InputError
@@ -138,7 +138,7 @@ class Cell:
 
 
 @dataclass(frozen=True, eq=False)
-class Robustness:
+class Robustness(ShowsItsRepr):
     """What `robustness` found: a cell for each perturbation and level, and the task with its unperturbed run.
 
     Example:
@@ -213,9 +213,6 @@ class Robustness:
 
     def __str__(self) -> str:
         return self.sentence
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def trial_seed(seed: int, index: int) -> int:

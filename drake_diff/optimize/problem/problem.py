@@ -1,6 +1,5 @@
 """What is to be optimized, checked when it is made; contains no solver."""
 
-import html
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
@@ -9,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, finite_array, frozen, positive_float, positive_int
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, select
@@ -31,7 +31,7 @@ SMALLEST_PART = 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Problem:
+class Problem(ShowsItsRepr):
     """A trajectory to be optimized: minimize the time integral of running_cost(x, u), plus final_cost(x_N).
 
     On a model's discrete steps the integral is sum_k h * running_cost(x_k, u_k) with h = model.time_step; collocation
@@ -144,9 +144,6 @@ class Problem:
         named = f" ({', '.join(self.parameters.names)})" if self.parameters.names else ""
         lines.append(f"optimize: {', '.join(self.optimize)}{named}")
         return "\n  ".join(lines)
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
 
     @property
     def has_model(self) -> bool:
