@@ -36,7 +36,7 @@ def collocate(problem, **options):
 @pytest.mark.parametrize("count", [2, 4, 10, 20])
 @pytest.mark.parametrize("solver", ["ipopt", "snopt"])
 def test_the_block_moves_by_the_transcriptions_own_optimum(count, solver):
-    """B01: J = 12 / (1 - 2/N^2 + 4/(3 N^3)): linear inputs, the running cost by trapezoids."""
+    """Of Drake's scheme J = 12 / (1 - 2/N^2 + 4/(3 N^3)): linear inputs, the running cost by trapezoids."""
     solution = collocate(move(count), solver=solver)
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(12 / (1 - 2 / count**2 + 4 / (3 * count**3)), rel=1e-8)

@@ -32,7 +32,7 @@ def test_the_objective_is_a_rate_times_the_time_step_plus_the_final_cost(load):
 
 
 def test_the_soft_pendulums_cost_without_input_is_the_oracles(load):
-    """B33 without input: hanging still costs (100 * 0.02 * 0.1 + 50) pi^2."""
+    """Without input: hanging still costs (100 * 0.02 * 0.1 + 50) pi^2."""
     problem = dd.Problem(
         load("pendulum.urdf", time_step=0.02),
         x0=[0, 0],

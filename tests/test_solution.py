@@ -113,6 +113,20 @@ def test_collocations_last_input_is_held_to_its_bound():
 
 
 @pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_worst_of_several_constraints_counts(method, order):
+    """One holds and one is broken by a known excess, in either order: the other way round both would seem to hold."""
+    s = solved(method)
+    kept = dd.Constraint(lambda x: x[0], upper=2.0, name="kept")
+    broken = dd.Constraint(lambda x: x[0], upper=float(s.xs[N, 0]) - 0.25, name="broken")
+    asked = dataclasses.replace(s.problem, constraints=(kept, broken)[::order])
+    measured = dataclasses.replace(s, problem=asked)
+    assert measured.constraint_violation == pytest.approx(0.25, rel=1e-9)
+    assert measured.constraint_excess["broken"] == (pytest.approx(0.25, rel=1e-9), N)
+    assert measured.constraint_excess["kept"][0] == 0
+
+
+@pytest.mark.parametrize("method", METHODS)
 def test_the_cost_is_computed_from_the_motion(method):
     """Inputs twice as large cost four times as much; the final cost of a motion left as it is stays."""
     s = solved(method)

@@ -15,7 +15,7 @@ SCHEMES = ("hermite_simpson", "trapezoid", "drake")
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_minimum_time_is_bang_bang(write_urdf, scheme):
-    """B06: from rest, distance D = 1, |u| <= 1, m = 1: T = 2 sqrt(D) = 2, u = +1 then -1; a node lies at the switch."""
+    """From rest, distance D = 1, |u| <= 1, m = 1: T = 2 sqrt(D) = 2, u = +1 then -1; a node lies at the switch."""
     problem = dd.Problem(
         write_urdf(time_step=0.1),
         x0=[-1, 0],
@@ -110,7 +110,7 @@ def test_a_broken_constraint_is_named_with_its_knot(write_urdf):
 
 
 def test_what_a_bound_is_exceeded_by_between_the_nodes_is_in_the_record(write_urdf, tmp_path):
-    """B14, Bryson and Denham: x <= 1/9, (0, 1) to (0, -1) in 1 s, nodes beside the ends of its arcs."""
+    """Bryson and Denham: x <= 1/9, (0, 1) to (0, -1) in 1 s, nodes beside the ends of its arcs."""
     problem = dd.Problem(
         write_urdf(time_step=0.1),
         x0=[0, 1],

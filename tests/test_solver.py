@@ -34,7 +34,7 @@ def swing_up(load, count, cost=EFFORT, **changes):
 @pytest.mark.parametrize(("count", "cost"), [(20, 62.58516350539), (40, 59.79288912066)])
 @pytest.mark.parametrize("running_cost", [EFFORT, lambda x, u: u[0] ** 2])
 def test_cart_pole_swing_up_by_collocation(load, count, cost, running_cost):
-    """B02, Drake's own values."""
+    """The optima that Drake's DirectCollocation finds with SNOPT."""
     solution = dd.solve(swing_up(load, count, running_cost), method="collocation", scheme="drake")
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(cost, rel=1e-8)
@@ -58,7 +58,7 @@ SOFT = {
 
 @pytest.mark.parametrize("solver", ["ipopt", "snopt"])
 def test_pendulum_with_a_hard_goal_by_shooting(load, solver):
-    """B33: J = 8.826541704941, the first inputs to the digits that the solver's tolerance leaves."""
+    """J = 8.826541704941 by a solve of the same steps beside Drake; inputs to the digits that a tolerance leaves."""
     solution = dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]), method="shooting", solver=solver)
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(8.826541704941, rel=1e-10)
@@ -67,7 +67,7 @@ def test_pendulum_with_a_hard_goal_by_shooting(load, solver):
 
 @pytest.mark.parametrize("method", ["shooting", "ilqr"])
 def test_pendulum_with_a_soft_goal(load, method):
-    """B33: J* = 1.88951695347."""
+    """J* = 1.88951695347 by a solve of the same steps beside Drake."""
     solution = dd.solve(pendulum(load, **SOFT), method=method)
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(1.88951695347, rel=1e-10)
