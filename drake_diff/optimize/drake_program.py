@@ -123,10 +123,8 @@ _RESULTS = {
     SolutionResult.kInfeasibleOrUnbounded: Outcome.INFEASIBLE,
     SolutionResult.kUnbounded: Outcome.UNBOUNDED,
 }
-_SNOPT_INACCURATE = (
-    3,
-    41,
-)  # feasible or not better: "requested accuracy could not be achieved", "numerical difficulties"
+# Feasible, or not better: "requested accuracy could not be achieved", "current point cannot be improved".
+_SNOPT_INACCURATE = (3, 41)
 _SNOPT_INFEASIBLE = (11, 12, 13, 14, 15, 16)
 
 
@@ -154,21 +152,14 @@ def _read_table(solver: str, print_file: Path) -> tuple[Iteration, ...]:
     return tuple(rows)
 
 
-_IPOPT_ROW = re.compile(
-    r"^\s*(?P<iter>\d+)(?:r|\s)\s*(?P<objective>-?\d\S+)\s+(?P<inf_pr>\S+)\s+(?P<inf_du>\S+)\s+\S+\s+\S+\s+\S+\s+\S+\s+"
-    r"(?P<alpha_pr>[\d.e+-]+)\w?\s+\d+"
-)
+# iter, objective, inf_pr, inf_du, four that are left out, alpha_pr with the letter of its step, line searches
+_IPOPT_ROW = re.compile(r"^\s*(\d+)[r\s]\s*(-?\d\S+)\s+(\S+)\s+(\S+)\s+\S+\s+\S+\s+\S+\s+\S+\s+([\d.e+-]+)\w?\s+\d+")
 
 
 def _ipopt_rows(lines: list[str]) -> Iterator[Iteration]:
     for match in filter(None, map(_IPOPT_ROW.match, lines)):
-        yield Iteration(
-            int(match["iter"]),
-            _number(match["objective"]),
-            _number(match["inf_pr"]),
-            _number(match["inf_du"]),
-            _number(match["alpha_pr"]),
-        )
+        number, *cells = match.groups()
+        yield Iteration(int(number), *map(_number, cells))
 
 
 def _snopt_rows(lines: list[str]) -> Iterator[Iteration]:
@@ -183,13 +174,8 @@ def _snopt_rows(lines: list[str]) -> Iterator[Iteration]:
         elif ends and re.match(r"^\s+\d+\s+\d+\s", line):
             objective = next((n for n in ("MeritFunction", "Objective") if n in ends), "")
             cell = {name: line[a:b].strip(" ()") for name, (a, b) in ends.items()}
-            yield Iteration(
-                int(cell["Major"]),
-                _number(cell.get(objective, "")),
-                _number(cell["Feasible"]),
-                _number(cell["Optimal"]),
-                _number(cell["Step"]),
-            )
+            numbers = (_number(cell.get(name, "")) for name in (objective, "Feasible", "Optimal", "Step"))
+            yield Iteration(int(cell["Major"]), *numbers)
 
 
 def _number(text: str) -> float:

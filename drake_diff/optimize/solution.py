@@ -30,7 +30,12 @@ TOLD = ("status", "message", "iterations", "solver_message", "options")  # field
 
 
 class Status(enum.Enum):
-    """How a solve ended; `sentence` says what that means and what to try."""
+    """How a solve ended. Only CONVERGED is a success: the solver converged and all measures taken again hold.
+
+    Example:
+        >>> dd.Status("iteration_limit").sentence
+        'the iteration limit came first; raise max_iterations or start from a better guess'
+    """
 
     CONVERGED = "converged"
     CONVERGED_NOT_VERIFIED = "converged_not_verified"
@@ -44,6 +49,7 @@ class Status(enum.Enum):
 
     @property
     def sentence(self) -> str:
+        """What it means, and what to try."""
         return _SENTENCES[self]
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from hashlib import sha256
 from typing import Any
@@ -175,14 +175,16 @@ class _Guess:
         return self.motion or (self.xs, np.vstack([self.us, self.us[-1:] if self.u_final is None else self.u_final]))
 
 
+@dataclass(eq=False)
 class _Task:
     """What all attempts at a problem share."""
 
-    def __init__(
-        self, problem: Problem, limits: Limits, seed: int, report: Report, on_start: Callable[[], None] | None
-    ):
-        self.problem, self.limits, self.seed, self.report, self.on_start = problem, limits, seed, report, on_start
-        self.start = time.monotonic()
+    problem: Problem
+    limits: Limits
+    seed: int
+    report: Report
+    on_start: Callable[[], None] | None
+    start: float = field(default_factory=time.monotonic)
 
     def prepare(self, attempt: Attempt, given: Any) -> Callable[[], Solution]:
         """Check that `attempt` can be made from the guess `given`; what is returned makes it."""
@@ -375,22 +377,18 @@ def _guess(problem: Problem, method: str, given: Any, seed: int) -> _Guess:
     return _Guess(xs, inside if problem.optimizes_controls else us)
 
 
+@dataclass(frozen=True, eq=False)
 class Run:
     """One solve by one method: certify at the guess, search, certify at the result, measure, judge."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        method: str,
-        scheme: str,
-        solver: str,
-        limits: Limits,
-        options: dict[str, Any],
-        report: Report | None,
-    ):
-        self.problem, self.method, self.scheme, self.solver = problem, method, scheme, solver
-        self.limits, self.options, self.report = limits, options, report
-        self.start = time.monotonic()
+    problem: Problem
+    method: str
+    scheme: str
+    solver: str
+    limits: Limits
+    options: dict[str, Any]
+    report: Report | None
+    start: float = field(default_factory=time.monotonic)
 
     def collocate(self, guess: _Guess, refinement: Refinement | None) -> Solution:
         """In CasADi; SNOPT, which that does not carry, in Drake's own DirectCollocation."""

@@ -1,5 +1,7 @@
 """Direct collocation: Drake's DirectCollocation over the model's equations of motion in continuous time."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -42,8 +44,7 @@ class _Transcription:
         self.program = self.drake.prog()
         self.states = [self.drake.state(k) for k in range(count + 1)]
         self.inputs = [self.drake.input(k) for k in range(count + 1)]
-        self._add_ends()
-        self._add_bounds()
+        self._add_limits()
         self._add_costs()
 
     def pack(self, xs: Array, us: Array) -> Array:
@@ -63,47 +64,33 @@ class _Transcription:
         us = [z[self.program.FindDecisionVariableIndices(v)] for v in self.inputs]
         return np.array(xs), np.array(us)
 
-    def _add_ends(self) -> None:
-        problem = self.problem
-        fixed = ~problem.initial_state_mask
-        if fixed.any():
-            self._add_box(problem.x0[fixed], problem.x0[fixed], self.states[0][fixed], "initial state")
-        wanted = ~np.isnan(problem.goal)
-        if wanted.any():
-            self._add_box(problem.goal[wanted], problem.goal[wanted], self.states[-1][wanted], "goal")
-
-    def _add_bounds(self) -> None:
+    def _add_limits(self) -> None:
+        """Bounds, equal where an end is given."""
+        for variables, lower, upper in zip(self.states, *self.problem.state_limits(), strict=True):
+            self.program.AddBoundingBoxConstraint(lower, upper, variables)
         b = self.problem.bounds
-        free = self.problem.initial_state_mask
-        if free.any():
-            self._add_box(b.x_lower[free], b.x_upper[free], self.states[0][free], "initial state bounds")
-        for k, variables in enumerate(self.states[1:], start=1):
-            self._add_box(b.x_lower, b.x_upper, variables, f"state bounds at knot {k}")
-        for k, variables in enumerate(self.inputs):
-            self._add_box(b.u_lower, b.u_upper, variables, f"input bounds at knot {k}")
-
-    def _add_box(self, lower: Array, upper: Array, variables: Any, name: str) -> None:
-        binding = self.program.AddBoundingBoxConstraint(lower, upper, variables)
-        binding.evaluator().set_description(name)
+        for variables in self.inputs:
+            self.program.AddBoundingBoxConstraint(b.u_lower, b.u_upper, variables)
 
     def _add_costs(self) -> None:
-        problem, h = self.problem, self.problem.model.time_step
-        if problem.running_cost is not None:
-            for k, (x, u) in enumerate(zip(self.states, self.inputs, strict=True)):
-                weight = h / 2 if k in (0, problem.num_steps) else h
-                self._add_running_cost(weight, x, u)
-        if isinstance(problem.final_cost, QuadraticCost):
-            self._add_quadratic_form(1.0, problem.final_cost.Q, problem.final_cost.x_ref, self.states[-1])
-        elif problem.final_cost is not None:
-            self.program.AddCost(_FinalCost(problem), vars=self.states[-1])
+        running, final, nx = self.problem.running_cost, self.problem.final_cost, self.problem.nx
+        h, count = self.problem.time_step, self.problem.num_steps
 
-    def _add_running_cost(self, weight: float, x: Any, u: Any) -> None:
-        cost = self.problem.running_cost
-        if isinstance(cost, QuadraticCost):
-            self._add_quadratic_form(weight, cost.Q, cost.x_ref, x)
-            self._add_quadratic_form(weight, cost.R, cost.u_ref, u)
-        else:
-            self.program.AddCost(_RunningCost(self.problem, weight), vars=np.concatenate([x, u]))
+        def differentiate_running(z: Array) -> tuple[float, Array]:
+            value, by_x, by_u = differentiate_cost(running, z[:nx], z[nx:])
+            return value, np.concatenate([by_x, by_u])
+
+        for k, (x, u) in enumerate(zip(self.states, self.inputs, strict=True)):
+            weight = h / 2 if k in (0, count) else h
+            if isinstance(running, QuadraticCost):
+                self._add_quadratic_form(weight, running.Q, running.x_ref, x)
+                self._add_quadratic_form(weight, running.R, running.u_ref, u)
+            elif running is not None:
+                self.program.AddCost(_Cost(differentiate_running, weight), vars=np.concatenate([x, u]))
+        if isinstance(final, QuadraticCost):
+            self._add_quadratic_form(1.0, final.Q, final.x_ref, self.states[-1])
+        elif final is not None:
+            self.program.AddCost(_Cost(partial(differentiate_final_cost, final), 1.0), vars=self.states[-1])
 
     def _add_quadratic_form(self, weight: float, form: Any, reference: Any, variables: Any) -> None:
         if form is None or not len(variables):
@@ -114,28 +101,12 @@ class _Transcription:
         )
 
 
-class _RunningCost:
-    """weight * running_cost(x, u) for a MathematicalProgram, floats or AutoDiffXd."""
+class _Cost:
+    """weight * cost(z) for a MathematicalProgram, floats or AutoDiffXd, from its value and gradient."""
 
-    def __init__(self, problem: Problem, weight: float):
-        self.cost, self.nx, self.weight = problem.running_cost, problem.model.nx, weight
+    def __init__(self, differentiate: Callable[[Array], tuple[float, Array]], weight: float):
+        self.differentiate, self.weight = differentiate, weight
 
     def __call__(self, z: Any) -> Any:
-        if z.dtype == float:
-            return self.weight * float(self.cost(z[: self.nx], z[self.nx :]))
-        at = ExtractValue(z).ravel()
-        value, by_x, by_u = differentiate_cost(self.cost, at[: self.nx], at[self.nx :])
-        return chain(self.weight * value, self.weight * np.concatenate([by_x, by_u]), z)
-
-
-class _FinalCost:
-    """final_cost(x) for a MathematicalProgram, floats or AutoDiffXd."""
-
-    def __init__(self, problem: Problem):
-        self.cost = problem.final_cost
-
-    def __call__(self, x: Any) -> Any:
-        if x.dtype == float:
-            return float(self.cost(x))  # type: ignore[misc]
-        value, gradient = differentiate_final_cost(self.cost, ExtractValue(x).ravel())  # type: ignore[arg-type]
-        return chain(value, gradient, x)
+        value, gradient = self.differentiate(z if z.dtype == float else ExtractValue(z).ravel())
+        return self.weight * value if z.dtype == float else chain(self.weight * value, self.weight * gradient, z)

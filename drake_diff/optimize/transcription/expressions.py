@@ -1,12 +1,11 @@
-"""Functions in ordinary arithmetic as CasADi functions, for exact second derivatives.
+"""Functions of a knot [x, u] within a CasADi program: traced to expressions where that is possible, else called back.
 
 A `Symbol` goes through a function as AutoDiffXd does: NumPy computes with arrays of it. It has no float() and no truth
 value, so that a function that branches on its numbers cannot pass for one that does not.
 
-Functions of a knot [x, u] within a CasADi program, at all their knots in one call: symbolic, or called back.
-
-Both give `values` (m, K), the nonzeros of the K Jacobians by the knot, and, where symbolic, those of the Hessians of
-weights (m, K) times values. `jacobian_at` and `hessian_at` are (rows, columns) of the nonzeros of one knot.
+Both kinds give `values` (m, K) at all K knots in one call, and the nonzeros of the K Jacobians by the knot; expressions
+also those of the Hessians of weights (m, K) times values. `jacobian_at` and `hessian_at` are (rows, columns) of the
+nonzeros of one knot.
 """
 
 import operator

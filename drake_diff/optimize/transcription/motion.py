@@ -189,9 +189,24 @@ def _finite(values: Array) -> Array:
 
 
 def violation_between_nodes(motion: Collocated) -> Excess:
-    """The largest excess over the bounds at 19 points within each interval, where the solver enforces nothing.
+    """How far a collocated motion leaves its bounds between the nodes, where the solver enforces nothing.
 
     A cost below the optimum of the problem with its bounds goes together with an excess here.
+
+    Args:
+        motion: `Solution.transcribed` of a solution by collocation.
+
+    Returns:
+        An `Excess`: the largest of a `state` and of an `input` over a bound, each in its own unit, at 19 points within
+        each interval, and `where` the larger one is.
+
+    Example:
+        >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1, x_upper=[1 / 9, np.inf])
+        >>> effort = dd.QuadraticCost(R=[[0.5]])
+        >>> problem = dd.Problem(block, x0=[0, 1], x_goal=[0, -1], num_steps=10, horizon=1.0, running_cost=effort)
+        >>> excess = dd.optimize.violation_between_nodes(dd.solve(problem).transcribed)
+        >>> round(excess.state, 5), excess.input
+        (0.0001, 0.0)
     """
     task, b = motion.task, motion.task.bounds
     k = np.repeat(np.arange(len(motion.mesh) - 1), len(DENSE))
