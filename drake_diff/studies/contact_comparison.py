@@ -303,14 +303,8 @@ def _load(case: ContactCase, model: Model, spec: Spec) -> Engine:
         return load_spec(spec, model)
     if case.axes != ("z",):
         raise ModelError("the hand calculation knows a ball on a vertical rail only")
-    by_hand = SphereOnGround(
-        mass=case.mass,
-        radius=case.radius,
-        stiffness=case.stiffness,
-        relaxation_time=case.relaxation_time,
-        gravity=case.gravity,
-    )
-    return NumpyEngine(by_hand, time_step=model.time_step)
+    same = {name: getattr(case, name) for name in ("mass", "radius", "stiffness", "relaxation_time", "gravity")}
+    return NumpyEngine(SphereOnGround(**same), time_step=model.time_step)
 
 
 def _judge(run: _Run, value: float, answer: Answer | None) -> tuple[Verdict, str]:

@@ -53,7 +53,7 @@ class Law:
     stepped: Force  # what it amounts to in steps of h, to the first order
     creep: float  # speed at which it holds on the slope [m/s]
     creep_gradient: float  # of the way that a start's speed makes it creep [s]
-    tail: float  # how far it goes on below, by its speed there [s]
+    tail: float = 0.0  # how far it goes on when friction is no longer mu N, by its speed there [s]
 
     def answer(self, ran: Ran) -> Answer:
         """The law's own answer, given how `ran` moved along the normal."""
@@ -192,45 +192,36 @@ def _spring(stiffness: float, relaxation_time: float, dissipation: float) -> For
 def _sap(case: ContactCase) -> Law:
     """f = k (x + tau x'), and mu v more of it as it slides; what sticks has the compliance R_t = sigma w / h."""
     per_axis = sqrt(len(case.axes) or 3) / (3 * case.mass)  # Frobenius norm of the contact's inverse inertia, over 3
-    creep = SIGMA * per_axis * case.time_step * case.mass * case.slope_gravity
     return Law(
         case,
-        f"k (x + tau x') with tau = {case.relaxation_time:g} s",
-        "friction that sticks is a damper of SAP's own, sigma = 1e-3",
-        _spring(case.stiffness, case.relaxation_time, 0.0),
-        _spring(case.stiffness, case.relaxation_time + case.time_step, 0.0),
-        creep,
+        normal=f"k (x + tau x') with tau = {case.relaxation_time:g} s",
+        sticking="friction that sticks is a damper of SAP's own, sigma = 1e-3",
+        force=_spring(case.stiffness, case.relaxation_time, 0.0),
+        stepped=_spring(case.stiffness, case.relaxation_time + case.time_step, 0.0),
+        creep=SIGMA * per_axis * case.time_step * case.mass * case.slope_gravity,
         # A step leaves r / (1 + r) of a speed, r = sigma w m, and the sum of its powers is r.
-        case.time_step * SIGMA * per_axis * case.mass,
-        0.0,
+        creep_gradient=case.time_step * SIGMA * per_axis * case.mass,
     )
 
 
 def _hunt_crossley(case: ContactCase) -> Law:
     """f = k x (1 + d x'), friction mu N v / sqrt(v^2 + s^2): implicit in v', explicit in nothing else."""
-    s = STICTION_TOLERANCE
     creep, creep_gradient = _block_that_holds(case) if case.kind == "hold" else (0.0, 0.0)
     return Law(
         case,
-        f"k x (1 + d x') with d = {case.dissipation:g} s/m",
-        f"friction is regularized below {s:g} m/s",
-        _spring(case.stiffness, 0.0, case.dissipation),
-        _spring(case.stiffness, case.time_step, case.dissipation),
-        creep,
-        creep_gradient,
-        0.0,
+        normal=f"k x (1 + d x') with d = {case.dissipation:g} s/m",
+        sticking=f"friction is regularized below {STICTION_TOLERANCE:g} m/s",
+        force=_spring(case.stiffness, 0.0, case.dissipation),
+        stepped=_spring(case.stiffness, case.time_step, case.dissipation),
+        creep=creep,
+        creep_gradient=creep_gradient,
     )
 
 
 def _block_that_holds(case: ContactCase) -> tuple[float, float]:
     """By the block calculated by hand: the speed after the case's steps [m/s], and d x_N / d v_0 [s]."""
-    block = SlidingBlock(
-        mass=case.mass,
-        friction=case.friction,
-        stiction_tolerance=STICTION_TOLERANCE,
-        slope=case.slope,
-        gravity=case.gravity,
-    )
+    same = {name: getattr(case, name) for name in ("mass", "friction", "slope", "gravity")}
+    block = SlidingBlock(stiction_tolerance=STICTION_TOLERANCE, **same)
     h, v, left, way = case.time_step, np.array([case.speed]), 1.0, 0.0
     for _ in range(case.num_steps):
         a, by = block.acceleration(h, np.zeros(1), v, np.zeros(1))
@@ -256,11 +247,11 @@ def _mujoco(case: ContactCase) -> Law:
 
     return Law(
         case,
-        f"a damper of {b / (1 / case.mass + R):.3g} N s/m and a spring",
-        f"friction below {case.friction * case.normal_gravity * holds:.2g} m/s or so is a damper, R f = -b v",
-        force,
-        force,
-        case.mass * R / FRICTION_IMPEDANCE_RATIO * case.slope_gravity / b,
-        holds - case.time_step,
-        holds - case.time_step,
+        normal=f"a damper of {b / (1 / case.mass + R):.3g} N s/m and a spring",
+        sticking=f"friction below {case.friction * case.normal_gravity * holds:.2g} m/s or so is a damper, R f = -b v",
+        force=force,
+        stepped=force,
+        creep=case.mass * R / FRICTION_IMPEDANCE_RATIO * case.slope_gravity / b,
+        creep_gradient=holds - case.time_step,
+        tail=holds - case.time_step,
     )
