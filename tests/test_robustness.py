@@ -213,9 +213,9 @@ def test_unknown_names_and_levels_are_named(cart, setup):
     with np.errstate(over="ignore"), pytest.raises(InputError, match="level of initial_state"):
         draws(setup, "initial_state", 1.7e308)
     for name in ("friction", "contact_approximation"):
-        with pytest.raises(InputError, match="one that cart has something for"):
+        with pytest.raises(InputError, match="one that applies to cart"):
             levels_of(task, [name])
-        with pytest.raises(InputError, match="one that cart has something for"):
+        with pytest.raises(InputError, match="one that applies to cart"):
             perturbed(setup, {name: 0.1}, 0)
     for levels in ([], [0.0], [np.inf]):
         with pytest.raises(InputError, match="levels of mass"):

@@ -57,7 +57,7 @@ class Perturbation:
     def check_is_of(self, model: Model) -> None:
         """InputError where there is nothing in `model` for it to change."""
         if not self.is_of(model):
-            raise InputError("perturbation", got=self.name, expected=f"one that {model.name} has something for")
+            raise InputError("perturbation", got=self.name, expected=f"one that applies to {model.name}")
 
 
 def perturbed(setup: Setup, levels: Mapping[str, float], seed: int) -> Setup:
@@ -82,7 +82,7 @@ def perturbation_named(name: str) -> Perturbation:
 
 
 def parameters_of(model: Model, quantity: str) -> dict[str, Array]:
-    """The parameters of a quantity that are not 0, of whole bodies and not of their geometries."""
+    """The parameters of a quantity that are not 0: those of bodies and joints, not of single geometries."""
     found = {p.name: p.value for p in list_parameters(model) if p.kind.quantity == quantity and "/" not in p.name}
     fixed = {"inertia", "mass"} & {quantity}
     moving = {body.name() for body in moving_bodies(model.plant)}
@@ -96,7 +96,7 @@ def parameters_of(model: Model, quantity: str) -> dict[str, Array]:
 def _scaled(quantity: str) -> Callable[[Setup, float, Random], Setup]:
     def apply(setup: Setup, level: float, random: Random) -> Setup:
         if level >= 1:
-            raise InputError(f"level of {quantity}", got=level, expected="less than 1, a part of the value")
+            raise InputError(f"level of {quantity}", got=level, expected="less than 1: it is a part of the value")
         values = {
             name: setup.parameters.get(name, value) * (1 + random.uniform(-level, level))
             for name, value in parameters_of(setup.model, quantity).items()
@@ -110,14 +110,16 @@ def _initial_state(setup: Setup, level: float, random: Random) -> Setup:
     space = tangent_space(setup.model)
     x0 = space.plus(setup.x0, level * random.standard_normal(space.size))
     if not np.all(np.isfinite(x0)):
-        raise InputError("level of initial_state", got=level, expected="one that leaves every start finite")
+        raise InputError("level of initial_state", got=level, expected="one small enough to keep every start finite")
     return replace(setup, x0=x0)
 
 
 def _time_step(setup: Setup, level: float, random: Random) -> Setup:
     parts = round(level)
     if parts != level or parts < 1:
-        raise InputError("level of time_step", got=level, expected="a whole number: into how many a step is cut")
+        raise InputError(
+            "level of time_step", got=level, expected="a whole number: how many parts each step is cut into"
+        )
     loop = replace(setup.loop, substeps=setup.loop.substeps * parts)
     return replace(setup, model=setup.model.at_time_step(setup.model.time_step / parts), loop=loop)
 
@@ -171,26 +173,26 @@ _KINDS = (
     Perturbation("friction", "1", PARTS, "each body's friction (1 + U)", _scaled("friction"), "friction"),
     Perturbation("stiffness", "1", PARTS, "each body's contact stiffness (1 + U)", _scaled("stiffness"), "stiffness"),
     Perturbation("damping", "1", PARTS, "each joint's damping (1 + U)", _scaled("damping"), "damping"),
-    Perturbation("time_step", "1", (2, 4), "each step of the plant cut into so many", _time_step),
+    Perturbation("time_step", "1", (2, 4), "each step of the plant cut into this many", _time_step),
     Perturbation("contact_approximation", "1", (1,), "another of sap, similar and lagged", _contact),
     Perturbation("gravity", "1", (0.01, 0.03, 0.1), "gravity (1 + U)", _scaled("gravity"), "gravity"),
     Perturbation("actuator_strength", "1", PARTS, "each input (1 + U)", _strength),
-    Perturbation("push", "N s", (0.03, 0.1, 0.3, 1.0), "a horizontal blow on a body, at a time before 3/4", _push),
+    Perturbation("push", "N s", (0.03, 0.1, 0.3, 1.0), "a horizontal blow to a body before 3/4 of the time", _push),
     Perturbation(
-        "sensor_noise", "q, v", (0.003, 0.01, 0.03, 0.1), "each coordinate that is seen + N",
+        "sensor_noise", "q, v", (0.003, 0.01, 0.03, 0.1), "each measured coordinate + N",
         _sensor(lambda sensor, level, random, size: {"noise": np.hypot(sensor.noise, level)}),
     ),
     Perturbation(
-        "sensor_bias", "q, v", (0.003, 0.01, 0.03, 0.1), "each coordinate that is seen + U, the same all along",
+        "sensor_bias", "q, v", (0.003, 0.01, 0.03, 0.1), "each measured coordinate + U, constant over a trial",
         _sensor(lambda sensor, level, random, size: {"bias": sensor.bias + random.uniform(-level, level, size)}),
     ),
     Perturbation(
-        "latency", "steps", (1, 2, 4, 8), "what is seen is so many of the controller's steps old",
+        "latency", "steps", (1, 2, 4, 8), "measurements arrive this many controller steps late",
         _sensor(lambda sensor, level, random, size: {"delay": sensor.delay + _steps("latency", level)}),
     ),
-    Perturbation("actuator_delay", "steps", (1, 2, 4, 8), "what is applied is so many steps old", _late),
+    Perturbation("actuator_delay", "steps", (1, 2, 4, 8), "commands arrive this many controller steps late", _late),
     Perturbation(
-        "dropped_frames", "1", (0.1, 0.3, 0.6), "so many of what is seen are lost",
+        "dropped_frames", "1", (0.1, 0.3, 0.6), "this part of the measurements is lost",
         _sensor(lambda sensor, level, random, size: {"dropout": 1 - (1 - sensor.dropout) * (1 - level)}),
     ),
 )  # fmt: skip

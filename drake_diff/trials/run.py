@@ -55,7 +55,7 @@ def robustness(
     Args:
         solution: its motion and inputs are the plan.
         perturbations: levels by name, or names, for their usual levels (`PERTURBATIONS` lists them). None means all
-            that the model has something for.
+            that apply to the model.
         trials: how many at each level.
         controller: "tvlqr" about the plan, "mpc" (over 20 steps), "open_loop", an `MPC` of your own, or a function
             of (plan, model, xs (N+1, nx), us (N, nu)) that makes a controller u = controller(x, t).
