@@ -125,7 +125,8 @@ def describe_tree(model: Model) -> Description:
         found.append("forces are added to Drake's")
     springs = springs_of(plant)
     if found or isinstance(springs, Refusal):
-        raise ModelError("this model cannot be given to another engine: " + "; ".join(found or [str(springs)]))
+        reasons = [*found, str(springs)] if isinstance(springs, Refusal) else found
+        raise ModelError("this model cannot be given to another engine: " + "; ".join(reasons))
     body_names, joint_names = names_of(plant)
     geometries, pairs = _geometries(model, body_names)
     return Description(
