@@ -1,5 +1,6 @@
 """Gradients of whole rollouts: closed forms, invariants of contact, and what they must refuse."""
 
+import dataclasses
 import math
 from importlib.util import find_spec
 
@@ -46,7 +47,7 @@ def test_a_long_loss_is_differentiated_in_blocks_without_changing_it(load):
 
 
 def test_reverse_accumulation_is_the_product_of_the_steps(load):
-    """A09 (iv): v' Phi, rtol 1e-10."""
+    """v' Phi, Phi the product of the steps' Jacobians; 1e-10 is the rounding of 25 products."""
     model, random = load("acrobot.xml"), np.random.default_rng(2)
     x0, us, v = random.standard_normal(4), random.standard_normal((25, 1)), random.standard_normal(4)
     product = np.eye(4)
@@ -57,7 +58,7 @@ def test_reverse_accumulation_is_the_product_of_the_steps(load):
 
 
 def test_the_projectiles_jacobian_is_exact(load):
-    """A01: d p_N / d v_0 = N h I, d p_N / d p_0 = I."""
+    """d p_N / d v_0 = N h I, d p_N / d p_0 = I."""
     model = load("projectile.sdf")
     for i in range(3):
         g = dd.differentiate_rollout(model, model.default_state, None, lambda x, i=i: x[4 + i], num_steps=100)
@@ -68,7 +69,7 @@ def test_the_projectiles_jacobian_is_exact(load):
 @pytest.mark.parametrize("masses", [(1.0, 1.0), (1.0, 2.0)])
 @pytest.mark.parametrize("approximation", ["lagged", "sap"])
 def test_momentum_invariants_of_a_collision(masses, approximation):
-    """A28: any contact law: sum_i m_i dv_i/dv_j = m_j, dv/dx -> 0, dx/dx -> m_j, dx/dv -> m_j T."""
+    """Of any contact law: sum_i m_i dv_i/dv_j = m_j, dv/dx -> 0, dx/dx -> m_j, dx/dv -> m_j T."""
     h, count = 1e-3, 1000
     plant = Plant(h, approximation, gravity=0.0)
     for name, mass in zip("ab", masses, strict=True):
@@ -86,13 +87,29 @@ def test_momentum_invariants_of_a_collision(masses, approximation):
     assert m @ product[:2, 2:] == pytest.approx(m * count * h, rel=1e-9)
 
 
+def test_results_print_in_a_few_lines_and_escape_names_for_a_notebook(load):
+    model, us = load("pendulum.urdf"), np.zeros((20, 1))
+    g = dd.differentiate_rollout(model, [0.1, 0.0], us, lambda x: x[0], parameters=("pole.mass",))
+    d = dd.differentiate_step(model, [0.1, 0.0], [0.0], parameters=("pole.mass",))
+    assert repr(g).startswith("RolloutGradient of 20 steps by ")
+    assert "by pole.mass " in repr(g)
+    assert "C by pole.mass from autodiff" in repr(d)
+    for result in (g, d, dd.rollout(model, [0.1, 0.0], us)):
+        assert len(repr(result).splitlines()) <= 4
+        assert str(result) == repr(result)
+        assert result._repr_html_().startswith("<pre>")
+    page = dataclasses.replace(g, parameter_names=("<script>.mass",))._repr_html_()
+    assert "&lt;script&gt;.mass" in page
+    assert "<script>" not in page
+
+
 def saltation(v_before, restitution, gravity=9.81):
-    """A26: how a rigid bounce maps a variation of (z, v)."""
+    """How a rigid bounce maps a variation of (z, v)."""
     return np.array([[-restitution, 0], [-(1 + restitution) * gravity / v_before, -restitution]])
 
 
 def test_the_rigid_bounce_has_the_oracles_numbers():
-    """A26: drop of 0.5 m with e = 1, 0.5 s: fall, bounce, flight."""
+    """A drop of 0.5 m with e = 1, 0.5 s: fall, bounce, flight."""
     assert saltation(-3, 0.8) == pytest.approx(np.array([[-0.8, 0], [5.886, -0.8]]), rel=1e-12)
     g, drop, horizon = 9.81, 0.5, 0.5
     t = math.sqrt(2 * drop / g)
@@ -112,7 +129,7 @@ def bouncing_ball(k):
 
 @pytest.mark.parametrize(("k", "at_least"), [(1e3, 0.05), (1e4, 0.5)])
 def test_a_compliant_bounce_does_not_have_the_rigid_gradient(k, at_least):
-    """C01: a bounce off the ground without loss has dy/dy0 = dy/dv0 = -1. That of Drake's discrete contact is
+    """A bounce off the ground without loss has dy/dy0 = dy/dv0 = -1. That of Drake's discrete contact is
     10 to 400 % off, the more the stiffer, although differences confirm it: not to be optimized with."""
     model = bouncing_ball(k)
     start = [1.001, -2.0]
@@ -123,7 +140,7 @@ def test_a_compliant_bounce_does_not_have_the_rigid_gradient(k, at_least):
 
 
 def test_a_rollout_that_touches_down_exactly_on_a_step_has_no_gradient():
-    """C01's own start: 0.9 m at 2 m/s are 216 steps of 1/480 s, after which the ball just touches."""
+    """The start of the bounce above: 0.9 m at 2 m/s are 216 steps of 1/480 s, after which the ball just touches."""
     certificate = dd.certify_rollout(bouncing_ball(1e3), [1.0, -2.0], None, lambda x: x[0], num_steps=480)
     assert certificate.verdict == "discontinuous"
 
@@ -155,7 +172,7 @@ def test_a_loss_that_carries_no_gradient_is_refused(load, loss, error, words):
 
 
 def test_lqr_sensitivity_of_the_optimal_cost(write_urdf):
-    """A30: d J* / d x_0 = 2 P_0 x_0, by the envelope theorem at the optimal inputs."""
+    """d J* / d x_0 = 2 P_0 x_0, by the envelope theorem at the optimal inputs."""
     h, Q, R, Qf = 0.1, np.eye(2), 0.1, 10 * np.eye(2)
     model = write_urdf(time_step=h)
     d = dd.differentiate_step(model, [0, 0], [0])

@@ -1,5 +1,8 @@
 """Feedback inside a rollout: policies u = policy(x, t), and their derivatives by the state and by their parameters.
 
+A policy is any function of x (nx,) and t [s] that returns u (nu,). One that can be trained has `parameters` (n,), and
+takes others as a third argument; one of whose parameters only some act at a time says which by `active(t)`, a slice.
+
 A policy is written with ordinary arithmetic, so that AutoDiffXd flows through it. Of NumPy these take AutoDiffXd:
 tanh, sin, cos, tan, arcsin, arccos, arctan, arctan2, sinh, cosh, exp, log, sqrt, square, power, abs, maximum,
 minimum, clip, where, sum, mean, dot, @, outer, einsum, concatenate, linalg.norm; these do not: expm1, log1p,
@@ -8,7 +11,7 @@ logaddexp, hypot, interp, heaviside, var, std, and every function of the module 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,27 +32,21 @@ FIXED_POINT_TOLERANCE = 1e-6
 NUDGE = 1e-6
 
 
-class Policy(Protocol):
-    """u (nu,) = policy(x, t, parameters): x (nx,), t [s]; `parameters` (n,) are the policy's own where left out.
-
-    A plain function u = policy(x, t) is a policy too, one without parameters.
-    """
-
-    @property
-    def parameters(self) -> Array:
-        """(n,) the numbers that the policy can be differentiated by and trained in."""
-        ...
-
-    def __call__(self, x: Any, t: float, parameters: Any = None) -> Any:
-        """(nu,): the input at state x (nx,) and time t [s]; floats or AutoDiffXd."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class ParametricPolicy:
-    """u = function(x, t, parameters) of any function, such as a neural network, and flat parameters (n,).
+    """u = function(x, t, parameters) of any function, such as a neural network, and its parameters.
 
     Another policy is such a function: ParametricPolicy(pd, better) is the PD law `pd` with other gains.
+
+    Args:
+        function: Of x (nx,), t [s] and the parameters; returns u (nu,).
+        parameters: (n,) all weights in one row.
+
+    Example:
+        >>> from drake_diff.motion import ParametricPolicy
+        >>> policy = ParametricPolicy(lambda x, t, p: np.tanh(p * x[:1]), [2.0])
+        >>> policy(np.array([0.0, 1.0]), 0.0)
+        array([0.])
     """
 
     function: Callable[[Any, float, Any], Any]
@@ -57,6 +54,10 @@ class ParametricPolicy:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", finite_array("parameters", self.parameters, ("n",)))
+
+    def __repr__(self) -> str:
+        name = getattr(self.function, "__name__", type(self.function).__name__)
+        return f"ParametricPolicy of {name}: {len(self.parameters)} parameters"
 
     def __call__(self, x: Any, t: float, parameters: Any = None) -> Any:
         return self.function(x, t, self.parameters if parameters is None else parameters)
@@ -68,11 +69,24 @@ class ParametricPolicy:
 
 
 class PD:
-    """u_i = kp_i (q_ref - q) + kd_i (v_ref - v) at the joint of actuator i; parameters = [kp; kd] (2 nu,).
+    """The policy u_i = kp_i (q_ref - q) + kd_i (v_ref - v) at the joint of actuator i. Angles are not wrapped.
 
     u is the effort at the joint [N or N m], as plant.MakeActuationMatrix() applies it, without gear ratio; Drake
-    actuates joints of one degree of freedom only. kp [N/m or N m/rad] and kd [N s/m or N m s/rad] are scalars or
-    (nu,), x_ref (nx,) the model's default state where left out. Angles are not wrapped.
+    actuates joints of one degree of freedom only. `parameters` is [kp; kd] (2 nu,).
+
+    Args:
+        model: A model with actuators.
+        kp: [N/m or N m/rad] a number, or (nu,).
+        kd: [N s/m or N m s/rad] a number, or (nu,).
+        x_ref: (nx,) what is held; the model's default state where left out.
+
+    Raises:
+        InputError: The model has no actuators, or an argument does not fit.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> dd.PD(model, kp=10.0, kd=1.0, x_ref=[0.5, 0.0])([0.0, 0.0], 0.0)
+        array([5.])
     """
 
     def __init__(self, model: Model, kp: ArrayLike, kd: ArrayLike, x_ref: ArrayLike | None = None):
@@ -91,26 +105,48 @@ class PD:
         kp, kd = gains[: len(self.kp)], gains[len(self.kp) :]
         return kp * error[self._positions] + kd * error[self._velocities]
 
+    def __repr__(self) -> str:
+        return f"PD of {len(self.kp)} joints: kp {_range(self.kp)}, kd {_range(self.kd)}"
+
 
 class LQR:
     """u = u_ref - K minus(x, x_ref): the discrete-time LQR of the model's own step at a fixed point x_ref, u_ref.
 
     K minimizes sum_k d_k' Q d_k + e_k' R e_k (no time step in it), with d = minus(x, x_ref) in the tangent space of
-    the state (nt,; nx less one for each quaternion) and e = u - u_ref. Q (nt, nt) is positive semidefinite, R
-    (nu, nu) positive definite. `gain` is K (nu, nt), `cost_to_go` P (nt, nt) with the cost d' P d, `parameters`
-    K row by row (nu * nt,). Raises InputError where step(x_ref, u_ref) is not x_ref within 1e-6, or no stabilizing
-    gain exists.
+    the state (nt,; nx less one for each quaternion) and e = u - u_ref. `gain` is K (nu, nt), `cost_to_go` P (nt, nt)
+    with the cost d' P d, `parameters` K row by row (nu * nt,).
+
+    Args:
+        model: The discrete model.
+        x_ref: (nx,) the fixed point.
+        u_ref: (nu,) the input that holds it [N or N m].
+        Q: (nt, nt) symmetric and positive semidefinite.
+        R: (nu, nu) symmetric and positive definite.
+
+    Raises:
+        InputError: step(x_ref, u_ref) is not x_ref within 1e-6, no gain stabilizes it, or a weight is not as said.
+
+    Example:
+        >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
+        >>> dd.LQR(model, [0, np.pi, 0, 0], [0], np.eye(4), np.eye(1)).gain.shape
+        (1, 4)
     """
 
     def __init__(self, model: Model, x_ref: ArrayLike, u_ref: ArrayLike, Q: ArrayLike, R: ArrayLike):
         self.x_ref, self.u_ref = finite_array("x_ref", x_ref, (model.nx,)), finite_array("u_ref", u_ref, (model.nu,))
         self._space = tangent_space(model)
         Q, R = _weight("Q", Q, self._space.size), _weight("R", R, model.nu, definite=True)
-        A, B, x_next = _tangent_step(model, self._space, self.x_ref, self.u_ref, self.x_ref)
-        drift = float(np.abs(self._space.minus(x_next, self.x_ref)).max(initial=0.0))
+        d = differentiate_step(model, self.x_ref, self.u_ref)
+        drift = float(np.abs(self._space.minus(d.x_next, self.x_ref)).max(initial=0.0))
         if not drift <= FIXED_POINT_TOLERANCE:
             raise InputError("x_ref, u_ref", got=f"a step that moves by {drift:.3g}", expected="a fixed point")
-        gain, cost_to_go = _regulator(A, B, Q, R)
+        A, B = _split(self._space, self._space.jacobian(self.x_ref, self.x_ref, d.A, d.B))
+        try:
+            gain, cost_to_go = DiscreteTimeLinearQuadraticRegulator(A=A, B=B, Q=Q, R=R)
+        except (RuntimeError, SystemExit) as error:  # pydrake makes a failed demand of Drake's a SystemExit
+            raise InputError(
+                "LQR", got=str(error), expected="a fixed point that the inputs can stabilize, and Q that sees all of it"
+            ) from error
         self.gain, self.cost_to_go = frozen(gain), frozen(cost_to_go)
         self.parameters = frozen(self.gain.ravel())
 
@@ -118,16 +154,35 @@ class LQR:
         gain = self.gain if parameters is None else parameters.reshape(self.gain.shape)
         return self.u_ref - gain @ self._space.minus(x, self.x_ref)
 
+    def __repr__(self) -> str:
+        return f"LQR: gain {self.gain.shape}, |K| {np.linalg.norm(self.gain):.3g}"
+
 
 class TVLQR:
     """u = us[k] - K_k minus(x, xs[k]), k = round(t / time_step) within 0..N-1: LQR along a trajectory.
 
-    `xs` (N+1, nx) and `us` (N, nu) is the trajectory, with A_k, B_k the step's Jacobians there in the tangent space
-    (nt,). From P_N = Qf (Q where left out) backward
+    With A_k, B_k the step's Jacobians there in the tangent space (nt,), from P_N = Qf backward
         K_k = (R + B' P B)^-1 B' P A,  P_k = Q + A' P (A - B K_k)   with P = P_(k+1),
-    which minimizes sum_k d_k' Q d_k + e_k' R e_k + d_N' Qf d_N (no time step in it) of the linearized motion. Q, Qf
-    (nt, nt) are positive semidefinite, R (nu, nu) positive definite. `gains` (N, nu, nt), `cost_to_go`
-    (N+1, nt, nt), `parameters` the gains flattened (N * nu * nt,).
+    which minimizes sum_k d_k' Q d_k + e_k' R e_k + d_N' Qf d_N (no time step in it) of the linearized motion.
+    `gains` (N, nu, nt), `cost_to_go` (N+1, nt, nt), `parameters` the gains flattened (N * nu * nt,).
+
+    Args:
+        model: The discrete model.
+        xs: (N+1, nx) the trajectory.
+        us: (N, nu) its inputs [N or N m].
+        Q: (nt, nt) symmetric and positive semidefinite.
+        R: (nu, nu) symmetric and positive definite.
+        Qf: (nt, nt) the weight of the end; Q where left out.
+
+    Raises:
+        InputError: The arrays do not fit one another or the model, or a weight is not as said.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> us = np.ones((30, 1))
+        >>> xs = dd.rollout(model, [0, 0], us).xs
+        >>> dd.TVLQR(model, xs, us, np.eye(2), np.eye(1)).gains.shape
+        (30, 1, 2)
     """
 
     def __init__(
@@ -160,6 +215,14 @@ class TVLQR:
 
     def _index(self, t: float) -> int:
         return min(max(round(t / self.time_step), 0), len(self.us) - 1)
+
+    def __repr__(self) -> str:
+        return f"TVLQR along {len(self.us)} steps, {len(self.us) * self.time_step:g} s: gains {self.gains.shape}"
+
+
+def _range(values: Array) -> str:
+    low, high = values.min(), values.max()
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
 def policy_parameters(policy: Any) -> Array:
@@ -241,24 +304,8 @@ def _check(numbers: Any, rows: Array, u: Array) -> None:
         raise GradientError("the derivative of the policy is not finite")
 
 
-def _tangent_step(model: Model, space: TangentSpace, x: Array, u: Array, x_to: Array) -> tuple[Array, Array, Array]:
-    """(A (nt, nt), B (nt, nu), x_next): the step's Jacobians from the tangent space at `x` to the one at `x_to`."""
-    d = differentiate_step(model, x, u)
-    return (*_split(space, space.jacobian(x, x_to, d.A, d.B)), d.x_next)
-
-
 def _split(space: TangentSpace, jacobian: Array) -> tuple[Array, Array]:
     return jacobian[:, : space.size], jacobian[:, space.size :]
-
-
-def _regulator(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:
-    try:
-        gain, cost_to_go = DiscreteTimeLinearQuadraticRegulator(A=A, B=B, Q=Q, R=R)
-    except (RuntimeError, SystemExit) as error:  # pydrake makes a failed demand of Drake's a SystemExit
-        raise InputError(
-            "LQR", got=str(error), expected="a fixed point that the inputs can stabilize, and Q that sees all of it"
-        ) from error
-    return gain, cost_to_go
 
 
 def _riccati(steps: list[tuple[Array, Array]], Q: Array, R: Array, Qf: Array) -> tuple[Array, Array]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -20,11 +21,16 @@ Policy = Callable[[Array, float], ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """N steps of the double plant and what was measured along them; arrays are read-only, SI units.
+    """N steps of the double plant and what was measured along them; `rollout` makes one. Arrays are read-only.
 
     The energy balance of the discrete plant is `energy_error` = energy - energy[0] - work + dissipation: with
     midpoint velocities work and dissipation are exact where M is constant, so that what remains is the error of
     the time stepping, and what contact, joint limits and constraints took or gave.
+
+    Example:
+        >>> dd.rollout(dd.load_model("models/pendulum.urdf", time_step=0.01), [0.5, 0], np.zeros((100, 1)))
+        Rollout of 100 steps, 1 s: energy ... to ... J, of which ... J are unaccounted for
+          deepest penetration 0 m, largest constraint violation 0, 0 steps with contact
     """
 
     times: Array  # (N+1,) [s]
@@ -40,6 +46,18 @@ class Rollout:
     # (couplers, balls, welds, distances), whose violation pydrake does not tell.
     constraint_violation: Array
     contacts: tuple[tuple[ContactPoint, ...], ...]  # N tuples: the contacts of each step
+
+    def __repr__(self) -> str:
+        energy, error = self.energy, float(np.abs(self.energy_error).max())
+        return (
+            f"Rollout of {len(self.us)} steps, {self.times[-1]:g} s: energy {energy[0]:.4g} to {energy[-1]:.4g} J, of "
+            f"which {error:.2g} J are unaccounted for\n"
+            f"  deepest penetration {self.penetration.max():.3g} m, largest constraint violation "
+            f"{self.constraint_violation.max():.3g}, {sum(map(bool, self.contacts))} steps with contact"
+        )
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
 
     @property
     def energy(self) -> Array:
@@ -73,11 +91,28 @@ def rollout(
     num_steps: int | None = None,
     parameters: Mapping[str, Any] | None = None,
 ) -> Rollout:
-    """Step from `x0` (nx,) under the inputs `us` (N, nu), or under `policy(x, t) -> u` for `num_steps` steps.
+    """Many steps of the double plant, with energy, contact, penetration and constraint violation along them.
 
-    A model without actuators needs `num_steps` alone. `parameters` maps names (see `list_parameters`) to values
-    that replace the model's own. Raises ShapeError, NonFiniteError, InputError, or
-    SimulationError where Drake cannot take a step.
+    Args:
+        model: The discrete model.
+        x0: (nx,) the first state.
+        us: (N, nu) the inputs [N or N m]; may be left out where the model has no actuators.
+        policy: `policy(x, t)` (nu,) of the state and the time [s], in place of `us`.
+        num_steps: N, where `us` does not say it.
+        parameters: Names (see `list_parameters`) and values that replace the model's own.
+
+    Returns:
+        The states `xs` (N+1, nx), and what was measured at each.
+
+    Raises:
+        ShapeError, NonFiniteError, InputError: Of what was given, or of what the policy returned.
+        SimulationError: Drake cannot take a step.
+
+    Example:
+        >>> model = dd.load_model("models/projectile.sdf", time_step=0.01)
+        >>> motion = dd.rollout(model, model.default_state, num_steps=100)
+        >>> float(motion.times[-1]), motion.xs.shape
+        (1.0, (101, 13))
     """
     if us is not None and policy is not None:
         raise InputError("rollout", got="us and policy", expected="one of them")

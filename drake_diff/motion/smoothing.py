@@ -15,6 +15,7 @@ a |b| <= gamma - epsilon with the distance gamma - epsilon set to 3 e, so it shr
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -35,10 +36,19 @@ CONFIDENCE = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Gaussian:
-    """Independent normal noise of standard deviation `sigma`, in the units of x.
+    """Independent normal noise.
 
-    `sigma` is a number above 0, or (n,) numbers of at least 0 of which one is above 0; noise does not move a
-    coordinate of 0. Raises InputError.
+    Args:
+        sigma: The standard deviation in the units of x: a number above 0, or (n,) numbers of at least 0 of which one
+            is above 0. Noise does not move a coordinate of 0.
+
+    Raises:
+        InputError: sigma is none of these.
+
+    Example:
+        >>> from drake_diff.motion import Gaussian
+        >>> float(Gaussian(2.0).score(1.0))
+        0.25
     """
 
     sigma: ArrayLike
@@ -63,8 +73,18 @@ class Barrier:
     makes of it, (u + sqrt(u^2 + c)) / 2 (Pang et al., arXiv 2206.10787). Its variance is infinite and its score
     bounded: for an f that grows linearly F and both orders exist, and both orders have a variance, but F's own
     estimate has none (`value_variance` then does not settle); an f that grows like |x|^2 has no F.
-    `c` is a number above 0, or (n,) numbers of at least 0 of which one is above 0; noise does not move a
-    coordinate of 0. Raises InputError.
+
+    Args:
+        c: In the squared units of x: a number above 0, or (n,) numbers of at least 0 of which one is above 0. Noise
+            does not move a coordinate of 0.
+
+    Raises:
+        InputError: c is none of these.
+
+    Example:
+        >>> from drake_diff.motion import Barrier
+        >>> float(Barrier(2.0).score(1.0))
+        1.0
     """
 
     c: ArrayLike
@@ -87,7 +107,7 @@ Noise = Gaussian | Barrier
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """F(x) and dF/dx from `samples` samples; all variances are those of the means, not of one sample.
+    """F(x) and dF/dx from `samples` samples; `smooth` makes one. All variances are of the means, not of one sample.
 
     `value` (m,) with `value_variance` (m,); `jacobian` (m, n) with `variance` (m, n) is what `method` chose:
     `weight` (m, n) of `first`, the rest of `zeroth`, each with its variance. `bias` (m, n) = first - zeroth is
@@ -96,6 +116,12 @@ class Smoothed:
     `biased`, a blend may be off by up to 3 bias_error beyond what `variance` says. `first`, `first_variance`, `bias`,
     `bias_error` and `biased` are None where there was no derivative. A column that noise does not move has no
     zeroth order: first order stands in `zeroth` there, with weight 1 and bias 0.
+
+    Example:
+        >>> from drake_diff.motion import Gaussian
+        >>> dd.smooth(lambda x: x**2, [0.0], lambda x: np.diag(2 * x), noise=Gaussian(0.1), samples=100)
+        blend of first and zeroth order, 1 x 1, 100 samples of Gaussian(sigma = 0.1), seed 0
+        standard errors up to ...; first order is biased in 0 of 1 entries, its weight is ...
     """
 
     value: Array
@@ -115,7 +141,7 @@ class Smoothed:
     bias_error: Array | None = None
     biased: Flags | None = None
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         rows, columns = self.jacobian.shape
         error = float(np.sqrt(np.max(self.variance)))
         head = f"{self.method} order" if self.method != "blend" else "blend of first and zeroth order"
@@ -128,6 +154,9 @@ class Smoothed:
             f"entries, its weight is {low:.2g} to {high:.2g}"
         )
 
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
+
 
 def smooth(
     f: Callable[[Array], Any],
@@ -139,15 +168,33 @@ def smooth(
     seed: int = 0,
     method: str = "blend",
 ) -> Smoothed:
-    """F(x) = E[f(x + w)] and dF/dx at `x` (n,), for `f`: (n,) -> (m,), or a number (m = 1).
+    """F(x) = E[f(x + w)] and dF/dx of any function f, with what first and zeroth order are worth there.
 
-    `jacobian`: (n,) -> (m, n), or (n,) where m = 1, is the derivative of f. `method` is "first", "zeroth" or
-    "blend" (see the top of this module); only "zeroth" does without `jacobian`, and only where noise moves all
-    coordinates, but where one is given all three are estimated. The same `seed` gives the same bytes.
+    Calls f `samples` + 1 times and `jacobian` `samples` times; keeps sums, not samples.
 
-    Calls f `samples` + 1 times and `jacobian` `samples` times; keeps sums, not samples. Raises UnknownNameError,
-    InputError (shapes, fewer than 2 samples, a missing `jacobian`), GradientError where f, `jacobian` or what
-    comes of them is not finite, and what f and `jacobian` raise.
+    Args:
+        f: (n,) -> (m,), or a number (m = 1).
+        x: (n,) where.
+        jacobian: (n,) -> (m, n), or (n,) where m = 1, the derivative of f. Only "zeroth" does without, and only where
+            noise moves all coordinates; where one is given all three orders are estimated.
+        noise: A `Gaussian` or a `Barrier`.
+        samples: How many, at least 2.
+        seed: The same gives the same bytes.
+        method: "first", "zeroth" or "blend", see the top of this module.
+
+    Returns:
+        The value (m,) and Jacobian (m, n) of F, with their variances.
+
+    Raises:
+        UnknownNameError: There is no such method.
+        InputError: Shapes that do not fit, fewer than 2 samples, or a missing `jacobian`.
+        GradientError: f, `jacobian` or what comes of them is not finite.
+
+    Example:
+        >>> from drake_diff.motion import Gaussian
+        >>> jump = dd.smooth(np.sign, [0.0], lambda x: [0.0], noise=Gaussian(1.0), samples=4000)
+        >>> float(jump.first[0, 0]), bool(jump.biased[0, 0]), bool(abs(jump.jacobian[0, 0] - 0.8) < 0.1)
+        (0.0, True, True)
     """
     if method not in METHODS:
         raise UnknownNameError("method", got=method, known=METHODS)
@@ -197,12 +244,31 @@ def smooth_step(
     seed: int = 0,
     method: str = "blend",
 ) -> Smoothed:
-    """`smooth` of one step of `model`, m = nx, over z = [x; u], n = nx + nu, from `differentiate_step`.
+    """`smooth` of one step of a model over z = [x; u], by the Jacobians of `differentiate_step`.
 
-    The noise has the units of z, which differ from entry to entry: (nx + nu,) numbers say more than one. A
-    coordinate whose number is 0 is not smoothed; its columns of `zeroth` hold the first order. Raises InputError
-    where the model has a quaternion, to which no noise can be added, SimulationError where Drake cannot
-    take a step, and what `smooth` and `differentiate_step` raise.
+    Args:
+        model: A discrete model without quaternions, to which no noise can be added.
+        x: (nx,) the state.
+        u: (nu,) the input [N or N m]; may be left out where the model has no actuators.
+        noise: In the units of z, which differ from entry to entry: (nx + nu,) numbers say more than one. A
+            coordinate whose number is 0 is not smoothed; its columns of `zeroth` hold the first order.
+        samples: How many, at least 2.
+        seed: The same gives the same bytes.
+        method: "first", "zeroth" or "blend".
+
+    Returns:
+        The value (nx,) and Jacobian (nx, nx + nu) of the smoothed step, with their variances.
+
+    Raises:
+        InputError: The model has a quaternion, or what `smooth` raises.
+        SimulationError: Drake cannot take a step.
+        GradientError: As by `differentiate_step`.
+
+    Example:
+        >>> from drake_diff.motion import Gaussian
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> dd.smooth_step(model, [0.1, 0.0], [0.0], noise=Gaussian([0.01, 0.01, 0]), samples=20).jacobian.shape
+        (2, 3)
     """
     x, u = check_point(model, x, u)
     quaternions = tangent_space(model).quaternions
