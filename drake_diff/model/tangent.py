@@ -41,7 +41,7 @@ class TangentSpace:
         """(size,): the tangent vector at `x0` that leads to `x1`."""
         if not self.quaternions:
             return x1 - x0
-        found, (of_x, of_d) = np.empty(self.size), self._plain
+        found, (of_x, of_d) = np.empty(self.size, np.result_type(x1, x0)), self._plain  # of AutoDiffXd, too
         found[of_d] = x1[of_x] - x0[of_x]
         for q, r in self._turns:
             between = _right_product(_conjugate(x0[q])) @ x1[q]

@@ -3,7 +3,6 @@
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
 from drake_diff._base.autodiff import gradient_of
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.derivatives.sources import check_method
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import InputError
@@ -27,7 +27,7 @@ EXPLODED, VANISHED = 1e6, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class RolloutGradient:
+class RolloutGradient(ShowsItsRepr):
     """A loss of a rollout and its gradient; `differentiate_rollout` makes one. Arrays are read-only.
 
     Under a policy `us` is what the policy chose, and all gradients go through the closed loop.
@@ -68,9 +68,6 @@ class RolloutGradient:
             f"  |d loss / d x_k| from {first:.3g} at the start to {last:.3g} at the end, a factor of "
             f"{self.growth_rate:.3g} a step"
         )
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
     @property
     def growth_rate(self) -> float:

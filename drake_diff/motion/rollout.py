@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import InputError
 from drake_diff.model.contact import ContactPoint, contacts_of_the_step, penetration
 from drake_diff.model.model import Model
@@ -20,7 +20,7 @@ Policy = Callable[[Array, float], ArrayLike]
 
 
 @dataclass(frozen=True, eq=False)
-class Rollout:
+class Rollout(ShowsItsRepr):
     """N steps of the double plant and what was measured along them; `rollout` makes one. Arrays are read-only.
 
     The energy balance of the discrete plant is `energy_error` = energy - energy[0] - work + dissipation: with
@@ -55,9 +55,6 @@ class Rollout:
             f"  deepest penetration {self.penetration.max():.3g} m, largest constraint violation "
             f"{self.constraint_violation.max():.3g}, {sum(map(bool, self.contacts))} steps with contact"
         )
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
     @property
     def energy(self) -> Array:

@@ -15,13 +15,13 @@ a |b| <= gamma - epsilon with the distance gamma - epsilon set to 3 e, so it shr
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_diff._base.arrays import Array, array_with_gaps, finite_array, frozen, positive_float, positive_int
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import GradientError, InputError, ShapeError, UnknownNameError
 from drake_diff.model.model import Model
@@ -106,7 +106,7 @@ Noise = Gaussian | Barrier
 
 
 @dataclass(frozen=True, eq=False)
-class Smoothed:
+class Smoothed(ShowsItsRepr):
     """F(x) and dF/dx from `samples` samples; `smooth` makes one. All variances are of the means, not of one sample.
 
     `value` (m,) with `value_variance` (m,); `jacobian` (m, n) with `variance` (m, n) is what `method` chose:
@@ -153,9 +153,6 @@ class Smoothed:
             f"{head}\nstandard errors up to {error:.2g}; first order is biased in {count} of {self.biased.size} "
             f"entries, its weight is {low:.2g} to {high:.2g}"
         )
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def smooth(
