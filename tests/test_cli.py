@@ -49,6 +49,21 @@ def test_a_run_that_holds_prints_its_checks_and_exits_with_0(tmp_path):
     assert dd.load_record(tmp_path / "artifacts" / "task").verdict == "pass"
 
 
+def test_a_script_may_define_plain_dynamics(tmp_path):
+    """A block that is pushed from rest to rest over 1 m in 1 s, at a least effort of 12."""
+    text = """import drake_diff as dd
+def problem():
+    block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+    ends = {"x0": [0, 0], "x_goal": [1, 0]}
+    return dd.Problem(block, **ends, num_steps=10, horizon=1.0, running_cost=dd.QuadraticCost(R=[[1.0]]))
+"""
+    (tmp_path / "block.py").write_text(text)
+    done = drake_diff("run", tmp_path / "block.py", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Dynamics of the states x0, x1 under the inputs u0, 10 steps" in done.stdout
+    assert re.search(r"cost +12 ", done.stdout)
+
+
 def test_out_names_the_run_directory(tmp_path):
     done = drake_diff("run", script(tmp_path), "--out", tmp_path / "elsewhere", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

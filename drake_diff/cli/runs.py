@@ -56,7 +56,7 @@ def run(
     known = [name for name in inspect.signature(solve).parameters if name not in ("problem", "progress", "on_start")]
     for name in options.keys() - set(known):
         raise UnknownNameError("solve_options", got=name, known=known)
-    show(plain(script.name, "bold"), f"{problem.model!r}, {problem.num_steps} steps")
+    show(plain(script.name, "bold"), f"{problem.system!r}, {problem.num_steps} steps")
     begun: list[Path] = []
 
     def on_start() -> None:

@@ -54,7 +54,7 @@ class Status(enum.Enum):
 
 
 _SENTENCES = {
-    Status.CONVERGED: "the solver converged and every measure taken again on the plant holds",
+    Status.CONVERGED: "the solver converged, and every measure that was taken again holds",
     Status.CONVERGED_NOT_VERIFIED: "the solver stopped at a solution, but a measure or a certificate does not hold",
     Status.ITERATION_LIMIT: "the iteration limit came first; raise max_iterations or start from a better guess",
     Status.TIME_LIMIT: "the time limit came first; raise time_limit or start from a better guess",

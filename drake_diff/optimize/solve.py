@@ -28,7 +28,7 @@ from drake_diff.optimize.solution import Solution, Status
 from drake_diff.optimize.transcription.drake import solve_collocation
 from drake_diff.optimize.transcription.motion import Collocated
 from drake_diff.optimize.transcription.scheme import DEFAULT_SCHEME, SCHEMES
-from drake_diff.optimize.transcription.solve import Refinement, Transcription
+from drake_diff.optimize.transcription.solve import MeshRefinement, Transcription
 from drake_diff.optimize.transcription.task import task_of
 
 METHODS = ("auto", "collocation", "shooting", "ilqr")
@@ -132,7 +132,7 @@ def solve(
         np.inf if time_limit is None else positive_float("time_limit [s]", time_limit),
         positive_float("tolerance", tolerance),
     )
-    refinement = Refinement(
+    refinement = MeshRefinement(
         positive_float("error_tolerance", error_tolerance), positive_int("max_num_steps", max_num_steps)
     )
     report = Report(print if progress is True else (progress or None), callback)
@@ -155,7 +155,7 @@ class Attempt:
     solver: str | None = None
     segments: int = 1
     continuation: Any = None
-    refinement: Refinement | None = None
+    refinement: MeshRefinement | None = None
     max_iterations: int | None = None
 
 
@@ -333,7 +333,7 @@ def choose_method(problem: Problem) -> tuple[str, str]:
         return "collocation", "plain dynamics have no discrete step"
     contract = problem.model.contract
     if problem.horizon is not None:
-        return "collocation", "the horizon is free"
+        return "collocation", "the horizon is " + ("free" if problem.horizon[0] < problem.horizon[1] else "given")
     if not problem.optimizes_controls:
         return "shooting", "the controls are not optimized"
     if problem.parameters.parameters or problem.trajectory_cost is not None:
@@ -390,7 +390,7 @@ class Run:
     report: Report | None
     start: float = field(default_factory=time.monotonic)
 
-    def collocate(self, guess: _Guess, refinement: Refinement | None) -> Solution:
+    def collocate(self, guess: _Guess, refinement: MeshRefinement | None) -> Solution:
         """In CasADi; SNOPT, which that does not carry, in Drake's own DirectCollocation."""
         problem, found = self.problem, dict[str, Any]()
         if self.solver == "snopt":

@@ -67,10 +67,10 @@ class QuadraticCost:
     def __call__(self, x: Any, u: Any = None) -> Any:
         """The cost of x (nx,) and u (nu,): floats or AutoDiffXd."""
         total = 0.0 * x[0]
-        if self.Q is not None:
-            total = total + _form(self.Q, x, self.x_ref)
-        if self.R is not None and u is not None:
-            total = total + _form(self.R, u, self.u_ref)
+        for weight, z, reference in ((self.Q, x, self.x_ref), (self.R, u, self.u_ref)):
+            if weight is not None and z is not None:
+                d = _apart(z, reference)
+                total = total + d @ (weight @ d)
         return total
 
     def along(self, xs: Array, us: Array) -> Array:
@@ -78,7 +78,7 @@ class QuadraticCost:
         total = 0.0 * xs[:, 0]  # NaN where that is
         for weight, z, reference in ((self.Q, xs, self.x_ref), (self.R, us, self.u_ref)):
             if weight is not None:
-                d = z if reference is None else z - reference
+                d = _apart(z, reference)
                 total += np.einsum("ki,ki->k", d, d @ weight)
         return total
 
@@ -110,9 +110,13 @@ class CostToGo:
         return self.gradient @ d + d @ (self.hessian @ d) / 2
 
 
-def _form(weight: Any, z: Any, reference: Any) -> Any:
-    d = z if reference is None else z - reference
-    return d @ (weight @ d)
+def _apart(z: Any, reference: Any) -> Any:
+    return z if reference is None else z - reference
+
+
+def _slope(weight: Any, z: Array, reference: Any) -> Array:
+    """(n,) the gradient of a quadratic form at z (n,)."""
+    return np.zeros(len(z)) if weight is None else np.asarray(2 * weight @ _apart(z, reference))
 
 
 def _semidefinite(name: str, weight: Any) -> Array:
@@ -130,8 +134,7 @@ def _semidefinite(name: str, weight: Any) -> Array:
 def differentiate_cost(cost: RunningCost, x: Array, u: Array) -> tuple[float, Array, Array]:
     """(value, gradient by x (nx,), gradient by u (nu,)) of a running cost."""
     if isinstance(cost, QuadraticCost):
-        by_x, by_u = _quadratic_gradient(cost, x, u)
-        return float(cost(x, u)), by_x, by_u
+        return float(cost(x, u)), _slope(cost.Q, x, cost.x_ref), _slope(cost.R, u, cost.u_ref)
     value, gradient = gradient_of(lambda z: cost(z[: len(x)], z[len(x) :]), np.concatenate([x, u]))
     return value, gradient[: len(x)], gradient[len(x) :]
 
@@ -139,19 +142,10 @@ def differentiate_cost(cost: RunningCost, x: Array, u: Array) -> tuple[float, Ar
 def differentiate_final_cost(cost: FinalCost, x: Array) -> tuple[float, Array]:
     """(value, gradient (nx,)) of a final cost."""
     if isinstance(cost, QuadraticCost):
-        return float(cost(x)), _quadratic_gradient(cost, x, np.zeros(0))[0]
+        return float(cost(x)), _slope(cost.Q, x, cost.x_ref)
     if isinstance(cost, CostToGo):
         return float(cost(x)), cost.gradient + cost.hessian @ (x - cost.x_ref)
     return gradient_of(cost, x)
-
-
-def _quadratic_gradient(cost: QuadraticCost, x: Array, u: Array) -> tuple[Array, Array]:
-    def gradient(weight: Any, z: Array, reference: Any) -> Array:
-        if weight is None or not len(z):
-            return np.zeros(len(z))
-        return np.asarray(2 * weight @ (z if reference is None else z - reference))
-
-    return gradient(cost.Q, x, cost.x_ref), gradient(cost.R, u, cost.u_ref)
 
 
 def running_cost_hessian(cost: RunningCost, x: Array, u: Array) -> Array:

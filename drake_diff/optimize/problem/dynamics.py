@@ -139,7 +139,7 @@ class Dynamics:
 
     def __repr__(self) -> str:
         states, inputs = ", ".join(self.state_names), ", ".join(self.input_names)
-        return f"Dynamics of {self.nx} states ({states}) under {self.nu} inputs ({inputs})"
+        return f"Dynamics of the states {states} under the inputs {inputs}"
 
     @property
     def form(self) -> Any:

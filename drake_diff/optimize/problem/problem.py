@@ -331,7 +331,7 @@ class Problem(ShowsItsRepr):
         given = self.constraints if isinstance(self.constraints, (tuple, list)) else (self.constraints,)
         for constraint in given:
             if not isinstance(constraint, Constraint):
-                raise InputError("constraints", got=type(constraint).__name__, expected="Constraints")
+                raise InputError("constraints", got=type(constraint).__name__, expected="a Constraint or several")
             self.knots_of(constraint, input_at_end=not self.has_model)
         return tuple(constraint.resolved(self.x0, np.zeros(self.nu)) for constraint in given)
 

@@ -163,13 +163,13 @@ class SymbolicPlant(Symbolic):
     def __init__(self, plant: PlantFunctions):
         self._plant = plant
         self.error: Exception | None = None
-        self._kept: dict[int, _Callback] = {}  # by the number of knots; CasADi holds no reference to its callbacks
+        self._kept: dict[int, _KnotCallback] = {}  # by the number of knots; CasADi holds no reference to its callbacks
         super().__init__(plant.function)
 
     def jacobian(self, knots: Any) -> Any:
         count = knots.shape[1]
         if count not in self._kept:
-            self._kept[count] = _Callback(self, count, self._jacobian.nnz_out(0), self._compute(count))
+            self._kept[count] = _KnotCallback(self, count, self._jacobian.nnz_out(0), self._compute(count))
         return ca.vec(self._kept[count](knots))
 
     def hessian(self, knots: Any, weights: Any) -> Any:
@@ -209,14 +209,14 @@ class Called:
         self._kept: list[Any] = []  # CasADi holds no reference to its callbacks
 
     def values(self, knots: Any) -> Any:
-        self._kept.append(_Callback(self, knots.shape[1], self.rows, self.evaluate))
+        self._kept.append(_KnotCallback(self, knots.shape[1], self.rows, self.evaluate))
         return self._kept[-1](knots)
 
     def jacobian(self, knots: Any) -> Any:
         def rows(at: Array) -> Array:
             return self.linearize(at)[1].transpose(0, 2, 1)
 
-        self._kept.append(_Callback(self, knots.shape[1], self.rows * self.width, rows))
+        self._kept.append(_KnotCallback(self, knots.shape[1], self.rows * self.width, rows))
         return ca.vec(self._kept[-1](knots))
 
     def jacobian_of(self, knot: Array) -> Array:
@@ -224,7 +224,7 @@ class Called:
         return np.asarray(self.linearize(knot[None])[1][0])
 
 
-class _Callback(ca.Callback):  # type: ignore[misc]
+class _KnotCallback(ca.Callback):  # type: ignore[misc]
     """(nx + nu, K) -> (rows, K); the last result is kept, since a solver asks twice for its first iterate's."""
 
     def __init__(self, owner: Called | SymbolicPlant, count: int, rows: int, at_knots: Values):

@@ -42,7 +42,7 @@ def solve_ipopt(
     """
     with interrupt_flag() as interrupted:
         watch = Watch(limits, interrupted)
-        callback = _Callback(program, watch, report)
+        callback = _IterateCallback(program, watch, report)
         options = OPTIONS | program.derivatives(exact) | _options(exact, limits) | {"iteration_callback": callback}
         solver = ca.nlpsol("solver", "ipopt", program.nlp, options)
         lower, upper = program.sides
@@ -58,7 +58,7 @@ def solve_ipopt(
     return NlpResult(np.asarray(found["x"]).ravel(), outcome, f"IPOPT: {words.replace('_', ' ')}", table)
 
 
-class _Callback(ca.Callback):  # type: ignore[misc]
+class _IterateCallback(ca.Callback):  # type: ignore[misc]
     """Called by the solver at every iterate: reports, keeps the best, says when to stop."""
 
     def __init__(self, program: TranscribedProgram, watch: Watch, report: Report | None):

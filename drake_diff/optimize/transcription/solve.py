@@ -25,7 +25,7 @@ FOUND = (Outcome.SOLVED, Outcome.INACCURATE)
 
 
 @dataclass(frozen=True)
-class Refinement:
+class MeshRefinement:
     """Until when a mesh is refined: `errors` and `cost_errors` at most `tolerance`, or `most` intervals."""
 
     tolerance: float
@@ -63,7 +63,7 @@ class Transcription:
         horizon: float | None = None,
         limits: Limits,
         report: Report | None,
-        refinement: Refinement | None = None,
+        refinement: MeshRefinement | None = None,
     ) -> Transcribed:
         """From a guess that `nodes_at` takes, and of `horizon` [s]; `limits.max_iterations` hold for each round.
 
