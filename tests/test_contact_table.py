@@ -423,6 +423,11 @@ def test_sentences_and_json(found):
     assert "wrong (bounce, damped bounce)" in said
     assert "gradient of damped bounce" in said
     assert "slide: -0.107 % from the rigid answer: friction is mu N, and k (x + tau x')" in said
+    assert repr(found).startswith("ContactTable(28 rows, 0 off)\n  drake (sap, autodiff): values: rigid answer (rest")
+    assert repr(found.row("stop", SAP)).startswith(
+        "ContactRow(stop in drake (sap, autodiff): stopping distance 0.09671 m"
+    )
+    assert "&#x27;" in found._repr_html_()  # own law's: it is escaped
     read = json.loads(as_json(found))
     assert len(read["rows"]) == len(found.rows)
     assert read["rows"][0]["value"] == found.rows[0].value

@@ -318,6 +318,17 @@ def test_a_case_that_cannot_be_is_refused(changes):
         replace(QUADRATIC, **changes)
 
 
+def test_results_print_in_a_few_lines():
+    evil = make("<script>", lambda x: A * x**2 / 2, lambda x: A * x, lambda x, s: A * x)
+    panel = dd.studies.gradient_panel([evil], ["first"], seeds=2, budget=21)
+    assert repr(evil) == "GradientCase('<script>': <script>; 1 variable, sigmas (0.5,))"
+    assert repr(panel).splitlines()[0] == "GradientPanel(1 case, 2 seeds of 30 samples)"
+    assert repr(panel.cases[0]).startswith("CasePanel(<script>)\n  least mean squared error")
+    assert repr(panel.cases[0].qualities[0]).startswith("Quality(first, sigma 0.5: variance")
+    assert max(len(text.splitlines()) for text in (repr(panel), repr(panel.cases[0]))) <= 5
+    assert "<script>" not in panel._repr_html_()
+
+
 def test_an_unknown_case_of_a_panel_is_named():
     with pytest.raises(UnknownNameError, match="quadratic"):
         dd.studies.gradient_panel([QUADRATIC], seeds=1).case("cubic")

@@ -125,6 +125,17 @@ def test_a_hostile_name_is_read_and_not_run(pages, browser, name):
     assert browser.execute_script("return document.querySelectorAll('.plot canvas').length") > 0
 
 
+@browsing
+@pytest.mark.parametrize("name", PAGES)
+def test_a_script_that_was_put_into_a_page_is_refused(pages, browser, tmp_path, name):
+    page = tmp_path / "page.html"
+    page.write_text(pages[name].read_text().replace("</header>", "</header><script>document.title = 'x'</script>", 1))
+    browser.get_log("browser")
+    browser.get(page.as_uri())
+    assert browser.title != "x"
+    assert any("Content Security Policy" in message for message in errors(browser))
+
+
 def test_a_live_view_has_no_hostile_path(pages):
     scene, _ = scene_of_run(pages["report"].parent)
     for path in (*scene.poses, *(shape.body for shape in scene.shapes)):

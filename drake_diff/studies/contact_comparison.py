@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -91,7 +90,7 @@ def contact_table(engines: Sequence[Spec] | None = None, cases: Sequence[Contact
     return ContactTable(tuple(rows), tuple(refused.values()))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ContactRow:
     """One engine in one case; numbers in SI units, None where there is none."""
 
@@ -122,6 +121,11 @@ class ContactRow:
     def law_gap(self) -> float | None:
         """The gap to what the engine's own law gives."""
         return None if self.law is None else gap(self.value, self.law)
+
+    def __repr__(self) -> str:
+        gradient = "none" if self.gradient is None else f"{self.gradient:.4g}, {self.gradient_verdict}"
+        value = f"{self.quantity} {self.value:.4g} {self.unit}, {self.verdict}"
+        return f"ContactRow({self.case} in {self.engine}: {value}; {self.derivative} {gradient})"
 
 
 @dataclass(frozen=True, repr=False)
@@ -204,27 +208,22 @@ class _Run:
         self.xs = self.motion.xs
         self.complete = len(self.motion.us) == case.num_steps
         self.no_gradient = "the engine has no derivative of a step in contact"
+        self._products: dict[int, Array | None] = {}
         single = engine.contract.precision != "float64"
         found = TOLERANCES[case.kind]
         least = SINGLE if single else 0.0
         self.tolerance = found._replace(value=max(found.value, least), gradient=max(found.gradient, least))
         self.zero = SINGLE_ZERO if single else ZERO
 
-    @cached_property
-    def jacobian(self) -> Array | None:
-        return self._product(self.motion)
-
-    def _product(self, motion: EngineMotion) -> Array | None:
-        try:
-            return rollout_jacobian(self.engine, self.space, motion)
-        except (GradientError, SimulationError) as error:
-            self.no_gradient = str(error)
-            return None
-
     def row(self, name: str, n: int) -> Array | None:
         m = self.motion
-        cut = EngineMotion(m.times[: n + 1], m.xs[: n + 1], m.us[:n], None, None, m.status)
-        found = self.jacobian if n == len(m.us) else self._product(cut)
+        if n not in self._products:
+            cut = EngineMotion(m.times[: n + 1], m.xs[: n + 1], m.us[:n], None, None, m.status)
+            try:
+                self._products[n] = rollout_jacobian(self.engine, self.space, cut)
+            except (GradientError, SimulationError) as error:
+                self.no_gradient, self._products[n] = str(error), None
+        found = self._products[n]
         return None if found is None else np.asarray(found[self._place(name)])
 
     @property

@@ -116,6 +116,10 @@ class Quality:
     cosine: float | None
     mean_squared_error: float
 
+    def __repr__(self) -> str:
+        told = f"variance {self.trace:.3g}, bias {np.linalg.norm(self.bias):.3g}{', biased' * self.biased}"
+        return f"Quality({self.order}, sigma {self.sigma:g}: {told})"
+
     @property
     def trace(self) -> float:
         """The sum of the variances of all entries."""

@@ -126,6 +126,9 @@ class CasePanel:
     qualities: tuple[Quality, ...]
     descents: tuple[Descent, ...]
 
+    def __repr__(self) -> str:
+        return "\n  ".join([f"CasePanel({self.case.name})", *self.verdict])
+
     def at(self, order: str, sigma: float) -> Quality:
         """The estimates of one order at one sigma."""
         return next(q for q in self.qualities if q.order == order and q.sigma == sigma)
