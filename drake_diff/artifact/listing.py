@@ -1,4 +1,4 @@
-"""Run directories side by side: a line for each, and what differs between two."""
+"""Directories side by side: a line for each of them, and what differs between two solves."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,7 @@ from drake_diff.record.sealed import SealedRecord
 from drake_diff.record.solve import EvidenceRecord
 
 CONFIGURATION = ("problem", "contract", "model", "inputs", "solver", "action", "observation")
-# Of the configuration, what is no choice: where a file was, what the solver said.
+# What nobody chose, of the configuration: where a file was, what the solver said.
 NO_CHOICE = ("contract.source", "solver.status", "solver.message", "solver.solver_message", "solver.iterations")
 
 
@@ -33,8 +33,8 @@ class RunLine:
 
 
 @dataclass(frozen=True)
-class Difference:
-    """One entry of the records that differs; None is an entry that is not there."""
+class ChangedEntry:
+    """One entry that differs between two records; None stands for an entry that is not there."""
 
     key: str
     a: Any
@@ -43,20 +43,47 @@ class Difference:
 
 @dataclass(frozen=True)
 class RunComparison:
-    """What differs between two runs; metrics whose definitions differ are not compared, `refused` says which."""
+    """What differs between two solves.
 
-    configuration: tuple[Difference, ...]
-    versions: tuple[Difference, ...]
-    metrics: tuple[Difference, ...]
+    Attributes:
+        configuration: Entries of what was asked that differ.
+        versions: Packages and commits that differ.
+        metrics: Metrics and invariants whose value or verdict differs.
+        refused: Metrics that cannot be compared, as they are defined in other words, units or tolerances.
+    """
+
+    configuration: tuple[ChangedEntry, ...]
+    versions: tuple[ChangedEntry, ...]
+    metrics: tuple[ChangedEntry, ...]
     refused: tuple[str, ...]
 
     @property
     def comparable(self) -> bool:
+        """Whether every metric could be compared."""
         return not self.refused
+
+    def __str__(self) -> str:
+        counts = f"versions: {len(self.versions)}; metrics: {len(self.metrics)}; not compared: {len(self.refused)}"
+        return f"configuration: {len(self.configuration)} entries differ; {counts}"
 
 
 def list_runs(directory: str | Path) -> list[RunLine]:
-    """A line for each directory in `directory` that has a record, by name. ArtifactError where there is no such one."""
+    """List the directories in `directory` that have a record, by name, without verifying them.
+
+    Args:
+        directory: Where the directories are.
+
+    Returns:
+        A `RunLine` for each.
+
+    Raises:
+        ArtifactError: There is no such directory.
+
+    Example:
+        >>> from drake_diff.artifact import list_runs
+        >>> [(line.name, line.kind, line.verdict) for line in list_runs("artifacts")]
+        [('pendulum_swing_up', 'solve', 'pass')]
+    """
     folder = Path(directory)
     if not folder.is_dir():
         raise ArtifactError(f"{folder}: expected a directory of runs, got no directory")
@@ -77,7 +104,24 @@ def _line(path: Path, kind: type[SealedRecord]) -> RunLine:
 
 
 def compare_runs(a: str | Path, b: str | Path) -> RunComparison:
-    """What differs between two run directories. ArtifactError where one has no readable record."""
+    """Compare what the records of two solves say: configuration, versions, metrics.
+
+    Args:
+        a: The directory of the first run.
+        b: The directory of the second one.
+
+    Returns:
+        A `RunComparison`.
+
+    Raises:
+        ArtifactError: One of them has no record that can be read.
+
+    Example:
+        >>> from drake_diff.artifact import compare_runs
+        >>> run = "artifacts/pendulum_swing_up"
+        >>> print(compare_runs(run, run))
+        configuration: 0 entries differ; versions: 0; metrics: 0; not compared: 0
+    """
     first, second = EvidenceRecord.read(a), EvidenceRecord.read(b)
     metrics, refused = _metrics(first, second)
     return RunComparison(
@@ -90,13 +134,13 @@ def compare_runs(a: str | Path, b: str | Path) -> RunComparison:
 
 def _differences(
     first: EvidenceRecord, second: EvidenceRecord, sections: tuple[str, ...], apart: tuple[str, ...]
-) -> tuple[Difference, ...]:
+) -> tuple[ChangedEntry, ...]:
     one, other = first.model_dump(mode="json"), second.model_dump(mode="json")
     found = differences({s: one[s] for s in sections}, {s: other[s] for s in sections})
-    return tuple(Difference(*entry) for entry in found if not entry[0].startswith(apart))
+    return tuple(ChangedEntry(*entry) for entry in found if not entry[0].startswith(apart))
 
 
-def _metrics(first: EvidenceRecord, second: EvidenceRecord) -> tuple[tuple[Difference, ...], tuple[str, ...]]:
+def _metrics(first: EvidenceRecord, second: EvidenceRecord) -> tuple[tuple[ChangedEntry, ...], tuple[str, ...]]:
     """Every metric of the two; a definition is its words, its unit, its direction and its tolerance."""
     ours = {m.name: m for m in (*first.metrics, *first.invariants)}
     theirs = {m.name: m for m in (*second.metrics, *second.invariants)}
@@ -112,5 +156,5 @@ def _metrics(first: EvidenceRecord, second: EvidenceRecord) -> tuple[tuple[Diffe
             was, now = getattr(a, other[0]), getattr(b, other[0])
             refused.append(f"{name}: its {other[0]} differs: {was!r} and {now!r}")
         elif a.value != b.value or a.verdict != b.verdict:
-            found.append(Difference(f"{name} [{a.unit}]", a.value, b.value))
+            found.append(ChangedEntry(f"{name} [{a.unit}]", a.value, b.value))
     return tuple(found), tuple(refused)

@@ -12,7 +12,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff.artifact.sections import UNKNOWN
+from drake_diff.artifact.sections import units_of
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
 from drake_diff.model.model import Model
@@ -169,12 +169,8 @@ def _measure(solution: Solution) -> Measurement:
 def _columns(problem: Problem) -> tuple[tuple[Column, ...], ...]:
     """(positions, velocities, inputs); all states of plain dynamics are positions, and their units are not known."""
     b = problem.bounds
-    names = (*problem.state_names, *problem.input_names)
-    units, count = [UNKNOWN] * len(names), problem.nx
-    if problem.has_model:
-        contract = problem.model.contract
-        units = [c.unit for c in contract.positions + contract.velocities + contract.inputs]
-        count = problem.model.nq
+    names, units = (*problem.state_names, *problem.input_names), units_of(problem)
+    count = problem.model.nq if problem.has_model else problem.nx
     limits = zip(np.append(b.x_lower, b.u_lower).tolist(), np.append(b.x_upper, b.u_upper).tolist(), strict=True)
     found = tuple(Column(name, unit, *pair) for name, unit, pair in zip(names, units, limits, strict=True))
     return found[:count], found[count : problem.nx], found[problem.nx :]

@@ -41,7 +41,7 @@ def write_plan(path: Path, solution: Solution) -> None:
 
 
 def read_plan(path: Path) -> PlanArrays:
-    """The arrays in `path`. ArtifactError where it is missing or no such file."""
+    """The arrays in `path`. ArtifactError where it is missing or not such a file."""
     try:
         with np.load(path, allow_pickle=False) as file:
             unknown, missing = set(file.files) - set(ARRAYS), set(REQUIRED) - set(file.files)
@@ -51,7 +51,7 @@ def read_plan(path: Path) -> PlanArrays:
     except ArtifactError:
         raise
     except Exception as error:  # NumPy's reader fails in many ways on what is no such file
-        raise ArtifactError(f"{path} is no plan: {type(error).__name__}: {error}") from error
+        raise ArtifactError(f"{path} is not a plan: {type(error).__name__}: {error}") from error
     horizon = found.get("free_horizon")
     return PlanArrays(
         xs=found["xs"],

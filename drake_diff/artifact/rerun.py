@@ -41,7 +41,7 @@ def rebuilt(given: ModelInput, source: Any, attachments: dict[str, bytes] | None
     if data is None or sha256(data).hexdigest() != given.file.sha256:
         raise ArtifactError(f"trace.mcap: it does not carry the model file {name} that record.json describes")
     if Path(name).name != name or not name.endswith(FORMATS):
-        raise ArtifactError(f"record.json: {name!r} is no name of a model file")
+        raise ArtifactError(f"record.json: {name!r} is not the name of a model file")
     with TemporaryDirectory() as folder:
         path = Path(folder) / name
         path.write_bytes(data)
@@ -53,7 +53,7 @@ def rebuilt(given: ModelInput, source: Any, attachments: dict[str, bytes] | None
 def _source_if_unchanged(given: ModelInput, source: Path) -> Path:
     """The model file where it stood; ModelError where it or a file that it names is not the recorded one."""
     if given.file is None or not (source.name.endswith(FORMATS) and source.is_file()):
-        raise ModelError(f"the model's file {source} is gone, and no copy of it that would do is in the artifact")
+        raise ModelError(f"the model's file {source} is gone, and the artifact has no copy that could be used")
     if file_evidence(source, given.file.path) != given.file:
         raise ModelError(f"the model's file {source} is not what it was")
     changed = [was.path for was in given.named if was not in named_files(source)]
@@ -68,7 +68,7 @@ def _load(path: Path, options: dict[str, Any]) -> Model:
             warnings.simplefilter("ignore", ModelWarning)  # said when the model was loaded first
             return load_model(path, **options)
     except (InputError, TypeError) as error:
-        raise ArtifactError(f"record.json: the model's options are none: {error}") from error
+        raise ArtifactError(f"record.json: the model cannot be loaded with the recorded options: {error}") from error
 
 
 def resolve(record: EvidenceRecord, model: Model, plan: PlanArrays) -> Solution:
@@ -97,4 +97,4 @@ def resolve(record: EvidenceRecord, model: Model, plan: PlanArrays) -> Solution:
             parameters=plan.parameters,
         )
     except (InputError, ValueError, KeyError, TypeError) as error:
-        raise ArtifactError(f"record.json: its problem is none: {error}") from error
+        raise ArtifactError(f"record.json: its problem cannot be rebuilt: {error}") from error

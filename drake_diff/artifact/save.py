@@ -26,7 +26,7 @@ def begin(directory: str | Path, problem: Problem) -> None:
     What an earlier run left there under the names of ours is removed.
     """
     folder = Path(directory)
-    sentence = "the run has begun and not ended: it is under way, or it was killed or broke off"
+    sentence = "the run has started and not finished: it is still running, or it was killed or broke off"
     record = _record(
         folder, WallClock(written_utc=written_now()), verdict="incomplete", sentence=sentence, **asked(problem)
     )

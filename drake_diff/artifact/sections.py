@@ -63,6 +63,186 @@ UNITS = {
     "sap_near_rigid_threshold": "1",
     "collision_pairs, constraints, num_steps": "1",
 }
+UNKNOWN = "unknown"  # the unit of a number of plain dynamics
+LIMITATIONS = [
+    "of the model in simulation only: nothing here was measured on a robot",
+    "a cost is that of a local optimum at best",
+    "certificates hold at the states that they name, replays in the variants that they name",
+]
+
+GAPS = {"lower": -np.inf, "upper": np.inf}  # what null is, of a bound
+GUESS = ("initial_guess", "initial_guess_sha256")
+
+
+def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
+    """The sections that are known when a run begins; with its `solution` those that it decides are exact."""
+    time_step = problem.time_step if solution is None else solution.time_step
+    options = {} if solution is None else solution.options
+    return {
+        "claim": _claim(problem),
+        "inputs": Inputs(
+            initial_guess=str(options.get("initial_guess", "not known yet")),
+            initial_guess_sha256=options.get("initial_guess_sha256"),
+            seed=int(options["seed"]) if "seed" in options else None,
+        ),
+        "problem": describe_problem(problem),
+        "contract": problem.model.contract.to_dict() if problem.has_model else {},
+        "units": UNITS,
+        "observation": _observation(problem, time_step),
+        "action": _action(problem, time_step, options.get("time_limit")),
+        "model": model_input(problem.model) if problem.has_model else ModelInput(file=None, options=None),
+    }
+
+
+def found(solution: Solution) -> dict[str, Any]:
+    """The sections that say how a solution was found."""
+    return {"solver": _solver(solution), "parameters": _parameters(solution), "gradient": _gradient(solution)}
+
+
+def units_of(problem: Problem) -> tuple[str, ...]:
+    """(nx + nu,) the units of the states and inputs."""
+    if not problem.has_model:
+        return (UNKNOWN,) * (problem.nx + problem.nu)
+    contract = problem.model.contract
+    return tuple(c.unit for c in contract.positions + contract.velocities + contract.inputs)
+
+
+def _claim(problem: Problem) -> Claim:
+    """What a run of this problem says is true when its verdict is "pass"."""
+    goal = "" if np.all(np.isnan(problem.goal)) else " and ends in x_goal"
+    equations = "Drake's equations" if problem.has_model else "the given equations"
+    statement = (
+        f"{problem.name}, by {equations}, starts in x0{goal} after {problem.num_steps} intervals, and "
+        f"keeps bounds and constraints at every knot; optimized: {', '.join(problem.optimize)}"
+    )
+    return Claim(statement=statement, limitations=LIMITATIONS)
+
+
+def _observation(problem: Problem, time_step: float) -> Observation:
+    """The state as it is observed: exactly, at every step."""
+    frames = _frames(problem.model) if problem.has_model else ["none: plain dynamics"] * problem.nx
+    exact = "exact simulation state: there is no sensor and no noise"
+    variables = [
+        ObservedVariable(name=name, unit=unit, frame=frame, uncertainty=Quantity(value=0.0, unit=unit, reason=exact))
+        for name, unit, frame in zip(problem.state_names, units_of(problem)[: problem.nx], frames, strict=True)
+    ]
+    clock = "simulated time, from the first state"
+    return Observation(variables=variables, clock=clock, start_s=0.0, period_s=time_step, count=problem.num_steps + 1)
+
+
+def _frames(model: Model) -> list[str]:
+    """(nx,) the frame of each entry of the state: a floating body's is the world's, a joint's its own axes'."""
+    found = [model.contract.frame] * model.nx
+    for joint in joints(model.plant):
+        if joint.type_name() not in FLOATING:
+            own = f"axes of {joint.name()}, {joint.parent_body().name()} to {joint.child_body().name()}"
+            for start, count in (
+                (joint.position_start(), joint.num_positions()),
+                (model.nq + joint.velocity_start(), joint.num_velocities()),
+            ):
+                found[start : start + count] = [own] * count
+    return found
+
+
+def _action(problem: Problem, time_step: float, limit: float | None) -> ActionInterface:
+    """How the inputs reach the plant in the replay, whatever the solver assumed between its knots."""
+    bounds, units, kind = (
+        problem.bounds,
+        units_of(problem)[problem.nx :],
+        "the input of plain dynamics: no plant takes it",
+    )
+    if problem.has_model:
+        kind = "effort, held over each step"
+        if any(a.kp is not None for a in problem.model.contract.actuators):
+            kind += ", added to the actuators' PD control"
+    lower, upper = finite_list(bounds.u_lower), finite_list(bounds.u_upper)
+    return ActionInterface(
+        command_type=kind,
+        commands=[
+            Command(name=name, unit=units[i], lower=lower[i], upper=upper[i])
+            for i, name in enumerate(problem.input_names)
+        ],
+        update_rate=Quantity(value=1 / time_step, unit="Hz"),
+        latency_budget=Quantity(
+            value=limit,
+            unit="s",
+            reason="of the solve as a whole" if limit else "none: planned ahead in simulation, no time limit was given",
+        ),
+        safety_fallback="none: in simulation there is nothing to protect",
+    )
+
+
+def _gradient(solution: Solution) -> GradientEvidence:
+    """What the solver differentiated, where each column came from, and how far it agrees with differences."""
+    problem = solution.problem
+    regularization, tolerance = "none", Quantity(value=None, unit="1", reason="plain dynamics have no contact solver")
+    if problem.has_model:
+        contact = problem.model.contract.contact
+        if contact.collision_pairs:
+            regularization = f"{contact.approximation} contact, whose compliance and stiction are part of the model"
+        reason = "relative, of Drake's contact solver"
+        tolerance = Quantity(value=contact.solver_relative_tolerance, unit="1", reason=reason)
+    norms = [] if solution.gradient_norms is None else finite_list(solution.gradient_norms)
+    return GradientEvidence(
+        differentiated=list(problem.optimize),
+        columns=_columns(solution),
+        smoothing="none",
+        regularization=regularization,
+        solver_tolerance=tolerance,
+        horizon=Quantity(value=solution.horizon, unit="s"),
+        norm_definition="|d cost / d x_k| in the cost's unit per the state's, by knot k",
+        norms=norms,
+        certificates=[gradient_evidence(c) for c in solution.certificates],
+    )
+
+
+def _columns(solution: Solution) -> list[GradientColumn]:
+    """States, inputs and parameters; of the first two the source that the certificates were of."""
+    problem, vector = solution.problem, solution.vector
+    methods = list(dict.fromkeys(c.method for c in solution.certificates)) or ["no certificate was reached"]
+    of_states = "; ".join(methods)
+    units = [p.unit for p in vector.parameters for _ in p.value]
+    names = (*problem.state_names, *problem.input_names)
+    return [
+        *(GradientColumn(name=n, unit=u, source=of_states) for n, u in zip(names, units_of(problem), strict=True)),
+        *(GradientColumn(name=name, unit=units[i], source=vector.sources[i]) for i, name in enumerate(vector.names)),
+    ]
+
+
+def _parameters(solution: Solution) -> list[ParameterEvidence]:
+    """Each entry of the parameter vector."""
+    problem, found = solution.problem, solution.vector
+    lower, upper = (finite_list(side) for side in problem.bounds_of_parameters())
+    units = [p.unit for p in found.parameters for _ in p.value]
+    return [
+        ParameterEvidence(
+            name=name,
+            unit=units[i],
+            derivative_source=found.sources[i],
+            start=float(problem.parameters.values[i]),
+            value=float(found.values[i]),
+            optimized=problem.optimizes_parameters,
+            lower=lower[i],
+            upper=upper[i],
+        )
+        for i, name in enumerate(found.names)
+    ]
+
+
+def _solver(solution: Solution) -> Solver:
+    """What solved the problem; an option that is no finite number is null, and the guess is in `inputs`."""
+    options = {k: v.item() if isinstance(v, np.generic) else v for k, v in solution.options.items() if k not in GUESS}
+    plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in options.items()}
+    return Solver(
+        method=solution.method,
+        solver=solution.solver,
+        scheme=solution.scheme,
+        status=solution.status.value,
+        message=solution.message,
+        solver_message=solution.solver_message,
+        options=plain,
+        iterations=len(solution.iterations),
+    )
 
 
 def describe_problem(problem: Problem) -> dict[str, Any]:
@@ -124,15 +304,9 @@ def unknown_functions(record: EvidenceRecord) -> tuple[list[str], list[str]]:
 def rebuild_problem(record: EvidenceRecord, model: Model, us: Array) -> Problem:
     """The problem of a record on `model`, without the user's functions; `us` (N, nu) are the inputs of the plan."""
     p: dict[str, Any] = dict(record.problem)
-    limits = [_numbers(p[f"{kind}_{side}"], sign) for kind in "xu" for side, sign in (("lower", -1), ("upper", 1))]
+    bounds = {f"{kind}_{side}": _numbers(p[f"{kind}_{side}"], gap) for kind in "xu" for side, gap in GAPS.items()}
     starts = np.array([entry.start for entry in record.parameters])
-    sides = [
-        np.array([sign * np.inf if v is None else v for v in values])
-        for sign, values in (
-            (-1, [entry.lower for entry in record.parameters]),
-            (1, [entry.upper for entry in record.parameters]),
-        )
-    ]
+    lower, upper = (_numbers([getattr(e, side) for e in record.parameters], gap) for side, gap in GAPS.items())
     vector = select(model, p["parameters"])
     pairs = list(zip(vector.parameters, vector.slices, strict=True))
     mask = np.array(p["initial_state_free"], dtype=bool)
@@ -140,7 +314,7 @@ def rebuild_problem(record: EvidenceRecord, model: Model, us: Array) -> Problem:
     running, final = _rebuild_cost(p["running_cost"]), _rebuild_cost(p["final_cost"])
     goal = _numbers(p["x_goal"], np.nan)
     if running is None and final is None and np.all(np.isnan(goal)):
-        final = _nothing  # a Problem wants a cost or a goal
+        final = QuadraticCost(Q=np.zeros((model.nx, model.nx)))  # a Problem wants a cost or a goal
     return Problem(
         model,
         x0=_numbers(p["x0"], np.nan),
@@ -150,25 +324,20 @@ def rebuild_problem(record: EvidenceRecord, model: Model, us: Array) -> Problem:
         x_goal=goal,
         waypoints={int(k): _numbers(x, np.nan) for k, x in p["waypoints"].items()},
         horizon=p["free_horizon_s"],
-        bounds=Bounds(*limits),
+        bounds=Bounds(**bounds),
         optimize=optimize,
         initial_state_mask=mask if mask.any() else None,
         us=None if "controls" in optimize else us,
         parameters={parameter.name: starts[s] for parameter, s in pairs},
         parameter_bounds={
-            parameter.name: (sides[0][s], sides[1][s]) for parameter, s in pairs if parameter.kind.quantity != "inertia"
+            parameter.name: (lower[s], upper[s]) for parameter, s in pairs if parameter.kind.quantity != "inertia"
         },
     )
 
 
-def _nothing(x: Any) -> Any:
-    return 0.0 * x[0]
-
-
 def _numbers(values: Any, missing: float) -> Array:
-    """(n,) numbers; where there is none `missing`, of a bound its sign times infinity."""
-    gap = missing if np.isnan(missing) else missing * np.inf
-    return np.array([gap if v is None else v for v in values], dtype=float)
+    """(n,) numbers, `missing` where there is none."""
+    return np.array([missing if v is None else v for v in values], dtype=float)
 
 
 def _rebuild_cost(cost: Any) -> Any:
@@ -177,183 +346,3 @@ def _rebuild_cost(cost: Any) -> Any:
     if "ConstantCost" in cost:
         return ConstantCost(cost["ConstantCost"]["rate"])
     return QuadraticCost(**cost["QuadraticCost"])
-
-
-UNKNOWN = "unknown"  # the unit of a number of plain dynamics
-LIMITATIONS = [
-    "of the model in simulation only: nothing here was measured on a robot",
-    "a cost is that of a local optimum at best",
-    "certificates hold at the states that they name, replays in the variants that they name",
-]
-
-GUESS = ("initial_guess", "initial_guess_sha256")
-
-
-def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
-    """The sections that are known when a run begins; with its `solution` those that it decides are exact."""
-    time_step = problem.time_step if solution is None else solution.time_step
-    options = {} if solution is None else solution.options
-    return {
-        "claim": _claim(problem),
-        "inputs": Inputs(
-            initial_guess=str(options.get("initial_guess", "not known yet")),
-            initial_guess_sha256=options.get("initial_guess_sha256"),
-            seed=int(options["seed"]) if "seed" in options else None,
-        ),
-        "problem": describe_problem(problem),
-        "contract": problem.model.contract.to_dict() if problem.has_model else {},
-        "units": UNITS,
-        "observation": _observation(problem, time_step),
-        "action": _action(problem, time_step, options.get("time_limit")),
-        "model": model_input(problem.model) if problem.has_model else ModelInput(file=None, options=None),
-    }
-
-
-def found(solution: Solution) -> dict[str, Any]:
-    """The sections that say how a solution was found."""
-    return {"solver": _solver(solution), "parameters": _parameters(solution), "gradient": _gradient(solution)}
-
-
-def _claim(problem: Problem) -> Claim:
-    """What a run of this problem says is true when its verdict is "pass"."""
-    goal = "" if np.all(np.isnan(problem.goal)) else " and ends in x_goal"
-    equations = "Drake's equations" if problem.has_model else "the given equations"
-    statement = (
-        f"{problem.name}, by {equations}, starts in x0{goal} after {problem.num_steps} intervals, and "
-        f"keeps bounds and constraints at every knot; optimized: {', '.join(problem.optimize)}"
-    )
-    return Claim(statement=statement, limitations=LIMITATIONS)
-
-
-def _observation(problem: Problem, time_step: float) -> Observation:
-    """The state as it is observed: exactly, at every step."""
-    units, frames = [UNKNOWN] * problem.nx, ["none: plain dynamics"] * problem.nx
-    if problem.has_model:
-        contract = problem.model.contract
-        units, frames = [x.unit for x in contract.positions + contract.velocities], _frames(problem.model)
-    variables = [
-        ObservedVariable(name=name, unit=unit, frame=frame, uncertainty=_exact(unit))
-        for name, unit, frame in zip(problem.state_names, units, frames, strict=True)
-    ]
-    clock = "simulated time, from the first state"
-    return Observation(variables=variables, clock=clock, start_s=0.0, period_s=time_step, count=problem.num_steps + 1)
-
-
-def _exact(unit: str) -> Quantity:
-    return Quantity(value=0.0, unit=unit, reason="exact simulation state: there is no sensor and no noise")
-
-
-def _frames(model: Model) -> list[str]:
-    """(nx,) the frame of each entry of the state: a floating body's is the world's, a joint's its own axes'."""
-    found = [model.contract.frame] * model.nx
-    for joint in joints(model.plant):
-        if joint.type_name() not in FLOATING:
-            own = f"axes of {joint.name()}, {joint.parent_body().name()} to {joint.child_body().name()}"
-            for start, count in (
-                (joint.position_start(), joint.num_positions()),
-                (model.nq + joint.velocity_start(), joint.num_velocities()),
-            ):
-                found[start : start + count] = [own] * count
-    return found
-
-
-def _action(problem: Problem, time_step: float, limit: float | None) -> ActionInterface:
-    """How the inputs reach the plant in the replay, whatever the solver assumed between its knots."""
-    bounds, units, kind = problem.bounds, [UNKNOWN] * problem.nu, "the input of plain dynamics: no plant takes it"
-    if problem.has_model:
-        contract = problem.model.contract
-        units, kind = [u.unit for u in contract.inputs], "effort, held over each step"
-        if any(a.kp is not None for a in contract.actuators):
-            kind += ", added to the actuators' PD control"
-    lower, upper = finite_list(bounds.u_lower), finite_list(bounds.u_upper)
-    return ActionInterface(
-        command_type=kind,
-        commands=[
-            Command(name=name, unit=units[i], lower=lower[i], upper=upper[i])
-            for i, name in enumerate(problem.input_names)
-        ],
-        update_rate=Quantity(value=1 / time_step, unit="Hz"),
-        latency_budget=Quantity(
-            value=limit,
-            unit="s",
-            reason="of the solve as a whole" if limit else "none: planned ahead in simulation, no time limit was given",
-        ),
-        safety_fallback="none: in simulation there is nothing to protect",
-    )
-
-
-def _gradient(solution: Solution) -> GradientEvidence:
-    """What the solver differentiated, where each column came from, and how far it agrees with differences."""
-    problem = solution.problem
-    regularization, tolerance = "none", Quantity(value=None, unit="1", reason="plain dynamics have no contact solver")
-    if problem.has_model:
-        contact = problem.model.contract.contact
-        if contact.collision_pairs:
-            regularization = f"{contact.approximation} contact, whose compliance and stiction are part of the model"
-        reason = "relative, of Drake's contact solver"
-        tolerance = Quantity(value=contact.solver_relative_tolerance, unit="1", reason=reason)
-    norms = [] if solution.gradient_norms is None else finite_list(solution.gradient_norms)
-    return GradientEvidence(
-        differentiated=list(problem.optimize),
-        columns=_columns(solution),
-        smoothing="none",
-        regularization=regularization,
-        solver_tolerance=tolerance,
-        horizon=Quantity(value=solution.horizon, unit="s"),
-        norm_definition="|d cost / d x_k| in the cost's unit per the state's, by knot k",
-        norms=norms,
-        certificates=[gradient_evidence(c) for c in solution.certificates],
-    )
-
-
-def _columns(solution: Solution) -> list[GradientColumn]:
-    """States, inputs and parameters; of the first two the source that the certificates were of."""
-    problem, vector = solution.problem, solution.vector
-    methods = list(dict.fromkeys(c.method for c in solution.certificates)) or ["no certificate was reached"]
-    of_states = "; ".join(methods)
-    units = [p.unit for p in vector.parameters for _ in p.value]
-    names = (*problem.state_names, *problem.input_names)
-    known = [UNKNOWN] * len(names)
-    if problem.has_model:
-        contract = problem.model.contract
-        known = [c.unit for c in contract.positions + contract.velocities + contract.inputs]
-    return [
-        *(GradientColumn(name=name, unit=unit, source=of_states) for name, unit in zip(names, known, strict=True)),
-        *(GradientColumn(name=name, unit=units[i], source=vector.sources[i]) for i, name in enumerate(vector.names)),
-    ]
-
-
-def _parameters(solution: Solution) -> list[ParameterEvidence]:
-    """Each entry of the parameter vector."""
-    problem, found = solution.problem, solution.vector
-    lower, upper = (finite_list(side) for side in problem.bounds_of_parameters())
-    units = [p.unit for p in found.parameters for _ in p.value]
-    return [
-        ParameterEvidence(
-            name=name,
-            unit=units[i],
-            derivative_source=found.sources[i],
-            start=float(problem.parameters.values[i]),
-            value=float(found.values[i]),
-            optimized=problem.optimizes_parameters,
-            lower=lower[i],
-            upper=upper[i],
-        )
-        for i, name in enumerate(found.names)
-    ]
-
-
-def _solver(solution: Solution) -> Solver:
-    """What solved the problem; an option that is no finite number is null, and the guess is in `inputs`."""
-    options = {k: v.item() if isinstance(v, np.generic) else v for k, v in solution.options.items() if k not in GUESS}
-    plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in options.items()}
-    return Solver(
-        method=solution.method,
-        solver=solution.solver,
-        scheme=solution.scheme,
-        status=solution.status.value,
-        message=solution.message,
-        solver_message=solution.solver_message,
-        options=plain,
-        iterations=len(solution.iterations),
-    )

@@ -167,7 +167,7 @@ def _event_channel(m: Measurement) -> Channel:
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """The numbers of a trace, bit for bit as they were written; arrays are read-only.
+    """The numbers of a trace; arrays are read-only.
 
     `xs` (N+1, nx) under `us` (N, nu) is the open-loop motion of the discrete plant, without rows where it could not
     be taken; `planned_xs` (N+1, nx), `planned_us` (N or N+1, nu) and `planned_us_mid` (N, nu) are the solver's.
@@ -188,6 +188,14 @@ class Trace:
     metadata: dict[str, str]
     attachments: dict[str, bytes]
 
+    def __repr__(self) -> str:
+        shapes = (
+            f"{self.planned_xs.shape[0]} planned states, {self.xs.shape[0]} of the motion, {self.us.shape[1]} inputs"
+        )
+        return f"Trace of {self.metadata.get('model', '?')}: {shapes}, {self.horizon:g} s\n  " + ", ".join(
+            self.attachments
+        )
+
     @property
     def plan(self) -> dict[str, Any]:
         """The fields of a `Solution` that hold its numbers: `Solution(problem, method, ..., **trace.plan)`."""
@@ -206,7 +214,22 @@ class Trace:
 
 
 def read_trace(path: str | Path) -> Trace:
-    """The numbers in a trace. ArtifactError where the file is damaged or lacks a channel."""
+    """Read the numbers of a trace back, bit for bit as they were written.
+
+    Args:
+        path: A trace.mcap that `save` wrote.
+
+    Returns:
+        A `Trace`.
+
+    Raises:
+        ArtifactError: The file is damaged or lacks a channel.
+
+    Example:
+        >>> trace = dd.read_trace("artifacts/pendulum_swing_up/trace.mcap")
+        >>> trace.xs.shape, trace.us.shape, float(trace.times[-1])
+        ((41, 2), (40, 1), 0.8)
+    """
     log = read_mcap(path)
     missing = CHANNELS - set(log.messages)
     if missing:

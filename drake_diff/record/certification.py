@@ -19,7 +19,7 @@ from drake_diff.model.sampling import SampledState, sample_states
 from drake_diff.model.step import advance
 from drake_diff.record.parts import Certified, FiniteTable, Part
 from drake_diff.record.provenance import gradient_evidence, model_input, provenance_of, written_now
-from drake_diff.record.sealed import SealedRecord, Verdict, WallClock
+from drake_diff.record.sealed import Passed, SealedRecord, WallClock
 
 
 class CertifiedState(Part):
@@ -105,7 +105,7 @@ def certify_model(
         raise InputError("seed", got=repr(seed), expected="a whole number of at least 0")
     names = [p.name for p in select(model, parameters).parameters]
 
-    def record(verdict: Verdict, sentence: str, found: Sequence[CertifiedState] = ()) -> CertificationRecord:
+    def record(verdict: Passed, sentence: str, found: Sequence[CertifiedState] = ()) -> CertificationRecord:
         return CertificationRecord(
             name=model.name,
             verdict=verdict,
@@ -121,7 +121,7 @@ def certify_model(
         )
 
     if directory is not None:
-        record("incomplete", "the run has begun and not ended: it is under way, or it was killed").begin(
+        record("incomplete", "the run has started and not finished: it is still running, or it was killed").begin(
             Path(directory)
         )
     found = [_certify_state(model, state, parameters, method) for state in sample_states(model, states, int(seed))]

@@ -21,7 +21,7 @@ from drake_diff.record.provenance import file_evidence
 SCHEMA_VERSION = "2.0.0"  # a new major one where a field goes or changes its meaning, a minor one where one is added
 SCHEMAS = Path(__file__).parent.parent / "schema"
 APART = ("wall_clock", "files", "record_sha256")  # of what is the same, byte for byte, in every run
-Verdict = Literal["pass", "fail", "incomplete"]
+Passed = Literal["pass", "fail", "incomplete"]
 
 
 class WallClock(Part):
@@ -43,7 +43,7 @@ class SealedRecord(Part):
     schema_version: str = SCHEMA_VERSION
     kind: str
     name: str
-    verdict: Verdict
+    verdict: Passed
     sentence: str
     model: ModelInput
     provenance: Provenance
