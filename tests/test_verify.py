@@ -233,7 +233,7 @@ def test_a_verification_prints_what_it_found(run, copy):
     (copy / "<b>").write_text("x")
     found = dd.verify(copy)
     assert "<b>: record.json does not list it" in repr(found)
-    assert "<li>&lt;b&gt;: record.json" in found._repr_html_()
+    assert "&lt;b&gt;: record.json" in found._repr_html_()
 
 
 def test_a_plan_of_another_run_is_found_although_all_hashes_are_right(run, other_run, copy):

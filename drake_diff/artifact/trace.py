@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.artifact.measurement import Measurement
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.exceptions import ArtifactError
@@ -165,8 +166,8 @@ def _event_channel(m: Measurement) -> Channel:
     return Channel("/events", kind.cls, [(nanoseconds(row.time), row) for row in rows], {"units": kind.units})
 
 
-@dataclass(frozen=True, eq=False)
-class Trace:
+@dataclass(frozen=True, eq=False, repr=False)
+class Trace(ShowsItsRepr):
     """The numbers of a trace; arrays are read-only.
 
     `xs` (N+1, nx) under `us` (N, nu) is the open-loop motion of the discrete plant, without rows where it could not

@@ -5,13 +5,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from hashlib import sha256
-from html import escape
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.artifact.measurement import Measurement, measure, replay_evidence
 from drake_diff.artifact.plan_file import PLAN, PlanArrays, read_plan
 from drake_diff.artifact.rerun import rebuilt, resolve
@@ -56,8 +56,8 @@ def _shown(value: float | None) -> str:
     return "none" if value is None else f"{value:.9g}"
 
 
-@dataclass(frozen=True)
-class Verification:
+@dataclass(frozen=True, repr=False)
+class Verification(ShowsItsRepr):
     """What `verify` found in a directory.
 
     `verdict` is "holds" where every file is as it was written and every number came out again; "intact" where every
@@ -117,10 +117,6 @@ class Verification:
     def __repr__(self) -> str:
         lines = [f"Verification of {self.directory}: {self.verdict}", *(self.complaints or (self.sentence,))]
         return "\n  ".join(dict.fromkeys((*lines, *self.not_rerun, *self.notes)))
-
-    def _repr_html_(self) -> str:
-        items = "".join(f"<li>{escape(line)}</li>" for line in (*self.complaints, *self.not_rerun, *self.notes))
-        return f"<div><b>{escape(str(self.directory))}: {escape(str(self))}</b><ul>{items}</ul></div>"
 
 
 def verify(directory: str | Path) -> Verification:

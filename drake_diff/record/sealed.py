@@ -7,13 +7,13 @@ written when a run begins, as "incomplete", and again, last of all files, when e
 import json
 from collections.abc import Iterable, Mapping
 from hashlib import sha256
-from html import escape
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, ValidationError
 
 from drake_diff._base.files import write_whole
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError
 from drake_diff.record.parts import FileEvidence, ModelInput, Part, Provenance
 from drake_diff.record.provenance import file_evidence
@@ -31,7 +31,7 @@ class WallClock(Part):
     duration_s: float | None = None
 
 
-class SealedRecord(Part):
+class SealedRecord(ShowsItsRepr, Part):
     """The base of every record. "incomplete" is what a run that is under way, or was killed, says of itself.
 
     `files` are all others of the directory, by their path in it. `record_sha256` is the hash of this record's canonical
@@ -130,11 +130,6 @@ class SealedRecord(Part):
     def __repr__(self) -> str:
         lines = [f"{type(self).__name__} {self.name}: {self.verdict}", self.sentence]
         return "\n  ".join(lines + [f"{key}: {value}" for key, value in self.facts().items()])
-
-    def _repr_html_(self) -> str:
-        rows = "".join(f"<tr><th>{escape(k)}</th><td>{escape(v)}</td></tr>" for k, v in self.facts().items())
-        title = f"<b>{escape(self.name)}: {escape(self.verdict)}</b>"
-        return f"<div>{title}<p>{escape(self.sentence)}</p><table>{rows}</table></div>"
 
 
 def canonical(fields: Mapping[str, Any]) -> str:
