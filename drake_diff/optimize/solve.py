@@ -106,6 +106,10 @@ def solve(
         InputError: something that was asked for does not fit; nothing ran.
         ModelError: the model cannot do what the method needs.
 
+    Source:
+        The schemes of collocation: Kelly, "An Introduction to Trajectory Optimization", SIAM Review 59(4), 2017.
+        The refinement of meshes: Betts, "Practical Methods for Optimal Control", ch. 4.
+
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
         >>> problem = dd.Problem(model, x0=[0, 0], x_goal=[0.5, 0], num_steps=20, final_cost=lambda x: x[1] ** 2)

@@ -22,7 +22,6 @@ from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.refusal import Refusal
 from drake_diff.mechanics.casadi_tree import PlantFunctions, agrees, symbolic_plant
 from drake_diff.optimize.problem.constraint import Constraint
-from drake_diff.optimize.problem.cost import differentiate_final_cost
 from drake_diff.optimize.problem.dynamics import Dynamics, PlantKnots, Pointwise
 from drake_diff.optimize.transcription.task import OptimalControl
 
@@ -315,6 +314,7 @@ class KnotFunctions:
 def knot_functions(task: OptimalControl) -> KnotFunctions:
     """The functions of `task`, each symbolic if it can be."""
     nx, width, probe = task.dynamics.nx, task.dynamics.nx + task.dynamics.nu, task.dynamics.probe()
+    final = task.final
 
     def choose(function: Any, values: Values, linearize: Linearize, rows: int) -> KnotFunction:
         with np.errstate(all="ignore"):
@@ -330,15 +330,6 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
         values, gradients = task.rate.linearize(knots)
         return values[:, None], gradients[:, None]
 
-    def final_values(knots: Array) -> Array:
-        return np.array([[float(task.final(knot[:nx]))] for knot in knots])
-
-    def final_rows(knots: Array) -> tuple[Array, Array]:
-        found = [differentiate_final_cost(task.final, knot[:nx]) for knot in knots]
-        rows = np.zeros((len(knots), 1, width))
-        rows[:, 0, :nx] = [gradient for _, gradient in found]
-        return np.array([[value] for value, _ in found]), rows
-
     def path(c: Constraint) -> KnotFunction:
         def values(knots: Array) -> Array:
             return np.array([c(knot[:nx], knot[nx:]) for knot in knots])
@@ -352,7 +343,7 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
     return KnotFunctions(
         _dynamics(task.dynamics),
         choose(task.rate, rate_values, rate_rows, 1),
-        choose(lambda x, u: task.final(x), final_values, final_rows, 1) if task.final_cost is not None else None,
+        final if final is None else choose(final.f, final.values, final.linearize, 1),
         tuple(path(p.constraint) for p in task.paths),
     )
 

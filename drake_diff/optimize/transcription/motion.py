@@ -83,7 +83,8 @@ class Collocated:
     def cost(self) -> float:
         """The scheme's own quadrature of the running cost, and the final cost."""
         weights = self.horizon * node_weights(self.mesh, self.task.scheme)
-        return float(weights @ self.task.rate.values(self.nodes)) + float(self.task.final(self.xs[-1]))
+        final = 0.0 if self.task.final is None else float(self.task.final.values(self.nodes[-1:])[0, 0])
+        return float(weights @ self.task.rate.values(self.nodes)) + final
 
     @cached_property
     def defects(self) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.optimize.problem.bounds import Bounds
 from drake_diff.optimize.problem.constraint import Constraint
-from drake_diff.optimize.problem.cost import ConstantCost, FinalCost, QuadraticCost, differentiate_cost
+from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost, differentiate_cost
 from drake_diff.optimize.problem.dynamics import Dynamics, Pointwise
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.transcription.scheme import SCHEMES, Scheme, node_fractions
@@ -76,7 +76,7 @@ class OptimalControl:
     x_goal: Array  # (nx,)
     horizon: tuple[float, float]
     rate: RunningRate
-    final_cost: FinalCost | None
+    final: Pointwise | None  # of knots [x, u], whose inputs have no part in it
     bounds: Bounds
     scheme: Scheme
     num_steps: int  # of the mesh that it begins with, whose knots waypoints and constraints refer to
@@ -86,10 +86,6 @@ class OptimalControl:
     @property
     def time_is_free(self) -> bool:
         return self.horizon[0] < self.horizon[1]
-
-    def final(self, x: Any) -> Any:
-        """The final cost at `x` (nx,)."""
-        return 0.0 if self.final_cost is None else self.final_cost(x)
 
     def node_limits(self, mesh: Array) -> tuple[Array, Array]:
         """(lower, upper), each (K, nx + nu): the bounds of the nodes, equal where an end or a waypoint is given."""
@@ -109,10 +105,10 @@ def task_of(problem: Problem, scheme: str) -> OptimalControl:
 
     Raises InputError or GradientError where a cost is no function that can be differentiated.
     """
-    dynamics, mesh, final_cost = problem.dynamics, np.linspace(0, 1, problem.num_steps + 1), problem.final_cost
-    if final_cost is not None and not isinstance(final_cost, QuadraticCost):  # raises where it is no such function
-        Pointwise("final_cost", lambda x, u: final_cost(x), dynamics.nx, (), dynamics.probe())
-    paths = []
+    dynamics, mesh, cost = problem.dynamics, np.linspace(0, 1, problem.num_steps + 1), problem.final_cost
+    final, paths = None, []
+    if cost is not None:
+        final = Pointwise("final_cost", lambda x, u: cost(x), dynamics.nx, (), dynamics.probe())
     for c in problem.constraints:
         knots = problem.knots_of(c, input_at_end=True)
         paths.append(PathConstraint(c, None if c.knots is None else mesh[list(knots)], knots[0]))
@@ -122,7 +118,7 @@ def task_of(problem: Problem, scheme: str) -> OptimalControl:
         x_goal=problem.goal,
         horizon=problem.horizon or (problem.start_horizon,) * 2,
         rate=RunningRate(problem.running_cost, dynamics),
-        final_cost=final_cost,
+        final=final,
         bounds=problem.bounds,
         scheme=SCHEMES[scheme],
         num_steps=problem.num_steps,
