@@ -1113,13 +1113,13 @@ def test_a_cube_has_the_coordinates_of_its_second_moment():
 
 @pytest.mark.parametrize("inertia", [(0, 0, 0, 0, 0, 0), (1, 1, 0, 0, 0, 0), (0.1, 0, 0.1, 0, 0, 0)])
 def test_a_point_and_a_rod_have_no_coordinates(inertia):
-    with pytest.raises(InputError, match="a point or a rod"):
+    with pytest.raises(InputError, match="neither a point nor a rod"):
         to_log_cholesky(np.array(inertia, dtype=float))
 
 
 def test_a_point_or_a_rod_is_refused_where_its_inertia_is_differenced_or_optimized(load):
     model = load("double_pendulum.urdf")
-    with pytest.raises(InputError, match="a point or a rod"):
+    with pytest.raises(InputError, match="neither a point nor a rod"):
         dd.certify(model, np.zeros(4), np.zeros(2), parameters=("lower.inertia",))
     problem = dd.Problem(
         model,
@@ -1129,5 +1129,5 @@ def test_a_point_or_a_rod_is_refused_where_its_inertia_is_differenced_or_optimiz
         parameters=("lower.inertia",),
         final_cost=lambda x: (x**2).sum(),
     )
-    with pytest.raises(InputError, match="a point or a rod"):
+    with pytest.raises(InputError, match="neither a point nor a rod"):
         dd.solve(problem, method="shooting")
