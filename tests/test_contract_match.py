@@ -10,9 +10,8 @@ from helpers.engines import engine_of
 from helpers.models import MODELS
 
 import drake_diff as dd
-from drake_diff.engines.closed_form import CartPole, DoublePendulum, MassSpringDamper, Pendulum
+from drake_diff.engines.closed_form import CartPole, DoublePendulum, MassSpringDamper, NumpyEngine, Pendulum
 from drake_diff.engines.mujoco.mjcf import mjcf
-from drake_diff.engines.numpy import NumpyEngine
 from drake_diff.exceptions import InputError, ModelError, NotOfferedError
 from drake_diff.mechanics.description import describe
 

@@ -34,13 +34,13 @@ from drake_diff.engines.closed_form import (
     CartPole,
     DoublePendulum,
     MassSpringDamper,
+    NumpyEngine,
     Pendulum,
     Projectile,
     SlidingBlock,
     SphereOnGround,
 )
-from drake_diff.engines.numpy import NumpyEngine
-from drake_diff.engines.quiet import without_lines
+from drake_diff.engines.common import without_lines
 from drake_diff.exceptions import (
     ModelError,
     ModelWarning,

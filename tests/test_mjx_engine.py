@@ -26,9 +26,8 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.tree import SpatialInertia
 
 import drake_diff as dd
-from drake_diff.engines.closed_form import MassSpringDamper
+from drake_diff.engines.closed_form import MassSpringDamper, NumpyEngine
 from drake_diff.engines.mujoco.mjcf import mjcf
-from drake_diff.engines.numpy import NumpyEngine
 from drake_diff.exceptions import GradientError, ModelError, SimulationError
 from drake_diff.mechanics.description import describe
 from drake_diff.model.tangent import tangent_space

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array
-from drake_diff.engines.common import PlantEngine, euler_step_jacobian
-from drake_diff.engines.interface import EngineContract, StepJacobian, floats, limit
+from drake_diff.engines.common import EulerEngine, PlantEngine
+from drake_diff.engines.interface import EngineContract, floats, limit
 from drake_diff.engines.urdf import carried_by, inertial_urdf
 from drake_diff.exceptions import MissingDependencyError, ModelError
-from drake_diff.mechanics.coordinates import euler_acceleration, euler_step
+from drake_diff.mechanics.coordinates import euler_acceleration
 from drake_diff.mechanics.description import Description, Link, joint_contract
 from drake_diff.mechanics.joints import JointContract
 from drake_diff.model.model import Model
@@ -38,46 +38,19 @@ except ImportError as error:
 NO_CONTACT = "adam's dynamics have no contact here"
 
 
-class CasadiEngine(PlantEngine):
+class CasadiEngine(EulerEngine, PlantEngine):
     """Trees of hinges, slides and free bodies; no contact and no joint limits."""
 
-    name, version = "casadi", version("adam-robotics")
+    name, version, method = "casadi", version("adam-robotics"), "casadi"
 
     def __init__(self, model: Model):
+        """The functions of q, v and a: M and bias; the potential energy; d (M a + bias) / dq and / dv."""
         super().__init__(model)
         self.gravity = self.description.gravity
         bases: list[Link | None] = [x for x in self.description.moving if x.kind == "quaternion_floating"]
         if carried_by(self.description, "world"):
             bases.append(None)
         self.trees = [_Tree(self.description, base) for base in bases]
-        self._build()
-
-    def step(self, x: ArrayLike, u: ArrayLike) -> Array:
-        x, u = self._point(x, u)
-        return euler_step(self.coordinates, self.time_step, x, self._acceleration(x, u))
-
-    def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
-        x, u = self._point(x, u)
-        acceleration = self._acceleration(x, u)
-        by = self._acceleration_derivative(x, u, acceleration)
-        return euler_step_jacobian(self.coordinates, self.time_step, x, acceleration, by, "casadi")
-
-    def energy(self, x: ArrayLike) -> float:
-        _, q, v = self._state(x)
-        return float(v @ self.mass_matrix(q) @ v) / 2 + float(self.potential(q))
-
-    def contact_depth(self, x: ArrayLike) -> float:
-        self._state(x)
-        return 0.0
-
-    def mass_matrix(self, q: ArrayLike) -> Array:
-        return np.array(self.terms(self._positions(q), np.zeros(self.nv))[0])
-
-    def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
-        return np.array(self.terms(*self._motion(q, v))[1]).ravel()
-
-    def _build(self) -> None:
-        """The functions of q, v and a: M and bias; the potential energy; d (M a + bias) / dq and / dv."""
         q, v, a = (ca.SX.sym(name, n) for name, n in (("q", self.nq), ("v", self.nv), ("a", self.nv)))
         M, bias, potential = ca.SX(self.nv, self.nv), ca.SX(self.nv, 1), ca.SX(0)
         for part in self.trees:
@@ -98,18 +71,27 @@ class CasadiEngine(PlantEngine):
         by = [ca.densify(ca.jacobian(needed, z)) for z in (q, v)]
         self.derivatives = ca.Function("derivatives", [q, v, a], by, options)
 
+    def energy(self, x: ArrayLike) -> float:
+        _, q, v = self._state(x)
+        return float(v @ self.mass_matrix(q) @ v) / 2 + float(self.potential(q))
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        return np.array(self.terms(self._positions(q), np.zeros(self.nv))[0])
+
+    def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
+        return np.array(self.terms(*self._motion(q, v))[1]).ravel()
+
     def _acceleration(self, x: Array, u: Array) -> Array:
         q, v = x[: self.nq], x[self.nq :]
         M, bias = (np.array(term) for term in self.terms(q, v))
         return euler_acceleration(M, self.damping, self.time_step, v, self._effort(u) - bias.ravel())
 
-    def _acceleration_derivative(self, x: Array, u: Array, acceleration: Array) -> Array:
-        """(nv, 2 nv + nu) by small motion, by v and by u."""
-        q, v = x[: self.nq], x[self.nq :]
+    def _acceleration_derivative(self, x: Array, u: Array) -> tuple[Array, Array]:
+        q, v, acceleration = x[: self.nq], x[self.nq :], self._acceleration(x, u)
         by_q, by_v = (np.array(term) for term in self.derivatives(q, v, acceleration))
         D = np.diag(self.damping)
         residual = np.hstack([by_q @ self.coordinates.rate(q), by_v + D, -self._effort_by_input(u)])
-        return np.asarray(-np.linalg.solve(self.mass_matrix(q) + self.time_step * D, residual))
+        return acceleration, np.asarray(-np.linalg.solve(self.mass_matrix(q) + self.time_step * D, residual))
 
     @property
     def contract(self) -> EngineContract:
@@ -198,7 +180,10 @@ class _Tree:
         """As adam has them."""
         carrier = {self.root: self.base.joint if self.base else None}
         carried: dict[str | None, list[tuple[float, Array, Array]]] = {}
-        poses = {name: np.array(ca.evalf(H)) for name, H in self._poses(self._zero()).items()}
+        zero = ca.SX.zeros(1 + max([*self.positions, self.base.q_start + 6 if self.base else 0]))
+        if self.base:
+            zero[self.base.q_start] = 1.0
+        poses = {name: np.array(ca.evalf(H)) for name, H in self._poses(zero).items()}
         for node in self.model.tree:
             if node.parent_arc is not None:
                 joint = node.parent_arc
@@ -208,29 +193,19 @@ class _Tree:
             R, inertia = H[:3, :3], np.array(ca.evalf(inertial.inertia.get_matrix().array))
             part = (float(inertial.mass.array), H[:3, 3], R @ inertia @ R.T)
             carried.setdefault(carrier[node.name], []).append(part)
-        names = [*([self.base.joint] if self.base else []), *self.model.actuated_joints]
-        return tuple(self._joint(name, poses, carried[name]) for name in names)
-
-    def _joint(self, name: str, poses: dict[str, Array], carried: list[tuple[float, Array, Array]]) -> JointContract:
-        if name not in self.links:
-            return joint_contract(
-                name=name, kind="quaternion_floating", axis=np.zeros(3), anchor=np.zeros(3), carried=carried,
-                damping=0.0, armature=0.0, stiffness=0.0, rest=0.0, lower=-np.inf, upper=np.inf,
-            )  # fmt: skip
-        joint, link = self.model.joints[name], self.links[name]
-        H, kind = poses[joint.child], "prismatic" if joint.type == "prismatic" else "revolute"
-        limits = (-np.inf, np.inf) if joint.type == "continuous" else (joint.limit.lower, joint.limit.upper)
-        return joint_contract(
-            name=name, kind=kind, axis=H[:3, :3] @ np.array(ca.evalf(joint.axis.array)).ravel(), anchor=H[:3, 3],
-            carried=carried, lower=limit(limits[0]), upper=limit(limits[1]),
-            **{k: getattr(link, k) for k in ("damping", "armature", "stiffness", "rest")},
-        )  # fmt: skip
-
-    def _zero(self) -> Any:
-        q = ca.SX.zeros(1 + max([*self.positions, self.base.q_start + 6 if self.base else 0]))
+        found = []
         if self.base:
-            q[self.base.q_start] = 1.0
-        return q
+            free, name, origin = "quaternion_floating", self.base.joint, np.zeros(3)
+            found.append(joint_contract(name=name, kind=free, axis=origin, anchor=origin, carried=carried[name]))
+        for name in self.model.actuated_joints:
+            joint, link = self.model.joints[name], self.links[name]
+            H, kind = poses[joint.child], "prismatic" if joint.type == "prismatic" else "revolute"
+            limits = (-np.inf, np.inf) if joint.type == "continuous" else (joint.limit.lower, joint.limit.upper)
+            own = {k: getattr(link, k) for k in ("damping", "armature", "stiffness", "rest")}
+            own |= {"axis": H[:3, :3] @ np.array(ca.evalf(joint.axis.array)).ravel(), "anchor": H[:3, 3]}
+            own |= {"lower": limit(limits[0]), "upper": limit(limits[1])}
+            found.append(joint_contract(name=name, kind=kind, carried=carried[name], **own))
+        return tuple(found)
 
 
 class _Joint(StdJoint):  # type: ignore[misc]  # adam has no types

@@ -1,4 +1,4 @@
-"""Models by hand: mass matrix, bias and their derivatives on paper, each readable beside its file in models/.
+"""Models by hand, each readable beside its file in models/, and an engine of them with nothing but NumPy.
 
 Every `residual_by_motion` is d(M(q) a + bias(q, v)) / dq at fixed a and v, every `bias_by_velocity` is d bias / dv. Of
 the two models with contact, a ball that lands and a block that slides, it is the next velocity and its derivative.
@@ -11,11 +11,16 @@ from math import cos, sin, sqrt
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, positive_float
+from drake_diff.engines.common import EulerEngine
+from drake_diff.engines.interface import EngineContract, float_rows, floats
+from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates, euler_acceleration
 from drake_diff.mechanics.description import joint_contract
 from drake_diff.mechanics.joints import JointContract
+from drake_diff.model.model import Model
 
 (X, Y, Z), ORIGIN, NO_INERTIA = np.eye(3), np.zeros(3), np.zeros((3, 3))
 Limits = tuple[float, float]
@@ -91,13 +96,13 @@ class ClosedForm(ABC):
 
     def _joint(
         self, index: int, kind: str, axis: Array, anchor: Array, mass: float, com: Array, inertia: Array = NO_INERTIA,
-        *, stiffness: float = 0.0, rest: float = 0.0,
+        **spring: float,
     ) -> JointContract:  # fmt: skip
         lower, upper = self.limits.get(self.joint_names[index], (-np.inf, np.inf))
         damping = 0.0 if kind == "quaternion_floating" else float(self.damping[index])
         return joint_contract(
             name=self.joint_names[index], kind=kind, axis=axis, anchor=anchor, carried=[(mass, com, inertia)],
-            damping=damping, armature=0.0, stiffness=stiffness, rest=rest, lower=lower, upper=upper,
+            damping=damping, lower=lower, upper=upper, **spring,
         )  # fmt: skip
 
 
@@ -358,18 +363,69 @@ class SlidingBlock(Slider):
     def acceleration(self, h: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
         w = float(v[0]) + h * (self.gravity * sin(self.slope) + float(u[0]) / self.mass)
         c, s = self.friction * self.gravity * h * cos(self.slope), self.stiction_tolerance
-        v_next = _slide(w, c, s)
+        # The root of v + c v / sqrt(v^2 + s^2) = w lies between 0 and w: halved until no float is left between.
+        low, high = min(0.0, w), max(0.0, w)
+        while low < (v_next := (low + high) / 2) < high:
+            if v_next + c * v_next / sqrt(v_next**2 + s**2) < w:
+                low = v_next
+            else:
+                high = v_next
         by_w = 1 / (1 + c * s**2 / (v_next**2 + s**2) ** 1.5)
         by = np.array([[0.0, by_w - 1, by_w * h / self.mass]]) / h
         return np.array([v_next - v[0]]) / h, by
 
 
-def _slide(w: float, c: float, s: float) -> float:
-    """The root of v + c v / sqrt(v^2 + s^2) = w, which lies between 0 and w: halved until no float is left between."""
-    low, high = min(0.0, w), max(0.0, w)
-    while low < (v := (low + high) / 2) < high:
-        if v + c * v / sqrt(v**2 + s**2) < w:
-            low = v
+class NumpyEngine(EulerEngine):
+    """A closed form, or the one for the model's name (`match_contracts` tells whether it is the same model)."""
+
+    name, version, status, method = "numpy", np.__version__, "ok", "by hand"
+
+    def __init__(self, model: Model | ClosedForm, *, time_step: float | None = None):
+        if isinstance(model, Model):
+            if model.name not in BY_MODEL:
+                known = ", ".join(sorted(BY_MODEL))
+                raise ModelError(f"there is no hand calculation of the model {model.name!r}; expected one of {known}")
+            self.form, self.time_step = BY_MODEL[model.name], model.time_step
         else:
-            high = v
-    return v
+            self.form, self.time_step = model, positive_float("time_step [s]", time_step)
+        self.coordinates = self.form.coordinates
+        self.nq, self.nv, self.nu = self.coordinates.nq, self.coordinates.nv, len(self.form.input_names)
+
+    def _acceleration(self, x: Array, u: Array) -> Array:
+        return self._acceleration_derivative(x, u)[0]
+
+    def _acceleration_derivative(self, x: Array, u: Array) -> tuple[Array, Array]:
+        return self.form.acceleration(self.time_step, x[: self.nq], x[self.nq :], u)
+
+    def energy(self, x: ArrayLike) -> float:
+        _, q, v = self._state(x)
+        return float(v @ self.form.mass_matrix(q) @ v) / 2 + self.form.potential_energy(q)
+
+    def contact_depth(self, x: ArrayLike) -> float:
+        return self.form.contact_depth(self._state(x)[1])
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        return self.form.mass_matrix(self._positions(q))
+
+    def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
+        return self.form.bias(*self._motion(q, v))
+
+    @property
+    def contract(self) -> EngineContract:
+        return EngineContract(
+            engine=self.name,
+            joints=self.form.joints(),
+            native_order=self.form.joint_names,
+            inputs=self.form.input_names,
+            actuation=float_rows(self.form.actuation),
+            effort_limits=self.form.effort_limits,
+            time_step=self.time_step,
+            gravity=floats(self.form.gravity_vector),
+            contact_law=self.form.contact_law,
+            derivatives="by every entry of x and u",
+            reasons={
+                "limit law": "the hand calculation has no joint limits",
+                "contact pairs": "the hand calculation has its one contact in its law",
+                "solver tolerance": "nothing is solved iteratively",
+            },
+        )

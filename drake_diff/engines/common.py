@@ -1,5 +1,11 @@
 """What the engines here have in common: their arguments checked, the plant's numbers in Drake's order, its shapes."""
 
+import os
+import sys
+import tempfile
+from abc import abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -34,6 +40,37 @@ class Arguments:
 
     def _motion(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
         return finite_array("q", q, (self.nq,)), finite_array("v", v, (self.nv,))
+
+
+class EulerEngine(Arguments):
+    """An engine whose dynamics are put into Drake's Euler step, without contact unless it says otherwise."""
+
+    coordinates: Coordinates
+    time_step: float
+    method: str  # by which its derivatives are taken
+
+    def step(self, x: ArrayLike, u: ArrayLike) -> Array:
+        x, u = self._point(x, u)
+        return euler_step(self.coordinates, self.time_step, x, self._acceleration(x, u))
+
+    def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
+        x, u = self._point(x, u)
+        acceleration, by = self._acceleration_derivative(x, u)
+        x_next = euler_step(self.coordinates, self.time_step, x, acceleration)
+        jacobian = euler_jacobian(self.coordinates, self.time_step, x, x_next, by)
+        return StepJacobian(frozen(jacobian[:, : len(x)]), frozen(jacobian[:, len(x) :]), self.method)
+
+    def contact_depth(self, x: ArrayLike) -> float:
+        self._state(x)
+        return 0.0
+
+    @abstractmethod
+    def _acceleration(self, x: Array, u: Array) -> Array:
+        """(nv,) (v' - v) / h of the step."""
+
+    @abstractmethod
+    def _acceleration_derivative(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """The acceleration, and its derivative (nv, 2 nv + nu) by small motion, by v and by u."""
 
 
 class PlantEngine(Arguments):
@@ -102,13 +139,35 @@ class RigidEngine(PlantEngine):
         return np.concatenate([q, np.linalg.solve(self.centers.turn(q), v)])
 
 
-def euler_step_jacobian(
-    coordinates: Coordinates, h: float, x: Array, acceleration: Array, by: Array, method: str
-) -> StepJacobian:
-    """Of Drake's Euler step, from the acceleration (nv,) and its derivative (nv, 2 nv + nu) by motion, v and u."""
-    x_next = euler_step(coordinates, h, x, acceleration)
-    jacobian = euler_jacobian(coordinates, h, x, x_next, by)
-    return StepJacobian(frozen(jacobian[:, : len(x)]), frozen(jacobian[:, len(x) :]), method)
+@contextmanager
+def without_lines(*greetings: str) -> Iterator[None]:
+    """What libraries print from C on stdout and stderr comes when it ends, but for lines that begin as a greeting."""
+    with _filtered(1, greetings), _filtered(2, greetings):
+        yield
+
+
+@contextmanager
+def _filtered(stream: int, greetings: tuple[str, ...]) -> Iterator[None]:
+    """Of one file descriptor."""
+    _flush()
+    kept = os.dup(stream)
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), stream)
+        try:
+            yield
+        finally:
+            _flush()
+            os.dup2(kept, stream)
+            os.close(kept)
+            file.seek(0)
+            for line in file.read().splitlines(keepends=True):
+                if not line.startswith(tuple(g.encode() for g in greetings)):
+                    os.write(stream, line)
+
+
+def _flush() -> None:
+    sys.stdout.flush()
+    sys.stderr.flush()
 
 
 def row(values: object) -> str:

@@ -8,7 +8,7 @@ from drake_diff.exceptions import InputError, MissingDependencyError, UnknownNam
 from drake_diff.model.model import Model
 
 ENGINES = {
-    "numpy": ("engines.numpy", "NumpyEngine"),
+    "numpy": ("engines.closed_form", "NumpyEngine"),
     "drake": ("engines.drake", "DrakeEngine"),
     "mujoco": ("engines.mujoco.engine", "MujocoEngine"),
     "mjx": ("engines.mujoco.mjx", "MjxEngine"),

@@ -7,17 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array
-from drake_diff.engines.common import PlantEngine, euler_step_jacobian
-from drake_diff.engines.interface import EngineContract, StepJacobian, floats
+from drake_diff.engines.common import EulerEngine, PlantEngine
+from drake_diff.engines.interface import EngineContract, floats
 from drake_diff.exceptions import MissingDependencyError
-from drake_diff.mechanics.coordinates import (
-    euler_acceleration,
-    euler_step,
-    native_positions,
-    turn,
-    turn_derivatives,
-    turning,
-)
+from drake_diff.mechanics.coordinates import euler_acceleration, native_positions, turn, turn_derivatives, turning
 from drake_diff.mechanics.description import joint_contract
 from drake_diff.mechanics.joints import JointContract
 from drake_diff.mechanics.pinocchio_tree import build
@@ -29,10 +22,10 @@ except ImportError as error:
     raise MissingDependencyError("this engine needs Pinocchio: pip install 'drake-diff[engines]'") from error
 
 
-class PinocchioEngine(PlantEngine):
+class PinocchioEngine(EulerEngine, PlantEngine):
     """Trees of hinges, slides and free bodies; no contact and no joint limits."""
 
-    name, version = "pinocchio", str(pin.__version__)
+    name, version, method = "pinocchio", str(pin.__version__), "analytic (RNEA derivatives)"
 
     def __init__(self, model: Model):
         super().__init__(model)
@@ -40,25 +33,10 @@ class PinocchioEngine(PlantEngine):
         self.pin.armature = self.armature
         self.data = self.pin.createData()
 
-    def step(self, x: ArrayLike, u: ArrayLike) -> Array:
-        x, u = self._point(x, u)
-        return euler_step(self.coordinates, self.time_step, x, self._drakes(x, self._acceleration(x, u)))
-
-    def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
-        x, u = self._point(x, u)
-        native = self._acceleration(x, u)
-        acceleration, by = self._drakes(x, native), self._acceleration_derivative(x, u, native)
-        method = "analytic (RNEA derivatives)"
-        return euler_step_jacobian(self.coordinates, self.time_step, x, acceleration, by, method)
-
     def energy(self, x: ArrayLike) -> float:
         _, q, v = self._state(x)
         gravity = float(pin.computePotentialEnergy(self.pin, self.data, native_positions(self.coordinates, q)))
         return float(v @ self.mass_matrix(q) @ v) / 2 + gravity + self._spring_energy(q) + self.anchored_energy
-
-    def contact_depth(self, x: ArrayLike) -> float:
-        self._state(x)
-        return 0.0
 
     def mass_matrix(self, q: ArrayLike) -> Array:
         q = self._positions(q)
@@ -72,7 +50,9 @@ class PinocchioEngine(PlantEngine):
         return np.asarray(Q.T @ needed + self.stiffness * self._stretch(q))
 
     def _acceleration(self, x: Array, u: Array) -> Array:
-        """(nv,) of the step, native."""
+        return self._drakes(x, self._native_acceleration(x, u))
+
+    def _native_acceleration(self, x: Array, u: Array) -> Array:
         q = x[: self.nq]
         native_q, native_v = native_positions(self.coordinates, q), turn(self.coordinates, q) @ x[self.nq :]
         force = self._effort(u) - self.stiffness * self._stretch(q)
@@ -82,9 +62,8 @@ class PinocchioEngine(PlantEngine):
     def _drakes(self, x: Array, native: Array) -> Array:
         return np.asarray(turn(self.coordinates, x[: self.nq]).T @ native + turning(self.coordinates, x[self.nq :]))
 
-    def _acceleration_derivative(self, x: Array, u: Array, native: Array) -> Array:
-        """(nv, 2 nv + nu) of Drake's acceleration by small motion, by v and by u."""
-        q, v = x[: self.nq], x[self.nq :]
+    def _acceleration_derivative(self, x: Array, u: Array) -> tuple[Array, Array]:
+        q, v, native = x[: self.nq], x[self.nq :], self._native_acceleration(x, u)
         Q, native_q, D = turn(self.coordinates, q), native_positions(self.coordinates, q), np.diag(self.damping)
         by_q, by_v, _ = pin.computeRNEADerivatives(self.pin, self.data, native_q, Q @ v, native)
         by_v = by_v + D
@@ -94,7 +73,7 @@ class PinocchioEngine(PlantEngine):
         by = -Q.T @ np.linalg.solve(self._mass(native_q) + self.time_step * D, residual)
         by[:, : self.nv] += out_by_motion
         by[:, self.nv : 2 * self.nv] += out_by_v
-        return np.asarray(by)
+        return self._drakes(x, native), np.asarray(by)
 
     def _mass(self, native_q: Array) -> Array:
         upper = np.triu(pin.crba(self.pin, self.data, native_q))

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drake_diff.engines.closed_form import NumpyEngine
 from drake_diff.engines.drake import DrakeEngine
-from drake_diff.engines.numpy import NumpyEngine
 from drake_diff.export.read_back import SUFFIX, complaints, written
 from drake_diff.model.model import load_model
 from drake_diff.model.tangent import tangent_space

@@ -23,12 +23,12 @@ class JointContract:
     mass: float  # [kg]
     center_of_mass: tuple[float, ...]  # [m]
     inertia: tuple[float, ...]  # xx yy zz xy xz yz about it [kg m^2]
-    damping: float  # [N s/m or N m s/rad]
-    armature: float  # what is added to the diagonal of M: rotor inertia times gear ratio squared
-    stiffness: float  # of a spring [N/m or N m/rad]
-    rest: float  # its rest position [m or rad]
-    lower: float  # of the position
-    upper: float
+    damping: float = 0.0  # [N s/m or N m s/rad]
+    armature: float = 0.0  # what is added to the diagonal of M: rotor inertia times gear ratio squared
+    stiffness: float = 0.0  # of a spring [N/m or N m/rad]
+    rest: float = 0.0  # its rest position [m or rad]
+    lower: float = -np.inf  # of the position
+    upper: float = np.inf
 
 
 @dataclass(frozen=True)
