@@ -40,7 +40,7 @@ def equal(model, xs, us, method="auto", expected=("analytic",), **known):
 # ---- closed forms --------------------------------------------------------------------------------------------------
 
 
-def test_the_damped_pendulum_a03(load):
+def test_the_damped_pendulum(load):
     """theta'' = (u - m g l sin theta - d theta') / (m l^2) with damping implicit, at three states in one call."""
     theta, h, gl = np.array([0.7, -2.0, 3.0]), 0.01, G / 0.5
     s, c = 1 / (1 + h * 0.1 / 0.25), np.cos(theta)
@@ -53,7 +53,7 @@ def test_the_damped_pendulum_a03(load):
     assert methods == ("analytic",) * 3
 
 
-def test_a_thrown_body_a01(load):
+def test_a_thrown_body(load):
     """A hundred steps' product is N h by velocity."""
     model, x = load("projectile.sdf"), np.array([1.0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 2, 1, 5])
     xs = dd.rollout(model, x, num_steps=100).xs

@@ -88,7 +88,7 @@ def riccati(A, B, Q, R, P, num_steps):
 
 
 def test_lqr_of_the_double_integrator_is_known(write_urdf):
-    """A30: the DARE's P and K."""
+    """The discrete algebraic Riccati equation's P and K, eight digits."""
     lqr = LQR(write_urdf(), [0, 0], [0], Q, R)
     assert lqr.cost_to_go == pytest.approx(np.array([[12.82704933, 2.58530726], [2.58530726, 4.31618637]]), abs=1e-8)
     assert lqr.gain == pytest.approx(np.array([[2.58530726, 3.31618637]]), abs=1e-8)
@@ -158,7 +158,7 @@ def test_lqr_of_what_cannot_be_stabilized_is_an_error_not_the_end_of_the_process
 
 
 def test_tvlqr_of_the_double_integrator_is_known(write_urdf):
-    """A30: N = 20, Qf = 10 I, x0 = (1, 0): P0, K0 and J*."""
+    """N = 20, Qf = 10 I, x0 = (1, 0): P0, K0 and J*."""
     model, count = write_urdf(), 20
     tvlqr = TVLQR(model, np.zeros((count + 1, 2)), np.zeros((count, 1)), Q, R, 10 * Q)
     assert tvlqr.gains.shape == (count, 1, 2)
@@ -246,7 +246,7 @@ def test_tvlqr_refuses_arrays_that_do_not_fit(write_urdf):
 
 
 def test_one_closed_loop_step_of_the_pendulum_under_pd_has_its_closed_form(load):
-    """A03 with u = kp (q_ref - q) + kd (w_ref - w): A + B K, K = (-kp, -kd), and d x+ / d(kp, kd) = B (e_q, e_w)."""
+    """Of u = kp (q_ref - q) + kd (w_ref - w): A + B K, K = (-kp, -kd), and d x+ / d(kp, kd) = B (e_q, e_w)."""
     model, x, ref = load("pendulum.urdf"), np.array([0.7, -1.2]), np.array([1.0, 0.2])
     kp, kd, h, inertia = 3.0, 0.4, 0.01, 0.25
     s = 1 / (1 + h * 0.1 / inertia)

@@ -1,4 +1,4 @@
-"""Rollouts: what is measured along them, in closed form where there is one (ORACLES A10, A15)."""
+"""Rollouts: what is measured along them, in closed form where there is one."""
 
 import math
 
@@ -15,7 +15,7 @@ from drake_diff.motion.rollout import Meter, drift
 
 @pytest.fixture
 def oscillator(tmp_path):
-    """A10: the mass on its spring, without damper or rest length."""
+    """The mass on its spring, without damper or rest length."""
     text = (MODELS / "mass_spring_damper.sdf").read_text()
     text = text.replace("<damping>1.5", "<damping>0").replace("<spring_reference>0.1", "<spring_reference>0")
     (tmp_path / "oscillator.sdf").write_text(text)
@@ -23,7 +23,7 @@ def oscillator(tmp_path):
 
 
 def test_symplectic_euler_conserves_a_modified_energy(oscillator):
-    """A10: v^2 + w^2 x^2 - h w^2 x v is constant, w = 5."""
+    """v^2 + w^2 x^2 - h w^2 x v is constant, w = 5."""
     motion = dd.rollout(oscillator, [0.2, 0.0], np.zeros((5000, 1)))
     x, v = motion.xs.T
     modified = v**2 + 25 * x**2 - 0.01 * 25 * x * v
@@ -41,7 +41,7 @@ def test_a_motion_of_no_steps_is_a_state(oscillator):
 
 
 def test_oscillating_energy_is_no_drift(oscillator):
-    """A10: the energy swings between E0 / (1 + h w / 2) and E0 / (1 - h w / 2) for ever, and drifts not at all."""
+    """The energy swings between E0 / (1 + h w / 2) and E0 / (1 - h w / 2) for ever, and drifts not at all."""
     motion = dd.rollout(oscillator, [0.2, 0.0], np.zeros((5000, 1)))
     relative = motion.energy / motion.energy[0] - 1
     assert relative.min() == pytest.approx(-0.024390243902, abs=1e-4)  # the extreme falls between samples
@@ -52,7 +52,7 @@ def test_oscillating_energy_is_no_drift(oscillator):
 
 @pytest.mark.parametrize("h", [0.02, 0.005])
 def test_the_oscillators_frequency_and_power_of_its_jacobian(oscillator, h):
-    """A10: A^N = (sin(N a) A - sin((N - 1) a) I) / sin a, cos a = 1 - h^2 w^2 / 2."""
+    """A^N = (sin(N a) A - sin((N - 1) a) I) / sin a, cos a = 1 - h^2 w^2 / 2."""
     model = dd.load_model(oscillator.source, time_step=h)
     A = dd.differentiate_step(model, [0.2, 0.0], [0.0]).A
     count, angle = 100, math.acos(1 - (5 * h) ** 2 / 2)
@@ -70,7 +70,7 @@ def test_a_straight_line_drifts_by_its_rise_and_the_line_under_an_oscillation_to
 
 
 def test_free_fall_drifts_as_symplectic_euler_must(load):
-    """A01: E_N - E_0 = -m g^2 h T / 2, a drift and no oscillation."""
+    """Of a thrown body E_N - E_0 = -m g^2 h T / 2, a drift and no oscillation."""
     model = load("projectile.sdf", time_step=0.01)
     motion = dd.rollout(model, model.default_state, num_steps=100)
     assert motion.energy_drift == pytest.approx(-0.5 * 9.81**2 * 0.01, rel=1e-9)

@@ -1,4 +1,4 @@
-"""Randomized smoothing against closed forms and quadrature (ORACLES C07, C11), within 5 standard errors."""
+"""Randomized smoothing against closed forms and quadrature, within 5 standard errors."""
 
 import math
 from itertools import pairwise
@@ -30,7 +30,7 @@ def integral(f, breaks, panels=20, order=20):
 
 
 def ball(theta, g, d, height):
-    """C07: J = -x_f^2 and dJ/dtheta of a ball thrown at `theta` with 1 m/s at a wall at d."""
+    """J = -x_f^2 and dJ/dtheta of a ball thrown at `theta` with 1 m/s at a wall at d."""
     reach = np.sin(2 * theta) / g
     at_the_wall = d * np.tan(theta) - g * d**2 / (2 * np.cos(theta) ** 2)
     blocked = (reach >= d) & (at_the_wall < height)
@@ -137,7 +137,7 @@ def test_ball_with_wall(case, biased):
 
 
 def test_the_reported_variances_are_those_of_one_sample_divided_by_their_number():
-    """C07: 7.7544e-6 and 5.60554e-3; the estimates of the variances scatter by about 1 % themselves."""
+    """7.7544e-6 and 5.60554e-3; the estimates of the variances scatter by about 1 % themselves."""
     found, exact = smooth_ball(0.7, *SUH), exact_ball(0.7, *SUH)
     assert exact["first_variance"] == pytest.approx(7.7544e-6, rel=1e-4)
     assert exact["zeroth_variance"] == pytest.approx(5.60554e-3, rel=1e-5)
@@ -153,7 +153,7 @@ def heaviside(theta, sigma, **options):
 
 @pytest.mark.parametrize(("theta", "sigma"), [(0.0, 0.05), (0.02, 0.05), (-0.3, 0.4), (7.0, 11.0)])
 def test_heaviside_is_biased_and_the_blend_follows_zeroth_order(theta, sigma):
-    """C07: first order is 0 always, the truth is the normal density of theta, F its distribution function."""
+    """First order is 0 always, the truth is the normal density of theta, F its distribution function."""
     truth = math.exp(-((theta / sigma) ** 2) / 2) / (sigma * math.sqrt(2 * math.pi))
     found = heaviside(theta, sigma, samples=5000)
     assert not found.first.any()
@@ -248,7 +248,7 @@ def test_a_wrong_derivative_is_seen():
 
 @pytest.mark.parametrize(("u", "c"), [(0.1, 0.04), (-0.3, 0.04), (0.0, 2.0), (5.0, 30.0)])
 def test_barrier_noise_makes_the_log_barrier(u, c):
-    """C11, first by quadrature in w = sqrt(c) tan t, which makes the density cos(t) / 2; then sampled."""
+    """First by quadrature in w = sqrt(c) tan t, which makes the density cos(t) / 2; then sampled."""
     root, edge = math.sqrt(c), math.atan(-u / math.sqrt(c))
     step, value = (1 + u / math.sqrt(u**2 + c)) / 2, (u + math.sqrt(u**2 + c)) / 2
     assert integral(lambda t: np.cos(t) / 2, [edge, math.pi / 2]) == pytest.approx(step, rel=1e-14)

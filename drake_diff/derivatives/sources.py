@@ -74,6 +74,8 @@ def _by_autodiff(steps: Steps, k: int) -> Array:
 
 def check_parity(model: Model, autodiff: Array, double: Array) -> None:
     """Refuse a derivative whose AutoDiffXd step does not lead where the double step leads."""
+    if np.abs(autodiff - double).max() <= PARITY_TOLERANCE:  # as a rule, and in half the time of what follows
+        return
     excess = np.abs(autodiff - double) - PARITY_TOLERANCE * np.maximum(1.0, np.abs(double))
     if not np.all(excess <= 0):  # NaN must not pass
         worst = int(np.argmax(np.where(np.isnan(excess), np.inf, excess)))

@@ -153,6 +153,9 @@ def differentiate_rollout(
     xs = np.vstack([x0, [d.x_next for d in linearization]])
     value, by_xs, by_us = differentiate_loss(loss, xs, inputs)
     totals = accumulate(linearization, by_xs, by_us, feedback, len(policy_parameters(policy)))
+    closed = [d.A for d in linearization]
+    if feedback:
+        closed = [d.A + d.B @ by_x for d, (by_x, _, _) in zip(linearization, feedback, strict=True)]
     return RolloutGradient(
         loss=value,
         by_x0=frozen(totals.states[0]),
@@ -162,7 +165,7 @@ def differentiate_rollout(
         parameter_sources=linearization[0].sources,
         by_policy=frozen(totals.policy),
         state_gradient_norms=frozen(np.linalg.norm(totals.states, axis=1)),
-        spectral_radii=frozen(_spectral_radii(linearization, feedback)),
+        spectral_radii=frozen(np.abs(np.linalg.eigvals(np.array(closed))).max(axis=1)),
         xs=frozen(xs),
         us=frozen(inputs),
         methods=tuple(sorted({d.method for d in linearization})),
@@ -220,11 +223,6 @@ def accumulate(
 def _last(where: NDArray[np.bool_]) -> int | None:
     found = np.flatnonzero(where)
     return int(found[-1]) if len(found) else None
-
-
-def _spectral_radii(linearization: Sequence[StepDerivatives], feedback: Sequence[Feedback]) -> Array:
-    closed = [d.A + d.B @ by_x for d, (by_x, _, _) in zip(linearization, feedback, strict=True)] if feedback else None
-    return np.abs(np.linalg.eigvals(np.array(closed or [d.A for d in linearization]))).max(axis=1)
 
 
 def evaluate_loss(loss: Loss, xs: Array, us: Array) -> float:

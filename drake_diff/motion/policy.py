@@ -243,7 +243,7 @@ def differentiate_policy(policy: Any, x: Array, t: float, nu: int) -> tuple[Arra
     derivatives were lost (float() was taken), u is another at the same point, or a derivative is not finite.
     """
     parameters = policy_parameters(policy)
-    u = _evaluate(policy, x, t, parameters, nu)
+    u = finite_array("policy(x, t)", _call(policy, x.copy(), t, parameters), (nu,))
     active = active_parameters(policy, t)
     variables = InitializeAutoDiff(np.concatenate([x, parameters[active]])).ravel()
     moved = parameters.astype(object)
@@ -258,10 +258,6 @@ def differentiate_policy(policy: Any, x: Array, t: float, nu: int) -> tuple[Arra
     by_parameters = np.zeros((nu, len(parameters)))
     by_parameters[:, active] = rows[:, len(x) :]
     return u, np.array(rows[:, : len(x)]), by_parameters
-
-
-def _evaluate(policy: Any, x: Array, t: float, parameters: Array, nu: int) -> Array:
-    return finite_array("policy(x, t)", _call(policy, x.copy(), t, parameters), (nu,))
 
 
 def _call(policy: Any, x: Any, t: float, parameters: Any) -> Any:
@@ -283,7 +279,7 @@ def _call_with_derivatives(policy: Any, x: Any, t: float, parameters: Any) -> An
 
 def _check_constant(policy: Any, x: Array, t: float, parameters: Array, u: Array, plain: Any) -> None:
     """Refuse a plain number in the output that is not constant: its derivatives were thrown away."""
-    near = _evaluate(policy, x + NUDGE, t, parameters + NUDGE, len(u))
+    near = finite_array("policy(x, t)", _call(policy, x + NUDGE, t, parameters + NUDGE), u.shape)
     changed = np.flatnonzero(plain & (near != u))
     if len(changed):
         raise GradientError(

@@ -1,8 +1,8 @@
 """The Jacobian of a step with contact from its own equation, without differentiating Drake's solver.
 
 Drake's step solves A (v' - v*) = sum_c J_c' g_c(J_c v'), with A = M + h D, v* the velocity without contact and g_c the
-impulse of contact c (`friction_cone`, `hunt_crossley`). At Drake's own v' it is a smooth step under a known force
-A (v' - v*) / h, which Pinocchio differentiates (`analytic_step`); what the impulses change is solved for:
+impulse of contact c (see `laws`). At Drake's own v' it is a smooth step under a known force
+A (v' - v*) / h, which Pinocchio differentiates (see `smooth_step`); what the impulses change is solved for:
 
     (A + sum_c J_c' G_c J_c) dv' = A dv'|_g + sum_c d(J_c' g_c)|_v',   G_c = -dg_c / d(J_c v').
 

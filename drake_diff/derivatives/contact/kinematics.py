@@ -90,7 +90,7 @@ class Contacts:
     point: Array  # (M, 3) p
     at_point: Array  # (M, nv, 3) L
     reach: Array  # (M,) from the centre to p
-    other_part: Array  # (M,) b of `contact_pairs`
+    other_part: Array  # (M,) b, see `pairs`
 
     @property
     def side(self) -> Array:

@@ -1,8 +1,10 @@
-"""The impulse of Drake's SAP contact at its own solution, and how it changes.
+"""The impulses of Drake's contact approximations at the solver's own solution, and how they change.
 
-With vn and vt the normal and tangential velocity after the step, phi the signed distance before it, w the size of the
-effective inverse mass, h the time step and tau the relaxation time (Castro, Permenter and Han, "An unconstrained convex
-formulation of compliant contact", 2021),
+With vn and vt the normal and tangential velocity after the step, phi the signed distance and vn_0 the normal velocity
+before it, w the size of the effective inverse mass and h the time step:
+
+`sap` (Castro, Permenter and Han, "An unconstrained convex formulation of compliant contact", 2021), with the relaxation
+time tau,
 
     R_n = max(beta^2 / (4 pi^2) w, 1 / (h k (h + tau))),   R_t = sigma w
     y_n = (-phi / (h + tau) - vn) / R_n,   y_t = -vt / R_t,   y_r = sqrt(|y_t|^2 + s^2)
@@ -11,11 +13,8 @@ the impulse is y inside the friction cone (y_r <= mu y_n: it sticks), 0 inside i
 
     g_n = (y_n + mu R_t / R_n y_r) / (1 + mu^2 R_t / R_n),   g_t = mu g_n y_t / y_r.
 
-The impulse of Drake's `similar` and `lagged` contact at its own solution, and how it changes.
-
-With phi the signed distance and vn_0 the normal velocity before the step, vn and vt those after it, w the size of the
-effective inverse mass, h the time step, d Hunt and Crossley's dissipation and v_s the stiction tolerance (Castro, Han
-and Masterjohn, "A theory of irrotational contact fields", 2023),
+`similar` and `lagged` (Castro, Han and Masterjohn, "A theory of irrotational contact fields", 2023), with Hunt and
+Crossley's dissipation d and the stiction tolerance v_s,
 
     n(z) = h (-k phi - h k z)+ (1 - d z)+,   n_0 = h (-k phi)+ (1 - d vn_0)+,   e = max(v_s, mu sigma w n_0)
     g_n = n(z),   g_t = -mu n_f vt / s,   s = sqrt(|vt|^2 + e^2)
@@ -31,8 +30,8 @@ from numpy.typing import NDArray
 from drake_diff._base.arrays import Array
 from drake_diff.derivatives.contact.material import MaterialChange
 
-SIGMA = 1e-3
-SOFT_NORM = 1e-7  # s [N s]
+SIGMA = 1e-3  # Drake's, of both papers: regularizes friction so that a contact sticks up to a creep
+SOFT_NORM = 1e-7  # s [N s], Drake's: keeps the norm of an impulse of 0 differentiable
 
 
 @dataclass(frozen=True, eq=False)

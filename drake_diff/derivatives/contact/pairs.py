@@ -90,34 +90,33 @@ def _curvature(normal: Array, outside: Array, length: Array) -> Array:
 def read_pairs(model: Model) -> ContactPairs:
     """The pairs of spheres of `model`, none where there are none."""
     plant, inspector = model.plant, model.double.inspector
-    found: list[tuple[Any, ...]] = []
+    ids, at, radius, boxes = [], [], [], []
     bodies: dict[Any, tuple[int, Any]] = {}
-    for ids in sorted(inspector.GetCollisionCandidates()) if inspector is not None else ():
-        shapes = [inspector.GetShape(i) for i in ids]
+    for pair in sorted(inspector.GetCollisionCandidates()) if inspector is not None else ():
+        shapes = [inspector.GetShape(i) for i in pair]
         first = 0 if isinstance(shapes[0], Sphere) else 1
         box = _rounded_box(shapes[1 - first])
         if not isinstance(shapes[first], Sphere) or box is None:
             continue
-        sphere, other = ids[first], ids[1 - first]
-        at = []
-        for i in (sphere, other):
-            body = plant.GetBodyFromFrameId(inspector.GetFrameId(i))
-            at.append(bodies.setdefault(body.index(), (len(bodies), body))[0])
-        found.append((sphere, other, at, shapes[first].radius(), *box))
-    poses = [[inspector.GetPoseInFrame(i) for i in pair[:2]] for pair in found]
-    count = len(found)
+        ids.append((pair[first], pair[1 - first]))
+        radius.append(shapes[first].radius())
+        boxes.append(box)
+        own = [plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in ids[-1]]
+        at.append([bodies.setdefault(body.index(), (len(bodies), body))[0] for body in own])
+    poses = [[inspector.GetPoseInFrame(i) for i in pair] for pair in ids]
+    count, of_body = len(ids), np.array(at, dtype=np.intp).reshape(-1, 2)
     return ContactPairs(
         bodies=tuple(body for _, body in bodies.values()),
-        ids=tuple((pair[0], pair[1]) for pair in found),
-        sphere_body=np.array([pair[2][0] for pair in found], dtype=np.intp),
-        other_body=np.array([pair[2][1] for pair in found], dtype=np.intp),
+        ids=tuple(ids),
+        sphere_body=of_body[:, 0],
+        other_body=of_body[:, 1],
         center=np.array([X.translation() for X, _ in poses]).reshape(count, 3),
-        radius=np.array([pair[3] for pair in found]),
+        radius=np.array(radius, dtype=float),
         rotation=np.array([X.rotation().matrix() for _, X in poses]).reshape(count, 3, 3),
         position=np.array([X.translation() for _, X in poses]).reshape(count, 3),
-        lower=np.array([pair[4] for pair in found]).reshape(count, 3),
-        upper=np.array([pair[5] for pair in found]).reshape(count, 3),
-        rounding=np.array([pair[6] for pair in found]),
+        lower=np.array([lower for lower, _, _ in boxes]).reshape(count, 3),
+        upper=np.array([upper for _, upper, _ in boxes]).reshape(count, 3),
+        rounding=np.array([rounding for _, _, rounding in boxes], dtype=float),
     )
 
 
