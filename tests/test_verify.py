@@ -347,6 +347,17 @@ def test_a_certification_of_a_model_that_changed_is_undecided(tmp_path):
     assert "is not what it was" in str(found)
 
 
+def test_a_pass_with_an_engine_or_a_perturbation_that_does_not_hold_is_refused(kinds):
+    fields = dd.load_record(kinds / "comparison").model_dump()
+    fields["engines"][1]["verdict"] = "unexplained"
+    with pytest.raises(ValueError, match=r'"pass" with numpy'):
+        dd.record.ComparisonRecord.model_validate({**fields, "verdict": "pass"})
+    fields = dd.load_record(kinds / "robustness").model_dump()
+    for change in ({"nominal": None}, {"perturbations": [{**fields["perturbations"][0], "margin": 0.0}]}):
+        with pytest.raises(ValueError, match=r'"pass" with (an unperturbed run|mass)'):
+            dd.record.RobustnessRecord.model_validate({**fields, "verdict": "pass", **change})
+
+
 def test_a_pass_of_a_state_that_does_not_agree_is_no_certification(kinds):
     fields = dd.load_record(kinds / "certification").model_dump()
     fields["states"][0]["gradient"] = None

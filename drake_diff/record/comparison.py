@@ -2,7 +2,7 @@
 
 from typing import ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from drake_diff.record.parts import Certified, FiniteTable, Part
 from drake_diff.record.sealed import SealedRecord, WallClock
@@ -104,3 +104,15 @@ class ComparisonRecord(SealedRecord):
     engines: list[EngineEvidence]
     refused: list[RefusedEvidence]
     wall_clock: ComparisonClock
+
+    @model_validator(mode="after")
+    def _passes_only_what_is_explained(self) -> "ComparisonRecord":
+        broken = [e.engine for e in self.engines if e.verdict not in ("same", "other law")]
+        if self.verdict == "pass" and (broken or not self.engines):
+            raise ValueError(f'a verdict "pass" with {", ".join(broken) or "no engine"}')
+        return self
+
+    def facts(self) -> dict[str, str]:
+        """The verdict on each engine but the reference."""
+        told = {e.engine: e.verdict for e in self.engines[1:]}
+        return told | {e.engine: "not compared" for e in self.refused} | super().facts()

@@ -2,6 +2,8 @@
 
 from typing import ClassVar, Literal
 
+from pydantic import model_validator
+
 from drake_diff.record.parts import Label, Part
 from drake_diff.record.sealed import SealedRecord, WallClock
 
@@ -125,3 +127,14 @@ class RobustnessRecord(SealedRecord):
     nominal: Nominal | None
     perturbations: list[PerturbationEvidence]
     wall_clock: RobustnessClock
+
+    @model_validator(mode="after")
+    def _passes_only_what_is_survived(self) -> "RobustnessRecord":
+        broken = [p.name for p in self.perturbations if p.margin <= 0]
+        if self.verdict == "pass" and (broken or self.nominal is None or not self.nominal.success):
+            raise ValueError(f'a verdict "pass" with {", ".join(broken) or "an unperturbed run that is no success"}')
+        return self
+
+    def facts(self) -> dict[str, str]:
+        """The margin of each perturbation."""
+        return {p.name: f"survived up to {p.margin:g} {p.unit}" for p in self.perturbations} | super().facts()
