@@ -111,7 +111,8 @@ def _by_autodiff(form: "Form", steps: Steps, k: int, jacobian: Array) -> float:
     write_autodiff(vector, model, variables[nx:])
     set_state(model.autodiff, variables[:nx])
     needed = model.autodiff.inverse_dynamics(np.array([AutoDiffXd(a) for a in change / h])).reshape(-1, 1)
-    missing = float(_missing(ExtractValue(needed).ravel(), damping * change - applied))
+    force, rest = ExtractValue(needed).ravel(), damping * change - applied  # as in _missing, of one step
+    missing = float(np.abs(force + rest).max() / max(1.0, np.abs(force).max(), np.abs(rest).max()))
     if not missing <= RESIDUAL_TOLERANCE:
         return missing
     rows = gradient_rows(needed, len(variables))
