@@ -4,8 +4,13 @@ Where nothing touches every engine here takes some Euler step with its own M, bi
 written out from the terms that the engines give, one term of the other engine is put in at a time, and what that
 changes of the step is this term's effect. What no Euler step explains is the contact law's, where something touches,
 or the limit law's, where a joint is beyond a limit; else it is unexplained, and said to be.
+
+Of a recording there is nothing to ask. Each recorded step that is apart is tried as the reference's with one thing
+changed: another Euler step or time step, gravity turned round, damping or armature left out. A change that takes the
+recorded step, but for a hundredth of the gap, is named; else the step is unexplained.
 """
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import product
@@ -14,9 +19,13 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff.comparison.recordings import Recording
+from drake_diff.engines.contract_match import SAME_NUMBER, ContractLine, match_contracts
+from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.interface import Engine, EngineContract, Precision
-from drake_diff.exceptions import NotOfferedError
+from drake_diff.exceptions import InputError, NotOfferedError
 from drake_diff.mechanics.coordinates import Coordinates, euler_acceleration, exponential_turn
+from drake_diff.model.step import set_state
 
 INTEGRATOR, CONTACT_LAW, LIMIT_LAW, UNEXPLAINED = "integrator", "contact law", "limit law", "unexplained"
 # How well a scheme must give a step to be the engine's, relative to the state: rounding, and no force.
@@ -70,7 +79,13 @@ def attribute(
     coordinates: Coordinates, one: Engine, two: Engine, x: Array, u: Array, steps: tuple[Array, Array]
 ) -> Attribution:
     """What makes the `steps` (nx,) that `one` and `two` took from `x` (nx,) under `u` (nu,) differ."""
-    (a, b), assumed = _terms_of_both(coordinates, one, two, x, u)
+    q, v = x[: coordinates.nq], x[coordinates.nq :]
+    masses, no_mass = _offered((one, two), "M(q)", lambda engine: engine.mass_matrix(q), np.eye(len(v)))
+    biases, no_bias = _offered((one, two), "bias(q, v)", lambda engine: engine.bias(q, v), np.zeros(len(v)))
+    a, b = (
+        Terms(M, bias, *forces(engine.contract, u), engine.contract.time_step)
+        for M, bias, engine in zip(masses, biases, (one, two), strict=True)
+    )
     after_a, after_b = (of_norm_one(coordinates, after, x) for after in steps)
     scheme_a, scheme_b = (
         _scheme(coordinates, x, terms, after, FITS[engine.contract.precision])
@@ -87,7 +102,7 @@ def attribute(
     effects[what] = max(left, effects.get(what, 0.0))
     ranked = dict(sorted(effects.items(), key=lambda item: -item[1]))
     gap = _size(after_b - after_a)
-    return Attribution(gap, ranked, next(iter(ranked)) if gap else "", (scheme_a, scheme_b), assumed)
+    return Attribution(gap, ranked, next(iter(ranked)) if gap else "", (scheme_a, scheme_b), (*no_mass, *no_bias))
 
 
 def euler(coordinates: Coordinates, x: Array, terms: Terms, scheme: EulerScheme) -> Array:
@@ -113,23 +128,10 @@ def of_norm_one(coordinates: Coordinates, x: Array, near: Array) -> Array:
     return x
 
 
-def _terms_of_both(
-    coordinates: Coordinates, one: Engine, two: Engine, x: Array, u: Array
-) -> tuple[tuple[Terms, Terms], tuple[str, ...]]:
-    """The terms of both, and what was assumed of them: where one offers none it gets the other's."""
-    q, v = x[: coordinates.nq], x[coordinates.nq :]
-    masses, no_mass = _offered((one, two), "M(q)", lambda engine: engine.mass_matrix(q), np.eye(len(v)))
-    biases, no_bias = _offered((one, two), "bias(q, v)", lambda engine: engine.bias(q, v), np.zeros(len(v)))
-    a, b = (
-        Terms(M, bias, *forces(engine.contract, u), engine.contract.time_step)
-        for M, bias, engine in zip(masses, biases, (one, two), strict=True)
-    )
-    return (a, b), (*no_mass, *no_bias)
-
-
 def _offered(
     engines: tuple[Engine, Engine], name: str, ask: Callable[[Engine], Array], otherwise: Array
 ) -> tuple[list[Array], list[str]]:
+    """What both say, and who says nothing: an engine that does not offer it gets the other's."""
     found: list[Array | None] = []
     for engine in engines:
         try:
@@ -159,8 +161,12 @@ def _scheme(coordinates: Coordinates, x: Array, terms: Terms, after: Array, fits
 def what_is_left(coordinates: Coordinates, one: Engine, two: Engine, x: Array, steps: tuple[Array, Array]) -> str:
     """What makes steps differ that no Euler step explains: a law that is at work at one of the states, if any."""
     states = (x, *steps)
-    if any(_depth(engine, state) > 0 for engine in (one, two) for state in states):
-        return CONTACT_LAW
+    for engine in (one, two):
+        try:
+            if any(engine.contact_depth(state) > 0 for state in states):
+                return CONTACT_LAW
+        except NotOfferedError:
+            continue
     joints = ([j for j in e.contract.joints if j.kind != "quaternion_floating"] for e in (one, two))
     singles = [pair for own in joints for pair in zip(own, coordinates.single, strict=True)]
     if any(not j.lower <= state[i] <= j.upper for j, (i, _) in singles for state in states):
@@ -168,12 +174,127 @@ def what_is_left(coordinates: Coordinates, one: Engine, two: Engine, x: Array, s
     return UNEXPLAINED if one.contract.integrator == two.contract.integrator else INTEGRATOR
 
 
-def _depth(engine: Engine, x: Array) -> float:
-    try:
-        return engine.contact_depth(x)
-    except NotOfferedError:
-        return 0.0
-
-
 def _size(difference: Array) -> float:
     return float(np.abs(difference).max(initial=0.0))
+
+
+NOT_TOLD = "the recording does not say"
+CLOSES = 0.01  # of the gap may be left by a change that explains it
+PRECISIONS: dict[str, Precision] = {"float64": "float64", "float32": "float32"}
+
+
+class Change(NamedTuple):
+    """One change of the reference's step, and the term that it is of; numbers are factors of the reference's."""
+
+    term: str
+    scheme: EulerScheme = SCHEMES[0]
+    time_step: float = 1.0
+    damping: float = 1.0
+    armature: float = 1.0
+    gravity: float = 1.0
+
+
+CHANGES: Mapping[str, Change] = {
+    "as if joint damping were explicit": Change(INTEGRATOR, scheme=EulerScheme(damping="explicit")),
+    "as if positions moved with the velocity before the step": Change(INTEGRATOR, scheme=EulerScheme(position="v")),
+    "as if rotations were by the exponential": Change(INTEGRATOR, scheme=EulerScheme(turn="exponential")),
+    "as if the time step were half": Change("time step", time_step=0.5),
+    "as if the time step were double": Change("time step", time_step=2.0),
+    "as if joint damping were 0": Change("damping", damping=0.0),
+    "as if armature were 0": Change("inertia", armature=0.0),
+    "as if gravity pointed the other way": Change("bias", gravity=-1.0),
+}
+
+
+def precision_of(recording: Recording) -> Precision:
+    """As the facts tell, else float64."""
+    told = recording.facts.get("precision", "float64")
+    if told not in PRECISIONS:
+        raise InputError(f"recording {recording.name}: precision", got=told, expected="float64 or float32")
+    return PRECISIONS[told]
+
+
+def told_lines(recording: Recording, reference: DrakeEngine) -> tuple[ContractLine, ...]:
+    """A line per quantity of a match: what no fact tells of is different, for that reason."""
+    ours, found = reference.contract, []
+    texts = {"integrator": ours.integrator, "contact law": ours.contact_law, "limit law": ours.limit_law}
+    numbers = {"time step": (ours.time_step,), "gravity": ours.gravity}
+    quantities = [line.quantity for line in match_contracts(reference, reference)]
+    for quantity in (*quantities, "seeds", "reset distribution"):
+        told = recording.facts.get(quantity)
+        if told is None:
+            found.append(ContractLine(quantity, "different", NOT_TOLD, NOT_TOLD))
+            continue
+        if quantity in texts:
+            own: object = texts[quantity]
+            same = told == own
+        elif quantity in numbers:
+            own = numbers[quantity]
+            theirs = _numbers(recording, quantity, told, len(numbers[quantity]))
+            same = np.allclose(theirs, np.array(own), rtol=SAME_NUMBER[precision_of(recording)], atol=0.0)
+        else:
+            found.append(ContractLine(quantity, "mapped", f"{told}; here each step starts from the recorded state"))
+            continue
+        detail = told if same else f"{ours.engine}: {own}; {recording.name}: {told}"
+        found.append(ContractLine(quantity, "equal" if same else "different", detail))
+    return tuple(found)
+
+
+def _numbers(recording: Recording, quantity: str, told: str, count: int) -> Array:
+    try:
+        values = np.atleast_1d(np.array(json.loads(told), dtype=float))
+    except (ValueError, TypeError):
+        values = np.zeros(0)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        expected = "a number" if count == 1 else f"a list of {count} numbers"
+        raise InputError(f"recording {recording.name}: {quantity}", got=told, expected=expected)
+    return values
+
+
+def advanced(reference: DrakeEngine, x: Array, u: Array, count: int) -> Array:
+    """(nx,) `count` of the reference's steps after `x`."""
+    for _ in range(count):
+        x = reference.step(x, u)
+    return x
+
+
+def attribute_recorded(
+    reference: DrakeEngine, x: Array, u: Array, count: int, after: Array, tolerance: float
+) -> Attribution:
+    """What makes the recorded state `after` (nx,) differ from that which `count` steps of the reference lead to."""
+    coordinates = reference.description.coordinates
+    theirs, ours = (of_norm_one(coordinates, state, x) for state in (after, advanced(reference, x, u, count)))
+    gap, schemes = float(np.abs(theirs - ours).max()), (SCHEMES[0], SCHEMES[0])
+    if gap <= tolerance:
+        return Attribution(gap, {}, "", schemes)
+    law = what_is_left(coordinates, reference, reference, x, (ours, theirs))
+    if law != UNEXPLAINED:
+        return Attribution(gap, {law: gap}, law, schemes)
+    misfits = {}
+    for name, change in CHANGES.items():
+        changed = _changed(reference, x, u, count, change)
+        misfits[name] = np.inf if changed is None else float(np.abs(theirs - changed).max())
+    best = min(misfits, key=lambda name: misfits[name])
+    if not misfits[best] <= CLOSES * gap:
+        return Attribution(gap, {UNEXPLAINED: gap}, UNEXPLAINED, schemes)
+    effects = {CHANGES[best].term: gap, UNEXPLAINED: misfits[best]}
+    return Attribution(gap, effects, CHANGES[best].term, (SCHEMES[0], CHANGES[best].scheme), as_if=best)
+
+
+def _changed(reference: DrakeEngine, x: Array, u: Array, count: int, change: Change) -> Array | None:
+    """(nx,) where Euler steps with the change lead; None where its time step is no part of the time between samples."""
+    steps = count / change.time_step
+    if steps != int(steps):
+        return None
+    model, coordinates = reference.model, reference.description.coordinates
+    armature = np.diag(reference.description.by_velocity("armature"))
+    actuation, damping = forces(reference.contract, u)
+    for _ in range(int(steps)):
+        q, v = x[: model.nq], x[model.nq :]
+        set_state(model.double, x)
+        weight = model.plant.CalcGravityGeneralizedForces(model.double.context)
+        inertia = reference.mass_matrix(q) - (1 - change.armature) * armature
+        bias = reference.bias(q, v) + (1 - change.gravity) * weight
+        terms = Terms(inertia, bias, actuation, change.damping * damping, change.time_step * model.time_step)
+        x = euler(coordinates, x, terms, change.scheme)
+    return x

@@ -1,6 +1,5 @@
 """A comparison saved: its record, a trace of every engine's motion, a replay with the engines as ghosts, a page."""
 
-from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,14 +8,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.comparison.attribution import Attribution
-from drake_diff.comparison.result import (
-    JACOBIAN_TOLERANCE,
-    STEP_TOLERANCE,
-    Compared,
-    Comparison,
-    slugs,
-)
-from drake_diff.engines.motion import EngineMotion
+from drake_diff.comparison.result import JACOBIAN_TOLERANCE, STEP_TOLERANCE, Compared, Comparison, slugs
 from drake_diff.logs.channels import input_channel, nanoseconds, state_channel, transform_channel
 from drake_diff.logs.messages import TYPES
 from drake_diff.logs.write import Channel, write_mcap
@@ -121,12 +113,9 @@ def _begun(name: str, model: Model) -> ComparisonRecord:
 
 
 def _engine(e: Compared) -> EngineEvidence:
+    same = ("engine", "version", "precision", "verdict", "sentence", "final_gap", "rollout_gap", "gradient")
     return EngineEvidence(
-        engine=e.engine,
-        version=e.version,
-        precision=e.precision,
-        verdict=e.verdict,
-        sentence=e.sentence,
+        **{name: getattr(e, name) for name in same},
         contract=[LineEvidence(**vars(line)) for line in e.lines],
         status=e.motion.status,
         steps=len(e.motion.us),
@@ -134,7 +123,6 @@ def _engine(e: Compared) -> EngineEvidence:
         first_apart_s=None if e.first_apart is None else float(e.motion.times[e.first_apart]),
         first=_attribution(e.first),
         largest=_attribution(e.largest),
-        final_gap=e.final_gap,
         energy_change_J=e.motion.energy_change,
         largest_penetration_m=None if e.motion.depth is None else float(np.max(e.motion.depth)),
         jacobians=[
@@ -150,8 +138,6 @@ def _engine(e: Compared) -> EngineEvidence:
             for j, gap, law in zip(e.jacobians, e.jacobian_gaps, e.laws, strict=True)
         ],
         rollout_jacobian=None if e.rollout_jacobian is None else _rows(e.rollout_jacobian),
-        rollout_gap=e.rollout_gap,
-        gradient=e.gradient,
     )
 
 
@@ -169,29 +155,27 @@ def _rows(matrix: Array) -> list[Numbers]:
 def write_comparison_trace(path: Path, comparison: Comparison) -> None:
     """Write every engine's states, energy and overlap under a topic of its name, and all bodies' frames."""
     metadata = {"model": comparison.model.name, "time_axis": "simulated", "engines": ", ".join(slugs(comparison))}
-    write_mcap(path, list(_channels(comparison)), metadata, {})
-
-
-def _channels(comparison: Comparison) -> Iterator[Channel]:
-    model, kind = comparison.model, TYPES["Diagnostics"]
+    model, kind, channels = comparison.model, TYPES["Diagnostics"], []
     motions = dict(zip(slugs(comparison), (e.motion for e in comparison.engines), strict=True))
     contract = model.contract
     for slug, motion in motions.items():
-        yield state_channel(f"/{slug}/state", motion.times, motion.xs, contract.positions, contract.velocities)
-        yield input_channel(f"/{slug}/input", motion.times[:-1], motion.us, contract.inputs)
-        yield Channel(f"/{slug}/diagnostics", kind.cls, _measures(motion, kind.cls), {"units": kind.units})
+        topic, missing = f"/{slug}", np.full(len(motion.times), np.nan)  # where the engine does not compute it
+        measures = [missing if values is None else values for values in (motion.energy, motion.depth)]
+        rows = [
+            (nanoseconds(t), kind.cls(energy_total=energy, max_penetration=depth))
+            for t, energy, depth in np.column_stack([motion.times, *measures]).tolist()
+        ]
+        channels += [
+            state_channel(f"{topic}/state", motion.times, motion.xs, contract.positions, contract.velocities),
+            input_channel(f"{topic}/input", motion.times[:-1], motion.us, contract.inputs),
+            Channel(f"{topic}/diagnostics", kind.cls, rows, {"units": kind.units}),
+        ]
     times = comparison.reference.motion.times
     alike = {s: m for s, m in motions.items() if np.allclose(m.times, times[: len(m.times)])}
-    yield transform_channel(model, times, {f"{s}/": m.xs for s, m in alike.items()})  # not what was sampled otherwise
-
-
-def _measures(motion: EngineMotion, message: Any) -> Iterable[tuple[int, Any]]:
-    """Energy and overlap; NaN where the engine does not compute them."""
-    missing = np.full(len(motion.times), np.nan)
-    energy = missing if motion.energy is None else motion.energy
-    depth = missing if motion.depth is None else motion.depth
-    for t, e, d in zip(motion.times.tolist(), energy.tolist(), depth.tolist(), strict=True):
-        yield nanoseconds(t), message(energy_total=e, max_penetration=d)
+    channels.append(
+        transform_channel(model, times, {f"{s}/": m.xs for s, m in alike.items()})
+    )  # none sampled otherwise
+    write_mcap(path, channels, metadata, {})
 
 
 def _scene(comparison: Comparison) -> Any:

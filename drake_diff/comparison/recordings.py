@@ -100,11 +100,6 @@ def steps_between(recording: Recording, time_step: float) -> int:
     return count
 
 
-def inputs_of(recording: Recording, time_step: float) -> Array:
-    """(N, nu) the recorded inputs, one for each step of `time_step` [s]."""
-    return np.repeat(recording.us, steps_between(recording, time_step), axis=0)
-
-
 Motion = tuple[Array, Array, Array]  # times (n,) [s], xs (n, nx), us (n - 1, nu)
 SUFFIXES = "a .csv file, an .mcap file or the directory of a ROS 2 bag"
 
@@ -155,10 +150,9 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None) -
     else:
         raise InputError("recording", got=str(path), expected=SUFFIXES)
     facts = {**facts, **_told(path)}
+    name, version = name or facts.get("engine", path.stem), facts.get("version", "(version unknown)")
     times, xs, us = (frozen(part) for part in motion)
-    recording = Recording(
-        name or facts.get("engine", path.stem), facts.get("version", "(version unknown)"), times, xs, us, facts
-    )
+    recording = Recording(name, version, times, xs, us, facts)
     check_recording(recording, model)
     return recording
 

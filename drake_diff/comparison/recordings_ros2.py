@@ -108,13 +108,11 @@ class _Found:
                 xs[k, link.q_start : link.q_start + 7] = bases[time][:7]
                 xs[k, model.nq + link.v_start : model.nq + link.v_start + 6] = bases[time][7:]
             for i, joint in enumerate(self.description.actuated if k < len(us) else ()):
-                us[k, i] = self._effort(joints, time, joint)
+                if self.description.actuated.count(joint) > 1 or joint not in [x.joint for x in self.singles]:
+                    expected = "one effort, one input"
+                    raise InputError(f"joint {joint}", got="not driven by one actuator alone", expected=expected)
+                us[k, i] = self._joint(joints[time], time, joint, "effort")
         return np.array([time - stamps[0] for time in stamps]) / 1e9, xs, us
-
-    def _effort(self, joints: Stamped, time: int, joint: str) -> float:
-        if self.description.actuated.count(joint) > 1 or joint not in [x.joint for x in self.singles]:
-            raise InputError(f"joint {joint}", got="not driven by one actuator alone", expected="one effort, one input")
-        return self._joint(joints[time], time, joint, "effort")
 
     def _joint(self, message: Any, time: int, joint: str, what: str) -> float:
         names, values = list(message.name), getattr(message, what)

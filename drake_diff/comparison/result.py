@@ -10,12 +10,10 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.jupyter import preformatted
-from drake_diff.comparison.attribution import Attribution
-from drake_diff.comparison.recorded import NOT_TOLD
+from drake_diff.comparison.attribution import NOT_TOLD, Attribution
 from drake_diff.engines.contract_match import ContractLine
 from drake_diff.engines.interface import Precision
-from drake_diff.engines.jacobians import AGREES, JacobianAt
-from drake_diff.engines.motion import BROKE_OFF, EngineMotion
+from drake_diff.engines.motion import AGREES, BROKE_OFF, EngineMotion, JacobianAt
 from drake_diff.model.model import Model
 
 Verdict = Literal["same", "other law", "other model", "unexplained"]
@@ -73,9 +71,7 @@ class Compared:
     largest: Attribution  # of the largest gap
     final_gap: float  # of the last state that both have, on the tangent space
     jacobians: tuple[JacobianAt, ...] = ()
-    jacobian_gaps: Array = field(
-        default_factory=lambda: frozen([])
-    )  # one per state, relative to the reference's largest entry
+    jacobian_gaps: Array = field(default_factory=lambda: frozen([]))  # per state, of the reference's largest entry
     laws: tuple[str, ...] = ()  # per state, of contact or limits where one is at work there, else ""
     rollout_jacobian: Array | None = None
     rollout_gap: float | None = None  # relative to the reference's largest entry; None where one of the two broke off

@@ -10,16 +10,32 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, finite_array, frozen
-from drake_diff.comparison.attribution import CONTACT_LAW, LIMIT_LAW, Attribution, attribute, what_is_left
-from drake_diff.comparison.recorded import advanced, attribute_recorded, precision_of, told_lines
-from drake_diff.comparison.recordings import Recording, check_recording, inputs_of, steps_between
+from drake_diff.comparison.attribution import (
+    CONTACT_LAW,
+    LIMIT_LAW,
+    Attribution,
+    advanced,
+    attribute,
+    attribute_recorded,
+    precision_of,
+    told_lines,
+    what_is_left,
+)  # fmt: skip
+from drake_diff.comparison.recordings import Recording, check_recording, steps_between
 from drake_diff.comparison.result import STEP_TOLERANCE, Compared, Comparison, Probe, Refused, first_above
 from drake_diff.engines.contract_match import match_contracts
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.interface import Engine
-from drake_diff.engines.jacobians import JacobianAt, jacobian_at, rollout_jacobian
 from drake_diff.engines.load import ELSEWHERE, ENGINES, load_spec
-from drake_diff.engines.motion import EngineMotion, measured, move, seconds
+from drake_diff.engines.motion import (
+    EngineMotion,
+    JacobianAt,
+    jacobian_at,
+    measured,
+    move,
+    rollout_jacobian,
+    seconds,
+)  # fmt: skip
 from drake_diff.exceptions import MissingDependencyError, ModelError, SimulationError
 from drake_diff.mechanics.description import describe
 from drake_diff.model.model import Model
@@ -76,7 +92,13 @@ def compare(
         check_recording(recording, model)
     x0, us = _task(model, recordings, x0, us, num_steps, seed)
     reference = DrakeEngine(model)
-    loaded, refused = _load(model, default_engines(model) if engines is None else tuple(engines))
+    loaded: list[Engine] = []
+    refused: list[Refused] = []
+    for wanted in default_engines(model) if engines is None else engines:
+        try:
+            loaded.append(load_spec(wanted, model) if isinstance(wanted, str) else wanted)
+        except (MissingDependencyError, ModelError) as error:
+            refused.append(Refused(str(wanted), str(error), isinstance(error, ModelError)))
     panel = _Panel(model, reference, x0, us, seed)
     compared = []
     each: tuple[Engine | Recording, ...] = (reference, *loaded, *recordings)
@@ -85,7 +107,7 @@ def compare(
             compared.append(panel.recorded(one) if isinstance(one, Recording) else panel.compared(one))
         except SimulationError as error:
             refused.append(Refused(one.name, f"it cannot take a step from one of the states: {error}", True))
-    return Comparison(model, x0, us, panel.probes, tuple(compared), tuple(refused))
+    return Comparison(model, x0, us, tuple(panel.probes), tuple(compared), tuple(refused))
 
 
 def default_engines(model: Model) -> tuple[str, ...]:
@@ -105,7 +127,9 @@ def _task(
 ) -> tuple[Array, Array]:
     """x0 (nx,) and us (N, nu), checked; without x0 those of the first recording, without any sampled ones."""
     if recordings and x0 is None:
-        x0, us = recordings[0].xs[0], inputs_of(recordings[0], model.time_step) if us is None else us
+        first = recordings[0]
+        x0 = first.xs[0]
+        us = np.repeat(first.us, steps_between(first, model.time_step), axis=0) if us is None else us
     sample = sample_states(model, 1, seed)[0]
     if us is None:
         count = num_steps or min(MOST_STEPS, max(1, round(DURATION / model.time_step)))
@@ -113,36 +137,22 @@ def _task(
     return (sample.x if x0 is None else finite_array("x0", x0, (model.nx,))), check_inputs(model, us, num_steps)
 
 
-def _probes(model: Model, motion: EngineMotion, seed: int) -> tuple[Probe, ...]:
-    """The motion's start, a state sampled free and one touching, and the motion's deepest overlap."""
-    probes = [Probe("start", motion.xs[0], motion.us[0])]
-    probes += [Probe(sample.kind, sample.x, sample.u) for sample in sample_states(model, 2, seed + 1)]
-    if motion.depth is not None and np.max(motion.depth[:-1], initial=0.0) > 0:
-        k = int(np.argmax(motion.depth[:-1]))
-        probes.append(Probe("deepest", motion.xs[k], motion.us[k]))
-    return tuple(probes)
-
-
-def _load(model: Model, wanted: tuple[str | Engine, ...]) -> tuple[list[Engine], list[Refused]]:
-    loaded: list[Engine] = []
-    refused: list[Refused] = []
-    for engine in wanted:
-        try:
-            loaded.append(load_spec(engine, model) if isinstance(engine, str) else engine)
-        except (MissingDependencyError, ModelError) as error:
-            refused.append(Refused(str(engine), str(error), isinstance(error, ModelError)))
-    return loaded, refused
-
-
 class _Panel:
-    """What is asked of each engine, and the reference's answers."""
+    """What is asked of each engine, and the reference's answers.
+
+    The probes are the motion's start, a state sampled free and one touching, and the motion's deepest overlap.
+    """
 
     def __init__(self, model: Model, reference: DrakeEngine, x0: Array, us: Array, seed: int):
         self.space, self.names, self.model = tangent_space(model), model.input_names, model
         self.reference, self.x0, self.us = reference, x0, us
         self.coordinates = describe(model).coordinates
-        self.motion = move(reference, x0, us)
-        self.probes = _probes(model, self.motion, seed)
+        self.motion = motion = move(reference, x0, us)
+        self.probes = [Probe("start", motion.xs[0], motion.us[0])]
+        self.probes += [Probe(sample.kind, sample.x, sample.u) for sample in sample_states(model, 2, seed + 1)]
+        if motion.depth is not None and np.max(motion.depth[:-1], initial=0.0) > 0:
+            k = int(np.argmax(motion.depth[:-1]))
+            self.probes.append(Probe("deepest", motion.xs[k], motion.us[k]))
         self.jacobians = self._jacobians(reference)
         self.product = rollout_jacobian(reference, self.space, self.motion)
 
@@ -152,6 +162,14 @@ class _Panel:
         jacobians = self.jacobians if is_reference else self._jacobians(engine)
         product = self.product if is_reference else rollout_jacobian(engine, self.space, motion)
         gaps, precision = self._step_gaps(motion), engine.contract.precision
+        rollout_gap = None  # where one of the two has no derivative, or broke off before the other
+        if product is not None and self.product is not None and len(motion.us) == len(self.motion.us):
+            rollout_gap = _gap(self.product, product)
+        laws = []
+        for x, u in ((probe.x, probe.u) for probe in self.probes):
+            steps = self.reference.step(x, u), engine.step(x, u)
+            law = what_is_left(self.coordinates, self.reference, engine, x, steps)
+            laws.append(law if law in (CONTACT_LAW, LIMIT_LAW) else "")
         return Compared(
             engine=engine.name,
             version=engine.version,
@@ -163,12 +181,12 @@ class _Panel:
             largest=self._attribution(engine, motion, int(np.argmax(gaps)) if len(gaps) else 0),
             final_gap=self._final_gap(motion.xs),
             jacobians=jacobians,
-            laws=tuple(self._law(engine, probe) for probe in self.probes),
+            laws=tuple(laws),
             jacobian_gaps=frozen(
                 [_gap(a.jacobian, b.jacobian) for a, b in zip(self.jacobians, jacobians, strict=True)]
             ),
             rollout_jacobian=product,
-            rollout_gap=self._rollout_gap(motion, product),
+            rollout_gap=rollout_gap,
             seconds_per_step=seconds(lambda: engine.step(self.x0, self.us[0])),
             seconds_per_jacobian=seconds(lambda: engine.differentiate_step(self.x0, self.us[0])),
         )
@@ -177,10 +195,9 @@ class _Panel:
         motion = measured(self.reference, recording.times - recording.times[0], recording.xs, recording.us)
         count, precision = steps_between(recording, self.model.time_step), precision_of(recording)
         gaps = self._step_gaps(motion, count)
+        xs, us, tolerance = motion.xs, motion.us, STEP_TOLERANCE[precision]
         first, largest = (
-            attribute_recorded(
-                self.reference, motion.xs[k], motion.us[k], count, motion.xs[k + 1], STEP_TOLERANCE[precision]
-            )
+            attribute_recorded(self.reference, xs[k], us[k], count, xs[k + 1], tolerance)
             for k in (first_above(gaps, precision) or 0, int(np.argmax(gaps)))
         )
         return Compared(
@@ -195,12 +212,6 @@ class _Panel:
             final_gap=self._final_gap(motion.xs, count),
         )
 
-    def _law(self, engine: Engine, probe: Probe) -> str:
-        """The law that is at work in a step from there, of either engine."""
-        steps = self.reference.step(probe.x, probe.u), engine.step(probe.x, probe.u)
-        found = what_is_left(self.coordinates, self.reference, engine, probe.x, steps)
-        return found if found in (CONTACT_LAW, LIMIT_LAW) else ""
-
     def _final_gap(self, xs: Array, count: int = 1) -> float:
         """On the tangent space, of the last of `xs`, `count` steps apart, that the reference's motion has too."""
         ours = self.motion.xs[::count]
@@ -209,12 +220,6 @@ class _Panel:
 
     def _jacobians(self, engine: Engine) -> tuple[JacobianAt, ...]:
         return tuple(jacobian_at(engine, self.space, self.names, *probe) for probe in self.probes)
-
-    def _rollout_gap(self, motion: EngineMotion, product: Array | None) -> float | None:
-        """None where one of the two has no derivative, or broke off before the other."""
-        if product is None or self.product is None or len(motion.us) != len(self.motion.us):
-            return None
-        return _gap(self.product, product)
 
     def _step_gaps(self, motion: EngineMotion, count: int = 1) -> Array:
         """Relative to the state after the step where that is above 1; states are `count` steps apart."""

@@ -13,9 +13,8 @@ from drake_diff.comparison.result import Refused
 from drake_diff.comparison.side_by_side import default_engines
 from drake_diff.engines.closed_form import NumpyEngine, SphereOnGround
 from drake_diff.engines.interface import Engine
-from drake_diff.engines.jacobians import rollout_jacobian
 from drake_diff.engines.load import load_spec
-from drake_diff.engines.motion import EngineMotion, move
+from drake_diff.engines.motion import EngineMotion, move, rollout_jacobian
 from drake_diff.exceptions import GradientError, MissingDependencyError, ModelError, SimulationError, UnknownNameError
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
