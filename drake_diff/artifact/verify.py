@@ -33,6 +33,7 @@ RELATIVE, ABSOLUTE = 1e-6, 1e-9
 CERTIFICATES = "not run again: the gradient certificates"
 R = TypeVar("R", bound=SealedRecord)
 NOT_TAKEN = "the numbers were not taken again"
+NOT_RERUN = {"comparison": "the engines", "robustness": "the trials"}
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,7 @@ def verify(directory: str | Path) -> Verification:
     except ArtifactError as error:
         notes = tuple(_other_versions(record))
         return Verification(folder, record, problems=(str(error),), not_rerun=("not run again",), notes=notes)
-    return Verification(folder, record, not_rerun=(f"not run again: the {record.kind}; {NOT_TAKEN}",))
+    return Verification(folder, record, not_rerun=(f"not run again: {NOT_RERUN[record.kind]}",))
 
 
 @contextmanager

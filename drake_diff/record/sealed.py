@@ -20,6 +20,7 @@ from drake_diff.record.provenance import file_evidence
 
 SCHEMA_VERSION = "2.0.0"  # a new major one where a field goes or changes its meaning, a minor one where one is added
 SCHEMAS = Path(__file__).parent.parent / "schema"
+MOST_NAMES = 5  # of files, in a printed record
 APART = ("wall_clock", "files", "record_sha256")  # of what is the same, byte for byte, in every run
 Passed = Literal["pass", "fail", "incomplete"]
 
@@ -122,7 +123,10 @@ class SealedRecord(ShowsItsRepr, Part):
     def facts(self) -> dict[str, str]:
         """A few lines about the record, for a reader; each kind adds its own."""
         drake = self.provenance.packages.get("drake", "?")
-        return {"made": f"{self.wall_clock.written_utc} with Drake {drake}", "files": ", ".join(sorted(self.files))}
+        names = sorted(self.files)
+        more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+        files = ", ".join(names[:MOST_NAMES]) + more
+        return {"made": f"{self.wall_clock.written_utc} with Drake {drake}", "files": files}
 
     def __str__(self) -> str:
         return f"{self.name}: {self.verdict}, {self.sentence}"
