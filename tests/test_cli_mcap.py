@@ -12,8 +12,8 @@ from drake_diff.artifact import measure
 from drake_diff.artifact.trace import write_trace
 from drake_diff.cli.main import app
 from drake_diff.exceptions import InputError
+from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.logs.messages import TYPES
-from drake_diff.logs.write import Channel, write_mcap
 from drake_diff.optimize.solution import Solution
 
 STATE = TYPES["State"]

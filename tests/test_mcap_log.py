@@ -16,9 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
+from drake_diff.logs.mcap_file import CHUNK_SIZE, Channel, read_mcap, recover_mcap, write_mcap
 from drake_diff.logs.messages import MESSAGES, TYPES
-from drake_diff.logs.read import read_mcap, recover_mcap
-from drake_diff.logs.write import CHUNK_SIZE, Channel, write_mcap
 
 STATE = TYPES["State"].cls
 

@@ -254,7 +254,7 @@ def test_no_flipped_byte_of_a_trace_is_read(trace_of_collocated, tmp_path):
 
 
 def test_a_whole_log_that_is_no_trace_is_refused(tmp_path):
-    from drake_diff.logs.write import write_mcap
+    from drake_diff.logs.mcap_file import write_mcap
 
     write_mcap(tmp_path / "a.mcap", [], {}, {})
     with pytest.raises(ArtifactError, match="no channel /diagnostics, /input"):

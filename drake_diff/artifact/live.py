@@ -16,7 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_diff.artifact.save import TRACE
 from drake_diff.exceptions import ArtifactError, ModelError
-from drake_diff.logs.read import read_mcap
+from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.load_file import FORMATS, read_into
 from drake_diff.model.plant import bodies
 from drake_diff.pages.meshcat import draw

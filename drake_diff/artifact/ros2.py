@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
-from drake_diff.logs.read import McapLog, read_mcap
+from drake_diff.logs.mcap_file import McapLog, read_mcap
 
 TRACE = "trace.mcap"
 BAG_VERSION = 8  # of metadata.yaml: the one that Humble and everything newer reads

@@ -18,9 +18,8 @@ from drake_diff.artifact.measurement import Measurement
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.exceptions import ArtifactError
 from drake_diff.logs.channels import Shown, input_channel, motion_channels, nanoseconds, state_channel
+from drake_diff.logs.mcap_file import Channel, McapLog, read_mcap, write_mcap
 from drake_diff.logs.messages import TYPES, MessageType
-from drake_diff.logs.read import McapLog, read_mcap
-from drake_diff.logs.write import Channel, write_mcap
 from drake_diff.model.parameters import applied
 from drake_diff.optimize.solution import Solution
 

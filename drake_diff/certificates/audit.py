@@ -4,35 +4,28 @@
 of contact come after the others; every number in them was measured on the Drake that this package is tested with.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.geometry import Box, Cylinder, Sphere
-from pydrake.multibody.plant import DiscreteContactApproximation
+from pydrake.geometry import Box, Cylinder, HalfSpace, ProximityProperties, Sphere, VolumeMesh
+from pydrake.multibody.plant import ContactModel, DiscreteContactApproximation
 from pydrake.multibody.tree import FixedOffsetFrame, WeldJoint
 
 from drake_diff._base.arrays import Array
-from drake_diff.certificates.audit_place import (
-    PARALLEL,
-    SEVERITIES,
-    Collider,
-    Finding,
-    Findings,
-    Found,
-    Pair,
-    Place,
-    Severity,
-    short,
-)
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.derivatives.step import StepDerivatives, differentiate_step
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError
-from drake_diff.model.load_file import MEETS_A_SPHERE
+from drake_diff.model.load_file import MEETS_A_SPHERE, autodiff_supports
 from drake_diff.model.model import Model
 from drake_diff.model.parameter_kinds import IDENTITY_OFFSET
 from drake_diff.model.plant import actuators, instances, is_driven, joints
 from drake_diff.model.step import advance, check_point, set_state
 
+PARALLEL = 1e-6  # [rad] between face normals
 AT_LIMIT = 1e-6  # [m or rad] from a joint's limit
 HUGE = 1e3  # of an entry of A or B: sap's reach 14, lagged contact's 4e4
 NEARLY_PARALLEL = 1e-2  # [rad]: jumps were measured up to 1e-3 and beyond
@@ -43,6 +36,8 @@ ON_AXIS = 1e-9  # [m] from a sphere's centre to a cylinder's axis
 TOUCH = 1e-9  # [m] of signed distance, where Drake computes it exactly
 ROUGH_TOUCH = 1e-6  # [m] where it iterates (measured: 1e-7 off for an ellipsoid)
 
+Severity = Literal["error", "warning", "info"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
 _PROPERTIES = {  # name: (group, unit, the tag in <drake:proximity_properties>)
     "coulomb_friction": ("material", "", "drake:mu_dynamic"),
     "point_contact_stiffness": ("material", " N/m", "drake:point_contact_stiffness"),
@@ -50,6 +45,41 @@ _PROPERTIES = {  # name: (group, unit, the tag in <drake:proximity_properties>)
     "relaxation_time": ("material", " s", "drake:relaxation_time"),
     "hydroelastic_modulus": ("hydroelastic", " Pa", "drake:hydroelastic_modulus"),
 }
+
+
+@dataclass(frozen=True, repr=False)
+class Finding(ShowsItsRepr):
+    """Something to know before a model is differentiated.
+
+    `severity` is "error" if Drake throws here or the derivative is wrong, "warning" if it may be or a number was not
+    chosen, and "info" if it is taken care of or a limit to know. `code` is a stable name of the kind of finding,
+    `subject` the part of the model, `message` says what is found and `remedy` what to change.
+
+    Example:
+        >>> dd.certificates.Finding("info", "locked_joint", "elbow", "is locked", "unlock it")
+        info locked_joint (elbow): is locked
+          -> unlock it
+    """
+
+    severity: Severity
+    code: str
+    subject: str
+    message: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.severity} {self.code} ({self.subject}): {self.message}\n  -> {self.remedy}"
+
+    __repr__ = __str__
+
+
+class Findings(list[Finding], ShowsItsRepr):
+    """What an audit found, the worst first: a list that prints one finding below the other."""
+
+    def __str__(self) -> str:
+        return "\n".join(map(str, self)) or "nothing found"
+
+    __repr__ = __str__
 
 
 def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) -> Findings:
@@ -78,10 +108,177 @@ def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) 
     return Findings(sorted(found, key=lambda f: (SEVERITIES.index(f.severity), f.subject, f.code)))
 
 
+@dataclass(frozen=True, eq=False)
+class Collider:
+    """A collision geometry at x. `own` is what the file or the user gave it, `all` what Drake uses."""
+
+    id: Any
+    label: str
+    body: str
+    shape: Any
+    pose: Any  # X_WG
+    box: Any  # its oriented box in its own frame; None for a half space
+    compliance: Literal["none", "rigid", "compliant"]
+    own: ProximityProperties
+    all: ProximityProperties
+
+    @property
+    def kind(self) -> str:
+        return type(self.shape).__name__
+
+    def axis(self, i: int) -> Array:
+        """(3,) the unit vector of its frame in the world."""
+        return np.asarray(self.pose.rotation().matrix())[:, i]
+
+    def extent(self, direction: Array) -> tuple[float, float]:
+        """Where its box begins and ends [m] along a direction in the world."""
+        if self.box is None:
+            middle, along = float(direction @ self.pose.translation()), float(direction @ self.axis(2))
+            infinite = abs(along) < 1 - PARALLEL
+            return (-np.inf if infinite or along > 0 else middle), (np.inf if infinite or along < 0 else middle)
+        pose = self.pose @ self.box.pose()
+        middle = float(direction @ pose.translation())
+        half = float(np.abs(direction @ pose.rotation().matrix()) @ self.box.half_width())
+        return middle - half, middle + half
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two geometries that can collide."""
+
+    a: Collider
+    b: Collider
+    model: Any
+
+    @property
+    def label(self) -> str:
+        return f"{self.a.label} - {self.b.label}"
+
+    @property
+    def bodies(self) -> tuple[str, str]:
+        return self.a.body, self.b.body
+
+    @property
+    def contact(self) -> Literal["point", "hydroelastic", "none"]:
+        """What Drake computes between them; "none" is what it throws at."""
+        both = {self.a.compliance, self.b.compliance}
+        soft_half_space = both == {"compliant"} and "HalfSpace" in (self.a.kind, self.b.kind)
+        hydroelastic = "none" not in both and both != {"rigid"} and not soft_half_space
+        if self.model == ContactModel.kPoint:
+            return "point"
+        if hydroelastic:
+            return "hydroelastic"
+        return "none" if self.model == ContactModel.kHydroelastic else "point"
+
+    @property
+    def refused(self) -> bool:
+        return self.contact == "none" or not autodiff_supports(self.a.shape, self.b.shape, self.contact)
+
+    def of_kinds(self, a: type, b: type) -> tuple[Collider, Collider] | None:
+        """The two in the order of the shapes that are asked for."""
+        for one, other in ((self.a, self.b), (self.b, self.a)):
+            if isinstance(one.shape, a) and isinstance(other.shape, b):
+                return one, other
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A model at x, u: what several checks ask for, computed once."""
+
+    model: Model
+    x: Array
+    u: Array
+
+    @cached_property
+    def has_poses(self) -> bool:
+        """Whether Drake can place the bodies: not with a quaternion of zeros."""
+        plant, context = self.model.plant, self.model.double.context
+        set_state(self.model.double, self.x)
+        try:
+            plant.EvalBodyPoseInWorld(context, plant.world_body())
+        except RuntimeError:
+            return False
+        return True
+
+    @cached_property
+    def step_error(self) -> SimulationError | None:
+        """Why the double step fails here."""
+        try:
+            advance(self.model.double, self.x, self.u)
+        except SimulationError as error:
+            return error
+        return None
+
+    @cached_property
+    def by_autodiff(self) -> StepDerivatives | DrakeDiffError:
+        """The Jacobians by AutoDiffXd through the whole step, or why there are none."""
+        try:
+            return differentiate_step(self.model, self.x, self.u, method="autodiff")
+        except (GradientError, ModelError, SimulationError) as error:
+            return error
+
+    @cached_property
+    def query(self) -> Any:
+        """Drake's QueryObject; it sees the state that the double context has when it is asked."""
+        return self.model.plant.get_geometry_query_input_port().Eval(self.model.double.context)
+
+    @cached_property
+    def colliders(self) -> dict[Any, Collider]:
+        """Those that can collide, by id, at x."""
+        set_state(self.model.double, self.x)
+        found = {}
+        for id_ in sorted({g for pair in self.candidates for g in pair}, key=lambda g: g.get_value()):
+            inspector, own = self.query.inspector(), self.model.double.scene_graph.model_inspector()
+            body = self.model.plant.GetBodyFromFrameId(inspector.GetFrameId(id_))
+            shape, body_name = inspector.GetShape(id_), body.name() if body is not None else "?"
+            found[id_] = Collider(
+                id=id_,
+                label=f"{body_name}/{inspector.GetName(id_).split('::')[-1]} ({type(shape).__name__})",
+                body=body_name,
+                shape=shape,
+                pose=self.query.GetPoseInWorld(id_),
+                box=inspector.GetObbInGeometryFrame(id_),
+                compliance=_compliance(self, id_, shape),
+                own=own.GetProximityProperties(id_),
+                all=inspector.GetProximityProperties(id_),
+            )
+        return found
+
+    @cached_property
+    def candidates(self) -> list[tuple[Any, Any]]:
+        """The ids of the geometries that can collide."""
+        port = self.model.plant.get_geometry_query_input_port()
+        if self.model.double.scene_graph is None or not port.HasValue(self.model.double.context):
+            return []
+        return sorted(self.query.inspector().GetCollisionCandidates(), key=lambda p: [g.get_value() for g in p])
+
+    @cached_property
+    def pairs(self) -> list[Pair]:
+        contact = self.model.plant.get_contact_model()
+        return [Pair(self.colliders[a], self.colliders[b], contact) for a, b in self.candidates]
+
+
+def _compliance(place: Place, id_: Any, shape: Any) -> Literal["none", "rigid", "compliant"]:
+    """How hydroelastic contact sees a geometry. Python cannot read Drake's compliance_type, so by its mesh."""
+    scene_graph = place.model.double.scene_graph
+    if not isinstance(shape, HalfSpace):
+        mesh = place.query.inspector().maybe_get_hydroelastic_mesh(id_)
+        return "none" if mesh is None else "compliant" if isinstance(mesh, VolumeMesh) else "rigid"
+    own = scene_graph.model_inspector().GetProximityProperties(id_)
+    if own.HasProperty("hydroelastic", "compliance_type"):
+        return "compliant" if own.HasProperty("hydroelastic", "slab_thickness") else "rigid"
+    default = scene_graph.get_config().default_proximity_properties.compliance_type
+    return "none" if default == "undefined" else "compliant" if default == "compliant" else "rigid"
+
+
+Found = Iterator[Finding]
+
+
 def _no_step(place: Place) -> Found:
     if place.step_error is not None:
         remedy = "choose x and u that `step` can take; if it names contact, see the finding pair_refused"
-        yield Finding("error", "no_step", "step", f"the double step fails here: {short(place.step_error)}", remedy)
+        yield Finding("error", "no_step", "step", f"the double step fails here: {_short(place.step_error)}", remedy)
 
 
 def _pd_gains(place: Place) -> Found:
@@ -160,7 +357,7 @@ def _jacobian(place: Place) -> Found:
         yield Finding("error", "autodiff_refused", "diagram", str(result), remedy)
     elif isinstance(result, SimulationError) and not any(pair.refused for pair in place.pairs):
         remedy = "leave out what it names, or accept differences (method finite_difference)"
-        yield Finding("error", "autodiff_refused", "step", f"the AutoDiffXd step throws: {short(result)}", remedy)
+        yield Finding("error", "autodiff_refused", "step", f"the AutoDiffXd step throws: {_short(result)}", remedy)
     if isinstance(result, ModelError | SimulationError):
         try:
             result = differentiate_step(place.model, place.x, place.u, method="finite_difference")
@@ -229,8 +426,8 @@ def _refusal(place: Place, pairs: list[Pair]) -> str:
     if not isinstance(error, SimulationError):
         return f"{names}: {why}. The AutoDiffXd step does not throw at x."
     if any(p.a.kind.lower() in str(error).lower() and p.b.kind.lower() in str(error).lower() for p in pairs):
-        return f"{names}: {why}. The AutoDiffXd step throws at x over such shapes: {short(error)}."
-    return f"{names}: {why}. At x the AutoDiffXd step throws over another pair: {short(error)}."
+        return f"{names}: {why}. The AutoDiffXd step throws at x over such shapes: {_short(error)}."
+    return f"{names}: {why}. At x the AutoDiffXd step throws over another pair: {_short(error)}."
 
 
 def _aligned_faces(place: Place) -> Found:
@@ -351,6 +548,10 @@ def _touching(place: Place) -> Found:
         message = "Drake computes no distance between these, so whether they are exactly at touch is not known"
         remedy = "compare x with x moved by 1e-6 m yourself, or replace one of them by spheres (corner_spheres)"
         yield Finding("info", "not_measured", ", ".join(unmeasured), message, remedy)
+
+
+def _short(error: DrakeDiffError) -> str:
+    return str(error).removeprefix("Drake cannot take this step: ").split(". ")[0].rstrip(".")
 
 
 _CHECKS_WITHOUT_POSES: tuple[Callable[[Place], Found], ...] = (_no_step, _pd_gains, _identity_frame, _joint_limit)

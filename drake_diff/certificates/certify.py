@@ -16,8 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.differences import one_by_one
-from drake_diff.certificates.certificate import JITTER, VERDICTS, Certificate, certify_displacement, jitter_direction
-from drake_diff.certificates.mode_changes import ModeChange, find_mode_changes
+from drake_diff.certificates.certificate import (
+    JITTER,
+    VERDICTS,
+    Certificate,
+    certify_displacement,
+    find_mode_changes,
+    jitter_direction,
+)
 from drake_diff.derivatives.sources import check_method, step_at
 from drake_diff.derivatives.step import StepDerivatives, step_jacobians
 from drake_diff.exceptions import InputError
@@ -124,48 +130,42 @@ def certify(
     check_method(method)
     x, u = check_point(model, x, u)
     vector = select(model, parameters)
-    with applied(vector) as set_model:
-        return _certify_step(set_model, vector, x, u, method, derivatives)
+    with applied(vector) as model:
+        space, end = tangent_space(model), model.nx + model.nu
+        point = np.concatenate([x, u, vector.values])
+        scale = np.concatenate([_scale(space, x), np.maximum(1.0, np.abs(u)), vector.difference_scale()])
 
+        def f(displacement: Array) -> Array:
+            moved = _move(space, model.nx, point, scale * displacement)
+            return step_at(model, vector, moved[: model.nx], moved[model.nx : end], moved[end:])
 
-def _certify_step(
-    model: Model, vector: ParameterVector, x: Array, u: Array, method: str, given: StepDerivatives | None
-) -> Certificate:
-    space, end = tangent_space(model), model.nx + model.nu
-    point = np.concatenate([x, u, vector.values])
-    scale = np.concatenate([_scale(space, x), np.maximum(1.0, np.abs(u)), vector.difference_scale()])
+        def on_tangent(at: Array, d: StepDerivatives) -> Array:
+            return space.jacobian(at[: model.nx], d.x_next, d.A, d.B, d.C) * scale
 
-    def f(displacement: Array) -> Array:
-        moved = _move(space, model.nx, point, scale * displacement)
-        return step_at(model, vector, moved[: model.nx], moved[model.nx : end], moved[end:])
-
-    def on_tangent(at: Array, d: StepDerivatives) -> Array:
-        return space.jacobian(at[: model.nx], d.x_next, d.A, d.B, d.C) * scale
-
-    d, beside = given or step_jacobians(model, vector, x, u, method), None
-    if given is None and not vector.parameters:
-        jittered = _move(space, model.nx, point, JITTER * scale * jitter_direction(len(scale)))
-        d_beside = step_jacobians(model, vector, jittered[: model.nx], jittered[model.nx :], method)
-        beside = on_tangent(jittered, d_beside)
-    derivative, by_point = on_tangent(point, d), space.names + model.input_names
-    changes: tuple[ModeChange, ...] = ()
-    if model.contract.contact.collision_pairs:
+        d, beside = derivatives or step_jacobians(model, vector, x, u, method), None
+        if derivatives is None and not vector.parameters:
+            jittered = _move(space, model.nx, point, JITTER * scale * jitter_direction(len(scale)))
+            d_beside = step_jacobians(model, vector, jittered[: model.nx], jittered[model.nx :], method)
+            beside = on_tangent(jittered, d_beside)
+        derivative, by_point = on_tangent(point, d), space.names + model.input_names
+        certificate = certify_displacement(
+            one_by_one(f),
+            derivative,
+            rows=space.names,
+            columns=by_point + vector.names,
+            scale=scale,
+            beside=beside,
+            minus=space.minus,
+            solver_tolerance=solver_tolerance(model, x, u),
+            method=" + ".join(dict.fromkeys((d.method, *d.sources))),
+            subject=f"the step of {model.name}",
+        )
+        if not model.contract.contact.collision_pairs:
+            return certificate
         changes = find_mode_changes(
             model, f, derivative, rows=space.names, columns=by_point, scale=scale, minus=space.minus
         )
-    certificate = certify_displacement(
-        one_by_one(f),
-        derivative,
-        rows=space.names,
-        columns=by_point + vector.names,
-        scale=scale,
-        beside=beside,
-        minus=space.minus,
-        solver_tolerance=solver_tolerance(model, x, u),
-        method=" + ".join(dict.fromkeys((d.method, *d.sources))),
-        subject=f"the step of {model.name}",
-    )
-    return replace(certificate, mode_changes=changes)
+        return replace(certificate, mode_changes=changes)
 
 
 def certify_rollout(

@@ -219,7 +219,7 @@ def export(
 
 def info(file: LogFile) -> None:
     """List the channels of FILE with their messages and units, its metadata and its attachments."""
-    from drake_diff.logs.read import read_mcap
+    from drake_diff.logs.mcap_file import read_mcap
 
     log = read_mcap(file)
     rows = table("channel", "schema", "messages", "from [s]", "to [s]", left=2)
@@ -243,7 +243,7 @@ def _units(units: dict[str, Any]) -> str:
 
 def check(file: LogFile) -> None:
     """Check every checksum and schema of FILE. Exit status 1 if one fails."""
-    from drake_diff.logs.read import read_mcap
+    from drake_diff.logs.mcap_file import read_mcap
 
     try:
         log = read_mcap(file)
@@ -262,7 +262,7 @@ def recover(
     file: LogFile, out: Annotated[Path, typer.Argument(metavar="OUT", help="The file to write.", dir_okay=False)]
 ) -> None:
     """Copy all of FILE that can be read, up to the first damage, to OUT; OUT's metadata say so."""
-    from drake_diff.logs.read import recover_mcap
+    from drake_diff.logs.mcap_file import recover_mcap
 
     done = recover_mcap(file, out)
     stopped = f"stopped at {done.stopped_at}" if done.stopped_at else "it was whole"

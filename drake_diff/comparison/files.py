@@ -10,8 +10,8 @@ from drake_diff._base.arrays import Array
 from drake_diff.comparison.attribution import Attribution
 from drake_diff.comparison.result import JACOBIAN_TOLERANCE, STEP_TOLERANCE, Compared, Comparison, slugs
 from drake_diff.logs.channels import input_channel, nanoseconds, state_channel, transform_channel
+from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.logs.messages import TYPES
-from drake_diff.logs.write import Channel, write_mcap
 from drake_diff.model.model import Model
 from drake_diff.record.comparison import (
     AttributionEvidence,

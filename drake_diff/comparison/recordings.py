@@ -13,7 +13,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff.comparison.recordings_ros2 import is_ros2, read_ros2
 from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.logs.read import read_mcap
+from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.mechanics.description import describe
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space

@@ -1,1 +1,1 @@
-from .read import read_mcap as read_mcap
+from .mcap_file import read_mcap as read_mcap

@@ -14,8 +14,8 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import SimulationError
+from drake_diff.logs.mcap_file import Channel
 from drake_diff.logs.messages import TYPES
-from drake_diff.logs.write import Channel
 from drake_diff.model.contact import ContactPoint
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators, bodies, joints

@@ -60,10 +60,7 @@ MESSAGES: dict[str, dict[str, tuple[tuple[str, bool], str]]] = {
         "holds": (FLAG, "1"),
         "failures": (TEXTS, ""),
     },
-    "Event": {
-        "time": (NUMBER, "s"),
-        **dict.fromkeys(("kind", "failure_label", "code", "message"), (TEXT, "")),
-    },
+    "Event": {"time": (NUMBER, "s"), **dict.fromkeys(("kind", "failure_label", "code", "message"), (TEXT, ""))},
 }
 
 

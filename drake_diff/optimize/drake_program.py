@@ -73,18 +73,17 @@ class _Callback:
 
     def _look(self, z: Array) -> None:
         cost = sum(float(self.program.EvalBinding(binding, z)[0]) for binding in self.program.GetAllCosts())
-        violation = max((self._violation(b, z) for b in self.program.GetAllConstraints()), default=0.0)
+        violations = []
+        for binding in self.program.GetAllConstraints():
+            constraint, values = binding.evaluator(), self.program.EvalBinding(binding, z)
+            beyond = np.maximum(constraint.lower_bound() - values, values - constraint.upper_bound())
+            violations.append(float(np.max(beyond, initial=0)))
+        violation = max(violations, default=0.0)
         self.watch.offer(z, cost, violation)
         if self.report:
             self.report.row(Iteration(self.evaluations, cost, violation, math.nan, math.nan), printed=False)
             spent = f"violation {violation:9.2e}  {self.watch.elapsed:6.1f} s"
             self.report.say(f"evaluation {self.evaluations:5d}  cost {cost:12.6g}  {spent}")
-
-    def _violation(self, binding: Any, z: Array) -> float:
-        constraint, values = binding.evaluator(), self.program.EvalBinding(binding, z)
-        return float(
-            np.max(np.maximum(constraint.lower_bound() - values, values - constraint.upper_bound()), initial=0)
-        )
 
 
 def _options(solver: str, limits: Limits, print_file: Path) -> SolverOptions:

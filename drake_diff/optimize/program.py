@@ -18,7 +18,7 @@ FEASIBILITY_TOLERANCE = 1e-5  # defect, goal and bounds, in the state's and inpu
 REPORT_PERIOD = 0.2  # [s] between two progress reports: each costs an evaluation of every constraint
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Iteration:
     """One row of the solver's own table; NaN where it prints no such number."""
 

@@ -44,14 +44,7 @@ def check_segments(problem: Problem, method: str, segments: int) -> None:
 
 
 def solve_shooting(
-    problem: Problem,
-    xs: Array,
-    us: Array,
-    *,
-    solver: str,
-    limits: Limits,
-    report: Report | None,
-    segments: int = 1,
+    problem: Problem, xs: Array, us: Array, *, solver: str, limits: Limits, report: Report | None, segments: int = 1
 ) -> tuple[NlpResult, Array, Array]:
     """Solve `problem` from the guess xs (N+1, nx), us (N, nu); gives (result, xs, us).
 
@@ -126,11 +119,11 @@ class SegmentedMotion:
         return program
 
     def _bounds(self) -> tuple[Array, Array]:
-        b, count = self.problem.bounds, self.problem.num_steps
-        lower, upper = self.problem.state_limits()
-        lowest, highest = self.problem.bounds_of_parameters()
-        least, most = np.tile(b.u_lower, (count, 1)), np.tile(b.u_upper, (count, 1))
-        return self.pack(lower, least, lowest), self.pack(upper, most, highest)
+        bounds, count = self.problem.bounds, self.problem.num_steps
+        inputs = [np.tile(side, (count, 1)) for side in (bounds.u_lower, bounds.u_upper)]
+        sides = zip(self.problem.state_limits(), inputs, self.problem.bounds_of_parameters(), strict=True)
+        lower, upper = (self.pack(*side) for side in sides)
+        return lower, upper
 
 
 class ShootingVariables:

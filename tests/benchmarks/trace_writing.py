@@ -23,8 +23,8 @@ import drake_diff as dd
 from drake_diff.artifact import measure
 from drake_diff.artifact.trace import write_trace
 from drake_diff.logs.channels import Shown, motion_channels
+from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.logs.messages import TYPES
-from drake_diff.logs.write import Channel, write_mcap
 from drake_diff.model.plant import bodies, joints
 from drake_diff.model.step import set_state
 from drake_diff.motion.rollout import Rollout

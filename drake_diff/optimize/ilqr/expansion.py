@@ -12,7 +12,6 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.derivatives.step import linearize, smooth_jacobians
-from drake_diff.model.model import Model
 from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic
 from drake_diff.optimize.problem.cost import (
@@ -129,25 +128,20 @@ def dynamics_curvature_along(problem: Problem, motion: Motion, v: Array) -> Arra
     here = smooth_jacobians(model, xs, us, motion.ends)
     if here is None:
         return None
-    curvature = np.zeros((len(us), model.nx + model.nu, model.nx + model.nu))
+    curvature, analytic = np.zeros((len(us), model.nx + model.nu, model.nx + model.nu)), analytic_of(model)
     for j in range(model.nx):
         moved = np.array(xs)
         moved[:, j] += DIFFERENCE_STEP * np.maximum(1.0, np.abs(xs[:, j]))
-        near = _nearby_jacobians(model, moved, us)
+        if isinstance(analytic, Refusal):
+            near = smooth_jacobians(model, moved, us)
+        else:
+            near = analytic.differentiate(moved, us)[0]  # no step is taken that might not be smooth
         if near is None:
             return None
         slopes = (near - here) / (moved - xs)[:, j, None, None]
         curvature[:, :, j] = np.einsum("kij,ki->kj", slopes, v)
     curvature[:, : model.nx, model.nx :] = curvature[:, model.nx :, : model.nx].swapaxes(1, 2)
     return (curvature + curvature.swapaxes(1, 2)) / 2
-
-
-def _nearby_jacobians(model: Model, xs: Array, us: Array) -> Array | None:
-    """(N, nx, nx + nu) of the steps from xs (N, nx) beside smooth ones; None if one that was taken is not smooth."""
-    analytic = analytic_of(model)
-    if not isinstance(analytic, Refusal):
-        return analytic.differentiate(xs, us)[0]  # no step is taken
-    return smooth_jacobians(model, xs, us)
 
 
 class DynamicsCurvature:

@@ -10,7 +10,7 @@ way (`expansion`), or taken by differences of the Jacobians where a smooth motio
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 
@@ -121,16 +121,7 @@ def _least_regularized(solve: _Solve, model: LinearQuadratic) -> AffinePolicy | 
     return solve(model, 0.0) or solve(model, SMALLEST_REGULARIZATION)
 
 
-def _best_policy(solve: _Solve, models: Sequence[LinearQuadratic], regularization: float) -> AffinePolicy | None:
-    """The policy of the first of the models whose Hessians allow one."""
-    for model in models:
-        policy = solve(model, regularization)
-        if policy is not None and policy.expected >= 0:
-            return policy
-    return None
-
-
-def _promise_at_most(solve: _Solve, models: Sequence[LinearQuadratic], limit: float) -> bool:
+def _promise_at_most(solve: _Solve, models: tuple[LinearQuadratic, ...], limit: float) -> bool:
     """Whether no model, regularized as little as it allows, promises more than `limit`, and one of them that much."""
     found = False
     for model in models:
@@ -227,7 +218,8 @@ class _Search:
         if len(self.rows) > self.limits.max_iterations:
             return Outcome.ITERATION_LIMIT
         while self.regularization <= LARGEST_REGULARIZATION:
-            policy = _best_policy(solve, models, self.regularization)
+            policies = (solve(one, self.regularization) for one in models)
+            policy = next((p for p in policies if p is not None and p.expected >= 0), None)
             if policy is not None and self._search_along(model, policy):
                 is_cut_back = math.isfinite(self.patience) and all(row.step <= CUT_BACK for row in self.rows[-2:])
                 relaxed = self.regularization / 8 if self.regularization / 8 > SMALLEST_REGULARIZATION else 0.0

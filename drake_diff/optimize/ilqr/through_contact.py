@@ -28,14 +28,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import chain
 from drake_diff.exceptions import GradientError, InputError, ModelError, SimulationError
 from drake_diff.model.model import Model
-from drake_diff.model.soft_contact import (
-    Separation,
-    SoftContact,
-    distances,
-    separations,
-    smallest_half_width,
-    softened,
-)
+from drake_diff.model.soft_contact import Separation, SoftContact, distances, separations, smallest_half_width, softened
 from drake_diff.model.step import advance, set_state
 from drake_diff.motion.rollout import roll_states
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr

@@ -1,41 +1,99 @@
-"""Read MCAP files of protobuf channels: a whole one with every checksum checked, or what a damaged one still holds.
+"""MCAP files of protobuf channels: written byte for byte the same for the same content, read, and saved when damaged.
 
 The `mcap` package skips three of the format's checksums (of attachments, of the data section, of the summary), so that
-this module walks through the records itself.
+this module walks through the records itself. Reading asks for every one of them.
 """
 
 import json
 import struct
 import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from heapq import merge
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from mcap import records as kinds
 from mcap.data_stream import ReadDataStream
 from mcap.reader import NonSeekingReader
-from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory
+from mcap_protobuf.schema import build_file_descriptor_set
 
 from drake_diff._base.files import whole_file
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
-from drake_diff.logs.write import start
 
+CHUNK_SIZE = 64 * 1024  # the most that is lost if a process is killed or a file damaged
+LIBRARY = "drake_diff"
+RECOVERED = "recovered"  # the name of the metadata record that a recovered file gets
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, CRC of the summary
 DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of all before it
 RECORD = struct.Struct("<BQ")  # opcode, length
 CRC = struct.Struct("<I")
 FOOTER_OPCODE, CHUNK, ATTACHMENT, METADATA, DATA_END_OPCODE = 0x02, 0x06, 0x09, 0x0C, 0x0F
+READERS: dict[int, Any] = {CHUNK: kinds.Chunk, ATTACHMENT: kinds.Attachment, METADATA: kinds.Metadata}
 
 
-RECOVERED = "recovered"  # the name of the metadata record that a recovered file gets
-READERS: dict[int, Any] = {CHUNK: Chunk, ATTACHMENT: Attachment, METADATA: Metadata}
+@dataclass(frozen=True)
+class Channel:
+    """One topic: messages of one protobuf class with their log times [ns], in order; units or names as metadata."""
+
+    topic: str
+    message_class: Any
+    messages: Iterable[tuple[int, Any]]
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+
+def write_mcap(
+    path: Path, channels: Sequence[Channel], metadata: Mapping[str, str], attachments: Mapping[str, tuple[str, bytes]]
+) -> None:
+    """Write `channels` to `path`; attachments are name: (media type, data).
+
+    Written chunk by chunk beside `path`, and moved into place once it is whole. InputError if a time decreases.
+    """
+    with whole_file(path) as file:
+        writer = start(file)
+        writer.add_metadata("run", dict(metadata))
+        for name, (media_type, data) in attachments.items():
+            writer.add_attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data)
+        ids = []
+        for channel in channels:
+            descriptors: FileDescriptorSet = build_file_descriptor_set(channel.message_class)
+            schema = writer.register_schema(
+                name=channel.message_class.DESCRIPTOR.full_name,
+                encoding="protobuf",
+                data=bytes(descriptors.SerializeToString(deterministic=True)),
+            )
+            told = {key: json.dumps(value, sort_keys=True) for key, value in sorted(channel.metadata.items())}
+            ids.append(writer.register_channel(channel.topic, "protobuf", schema, told))
+        for time, rank, sequence, message in merge(*(_timed(rank, channel) for rank, channel in enumerate(channels))):
+            data = message.SerializeToString(deterministic=True)
+            writer.add_message(ids[rank], log_time=time, data=data, publish_time=time, sequence=sequence)
+        writer.finish()
+
+
+def start(file: Any) -> Writer:
+    """The writer of all our files: small chunks, every checksum."""
+    writer = Writer(
+        file, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True
+    )
+    writer.start(profile="", library=LIBRARY)
+    return writer
+
+
+def _timed(rank: int, channel: Channel) -> Iterator[tuple[int, int, int, Any]]:
+    last = 0
+    for sequence, (time, message) in enumerate(channel.messages):
+        if time < last:
+            raise InputError(f"time of message {sequence} of {channel.topic}", got=time, expected=f"at least {last}")
+        last = time
+        yield time, rank, sequence, message
 
 
 @dataclass(frozen=True, repr=False)
@@ -221,8 +279,8 @@ def _column(field: Any, values: list[Any], width: int) -> Any:
     repeated = field.default_value == []  # `is_repeated` came with protobuf 6
     if field.cpp_type in (field.CPPTYPE_STRING, field.CPPTYPE_MESSAGE):
         return [list(value) if repeated else value for value in values]
-    kinds: dict[int, Any] = {field.CPPTYPE_INT64: np.int64, field.CPPTYPE_BOOL: np.bool_}
-    kind = kinds.get(field.cpp_type, np.float64)
+    dtypes: dict[int, Any] = {field.CPPTYPE_INT64: np.int64, field.CPPTYPE_BOOL: np.bool_}
+    kind = dtypes.get(field.cpp_type, np.float64)
     if not repeated:
         return np.array(values, dtype=kind)
     lists = [np.array(value, dtype=kind) for value in values]
@@ -239,19 +297,19 @@ class _Copy:
         self.channels: dict[int, int] = {}
 
     def add(self, record: Any) -> None:
-        if isinstance(record, Message):
+        if isinstance(record, kinds.Message):
             times = {"log_time": record.log_time, "publish_time": record.publish_time}
             number = self.channels[record.channel_id]
             self.writer.add_message(number, data=record.data, sequence=record.sequence, **times)
             self.messages += 1
-        elif isinstance(record, Schema) and record.id not in self.schemas:
+        elif isinstance(record, kinds.Schema) and record.id not in self.schemas:
             self.schemas[record.id] = self.writer.register_schema(record.name, record.encoding, record.data)
-        elif isinstance(record, Channel) and record.id not in self.channels:
+        elif isinstance(record, kinds.Channel) and record.id not in self.channels:
             self.channels[record.id] = self.writer.register_channel(
                 record.topic, record.message_encoding, self.schemas[record.schema_id], record.metadata
             )
-        elif isinstance(record, Metadata):
+        elif isinstance(record, kinds.Metadata):
             self.writer.add_metadata(record.name, record.metadata)
-        elif isinstance(record, Attachment):
+        elif isinstance(record, kinds.Attachment):
             self.writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
             self.attachments += 1
