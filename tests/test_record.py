@@ -1,6 +1,7 @@
 """The record's fields: what they refuse, that they come back as they were, and that they say what is true."""
 
 import dataclasses
+import doctest
 import math
 import subprocess
 import sys
@@ -11,12 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.models import MODELS
+from helpers.models import MODELS, ROOT
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import BaseModel, JsonValue, ValidationError
 
 import drake_diff as dd
+from drake_diff import artifact
 from drake_diff.artifact import measure
 from drake_diff.artifact.sections import describe_problem, rebuild_problem
 from drake_diff.exceptions import ArtifactError
@@ -388,3 +390,17 @@ def test_records_print_in_a_few_lines_and_their_text_is_escaped(record):
     assert "&lt;script&gt;" in evil._repr_html_()
     certified = dd.record.certify_model(pendulum().model, states=2)
     assert "states: 2 agree" in repr(certified)
+
+
+EXAMPLES = [dd.save, dd.load_record, dd.verify, dd.read_trace, dd.record.certify_model]
+EXAMPLES += [getattr(artifact, name) for name in artifact.__all__]
+
+
+@pytest.mark.parametrize("documented", EXAMPLES, ids=lambda documented: documented.__name__)
+def test_the_example_of_every_public_name_runs(documented, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
+    found = doctest.DocTestFinder(recurse=False).find(documented, globs={"dd": dd, "np": np})
+    assert sum(len(example.examples) for example in found) > 0
+    for example in found:
+        assert runner.run(example).failed == 0

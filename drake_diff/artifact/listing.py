@@ -20,6 +20,12 @@ class RunLine:
     """One directory: what its record says, unverified; `verdict` is "unreadable" where it says nothing.
 
     `kind` is "solve", "comparison", "robustness" or "certification"; only a solve has a status and a cost.
+
+    Example:
+        >>> from drake_diff.artifact import list_runs
+        >>> line = next(line for line in list_runs("artifacts") if line.name == "pendulum_swing_up")
+        >>> line.kind, line.status, line.model
+        ('solve', 'converged', 'pendulum')
     """
 
     directory: Path
@@ -50,6 +56,12 @@ class RunComparison:
         versions: Packages and commits that differ.
         metrics: Metrics and invariants whose value or verdict differs.
         refused: Metrics that cannot be compared, as they are defined in other words, units or tolerances.
+
+    Example:
+        >>> from drake_diff.artifact import compare_runs
+        >>> run = "artifacts/pendulum_swing_up"
+        >>> compare_runs(run, run).comparable
+        True
     """
 
     configuration: tuple[ChangedEntry, ...]
@@ -81,8 +93,8 @@ def list_runs(directory: str | Path) -> list[RunLine]:
 
     Example:
         >>> from drake_diff.artifact import list_runs
-        >>> [(line.name, line.kind, line.verdict) for line in list_runs("artifacts")]
-        [('pendulum_swing_up', 'solve', 'pass')]
+        >>> {line.name: line.verdict for line in list_runs("artifacts")}["pendulum_swing_up"]
+        'pass'
     """
     folder = Path(directory)
     if not folder.is_dir():

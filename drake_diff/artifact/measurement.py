@@ -78,6 +78,14 @@ class Measurement(ShowsItsRepr):
         invariants: What physics keeps along the replay.
         failures: Why the run is no success; none for a success.
         events: What happened, in order: the solver, contacts, inputs at their limits, failures.
+
+    Example:
+        >>> from drake_diff.artifact import measure
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
+        >>> problem = dd.Problem(model, x0=[0.1, 0], num_steps=5, running_cost=dd.QuadraticCost(R=[[1.0]]))
+        >>> m = measure(dd.solve(problem, method="shooting"))
+        >>> [column.name for column in m.positions], m.xs.shape, len(m.failures)
+        (['hinge_q'], (6, 2), 0)
     """
 
     solution: Solution

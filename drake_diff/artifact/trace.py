@@ -171,6 +171,11 @@ class Trace(ShowsItsRepr):
 
     `xs` (N+1, nx) under `us` (N, nu) is the open-loop motion of the discrete plant, without rows where it could not
     be taken; `planned_xs` (N+1, nx), `planned_us` (N or N+1, nu) and `planned_us_mid` (N, nu) are the solver's.
+
+    Example:
+        >>> trace = dd.read_trace("artifacts/pendulum_swing_up/trace.mcap")
+        >>> sorted(trace.attachments), float(trace.diagnostics["max_penetration"].max())
+        (['configuration.json', 'pendulum.urdf', 'record.json'], 0.0)
     """
 
     times: Array  # (N+1,) [s]

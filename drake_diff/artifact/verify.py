@@ -66,6 +66,20 @@ class Verification(ShowsItsRepr):
     not be run again; "broken" where something is not what it was.
 
     That a record holds says that it is true, not that the run was a success: that is `record.verdict`.
+
+    Attributes:
+        directory: What was verified.
+        record: The record in it; None where it cannot be read.
+        problems: A sentence for each file that is not as it was written, and for what does not fit together.
+        comparisons: Every recorded number beside the one that was computed again.
+        not_rerun: What was not run again.
+        undecided: What of it the record's verdict rests on.
+        notes: Versions that differ from those of the record.
+
+    Example:
+        >>> found = dd.verify("artifacts/pendulum_swing_up").require()
+        >>> found.comparisons[2].name, found.comparisons[2].holds
+        ('goal error', True)
     """
 
     directory: Path
