@@ -8,7 +8,7 @@ from helpers.problems import pendulum
 import drake_diff as dd
 from drake_diff.derivatives import analytic
 from drake_diff.exceptions import ModelError
-from drake_diff.optimize.ilqr.expansion import Motion, dynamics_curvature_along
+from drake_diff.optimize.ilqr.expansion import Motion, curvature_along
 
 
 def motion_of(problem, us):
@@ -39,7 +39,7 @@ def test_of_a_pendulum_by_hand(source):
     expected = np.zeros((30, 3, 3))
     slope = h / (1 + h * b / inertia) * g / length * np.sin(motion.xs[:-1, 0])
     expected[:, 0, 0] = (v[:, 1] + h * v[:, 0]) * slope
-    found = dynamics_curvature_along(problem, motion, v)
+    found = curvature_along(problem, motion, v)
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * np.abs(expected).max())
 
 
@@ -51,7 +51,7 @@ def test_of_a_floating_body_with_wheels_by_differences():
     x0[model.nq :] = random.standard_normal(model.nv)
     problem = dd.Problem(model, x0=x0, num_steps=3, running_cost=dd.QuadraticCost(R=np.eye(3)))
     motion, v = motion_of(problem, random.standard_normal((3, 3))), random.standard_normal((3, model.nx))
-    found = dynamics_curvature_along(problem, motion, v)
+    found = curvature_along(problem, motion, v)
     size, e = model.nx + model.nu, 1e-4 * np.eye(model.nx + model.nu)
     for k in range(3):
         z = np.concatenate([motion.xs[k], motion.us[k]])
@@ -70,5 +70,5 @@ def test_it_is_refused_where_spheres_touch(two_spheres):
     cost = dd.QuadraticCost(R=[[1.0]])
     for gap, touches in ((0.1, False), (-0.001, True)):
         problem = dd.Problem(two_spheres(), x0=[0, 0.2 + gap, 0, 0], num_steps=3, running_cost=cost)
-        found = dynamics_curvature_along(problem, motion_of(problem, np.zeros((3, 1))), np.ones((3, 4)))
+        found = curvature_along(problem, motion_of(problem, np.zeros((3, 1))), np.ones((3, 4)))
         assert (found is None) == touches

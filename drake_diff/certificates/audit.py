@@ -440,16 +440,15 @@ def _aligned_faces(place: Place) -> Found:
         angle, gap = _alignment(pair) if pair.contact == "hydroelastic" else (None, np.inf)
         if angle is None:
             continue
-        message = f"faces {angle:.2g} rad from parallel at x, {gap:.3g} m apart: "
+        severity: Severity = "info"
+        told = "tilted now; if they come to lie flat the hydroelastic step jumps"
         if angle <= PARALLEL and gap <= REACH:
-            message += "the hydroelastic step jumps there, and AutoDiffXd gives a finite, plausible, wrong number"
-            yield Finding("error", "aligned_faces", pair.label, message, remedy)
+            severity = "error"
+            told = "the hydroelastic step jumps there, and AutoDiffXd gives a finite, plausible, wrong number"
         elif angle <= NEARLY_PARALLEL:
-            message += "if they meet like this the hydroelastic step jumps"
-            yield Finding("warning", "aligned_faces", pair.label, message, remedy)
-        else:
-            message += "tilted now; if they come to lie flat the hydroelastic step jumps"
-            yield Finding("info", "aligned_faces", pair.label, message, remedy)
+            severity, told = "warning", "if they meet like this the hydroelastic step jumps"
+        message = f"faces {angle:.2g} rad from parallel at x, {gap:.3g} m apart: {told}"
+        yield Finding(severity, "aligned_faces", pair.label, message, remedy)
 
 
 def _alignment(pair: Pair) -> tuple[float | None, float]:

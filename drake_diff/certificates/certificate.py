@@ -16,8 +16,7 @@ from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.differences import ROUNDING, Difference, Function, Many, one_by_one, richardson, sweep_of
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import CertificateError, GradientError, ShapeError
-from drake_diff.model.contact import SEPARATED, Pair, active_modes
-from drake_diff.model.model import Model
+from drake_diff.model.contact import Pair
 
 STEPS = tuple(10.0 ** (-k / 2) for k in range(4, 17))  # 1e-2 ... 1e-8
 RELATIVE_TOLERANCE = 1e-6
@@ -27,9 +26,6 @@ NEGLIGIBLE, NOTHING = 1e-6, 1e-9
 # An iterative solver stops early, and the derivative shows it: measured up to 60 times its tolerance, by row.
 SOLVER_FACTOR = 100.0
 DOUBTFUL = 10.0  # a gap up to this many times that may still be the solver's: undecided, which does not pass
-NEIGHBOURHOOD = 1e-4  # in scaled coordinates: how far away a change of contact mode is looked for
-# A row is touched by one if its change departs from what the derivative predicts by this part of the larger one.
-TOUCHED = 1e-2
 JITTER = 1e-9
 JITTER_CHANGE = 0.1
 VERDICTS = ("agree", "undecided", "not_converged", "disagree", "discontinuous")  # from good to bad
@@ -330,35 +326,3 @@ def _jittery(a: Array, beside: Array, reach: Array, solver_tolerance: float) -> 
     row_size = size.max(axis=1, keepdims=True, initial=0)
     told = change > np.maximum(RESOLVED * reach, SOLVER_FACTOR * solver_tolerance * row_size)
     return told & (change > JITTER_CHANGE * size) & (size > NEGLIGIBLE * row_size)
-
-
-def find_mode_changes(
-    model: Model,
-    f: Callable[[Array], Array],
-    derivative: Array,
-    *,
-    rows: tuple[str, ...],
-    columns: tuple[str, ...],
-    scale: Array,
-    minus: Callable[[Array, Array], Array],
-) -> tuple[ModeChange, ...]:
-    """Displace each of the `columns` by 1e-4 of its scale to both sides and compare the modes of the step `f`.
-
-    `f` takes a scaled displacement (n,) and leaves the double twin at the step; `derivative` (m, n) is by it.
-    """
-    directions = np.eye(derivative.shape[1])
-    centre, found = f(np.zeros(len(directions))), []
-    here = active_modes(model)
-    for j, column in enumerate(columns):
-        for reach in (NEIGHBOURHOOD, -NEIGHBOURHOOD):
-            step = reach * directions[j]
-            change = minus(f(step), centre)
-            there = active_modes(model)
-            predicted = derivative @ step
-            size = np.maximum(np.abs(predicted), np.abs(change))
-            missed = np.abs(change - predicted) > TOUCHED * np.maximum(size, 1e-6 * size.max(initial=0.0))
-            touched = tuple(name for name, miss in zip(rows, missed, strict=True) if miss)
-            for pair in sorted(pair for pair in here.keys() | there.keys() if here.get(pair) != there.get(pair)):
-                before, after = here.get(pair, SEPARATED), there.get(pair, SEPARATED)
-                found.append(ModeChange(pair, before, after, column, float(reach * scale[j]), touched))
-    return tuple(found)

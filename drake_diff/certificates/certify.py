@@ -8,7 +8,7 @@ limit is g3 + d2. An entry has converged if |d2| <= 0.75 |d1| and its first valu
 both changes are below 1 %.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,13 +20,14 @@ from drake_diff.certificates.certificate import (
     JITTER,
     VERDICTS,
     Certificate,
+    ModeChange,
     certify_displacement,
-    find_mode_changes,
     jitter_direction,
 )
 from drake_diff.derivatives.sources import check_method, step_at
 from drake_diff.derivatives.step import StepDerivatives, step_jacobians
 from drake_diff.exceptions import InputError
+from drake_diff.model.contact import SEPARATED, active_modes
 from drake_diff.model.contract import SAP_RELATIVE_TOLERANCE
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, Parameters, ParameterVector, applied, list_parameters, select
@@ -43,6 +44,9 @@ TRUSTED = 0.1  # how far from its limit a gradient may be, relative to it
 STILL = 1e-2  # changes below this part tell no rate
 NEGLIGIBLE = 1e-3  # entries below this part of the largest are judged by its measure
 LIMIT_REACH = 0.05  # [m or rad] a joint limit this near may hold the joint in one of the displaced steps
+NEIGHBOURHOOD = 1e-4  # in scaled coordinates: how far away a change of contact mode is looked for
+# A row is touched by one if its change departs from what the derivative predicts by this part of the larger one.
+TOUCHED = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,12 +151,12 @@ def certify(
             jittered = _move(space, model.nx, point, JITTER * scale * jitter_direction(len(scale)))
             d_beside = step_jacobians(model, vector, jittered[: model.nx], jittered[model.nx :], method)
             beside = on_tangent(jittered, d_beside)
-        derivative, by_point = on_tangent(point, d), space.names + model.input_names
+        derivative = on_tangent(point, d)
         certificate = certify_displacement(
             one_by_one(f),
             derivative,
             rows=space.names,
-            columns=by_point + vector.names,
+            columns=space.names + model.input_names + vector.names,
             scale=scale,
             beside=beside,
             minus=space.minus,
@@ -162,10 +166,32 @@ def certify(
         )
         if not model.contract.contact.collision_pairs:
             return certificate
-        changes = find_mode_changes(
-            model, f, derivative, rows=space.names, columns=by_point, scale=scale, minus=space.minus
-        )
-        return replace(certificate, mode_changes=changes)
+        return replace(certificate, mode_changes=_find_mode_changes(model, space, f, derivative, scale))
+
+
+def _find_mode_changes(
+    model: Model, space: TangentSpace, f: Callable[[Array], Array], derivative: Array, scale: Array
+) -> tuple[ModeChange, ...]:
+    """Displace each state and input by 1e-4 of its scale to both sides and compare the modes of the step `f`.
+
+    `f` takes a scaled displacement (n,) and leaves the double twin at the step; `derivative` (m, n) is by it.
+    """
+    directions = np.eye(derivative.shape[1])
+    centre, found = f(np.zeros(len(directions))), []
+    here = active_modes(model)
+    for j, column in enumerate(space.names + model.input_names):
+        for reach in (NEIGHBOURHOOD, -NEIGHBOURHOOD):
+            step = reach * directions[j]
+            change = space.minus(f(step), centre)
+            there = active_modes(model)
+            predicted = derivative @ step
+            size = np.maximum(np.abs(predicted), np.abs(change))
+            missed = np.abs(change - predicted) > TOUCHED * np.maximum(size, 1e-6 * size.max(initial=0.0))
+            touched = tuple(name for name, miss in zip(space.names, missed, strict=True) if miss)
+            for pair in sorted(pair for pair in here.keys() | there.keys() if here.get(pair) != there.get(pair)):
+                before, after = here.get(pair, SEPARATED), there.get(pair, SEPARATED)
+                found.append(ModeChange(pair, before, after, column, float(reach * scale[j]), touched))
+    return tuple(found)
 
 
 def certify_rollout(

@@ -19,7 +19,7 @@ from pydrake.solvers import (
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, UnknownNameError
-from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch, interrupt_flag
+from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch, ctrl_c
 
 SOLVERS = ("ipopt", "snopt")
 
@@ -40,7 +40,7 @@ def solve_program(
     engine = IpoptSolver() if solver == "ipopt" else SnoptSolver()
     if not (engine.available() and engine.enabled()):
         raise MissingDependencyError(f"the solver {solver} is not in this Drake: take another one, or Drake's wheel")
-    with tempfile.TemporaryDirectory() as folder, interrupt_flag() as interrupted:
+    with tempfile.TemporaryDirectory() as folder, ctrl_c() as interrupted:
         print_file = Path(folder) / "log"
         watch = Watch(limits, interrupted)
         callback = _Callback(program, watch, report)

@@ -18,8 +18,6 @@ from drake_diff.optimize.shooting import ShootingVariables, final_sensitivity
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
 
 NO_EFFECT = 1e-12
-
-
 _STATUSES = {
     Outcome.ITERATION_LIMIT: Status.ITERATION_LIMIT,
     Outcome.TIME_LIMIT: Status.TIME_LIMIT,

@@ -137,7 +137,7 @@ class _Flag(threading.Event):
 
 
 @contextmanager
-def interrupt_flag() -> Iterator[threading.Event]:
+def ctrl_c() -> Iterator[threading.Event]:
     """An event that Ctrl-C sets, in the main thread, until the block ends; that of a block around it, if any."""
     flag = _Flag()
     if threading.current_thread() is not threading.main_thread():

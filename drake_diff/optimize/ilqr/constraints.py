@@ -7,7 +7,6 @@ p J'J of the rows that push is kept (Gauss-Newton), which no constraint can make
 """
 
 from collections.abc import Callable
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -37,6 +36,8 @@ class AugmentedLagrangian:
         self.groups = [_Rows(problem, constraint) for constraint in problem.constraints]
         self.lower = np.concatenate([lower.ravel(), *(g.lower for g in self.groups)])
         self.upper = np.concatenate([upper.ravel(), *(g.upper for g in self.groups)])
+        ends = np.cumsum([lower.size, *(g.size for g in self.groups)]).tolist()
+        self.slices = [slice(start, end) for start, end in pairwise(ends)]  # where the rows of each group are
         self.scale = np.ones(len(self.lower))
         self.multipliers = np.zeros(len(self.lower))
         self.penalty = FIRST_PENALTIES[0]
@@ -80,7 +81,7 @@ class AugmentedLagrangian:
         gradients, hessians = np.zeros((count, n)), np.zeros((count, n, n))
         gradients[:, :nx] = pushes[: xs.size].reshape(xs.shape)
         hessians[:, np.arange(nx), np.arange(nx)] = stiffness[: xs.size].reshape(xs.shape)
-        for group, rows in zip(self.groups, self._slices, strict=True):
+        for group, rows in zip(self.groups, self.slices, strict=True):
             jacobians = self.scale[rows].reshape(group.shape)[:, :, None] * group.jacobians(xs, us)
             gradients[group.knots] += np.einsum("kr,kri->ki", pushes[rows].reshape(group.shape), jacobians)
             stiff = stiffness[rows].reshape(group.shape)[:, :, None] * jacobians
@@ -93,13 +94,8 @@ class AugmentedLagrangian:
         self._choose_scales(xs, us)
         self.multipliers = forces / self.scale
 
-    @cached_property
-    def _slices(self) -> list[slice]:
-        ends = np.cumsum([len(self.lower) - sum(g.size for g in self.groups), *(g.size for g in self.groups)])
-        return [slice(int(a), int(b)) for a, b in pairwise(ends)]
-
     def _choose_scales(self, xs: Array, us: Array) -> None:
-        for group, rows in zip(self.groups, self._slices, strict=True):
+        for group, rows in zip(self.groups, self.slices, strict=True):
             self.scale[rows] = group.scale(xs, us)
 
     def _values(self, xs: Array, us: Array) -> Array:

@@ -118,7 +118,7 @@ def _off_bounds(problem: Problem, us: Array) -> Array:
     return np.where(us == upper, np.nextafter(us, lower), np.where(us == lower, np.nextafter(us, upper), us))
 
 
-def dynamics_curvature_along(problem: Problem, motion: Motion, v: Array) -> Array | None:
+def curvature_along(problem: Problem, motion: Motion, v: Array) -> Array | None:
     """(N, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx); None if contact or a limit acts.
 
     By differences of the Jacobians along every state: in its inputs alone a smooth step is linear. None also if
@@ -162,7 +162,7 @@ class DynamicsCurvature:
         if not self._F.size:
             self.M, self._F = np.zeros_like(problem.hessians), problem.F
             return
-        v = multipliers(problem)
+        v = problem.multipliers()
         r = np.einsum("kij,ki->kj", problem.F - self._F, v) - np.einsum("kij,kj->ki", self.M, dz)
         divisor = np.einsum("ki,ki->k", r, dz)
         length = np.linalg.norm(dz, axis=1)
@@ -170,12 +170,3 @@ class DynamicsCurvature:
         r, divisor = r[safe], divisor[safe]
         self.M[safe] += r[:, :, None] * r[:, None, :] / divisor[:, None, None]
         self._F = problem.F
-
-
-def multipliers(problem: LinearQuadratic) -> Array:
-    """(N, n): v_k = d cost / d x_(k+1), all inputs as they are and all gaps kept."""
-    n, v = problem.num_states, np.empty_like(problem.gaps)
-    v[-1] = problem.final_gradient
-    for k in range(len(v) - 1, 0, -1):
-        v[k - 1] = problem.gradients[k, :n] + problem.F[k, :, :n].T @ v[k]
-    return v

@@ -21,26 +21,11 @@ from drake_diff.exceptions import InputError, SimulationError
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.ilqr.constraints import GROWTH, LARGEST_PENALTY, AugmentedLagrangian
-from drake_diff.optimize.ilqr.expansion import (
-    DynamicsCurvature,
-    Motion,
-    dynamics_curvature_along,
-    expand,
-    jacobians_along,
-    multipliers,
-)
+from drake_diff.optimize.ilqr.expansion import DynamicsCurvature, Motion, curvature_along, expand, jacobians_along
 from drake_diff.optimize.ilqr.riccati import AffinePolicy, LinearQuadratic, slope_along, solve_riccati
 from drake_diff.optimize.problem.cost import CostToGo
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import (
-    FEASIBILITY_TOLERANCE,
-    Iteration,
-    Limits,
-    NlpResult,
-    Outcome,
-    Report,
-    interrupt_flag,
-)
+from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Outcome, Report, ctrl_c
 
 SMALLEST_REGULARIZATION, LARGEST_REGULARIZATION = 1e-8, 1e8
 SUFFICIENT_DECREASE = 1e-4
@@ -96,7 +81,7 @@ def solve_ilqr(
     """
     search = _Search(problem, xs, us, limits, report, patience)
     search.constraints.penalty = max(search.constraints.penalty, least_penalty)
-    with interrupt_flag() as interrupted:
+    with ctrl_c() as interrupted:
         outcome = search.run(interrupted)
     message = f"iLQR: {outcome.value} after {len(search.rows) - 1} steps"
     motion = search.motion
@@ -195,7 +180,7 @@ class _Search:
         model = expand(self.problem, new, self.jacobians, self.constraints)
         self.curvature.update(model, np.hstack([new.xs[:-1] - old.xs[:-1], new.us - old.us]))
         if self.gains[1] > SLOW * self.gains[0]:
-            M = dynamics_curvature_along(self.problem, new, multipliers(model))
+            M = curvature_along(self.problem, new, model.multipliers())
             self.curvature.M = self.curvature.M if M is None else M
         self.expanded = new
         return model

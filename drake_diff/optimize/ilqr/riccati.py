@@ -36,6 +36,14 @@ class LinearQuadratic:
     def num_states(self) -> int:
         return len(self.final_gradient)
 
+    def multipliers(self) -> Array:
+        """(N, n): v_k = d cost / d x_(k+1), all inputs as they are and all gaps kept."""
+        n, v = self.num_states, np.empty_like(self.gaps)
+        v[-1] = self.final_gradient
+        for k in range(len(v) - 1, 0, -1):
+            v[k - 1] = self.gradients[k, :n] + self.F[k, :, :n].T @ v[k]
+        return v
+
 
 @dataclass(frozen=True, eq=False)
 class AffinePolicy:

@@ -34,15 +34,7 @@ from drake_diff.motion.rollout import roll_states
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import (
-    FEASIBILITY_TOLERANCE,
-    Iteration,
-    Limits,
-    NlpResult,
-    Outcome,
-    Report,
-    interrupt_flag,
-)
+from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Outcome, Report, ctrl_c
 from drake_diff.optimize.shooting import ShootingVariables, final_sensitivity
 
 MARGIN = 1e-5  # [m] that a held pair keeps from just touching: differences of 1e-6 then see no jump
@@ -111,7 +103,7 @@ def solve_continuation(
         if report:
             report.say(str(logs[-1]))
 
-    with interrupt_flag() as interrupted:
+    with ctrl_c() as interrupted:
         for contact in stages:
             softer = replace(problem, system=softened(problem.model, contact))
             iterations, tolerance = min(STAGE_ITERATIONS, limits.max_iterations), max(STAGE_TOLERANCE, limits.tolerance)
@@ -247,7 +239,7 @@ def solve_through_jumps(
     sequences together. Raises as `solve_ilqr` does.
     """
     search = _Sequences(problem, limits, report)
-    with interrupt_flag() as interrupted:
+    with ctrl_c() as interrupted:
         result, xs, us = search.run(xs, us, interrupted)
     return replace(result, z=us.ravel(), iterations=tuple(search.rows)), xs, us
 

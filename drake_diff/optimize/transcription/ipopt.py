@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
-from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch, interrupt_flag
+from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch, ctrl_c
 from drake_diff.optimize.transcription.program import TranscribedProgram
 
 OUTCOMES = {
@@ -40,7 +40,7 @@ def solve_ipopt(
     `report` gets a line of progress a few times a second. Ctrl-C ends the solve with the best iterate so far.
     An error that a function of the user's raised is raised again, but that of a simulation or gradient is told.
     """
-    with interrupt_flag() as interrupted:
+    with ctrl_c() as interrupted:
         watch = Watch(limits, interrupted)
         callback = _IterateCallback(program, watch, report)
         options = OPTIONS | program.derivatives(exact) | _options(exact, limits) | {"iteration_callback": callback}
