@@ -354,6 +354,12 @@ def model_from_diagram(diagram: Diagram) -> Model:
 
     The plant may sit at any depth. drake_diff drives its actuation input itself, so that must not be connected.
 
+    Args:
+        diagram: A pydrake Diagram, built.
+
+    Returns:
+        The model; systems other than the plant keep their default state.
+
     Raises:
         InputError: `diagram` is no Diagram.
         ModelError: The plant is continuous, not finalized, has sampled output ports, or has its actuation input

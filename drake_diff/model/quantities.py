@@ -150,6 +150,9 @@ def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfSta
 def center_of_mass(model: Model) -> OfState:
     """The centre of mass of all bodies in the world, as a function of the state.
 
+    Args:
+        model: The model.
+
     Returns:
         x (nx,) -> (3,) [m].
 

@@ -1,0 +1,66 @@
+"""Every public function and class says what it takes and gives, and its example runs."""
+
+import doctest
+import importlib
+import inspect
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.models import ROOT
+
+import drake_diff as dd
+from drake_diff import quantities
+
+OPTIONS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+ROOMS = [path.parent.name for path in sorted(Path(dd.__file__).parent.glob("*/__init__.pyi"))]
+OF_QUANTITIES = ["center_of_mass", "contact_force", "frame_position", "frame_rotation_error", "frame_velocity"]
+
+
+def public():
+    """Each public function and class once, by its full name."""
+    found = {f"dd.{name}": getattr(dd, name) for name in dd.__all__}
+    found |= {f"dd.quantities.{name}": getattr(quantities, name) for name in OF_QUANTITIES}
+    for room in ROOMS:
+        package = importlib.import_module(f"drake_diff.{room}")
+        found |= {f"drake_diff.{room}.{name}": getattr(package, name) for name in package.__all__}
+    once = {}
+    for name, value in found.items():
+        if callable(value) and not any(value is other for other in once.values()):
+            once[name] = value
+    return once
+
+
+PUBLIC = public()
+FUNCTIONS = {name: value for name, value in PUBLIC.items() if inspect.isfunction(value)}
+EXAMPLES = {*FUNCTIONS, *(name for name in PUBLIC if name.startswith("dd."))}  # of what a user calls or makes
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_function_names_each_argument_and_what_it_returns(name):
+    function = FUNCTIONS[name]
+    text = inspect.getdoc(function)
+    for argument in inspect.signature(function).parameters:
+        assert f"{argument}" in text.partition("Args:")[2], argument
+    assert "Returns:" in text or inspect.signature(function).return_annotation is None
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_the_example_runs(name, monkeypatch, tmp_path):
+    (tmp_path / "artifacts").mkdir()
+    for folder in ("models", "examples", "artifacts/pendulum_swing_up"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
+    monkeypatch.chdir(tmp_path)
+    text = inspect.getdoc(PUBLIC[name])
+    test = doctest.DocTestParser().get_doctest(text, {"dd": dd, "np": np}, name, None, 0)
+    assert test.examples or name not in EXAMPLES
+    said = []
+    doctest.DocTestRunner(optionflags=OPTIONS).run(test, out=said.append)
+    assert not said, "".join(said)
+
+
+def test_an_example_that_is_wrong_is_found():
+    test = doctest.DocTestParser().get_doctest(">>> 1 + 1\n3\n", {}, "wrong", None, 0)
+    said = []
+    doctest.DocTestRunner(optionflags=OPTIONS).run(test, out=said.append)
+    assert "Expected" in "".join(said)
