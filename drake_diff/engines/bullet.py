@@ -80,7 +80,12 @@ class PybulletEngine(RigidEngine):
             pose = (list(geometry.pose.translation()), list(_turn(geometry.pose.rotation().matrix())))
             self.owners[geometry.name] = (self.bullet.createMultiBody(0, shape, -1, *pose), -1)
         self._set_contacts()
-        self._find_frames()
+        # Centres of mass of the free bodies and their principal axes, as Bullet has them.
+        bodies = {x.joint.v_start: self.places[i] for i, x in enumerate(self.tree.links) if x.free}
+        found = [self.bullet.getDynamicsInfo(*bodies[v]) for _, v in self.coordinates.free]
+        self.centers = Centers(self.coordinates, tuple(np.array(info[3]) for info in found))
+        self.principal = [rotation(np.array(info[4])[[3, 0, 1, 2]]) for info in found]
+        self.bases = [bodies[v][0] for _, v in self.coordinates.free]
         self.untouched = self.bullet.saveState()
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
@@ -143,6 +148,8 @@ class PybulletEngine(RigidEngine):
         parameters = self.bullet.getPhysicsEngineParameters()
         damping = sorted({self.bullet.getDynamicsInfo(*o)[8] for o in self.owners.values()})
         law = f"springs and dampers of {damping} N s/m, implicit, by sequential impulses"
+        free = ", free bodies by v' of the centre of mass, quaternions by the exponential of h w'"
+        euler = f"semi-implicit Euler, joint damping explicit{free if self.coordinates.free else ''}"
         return EngineContract(
             **{**self._plant_fields(), "time_step": float(parameters["fixedTimeStep"])},
             engine=self.name,
@@ -150,7 +157,7 @@ class PybulletEngine(RigidEngine):
             native_order=tuple(link.joint.joint for link in self.tree.links),
             state="position of the centre of mass, quaternion x y z w of the principal axes; velocity of a free body "
             "linear of its centre of mass then angular, in world",
-            integrator=self._integrator(),
+            integrator=euler if np.any(self.damping) or self.coordinates.free else DRAKES_STEP,
             gravity=tuple(float(parameters[f"gravityAcceleration{axis}"]) for axis in "XYZ"),
             contact_law=law if self.tree.pairs else "none",
             contacts=_read_pairs(self.bullet, self.tree, self.owners),
@@ -166,12 +173,6 @@ class PybulletEngine(RigidEngine):
                 "solver tolerance": "Bullet runs a limited number of iterations and has no tolerance",
             },
         )
-
-    def _integrator(self) -> str:
-        if not np.any(self.damping) and not self.coordinates.free:
-            return DRAKES_STEP
-        free = ", free bodies by v' of the centre of mass, quaternions by the exponential of h w'"
-        return f"semi-implicit Euler, joint damping explicit{free if self.coordinates.free else ''}"
 
     def _build(self, part: range) -> None:
         links = [(i, self.tree.links[i]) for i in part]
@@ -190,24 +191,24 @@ class PybulletEngine(RigidEngine):
         self.owners |= {g.name: self.places[i] for i, g in self.tree.geometries if i in part}
 
     def _set_contacts(self) -> None:
+        """Friction and stiffness of each link that touches are as near to those of Drake's pairs as they can come.
+
+        Where pairs disagree it is the least squares' solution, which the contract shows.
+        """
         for owner in set(self.owners.values()):
             self.bullet.setCollisionFilterGroupMask(*owner, 0, 0)
-        for pair in self.tree.pairs:
-            (a, i), (b, j) = _owners_of(pair, self.owners)
+        pairs = [(_owners_of(pair, self.owners), pair) for pair in self.tree.pairs]
+        for ((a, i), (b, j)), _ in pairs:
             self.bullet.setCollisionFilterPair(a, b, i, j, 1)
-        for owner, (friction, stiffness) in _side_values(self.tree, self.owners).items():
-            values = {**NO_OTHER_FRICTION, **({} if friction is None else {"lateralFriction": friction})}
-            if stiffness is not None:
-                values |= {"contactStiffness": stiffness, "contactDamping": 0.0}
+        friction = split([(x, np.log(max(pair.friction, SMALLEST))) for x, pair in pairs if pair.friction is not None])
+        compliance = split([(x, 1 / max(pair.stiffness, SMALLEST)) for x, pair in pairs if pair.stiffness is not None])
+        for owner in {owner for sides, _ in pairs for owner in sides}:
+            values = dict(NO_OTHER_FRICTION)
+            if owner in friction:
+                values["lateralFriction"] = float(np.exp(friction[owner]))
+            if owner in compliance:
+                values |= {"contactStiffness": 1 / max(compliance[owner], SMALLEST), "contactDamping": 0.0}
             self.bullet.changeDynamics(*owner, **values)
-
-    def _find_frames(self) -> None:
-        """Centres of mass of the free bodies and their principal axes, as Bullet has them."""
-        bodies = {x.joint.v_start: self.places[i] for i, x in enumerate(self.tree.links) if x.free}
-        found = [self.bullet.getDynamicsInfo(*bodies[v]) for _, v in self.coordinates.free]
-        self.centers = Centers(self.coordinates, tuple(np.array(info[3]) for info in found))
-        self.principal = [rotation(np.array(info[4])[[3, 0, 1, 2]]) for info in found]
-        self.bases = [bodies[v][0] for _, v in self.coordinates.free]
 
     def _joints(self) -> Iterator[tuple[Owner, RigidLink]]:
         """Of hinges and slides, with Bullet's places."""
@@ -262,24 +263,6 @@ def _owners_of(pair: PairContract, owners: dict[str, Owner]) -> tuple[Owner, Own
     return a, b
 
 
-def _side_values(tree: RigidLinks, owners: dict[str, Owner]) -> dict[Owner, tuple[float | None, float | None]]:
-    """Friction and stiffness of each link that touches, as near to those of Drake's pairs as they can come.
-
-    None where no pair of the link has one. Where pairs disagree it is the least squares' solution, which the contract
-    shows.
-    """
-    pairs = [(_owners_of(pair, owners), pair) for pair in tree.pairs]
-    friction = split([(x, np.log(max(pair.friction, SMALLEST))) for x, pair in pairs if pair.friction is not None])
-    compliance = split([(x, 1 / max(pair.stiffness, SMALLEST)) for x, pair in pairs if pair.stiffness is not None])
-    return {
-        owner: (
-            float(np.exp(friction[owner])) if owner in friction else None,
-            1 / max(compliance[owner], SMALLEST) if owner in compliance else None,
-        )
-        for owner in {owner for sides, _ in pairs for owner in sides}
-    }
-
-
 def _read_part(bullet: Any, place: Owner) -> tuple[float, Array, Array, Array]:
     """Mass, centre of mass (3,), inertia (3, 3) about it and principal axes (3, 3) of a link, in world."""
     info = bullet.getDynamicsInfo(*place)
@@ -291,16 +274,16 @@ def _read_part(bullet: Any, place: Owner) -> tuple[float, Array, Array, Array]:
 def _read_joint(bullet: Any, place: Owner, link: RigidLink) -> JointContract:
     """Where Bullet is at Drake's q = 0; springs are those of the engine."""
     mass, center, inertia, R = _read_part(bullet, place)
-    kind, axis, anchor, damping, lower, upper = "quaternion_floating", np.zeros(3), center, 0.0, -np.inf, np.inf
-    if place[1] >= 0:
-        info = bullet.getJointInfo(*place)
-        kind, damping, axis = KINDS[info[2]], float(info[6]), R @ info[13]  # the axis is in the principal axes
-        _, above, _, turned = _read_part(bullet, (place[0], info[16]))
-        anchor = above + turned @ info[14]
-        lower, upper = (limit(side) for side in info[8:10]) if info[8] <= info[9] else (lower, upper)
+    name, carried = link.joint.joint, [(mass, center, inertia)]
+    if place[1] < 0:
+        free = "quaternion_floating"
+        return joint_contract(name=name, kind=free, axis=np.zeros(3), anchor=center, carried=carried)
+    info = bullet.getJointInfo(*place)
+    _, above, _, turned = _read_part(bullet, (place[0], info[16]))
+    lower, upper = (limit(side) for side in info[8:10]) if info[8] <= info[9] else (-np.inf, np.inf)
     return joint_contract(
-        name=link.joint.joint, kind=kind, axis=axis, anchor=anchor, carried=[(mass, center, inertia)], damping=damping,
-        armature=0.0, stiffness=link.joint.stiffness, rest=link.joint.rest, lower=lower, upper=upper,
+        name=name, kind=KINDS[info[2]], axis=R @ info[13], anchor=above + turned @ info[14], carried=carried,
+        damping=float(info[6]), stiffness=link.joint.stiffness, rest=link.joint.rest, lower=lower, upper=upper,
     )  # fmt: skip
 
 
@@ -313,12 +296,13 @@ def _read_pairs(bullet: Any, tree: RigidLinks, owners: dict[str, Owner]) -> tupl
             both = a < b and tuple(sorted((owners[a], owners[b]))) in links
             if both and (a, b) not in found and (b, a) not in found:
                 found.append((a, b))
-    return tuple(_pair(names, [bullet.getDynamicsInfo(*owners[name]) for name in names]) for names in found)
-
-
-def _pair(names: tuple[str, str], sides: list[Any]) -> PairContract:
-    a, b = (float(side[9]) for side in sides)
-    return PairContract(names, float(sides[0][1] * sides[1][1]), a * b / (a + b) if min(a, b) > 0 else None)
+    contracts = []
+    for names in found:
+        one, two = (bullet.getDynamicsInfo(*owners[name]) for name in names)
+        k_one, k_two = float(one[9]), float(two[9])
+        stiffness = k_one * k_two / (k_one + k_two) if min(k_one, k_two) > 0 else None
+        contracts.append(PairContract(names, float(one[1] * two[1]), stiffness))
+    return tuple(contracts)
 
 
 def _shape(geometry: Geometry) -> dict[str, Any]:

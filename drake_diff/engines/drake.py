@@ -41,21 +41,22 @@ class DrakeEngine:
         return StepJacobian(found.A, found.B, found.method)
 
     def energy(self, x: ArrayLike) -> float:
-        self._set(finite_array("x", x, (self.model.nx,)))
+        set_state(self.model.double, finite_array("x", x, (self.model.nx,)))
         plant, context = self.model.plant, self.model.double.context
         return float(plant.CalcKineticEnergy(context) + plant.CalcPotentialEnergy(context))
 
     def contact_depth(self, x: ArrayLike) -> float:
-        self._set(finite_array("x", x, (self.model.nx,)))
+        set_state(self.model.double, finite_array("x", x, (self.model.nx,)))
         return penetration(self.model)
 
     def mass_matrix(self, q: ArrayLike) -> Array:
-        self._set(np.concatenate([finite_array("q", q, (self.model.nq,)), np.zeros(self.model.nv)]))
+        q = finite_array("q", q, (self.model.nq,))
+        set_state(self.model.double, np.concatenate([q, np.zeros(self.model.nv)]))
         return np.asarray(self.model.plant.CalcMassMatrix(self.model.double.context))
 
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
         q, v = finite_array("q", q, (self.model.nq,)), finite_array("v", v, (self.model.nv,))
-        self._set(np.concatenate([q, v]))
+        set_state(self.model.double, np.concatenate([q, v]))
         return np.asarray(self.model.double.inverse_dynamics(np.zeros(self.model.nv)) - self.model.double.damping() * v)
 
     @property
@@ -77,6 +78,3 @@ class DrakeEngine:
             limit_law="implicit springs in the step's solver",
             derivatives="by every entry of x and u",
         )
-
-    def _set(self, x: Array) -> None:
-        set_state(self.model.double, x)

@@ -47,7 +47,19 @@ class NewtonEngine(RigidEngine):
         with without_lines(NO_GPU):
             self.newton, self.shapes = _build(self.tree, self.description.gravity)
         self.solver = newton.solvers.SolverFeatherstone(self.newton, update_mass_matrix_interval=1)
-        self._find_places()
+        # Newton's places in Drake's order, and the centres of mass that it uses.
+        q_starts, v_starts = self.newton.joint_q_start.numpy(), self.newton.joint_qd_start.numpy()
+        self.positions, self.dofs = np.zeros(self.nq, dtype=int), np.zeros(self.nv, dtype=int)
+        of_free = {}
+        for i, link in enumerate(self.tree.links):
+            q, v, at_q, at_v = link.joint.q_start, link.joint.v_start, int(q_starts[i]), int(v_starts[i])
+            if link.free:
+                self.positions[q : q + 7] = at_q + np.array([6, 3, 4, 5, 0, 1, 2])
+                self.dofs[v : v + 6] = at_v + np.array([3, 4, 5, 0, 1, 2])
+                of_free[v] = _numbers(self.newton.body_com)[i]
+            else:
+                self.positions[q], self.dofs[v] = at_q, at_v
+        self.centers = Centers(self.coordinates, tuple(of_free[v] for _, v in self.coordinates.free))
         self.laws = {tuple(sorted(self.shapes[name] for name in p.names)): p for p in self.tree.pairs}
         pairs = wp.array(list(self.laws), dtype=wp.vec2i, device="cpu") if self.laws else None
         options = {"broad_phase": "explicit", "shape_pairs_filtered": pairs, "requires_grad": False}
@@ -58,7 +70,8 @@ class NewtonEngine(RigidEngine):
         after = self.newton.state(requires_grad=True)
         contacts = self._contacts(before)
         self.solver.step(before, after, control, contacts, self.time_step)
-        self.status = _status(contacts)
+        found, room = 0 if contacts is None else int(contacts.rigid_contact_count.numpy()[0]), _count(contacts)
+        self.status = "ok" if found <= room else f"{found} contacts, and Newton has room for {room}"
         return self._drakes(after, x, u)
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
@@ -123,6 +136,9 @@ class NewtonEngine(RigidEngine):
         damper, slope = (_listed(getattr(self.newton, f"shape_material_{name}")) for name in ("kd", "kf"))
         springs, dampers = (_listed(getattr(self.newton, f"joint_limit_{name}")) for name in ("ke", "kd"))
         law = f"explicit spring, damper of {damper} N s/m while closing, friction of {slope} N s/m up to mu N"
+        how = ["joint damping explicit"] if np.any(_numbers(self.newton.joint_damping)) else []
+        if self.coordinates.free:
+            how.append("free bodies by v' of the centre of mass, quaternions by their rate, then of norm 1")
         return EngineContract(
             **self._plant_fields(),
             engine=self.name,
@@ -130,7 +146,7 @@ class NewtonEngine(RigidEngine):
             native_order=tuple(self.newton.joint_label),
             state="position of the body's origin, quaternion x y z w after it; velocity of a free body linear of its "
             "centre of mass then angular, in world",
-            integrator=self._integrator(),
+            integrator=", ".join(["semi-implicit Euler", *how]) if how else DRAKES_STEP,
             gravity=floats(self._gravity()),
             contact_law=law if self.pipeline else "none",
             contacts=self.tree.pairs,
@@ -147,32 +163,8 @@ class NewtonEngine(RigidEngine):
             },
         )
 
-    def _integrator(self) -> str:
-        damped = bool(np.any(_numbers(self.newton.joint_damping)))
-        if not damped and not self.coordinates.free:
-            return DRAKES_STEP
-        how = ["semi-implicit Euler", *["joint damping explicit"] * damped]
-        if self.coordinates.free:
-            how.append("free bodies by v' of the centre of mass, quaternions by their rate, then of norm 1")
-        return ", ".join(how)
-
     def _gravity(self) -> Array:
         return np.asarray(_numbers(self.newton.gravity)[0])
-
-    def _find_places(self) -> None:
-        """Newton's places in Drake's order, and the centres of mass that it uses."""
-        q_starts, v_starts = self.newton.joint_q_start.numpy(), self.newton.joint_qd_start.numpy()
-        self.positions, self.dofs = np.zeros(self.nq, dtype=int), np.zeros(self.nv, dtype=int)
-        of_free = {}
-        for i, link in enumerate(self.tree.links):
-            q, v, at_q, at_v = link.joint.q_start, link.joint.v_start, int(q_starts[i]), int(v_starts[i])
-            if link.free:
-                self.positions[q : q + 7] = at_q + np.array([6, 3, 4, 5, 0, 1, 2])
-                self.dofs[v : v + 6] = at_v + np.array([3, 4, 5, 0, 1, 2])
-                of_free[v] = _numbers(self.newton.body_com)[i]
-            else:
-                self.positions[q], self.dofs[v] = at_q, at_v
-        self.centers = Centers(self.coordinates, tuple(of_free[v] for _, v in self.coordinates.free))
 
     def _at(self, q: Array) -> Any:
         return self._given(np.concatenate([q, np.zeros(self.nv)]), np.zeros(self.nu))[0]
@@ -231,18 +223,14 @@ def _build(tree: RigidLinks, gravity: Array) -> tuple[Any, dict[str, int]]:
     """Newton's model, and the number of each geometry's shape in it."""
     builder = newton.ModelBuilder(gravity=tuple(float(g) for g in gravity))
     for part in tree.trees:
-        builder.add_articulation([_add_joint(builder, tree.links[i], _add_link(builder, tree.links[i])) for i in part])
+        joints = []
+        for link in (tree.links[i] for i in part):
+            body = {"mass": link.mass, "com": floats(link.center_of_mass), "inertia": wp.mat33(*floats(link.inertia))}
+            number = builder.add_link(**body, lock_inertia=True, label=link.joint.body)
+            joints.append(_add_joint(builder, link, int(number)))
+        builder.add_articulation(joints)
     shapes = {geometry.name: _add_shape(builder, number, geometry) for number, geometry in tree.geometries}
     return builder.finalize(device="cpu", requires_grad=True, skip_validation_inertia=True), shapes
-
-
-def _add_link(builder: Any, link: RigidLink) -> int:
-    return int(
-        builder.add_link(
-            mass=link.mass, com=floats(link.center_of_mass), inertia=wp.mat33(*floats(link.inertia)), lock_inertia=True,
-            label=link.joint.body,
-        )
-    )  # fmt: skip
 
 
 def _add_joint(builder: Any, link: RigidLink, number: int) -> int:
@@ -318,10 +306,5 @@ def _pose(X: RigidTransform) -> Any:
     return wp.transform(floats(X.translation()), wp.quat(x, y, z, w))
 
 
-def _status(contacts: Any) -> str:
-    found, room = (0, 0) if contacts is None else (int(contacts.rigid_contact_count.numpy()[0]), _count(contacts))
-    return "ok" if found <= room else f"{found} contacts, and Newton has room for {room}"
-
-
 def _count(contacts: Any) -> int:
-    return min(int(contacts.rigid_contact_count.numpy()[0]), int(contacts.rigid_contact_max))
+    return 0 if contacts is None else min(int(contacts.rigid_contact_count.numpy()[0]), int(contacts.rigid_contact_max))

@@ -21,7 +21,7 @@ from drake_diff.engines.common import RigidEngine, principal, shape_of
 from drake_diff.engines.interface import DRAKES_STEP, EngineContract, StepJacobian, floats
 from drake_diff.exceptions import MissingDependencyError, ModelError, NotOfferedError
 from drake_diff.mechanics.coordinates import Centers, rotation, unit
-from drake_diff.mechanics.description import Geometry, RigidLink, RigidLinks, joint_contract
+from drake_diff.mechanics.description import Geometry, RigidLink, joint_contract
 from drake_diff.mechanics.joints import JointContract, PairContract, split
 from drake_diff.model.model import Model
 
@@ -35,7 +35,6 @@ except ImportError as error:
 
 KINDS = {"revolute_unwrapped": "revolute", "prismatic": "prismatic", "undefined": "quaternion_floating"}
 GROUPS = 32  # bits of a collision group
-Pair = tuple[str, str]
 UNLIMITED = 1e6  # [rad/s or m/s] instead of PhysX's 100 and 50
 # PhysX takes a mass [kg] or moment of inertia [kg m^2] of 0 for infinite: massless links and point masses get this.
 SMALLEST = 1e-9
@@ -62,8 +61,15 @@ class SapienEngine(RigidEngine):
 
     def __init__(self, model: Model):
         super().__init__(model)
-        self.pairs, self.adjacent = _touching(self.tree)
-        self.friction, self.groups = _friction_by_shape(self.pairs), groups_by_shape(self.pairs)
+        owner = {geometry.name: number for number, geometry in self.tree.geometries}
+        sides = {pair.names: sorted(owner[name] for name in pair.names) for pair in self.tree.pairs}
+        # A link and its parent never touch in PhysX.
+        self.adjacent = [names for names, (a, b) in sides.items() if a >= 0 and self.tree.links[b].parent == a]
+        self.pairs = tuple(pair for pair in self.tree.pairs if pair.names not in self.adjacent)
+        self.groups = groups_by_shape(self.pairs)
+        # Friction of each shape, as near to those of the pairs as they can come; the contract shows what comes of it.
+        given = [(pair.names, 2 * pair.friction) for pair in self.pairs if pair.friction is not None]
+        self.friction = {name: max(value, 0.0) for name, value in split(given).items()}
         centers = {x.joint.v_start: x.center_of_mass for x in self.tree.links if x.free}
         self.centers = Centers(self.coordinates, tuple(centers[v] for _, v in self.coordinates.free))
 
@@ -108,6 +114,14 @@ class SapienEngine(RigidEngine):
         world = self._world(self._zero(), np.zeros(self.nv))
         joints = {x.joint.v_start: _read_joint(link, x) for link, x in zip(world.links, self.tree.links, strict=True)}
         names = [joint.name for tree in world.trees for joint in tree.joints if joint.type in KINDS]
+        contacts = []
+        for pair in self.pairs:
+            a, b = (_material(self.friction.get(name)).dynamic_friction for name in pair.names)
+            contacts.append(PairContract(pair.names, float(a + b) / 2, None))
+        euler = (
+            "semi-implicit Euler, joint damping implicit, free bodies by v' of the centre of mass, quaternions by the "
+            "exponential of h w', w' scaled to the angular momentum before"
+        )
         return EngineContract(
             **{**self._plant_fields(), "time_step": float(world.system.timestep)},
             engine=self.name,
@@ -115,10 +129,10 @@ class SapienEngine(RigidEngine):
             native_order=tuple(names),
             state="position of the body's origin, quaternion w x y z after it; velocity of a free body linear of its "
             "centre of mass then angular, in world",
-            integrator=self._integrator(),
+            integrator=euler if self.coordinates.free else DRAKES_STEP,
             gravity=floats(world.system.config.gravity),
             contact_law="rigid, Coulomb's friction by patches" if self.pairs else "none",
-            contacts=tuple(PairContract(pair.names, self._friction(pair), None) for pair in self.pairs),
+            contacts=tuple(contacts),
             limit_law="rigid",
             precision="float32",
             reasons={
@@ -130,18 +144,6 @@ class SapienEngine(RigidEngine):
                 "solver tolerance": "PhysX runs a fixed number of iterations",
             },
         )
-
-    def _integrator(self) -> str:
-        if not self.coordinates.free:
-            return DRAKES_STEP
-        return (
-            "semi-implicit Euler, joint damping implicit, free bodies by v' of the centre of mass, quaternions by the "
-            "exponential of h w', w' scaled to the angular momentum before"
-        )
-
-    def _friction(self, pair: PairContract) -> float:
-        a, b = (_material(self.friction.get(name)).dynamic_friction for name in pair.names)
-        return float(a + b) / 2
 
     def _world(self, x: Array, force: Array) -> World:
         """A scene at `x` (nx,), with `force` (nv,) on its joints."""
@@ -197,9 +199,21 @@ class SapienEngine(RigidEngine):
         return found
 
     def _shape(self, geometry: Geometry) -> Any:
-        shape = _bare_shape(geometry, _material(self.friction.get(geometry.name)))
-        shape.set_collision_groups([*self.groups[geometry.name], 0, 0])
-        return shape
+        (kind, sizes), X, material = shape_of(geometry), geometry.pose, _material(self.friction.get(geometry.name))
+        if kind == "Sphere":
+            found = physx.PhysxCollisionShapeSphere(sizes["radius"][0], material)
+        elif kind == "Box":
+            found = physx.PhysxCollisionShapeBox([side / 2 for side in sizes["size"]], material)
+        else:  # PhysX's axis is x, Drake's z
+            X = X @ RigidTransform(RotationMatrix.MakeYRotation(-np.pi / 2), np.zeros(3))
+            if kind == "HalfSpace":
+                found = physx.PhysxCollisionShapePlane(material)
+            else:
+                make = physx.PhysxCollisionShapeCylinder if kind == "Cylinder" else physx.PhysxCollisionShapeCapsule
+                found = make(sizes["radius"][0], sizes["length"][0] / 2, material)
+        found.local_pose = _pose(X)
+        found.set_collision_groups([*self.groups[geometry.name], 0, 0])
+        return found
 
     def _place(self, tree: Any, part: range, q: Array, v: Array, force: Array) -> None:
         tree.set_solver_position_iterations(ITERATIONS)
@@ -231,18 +245,6 @@ class SapienEngine(RigidEngine):
         return self._found("PhysX", q, v, x, u)
 
 
-def _touching(tree: RigidLinks) -> tuple[tuple[PairContract, ...], tuple[Pair, ...]]:
-    """The pairs that PhysX can have, and those between a link and its parent, which never touch in PhysX."""
-    owner = {geometry.name: number for number, geometry in tree.geometries}
-
-    def adjacent(pair: PairContract) -> bool:
-        a, b = sorted(owner[name] for name in pair.names)
-        return a >= 0 and tree.links[b].parent == a
-
-    found = tuple(pair for pair in tree.pairs if not adjacent(pair))
-    return found, tuple(pair.names for pair in tree.pairs if adjacent(pair))
-
-
 def groups_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, tuple[int, int]]:
     """Of each shape its own bit and those of its partners; those with the same partners share a bit. ModelError."""
     names = sorted({name for pair in pairs for name in pair.names})
@@ -256,12 +258,6 @@ def groups_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, tuple[int, int
         for partner in partners[name]:
             masks[name] |= bit[partner]
     return {name: (bit[name], masks[name]) for name in names}
-
-
-def _friction_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, float]:
-    """[1] of each shape, as near to those of the pairs as they can come; the contract shows what comes of it."""
-    given = [(pair.names, 2 * pair.friction) for pair in pairs if pair.friction is not None]
-    return {name: max(value, 0.0) for name, value in split(given).items()}
 
 
 def _read_part(link: Any) -> tuple[float, Array, Array, Array]:
@@ -314,23 +310,6 @@ def _material(friction: float | None) -> Any:
     if friction is None:
         return physx.get_default_material()
     return physx.PhysxMaterial(friction, friction, 0.0)
-
-
-def _bare_shape(geometry: Geometry, material: Any) -> Any:
-    (kind, sizes), X = shape_of(geometry), geometry.pose
-    if kind == "Sphere":
-        found = physx.PhysxCollisionShapeSphere(sizes["radius"][0], material)
-    elif kind == "Box":
-        found = physx.PhysxCollisionShapeBox([side / 2 for side in sizes["size"]], material)
-    else:  # PhysX's axis is x, Drake's z
-        X = X @ RigidTransform(RotationMatrix.MakeYRotation(-np.pi / 2), np.zeros(3))
-        if kind == "HalfSpace":
-            found = physx.PhysxCollisionShapePlane(material)
-        else:
-            make = physx.PhysxCollisionShapeCylinder if kind == "Cylinder" else physx.PhysxCollisionShapeCapsule
-            found = make(sizes["radius"][0], sizes["length"][0] / 2, material)
-    found.local_pose = _pose(X)
-    return found
 
 
 def _pose(X: RigidTransform) -> Any:

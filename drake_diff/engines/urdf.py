@@ -32,7 +32,16 @@ def urdf(description: Description) -> str:
     zero = AtZero(description)
     for geometry in (g for g in description.geometries if shape_of(g)[0] in SHAPES):
         _add_collision(elements[geometry.body], geometry, zero.in_frame(geometry.body) @ geometry.pose)
-    _add_motors(root, description)
+    armature = {x.joint: x.armature for x in description.moving}
+    for name, joint in zip(description.inputs, description.actuated, strict=True):
+        transmission = SubElement(root, "transmission", name=name)
+        SubElement(transmission, "type").text = "transmission_interface/SimpleTransmission"
+        driven = SubElement(transmission, "joint", name=joint)
+        SubElement(driven, "hardwareInterface").text = "EffortJointInterface"
+        motor = SubElement(transmission, "actuator", name=name)
+        # The first motor of a joint has its whole armature.
+        SubElement(motor, "drake:rotor_inertia", value=row(armature.pop(joint, 0.0)))
+        SubElement(motor, "drake:gear_ratio", value="1.0")
     return _text(root)
 
 
@@ -61,7 +70,11 @@ def bullet_urdf(links: Sequence[tuple[int, RigidLink]], geometries: Sequence[tup
                 raise ModelError(f"geometry {geometry.name}: Bullet has half spaces only on the world")
             _add_collision(body, geometry, geometry.pose)
         if not link.free:
-            _add_bullet_joint(root, number, link)
+            parent = "world" if link.parent < 0 else f"link_{link.parent}"
+            joint = _add_joint(root, f"joint_{number}", link.joint.kind, (parent, f"link_{number}"), link.on_parent)
+            limited = np.isfinite(link.joint.lower) or np.isfinite(link.joint.upper)
+            sides = (link.joint.lower, link.joint.upper) if limited else (1.0, -1.0)  # upper below lower: no limit
+            _add_freedom(joint, link.axis, link.joint.damping, UNLIMITED, sides)
     return _text(root)
 
 
@@ -127,14 +140,6 @@ def _tree(description: Description, base: str, links: tuple[Link, ...]) -> tuple
     return root, elements
 
 
-def _add_bullet_joint(root: Element, number: int, link: RigidLink) -> None:
-    parent = "world" if link.parent < 0 else f"link_{link.parent}"
-    joint = _add_joint(root, f"joint_{number}", link.joint.kind, (parent, f"link_{number}"), link.on_parent)
-    limited = np.isfinite(link.joint.lower) or np.isfinite(link.joint.upper)
-    sides = (link.joint.lower, link.joint.upper) if limited else (1.0, -1.0)  # an upper below the lower: no limit
-    _add_freedom(joint, link.axis, link.joint.damping, UNLIMITED, sides)
-
-
 def _add_joint(root: Element, name: str, kind: str, sides: tuple[str, str], X: RigidTransform) -> Element:
     joint = SubElement(root, "joint", name=name, type=kind)
     SubElement(joint, "parent", link=sides[0])
@@ -159,19 +164,6 @@ def _add_inertial(body: Element, mass: float, center: RigidTransform, inertia: A
     SubElement(inertial, "mass", value=row(mass))
     places = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
     SubElement(inertial, "inertia", {name: row(inertia[place]) for name, place in places.items()})
-
-
-def _add_motors(root: Element, description: Description) -> None:
-    """One each, the first of a joint with the whole armature."""
-    armature = {x.joint: x.armature for x in description.moving}
-    for name, joint in zip(description.inputs, description.actuated, strict=True):
-        transmission = SubElement(root, "transmission", name=name)
-        SubElement(transmission, "type").text = "transmission_interface/SimpleTransmission"
-        driven = SubElement(transmission, "joint", name=joint)
-        SubElement(driven, "hardwareInterface").text = "EffortJointInterface"
-        motor = SubElement(transmission, "actuator", name=name)
-        SubElement(motor, "drake:rotor_inertia", value=row(armature.pop(joint, 0.0)))
-        SubElement(motor, "drake:gear_ratio", value="1.0")
 
 
 def _add_collision(body: Element, geometry: Geometry, X: RigidTransform) -> None:
