@@ -1,9 +1,7 @@
 """Models from files and diagrams: what is accepted, what is refused, and what the contract says."""
 
-import doctest
 import json
 import math
-import operator
 import warnings
 
 import numpy as np
@@ -20,38 +18,6 @@ from drake_diff.exceptions import InputError, ModelError, ModelWarning, ShapeErr
 from drake_diff.model.parameters import applied, select
 
 NAMES = sorted(p.name for p in MODELS.iterdir())
-
-
-PUBLIC = [
-    "Model",
-    "Model.changed",
-    "load_model",
-    "model_from_diagram",
-    "step",
-    "list_parameters",
-    "contact_modes",
-    "exceptions",
-    "model",
-    "model.Contract",
-    "model.SoftContact",
-    "model.softened",
-    "quantities",
-    "quantities.frame_position",
-    "quantities.frame_rotation_error",
-    "quantities.frame_velocity",
-    "quantities.center_of_mass",
-    "quantities.contact_force",
-]
-
-
-@pytest.mark.parametrize("name", PUBLIC)
-def test_the_example_in_its_docstring_runs(name, monkeypatch):
-    monkeypatch.chdir(MODELS.parent)
-    finder = doctest.DocTestFinder(recurse=False)
-    found = finder.find(operator.attrgetter(name)(dd), name, globs={"dd": dd, "np": np})
-    assert [len(example.examples) > 0 for example in found] == [True]
-    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
-    assert runner.run(found[0]).failed == 0
 
 
 def test_there_is_a_model_of_each_format():

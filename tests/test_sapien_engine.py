@@ -276,7 +276,7 @@ def test_bad_input_and_what_physx_has_not_are_named(load):
 
 def test_more_groups_than_physx_has_are_refused():
     from drake_diff.engines.physx import groups_by_shape
-    from drake_diff.mechanics.joints import PairContract
+    from drake_diff.mechanics.description import PairContract
 
     chain = tuple(PairContract((f"shape {i}", f"shape {i + 1}"), 0.5, None) for i in range(40))
     with pytest.raises(ModelError, match="32 groups"):

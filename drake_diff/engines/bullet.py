@@ -26,8 +26,15 @@ from drake_diff.engines.interface import DRAKES_STEP, EngineContract, StepJacobi
 from drake_diff.engines.urdf import bullet_urdf
 from drake_diff.exceptions import MissingDependencyError, NotOfferedError
 from drake_diff.mechanics.coordinates import Centers, rotation, unit
-from drake_diff.mechanics.description import Geometry, RigidLink, RigidLinks, joint_contract
-from drake_diff.mechanics.joints import JointContract, PairContract, split
+from drake_diff.mechanics.description import (
+    Geometry,
+    JointContract,
+    PairContract,
+    RigidLink,
+    RigidLinks,
+    joint_contract,
+    split,
+)
 from drake_diff.model.model import Model
 
 try:

@@ -21,8 +21,7 @@ from drake_diff.engines.interface import EngineContract, floats, limit
 from drake_diff.engines.urdf import carried_by, inertial_urdf
 from drake_diff.exceptions import MissingDependencyError, ModelError
 from drake_diff.mechanics.coordinates import euler_acceleration
-from drake_diff.mechanics.description import Description, Link, joint_contract
-from drake_diff.mechanics.joints import JointContract
+from drake_diff.mechanics.description import Description, JointContract, Link, joint_contract
 from drake_diff.model.model import Model
 
 try:

@@ -18,8 +18,7 @@ from drake_diff.engines.common import EulerEngine
 from drake_diff.engines.interface import EngineContract, float_rows, floats
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates, euler_acceleration
-from drake_diff.mechanics.description import joint_contract
-from drake_diff.mechanics.joints import JointContract
+from drake_diff.mechanics.description import JointContract, joint_contract
 from drake_diff.model.model import Model
 
 (X, Y, Z), ORIGIN, NO_INERTIA = np.eye(3), np.zeros(3), np.zeros((3, 3))

@@ -10,7 +10,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.engines.interface import Engine, EngineContract, Precision
 from drake_diff.exceptions import NotOfferedError
-from drake_diff.mechanics.joints import JointContract
+from drake_diff.mechanics.description import JointContract
 
 Verdict = Literal["equal", "mapped", "different"]
 # Two libraries' sums over a tree differ by rounding, magnified by cancellation; a wrong number differs by far more.

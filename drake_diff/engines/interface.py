@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array
-from drake_diff.mechanics.joints import JointContract, PairContract
+from drake_diff.mechanics.description import JointContract, PairContract
 
 Precision = Literal["float64", "float32"]
 DRAKES_STEP = "semi-implicit Euler, joint damping implicit, q' = q + h N(q) v'"

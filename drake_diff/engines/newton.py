@@ -18,8 +18,7 @@ from drake_diff.engines.common import RigidEngine, shape_of, without_lines
 from drake_diff.engines.interface import DRAKES_STEP, UNLIMITED, EngineContract, StepJacobian, floats, limit
 from drake_diff.exceptions import MissingDependencyError, NotOfferedError
 from drake_diff.mechanics.coordinates import Centers, rotation, unit
-from drake_diff.mechanics.description import Geometry, RigidLink, RigidLinks, joint_contract
-from drake_diff.mechanics.joints import JointContract
+from drake_diff.mechanics.description import Geometry, JointContract, RigidLink, RigidLinks, joint_contract
 from drake_diff.model.model import Model
 
 try:

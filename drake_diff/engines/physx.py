@@ -21,8 +21,7 @@ from drake_diff.engines.common import RigidEngine, principal, shape_of
 from drake_diff.engines.interface import DRAKES_STEP, EngineContract, StepJacobian, floats
 from drake_diff.exceptions import MissingDependencyError, ModelError, NotOfferedError
 from drake_diff.mechanics.coordinates import Centers, rotation, unit
-from drake_diff.mechanics.description import Geometry, RigidLink, joint_contract
-from drake_diff.mechanics.joints import JointContract, PairContract, split
+from drake_diff.mechanics.description import Geometry, JointContract, PairContract, RigidLink, joint_contract, split
 from drake_diff.model.model import Model
 
 try:

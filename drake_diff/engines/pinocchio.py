@@ -11,8 +11,7 @@ from drake_diff.engines.common import EulerEngine, PlantEngine
 from drake_diff.engines.interface import EngineContract, floats
 from drake_diff.exceptions import MissingDependencyError
 from drake_diff.mechanics.coordinates import euler_acceleration, native_positions, turn, turn_derivatives, turning
-from drake_diff.mechanics.description import joint_contract
-from drake_diff.mechanics.joints import JointContract
+from drake_diff.mechanics.description import JointContract, joint_contract
 from drake_diff.mechanics.pinocchio_tree import build
 from drake_diff.model.model import Model
 

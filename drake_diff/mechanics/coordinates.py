@@ -64,7 +64,9 @@ class Coordinates:
         """(..., nq, nq) the derivative of N(q) v by q, which does not depend on q, at v (..., nv)."""
         derivative = np.zeros((*v.shape[:-1], self.nq, self.nq))
         for i, j in self.free:
-            derivative[..., i : i + 4, i : i + 4] = 0.5 * _left_product(v[..., j : j + 3])
+            derivative[..., i : i + 4, i : i + 4] = 0.5 * (v[..., j : j + 3] @ _LEFT_PRODUCT).reshape(
+                *v.shape[:-1], 4, 4
+            )
         return derivative
 
     def motion(self, q: Array) -> Array:
@@ -235,14 +237,9 @@ def _times_from_left(q: Array) -> Array:
     return np.asarray((q @ _TIMES_FROM_LEFT).reshape(*q.shape[:-1], 4, 3))
 
 
-def _left_product(w: Array) -> Array:
-    """(..., 4, 4): q -> (0, w) * q."""
-    return np.asarray((w @ _LEFT_PRODUCT).reshape(*w.shape[:-1], 4, 4))
-
-
 # Matrices whose entries are linear in a vector: row i holds the matrix of the vector's entry i, flattened.
 _ONE = np.eye(3)
 _PRODUCT = np.zeros((3, 4, 4))
 _PRODUCT[:, 0, 1:], _PRODUCT[:, 1:, 0], _PRODUCT[:, 1:, 1:] = -_ONE, _ONE, skew(_ONE)
-_LEFT_PRODUCT = _PRODUCT.reshape(3, 16)
+_LEFT_PRODUCT = _PRODUCT.reshape(3, 16)  # of w: q -> (0, w) * q
 _TIMES_FROM_LEFT = np.transpose(_PRODUCT, (2, 1, 0)).reshape(4, 12)

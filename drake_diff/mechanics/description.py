@@ -6,7 +6,7 @@ formulas that go joint by joint; `joint_contracts` gives the same in one frame, 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from pydrake.geometry import Role
@@ -17,13 +17,44 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates
-from drake_diff.mechanics.joints import JointContract, PairContract
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators, bodies, instances, joints, labelled, proximity_property
 
 MOVING = ("revolute", "prismatic", "quaternion_floating")
 SHAPES = ("Sphere", "Box", "Cylinder", "Capsule", "HalfSpace")
+T = TypeVar("T")
 Part = tuple[float, Array, Array]  # mass [kg], centre of mass (3,) [m], inertia (3, 3) about it [kg m^2]
+
+
+@dataclass(frozen=True)
+class JointContract:
+    """One joint and what it carries by welds, in the world frame where q = 0 (a free body at the origin, unturned).
+
+    Axis and anchor of all joints in one configuration, with masses and inertias there, are the whole tree.
+    """
+
+    name: str
+    kind: str  # revolute, prismatic, quaternion_floating
+    axis: tuple[float, ...]  # unit; zero for a free body
+    anchor: tuple[float, ...]  # a point on the axis [m], nearest to the origin; zero for a slide or a free body
+    mass: float  # [kg]
+    center_of_mass: tuple[float, ...]  # [m]
+    inertia: tuple[float, ...]  # xx yy zz xy xz yz about it [kg m^2]
+    damping: float = 0.0  # [N s/m or N m s/rad]
+    armature: float = 0.0  # what is added to the diagonal of M: rotor inertia times gear ratio squared
+    stiffness: float = 0.0  # of a spring [N/m or N m/rad]
+    rest: float = 0.0  # its rest position [m or rad]
+    lower: float = -np.inf  # of the position
+    upper: float = np.inf
+
+
+@dataclass(frozen=True)
+class PairContract:
+    """Two geometries that may touch; None is a value that the model does not give."""
+
+    names: tuple[str, str]
+    friction: float | None
+    stiffness: float | None  # [N/m], of both sides together
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,14 +394,9 @@ def joint_contract(*, kind: str, axis: Array, anchor: Array, carried: list[Part]
     i, j = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
     on_axis = anchor - axis * (axis @ anchor) if kind == "revolute" else np.zeros(3)
     numbers = [tuple(float(n) for n in values) for values in (axis, on_axis, com, total[i, j])]
+    axis_, anchor_, center, inertia = numbers
     return JointContract(
-        kind=kind,
-        axis=numbers[0],
-        anchor=numbers[1],
-        mass=mass,
-        center_of_mass=numbers[2],
-        inertia=numbers[3],
-        **rest,
+        kind=kind, axis=axis_, anchor=anchor_, mass=mass, center_of_mass=center, inertia=inertia, **rest
     )
 
 
@@ -383,3 +409,14 @@ def merged(parts: list[Part]) -> Part:
         arm = c - com
         total += inertia + m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     return mass, com, total
+
+
+def split(given: Sequence[tuple[tuple[T, T], float]]) -> dict[T, float]:
+    """s with s_a + s_b = the value of each pair (a, b): the least squares' solution, the smallest where many are."""
+    found = list(dict.fromkeys(side for pair, _ in given for side in pair))
+    sums = np.zeros((len(given), len(found)))
+    for row, (pair, _) in zip(sums, given, strict=True):
+        for side in pair:
+            row[found.index(side)] += 1.0
+    values = np.linalg.lstsq(sums, np.array([value for _, value in given]), rcond=None)[0] if given else []
+    return dict(zip(found, (float(value) for value in values), strict=True))

@@ -24,13 +24,16 @@ def build(links: tuple[Link, ...], gravity: Array) -> tuple[Any, float]:
     model, fixed = pin.Model(), 0.0
     model.gravity.linear = gravity
     carrier: dict[str, tuple[int, Any]] = {"world": (0, pin.SE3.Identity())}
+    kinds = {"revolute": pin.JointModelRevoluteUnaligned, "prismatic": pin.JointModelPrismaticUnaligned}
     for link in links:
         parent, pose = carrier[link.parent]
         frame, in_frame = pose * _pose(link.on_parent), _pose(link.on_child.inverse())
         if link.kind == "weld":
             carrier[link.body] = (parent, frame * in_frame)
         else:
-            carrier[link.body] = (model.addJoint(parent, _joint(link), frame, link.joint), in_frame)
+            kind = kinds.get(link.kind)
+            joint = kind(link.axis / np.linalg.norm(link.axis)) if kind else pin.JointModelFreeFlyer()
+            carrier[link.body] = (model.addJoint(parent, joint, frame, link.joint), in_frame)
         number, pose = carrier[link.body]
         model.appendBodyToJoint(number, pin.Inertia(link.mass, link.center_of_mass, link.inertia), pose)
         if number == 0:
@@ -39,13 +42,6 @@ def build(links: tuple[Link, ...], gravity: Array) -> tuple[Any, float]:
     if list(model.idx_vs)[1:] != starts:
         raise ModelError(f"Pinocchio's joints: expected them to start at {starts} in v, got {list(model.idx_vs)[1:]}")
     return model, fixed
-
-
-def _joint(link: Link) -> Any:
-    if link.kind == "quaternion_floating":
-        return pin.JointModelFreeFlyer()
-    kind = pin.JointModelRevoluteUnaligned if link.kind == "revolute" else pin.JointModelPrismaticUnaligned
-    return kind(link.axis / np.linalg.norm(link.axis))
 
 
 def _pose(X: RigidTransform) -> Any:

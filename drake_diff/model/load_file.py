@@ -19,25 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import (
-    AddCompliantHydroelasticProperties,
-    AddRigidHydroelasticProperties,
-    Box,
-    Capsule,
-    CollisionFilterDeclaration,
-    Convex,
-    Cylinder,
-    Ellipsoid,
-    GeometrySet,
-    HalfSpace,
-    Mesh,
-    ProximityProperties,
-    Role,
-    RoleAssign,
-    SceneGraph,
-    Shape,
-    Sphere,
-)
+from pydrake import geometry as pg
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import ContactModel, MultibodyPlant
@@ -69,9 +51,8 @@ def read_into(plant: MultibodyPlant, path: Path) -> tuple[str, ...]:
     with _drake_warnings(notes):
         try:
             # package://NAME/ is the nearest folder called NAME above the file.
-            for name in sorted(
-                set(re.findall(r"(?:package|model)://([^/\"<>\s]+)/", path.read_text(errors="replace")))
-            ):
+            packages = re.findall(r"(?:package|model)://([^/\"<>\s]+)/", path.read_text(errors="replace"))
+            for name in sorted(set(packages)):
                 folder = next((p for p in path.resolve().parents if p.name == name), None)
                 if folder is not None and not parser.package_map().Contains(name):
                     parser.package_map().Add(name, str(folder))
@@ -157,7 +138,7 @@ HYDROELASTIC_SHAPES = MEETS_A_SPHERE | {"Ellipsoid", "Convex", "Mesh"}
 CONTACT_MODELS = ("point", "hydroelastic", "hydroelastic_with_fallback")
 
 
-def autodiff_supports(shape_a: Shape, shape_b: Shape, contact_model: str) -> bool:
+def autodiff_supports(shape_a: pg.Shape, shape_b: pg.Shape, contact_model: str) -> bool:
     """Whether the AutoDiffXd step takes this pair of touching shapes, as measured with Drake 1.51 and 1.58.
 
     For the two hydroelastic models the shapes have the properties that the route "hydroelastic" gives them.
@@ -171,11 +152,10 @@ def autodiff_supports(shape_a: Shape, shape_b: Shape, contact_model: str) -> boo
     return shapes <= HYDROELASTIC_SHAPES and shapes != {"HalfSpace"}
 
 
-def replace_collision_geometry(plant: MultibodyPlant, scene_graph: SceneGraph, route: str) -> tuple[str, ...]:
+def replace_collision_geometry(plant: MultibodyPlant, scene_graph: pg.SceneGraph, route: str) -> tuple[str, ...]:
     """Change what `plant` collides with, so that AutoDiffXd can step it; a sentence for each change.
 
-    Call it when every geometry is there and before plant.Finalize(); `scene_graph` is what AddMultibodyPlant
-    returned beside the plant. Masses, inertias and what is drawn stay as they are. `route` is one of
+    To be called when every geometry is there. Masses, inertias and what is drawn stay as they are. `route` is one of
 
     - "corner_spheres": each box, cylinder and capsule on a body that can move becomes spheres inside it;
     - "hydroelastic": each geometry without hydroelastic properties gets compliant ones, a half space rigid
@@ -201,7 +181,7 @@ def replace_collision_geometry(plant: MultibodyPlant, scene_graph: SceneGraph, r
     )
 
 
-def _to_corner_spheres(plant: MultibodyPlant, scene_graph: SceneGraph) -> tuple[str, ...]:
+def _to_corner_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
     inspector = scene_graph.model_inspector()
     found = _collision_geometries(plant, scene_graph)
     welded = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
@@ -214,21 +194,23 @@ def _to_corner_spheres(plant: MultibodyPlant, scene_graph: SceneGraph) -> tuple[
     notes = []
     for (body, geometry), stays in zip(found, fixed, strict=True):
         name, shape = f"{inspector.GetName(geometry)} on {body.name()}", inspector.GetShape(geometry)
-        if isinstance(shape, Convex | Ellipsoid | Mesh):
+        if isinstance(shape, pg.Convex | pg.Ellipsoid | pg.Mesh):
             notes.append(
                 f"{name}: a {type(shape).__name__} stays as it is, and AutoDiffXd refuses every point contact with it; "
                 "take the route hydroelastic or differences where something can touch it."
             )
-        elif not stays and isinstance(shape, Box | Capsule | Cylinder):
-            became[geometry] = _replace(plant, scene_graph, body, geometry, shape)
-            notes.append(_what_became(name, shape))
+        elif not stays and isinstance(shape, pg.Box | pg.Capsule | pg.Cylinder):
+            became[geometry], note = _replace(plant, scene_graph, body, geometry, shape)
+            notes.append(f"{name}: {note}")
     for a, b in filtered:
-        declaration = CollisionFilterDeclaration().ExcludeBetween(GeometrySet(became[a]), GeometrySet(became[b]))
+        declaration = pg.CollisionFilterDeclaration().ExcludeBetween(
+            pg.GeometrySet(became[a]), pg.GeometrySet(became[b])
+        )
         scene_graph.collision_filter_manager().Apply(declaration)
     return tuple(notes)
 
 
-def _collision_geometries(plant: MultibodyPlant, scene_graph: SceneGraph) -> list[tuple[Any, Any]]:
+def _collision_geometries(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> list[tuple[Any, Any]]:
     """The body and the id of every rigid geometry of the plant that has the proximity role.
 
     Not by plant.GetCollisionGeometriesForBody: its ids live in the plant's own list, which moves when it grows.
@@ -239,25 +221,33 @@ def _collision_geometries(plant: MultibodyPlant, scene_graph: SceneGraph) -> lis
         (body, geometry)
         for body, frame in frames
         if frame is not None
-        for geometry in inspector.GetGeometries(frame, Role.kProximity)
+        for geometry in inspector.GetGeometries(frame, pg.Role.kProximity)
         if inspector.BelongsToSource(geometry, source) and not inspector.IsDeformableGeometry(geometry)
     ]
 
 
-def _replace(plant: MultibodyPlant, scene_graph: SceneGraph, body: Any, geometry: Any, shape: Any) -> list[Any]:
-    """Spheres in place of a geometry, which loses its proximity role; their ids."""
+def _replace(
+    plant: MultibodyPlant, scene_graph: pg.SceneGraph, body: Any, geometry: Any, shape: Any
+) -> tuple[list[Any], str]:
+    """Spheres in place of a geometry, which loses its proximity role; their ids, and what became of it."""
     inspector = scene_graph.model_inspector()
     X_BG = RigidTransform(inspector.GetPoseInFrame(geometry))
-    properties = ProximityProperties(inspector.GetProximityProperties(geometry))
+    properties = pg.ProximityProperties(inspector.GetProximityProperties(geometry))
     name = inspector.GetName(geometry).removeprefix(f"{plant.GetModelInstanceName(body.model_instance())}::")
-    scene_graph.RemoveRole(plant.get_source_id(), geometry, Role.kProximity)
+    scene_graph.RemoveRole(plant.get_source_id(), geometry, pg.Role.kProximity)
     radius, centres = _spheres(shape)
-    return [
-        plant.RegisterCollisionGeometry(
-            body, X_BG @ RigidTransform(p_GS), Sphere(radius), f"{name}_corner_{i}", properties
-        )
-        for i, p_GS in enumerate(centres)
-    ]
+    spheres = []
+    for i, p_GS in enumerate(centres):
+        pose, corner = X_BG @ RigidTransform(p_GS), f"{name}_corner_{i}"
+        spheres.append(plant.RegisterCollisionGeometry(body, pose, pg.Sphere(radius), corner, properties))
+    became = f"a {type(shape).__name__.lower()} became {len(centres)} spheres of radius {radius:.4g} m"
+    stiffness = "each with the stiffness of the whole, as every contact point has its own spring"
+    if isinstance(shape, pg.Capsule):
+        return spheres, f"{became}, its ends ({stiffness}); nothing touches between them."
+    if isinstance(shape, pg.Box):
+        where = f"in its corners ({stiffness}: a face rests on 4 springs)"
+        return spheres, f"{became} {where}; edges and faces between them are open."
+    return spheres, f"{became} along its rims, which is approximate ({stiffness}); it rolls like a polygon."
 
 
 def _spheres(shape: Any) -> tuple[float, list[Array]]:
@@ -266,9 +256,9 @@ def _spheres(shape: Any) -> tuple[float, list[Array]]:
     Each touches the surface from inside: three faces of a box, a cap and the side of a cylinder. Those of a
     capsule are its two ends.
     """
-    if isinstance(shape, Capsule):
+    if isinstance(shape, pg.Capsule):
         return shape.radius(), [np.array([0, 0, z * shape.length() / 2]) for z in (-1, 1)]
-    if isinstance(shape, Box):
+    if isinstance(shape, pg.Box):
         half = np.asarray(shape.size()) / 2
         radius = CORNER_RADIUS * 2 * float(np.min(half))
         return radius, [np.array(signs) * (half - radius) for signs in product((-1, 1), repeat=3)]
@@ -278,45 +268,32 @@ def _spheres(shape: Any) -> tuple[float, list[Array]]:
     return radius, [np.array([ring * np.cos(a), ring * np.sin(a), z * height]) for z in (-1, 1) for a in angles]
 
 
-def _what_became(name: str, shape: Any) -> str:
-    radius, centres = _spheres(shape)
-    start = f"{name}: a {type(shape).__name__.lower()} became {len(centres)} spheres of radius {radius:.4g} m"
-    stiffness = "each with the stiffness of the whole, as every contact point has its own spring"
-    if isinstance(shape, Capsule):
-        return f"{start}, its ends ({stiffness}); nothing touches between them."
-    if isinstance(shape, Box):
-        return (
-            f"{start} in its corners ({stiffness}: a face rests on 4 springs); edges and faces between them are open."
-        )
-    return f"{start} along its rims, which is approximate ({stiffness}); it rolls like a polygon."
-
-
-def _to_hydroelastic(plant: MultibodyPlant, scene_graph: SceneGraph) -> tuple[str, ...]:
+def _to_hydroelastic(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
     if plant.get_contact_model() == ContactModel.kPoint:
         expected = "hydroelastic or hydroelastic_with_fallback, as the route is hydroelastic"
         raise InputError("contact_model", got="point", expected=expected)
     inspector, notes = scene_graph.model_inspector(), []
     for body, geometry in _collision_geometries(plant, scene_graph):
         name = f"{inspector.GetName(geometry)} on {body.name()}"
-        properties = ProximityProperties(inspector.GetProximityProperties(geometry))
+        properties = pg.ProximityProperties(inspector.GetProximityProperties(geometry))
         if properties.HasProperty("hydroelastic", "compliance_type"):
             notes.append(f"{name}: keeps its own hydroelastic properties.")
             continue
         box = inspector.GetObbInGeometryFrame(geometry)
-        if isinstance(inspector.GetShape(geometry), HalfSpace) or box is None:
-            AddRigidHydroelasticProperties(properties)
+        if isinstance(inspector.GetShape(geometry), pg.HalfSpace) or box is None:
+            pg.AddRigidHydroelasticProperties(properties)
             became = "rigid hydroelastic, as a compliant half space has no contact with a compliant body"
         else:  # a modulus or hint of its own stays
             hint = _taken(properties, "resolution_hint", float(np.min(box.half_width())))
             modulus = _taken(properties, "hydroelastic_modulus", HYDROELASTIC_MODULUS)
-            AddCompliantHydroelasticProperties(hint, modulus, properties)
+            pg.AddCompliantHydroelasticProperties(hint, modulus, properties)
             became = f"compliant hydroelastic, modulus {modulus:.4g} Pa, resolution {hint:.4g} m"
-        scene_graph.AssignRole(plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
+        scene_graph.AssignRole(plant.get_source_id(), geometry, properties, pg.RoleAssign.kReplace)
         notes.append(f"{name}: became {became}.")
     return tuple(notes)
 
 
-def _taken(properties: ProximityProperties, name: str, default: float) -> float:
+def _taken(properties: pg.ProximityProperties, name: str, default: float) -> float:
     """A hydroelastic property that a geometry has already, taken out of its properties, or the default."""
     value = float(properties.GetPropertyOrDefault("hydroelastic", name, default))
     properties.RemoveProperty("hydroelastic", name)

@@ -84,18 +84,8 @@ def _bodies(model: Model) -> dict[str, Any]:
     return labelled(bodies(model.plant))
 
 
-def _heavy_bodies(model: Model) -> dict[str, Any]:
-    """A frame without mass has no inertia: setting it would end the process."""
-    return {label: body for label, body in _bodies(model).items() if body.default_mass() > 0}
-
-
-def _damped_joints(model: Model) -> dict[str, Any]:
-    return {k: j for k, j in labelled(joints(model.plant)).items() if len(j.default_damping_vector()) == 1}
-
-
-def _offset_joints(model: Model) -> dict[str, Any]:
-    moving = {k: j for k, j in labelled(joints(model.plant)).items() if not isinstance(j, WeldJoint)}
-    return {label: joint for label, joint in moving.items() if isinstance(joint.frame_on_parent(), FixedOffsetFrame)}
+def _joints(model: Model) -> dict[str, Any]:
+    return labelled(joints(model.plant))
 
 
 def _springs(plant: Any, kind: Any) -> dict[str, Any]:
@@ -119,10 +109,6 @@ def _actuators(model: Model) -> dict[str, Any]:
     return labelled(actuators(model.plant))
 
 
-def _controlled(model: Model) -> dict[str, Any]:
-    return {label: actuator for label, actuator in _actuators(model).items() if actuator.has_controller()}
-
-
 def geometries_of(twin: Twin) -> dict[str, list[Any]]:
     """Collision geometries by the label of a body, and one by one."""
     inspector, plant = twin.inspector, twin.plant
@@ -138,14 +124,12 @@ def geometries_of(twin: Twin) -> dict[str, list[Any]]:
     return found
 
 
-def _central_inertia(body: Any) -> list[float]:
+def _read_inertia(body: Any) -> list[float] | None:
+    if not body.default_mass() > 0:
+        return None  # a frame without mass has no inertia: setting it would end the process
     inertia = body.default_spatial_inertia()
     about_com = inertia.Shift(inertia.get_com()).CalcRotationalInertia()
     return [*about_com.get_moments(), *about_com.get_products()]
-
-
-def _write_center_of_mass(twin: Twin, label: str, value: Values) -> None:
-    twin.body(label).SetCenterOfMassInBodyFrame(twin.context, value)
 
 
 def _write_inertia(twin: Twin, label: str, value: Values) -> None:
@@ -158,12 +142,16 @@ def _write_inertia(twin: Twin, label: str, value: Values) -> None:
     )
 
 
-def _write_damping(twin: Twin, label: str, value: Values) -> None:
-    twin.joint(label).SetDampingVector(twin.context, value)
+def _read_damping(joint: Any) -> Any:
+    damping = joint.default_damping_vector()
+    return damping if len(damping) == 1 else None
 
 
 def _read_offset(joint: Any) -> Any:
-    return joint.frame_on_parent().GetFixedPoseInBodyFrame().translation()
+    frame = joint.frame_on_parent()
+    if isinstance(joint, WeldJoint) or not isinstance(frame, FixedOffsetFrame):
+        return None
+    return frame.GetFixedPoseInBodyFrame().translation()
 
 
 def _write_offset(twin: Twin, label: str, value: Values) -> None:
@@ -175,11 +163,11 @@ def _write_offset(twin: Twin, label: str, value: Values) -> None:
     frame.SetPoseInParentFrame(twin.context, pose)
 
 
-def _setter(element: Callable[[Twin, str], Any], name: str) -> Write:
-    """Write a number by the method of Drake's element that is called `name`."""
+def _setter(element: Callable[[Twin, str], Any], name: str, *, vector: bool = False) -> Write:
+    """Write a number, or a vector, by the method of Drake's element that is called `name`."""
 
     def write(twin: Twin, label: str, value: Values) -> None:
-        getattr(element(twin, label), name)(twin.context, value[0])
+        getattr(element(twin, label), name)(twin.context, value if vector else value[0])
 
     return write
 
@@ -205,10 +193,10 @@ def _gain(quantity: str, which: str, unit: tuple[str, str]) -> Kind:
         gains[which] = float(value[0])
         actuator.set_controller_gains(PdControllerGains(**gains))
 
-    def read(actuator: Any) -> float:
-        return float(getattr(actuator.get_controller_gains(), which))
+    def read(actuator: Any) -> float | None:
+        return float(getattr(actuator.get_controller_gains(), which)) if actuator.has_controller() else None
 
-    return Kind(quantity, DIFFERENCE, _controlled, unit, read, write, positive=True, on_plant=True)
+    return Kind(quantity, DIFFERENCE, _actuators, unit, read, write, positive=True, on_plant=True)
 
 
 def _read_gravity(model: Model) -> Any:
@@ -222,16 +210,19 @@ def _write_gravity(twin: Twin, label: str, value: Values) -> None:
         twin.added["gravity"] = GravityChange(value - own)
 
 
+_set_center_of_mass = _setter(Twin.body, "SetCenterOfMassInBodyFrame", vector=True)
+_set_damping = _setter(Twin.joint, "SetDampingVector", vector=True)
+
 # In the order of writing: what an earlier one moves along, a later one sets.
 MECHANISM_KINDS = (
     # A plant keeps its time step, so nothing is written: another model stands in (`parameters.applied`).
     Kind("time_step", DIFFERENCE, _rebuildable, "s", attrgetter("time_step"), lambda *_: None, positive=True),
     Kind("gravity", CHAIN_RULE, _taking_forces, "m/s^2", _read_gravity, _write_gravity, on_plant=True),
     Kind("mass", AUTODIFF, _bodies, "kg", get("default_mass"), _setter(Twin.body, "SetMass"), positive=True),
-    Kind("center_of_mass", AUTODIFF, _bodies, "m", get("default_com"), _write_center_of_mass),
-    Kind("inertia", AUTODIFF, _heavy_bodies, "kg m^2", _central_inertia, _write_inertia),
-    Kind("damping", AUTODIFF, _damped_joints, DAMPING, get("default_damping_vector"), _write_damping, positive=True),
-    Kind("offset", AUTODIFF, _offset_joints, "m", _read_offset, _write_offset),
+    Kind("center_of_mass", AUTODIFF, _bodies, "m", get("default_com"), _set_center_of_mass),
+    Kind("inertia", AUTODIFF, _bodies, "kg m^2", _read_inertia, _write_inertia),
+    Kind("damping", AUTODIFF, _joints, DAMPING, _read_damping, _set_damping, positive=True),
+    Kind("offset", AUTODIFF, _joints, "m", _read_offset, _write_offset),
     Kind(
         "spring_stiffness",
         AUTODIFF,
@@ -290,15 +281,11 @@ def _contact_kind(quantity: str, unit: str, read: Callable[[Any, Any], Any], cha
     return Kind(quantity, DIFFERENCE, values, unit, lambda v: v.pop() if len(v) == 1 else None, write, positive=True)
 
 
-def _change_property(quantity: str) -> Callable[..., None]:
-    def change(twin: Twin, geometry: Any, value: float, root: Any) -> None:
-        properties = ProximityProperties(twin.inspector.GetProximityProperties(geometry))
-        properties.UpdateProperty(
-            *PROXIMITY[quantity], CoulombFriction(value, value) if quantity == "friction" else value
-        )
-        twin.scene_graph.AssignRole(root, twin.plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
-
-    return change
+def _change_property(twin: Twin, geometry: Any, value: float, root: Any, *, quantity: str) -> None:
+    properties = ProximityProperties(twin.inspector.GetProximityProperties(geometry))
+    friction_or_number = CoulombFriction(value, value) if quantity == "friction" else value
+    properties.UpdateProperty(*PROXIMITY[quantity], friction_or_number)
+    twin.scene_graph.AssignRole(root, twin.plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
 
 
 def _read_radius(inspector: Any, geometry: Any) -> float | None:
@@ -312,10 +299,12 @@ def _change_radius(twin: Twin, geometry: Any, radius: float, root: Any) -> None:
     twin.scene_graph.ChangeShape(root, twin.plant.get_source_id(), geometry, new)
 
 
+def _property_kind(quantity: str, unit: str) -> Kind:
+    read = partial(proximity_property, quantity=quantity)
+    return _contact_kind(quantity, unit, read, partial(_change_property, quantity=quantity))
+
+
 CONTACT_KINDS = (
-    *(
-        _contact_kind(quantity, unit, partial(proximity_property, quantity=quantity), _change_property(quantity))
-        for quantity, unit in zip(PROXIMITY, ("1", "N/m", "s/m", "s", "Pa"), strict=True)
-    ),
+    *map(_property_kind, PROXIMITY, ("1", "N/m", "s/m", "s", "Pa")),
     _contact_kind("radius", "m", _read_radius, _change_radius),
 )

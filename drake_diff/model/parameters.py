@@ -170,31 +170,28 @@ class ParameterVector:
         wanted = np.zeros(len(self.values), dtype=bool)
         wanted[entries] = True
         for p, s in self._pairs:
-            if wanted[s].any():
-                scale[s] = self._room(p, self.values[s])
+            value = self.values[s]
+            if not wanted[s].any():
+                continue
+            if p.kind.quantity == "inertia":
+                scale[s] = room_of_inertia(value)
+                if scale[s][0] <= 0:
+                    expected = (
+                        "an inertia that may change a little and stay possible, which that of a point or a rod may not"
+                    )
+                    raise InputError(p.name, got=value, expected=expected)
+            elif not p.kind.positive:
+                scale[s] = np.maximum(1.0, np.abs(value))
+            elif np.all(value > 0):
+                scale[s] = value
+            else:
+                expected = "a value above 0, so that differences can go both ways; give one by parameters={name: value}"
+                raise InputError(p.name, got=float(value[0]), expected=expected)
         return scale[entries]
 
     @property
     def _pairs(self) -> Iterator[tuple[Parameter, slice]]:
         return zip(self.parameters, self.slices, strict=True)
-
-    @staticmethod
-    def _room(p: Parameter, value: Array) -> Array:
-        if p.kind.quantity == "inertia":
-            room = room_of_inertia(value)
-            if room <= 0:
-                expected = (
-                    "an inertia that may change a little and stay possible, which that of a point or a rod may not"
-                )
-                raise InputError(p.name, got=value, expected=expected)
-            return np.full(6, room)
-        if p.kind.positive and not np.all(value > 0):
-            raise InputError(
-                p.name,
-                got=float(value[0]),
-                expected="a value above 0, so that differences can go both ways; give one by parameters={name: value}",
-            )
-        return np.array(value) if p.kind.positive else np.maximum(1.0, np.abs(value))
 
 
 Parameters = Sequence[str] | Mapping[str, Any] | ParameterVector
@@ -218,7 +215,11 @@ def select(model: Model, parameters: Parameters) -> ParameterVector:
         if name not in known:
             raise UnknownNameError("parameter", got=name, known=known)
     found = tuple(known[name] for name in names)
-    _check_overlap(found)
+    for p in found:
+        whole = f"{p.label.rsplit('/', 1)[0]}.{p.kind.quantity}"
+        if p.kind in CONTACT_KINDS and "/" in p.label and whole in names:
+            expected = "only one of them, as the first sets the second too"
+            raise InputError("parameters", got=f"{whole} and {p.name}", expected=expected)
     given = parameters if isinstance(parameters, Mapping) else {}
     values = [_check_value(p, given[p.name]) if p.name in given else p.value for p in found]
     return ParameterVector(model, found, frozen(np.concatenate(values)))
@@ -231,17 +232,6 @@ def _check_value(p: Parameter, given: Any) -> Array:
     if p.kind.quantity == "inertia" and room_of_inertia(value) < 0:
         raise InputError(p.name, got=given, expected="an inertia that a distribution of mass can have")
     return value
-
-
-def _check_overlap(parameters: Sequence[Parameter]) -> None:
-    """A body's contact and that of one of its geometries are not independent."""
-    names = {p.name for p in parameters}
-    for p in parameters:
-        whole = f"{p.label.rsplit('/', 1)[0]}.{p.kind.quantity}"
-        if p.kind in CONTACT_KINDS and "/" in p.label and whole in names:
-            raise InputError(
-                "parameters", got=f"{whole} and {p.name}", expected="only one of them, as the first sets the second too"
-            )
 
 
 @contextmanager
@@ -359,11 +349,9 @@ def from_log_cholesky(coordinates: Any) -> Any:
     a, b, c, l10, l20, l21 = coordinates
     zero = 0.0 * a
     lower = np.array([[np.exp(a), zero, zero], [l10, np.exp(b), zero], [l20, l21, np.exp(c)]])
-    moment = lower @ lower.T
-    trace = moment[0, 0] + moment[1, 1] + moment[2, 2]
-    return np.array(
-        [trace - moment[0, 0], trace - moment[1, 1], trace - moment[2, 2], -moment[0, 1], -moment[0, 2], -moment[1, 2]]
-    )
+    S = lower @ lower.T
+    trace = S[0, 0] + S[1, 1] + S[2, 2]
+    return np.array([trace - S[0, 0], trace - S[1, 1], trace - S[2, 2], -S[0, 1], -S[0, 2], -S[1, 2]])
 
 
 def derivative_of_from_log_cholesky(coordinates: Array) -> tuple[Array, Array]:

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 from pydrake.autodiffutils import AutoDiffXd
 from pydrake.multibody.tree import FrameIndex
 
-from drake_diff._base.arrays import Array, finite_array
+from drake_diff._base.arrays import finite_array
 from drake_diff._base.autodiff import plain
 from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
 from drake_diff.model.contact import body_of, contact_forces
@@ -69,8 +69,7 @@ def frame_position(model: Model, frame: str, point: ArrayLike = ORIGIN, relative
     here, base, p = _frame_index(model, frame), _frame_index(model, relative_to), finite_array("point", point, (3,))
 
     def position(x: Any) -> Any:
-        _refuse_other(model, PLACE)
-        twin, _ = _at(model, x)
+        twin, _ = _at(model, PLACE, x)
         pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
         return pose.translation() + pose.rotation().matrix() @ p
 
@@ -103,11 +102,15 @@ def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_t
         >>> error([0.01, 0.0]).round(6)
         array([0.  , 0.01, 0.  ])
     """
-    here, base, goal = _frame_index(model, frame), _frame_index(model, relative_to), _check_rotation(R_goal)
+    here, base = _frame_index(model, frame), _frame_index(model, relative_to)
+    goal = finite_array("R_goal", R_goal, (3, 3))
+    off, determinant = float(np.abs(goal.T @ goal - np.eye(3)).max()), np.linalg.det(goal)
+    if off > ROTATION_TOLERANCE or determinant < 0:
+        got = f"R' R off by {off:.2g}, determinant {determinant:.2g}"
+        raise InputError("R_goal", got=got, expected="a rotation matrix")
 
     def error(x: Any) -> Any:
-        _refuse_other(model, PLACE)
-        twin, _ = _at(model, x)
+        twin, _ = _at(model, PLACE, x)
         pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
         return 2 * _quaternion(pose.rotation().matrix() @ goal.T)[1:]
 
@@ -138,8 +141,7 @@ def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfSta
     here, p = _frame_index(model, frame), finite_array("point", point, (3,))
 
     def velocity(x: Any) -> Any:
-        _refuse_other(model, PLACE)
-        twin, _ = _at(model, x)
+        twin, _ = _at(model, PLACE, x)
         world, moving = twin.plant.world_frame(), twin.plant.get_frame(here)
         arm = moving.CalcPose(twin.context, world).rotation().matrix() @ p
         return moving.CalcSpatialVelocity(twin.context, world, world).Shift(arm).translational()
@@ -168,8 +170,7 @@ def center_of_mass(model: Model) -> OfState:
         raise ModelError("the bodies have no mass, and so no centre of mass")
 
     def center(x: Any) -> Any:
-        _refuse_other(model, BALANCE)
-        twin, _ = _at(model, x)
+        twin, _ = _at(model, BALANCE, x)
         return np.array(twin.plant.CalcCenterOfMassPositionInWorld(twin.context))
 
     return center
@@ -205,8 +206,7 @@ def contact_force(model: Model, body: str) -> OfStateAndInput:
     index = known[body].index()
 
     def force(x: Any, u: Any) -> Any:
-        _refuse_other(model, model.other_quantities)
-        twin, (x, u) = _at(model, x, u)
+        twin, (x, u) = _at(model, model.other_quantities, x, u)
         advance(twin, x, u)
         total = np.array([twin.scalar(0.0)] * 3)
         for a, b, on_a, _ in contact_forces(twin):
@@ -217,15 +217,14 @@ def contact_force(model: Model, body: str) -> OfStateAndInput:
     return force
 
 
-def _refuse_other(model: Model, depends_on: frozenset[str]) -> None:
+def _at(model: Model, depends_on: frozenset[str], x: Any, *inputs: Any) -> tuple[Twin, list[Any]]:
+    """The twin for these numbers, its state set to `x`, and x and the inputs as its scalars.
+
+    InputError where parameters are applied that the result would depend on.
+    """
     for quantity in sorted(model.other_quantities & depends_on):
-        raise InputError(
-            "parameters", got=quantity, expected="only such as the functions of dd.quantities do not depend on"
-        )
-
-
-def _at(model: Model, x: Any, *inputs: Any) -> tuple[Twin, list[Any]]:
-    """The twin for these numbers, its state set to `x`, and x and the inputs as its scalars."""
+        expected = "only such as the functions of dd.quantities do not depend on"
+        raise InputError("parameters", got=quantity, expected=expected)
     given = [np.asarray(array) for array in (x, *inputs)]
     for name, array, size in zip(("x", "u"), given, (model.nx, model.nu), strict=False):
         if array.shape != (size,):
@@ -250,15 +249,6 @@ def _frame_index(model: Model, name: str) -> FrameIndex:
     if name in full:
         return full[name]
     raise UnknownNameError("frame", got=name, known=[*known, *(n for n in full if n.split("::")[-1] not in known)])
-
-
-def _check_rotation(R: ArrayLike) -> Array:
-    rotation = finite_array("R_goal", R, (3, 3))
-    off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if off > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        got = f"R' R off by {off:.2g}, determinant {np.linalg.det(rotation):.2g}"
-        raise InputError("R_goal", got=got, expected="a rotation matrix")
-    return rotation
 
 
 def _quaternion(R: Any) -> Any:

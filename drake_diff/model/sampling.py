@@ -32,13 +32,15 @@ class SampledState:
 def sample_states(model: Model, count: int, seed: int = 0) -> list[SampledState]:
     """`count` states, every other one touching where contact can be found; the same seed gives the same states."""
     random = np.random.default_rng(seed)
+    limit = np.minimum(np.abs(model.plant.GetEffortLowerLimits()), np.abs(model.plant.GetEffortUpperLimits()))
+    effort = EFFORT * np.where(limit < 1e6, limit, 1.0)
     touches = model.contract.contact.collision_pairs > 0
     found: list[SampledState] = []
     for i in range(count):
         x = _touching(model, random) if touches and i % 2 else None
         kind = FREE if x is None else CONTACT
         x = _free(model, random) if x is None else x
-        found.append(SampledState(kind, frozen(x), frozen(_input(model, random))))
+        found.append(SampledState(kind, frozen(x), frozen(effort * random.uniform(-1, 1, model.nu))))
     return found
 
 
@@ -89,11 +91,6 @@ def _any(model: Model, random: np.random.Generator) -> Array:
     lowest, highest = plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits()
     x[nq:] = np.clip(SPEED * random.standard_normal(model.nv), lowest, highest)
     return x
-
-
-def _input(model: Model, random: np.random.Generator) -> Array:
-    limit = np.minimum(np.abs(model.plant.GetEffortLowerLimits()), np.abs(model.plant.GetEffortUpperLimits()))
-    return np.asarray(EFFORT * np.where(limit < 1e6, limit, 1.0) * random.uniform(-1, 1, model.nu))
 
 
 def _depth(model: Model, x: Array) -> float:

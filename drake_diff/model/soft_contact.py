@@ -109,11 +109,8 @@ def softened(model: Model, contact: SoftContact) -> Model:
     if not isinstance(contact, SoftContact):
         raise InputError("contact", got=type(contact).__name__, expected="a SoftContact")
     if not model.takes_forces:
-        raise InputError(
-            "model",
-            got="a diagram that sets the applied generalized forces",
-            expected="one that leaves that input port free",
-        )
+        got = "a diagram that sets the applied generalized forces"
+        raise InputError("model", got=got, expected="one that leaves that input port free")
     if not model.contract.contact.collision_pairs:
         raise InputError("model", got="no geometries that may collide", expected="at least one pair")
 
@@ -175,10 +172,15 @@ def smallest_half_width(twin: Twin) -> float:
 
 
 def _distance_rate(plant: Any, context: Any, pair: Any, bodies: tuple[Any, Any]) -> Any:
-    """(nv,) the derivative of the distance's rate by v."""
-    at_a = _jacobian(plant, context, bodies[0], pair.id_A, pair.p_ACa)
-    at_b = _jacobian(plant, context, bodies[1], pair.id_B, pair.p_BCb)
-    return (at_a - at_b).T @ np.asarray(pair.nhat_BA_W)
+    """(nv,) the derivative of the distance's rate by v: of the velocity at which the closest points part."""
+    inspector = plant.get_geometry_query_input_port().Eval(context).inspector()
+    world, by_v, jacobians = plant.world_frame(), JacobianWrtVariable.kV, []
+    for body, geometry, p_GC in zip(bodies, (pair.id_A, pair.id_B), (pair.p_ACa, pair.p_BCb), strict=True):
+        X_BG = inspector.GetPoseInFrame(geometry)
+        p_BC = (X_BG.rotation().matrix() @ np.asarray(p_GC) + X_BG.translation()).reshape(3, 1)
+        own = body.body_frame()
+        jacobians.append(plant.CalcJacobianTranslationalVelocity(context, by_v, own, p_BC, world, world))
+    return (jacobians[0] - jacobians[1]).T @ np.asarray(pair.nhat_BA_W)
 
 
 def _pairs(plant: Any, context: Any) -> list[tuple[Any, tuple[Any, Any]]]:
@@ -192,19 +194,8 @@ def _pairs(plant: Any, context: Any) -> list[tuple[Any, tuple[Any, Any]]]:
         try:
             pair = query.ComputeSignedDistancePairClosestPoints(*ids)
         except RuntimeError as error:
-            raise ModelError(
-                f"soft contact needs the distance of every pair, and Drake cannot compute one: {error}"
-            ) from error
+            why = "soft contact needs the distance of every pair, and Drake cannot compute one"
+            raise ModelError(f"{why}: {error}") from error
         bodies = [plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in (pair.id_A, pair.id_B)]
         found.append((pair, (bodies[0], bodies[1])))
     return found
-
-
-def _jacobian(plant: Any, context: Any, body: Any, geometry: Any, p_GC: Any) -> Any:
-    """(3, nv) the derivative by v of the velocity of the point `p_GC` of a geometry's frame, world frame."""
-    X_BG = plant.get_geometry_query_input_port().Eval(context).inspector().GetPoseInFrame(geometry)
-    p_BC = X_BG.rotation().matrix() @ np.asarray(p_GC) + X_BG.translation()
-    world = plant.world_frame()
-    return plant.CalcJacobianTranslationalVelocity(
-        context, JacobianWrtVariable.kV, body.body_frame(), p_BC.reshape(3, 1), world, world
-    )

@@ -34,7 +34,8 @@ class TangentSpace:
         moved, (of_x, of_d) = np.array(x, dtype=float), self._plain
         moved[of_x] += dx[of_d]
         for q, r in self._turns:
-            moved[q] = _turn(x[q], dx[r])
+            turned = _right_product(x[q]) @ np.concatenate([[1.0], dx[r] / 2])
+            moved[q] = turned * (np.linalg.norm(x[q]) / np.linalg.norm(turned))
         return moved
 
     def minus(self, x1: Array, x0: Array) -> Array:
@@ -101,8 +102,3 @@ def _right_product(q: Array) -> Array:
     """(4, 4): the matrix R with R p = p * q."""
     w, x, y, z = q
     return np.array([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]])
-
-
-def _turn(q: Array, rotation: Array) -> Array:
-    turned = _right_product(q) @ np.concatenate([[1.0], rotation / 2])
-    return np.asarray(turned * (np.linalg.norm(q) / np.linalg.norm(turned)))

@@ -11,8 +11,7 @@ from drake_diff._base.arrays import Array
 from drake_diff.engines.interface import DRAKES_STEP, EngineContract, float_rows, floats, limit
 from drake_diff.engines.mujoco.coordinates import KINDS, MujocoCoordinates, name_of
 from drake_diff.exceptions import ModelError
-from drake_diff.mechanics.description import Description, joint_contract
-from drake_diff.mechanics.joints import JointContract, PairContract
+from drake_diff.mechanics.description import Description, JointContract, PairContract, joint_contract
 
 CONES = {0: "pyramidal", 1: "elliptic"}  # mjtCone
 INTEGRATORS = {0: "EULER", 1: "RK4", 2: "IMPLICIT", 3: "IMPLICITFAST"}  # mjtIntegrator
