@@ -143,13 +143,12 @@ def describe(model: Model) -> Description:
 def describe_tree(model: Model) -> Description:
     """As `describe`, PD control of the actuators left out."""
     plant = model.plant
-    found = [f"joint {j.name()} is of type {j.type_name()}" for j in joints(plant) if j.type_name() not in _KNOWN]
-    found += [f"joint {j.name()} is locked" for j in joints(plant) if j.is_locked(model.double.context)]
-    found += [
-        f"the free body of joint {j.name()} is damped"
-        for j in joints(plant)
-        if j.type_name() == "quaternion_floating" and np.any(j.default_damping_vector())
+    found = [
+        f"joint {j.name()} is of type {j.type_name()}" for j in joints(plant) if j.type_name() not in ("weld", *MOVING)
     ]
+    found += [f"joint {j.name()} is locked" for j in joints(plant) if j.is_locked(model.double.context)]
+    damped = [j for j in joints(plant) if np.any(j.default_damping_vector())]
+    found += [f"the free body of joint {j.name()} is damped" for j in damped if j.type_name() == "quaternion_floating"]
     if plant.num_constraints():
         found.append(f"{plant.num_constraints()} constraints (couplers, balls, welds, distances)")
     if model.forces:
@@ -169,9 +168,6 @@ def describe_tree(model: Model) -> Description:
         geometries=geometries,
         pairs=pairs,
     )
-
-
-_KNOWN = ("weld", *MOVING)
 
 
 def names_of(plant: Any) -> tuple[dict[Any, str], dict[Any, str]]:
@@ -204,10 +200,8 @@ def read_links(plant: Any, springs: dict[Any, tuple[float, float]]) -> list[Link
     rotors = dict.fromkeys(joint_names, 0.0)
     for a in actuators(plant):
         rotors[a.joint().index()] += a.default_rotor_inertia() * a.default_gear_ratio() ** 2
-    waiting = [
-        _link(j, joint_names[j.index()], body_names, rotors[j.index()], springs.get(j.index(), (0.0, 0.0)))
-        for j in joints(plant)
-    ]
+    numbered = [(j, j.index()) for j in joints(plant)]
+    waiting = [_link(j, joint_names[i], body_names, rotors[i], springs.get(i, (0.0, 0.0))) for j, i in numbered]
     waiting.sort(key=lambda link: link.v_start)
     placed, ordered = {"world"}, []
     while waiting:
@@ -259,16 +253,14 @@ def _geometries(model: Model, body_names: dict[Any, str]) -> tuple[tuple[Geometr
         found.append(Geometry(names[geometry], body, pose, shape))
     pairs = []
     for a, b in sorted(inspector.GetCollisionCandidates(), key=lambda ids: (names[ids[0]], names[ids[1]])):
-        friction, stiffness = (
-            _combined(*(proximity_property(inspector, g, quantity) for g in (a, b)))
-            for quantity in ("friction", "stiffness")
-        )
+        friction, stiffness = (_combined(inspector, (a, b), quantity) for quantity in ("friction", "stiffness"))
         pairs.append(PairContract((names[a], names[b]), None if friction is None else 2 * friction, stiffness))
     return tuple(found), tuple(pairs)
 
 
-def _combined(a: float | None, b: float | None) -> float | None:
-    """a b / (a + b): Drake's rule for stiffness, and half of its rule for friction."""
+def _combined(inspector: Any, pair: Sequence[Any], quantity: str) -> float | None:
+    """a b / (a + b) of the two sides: Drake's rule for stiffness, and half of its rule for friction."""
+    a, b = (proximity_property(inspector, geometry, quantity) for geometry in pair)
     if a is None or b is None:
         return None
     return a * b / (a + b) if a + b else 0.0

@@ -90,17 +90,12 @@ def contacts_of_the_step(model: Model) -> tuple[ContactPoint, ...]:
         body_a, body_b, normal = body_of(model, a), body_of(model, b), _normal(info)
         if model.plant.IsAnchored(body_a):  # the force is the one on what can move
             body_a, body_b, normal, force = body_b, body_a, -normal, -force
-        patch = hasattr(info, "contact_surface")
-        contact = ContactPoint(
-            body_a=body_a.name(),
-            body_b=body_b.name(),
-            point=frozen(info.contact_surface().centroid() if patch else info.contact_point()),
-            normal=frozen(normal),
-            force=frozen(force),
-            depth=0.0 if patch else float(info.point_pair().depth),
-            slip_speed=0.0 if patch else float(info.slip_speed()),
-        )
-        found.append(contact)
+        if hasattr(info, "contact_surface"):
+            point, depth, slip_speed = info.contact_surface().centroid(), 0.0, 0.0
+        else:
+            point, depth, slip_speed = info.contact_point(), info.point_pair().depth, info.slip_speed()
+        where, sizes = (frozen(point), frozen(normal), frozen(force)), (float(depth), float(slip_speed))
+        found.append(ContactPoint(body_a.name(), body_b.name(), *where, *sizes))
     return tuple(found)
 
 

@@ -120,7 +120,46 @@ class Contract:
         return plain
 
     def __str__(self) -> str:
-        return "\n".join(_lines(self))
+        lines = [
+            f"{self.name}: time step {self.time_step:g} s, {self.integrator}",
+            f"  source     {self.source or 'a diagram'}; scalar types {', '.join(self.scalar_types)}",
+            f"  frame      {self.frame}; gravity {_row(self.gravity)} m/s^2",
+            f"  contact    {self.contact.model}, {self.contact.approximation}, geometry {self.contact.geometry},"
+            f" {self.contact.collision_pairs} pairs,"
+            f" solver tolerance {self.contact.solver_relative_tolerance:g} (relative)",
+        ]
+        for kind, coordinates in (("q", self.positions), ("v", self.velocities), ("u", self.inputs)):
+            for i, x in enumerate(coordinates):
+                limits = "" if math.isinf(x.lower) and math.isinf(x.upper) else f" in [{x.lower:g}, {x.upper:g}]"
+                lines.append(f"  {kind}[{i}]".ljust(13) + f"{x.name} [{x.unit}]{limits}")
+        for body in self.bodies:
+            lines.append(
+                f"  body       {body.name}: {body.mass:g} kg at {_row(body.center_of_mass)} m,"
+                f" inertia xx yy zz xy xz yz {_row(body.inertia)} kg m^2"
+            )
+        for joint in self.joints:
+            damping = f", damping {_row(joint.damping)}" if any(joint.damping) else ""
+            lines.append(
+                f"  joint      {joint.name}: {joint.type}, {joint.parent} -> {joint.child}{damping}"
+                f"{', locked' if joint.locked else ''}"
+            )
+        for a in self.actuators:
+            gains = "" if a.kp is None else f", PD kp {a.kp:g} kd {a.kd:g}"
+            limit = f", limit {a.effort_limit:g}" if math.isfinite(a.effort_limit) else ""
+            lines.append(
+                f"  actuator   {a.name} on {a.joint}{limit}, gear {a.gear_ratio:g}, rotor {a.rotor_inertia:g}{gains}"
+            )
+        for g in self.geometries:
+            # sap knows only the relaxation time, similar and lagged only Hunt and Crossley's dissipation
+            damped = f"dissipation {_or_default(g.dissipation)} s/m"
+            if self.contact.approximation == "sap":
+                damped = f"relaxation time {_or_default(g.relaxation_time)} s"
+            lines.append(
+                f"  collision  {g.name} of {g.body}: {g.shape}, friction {_or_default(g.friction)},"
+                f" stiffness {_or_default(g.stiffness)} N/m, {damped}"
+            )
+        lines += [f"  note       {note}" for note in self.notes]
+        return "\n".join(lines)
 
     def __repr__(self) -> str:
         counts = ["positions", "velocities", "inputs", "bodies", "joints", "geometries"]
@@ -143,48 +182,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-
-def _lines(c: Contract) -> list[str]:
-    lines = [
-        f"{c.name}: time step {c.time_step:g} s, {c.integrator}",
-        f"  source     {c.source or 'a diagram'}; scalar types {', '.join(c.scalar_types)}",
-        f"  frame      {c.frame}; gravity {_row(c.gravity)} m/s^2",
-        f"  contact    {c.contact.model}, {c.contact.approximation}, geometry {c.contact.geometry},"
-        f" {c.contact.collision_pairs} pairs,"
-        f" solver tolerance {c.contact.solver_relative_tolerance:g} (relative)",
-    ]
-    for kind, coordinates in (("q", c.positions), ("v", c.velocities), ("u", c.inputs)):
-        for i, x in enumerate(coordinates):
-            limits = "" if math.isinf(x.lower) and math.isinf(x.upper) else f" in [{x.lower:g}, {x.upper:g}]"
-            lines.append(f"  {kind}[{i}]".ljust(13) + f"{x.name} [{x.unit}]{limits}")
-    for body in c.bodies:
-        lines.append(
-            f"  body       {body.name}: {body.mass:g} kg at {_row(body.center_of_mass)} m,"
-            f" inertia xx yy zz xy xz yz {_row(body.inertia)} kg m^2"
-        )
-    for joint in c.joints:
-        damping = f", damping {_row(joint.damping)}" if any(joint.damping) else ""
-        lines.append(
-            f"  joint      {joint.name}: {joint.type}, {joint.parent} -> {joint.child}{damping}"
-            f"{', locked' if joint.locked else ''}"
-        )
-    for a in c.actuators:
-        gains = "" if a.kp is None else f", PD kp {a.kp:g} kd {a.kd:g}"
-        limit = f", limit {a.effort_limit:g}" if math.isfinite(a.effort_limit) else ""
-        lines.append(
-            f"  actuator   {a.name} on {a.joint}{limit}, gear {a.gear_ratio:g}, rotor {a.rotor_inertia:g}{gains}"
-        )
-    for g in c.geometries:
-        # sap knows only the relaxation time, similar and lagged only Hunt and Crossley's dissipation
-        damped = f"dissipation {_or_default(g.dissipation)} s/m"
-        if c.contact.approximation == "sap":
-            damped = f"relaxation time {_or_default(g.relaxation_time)} s"
-        lines.append(
-            f"  collision  {g.name} of {g.body}: {g.shape}, friction {_or_default(g.friction)},"
-            f" stiffness {_or_default(g.stiffness)} N/m, {damped}"
-        )
-    return lines + [f"  note       {note}" for note in c.notes]
 
 
 def _row(values: tuple[float, ...]) -> str:
@@ -224,10 +221,10 @@ def read_contract(
     plant, inspector = twin.plant, twin.inspector
     positions, velocities, inputs = coordinates
     efforts = ["N" if a.joint().type_name() == "prismatic" else "N m" for a in actuators(plant)]
+    geometries = [] if inspector is None else inspector.GetAllGeometryIds(Role.kProximity)
+    contact_models = {"kPoint": "point", "kHydroelastic": "hydroelastic"}
     contact = ContactTerms(
-        model={"kPoint": "point", "kHydroelastic": "hydroelastic"}.get(
-            plant.get_contact_model().name, "hydroelastic_with_fallback"
-        ),
+        model=contact_models.get(plant.get_contact_model().name, "hydroelastic_with_fallback"),
         approximation=plant.get_discrete_contact_approximation().name.removeprefix("k").lower(),
         geometry=contact_geometry or "as modelled",
         collision_pairs=len(inspector.GetCollisionCandidates()) if inspector is not None else 0,
@@ -248,9 +245,7 @@ def read_contract(
         bodies=tuple(_body(twin, body) for body in bodies(plant)),
         joints=tuple(_joint(twin, joint) for joint in joints(plant)),
         actuators=tuple(_actuator(actuator) for actuator in actuators(plant)),
-        geometries=tuple(_geometry(twin, id_) for id_ in inspector.GetAllGeometryIds(Role.kProximity))
-        if inspector is not None
-        else (),
+        geometries=tuple(_geometry(twin, geometry) for geometry in geometries),
         contact=contact,
         constraints=plant.num_constraints(),
         notes=notes,

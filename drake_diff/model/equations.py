@@ -94,8 +94,7 @@ def ContinuousSystem_(T):  # type: ignore[no-untyped-def]
 
         def _construct(self, equations, converter=None):  # type: ignore[no-untyped-def]
             LeafSystem_[T].__init__(self, converter)
-            self.equations = equations
-            model = equations.model
+            self.equations, model = equations, equations.model
             self.DeclareVectorInputPort("u", BasicVector_[T](model.nu))
             self.DeclareContinuousState(model.nq, model.nv, 0)
 
@@ -103,10 +102,9 @@ def ContinuousSystem_(T):  # type: ignore[no-untyped-def]
             self._construct(other.equations, converter=converter)  # type: ignore[no-untyped-call]
 
         def DoCalcTimeDerivatives(self, context, derivatives):  # type: ignore[no-untyped-def]
-            x = context.get_continuous_state_vector().CopyToVector()
-            u = self.get_input_port().Eval(context)
             evaluate = self.equations if T is float else self.equations.autodiff
-            derivatives.SetFromVector(evaluate(x, u))
+            x = context.get_continuous_state_vector().CopyToVector()
+            derivatives.SetFromVector(evaluate(x, self.get_input_port().Eval(context)))
 
     return Impl
 

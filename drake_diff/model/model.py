@@ -19,13 +19,7 @@ from drake_diff._base.arrays import finite_array, positive_float
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, UnknownNameError
 from drake_diff.model.contract import Contract, read_contract
-from drake_diff.model.load_file import (
-    CONTACT_MODELS,
-    DRAKES_REFUSALS,
-    ROUTES,
-    read_into,
-    replace_collision_geometry,
-)
+from drake_diff.model.load_file import CONTACT_MODELS, DRAKES_REFUSALS, ROUTES, read_into, replace_collision_geometry
 from drake_diff.model.plant import (
     actuators,
     bodies,
@@ -225,9 +219,8 @@ class Model(ShowsItsRepr):
         context = plant.GetMyMutableContextFromRoot(root)
         for instance, target in self.pd_targets.items():
             plant.get_desired_state_input_port(instance).FixValue(context, target)
-        return Twin(
-            scalar, diagram, plant, scene_graph_beside(diagram, self.path), root, context, defaults, self.forces
-        )
+        scene_graph = scene_graph_beside(diagram, self.path)
+        return Twin(scalar, diagram, plant, scene_graph, root, context, defaults, self.forces)
 
     @cached_property
     def pd_targets(self) -> dict[Any, np.ndarray]:
@@ -390,9 +383,8 @@ def _change_plant(plant: MultibodyPlant, source: Path, *, weld_base: str | None,
         try:
             plant.WeldFrames(plant.world_frame(), link.body_frame())
         except DRAKES_REFUSALS as error:
-            raise ModelError(
-                f"{source}: expected weld_base to be a link without a joint to its parent: {error}"
-            ) from error
+            expected = "expected weld_base to be a link without a joint to its parent"
+            raise ModelError(f"{source}: {expected}: {error}") from error
     if ground is None:
         return
     if isinstance(ground, bool) or not isinstance(ground, (int, float, np.number)) or not 0 <= ground < np.inf:

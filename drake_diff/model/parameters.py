@@ -132,11 +132,11 @@ class ParameterVector:
 
     def to_dict(self) -> dict[str, Array]:
         """The values by parameter name."""
-        return {p.name: self.values[s] for p, s in self._pairs}
+        return {p.name: self.values[s] for p, s in self.pairs}
 
     def time_step(self, values: Array) -> float:
         """The time step [s] that goes with `values` (np,)."""
-        for p, s in self._pairs:
+        for p, s in self.pairs:
             if p.name == TIME_STEP:
                 return float(values[s][0])
         return self.model.time_step
@@ -159,7 +159,7 @@ class ParameterVector:
 
     @cached_property
     def _in_order(self) -> list[tuple[Parameter, slice]]:
-        return sorted(self._pairs, key=lambda pair: KINDS.index(pair[0].kind))
+        return sorted(self.pairs, key=lambda pair: KINDS.index(pair[0].kind))
 
     def difference_scale(self, entries: Any = slice(None)) -> Array:
         """How far differences move each of `entries`, relative to their step; never to values that Drake does not take.
@@ -169,7 +169,7 @@ class ParameterVector:
         scale = np.full(len(self.values), np.nan)
         wanted = np.zeros(len(self.values), dtype=bool)
         wanted[entries] = True
-        for p, s in self._pairs:
+        for p, s in self.pairs:
             value = self.values[s]
             if not wanted[s].any():
                 continue
@@ -190,7 +190,8 @@ class ParameterVector:
         return scale[entries]
 
     @property
-    def _pairs(self) -> Iterator[tuple[Parameter, slice]]:
+    def pairs(self) -> Iterator[tuple[Parameter, slice]]:
+        """Each parameter, and where it stands in the vector."""
         return zip(self.parameters, self.slices, strict=True)
 
 
@@ -284,8 +285,7 @@ class ParameterCoordinates:
 
     @property
     def _inertias(self) -> list[slice]:
-        pairs = zip(self.start.parameters, self.start.slices, strict=True)
-        return [s for p, s in pairs if p.kind.quantity == "inertia"]
+        return [s for p, s in self.start.pairs if p.kind.quantity == "inertia"]
 
     def from_values(self, values: Array) -> Array:
         """z of parameter values (np,); bounds of an inertia are the whole line."""
