@@ -218,14 +218,34 @@ class Stubborn:
         return [1.0]
 
 
+@pytest.mark.parametrize(("where", "steps"), [("start", 0), ("estimate", 3), ("shape", 3)])
+def test_whatever_an_estimator_raises_ends_the_run_and_is_told(cart, where, steps):
+    class Broken:
+        def start(self, x0):
+            self.calls = 0
+            if where == "start":
+                raise KeyError("no model")
+
+        def estimate(self, observation, u):
+            self.calls += 1
+            if where == "estimate" and self.calls > 3:
+                raise KeyError("no model")
+            return [1.0] if where == "shape" and self.calls > 3 else observation
+
+    run = closed_loop(cart, lambda x, t: [1.0], [0.0, 0.0], 20, Loop(estimator=Broken(), fallback=Fallback("stop")))
+    why = "ShapeError: the estimate" if where == "shape" else "KeyError: 'no model'"
+    assert run.ended.startswith(f"at t = {steps * H:.4g} s: the estimator failed: {why}")
+    assert (run.failed_part, run.controller_error, len(run.times)) == ("estimator", "", steps)
+
+
 @pytest.mark.parametrize(("where", "steps"), [("start", 0), ("call", 6)])
 def test_whatever_a_controller_raises_is_its_own_failure(cart, where, steps):
     alone = closed_loop(cart, Stubborn(where), [0.0, 0.0], 20)
-    assert alone.controller_error == "KeyError: 'no such gain'"
+    assert (alone.failed_part, alone.controller_error) == ("controller", "KeyError: 'no such gain'")
     assert alone.ended == f"at t = {steps * H:.4g} s: the controller failed: KeyError: 'no such gain'"
     assert len(alone.times) == steps
     kept = closed_loop(cart, Stubborn(where), [0.0, 0.0], 20, Loop(fallback=Fallback("stop")))
-    assert (kept.ended, kept.controller_error) == ("", "")
+    assert (kept.ended, kept.failed_part, kept.controller_error) == ("", "", "")
     assert kept.controller_status[6] == "the controller failed: KeyError: 'no such gain'"
     np.testing.assert_allclose(kept.motion.xs[-1, 1], steps * H / MASS, rtol=1e-12)
 

@@ -18,7 +18,7 @@ import drake_diff as dd
 from drake_diff._base.statistics import success_rate
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
 from drake_diff.panels.panel_file import expand, load_panel
-from drake_diff.panels.trial_row import row_of
+from drake_diff.panels.workers import row_of
 
 FUNCTIONS = """
 import os, random, time

@@ -285,6 +285,40 @@ def raising(at):
     return make
 
 
+class Breaks(dd.loop.Hold):
+    """An estimator that raises beyond 1 m."""
+
+    def estimate(self, observation, u):
+        if observation[0] > 1:
+            raise ZeroDivisionError("out of its range")
+        return observation
+
+
+class Breaking(dd.loop.Sensor):
+    """A sensor that raises beyond 1 m."""
+
+    def start(self, space, random):
+        def read(k, x):
+            return Breaks().estimate(x, None)
+
+        return read
+
+
+@pytest.mark.parametrize(
+    ("part", "label", "loop"),
+    [
+        ("sensor", "perception_error", dd.loop.Loop(sensor=Breaking())),
+        ("estimator", "state_error", dd.loop.Loop(estimator=Breaks())),
+    ],
+)
+def test_a_sensor_or_estimator_that_raises_fails_its_trial_and_the_others_go_on(cart, part, label, loop):
+    """The plan ends at 2 m, so that every run raises on its way, and none ends the call."""
+    found = dd.robustness(pushed_and_stopped(cart), {"mass": [0.02]}, trials=3, controller="open_loop", loop=loop)
+    assert found.cells[0].labels == {label: 3}
+    assert f"the {part} failed: ZeroDivisionError: out of its range" in found.task.nominal.run.ended
+    assert {e.reason.split("; ")[-1] for e in found.cells[0].endings} == {f"the {part} itself failed"}
+
+
 def test_trials_whose_controller_raises_are_control_errors_and_the_others_go_on(cart):
     """A mass m (1 + U) ends at 2 / (1 + U) m: beyond 2.2 m where U < -1/11, and there the controller raises."""
     found = dd.robustness(pushed_and_stopped(cart), {"mass": [0.2, 0.02]}, trials=40, controller=raising(2.2))

@@ -65,14 +65,29 @@ class MPC:
     def __init__(
         self, problem: Problem, *, horizon: int, plan: Any = None, replan_every: int = 1, max_iterations: int = 5
     ):
-        _check(problem)
+        if not isinstance(problem, Problem):
+            raise InputError("problem", got=type(problem).__name__, expected="a Problem")
+        check_problem(problem)
+        for subject in ("horizon", "waypoints", "constraints"):
+            if getattr(problem, subject):
+                raise InputError(subject, got="given", expected="none: MPC cannot keep it")
+        if not problem.initial_state_is_given:
+            raise InputError("optimize", got=list(problem.optimize), expected='("controls",) for MPC')
         self.horizon = positive_int("horizon", horizon)
         self.replan_every = positive_int("replan_every", replan_every)
         self._limits = Limits(positive_int("max_iterations", max_iterations), np.inf, TOLERANCE)
         xs, us = _first_plan(problem, plan)
         self._stay = None if problem.x_goal is None else _staying(problem, xs, us)
-        self._problem = _without_goal(problem, self._stay)
-        self._reference = self._plan_whole(xs, us)
+        self._problem = problem
+        if self._stay is not None:  # the cost of staying at the goal in place of the goal
+            own, stay = problem.final_cost, self._stay.final
+            both = stay if own is None else lambda x: own(x) + stay(x)
+            self._problem = replace(problem, x_goal=None, final_cost=both)
+        limits = replace(self._limits, max_iterations=PLAN_ITERATIONS)
+        result, xs, us = solve_ilqr(self._problem, xs, us, limits=limits, report=None)
+        if result.outcome not in (Outcome.SOLVED, Outcome.INACCURATE):
+            raise InputError("plan", got=result.message, expected="a plan from which iLQR finds a minimum")
+        self._reference = xs, us
         self._tails = costs_to_go(self._problem, *self._reference)
         self.start(problem.x0)
 
@@ -134,13 +149,6 @@ class MPC:
             return last[k - self._begin]
         return first[k] if k < len(first) else first[-1] if end is None else end
 
-    def _plan_whole(self, xs: Array, us: Array) -> tuple[Array, Array]:
-        limits = replace(self._limits, max_iterations=PLAN_ITERATIONS)
-        result, xs, us = solve_ilqr(self._problem, xs, us, limits=limits, report=None)
-        if result.outcome not in (Outcome.SOLVED, Outcome.INACCURATE):
-            raise InputError("plan", got=result.message, expected="a plan from which iLQR finds a minimum")
-        return xs, us
-
 
 @dataclass(frozen=True, eq=False)
 class _Staying:
@@ -172,15 +180,6 @@ def _staying(problem: Problem, xs: Array, us: Array) -> _Staying:
     return _Staying(goal, u, running, QuadraticCost(Q=(P + P.T) / 2, x_ref=goal))
 
 
-def _without_goal(problem: Problem, stay: _Staying | None) -> Problem:
-    """`problem` with the cost of staying at its goal in place of the goal."""
-    if stay is None:
-        return problem
-    own, final = problem.final_cost, stay.final
-    both = final if own is None else lambda x: own(x) + final(x)
-    return replace(problem, x_goal=None, final_cost=both)
-
-
 def _first_plan(problem: Problem, plan: Any) -> tuple[Array, Array]:
     if plan is None:
         plan = solve(problem)
@@ -194,14 +193,3 @@ def _first_plan(problem: Problem, plan: Any) -> tuple[Array, Array]:
         raise InputError("plan", got=type(plan).__name__, expected="None, (xs, us) or a Solution")
     xs = finite_array("plan xs", plan[0], (problem.num_steps + 1, problem.model.nx))
     return xs, finite_array("plan us", plan[1], (problem.num_steps, problem.model.nu))
-
-
-def _check(problem: Problem) -> None:
-    if not isinstance(problem, Problem):
-        raise InputError("problem", got=type(problem).__name__, expected="a Problem")
-    check_problem(problem)
-    for subject in ("horizon", "waypoints", "constraints"):
-        if getattr(problem, subject):
-            raise InputError(subject, got="given", expected="none: MPC cannot keep it")
-    if not problem.initial_state_is_given:
-        raise InputError("optimize", got=list(problem.optimize), expected='("controls",) for MPC')

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.multibody.tree import JacobianWrtVariable
 
-from drake_diff._base.arrays import Array, count, finite_array, frozen, positive_float, positive_int
+from drake_diff._base.arrays import Array, array_with_gaps, count, finite_array, frozen, positive_float
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import InputError, NonFiniteError, SimulationError, UnknownNameError
 from drake_diff.loop.parts import Actuator, Estimator, Fallback, Hold, Sensor
@@ -87,8 +87,9 @@ class LoopEvent(NamedTuple):
 class ClosedLoop(ShowsItsRepr):
     """What happened in a loop: one row for each step of the controller, in read-only arrays.
 
-    `motion` has the plant's own steps. `ended` is "" or says when and why the run broke off, and `controller_error`
-    is "" or the type and message of the controller's exception that ended it.
+    `motion` has the plant's own steps. `ended` is "" or says when and why the run broke off. `failed_part` is "" or the
+    part of the loop whose exception ended it: "controller", "sensor" or "estimator"; `controller_error` is the type and
+    message of the controller's.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -108,6 +109,7 @@ class ClosedLoop(ShowsItsRepr):
     latencies: Array  # (N,) [s] that the controller took, on this machine
     latency_budget: float | None
     ended: str
+    failed_part: str
     controller_error: str
 
     @property
@@ -140,8 +142,9 @@ def closed_loop(
         seed: of all randomness. The same seed gives the same run.
 
     Returns:
-        The motion, and what was measured, estimated, commanded and applied. A step that the plant cannot take, or a
-        controller that raises or answers nonsense without a fallback, ends the run: `ended` says why.
+        The motion, and what was measured, estimated, commanded and applied. A step that the plant cannot take, a sensor
+        or estimator that raises, or a controller that does or answers nonsense without a fallback, ends the run:
+        `ended` says why.
 
     Raises:
         ShapeError, NonFiniteError: `x0` or an impulse is not an array of the right shape of finite numbers.
@@ -155,7 +158,7 @@ def closed_loop(
         >>> run.applied[:, 0]
         array([0.5, 0.5, 0.5])
     """
-    x0, steps = finite_array("x0", x0, (model.nx,)), positive_int("num_steps", num_steps)
+    x0, steps = finite_array("x0", x0, (model.nx,)), count("num_steps", num_steps, 1)
     return _LoopRun(model, controller, loop or Loop(), np.random.default_rng(count("seed", seed, 0))).result(x0, steps)
 
 
@@ -192,20 +195,27 @@ class _LoopRun:
         self.period = count("Loop.substeps", loop.substeps, 1) * model.time_step
         self.read = loop.sensor.start(tangent_space(model), random)
         self.drive = loop.actuator.start(model.nu, self.period)
-        self.pushes = [(*_place(p, model), finite_array("Push.impulse", p.impulse, (3,))) for p in loop.pushes]
+        self.pushes = []  # (the plant's step, body, impulse)
+        for push in loop.pushes:
+            if not (np.isfinite(push.at) and push.at >= 0):
+                raise InputError("Push.at", got=push.at, expected="a time [s] of at least 0")
+            if not model.plant.HasBodyNamed(push.body):
+                raise UnknownNameError("Push.body", got=push.body, known=tuple(b.name() for b in bodies(model.plant)))
+            body, impulse = model.plant.GetBodyByName(push.body), finite_array("Push.impulse", push.impulse, (3,))
+            self.pushes.append((round(push.at / model.time_step), body, impulse))
         self.rows: list[tuple[Array, Array, Array, Array, str, float]] = []
         self.events: list[LoopEvent] = []
-        self.unseen, self.in_charge, self.ended = 0, True, ""
-        self.start_error: Exception | None = None
-        self.controller_error = ""
+        self.unseen, self.in_charge = 0, True
+        self.start_errors: dict[str, Exception] = {}
+        self.ended = self.failed_part = self.controller_error = ""
 
     def result(self, x0: Array, num_steps: int) -> ClosedLoop:
-        self.loop.estimator.start(x0)
-        try:
-            if hasattr(self.controller, "start"):
-                self.controller.start(x0)
-        except Exception as error:  # as one of a call: see `_command`
-            self.start_error = error
+        for name, part in (("estimator", self.loop.estimator), ("controller", self.controller)):
+            try:
+                if hasattr(part, "start"):
+                    part.start(x0)
+            except Exception as error:  # as one of its first call
+                self.start_errors[name] = error
         meter, xs = Meter(self.model), [x0]
         us: list[Array] = []
         for k in range(num_steps):
@@ -226,22 +236,56 @@ class _LoopRun:
                 break
         set_state(self.model.double, xs[-1])
         meter.measure_state(xs[-1])
-        return self._told(meter.result(np.array(xs), np.array(us).reshape(len(us), self.model.nu)))
+        steps, nx, nu = len(self.rows), self.model.nx, self.model.nu
+
+        def column(i: int, size: int) -> Array:
+            return frozen(np.array([row[i] for row in self.rows], dtype=float).reshape(steps, size))
+
+        return ClosedLoop(
+            motion=meter.result(np.array(xs), np.array(us).reshape(len(us), nu)),
+            times=frozen(self.period * np.arange(steps)),
+            observations=column(0, nx),
+            estimates=column(1, nx),
+            commands=column(2, nu),
+            applied=column(3, nu),
+            controller_status=tuple(row[4] for row in self.rows),
+            events=tuple(self.events),
+            latencies=frozen([row[5] for row in self.rows]),
+            latency_budget=self.loop.latency_budget,
+            ended=self.ended,
+            failed_part=self.failed_part,
+            controller_error=self.controller_error,
+        )
 
     def _decide(self, k: int, x: Array) -> Array | None:
         """What the actuator applies in step k; None where the run ends."""
         fallback, t = self.loop.fallback, k * self.period
-        seen = self.read(k, x)
+        last, part = self.rows[-1][2] if self.rows else None, "sensor"
+        try:  # they may be a user's code, as the controller
+            seen = self.read(k, x)
+            if seen is not None:
+                seen = array_with_gaps("the measurement", seen, x.shape)
+            part = "estimator"
+            if part in self.start_errors:
+                raise self.start_errors[part]
+            estimate = array_with_gaps("the estimate", self.loop.estimator.estimate(seen, last), x.shape)
+        except Exception as error:
+            self.failed_part = part
+            self._end(k, f"the {part} failed: {type(error).__name__}: {error}")
+            return None
         self.unseen = 0 if seen is not None else self.unseen + 1
-        last = self.rows[-1][2] if self.rows else None
-        estimate = self.loop.estimator.estimate(seen, last)
         if fallback is not None and self.unseen > fallback.patience:
             command, status, taken = None, f"nothing was seen for {self.unseen} steps", 0.0
         else:
             command, status, taken = self._command(estimate, t)
-        self._note_who_is_in_charge(command is not None, t, status)
+        if command is not None and not self.in_charge:
+            self.events.append(LoopEvent(t, "recovery", "the controller is followed again"))
+        elif command is None and self.in_charge and fallback is not None:
+            self.events.append(LoopEvent(t, "fallback", f"{fallback.mode}: {status}"))
+        self.in_charge = command is not None
         if command is None:
             if fallback is None:
+                self.failed_part = "controller"
                 self._end(k, status)
                 return None
             self.controller_error = ""
@@ -255,8 +299,8 @@ class _LoopRun:
         """The controller's answer, or None where it has none; its status; and the time that it took [s]."""
         begin = perf_counter()
         try:
-            if self.start_error is not None:
-                raise self.start_error
+            if "controller" in self.start_errors:
+                raise self.start_errors["controller"]
             command = finite_array("the controller's command", self.controller(np.array(estimate), t), (self.model.nu,))
             status = str(getattr(self.controller, "status", OK))
         except Exception as error:  # it is a user's code: whatever it raises is a failure of the controller, not ours
@@ -264,14 +308,6 @@ class _LoopRun:
             told = "it is not finite" if isinstance(error, NonFiniteError) else self.controller_error
             return None, f"the controller failed: {told}", perf_counter() - begin
         return command, status, perf_counter() - begin
-
-    def _note_who_is_in_charge(self, controller: bool, t: float, status: str) -> None:
-        """Events where the fallback takes over and where the controller recovers."""
-        if controller and not self.in_charge:
-            self.events.append(LoopEvent(t, "recovery", "the controller is followed again"))
-        elif self.in_charge and not controller and self.loop.fallback is not None:
-            self.events.append(LoopEvent(t, "fallback", f"{self.loop.fallback.mode}: {status}"))
-        self.in_charge = controller
 
     def _end(self, k: int, why: str) -> None:
         self.ended = f"at t = {k * self.period:.4g} s: {why}"
@@ -292,34 +328,3 @@ class _LoopRun:
                 told = f"{body.name()} is pushed by {np.linalg.norm(impulse):.3g} N s"
                 self.events.append(LoopEvent(k * self.model.time_step, "push", told))
         return x
-
-    def _told(self, motion: Rollout) -> ClosedLoop:
-        steps, nx, nu = len(self.rows), self.model.nx, self.model.nu
-
-        def column(i: int, size: int) -> Array:
-            return frozen(np.array([row[i] for row in self.rows], dtype=float).reshape(steps, size))
-
-        return ClosedLoop(
-            motion=motion,
-            times=frozen(self.period * np.arange(steps)),
-            observations=column(0, nx),
-            estimates=column(1, nx),
-            commands=column(2, nu),
-            applied=column(3, nu),
-            controller_status=tuple(row[4] for row in self.rows),
-            events=tuple(self.events),
-            latencies=frozen([row[5] for row in self.rows]),
-            latency_budget=self.loop.latency_budget,
-            ended=self.ended,
-            controller_error=self.controller_error,
-        )
-
-
-def _place(push: Push, model: Model) -> tuple[int, Any]:
-    """The step of the plant at which a push comes, and the body that it hits."""
-    plant = model.plant
-    if not (np.isfinite(push.at) and push.at >= 0):
-        raise InputError("Push.at", got=push.at, expected="a time [s] of at least 0")
-    if not plant.HasBodyNamed(push.body):
-        raise UnknownNameError("Push.body", got=push.body, known=tuple(b.name() for b in bodies(plant)))
-    return round(push.at / model.time_step), plant.GetBodyByName(push.body)

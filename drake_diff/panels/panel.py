@@ -5,11 +5,9 @@ from contextlib import closing
 from pathlib import Path
 
 from drake_diff._base.arrays import positive_int
-from drake_diff.panels.journal import journal
 from drake_diff.panels.panel_file import expand, load_panel
-from drake_diff.panels.table import PanelTable, write_table
-from drake_diff.panels.trial_row import TrialFunction
-from drake_diff.panels.workers import check_engine, evaluate_all
+from drake_diff.panels.results import PanelTable, journal, write_table
+from drake_diff.panels.workers import TrialFunction, check_engine, evaluate_all
 from drake_diff.record.provenance import provenance_of
 
 Progress = Callable[[int, int, int], None]

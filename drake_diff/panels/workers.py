@@ -1,33 +1,127 @@
-"""Trials evaluated in parallel: by processes of this machine (loky), or by a Ray cluster.
+"""The function that a panel file names, evaluated in parallel: by processes of this machine (loky), or a Ray cluster.
 
 Both engines give the same rows. A process evaluates one trial at a time; where it dies, only its trial is lost, and
 that trial is evaluated once more. A worker that dies in the second try too is an error in the trial's row.
 """
 
+import importlib
+import importlib.util
 import multiprocessing.resource_tracker
 import os
+import random
 import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, partial
+from hashlib import sha256
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import loky
+import numpy as np
 
 from drake_diff.exceptions import InputError, MissingDependencyError, UnknownNameError
 from drake_diff.panels.panel_file import PanelTrial
-from drake_diff.panels.trial_row import DIED, ONE_THREAD, Function, Row, TrialFunction, row_of
 
 ENGINES = ("local", "ray")
 PER_CORE = 2  # tasks in flight for each core of a cluster: the next one is there when one ends
 CHECK_PARENT = 0.5  # seconds between two looks of a worker at whether its parent still lives
 
+Row = dict[str, Any]
+Function = Callable[[dict[str, Any]], Mapping[str, Any]]
+# A worker dies when it is killed, runs out of memory, or crashes below Python.
+DIED: Row = {"error": "WorkerDied: the process that evaluated this trial died, and so did the one that tried again"}
+# A worker has one core: its libraries start no threads of their own.
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 Answers = Generator[tuple[PanelTrial, Row | None]]  # None for a row: the process died
 Evaluate = Callable[[Sequence[PanelTrial]], Answers]
+
+
+@dataclass(frozen=True)
+class TrialFunction:
+    """What `evaluate` names: "FILE.py:function", the file beside the panel in `directory`, or "module:function".
+
+    Workers run in the panel's directory, so that relative paths in a panel start from there.
+    """
+
+    evaluate: str
+    directory: str
+
+    def enter(self) -> Function:
+        """The function, loaded, with its panel's directory as the process's own."""
+        os.chdir(self.directory)
+        return self.load()
+
+    def load(self) -> Function:
+        """The function; InputError where there is none."""
+        name = self.evaluate.rpartition(":")[2]
+        function = getattr(self._module(), name, None)
+        if not callable(function):
+            raise InputError("evaluate", got=f"{self.evaluate}, which is not one", expected="a function")
+        return function
+
+    def sha256(self) -> str | None:
+        """The hash of the function's file; what that file imports is not covered."""
+        place = self.evaluate.rpartition(":")[0]
+        path = Path(self.directory, place) if place.endswith(".py") else getattr(self._module(), "__file__", None)
+        return sha256(Path(path).read_bytes()).hexdigest() if path else None
+
+    def _module(self) -> ModuleType:
+        place = self.evaluate.rpartition(":")[0]
+        try:
+            if not place.endswith(".py"):
+                return importlib.import_module(place)
+            spec = importlib.util.spec_from_file_location("drake_diff_trials", Path(self.directory, place))
+            if spec is None or spec.loader is None:
+                raise ImportError(f"{place} is not a Python file")
+            module = importlib.util.module_from_spec(spec)
+            spec.loader.exec_module(module)
+            return module
+        except Exception as error:
+            got = f"{self.evaluate}: {type(error).__name__}: {error}"
+            raise InputError("evaluate", got=got, expected="a file or module that can be imported") from error
+
+
+def row_of(function: Function, fields: Mapping[str, Any]) -> Row:
+    """What `function` returns for one trial, in JSON's types, or {"error": "Type: message"} where it raises.
+
+    NaN and infinity become None. The global generators of NumPy and Python start from the trial's seed.
+    """
+    random.seed(fields["seed"])
+    np.random.seed(fields["seed"] % 2**32)
+    try:
+        row = function(dict(fields))
+        if not isinstance(row, Mapping):
+            raise InputError("row", got=type(row).__name__, expected="a mapping of names to values")
+        for key in row:
+            if not isinstance(key, str) or key in fields or key == "id":
+                raise InputError("row", got=repr(key), expected="names that are not the trial's own")
+        return {key: _plain(value) for key, value in row.items()}
+    except (Exception, SystemExit) as error:  # sys.exit() in a trial ends that trial, not the panel
+        return {"error": f"{type(error).__name__}: {error}"}
+
+
+def _plain(value: Any) -> Any:
+    """`value` in JSON's types."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        value = value.tolist()
+    if value is None or isinstance(value, (str, bool)):
+        return value
+    if isinstance(value, int) and abs(value) < 2**63:
+        return value
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
+        return {key: _plain(item) for key, item in value.items()}
+    raise InputError("row", got=f"{type(value).__name__} {value!r:.80}", expected="numbers, words, lists and mappings")
 
 
 def evaluate_all(
@@ -40,7 +134,12 @@ def evaluate_all(
     left = list(trials)
     if not left:
         return
-    with _engine(function, workers, engine, address) as evaluate:
+    pool: AbstractContextManager[Evaluate]
+    if engine == "ray":
+        pool = _ray(function, workers, address)
+    else:
+        pool = nullcontext(partial(_local_answers, function=function, workers=workers or loky.cpu_count()))
+    with pool as evaluate:
         for _ in range(2):
             died = []
             with closing(evaluate(left)) as answers:
@@ -60,14 +159,6 @@ def check_engine(engine: str, address: str | None) -> None:
         raise UnknownNameError("engine", got=engine, known=ENGINES)
     if address is not None and engine != "ray":
         raise InputError("address", got=address, expected='none for engine="local"; engine="ray" takes it')
-
-
-def _engine(
-    function: TrialFunction, workers: int | None, engine: str, address: str | None
-) -> AbstractContextManager[Evaluate]:
-    if engine == "ray":
-        return _ray(function, workers, address)
-    return nullcontext(lambda trials: _local_answers(trials, function, workers or loky.cpu_count()))
 
 
 # --- what a worker does
@@ -168,7 +259,13 @@ def _ray(function: TrialFunction, workers: int | None, address: str | None) -> I
 
     On a cluster, `workers` trials are in flight at a time.
     """
-    ray = _import_ray(address)
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    if address is None:
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # makes Ray take the loopback address, on Linux too
+    try:
+        import ray
+    except ImportError as error:
+        raise MissingDependencyError(f"Ray is not installed ({error}): pip install 'drake-diff[cluster]'") from error
     cores = {"num_cpus": workers or os.cpu_count(), "include_dashboard": False} if address is None else {}
     _check_listens(address)
     environment = {"env_vars": ONE_THREAD}
@@ -183,17 +280,6 @@ def _ray(function: TrialFunction, workers: int | None, address: str | None) -> I
         yield lambda trials: _ray_answers(ray, trials, function, workers)
     finally:
         ray.shutdown()
-
-
-def _import_ray(address: str | None) -> Any:
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    if address is None:
-        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # makes Ray take the loopback address, on Linux too
-    try:
-        import ray
-    except ImportError as error:
-        raise MissingDependencyError(f"Ray is not installed ({error}): pip install 'drake-diff[cluster]'") from error
-    return ray
 
 
 def _check_listens(address: str | None) -> None:

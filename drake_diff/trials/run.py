@@ -50,7 +50,7 @@ def robustness(
     """Try the plan of a solution many times under each perturbation and level.
 
     A trial succeeds where it reaches the goal (without one, the plan's end) and keeps the bounds. A failure has a
-    label that says whose fault it is. A controller that raises is such a failure: a control error.
+    label that says whose fault it is. A controller, sensor or estimator that raises is such a failure too.
 
     Args:
         solution: its motion and inputs are the plan.

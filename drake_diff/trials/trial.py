@@ -4,10 +4,13 @@ The label of a failure is found by running the trial again with one thing put ri
 
     planning_error    unperturbed, it fails too
     perception_error  with a perfect sensor it succeeds
-    control_error     with a perfect actuator it succeeds, or the controller itself failed
+    control_error     with a perfect actuator it succeeds
     state_error       with the plant and the start as planned, and no pushes, it succeeds
     control_error     no single thing helps: the controller is not up to all of them together
     evaluation_error  the result cannot be judged
+
+Where a part of the loop raised, that comes before all: the sensor is a perception_error, the estimator a state_error,
+the controller a control_error.
 """
 
 from collections.abc import Callable, Mapping
@@ -30,6 +33,9 @@ from drake_diff.trials.perturbation import Setup, perturbed
 
 CONTROLLERS = ("tvlqr", "mpc", "open_loop")
 MPC_HORIZON = 20  # steps
+RAISED: Mapping[str, Label] = {
+    "sensor": "perception_error", "estimator": "state_error", "controller": "control_error"
+}  # fmt: skip
 MakeController = Callable[[Plan, Model, Array, Array], Controller]
 
 
@@ -165,8 +171,8 @@ def run_trial(task: Task, levels: Mapping[str, float], seed: int) -> Trial:
 
 
 def _label(task: Task, setup: Setup, seed: int, outcome: Judgement) -> tuple[Label, str]:
-    if outcome.run.controller_error:
-        return "control_error", "the controller itself failed"
+    if part := outcome.run.failed_part:
+        return RAISED[part], f"the {part} itself failed"
     if not task.nominal.success:
         return "planning_error", f"unperturbed it fails too: {task.nominal.failures[0]}"
     loop, planned = setup.loop, task.setup

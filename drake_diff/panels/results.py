@@ -1,0 +1,205 @@
+"""What a panel writes: a journal with a line for each finished trial, and at the end a table and a summary of each cell.
+
+The first line of the journal says what the panel is. Each line carries a hash of itself and of the first line, so that
+a changed line and a line of another panel are noticed.
+"""
+
+import csv
+import fcntl
+import io
+import json
+import os
+import statistics
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from drake_diff._base.files import write_whole
+from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.statistics import success_rate
+from drake_diff.exceptions import ArtifactError
+from drake_diff.panels.panel_file import PanelTrial, canonical, cell_name
+from drake_diff.panels.workers import Row
+
+JOURNAL, TABLE, SUMMARY = "trials.jsonl", "table.csv", "summary.json"
+SHOWN_CELLS = 8  # in a repr
+
+
+class Journal:
+    """An open journal; `rows` are those of the finished trials, by id."""
+
+    def __init__(self, path: Path, file: BinaryIO, panel: Mapping[str, Any], known: Collection[str]):
+        self.path, self.file = path, file
+        self.head = _line({"panel": panel}, b"")
+        self.rows = self._read(panel, known)
+
+    def add(self, trial: str, row: Row) -> None:
+        """Write the row of a finished trial to the disk."""
+        self._write(_line({"id": trial, "row": row}, self.head))
+        self.rows[trial] = row
+
+    def _write(self, line: bytes) -> None:
+        self.file.write(line)
+        self.file.flush()
+        os.fsync(self.file.fileno())
+
+    def _read(self, panel: Mapping[str, Any], known: Collection[str]) -> dict[str, Row]:
+        """Read all whole lines and cut off the rest: a line that a killed process left half written."""
+        whole = self.file.read().rpartition(b"\n")
+        lines = whole[0].split(b"\n") if whole[1] else []
+        self.file.seek(len(whole[0]) + len(whole[1]))
+        self.file.truncate()
+        if not lines:
+            self._write(self.head)
+            return {}
+        old = _read_line(self.path, 1, lines[0], b"").get("panel", {})
+        for key in sorted({*old, *panel}):
+            if old.get(key) != panel.get(key):
+                raise ArtifactError(
+                    f"{self.path} is the journal of another panel: {key}: expected {panel.get(key)}, "
+                    f"got {old.get(key)}; choose another directory, or remove this one to start over"
+                )
+        rows: dict[str, Row] = {}
+        for number, line in enumerate(lines[1:], 2):
+            found = _read_line(self.path, number, line, self.head)
+            if found["id"] not in known or found["id"] in rows:
+                raise ArtifactError(f"{self.path}, line {number}: trial {found['id']} is unknown or stands there twice")
+            rows[found["id"]] = found["row"]
+        return rows
+
+
+@contextmanager
+def journal(directory: Path, panel: Mapping[str, Any], known: Collection[str]) -> Iterator[Journal]:
+    """Open the journal in `directory` of the panel that `panel` describes, with the trials `known`.
+
+    ArtifactError where it is another panel's, where a whole line is damaged, or where another process has it open.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    path = directory / JOURNAL
+    with open(path, "a+b") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise ArtifactError(f"{path}: another process is at work on this panel") from error
+        file.seek(0)
+        yield Journal(path, file, panel, known)
+
+
+def _line(content: Mapping[str, Any], head: bytes) -> bytes:
+    return _json({**content, "sha256": sha256(head + _json(content)).hexdigest()}) + b"\n"
+
+
+def _json(content: Mapping[str, Any]) -> bytes:
+    """Keys keep their order: a row's is that of the table's columns."""
+    return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _read_line(path: Path, number: int, line: bytes, head: bytes) -> dict[str, Any]:
+    """What `line` says; ArtifactError where it is not as it was written."""
+    try:
+        content: dict[str, Any] = json.loads(line)
+        content.pop("sha256")
+        if _line(content, head) == line + b"\n":
+            return content
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ArtifactError(f"{path}, line {number} is damaged: {type(error).__name__}: {error}") from error
+    raise ArtifactError(f"{path}, line {number} is damaged or another panel's: its hash does not fit")
+
+
+@dataclass(frozen=True, eq=False)
+class PanelTable(ShowsItsRepr):
+    """What `run_panel` found.
+
+    `rows` has a row for each trial, in the panel's order: its cell, id, repeat and seed, then what its function
+    returned. `summary` has the counts, means and success rates of each cell. They are what `table.csv` and
+    `summary.json` in `directory` hold.
+    """
+
+    directory: Path
+    rows: tuple[Row, ...]
+    summary: dict[str, Any]
+
+    @property
+    def errors(self) -> int:
+        """How many trials ended in an error."""
+        return int(self.summary["errors"])
+
+    def __repr__(self) -> str:
+        cells = self.summary["cells"]
+        lines = [f"{len(self.rows)} trials in {len(cells)} cells, {self.errors} errors, in {self.directory}"]
+        for cell in cells[:SHOWN_CELLS]:
+            told = [f"success {cell['success']['rate']:.3g}"] if "success" in cell else []
+            told += [f"{name} {numbers['mean']:.4g}" for name, numbers in cell["numbers"].items()]
+            lines.append(f"  {cell_name(cell['cell'])}: {', '.join(told) or 'no numbers'}")
+        if len(cells) > SHOWN_CELLS:
+            lines.append(f"  and {len(cells) - SHOWN_CELLS} more cells")
+        return "\n".join(lines)
+
+
+def write_table(
+    directory: Path, trials: Sequence[PanelTrial], found: Mapping[str, Row], made: Mapping[str, Any]
+) -> PanelTable:
+    """Write `table.csv` and `summary.json` of all `trials` into `directory`; `made` says what the panel is."""
+    cells: dict[bytes, list[PanelTrial]] = {}
+    for trial in trials:
+        cells.setdefault(canonical(trial.cell), []).append(trial)
+    judged = any(isinstance(row.get("success"), bool) for row in found.values())
+    rows = tuple(
+        {"id": t.id, **t.cell, "repeat": t.fields["repeat"], "seed": t.fields["seed"], **found[t.id]} for t in trials
+    )
+    summary = {
+        "panel": dict(made),
+        "trials": len(trials),
+        "errors": sum("error" in row for row in found.values()),
+        "cells": [_cell(group[0].cell, [found[t.id] for t in group], judged) for group in cells.values()],
+    }
+    write_whole(directory / TABLE, _csv(rows, {name for row in found.values() for name in row}))
+    text = json.dumps(summary, indent=1, allow_nan=False, ensure_ascii=False)
+    write_whole(directory / SUMMARY, text.encode() + b"\n")
+    return PanelTable(directory, rows, summary)
+
+
+def _csv(rows: Sequence[Row], answered: set[str]) -> bytes:
+    """RFC 4180: the cells' columns before the function's, each in the order in which it first appears; error last."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    ours = [name for name in names if name not in answered and name not in ("repeat", "seed")]
+    theirs = [name for name in names if name in answered and name != "error"]
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    columns = [*ours, "repeat", "seed", *theirs, "error"]
+    writer.writerow(columns)
+    writer.writerows([_text(row.get(name)) for name in columns] for row in rows)
+    return text.getvalue().encode()
+
+
+def _text(value: Any) -> str:
+    """A value in a field: nothing for null, words as they are, everything else as in JSON."""
+    return "" if value is None else value if isinstance(value, str) else canonical(value).decode()
+
+
+def _cell(cell: dict[str, Any], rows: Sequence[Row], judged: bool) -> dict[str, Any]:
+    """One cell: a trial that ended in an error is no success."""
+    numbers: dict[str, list[float]] = {}
+    for row in rows:
+        for name, value in row.items():
+            if isinstance(value, (int, float)) and not isinstance(value, bool):
+                numbers.setdefault(name, []).append(float(value))
+    summary: dict[str, Any] = {"cell": cell, "trials": len(rows), "errors": sum("error" in row for row in rows)}
+    if judged:
+        successes = sum(row.get("success") is True for row in rows)
+        rate = success_rate(successes, len(rows))
+        summary["success"] = {"count": successes, "rate": rate.value, "low": rate.lower, "high": rate.upper}
+    summary["numbers"] = {
+        name: {
+            "count": len(values),
+            "mean": statistics.mean(values),  # its sums are exact and rounded once
+            "std": statistics.stdev(values) if len(values) > 1 else None,
+            "min": min(values),
+            "max": max(values),
+        }
+        for name, values in numbers.items()
+    }
+    return summary
