@@ -119,6 +119,7 @@ def _show_comparison(record: Any) -> None:
     )
     clock = record.wall_clock
     for i, e in enumerate(record.engines):
+        times = (clock.seconds_per_step[e.engine], clock.seconds_per_jacobian[e.engine])
         own = {"its own step's": "yes", "not its own step's": "no"}.get(e.gradient, e.gradient)
         rows.add_row(
             plain(e.engine),
@@ -127,7 +128,7 @@ def _show_comparison(record: Any) -> None:
             "" if e.first_apart_s is None else f"{e.first_apart_s:.4g} s",
             f"{max((j.gap for j in e.jacobians), default=0.0):.1e}",
             plain(own, "red" if own == "no" else ""),
-            *(_time(seconds[e.engine]) for seconds in (clock.seconds_per_step, clock.seconds_per_jacobian)),
+            *("-" if t is None else f"{1e6 * t:.0f} µs" for t in times),
         )
     show(rows)
     for e in record.engines[1:]:
@@ -135,10 +136,6 @@ def _show_comparison(record: Any) -> None:
     for r in record.refused:
         show(plain(r.engine, "bold dim"), plain(f"not compared: {r.reason}", "dim"))
     show(judged(record.verdict), record.sentence)
-
-
-def _time(seconds: float | None) -> str:
-    return "-" if seconds is None else f"{1e6 * seconds:.0f} µs"
 
 
 def export(

@@ -251,11 +251,8 @@ def check(file: LogFile) -> None:
         show(judged("damaged"), f" {error}")
         raise typer.Exit(1) from error
     count = sum(len(messages) for messages in log.messages.values())
-    show(
-        plain("whole", "bold green"),
-        f" {file}: {count} messages in {len(log.messages)} channels, {len(log.attachments)} attachments, "
-        "every checksum holds",
-    )
+    told = f"{count} messages in {len(log.messages)} channels, {len(log.attachments)} attachments"
+    show(plain("whole", "bold green"), f" {file}: {told}, every checksum holds")
 
 
 def recover(

@@ -1,4 +1,4 @@
-"""What a panel writes: a journal with a line for each finished trial, and at the end a table and a summary of each cell.
+"""What a panel writes: a journal with a line for each finished trial, and at the end a table and a summary by cell.
 
 The first line of the journal says what the panel is. Each line carries a hash of itself and of the first line, so that
 a changed line and a line of another panel are noticed.

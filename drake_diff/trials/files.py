@@ -78,7 +78,11 @@ def save_robustness(result: Robustness, directory: str | Path, run: str | Path |
     source = None if run is None else RunEvidence(path=str(run), record_sha256=EvidenceRecord.read(run).record_sha256)
     begin_robustness(folder, task.model)
     record = record_of(result, folder.name, source)
-    again = str(run) if run is not None and _is_plain(task) else None
+    # A trial can be run again from what trial.json says where nothing in the loop is a user's own.
+    loop, named = task.loop, ("sensor", "actuator", "fallback", "substeps")
+    plain = all(repr(getattr(loop, name)) == repr(getattr(PLAIN, name)) for name in named)
+    plain = plain and isinstance(task.controller, str) and type(loop.estimator) is Hold and not loop.pushes
+    again = str(run) if run is not None and plain else None
     for name in result.names:
         write_trial(folder / _place(result.worst(name)), task, result.worst(name).worst, again)
     write_whole(folder / TABLE, _table(result).encode())
@@ -104,7 +108,17 @@ def record_of(result: Robustness, name: str, run: RunEvidence | None = None) -> 
             goal_error=finite(nominal.goal_error),
             ended=nominal.run.ended,
         ),
-        perturbations=[_perturbation(result, name) for name in result.names],
+        perturbations=[
+            PerturbationEvidence(
+                name=name,
+                unit=perturbation_named(name).unit,
+                meaning=perturbation_named(name).meaning,
+                margin=result.margins[name],
+                cells=[_cell(c) for c in result.of(name)],
+                worst=_place(result.worst(name)),
+            )
+            for name in result.names
+        ],
         wall_clock=_times(result),
     )
 
@@ -126,18 +140,6 @@ def _record(name: str, model: Model, verdict: Any, sentence: str, **rest: Any) -
 
 def _place(cell: Cell) -> str:
     return f"{WORST}/{cell.perturbation}_{cell.level:g}"
-
-
-def _perturbation(result: Robustness, name: str) -> PerturbationEvidence:
-    kind = perturbation_named(name)
-    return PerturbationEvidence(
-        name=name,
-        unit=kind.unit,
-        meaning=kind.meaning,
-        margin=result.margins[name],
-        cells=[_cell(c) for c in result.of(name)],
-        worst=_place(result.worst(name)),
-    )
 
 
 def _cell(c: Cell) -> CellEvidence:
@@ -183,13 +185,6 @@ def _numbers(value: ArrayLike) -> float | list[float | None] | None:
     if np.ndim(value) == 0:
         return finite(float(np.asarray(value)))
     return [finite(float(v)) for v in np.asarray(value, dtype=float)]
-
-
-def _is_plain(task: Task) -> bool:
-    """Whether a trial can be run again from what trial.json says: nothing in the loop is a user's own."""
-    own, named = task.loop, ("sensor", "actuator", "fallback", "substeps")
-    plain = all(repr(getattr(own, name)) == repr(getattr(PLAIN, name)) for name in named)
-    return isinstance(task.controller, str) and plain and type(own.estimator) is Hold and not own.pushes
 
 
 def _times(result: Robustness) -> RobustnessClock:

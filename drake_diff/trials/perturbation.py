@@ -48,11 +48,10 @@ class Perturbation:
         """Whether there is anything in `model` for it to change."""
         if self.quantity:
             return bool(parameters_of(model, self.quantity))
-        needs = {
-            "contact_approximation": model.contract.contact.collision_pairs > 0 and model.can_rebuild,
-            "time_step": model.can_rebuild,
-        }
-        return needs.get(self.name, model.nu > 0 or self.name in ("initial_state", "push"))
+        if self.name in ("contact_approximation", "time_step"):
+            pairs = model.contract.contact.collision_pairs
+            return model.can_rebuild and (pairs > 0 or self.name == "time_step")
+        return model.nu > 0 or self.name in ("initial_state", "push")
 
     def check_is_of(self, model: Model) -> None:
         """InputError where there is nothing in `model` for it to change."""
@@ -117,9 +116,8 @@ def _initial_state(setup: Setup, level: float, random: Random) -> Setup:
 def _time_step(setup: Setup, level: float, random: Random) -> Setup:
     parts = round(level)
     if parts != level or parts < 1:
-        raise InputError(
-            "level of time_step", got=level, expected="a whole number: how many parts each step is cut into"
-        )
+        expected = "a whole number: how many parts each step is cut into"
+        raise InputError("level of time_step", got=level, expected=expected)
     loop = replace(setup.loop, substeps=setup.loop.substeps * parts)
     return replace(setup, model=setup.model.at_time_step(setup.model.time_step / parts), loop=loop)
 

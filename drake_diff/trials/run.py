@@ -15,12 +15,11 @@ import numpy as np
 from drake_diff._base.arrays import Array, count, positive_int
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.statistics import Rate, margin, success_rate
-from drake_diff.derivatives.step import StepDerivatives, derivatives_along
+from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import InputError
 from drake_diff.loop.mpc import MPC
 from drake_diff.loop.parts import Hold
 from drake_diff.loop.run import Loop
-from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.solution import Solution
@@ -132,9 +131,8 @@ class Cell:
     def __repr__(self) -> str:
         level = sized(self.perturbation, self.level)
         labels = ", ".join(f"{count} {label}" for label, count in self.labels.items())
-        return f"{self.perturbation} {level}: {self.rate.successes} of {self.rate.trials} succeed; {labels}".rstrip(
-            "; "
-        )
+        told = f"{self.perturbation} {level}: {self.rate.successes} of {self.rate.trials} succeed"
+        return f"{told}; {labels}" if labels else told
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,23 +346,21 @@ class Sensitivity:
 
     def predicted(self, name: str, level: float) -> float | None:
         """The root mean square of the last state's displacement; None where gradients say nothing."""
-        if not self.is_known or name not in TOLD or not PERTURBATIONS[name].is_of(self.task.model):
+        known = self.is_known and name in TOLD and PERTURBATIONS[name].is_of(self.task.model)
+        if not known or self._gains is None:
             return None
-        if self._gains is None:
-            return None
-        found = float(level * np.linalg.norm(self._effect(name)))
-        return found if np.isfinite(found) else None
-
-    def _effect(self, name: str) -> Array:
-        """(nt, .) the last state's derivative by what a perturbation of level 1 draws, times its spread."""
+        # The last state's derivative by what a perturbation of level 1 draws, times its spread.
         start, _, noise, factor = self._effects
         if name == "initial_state":
-            return start
-        if name == "sensor_noise":
-            return noise
-        if name == "sensor_bias":  # the same at every step
-            return np.asarray(UNIFORM * noise.reshape(self.space.size, -1, self.space.size).sum(axis=1))
-        return np.asarray(UNIFORM * (factor if name == "actuator_strength" else self._by_factor(name)))
+            effect = start
+        elif name == "sensor_noise":
+            effect = noise
+        elif name == "sensor_bias":  # the same at every step
+            effect = UNIFORM * noise.reshape(self.space.size, -1, self.space.size).sum(axis=1)
+        else:
+            effect = UNIFORM * (factor if name == "actuator_strength" else self._by_factor(name))
+        found = float(level * np.linalg.norm(effect))
+        return found if np.isfinite(found) else None
 
     def _by_factor(self, quantity: str) -> Array:
         """(nt, n) the derivative by a factor of each parameter of a quantity."""
@@ -387,8 +383,12 @@ class Sensitivity:
         # The inertia apart: a mass that is changed alone takes it along, one that is set beside it does not.
         inertia, others = list(self.parameters["inertia"]), [n for q in FACTORS[1:] for n in self.parameters[q]]
         groups = [inertia, others] if inertia else [others]
+        along = []
         with applied(select(task.setup.model, task.setup.parameters)) as model:
-            along = [_along(model, xs[:-1], us, names) for names in groups]
+            for names in groups:
+                vector = select(model, names)
+                with applied(vector) as same:
+                    along.append(derivatives_along(same, xs[0], us, vector=vector, xs=xs[:-1]))
         for k, (u, K) in enumerate(zip(us, self._gains or (), strict=True)):
             steps = [found[k] for found in along]
             found = self.space.jacobian(xs[k], xs[k + 1], steps[0].A, steps[0].B, *(step.C for step in steps))
@@ -417,10 +417,3 @@ class Sensitivity:
                 columns.append((np.asarray(ahead, dtype=float) - np.asarray(behind, dtype=float)) / (2 * DIFFERENCE))
             gains.append(np.array(columns).T.reshape(shape))
         return gains
-
-
-def _along(model: Model, xs: Array, us: Array, names: list[str]) -> list[StepDerivatives]:
-    """The derivatives, by the parameters `names` too, of the steps from each of xs (N, nx) under us (N, nu)."""
-    vector = select(model, names)
-    with applied(vector) as set_model:
-        return derivatives_along(set_model, xs[0], us, vector=vector, xs=xs)

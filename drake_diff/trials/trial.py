@@ -118,40 +118,34 @@ class Task:
         if isinstance(given, MPC):
             return given
         if callable(given):
-            return self._made(given, model)
+            try:
+                found: Any = given(self.plan, model, self.xs, self.us)
+            except DrakeDiffError:
+                raise
+            except Exception as error:
+                got = f"{type(error).__name__}: {error}"
+                raise InputError("controller", got=got, expected="a function that makes a controller") from error
+            if not callable(found):
+                got = f"one that makes {type(found).__name__}"
+                raise InputError("controller", got=got, expected="u = controller(x, t)")
+            return found
         if given == "tvlqr" and model.nu:
             return track(self.plan, model, self.xs, self.us)
         if given == "mpc" and model.nu:
             return MPC(self.plan.problem, horizon=MPC_HORIZON, plan=(self.xs, self.us))
         return OpenLoop(self.us, model.time_step)
 
-    def _made(self, make: MakeController, model: Model) -> Controller:
-        try:
-            found: Any = make(self.plan, model, self.xs, self.us)
-        except DrakeDiffError:
-            raise
-        except Exception as error:
-            got = f"{type(error).__name__}: {error}"
-            raise InputError("controller", got=got, expected="a function that makes a controller") from error
-        if not callable(found):
-            raise InputError(
-                "controller", got=f"one that makes {type(found).__name__}", expected="u = controller(x, t)"
-            )
-        return found
-
     def run(self, setup: Setup, seed: int) -> Judgement:
         """One run of `setup`, judged."""
         with applied(select(setup.model, setup.parameters)) as model:
             found = closed_loop(model, self.policy, setup.x0, len(self.us), setup.loop, seed=seed)
-            depth = tuple(too_deep(model, found.motion)) if not found.ended else ()
+            depth = () if found.ended else tuple(too_deep(model, found.motion))
         last = found.motion.xs[-1]
         goal = self.plan.problem.goal_error(last) if self.judged_by == "the goal" else last - self.xs[-1]
-        failures = (
-            (found.ended,) if found.ended else (*missed_goal(self.plan, goal), *left_bounds(self.plan, found.motion))
-        )
+        kept_not = (*missed_goal(self.plan, goal), *left_bounds(self.plan, found.motion), *depth)
         return Judgement(
             run=found,
-            failures=(*failures, *depth),
+            failures=(found.ended,) if found.ended else kept_not,
             goal_error=float(np.max(np.abs(goal))),
             displacement=tangent_space(self.model).minus(last, self._end),
             judged=bool(np.all(np.isfinite(goal))),

@@ -1,7 +1,7 @@
 """One trial on disk: what it was, a trace of all that the loop saw and did, a replay beside the plan, its latencies."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -102,32 +102,30 @@ def write_trial_trace(path: Path, shown: Shown, trial: Trial) -> None:
         "perturbation": json.dumps(dict(trial.levels), sort_keys=True),
         "label": trial.label or "success",
     }
-    write_mcap(path, list(_channels(shown, trial)), metadata, {})
-
-
-def _channels(shown: Shown, trial: Trial) -> Iterator[Channel]:
-    """The true motion and the plan, then observations, estimates, commands, what was applied, and the events."""
-    yield from motion_channels(shown)
     run, contract = trial.outcome.run, shown.model.contract
     states, planned = (contract.positions, contract.velocities), shown.planned_xs
-    yield state_channel("/planned/state", shown.times(len(planned)), planned, *states)
     seen = ~np.isnan(run.observations).any(axis=1)
-    yield state_channel("/observation", run.times[seen], run.observations[seen], *states)
-    yield state_channel("/estimate", run.times, run.estimates, *states)
-    yield input_channel("/command", run.times, run.commands, contract.inputs)
-    yield input_channel("/applied", run.times, run.applied, contract.inputs)
     kind = TYPES["Event"]
     statuses = [
         kind.cls(time=t, kind="controller", code=OK if status == OK else "other", message=status)
         for t, status in zip(run.times.tolist(), run.controller_status, strict=True)
     ]
-    yield _events("/controller/status", statuses)
     events = [kind.cls(time=e.t, kind=e.kind, message=e.message) for e in run.events]
     end = shown.time_step * (len(shown.xs) - 1)
     if trial.label is not None:
         last = kind.cls(time=end, kind="failure", failure_label=trial.label, code=trial.label, message=trial.reason)
         events.append(last)
-    yield _events("/events", events)
+    channels = [
+        *motion_channels(shown),
+        state_channel("/planned/state", shown.times(len(planned)), planned, *states),
+        state_channel("/observation", run.times[seen], run.observations[seen], *states),
+        state_channel("/estimate", run.times, run.estimates, *states),
+        input_channel("/command", run.times, run.commands, contract.inputs),
+        input_channel("/applied", run.times, run.applied, contract.inputs),
+        _events("/controller/status", statuses),
+        _events("/events", events),
+    ]
+    write_mcap(path, channels, metadata, {})
 
 
 def _events(topic: str, events: Sequence[Any]) -> Channel:
