@@ -488,14 +488,14 @@ def _cylinder_axis(place: Place) -> Found:
             continue
         offset = both[0].pose.translation() - both[1].pose.translation()
         distance = float(np.linalg.norm(np.cross(both[1].axis(2), offset)))
-        message = f"the sphere's centre is {distance:.3g} m from the cylinder's axis: "
-        remedy = "move the sphere off the axis by 1e-6 m or more, or replace the cylinder by a box"
+        severity: Severity = "info"
+        told = "exactly on it AutoDiffXd would be singular"
         if distance < ON_AXIS:
-            message += "if they touch AutoDiffXd is singular on it (NaN, or a plausible wrong number)"
-            yield Finding("error", "cylinder_axis", pair.label, message, remedy)
-        else:
-            message += "exactly on it AutoDiffXd would be singular"
-            yield Finding("info", "cylinder_axis", pair.label, message, remedy)
+            severity = "error"
+            told = "if they touch AutoDiffXd is singular on it (NaN, or a plausible wrong number)"
+        message = f"the sphere's centre is {distance:.3g} m from the cylinder's axis: {told}"
+        remedy = "move the sphere off the axis by 1e-6 m or more, or replace the cylinder by a box"
+        yield Finding(severity, "cylinder_axis", pair.label, message, remedy)
 
 
 def _default_decides(place: Place) -> Found:

@@ -1,11 +1,8 @@
 """Certify the derivative of a step, or of a whole rollout, before it is used.
 
-AutoDiffXd can equal difference quotients and both be wrong about the physics: through a compliant bounce the gradient
-of the discrete motion can be 10 to 400 times that of the motion it stands for. So a rollout's gradient may also be
-taken at h, h/2 and h/4, or at k, 4 k and 16 k of the contact stiffness (a compliant contact is off by 1/sqrt(k)). An
-error of first order in h makes two successive changes d1 and d2 of the gradient halve, |d2| about |d1| / 2, and the
-limit is g3 + d2. An entry has converged if |d2| <= 0.75 |d1| and its first value is within 10 % of the limit, or if
-both changes are below 1 %.
+Both AutoDiffXd and difference quotients can be wrong about the physics: through a compliant bounce the gradient of the
+discrete motion can be 10 to 400 times that of the motion it stands for. So a rollout's gradient may also be taken at h,
+h/2 and h/4, or at k, 4 k and 16 k of the contact stiffness (a compliant contact is off by 1/sqrt(k)).
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -327,7 +324,11 @@ def _in_stiffer_contact(
 def _judge(
     by: str, levels: tuple[float, ...], columns: Sequence[str], values: Array, first: int, shape: tuple[int, ...]
 ) -> Refinement:
-    """Which columns of `values` (3, n) converge; from `first` on are those by the inputs, of `shape` (N, nu)."""
+    """Which columns of `values` (3, n) converge; from `first` on are those by the inputs, of `shape` (N, nu).
+
+    An error of first order makes the changes d1 and d2 halve, and the limit is g3 + d2. An entry has converged if
+    |d2| <= 0.75 |d1| and its first value is within 10 % of the limit, or if both changes are below 1 %.
+    """
     d1, d2 = np.diff(values, axis=0)
     limit = values[2] + d2
     size = np.maximum(np.abs(values).max(axis=0), np.abs(limit))

@@ -1,13 +1,10 @@
 """Replay a plan on Drake's double plant: at its own step and half of it, and in another contact approximation.
 
-A motion that exists at one step size or in one approximation of contact only is an artefact of the numerics. So the
-inputs are rolled out as they are (open loop) and with TVLQR feedback about the plan, in several variants of the plant.
-A variant holds if one of the two reaches the goal and keeps bounds, constraints, the energy balance and the
-penetration limit: an unstable motion diverges open loop however right it is, and feedback through contact can do harm.
-
-A discrete plan has to hold at h and at h/2. A collocated one is a motion in continuous time, whose interval need not be
-a step that the simulator can take: it has to hold at two successive ones of h, h/2, h/4, ... h/16. A user's diagram has
-one time step and one contact approximation, so it has no other variants.
+A motion that exists at one step size or in one approximation of contact only is an artefact of the numerics. A variant
+of the plant holds if the inputs, open loop or with TVLQR feedback about the plan, reach the goal and keep all limits:
+an unstable motion diverges open loop however right it is, and feedback through contact can do harm. A discrete plan has
+to hold at h and h/2; a collocated one, whose interval need not be a step that the simulator can take, at two successive
+ones of h, h/2, ... h/16.
 """
 
 from collections.abc import Callable, Iterator, Sequence

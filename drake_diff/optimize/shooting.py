@@ -1,10 +1,8 @@
 """Shooting, single or multiple: a motion as a function of the variables it is shot from, through Drake's own steps.
 
 In multiple shooting (Bock and Plitt, "A multiple shooting algorithm for direct solution of optimal control problems",
-1984) the motion is cut into segments. The states that they start from are variables too, and that each ends where the
-next begins is a constraint: what a late input does need not be seen through all the steps before it, and a guess of
-the states counts. With as many segments as steps it is direct transcription of the discrete plant; single shooting is
-the case of one segment.
+1984) the states that segments start from are variables too, and that each ends where the next begins is a constraint:
+what a late input does need not be seen through all the steps before it. One segment is single shooting.
 """
 
 from collections import deque
@@ -119,11 +117,11 @@ class SegmentedMotion:
         return program
 
     def _bounds(self) -> tuple[Array, Array]:
-        bounds, count = self.problem.bounds, self.problem.num_steps
-        inputs = [np.tile(side, (count, 1)) for side in (bounds.u_lower, bounds.u_upper)]
-        sides = zip(self.problem.state_limits(), inputs, self.problem.bounds_of_parameters(), strict=True)
-        lower, upper = (self.pack(*side) for side in sides)
-        return lower, upper
+        b, count = self.problem.bounds, self.problem.num_steps
+        lower, upper = self.problem.state_limits()
+        lowest, highest = self.problem.bounds_of_parameters()
+        least, most = np.tile(b.u_lower, (count, 1)), np.tile(b.u_upper, (count, 1))
+        return self.pack(lower, least, lowest), self.pack(upper, most, highest)
 
 
 class ShootingVariables:

@@ -3,7 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from hashlib import sha256
 from typing import Any
@@ -440,7 +440,7 @@ class Run:
             if stages:
                 limits, report = self.limits, self.report
                 result, xs_found, us, logs = solve_continuation(self.problem, us, stages, limits=limits, report=report)
-                self.options["continuation"] = [log.to_dict() for log in logs]
+                self.options["continuation"] = [asdict(log) for log in logs]
                 return result, xs_found, us
             solve_method = solve_through_jumps if self.problem.model.contract.contact.collision_pairs else solve_ilqr
             return solve_method(self.problem, xs if given else rolled, us, limits=self.limits, report=self.report)

@@ -2,9 +2,9 @@
 
 Li and Todorov, "Iterative linear quadratic regulator design for nonlinear biological movement systems", 2004, and
 the feasibility-driven form of Mastalli et al., "Crocoddyl", 2020: the guess need not be a rollout, and a step of size a
-leaves 1 - a of each gap between step(x_k, u_k) and x_(k+1). A hard goal, waypoints, state bounds and constraints are
-augmented Lagrangians (`constraints`), and the dynamics' second derivatives, which iLQR leaves out, are learned on the
-way (`expansion`), or taken by differences of the Jacobians where a smooth motion converges slowly.
+leaves 1 - a of each gap between step(x_k, u_k) and x_(k+1). What must hold is an augmented Lagrangian (`constraints`).
+The dynamics' second derivatives, which iLQR leaves out, are learned on the way, or taken by differences where a smooth
+motion converges slowly (`expansion`).
 """
 
 import math

@@ -1,24 +1,18 @@
 """Trajectory optimization through contact by iLQR: stages of softer contact, then the true plant, whose step jumps.
 
-What does not touch has no gradient. So `solve_continuation` solves a row of problems: the same plant with a force at
-a distance added (`soft_contact`), of a shorter reach in each stage, and in the last one the true plant. A stage starts
-from the inputs of the one before and only warms up the next: it is short, and the schedule goes on if it fails.
-
-On the true plant, contact begins only where two bodies overlap at the start of a step, so the step jumps where they
-just touch. The least cost often lies at such a jump, where no gradient tells a minimum. So `solve_through_jumps` holds
-every beginning of a touch at its knot, by rows phi >= m before it and phi <= -m at it, phi being the signed distance
-and m a margin; under these rows the problem is smooth. A minimum that presses against a row is compared with that of
-the sequence beyond it, in which the touch begins a knot earlier or later, and the search goes on where it is cheaper.
-
-A search that still stops short of its goal is taken there by `restore_goal`, by Newton steps on the inputs from the
-first contact on. What comes out reaches the goal near the least cost, but is not shown to be a minimum.
+What does not touch has no gradient. So `solve_continuation` first solves the same plant with a force at a distance
+added (`soft_contact`), of a shorter reach in each stage. A stage only warms up the next: the schedule goes on if it
+fails. The true plant's step jumps where two bodies just touch, and the least cost often lies at such a jump, where no
+gradient tells a minimum. So `solve_through_jumps` holds every beginning of a touch at its knot, by rows phi >= m before
+it and phi <= -m at it, phi being the signed distance and m a margin: under these the problem is smooth. A minimum that
+presses against a row is compared with that of the sequence beyond it, where the touch begins a knot earlier or later.
 """
 
 import math
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -81,9 +75,6 @@ class StageLog:
             contact = f"distance {self.distance:.3g} m, stiffness {self.stiffness:.3g} N/m"
         numbers = "" if self.cost is None else f", cost {self.cost:.6g}, goal error {self.goal_error:.2g}"
         return f"stage {self.number}: {contact}: {self.status} after {self.iterations} steps{numbers}"
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def solve_continuation(
@@ -230,9 +221,7 @@ class ContactHold:
         return f"{' and '.join(self.names)} {'apart' if self.apart else 'touching'} at knot {self.knot}"
 
 
-def solve_through_jumps(
-    problem: Problem, xs: Array, us: Array, *, limits: Limits, report: Report | None
-) -> tuple[NlpResult, Array, Array]:
+def solve_through_jumps(problem: Problem, xs: Array, us: Array, *, limits: Limits, report: Report | None) -> Found:
     """What `solve_ilqr` gives, from a search that holds beginnings of touches where it stalls at one.
 
     Where they press, the result's note says which, and what the sequences beyond them cost. `limits` are those of all
@@ -290,7 +279,7 @@ class _Sequences:
         note = f"a minimum for its own sequence of contacts, cost {cost:.6g}, held by " + "; ".join(told)
         return replace(best[0], note=note), *best[1:]
 
-    def _beyond(self, hold: ContactHold, xs: Array, us: Array) -> "Found | float":
+    def _beyond(self, hold: ContactHold, xs: Array, us: Array) -> Found | float:
         """The minimum of the sequence beyond `hold`; its cost alone if it is known, infinite if there is none."""
         beyond = np.array(xs)
         beyond[hold.knot] = hold.moved_beyond(self.problem.model, xs[hold.knot])
@@ -321,14 +310,13 @@ class _Sequences:
         if holds:
             self._say("held: " + "; ".join(map(str, holds)))
         penalty, report = HOLDING if holds else 0.0, self.report
-        result, xs, us = solve_ilqr(
-            held, xs, us, limits=limits, report=report, patience=patience, least_penalty=penalty
-        )
+        found = solve_ilqr(held, xs, us, limits=limits, report=report, patience=patience, least_penalty=penalty)
+        result, xs, us = found
         self.ended = result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT)
         first = len(self.rows) - 1 if self.rows else 0
         self.rows += [replace(r, iteration=first + r.iteration) for r in result.iterations[bool(self.rows) :]]
         self.costs[holds] = self.problem.objective(xs, us) if result.outcome is Outcome.SOLVED else np.inf
-        return result, xs, us
+        return found
 
     def _say(self, text: str) -> None:
         if self.report:
@@ -368,7 +356,7 @@ def restore_goal(
 
     xs is a rollout of us. Each step is the least change of the inputs from the first contact on, within their
     bounds, halved until the miss is smaller and bounds of states, waypoints and constraints hold as before. It ends
-    early if `is_over` says so.
+    early if `is_over` says so. What comes out is near the least cost, but is not shown to be a minimum.
     """
     first, done, twin = 0, "", problem.model.double
     for k, u in enumerate(us):
