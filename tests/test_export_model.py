@@ -18,10 +18,9 @@ from drake_diff.engines.closed_form import BY_MODEL
 from drake_diff.engines.motion import move
 from drake_diff.engines.urdf import urdf
 from drake_diff.exceptions import CertificateError, InputError, ModelError, ModelWarning, UnknownNameError
-from drake_diff.export import export, read_back, small_models
+from drake_diff.export import checks, export
+from drake_diff.export.checks import check_small_models, complaints, written
 from drake_diff.export.export import export_model
-from drake_diff.export.read_back import complaints, written
-from drake_diff.export.small_models import check_small_models
 from drake_diff.mechanics.description import describe
 from drake_diff.model.sampling import sample_states
 
@@ -138,12 +137,12 @@ def test_mujoco_s_own_urdf_reader_has_the_same_mass_matrix(tmp_path):
 
 
 def test_the_small_models_are_right():
-    checks = check_small_models()
-    assert [c.name for c in checks[:4]] == [
+    found = check_small_models()
+    assert [c.name for c in found[:4]] == [
         "pendulum: step", "pendulum: Jacobian", "pendulum: energy", "pendulum: urdf read back",
     ]  # fmt: skip
-    assert len(checks) == 12
-    assert all(c.holds for c in checks), [c for c in checks if not c.holds]
+    assert len(found) == 12
+    assert all(c.holds for c in found), [c for c in found if not c.holds]
 
 
 def wrong_length(monkeypatch):
@@ -155,13 +154,13 @@ def wrong_gravity(monkeypatch):
 
 
 def wrong_file(form):
-    right = read_back.written
+    right = checks.written
 
     def wrong(asked, description, time_step):
         text = right(asked, description, time_step)
         return text.replace("0.1", "0.1001") if asked == form else text
 
-    return lambda monkeypatch: monkeypatch.setattr(small_models, "written", wrong)
+    return lambda monkeypatch: monkeypatch.setattr(checks, "written", wrong)
 
 
 @pytest.mark.parametrize(
@@ -188,7 +187,7 @@ def test_what_a_format_cannot_say_is_refused(load, tmp_path, monkeypatch):
         export_model(model, tmp_path / "out", target="isaaclab")
     assert not (tmp_path / "out").exists()
     export_model(model, tmp_path / "out", target="gazebo")  # SDF has springs
-    monkeypatch.setattr(read_back, "find_spec", lambda name: None)
+    monkeypatch.setattr(checks, "find_spec", lambda name: None)
     with pytest.raises(ModelError, match="MuJoCo is not installed"):  # and Drake reads no springs in MJCF
         export_model(model, tmp_path / "mjcf", target="mjcf")
 

@@ -7,7 +7,7 @@ the file, read back, says what the plant does.
 import csv
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from math import isfinite
 from pathlib import Path
@@ -15,10 +15,8 @@ from typing import Any
 
 from drake_diff._base.arrays import positive_int
 from drake_diff.engines.drake import DrakeEngine
-from drake_diff.engines.interface import EngineContract
 from drake_diff.exceptions import CertificateError, InputError, MissingDependencyError, ModelError, UnknownNameError
-from drake_diff.export.read_back import SUFFIX, complaints, named_in, written
-from drake_diff.export.small_models import check_small_models
+from drake_diff.export.checks import SUFFIX, check_small_models, complaints, named_in, written
 from drake_diff.mechanics.description import Description, describe
 from drake_diff.model.model import Model
 from drake_diff.model.sampling import ATTEMPTS, DEPTH, EFFORT, REACH, SPEED, sample_states
@@ -140,30 +138,6 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
     left_out = [g.name for g in description.geometries if named_in(form, g.name) not in text]
     contract = DrakeEngine(model).contract
     made = {"seed": seed, "count": states, "distribution": DISTRIBUTION}
-    files = {
-        f"model{SUFFIX[form]}": text,
-        "contract.json": json.dumps(_plain({**asdict(contract), "initial_states": made}), indent=1) + "\n",
-        "initial_states.csv": _table(["state", "kind", *model.state_names], ([s.kind, *s.x] for s in samples)),
-        "inputs.csv": _table(["state", *model.input_names], (s.u for s in samples)),
-        "README.md": _readme(target, f"model{SUFFIX[form]}", model, contract, made, left_out, about_usd),
-        **made_usd,
-    }
-    directory.mkdir()
-    for name, content in files.items():
-        (directory / name).write_text(content)
-    return [directory / name for name in files]
-
-
-def _readme(
-    target: str,
-    file: str,
-    model: Model,
-    contract: EngineContract,
-    made: Mapping[str, Any],
-    left_out: Sequence[str],
-    about_usd: str,
-) -> str:
-    """README.md of an export; `made` has count, seed and distribution of the states, `left_out` names geometries."""
     facts = {
         "h": repr(contract.time_step),
         "gravity": list(contract.gravity),
@@ -171,13 +145,23 @@ def _readme(
         "contact_law": contract.contact_law,
         "inputs": ", ".join(contract.inputs) or "none",
     }
-    settings = (COMMON + OF_TARGET.get(target, "")).format(**facts)
-    header = ",".join(["time", *model.state_names, *model.input_names])
-    shapes = ", ".join(left_out) or "none"
-    return README.format(
-        name=model.name, target=target, file=file, settings=settings, header=header, left_out=shapes,
-        about_usd=about_usd, **facts, **made,
+    readme = README.format(
+        name=model.name, target=target, file=f"model{SUFFIX[form]}", about_usd=about_usd,
+        settings=(COMMON + OF_TARGET.get(target, "")).format(**facts), left_out=", ".join(left_out) or "none",
+        header=",".join(["time", *model.state_names, *model.input_names]), **facts, **made,
     )  # fmt: skip
+    files = {
+        f"model{SUFFIX[form]}": text,
+        "contract.json": json.dumps(_plain({**asdict(contract), "initial_states": made}), indent=1) + "\n",
+        "initial_states.csv": _table(["state", "kind", *model.state_names], ([s.kind, *s.x] for s in samples)),
+        "inputs.csv": _table(["state", *model.input_names], (s.u for s in samples)),
+        "README.md": readme,
+        **made_usd,
+    }
+    directory.mkdir()
+    for name, content in files.items():
+        (directory / name).write_text(content)
+    return [directory / name for name in files]
 
 
 def _usd(description: Description) -> tuple[dict[str, str], str]:

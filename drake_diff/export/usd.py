@@ -28,7 +28,13 @@ def usd(description: Description) -> str:
     ModelError where a link has no mass or moment of inertia, which USD takes for one to be computed from its shapes,
     and where a name is none of USD's.
     """
-    _check(description)
+    for link in description.links:
+        if link.mass <= 0 or np.any(principal(link.inertia)[0] <= 0):
+            # Readers of USD take a 0 for a number that they are to compute from the shapes.
+            raise ModelError(f"link {link.body}: USD cannot hold a mass or moment of inertia of 0")
+        for name in (link.body, link.joint):
+            if not Tf.IsValidIdentifier(name):
+                raise ModelError(f"{name!r} is not a valid name in USD")
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -48,16 +54,6 @@ def usd(description: Description) -> str:
     for i, geometry in enumerate(description.geometries):
         _add_geometry(stage, i, geometry, zero.in_frame(geometry.body) @ geometry.pose)
     return str(stage.GetRootLayer().ExportToString())
-
-
-def _check(description: Description) -> None:
-    for link in description.links:
-        if link.mass <= 0 or np.any(principal(link.inertia)[0] <= 0):
-            # Readers of USD take a 0 for a number that they are to compute from the shapes.
-            raise ModelError(f"link {link.body}: USD cannot hold a mass or moment of inertia of 0")
-        for name in (link.body, link.joint):
-            if not Tf.IsValidIdentifier(name):
-                raise ModelError(f"{name!r} is not a valid name in USD")
 
 
 def _vector(values: Any) -> Any:

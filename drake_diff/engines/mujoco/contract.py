@@ -38,9 +38,25 @@ def check_known(m: Any, flags: int) -> None:
 
 def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Description, **own: Any) -> EngineContract:
     """What `m` has, where `d` is at Drake's q = 0; `own` are the fields and `reasons` that MuJoCo and MJX differ in."""
-    left_out = [pair.names for pair in description.pairs if pair_index(m, pair.names) < 0]
+    left_out, pairs, limits = [], [], []
+    for pair in description.pairs:
+        i = pair_index(m, pair.names)
+        if i < 0:
+            left_out.append(pair.names)
+        else:
+            s = -float(m.pair_solref[i][0])
+            stiffness = s * resting_stiffness(m, i) if s > 0 else None
+            pairs.append(PairContract(pair.names, float(m.pair_friction[i][0]), stiffness))
+    for i in native.actuator:  # of MuJoCo's limits of control and force that which is reached first
+        by_force = float(m.actuator_forcerange[i][1]) if m.actuator_forcelimited[i] else np.inf
+        by_control = float(m.actuator_ctrlrange[i][1]) if m.actuator_ctrllimited[i] else np.inf
+        limits.append(min(by_force / abs(float(m.actuator_gainprm[i][0])), by_control))
     law = f"soft constraint, {CONES[int(m.opt.cone)]} cone, impratio {float(m.opt.impratio):g}"
     free, who = native.coordinates.free, own.pop("who")
+    name, explicit = INTEGRATORS[int(m.opt.integrator)], bool(int(m.opt.disableflags) & NO_EULERDAMP)
+    drakes = name == "IMPLICITFAST" or (name == "EULER" and not explicit)
+    damping = "implicit" if drakes or name == "IMPLICIT" else "explicit"
+    euler = f"MuJoCo's {name}, joint damping {damping}{', quaternions by the exponential' if free else ''}"
     reasons = {
         "integrator": f"{who} turns quaternions by the exponential of h w', Drake by its first term"
         if free
@@ -57,27 +73,17 @@ def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Descri
         state="quaternion w x y z after the position; velocity of a free body linear in world, angular in the body",
         inputs=tuple(name_of(m, m.name_actuatoradr[i]) for i in native.actuator),
         actuation=_read_actuation(m, native.dofs, native.actuator),
-        effort_limits=tuple(_read_effort_limit(m, i) for i in native.actuator),
+        effort_limits=tuple(limits),
         time_step=float(m.opt.timestep),
-        integrator=_read_integrator(m, bool(free)),
+        integrator=DRAKES_STEP if drakes and not free else euler,
         gravity=floats(m.opt.gravity),
         contact_law=law if touches(m) else "none",
-        contacts=_read_pairs(m, description.pairs),
+        contacts=tuple(pairs),
         solver_tolerance=float(m.opt.tolerance),
         limit_law="soft constraint of the step's solver",
         reasons=reasons,
         **own,
     )
-
-
-def _read_integrator(m: Any, free: bool) -> str:
-    """Drake's step where it is that."""
-    name, explicit = INTEGRATORS[int(m.opt.integrator)], bool(int(m.opt.disableflags) & NO_EULERDAMP)
-    drakes = name == "IMPLICITFAST" or (name == "EULER" and not explicit)
-    if drakes and not free:
-        return DRAKES_STEP
-    damping = "implicit" if drakes or name == "IMPLICIT" else "explicit"
-    return f"MuJoCo's {name}, joint damping {damping}{', quaternions by the exponential' if free else ''}"
 
 
 def touches(m: Any) -> bool:
@@ -114,13 +120,6 @@ def _read_actuation(m: Any, dofs: Array, actuators: list[int]) -> tuple[tuple[fl
     return float_rows(B)
 
 
-def _read_effort_limit(m: Any, i: int) -> float:
-    """Of the input, whichever of MuJoCo's limits of control and force is reached first."""
-    by_force = float(m.actuator_forcerange[i][1]) if m.actuator_forcelimited[i] else np.inf
-    by_control = float(m.actuator_ctrlrange[i][1]) if m.actuator_ctrllimited[i] else np.inf
-    return min(by_force / abs(float(m.actuator_gainprm[i][0])), by_control)
-
-
 def pair_index(m: Any, names: tuple[str, str]) -> int:
     """Which of the model's contact pairs these two geometries are; -1 where they are none."""
     for i in range(m.npair):
@@ -137,15 +136,3 @@ def resting_stiffness(m: Any, i: int) -> float:
     bodies = [int(m.geom_bodyid[g]) for g in (m.pair_geom1[i], m.pair_geom2[i])]
     inverse_mass = sum(float(m.body_invweight0[b][0]) for b in bodies)
     return 1 / ((1 - float(m.pair_solimp[i][1])) * inverse_mass)
-
-
-def _read_pairs(m: Any, wanted: tuple[PairContract, ...]) -> tuple[PairContract, ...]:
-    """Those of Drake's pairs that the model has, with MuJoCo's friction and the stiffness where they rest."""
-    found = []
-    for pair in wanted:
-        i = pair_index(m, pair.names)
-        if i >= 0:
-            s = -float(m.pair_solref[i][0])
-            stiffness = s * resting_stiffness(m, i) if s > 0 else None
-            found.append(PairContract(pair.names, float(m.pair_friction[i][0]), stiffness))
-    return tuple(found)

@@ -54,24 +54,25 @@ class MujocoEngine(PlantEngine):
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
         self._set(*self._point(x, u))
         mujoco.mj_step(self.model, self.data)
-        self._check(x, u)
+        bad = [name for name in BAD if self.data.warning[int(getattr(mujoco.mjtWarning, name))].number > 0]
+        if bad or not np.all(np.isfinite(self.data.qpos)):
+            raise SimulationError(f"MuJoCo cannot take this step: {bad}, from x = {np.asarray(x)}, u = {np.asarray(u)}")
+        used = int(np.max(self.data.solver_niter)) if self.data.nefc else 0
+        self.status = "ok" if used < self.model.opt.iterations else f"the solver used all of its {used} iterations"
         return self.native.to_drake(self.data.qpos, self.data.qvel)
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
         x, u = self._point(x, u)
         x_next = self.step(x, u)
         self._set(x, u)
-        A, B, method = self._native_jacobian()
-        A, B = self.native.jacobian(x, x_next, A, B)
-        return StepJacobian(frozen(A), frozen(B), method)
-
-    def _native_jacobian(self) -> tuple[Array, Array, str]:
         small = self._differences(DIFFERENCE_STEP)
         near, far = self._differences(FREE_STEP), self._differences(2 * FREE_STEP)
         A, B = ((4 * a - b) / 3 for a, b in zip(near, far, strict=True))
-        if np.abs(A - small[0]).max() <= SAME_JACOBIAN * max(1.0, float(np.abs(A).max())):
-            return A, B, "centred differences (mjd_transitionFD), extrapolated"
-        return *small, "centred differences (mjd_transitionFD)"
+        method = "centred differences (mjd_transitionFD), extrapolated"
+        if not np.abs(A - small[0]).max() <= SAME_JACOBIAN * max(1.0, float(np.abs(A).max())):
+            (A, B), method = small, "centred differences (mjd_transitionFD)"
+        A, B = self.native.jacobian(x, x_next, A, B)
+        return StepJacobian(frozen(A), frozen(B), method)
 
     def _differences(self, step: float) -> tuple[Array, Array]:
         """A (2 nv, 2 nv) and B (2 nv, nu) in MuJoCo's tangent coordinates and inputs."""
@@ -113,27 +114,13 @@ class MujocoEngine(PlantEngine):
         self._set(self._zero(), np.zeros(self.nu))
         mujoco.mj_forward(self.model, self.data)
         derivatives = "by tangent vectors of qpos and by qvel, centred differences in C"
-        return read_contract(
-            self.model,
-            self.data,
-            self.native,
-            self.description,
-            who="MuJoCo",
-            engine=self.name,
-            derivatives=derivatives,
-        )
+        own = {"who": "MuJoCo", "engine": self.name, "derivatives": derivatives}
+        return read_contract(self.model, self.data, self.native, self.description, **own)
 
     def _set(self, x: Array, u: Array) -> None:
         mujoco.mj_resetData(self.model, self.data)  # which takes the warm start too
         self.data.qpos[:], self.data.qvel[:] = self.native.to_native(x)
         self.data.ctrl[:] = self.native.control(u)
-
-    def _check(self, x: ArrayLike, u: ArrayLike) -> None:
-        bad = [name for name in BAD if self.data.warning[int(getattr(mujoco.mjtWarning, name))].number > 0]
-        if bad or not np.all(np.isfinite(self.data.qpos)):
-            raise SimulationError(f"MuJoCo cannot take this step: {bad}, from x = {np.asarray(x)}, u = {np.asarray(u)}")
-        used = int(np.max(self.data.solver_niter)) if self.data.nefc else 0
-        self.status = "ok" if used < self.model.opt.iterations else f"the solver used all of its {used} iterations"
 
 
 def mujoco_model(description: Description, time_step: float, path: str | Path | None) -> tuple[str, Any]:
@@ -142,7 +129,11 @@ def mujoco_model(description: Description, time_step: float, path: str | Path | 
         text = generated(description, time_step)
         model = _compile(text)
     else:
-        text, model = Path(path).read_text(), _read(path)
+        text = Path(path).read_text()
+        try:
+            model = mujoco.MjModel.from_xml_path(str(path))
+        except ValueError as error:
+            raise ModelError(f"MuJoCo cannot read {path}: {error}") from error
     flags = mujoco.mjtDisableBit
     check_known(model, int(flags.mjDSBL_WARMSTART | flags.mjDSBL_EULERDAMP))
     return text, model
@@ -167,13 +158,6 @@ def _compile(text: str) -> Any:
         raise ModelError(f"MuJoCo cannot take this model: {error}") from error
 
 
-def _read(path: str | Path) -> Any:
-    try:
-        return mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise ModelError(f"MuJoCo cannot read {path}: {error}") from error
-
-
 def exponential_gap(x: Array, x_next: Array, h: float, q_start: int = 0, w_start: int = 7) -> Array:
     """(4,) MuJoCo's quaternion after a step less Drake's of the norm 1: exp(h w') against 1 + h w' / 2.
 
@@ -182,8 +166,5 @@ def exponential_gap(x: Array, x_next: Array, h: float, q_start: int = 0, w_start
     q, turn = x[q_start : q_start + 4], h * x_next[w_start : w_start + 3] / 2
     angle = float(np.linalg.norm(turn))
     axis = turn / angle if angle else turn
-    difference = np.array(
-        [np.cos(angle) - np.cos(np.arctan(angle)), *(np.sin(angle) - np.sin(np.arctan(angle))) * axis]
-    )
-    w, v = difference[0], difference[1:]
+    w, v = np.cos(angle) - np.cos(np.arctan(angle)), (np.sin(angle) - np.sin(np.arctan(angle))) * axis
     return np.concatenate([[w * q[0] - v @ q[1:]], w * q[1:] + q[0] * v + np.cross(v, q[1:])]) / np.linalg.norm(q)

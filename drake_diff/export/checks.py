@@ -1,0 +1,154 @@
+"""What must hold before anything is exported: the file, read back, says what the plant does; two small models agree.
+
+The small models are compared in Drake with the hand calculation, and as files of every format.
+"""
+
+import warnings
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import numpy as np
+
+from drake_diff.comparison.result import LAWS
+from drake_diff.engines.closed_form import NumpyEngine
+from drake_diff.engines.contract_match import match_contracts
+from drake_diff.engines.drake import DrakeEngine
+from drake_diff.engines.interface import EngineContract, limit
+from drake_diff.engines.load import load_engine
+from drake_diff.engines.mujoco.mjcf import mjcf
+from drake_diff.engines.urdf import urdf
+from drake_diff.exceptions import DrakeDiffError, ModelWarning
+from drake_diff.export.sdf import collision_name, sdf
+from drake_diff.mechanics.description import Description
+from drake_diff.model.model import Model, load_model
+from drake_diff.model.tangent import tangent_space
+
+SUFFIX = {"urdf": ".urdf", "sdf": ".sdf", "mjcf": ".xml"}
+H = 0.01  # [s]
+# Of rounding in numbers of size 1 to 100; the Jacobian's second derivatives magnify it.
+STEP_TOLERANCE, JACOBIAN_TOLERANCE = 1e-12, 1e-10
+PENDULUM = """<robot name="pendulum">
+  <link name="pole"><inertial><origin xyz="0 0 -0.5"/><mass value="1"/>
+    <inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="hinge" type="continuous"><parent link="world"/><child link="pole"/><axis xyz="0 1 0"/>
+    <dynamics damping="0.1"/></joint>
+  <transmission><type>transmission_interface/SimpleTransmission</type>
+    <joint name="hinge"><hardwareInterface>EffortJointInterface</hardwareInterface></joint>
+    <actuator name="motor"/></transmission>
+</robot>"""
+PROJECTILE = """<robot name="projectile">
+  <link name="ball"><inertial><mass value="1"/>
+    <inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
+</robot>"""
+SMALL: dict[str, tuple[str, list[float], list[float]]] = {  # URDF, x, u
+    "pendulum": (PENDULUM, [0.7, -1.2], [0.3]),
+    "projectile": (PROJECTILE, [0.6, -0.48, 0.64, 0, 1, 2, 3, 0.4, -0.5, 0.6, 2, 1, 5], []),
+}
+
+
+def written(form: str, description: Description, time_step: float) -> str:
+    """The text of a urdf, sdf or mjcf."""
+    if form == "urdf":
+        return urdf(description)
+    return sdf(description, time_step) if form == "sdf" else mjcf(description, time_step)
+
+
+def named_in(form: str, geometry: str) -> str:
+    """The name that a geometry has in a file."""
+    return collision_name(geometry) if form == "sdf" else geometry
+
+
+def complaints(form: str, model: Model, text: str) -> list[str]:
+    """What of `model` the file `text` does not say, by each reader: Drake, and of MJCF MuJoCo where it is installed.
+
+    Drake reads no springs in MJCF: of a model with springs only MuJoCo reads it, or nobody does, which is a complaint.
+    """
+    reference, gravity = DrakeEngine(model), model.plant.gravity_field().gravity_vector()
+    springs = any(link.stiffness for link in reference.description.links)
+    readers = ["drake"] if form != "mjcf" or not springs else []
+    readers += ["mujoco"] if form == "mjcf" and find_spec("mujoco") else []
+    found = [] if readers else ["MuJoCo is not installed, and Drake reads no springs in MJCF"]
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"model{SUFFIX[form]}"
+        path.write_text(text)
+        for reader in readers:
+            try:
+                if reader == "mujoco":
+                    engine = load_engine("mujoco", model, path=path)
+                else:
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("ignore", ModelWarning)  # of what is other engines' alone
+                        # Drake reads gravity of no format.
+                        engine = _Unlimited(load_model(path, time_step=model.time_step, gravity=gravity))
+                lines = match_contracts(_Named(model, form), engine)
+            except DrakeDiffError as error:
+                found.append(f"{reader} cannot read it: {error}")
+            else:
+                wrong = (line for line in lines if line.verdict == "different" and line.quantity not in LAWS)
+                found += [f"read by {reader}, {line.quantity}: {line.detail}" for line in wrong]
+    return found
+
+
+class _Named(DrakeEngine):
+    """The plant, its inputs named as the format names them."""
+
+    def __init__(self, model: Model, form: str):
+        super().__init__(model)
+        self.form = form
+
+    @property
+    def contract(self) -> EngineContract:
+        own = super().contract
+        return replace(own, inputs=self.description.actuated) if self.form == "sdf" else own
+
+
+class _Unlimited(DrakeEngine):
+    """What was read, without the limits that stand for none."""
+
+    @property
+    def contract(self) -> EngineContract:
+        own = super().contract
+        joints = [replace(j, lower=limit(j.lower), upper=limit(j.upper)) for j in own.joints]
+        return replace(own, joints=tuple(joints), effort_limits=tuple(limit(x) for x in own.effort_limits))
+
+
+class Check(NamedTuple):
+    """One thing that must hold, and what was found."""
+
+    name: str
+    holds: bool
+    found: str
+
+
+def check_small_models() -> tuple[Check, ...]:
+    """A pendulum and a projectile in Drake against the hand calculation: step, Jacobian, energy and contract.
+
+    Then each of them as URDF, SDF and MJCF, read back by Drake, and as MJCF by MuJoCo where it is installed.
+    """
+    checks = []
+    for name, (text, state, effort) in SMALL.items():
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "model.urdf"
+            path.write_text(text)
+            model = load_model(path, time_step=H)
+        x, u, space = np.array(state), np.array(effort), tangent_space(model)
+        drake, hand = DrakeEngine(model), NumpyEngine(model)
+        found = {}
+        for engine in (drake, hand):
+            x_next, (A, B, _) = engine.step(x, u), engine.differentiate_step(x, u)
+            found[engine] = {
+                "step": (x_next, STEP_TOLERANCE),
+                "Jacobian": (space.jacobian(x, x_next, A, B), JACOBIAN_TOLERANCE),
+                "energy": (np.array([engine.energy(x)]), STEP_TOLERANCE),
+            }
+        for what, (right, tolerance) in found[hand].items():
+            gap = float(np.abs(found[drake][what][0] - right).max() / max(1.0, np.abs(right).max()))
+            told = f"Drake is {gap:.1e} from the hand calculation, {tolerance:g} is allowed"
+            checks.append(Check(f"{name}: {what}", gap <= tolerance, told))
+        for form in SUFFIX:
+            wrong = complaints(form, model, written(form, drake.description, H))
+            checks.append(Check(f"{name}: {form} read back", not wrong, "; ".join(wrong) or "the same model"))
+    return tuple(checks)
