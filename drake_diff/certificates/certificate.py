@@ -194,7 +194,7 @@ def certify_jacobian(
     scale = np.maximum(1.0, np.abs(x))
     at_x, beside = np.asarray(jacobian(x) if callable(jacobian) else jacobian, dtype=float), None
     if callable(jacobian):
-        beside = np.asarray(jacobian(x + JITTER * scale * jitter_direction(len(x))), dtype=float) * scale
+        beside = np.asarray(jacobian(x + jitter(scale)), dtype=float) * scale
     many = f if batched else one_by_one(lambda at: np.asarray(f(at), dtype=float))
     return certify_displacement(
         lambda d: many(x + scale * d),
@@ -245,10 +245,10 @@ def certify_displacement(
     return Certificate(rows, columns, a, d, t, codes, method, subject)
 
 
-def jitter_direction(size: int) -> Array:
-    """(size,) entries between 0.5 and 1 of either sign, always the same ones."""
-    random = np.random.default_rng(0)
-    return random.uniform(0.5, 1.0, size) * random.choice([-1.0, 1.0], size)
+def jitter(scale: Array) -> Array:
+    """(n,) entries between a half and all of 1e-9 `scale` (n,), of either sign, always the same ones."""
+    random, size = np.random.default_rng(0), len(scale)
+    return JITTER * scale * (random.uniform(0.5, 1.0, size) * random.choice([-1.0, 1.0], size))
 
 
 def _judge(

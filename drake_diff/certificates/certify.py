@@ -13,14 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.differences import one_by_one
-from drake_diff.certificates.certificate import (
-    JITTER,
-    VERDICTS,
-    Certificate,
-    ModeChange,
-    certify_displacement,
-    jitter_direction,
-)
+from drake_diff.certificates.certificate import VERDICTS, Certificate, ModeChange, certify_displacement, jitter
 from drake_diff.derivatives.sources import check_method, step_at
 from drake_diff.derivatives.step import StepDerivatives, step_jacobians
 from drake_diff.exceptions import InputError
@@ -145,7 +138,7 @@ def certify(
 
         d, beside = derivatives or step_jacobians(model, vector, x, u, method), None
         if derivatives is None and not vector.parameters:
-            jittered = _move(space, model.nx, point, JITTER * scale * jitter_direction(len(scale)))
+            jittered = _move(space, model.nx, point, jitter(scale))
             d_beside = step_jacobians(model, vector, jittered[: model.nx], jittered[model.nx :], method)
             beside = on_tangent(jittered, d_beside)
         derivative = on_tangent(point, d)
@@ -273,7 +266,7 @@ def certify_rollout(
         rows=("loss",),
         columns=columns,
         scale=scale,
-        beside=_flat(space, gradient_at(JITTER * jitter_direction(len(scale))), us.shape)[None] * scale,
+        beside=_flat(space, gradient_at(jitter(np.ones(len(scale)))), us.shape)[None] * scale,
         solver_tolerance=max(solver_tolerance(model, x, u) for x, u in zip(gradient.xs[:-1], us, strict=True)),
         method=" + ".join(dict.fromkeys((*gradient.methods, *gradient.parameter_sources))),
         subject=f"the rollout of {model.name}",

@@ -187,7 +187,7 @@ class _Search:
 
     def _step(self, model: LinearQuadratic, final: bool) -> Outcome | None:
         """Take one step that lowers the merit; an outcome if there is none left to take."""
-        merit = self._merit()
+        merit = self._merit(self.motion, self.cost)
         scale = 1 + abs(merit)
         left_over = self.limits.tolerance**2 * scale
         if not final:
@@ -228,13 +228,13 @@ class _Search:
             slope, curvature = slope_along(model, policy)
             self.gap_weight = max(self.gap_weight, 2 * (slope + max(curvature, 0) / 2) / distance)
             slope -= self.gap_weight * distance
-        merit = self._merit()
+        merit = self._merit(self.motion, self.cost)
         for size in STEP_SIZES:
             try:
                 motion = self._roll(policy, size)
                 with np.errstate(all="ignore"):  # a merit that is not finite is no decrease
                     cost = self.problem.objective(motion.xs, motion.us)
-                    found = self._merit_of(motion, cost)
+                    found = self._merit(motion, cost)
             except SimulationError:
                 continue  # too long a step: a shorter one is tried next
             if found <= merit + SUFFICIENT_DECREASE * size * slope:
@@ -282,10 +282,7 @@ class _Search:
         bounds = self.problem.bounds
         return np.where(self.problem.initial_state_mask, np.clip(x, bounds.x_lower, bounds.x_upper), x)
 
-    def _merit(self) -> float:
-        return self._merit_of(self.motion, self.cost)
-
-    def _merit_of(self, motion: Motion, cost: float) -> float:
+    def _merit(self, motion: Motion, cost: float) -> float:
         """Cost, augmented by the constraints, plus the weighted sum of all gaps."""
         return cost + self.constraints.value(*motion.point) + self.gap_weight * motion.distance
 
