@@ -14,7 +14,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.contact.jacobian import contact_form, contact_jacobians, material_of, place
-from drake_diff.derivatives.contact.material import QUANTITIES, material_change, of_contact_alone
+from drake_diff.derivatives.contact.material import QUANTITIES, material_change
 from drake_diff.derivatives.implicit import form_of
 from drake_diff.derivatives.smooth_step import SmoothStep, build_analytic
 from drake_diff.derivatives.steps import Flags, Jacobians, NotSmoothError, Steps, take_step
@@ -42,7 +42,7 @@ class Analytic:
 
     def differentiate(self, steps: Steps) -> Jacobians | Refusal:
         """All in one call."""
-        if not of_contact_alone(steps.vector):
+        if any(p.kind.quantity not in QUANTITIES for p in steps.vector.parameters):
             return Refusal("derivatives by parameters other than of contact are asked for")
         smooth = analytic_of(steps.model)
         if isinstance(smooth, Refusal):

@@ -22,7 +22,7 @@ from drake_diff.derivatives.implicit import Form, form_of
 from drake_diff.derivatives.steps import Steps
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates, native_positions, turn, turn_change, turn_derivatives, turning
-from drake_diff.mechanics.description import Description, describe_tree
+from drake_diff.mechanics.description import describe_tree
 from drake_diff.model.model import Model
 
 # What a limit or a controller at its limit changes in x' is larger; x' known to rounding alone, as x + gap, is not.
@@ -129,10 +129,8 @@ class SmoothStep:
         q, v = xs[:, : c.nq], xs[:, c.nq :]
         force, clipped = self._force(q, v, us)
         native = self.into_native(q, v)
-        velocities, v_next = self._velocities(
-            native, self._accelerate(native.q_native, native.v_native, force), clipped
-        )
-        return self.assemble(native, velocities, v_next)
+        solved = self._accelerate(native.q_native, native.v_native, force)
+        return self.assemble(native, *self._velocities(native, solved, clipped))
 
     def into_native(self, q: Array, v: Array) -> Native:
         """The states q (N, nq), v (N, nv) in Pinocchio's coordinates."""
@@ -208,7 +206,12 @@ def build_analytic(model: Model) -> SmoothStep:
     from drake_diff.mechanics.pinocchio_tree import acceleration_derivatives, build  # here, as Pinocchio is an extra
 
     built, _ = build(description.links, description.gravity)
-    stiffness, damping, rest = _springs(model, form, description)
+    kp, kd = form.gains()
+    stiffness, damping = description.by_velocity("stiffness"), description.by_velocity("damping")
+    rest = stiffness * description.by_velocity("rest")
+    np.add.at(stiffness, form.velocity, kp)
+    np.add.at(damping, form.velocity, kd + model.time_step * kp)
+    np.add.at(rest, form.velocity, kp * form.reference[0] + kd * form.reference[1])
     data = built.createData()
     built.armature = description.by_velocity("armature") + model.time_step * damping
     positions, limits = np.zeros(model.nv, dtype=int), np.array([[-np.inf], [np.inf]]) * np.ones(model.nv)
@@ -233,14 +236,3 @@ def build_analytic(model: Model) -> SmoothStep:
         sprung=bool(stiffness.any()),
         joint_of=np.repeat(np.arange(built.njoints - 1), list(built.nvs)[1:]),
     )
-
-
-def _springs(model: Model, form: Form, description: Description) -> tuple[Array, Array, Array]:
-    """K, D and c (each (nv,)), those of PD control included."""
-    kp, kd = form.gains()
-    stiffness, damping = description.by_velocity("stiffness"), description.by_velocity("damping")
-    rest = stiffness * description.by_velocity("rest")
-    np.add.at(stiffness, form.velocity, kp)
-    np.add.at(damping, form.velocity, kd + model.time_step * kp)
-    np.add.at(rest, form.velocity, kp * form.reference[0] + kd * form.reference[1])
-    return stiffness, damping, rest

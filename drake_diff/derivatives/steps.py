@@ -51,15 +51,8 @@ class Steps:
         """Some of the steps."""
         if len(which) == len(self.xs):
             return self
-        return Steps(
-            self.model,
-            self.vector,
-            self.xs[which],
-            self.us[which],
-            self.x_next[which],
-            self.touching[which],
-            self.taken,
-        )
+        xs, us, x_next, touching = self.xs[which], self.us[which], self.x_next[which], self.touching[which]
+        return Steps(self.model, self.vector, xs, us, x_next, touching, self.taken)
 
     def stand_at(self, k: int) -> None:
         """Put the double twin's context at the state of step k, where it does not stand there anyway.
@@ -80,7 +73,7 @@ def take_step(model: Model, vector: ParameterVector, x: Array, u: Array) -> Step
 
 def take_steps(model: Model, vector: ParameterVector, x0: Array, us: Array, xs: Array | None = None) -> Steps:
     """Drake's steps from x0 (nx,) under us (N, nu), one after the other, or from each of xs (N, nx)."""
-    can_touch = _can_touch(model)
+    can_touch = model.contract.contact.collision_pairs > 0
     starts, ends = np.empty((len(us), model.nx)), np.empty((len(us), model.nx))
     touching = np.zeros(len(us), dtype=bool)
     x = x0
@@ -94,15 +87,11 @@ def take_steps(model: Model, vector: ParameterVector, x0: Array, us: Array, xs: 
 def known_steps(model: Model, vector: ParameterVector, xs: Array, us: Array, x_next: Array) -> Steps:
     """Steps of which the caller says where they lead: Drake is asked only what overlaps in xs (N, nx)."""
     touching = np.zeros(len(us), dtype=bool)
-    if _can_touch(model):
+    if model.contract.contact.collision_pairs:
         for k, x in enumerate(xs):
             set_state(model.double, x)
             touching[k] = model.double.overlaps()
     return Steps(model, vector, xs, us, x_next, touching, taken=False)
-
-
-def _can_touch(model: Model) -> bool:
-    return model.contract.contact.collision_pairs > 0
 
 
 @dataclass(eq=False, slots=True)

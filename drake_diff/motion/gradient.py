@@ -58,9 +58,8 @@ class RolloutGradient(ShowsItsRepr):
     def __repr__(self) -> str:
         sizes = [f"|by x0| {np.linalg.norm(self.by_x0):.3g}", f"|by us| {np.linalg.norm(self.by_us):.3g}"]
         sizes += [f"|by the policy| {np.linalg.norm(self.by_policy):.3g}"] if self.by_policy.size else []
-        sizes += [
-            f"by {name} {value:.3g}" for name, value in zip(self.parameter_names, self.by_parameters, strict=True)
-        ]
+        named = zip(self.parameter_names, self.by_parameters, strict=True)
+        sizes += [f"by {name} {value:.3g}" for name, value in named]
         first, last = self.state_gradient_norms[[0, -1]]
         return (
             f"RolloutGradient of {len(self.us)} steps by {' and '.join(self.methods)}: loss {self.loss:.6g}\n"
@@ -246,11 +245,8 @@ def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, 
 
 def takes_one_argument(loss: Loss) -> bool:
     """Whether `loss` is a function of the final state alone."""
-    required = [
-        p
-        for p in inspect.signature(loss).parameters.values()
-        if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
-    ]
+    arguments = [p for p in inspect.signature(loss).parameters.values() if p.default is p.empty]
+    required = [p for p in arguments if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     if len(required) not in (1, 2):
         raise InputError("loss", got=f"{len(required)} arguments", expected="loss(xs, us) or loss(x_final)")
     return len(required) == 1

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 
-from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff._base.arrays import Array, finite_array, frozen, scale
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff.derivatives.sources import PARITY_TOLERANCE
 from drake_diff.derivatives.step import differentiate_step, linearize
@@ -94,7 +94,7 @@ class PD:
         if not joints:
             raise InputError("model", got="no actuators", expected="at least one")
         self.x_ref = finite_array("x_ref", model.default_state if x_ref is None else x_ref, (model.nx,))
-        self.kp, self.kd = _gains("kp", kp, model.nu), _gains("kd", kd, model.nu)
+        self.kp, self.kd = scale("kp", kp, model.nu), scale("kd", kd, model.nu)
         self.parameters = frozen(np.concatenate([self.kp, self.kd]))
         self._positions = [joint.position_start() for joint in joints]
         self._velocities = [model.nq + joint.velocity_start() for joint in joints]
@@ -144,9 +144,8 @@ class LQR:
         try:
             gain, cost_to_go = DiscreteTimeLinearQuadraticRegulator(A=A, B=B, Q=Q, R=R)
         except (RuntimeError, SystemExit) as error:  # pydrake makes a failed demand of Drake's a SystemExit
-            raise InputError(
-                "LQR", got=str(error), expected="a fixed point that the inputs can stabilize, and Q that sees all of it"
-            ) from error
+            expected = "a fixed point that the inputs can stabilize, and Q that sees all of it"
+            raise InputError("LQR", got=str(error), expected=expected) from error
         self.gain, self.cost_to_go = frozen(gain), frozen(cost_to_go)
         self.parameters = frozen(self.gain.ravel())
 
@@ -250,8 +249,14 @@ def differentiate_policy(policy: Any, x: Array, t: float, nu: int) -> tuple[Arra
     moved[active] = variables[len(x) :]
     result = _call_with_derivatives(policy, variables[: len(x)], t, moved)
     plain = np.array([not isinstance(entry, AutoDiffXd) for entry in result], dtype=bool)
-    if plain.any():
-        _check_constant(policy, x, t, parameters, u, plain)
+    if plain.any():  # which must be a constant: else its derivatives were thrown away
+        near = finite_array("policy(x, t)", _call(policy, x + NUDGE, t, parameters + NUDGE), (nu,))
+        changed = np.flatnonzero(plain & (near != u))
+        if len(changed):
+            raise GradientError(
+                f"the policy lost its derivatives: u[{changed[0]}] is a plain number, yet it changes with the state or "
+                "the parameters (or jumps there)"
+            )
     numbers = np.array([AutoDiffXd(entry) if lost else entry for entry, lost in zip(result, plain, strict=True)])
     rows = gradient_rows(numbers, len(variables)) if nu else np.zeros((0, len(variables)))
     _check(numbers, rows, u)
@@ -275,17 +280,6 @@ def _call_with_derivatives(policy: Any, x: Any, t: float, parameters: Any) -> An
             f"the policy lost its derivatives: {error}; write it with ordinary arithmetic and NumPy functions, "
             "without float() and without putting results into an array of floats"
         ) from error
-
-
-def _check_constant(policy: Any, x: Array, t: float, parameters: Array, u: Array, plain: Any) -> None:
-    """Refuse a plain number in the output that is not constant: its derivatives were thrown away."""
-    near = finite_array("policy(x, t)", _call(policy, x + NUDGE, t, parameters + NUDGE), u.shape)
-    changed = np.flatnonzero(plain & (near != u))
-    if len(changed):
-        raise GradientError(
-            f"the policy lost its derivatives: u[{changed[0]}] is a plain number, yet it changes with the state or "
-            "the parameters (or jumps there)"
-        )
 
 
 def _check(numbers: Any, rows: Array, u: Array) -> None:
@@ -317,17 +311,13 @@ def _riccati(steps: list[tuple[Array, Array]], Q: Array, R: Array, Qf: Array) ->
     return np.array(gains[::-1]), np.array(cost_to_go[::-1])
 
 
-def _gains(name: str, value: ArrayLike, nu: int) -> Array:
-    return finite_array(name, np.full(nu, value) if np.ndim(value) == 0 else value, (nu,))
-
-
 def _weight(name: str, value: ArrayLike, size: int, *, definite: bool = False) -> Array:
     matrix = finite_array(name, value, (size, size))
-    scale = float(np.abs(matrix).max(initial=0.0))
-    if not np.allclose(matrix, matrix.T, rtol=0, atol=1e-12 * scale):
+    rounding = 1e-12 * float(np.abs(matrix).max(initial=0.0))
+    if not np.allclose(matrix, matrix.T, rtol=0, atol=rounding):
         raise InputError(name, got="a matrix that is not symmetric", expected="a symmetric matrix")
     lowest = float(np.min(np.linalg.eigvalsh(matrix), initial=np.inf))
-    if lowest <= 1e-12 * scale if definite else lowest < -1e-12 * scale:
+    if lowest <= rounding if definite else lowest < -rounding:
         kind = "definite" if definite else "semidefinite"
         raise InputError(name, got=f"lowest eigenvalue {lowest:.3g}", expected=f"a positive {kind} matrix")
     return matrix

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_diff._base.arrays import Array, array_with_gaps, finite_array, frozen, positive_float, positive_int
+from drake_diff._base.arrays import Array, array_with_gaps, count, finite_array, frozen, positive_float, positive_int
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import GradientError, InputError, ShapeError, UnknownNameError
@@ -148,9 +148,9 @@ class Smoothed(ShowsItsRepr):
         head += f", {rows} x {columns}, {self.samples} samples of {_words(self.noise)}, seed {self.seed}"
         if self.biased is None:
             return f"{head}\nstandard errors up to {error:.2g}; no derivative to compare with"
-        low, high, count = np.min(self.weight), np.max(self.weight), np.count_nonzero(self.biased)
+        low, high, biased = np.min(self.weight), np.max(self.weight), np.count_nonzero(self.biased)
         return (
-            f"{head}\nstandard errors up to {error:.2g}; first order is biased in {count} of {self.biased.size} "
+            f"{head}\nstandard errors up to {error:.2g}; first order is biased in {biased} of {self.biased.size} "
             f"entries, its weight is {low:.2g} to {high:.2g}"
         )
 
@@ -200,7 +200,9 @@ def smooth(
     if jacobian is None and (method != "zeroth" or not moved.all()):
         why = "a function (n,) -> (m, n): only zeroth order of coordinates that noise moves does without"
         raise InputError("jacobian", got=None, expected=why)
-    samples, seed = _check_counts(samples, seed)
+    if positive_int("samples", samples) < 2:
+        raise InputError("samples", got=samples, expected="at least 2: one has no variance")
+    samples, seed = int(samples), count("seed", seed, 0)
     means, variances = _moments(f, x, jacobian, noise, moved, samples, seed)
     (value, zeroth, *derivative), (value_variance, zeroth_variance, *derivative_variance) = means, variances
     common: dict[str, Any] = {"method": method, "samples": samples, "seed": seed, "noise": noise}
@@ -317,14 +319,6 @@ def _moved(noise: Noise, size: int) -> Flags:
     return np.array(np.broadcast_to(scale > 0, (size,)))
 
 
-def _check_counts(samples: Any, seed: Any) -> tuple[int, int]:
-    if positive_int("samples", samples) < 2:
-        raise InputError("samples", got=samples, expected="at least 2: one has no variance")
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise InputError("seed", got=repr(seed), expected="a whole number of at least 0")
-    return int(samples), int(seed)
-
-
 def _moments(
     f: Callable[[Array], Any],
     x: Array,
@@ -340,7 +334,7 @@ def _moments(
     if not (rows and size):
         raise InputError("x and f(x)", got=f"{size} and {rows} entries", expected="at least one of each")
     mean, squares = np.zeros(()), np.zeros(())
-    for count, w in enumerate(noise.sample(np.random.default_rng(seed), (samples, size)), start=1):
+    for n, w in enumerate(noise.sample(np.random.default_rng(seed), (samples, size)), start=1):
         value = _evaluate("f", f, x + w, (rows,))
         first = None if jacobian is None else _evaluate("jacobian", jacobian, x + w, (rows, size))
         with np.errstate(over="ignore", invalid="ignore"):  # refused below
@@ -350,8 +344,8 @@ def _moments(
                 zeroth[:, ~moved] = first[:, ~moved]
                 parts = [value, zeroth.ravel(), first.ravel(), (first - zeroth).ravel()]
             change = np.concatenate(parts) - mean
-            mean = mean + change / count
-            squares = squares + change * change * ((count - 1) / count)
+            mean = mean + change / n
+            squares = squares + change * change * ((n - 1) / n)
     variance = squares / ((samples - 1) * samples)
     if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(variance))):
         raise GradientError("the mean or the variance of the samples is not finite: f or its derivative is too large")

@@ -136,7 +136,11 @@ def contact_jacobians(
     left = at.A - at.total(J @ at.impulse.by_velocity() @ J.swapaxes(-1, -2))
     velocities = np.asarray(np.linalg.solve(left, right), dtype=float)
     jacobians, _ = smooth.assemble(at.native, velocities, at.v_next)
-    return jacobians, _is_solved(at) & ~smooth.at_a_limit(steps)
+    # What is missing is the impulse that Drake's solver leaves, in the norm that it ends by.
+    diagonal, momentum = np.einsum("kii->ki", at.A), (at.A @ at.v_next[..., None])[..., 0]
+    missing, had, given = (np.sqrt((p * p / diagonal).sum(axis=1)) for p in (at.gained - at.push, momentum, at.push))
+    solved = missing <= OPTIMALITY * np.maximum(had, given) + ROUNDING
+    return jacobians, solved & ~smooth.at_a_limit(steps)
 
 
 def _at_the_solution(form: ContactForm, smooth: SmoothStep, steps: Steps, poses: Array, material: Material) -> Solved:
@@ -168,24 +172,14 @@ def _by_motion(at: Solved) -> Array:
     """(M, nv, nv) the change of J' g with the degrees of freedom, v' being fixed."""
     contacts, (v, v_next) = at.contacts, at.speeds
     point, normal, phi = contacts.displacement()
-    changed = at.impulse.by_state(
-        StateChange(
-            velocity=contacts.velocity_change(v_next, point),
-            normal=normal,
-            phi=phi,
-            weight=contacts.weight_change(at.weight, at.diagonal, at.diagonal_change, point),
-            before=_approach_change(at, v, point, normal),
-        )
-    )
+    velocity = contacts.velocity_change(v_next, point)
+    weight = contacts.weight_change(at.weight, at.diagonal, at.diagonal_change, point)
+    before = np.zeros(v.shape)
+    if isinstance(at.impulse, HuntCrossleyImpulse):  # the only law that knows the normal velocity before the step
+        along = contacts.velocity_change(v, point) @ contacts.touch.normal[:, :, None]
+        before = (along + normal @ np.swapaxes(v[:, None, :] @ contacts.jacobian, -1, -2))[..., 0]
+    changed = at.impulse.by_state(StateChange(velocity, normal, phi, weight, before))
     return contacts.force_change(at.impulse.impulse, point) + contacts.jacobian @ changed.swapaxes(-1, -2)
-
-
-def _approach_change(at: Solved, v: Array, point: Array, normal: Array) -> Array:
-    """(M, nv) the change of the normal velocity before the step, 0 where the law does not know it."""
-    if isinstance(at.impulse, Impulse):
-        return np.zeros(v.shape)
-    along = at.contacts.velocity_change(v, point) @ at.contacts.touch.normal[:, :, None]
-    return np.asarray((along + normal @ np.swapaxes(v[:, None, :] @ at.contacts.jacobian, -1, -2))[..., 0])
 
 
 def _by_material(at: Solved, change: MaterialChange) -> Array:
@@ -193,13 +187,8 @@ def _by_material(at: Solved, change: MaterialChange) -> Array:
     contacts, touch, nothing = at.contacts, at.contacts.touch, np.zeros((*change.friction.shape, 3))
     point = -(touch.phi[:, None] * change.other_part)[..., None] * touch.normal[:, None]
     before, after = (contacts.velocity_change(v, point, moves=False) for v in at.speeds)
-    moved = StateChange(
-        velocity=after,
-        normal=nothing,
-        phi=nothing[..., 0],
-        weight=contacts.weight_change(at.weight, at.diagonal, None, point),
-        before=(before @ touch.normal[:, :, None])[..., 0],
-    )
+    weight = contacts.weight_change(at.weight, at.diagonal, None, point)
+    moved = StateChange(after, nothing, nothing[..., 0], weight, (before @ touch.normal[:, :, None])[..., 0])
     changed = np.swapaxes(at.impulse.by_material(change) + at.impulse.by_state(moved), -1, -2)
     return np.asarray(contacts.force_change(at.impulse.impulse, point, moves=False) + contacts.jacobian @ changed)
 
@@ -251,11 +240,3 @@ def _sum(at: Indices, of_contacts: Array, count: int) -> Array:
     total = np.zeros((count, *of_contacts.shape[1:]))
     np.add.at(total, at, of_contacts)
     return total
-
-
-def _is_solved(at: Solved) -> Flags:
-    """(N,) whether the impulse that is missing is what Drake's solver leaves, in the norm that it ends by."""
-    diagonal = np.einsum("kii->ki", at.A)
-    momentum = (at.A @ at.v_next[..., None])[..., 0]
-    left, had, given = (np.sqrt((p * p / diagonal).sum(axis=1)) for p in (at.gained - at.push, momentum, at.push))
-    return np.asarray(left <= OPTIMALITY * np.maximum(had, given) + ROUNDING)

@@ -9,14 +9,13 @@ dq being the small motion that a velocity makes. Drake weighs friction by w = |W
 A the mass matrix with what joint damping adds in a step.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from drake_diff._base.arrays import Array, cross
 from drake_diff.derivatives.contact.pairs import Touches
-from drake_diff.mechanics.description import Description, Link
+from drake_diff.mechanics.description import Description
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +34,7 @@ def topology_of(description: Description) -> Topology:
     moves, before, turns = np.zeros((nv, nv)), np.zeros((nv, nv)), np.ones(nv)
     bodies = {"world": np.zeros(nv)}
     for link in description.links:
-        own = np.array(list(_dofs(link)), dtype=np.intp)
+        own = link.v_start + np.arange({"weld": 0, "quaternion_floating": 6}.get(link.kind, 1))
         above = np.flatnonzero(bodies[link.parent])
         moves[np.ix_(above, own)] = before[np.ix_(own, above)] = before[np.ix_(own, own)] = 1.0
         if len(own) > 1:
@@ -44,11 +43,6 @@ def topology_of(description: Description) -> Topology:
         bodies[link.body] = np.array(bodies[link.parent])
         bodies[link.body][own] = 1.0
     return Topology(moves, before, turns, bodies)
-
-
-def _dofs(link: Link) -> Iterator[int]:
-    count = {"weld": 0, "quaternion_floating": 6}.get(link.kind, 1)
-    yield from range(link.v_start, link.v_start + count)
 
 
 def mass_matrix(S: Array, inertia: Array, topology: Topology) -> Array:

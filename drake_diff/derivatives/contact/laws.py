@@ -149,14 +149,11 @@ class Impulse:
         d_Rn = np.where(compliant, -change.stiffness / c.stiffness[:, None] - change.time / soft, 0.0)
         d_yn = c.phi[:, None] / soft**2 * change.time / self.R_n[:, None] - self.y_n[:, None] * d_Rn
         nothing = np.zeros((*change.friction.shape, 3))
-        return self._projected(d_yn, nothing, -d_Rn, nothing) + self._by_friction(change.friction)
-
-    def _by_friction(self, friction: Array) -> Array:
-        mu, ratio = self.cone.friction, self.R_t / self.R_n
-        slides = self.pushes & ~self.sticks
+        mu, ratio, slides = c.friction, self.R_t / self.R_n, self.pushes & ~self.sticks
         by_n = ratio * (self.y_r - 2 * mu * self.g_n) / (1 + mu * mu * ratio)
-        by_mu = (self.g_n + mu * by_n)[:, None] * self.tangent + by_n[:, None] * self.cone.normal
-        return np.where(slides[:, None, None], friction[..., None] * by_mu[:, None, :], 0.0)
+        by_mu = (self.g_n + mu * by_n)[:, None] * self.tangent + by_n[:, None] * c.normal
+        by_friction = np.where(slides[:, None, None], change.friction[..., None] * by_mu[:, None, :], 0.0)
+        return self._projected(d_yn, nothing, -d_Rn, nothing) + by_friction
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,8 +254,11 @@ class HuntCrossleyImpulse:
         law, h, n = self.law, self.law.time_step, self.law.normal[:, None, :]
         mu, k, d = law.friction[:, None], law.stiffness[:, None], law.dissipation[:, None]
         s, e, tangent = self.s[:, None], self.e[:, None], self.tangent[:, None]
-        d_force, d_n0 = self._change_before(by, of)
-        n_0 = (self.elastic * self.damping)[:, None]
+        elastic, damping = self.elastic[:, None], self.damping[:, None]
+        d_force = -k * by.phi - law.phi[:, None] * of.stiffness  # of -k phi, which overlap makes positive
+        slower = -d * by.before - law.before[:, None] * of.dissipation
+        d_n0 = h * damping * d_force + elastic * np.where(damping > 0, slower, 0.0)
+        n_0 = elastic * damping
         soft = SIGMA * (of.friction * law.weight[:, None] * n_0 + mu * (by.weight * n_0 + law.weight[:, None] * d_n0))
         d_e = np.where(self.is_soft[:, None], soft, 0.0)
         d_vn = (by.velocity * n).sum(axis=-1) + (law.velocity[:, None, :] * by.normal).sum(axis=-1)
@@ -272,10 +272,3 @@ class HuntCrossleyImpulse:
         n_f, d_nf = self.n_f[:, None], d_n0 if law.lagged else d_gn
         d_gt = (of.friction * n_f + mu * d_nf)[..., None] * tangent + (mu * n_f)[..., None] * d_tangent
         return np.asarray(d_gn[..., None] * n + self.g_n[:, None, None] * by.normal - d_gt)
-
-    def _change_before(self, by: StateChange, of: MaterialChange) -> tuple[Array, Array]:
-        """(M, K) of -k phi, which overlap makes positive, and of n_0."""
-        law, elastic, damping = self.law, self.elastic[:, None], self.damping[:, None]
-        d_force = -law.stiffness[:, None] * by.phi - law.phi[:, None] * of.stiffness
-        slower = -law.dissipation[:, None] * by.before - law.before[:, None] * of.dissipation
-        return d_force, law.time_step * damping * d_force + elastic * np.where(damping > 0, slower, 0.0)

@@ -7,9 +7,7 @@ of the sphere's and the other side: friction, stiffness, relaxation time (of `sa
 dissipation (of `similar` and `lagged` alone).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 
@@ -17,17 +15,10 @@ from drake_diff._base.arrays import Array
 from drake_diff.derivatives.contact.pairs import ContactPairs, Indices
 from drake_diff.model.parameter_kinds import geometries_of
 from drake_diff.model.parameters import ParameterVector
+from drake_diff.model.plant import proximity_property
 from drake_diff.model.twin import Twin
 
 QUANTITIES = ("friction", "stiffness", "relaxation_time", "dissipation")  # whose derivatives have a closed form
-
-
-_NAMES = ("coulomb_friction", "point_contact_stiffness", "relaxation_time", "hunt_crossley_dissipation")  # Drake's
-
-
-def of_contact_alone(vector: ParameterVector) -> bool:
-    """Whether all the vector's quantities are QUANTITIES."""
-    return all(p.kind.quantity in QUANTITIES for p in vector.parameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,11 +50,8 @@ class MaterialChange:
 
 def read_material(twin: Twin, pairs: ContactPairs) -> Material:
     """What the context has for the pairs, parameters that are applied included; Drake fills in its defaults there."""
-    inspector, read = twin.inspector, {}
-    for i in {i for ids in pairs.ids for i in ids}:
-        properties = inspector.GetProximityProperties(i)
-        friction, *rest = (properties.GetProperty("material", name) for name in _NAMES)
-        read[i] = (friction.dynamic_friction(), *rest)
+    inspector, geometries = twin.inspector, {i for ids in pairs.ids for i in ids}
+    read = {i: [proximity_property(inspector, i, quantity) for quantity in QUANTITIES] for i in geometries}
     sides = np.array([[read[i] for i in ids] for ids in pairs.ids], dtype=float).reshape(len(pairs.ids), 2, 4)
     mu, k, tau, d = np.moveaxis(sides, -1, 0)
     b = k[:, 1] / k.sum(axis=1)
@@ -81,8 +69,8 @@ def material_change(pairs: ContactPairs, material: Material, vector: ParameterVe
     by_sides = np.zeros((len(vector.values), *material.sides.shape))
     of_label = geometries_of(twin)
     for column, parameter in zip(by_sides, vector.parameters, strict=True):
-        has = np.array([_which(ids, of_label[parameter.label]) for ids in pairs.ids])
-        column[..., QUANTITIES.index(parameter.kind.quantity)] = has
+        wanted = of_label[parameter.label]
+        column[..., QUANTITIES.index(parameter.kind.quantity)] = [[i in wanted for i in ids] for ids in pairs.ids]
     by_mu, by_k, by_tau, by_d = np.moveaxis(by_sides, (-1, 0), (0, -1))  # (P, 2, np)
     mu, k, _, d = np.moveaxis(material.sides, -1, 0)
     b = material.other_part[:, None]
@@ -94,10 +82,6 @@ def material_change(pairs: ContactPairs, material: Material, vector: ParameterVe
         dissipation=b * by_d[:, 0] + (1 - b) * by_d[:, 1] + (d[:, :1] - d[:, 1:]) * by_b,
         other_part=by_b,
     )
-
-
-def _which(ids: Sequence[Any], wanted: Sequence[Any]) -> list[bool]:
-    return [i in wanted for i in ids]
 
 
 def _harmonic_change(sides: Array, change: Array) -> Array:
