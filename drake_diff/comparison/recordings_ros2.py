@@ -18,7 +18,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
 from drake_diff.mechanics.coordinates import rotation
-from drake_diff.mechanics.description import Description, Link, describe
+from drake_diff.mechanics.description import Description, describe
 from drake_diff.model.model import Model
 
 JOINTS, ODOMETRY = "sensor_msgs/msg/JointState", "nav_msgs/msg/Odometry"
@@ -54,7 +54,7 @@ def read_ros2(path: Path, model: Model) -> tuple[tuple[Array, Array, Array], Map
         if kind in USED:
             message = store.deserialize_cdr(data, kind)
             stamp = message.header.stamp
-            found.add(kind, topic, stamp.sec * 1_000_000_000 + stamp.nanosec, message)
+            found.topics[kind].setdefault(topic, {})[stamp.sec * 1_000_000_000 + stamp.nanosec] = message
     return found.motion(model), facts
 
 
@@ -88,9 +88,6 @@ class _Found:
         self.topics: dict[str, dict[str, Stamped]] = {kind: {} for kind in USED}
         self.singles = [x for x in description.moving if x.kind != "quaternion_floating"]
         self.free = [x for x in description.moving if x.kind == "quaternion_floating"]
-
-    def add(self, kind: str, topic: str, time: int, message: Any) -> None:
-        self.topics[kind].setdefault(topic, {})[time] = message
 
     def motion(self, model: Model) -> tuple[Array, Array, Array]:
         joints = self._only(JOINTS, "/joint_states") if self.singles else {}
@@ -147,14 +144,14 @@ class _Found:
         if poses.keys() != twists.keys():
             k = min(poses.keys() ^ twists.keys())
             raise InputError(f"{self.source}: t = {k} ns", got="pose or twist alone", expected="both at each time")
-        return {t: _base(poses[t].pose, twists[t].twist, self._in_body(poses[t], twists[t], link)) for t in poses}
-
-    def _in_body(self, pose: Any, twist: Any, link: Link) -> bool:
-        frame, world = twist.header.frame_id, pose.header.frame_id
-        if frame not in (world, link.body) or world == link.body:
-            expected = f"{world!r}, the pose's, or {link.body!r}, the body"
-            raise InputError(f"{self.source}: frame_id of TwistStamped", got=repr(frame), expected=expected)
-        return bool(frame == link.body)
+        found = {}
+        for t, pose in poses.items():
+            frame, world = twists[t].header.frame_id, pose.header.frame_id
+            if frame not in (world, link.body) or world == link.body:
+                expected = f"{world!r}, the pose's, or {link.body!r}, the body"
+                raise InputError(f"{self.source}: frame_id of TwistStamped", got=repr(frame), expected=expected)
+            found[t] = _base(pose.pose, twists[t].twist, in_body=frame == link.body)
+        return found
 
 
 def _base(pose: Any, twist: Any, in_body: bool) -> Array:

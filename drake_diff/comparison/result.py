@@ -250,18 +250,16 @@ class Comparison:
             "contact law" in (e.first.responsible, e.largest.responsible) for e in others if e.verdict != "same"
         )
         note = " From the first touch on a state is only as good as the contact law: drake-diff contact-table."
-        return f"{'; '.join(parts or ['no engine was compared'])}. {self._trust()}{note if after_contact else ''}"
-
-    def _trust(self) -> str:
         own, wrong, open_, blind = (
             [e.engine for e in self.engines if e.gradient == kind]
             for kind in ("its own step's", "not its own step's", "undecided", "none")
         )
-        parts = [f"Gradients to trust at the states looked at: {_list(own)}"] if own else ["No gradient to trust"]
-        parts += [f"not those of {_list(wrong)}, which are not the derivatives of their own steps"] if wrong else []
-        parts += [f"those of {_list(open_)} could not be decided"] if open_ else []
-        parts += [f"{_list(blind)} {'offer' if len(blind) > 1 else 'offers'} none"] if blind else []
-        return "; ".join(parts) + "."
+        trust = [f"Gradients to trust at the states looked at: {_list(own)}"] if own else ["No gradient to trust"]
+        trust += [f"not those of {_list(wrong)}, which are not the derivatives of their own steps"] if wrong else []
+        trust += [f"those of {_list(open_)} could not be decided"] if open_ else []
+        trust += [f"{_list(blind)} {'offer' if len(blind) > 1 else 'offers'} none"] if blind else []
+        found = f"{'; '.join(parts or ['no engine was compared'])}. {'; '.join(trust)}."
+        return f"{found}{note if after_contact else ''}"
 
 
 def first_above(gaps: Array, precision: Precision) -> int | None:

@@ -3,10 +3,7 @@
 Its step is semi-implicit Euler as Drake's, but joint damping is explicit, M a = ... - D v, a free body moves by the
 velocity of its centre of mass, and its quaternion turns by the exponential of h w'. It has no armature; springs are
 Drake's forces, given with those of the actuators.
-
-A free body's native pose is that of the principal axes in its centre of mass, quaternion x y z w; its velocity is that
-of the centre of mass and angular, both in world. Bullet has friction and stiffness by link and makes those of pairs:
-mu = mu_a mu_b and 1/k = 1/k_a + 1/k_b.
+Bullet has friction and stiffness by link, and makes those of pairs: mu = mu_a mu_b and 1/k = 1/k_a + 1/k_b.
 """
 
 from collections.abc import Iterator

@@ -390,9 +390,6 @@ class NumpyEngine(EulerEngine):
         self.coordinates = self.form.coordinates
         self.nq, self.nv, self.nu = self.coordinates.nq, self.coordinates.nv, len(self.form.input_names)
 
-    def _acceleration(self, x: Array, u: Array) -> Array:
-        return self._acceleration_derivative(x, u)[0]
-
     def _acceleration_derivative(self, x: Array, u: Array) -> tuple[Array, Array]:
         return self.form.acceleration(self.time_step, x[: self.nq], x[self.nq :], u)
 

@@ -3,8 +3,6 @@
 Its step is semi-implicit Euler as Drake's, but joint damping is explicit, M a = ... - D v, a free body moves by the
 velocity of its centre of mass, and its quaternion has the norm 1 after the step. Isaac Lab's SolverMuJoCo is MuJoCo's
 step (this package's engine mujoco) by mujoco-warp, which does not come with Newton.
-
-A free body's native state is (p, quaternion x y z w) and (v of the centre of mass, w), both in world.
 """
 
 from typing import Any

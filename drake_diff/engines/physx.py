@@ -5,8 +5,6 @@ Drake's, joint damping implicit. A free body moves by the velocity of its centre
 of h w'; the explicit w' is scaled to the angular momentum that it had. Contacts and limits are rigid; PhysX has
 friction by shape and makes the pair's by the mean of the two. A new scene is built for each call, since PhysX keeps
 contacts from one step to the next.
-
-A free body's native state is (p, quaternion w x y z) and (v of the centre of mass, w), both in world.
 """
 
 import warnings
@@ -76,7 +74,17 @@ class SapienEngine(RigidEngine):
         x, u = self._point(x, u)
         world = self._world(x, self._effort(u) - self.stiffness * self._stretch(x[: self.nq]))
         world.scene.step()
-        return self._read(world, x, u)
+        q, v = np.zeros(self.nq), np.zeros(self.nv)
+        for tree, part in zip(world.trees, self.tree.trees, strict=True):
+            rigid = {self.tree.links[i].joint.joint: self.tree.links[i].joint for i in part}
+            for joint, position, speed in zip(tree.active_joints, tree.qpos, tree.qvel, strict=True):
+                q[rigid[joint.name].q_start], v[rigid[joint.name].v_start] = position, speed
+            root = self.tree.links[part.start]
+            if root.free:
+                i, j = root.joint.q_start, root.joint.v_start
+                q[i : i + 4], q[i + 4 : i + 7] = tree.root_pose.q, tree.root_pose.p
+                v[j + 3 : j + 6], v[j : j + 3] = tree.root_linear_velocity, tree.root_angular_velocity
+        return self._found("PhysX", q, v, x, u)
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
         raise NotOfferedError("PhysX has no derivatives of its step")
@@ -229,19 +237,6 @@ class SapienEngine(RigidEngine):
                 tree.qpos = np.array([q[x.q_start] for x in joints]).astype(np.float32)
                 tree.qvel = np.array([v[x.v_start] for x in joints]).astype(np.float32)
                 tree.qf = np.array([force[x.v_start] for x in joints]).astype(np.float32)
-
-    def _read(self, world: World, x: Array, u: Array) -> Array:
-        q, v = np.zeros(self.nq), np.zeros(self.nv)
-        for tree, part in zip(world.trees, self.tree.trees, strict=True):
-            rigid = {self.tree.links[i].joint.joint: self.tree.links[i].joint for i in part}
-            for joint, position, speed in zip(tree.active_joints, tree.qpos, tree.qvel, strict=True):
-                q[rigid[joint.name].q_start], v[rigid[joint.name].v_start] = position, speed
-            root = self.tree.links[part.start]
-            if root.free:
-                i, j = root.joint.q_start, root.joint.v_start
-                q[i : i + 4], q[i + 4 : i + 7] = tree.root_pose.q, tree.root_pose.p
-                v[j + 3 : j + 6], v[j : j + 3] = tree.root_linear_velocity, tree.root_angular_velocity
-        return self._found("PhysX", q, v, x, u)
 
 
 def groups_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, tuple[int, int]]:

@@ -79,8 +79,6 @@ OF_TARGET: Mapping[str, str] = {
   randomization events, no observation noise; log the seed all the same, and the reset distribution. Isaac Lab 3 has
   quaternions as x y z w, before it w x y z; the CSV has w x y z""",
 }
-
-
 TARGETS = {"gazebo": "sdf", "isaaclab": "urdf", "urdf": "urdf", "sdf": "sdf", "mjcf": "mjcf"}  # the format of each
 DISTRIBUTION = (
     f"positions uniform in the middle 90 % of their limits, else within {REACH:g} m or pi rad of the default; "
@@ -138,13 +136,8 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
     left_out = [g.name for g in description.geometries if named_in(form, g.name) not in text]
     contract = DrakeEngine(model).contract
     made = {"seed": seed, "count": states, "distribution": DISTRIBUTION}
-    facts = {
-        "h": repr(contract.time_step),
-        "gravity": list(contract.gravity),
-        "integrator": contract.integrator,
-        "contact_law": contract.contact_law,
-        "inputs": ", ".join(contract.inputs) or "none",
-    }
+    facts: dict[str, Any] = {**vars(contract), "h": repr(contract.time_step), "gravity": list(contract.gravity)}
+    facts["inputs"] = ", ".join(contract.inputs) or "none"
     readme = README.format(
         name=model.name, target=target, file=f"model{SUFFIX[form]}", about_usd=about_usd,
         settings=(COMMON + OF_TARGET.get(target, "")).format(**facts), left_out=", ".join(left_out) or "none",

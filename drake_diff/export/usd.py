@@ -84,12 +84,8 @@ def _add_link(stage: Any, link: Link, zero: AtZero) -> None:
 
 
 def _add_joint(stage: Any, link: Link, zero: AtZero) -> None:
-    kinds = {
-        "weld": UsdPhysics.FixedJoint,
-        "revolute": UsdPhysics.RevoluteJoint,
-        "prismatic": UsdPhysics.PrismaticJoint,
-    }
-    joint = kinds[link.kind].Define(stage, f"{ROOT}/joints/{link.joint}")
+    name = {"weld": "FixedJoint", "revolute": "RevoluteJoint", "prismatic": "PrismaticJoint"}[link.kind]
+    joint = getattr(UsdPhysics, name).Define(stage, f"{ROOT}/joints/{link.joint}")
     if link.parent != "world":
         joint.CreateBody0Rel().SetTargets([f"{ROOT}/{link.parent}"])
     joint.CreateBody1Rel().SetTargets([f"{ROOT}/{link.body}"])

@@ -24,21 +24,17 @@ class MujocoCoordinates:
         wanted = description.moving
         ids = {name_of(m, m.name_jntadr[j]): j for j in range(m.njnt)}
         drives = {name_of(m, m.name_actuatoradr[i]): i for i in range(m.nu)}
-        for kind, names, known in (
-            ("joints", [x.joint for x in wanted], ids),
-            ("actuators", list(description.inputs), drives),
-        ):
+        sides = (("joints", [x.joint for x in wanted], ids), ("actuators", list(description.inputs), drives))
+        for kind, names, known in sides:
             if set(names) != set(known):
-                raise InputError(
-                    f"{kind} of the MJCF", got=sorted(known), expected=f"those of the plant, {sorted(names)}"
-                )
+                expected = f"those of the plant, {sorted(names)}"
+                raise InputError(f"{kind} of the MJCF", got=sorted(known), expected=expected)
         self.joints = [ids[x.joint] for x in wanted]
-        for x, j in zip(wanted, self.joints, strict=True):
-            if KINDS[int(m.jnt_type[j])] != x.kind:
-                raise InputError(f"joint {x.joint} of the MJCF", got=KINDS[int(m.jnt_type[j])], expected=x.kind)
         self.actuator = [drives[name] for name in description.inputs]
         self.positions, self.dofs = np.zeros(self.nq, dtype=int), np.zeros(self.nv, dtype=int)
         for x, j in zip(wanted, self.joints, strict=True):
+            if KINDS[int(m.jnt_type[j])] != x.kind:
+                raise InputError(f"joint {x.joint} of the MJCF", got=KINDS[int(m.jnt_type[j])], expected=x.kind)
             at_q, at_v = int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j])
             if x.kind == "quaternion_floating":
                 self.positions[x.q_start : x.q_start + 7] = at_q + np.array([3, 4, 5, 6, 0, 1, 2])

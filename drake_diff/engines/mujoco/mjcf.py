@@ -76,21 +76,17 @@ def _add_link(parent: Element, link: Link) -> Element:
             raise ModelError(f"joint {link.joint}: a free body in MuJoCo must float in the world, by its own frame")
         SubElement(body, "freejoint", name=link.joint)
     elif link.kind != "weld":
-        _add_joint(body, link)
+        joint = SubElement(body, "joint", name=link.joint, type="hinge" if link.kind == "revolute" else "slide")
+        joint.set("pos", row(link.on_child.translation()))
+        joint.set("axis", row(link.on_child.rotation().matrix() @ link.axis))
+        for name in ("damping", "armature", "stiffness"):
+            joint.set(name, row(getattr(link, name)))
+        joint.set("springref", row(link.rest))
+        limited = np.isfinite(link.lower) or np.isfinite(link.upper)
+        joint.set("limited", "true" if limited else "false")
+        if limited:
+            joint.set("range", row(np.clip([link.lower, link.upper], -UNLIMITED, UNLIMITED)))
     return body
-
-
-def _add_joint(body: Element, link: Link) -> None:
-    joint = SubElement(body, "joint", name=link.joint, type="hinge" if link.kind == "revolute" else "slide")
-    joint.set("pos", row(link.on_child.translation()))
-    joint.set("axis", row(link.on_child.rotation().matrix() @ link.axis))
-    numbers = {"damping": link.damping, "armature": link.armature, "stiffness": link.stiffness, "springref": link.rest}
-    for name, value in numbers.items():
-        joint.set(name, row(value))
-    limited = np.isfinite(link.lower) or np.isfinite(link.upper)
-    joint.set("limited", "true" if limited else "false")
-    if limited:
-        joint.set("range", row(np.clip([link.lower, link.upper], -UNLIMITED, UNLIMITED)))
 
 
 def _add_geometry(body: Element, geometry: Geometry) -> bool:
