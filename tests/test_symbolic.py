@@ -157,10 +157,10 @@ def test_a_solve_computes_each_jacobian_once(monkeypatch):
     motion = Transcription(problem, "hermite_simpson").solve(
         (np.zeros((11, 4)), np.zeros((11, 1))), limits=Limits(100, 10.0, 1e-8), report=None
     )
-    assert motion.outcome is Outcome.SOLVED
+    assert motion.result.outcome is Outcome.SOLVED
     assert motion.derivatives == EXACT
     assert set(calls) == {21}
-    assert len(motion.iterations) <= len(calls) <= len(motion.iterations) + 2
+    assert len(motion.result.iterations) <= len(calls) <= len(motion.result.iterations) + 2
 
 
 @pytest.mark.parametrize("left_out", ["damping", "stiffness", "reflected", "mass", "gravity"])

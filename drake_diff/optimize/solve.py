@@ -27,9 +27,8 @@ from drake_diff.optimize.shooting import RolloutCost, ShootingVariables, check_s
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.optimize.transcription.drake import solve_collocation
 from drake_diff.optimize.transcription.motion import Collocated
-from drake_diff.optimize.transcription.scheme import DEFAULT_SCHEME, SCHEMES
 from drake_diff.optimize.transcription.solve import MeshRefinement, Transcription
-from drake_diff.optimize.transcription.task import task_of
+from drake_diff.optimize.transcription.task import DEFAULT_SCHEME, SCHEMES, task_of
 
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": "riccati"}
@@ -418,8 +417,7 @@ class Run:
                 report=self.report,
                 refinement=refinement,
             )
-            result = NlpResult(motion.nodes.ravel(), motion.outcome, motion.message, motion.iterations, motion.note)
-            xs, us, u_final = motion.xs, motion.us[:-1], motion.us[-1]
+            result, xs, us, u_final = motion.result, motion.xs, motion.us[:-1], motion.us[-1]
             self.options["derivatives"] = motion.derivatives
             found["us_mid"] = None if self.scheme == "drake" else motion.us_mid
             found["free_horizon"] = motion.horizon if problem.horizon else None

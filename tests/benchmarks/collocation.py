@@ -66,7 +66,7 @@ def ours(problem: dd.Problem, scheme: str) -> Row:
     start = time.process_time()
     motion = Transcription(problem, scheme).solve(guess, limits=LIMITS, report=None)
     seconds = time.process_time() - start
-    return seconds, motion.outcome.value, motion.cost, len(motion.iterations) - 1
+    return seconds, motion.result.outcome.value, motion.cost, len(motion.result.iterations) - 1
 
 
 def verified(problem: dd.Problem, scheme: str) -> Row:

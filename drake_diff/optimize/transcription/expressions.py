@@ -49,17 +49,14 @@ class Symbol:
         raise TypeError("it branches on its numbers")
 
 
-def _binary(operation: Callable[[Any, Any], Any]) -> Callable[[Symbol, Any], Any]:
+def _binary(operation: Callable[[Any, Any], Any], *, turned: bool = False) -> Callable[[Symbol, Any], Any]:
     def apply(self: Symbol, other: Any) -> Any:
         if not isinstance(other, (Symbol, int, float, np.integer, np.floating)):
             return NotImplemented
-        return Symbol(operation(self.sx, other.sx if isinstance(other, Symbol) else float(other)))
+        sx = other.sx if isinstance(other, Symbol) else float(other)
+        return Symbol(operation(sx, self.sx) if turned else operation(self.sx, sx))
 
     return apply
-
-
-def _turned(operation: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    return lambda a, b: operation(b, a)
 
 
 def _unary(name: str) -> Callable[[Symbol], Symbol]:
@@ -72,7 +69,7 @@ def _compare(self: Symbol, other: Any) -> bool:
 
 for _name in ("add", "sub", "mul", "truediv", "pow"):
     setattr(Symbol, f"__{_name}__", _binary(getattr(operator, _name)))
-    setattr(Symbol, f"__r{_name}__", _binary(_turned(getattr(operator, _name))))
+    setattr(Symbol, f"__r{_name}__", _binary(getattr(operator, _name), turned=True))
 for _name in ("lt", "le", "gt", "ge", "eq", "ne"):
     setattr(Symbol, f"__{_name}__", _compare)
 for _name in (

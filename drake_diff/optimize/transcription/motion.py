@@ -8,9 +8,8 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import Iteration, Outcome
-from drake_diff.optimize.transcription.scheme import interval_defects, node_weights, per_interval
-from drake_diff.optimize.transcription.task import OptimalControl, task_of
+from drake_diff.optimize.program import NlpResult
+from drake_diff.optimize.transcription.task import OptimalControl, interval_defects, node_weights, per_interval, task_of
 
 SUBSTEPS = 10  # of the Runge-Kutta method that measures an interval
 DENSE = np.linspace(0, 1, 21)[1:-1]  # where bounds are looked at between two knots
@@ -95,11 +94,6 @@ class Collocated:
         return np.asarray(np.max(np.abs(defects), axis=(1, 2)))
 
     @property
-    def defect(self) -> float:
-        """The largest of `defects`; inf where one is not a number."""
-        return float(np.max(_finite(self.defects)))
-
-    @property
     def errors(self) -> Array:
         """(N,) distance of knot k+1 from an integration from knot k under the scheme's input; inf where it diverges.
 
@@ -176,12 +170,9 @@ class Collocated:
 class Transcribed(Collocated):
     """What a solver found, and how it ended; `refinements` are (intervals, largest error) of each round."""
 
-    outcome: Outcome
-    message: str
-    iterations: tuple[Iteration, ...]
+    result: NlpResult
     derivatives: str  # where the solver's came from, and why there is no Hessian where there is none
     refinements: tuple[tuple[int, float], ...] = ()
-    note: str = ""  # what a claim of a minimum is limited to, if it is
 
 
 def _finite(values: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Optimal control by collocation as a sparse program for IPOPT: its functions and their exact derivatives.
+"""Optimal control by collocation as a sparse program, its exact derivatives, and IPOPT, which CasADi carries, on it.
 
 With the rates F and their Jacobians J at all nodes, each computed once, the rest is linear in them:
 
@@ -8,6 +8,7 @@ with constant sparse S and D from the scheme's states and slopes, so that the He
 for a free final time T. Path constraints add rows to g and terms to the blocks of their nodes.
 """
 
+import math
 from functools import cached_property
 from typing import Any
 
@@ -15,9 +16,28 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff.optimize.transcription.expressions import KnotFunction, KnotFunctions
-from drake_diff.optimize.transcription.scheme import node_weights
-from drake_diff.optimize.transcription.task import OptimalControl
+from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
+from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch, ctrl_c
+from drake_diff.optimize.transcription.expressions import KnotFunctions
+from drake_diff.optimize.transcription.task import OptimalControl, node_weights
+
+OUTCOMES = {
+    "Solve_Succeeded": Outcome.SOLVED,
+    "Solved_To_Acceptable_Level": Outcome.INACCURATE,
+    "Maximum_Iterations_Exceeded": Outcome.ITERATION_LIMIT,
+    "Infeasible_Problem_Detected": Outcome.INFEASIBLE,
+    "Diverging_Iterates": Outcome.UNBOUNDED,
+}
+OPTIONS = {
+    "ipopt.mu_strategy": "adaptive",  # the monotone one ends minimum times of a pendulum as infeasible
+    "print_time": False,
+    "show_eval_warnings": False,
+    "calc_lam_p": False,
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "ipopt.print_user_options": "no",
+}
+NOT_FINITE = "IPOPT: Invalid Number Detected"
 
 
 class TranscribedProgram:
@@ -34,9 +54,11 @@ class TranscribedProgram:
         self.z = ca.MX.sym("z", len(self.lower))
         self.knots = ca.reshape(self.z[: self.every.size * self.width], self.width, self.every.size)
         self.time = self.z[-1] if self.free else ca.MX(task.horizon[0])
-        self.paths = [(p.nodes(mesh, task.scheme), p.constraint) for p in task.paths]
+        paths = zip(functions.paths, task.paths, strict=True)
+        self.paths = [(f, p.nodes(mesh, task.scheme), p.constraint) for f, p in paths]
+        self.rates, self.costs = functions.dynamics.values(self.knots), functions.rate.values(self.knots)
+        self.rate_rows, self.cost_rows = functions.dynamics.jacobian(self.knots), functions.rate.jacobian(self.knots)
         self._set_links()
-        self._linear = self._linear_inputs() if task.scheme.input_is_linear else None
 
     def pack(self, nodes: Array, horizon: float) -> Array:
         """The decision variables of `nodes` (K, nx + nu) and `horizon` [s]."""
@@ -50,23 +72,19 @@ class TranscribedProgram:
     @cached_property
     def sides(self) -> tuple[Array, Array]:
         """(lower, upper) of g: 0 for the defects, then each path constraint's own, node by node."""
-        lower, upper = [np.zeros(self.num_defects)], [np.zeros(self.num_defects)]
-        for at, constraint in self.paths:
-            lower.append(np.tile(constraint.lower, len(at)))
-            upper.append(np.tile(constraint.upper, len(at)))
-        if self._linear is not None:
-            lower.append(np.zeros(self._linear.shape[0]))
-            upper.append(np.zeros(self._linear.shape[0]))
-        return np.concatenate(lower), np.concatenate(upper)
+        before, after = np.zeros(self.num_defects), np.zeros(0 if self._linear is None else self._linear.shape[0])
+        lower = [np.tile(constraint.lower, len(at)) for _, at, constraint in self.paths]
+        upper = [np.tile(constraint.upper, len(at)) for _, at, constraint in self.paths]
+        return np.concatenate([before, *lower, after]), np.concatenate([before, *upper, after])
 
     @cached_property
     def nlp(self) -> dict[str, Any]:
         """x, f and g as CasADi's nlpsol takes them."""
-        f = self.time * ca.dot(self._costs, ca.DM(self.weights).T)
+        f = self.time * ca.dot(self.costs, ca.DM(self.weights).T)
         if self.functions.final is not None:
             f += self.functions.final.values(self.knots[:, -1])
-        g = [ca.mtimes(self._S, self.z) - self.time * ca.mtimes(self._D, ca.vec(self._rates))]
-        g += [ca.vec(f.values(self.knots[:, at.tolist()])) for f, at in self._path_functions]
+        g = [ca.mtimes(self._S, self.z) - self.time * ca.mtimes(self._D, ca.vec(self.rates))]
+        g += [ca.vec(f.values(self.knots[:, at.tolist()])) for f, at, _ in self.paths]
         if self._linear is not None:
             g.append(ca.mtimes(self._linear, self.z))
         return {"x": self.z, "f": f, "g": ca.vertcat(*g)}
@@ -98,44 +116,25 @@ class TranscribedProgram:
         self._S = _sparse(rows, columns, self.state[:, None], (self.num_defects, self.z.numel()))
         self._D = _sparse(rows, self.rate_index, self.slope[:, None], (self.num_defects, self.every.size * self.nx))
         self.link_columns = columns
-
-    def _linear_inputs(self) -> Any:
-        """The matrix of 2 u_mid - u_0 - u_1, for all intervals and inputs."""
+        self._linear = None
+        if not scheme.input_is_linear:
+            return
+        # 2 u_mid - u_0 - u_1 = 0 in all intervals
         middle = np.arange(1, self.every.size, 2)[:, None] * self.width + np.arange(self.nx, self.width)
         rows = np.arange(middle.size).reshape(middle.shape)
         columns = np.stack([middle, middle - self.width, middle + self.width])
         values = np.array([2.0, -1, -1])[:, None, None]
-        return _sparse(rows, columns, values, (middle.size, self.z.numel()))
-
-    @cached_property
-    def _rates(self) -> Any:
-        return self.functions.dynamics.values(self.knots)
-
-    @cached_property
-    def _rows(self) -> Any:
-        return self.functions.dynamics.jacobian(self.knots)
-
-    @cached_property
-    def _costs(self) -> Any:
-        return self.functions.rate.values(self.knots)
-
-    @cached_property
-    def _cost_rows(self) -> Any:
-        return self.functions.rate.jacobian(self.knots)
-
-    @property
-    def _path_functions(self) -> list[tuple[KnotFunction, Indices]]:
-        return [(f, at) for f, (at, _) in zip(self.functions.paths, self.paths, strict=True)]
+        self._linear = _sparse(rows, columns, values, (middle.size, self.z.numel()))
 
     def _gradient(self) -> Any:
         total, last = _Sum((self.z.numel(), 1)), self.every[-1:]
-        b = _Blocks(self.functions.rate.jacobian_at, self.every)
-        total.add(b.column(self.width), 0, self.weights[b.node], self.time * self._cost_rows, b.index)
+        b = _Blocks(self.functions.rate.jacobian_at, self.every, self.width)
+        total.add(b.column, 0, self.weights[b.node], self.time * self.cost_rows, b.index)
         if self.free:
-            total.add(self.z.numel() - 1, 0, self.weights, ca.vec(self._costs), self.every)
+            total.add(self.z.numel() - 1, 0, self.weights, ca.vec(self.costs), self.every)
         if self.functions.final is not None:
-            b = _Blocks(self.functions.final.jacobian_at, last)
-            total.add(b.column(self.width), 0, 1.0, self.functions.final.jacobian(self.knots[:, -1]), b.index)
+            b = _Blocks(self.functions.final.jacobian_at, last, self.width)
+            total.add(b.column, 0, 1.0, self.functions.final.jacobian(self.knots[:, -1]), b.index)
         return ca.densify(total.matrix())
 
     def _jacobian(self) -> Any:
@@ -144,20 +143,15 @@ class TranscribedProgram:
         rows, columns = f.jacobian_at
         index = self.node[:, None] * len(rows) + np.arange(len(rows))
         at = self.defect[:, None] * self.nx + rows, self.node[:, None] * self.width + columns
-        total.add(*at, -self.slope[:, None], self.time * self._rows, index)
+        total.add(*at, -self.slope[:, None], self.time * self.rate_rows, index)
         if self.free:
-            source = ca.vec(self._rates)
+            source = ca.vec(self.rates)
             total.add(self.link_rows, self.z.numel() - 1, -self.slope[:, None], source, self.rate_index)
         first = self.num_defects
-        for path, nodes in self._path_functions:
-            b = _Blocks(path.jacobian_at, nodes)
-            total.add(
-                first + b.place * path.rows + b.rows,
-                b.column(self.width),
-                1.0,
-                path.jacobian(self.knots[:, nodes.tolist()]),
-                b.index,
-            )
+        for path, nodes, _ in self.paths:
+            b = _Blocks(path.jacobian_at, nodes, self.width)
+            source = path.jacobian(self.knots[:, nodes.tolist()])
+            total.add(first + b.place * path.rows + b.rows, b.column, 1.0, source, b.index)
             first += path.rows * len(nodes)
         if self._linear is not None:
             rows, columns = (np.array(a) for a in self._linear.sparsity().get_triplet())
@@ -176,36 +170,114 @@ class TranscribedProgram:
         if self.functions.final is not None:
             terms.append((self.functions.final, self.every[-1:], sigma))
         first = self.num_defects
-        for path, nodes in self._path_functions:
+        for path, nodes, _ in self.paths:
             last = first + path.rows * len(nodes)
             terms.append((path, nodes, ca.reshape(multipliers[first:last], path.rows, len(nodes))))
             first = last
         for function, nodes, seeds in terms:
-            b = _Blocks(function.hessian_at, nodes)
+            b = _Blocks(function.hessian_at, nodes, self.width)
             source = function.hessian(self.knots[:, nodes.tolist()], seeds)
-            total.add(b.node * self.width + b.rows, b.column(self.width), 1.0, source, b.index)
+            total.add(b.node * self.width + b.rows, b.column, 1.0, source, b.index)
         if self.free:
-            b = _Blocks(f.jacobian_at, self.every)
-            source = self._rows * nu[(b.node * self.nx + b.rows).ravel().tolist()]
-            total.add(b.column(self.width), self.z.numel() - 1, -1.0, source, b.index)
-            b = _Blocks(rate.jacobian_at, self.every)
-            source = sigma * self._cost_rows
-            total.add(b.column(self.width), self.z.numel() - 1, self.weights[b.node], source, b.index)
+            b = _Blocks(f.jacobian_at, self.every, self.width)
+            source = self.rate_rows * nu[(b.node * self.nx + b.rows).ravel().tolist()]
+            total.add(b.column, self.z.numel() - 1, -1.0, source, b.index)
+            b = _Blocks(rate.jacobian_at, self.every, self.width)
+            source = sigma * self.cost_rows
+            total.add(b.column, self.z.numel() - 1, self.weights[b.node], source, b.index)
         return total.matrix()
 
 
-class _Blocks:
-    """The nonzeros at `at` (rows, columns) of one block a node, as arrays (nodes, nonzeros)."""
+def solve_ipopt(
+    program: TranscribedProgram, guess: Array, limits: Limits, report: Report | None, *, exact: bool
+) -> NlpResult:
+    """Solve `program` from `guess` (n,), with its `exact` Hessian or IPOPT's limited-memory one.
 
-    def __init__(self, at: tuple[Indices, Indices], nodes: Indices):
-        self.rows, self.columns = (np.tile(a, (len(nodes), 1)) for a in at)
+    `report` gets a line of progress a few times a second. Ctrl-C ends the solve with the best iterate so far.
+    An error that a function of the user's raised is raised again, but that of a simulation or gradient is told.
+    """
+    options = OPTIONS | {
+        "ipopt.tol": limits.tolerance,
+        "ipopt.constr_viol_tol": limits.tolerance,
+        "ipopt.max_iter": limits.max_iterations,
+    }
+    if not exact:
+        options |= {"ipopt.hessian_approximation": "limited-memory", "pass_nonlinear_variables": False}
+    with ctrl_c() as interrupted:
+        watch = Watch(limits, interrupted)
+        callback = _IterateCallback(program, watch, report)
+        options |= program.derivatives(exact) | {"iteration_callback": callback}
+        solver = ca.nlpsol("solver", "ipopt", program.nlp, options)
+        lower, upper = program.sides
+        found = solver(x0=guess, lbx=program.lower, ubx=program.upper, lbg=lower, ubg=upper)
+        stats = solver.stats()
+    columns = [stats.get("iterations", {}).get(name, ()) for name in ("obj", "inf_pr", "inf_du", "alpha_pr")]
+    table = tuple(Iteration(i, *map(float, row)) for i, row in enumerate(zip(*columns, strict=True)))
+    error = callback.error or program.functions.error
+    if error is not None:
+        if not isinstance(error, DrakeDiffError):
+            raise error
+        outcome = Outcome.NO_GRADIENT if isinstance(error, GradientError) else Outcome.FAILED
+        outcome = Outcome.DIVERGED if isinstance(error, SimulationError) else outcome
+        return NlpResult(watch.best_of(guess), outcome, f"{type(error).__name__}: {error}", table)
+    if watch.stopped_by is not None:
+        return NlpResult(watch.best_of(guess), watch.stopped_by, f"stopped: {watch.stopped_by.value}", table)
+    words = str(stats["return_status"])
+    outcome = OUTCOMES.get(words, Outcome.FAILED)
+    return NlpResult(np.asarray(found["x"]).ravel(), outcome, f"IPOPT: {words.replace('_', ' ')}", table)
+
+
+class _IterateCallback(ca.Callback):  # type: ignore[misc]
+    """Called by the solver at every iterate: reports, keeps the best, says when to stop."""
+
+    def __init__(self, program: TranscribedProgram, watch: Watch, report: Report | None):
+        ca.Callback.__init__(self)
+        self.program, self.watch, self.report = program, watch, report
+        self.sizes = {"x": program.z.numel(), "f": 1, "g": program.nlp["g"].numel(), "lam_x": program.z.numel()}
+        self.sizes |= {"lam_g": self.sizes["g"], "lam_p": 0}
+        self.iterates = 0
+        self.error: Exception | None = None
+        self.construct("callback", {})
+
+    def get_n_in(self) -> int:
+        return ca.nlpsol_n_out()
+
+    def get_n_out(self) -> int:
+        return 1
+
+    def get_sparsity_in(self, i: int) -> Any:
+        return ca.Sparsity.dense(self.sizes[ca.nlpsol_out(i)], 1)
+
+    def has_eval_buffer(self) -> bool:
+        return True
+
+    def eval_buffer(self, arguments: Any, results: Any) -> int:
+        try:
+            x, f, g = (np.frombuffer(a, float) for a in arguments[:3])
+            p = self.program
+            sides = (p.lower - x, x - p.upper, p.sides[0] - g, g - p.sides[1])
+            violation = max(float(np.max(side, initial=0.0)) for side in sides)
+            self.watch.offer(x, float(f[0]), violation)
+            due = self.watch.look_up()
+            if self.report:
+                self.report.row(Iteration(self.iterates, float(f[0]), violation, math.nan, math.nan), printed=due)
+            self.iterates += 1
+        except Exception as error:  # of `report`; must not go through C++, the solve raises it
+            self.error = error
+        stop = self.watch.stopped_by is not None or self.error is not None or self.program.functions.error is not None
+        np.frombuffer(results[0], float)[:] = float(stop)
+        return 0
+
+
+class _Blocks:
+    """The nonzeros at `at` (rows, columns) of one block a node, as arrays (nodes, nonzeros); `column` is of all z."""
+
+    def __init__(self, at: tuple[Indices, Indices], nodes: Indices, width: int):
+        self.rows, columns = (np.tile(a, (len(nodes), 1)) for a in at)
         self.place = np.repeat(np.arange(len(nodes))[:, None], len(at[0]), axis=1)
         self.node = np.repeat(nodes[:, None], len(at[0]), axis=1)
+        self.column = self.node * width + columns
         self.index = np.arange(self.rows.size).reshape(self.rows.shape)
-
-    def column(self, width: int) -> Indices:
-        """The decision variables of the columns."""
-        return self.node * width + self.columns
 
 
 class _Sum:

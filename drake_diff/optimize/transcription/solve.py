@@ -6,9 +6,8 @@
 too coarse for the best input, only a finer one tells.
 """
 
-import dataclasses
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,7 @@ from drake_diff._base.arrays import Array, frozen
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, Outcome, Report
 from drake_diff.optimize.transcription.motion import Collocated, Transcribed
-from drake_diff.optimize.transcription.scheme import node_fractions
-from drake_diff.optimize.transcription.task import OptimalControl, task_of
+from drake_diff.optimize.transcription.task import node_fractions, task_of
 
 MOST_PIECES = 4  # of one interval in one round of refinement
 FOUND = (Outcome.SOLVED, Outcome.INACCURATE)
@@ -71,44 +69,40 @@ class Transcription:
         """
         start, mesh = time.monotonic(), self.mesh
         first = float(np.clip(self.problem.start_horizon if horizon is None else horizon, *self.task.horizon))
-        motion = solve_on_mesh(self.task, mesh, self.functions, self.nodes_at(mesh, guess), first, limits, report)
+        motion = self._solve_on(mesh, self.nodes_at(mesh, guess), first, limits, report)
         if refinement is None:
             return motion
         rounds = [(len(mesh) - 1, float(np.max(_worst(motion))))]
-        while motion.outcome in FOUND and rounds[-1][1] > refinement.tolerance:
+        while motion.result.outcome in FOUND and rounds[-1][1] > refinement.tolerance:
+            count, error = rounds[-1]
             mesh = _split(motion, refinement.tolerance)
             if len(mesh) - 1 > refinement.most:
-                told = f"the error is still {rounds[-1][1]:.2g} with {rounds[-1][0]} intervals: raise max_num_steps"
-                motion = dataclasses.replace(motion, note=told)
+                told = f"the error is still {error:.2g} with {count} intervals: raise max_num_steps"
+                motion = replace(motion, result=replace(motion.result, note=told))
                 break
             if report is not None:
-                report.say(f"error {rounds[-1][1]:.2g} with {rounds[-1][0]} intervals: refined to {len(mesh) - 1}")
-            left = dataclasses.replace(limits, time_limit=max(0.0, limits.time_limit - (time.monotonic() - start)))
-            nodes = self.nodes_at(mesh, motion)
-            motion = solve_on_mesh(self.task, mesh, self.functions, nodes, motion.horizon, left, report)
+                report.say(f"error {error:.2g} with {count} intervals: refined to {len(mesh) - 1}")
+            left = replace(limits, time_limit=max(0.0, limits.time_limit - (time.monotonic() - start)))
+            motion = self._solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, left, report)
             rounds.append((len(mesh) - 1, float(np.max(_worst(motion)))))
-        return dataclasses.replace(motion, refinements=tuple(rounds))
+        return replace(motion, refinements=tuple(rounds))
 
+    def _solve_on(
+        self, mesh: Array, nodes: Array, horizon: float, limits: Limits, report: Report | None
+    ) -> Transcribed:
+        """IPOPT on one mesh, from `nodes` (K, nx + nu) and `horizon` [s]."""
+        from drake_diff.optimize.transcription.program import NOT_FINITE, TranscribedProgram, solve_ipopt
 
-def solve_on_mesh(
-    task: OptimalControl, mesh: Array, functions: Any, nodes: Array, time: float, limits: Limits, report: Report | None
-) -> Transcribed:
-    """IPOPT on one mesh, from `nodes` (K, nx + nu) and `time` [s]."""
-    from drake_diff.optimize.transcription.ipopt import NOT_FINITE, solve_ipopt
-    from drake_diff.optimize.transcription.program import TranscribedProgram
-
-    program = TranscribedProgram(task, mesh, functions)
-    guess, why = program.pack(nodes, time), functions.why_not
-    told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
-    result = solve_ipopt(program, guess, limits, report, exact=not why)
-    if not why and result.message == NOT_FINITE:
-        again = solve_ipopt(program, guess, limits, report, exact=False)
-        if again.message != NOT_FINITE:  # then it was the Hessian
-            told, result = "symbolic, limited-memory Hessian: the exact one is not finite at an iterate", again
-    found, horizon = program.unpack(result.z)
-    return Transcribed(
-        task, frozen(mesh), frozen(found), horizon, result.outcome, result.message, result.iterations, told
-    )
+        program, why = TranscribedProgram(self.task, mesh, self.functions), self.functions.why_not
+        guess = program.pack(nodes, horizon)
+        told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
+        result = solve_ipopt(program, guess, limits, report, exact=not why)
+        if not why and result.message == NOT_FINITE:
+            again = solve_ipopt(program, guess, limits, report, exact=False)
+            if again.message != NOT_FINITE:  # then it was the Hessian
+                told, result = "symbolic, limited-memory Hessian: the exact one is not finite at an iterate", again
+        found, horizon = program.unpack(result.z)
+        return Transcribed(self.task, frozen(mesh), frozen(found), horizon, result, told)
 
 
 def _worst(motion: Transcribed) -> Array:
