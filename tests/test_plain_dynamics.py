@@ -9,7 +9,8 @@ from helpers.models import MODELS
 from helpers.transcription import BLOCK, heavy_pendulum, own_derivatives, push
 
 import drake_diff as dd
-from drake_diff.exceptions import InputError, ModelError
+from drake_diff.artifact.live import scene_of_run
+from drake_diff.exceptions import ArtifactError, InputError, ModelError
 from drake_diff.optimize.judge import complaints_about
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
@@ -105,6 +106,24 @@ def test_what_a_solver_would_leave_out_is_refused(load, changes, options, match)
     problem = dataclasses.replace(block_move(), **changes)
     with pytest.raises(InputError, match=match):
         dd.solve(problem, **{"method": "collocation"} | options)
+
+
+def test_what_does_not_hold_is_told_in_the_words_of_plain_dynamics():
+    """No time step that could be smaller, and no model: a finer mesh, and the dynamics."""
+    swing = dd.Dynamics(lambda x, u: [x[1], u[0] - 10 * np.sin(x[0])], nx=2, nu=1)
+    asked = {"x0": [0, 0], "x_goal": [np.pi, 0], "num_steps": 4, "horizon": 2.0, "running_cost": EFFORT}
+    coarse = dd.solve(dd.Problem(swing, **asked))
+    assert coarse.status is dd.Status.CONVERGED_NOT_VERIFIED
+    assert "pass refine=True, or take more steps (num_steps)" in coarse.message
+    assert "time step" not in coarse.message
+    moved = dataclasses.replace(coarse, xs=coarse.xs + 1.0)
+    assert "is not that of the dynamics after knots" in " ".join(complaints_about(moved))
+
+
+def test_a_run_of_plain_dynamics_has_no_body_to_draw(tmp_path):
+    dd.save(dd.solve(block_move()), tmp_path / "run")
+    with pytest.raises(ArtifactError, match="plain dynamics: there is no body to draw"):
+        scene_of_run(tmp_path / "run")
 
 
 # ------------------------------------------------------------------------------ refined meshes

@@ -54,10 +54,10 @@ def scene_of_run(directory: str | Path) -> tuple[Scene, tuple[str, ...]]:
     folder = Path(directory)
     record, log = EvidenceRecord.read(folder), read_mcap(folder / TRACE)
     rows = log.messages.get("/tf", [])
+    if not record.contract:
+        raise ArtifactError(f"{folder} is a run of plain dynamics: there is no body to draw")
     if len(rows) < 2:
-        raise ArtifactError(
-            f"{folder / TRACE} has no motion: there is no plant, or it could not be stepped along the inputs"
-        )
+        raise ArtifactError(f"{folder / TRACE} has no motion: the plant could not be stepped along the inputs")
     times = np.array([time for time, _ in rows]) / 1e9
     poses = _poses(message for _, message in rows)
     contacts = {time: _forces(message) for time, message in log.messages.get("/contacts", [])}

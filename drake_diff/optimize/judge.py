@@ -18,6 +18,7 @@ from drake_diff.optimize.shooting import ShootingVariables, final_sensitivity
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
 
 NO_EFFECT = 1e-12
+FINER = "pass refine=True, or take more steps (num_steps)"
 _STATUSES = {
     Outcome.ITERATION_LIMIT: Status.ITERATION_LIMIT,
     Outcome.TIME_LIMIT: Status.TIME_LIMIT,
@@ -66,9 +67,10 @@ def complaints_about(solution: Solution) -> Iterator[str]:
         yield "the cost is not finite"
     if solution.transcribed is not None and not solution.integration_error <= INTEGRATION_TOLERANCE:
         knot = int(np.argmax(solution.integration_errors))
+        finer = "take a smaller time step" if solution.problem.horizon is None else FINER
         yield (
             f"an accurate integration from knot {knot} misses the next by {solution.integration_error:.3g}, "
-            f"tolerance {INTEGRATION_TOLERANCE:g}: take a smaller time step"
+            f"tolerance {INTEGRATION_TOLERANCE:g}: {finer}"
         )
     if solution.transcribed is not None and solution.problem.has_model:
         model, depths = solution.problem.model, []
@@ -89,7 +91,8 @@ def _infeasibilities(solution: Solution) -> Iterator[str]:
     names, above = solution.problem.state_names, f"above {FEASIBILITY_TOLERANCE:g}"
     if not solution.defect <= FEASIBILITY_TOLERANCE:
         where = _spans(np.flatnonzero(~(solution.defects <= FEASIBILITY_TOLERANCE)))
-        yield f"defect {solution.defect:.3g} is {above}: the motion is not the model's after knots {where}"
+        whose = "the model's" if solution.problem.has_model else "that of the dynamics"
+        yield f"defect {solution.defect:.3g} is {above}: the motion is not {whose} after knots {where}"
     if not solution.goal_error <= FEASIBILITY_TOLERANCE:
         worst = int(np.argmax(np.nan_to_num(np.abs(solution.problem.goal_error(solution.xs[-1])), nan=np.inf)))
         yield f"goal error {solution.goal_error:.3g} is {above}: {names[worst]} does not reach its goal"

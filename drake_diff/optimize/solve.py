@@ -150,7 +150,7 @@ def solve(
 
 @dataclass(frozen=True)
 class Attempt:
-    """One method, and why it is taken."""
+    """One method, and why it is taken; with `max_iterations` where they are fewer than the task's."""
 
     method: str
     reason: str
@@ -172,11 +172,6 @@ class _Guess:
     horizon: float | None = None  # [s]
     motion: Collocated | None = None
 
-    @property
-    def for_collocation(self) -> Any:
-        """What a transcription takes: a motion, or xs and the inputs at the knots."""
-        return self.motion or (self.xs, np.vstack([self.us, self.us[-1:] if self.u_final is None else self.u_final]))
-
 
 @dataclass(eq=False)
 class _Task:
@@ -192,8 +187,7 @@ class _Task:
     def prepare(self, attempt: Attempt, given: Any) -> Callable[[], Solution]:
         """Check that `attempt` can be made from the guess `given`; what is returned makes it."""
         problem, method = self.problem, attempt.method
-        scheme = _choose_scheme(attempt)
-        _check_method(problem, attempt)
+        scheme = _check_attempt(problem, attempt)
         guess = _guess(problem, method, given, self.seed)
         xs, us = guess.xs, guess.us
         check_segments(problem, method, attempt.segments)
@@ -202,8 +196,7 @@ class _Task:
             raise InputError("continuation", got="given", expected=expected)
         stages = () if attempt.continuation is None else check_schedule(problem, attempt.continuation)
         left = self.limits.time_limit - (time.monotonic() - self.start)
-        most = self.limits.max_iterations if attempt.max_iterations is None else attempt.max_iterations
-        most = min(most, self.limits.max_iterations)
+        most = min(attempt.max_iterations or self.limits.max_iterations, self.limits.max_iterations)
         limits = dataclasses.replace(self.limits, time_limit=max(left, 0.0), max_iterations=most)
         options = {
             "max_iterations": limits.max_iterations,
@@ -250,13 +243,13 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
         chain.append({"method": attempt.method, "reason": attempt.reason, "ended": last.status.value})
         if last.status in ENDED:
             break
-    best = min(found, key=_preference)
+
+    def preference(solution: Solution) -> tuple[int, float]:
+        rank = PREFERENCE.index(solution.status) if solution.status in PREFERENCE else len(PREFERENCE)
+        return rank, solution.defect + solution.goal_error
+
+    best = min(found, key=preference)
     return best.told(options=best.options | {"chain": chain})
-
-
-def _preference(solution: Solution) -> tuple[int, float]:
-    rank = PREFERENCE.index(solution.status) if solution.status in PREFERENCE else len(PREFERENCE)
-    return rank, solution.defect + solution.goal_error
 
 
 def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution]) -> Iterator[tuple[Attempt, Any]]:
@@ -277,30 +270,37 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
         yield dataclasses.replace(asked, method=after, reason="from the motion that iLQR found"), begun
 
 
-def _check_method(problem: Problem, attempt: Attempt) -> None:
-    """Refuse a problem that the method cannot take, and what belongs to another method."""
-    method = attempt.method
-    if method != "collocation":
-        takes = 'method="collocation" takes it'
-        if not problem.has_model:
-            expected = f'a model for method="{method}"; method="collocation" takes both'
-            raise InputError("problem", got="plain dynamics", expected=expected)
-        if problem.horizon is not None:
-            raise InputError("horizon", got="given", expected=f"none for discrete steps: {takes}")
-        if attempt.refinement is not None:
-            raise InputError("refine", got=True, expected=f'False for method="{method}": {takes}')
-        if method == "ilqr":
-            check_problem(problem)
-    else:
-        _check_collocation(problem, attempt)
+def _check_attempt(problem: Problem, attempt: Attempt) -> str:
+    """The scheme, "step" of the discrete methods; refuses what the method cannot take, and what is another's."""
+    method, scheme = attempt.method, attempt.scheme
+    if method == "collocation":
+        return _check_collocation(problem, attempt)
+    takes = 'method="collocation" takes it'
+    if scheme is not None:
+        raise InputError("scheme", got=repr(scheme), expected=f'none for method="{method}"')
+    if not problem.has_model:
+        expected = f'a model for method="{method}"; method="collocation" takes both'
+        raise InputError("problem", got="plain dynamics", expected=expected)
+    if problem.horizon is not None:
+        raise InputError("horizon", got="given", expected=f"none for discrete steps: {takes}")
+    if attempt.refinement is not None:
+        raise InputError("refine", got=True, expected=f'False for method="{method}": {takes}')
+    if method == "ilqr":
+        check_problem(problem)
+    return "step"
 
 
-def _check_collocation(problem: Problem, attempt: Attempt) -> None:
+def _check_collocation(problem: Problem, attempt: Attempt) -> str:
+    scheme = DEFAULT_SCHEME if attempt.scheme is None else attempt.scheme
+    if scheme not in SCHEMES:
+        raise UnknownNameError("scheme", got=scheme, known=SCHEMES)
+    if attempt.solver == "snopt" and scheme != "drake":
+        raise InputError("solver", got='"snopt"', expected=f'"ipopt" for scheme="{scheme}"; scheme="drake" takes both')
     if problem.parameters.parameters or problem.trajectory_cost is not None:
         raise InputError("parameters, trajectory_cost", got="given", expected='method="shooting"')
     if not problem.optimizes_controls:
         raise InputError("optimize", got=list(problem.optimize), expected='"controls" for method="collocation"')
-    task_of(problem, _choose_scheme(attempt))  # raises where a cost is no function that can be differentiated
+    task_of(problem, scheme)  # raises where a cost is no function that can be differentiated
     if attempt.solver == "snopt":  # Drake's DirectCollocation gets bounds, ends and costs alone
         left_out = {
             "dynamics": not problem.has_model,
@@ -312,21 +312,6 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> None:
         for name, value in left_out.items():
             if value:
                 raise InputError(name, got="given", expected='none for solver="snopt": solver="ipopt" takes it')
-
-
-def _choose_scheme(attempt: Attempt) -> str:
-    """The collocation scheme, "step" of the discrete methods; InputError where the solver does not go with it."""
-    scheme = attempt.scheme
-    if attempt.method != "collocation":
-        if scheme is not None:
-            raise InputError("scheme", got=repr(scheme), expected=f'none for method="{attempt.method}"')
-        return "step"
-    if scheme is None:
-        scheme = DEFAULT_SCHEME
-    if scheme not in SCHEMES:
-        raise UnknownNameError("scheme", got=scheme, known=SCHEMES)
-    if attempt.solver == "snopt" and scheme != "drake":
-        raise InputError("solver", got='"snopt"', expected=f'"ipopt" for scheme="{scheme}"; scheme="drake" takes both')
     return scheme
 
 
@@ -410,12 +395,11 @@ class Run:
                 problem, guess.xs, guess.us, solver=self.solver, limits=self.limits, report=self.report
             )
         else:
+            us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
+            begun = guess.motion or (guess.xs, np.vstack([guess.us, us_end]))
+            limits, report = self.limits, self.report
             motion = transcription.solve(
-                guess.for_collocation,
-                horizon=guess.horizon,
-                limits=self.limits,
-                report=self.report,
-                refinement=refinement,
+                begun, horizon=guess.horizon, limits=limits, report=report, refinement=refinement
             )
             result, xs, us, u_final = motion.result, motion.xs, motion.us[:-1], motion.us[-1]
             self.options["derivatives"] = motion.derivatives
@@ -487,11 +471,10 @@ class Run:
             return refused(self._draft(xs, us, certificates=before), error)
         norms = np.linalg.norm(RolloutCost(self.problem, variables).differentiate(z)[2], axis=1)
         values = variables.parameters(z).values
-        found = {"certificates": before + after, "gradient_norms": frozen(norms), "parameters": values}
         if result.note:
             self.options["contact_sequence"] = result.note
-        draft = self._draft(xs, us, **found)
-        solution = judged(draft, result)
+        found = {"certificates": before + after, "gradient_norms": frozen(norms), "parameters": values}
+        solution = judged(self._draft(xs, us, **found), result)
         return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
 
     def _draft(self, xs: Array, us: Array, **found: Any) -> Solution:
