@@ -19,8 +19,8 @@ from drake_diff.artifact import measure
 from drake_diff.artifact.live import scene_of_run, serve
 from drake_diff.artifact.page import plots_of
 from drake_diff.exceptions import ArtifactError, UnknownNameError
+from drake_diff.pages.html import page_data
 from drake_diff.pages.meshcat import frames_of
-from drake_diff.pages.plots import page_data
 from drake_diff.pages.scene import ARROW_PART, scene_of
 
 HOSTILE = "<script>alert(1)</script>"

@@ -18,7 +18,6 @@ from drake_diff.artifact.save import TRACE
 from drake_diff.exceptions import ArtifactError, ModelError
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.load_file import FORMATS, read_into
-from drake_diff.model.plant import bodies
 from drake_diff.pages.meshcat import draw
 from drake_diff.pages.scene import (
     BLUE,
@@ -65,13 +64,12 @@ def scene_of_run(directory: str | Path) -> tuple[Scene, tuple[str, ...]]:
         plant, context, notes = _load(log.attachments, record.contract.get("source"))
         moving = {f"{plant.GetModelInstanceName(b.model_instance())}::{b.name()}": b for b in moving_bodies(plant)}
         paths = {name: body_path(body) for name, body in moving.items()}
-        centres = {body_path(body): np.asarray(body.default_com()) for body in moving.values()}
-        shapes = tuple(shapes_of(plant, context, bodies(plant)))
+        shapes = tuple(shapes_of(plant, context))
     except ModelError as error:
         notes = (f"the model cannot be loaded, so a ball stands for each body: {error}",)
         names = [name for name in poses if not name.startswith(GHOST)]
         paths = {name: meshcat_path(i, name) for i, name in enumerate(names)}
-        centres = {path: np.zeros(3) for path in paths.values()}
+        moving = {}
         shapes = tuple(ball(path) for path in paths.values())
     motion = {path: poses[name] for name, path in paths.items() if name in poses}
     plan = {path: poses[GHOST + name] for name, path in paths.items() if GHOST + name in poses}
@@ -81,7 +79,7 @@ def scene_of_run(directory: str | Path) -> tuple[Scene, tuple[str, ...]]:
         poses=motion,
         ghosts=(Ghost("plan", plan, BLUE),) if plan else (),
         forces=tuple(contacts.get(time, ()) for time, _ in rows[:-1]),
-        trail=longest_path(motion, centres),
+        trail=longest_path(motion, tuple(moving.values())),
     ), notes
 
 
@@ -108,20 +106,21 @@ def _load(attachments: dict[str, bytes], source: Any) -> tuple[Any, Any, tuple[s
     if name is None:
         raise ModelError("the run has no model file attached: it was made from a diagram")
     if isinstance(source, str) and Path(source).is_file() and Path(source).read_bytes() == attachments[name]:
-        return _plant(Path(source), ())
+        return _plant(Path(source))
     suffix = next(end for end in FORMATS if name.endswith(end))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"model{suffix}"
         text, skipped = _without_meshes(attachments[name], suffix)
         path.write_bytes(text)
-        gone = (f"the model's source is gone or changed: {skipped} meshes are not drawn",) if skipped else ()
-        return _plant(path, gone)
+        plant, context, notes = _plant(path)
+    gone = (f"the model's source is gone or changed: {skipped} meshes are not drawn",) if skipped else ()
+    return plant, context, gone + notes
 
 
-def _plant(path: Path, notes: tuple[str, ...]) -> tuple[Any, Any, tuple[str, ...]]:
+def _plant(path: Path) -> tuple[Any, Any, tuple[str, ...]]:
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=0.01)
-    notes += read_into(plant, path)
+    notes = read_into(plant, path)
     plant.Finalize()
     diagram = builder.Build()
     root = diagram.CreateDefaultContext()

@@ -11,9 +11,8 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.artifact.measurement import Column, Measurement
 from drake_diff.motion.rollout import Rollout
-from drake_diff.pages.html import write_page
+from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.pages.meshcat import write_replay
-from drake_diff.pages.plots import Line, Plot, page_data
 from drake_diff.pages.scene import BLUE, Scene, scene_of
 
 SERIES_PER_PLOT = 6  # more lines cannot be told apart

@@ -9,8 +9,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.comparison.result import Comparison
 from drake_diff.engines.motion import EngineMotion
-from drake_diff.pages.html import write_page
-from drake_diff.pages.plots import Line, Plot, page_data
+from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.record.comparison import ComparisonRecord
 
 SAME_TIME = 1e-6  # [s] clocks in single precision are within it

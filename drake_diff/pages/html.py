@@ -7,9 +7,11 @@ script that got into the page all the same is refused.
 """
 
 import base64
+import math
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from importlib.resources import files
@@ -17,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drake_diff._base.files import write_whole
+from drake_diff.certificates.certificate import VERDICTS, Certificate
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -29,6 +32,70 @@ APART = ("wall_clock", "files", "record_sha256")
 _SCRIPT = re.compile(r"<script(?![^>]*application/json)[^>]*>(.*?)</script>", re.DOTALL)
 
 
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A series `y` (n,) of a plot; `held` values are drawn as steps."""
+
+    name: str
+    y: Iterable[Any]
+    dashed: bool = False
+    held: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Plot:
+    """One plot of `series` over `x`.
+
+    Attributes:
+        title: What is plotted, as its heading.
+        unit: The unit of y.
+        x: (n,) where the series have their values.
+        series: The lines; a name shows in the legend.
+        axis: What x is: "time" [s] follows the slider, any other word is a label.
+        place: Where on the page: that of the template's macro `plots`.
+        log: Whether y has a logarithmic scale; what is not above 0 is left out.
+        levels: Whether x are the few levels of something, each a tick on a logarithmic scale.
+        limits: The lower and upper limit of y, None or infinite where there is none; what is beyond is shaded.
+        range: The range of y, where it is not to follow the data.
+        marks: "lines", "points" or "both".
+        band: Whether to shade between the last two series.
+        note: A remark below the plot.
+    """
+
+    title: str
+    unit: str
+    x: Iterable[Any]
+    series: Sequence[Line]
+    axis: str = "time"
+    place: str = "plots"
+    log: bool = False
+    levels: bool = False
+    limits: Sequence[float | None] = (None, None)
+    range: Sequence[float] | None = None
+    marks: str = "lines"
+    band: bool = False
+    note: str = ""
+
+
+def page_data(duration: float, plots: Iterable[Plot], certificates: Iterable[Certificate] = ()) -> dict[str, Any]:
+    """All that `report.js` draws, for JSON: `plots` and a heat map of each of `certificates`, over `duration` [s]."""
+    drawn = []
+    for p in plots:
+        series = [{**vars(line), "y": numbers(line.y)} for line in p.series]
+        drawn.append({**vars(p), "x": numbers(p.x), "series": series, "limits": numbers(p.limits)})
+    maps = []
+    for c in certificates:
+        entries = {name: numbers(getattr(c, name).ravel()) for name in ("derivative", "difference", "tolerance")}
+        told = {"subject": c.subject, "method": c.method, "verdict": c.verdict}
+        maps.append({**told, "rows": [*c.rows], "columns": [*c.columns], "codes": c.codes.ravel().tolist(), **entries})
+    return {"duration": duration, "plots": drawn, "certificates": maps, "verdicts": list(VERDICTS)}
+
+
+def numbers(values: Iterable[Any]) -> list[float | None]:
+    """`values` with eight digits, more than a screen shows; None where there is none, or none that is finite."""
+    return [float(f"{v:.8g}") if v is not None and math.isfinite(v) else None for v in values]
+
+
 def write_page(
     path: Path, template: str, *, record: Mapping[str, Any], data: Mapping[str, Any], view: str = "", **facts: Any
 ) -> None:
@@ -39,7 +106,7 @@ def write_page(
         template: A name in `templates/`, of one that extends base.html.j2.
         record: The record of what the page shows, as plain data. A reader can download it from the page, without the
             fields `APART`.
-        data: What `report.js` draws: see `plots.page_data`.
+        data: What `report.js` draws: see `page_data`.
         view: The page of the replay (see `meshcat.write_replay`), shown in a frame; "" where the page has no motion.
         facts: What else the template asks for.
 
@@ -78,12 +145,9 @@ def render(template: str, **values: Any) -> str:
 def _environment() -> "Environment":
     from jinja2 import Environment, PackageLoader, StrictUndefined  # loaded when the first page is written
 
+    loader = PackageLoader("drake_diff.pages")
     environment = Environment(
-        loader=PackageLoader("drake_diff.pages"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     # tojson writes <, >, & and ' as \u003c and so on: no text can end the script element that it is in.
     environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "allow_nan": False, "separators": (",", ":")}

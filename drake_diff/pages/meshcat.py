@@ -24,7 +24,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from drake_diff._base.arrays import Array
 from drake_diff._base.files import write_whole
 from drake_diff.pages.html import content_policy
-from drake_diff.pages.scene import ARROW_PART, ContactForce, Drawn, Poses, Scene
+from drake_diff.pages.scene import ARROW_PART, ContactForce, Drawn, Scene
 
 # Drake prints the port that it listens on, but nobody is meant to connect to it.
 logging.getLogger("drake").addFilter(lambda record: "Meshcat listening" not in record.getMessage())
@@ -55,24 +55,31 @@ def write_replay(path: Path, scene: Scene, *, title: str = "") -> None:
 
 def draw(meshcat: Meshcat, scene: Scene) -> None:
     """Draw `scene` and publish its animation."""
+    for i, drawn in enumerate(scene.shapes):
+        _draw_shape(meshcat, f"motion/{drawn.body or WORLD}/{i}", drawn, drawn.colour, scene.size)
+        for ghost in scene.ghosts:
+            if drawn.body in ghost.poses:
+                _draw_shape(meshcat, f"{ghost.name}/{drawn.body}/{i}", drawn, ghost.colour, scene.size)
+    radius = THICKNESS * scene.size
+    _draw_tube(meshcat, "trail", scene.trail, radius)
     slots = max((len(step) for step in scene.forces), default=0)  # so many arrows, of which a frame shows some
-    _draw_bodies(meshcat, scene)
-    _draw_tube(meshcat, "trail", scene.trail, THICKNESS * scene.size)
-    for slot in range(slots):
-        _draw_arrow(meshcat, f"contacts/{slot}", THICKNESS * scene.size)
+    for slot in range(slots):  # each along +z from its contact point, one metre long until it is scaled
+        path = f"contacts/{slot}"
+        meshcat.SetObject(f"{path}/point", Sphere(2 * radius), RED)
+        meshcat.SetObject(f"{path}/shaft/unit", Cylinder(radius, 1.0), RED)
+        meshcat.SetTransform(f"{path}/shaft/unit", RigidTransform([0.0, 0.0, 0.5]))
+        meshcat.SetObject(f"{path}/tip/cone", MeshcatCone(8 * radius, 3 * radius, 3 * radius), RED)
+        turned = RollPitchYaw(np.pi, 0.0, 0.0)
+        meshcat.SetTransform(f"{path}/tip/cone", RigidTransform(turned, [0.0, 0.0, 4 * radius]))
     frames = frames_of(scene.times)
     forces = [_arrows(scene, k) for _, k in frames]
     rate = (len(frames) - 1) / float(scene.times[-1])
     meshcat.StartRecording(frames_per_second=rate, set_visualizations_while_recording=False)
     for (time, k), arrows in zip(frames, forces, strict=True):
-        _pose(meshcat, "motion", scene.poses, k, time)
-        for ghost in scene.ghosts:
-            _pose(meshcat, ghost.name, ghost.poses, k, time)
+        _place(meshcat, scene, k, time)
         _place_arrows(meshcat, arrows, slots, time)
     meshcat.StopRecording()
-    _pose(meshcat, "motion", scene.poses, 0, None)  # what is seen before play
-    for ghost in scene.ghosts:
-        _pose(meshcat, ghost.name, ghost.poses, 0, None)
+    _place(meshcat, scene, 0, None)  # what is seen before play
     _place_arrows(meshcat, forces[0], slots, None)
     animation = meshcat.get_mutable_recording()
     animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
@@ -89,19 +96,11 @@ def frames_of(times: Array) -> list[tuple[float, int]]:
     return [(float(times[-1]) * k / count, round(k * steps / count)) for k in range(count + 1)]
 
 
-def _draw_bodies(meshcat: Meshcat, scene: Scene) -> None:
-    for i, drawn in enumerate(scene.shapes):
-        _draw_shape(meshcat, f"motion/{drawn.body or WORLD}/{i}", drawn, drawn.colour, scene)
-        for ghost in scene.ghosts:
-            if drawn.body in ghost.poses:
-                _draw_shape(meshcat, f"{ghost.name}/{drawn.body}/{i}", drawn, ghost.colour, scene)
-
-
-def _draw_shape(meshcat: Meshcat, path: str, drawn: Drawn, colour: Rgba, scene: Scene) -> None:
+def _draw_shape(meshcat: Meshcat, path: str, drawn: Drawn, colour: Rgba, size: float) -> None:
     """Transparency is in the colour: a property set later does not reach a static page's objects."""
     shape, pose = drawn.shape, drawn.pose
     if isinstance(shape, HalfSpace):
-        side = 20 * scene.size
+        side = 20 * size
         shape, pose = Box(side, side, 0.01), pose @ RigidTransform([0.0, 0.0, -0.005])
     if isinstance(shape, Mesh) and colour.a() < 1:
         meshcat.SetTriangleMesh(path, *_hull(shape), colour)  # a mesh has colours of its own, its hull has none
@@ -143,15 +142,6 @@ def _draw_tube(meshcat: Meshcat, path: str, points: Array, radius: float) -> Non
     meshcat.SetTriangleMesh(path, vertices.T, np.array(faces, dtype=np.int32).T, TRAIL)
 
 
-def _draw_arrow(meshcat: Meshcat, path: str, radius: float) -> None:
-    """An arrow along +z from the contact point, one metre long until it is scaled."""
-    meshcat.SetObject(f"{path}/point", Sphere(2 * radius), RED)
-    meshcat.SetObject(f"{path}/shaft/unit", Cylinder(radius, 1.0), RED)
-    meshcat.SetTransform(f"{path}/shaft/unit", RigidTransform([0.0, 0.0, 0.5]))
-    meshcat.SetObject(f"{path}/tip/cone", MeshcatCone(8 * radius, 3 * radius, 3 * radius), RED)
-    meshcat.SetTransform(f"{path}/tip/cone", RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.0, 0.0, 4 * radius]))
-
-
 def _arrows(scene: Scene, k: int) -> list[tuple[ContactForce, float]]:
     """The forces in the step from state k, or in the last step, with the lengths of their arrows [m]."""
     found = []
@@ -160,6 +150,12 @@ def _arrows(scene: Scene, k: int) -> list[tuple[ContactForce, float]]:
         if part > 0:
             found.append((contact, min(part, LONGEST) * ARROW_PART * scene.size))
     return found
+
+
+def _place(meshcat: Meshcat, scene: Scene, k: int, time: float | None) -> None:
+    for root, poses in (("motion", scene.poses), *((ghost.name, ghost.poses) for ghost in scene.ghosts)):
+        for path, found in poses.items():
+            meshcat.SetTransform(f"{root}/{path}", found[k], time_in_recording=time)
 
 
 def _place_arrows(meshcat: Meshcat, arrows: list[tuple[ContactForce, float]], slots: int, time: float | None) -> None:
@@ -174,42 +170,28 @@ def _place_arrows(meshcat: Meshcat, arrows: list[tuple[ContactForce, float]], sl
         meshcat.SetProperty(path, "visible", used, time_in_recording=time)
 
 
-def _pose(meshcat: Meshcat, root: str, poses: Poses, k: int, time: float | None) -> None:
-    for path, found in poses.items():
-        meshcat.SetTransform(f"{root}/{path}", found[k], time_in_recording=time)
-
-
 def _look_at(meshcat: Meshcat, scene: Scene) -> None:
     """A camera far enough back to have all of the motion in view, and a grid to see it by."""
     low, high = scene.box
-    centre = (low + high) / 2
-    meshcat.SetCameraPose(centre + 0.52 * scene.size / np.tan(FIELD_OF_VIEW / 2) * _direction(high - low), centre)
+    centre, flat = (low + high) / 2, high - low < 0.35 * np.max(high - low)
+    view = [0.6, -0.9, 0.45]  # at an angle, or onto the motion's plane where it has one
+    if flat[0] or flat[1]:
+        view = [0.15, -1.0, 0.25] if flat[1] else [1.0, -0.15, 0.25]
+    back = 0.52 * scene.size / np.tan(FIELD_OF_VIEW / 2)
+    meshcat.SetCameraPose(centre + back * (np.array(view) / np.linalg.norm(view)), centre)
     for decoration in ("/Axes", "/Grid"):
         meshcat.SetProperty(decoration, "visible", False)
     meshcat.SetProperty("/Background/<object>", "top_color", TOP)
     meshcat.SetProperty("/Background/<object>", "bottom_color", BOTTOM)
-    _draw_grid(meshcat, scene)
-
-
-def _draw_grid(meshcat: Meshcat, scene: Scene) -> None:
-    """Lines on the ground, or under the lowest point of the motion, apart by half or a fifth of a power of ten."""
-    low, high = scene.box
+    # The grid is on the ground, or under the lowest point of the motion; cells are half or a fifth of a power of ten.
     grounds = [d.pose.translation()[2] for d in scene.shapes if isinstance(d.shape, HalfSpace)]
     below = 0.002 * scene.size
     height = max(grounds) + below if grounds else low[2] - below
     decade = 10.0 ** np.floor(np.log10(scene.size))
     cell = decade / (2 if scene.size > 3 * decade else 5)
-    centre = np.round((low + high)[:2] / 2 / cell) * cell
+    middle = np.round(centre[:2] / cell) * cell
     reach = cell * np.ceil(0.9 * scene.size / cell)
     at = np.arange(-reach, reach + cell / 2, cell)
     ends = [[(a, -reach), (a, reach)] for a in at] + [[(-reach, a), (reach, a)] for a in at]
-    points = np.array([[[*(centre + end), height] for end in pair] for pair in ends])
+    points = np.array([[[*(middle + end), height] for end in pair] for pair in ends])
     meshcat.SetLineSegments("grid", points[:, 0].T, points[:, 1].T, 1.0, LINES)
-
-
-def _direction(extent: Array) -> Array:
-    """From where to look: onto the motion's plane where it has one, else at an angle."""
-    flat = extent < 0.35 * np.max(extent)
-    view = np.array([0.15, -1.0, 0.25]) if flat[1] else np.array([1.0, -0.15, 0.25]) if flat[0] else None
-    view = np.array([0.6, -0.9, 0.45]) if view is None else view
-    return view / np.linalg.norm(view)

@@ -8,18 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.geometry import (
-    Box,
-    Capsule,
-    Convex,
-    Cylinder,
-    Ellipsoid,
-    HalfSpace,
-    Mesh,
-    Rgba,
-    Role,
-    Sphere,
-)
+from pydrake.geometry import Box, Capsule, Convex, Cylinder, Ellipsoid, HalfSpace, Mesh, Rgba, Role, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import FrameIndex
 
@@ -137,17 +126,13 @@ def scene_of(
     Raises:
         UnknownNameError: If there is no such frame.
     """
-    plant, drawn = model.plant, bodies(model.plant)
-    moving = [body for body in drawn if not plant.IsAnchored(body)]
+    moving = moving_bodies(model.plant)
     seen = {name: states for name, (states, _) in (ghosts or {}).items() if not np.array_equal(states, xs)}
     poses = _poses_of(model, moving, xs)
     of_ghosts = {name: _poses_of(model, moving, states) for name, states in seen.items()}
-    if frame is None:
-        trail = longest_path(poses, {body_path(body): np.asarray(body.default_com()) for body in moving})
-    else:
-        trail = _path_of(model, poses, len(xs), frame)
+    trail = longest_path(poses, moving) if frame is None else _path_of(model, poses, len(xs), frame)
     return Scene(
-        shapes=tuple(shapes_of(plant, model.double.context, drawn)),
+        shapes=tuple(shapes_of(model.plant, model.double.context)),
         times=times,
         poses=poses,
         ghosts=tuple(Ghost(name, found, (ghosts or {})[name][1]) for name, found in of_ghosts.items()),
@@ -171,9 +156,10 @@ def moving_bodies(plant: Any) -> list[Any]:
     return [body for body in bodies(plant) if not plant.IsAnchored(body)]
 
 
-def longest_path(poses: Poses, centres: Mapping[str, Array]) -> Array:
-    """(N+1, 3) the path of that of `centres`, (3,) [m] on each body, that moves most."""
-    paths = [np.array([pose @ centres[name] for pose in found]) for name, found in poses.items()]
+def longest_path(poses: Poses, moving: Sequence[Any] = ()) -> Array:
+    """(N+1, 3) the path of that centre of mass of the bodies `moving` that moves most; of the origins without any."""
+    centres = {body_path(body): np.asarray(body.default_com()) for body in moving}
+    paths = [np.array([pose @ centres.get(name, np.zeros(3)) for pose in found]) for name, found in poses.items()]
     return max(paths, key=lambda path: float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()))
 
 
@@ -188,13 +174,13 @@ def _path_of(model: Model, poses: Poses, count: int, name: str) -> Array:
     return np.array([pose @ origin for pose in poses.get(body_path(body), [fixed] * count)])
 
 
-def shapes_of(plant: Any, context: Any, drawn: Sequence[Any]) -> list[Drawn]:
-    """The shapes of the world and of the bodies `drawn`; a small ball at each centre of mass where there are none."""
+def shapes_of(plant: Any, context: Any) -> list[Drawn]:
+    """The shapes of the world and of all bodies; a small ball at each centre of mass where there are none."""
     port = plant.get_geometry_query_input_port()
     found: list[Drawn] = []
     if port.HasValue(context):
         inspector = port.Eval(context).inspector()
-        for body in [plant.world_body(), *drawn]:
+        for body in [plant.world_body(), *bodies(plant)]:
             frame = plant.GetBodyFrameIdIfExists(body.index())
             if frame is not None:
                 shapes = _shapes_on(inspector, frame, body_path(body))
@@ -202,7 +188,7 @@ def shapes_of(plant: Any, context: Any, drawn: Sequence[Any]) -> list[Drawn]:
                     pose = plant.EvalBodyPoseInWorld(context, body)
                     shapes = [replace(s, body="", pose=pose @ s.pose, centre=pose @ s.centre) for s in shapes]
                 found += shapes
-    return found or [ball(body_path(body), body.default_com()) for body in drawn if not plant.IsAnchored(body)]
+    return found or [ball(body_path(body), body.default_com()) for body in moving_bodies(plant)]
 
 
 def ball(path: str, centre: ArrayLike = (0.0, 0.0, 0.0)) -> Drawn:

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from contextlib import suppress
 from datetime import UTC, datetime
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
@@ -22,18 +23,10 @@ from drake_diff.model.model import Model
 from drake_diff.record.parts import Certified, FileEvidence, ModelInput, Provenance
 
 MESHES = (".obj", ".mtl", ".vtk", ".gltf", ".glb", ".bin", ".stl", ".dae", ".ply", ".off", ".msh", ".png", ".jpg")
+LIBRARIES = (".so", ".dll", ".dylib")  # plugins of Gazebo, which Drake does not read
 READABLE = (*MESHES, *FORMATS)
-PACKAGES = (
-    "drake",
-    "drake-diff",
-    "numpy",
-    "casadi",
-    "mcap",
-    "mcap-protobuf-support",
-    "protobuf",
-    "foxglove-schemas-protobuf",
-    "pydantic",
-)
+WRITERS = ("mcap", "mcap-protobuf-support", "protobuf", "foxglove-schemas-protobuf", "pydantic")
+PACKAGES = ("drake", "drake-diff", "numpy", "casadi", *WRITERS)
 
 
 def gradient_evidence(certificate: Certificate) -> Certified:
@@ -64,25 +57,18 @@ def written_now() -> str:
 
 def provenance_of() -> Provenance:
     """With which versions, from which commit and by which command something is made."""
+    packages = {}
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):
+            packages[name] = version(name)
+    words = (Path(sys.argv[0]).name, *sys.argv[1:])
     return Provenance(
         python=platform.python_version(),
         platform=f"{platform.system()} {platform.machine()}",
-        packages={name: found for name in PACKAGES if (found := _version(name))},
+        packages=packages,
         git=_git(),
-        command=[_text(word) for word in (Path(sys.argv[0]).name, *sys.argv[1:])],
+        command=[w.encode("utf-8", "replace").decode() for w in words],  # a file's name may have bytes that are no text
     )
-
-
-def _text(word: str) -> str:
-    """Without the bytes of a file name that are no text."""
-    return word.encode("utf-8", "replace").decode()
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 def _git() -> dict[str, str | bool] | None:
@@ -139,12 +125,7 @@ def _names(path: Path) -> set[tuple[str, str]]:
     folder = folders.get("meshdir") or folders.get("assetdir") or ""
     found = {(element.get(key, ""), folder) for element in root.iter() for key in ("filename", "file")}
     found |= {((element.text or "").strip(), "") for element in root.iter("uri")}
-    return {(name, start) for name, start in found if name and not _is_plugin(name)}
-
-
-def _is_plugin(name: str) -> bool:
-    """Whether it is a library of Gazebo's, which Drake does not read."""
-    return name.endswith((".so", ".dll", ".dylib"))
+    return {(name, start) for name, start in found if name and not name.endswith(LIBRARIES)}
 
 
 def _resolve(path: Path, name: str, folder: str) -> Path | None:

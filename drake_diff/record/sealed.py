@@ -6,7 +6,9 @@ written when a run begins, as "incomplete", and again, last of all files, when e
 
 import json
 from collections.abc import Iterable, Mapping
+from functools import reduce
 from hashlib import sha256
+from operator import getitem
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
@@ -89,8 +91,9 @@ class SealedRecord(ShowsItsRepr, Part):
         try:
             return cls.model_validate(known)
         except ValidationError as error:
-            if version != SCHEMA_VERSION:
-                _drop_unknown(known, error)
+            unknown = [entry["loc"] for entry in error.errors() if entry["type"] == "extra_forbidden"]
+        for *part, name in unknown if version != SCHEMA_VERSION else ():
+            del reduce(getitem, part, known)[name]
         try:
             return cls.model_validate(known)
         except ValidationError as error:
@@ -122,11 +125,10 @@ class SealedRecord(ShowsItsRepr, Part):
 
     def facts(self) -> dict[str, str]:
         """A few lines about the record, for a reader; each kind adds its own."""
-        drake = self.provenance.packages.get("drake", "?")
         names = sorted(self.files)
         more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-        files = ", ".join(names[:MOST_NAMES]) + more
-        return {"made": f"{self.wall_clock.written_utc} with Drake {drake}", "files": files}
+        made = f"{self.wall_clock.written_utc} with Drake {self.provenance.packages.get('drake', '?')}"
+        return {"made": made, "files": ", ".join(names[:MOST_NAMES]) + more}
 
     def __str__(self) -> str:
         return f"{self.name}: {self.verdict}, {self.sentence}"
@@ -172,13 +174,3 @@ def read_fields(path: Path) -> dict[str, Any]:
 
 def _refuse(constant: str) -> None:
     raise ValueError(f"{constant} is not a number in JSON")
-
-
-def _drop_unknown(fields: Any, error: ValidationError) -> None:
-    """Remove the fields that the schema does not have."""
-    for found in error.errors():
-        if found["type"] == "extra_forbidden":
-            part = fields
-            for key in found["loc"][:-1]:
-                part = part[key]
-            del part[found["loc"][-1]]

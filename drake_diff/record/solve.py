@@ -4,15 +4,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from drake_diff.record.parts import (
-    Certified,
-    Event,
-    Failure,
-    FiniteTable,
-    Metric,
-    Part,
-    Quantity,
-)
+from drake_diff.record.parts import Certified, Event, Failure, FiniteTable, Metric, Part, Quantity
 from drake_diff.record.sealed import SealedRecord
 
 

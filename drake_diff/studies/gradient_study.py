@@ -19,8 +19,7 @@ from drake_diff._base.files import write_whole
 from drake_diff._base.jupyter import preformatted
 from drake_diff._base.statistics import Rate, success_rate
 from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.pages.html import write_page
-from drake_diff.pages.plots import Line, Plot, page_data
+from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.studies.gradient_cases import CASES
 from drake_diff.studies.gradient_estimates import (
     ORDERS,

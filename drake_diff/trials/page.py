@@ -8,8 +8,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.statistics import ENOUGH
-from drake_diff.pages.html import write_page
-from drake_diff.pages.plots import Line, Plot, page_data
+from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.record.robustness import RobustnessRecord
 from drake_diff.trials.perturbation import perturbed
 from drake_diff.trials.run import Robustness, agrees, sized
