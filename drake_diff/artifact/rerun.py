@@ -1,10 +1,11 @@
-"""A solution rebuilt from its run directory alone: the model, the problem and the plan.
+"""A plan written to plan.npz, exact to the bit, and a solution rebuilt from its run directory alone.
 
 The model is built from the file that trace.mcap carries, in a folder of its own. One that names other files (meshes) is
 built where it stood, and only if it and all of them are still what the record says: the artifact has their hashes, not
 their bytes.
 """
 
+import io
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +14,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from drake_diff.artifact.plan_file import PLAN, PlanArrays
+import numpy as np
+
+from drake_diff._base.arrays import frozen
+from drake_diff._base.files import write_whole
 from drake_diff.artifact.sections import rebuild_problem
 from drake_diff.exceptions import ArtifactError, InputError, ModelError, ModelWarning
 from drake_diff.model.load_file import FORMATS
@@ -22,6 +26,36 @@ from drake_diff.optimize.solution import Solution, Status
 from drake_diff.record.parts import ModelInput
 from drake_diff.record.provenance import file_evidence, named_files
 from drake_diff.record.solve import EvidenceRecord
+
+PLAN = "plan.npz"
+REQUIRED, OPTIONAL = ("xs", "us", "parameters"), ("us_mid", "u_final", "mesh", "free_horizon")  # of a Solution
+
+
+def write_plan(path: Path, solution: Solution) -> None:
+    """Write the arrays of `solution`: the same ones give the same bytes."""
+    given: dict[str, Any] = {"xs": solution.xs, "us": solution.us, "parameters": solution.vector.values}
+    given |= {name: getattr(solution, name) for name in OPTIONAL}
+    buffer = io.BytesIO()
+    arrays: dict[str, Any] = {name: np.asarray(v, dtype=float) for name, v in sorted(given.items()) if v is not None}
+    np.savez(buffer, **arrays)
+    write_whole(path, buffer.getvalue())
+
+
+def read_plan(path: Path) -> dict[str, Any]:
+    """The fields of a `Solution` that are in `path`. ArtifactError where it is missing or not such a file."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            unknown, missing = set(file.files).difference(REQUIRED, OPTIONAL), set(REQUIRED).difference(file.files)
+            if unknown or missing:
+                raise ArtifactError(f"{path}: unknown arrays {sorted(unknown)}, missing {sorted(missing)}")
+            found: dict[str, Any] = {name: frozen(file[name]) for name in file.files}
+            if "free_horizon" in found:
+                found["free_horizon"] = float(found["free_horizon"])
+    except ArtifactError:
+        raise
+    except Exception as error:  # NumPy's reader fails in many ways on what is no such file
+        raise ArtifactError(f"{path} is not a plan: {type(error).__name__}: {error}") from error
+    return found
 
 
 @contextmanager
@@ -71,30 +105,26 @@ def _load(path: Path, options: dict[str, Any]) -> Model:
         raise ArtifactError(f"record.json: the model cannot be loaded with the recorded options: {error}") from error
 
 
-def resolve(record: EvidenceRecord, model: Model, plan: PlanArrays) -> Solution:
+def resolve(record: EvidenceRecord, model: Model, plan: dict[str, Any]) -> Solution:
     """The solution of a record, to be measured again. ArtifactError where plan and problem do not go together."""
     solver = record.solver
     if solver is None:
         raise ArtifactError("record.json: it has no solver")
-    count = record.problem.get("num_steps") if plan.mesh is None else len(plan.mesh) - 1
-    if plan.us.shape != (count, model.nu) or plan.xs.shape != (len(plan.us) + 1, model.nx):
-        got = f"xs {plan.xs.shape}, us {plan.us.shape}"
+    count, xs, us = record.problem.get("num_steps"), plan["xs"], plan["us"]
+    if "mesh" in plan:
+        count = len(plan["mesh"]) - 1
+    if us.shape != (count, model.nu) or xs.shape != (len(us) + 1, model.nx):
+        got = f"xs {xs.shape}, us {us.shape}"
         raise ArtifactError(f"{PLAN}: expected {count} steps of {model.nx} states and {model.nu} inputs, got {got}")
     try:
         return Solution(
-            problem=rebuild_problem(record, model, plan.us),
+            problem=rebuild_problem(record, model, us),
             method=solver.method,
             solver=solver.solver,
             status=Status(solver.status),
             message=solver.message,
-            xs=plan.xs,
-            us=plan.us,
             scheme=solver.scheme,
-            us_mid=plan.us_mid,
-            u_final=plan.u_final,
-            mesh=plan.mesh,
-            free_horizon=plan.free_horizon,
-            parameters=plan.parameters,
+            **plan,
         )
     except (InputError, ValueError, KeyError, TypeError) as error:
         raise ArtifactError(f"record.json: its problem cannot be rebuilt: {error}") from error

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from drake_diff.artifact.measurement import Measurement, failure_of, measure, replay_evidence
-from drake_diff.artifact.plan_file import PLAN, write_plan
+from drake_diff.artifact.rerun import PLAN, write_plan
 from drake_diff.artifact.sections import asked, found
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution

@@ -13,7 +13,6 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import select
 from drake_diff.model.plant import FLOATING, joints
 from drake_diff.optimize.problem.bounds import Bounds
-from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
@@ -69,7 +68,8 @@ LIMITATIONS = [
     "a cost is that of a local optimum at best",
     "certificates hold at the states that they name, replays in the variants that they name",
 ]
-
+COSTS = ("running_cost", "final_cost", "trajectory_cost")
+LIMITS = ("x_lower", "x_upper", "u_lower", "u_upper")
 GAPS = {"lower": -np.inf, "upper": np.inf}  # what null is, of a bound
 GUESS = ("initial_guess", "initial_guess_sha256")
 
@@ -78,8 +78,14 @@ def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
     """The sections that are known when a run begins; with its `solution` those that it decides are exact."""
     time_step = problem.time_step if solution is None else solution.time_step
     options = {} if solution is None else solution.options
+    goal = "" if np.all(np.isnan(problem.goal)) else " and ends in x_goal"
+    equations = "Drake's equations" if problem.has_model else "the given equations"
+    statement = (
+        f"{problem.name}, by {equations}, starts in x0{goal} after {problem.num_steps} intervals, and "
+        f"keeps bounds and constraints at every knot; optimized: {', '.join(problem.optimize)}"
+    )
     return {
-        "claim": _claim(problem),
+        "claim": Claim(statement=statement, limitations=LIMITATIONS),
         "inputs": Inputs(
             initial_guess=str(options.get("initial_guess", "not known yet")),
             initial_guess_sha256=options.get("initial_guess_sha256"),
@@ -95,8 +101,19 @@ def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
 
 
 def found(solution: Solution) -> dict[str, Any]:
-    """The sections that say how a solution was found."""
-    return {"solver": _solver(solution), "parameters": _parameters(solution), "gradient": _gradient(solution)}
+    """The sections that say how a solution was found. An option that is no finite number is null."""
+    options = {k: v.item() if isinstance(v, np.generic) else v for k, v in solution.options.items() if k not in GUESS}
+    solver = Solver(
+        method=solution.method,
+        solver=solution.solver,
+        scheme=solution.scheme,
+        status=solution.status.value,
+        message=solution.message,
+        solver_message=solution.solver_message,
+        options={k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in options.items()},
+        iterations=len(solution.iterations),
+    )
+    return {"solver": solver, "parameters": _parameters(solution), "gradient": _gradient(solution)}
 
 
 def units_of(problem: Problem) -> tuple[str, ...]:
@@ -105,17 +122,6 @@ def units_of(problem: Problem) -> tuple[str, ...]:
         return (UNKNOWN,) * (problem.nx + problem.nu)
     contract = problem.model.contract
     return tuple(c.unit for c in contract.positions + contract.velocities + contract.inputs)
-
-
-def _claim(problem: Problem) -> Claim:
-    """What a run of this problem says is true when its verdict is "pass"."""
-    goal = "" if np.all(np.isnan(problem.goal)) else " and ends in x_goal"
-    equations = "Drake's equations" if problem.has_model else "the given equations"
-    statement = (
-        f"{problem.name}, by {equations}, starts in x0{goal} after {problem.num_steps} intervals, and "
-        f"keeps bounds and constraints at every knot; optimized: {', '.join(problem.optimize)}"
-    )
-    return Claim(statement=statement, limitations=LIMITATIONS)
 
 
 def _observation(problem: Problem, time_step: float) -> Observation:
@@ -146,35 +152,29 @@ def _frames(model: Model) -> list[str]:
 
 def _action(problem: Problem, time_step: float, limit: float | None) -> ActionInterface:
     """How the inputs reach the plant in the replay, whatever the solver assumed between its knots."""
-    bounds, units, kind = (
-        problem.bounds,
-        units_of(problem)[problem.nx :],
-        "the input of plain dynamics: no plant takes it",
-    )
+    kind = "the input of plain dynamics: no plant takes it"
     if problem.has_model:
         kind = "effort, held over each step"
         if any(a.kp is not None for a in problem.model.contract.actuators):
             kind += ", added to the actuators' PD control"
-    lower, upper = finite_list(bounds.u_lower), finite_list(bounds.u_upper)
+    limits = (finite_list(problem.bounds.u_lower), finite_list(problem.bounds.u_upper))
+    inputs = zip(problem.input_names, units_of(problem)[problem.nx :], *limits, strict=True)
+    reason = "of the solve as a whole" if limit else "none: planned ahead in simulation, no time limit was given"
     return ActionInterface(
         command_type=kind,
-        commands=[
-            Command(name=name, unit=units[i], lower=lower[i], upper=upper[i])
-            for i, name in enumerate(problem.input_names)
-        ],
+        commands=[Command(name=name, unit=unit, lower=low, upper=high) for name, unit, low, high in inputs],
         update_rate=Quantity(value=1 / time_step, unit="Hz"),
-        latency_budget=Quantity(
-            value=limit,
-            unit="s",
-            reason="of the solve as a whole" if limit else "none: planned ahead in simulation, no time limit was given",
-        ),
+        latency_budget=Quantity(value=limit, unit="s", reason=reason),
         safety_fallback="none: in simulation there is nothing to protect",
     )
 
 
 def _gradient(solution: Solution) -> GradientEvidence:
-    """What the solver differentiated, where each column came from, and how far it agrees with differences."""
-    problem = solution.problem
+    """What the solver differentiated, where each column came from, and how far it agrees with differences.
+
+    The source of states and inputs is that of the certificates.
+    """
+    problem, vector = solution.problem, solution.vector
     regularization, tolerance = "none", Quantity(value=None, unit="1", reason="plain dynamics have no contact solver")
     if problem.has_model:
         contact = problem.model.contract.contact
@@ -182,10 +182,15 @@ def _gradient(solution: Solution) -> GradientEvidence:
             regularization = f"{contact.approximation} contact, whose compliance and stiction are part of the model"
         reason = "relative, of Drake's contact solver"
         tolerance = Quantity(value=contact.solver_relative_tolerance, unit="1", reason=reason)
+    methods = "; ".join(dict.fromkeys(c.method for c in solution.certificates)) or "no certificate was reached"
+    names = (*problem.state_names, *problem.input_names, *vector.names)
+    units = (*units_of(problem), *(p.unit for p in vector.parameters for _ in p.value))
+    sources = (*[methods] * (problem.nx + problem.nu), *vector.sources)
+    columns = zip(names, units, sources, strict=True)
     norms = [] if solution.gradient_norms is None else finite_list(solution.gradient_norms)
     return GradientEvidence(
         differentiated=list(problem.optimize),
-        columns=_columns(solution),
+        columns=[GradientColumn(name=name, unit=unit, source=source) for name, unit, source in columns],
         smoothing="none",
         regularization=regularization,
         solver_tolerance=tolerance,
@@ -194,19 +199,6 @@ def _gradient(solution: Solution) -> GradientEvidence:
         norms=norms,
         certificates=[gradient_evidence(c) for c in solution.certificates],
     )
-
-
-def _columns(solution: Solution) -> list[GradientColumn]:
-    """States, inputs and parameters; of the first two the source that the certificates were of."""
-    problem, vector = solution.problem, solution.vector
-    methods = list(dict.fromkeys(c.method for c in solution.certificates)) or ["no certificate was reached"]
-    of_states = "; ".join(methods)
-    units = [p.unit for p in vector.parameters for _ in p.value]
-    names = (*problem.state_names, *problem.input_names)
-    return [
-        *(GradientColumn(name=n, unit=u, source=of_states) for n, u in zip(names, units_of(problem), strict=True)),
-        *(GradientColumn(name=name, unit=units[i], source=vector.sources[i]) for i, name in enumerate(vector.names)),
-    ]
 
 
 def _parameters(solution: Solution) -> list[ParameterEvidence]:
@@ -229,25 +221,9 @@ def _parameters(solution: Solution) -> list[ParameterEvidence]:
     ]
 
 
-def _solver(solution: Solution) -> Solver:
-    """What solved the problem; an option that is no finite number is null, and the guess is in `inputs`."""
-    options = {k: v.item() if isinstance(v, np.generic) else v for k, v in solution.options.items() if k not in GUESS}
-    plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in options.items()}
-    return Solver(
-        method=solution.method,
-        solver=solution.solver,
-        scheme=solution.scheme,
-        status=solution.status.value,
-        message=solution.message,
-        solver_message=solution.solver_message,
-        options=plain,
-        iterations=len(solution.iterations),
-    )
-
-
 def describe_problem(problem: Problem) -> dict[str, Any]:
     """The problem for a record; functions by their names."""
-    b = problem.bounds
+    knots = [list(problem.knots_of(c, input_at_end=not problem.has_model)) for c in problem.constraints]
     return {
         "system": problem.name,
         "num_steps": problem.num_steps,
@@ -258,17 +234,15 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
         "x0": finite_list(problem.x0),
         "x_goal": finite_list(problem.goal),
         "waypoints": {str(k): finite_list(x) for k, x in problem.waypoints.items()},
-        "constraints": [_constraint(problem, c) for c in problem.constraints],
+        "constraints": [
+            {"name": c.label, "lower": finite_list(c.lower), "upper": finite_list(c.upper), "knots": at}
+            for c, at in zip(problem.constraints, knots, strict=True)
+        ],
         "free_horizon_s": None if problem.horizon is None else list(problem.horizon),
-        "x_lower": finite_list(b.x_lower),
-        "x_upper": finite_list(b.x_upper),
-        "u_lower": finite_list(b.u_lower),
-        "u_upper": finite_list(b.u_upper),
+        **{name: finite_list(getattr(problem.bounds, name)) for name in LIMITS},
         "optimize": list(problem.optimize),
         "parameters": [p.name for p in problem.parameters.parameters],
-        "running_cost": _cost(problem.running_cost),
-        "final_cost": _cost(problem.final_cost),
-        "trajectory_cost": _cost(problem.trajectory_cost),
+        **{name: _cost(getattr(problem, name)) for name in COSTS},
         "initial_state_free": [bool(free) for free in problem.initial_state_mask],
     }
 
@@ -276,11 +250,6 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
 def finite_list(values: Any) -> list[float | None]:
     """Numbers for JSON; None where there is no bound or no goal (infinite, NaN)."""
     return [float(v) if math.isfinite(v) else None for v in np.asarray(values).ravel()]
-
-
-def _constraint(problem: Problem, c: Constraint) -> dict[str, Any]:
-    knots = problem.knots_of(c, input_at_end=not problem.has_model)
-    return {"name": c.label, "lower": finite_list(c.lower), "upper": finite_list(c.upper), "knots": list(knots)}
 
 
 def _cost(cost: Any) -> Any:
@@ -294,8 +263,7 @@ def _cost(cost: Any) -> Any:
 
 def unknown_functions(record: EvidenceRecord) -> tuple[list[str], list[str]]:
     """(costs, constraints) of a record's problem that are the user's functions: their code is not in it."""
-    names = ("running_cost", "final_cost", "trajectory_cost")
-    costs = [f"{name} {record.problem[name]}" for name in names if isinstance(record.problem.get(name), str)]
+    costs = [f"{name} {record.problem[name]}" for name in COSTS if isinstance(record.problem.get(name), str)]
     listed = record.problem.get("constraints")
     constraints: list[Any] = listed if isinstance(listed, list) else []
     return costs, [str(c.get("name")) for c in constraints if isinstance(c, dict)]
@@ -304,13 +272,12 @@ def unknown_functions(record: EvidenceRecord) -> tuple[list[str], list[str]]:
 def rebuild_problem(record: EvidenceRecord, model: Model, us: Array) -> Problem:
     """The problem of a record on `model`, without the user's functions; `us` (N, nu) are the inputs of the plan."""
     p: dict[str, Any] = dict(record.problem)
-    bounds = {f"{kind}_{side}": _numbers(p[f"{kind}_{side}"], gap) for kind in "xu" for side, gap in GAPS.items()}
+    bounds = {name: _numbers(p[name], GAPS[name[2:]]) for name in LIMITS}
     starts = np.array([entry.start for entry in record.parameters])
     lower, upper = (_numbers([getattr(e, side) for e in record.parameters], gap) for side, gap in GAPS.items())
     vector = select(model, p["parameters"])
     pairs = list(zip(vector.parameters, vector.slices, strict=True))
     mask = np.array(p["initial_state_free"], dtype=bool)
-    optimize = p["optimize"]
     running, final = _rebuild_cost(p["running_cost"]), _rebuild_cost(p["final_cost"])
     goal = _numbers(p["x_goal"], np.nan)
     if running is None and final is None and np.all(np.isnan(goal)):
@@ -325,9 +292,9 @@ def rebuild_problem(record: EvidenceRecord, model: Model, us: Array) -> Problem:
         waypoints={int(k): _numbers(x, np.nan) for k, x in p["waypoints"].items()},
         horizon=p["free_horizon_s"],
         bounds=Bounds(**bounds),
-        optimize=optimize,
+        optimize=p["optimize"],
         initial_state_mask=mask if mask.any() else None,
-        us=None if "controls" in optimize else us,
+        us=None if "controls" in p["optimize"] else us,
         parameters={parameter.name: starts[s] for parameter, s in pairs},
         parameter_bounds={
             parameter.name: (lower[s], upper[s]) for parameter, s in pairs if parameter.kind.quantity != "inertia"

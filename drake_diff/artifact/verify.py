@@ -13,8 +13,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.artifact.measurement import Measurement, measure, replay_evidence
-from drake_diff.artifact.plan_file import PLAN, PlanArrays, read_plan
-from drake_diff.artifact.rerun import rebuilt, resolve
+from drake_diff.artifact.rerun import PLAN, read_plan, rebuilt, resolve
 from drake_diff.artifact.save import TRACE
 from drake_diff.artifact.sections import unknown_functions
 from drake_diff.artifact.trace import Trace, read_trace
@@ -210,19 +209,15 @@ def _refuse(folder: Path, problems: Sequence[str]) -> None:
 def _read_checked(folder: Path, kind: type[R]) -> tuple[R, tuple[str, ...]]:
     """The record in `folder`, and what of it and of the files beside it is damaged."""
     try:
-        fields = read_fields(folder / kind.FILE)
+        fields, problems = read_fields(folder / kind.FILE), []
         record = kind.parse(folder / kind.FILE, fields)
-        return record, (*_damage_of_record(folder / kind.FILE, fields), *_damage_of_files(folder, record))
+        if canonical(fields).encode() != (folder / kind.FILE).read_bytes():
+            problems.append(f"{kind.FILE}: its bytes are not those that drake_diff writes for its content")
+        if own_sha256(fields) != fields.get("record_sha256"):
+            problems.append(f"{kind.FILE}: its content does not match its record_sha256: something in it was changed")
     except RecursionError as error:
         raise ArtifactError(f"{kind.FILE}: nested too deep") from error
-
-
-def _damage_of_record(path: Path, fields: dict[str, Any]) -> Iterator[str]:
-    """Whether the record is, byte for byte, what its content and its own hash say."""
-    if canonical(fields).encode() != path.read_bytes():
-        yield f"{path.name}: its bytes are not those that drake_diff writes for its content"
-    if own_sha256(fields) != fields.get("record_sha256"):
-        yield f"{path.name}: its content does not match its record_sha256: something in it was changed"
+    return record, (*problems, *_damage_of_files(folder, record))
 
 
 def _damage_of_files(folder: Path, record: SealedRecord) -> Iterator[str]:
@@ -372,12 +367,12 @@ def _compare_motion(recorded: Array, again: Measurement) -> Recomputed:
     return replace(found, file=TRACE)
 
 
-def _odd_trace(trace: Trace, plan: PlanArrays, record: EvidenceRecord) -> Iterator[str]:
+def _odd_trace(trace: Trace, plan: dict[str, Any], record: EvidenceRecord) -> Iterator[str]:
     """What in the trace is not what record.json and plan.npz have."""
     if trace.attachments.get(record.FILE) != reproducible(record.model_dump(mode="json")).encode():
         yield f"{TRACE}: the record that it carries is not {record.FILE}"
-    inputs = plan.us if plan.u_final is None else np.vstack([plan.us, plan.u_final])
-    for topic, recorded, planned in (("state", trace.planned_xs, plan.xs), ("input", trace.planned_us, inputs)):
+    inputs = np.vstack([plan["us"], plan["u_final"]]) if "u_final" in plan else plan["us"]
+    for topic, recorded, planned in (("state", trace.planned_xs, plan["xs"]), ("input", trace.planned_us, inputs)):
         if not np.array_equal(recorded, planned, equal_nan=True):
             yield f"{TRACE}: /planned/{topic} is not what {PLAN} has"
 
