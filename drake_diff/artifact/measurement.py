@@ -16,11 +16,10 @@ from drake_diff.artifact.sections import units_of
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import ParameterVector, applied
+from drake_diff.model.parameters import Parameter, ParameterVector, applied
 from drake_diff.model.plant import FLOATING, bodies, joints
 from drake_diff.model.step import set_state
 from drake_diff.motion.rollout import Rollout, drift, smooth_mean
-from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.replay import PENETRATION_PART, Replay
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
@@ -31,6 +30,7 @@ from drake_diff.record.solve import ReplayEvidence
 AT_LIMIT = 1e-3  # of a limit: so close to it an input counts as there; interior points never quite reach it
 ON_THE_PLANT = "in the open-loop replay on the discrete plant"
 NO_REPLAY = "the discrete plant could not be stepped along these inputs"
+NEVER_FREE = "there is contact, or a limit, from the first step on"
 INVARIANTS = {
     "free-motion energy drift": "J",
     "free-motion energy oscillation": "J",
@@ -121,6 +121,7 @@ class Measurement(ShowsItsRepr):
         return "\n  ".join((*lines, *(f"{m.name}: {m.value} {m.unit} ({m.verdict})" for m in self.metrics)))
 
 
+@np.errstate(over="ignore", invalid="ignore")  # numbers of a run that diverged: they are measured as infinite
 def measure(solution: Solution) -> Measurement:
     """Measure a solution on the plant: once, for all that is written of it.
 
@@ -137,14 +138,13 @@ def measure(solution: Solution) -> Measurement:
         >>> print(measure(dd.solve(problem, method="shooting")))
         converged: 5 of 5 bounds are kept
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # numbers of a run that diverged: they are measured as infinite
-        return _measure(solution)
-
-
-def _measure(solution: Solution) -> Measurement:
-    problem, motion, knots = solution.problem, solution.replay, solution.knots
-    positions, velocities, inputs = _columns(problem)
-    states = (*positions, *velocities)
+    problem, motion, knots, us = solution.problem, solution.replay, solution.knots, solution.inputs_at_knots
+    names, b = (*problem.state_names, *problem.input_names), problem.bounds
+    limits = np.append(b.x_lower, b.u_lower).tolist(), np.append(b.x_upper, b.u_upper).tolist()
+    columns = tuple(Column(*column) for column in zip(names, units_of(problem), *limits, strict=True))
+    states, inputs = columns[: problem.nx], columns[problem.nx :]
+    count = problem.model.nq if problem.has_model else problem.nx  # all states of plain dynamics are positions
+    positions, velocities = states[:count], states[count:]
     metrics = [*_metrics_of_the_plan(solution, states, inputs)]
     invariants: list[Metric] = []
     limit, thinnest = math.inf, ""
@@ -153,7 +153,6 @@ def _measure(solution: Solution) -> Measurement:
         invariants += _invariants(solution.vector, motion, _unit(positions))
         limit, thinnest = thinnest_geometry(problem.model)
     failures = tuple(_failures(solution, metrics))
-    us = solution.inputs_at_knots
     return Measurement(
         solution=solution,
         positions=positions,
@@ -174,56 +173,41 @@ def _measure(solution: Solution) -> Measurement:
     )
 
 
-def _columns(problem: Problem) -> tuple[tuple[Column, ...], ...]:
-    """(positions, velocities, inputs); all states of plain dynamics are positions, and their units are not known."""
-    b = problem.bounds
-    names, units = (*problem.state_names, *problem.input_names), units_of(problem)
-    count = problem.model.nq if problem.has_model else problem.nx
-    limits = zip(np.append(b.x_lower, b.u_lower).tolist(), np.append(b.x_upper, b.u_upper).tolist(), strict=True)
-    found = tuple(Column(name, unit, *pair) for name, unit, pair in zip(names, units, limits, strict=True))
-    return found[:count], found[count : problem.nx], found[problem.nx :]
-
-
-def _unit(columns: Sequence[Column]) -> str:
-    """The units of the worst of several coordinates: "rad or m"."""
+def _unit(columns: Sequence[Column | Parameter]) -> str:
+    """The units of the worst of several numbers: "rad or m"."""
     return " or ".join(dict.fromkeys(column.unit for column in columns))
 
 
-def _metrics_of_the_plan(solution: Solution, states: Sequence[Column], inputs: Sequence[Column]) -> Iterator[Metric]:
+def _metrics_of_the_plan(s: Solution, states: Sequence[Column], inputs: Sequence[Column]) -> Iterator[Metric]:
     tolerance, x = FEASIBILITY_TOLERANCE, _unit(states)
-    units = [c.unit for c in (*states, *inputs)] + [p.unit for p in solution.vector.parameters]
-    bounded = " or ".join(dict.fromkeys(units))
-    worst = int(np.argmax(solution.defects)) if len(solution.defects) else 0
-    when = float(solution.times[min(worst, len(solution.times) - 1)])
-    yield measured("cost", "objective of the states and inputs as the problem defines it", solution.cost, "1")
-    yield measured(
-        "defect", "largest distance from the dynamics over one step", solution.defect, x, tolerance, t_s=when
-    )
-    yield measured("goal error", "largest distance of the final state from the goal", solution.goal_error, x, tolerance)
-    yield measured("bound violation", "largest excess over a bound", solution.bound_violation, bounded, tolerance)
-    yield measured(
-        "initial state error", "distance of the first state from x0", solution.initial_state_error, x, tolerance
-    )
+    bounded = _unit((*states, *inputs, *s.vector.parameters))
+    worst = int(np.argmax(s.defects)) if len(s.defects) else 0
+    when = float(s.times[min(worst, len(s.times) - 1)])
+    yield measured("cost", "objective of the states and inputs as the problem defines it", s.cost, "1")
+    yield measured("defect", "largest distance from the dynamics over one step", s.defect, x, tolerance, t_s=when)
+    yield measured("goal error", "largest distance of the final state from the goal", s.goal_error, x, tolerance)
+    yield measured("bound violation", "largest excess over a bound", s.bound_violation, bounded, tolerance)
+    yield measured("initial state error", "distance of the first state from x0", s.initial_state_error, x, tolerance)
     excess = "largest excess over a bound of a constraint, or distance from a waypoint"
-    yield measured("constraint violation", excess, solution.constraint_violation, "the constraint's", tolerance)
-    yield measured("horizon", "time from the first state to the last", solution.horizon, "s")
-    if solution.transcribed is None:
+    yield measured("constraint violation", excess, s.constraint_violation, "the constraint's", tolerance)
+    yield measured("horizon", "time from the first state to the last", s.horizon, "s")
+    if s.transcribed is None:
         return
     definition = "largest distance of a knot from an accurate integration from the knot before"
-    yield measured("integration error", definition, solution.integration_error, x, INTEGRATION_TOLERANCE)
-    between = violation_between_nodes(solution.transcribed)
+    yield measured("integration error", definition, s.integration_error, x, INTEGRATION_TOLERANCE)
+    between = violation_between_nodes(s.transcribed)
     for name, value, unit in (("state", between.state, x), ("input", between.input, _unit(inputs))):
         definition = f"largest excess of the {name} over its bounds between the nodes, where no solver keeps them"
         yield measured(f"{name} excess between nodes", definition, value, unit)
-    if solution.integrated is not None and not solution.problem.has_model:
+    if s.integrated is not None and not s.problem.has_model:
         definition = "largest distance of the final state from where the equations lead from the first, unstable or not"
-        yield measured("open-loop end error", definition, _largest(solution.integrated[-1] - solution.xs[-1]), x)
+        yield measured("open-loop end error", definition, float(np.abs(s.integrated[-1] - s.xs[-1]).max()), x)
 
 
 def _metrics_of_the_replay(
     solution: Solution, motion: Rollout | None, states: Sequence[Column], positions: Sequence[Column]
 ) -> Iterator[Metric]:
-    here, x = ON_THE_PLANT, _unit(states)
+    here, x, position = ON_THE_PLANT, _unit(states), _unit(positions)
     measures = (
         ("replay end error", f"largest distance of the final state {here} from the plan's", x),
         ("half-step end error", "the same, in steps half as long", x),
@@ -231,31 +215,22 @@ def _metrics_of_the_replay(
         ("energy oscillation", f"largest oscillation of that energy about its drift, {here}", "J"),
         ("energy scale", f"range of kinetic plus potential energy {here}", "J"),
         ("penetration", f"largest overlap of two geometries {here}", "m"),
-        (
-            "joint limit violation",
-            f"largest excess over a joint limit or of a quaternion's norm {here}",
-            _unit(positions),
-        ),
+        ("joint limit violation", f"largest excess over a joint limit or of a quaternion's norm {here}", position),
     )
-    if motion is None:
-        for name, definition, unit in measures:
-            yield measured(name, definition, float("inf"), unit, reason=NO_REPLAY)
-        return
-    values = (
-        _largest(motion.xs[-1] - solution.xs[-1]),
-        solution.half_step_error,
-        motion.energy_drift,
-        motion.energy_oscillation,
-        float(np.ptp(motion.energy)),
-        float(np.max(motion.penetration)),
-        float(np.max(motion.constraint_violation)),
-    )
+    values, reason = [math.inf] * len(measures), NO_REPLAY
+    if motion is not None:
+        reason = "not finite"
+        values = [
+            float(np.abs(motion.xs[-1] - solution.xs[-1]).max()),
+            solution.half_step_error,
+            motion.energy_drift,
+            motion.energy_oscillation,
+            float(np.ptp(motion.energy)),
+            float(np.max(motion.penetration)),
+            float(np.max(motion.constraint_violation)),
+        ]
     for (name, definition, unit), value in zip(measures, values, strict=True):
-        yield measured(name, definition, value, unit)
-
-
-def _largest(distance: Array) -> float:
-    return float(np.abs(distance).max())
+        yield measured(name, definition, value, unit, reason=reason)
 
 
 def _failures(solution: Solution, metrics: Sequence[Metric]) -> Iterator[Failure]:
@@ -385,66 +360,51 @@ def _invariants(vector: ParameterVector, motion: Rollout | None, unit: str) -> I
         for name, own in INVARIANTS.items():
             yield measured(name, ON_THE_PLANT, np.inf, own or unit, reason=NO_REPLAY)
         return
-    free = _free_steps(vector.model, motion)
+    plant, positions = vector.model.plant, motion.xs[:, : vector.model.nq]
+    limits = (positions <= plant.GetPositionLowerLimits()) | (positions >= plant.GetPositionUpperLimits())
+    # A limit is implicit: it acts in the step before it is met.
+    held = np.array([bool(c) for c in motion.contacts]) | np.any(limits, axis=1)[1:]
+    free = int(np.argmax(held)) if held.any() else len(held)  # steps from the start with nothing in the way
     yield from _energy(motion, free)
     yield from _momentum(vector, motion, free)
     yield _worst("penetration", f"largest overlap of two geometries {ON_THE_PLANT}", "m", motion, motion.penetration)
-    yield _worst(
-        "limit violation",
-        f"largest excess over a joint limit, or of a quaternion's norm over 1, {ON_THE_PLANT}",
-        unit,
-        motion,
-        motion.constraint_violation,
-        reason="the plant has constraints (couplers, balls, welds), whose violation pydrake does not tell",
-    )
+    definition = f"largest excess over a joint limit, or of a quaternion's norm over 1, {ON_THE_PLANT}"
+    untold = "the plant has constraints (couplers, balls, welds), whose violation pydrake does not tell"
+    yield _worst("limit violation", definition, unit, motion, motion.constraint_violation, untold)
     yield _friction_cone(vector, motion)
 
 
 def _worst(name: str, definition: str, unit: str, motion: Rollout, values: Array, reason: str = "not finite") -> Metric:
-    worst = int(np.argmax(values))
-    when = float(motion.times[worst])
-    return measured(name, definition, float(values[worst]), unit, reason=reason, t_s=when)
-
-
-def _free_steps(model: Model, motion: Rollout) -> int:
-    """How many steps from the start there is neither contact nor a joint limit in the way."""
-    lower, upper = model.plant.GetPositionLowerLimits(), model.plant.GetPositionUpperLimits()
-    positions = motion.xs[:, : model.nq]
-    beyond = np.any((positions <= lower) | (positions >= upper), axis=1)
-    held = np.array([bool(c) for c in motion.contacts]) | beyond[1:]  # a limit is implicit: it acts before it is met
-    return int(np.argmax(held)) if held.any() else len(held)
+    k = int(np.argmax(values))
+    return measured(name, definition, float(values[k]), unit, reason=reason, t_s=float(motion.times[k]))
 
 
 def _energy(motion: Rollout, free: int) -> Iterator[Metric]:
     """Of the first, free part: what neither actuators nor damping explain, drift apart from oscillation."""
     error = motion.energy_error[: free + 1]
     part = f"over the {free} steps from the start without contact, {ON_THE_PLANT}"
-    names = list(INVARIANTS)[:2]
-    definitions = (
-        f"lasting part of the energy that neither actuators nor damping explain, {part}",
-        f"largest distance of that energy from its drift line, {part}",
-    )
-    lasting, swing = float("inf"), float("inf")
+    lasting = swing = math.inf
     if free > 0:
         lasting = drift(error)
         swing = float(np.abs(error - smooth_mean(error) - lasting * np.linspace(-0.5, 0.5, len(error))).max())
-    for name, definition, value in zip(names, definitions, (lasting, swing), strict=True):
-        yield measured(name, definition, value, "J", reason="there is contact, or a limit, from the first step on")
+    definition = f"lasting part of the energy that neither actuators nor damping explain, {part}"
+    yield measured("free-motion energy drift", definition, lasting, "J", reason=NEVER_FREE)
+    definition = f"largest distance of that energy from its drift line, {part}"
+    yield measured("free-motion energy oscillation", definition, swing, "J", reason=NEVER_FREE)
 
 
 def _momentum(vector: ParameterVector, motion: Rollout, free: int) -> Iterator[Metric]:
     """Of a system that nothing holds to the world: momentum less what gravity gave, and spin about the mass centre."""
-    definitions = {
-        "linear momentum error": "largest change of the linear momentum beyond gravity's, in free motion",
-        "angular momentum error": "largest change of the angular momentum about the centre of mass, in free motion",
-    }
+    linear = angular = math.inf
     reason = _why_not_conserved(vector.model, free)
-    values = (np.inf, np.inf)
     if not reason:
+        reason = "not finite"
         with applied(vector) as model:
-            values = _momentum_errors(model, motion, free)
-    for (name, definition), value in zip(definitions.items(), values, strict=True):
-        yield measured(name, definition, value, INVARIANTS[name], reason=reason or "not finite")
+            linear, angular = _momentum_errors(model, motion, free)
+    definition = "largest change of the linear momentum beyond gravity's, in free motion"
+    yield measured("linear momentum error", definition, linear, "N s", reason=reason)
+    definition = "largest change of the angular momentum about the centre of mass, in free motion"
+    yield measured("angular momentum error", definition, angular, "N m s", reason=reason)
 
 
 def _why_not_conserved(model: Model, free: int) -> str:
@@ -455,7 +415,7 @@ def _why_not_conserved(model: Model, free: int) -> str:
             return f"{joint.name()} holds the model to the world, which takes up momentum"
         if joint.type_name() in FLOATING and np.any(np.asarray(joint.default_damping_vector()) != 0):
             return f"{joint.name()} is damped, which takes momentum away"
-    return "" if free > 0 else "there is contact, or a limit, from the first step on"
+    return "" if free > 0 else NEVER_FREE
 
 
 def _momentum_errors(model: Model, motion: Rollout, free: int) -> tuple[float, float]:
@@ -475,33 +435,23 @@ def _momentum_errors(model: Model, motion: Rollout, free: int) -> tuple[float, f
     return float(np.abs(change).max()), float(np.abs(np.array(angular) - angular[0]).max())
 
 
-def _friction_by_body(model: Model) -> dict[str, float]:
-    """The coefficient of each body that has one for all its geometries."""
-    found: dict[str, set[Any]] = {}
-    for geometry in model.contract.geometries:
-        found.setdefault(geometry.body, set()).add(geometry.friction)
-    return {body: values.pop() for body, values in found.items() if len(values) == 1}
-
-
-def _combined(a: float | None, b: float | None) -> float | None:
-    """Drake's coefficient for two bodies, 2 a b / (a + b); None where one is not known."""
-    if a is None or b is None:
-        return None
-    return 2 * a * b / (a + b) if a + b else 0.0
-
-
 def _friction_cone(vector: ParameterVector, motion: Rollout) -> Metric:
     """By how much a tangential contact force is larger than friction allows."""
     name, definition = "friction-cone excess", f"largest |f_t| - mu f_n of a contact's force {ON_THE_PLANT}"
     if any(parameter.name.endswith(".friction") for parameter in vector.parameters):
         return measured(name, definition, np.inf, "N", reason="friction is a parameter here, not the contract's")
-    known, worst, when = _friction_by_body(vector.model), -np.inf, 0.0
+    coefficients: dict[str, set[Any]] = {}
+    for geometry in vector.model.contract.geometries:
+        coefficients.setdefault(geometry.body, set()).add(geometry.friction)
+    known = {body: of_body.pop() for body, of_body in coefficients.items() if len(of_body) == 1}
+    worst, when = -np.inf, 0.0
     for time, contacts in zip(motion.times, motion.contacts, strict=False):
         for contact in contacts:
-            mu = _combined(known.get(contact.body_a), known.get(contact.body_b))
-            if mu is None:
+            a, b = known.get(contact.body_a), known.get(contact.body_b)
+            if a is None or b is None:
                 pair = f"{contact.body_a} and {contact.body_b}"
                 return measured(name, definition, np.inf, "N", reason=f"the friction between {pair} is not one number")
+            mu = 2 * a * b / (a + b) if a + b else 0.0  # Drake's coefficient for two bodies
             push = float(contact.force @ contact.normal)
             excess = float(np.linalg.norm(contact.force - push * contact.normal)) - mu * push
             if excess > worst:

@@ -10,10 +10,9 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.artifact.measurement import Column, Measurement
-from drake_diff.motion.rollout import Rollout
 from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.pages.meshcat import write_replay
-from drake_diff.pages.scene import BLUE, Scene, scene_of
+from drake_diff.pages.scene import BLUE, scene_of
 
 SERIES_PER_PLOT = 6  # more lines cannot be told apart
 
@@ -26,7 +25,14 @@ def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str,
     """
     plots, view = list(plots_of(m)), ""
     if m.solution.problem.has_model:
-        scene = _scene(m)
+        xs, ghosts = m.xs, None
+        if m.motion is None:  # the plan alone; states of it that are not finite are drawn at x0
+            xs = np.where(np.all(np.isfinite(xs), axis=1)[:, None], xs, m.solution.problem.x0)
+        else:  # beside a plan in continuous time
+            xs = m.motion.xs
+            ghosts = {"plan": (m.xs, BLUE)} if m.solution.transcribed is not None else None
+        contacts = () if m.motion is None else m.motion.contacts
+        scene = scene_of(m.solution.problem.model, m.times, xs, contacts=contacts, ghosts=ghosts)
         write_replay(replay, scene, title=f"{record['name']}: {m.solution.status.value}")
         view = replay.read_text(encoding="utf-8")
     write_page(
@@ -42,28 +48,22 @@ def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str,
     )
 
 
-def _scene(m: Measurement) -> Scene:
-    """The plant's motion, beside that of a plan in continuous time; the plan alone where it could not be stepped."""
-    model, motion = m.solution.problem.model, m.motion
-    if motion is None:  # a page cannot show nothing: states that are not finite are drawn at x0
-        finite = np.all(np.isfinite(m.xs), axis=1)
-        return scene_of(model, m.times, np.where(finite[:, None], m.xs, m.solution.problem.x0))
-    ghosts = {"plan": (m.xs, BLUE)} if m.solution.transcribed is not None else None
-    return scene_of(model, m.times, motion.xs, contacts=motion.contacts, ghosts=ghosts)
-
-
 def plots_of(m: Measurement) -> Iterator[Plot]:
     """What the report plots, over time and over the solver's iterations."""
     yield from _state_plots(m, "positions", 0, m.positions)
     yield from _state_plots(m, "velocities", len(m.positions), m.velocities)
     yield from _input_plots(m)
     if m.motion is not None:
-        yield from _energy_plots(m.motion)
+        times, energy = m.motion.times, Line("total", m.motion.energy)
+        parts = [Line("kinetic", m.motion.kinetic_energy), Line("potential", m.motion.potential_energy), energy]
+        yield Plot("energy", "J", times, parts)
+        note = "what neither actuators nor damping account for: the time stepping's error, and what contact takes"
+        yield Plot("unexplained energy", "J", times, [Line("error", m.motion.energy_error)], note=note)
         note = "nothing can touch"
         if math.isfinite(m.penetration_limit):
             note = f"limit {m.penetration_limit:.3g} m, a quarter of {m.thinnest}"
         overlap = [Line("largest overlap", m.motion.penetration)]
-        yield Plot("penetration", "m", m.motion.times, overlap, limits=(None, m.penetration_limit), note=note)
+        yield Plot("penetration", "m", times, overlap, limits=(None, m.penetration_limit), note=note)
     yield from _replay_plots(m)
     yield from _solver_plots(m)
 
@@ -101,13 +101,6 @@ def _as_long(values: Array, times: Array) -> Array:
     """`values` with as many entries as there are times, the last one held or missing ones NaN."""
     missing = max(0, len(times) - len(values))
     return np.append(values, np.full(missing, values[-1] if missing == 1 and len(values) else np.nan))
-
-
-def _energy_plots(motion: Rollout) -> Iterator[Plot]:
-    shown = [("kinetic", motion.kinetic_energy), ("potential", motion.potential_energy), ("total", motion.energy)]
-    yield Plot("energy", "J", motion.times, [Line(name, values) for name, values in shown])
-    note = "what neither actuators nor damping account for: the time stepping's error, and what contact takes"
-    yield Plot("unexplained energy", "J", motion.times, [Line("error", motion.energy_error)], note=note)
 
 
 def _replay_plots(m: Measurement) -> Iterator[Plot]:

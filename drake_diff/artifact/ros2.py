@@ -1,13 +1,14 @@
 """A run's motion as a bag that `ros2 bag` reads: the trace's own channels in ROS 2's messages and encoding."""
 
 from collections.abc import Callable
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError
-from drake_diff.logs.mcap_file import McapLog, read_mcap
+from drake_diff.logs.mcap_file import read_mcap
 
 TRACE = "trace.mcap"
 BAG_VERSION = 8  # of metadata.yaml: the one that Humble and everything newer reads
@@ -35,19 +36,13 @@ def export_ros2(run: str | Path, out: str | Path) -> dict[str, int]:
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Writer(out, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as bag:
         bag.set_custom_data("written_by", "drake_diff")
-        connections = {
-            topic: bag.add_connection(topic, name, typestore=store) for topic, (name, _) in CONVERTED.items()
-        }
-        for time, topic, message in _in_order(log):
+        bags = {topic: bag.add_connection(topic, name, typestore=store) for topic, (name, _) in CONVERTED.items()}
+        rows = [(time, topic, message) for topic in CONVERTED for time, message in log.messages[topic]]
+        for time, topic, message in sorted(rows, key=itemgetter(0)):
             name, convert = CONVERTED[topic]
             converted = convert(store.types, time, message, log.channel_metadata[topic])
-            bag.write(connections[topic], time, store.serialize_cdr(converted, name))
+            bag.write(bags[topic], time, store.serialize_cdr(converted, name))
     return {topic: len(log.messages[topic]) for topic in CONVERTED}
-
-
-def _in_order(log: McapLog) -> list[tuple[int, str, Any]]:
-    rows = [(time, topic, message) for topic in CONVERTED for time, message in log.messages[topic]]
-    return sorted(rows, key=lambda row: row[0])
 
 
 def _joint_state(types: dict[str, Any], time: int, message: Any, _: dict[str, Any]) -> Any:
@@ -72,11 +67,8 @@ def _transforms(types: dict[str, Any], time: int, message: Any, _: dict[str, Any
         )
 
     stamped = types["geometry_msgs/msg/TransformStamped"]
-    return types["tf2_msgs/msg/TFMessage"](
-        transforms=[
-            stamped(_header(types, time, t.parent_frame_id), t.child_frame_id, pose(t)) for t in message.transforms
-        ]
-    )
+    found = [stamped(_header(types, time, t.parent_frame_id), t.child_frame_id, pose(t)) for t in message.transforms]
+    return types["tf2_msgs/msg/TFMessage"](transforms=found)
 
 
 def _input(types: dict[str, Any], _: int, message: Any, metadata: dict[str, Any]) -> Any:
@@ -91,13 +83,10 @@ def _diagnostics(types: dict[str, Any], time: int, message: Any, metadata: dict[
     """diagnostic_msgs/DiagnosticArray: every number as text that reads back to the same bits, its unit beside it."""
     units = metadata["units"]
     pair = types["diagnostic_msgs/msg/KeyValue"]
-    values = [
-        pair(f"{field.name} [{units[field.name]}]", repr(getattr(message, field.name)))
-        for field in message.DESCRIPTOR.fields
-    ]
-    status = types["diagnostic_msgs/msg/DiagnosticStatus"](
-        level=0, name="drake_diff", message="", hardware_id="", values=values
-    )
+    names = [field.name for field in message.DESCRIPTOR.fields]
+    values = [pair(f"{name} [{units[name]}]", repr(getattr(message, name))) for name in names]
+    told = types["diagnostic_msgs/msg/DiagnosticStatus"]
+    status = told(level=0, name="drake_diff", message="", hardware_id="", values=values)
     return types["diagnostic_msgs/msg/DiagnosticArray"](header=_header(types, time), status=[status])
 
 

@@ -18,7 +18,7 @@ from drake_diff.artifact.measurement import Measurement
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.exceptions import ArtifactError
 from drake_diff.logs.channels import Shown, input_channel, motion_channels, nanoseconds, state_channel
-from drake_diff.logs.mcap_file import Channel, McapLog, read_mcap, write_mcap
+from drake_diff.logs.mcap_file import Channel, read_mcap, write_mcap
 from drake_diff.logs.messages import TYPES, MessageType
 from drake_diff.model.parameters import applied
 from drake_diff.optimize.solution import Solution
@@ -112,10 +112,8 @@ def _solver_channels(m: Measurement) -> Iterator[Channel]:
     yield _table("/gradient/check", TYPES["GradientCheck"], checks, "certificate")
     kind = TYPES["GradientNorm"]
     norms = [] if solution.gradient_norms is None else solution.gradient_norms.tolist()
-    rows = [
-        (nanoseconds(t), kind.cls(step=k, norm=norm))
-        for k, (t, norm) in enumerate(zip(solution.times[: len(norms)], norms, strict=True))
-    ]
+    timed = enumerate(zip(solution.times[: len(norms)], norms, strict=True))
+    rows = [(nanoseconds(t), kind.cls(step=k, norm=norm)) for k, (t, norm) in timed]
     yield Channel("/gradient/norm", kind.cls, rows, {"units": kind.units})
     kind = TYPES["Replay"]
     yield _table("/replays", kind, [_fields(kind, replay) for replay in m.replays], "replay")
@@ -154,11 +152,8 @@ def _gradient_check(c: Certificate) -> Any:
 def _event_channel(m: Measurement) -> Channel:
     """The events and failures of the record: what is before the motion at 0 s, failures at its end."""
     kind = TYPES["Event"]
-    rows = [
-        kind.cls(time=event.t_s or 0.0, kind=event.kind, message=event.message)
-        for event in m.events
-        if event.kind != "failure"
-    ]
+    before = [event for event in m.events if event.kind != "failure"]
+    rows = [kind.cls(time=event.t_s or 0.0, kind=event.kind, message=event.message) for event in before]
     end = float(m.solution.times[-1])
     for f in m.failures:
         rows.append(kind.cls(time=end, kind="failure", failure_label=f.label, code=f.code, message=f.message))
@@ -194,24 +189,20 @@ class Trace(ShowsItsRepr):
     attachments: dict[str, bytes]
 
     def __repr__(self) -> str:
-        shapes = (
-            f"{self.planned_xs.shape[0]} planned states, {self.xs.shape[0]} of the motion, {self.us.shape[1]} inputs"
-        )
-        return f"Trace of {self.metadata.get('model', '?')}: {shapes}, {self.horizon:g} s\n  " + ", ".join(
-            self.attachments
-        )
+        counts = f"{len(self.planned_xs)} planned states, {len(self.xs)} of the motion, {self.us.shape[1]} inputs"
+        files = ", ".join(self.attachments)
+        return f"Trace of {self.metadata.get('model', '?')}: {counts}, {self.horizon:g} s\n  {files}"
 
     @property
     def plan(self) -> dict[str, Any]:
         """The fields of a `Solution` that hold its numbers: `Solution(problem, method, ..., **trace.plan)`."""
         count = max(len(self.planned_xs) - 1, 0)
-        final = self.planned_us[count] if len(self.planned_us) > count else None
         return {
             "xs": self.planned_xs,
             "us": self.planned_us[:count],
             "scheme": self.scheme,
             "us_mid": self.planned_us_mid,
-            "u_final": final,
+            "u_final": self.planned_us[count] if len(self.planned_us) > count else None,
             "mesh": self.mesh,
             "free_horizon": self.horizon if self.horizon_is_free else None,
             "parameters": self.parameters,
@@ -242,14 +233,14 @@ def read_trace(path: str | Path) -> Trace:
     plan = log.arrays("/planned/plan")
     if len(plan["horizon"]) != 1:
         raise ArtifactError(f"{path}: expected one message of /planned/plan, got {len(plan['horizon'])}")
-    planned = log.arrays("/planned/state")
+    planned, middles = log.arrays("/planned/state"), "/planned/input_mid"
     return Trace(
         times=frozen(planned["time"]),
         xs=_states(log.arrays("/state")),
         us=frozen(log.arrays("/input")["u"]),
         planned_xs=_states(planned),
         planned_us=frozen(log.arrays("/planned/input")["u"]),
-        planned_us_mid=_middles(log),
+        planned_us_mid=frozen(log.arrays(middles)["u"]) if middles in log.messages else None,
         scheme=str(plan["scheme"][0]),
         horizon=float(plan["horizon"][0]),
         horizon_is_free=bool(plan["horizon_is_free"][0]),
@@ -263,8 +254,3 @@ def read_trace(path: str | Path) -> Trace:
 
 def _states(columns: dict[str, Any]) -> Array:
     return frozen(np.hstack([columns["q"], columns["v"]]))
-
-
-def _middles(log: McapLog) -> Array | None:
-    topic = "/planned/input_mid"
-    return frozen(log.arrays(topic)["u"]) if topic in log.messages else None
