@@ -118,7 +118,7 @@ def test_between_two_plans_the_first_ones_inputs_are_given(swung):
 def test_a_refused_solve_is_told_and_the_last_plan_followed(swung, monkeypatch):
     mpc = dd.loop.MPC(swung.problem, horizon=30, plan=swung)
     x1 = advance(swung.problem.model.double, np.zeros(4), mpc(np.zeros(4), 0.0))
-    planned = np.array(mpc._us)
+    planned = np.array(mpc._last[1])
     with monkeypatch.context() as patch:
 
         def refuse(*_, **__):

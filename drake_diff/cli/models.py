@@ -53,13 +53,7 @@ def certify(
     directory = out or Path("artifacts") / f"certify_{file.stem}"
     show(plain(file.name, "bold"), f"{model!r}, contact {model.contract.contact.model}")
     names = tuple(names_in(parameters) or ())
-    record = certify_model(model, states=states, seed=seed, parameters=names, method=method, directory=directory)
-    _show_certification(record)
-    show(f"wrote {directory / record.FILE}")
-    raise typer.Exit(0 if record.verdict == "pass" else 1)
-
-
-def _show_certification(record: Any) -> None:
+    record: Any = certify_model(model, states=states, seed=seed, parameters=names, method=method, directory=directory)
     rows = table("state", "motion", "contacts", "entries", "largest", "from", "verdict")
     for i, state in enumerate(record.states):
         modes = list(state.contact_modes.values())
@@ -80,6 +74,8 @@ def _show_certification(record: Any) -> None:
             for change in state.mode_changes[:3]:
                 show(f"    {change}")
     show(judged(record.verdict), f"{record.sentence}, {record.wall_clock.duration_s:.1f} s")
+    show(f"wrote {directory / record.FILE}")
+    raise typer.Exit(0 if record.verdict == "pass" else 1)
 
 
 def compare(
@@ -108,12 +104,6 @@ def compare(
     begin_comparison(directory, model)
     found = compare_engines(model, names_in(engines), recordings=recordings, num_steps=num_steps, seed=seed)
     record = save_comparison(found, directory)
-    _show_comparison(record)
-    show(f"wrote {directory / PAGE}")
-    raise typer.Exit(0 if record.verdict == "pass" else 1)
-
-
-def _show_comparison(record: Any) -> None:
     rows = table(
         "engine", "verdict", "step gap", "apart from", "Jacobian gap", "its own", "step", "Jacobian", wrap=False
     )
@@ -136,6 +126,8 @@ def _show_comparison(record: Any) -> None:
     for r in record.refused:
         show(plain(r.engine, "bold dim"), plain(f"not compared: {r.reason}", "dim"))
     show(judged(record.verdict), record.sentence)
+    show(f"wrote {directory / PAGE}")
+    raise typer.Exit(0 if record.verdict == "pass" else 1)
 
 
 def export(

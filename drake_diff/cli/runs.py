@@ -29,9 +29,6 @@ def add_commands(app: typer.Typer) -> None:
     app.add_typer(mcap, name="mcap")
 
 
-# --- solve and save
-
-
 def run(
     script: Annotated[Path, typer.Argument(metavar="SCRIPT", help="A Python file with a function problem().")],
     out: Annotated[Path | None, out_option("artifacts/<script>")] = None,
@@ -111,9 +108,6 @@ def _show_record(record: Any) -> None:
         f"gradients: {verdicts.count('agree')} of {len(verdicts)} certificates agree; {solver.method} with "
         f"{solver.solver}, {solver.iterations} iterations, {record.wall_clock.duration_s:.1f} s"
     )
-
-
-# --- saved runs
 
 
 def verify(run: RunDirectory) -> None:
@@ -212,9 +206,6 @@ def export(
     folder = out or run.resolve().with_name(f"{run.resolve().name}_ros2")
     counts = export_ros2(run, folder)
     show(f"wrote {folder}: {', '.join(f'{topic} {count}' for topic, count in counts.items())}")
-
-
-# --- logs
 
 
 def info(file: LogFile) -> None:

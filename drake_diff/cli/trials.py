@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -56,14 +56,8 @@ def robustness(
         with progress_line("trying", stderr=True) as report:
             result = try_plan(solution, names, trials=trials, controller=controller, seed=seed, progress=report)
         record = save_robustness(result, directory, run)
-    _show_robustness(record)
-    show(f"wrote {directory / PAGE}")
-    raise typer.Exit(0 if record.verdict == "pass" else 1)
-
-
-def _show_robustness(record: Any) -> None:
-    names = ("perturbation", "level", "success", "95 % interval", "goal error", "measured", "predicted", "labels")
-    rows = table(*names, wrap=False)
+    columns = ("perturbation", "level", "success", "95 % interval", "goal error", "measured", "predicted", "labels")
+    rows = table(*columns, wrap=False)
     for p in record.perturbations:
         for i, c in enumerate(p.cells):
             labels = ", ".join(f"{count} {label.removesuffix('_error')}" for label, count in c.labels.items())
@@ -77,6 +71,8 @@ def _show_robustness(record: Any) -> None:
             )
     show(rows)
     show(judged(record.verdict), record.sentence)
+    show(f"wrote {directory / PAGE}")
+    raise typer.Exit(0 if record.verdict == "pass" else 1)
 
 
 def panel(
@@ -104,7 +100,23 @@ def panel(
     except KeyboardInterrupt:
         show(f"interrupted: finished trials are in {directory}; the same command goes on from there")
         raise typer.Exit(INTERRUPTED) from None
-    _show_panel(found)
+    cells = found.summary["cells"]
+    with_success = any("success" in cell for cell in cells)
+    axes, names = (list(dict.fromkeys(name for cell in cells for name in cell[key])) for key in ("cell", "numbers"))
+    judgement = ["success", "95 %"] if with_success else []
+    rows = table(*axes, "trials", "errors", *judgement, *names, wrap=console().is_terminal)
+    for cell in cells:
+        words = [cell["cell"].get(name) for name in axes] + [cell["trials"], cell["errors"]]
+        if with_success:
+            success = cell["success"]
+            words += [f"{success['rate']:.3g}", f"{success['low']:.3g} to {success['high']:.3g}"]
+        for name in names:
+            n = cell["numbers"].get(name)
+            spread = "" if n is None or n["std"] is None else f" ± {n['std']:.2g}"
+            words.append(None if n is None else f"{n['mean']:.4g}{spread}")
+        rows.add_row(*(plain(word) for word in words))
+    show(rows)
+    show(f"{found.summary['trials']} trials, {found.errors} errors")
     show(f"wrote {directory}: table.csv, summary.json, trials.jsonl")
     raise typer.Exit(1 if found.errors else 0)
 
@@ -124,29 +136,6 @@ def _counted() -> Iterator[Callable[[int, int, int], None]]:
                 report(f"{finished} of {trials} trials, {errors} errors, {now - start:.0f} s")
 
         yield count
-
-
-def _show_panel(found: Any) -> None:
-    cells = found.summary["cells"]
-    with_success = any("success" in cell for cell in cells)
-    axes, names = (list(dict.fromkeys(name for cell in cells for name in cell[key])) for key in ("cell", "numbers"))
-    judgement = ["success", "95 %"] if with_success else []
-    rows = table(*axes, "trials", "errors", *judgement, *names, wrap=console().is_terminal)
-    for cell in cells:
-        words = [cell["cell"].get(name) for name in axes] + [cell["trials"], cell["errors"]]
-        if with_success:
-            success = cell["success"]
-            words += [f"{success['rate']:.3g}", f"{success['low']:.3g} to {success['high']:.3g}"]
-        for name in names:
-            n = cell["numbers"].get(name)
-            spread = "" if n is None or n["std"] is None else f" ± {n['std']:.2g}"
-            words.append(None if n is None else f"{n['mean']:.4g}{spread}")
-        rows.add_row(*(plain(word) for word in words))
-    show(rows)
-    show(f"{found.summary['trials']} trials, {found.errors} errors")
-
-
-# --- gradients of different orders, contact laws of the engines
 
 
 def gradient_panel(

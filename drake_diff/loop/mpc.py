@@ -93,21 +93,20 @@ class MPC:
 
     def start(self, x0: Array) -> None:
         """Forget all but the first plan; the first call plans from its own estimate, whatever `x0` (nx,) is."""
-        self._begin, (self._xs, self._us) = 0, self._reference
-        self._fresh = True
+        self._begin, self._last, self._fresh = 0, self._reference, True
         self.status = OK
 
     def __call__(self, x: Any, t: float) -> Array:
         k = max(round(t / self._problem.model.time_step), 0)
         if self._fresh or not self._begin <= k < self._begin + self.replan_every:
             self._replan(x, k)
-        return np.array(self._input(k))
+        return np.array(self._row(k, 1))
 
     def _replan(self, x: Any, k: int) -> None:
         """Plan from step `k` on; where that fails, keep the last plan, moved on to `k`."""
         count = self._count(k)
-        xs = np.array([self._state(i) for i in range(k, k + count + 1)])
-        us = np.array([self._input(i) for i in range(k, k + count)])
+        xs = np.array([self._row(i, 0) for i in range(k, k + count + 1)])
+        us = np.array([self._row(i, 1) for i in range(k, k + count)])
         try:
             x = finite_array("x", x, (self._problem.model.nx,))
             result, found_xs, found_us = solve_ilqr(self._ahead(x, k), xs, us, limits=self._limits, report=None)
@@ -118,7 +117,7 @@ class MPC:
                 raise KeyboardInterrupt
             xs, us = found_xs, found_us
             self.status = OK if result.outcome is Outcome.SOLVED else result.message
-        self._begin, self._xs, self._us, self._fresh = k, xs, us, False
+        self._begin, self._last, self._fresh = k, (xs, us), False
 
     def _count(self, k: int) -> int:
         """How many steps are planned from step `k`."""
@@ -137,25 +136,21 @@ class MPC:
         bounds = Bounds(np.minimum(b.x_lower, x), np.maximum(b.x_upper, x), b.u_lower, b.u_upper)
         return replace(problem, x0=x, num_steps=count, us=None, running_cost=running, final_cost=final, bounds=bounds)
 
-    def _state(self, k: int) -> Array:
-        return self._of_plan(k, self._xs, self._reference[0], None if self._stay is None else self._stay.x)
-
-    def _input(self, k: int) -> Array:
-        return self._of_plan(k, self._us, self._reference[1], None if self._stay is None else self._stay.u)
-
-    def _of_plan(self, k: int, last: Array, first: Array, end: Array | None) -> Array:
-        """Row `k` of the last plan; where it has none, of the first one; after its end, what stays at the goal."""
+    def _row(self, k: int, i: int) -> Array:
+        """State (i = 0) or input (1) `k` of the last plan, else of the first, and after its end what stays there."""
+        last, first = self._last[i], self._reference[i]
         if self._begin <= k < self._begin + len(last):
             return last[k - self._begin]
-        return first[k] if k < len(first) else first[-1] if end is None else end
+        if k < len(first):
+            return first[k]
+        return first[-1] if self._stay is None else self._stay.point[i]
 
 
 @dataclass(frozen=True, eq=False)
 class _Staying:
-    """Staying at the goal `x` by the input `u`; `final` is what staying costs from a state nearby."""
+    """Staying at `point`, the goal and its input; `final` is what staying costs from a state nearby."""
 
-    x: Array
-    u: Array
+    point: tuple[Array, Array]
     running: QuadraticCost
     final: QuadraticCost
 
@@ -177,16 +172,15 @@ def _staying(problem: Problem, xs: Array, us: Array) -> _Staying:
     regulator, to_tangent = LQR(model, goal, u, Q, R), tangent_space(model).derivative_of_minus(goal)
     h, Q, P = model.time_step, to_tangent.T @ Q @ to_tangent, to_tangent.T @ regulator.cost_to_go @ to_tangent
     running = QuadraticCost(Q=Q / h, R=R / h, x_ref=goal, u_ref=u)
-    return _Staying(goal, u, running, QuadraticCost(Q=(P + P.T) / 2, x_ref=goal))
+    return _Staying((goal, u), running, QuadraticCost(Q=(P + P.T) / 2, x_ref=goal))
 
 
 def _first_plan(problem: Problem, plan: Any) -> tuple[Array, Array]:
     if plan is None:
         plan = solve(problem)
         if not plan.success:
-            raise InputError(
-                "problem", got=f"solve: {plan.message}", expected="a problem that `solve` solves, or a plan"
-            )
+            expected = "a problem that `solve` solves, or a plan"
+            raise InputError("problem", got=f"solve: {plan.message}", expected=expected)
     if isinstance(plan, Solution):
         plan = (plan.xs, plan.us)
     if not (isinstance(plan, (tuple, list)) and len(plan) == 2):

@@ -58,9 +58,8 @@ class Panel(BaseModel):
         if not self.axes and not self.cells:
             raise ValueError("expected at least one axis or one of [[cells]], got neither")
         for name in {*self.axes, *(name for cell in self.cells for name in cell)} & {*self.fixed, *OURS}:
-            raise ValueError(
-                f"axes and cells: {name} cannot be used: it is in [fixed], or drake_diff gives it to each trial"
-            )
+            why = "it is in [fixed], or drake_diff gives it to each trial"
+            raise ValueError(f"axes and cells: {name} cannot be used: {why}")
         for name in self.fixed.keys() & set(OURS):
             raise ValueError(f"fixed: {name} cannot be used: drake_diff gives it to each trial")
         return self
@@ -112,24 +111,18 @@ def load_panel(path: Path) -> Panel:
     try:
         return Panel.model_validate(said)
     except ValidationError as error:
-        raise InputError(str(path), got="; ".join(_wrong(error)), expected=f"the fields {_FIELDS}") from error
-
-
-_FIELDS = ", ".join(Panel.model_fields)
-
-
-def _wrong(error: ValidationError) -> list[str]:
-    wrong = []
-    for found in error.errors():
-        place = ".".join(str(part) for part in found["loc"])
-        if found["type"] == "extra_forbidden":
-            wrong.append(f"{place}, which is not one of them")
-        elif found["type"] == "missing":
-            wrong.append(f"no {place}")
-        else:
-            got = "" if found["type"] == "value_error" else f", got {found['input']!r:.80}"
-            wrong.append(f"{place or 'panel'}: {found['msg'].removeprefix('Value error, ')}{got}")
-    return wrong
+        wrong = []
+        for found in error.errors():
+            place = ".".join(str(part) for part in found["loc"])
+            if found["type"] == "extra_forbidden":
+                wrong.append(f"{place}, which is not one of them")
+            elif found["type"] == "missing":
+                wrong.append(f"no {place}")
+            else:
+                got = "" if found["type"] == "value_error" else f", got {found['input']!r:.80}"
+                wrong.append(f"{place or 'panel'}: {found['msg'].removeprefix('Value error, ')}{got}")
+        expected = f"the fields {', '.join(Panel.model_fields)}"
+        raise InputError(str(path), got="; ".join(wrong), expected=expected) from error
 
 
 def expand(panel: Panel) -> tuple[PanelTrial, ...]:
@@ -137,17 +130,13 @@ def expand(panel: Panel) -> tuple[PanelTrial, ...]:
     axes: dict[str, Any] = panel.axes
     combinations = product(*axes.values()) if axes else ()
     cells = [*(dict(zip(axes, values, strict=True)) for values in combinations), *panel.cells]
-    trials = tuple(_trial(panel, cell, repeat) for cell in cells for repeat in range(panel.seeds))
-    seen: set[str] = set()
-    for trial in trials:
-        if trial.id in seen:
-            raise InputError("axes and cells", got=f"{cell_name(trial.cell)} twice", expected="each cell once")
-        seen.add(trial.id)
-    return trials
-
-
-def _trial(panel: Panel, cell: dict[str, Any], repeat: int) -> PanelTrial:
-    fields = {**panel.fixed, **cell, "repeat": repeat}
-    words = np.frombuffer(sha256(canonical(fields)).digest(), "<u4")
-    state = np.random.SeedSequence([panel.seed, *words.tolist()]).generate_state(1, np.uint64)
-    return PanelTrial(cell, {**fields, "seed": int(state[0]) >> 11})
+    trials: dict[str, PanelTrial] = {}
+    for cell, repeat in product(cells, range(panel.seeds)):
+        fields = {**panel.fixed, **cell, "repeat": repeat}
+        words = np.frombuffer(sha256(canonical(fields)).digest(), "<u4")
+        state = np.random.SeedSequence([panel.seed, *words.tolist()]).generate_state(1, np.uint64)
+        trial = PanelTrial(cell, {**fields, "seed": int(state[0]) >> 11})
+        if trial.id in trials:
+            raise InputError("axes and cells", got=f"{cell_name(cell)} twice", expected="each cell once")
+        trials[trial.id] = trial
+    return tuple(trials.values())

@@ -161,9 +161,6 @@ def check_engine(engine: str, address: str | None) -> None:
         raise InputError("address", got=address, expected='none for engine="local"; engine="ray" takes it')
 
 
-# --- what a worker does
-
-
 def _answer(function: TrialFunction, fields: dict[str, Any]) -> tuple[Row | None, str]:
     """In the worker: a row, or why the function cannot be loaded there."""
     try:
@@ -184,9 +181,6 @@ def _accept(answer: tuple[Row | None, str]) -> Row | None:
     if refusal:
         raise InputError("evaluate in a worker", got=refusal, expected="a function that can be loaded there")
     return row
-
-
-# --- processes of this machine
 
 
 def _local_answers(trials: Sequence[PanelTrial], function: TrialFunction, workers: int) -> Answers:
@@ -248,9 +242,6 @@ def _begin(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-# --- a Ray cluster
 
 
 @contextmanager

@@ -226,11 +226,9 @@ class _Run:
 
     @property
     def gradient(self) -> float | None:
-        top, bottom = {
-            "stop": ("x", "vx"), "hold": ("x", "vx"), "slide": ("vx", "vx"), "roll": ("vx", "vx")
-        }.get(self.case.kind, ("z", "z"))  # fmt: skip
-        row = self.row(top, len(self.motion.us))
-        return None if row is None else float(row[self._place(bottom)])
+        end = {"stop": "x", "hold": "x", "slide": "vx", "roll": "vx"}.get(self.case.kind, "z")
+        row = self.row(end, len(self.motion.us))
+        return None if row is None else float(row[self._place("z" if end == "z" else "vx")])
 
     def _place(self, name: str) -> int:
         """On the tangent space, where a turn has three coordinates and not four."""

@@ -87,7 +87,11 @@ class Law:
         """The same sum up to the last step that slips; then the tail."""
         case, h = self.case, self.case.time_step
         vx, mu = case.place("vx"), case.friction
-        n = _slipping(case, ran.xs)
+        # How many steps, on level rails and from the first on, have friction mu N, to 1e-3.
+        dv = np.diff(ran.xs[:, [vx, case.place("vz")]], axis=0)
+        limit = mu * (dv[:, 1] + case.gravity * h)
+        slips = np.abs(dv[:, 0] + limit) <= 1e-3 * np.maximum(limit, mu * case.gravity * h)
+        n = len(slips) if slips.all() else int(np.argmin(slips))
         z, vz = (ran.xs[n][case.place(name)] - ran.xs[0][case.place(name)] for name in ("z", "vz"))
         speed = case.speed - mu * case.gravity * h * n - mu * float(vz)
         value = slid(case.speed, mu * case.gravity, h, n) - mu * float(z) + self.tail * speed
@@ -110,14 +114,6 @@ class Law:
         by = "by its damper" if self.force is self.stepped else "by its damper and by the step's own, k h v"
         missed = f"at touch the force jumps {by}; products of step Jacobians miss the jump and give {seen:.3g}"
         return Answer(height, gradient, f"m z'' = -m g + {self.normal} {does}", missed)
-
-
-def _slipping(case: ContactCase, xs: Array) -> int:
-    """How many steps of `xs` (n, 4), on level rails and from the first on, have friction mu N, to 1e-3."""
-    dv = np.diff(xs[:, [case.place("vx"), case.place("vz")]], axis=0)
-    limit = case.friction * (dv[:, 1] + case.gravity * case.time_step)
-    slips = np.abs(dv[:, 0] + limit) <= 1e-3 * np.maximum(limit, case.friction * case.gravity * case.time_step)
-    return len(slips) if slips.all() else int(np.argmin(slips))
 
 
 def impact(force: Force, case: ContactCase, x: float, rate: float, duration: float) -> tuple[float, float, float, bool]:
@@ -173,14 +169,10 @@ def impact_gradients(force: Force, case: ContactCase) -> tuple[float, float]:
 
 def law_of(contact_law: str, case: ContactCase) -> Law | None:
     """The law that an engine's contract calls `contact_law`; None where there is no formula for it here."""
-    known = {
-        "point, sap": _sap,
-        SphereOnGround.contact_law: _sap,
-        "point, similar": _hunt_crossley,
-        "point, lagged": _hunt_crossley,
-    }
-    if contact_law in known:
-        return known[contact_law](case)
+    if contact_law in ("point, sap", SphereOnGround.contact_law):
+        return _sap(case)
+    if contact_law in ("point, similar", "point, lagged"):
+        return _hunt_crossley(case)
     mujocos = f"soft constraint, elliptic cone, impratio {FRICTION_IMPEDANCE_RATIO:g}"
     return _mujoco(case) if contact_law == mujocos else None
 
@@ -206,7 +198,16 @@ def _sap(case: ContactCase) -> Law:
 
 def _hunt_crossley(case: ContactCase) -> Law:
     """f = k x (1 + d x'), friction mu N v / sqrt(v^2 + s^2): implicit in v', explicit in nothing else."""
-    creep, creep_gradient = _block_that_holds(case) if case.kind == "hold" else (0.0, 0.0)
+    creep, creep_gradient = 0.0, 0.0
+    if case.kind == "hold":  # by the block calculated by hand
+        same = {name: getattr(case, name) for name in ("mass", "friction", "slope", "gravity")}
+        block = SlidingBlock(stiction_tolerance=STICTION_TOLERANCE, **same)
+        h, v, left = case.time_step, np.array([case.speed]), 1.0
+        for _ in range(case.num_steps):
+            a, by = block.acceleration(h, np.zeros(1), v, np.zeros(1))
+            v, left = v + h * a, left * (1 + h * float(by[0, 1]))
+            creep_gradient += h * left
+        creep = float(v[0])
     return Law(
         case,
         normal=f"k x (1 + d x') with d = {case.dissipation:g} s/m",
@@ -216,18 +217,6 @@ def _hunt_crossley(case: ContactCase) -> Law:
         creep=creep,
         creep_gradient=creep_gradient,
     )
-
-
-def _block_that_holds(case: ContactCase) -> tuple[float, float]:
-    """By the block calculated by hand: the speed after the case's steps [m/s], and d x_N / d v_0 [s]."""
-    same = {name: getattr(case, name) for name in ("mass", "friction", "slope", "gravity")}
-    block = SlidingBlock(stiction_tolerance=STICTION_TOLERANCE, **same)
-    h, v, left, way = case.time_step, np.array([case.speed]), 1.0, 0.0
-    for _ in range(case.num_steps):
-        a, by = block.acceleration(h, np.zeros(1), v, np.zeros(1))
-        v, left = v + h * a, left * (1 + h * float(by[0, 1]))
-        way += h * left
-    return float(v[0]), way
 
 
 def _mujoco(case: ContactCase) -> Law:

@@ -147,8 +147,16 @@ def double_pendulum(
     goal: float = 0.4,
 ) -> GradientCase:
     """The angles [rad] to let a double pendulum go from, so that its tip is far to one side at the end: chaos."""
+    builder, plant = _plant(time_step)
+    # Two point masses at the ends of rods that weigh nothing, hinged about y; no actuators.
+    end, frame = np.array([0, 0, -ROD]), plant.world_frame()
+    for name in ("upper", "lower"):
+        body = plant.AddRigidBody(name, SpatialInertia(MASS, end, UnitInertia.PointMass(end)))
+        plant.AddJoint(RevoluteJoint(name, frame, body.body_frame(), [0, 1, 0]))
+        frame = plant.AddFrame(FixedOffsetFrame(f"{name}_end", body.body_frame(), RigidTransform(end)))
+    plant.Finalize()
     return _rollout_case(
-        _double_pendulum(time_step),
+        model_from_diagram(builder.Build()),
         lambda x: 1 + (np.sin(x[0]) + np.sin(x[0] + x[1])) / 2,
         states=np.eye(4, 2),
         inputs=np.zeros((num_steps, 2)),
@@ -228,18 +236,5 @@ def _ball(
         surface.AddProperty("material", "relaxation_time", 1e-4)
         plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(RADIUS), "ball", surface)
         plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", surface)
-    plant.Finalize()
-    return model_from_diagram(builder.Build())
-
-
-def _double_pendulum(time_step: float) -> Model:
-    """Two point masses at the ends of rods of 0.5 m that weigh nothing, hinged about y; no actuators."""
-    builder, plant = _plant(time_step)
-    end = np.array([0, 0, -ROD])
-    frame = plant.world_frame()
-    for name in ("upper", "lower"):
-        body = plant.AddRigidBody(name, SpatialInertia(MASS, end, UnitInertia.PointMass(end)))
-        plant.AddJoint(RevoluteJoint(name, frame, body.body_frame(), [0, 1, 0]))
-        frame = plant.AddFrame(FixedOffsetFrame(f"{name}_end", body.body_frame(), RigidTransform(end)))
     plant.Finalize()
     return model_from_diagram(builder.Build())

@@ -191,12 +191,8 @@ class GradientPanel:
 
     def to_dict(self) -> Json:
         """Every number, as plain data for JSON; None stands for no number."""
-        counts = ("samples", "seeds", "reference_samples", "budget", "batch")
-        return {
-            "orders": list(self.orders),
-            **{name: getattr(self, name) for name in counts},
-            "cases": [_case_dict(panel) for panel in self.cases],
-        }
+        counts = _fields(self, "orders", "samples", "seeds", "reference_samples", "budget", "batch")
+        return {**counts, "cases": [_case_dict(panel) for panel in self.cases]}
 
     def rows(self) -> list[Json]:
         """A row for each case, sigma and order, as the table and its file have them."""
@@ -260,9 +256,8 @@ def _case_of(case: GradientCase | str) -> GradientCase:
 
 
 def _row(panel: CasePanel, q: Quality) -> Json:
-    last, rate = q.sigma == panel.sigmas[-1], panel.rate(q.order)
-    descents = panel.descents_of(q.order)
-    estimate = q.estimates[0]
+    last, rate, estimate = q.sigma == panel.sigmas[-1], panel.rate(q.order), q.estimates[0]
+    losses = [d.losses[-1] for d in panel.descents_of(q.order)]
     return {
         "case": panel.case.name,
         "order": q.order,
@@ -280,7 +275,7 @@ def _row(panel: CasePanel, q: Quality) -> Json:
         "descents": rate.trials if last else None,
         "arrived_lower": rate.lower if last else None,
         "arrived_upper": rate.upper if last else None,
-        "final_loss": float(np.mean([d.losses[-1] for d in descents])) if last else None,
+        "final_loss": float(np.mean(losses)) if last else None,
     }
 
 
@@ -296,20 +291,15 @@ def _line(row: Json) -> str:
 
 
 def _case_dict(panel: CasePanel) -> Json:
-    case = panel.case
-    truths = zip(panel.sigmas, panel.truths, strict=True)
-    qualities = [
-        _row(panel, q)
-        | {
-            "entries": _fields(q, "variance", "bias", "bias_error"),
-            "estimates": [_fields(e, "seed", "gradient", "variance", "cosine") for e in q.estimates],
-        }
-        for q in panel.qualities
-    ]
+    qualities = []
+    for q in panel.qualities:
+        entries = _fields(q, "variance", "bias", "bias_error")
+        estimates = [_fields(e, "seed", "gradient", "variance", "cosine") for e in q.estimates]
+        qualities.append({**_row(panel, q), "entries": entries, "estimates": estimates})
     return {
-        **_fields(case, "name", "about", "start", "rate", "goal"),
+        **_fields(panel.case, "name", "about", "start", "rate", "goal"),
         "verdict": list(panel.verdict),
-        "truths": [{"sigma": sigma, **_fields(truth)} for sigma, truth in truths],
+        "truths": [{"sigma": s, **_fields(truth)} for s, truth in zip(panel.sigmas, panel.truths, strict=True)],
         "qualities": qualities,
         "descents": [_fields(d) for d in panel.descents],
     }

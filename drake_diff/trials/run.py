@@ -258,9 +258,6 @@ def cell_of(name: str, level: float, trials: Sequence[Trial], predicted: float |
     )
 
 
-# --- what was found, in sentences
-
-
 def agrees(ratio: float | None) -> bool:
     """Whether a measured displacement is within a factor of AGREE of the predicted one."""
     return ratio is not None and 1 / AGREE <= ratio <= AGREE
@@ -308,9 +305,6 @@ def _gradients(result: Robustness) -> str:
         f"Gradients predict the displacement of the last state within a factor of {AGREE:g} in {right} of the "
         f"{len(told)} cells that they cover; {about}."
     )
-
-
-# --- what gradients predict
 
 
 class Sensitivity:
