@@ -127,12 +127,10 @@ def _engine(e: Compared) -> EngineEvidence:
         largest_penetration_m=None if e.motion.depth is None else float(np.max(e.motion.depth)),
         jacobians=[
             JacobianEvidence(
-                state=j.state,
-                method=j.method,
+                **{name: getattr(j, name) for name in ("state", "method", "own")},
                 gap=float(gap),
                 jacobian=_rows(j.jacobian),
                 law=law,
-                own=j.own,
                 certificate=None if j.certificate is None else gradient_evidence(j.certificate),
             )
             for j, gap, law in zip(e.jacobians, e.jacobian_gaps, e.laws, strict=True)

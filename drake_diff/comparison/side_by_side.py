@@ -90,42 +90,6 @@ def compare(
     """
     for recording in recordings:
         check_recording(recording, model)
-    x0, us = _task(model, recordings, x0, us, num_steps, seed)
-    reference = DrakeEngine(model)
-    loaded: list[Engine] = []
-    refused: list[Refused] = []
-    for wanted in default_engines(model) if engines is None else engines:
-        try:
-            loaded.append(load_spec(wanted, model) if isinstance(wanted, str) else wanted)
-        except (MissingDependencyError, ModelError) as error:
-            refused.append(Refused(str(wanted), str(error), isinstance(error, ModelError)))
-    panel = _Panel(model, reference, x0, us, seed)
-    compared = []
-    each: tuple[Engine | Recording, ...] = (reference, *loaded, *recordings)
-    for one in each:
-        try:
-            compared.append(panel.recorded(one) if isinstance(one, Recording) else panel.compared(one))
-        except SimulationError as error:
-            refused.append(Refused(one.name, f"it cannot take a step from one of the states: {error}", True))
-    return Comparison(model, x0, us, tuple(panel.probes), tuple(compared), tuple(refused))
-
-
-def default_engines(model: Model) -> tuple[str, ...]:
-    """Drake's other contact approximations, where something can touch, every other engine, and what is none."""
-    own = model.contract.contact
-    others = [a for a in ("sap", "similar", "lagged") if own.collision_pairs and a != own.approximation]
-    return (*(f"drake:{a}" for a in others), *(name for name in ENGINES if name != "drake"), *ELSEWHERE)
-
-
-def _task(
-    model: Model,
-    recordings: Sequence[Recording],
-    x0: ArrayLike | None,
-    us: ArrayLike | None,
-    num_steps: int | None,
-    seed: int,
-) -> tuple[Array, Array]:
-    """x0 (nx,) and us (N, nu), checked; without x0 those of the first recording, without any sampled ones."""
     if recordings and x0 is None:
         first = recordings[0]
         x0 = first.xs[0]
@@ -134,7 +98,32 @@ def _task(
     if us is None:
         count = num_steps or min(MOST_STEPS, max(1, round(DURATION / model.time_step)))
         us = np.tile(sample.u, (count, 1))
-    return (sample.x if x0 is None else finite_array("x0", x0, (model.nx,))), check_inputs(model, us, num_steps)
+    start = sample.x if x0 is None else finite_array("x0", x0, (model.nx,))
+    inputs = check_inputs(model, us, num_steps)
+    reference = DrakeEngine(model)
+    loaded: list[Engine] = []
+    refused: list[Refused] = []
+    for wanted in default_engines(model) if engines is None else engines:
+        try:
+            loaded.append(load_spec(wanted, model) if isinstance(wanted, str) else wanted)
+        except (MissingDependencyError, ModelError) as error:
+            refused.append(Refused(str(wanted), str(error), isinstance(error, ModelError)))
+    panel = _Panel(model, reference, start, inputs, seed)
+    compared = []
+    each: tuple[Engine | Recording, ...] = (reference, *loaded, *recordings)
+    for one in each:
+        try:
+            compared.append(panel.recorded(one) if isinstance(one, Recording) else panel.compared(one))
+        except SimulationError as error:
+            refused.append(Refused(one.name, f"it cannot take a step from one of the states: {error}", True))
+    return Comparison(model, start, inputs, tuple(panel.probes), tuple(compared), tuple(refused))
+
+
+def default_engines(model: Model) -> tuple[str, ...]:
+    """Drake's other contact approximations, where something can touch, every other engine, and what is none."""
+    own = model.contract.contact
+    others = [a for a in ("sap", "similar", "lagged") if own.collision_pairs and a != own.approximation]
+    return (*(f"drake:{a}" for a in others), *(name for name in ENGINES if name != "drake"), *ELSEWHERE)
 
 
 class _Panel:
@@ -170,6 +159,7 @@ class _Panel:
             steps = self.reference.step(x, u), engine.step(x, u)
             law = what_is_left(self.coordinates, self.reference, engine, x, steps)
             laws.append(law if law in (CONTACT_LAW, LIMIT_LAW) else "")
+        both = zip(self.jacobians, jacobians, strict=True)
         return Compared(
             engine=engine.name,
             version=engine.version,
@@ -182,9 +172,7 @@ class _Panel:
             final_gap=self._final_gap(motion.xs),
             jacobians=jacobians,
             laws=tuple(laws),
-            jacobian_gaps=frozen(
-                [_gap(a.jacobian, b.jacobian) for a, b in zip(self.jacobians, jacobians, strict=True)]
-            ),
+            jacobian_gaps=frozen([_gap(a.jacobian, b.jacobian) for a, b in both]),
             rollout_jacobian=product,
             rollout_gap=rollout_gap,
             seconds_per_step=seconds(lambda: engine.step(self.x0, self.us[0])),

@@ -101,7 +101,17 @@ class PybulletEngine(RigidEngine):
         islands = self.bullet.stepSimulation()
         used = max([0, *(island["numIterationsUsed"] for island in islands or ())])
         room = int(self.bullet.getPhysicsEngineParameters()["numSolverIterations"])
-        found = self._read(x, u)
+        q, v = np.zeros(self.nq), np.zeros(self.nv)
+        for place, link in self._joints():
+            q[link.joint.q_start], v[link.joint.v_start] = self.bullet.getJointState(*place)[:2]
+        for i, j, base, center, turned in self._free():
+            position, turn = self.bullet.getBasePositionAndOrientation(base)
+            R = rotation(np.array(turn)[[3, 0, 1, 2]]) @ turned.T
+            q[i : i + 4] = RotationMatrix(R).ToQuaternion().wxyz()
+            q[i : i + 4] *= np.sign(q[i : i + 4] @ x[i : i + 4])  # of the two, that which x goes on to
+            q[i + 4 : i + 7] = np.array(position) - R @ center
+            v[j + 3 : j + 6], v[j : j + 3] = self.bullet.getBaseVelocity(base)
+        found = self._found("Bullet", q, v, x, u)
         self.status = "ok" if used < room else f"the solver used all of its {room} iterations"
         return found
 
@@ -245,20 +255,6 @@ class PybulletEngine(RigidEngine):
             self.bullet.resetBaseVelocity(base, list(v[j + 3 : j + 6]), list(v[j : j + 3]))
         for place, link in self._joints():
             self.bullet.resetJointState(*place, float(q[link.joint.q_start]), float(v[link.joint.v_start]))
-
-    def _read(self, x: Array, u: Array) -> Array:
-        """(nx,) where Bullet is, after the step from `x` under `u`."""
-        q, v = np.zeros(self.nq), np.zeros(self.nv)
-        for place, link in self._joints():
-            q[link.joint.q_start], v[link.joint.v_start] = self.bullet.getJointState(*place)[:2]
-        for i, j, base, center, turned in self._free():
-            position, turn = self.bullet.getBasePositionAndOrientation(base)
-            R = rotation(np.array(turn)[[3, 0, 1, 2]]) @ turned.T
-            q[i : i + 4] = RotationMatrix(R).ToQuaternion().wxyz()
-            q[i : i + 4] *= np.sign(q[i : i + 4] @ x[i : i + 4])  # of the two, that which x goes on to
-            q[i + 4 : i + 7] = np.array(position) - R @ center
-            v[j + 3 : j + 6], v[j : j + 3] = self.bullet.getBaseVelocity(base)
-        return self._found("Bullet", q, v, x, u)
 
 
 def _owners_of(pair: PairContract, owners: dict[str, Owner]) -> tuple[Owner, Owner]:

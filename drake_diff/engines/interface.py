@@ -82,46 +82,36 @@ class Engine(Protocol):
     @property
     def name(self) -> str:
         """The engine's name, with the options that were chosen."""
-        ...
 
     @property
     def version(self) -> str:
         """The library's version."""
-        ...
 
     @property
     def contract(self) -> EngineContract:
         """What the engine uses, read back from it."""
-        ...
 
     @property
     def status(self) -> str:
         """How the last step went: "ok", or what the engine's solver said."""
-        ...
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
         """The state (nx,) one time step after `x` (nx,) under `u` (nu,)."""
-        ...
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
         """The Jacobians of `step`."""
-        ...
 
     def energy(self, x: ArrayLike) -> float:
         """Kinetic and potential energy [J]; potential energy is 0 with all mass at height 0 and springs at rest."""
-        ...
 
     def contact_depth(self, x: ArrayLike) -> float:
         """The deepest overlap [m], 0 where nothing touches or the engine has no contact."""
-        ...
 
     def mass_matrix(self, q: ArrayLike) -> Array:
         """(nv, nv), armature included."""
-        ...
 
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
         """(nv,) in M dv/dt + bias = B u - damping v: velocity products less gravity and springs."""
-        ...
 
 
 def floats(values: Any) -> tuple[float, ...]:

@@ -18,7 +18,6 @@ ENGINES = {
     "pybullet": ("engines.bullet", "PybulletEngine"),
     "sapien": ("engines.physx", "SapienEngine"),
 }
-
 # Tools that people ask for and that are no engine here, and why.
 ELSEWHERE = {
     "isaaclab": "it needs its own Python environment: run drake-diff export-model, record there, and compare the file",

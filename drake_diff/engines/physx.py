@@ -198,9 +198,16 @@ class SapienEngine(RigidEngine):
             link.max_linear_velocity = link.max_angular_velocity = UNLIMITED
             for geometry in (g for number, g in self.tree.geometries if number == i and g.name in self.groups):
                 link.attach(self._shape(geometry))
-            link.joint.name = link.name = rigid.joint.joint
+            joint, own = link.joint, rigid.joint
+            joint.name = link.name = own.joint
             if not rigid.free:
-                _set_joint(link.joint, rigid)
+                along = RigidTransform(RotationMatrix.MakeFromOneVector(rigid.axis, 0), np.zeros(3))  # PhysX's axis: x
+                joint.type = "revolute_unwrapped" if own.kind == "revolute" else "prismatic"
+                joint.pose_in_parent, joint.pose_in_child = _pose(rigid.on_parent @ along), _pose(along)
+                joint.limit = np.array([[own.lower, own.upper]], dtype=np.float32)
+                joint.friction, joint.armature = 0.0, np.array([own.armature], dtype=np.float32)
+                joint.max_velocity = UNLIMITED
+                joint.set_drive_properties(0.0, own.damping)
             found.append(link)
             scene.add_entity(entity)
         return found
@@ -287,16 +294,6 @@ def _fixed(scene: Any) -> Any:
     link.joint.type = "fixed"
     scene.add_entity(entity)
     return link
-
-
-def _set_joint(joint: Any, rigid: RigidLink) -> None:
-    along = RigidTransform(RotationMatrix.MakeFromOneVector(rigid.axis, 0), np.zeros(3))  # PhysX's axis is x
-    joint.type = "revolute_unwrapped" if rigid.joint.kind == "revolute" else "prismatic"
-    joint.pose_in_parent, joint.pose_in_child = _pose(rigid.on_parent @ along), _pose(along)
-    joint.limit = np.array([[rigid.joint.lower, rigid.joint.upper]], dtype=np.float32)
-    joint.friction, joint.armature = 0.0, np.array([rigid.joint.armature], dtype=np.float32)
-    joint.max_velocity = UNLIMITED
-    joint.set_drive_properties(0.0, rigid.joint.damping)
 
 
 def _material(friction: float | None) -> Any:
