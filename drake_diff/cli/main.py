@@ -38,7 +38,11 @@ def about(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
-    """Trajectory optimization on Drake with gradients that are checked before they are used."""
+    """Trajectory optimization on Drake with gradients that are checked before they are used.
+
+    Exit status: 0 what was asked for holds, 1 a check failed, 2 bad input, 3 a missing solver, engine or extra,
+    4 an internal error or one in your script.
+    """
 
 
 def main() -> None:
@@ -50,7 +54,8 @@ def main() -> None:
         sys.exit(MISSING if isinstance(error, MissingDependencyError) else USAGE)
     except Exception:
         traceback.print_exc()
-        print("drake-diff: this is a bug in the script or in drake-diff, not in what was asked", file=sys.stderr)
+        advice = "the last lines above say where it failed: mend your script there, or report a bug in drake-diff"
+        print(f"drake-diff: {advice}", file=sys.stderr)
         sys.exit(INTERNAL)
 
 

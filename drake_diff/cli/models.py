@@ -38,7 +38,9 @@ def audit(model: Any, file: Path) -> None:
 def certify(
     model: Any,
     file: Path,
-    states: Annotated[int, typer.Option(help="How many states to sample; every second one is in contact.")] = 20,
+    states: Annotated[
+        int, typer.Option(help="How many states to sample; every second one in contact, if it can be.")
+    ] = 20,
     seed: Seed = 0,
     parameters: Annotated[str | None, names_option("Parameters to differentiate by too", "none")] = None,
     method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "auto",
@@ -51,7 +53,7 @@ def certify(
     from drake_diff.record.certification import certify_model
 
     directory = out or Path("artifacts") / f"certify_{file.stem}"
-    show(plain(file.name, "bold"), f"{model!r}, contact {model.contract.contact.model}")
+    show(plain(file.name, "bold"), f"{model}, contact {model.contract.contact.model}")
     names = tuple(names_in(parameters) or ())
     record: Any = certify_model(model, states=states, seed=seed, parameters=names, method=method, directory=directory)
     rows = table("state", "motion", "contacts", "entries", "largest", "from", "verdict")
@@ -91,7 +93,7 @@ def compare(
     seed: Seed = 0,
     out: Annotated[Path | None, out_option("artifacts/compare_<model>")] = None,
 ) -> None:
-    """Simulate MODEL in every engine under one contract; say which ones agree, which do not, and why.
+    """Simulate MODEL in every engine with the same masses, limits and time step; say which agree and why others differ.
 
     Exit status 0 only if every engine agrees with Drake, or differs by a law that its contract states.
     """
@@ -134,7 +136,7 @@ def export(
     model: Any,
     file: Path,
     to: Annotated[str, typer.Option(help="gazebo, isaaclab, urdf, sdf or mjcf")],
-    out: Annotated[Path, typer.Option(help="A directory that does not exist yet.")],
+    out: Annotated[Path, typer.Option(help="Directory to write. It must not exist yet.")],
 ) -> None:
     """Write MODEL for an engine that does not run here: model file, contract, start states, and what to record."""
     from drake_diff.export.export import export_model

@@ -53,7 +53,7 @@ def run(
     known = [name for name in inspect.signature(solve).parameters if name not in ("problem", "progress", "on_start")]
     for name in options.keys() - set(known):
         raise UnknownNameError("solve_options", got=name, known=known)
-    show(plain(script.name, "bold"), f"{problem.system!r}, {problem.num_steps} steps")
+    show(plain(script.name, "bold"), f"{problem.system}, {problem.num_steps} steps")
     begun: list[Path] = []
 
     def on_start() -> None:
@@ -111,10 +111,10 @@ def _show_record(record: Any) -> None:
 
 
 def verify(run: RunDirectory) -> None:
-    """Check every byte of RUN, run it again from its own files, and compare every number.
+    """Check every file of RUN, simulate it again from its own files, and compare the numbers.
 
     RUN is what a solve, a comparison, robustness trials or a certification wrote.
-    Exit status 0 only if every number came out again. The run's own verdict is printed too.
+    Exit status 0 only if every number that was taken again is the recorded one. The run's own verdict is printed too.
     Comparisons and robustness trials are not run again: unchanged, they are "intact", with exit status 1.
     """
     from drake_diff.artifact.verify import verify as verify_run
@@ -135,7 +135,7 @@ def verify(run: RunDirectory) -> None:
 def list_all(
     directory: Annotated[Path, typer.Argument(metavar="DIRECTORY", help="Where the runs are.")] = Path("artifacts"),
 ) -> None:
-    """List the records in DIRECTORY and what they say; verify tells whether it is true."""
+    """List the records in DIRECTORY and their verdicts as written; `verify` checks them."""
     from drake_diff.artifact.listing import list_runs
 
     rows = table("run", "verdict", "kind", "status", "cost", "model", "written")

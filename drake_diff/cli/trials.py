@@ -35,15 +35,16 @@ def add_commands(app: typer.Typer) -> None:
 
 def robustness(
     run: RunDirectory,
-    trials: Annotated[int, typer.Option(help="How many at each level.")] = 100,
+    trials: Annotated[int, typer.Option(help="How many trials at each level.")] = 100,
     perturbations: Annotated[str | None, names_option("Perturbations", "all that apply to the model")] = None,
     controller: Annotated[str, typer.Option(help="tvlqr, mpc or open_loop")] = "tvlqr",
     seed: Seed = 0,
     out: Annotated[Path | None, out_option("<RUN>_robustness")] = None,
 ) -> None:
-    """Try the plan of RUN under perturbations of plant, start, sensor and actuator: how often does it arrive?
+    """Try the plan of RUN under perturbations of plant, start, sensor and actuator: how often does it reach the goal?
 
-    Exit status 0 only if it arrives unperturbed, and each perturbation has a level that 95 % of the trials survive.
+    Exit status 0 only if it reaches the goal unperturbed, and each perturbation has a level at which 95 % of the
+    trials succeed.
     """
     from drake_diff.artifact.verify import recalled
     from drake_diff.trials.files import PAGE, begin_robustness, save_robustness
@@ -144,7 +145,7 @@ def gradient_panel(
     seeds: Annotated[int, typer.Option(help="How many estimates and how many descents.")] = 10,
     out: Annotated[Path | None, out_option("artifacts/gradient_panel")] = None,
 ) -> None:
-    """Compare first-order, zeroth-order and blended gradients: variance, bias, and whether a descent arrives.
+    """Compare first-order, zeroth-order and blended gradients: variance, bias, and whether a descent succeeds.
 
     All cases take minutes. Writes gradient_panel.json, .csv and .html.
     """
@@ -165,7 +166,7 @@ def contact_table(
 ) -> None:
     """Rest, stop, slide, hold, roll and bounce in every engine, beside the rigid answer and the engine's own law.
 
-    Exit status 1 if a value is neither.
+    Exit status 1 if a value matches neither of the two.
     """
     from drake_diff._base.files import write_whole
     from drake_diff.studies.contact_comparison import as_json, lines_of

@@ -270,7 +270,7 @@ def _spheres(shape: Any) -> tuple[float, list[Array]]:
 
 def _to_hydroelastic(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
     if plant.get_contact_model() == ContactModel.kPoint:
-        expected = "hydroelastic or hydroelastic_with_fallback, as the route is hydroelastic"
+        expected = 'hydroelastic or hydroelastic_with_fallback, since contact_geometry is "hydroelastic"'
         raise InputError("contact_model", got="point", expected=expected)
     inspector, notes = scene_graph.model_inspector(), []
     for body, geometry in _collision_geometries(plant, scene_graph):
