@@ -22,7 +22,7 @@ from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, Sim
 from drake_diff.model.load_file import MEETS_A_SPHERE, autodiff_supports
 from drake_diff.model.model import Model
 from drake_diff.model.parameter_kinds import IDENTITY_OFFSET
-from drake_diff.model.plant import actuators, instances, is_driven, joints
+from drake_diff.model.plant import PROXIMITY, actuators, instances, is_driven, joints
 from drake_diff.model.step import advance, check_point, set_state
 
 PARALLEL = 1e-6  # [rad] between face normals
@@ -38,13 +38,7 @@ ROUGH_TOUCH = 1e-6  # [m] where it iterates (measured: 1e-7 off for an ellipsoid
 
 Severity = Literal["error", "warning", "info"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
-_PROPERTIES = {  # name: (group, unit, the tag in <drake:proximity_properties>)
-    "coulomb_friction": ("material", "", "drake:mu_dynamic"),
-    "point_contact_stiffness": ("material", " N/m", "drake:point_contact_stiffness"),
-    "hunt_crossley_dissipation": ("material", " s/m", "drake:hunt_crossley_dissipation"),
-    "relaxation_time": ("material", " s", "drake:relaxation_time"),
-    "hydroelastic_modulus": ("hydroelastic", " Pa", "drake:hydroelastic_modulus"),
-}
+UNITS = dict(zip(PROXIMITY, ("", " N/m", " s/m", " s", " Pa"), strict=True))
 
 
 @dataclass(frozen=True, repr=False)
@@ -503,30 +497,29 @@ def _default_decides(place: Place) -> Found:
     groups: dict[tuple[str, ...], list[Collider]] = {}
     for collider in place.colliders.values():
         contacts = {pair.contact for pair in place.pairs if collider in (pair.a, pair.b)}
-        read = ["coulomb_friction", "relaxation_time" if sap else "hunt_crossley_dissipation"]  # by the step
-        read += ["point_contact_stiffness"] * ("point" in contacts)
+        read = ["friction", "relaxation_time" if sap else "dissipation"]  # by the step
+        read += ["stiffness"] * ("point" in contacts)
         read += ["hydroelastic_modulus"] * ("hydroelastic" in contacts and collider.compliance == "compliant")
-        missing = tuple(name for name in read if not collider.own.HasProperty(_PROPERTIES[name][0], name))
+        missing = tuple(name for name in read if not collider.own.HasProperty(*PROXIMITY[name]))
         if missing:
             groups.setdefault(missing, []).append(collider)
     for missing, colliders in groups.items():
         values = {name: _value(colliders[0], name) for name in missing}
-        told = ", ".join(f"{name} {value}" for name, value in values.items())
+        told = ", ".join(f"{PROXIMITY[name][1]} {value}" for name, value in values.items())
         message = f"not given, so the scene graph's default decides: {told}"
         if values.get("relaxation_time") == "0.1 s":
             message += " (with which a ball hardly bounces)"
-        tags = ", ".join(_PROPERTIES[name][2] for name in missing)
+        tags = ", ".join(f"drake:{'mu_dynamic' if name == 'friction' else PROXIMITY[name][1]}" for name in missing)
         remedy = f"give them in <drake:proximity_properties> ({tags}) or in the geometry's ProximityProperties"
         yield Finding("warning", "default_decides", ", ".join(c.label for c in colliders), message, remedy)
 
 
 def _value(collider: Collider, name: str) -> str:
     """The number that Drake uses, with its unit."""
-    group, unit, _ = _PROPERTIES[name]
-    if not collider.all.HasProperty(group, name):
+    if not collider.all.HasProperty(*PROXIMITY[name]):
         return "(Drake's own)"
-    value = collider.all.GetProperty(group, name)
-    return f"{value.dynamic_friction() if name == 'coulomb_friction' else value:g}{unit}"
+    value = collider.all.GetProperty(*PROXIMITY[name])
+    return f"{value.dynamic_friction() if name == 'friction' else value:g}{UNITS[name]}"
 
 
 def _touching(place: Place) -> Found:

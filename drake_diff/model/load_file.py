@@ -1,9 +1,5 @@
 """From a robot file to a plant: read the file, and replace collision geometry that AutoDiffXd cannot step.
 
-Drake's parsers do the reading. What they cannot use is left out and noted (meshes in formats that Drake does not
-know); what they refuse becomes one ModelError with the file's name, however Drake says it: as a RuntimeError, a
-ValueError, or the SystemExit of a failed condition in C++, which would end the process.
-
 In point contact the AutoDiffXd step takes a sphere against a sphere, box, cylinder, capsule or half space and nothing
 else. One other pair whose bounding boxes meet is enough for the whole step to throw, so there are routes around such
 pairs, chosen before the plant is finalized.
@@ -158,12 +154,8 @@ def replace_collision_geometry(plant: MultibodyPlant, scene_graph: pg.SceneGraph
     To be called when every geometry is there. Masses, inertias and what is drawn stay as they are. `route` is one of
 
     - "corner_spheres": each box, cylinder and capsule on a body that can move becomes spheres inside it;
-    - "hydroelastic": each geometry without hydroelastic properties gets compliant ones, a half space rigid
-      ones (Drake has no contact between a compliant half space and a compliant body);
+    - "hydroelastic": each geometry without hydroelastic properties gets compliant ones, a half space rigid ones;
     - "differences": nothing changes, and what AutoDiffXd refuses is differenced.
-
-    Raises UnknownNameError (no such route), InputError (hydroelastic with a plant in point contact) or
-    ModelError (the plant is finalized, or Drake refuses a change).
     """
     if route not in ROUTES:
         raise UnknownNameError("contact_geometry", got=route, known=ROUTES)

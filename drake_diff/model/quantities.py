@@ -1,11 +1,7 @@
 """Functions of the state that tasks are written with: positions, rotations, velocities and contact forces.
 
 Each takes a model and names, checks them at once, and returns a function of x (nx,), or of x and u (nu,), for floats
-and for AutoDiffXd, to use in costs and constraints:
-
-    hand = dd.quantities.frame_position(model, "tool0")
-    dd.Problem(..., final_cost=lambda x: 100 * np.sum((hand(x) - target) ** 2))
-    dd.Problem(..., constraints=dd.Constraint(lambda x: hand(x)[2], lower=0.1))
+and for AutoDiffXd, to use in costs and in a `dd.Constraint`.
 
 They belong to the model's own parameters and have no derivative by any. Where other parameters are applied that they
 depend on (joint offsets; masses and centres of mass; for contact forces all), they raise InputError, and so does a

@@ -1,12 +1,7 @@
 """Contact that acts at a distance: a smooth force added to a plant, so that what does not touch has a gradient too.
 
-Between every two geometries that may collide, at the signed distance phi [m], there is the normal force
-
-    c(phi) = sigma k log(1 + exp(-phi / sigma)),
-
-Kurtz and Lin, "Inverse dynamics trajectory optimization for contact-implicit model predictive control", 2023, without
-their dissipation and friction. It is explicit in the state before the step; Drake's own contact, friction included,
-acts beside it. As sigma -> 0 it goes to k max(0, -phi), and apart from overlaps to nothing.
+The force of `SoftContact` acts between every two geometries that may collide and is explicit in the state before the
+step; Drake's own contact, friction included, acts beside it.
 """
 
 from dataclasses import dataclass

@@ -116,7 +116,16 @@ def rollout(
     inputs = check_inputs(model, us, num_steps) if policy is None else policy
     count = len(inputs) if policy is None else positive_int("num_steps", num_steps)  # type: ignore[arg-type]
     with applied(select(model, parameters or ())) as set_model:
-        return _roll(set_model, x0, inputs, count)
+        h, meter = set_model.time_step, Meter(set_model)
+        xs, us = np.empty((count + 1, model.nx)), np.empty((count, model.nu))
+        xs[0] = finite_array("x0", x0, (model.nx,))
+        for k in range(count):
+            us[k] = finite_array("u", inputs(xs[k].copy(), k * h), (model.nu,)) if callable(inputs) else inputs[k]
+            xs[k + 1] = advance(set_model.double, xs[k], us[k])
+            meter.measure_step(xs[k], xs[k + 1])
+        set_state(set_model.double, xs[-1])
+        meter.measure_state(xs[-1])
+        return meter.result(xs, us)
 
 
 def check_inputs(model: Model, us: ArrayLike | None, num_steps: int | None = None) -> Array:
@@ -138,19 +147,6 @@ def roll_states(model: Model, x0: Array, us: Array) -> Array:
     for k, u in enumerate(us):
         xs[k + 1] = advance(model.double, xs[k], u)
     return xs
-
-
-def _roll(model: Model, x0: ArrayLike, inputs: Array | Policy, count: int) -> Rollout:
-    h, meter = model.time_step, Meter(model)
-    xs, us = np.empty((count + 1, model.nx)), np.empty((count, model.nu))
-    xs[0] = finite_array("x0", x0, (model.nx,))
-    for k in range(count):
-        us[k] = finite_array("u", inputs(xs[k].copy(), k * h), (model.nu,)) if callable(inputs) else inputs[k]
-        xs[k + 1] = advance(model.double, xs[k], us[k])
-        meter.measure_step(xs[k], xs[k + 1])
-    set_state(model.double, xs[-1])
-    meter.measure_state(xs[-1])
-    return meter.result(xs, us)
 
 
 class Meter:

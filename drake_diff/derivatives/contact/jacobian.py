@@ -202,19 +202,10 @@ def _law(
     if form.approximation == "sap":
         time = material.time[pair]
         return Cone(after, touch.normal, touch.phi, weight.value, friction, stiffness, time, h, form.near_rigid)
-    return HuntCrossley(
-        velocity=after,
-        before=(before * touch.normal).sum(axis=-1),
-        normal=touch.normal,
-        phi=touch.phi,
-        weight=weight.value,
-        friction=friction,
-        stiffness=stiffness,
-        dissipation=material.dissipation[pair],
-        time_step=h,
-        stiction_tolerance=STICTION_TOLERANCE,
-        lagged=form.approximation == "lagged",
-    )
+    approach, n, phi, w = (before * touch.normal).sum(axis=-1), touch.normal, touch.phi, weight.value
+    dissipation, lagged = material.dissipation[pair], form.approximation == "lagged"
+    material_and_step = friction, stiffness, dissipation, h, STICTION_TOLERANCE, lagged
+    return HuntCrossley(after, approach, n, phi, w, *material_and_step)
 
 
 def _contacts(form: ContactForm, touch: Touches, S: Array, material: Material) -> Contacts:

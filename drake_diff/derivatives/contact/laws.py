@@ -185,22 +185,9 @@ class HuntCrossley:
         force, left = -k * self.phi - h * k * z, 1 - d * z
         pushes = (force > 0) & (left > 0)
         n = np.where(pushes, h * force * left, 0.0)
-        return HuntCrossleyImpulse(
-            law=self,
-            elastic=elastic,
-            damping=damping,
-            is_soft=soft > self.stiction_tolerance,
-            e=e,
-            vn=vn,
-            s=s,
-            tangent=vt / s[:, None],
-            z=z,
-            force=force,
-            left=left,
-            pushes=pushes,
-            g_n=n,
-            n_f=elastic * damping if self.lagged else n,
-        )
+        tangent, is_soft = vt / s[:, None], soft > self.stiction_tolerance
+        n_f = elastic * damping if self.lagged else n
+        return HuntCrossleyImpulse(self, elastic, damping, is_soft, e, vn, s, tangent, z, force, left, pushes, n, n_f)
 
 
 @dataclass(frozen=True, eq=False)
