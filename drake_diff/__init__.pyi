@@ -36,7 +36,7 @@ from .motion.policy import TVLQR as TVLQR
 from .motion.rollout import rollout as rollout
 from .motion.smoothing import smooth as smooth
 from .motion.smoothing import smooth_step as smooth_step
-from .optimize.problem.bounds import Bounds as Bounds
+from .optimize.problem.constraint import Bounds as Bounds
 from .optimize.problem.constraint import Constraint as Constraint
 from .optimize.problem.cost import QuadraticCost as QuadraticCost
 from .optimize.problem.dynamics import Dynamics as Dynamics

@@ -553,7 +553,7 @@ def test_dynamics_of_many_knots_are_those_of_each(form):
         steps = 1e-6 * np.eye(4)
         rough = [(np.array(f(*np.split(knot + e, 2))) - np.array(f(*np.split(knot - e, 2)))) / 2e-6 for e in steps]
         assert rows[k] == pytest.approx(np.array(rough).T, abs=1e-8)
-    assert dynamics._at.takes_columns == (form in ("columns", "a list", "matrix products"))
+    assert dynamics.form.takes_columns == (form in ("columns", "a list", "matrix products"))
 
 
 # ------------------------------------------------------------------------------ bad input

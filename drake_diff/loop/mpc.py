@@ -18,7 +18,7 @@ from drake_diff.loop.run import OK
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import LQR
 from drake_diff.optimize.ilqr.ilqr import check_problem, costs_to_go, solve_ilqr
-from drake_diff.optimize.problem.bounds import Bounds
+from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.cost import QuadraticCost
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, Outcome

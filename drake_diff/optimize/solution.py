@@ -3,7 +3,7 @@
 import copy
 import enum
 from collections import Counter
-from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -14,7 +14,6 @@ from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
-from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.model.step import advance
 from drake_diff.motion.rollout import Rollout, roll_states
@@ -127,22 +126,21 @@ class Solution(ShowsItsRepr):
         return f"{self.problem.name} by {self.method}: {self.status.value}, {measures}"
 
     def __repr__(self) -> str:
-        return "\n  ".join(self._lines())
-
-    def _lines(self) -> Iterator[str]:
         how = ", ".join(name for name in (self.scheme, self.solver) if name not in ("step", ""))
-        yield f"Solution of {self.problem.name} by {self.method}{f' ({how})' if how else ''}: {self.status.value}"
-        yield self.message
-        yield f"cost {self.cost:.6g} over {self.horizon:g} s in {len(self.us)} intervals"
-        yield f"defect {self.defect:.2g}, integration error {self.integration_error:.2g}"
         beyond = f"bound violation {self.bound_violation:.2g}, constraint violation {self.constraint_violation:.2g}"
-        yield f"goal error {self.goal_error:.2g}, {beyond}"
         verdicts = Counter(certificate.verdict for certificate in self.certificates)
         told = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items()) or "none"
-        yield f"{len(self.iterations)} iterations in {self.wall_time:.2g} s; certificates: {told}"
+        lines = [
+            f"Solution of {self.problem.name} by {self.method}{f' ({how})' if how else ''}: {self.status.value}",
+            self.message,
+            f"cost {self.cost:.6g} over {self.horizon:g} s in {len(self.us)} intervals",
+            f"defect {self.defect:.2g}, integration error {self.integration_error:.2g}",
+            f"goal error {self.goal_error:.2g}, {beyond}",
+            f"{len(self.iterations)} iterations in {self.wall_time:.2g} s; certificates: {told}",
+        ]
         if "replays" in vars(self) and self.replays:  # they take time: a printed line starts none
-            holding = sum(replay.holds for replay in self.replays)
-            yield f"replays: {holding} of {len(self.replays)} hold"
+            lines.append(f"replays: {sum(r.holds for r in self.replays)} of {len(self.replays)} hold")
+        return "\n  ".join(lines)
 
     def told(self, **fields: Any) -> "Solution":
         """The same motion with other `fields` out of TOLD: its measures stay. UnknownNameError of others."""
@@ -219,8 +217,12 @@ class Solution(ShowsItsRepr):
             return np.full(self._num_intervals, np.inf)
         if self.transcribed is not None:
             return np.nan_to_num(self.transcribed.defects, nan=np.inf)
+        found = np.full(len(self.us), np.inf)
         with applied(self.vector) as model:
-            return np.array([self._step_defect(model, k) for k in range(len(self.us))])
+            for k, u in enumerate(self.us):
+                with suppress(SimulationError):
+                    found[k] = _largest(np.abs(self.xs[k + 1] - advance(model.double, self.xs[k], u)))
+        return found
 
     @property
     def defect(self) -> float:
@@ -359,12 +361,6 @@ class Solution(ShowsItsRepr):
             return False
         parts = [part for part in (self.xs, self.inputs_at_knots, self.us_mid) if part is not None]
         return self.scheme == "step" or all(bool(np.all(np.isfinite(part))) for part in parts)
-
-    def _step_defect(self, model: Model, k: int) -> float:
-        try:
-            return _largest(np.abs(self.xs[k + 1] - advance(model.double, self.xs[k], self.us[k])))
-        except SimulationError:
-            return float("inf")
 
 
 def _largest(values: Array) -> float:

@@ -10,7 +10,7 @@ from drake_diff._base.arrays import Array, finite_array
 from drake_diff._base.autodiff import gradient_of
 from drake_diff._base.differences import central_differences
 from drake_diff.exceptions import InputError, ShapeError
-from drake_diff.optimize.problem.bounds import short
+from drake_diff.optimize.problem.constraint import short
 
 RunningCost = Callable[[Any, Any], Any]  # (x, u) -> scalar
 FinalCost = Callable[[Any], Any]  # (x) -> scalar
@@ -47,7 +47,17 @@ class QuadraticCost:
     def __post_init__(self) -> None:
         for name in ("Q", "R"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, _semidefinite(name, getattr(self, name)))
+                matrix = finite_array(name, getattr(self, name), ("n", "n"))
+                largest = np.abs(matrix).max(initial=1)
+                if matrix.shape[0] != matrix.shape[1]:
+                    raise InputError(name, got=f"shape {matrix.shape}", expected="a square matrix")
+                if not np.allclose(matrix, matrix.T, rtol=0, atol=1e-12 * largest):
+                    raise InputError(name, got="a matrix that is not symmetric", expected="a symmetric matrix")
+                lowest = float(np.min(np.linalg.eigvalsh(matrix), initial=0.0))
+                if lowest < -1e-12 * largest:
+                    got = f"lowest eigenvalue {lowest:.3g}"
+                    raise InputError(name, got=got, expected="a positive semidefinite matrix")
+                object.__setattr__(self, name, matrix)
         for name, weight in (("x_ref", self.Q), ("u_ref", self.R)):
             if getattr(self, name) is not None:
                 size = "n" if weight is None else len(weight)
@@ -117,18 +127,6 @@ def _apart(z: Any, reference: Any) -> Any:
 def _slope(weight: Any, z: Array, reference: Any) -> Array:
     """(n,) the gradient of a quadratic form at z (n,)."""
     return np.zeros(len(z)) if weight is None else np.asarray(2 * weight @ _apart(z, reference))
-
-
-def _semidefinite(name: str, weight: Any) -> Array:
-    matrix = finite_array(name, weight, ("n", "n"))
-    if matrix.shape[0] != matrix.shape[1]:
-        raise InputError(name, got=f"shape {matrix.shape}", expected="a square matrix")
-    if not np.allclose(matrix, matrix.T, rtol=0, atol=1e-12 * np.abs(matrix).max(initial=1)):
-        raise InputError(name, got="a matrix that is not symmetric", expected="a symmetric matrix")
-    lowest = float(np.min(np.linalg.eigvalsh(matrix), initial=0.0))
-    if lowest < -1e-12 * np.abs(matrix).max(initial=1):
-        raise InputError(name, got=f"lowest eigenvalue {lowest:.3g}", expected="a positive semidefinite matrix")
-    return matrix
 
 
 def differentiate_cost(cost: RunningCost, x: Array, u: Array) -> tuple[float, Array, Array]:

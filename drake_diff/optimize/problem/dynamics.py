@@ -13,11 +13,11 @@ from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff.exceptions import GradientError, InputError, ShapeError
-from drake_diff.mechanics.tree import TreeDynamics, tree_for
+from drake_diff.mechanics.tree import tree_for
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.model import Model
 from drake_diff.model.step import set_state
-from drake_diff.optimize.problem.bounds import Bounds, plant_limits, resolve_bounds
+from drake_diff.optimize.problem.constraint import Bounds, plant_limits, resolve_bounds
 
 PROBED = 3  # knots at which a function is tried before it is used
 ORDINARY = "a function of x and u in ordinary arithmetic and NumPy functions, without float()"
@@ -43,7 +43,12 @@ class Pointwise:
             if isinstance(error, InputError):
                 raise
             raise InputError(subject, got=f"{type(error).__name__}: {error}", expected=ORDINARY) from error
-        self.takes_columns = self._agrees(probe, single)
+        try:
+            self.takes_columns = True
+            together, _ = self.linearize(probe)
+            self.takes_columns = bool(np.allclose(together, single, rtol=1e-12, atol=1e-12, equal_nan=True))
+        except Exception:  # whatever it is that f cannot do with columns: it need not
+            self.takes_columns = False
 
     def values(self, knots: Array) -> Array:
         """(K, r) at `knots` (K, nx + nu)."""
@@ -78,14 +83,6 @@ class Pointwise:
             raise GradientError(f"{self.subject} lost its derivatives: write it as {ORDINARY}")
         full = np.array([v if isinstance(v, AutoDiffXd) else AutoDiffXd(float(v)) for v in flat])
         return ExtractValue(full.reshape(-1, 1)).ravel(), gradient_rows(full, width)
-
-    def _agrees(self, probe: Array, single: Array) -> bool:
-        try:
-            self.takes_columns = True
-            together, _ = self.linearize(probe)
-            return bool(np.allclose(together, single, rtol=1e-12, atol=1e-12, equal_nan=True))
-        except Exception:  # whatever it is that f cannot do with columns: it need not
-            return False
 
 
 class Dynamics:
@@ -135,16 +132,11 @@ class Dynamics:
         self.bounds = unlimited
         self.bounds = self.limits(Bounds(x_lower, x_upper, u_lower, u_upper))
         own = hasattr(f, "linearize")
-        self._at = f if own else Pointwise("dynamics", f, self.nx, (self.nx,), self.probe())
+        self.form = f if own else Pointwise("dynamics", f, self.nx, (self.nx,), self.probe())
 
     def __repr__(self) -> str:
         states, inputs = ", ".join(self.state_names), ", ".join(self.input_names)
         return f"Dynamics of the states {states} under the inputs {inputs}"
-
-    @property
-    def form(self) -> Any:
-        """What computes it: a `Pointwise`, a `PlantKnots`, or the caller's own object."""
-        return self._at
 
     def __call__(self, x: Any, u: Any) -> Array:
         """(nx,) the rates at `x` (nx,), `u` (nu,)."""
@@ -157,11 +149,11 @@ class Dynamics:
 
     def values(self, knots: Array) -> Array:
         """(K, nx) the rates at `knots` (K, nx + nu), rows [x, u]."""
-        return np.asarray(self._at.values(knots))
+        return np.asarray(self.form.values(knots))
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
         """(K, nx) the rates and (K, nx, nx + nu) their Jacobians [A, B] at `knots` (K, nx + nu)."""
-        values, rows = self._at.linearize(knots)
+        values, rows = self.form.linearize(knots)
         return values, rows
 
     def probe(self) -> Array:
@@ -220,15 +212,12 @@ class PlantKnots:
         return self.equations.values(knots)
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
-        if self.tree is not None:
-            return self._linearize_tree(self.tree, knots)
-        found = [self._linearize(k[: self.model.nx], k[self.model.nx :]) for k in knots]
-        return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
-
-    def _linearize_tree(self, tree: TreeDynamics, knots: Array) -> tuple[Array, Array]:
+        if self.tree is None:
+            found = [self._linearize(k[: self.model.nx], k[self.model.nx :]) for k in knots]
+            return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
         n, actuation = self.model.nv, self.equations.actuation
         q, values = knots[:, :n], self.values(knots)
-        d = tree(tree.place(self.model, q), q, values[:, :n], values[:, n:])
+        d = self.tree(self.tree.place(self.model, q), q, values[:, :n], values[:, n:])
         by_u = np.broadcast_to(-actuation, (len(knots), *actuation.shape))
         rows = np.zeros((len(knots), 2 * n, knots.shape[1]))
         rows[:, :n, n : 2 * n] = np.eye(n)

@@ -7,21 +7,12 @@ from typing import Any, cast
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, Indices, finite_array, frozen, positive_float, positive_int
+from drake_diff._base.arrays import Array, Indices, array_with_gaps, finite_array, frozen, positive_float, positive_int
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, select
-from drake_diff.optimize.problem.bounds import (
-    check_inside,
-    checked_horizon,
-    checked_state,
-    checked_waypoints,
-    plant_limits,
-    resolve_bounds,
-    short,
-)
-from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.constraint import Constraint, check_inside, plant_limits, resolve_bounds, short
 from drake_diff.optimize.problem.cost import ConstantCost, FinalCost, QuadraticCost
 from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
 
@@ -103,20 +94,27 @@ class Problem(ShowsItsRepr):
             self._set("parameters", select(system, self.parameters))
             own = plant_limits(system.plant)
         else:
-            self._set("parameters", self._no_parameters())
+            given = self.parameters.names if isinstance(self.parameters, ParameterVector) else self.parameters
+            if given:
+                raise InputError("parameters", got=given, expected="none for plain dynamics: only a model has some")
+            self._set("parameters", ParameterVector(cast(Model, None), (), frozen([])))  # none of no model
             own = vars(system.bounds)
         self._check_parameters()
         bounds = resolve_bounds(self.bounds, own, self.state_names, self.input_names)
         self._set("bounds", bounds)
         self._set("initial_state_mask", self._check_mask())
-        self._set("us", self._check_us())
+        shape = (self.num_steps, self.nu)
+        us = frozen(np.zeros(shape)) if self.us is None else finite_array("us", self.us, shape)
+        if self.us is not None and not self.optimizes_controls:
+            check_inside("us", us, bounds.u_lower, bounds.u_upper, self.input_names)
+        self._set("us", us)
         check_inside("x0", self.x0, bounds.x_lower, bounds.x_upper, self.state_names)
         if self.x_goal is not None:
-            self._set("x_goal", checked_state("x_goal", self.x_goal, bounds, self.state_names))
-        self._set("waypoints", checked_waypoints(self.waypoints, self.num_steps, bounds, self.state_names))
+            self._set("x_goal", self._check_state("x_goal", self.x_goal))
+        self._set("waypoints", self._check_waypoints())
         self._set("constraints", self._check_constraints())
         if self.horizon is not None:
-            self._set("horizon", checked_horizon(self.horizon))
+            self._set("horizon", _check_horizon(self.horizon))
         elif not self.has_model:
             raise InputError("horizon", got="none", expected="a number of seconds, or (lower, upper)")
         self._check_costs()
@@ -272,25 +270,17 @@ class Problem(ShowsItsRepr):
         """
         total = 0.0 if self.final_cost is None else float(self.final_cost(xs[-1]))
         if self.running_cost is not None:
-            rates = self._rates(xs[: len(inputs)], inputs)
+            before = xs[: len(inputs)]
+            if isinstance(self.running_cost, QuadraticCost):
+                rates = self.running_cost.along(before, inputs)
+            else:
+                rates = np.array([float(self.running_cost(x, u)) for x, u in zip(before, inputs, strict=True)])
             if len(inputs) == len(xs):
                 rates[0], rates[-1] = rates[0] / 2, rates[-1] / 2
             total += self.time_step * float(np.sum(rates))
         if self.trajectory_cost is not None:
             total += float(self.trajectory_cost(xs, inputs))
         return total
-
-    def _rates(self, xs: Array, us: Array) -> Array:
-        """(N,): the running cost of xs (N, nx), us (N, nu)."""
-        if isinstance(self.running_cost, QuadraticCost):
-            return self.running_cost.along(xs, us)
-        return np.array([float(self.running_cost(x, u)) for x, u in zip(xs, us, strict=True)])
-
-    def _no_parameters(self) -> ParameterVector:
-        given = self.parameters.names if isinstance(self.parameters, ParameterVector) else self.parameters
-        if given:
-            raise InputError("parameters", got=given, expected="none for plain dynamics: only a model has some")
-        return ParameterVector(cast(Model, None), (), frozen([]))  # none of no model
 
     def _check_parameters(self) -> None:
         vector, given = self.parameters, self.parameter_bounds or {}
@@ -320,12 +310,22 @@ class Problem(ShowsItsRepr):
             raise InputError("initial_state_mask", got="a mask", expected='"initial_state" in optimize')
         return mask
 
-    def _check_us(self) -> Array:
-        shape = (self.num_steps, self.nu)
-        us = frozen(np.zeros(shape)) if self.us is None else finite_array("us", self.us, shape)
-        if self.us is not None and not self.optimizes_controls:
-            check_inside("us", us, self.bounds.u_lower, self.bounds.u_upper, self.input_names)
-        return us
+    def _check_state(self, subject: str, given: Any) -> Array:
+        """`given` (nx,), NaN where free, within the bounds."""
+        state = array_with_gaps(subject, given, (self.nx,))
+        if np.any(np.isinf(state)):
+            raise InputError(subject, got=state, expected="finite numbers, NaN where free")
+        check_inside(subject, state, self.bounds.x_lower, self.bounds.x_upper, self.state_names)
+        return state
+
+    def _check_waypoints(self) -> dict[int, Array]:
+        found = {}
+        for knot, state in (self.waypoints or {}).items():
+            if isinstance(knot, bool) or not isinstance(knot, (int, np.integer)) or not 0 < knot < self.num_steps:
+                expected = f"whole numbers from 1 to {self.num_steps - 1} (the last state's is x_goal)"
+                raise InputError("knots of waypoints", got=repr(knot), expected=expected)
+            found[int(knot)] = self._check_state(f"waypoint at knot {knot}", state)
+        return dict(sorted(found.items()))
 
     def _check_constraints(self) -> tuple[Constraint, ...]:
         given = self.constraints if isinstance(self.constraints, (tuple, list)) else (self.constraints,)
@@ -376,3 +376,13 @@ def _check_optimize(nu: int, optimize: Sequence[str]) -> tuple[str, ...]:
     if "controls" in names and nu == 0:
         raise InputError("optimize", got='"controls", but the model has no actuators', expected="an actuated model")
     return names
+
+
+def _check_horizon(given: Any) -> tuple[float, float]:
+    pair = given if isinstance(given, (tuple, list)) else (given, given)
+    if len(pair) != 2:
+        raise InputError("horizon", got=repr(given), expected="a number of seconds, or (lower, upper)")
+    lower, upper = (positive_float("horizon [s]", value) for value in pair)
+    if lower > upper:
+        raise InputError("horizon", got=repr(given), expected="lower at most upper")
+    return lower, upper

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from pydrake.autodiffutils import ExtractValue
+from pydrake.solvers import MathematicalProgram
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import chain
@@ -24,81 +25,56 @@ def solve_collocation(
     N intervals of exactly model.time_step; inputs linear between knots; running cost by the trapezoid rule.
     Raises ModelError where the model has no continuous form.
     """
-    transcription = _Transcription(problem)
-    guess = transcription.pack(xs, np.vstack([us, us[-1:]]))
-    result = solve_program(transcription.program, guess, solver=solver, limits=limits, report=report)
-    found_xs, found_us = transcription.unpack(result.z)
-    return result, found_xs, found_us[:-1], found_us[-1]
+    from pydrake.planning import DirectCollocation  # as slow to import as NumPy, and of this method alone
+
+    h, count, b = problem.model.time_step, problem.num_steps, problem.bounds
+    system = ContinuousSystem(EquationsOfMotion(problem.model))
+    drake = DirectCollocation(system, system.CreateDefaultContext(), count + 1, h, h)
+    program = drake.prog()
+    states = [drake.state(k) for k in range(count + 1)]
+    inputs = [drake.input(k) for k in range(count + 1)]
+    for variables, lower, upper in zip(states, *problem.state_limits(), strict=True):
+        program.AddBoundingBoxConstraint(lower, upper, variables)
+    for variables in inputs:
+        program.AddBoundingBoxConstraint(b.u_lower, b.u_upper, variables)
+    _add_costs(problem, program, states, inputs)
+    guess, steps = np.zeros(program.num_vars()), [drake.time_step(k) for k in range(count)]
+    for variables, values in zip([*states, *inputs, *steps], [*xs, *us, us[-1], *[[h]] * count], strict=True):
+        program.SetDecisionVariableValueInVector(variables, values, guess)
+    result = solve_program(program, guess, solver=solver, limits=limits, report=report)
+    xs, us = (
+        np.array([result.z[program.FindDecisionVariableIndices(v)] for v in variables])
+        for variables in (states, inputs)
+    )
+    return result, xs, us[:-1], us[-1]
 
 
-class _Transcription:
-    """Drake's program with this problem's costs and constraints on it."""
+def _add_costs(problem: Problem, program: MathematicalProgram, states: list[Any], inputs: list[Any]) -> None:
+    running, final, nx = problem.running_cost, problem.final_cost, problem.nx
+    h, count = problem.time_step, problem.num_steps
 
-    def __init__(self, problem: Problem):
-        from pydrake.planning import DirectCollocation  # as slow to import as NumPy, and of this method alone
+    def differentiate_running(z: Array) -> tuple[float, Array]:
+        value, by_x, by_u = differentiate_cost(running, z[:nx], z[nx:])
+        return value, np.concatenate([by_x, by_u])
 
-        self.problem = problem
-        h, count = problem.model.time_step, problem.num_steps
-        system = ContinuousSystem(EquationsOfMotion(problem.model))
-        self.drake = DirectCollocation(system, system.CreateDefaultContext(), count + 1, h, h)
-        self.program = self.drake.prog()
-        self.states = [self.drake.state(k) for k in range(count + 1)]
-        self.inputs = [self.drake.input(k) for k in range(count + 1)]
-        self._add_limits()
-        self._add_costs()
-
-    def pack(self, xs: Array, us: Array) -> Array:
-        """The decision variables from xs (N+1, nx) and us (N+1, nu)."""
-        z = np.zeros(self.program.num_vars())
-        for variables, values in zip(self.states + self.inputs, [*xs, *us], strict=True):
-            self.program.SetDecisionVariableValueInVector(variables, values, z)
-        for k in range(self.problem.num_steps):
-            self.program.SetDecisionVariableValueInVector(
-                self.drake.time_step(k), np.array([self.problem.model.time_step]), z
-            )
-        return z
-
-    def unpack(self, z: Array) -> tuple[Array, Array]:
-        """xs (N+1, nx) and us (N+1, nu) from the decision variables."""
-        xs = [z[self.program.FindDecisionVariableIndices(v)] for v in self.states]
-        us = [z[self.program.FindDecisionVariableIndices(v)] for v in self.inputs]
-        return np.array(xs), np.array(us)
-
-    def _add_limits(self) -> None:
-        """Bounds, equal where an end is given."""
-        for variables, lower, upper in zip(self.states, *self.problem.state_limits(), strict=True):
-            self.program.AddBoundingBoxConstraint(lower, upper, variables)
-        b = self.problem.bounds
-        for variables in self.inputs:
-            self.program.AddBoundingBoxConstraint(b.u_lower, b.u_upper, variables)
-
-    def _add_costs(self) -> None:
-        running, final, nx = self.problem.running_cost, self.problem.final_cost, self.problem.nx
-        h, count = self.problem.time_step, self.problem.num_steps
-
-        def differentiate_running(z: Array) -> tuple[float, Array]:
-            value, by_x, by_u = differentiate_cost(running, z[:nx], z[nx:])
-            return value, np.concatenate([by_x, by_u])
-
-        for k, (x, u) in enumerate(zip(self.states, self.inputs, strict=True)):
-            weight = h / 2 if k in (0, count) else h
-            if isinstance(running, QuadraticCost):
-                self._add_quadratic_form(weight, running.Q, running.x_ref, x)
-                self._add_quadratic_form(weight, running.R, running.u_ref, u)
-            elif running is not None:
-                self.program.AddCost(_Cost(differentiate_running, weight), vars=np.concatenate([x, u]))
-        if isinstance(final, QuadraticCost):
-            self._add_quadratic_form(1.0, final.Q, final.x_ref, self.states[-1])
-        elif final is not None:
-            self.program.AddCost(_Cost(partial(differentiate_final_cost, final), 1.0), vars=self.states[-1])
-
-    def _add_quadratic_form(self, weight: float, form: Any, reference: Any, variables: Any) -> None:
+    def add_quadratic_form(weight: float, form: Any, reference: Any, variables: Any) -> None:
         if form is None or not len(variables):
             return
         r = np.zeros(len(variables)) if reference is None else reference
-        self.program.AddQuadraticCost(
-            2 * weight * form, -2 * weight * form @ r, weight * float(r @ form @ r), variables, is_convex=True
-        )
+        constant = weight * float(r @ form @ r)
+        program.AddQuadraticCost(2 * weight * form, -2 * weight * form @ r, constant, variables, is_convex=True)
+
+    for k, (x, u) in enumerate(zip(states, inputs, strict=True)):
+        weight = h / 2 if k in (0, count) else h
+        if isinstance(running, QuadraticCost):
+            add_quadratic_form(weight, running.Q, running.x_ref, x)
+            add_quadratic_form(weight, running.R, running.u_ref, u)
+        elif running is not None:
+            program.AddCost(_Cost(differentiate_running, weight), vars=np.concatenate([x, u]))
+    if isinstance(final, QuadraticCost):
+        add_quadratic_form(1.0, final.Q, final.x_ref, states[-1])
+    elif final is not None:
+        program.AddCost(_Cost(partial(differentiate_final_cost, final), 1.0), vars=states[-1])
 
 
 class _Cost:

@@ -48,7 +48,7 @@ class TranscribedProgram:
         self.nx, self.width = task.dynamics.nx, task.dynamics.nx + task.dynamics.nu
         self.weights = node_weights(mesh, task.scheme)
         self.every = np.arange(len(self.weights))
-        self.free = int(task.time_is_free)
+        self.free = int(task.horizon[0] < task.horizon[1])
         nodes = zip(task.node_limits(mesh), task.horizon, strict=True)
         self.lower, self.upper = (np.append(side.ravel(), [time] * self.free) for side, time in nodes)
         self.z = ca.MX.sym("z", len(self.lower))

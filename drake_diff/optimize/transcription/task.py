@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff.optimize.problem.bounds import Bounds
-from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.constraint import Bounds, Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost, differentiate_cost
 from drake_diff.optimize.problem.dynamics import Dynamics, Pointwise
 from drake_diff.optimize.problem.problem import Problem
@@ -161,10 +160,6 @@ class OptimalControl:
     num_steps: int  # of the mesh that it begins with, whose knots waypoints and constraints refer to
     waypoints: tuple[tuple[float, Array], ...] = ()  # fraction of the horizon, state (nx,)
     paths: tuple[PathConstraint, ...] = ()
-
-    @property
-    def time_is_free(self) -> bool:
-        return self.horizon[0] < self.horizon[1]
 
     def node_limits(self, mesh: Array) -> tuple[Array, Array]:
         """(lower, upper), each (K, nx + nu): the bounds of the nodes, equal where an end or a waypoint is given."""
