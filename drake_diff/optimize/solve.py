@@ -4,7 +4,6 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from hashlib import sha256
 from typing import Any
 
@@ -28,7 +27,7 @@ from drake_diff.optimize.solution import Solution, Status
 from drake_diff.optimize.transcription.drake import solve_collocation
 from drake_diff.optimize.transcription.motion import Collocated
 from drake_diff.optimize.transcription.solve import MeshRefinement, Transcription
-from drake_diff.optimize.transcription.task import DEFAULT_SCHEME, SCHEMES, task_of
+from drake_diff.optimize.transcription.task import DEFAULT_SCHEME, SCHEMES, OptimalControl
 
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": "riccati"}
@@ -218,9 +217,8 @@ class _Task:
                 return run.collocate(guess, attempt.refinement)
             if method == "ilqr":
                 return run.sweep(xs, us, given=given is not None, stages=stages)
-            if attempt.segments > 1:
-                return run.shoot_segments(xs, us, attempt.segments)
-            return run.shoot(xs, us, improve=given is None and is_unconstrained(problem))
+            improve = given is None and attempt.segments == 1 and is_unconstrained(problem)
+            return run.shoot(xs, us, attempt.segments, improve=improve)
 
         return make
 
@@ -300,7 +298,7 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
         raise InputError("parameters, trajectory_cost", got="given", expected='method="shooting"')
     if not problem.optimizes_controls:
         raise InputError("optimize", got=list(problem.optimize), expected='"controls" for method="collocation"')
-    task_of(problem, scheme)  # raises where a cost is no function that can be differentiated
+    OptimalControl(problem, scheme)  # raises where a cost is no function that can be differentiated
     if attempt.solver == "snopt":  # Drake's DirectCollocation gets bounds, ends and costs alone
         left_out = {
             "dynamics": not problem.has_model,
@@ -429,27 +427,29 @@ class Run:
 
         return self._through_steps(xs, us, search, may_be_blind=bool(stages))
 
-    def shoot(self, xs: Array, us: Array, *, improve: bool) -> Solution:
-        """Shooting; `improve` the guess by iLQR, which gets out of curved valleys that shooting crawls along."""
+    def shoot(self, xs: Array, us: Array, segments: int, *, improve: bool) -> Solution:
+        """Shooting; `improve` the guess by iLQR, which gets out of curved valleys that shooting crawls along.
+
+        Several `segments` are looked at around their own states, which defects part.
+        """
+        limits, report = self.limits, self.report
+        if segments > 1:
+            try:
+                xs = roll_segments(self.problem, xs, us, segments)
+            except SimulationError as error:
+                return refused(self._draft(xs, us), error)
 
         def search(xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
             if improve:
-                result, xs, us = solve_ilqr(self.problem, xs, us, limits=self.limits, report=self.report)
+                result, xs, us = solve_ilqr(self.problem, xs, us, limits=limits, report=report)
                 self.options["initial_guess"] = f"default, then {result.message}"
                 if result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
                     return result, xs, us
-            return solve_shooting(self.problem, xs, us, solver=self.solver, limits=self.limits, report=self.report)
+            return solve_shooting(
+                self.problem, xs, us, solver=self.solver, limits=limits, report=report, segments=segments
+            )
 
-        return self._through_steps(xs, us, search)
-
-    def shoot_segments(self, xs: Array, us: Array, segments: int) -> Solution:
-        """Multiple shooting, looked at around the segments' own states, which defects part."""
-        try:
-            xs = roll_segments(self.problem, xs, us, segments)
-        except SimulationError as error:
-            return refused(self._draft(xs, us), error)
-        search = partial(solve_shooting, solver=self.solver, limits=self.limits, report=self.report, segments=segments)
-        return self._through_steps(xs, us, partial(search, self.problem), segmented=True)
+        return self._through_steps(xs, us, search, segmented=segments > 1)
 
     def _through_steps(
         self, xs: Array, us: Array, search: Search, *, segmented: bool = False, may_be_blind: bool = False

@@ -286,7 +286,7 @@ def _places(sparsity: Any) -> tuple[Indices, Indices]:
 
 @dataclass(frozen=True, eq=False)
 class KnotFunctions:
-    """Those of a task; the final cost is one of the last knot, `paths` are in the order of the task's."""
+    """Those of a task; the final cost is one of the last knot, `paths` are its constraints."""
 
     dynamics: KnotFunction
     rate: KnotFunction
@@ -341,7 +341,7 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
         _dynamics(task.dynamics),
         choose(task.rate, rate_values, rate_rows, 1),
         final if final is None else choose(final.f, final.values, final.linearize, 1),
-        tuple(path(p.constraint) for p in task.paths),
+        tuple(path(constraint) for constraint in task.problem.constraints),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import NlpResult
-from drake_diff.optimize.transcription.task import OptimalControl, interval_defects, node_weights, per_interval, task_of
+from drake_diff.optimize.transcription.task import OptimalControl, interval_defects, node_weights, per_interval
 
 SUBSTEPS = 10  # of the Runge-Kutta method that measures an interval
 DENSE = np.linspace(0, 1, 21)[1:-1]  # where bounds are looked at between two knots
@@ -37,11 +37,6 @@ class Collocated:
     horizon: float
 
     @property
-    def times(self) -> Array:
-        """(N+1,) [s] of the knots."""
-        return self.horizon * self.mesh
-
-    @property
     def xs(self) -> Array:
         return self.nodes[:: self.task.scheme.nodes, : self.task.dynamics.nx]
 
@@ -62,7 +57,7 @@ class Collocated:
 
         xs (m N + 1, nx), and the mean inputs us (m N, nu) over each part.
         """
-        count, scheme = self.task.num_steps, self.task.scheme
+        count, scheme = self.task.problem.num_steps, self.task.scheme
         inputs = per_interval(self.nodes[:, self.task.dynamics.nx :], scheme)
         if len(self.mesh) == count + 1:
             k, tau = np.repeat(np.arange(count), parts), np.tile(np.arange(parts) / parts, count)
@@ -209,7 +204,7 @@ def violation_between_nodes(motion: Collocated) -> Excess:
     both = np.hstack([by_state, by_input])
     at, column = np.unravel_index(int(np.argmax(both)), both.shape)
     name = (task.dynamics.state_names + task.dynamics.input_names)[column]
-    time = motion.times[k[at]] + tau[at] * motion._lengths[k[at]]
+    time = motion.horizon * motion.mesh[k[at]] + tau[at] * motion._lengths[k[at]]
     where = f"{name} by {both[at, column]:.3g} at {time:.4g} s" if both[at, column] > 0 else "nowhere"
     return Excess(float(np.max(by_state)), float(np.max(by_input)), where)
 
@@ -218,7 +213,7 @@ def collocated(
     problem: Problem, scheme: str, xs: Array, us: Array, us_mid: Array | None, horizon: float, mesh: Array
 ) -> Collocated:
     """The motion with knots xs (N+1, nx), us (N+1, nu) and midpoint inputs (N, nu), linear in between where None."""
-    task, knots = task_of(problem, scheme), np.hstack([xs, us])
+    task, knots = OptimalControl(problem, scheme), np.hstack([xs, us])
     if task.scheme.nodes == 1:
         return Collocated(task, mesh, knots, horizon)
     rates, h = task.dynamics.values(knots), horizon * np.diff(mesh)[:, None]

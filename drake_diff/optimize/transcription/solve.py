@@ -16,7 +16,7 @@ from drake_diff._base.arrays import Array, frozen
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, Outcome, Report
 from drake_diff.optimize.transcription.motion import Collocated, Transcribed
-from drake_diff.optimize.transcription.task import node_fractions, task_of
+from drake_diff.optimize.transcription.task import OptimalControl, node_fractions
 
 MOST_PIECES = 4  # of one interval in one round of refinement
 FOUND = (Outcome.SOLVED, Outcome.INACCURATE)
@@ -36,7 +36,7 @@ class Transcription:
     def __init__(self, problem: Problem, scheme: str):
         from drake_diff.optimize.transcription.expressions import knot_functions  # loads CasADi
 
-        self.problem, self.task = problem, task_of(problem, scheme)
+        self.problem, self.task = problem, OptimalControl(problem, scheme)
         self.mesh = np.linspace(0, 1, problem.num_steps + 1)
         self.functions = knot_functions(self.task)
 

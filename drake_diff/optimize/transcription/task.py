@@ -11,6 +11,7 @@ transcribes: Hermite-Simpson with the mean of its neighbours for the midpoint's 
 rule, which makes the optimum of order 2.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff.optimize.problem.constraint import Bounds, Constraint
+from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost, differentiate_cost
 from drake_diff.optimize.problem.dynamics import Dynamics, Pointwise
 from drake_diff.optimize.problem.problem import Problem
@@ -125,41 +126,28 @@ class RunningRate:
         return values[:, 0], rows[:, 0]
 
 
-@dataclass(frozen=True, eq=False)
-class PathConstraint:
-    """A constraint at the nodes at `fractions` of the horizon, or, where None, at all but a given first one."""
-
-    constraint: Constraint
-    fractions: Array | None
-    first: int
-
-    def nodes(self, mesh: Array, scheme: Scheme) -> Indices:
-        """The numbers of its nodes on `mesh` (N+1,), which holds the fractions."""
-        if self.fractions is not None:
-            return nodes_at(self.fractions, mesh, scheme)
-        return np.arange(self.first, scheme.nodes * (len(mesh) - 1) + 1)
-
-
-def nodes_at(fractions: Array, mesh: Array, scheme: Scheme) -> Indices:
-    """The numbers of the nodes at `fractions` of the horizon that knots of `mesh` lie at."""
-    return scheme.nodes * np.argmin(np.abs(mesh[None] - np.asarray(fractions)[:, None]), axis=1)
-
-
-@dataclass(frozen=True, eq=False)
 class OptimalControl:
-    """What is transcribed, checked: NaN in `x0`, `x_goal` and waypoints is free; `horizon` (lower, upper) [s]."""
+    """What `problem` asks of a collocation scheme; ModelError where its model has no continuous form.
 
-    dynamics: Dynamics
-    x0: Array  # (nx,)
-    x_goal: Array  # (nx,)
-    horizon: tuple[float, float]
-    rate: RunningRate
-    final: Pointwise | None  # of knots [x, u], whose inputs have no part in it
-    bounds: Bounds
-    scheme: Scheme
-    num_steps: int  # of the mesh that it begins with, whose knots waypoints and constraints refer to
-    waypoints: tuple[tuple[float, Array], ...] = ()  # fraction of the horizon, state (nx,)
-    paths: tuple[PathConstraint, ...] = ()
+    Raises InputError or GradientError where a cost is no function that can be differentiated.
+    """
+
+    def __init__(self, problem: Problem, scheme: str):
+        self.problem, self.scheme = problem, SCHEMES[scheme]
+        self.dynamics, self.bounds = problem.dynamics, problem.bounds
+        self.horizon: tuple[float, float] = problem.horizon or (problem.start_horizon,) * 2  # (lower, upper) [s]
+        self.rate = RunningRate(problem.running_cost, self.dynamics)
+        self.final: Pointwise | None = None  # of knots [x, u], whose inputs have no part in it
+        cost = problem.final_cost
+        if cost is not None:
+            self.final = Pointwise("final_cost", lambda x, u: cost(x), self.dynamics.nx, (), self.dynamics.probe())
+
+    def nodes_of(self, constraint: Constraint, mesh: Array) -> Indices:
+        """The nodes of `mesh` (N+1,) where `constraint` holds: its knots, or all nodes but a given first one."""
+        knots = self.problem.knots_of(constraint, input_at_end=True)
+        if constraint.knots is None:
+            return np.arange(knots[0], self.scheme.nodes * (len(mesh) - 1) + 1)
+        return self._nodes_at(knots, mesh)
 
     def node_limits(self, mesh: Array) -> tuple[Array, Array]:
         """(lower, upper), each (K, nx + nu): the bounds of the nodes, equal where an end or a waypoint is given."""
@@ -167,35 +155,13 @@ class OptimalControl:
         sides = [np.tile(np.concatenate(s), (count, 1)) for s in ((b.x_lower, b.u_lower), (b.x_upper, b.u_upper))]
         if self.scheme.input_is_linear:  # Drake bounds knots alone
             sides[0][1::2], sides[1][1::2] = -np.inf, np.inf
-        between = [(int(nodes_at(np.array([at]), mesh, self.scheme)[0]), wanted) for at, wanted in self.waypoints]
-        for node, wanted in ((0, self.x0), *between, (-1, self.x_goal)):
+        between = zip(self._nodes_at(self.problem.waypoints, mesh), self.problem.waypoints.values(), strict=True)
+        for node, wanted in ((0, self.problem.start), *between, (-1, self.problem.goal)):
             for side in sides:
                 side[node, :nx] = np.where(np.isnan(wanted), side[node, :nx], wanted)
         return sides[0], sides[1]
 
-
-def task_of(problem: Problem, scheme: str) -> OptimalControl:
-    """What `problem` asks of a collocation scheme; ModelError where its model has no continuous form.
-
-    Raises InputError or GradientError where a cost is no function that can be differentiated.
-    """
-    dynamics, mesh, cost = problem.dynamics, np.linspace(0, 1, problem.num_steps + 1), problem.final_cost
-    final, paths = None, []
-    if cost is not None:
-        final = Pointwise("final_cost", lambda x, u: cost(x), dynamics.nx, (), dynamics.probe())
-    for c in problem.constraints:
-        knots = problem.knots_of(c, input_at_end=True)
-        paths.append(PathConstraint(c, None if c.knots is None else mesh[list(knots)], knots[0]))
-    return OptimalControl(
-        dynamics=dynamics,
-        x0=problem.start,
-        x_goal=problem.goal,
-        horizon=problem.horizon or (problem.start_horizon,) * 2,
-        rate=RunningRate(problem.running_cost, dynamics),
-        final=final,
-        bounds=problem.bounds,
-        scheme=SCHEMES[scheme],
-        num_steps=problem.num_steps,
-        waypoints=tuple((float(mesh[knot]), state) for knot, state in problem.waypoints.items()),
-        paths=tuple(paths),
-    )
+    def _nodes_at(self, knots: Iterable[int], mesh: Array) -> Indices:
+        """The nodes that the problem's own `knots` are, which stay knots of a refined mesh."""
+        fractions = np.linspace(0, 1, self.problem.num_steps + 1)[list(knots)]
+        return self.scheme.nodes * np.argmin(np.abs(mesh[None] - fractions[:, None]), axis=1)
