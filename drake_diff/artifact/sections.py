@@ -12,7 +12,7 @@ from drake_diff._base.arrays import Array
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import select
 from drake_diff.model.plant import FLOATING, joints
-from drake_diff.optimize.problem.bounds import Bounds
+from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
