@@ -20,9 +20,9 @@ from drake_diff.mechanics.casadi_tree import PlantFunctions, symbolic_plant
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
 from drake_diff.optimize.program import Limits, Outcome
+from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.optimize.transcription.expressions import SymbolicPlant, trace
 from drake_diff.optimize.transcription.program import TranscribedProgram
-from drake_diff.optimize.transcription.solve import Transcription
 
 EXACT = "symbolic, exact Hessian"
 FORMS = {

@@ -24,8 +24,8 @@ from drake_diff.exceptions import GradientError, InputError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.optimize.judge import complaints_about
 from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
+from drake_diff.optimize.transcription.collocation import violation_between_nodes
 from drake_diff.optimize.transcription.expressions import knot_functions
-from drake_diff.optimize.transcription.motion import violation_between_nodes
 from drake_diff.optimize.transcription.program import TranscribedProgram
 
 SCHEMES = ("trapezoid", "hermite_simpson")

@@ -23,7 +23,7 @@ from drake_diff.motion.rollout import Rollout, drift, smooth_mean
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.replay import PENETRATION_PART, Replay
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
-from drake_diff.optimize.transcription.motion import violation_between_nodes
+from drake_diff.optimize.transcription.collocation import violation_between_nodes
 from drake_diff.record.parts import Event, Failure, Label, Metric
 from drake_diff.record.solve import ReplayEvidence
 

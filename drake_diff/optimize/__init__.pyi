@@ -1,2 +1,2 @@
 from .problem.dynamics import plant_dynamics as plant_dynamics
-from .transcription.motion import violation_between_nodes as violation_between_nodes
+from .transcription.collocation import violation_between_nodes as violation_between_nodes

@@ -20,7 +20,7 @@ from drake_diff.motion.rollout import Rollout, roll_states
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration
 from drake_diff.optimize.replay import Plan, Replay, held, replays
-from drake_diff.optimize.transcription.motion import Collocated, collocated
+from drake_diff.optimize.transcription.collocation import Collocated, collocated
 
 # Between two knots the transcription is a cubic; further than this [state units] from an accurate integration
 # its motion is not the model's.

@@ -24,9 +24,8 @@ from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, R
 from drake_diff.optimize.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
 from drake_diff.optimize.shooting import RolloutCost, ShootingVariables, check_segments, roll_segments, solve_shooting
 from drake_diff.optimize.solution import Solution, Status
+from drake_diff.optimize.transcription.collocation import Collocated, MeshRefinement, Transcription
 from drake_diff.optimize.transcription.drake import solve_collocation
-from drake_diff.optimize.transcription.motion import Collocated
-from drake_diff.optimize.transcription.solve import MeshRefinement, Transcription
 from drake_diff.optimize.transcription.task import DEFAULT_SCHEME, SCHEMES, OptimalControl
 
 METHODS = ("auto", "collocation", "shooting", "ilqr")

@@ -27,8 +27,8 @@ from step_derivatives import MODELS, panda_arm
 import drake_diff as dd
 from drake_diff.exceptions import ModelWarning
 from drake_diff.optimize.program import Limits, Outcome
+from drake_diff.optimize.transcription.collocation import Transcription
 from drake_diff.optimize.transcription.drake import solve_collocation
-from drake_diff.optimize.transcription.solve import Transcription
 
 LIMITS = Limits(max_iterations=3000, time_limit=60.0, tolerance=1e-6)
 LONG, RUNS = 30.0, 5

@@ -19,7 +19,7 @@ from drake_diff._base.arrays import Array, Indices
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch, ctrl_c
 from drake_diff.optimize.transcription.expressions import KnotFunctions
-from drake_diff.optimize.transcription.task import OptimalControl, node_weights
+from drake_diff.optimize.transcription.task import OptimalControl
 
 OUTCOMES = {
     "Solve_Succeeded": Outcome.SOLVED,
@@ -46,7 +46,7 @@ class TranscribedProgram:
     def __init__(self, task: OptimalControl, mesh: Array, functions: KnotFunctions):
         self.task, self.mesh, self.functions = task, mesh, functions
         self.nx, self.width = task.dynamics.nx, task.dynamics.nx + task.dynamics.nu
-        self.weights = node_weights(mesh, task.scheme)
+        self.weights = task.scheme.node_weights(mesh)
         self.every = np.arange(len(self.weights))
         self.free = int(task.horizon[0] < task.horizon[1])
         nodes = zip(task.node_limits(mesh), task.horizon, strict=True)

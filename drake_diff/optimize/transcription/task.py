@@ -54,6 +54,27 @@ class Scheme:
         powers = np.arange(1, self.basis.shape[1] + 1)
         return np.asarray(tau[:, None] ** powers / powers @ self.basis.T)
 
+    def node_fractions(self, mesh: Array) -> Array:
+        """(K,) where the nodes of `mesh` (N+1,) lie, both from 0 to 1; K = s N + 1."""
+        inner = np.arange(self.nodes) / self.nodes
+        return np.append((mesh[:-1, None] + np.diff(mesh)[:, None] * inner).ravel(), 1.0)
+
+    def node_weights(self, mesh: Array) -> Array:
+        """(K,) the weight of each node in the integral over a horizon of 1."""
+        weights = np.zeros(self.nodes * (len(mesh) - 1) + 1)
+        for k, h in enumerate(np.diff(mesh)):
+            weights[self.nodes * k : self.nodes * (k + 1) + 1] += h * self.weights
+        return weights
+
+    def per_interval(self, nodes: Array) -> Array:
+        """(N, s+1, ...): the nodes (K, ...) of each interval; neighbours share one."""
+        starts = np.arange(0, len(nodes) - 1, self.nodes)
+        return np.asarray(nodes[starts[:, None] + np.arange(self.nodes + 1)])
+
+    def interval_defects(self, h: Array, xs: Array, fs: Array) -> Array:
+        """(N, r, nx) from lengths h (N,) [s], states xs and rates fs (N, s+1, nx); in the state's units."""
+        return np.asarray(self.states @ xs - h[:, None, None] * (self.slopes @ fs))
+
 
 _SIMPSON = (
     np.array([[-1.0, 0, 1], [-0.5, 1, -0.5]]),
@@ -66,31 +87,6 @@ SCHEMES = {
     "drake": Scheme(2, *_SIMPSON, input_is_linear=True),
 }
 DEFAULT_SCHEME = "hermite_simpson"
-
-
-def node_fractions(mesh: Array, scheme: Scheme) -> Array:
-    """(K,) where the nodes of `mesh` (N+1,) lie, both from 0 to 1; K = s N + 1."""
-    inner = np.arange(scheme.nodes) / scheme.nodes
-    return np.append((mesh[:-1, None] + np.diff(mesh)[:, None] * inner).ravel(), 1.0)
-
-
-def node_weights(mesh: Array, scheme: Scheme) -> Array:
-    """(K,) the weight of each node in the integral over a horizon of 1."""
-    weights = np.zeros(scheme.nodes * (len(mesh) - 1) + 1)
-    for k, h in enumerate(np.diff(mesh)):
-        weights[scheme.nodes * k : scheme.nodes * (k + 1) + 1] += h * scheme.weights
-    return weights
-
-
-def per_interval(nodes: Array, scheme: Scheme) -> Array:
-    """(N, s+1, ...): the nodes (K, ...) of each interval; neighbours share one."""
-    starts = np.arange(0, len(nodes) - 1, scheme.nodes)
-    return np.asarray(nodes[starts[:, None] + np.arange(scheme.nodes + 1)])
-
-
-def interval_defects(scheme: Scheme, h: Array, xs: Array, fs: Array) -> Array:
-    """(N, r, nx) from lengths h (N,) [s], states xs and rates fs (N, s+1, nx); in the state's units."""
-    return np.asarray(scheme.states @ xs - h[:, None, None] * (scheme.slopes @ fs))
 
 
 class RunningRate:
@@ -151,7 +147,7 @@ class OptimalControl:
 
     def node_limits(self, mesh: Array) -> tuple[Array, Array]:
         """(lower, upper), each (K, nx + nu): the bounds of the nodes, equal where an end or a waypoint is given."""
-        b, nx, count = self.bounds, self.dynamics.nx, len(node_fractions(mesh, self.scheme))
+        b, nx, count = self.bounds, self.dynamics.nx, len(self.scheme.node_fractions(mesh))
         sides = [np.tile(np.concatenate(s), (count, 1)) for s in ((b.x_lower, b.u_lower), (b.x_upper, b.u_upper))]
         if self.scheme.input_is_linear:  # Drake bounds knots alone
             sides[0][1::2], sides[1][1::2] = -np.inf, np.inf

@@ -1,18 +1,27 @@
-"""What a transcription found, and measures of it that are computed from its nodes, not taken from the solver."""
+"""A problem in a collocation scheme: solved by IPOPT, again on a mesh that is refined, and the motion measured.
 
-from dataclasses import dataclass
+    minimize    int_0^T L(x, u) dt + F(x(T)),    x' = f(x, u),    x(0) = x0, x(T) = x_goal where they are given.
+
+`errors` of a result say that its motion is what the dynamics do, not that no better one exists: where the mesh is
+too coarse for the best input, only a finer one tells.
+"""
+
+import time
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.arrays import Array, Indices, frozen
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import NlpResult
-from drake_diff.optimize.transcription.task import OptimalControl, interval_defects, node_weights, per_interval
+from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report
+from drake_diff.optimize.transcription.task import OptimalControl
 
 SUBSTEPS = 10  # of the Runge-Kutta method that measures an interval
 DENSE = np.linspace(0, 1, 21)[1:-1]  # where bounds are looked at between two knots
+MOST_PIECES = 4  # of one interval in one round of refinement
+FOUND = (Outcome.SOLVED, Outcome.INACCURATE)
 
 
 @dataclass(frozen=True)
@@ -58,7 +67,7 @@ class Collocated:
         xs (m N + 1, nx), and the mean inputs us (m N, nu) over each part.
         """
         count, scheme = self.task.problem.num_steps, self.task.scheme
-        inputs = per_interval(self.nodes[:, self.task.dynamics.nx :], scheme)
+        inputs = scheme.per_interval(self.nodes[:, self.task.dynamics.nx :])
         if len(self.mesh) == count + 1:
             k, tau = np.repeat(np.arange(count), parts), np.tile(np.arange(parts) / parts, count)
             weights = scheme.integrated(tau + 1 / parts) - scheme.integrated(tau)
@@ -76,16 +85,16 @@ class Collocated:
     @cached_property
     def cost(self) -> float:
         """The scheme's own quadrature of the running cost, and the final cost."""
-        weights = self.horizon * node_weights(self.mesh, self.task.scheme)
+        weights = self.horizon * self.task.scheme.node_weights(self.mesh)
         final = 0.0 if self.task.final is None else float(self.task.final.values(self.nodes[-1:])[0, 0])
         return float(weights @ self.task.rate.values(self.nodes)) + final
 
     @cached_property
     def defects(self) -> Array:
         """(N,) how far each interval is from the scheme's equations, in the worst coordinate's unit."""
-        xs = per_interval(self.nodes[:, : self.task.dynamics.nx], self.task.scheme)
-        rates = per_interval(self._rates, self.task.scheme)
-        defects = interval_defects(self.task.scheme, self._lengths, xs, rates)
+        xs = self.task.scheme.per_interval(self.nodes[:, : self.task.dynamics.nx])
+        rates = self.task.scheme.per_interval(self._rates)
+        defects = self.task.scheme.interval_defects(self._lengths, xs, rates)
         return np.asarray(np.max(np.abs(defects), axis=(1, 2)))
 
     @property
@@ -100,7 +109,7 @@ class Collocated:
     def cost_errors(self) -> Array:
         """(N,) the same of the running cost's quadrature, as a part of the whole cost (of 1 where that is less)."""
         scheme, rates = self.task.scheme, self.task.rate.values(self.nodes)
-        quadrature = self._lengths * (per_interval(rates, scheme) @ scheme.weights)
+        quadrature = self._lengths * (scheme.per_interval(rates) @ scheme.weights)
         return _finite(np.abs(self._integrated[:, -1] - quadrature) / max(1.0, abs(self.cost)))
 
     def at(self, times: Any) -> tuple[Array, Array]:
@@ -123,8 +132,8 @@ class Collocated:
     def _between(self, k: Any, tau: Array) -> tuple[Array, Array]:
         """xs and us in the intervals `k` (S,) at `tau` (S,) of each."""
         scheme, nx = self.task.scheme, self.task.dynamics.nx
-        us = per_interval(self.nodes[:, nx:], scheme)[k]
-        moved = np.einsum("sj,sjx->sx", scheme.integrated(tau), per_interval(self._rates, scheme)[k])
+        us = scheme.per_interval(self.nodes[:, nx:])[k]
+        moved = np.einsum("sj,sjx->sx", scheme.integrated(tau), scheme.per_interval(self._rates)[k])
         return self.xs[k] + self._lengths[k, None] * moved, np.einsum("sj,sju->su", scheme.at(tau), us)
 
     @property
@@ -222,3 +231,99 @@ def collocated(
     nodes = np.empty((2 * len(xs) - 1, knots.shape[1]))
     nodes[::2], nodes[1::2] = knots, np.hstack([x_mid, u_mid])
     return Collocated(task, mesh, nodes, horizon)
+
+
+@dataclass(frozen=True)
+class MeshRefinement:
+    """Until when a mesh is refined: `errors` and `cost_errors` at most `tolerance`, or `most` intervals."""
+
+    tolerance: float
+    most: int
+
+
+class Transcription:
+    """A `Problem` in a scheme, on its own `num_steps` equal intervals to begin with."""
+
+    def __init__(self, problem: Problem, scheme: str):
+        from drake_diff.optimize.transcription.expressions import knot_functions  # loads CasADi
+
+        self.problem, self.task = problem, OptimalControl(problem, scheme)
+        self.mesh = np.linspace(0, 1, problem.num_steps + 1)
+        self.functions = knot_functions(self.task)
+
+    def jacobian(self, knot: Array) -> Array:
+        """(nx, nx + nu) of the rates at `knot` (nx + nu,), as the solver gets it."""
+        return np.asarray(self.functions.dynamics.jacobian_of(knot))
+
+    def nodes_at(self, mesh: Array, guess: Any) -> Array:
+        """(K, nx + nu) the nodes of a guess, xs (N+1, nx) and us (N+1, nu) or a motion, within the input's bounds."""
+        f, where = self.task.dynamics, self.task.scheme.node_fractions(mesh)
+        if isinstance(guess, Collocated):
+            nodes = np.hstack(guess.at(guess.horizon * where))
+        else:
+            nodes = np.array([np.interp(where, mesh, column) for column in np.hstack(guess).T]).T
+        nodes[:, f.nx :] = np.clip(nodes[:, f.nx :], self.task.bounds.u_lower, self.task.bounds.u_upper)
+        return nodes
+
+    def solve(
+        self,
+        guess: Any,
+        *,
+        horizon: float | None = None,
+        limits: Limits,
+        report: Report | None,
+        refinement: MeshRefinement | None = None,
+    ) -> Transcribed:
+        """From a guess that `nodes_at` takes, and of `horizon` [s]; `limits.max_iterations` hold for each round.
+
+        A refinement splits the intervals whose error is above its tolerance and solves again from what was found.
+        """
+        start, mesh = time.monotonic(), self.mesh
+        first = float(np.clip(self.problem.start_horizon if horizon is None else horizon, *self.task.horizon))
+        motion = self._solve_on(mesh, self.nodes_at(mesh, guess), first, limits, report)
+        if refinement is None:
+            return motion
+        rounds = [(len(mesh) - 1, float(np.max(_worst(motion))))]
+        while motion.result.outcome in FOUND and rounds[-1][1] > refinement.tolerance:
+            count, error = rounds[-1]
+            mesh = _split(motion, refinement.tolerance)
+            if len(mesh) - 1 > refinement.most:
+                told = f"the error is still {error:.2g} with {count} intervals: raise max_num_steps"
+                motion = replace(motion, result=replace(motion.result, note=told))
+                break
+            if report is not None:
+                report.say(f"error {error:.2g} with {count} intervals: refined to {len(mesh) - 1}")
+            left = replace(limits, time_limit=max(0.0, limits.time_limit - (time.monotonic() - start)))
+            motion = self._solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, left, report)
+            rounds.append((len(mesh) - 1, float(np.max(_worst(motion)))))
+        return replace(motion, refinements=tuple(rounds))
+
+    def _solve_on(
+        self, mesh: Array, nodes: Array, horizon: float, limits: Limits, report: Report | None
+    ) -> Transcribed:
+        """IPOPT on one mesh, from `nodes` (K, nx + nu) and `horizon` [s]."""
+        from drake_diff.optimize.transcription.program import NOT_FINITE, TranscribedProgram, solve_ipopt
+
+        program, why = TranscribedProgram(self.task, mesh, self.functions), self.functions.why_not
+        guess = program.pack(nodes, horizon)
+        told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
+        result = solve_ipopt(program, guess, limits, report, exact=not why)
+        if not why and result.message == NOT_FINITE:
+            again = solve_ipopt(program, guess, limits, report, exact=False)
+            if again.message != NOT_FINITE:  # then it was the Hessian
+                told, result = "symbolic, limited-memory Hessian: the exact one is not finite at an iterate", again
+        found, horizon = program.unpack(result.z)
+        return Transcribed(self.task, frozen(mesh), frozen(found), horizon, result, told)
+
+
+def _worst(motion: Transcribed) -> Array:
+    return np.maximum(motion.errors, motion.cost_errors)
+
+
+def _split(motion: Transcribed, tolerance: float) -> Array:
+    """The mesh with intervals above the tolerance in as many pieces as the scheme's order asks for, at most 4."""
+    errors = _worst(motion)
+    wanted = (errors / tolerance) ** (1 / (motion.task.scheme.order + 1))
+    pieces = np.where(errors > tolerance, np.clip(np.ceil(wanted), 2, MOST_PIECES), 1).astype(int)
+    ends = zip(motion.mesh[:-1], motion.mesh[1:], pieces, strict=True)
+    return np.append(np.concatenate([a + (b - a) * np.arange(n) / n for a, b, n in ends]), 1.0)
