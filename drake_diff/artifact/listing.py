@@ -135,12 +135,25 @@ def compare_runs(a: str | Path, b: str | Path) -> RunComparison:
         configuration: 0 entries differ; versions: 0; metrics: 0; not compared: 0
     """
     first, second = EvidenceRecord.read(a), EvidenceRecord.read(b)
-    metrics, refused = _metrics(first, second)
+    ours = {m.name: m for m in (*first.metrics, *first.invariants)}
+    theirs = {m.name: m for m in (*second.metrics, *second.invariants)}
+    found, refused = [], []
+    for name in dict.fromkeys([*ours, *theirs]):
+        if name not in ours or name not in theirs:
+            refused.append(f"{name}: only {'the first' if name in ours else 'the second'} run has it")
+            continue
+        one, other = ours[name], theirs[name]
+        keys = ("definition", "unit", "direction", "tolerance")
+        odd = next((key for key in keys if getattr(one, key) != getattr(other, key)), None)
+        if odd is not None:
+            refused.append(f"{name}: its {odd} differs: {getattr(one, odd)!r} and {getattr(other, odd)!r}")
+        elif (one.value, one.verdict) != (other.value, other.verdict):
+            found.append(ChangedEntry(f"{name} [{one.unit}]", one.value, other.value))
     return RunComparison(
         configuration=_differences(first, second, CONFIGURATION, NO_CHOICE),
         versions=_differences(first, second, ("schema_version", "provenance"), ("provenance.command",)),
-        metrics=metrics,
-        refused=refused,
+        metrics=tuple(found),
+        refused=tuple(refused),
     )
 
 
@@ -150,23 +163,3 @@ def _differences(
     one, other = first.model_dump(mode="json"), second.model_dump(mode="json")
     found = differences({s: one[s] for s in sections}, {s: other[s] for s in sections})
     return tuple(ChangedEntry(*entry) for entry in found if not entry[0].startswith(apart))
-
-
-def _metrics(first: EvidenceRecord, second: EvidenceRecord) -> tuple[tuple[ChangedEntry, ...], tuple[str, ...]]:
-    """Every metric of the two; a definition is its words, its unit, its direction and its tolerance."""
-    ours = {m.name: m for m in (*first.metrics, *first.invariants)}
-    theirs = {m.name: m for m in (*second.metrics, *second.invariants)}
-    found, refused = [], []
-    for name in dict.fromkeys([*ours, *theirs]):
-        a, b = ours.get(name), theirs.get(name)
-        if a is None or b is None:
-            refused.append(f"{name}: only {'the first' if b is None else 'the second'} run has it")
-            continue
-        keys = ("definition", "unit", "direction", "tolerance")
-        other = [key for key in keys if getattr(a, key) != getattr(b, key)]
-        if other:
-            was, now = getattr(a, other[0]), getattr(b, other[0])
-            refused.append(f"{name}: its {other[0]} differs: {was!r} and {now!r}")
-        elif a.value != b.value or a.verdict != b.verdict:
-            found.append(ChangedEntry(f"{name} [{a.unit}]", a.value, b.value))
-    return tuple(found), tuple(refused)

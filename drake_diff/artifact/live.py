@@ -18,6 +18,7 @@ from drake_diff.artifact.save import TRACE
 from drake_diff.exceptions import ArtifactError, ModelError
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.load_file import FORMATS, read_into
+from drake_diff.model.plant import bodies
 from drake_diff.pages.meshcat import draw
 from drake_diff.pages.scene import (
     BLUE,
@@ -64,7 +65,7 @@ def scene_of_run(directory: str | Path) -> tuple[Scene, tuple[str, ...]]:
         plant, context, notes = _load(log.attachments, record.contract.get("source"))
         moving = {f"{plant.GetModelInstanceName(b.model_instance())}::{b.name()}": b for b in moving_bodies(plant)}
         paths = {name: body_path(body) for name, body in moving.items()}
-        shapes = tuple(shapes_of(plant, context))
+        shapes = tuple(shapes_of(plant, context, bodies(plant)))
     except ModelError as error:
         notes = (f"the model cannot be loaded, so a ball stands for each body: {error}",)
         names = [name for name in poses if not name.startswith(GHOST)]

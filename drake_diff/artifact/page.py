@@ -35,11 +35,12 @@ def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str,
         scene = scene_of(m.solution.problem.model, m.times, xs, contacts=contacts, ghosts=ghosts)
         write_replay(replay, scene, title=f"{record['name']}: {m.solution.status.value}")
         view = replay.read_text(encoding="utf-8")
+    data = page_data(float(m.times[-1]), plots, m.solution.certificates)
     write_page(
         report,
         "report.html.j2",
         record=record,
-        data=page_data(float(m.times[-1]), plots, m.solution.certificates),
+        data=data,
         view=view,
         cost=m.solution.cost,
         replayed=m.motion is not None,

@@ -27,10 +27,7 @@ def begin(directory: str | Path, problem: Problem) -> None:
     """
     folder = Path(directory)
     sentence = "the run has started and not finished: it is still running, or it was killed or broke off"
-    record = _record(
-        folder, WallClock(written_utc=written_now()), verdict="incomplete", sentence=sentence, **asked(problem)
-    )
-    record.begin(folder, FILES)
+    _record(folder, verdict="incomplete", sentence=sentence, **asked(problem)).begin(folder, FILES)
 
 
 def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
@@ -83,14 +80,14 @@ def save_failure(error: Exception, directory: str | Path, problem: Problem) -> E
         "failures": [failure],
         "events": [Event(t_s=None, kind="failure", message=failure.message)],
     }
-    return _record(folder, WallClock(written_utc=written_now()), **told, **asked(problem)).write(folder)
+    return _record(folder, **told, **asked(problem)).write(folder)
 
 
 def record_of(m: Measurement, folder: Path) -> EvidenceRecord:
     """The record of a measurement, but for the files; it has the name of `folder`."""
     return _record(
         folder,
-        WallClock(written_utc=written_now(), duration_s=m.solution.wall_time),
+        m.solution.wall_time,
         verdict="fail" if m.failures else "pass",
         sentence=m.solution.message,
         metrics=m.metrics,
@@ -103,5 +100,6 @@ def record_of(m: Measurement, folder: Path) -> EvidenceRecord:
     )
 
 
-def _record(folder: Path, clock: WallClock, **fields: Any) -> EvidenceRecord:
+def _record(folder: Path, duration: float | None = None, **fields: Any) -> EvidenceRecord:
+    clock = WallClock(written_utc=written_now(), duration_s=duration)
     return EvidenceRecord(name=folder.name, provenance=provenance_of(), wall_clock=clock, **fields)

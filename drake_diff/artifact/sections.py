@@ -102,6 +102,22 @@ def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
 
 def found(solution: Solution) -> dict[str, Any]:
     """The sections that say how a solution was found. An option that is no finite number is null."""
+    problem, vector = solution.problem, solution.vector
+    units = [p.unit for p in vector.parameters for _ in p.value]
+    lower, upper = (finite_list(side) for side in problem.bounds_of_parameters())
+    parameters = [
+        ParameterEvidence(
+            name=name,
+            unit=units[i],
+            derivative_source=vector.sources[i],
+            start=float(problem.parameters.values[i]),
+            value=float(vector.values[i]),
+            optimized=problem.optimizes_parameters,
+            lower=lower[i],
+            upper=upper[i],
+        )
+        for i, name in enumerate(vector.names)
+    ]
     options = {k: v.item() if isinstance(v, np.generic) else v for k, v in solution.options.items() if k not in GUESS}
     solver = Solver(
         method=solution.method,
@@ -113,7 +129,7 @@ def found(solution: Solution) -> dict[str, Any]:
         options={k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in options.items()},
         iterations=len(solution.iterations),
     )
-    return {"solver": solver, "parameters": _parameters(solution), "gradient": _gradient(solution)}
+    return {"solver": solver, "parameters": parameters, "gradient": _gradient(solution)}
 
 
 def units_of(problem: Problem) -> tuple[str, ...]:
@@ -199,26 +215,6 @@ def _gradient(solution: Solution) -> GradientEvidence:
         norms=norms,
         certificates=[gradient_evidence(c) for c in solution.certificates],
     )
-
-
-def _parameters(solution: Solution) -> list[ParameterEvidence]:
-    """Each entry of the parameter vector."""
-    problem, found = solution.problem, solution.vector
-    lower, upper = (finite_list(side) for side in problem.bounds_of_parameters())
-    units = [p.unit for p in found.parameters for _ in p.value]
-    return [
-        ParameterEvidence(
-            name=name,
-            unit=units[i],
-            derivative_source=found.sources[i],
-            start=float(problem.parameters.values[i]),
-            value=float(found.values[i]),
-            optimized=problem.optimizes_parameters,
-            lower=lower[i],
-            upper=upper[i],
-        )
-        for i, name in enumerate(found.names)
-    ]
 
 
 def describe_problem(problem: Problem) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from drake_diff.logs.channels import Shown, input_channel, motion_channels, nano
 from drake_diff.logs.mcap_file import Channel, read_mcap, write_mcap
 from drake_diff.logs.messages import TYPES, MessageType
 from drake_diff.model.parameters import applied
-from drake_diff.optimize.solution import Solution
+from drake_diff.record.sealed import canonical
 
 ROW_PERIOD = 1_000_000  # [ns] of log time per row of a table
 CONFIGURATION = "configuration.json"
@@ -38,7 +38,16 @@ def write_trace(path: Path, m: Measurement, attachments: Mapping[str, tuple[str,
     """
     solution = m.solution
     problem = solution.problem
-    files = {CONFIGURATION: ("application/json", _configuration(solution)), **attachments}
+    configuration = {
+        "method": solution.method,
+        "solver": solution.solver,
+        "scheme": solution.scheme,
+        "num_steps": problem.num_steps,
+        "time_step_s": problem.time_step,
+        # A number that is not finite is text here, as JSON has none.
+        "options": json.loads(json.dumps(solution.options, default=str), parse_constant=str),
+    }
+    files = {CONFIGURATION: ("application/json", canonical(configuration).encode()), **attachments}
     if problem.has_model and problem.model.source is not None:
         source = problem.model.source
         files[source.name] = (MEDIA_TYPES.get(source.suffix, "application/octet-stream"), source.read_bytes())
@@ -54,19 +63,6 @@ def write_trace(path: Path, m: Measurement, attachments: Mapping[str, tuple[str,
     channels = [*_solver_channels(m), *_plan_channels(m), _event_channel(m)]
     with applied(solution.vector) if shown else nullcontext():
         write_mcap(path, [*(motion_channels(shown) if shown else _no_motion(m)), *channels], metadata, files)
-
-
-def _configuration(solution: Solution) -> bytes:
-    """How it was solved, as JSON; a number that is not finite as text."""
-    fields = {
-        "method": solution.method,
-        "solver": solution.solver,
-        "scheme": solution.scheme,
-        "num_steps": solution.problem.num_steps,
-        "time_step_s": solution.problem.time_step,
-        "options": json.loads(json.dumps(solution.options, default=str), parse_constant=str),
-    }
-    return (json.dumps(fields, sort_keys=True, indent=2, allow_nan=False) + "\n").encode()
 
 
 def _no_motion(m: Measurement) -> Iterator[Channel]:

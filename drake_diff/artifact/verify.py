@@ -177,11 +177,11 @@ def verify(directory: str | Path) -> Verification:
         if isinstance(record, CertificationRecord):
             return _certify_again(folder, record)
     except ModelError as error:
-        why, notes = f"not run again: {error}", tuple(_other_versions(record))
-        return Verification(folder, record, not_rerun=(why,), undecided=(why,), notes=notes)
+        why = f"not run again: {error}"
+        return Verification(folder, record, not_rerun=(why,), undecided=(why,), notes=_other_versions(record))
     except ArtifactError as error:
-        notes = tuple(_other_versions(record))
-        return Verification(folder, record, problems=(str(error),), not_rerun=("not run again",), notes=notes)
+        problems, notes = (str(error),), _other_versions(record)
+        return Verification(folder, record, problems, not_rerun=("not run again",), notes=notes)
     return Verification(folder, record, not_rerun=(f"not run again: {NOT_RERUN[record.kind]}",))
 
 
@@ -246,19 +246,17 @@ def _solve_again(folder: Path, record: EvidenceRecord) -> Verification:
         problems += _odd_contract(record, model.contract.to_dict())
         again = measure(resolve(record, model, plan))
         skip = ["cost"] * bool(costs) + ["constraint violation"] * bool(constraints)
+        invariants = compare_metrics(record.invariants, again.invariants, ())
         comparisons = [
             *compare_metrics(record.metrics, again.metrics, skip),
-            *(
-                replace(found, name=f"invariant {found.name}")
-                for found in compare_metrics(record.invariants, again.invariants, ())
-            ),
+            *(replace(found, name=f"invariant {found.name}") for found in invariants),
             *compare_replays(record.replays, [replay_evidence(r) for r in again.replays], not constraints),
             _compare_motion(trace.xs, again),
         ]
     undecided = tuple(f"not run again: constraint {name} is a user's function" for name in constraints)
     not_rerun = (*(f"not run again: {cost} is a user's function" for cost in costs), *undecided, CERTIFICATES)
-    notes = tuple(_other_versions(record))
-    return Verification(folder, record, tuple(problems), tuple(comparisons), not_rerun, undecided, notes)
+    told = (not_rerun, undecided, _other_versions(record))
+    return Verification(folder, record, tuple(problems), tuple(comparisons), *told)
 
 
 def _certify_again(folder: Path, record: CertificationRecord) -> Verification:
@@ -274,8 +272,7 @@ def _certify_again(folder: Path, record: CertificationRecord) -> Verification:
         problems += [f"{record.FILE}: {key}: recorded {old}, again {new}" for key, old, new in found]
         largest = compare_numbers(f"state {i}: largest entry", was.largest, now.largest, "")
         comparisons.append(replace(largest, file=record.FILE))
-    notes = tuple(_other_versions(record))
-    return Verification(folder, record, tuple(problems), tuple(comparisons), notes=notes)
+    return Verification(folder, record, tuple(problems), tuple(comparisons), notes=_other_versions(record))
 
 
 def _what_is_certified(state: CertifiedState) -> dict[str, Any]:
@@ -380,18 +377,12 @@ def _odd_trace(trace: Trace, plan: dict[str, Any], record: EvidenceRecord) -> It
 def _odd_contract(record: EvidenceRecord | CertificationRecord, again: dict[str, Any]) -> list[str]:
     """Where the rebuilt model is another than the recorded contract; where the file was, and notes, do not matter."""
     apart = ("source", "notes")
-    recorded, rebuilt_now = (
-        {key: value for key, value in contract.items() if key not in apart} for contract in (record.contract, again)
-    )
-    return [
-        f"{record.FILE}: contract, {key}: recorded {was}, the model has {now}"
-        for key, was, now in differences(recorded, rebuilt_now)
-    ]
+    old, new = ({key: value for key, value in c.items() if key not in apart} for c in (record.contract, again))
+    told = f"{record.FILE}: contract"
+    return [f"{told}, {key}: recorded {was}, the model has {now}" for key, was, now in differences(old, new)]
 
 
-def _other_versions(record: SealedRecord) -> Iterator[str]:
-    now = provenance_of().packages
-    for name in ("drake", "drake-diff", "numpy", "casadi"):
-        was = record.provenance.packages.get(name)
-        if was != now.get(name):
-            yield f"recorded with {name} {was}, run again with {now.get(name)}"
+def _other_versions(record: SealedRecord) -> tuple[str, ...]:
+    was, now = record.provenance.packages, provenance_of().packages
+    names = [n for n in ("drake", "drake-diff", "numpy", "casadi") if was.get(n) != now.get(n)]
+    return tuple(f"recorded with {name} {was.get(name)}, run again with {now.get(name)}" for name in names)

@@ -126,13 +126,14 @@ def scene_of(
     Raises:
         UnknownNameError: If there is no such frame.
     """
-    moving = moving_bodies(model.plant)
+    drawn = bodies(model.plant)
+    moving = [body for body in drawn if not model.plant.IsAnchored(body)]
     seen = {name: states for name, (states, _) in (ghosts or {}).items() if not np.array_equal(states, xs)}
     poses = _poses_of(model, moving, xs)
     of_ghosts = {name: _poses_of(model, moving, states) for name, states in seen.items()}
     trail = longest_path(poses, moving) if frame is None else _path_of(model, poses, len(xs), frame)
     return Scene(
-        shapes=tuple(shapes_of(model.plant, model.double.context)),
+        shapes=tuple(shapes_of(model.plant, model.double.context, drawn)),
         times=times,
         poses=poses,
         ghosts=tuple(Ghost(name, found, (ghosts or {})[name][1]) for name, found in of_ghosts.items()),
@@ -174,13 +175,13 @@ def _path_of(model: Model, poses: Poses, count: int, name: str) -> Array:
     return np.array([pose @ origin for pose in poses.get(body_path(body), [fixed] * count)])
 
 
-def shapes_of(plant: Any, context: Any) -> list[Drawn]:
-    """The shapes of the world and of all bodies; a small ball at each centre of mass where there are none."""
+def shapes_of(plant: Any, context: Any, drawn: Sequence[Any]) -> list[Drawn]:
+    """The shapes of the world and of the bodies `drawn`; a small ball at each centre of mass where there are none."""
     port = plant.get_geometry_query_input_port()
     found: list[Drawn] = []
     if port.HasValue(context):
         inspector = port.Eval(context).inspector()
-        for body in [plant.world_body(), *bodies(plant)]:
+        for body in [plant.world_body(), *drawn]:
             frame = plant.GetBodyFrameIdIfExists(body.index())
             if frame is not None:
                 shapes = _shapes_on(inspector, frame, body_path(body))
@@ -188,7 +189,7 @@ def shapes_of(plant: Any, context: Any) -> list[Drawn]:
                     pose = plant.EvalBodyPoseInWorld(context, body)
                     shapes = [replace(s, body="", pose=pose @ s.pose, centre=pose @ s.centre) for s in shapes]
                 found += shapes
-    return found or [ball(body_path(body), body.default_com()) for body in moving_bodies(plant)]
+    return found or [ball(body_path(body), body.default_com()) for body in drawn if not plant.IsAnchored(body)]
 
 
 def ball(path: str, centre: ArrayLike = (0.0, 0.0, 0.0)) -> Drawn:
