@@ -76,12 +76,9 @@ class Constraint:
             raise InputError("Constraint.function", got=type(self.function).__name__, expected=FORM)
         if self.lower is None and self.upper is None:
             raise InputError("Constraint", got="no lower and no upper", expected="one of them, or both")
-        sides = [np.atleast_1d(np.inf if v is None else v) for v in (self.lower, self.upper)]
-        if self.lower is None:
-            sides[0] = -sides[0]
-        lower, upper = (
-            array_with_gaps(f"Constraint.{n}", v, ("m",)) for n, v in zip(("lower", "upper"), sides, strict=True)
-        )
+        lower, upper = -np.inf if self.lower is None else self.lower, np.inf if self.upper is None else self.upper
+        lower = array_with_gaps("Constraint.lower", np.atleast_1d(lower), ("m",))
+        upper = array_with_gaps("Constraint.upper", np.atleast_1d(upper), ("m",))
         try:
             lower, upper = np.broadcast_arrays(lower, upper)
         except ValueError as error:

@@ -102,6 +102,10 @@ class ConstantCost:
     def __call__(self, x: Any, u: Any) -> Any:
         return self.rate + 0.0 * x[0]
 
+    def along(self, xs: Array, us: Array) -> Array:
+        """(K,) the costs of xs (K, nx) and us (K, nu)."""
+        return np.full(len(xs), self.rate)
+
 
 @dataclass(frozen=True, eq=False)
 class CostToGo:

@@ -128,8 +128,7 @@ class Dynamics:
         self.nx, self.nu = positive_int("nx", nx), positive_int("nu", nu)
         self.state_names = _names("state_names", state_names, "x", self.nx)
         self.input_names = _names("input_names", input_names, "u", self.nu)
-        unlimited = Bounds(*(frozen(np.full(n, v)) for n in (self.nx, self.nu) for v in (-np.inf, np.inf)))
-        self.bounds = unlimited
+        self.bounds = Bounds(*(frozen(np.full(n, v)) for n in (self.nx, self.nu) for v in (-np.inf, np.inf)))
         self.bounds = self.limits(Bounds(x_lower, x_upper, u_lower, u_upper))
         own = hasattr(f, "linearize")
         self.form = f if own else Pointwise("dynamics", f, self.nx, (self.nx,), self.probe())

@@ -261,7 +261,7 @@ class Problem(ShowsItsRepr):
     def goal_error(self, x: Array) -> Array:
         """(nx,) the distance of `x` from the goal, 0 where the goal is free."""
         goal = self.goal
-        return np.where(np.isnan(goal), 0.0, x - np.where(np.isnan(goal), 0.0, goal))
+        return np.where(np.isnan(goal), 0.0, x - goal)
 
     def objective(self, xs: Array, inputs: Array) -> float:
         """The objective of xs (N+1, nx) under inputs (N, nu) held over each step.

@@ -93,33 +93,28 @@ class RunningRate:
     """A running cost at many knots: none, a ConstantCost, a QuadraticCost, or a function (x, u) -> scalar."""
 
     def __init__(self, cost: Any, dynamics: Dynamics):
-        self.cost, self.nx, self.width = cost, dynamics.nx, dynamics.nx + dynamics.nu
-        self.quadratic = isinstance(cost, QuadraticCost)
-        self.constant = 0.0 if cost is None else cost.rate if isinstance(cost, ConstantCost) else None
-        if self.constant is None and not self.quadratic:
+        self.cost, self.nx = ConstantCost(0.0) if cost is None else cost, dynamics.nx
+        self._at: Pointwise | None = None
+        if not isinstance(self.cost, (ConstantCost, QuadraticCost)):
             self._at = Pointwise("running_cost", cost, self.nx, (), dynamics.probe())
 
     def __call__(self, x: Any, u: Any) -> Any:
         """The rate at x (nx,), u (nu,): floats or what else goes through the cost."""
-        return self.cost(x, u) if self.constant is None else self.constant
+        return self.cost(x, u)
 
     def values(self, knots: Array) -> Array:
         """(K,) at `knots` (K, nx + nu)."""
-        if self.constant is not None:
-            return np.full(len(knots), self.constant)
-        if self.quadratic:
-            return np.asarray(self.cost.along(knots[:, : self.nx], knots[:, self.nx :]))
-        return self._at.values(knots)[:, 0]
+        if self._at is not None:
+            return self._at.values(knots)[:, 0]
+        return np.asarray(self.cost.along(knots[:, : self.nx], knots[:, self.nx :]))
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
         """(K,) and the gradients (K, nx + nu)."""
-        if self.constant is not None:
-            return self.values(knots), np.zeros(knots.shape)
-        if self.quadratic:
-            found = [differentiate_cost(self.cost, k[: self.nx], k[self.nx :]) for k in knots]
-            return np.array([v for v, _, _ in found]), np.array([np.concatenate(g) for _, *g in found])
-        values, rows = self._at.linearize(knots)
-        return values[:, 0], rows[:, 0]
+        if self._at is not None:
+            values, rows = self._at.linearize(knots)
+            return values[:, 0], rows[:, 0]
+        found = [differentiate_cost(self.cost, k[: self.nx], k[self.nx :]) for k in knots]
+        return np.array([v for v, _, _ in found]), np.array([np.concatenate(g) for _, *g in found])
 
 
 class OptimalControl:
