@@ -24,7 +24,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from drake_diff._base.arrays import Array
 from drake_diff._base.files import write_whole
 from drake_diff.pages.html import content_policy
-from drake_diff.pages.scene import ARROW_PART, ContactForce, Drawn, Scene
+from drake_diff.pages.scene import ARROW_PART, Drawn, Scene
 
 # Drake prints the port that it listens on, but nobody is meant to connect to it.
 logging.getLogger("drake").addFilter(lambda record: "Meshcat listening" not in record.getMessage())
@@ -72,15 +72,12 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
         turned = RollPitchYaw(np.pi, 0.0, 0.0)
         meshcat.SetTransform(f"{path}/tip/cone", RigidTransform(turned, [0.0, 0.0, 4 * radius]))
     frames = frames_of(scene.times)
-    forces = [_arrows(scene, k) for _, k in frames]
     rate = (len(frames) - 1) / float(scene.times[-1])
     meshcat.StartRecording(frames_per_second=rate, set_visualizations_while_recording=False)
-    for (time, k), arrows in zip(frames, forces, strict=True):
-        _place(meshcat, scene, k, time)
-        _place_arrows(meshcat, arrows, slots, time)
+    for time, k in frames:
+        _place(meshcat, scene, k, slots, time)
     meshcat.StopRecording()
-    _place(meshcat, scene, 0, None)  # what is seen before play
-    _place_arrows(meshcat, forces[0], slots, None)
+    _place(meshcat, scene, 0, slots, None)  # what is seen before play
     animation = meshcat.get_mutable_recording()
     animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
     animation.set_repetitions(REPETITIONS)
@@ -142,29 +139,20 @@ def _draw_tube(meshcat: Meshcat, path: str, points: Array, radius: float) -> Non
     meshcat.SetTriangleMesh(path, vertices.T, np.array(faces, dtype=np.int32).T, TRAIL)
 
 
-def _arrows(scene: Scene, k: int) -> list[tuple[ContactForce, float]]:
-    """The forces in the step from state k, or in the last step, with the lengths of their arrows [m]."""
-    found = []
-    for contact in scene.forces[min(k, len(scene.forces) - 1)] if scene.forces else ():
-        part = float(np.linalg.norm(contact.force)) / scene.reference_force
-        if part > 0:
-            found.append((contact, min(part, LONGEST) * ARROW_PART * scene.size))
-    return found
-
-
-def _place(meshcat: Meshcat, scene: Scene, k: int, time: float | None) -> None:
+def _place(meshcat: Meshcat, scene: Scene, k: int, slots: int, time: float | None) -> None:
+    """Bodies and ghosts as in state k, and arrows of the forces in the step from there, or in the last step."""
     for root, poses in (("motion", scene.poses), *((ghost.name, ghost.poses) for ghost in scene.ghosts)):
         for path, found in poses.items():
             meshcat.SetTransform(f"{root}/{path}", found[k], time_in_recording=time)
-
-
-def _place_arrows(meshcat: Meshcat, arrows: list[tuple[ContactForce, float]], slots: int, time: float | None) -> None:
+    contacts = scene.forces[min(k, len(scene.forces) - 1)] if scene.forces else ()
+    pushing = [contact for contact in contacts if np.linalg.norm(contact.force) > 0]
     for slot in range(slots):
-        path, used = f"contacts/{slot}", slot < len(arrows)
+        path, used = f"contacts/{slot}", slot < len(pushing)
         if used:
-            contact, length = arrows[slot]
-            turned = RotationMatrix.MakeFromOneVector(contact.force, 2)
-            meshcat.SetTransform(path, RigidTransform(turned, contact.point), time_in_recording=time)
+            force = pushing[slot].force
+            length = min(float(np.linalg.norm(force)) / scene.reference_force, LONGEST) * ARROW_PART * scene.size
+            pose = RigidTransform(RotationMatrix.MakeFromOneVector(force, 2), pushing[slot].point)
+            meshcat.SetTransform(path, pose, time_in_recording=time)
             meshcat.SetTransform(f"{path}/tip", RigidTransform([0.0, 0.0, length]), time_in_recording=time)
             meshcat.SetProperty(f"{path}/shaft", "scale", [1.0, 1.0, length], time_in_recording=time)
         meshcat.SetProperty(path, "visible", used, time_in_recording=time)

@@ -121,9 +121,8 @@ def certify_model(
         )
 
     if directory is not None:
-        record("incomplete", "the run has started and not finished: it is still running, or it was killed").begin(
-            Path(directory)
-        )
+        sentence = "the run has started and not finished: it is still running, or it was killed"
+        record("incomplete", sentence).begin(Path(directory))
     found = [_certify_state(model, state, parameters, method) for state in sample_states(model, states, int(seed))]
     agree = sum(state.verdict == "agree" for state in found)
     sentence = f"{agree} of {len(found)} sampled states have a certified derivative"
