@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.contracts import arms
 from helpers.engines import engine_of
+from helpers.table import each_row
 
 from drake_diff.comparison.attribution import SCHEMES, Terms, attribute, euler
 from drake_diff.engines.mujoco.mjcf import mjcf
@@ -61,8 +62,8 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize("name", ["drake", "mujoco", "pinocchio"])
+@each_row("change", CHANGES)
+@each_row("name", ["drake", "mujoco", "pinocchio"])
 def test_the_term_that_was_changed_is_found(tmp_path, name, change):
     changes, terms = CHANGES[change]
     plain = engine_of("drake", arms(tmp_path))

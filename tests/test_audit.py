@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 import pytest
 from helpers.models import MODELS, Plant, add_slide, contact_properties, robot_file
+from helpers.table import each_row
 from pydrake.geometry import (
     AddCompliantHydroelasticProperties,
     AddRigidHydroelasticProperties,
@@ -78,7 +79,7 @@ def block(limit=np.inf, gains=None, start=0.0):
     return plant
 
 
-@pytest.mark.parametrize("name", sorted(p.name for p in MODELS.iterdir()))
+@each_row("name", sorted(p.name for p in MODELS.iterdir()))
 def test_the_models_of_this_repository_are_clean(load, name):
     model = load(name)
     findings = audit(model)
@@ -269,8 +270,8 @@ def test_an_identity_frame_is_told_and_another_is_not():
 HYDROELASTIC = {"compliance": ("compliant", "compliant"), "contact_model": "hydroelastic_with_fallback"}
 
 
-@pytest.mark.parametrize(
-    ("upper", "lower", "height"),
+@each_row(
+    "upper, lower, height",
     [
         (Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), 0.0995),
         (Cylinder(0.1, 0.2), Cylinder(0.2, 0.2), 0.095),

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.table import each_row
 
 from drake_diff.exceptions import InputError
 
@@ -98,8 +99,8 @@ def test_a_peer_twice_as_slow_is_told(saved, tmp_path):
     assert any("in one file alone" in line and gone["quantity"] in line for line in lines)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "changed"),
+@each_row(
+    "old, new, changed",
     [
         ((1.0, 0.9, 1.1), (2.0, 1.9, 2.1), True),
         ((1.0, 0.4, 2.5), (2.0, 1.9, 2.1), False),  # the spread of one covers the other

@@ -10,7 +10,7 @@ R, T = 0.2, 1.0
 
 
 def rigid_end(z, force):
-    """C03 along the line of centres: where ball 2 ends, z = (x1, x2, v1, v2), the force on ball 1, m = 1, e = 1."""
+    """Along the line of centres: where ball 2 ends, z = (x1, x2, v1, v2), the force on ball 1, m = 1, restitution 1."""
     x1, x2, v1, v2 = z
     gap, closing = x2 - x1 - 2 * R, v1 - v2
     s = (-closing + np.sqrt(closing**2 + 2 * force * gap)) / force
@@ -42,11 +42,12 @@ def gradient(f, z):
 
 
 DIAGONAL = np.sqrt(2)
-START = np.array([-2 * DIAGONAL, -DIAGONAL, 0.0, 0.0])  # C03: (-2, -2) and (-1, -1), force (3, 3)
+START = np.array([-2 * DIAGONAL, -DIAGONAL, 0.0, 0.0])  # from (-2, -2) and (-1, -1), pushed by (3, 3)
 FORCE = 3 * DIAGONAL
 
 
-def test_the_rigid_oracle_has_c03s_digits():
+def test_the_rigid_motion_ends_where_the_plane_problem_does():
+    """Digits of the same collision in the plane: the loss |p2(T)|^2 and its gradient by the start, to ten places."""
     end = rigid_end(START, FORCE)
     assert end == pytest.approx(-0.5090613972, abs=1e-10)
     # The loss |x2(T)|^2 by one of two equal components: 1 / sqrt(2) of that along the diagonal.
@@ -85,7 +86,7 @@ def test_a_resolved_collision_has_the_compliant_gradient(k, force, x2):
 
 
 def test_the_same_collision_in_steps_that_do_not_resolve_it_has_another():
-    """h w = 0.6: the sums by momentum hold (A28), the parts do not."""
+    """h w = 0.6: the sums hold, as no step changes the momentum; the parts do not."""
     h, k = 0.01, 2e3
     us = np.full((100, 1), FORCE)
     found = dd.differentiate_rollout(balls(h, k), START, us, lambda x: x[1])
@@ -94,11 +95,11 @@ def test_the_same_collision_in_steps_that_do_not_resolve_it_has_another():
 
 
 EPSILON = 0.01
-ONE, TWO = np.array([-1.0, -2.0]), np.array([-1.0, -1.0])  # C05
+ONE, TWO = np.array([-1.0, -2.0]), np.array([-1.0, -1.0])  # both at rest; ball 1 is to hit ball 2 towards the origin
 
 
 def collision(s, angle, v):
-    """C05: ball 1 hits ball 2 at time s where `angle` says, at the speed v along the line of centres.
+    """Ball 1 hits ball 2 at time s where `angle` says, at the speed v along the line of centres.
 
     Gives (cost, inputs as a function of time (2,)): to move by d in s to the speed v takes at least
     12 d^2 / s^3 - 12 d v / s^2 + 4 v^2 / s, and 3 d^2 / s^3 where the speed is free, as it is along the tangent.
@@ -130,7 +131,8 @@ def best_collision():
     return z
 
 
-def test_the_rigid_optimum_has_c05s_digits():
+def test_the_rigid_optimum_is_a_known_one():
+    """Least |p2(T)|^2 + EPSILON integral |u|^2, as a solver of the event-driven problem finds it."""
     s, angle, v = best_collision()
     assert collision(s, angle, v)[0] == pytest.approx(0.31141687036, abs=1e-9)
     assert s == pytest.approx(0.460708, abs=1e-5)

@@ -9,6 +9,7 @@ import pytest
 from helpers.contracts import different
 from helpers.engines import HERE, ROBOTS, G, assert_free_steps_agree, engine_of, needs
 from helpers.models import Plant, robot
+from helpers.table import each_row
 from pydrake.geometry import Role
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import (
@@ -56,12 +57,12 @@ def turned(*, free):
 
 
 # 1e-12: M and bias are sums over a tree in another order than Drake's, solved once; Jacobians of the same.
-@pytest.mark.parametrize("file", HERE)
+@each_row("file", HERE)
 def test_casadi_is_drake(load, file):
     assert_free_steps_agree(load(file), "casadi", 1e-12, 1e-12)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@each_row("name", ROBOTS)
 def test_casadi_is_drake_on_robots(tmp_path, name):
     assert_free_steps_agree(robot(name, tmp_path), "casadi", 1e-12, 1e-12, states=2)
 
@@ -188,7 +189,7 @@ def read_back(model, tmp_path):
         return dd.load_model(path, time_step=model.time_step)
 
 
-@pytest.mark.parametrize("file", ["cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "projectile.sdf"])
+@each_row("file", ["cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "projectile.sdf"])
 def test_drake_reads_the_same_model_from_the_urdf(load, tmp_path, file):
     found = different(*(dd.engines.load_engine("drake", m) for m in (load(file), read_back(load(file), tmp_path))))
     assert all(quantity == "effort limits" and "1e+10" in detail for quantity, detail in found.items())

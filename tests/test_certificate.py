@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 from helpers.models import random_state
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff._base.differences import sweep_of
@@ -168,7 +169,7 @@ def test_nothing_but_agree_passes_require():
 SMOOTH = ("pendulum.urdf", "cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "mass_spring_damper.sdf")
 
 
-@pytest.mark.parametrize("name", [*SMOOTH, "projectile.sdf"])
+@each_row("name", [*SMOOTH, "projectile.sdf"])
 def test_every_smooth_model_is_certified_at_random_states(load, name):
     model, random = load(name), np.random.default_rng(3)
     for _ in range(8):

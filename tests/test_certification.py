@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS, robot_file
 from helpers.plants import offset_pendulum
+from helpers.table import each_row
 from typer.testing import CliRunner
 
 import drake_diff as dd
@@ -19,7 +20,7 @@ from drake_diff.model.step import set_state
 NAMES = sorted(path.name for path in MODELS.iterdir())
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each_row("name", NAMES)
 def test_every_model_here_is_certified_at_every_sampled_state(load, name):
     """Eight models of 20 states, contact among them: the good states of the zoo."""
     record = dd.record.certify_model(load(name, time_step=0.005), states=20, seed=3)
@@ -48,7 +49,7 @@ def test_every_other_state_touches_and_the_rest_are_free(load, name):
         assert (depth == 0.0) if state.kind == "free" else (1e-4 <= depth <= 1e-3)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each_row("name", NAMES)
 def test_states_are_seeded_and_within_limits(load, name):
     model = load(name)
     first, again, other = (sample_states(model, 6, seed) for seed in (5, 5, 6))
@@ -85,8 +86,8 @@ def test_a_refused_derivative_is_told_and_fails(load, monkeypatch):
     assert "expected a finite number of at most" in record.states[0].refusal
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
+@each_row(
+    "options, words",
     [
         ({"states": 0}, "states"),
         ({"seed": -1}, "seed"),

@@ -10,6 +10,7 @@ from importlib import metadata
 
 import pytest
 from helpers.models import ROOT
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.cli import main as cli
@@ -88,8 +89,8 @@ def test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact(tm
     }
 
 
-@pytest.mark.parametrize(
-    ("edit", "words"),
+@each_row(
+    "edit, words",
     [
         (("num_steps=40", "num_steps=0"), "num_steps"),
         (("x0=[0, 0]", "x0=[0, 0, 0]"), "expected shape (2,)"),
@@ -149,7 +150,7 @@ def test_ctrl_c_ends_the_run_with_the_best_motion_so_far(tmp_path):
     assert found.failures[0].code == "interrupted"
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.3, 1.0, 1.5])
+@each_row("delay", [0.0, 0.3, 1.0, 1.5])
 def test_a_killed_run_never_looks_finished(tmp_path, delay):
     running = start(script(tmp_path, num_steps=60), tmp_path)
     record = tmp_path / "artifacts" / "task" / "record.json"
@@ -213,8 +214,8 @@ def test_help_tells_all_defaults_and_no_text_is_taken_for_markup(monkeypatch, ca
             assert f"--{option}" in shown[command]
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
+@each_row(
+    "words, told",
     [
         (("certify", "PENDULUM", "--method", "magic"), "expected one of analytic"),
         (("certify", "PENDULUM", "--parameters", "hinge.damping, wind"), "got 'wind'"),

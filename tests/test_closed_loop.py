@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.loops import MASS, H
 from helpers.models import MODELS
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
@@ -57,8 +58,8 @@ def test_the_stability_limit_of_the_double_integrator_under_a_delay(cart, delay)
         assert (speeds[-50:].max() < speeds[50:100].max()) == stable
 
 
-@pytest.mark.parametrize("upright", [False, True])
-@pytest.mark.parametrize("limit", ["lower", "upper"])
+@each_row("upright", [False, True])
+@each_row("limit", ["lower", "upper"])
 def test_the_stability_limits_of_the_pendulum_under_a_delay_of_one_step(load, upright, limit):
     """Linearized about hanging (c = 1) or upright (c = -1), q from there, m = 1 kg, l = 0.5 m, I = m l^2, b = 0.1,
         w+ = s (w - h c (g / l) q + h u / I),  q+ = q + h w+,  s = 1 / (1 + h b / I),  u_k = -kp q_(k-1) - kd w_(k-1).
@@ -280,8 +281,8 @@ def test_latency_is_measured_and_changes_nothing(cart):
     assert np.array_equal(found.motion.xs, quick.motion.xs)
 
 
-@pytest.mark.parametrize(
-    ("make", "said"),
+@each_row(
+    "make, said",
     [
         (lambda: Sensor(delay=-1), "Sensor.delay"),
         (lambda: Sensor(every=0), "Sensor.every"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS
 from helpers.plants import block
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError
@@ -33,8 +34,8 @@ def collocate(problem, **options):
     return dd.solve(problem, method="collocation", scheme="drake", **options)
 
 
-@pytest.mark.parametrize("count", [2, 4, 10, 20])
-@pytest.mark.parametrize("solver", ["ipopt", "snopt"])
+@each_row("count", [2, 4, 10, 20])
+@each_row("solver", ["ipopt", "snopt"])
 def test_the_block_moves_by_the_transcriptions_own_optimum(count, solver):
     """Of Drake's scheme J = 12 / (1 - 2/N^2 + 4/(3 N^3)): linear inputs, the running cost by trapezoids."""
     solution = collocate(move(count), solver=solver)
@@ -155,7 +156,7 @@ def test_a_collocation_solver_that_lies_is_not_believed(monkeypatch):
     assert "is above 1e-05" in solution.message
 
 
-@pytest.mark.parametrize(("row", "column"), [(2, 1), (2, 3), (3, 1), (3, 3), (2, 4), (3, 4)])
+@each_row("row, column", [(2, 1), (2, 3), (3, 1), (3, 3), (2, 4), (3, 4)])
 def test_a_derivative_that_is_one_percent_off_is_named(row, column, monkeypatch):
     """Every entry of [A B] of the accelerations that is not zero by itself, the guess being a moving one."""
     from drake_diff.model.equations import EquationsOfMotion

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import GradientError, InputError, ShapeError
@@ -19,8 +20,8 @@ def test_values_and_jacobian_are_those_of_the_formula():
     assert c.excess(np.array([np.nan, 0.5]), np.array([2.0])) == np.inf
 
 
-@pytest.mark.parametrize(
-    ("knots", "takes_input", "given", "expected"),
+@each_row(
+    "knots, takes_input, given, expected",
     [
         (None, False, True, (1, 2, 3)),
         (None, False, False, (0, 1, 2, 3)),
@@ -35,14 +36,14 @@ def test_it_holds_at_these_knots_of_three_steps(knots, takes_input, given, expec
     assert Constraint(function, upper=1, knots=knots).at_knots(3, given) == expected
 
 
-@pytest.mark.parametrize("knots", [4, [-5], [], 1.5, ["a"], [[1]]])
+@each_row("knots", [4, [-5], [], 1.5, ["a"], [[1]]])
 def test_knots_that_are_none_are_refused(knots):
     with pytest.raises(InputError, match="expected whole numbers from -4 to 3"):
         Constraint(lambda x: x[0], upper=1, knots=knots).at_knots(3, True)
 
 
-@pytest.mark.parametrize(
-    ("fields", "match"),
+@each_row(
+    "fields, match",
     [
         ({}, "no lower and no upper"),
         ({"lower": 2, "upper": 1}, "lower at most upper"),

@@ -6,6 +6,7 @@ from itertools import combinations_with_replacement, product
 import numpy as np
 import pytest
 from helpers.models import Plant, contact_properties
+from helpers.table import each_row
 from pydrake.geometry import (
     AddCompliantHydroelasticProperties,
     AddCompliantHydroelasticPropertiesForHalfSpace,
@@ -423,8 +424,8 @@ def hydroelastic(shape, half_space):
     return properties
 
 
-@pytest.mark.parametrize("contact_model", ["point", "hydroelastic", "hydroelastic_with_fallback"])
-@pytest.mark.parametrize(("a", "b"), list(combinations_with_replacement(SHAPES, 2)))
+@each_row("contact_model", ["point", "hydroelastic", "hydroelastic_with_fallback"])
+@each_row("a, b", list(combinations_with_replacement(SHAPES, 2)))
 def test_autodiff_throws_where_the_table_says_so_and_nowhere_else(shapes, a, b, contact_model):
     supported = autodiff_supports(shapes[a], shapes[b], contact_model)
     assert autodiff_supports(shapes[b], shapes[a], contact_model) == supported
@@ -432,7 +433,7 @@ def test_autodiff_throws_where_the_table_says_so_and_nowhere_else(shapes, a, b, 
     assert step_throws(shapes[b], shapes[a], contact_model) is not supported
 
 
-@pytest.mark.parametrize("kind", SHAPES)
+@each_row("kind", SHAPES)
 def test_a_compliant_half_space_meets_no_compliant_body(shapes, kind):
     """Why the route hydroelastic makes half spaces rigid: not even the double step takes these."""
     for twin in TWINS:

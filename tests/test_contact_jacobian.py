@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.derivatives import analytic
@@ -186,7 +187,7 @@ def test_spheres_meet_moving_shapes(tmp_path, other):
     assert seen > 40
 
 
-@pytest.mark.parametrize("other", ["ground", "box", "capsule", "ball"])
+@each_row("other", ["ground", "box", "capsule", "ball"])
 def test_distances_and_normals_are_drakes(tmp_path, other):
     fixed = _collision("shape", SHAPES[other], "0.1 -0.2 0.05 0.4 -0.3 0.2")
     model = _load(tmp_path, fixed, _link("b", _sphere("probe", "0.01 0.02 0.03", 0.08)))
@@ -356,8 +357,8 @@ def _changed(solved, name, change):
 ARGUMENTS = ["velocity", "normal", "phi", "weight", "friction", "stiffness"]
 
 
-@pytest.mark.parametrize(
-    ("approximation", "name"),
+@each_row(
+    "approximation, name",
     [(a, n) for a in ("sap", "similar", "lagged") for n in ARGUMENTS]
     + [("sap", "time"), *((a, n) for a in ("similar", "lagged") for n in ("before", "dissipation"))],
 )

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers.models import Plant, contact_properties
+from helpers.table import each_row
 from pydrake.geometry import AddCompliantHydroelasticProperties, AddRigidHydroelasticProperties, Box
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import SpatialInertia
@@ -23,8 +24,8 @@ def pushed_ball(approximation, mu=MU):
     return plant.model()
 
 
-@pytest.mark.parametrize("approximation", ["sap", "similar", "lagged"])
-@pytest.mark.parametrize("mu", [0.3, 0.5])
+@each_row("approximation", ["sap", "similar", "lagged"])
+@each_row("mu", [0.3, 0.5])
 def test_a_push_below_the_friction_limit_sticks_and_one_above_slides(approximation, mu):
     """The limit is mu m g."""
     model, x = pushed_ball(approximation, mu), [0.0, REST, 0.0, 0.0]

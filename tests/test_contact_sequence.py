@@ -5,6 +5,7 @@ import signal
 import numpy as np
 import pytest
 from helpers.problems import push
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.model.soft_contact import separations
@@ -19,8 +20,8 @@ def separation(model, x):
     return separations(model.double)[0]
 
 
-@pytest.mark.parametrize(
-    ("name", "x"),
+@each_row(
+    "name, x",
     [
         ("two_spheres.sdf", [0.1, 0.5, 0, 0]),
         ("box_push.sdf", [0.1, 0.05, 0.3, -0.3, -0.02, 0, 0, 0, 0, 0]),
@@ -63,8 +64,8 @@ def test_beginnings_are_where_a_distance_turns_negative(two_spheres):
         assert rows[1] == pytest.approx(np.array([[-1.0, 1, 0, 0, 0]]), abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("gap", "goal", "fields"),
+@each_row(
+    "gap, goal, fields",
     [
         (0.15, 0.7, {"damping": 1.0, "ball": 1.2}),
         (0.3, 1.0, {}),

@@ -9,6 +9,7 @@ from math import cos, exp, log, radians, sin, sqrt
 import numpy as np
 import pytest
 from helpers.engines import needs
+from helpers.table import each_row
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -108,7 +109,7 @@ def test_the_restitution_of_a_damper_has_its_limits():
         assert linear_restitution(z) == pytest.approx(exp(-2), rel=1e-5)  # z = 1 to 1e-6, slope of order 1
 
 
-@pytest.mark.parametrize(("tau", "d"), [(0.0, 0.0), (2e-3, 0.0), (0.02, 0.0), (0.03, 0.0), (0.0, 0.3), (0.0, 2.0)])
+@each_row("tau, d", [(0.0, 0.0), (2e-3, 0.0), (0.02, 0.0), (0.03, 0.0), (0.0, 0.3), (0.0, 2.0)])
 def test_the_impact_without_gravity_has_the_restitution_of_the_closed_form(tau, d):
     case = replace(CASES["bounce"], gravity=1e-12)
     v, k = 0.7, case.stiffness
@@ -261,8 +262,8 @@ def doctored(case, engine="drake", contact=None, **changes):
     return load
 
 
-@pytest.mark.parametrize(
-    ("kind", "changes"),
+@each_row(
+    "kind, changes",
     [
         ("rest", {"stiffness": 1.001}),
         ("rest", {"gravity": 1.01}),
@@ -288,8 +289,8 @@ def test_a_doctored_engine_is_off(kind, changes):
     assert "%" in row.why or "m/s" in row.why
 
 
-@pytest.mark.parametrize(
-    ("kind", "changes"),
+@each_row(
+    "kind, changes",
     [
         ("rest", {"stiffness": 1.001}),
         ("stop", {"friction": 1.1}),

@@ -6,6 +6,7 @@ import signal
 import numpy as np
 import pytest
 from helpers.problems import FREE, push
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
@@ -123,7 +124,7 @@ def test_ctrl_c_ends_all_stages(two_spheres):
     assert signal.getsignal(signal.SIGINT) is before
 
 
-@pytest.mark.parametrize("wrong", ["soft", 0.1, [], [0.1], (dd.model.SoftContact(0.1, 1.0), None)])
+@each_row("wrong", ["soft", 0.1, [], [0.1], (dd.model.SoftContact(0.1, 1.0), None)])
 def test_a_schedule_that_is_none_is_refused(two_spheres, wrong):
     with pytest.raises(InputError, match="continuation"):
         dd.solve(push(two_spheres(), gap=0.4, goal=1.0), continuation=wrong)

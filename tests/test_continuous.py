@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS, random_state
 from helpers.plants import pd_pendulum
+from helpers.table import each_row
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
@@ -45,7 +46,7 @@ def test_the_damped_pendulum(load, q, w, u):
 NAMES = ("cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "mass_spring_damper.sdf", "projectile.sdf")
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each_row("name", NAMES)
 def test_values_and_derivatives_are_those_of_drakes_continuous_plant(load, name):
     model, random = load(name), np.random.default_rng(0)
     plant = MultibodyPlant(0.0)

@@ -8,6 +8,7 @@ import pytest
 from helpers.contracts import CHANGES, FOLLOWS, arms, different
 from helpers.engines import engine_of
 from helpers.models import MODELS
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.engines.closed_form import CartPole, DoublePendulum, MassSpringDamper, NumpyEngine, Pendulum
@@ -54,7 +55,7 @@ HAND = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("change", HAND)
+@each_row("change", HAND)
 def test_a_change_of_a_hand_calculation_is_found_and_named(load, change):
     file, form, quantities = HAND[change]
     drake = dd.engines.load_engine("drake", load(file))
@@ -122,7 +123,7 @@ def test_a_users_own_mjcf_is_mapped_by_name_and_its_gear_is_found(tmp_path):
         )
 
 
-@pytest.mark.parametrize(("old", "new", "said"), [
+@each_row("old, new, said", [
     ("Euler", "implicitfast", None), ("Euler", "implicit", "IMPLICIT, joint damping implicit"),
     ("Euler", "RK4", "RK4, joint damping explicit"),
     ('warmstart="disable"', 'eulerdamp="disable"', "EULER, joint damping explicit"),
@@ -137,7 +138,7 @@ def test_the_integrators_step_is_drakes_exactly_where_the_contract_says_so(tmp_p
     assert gap < 1e-13 if said is None else gap > 1e-7
 
 
-@pytest.mark.parametrize(("old", "new", "said"), [
+@each_row("old, new, said", [
     ('armature=', 'frictionloss="0.1" armature=', "friction loss"), ("<option ", '<option density="1.2" ', "a fluid"),
     ('warmstart=', 'gravity="disable" warmstart=', "disabled parts"),
     ("<contact", '<equality><joint joint1="left_joint_1"/></equality><contact', "equality constraints"),

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers.engines import engine_of
+from helpers.table import each_row
 
 import drake_diff as dd
 
@@ -16,8 +17,8 @@ def linearized(engine, model):
     return engine.differentiate_step(x, np.zeros(model.nu))
 
 
-@pytest.mark.parametrize("name", ENGINES)
-def test_the_poles_of_a_mass_on_a_spring_a10(load, name):
+@each_row("name", ENGINES)
+def test_the_poles_of_a_mass_on_a_spring(load, name):
     """M v' = M v - h (k q + d v'), q' = q + h v': poles of det (z^2 (1 + h d/m) - z (2 + h d/m - h^2 k/m) + 1) = 0."""
     model = load("mass_spring_damper.sdf", time_step=H)
     A, B, _ = linearized(engine_of(name, model), model)
@@ -29,9 +30,9 @@ def test_the_poles_of_a_mass_on_a_spring_a10(load, name):
     np.testing.assert_allclose(np.sort_complex(poles), np.sort_complex(expected), atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ENGINES)
+@each_row("name", ENGINES)
 def test_the_poles_of_a_hanging_pendulum(load, name):
-    """With w^2 = m g l / J the free pendulum is the oscillator of A10; friction as above."""
+    """With w^2 = m g l / J the free pendulum is the oscillator above, damped as there."""
     model = load("pendulum.urdf", time_step=H)
     engine = engine_of(name, model)
     A, B, _ = linearized(engine, model)
@@ -45,7 +46,7 @@ def test_the_poles_of_a_hanging_pendulum(load, name):
     np.testing.assert_allclose(np.sort_complex(poles), np.sort_complex(expected), atol=1e-8)
 
 
-@pytest.mark.parametrize("name", ENGINES)
+@each_row("name", ENGINES)
 def test_the_lqr_gain_of_the_cart_pole_upright(load, name):
     """python-control's gain solves the Riccati equation for each engine's A and B, balances, and is the same in all."""
     model = load("cart_pole.urdf", time_step=H)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.table import each_row
 from pydrake.autodiffutils import InitializeAutoDiff
 
 import drake_diff as dd
@@ -111,8 +112,8 @@ def test_a_semidefinite_weight_is_allowed():
     assert dd.QuadraticCost(Q=[[1.0, 1.0], [1.0, 1.0]])(np.array([1.0, -1.0])) == 0.0
 
 
-@pytest.mark.parametrize(
-    ("fields", "words"),
+@each_row(
+    "fields, words",
     [
         ({"R": [[1.0, 1e-6], [0.0, 1.0]]}, "R: expected a symmetric matrix, got a matrix that is not"),
         ({"R": [[1.0, 2.0], [2.0, 1.0]]}, "R: expected a positive semidefinite matrix, got lowest eigenvalue -1"),
@@ -128,8 +129,8 @@ def test_a_bad_weight_or_reference_is_named(fields, words):
         dd.QuadraticCost(**fields)
 
 
-@pytest.mark.parametrize(
-    ("cost", "words"),
+@each_row(
+    "cost, words",
     [
         (lambda x, u: 1.0, "lost its derivatives"),
         (lambda x, u: x[0].value(), "lost its derivatives"),

@@ -19,6 +19,7 @@ from helpers.engines import (
 from helpers.forward_formula import free_box
 from helpers.models import Plant, contact_properties, random_state, robot
 from helpers.plants import block_on_rails, pd_pendulum, tetrahedron_on_ground
+from helpers.table import each_row
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
@@ -135,7 +136,7 @@ def test_a_dissipating_ground_holds_and_lets_go():
     np.testing.assert_allclose(engine.differentiate_step([0.097, 0.4], []).A[1], [0, 1], atol=1e-15)
 
 
-@pytest.mark.parametrize(("u", "v0", "v", "by_v0", "by_u"), [
+@each_row("u, v0, v, by_v0, by_u", [
     (0, 1, 0.9509500002712, 0.99999999943, None), (2, 0, 4.453632360759e-5, None, 2.66732351568e-5),
     (4.9, 0, 6.055159639138e-4, None, 3.20313813328e-3), (6, 0, 0.01095204452046, None, 9.996268039878e-3),
 ])  # fmt: skip
@@ -165,7 +166,7 @@ def test_a_block_stops_on_the_flat_and_slides_down_a_slope():
     np.testing.assert_allclose(x, [1.2996994024252, 2.0914415968662], rtol=1e-8)  # less friction by (s / v)^2 / 2
 
 
-@pytest.mark.parametrize("form", [*BY_MODEL.values(), SphereOnGround(relaxation_time=0.01), SlidingBlock()])
+@each_row("form", [*BY_MODEL.values(), SphereOnGround(relaxation_time=0.01), SlidingBlock()])
 def test_hand_jacobians_are_those_of_the_hand_steps(form):
     engine, random = NumpyEngine(form, time_step=0.01), np.random.default_rng(1)
     nx, nu = engine.nq + engine.nv, len(form.input_names)
@@ -182,23 +183,23 @@ def test_hand_jacobians_are_those_of_the_hand_steps(form):
 # ---- free motion, engine against engine ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("file", HAND)
+@each_row("file", HAND)
 def test_the_hand_calculation_is_drake(load, file):
     assert_free_steps_agree(load(file), "numpy", 1e-13, 1e-12)  # a few roundings
 
 
-@pytest.mark.parametrize("file", HERE)
+@each_row("file", HERE)
 def test_pinocchio_is_drake(load, file):
     assert_free_steps_agree(load(file), "pinocchio", 1e-12, 1e-12)
 
 
-@pytest.mark.parametrize("file", [f for f in HERE if f != "projectile.sdf"])
+@each_row("file", [f for f in HERE if f != "projectile.sdf"])
 def test_mujoco_is_drake_where_no_body_is_free(load, file):
     # 1e-10: the Jacobian is of differences; the step is good to 1e-14, and to 1e-12 on inertias of 2e-15 for 0.
     assert_free_steps_agree(load(file), "mujoco", 1e-12, 1e-10)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@each_row("name", ROBOTS)
 def test_pinocchio_is_drake_on_robots(tmp_path, name):
     assert_free_steps_agree(robot(name, tmp_path), "pinocchio", 1e-12, 1e-12, states=2)
 
@@ -235,8 +236,8 @@ def test_a_swapped_quaternion_or_velocity_frame_is_found(load, monkeypatch, name
 # ---- Drake's own variants, contact, refusals -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("contact", ["sap", "similar", "lagged"])
-@pytest.mark.parametrize("method", ["autodiff", "implicit", "finite_difference"])
+@each_row("contact", ["sap", "similar", "lagged"])
+@each_row("method", ["autodiff", "implicit", "finite_difference"])
 def test_drake_is_the_hand_calculation_in_every_variant(load, contact, method):
     drake = dd.engines.load_engine("drake", load("pendulum.urdf"), contact=contact, method=method)
     hand = NumpyEngine(Pendulum(), time_step=0.01)
@@ -246,7 +247,7 @@ def test_drake_is_the_hand_calculation_in_every_variant(load, contact, method):
     np.testing.assert_allclose(one.A, two.A, rtol=0, atol=1e-9)  # differences: rounding over a step of 1e-5
 
 
-@pytest.mark.parametrize(("contact", "relaxation"), [("lagged", 0.0), ("similar", 0.0), ("sap", 0.0), ("sap", 0.02)])
+@each_row("contact, relaxation", [("lagged", 0.0), ("similar", 0.0), ("sap", 0.0), ("sap", 0.02)])
 def test_the_hand_calculation_of_landing_is_drake(contact, relaxation):
     plant = Plant(0.005, contact)
     plant.ball("ball", 1.0, 0.1, contact_properties(1e4, relaxation_time=relaxation / 2), "z")
@@ -357,7 +358,7 @@ def test_effort_limits_cut_and_the_derivative_is_zero_there(load):
         assert np.abs(engine.differentiate_step(x, u).B).max() == 0
 
 
-@pytest.mark.parametrize("name", ["numpy", "drake", "pinocchio", "casadi", "mujoco", "mjx"])
+@each_row("name", ["numpy", "drake", "pinocchio", "casadi", "mujoco", "mjx"])
 def test_bad_input_is_named(load, name):
     engine = engine_of(name, load("pendulum.urdf"))
     with pytest.raises(ShapeError, match="x"):
@@ -447,8 +448,8 @@ def refused(kind):
     return plant.model()
 
 
-@pytest.mark.parametrize("kind", ["universal", "PD gains", "locked", "damped", "gravity is off"])
-@pytest.mark.parametrize("name", ["pinocchio", "casadi", "mujoco", "mjx"])
+@each_row("kind", ["universal", "PD gains", "locked", "damped", "gravity is off"])
+@each_row("name", ["pinocchio", "casadi", "mujoco", "mjx"])
 def test_a_model_that_other_engines_would_simulate_otherwise_is_refused(name, kind):
     model = refused(kind)
     with pytest.raises(ModelError, match=kind):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import ModelWarning
@@ -22,7 +23,9 @@ def example(name):
 
 
 def test_the_cart_pole_swings_up_near_the_continuous_optimum():
-    """The continuous optimum is 58.8077 (ORACLES B02); semi-implicit Euler is first order: 1% at h = 0.02 s."""
+    """From u = 0 it leads to the local optimum whose cost without time steps is 58.8077 N^2 s (Hermite-Simpson at 50
+    and 100 intervals agree on it); another of 57.9448 is known. Semi-implicit Euler is first order: 1% at h = 0.02 s.
+    """
     module = example("cart_pole_swing_up")
     solution = dd.solve(module.problem(), **module.solve_options)
     assert solution.success, solution.message
@@ -30,7 +33,7 @@ def test_the_cart_pole_swings_up_near_the_continuous_optimum():
     assert np.abs(solution.replay.xs[-1] - [1, np.pi, 0, 0]).max() < 1e-8  # the simulator itself arrives
 
 
-@pytest.mark.parametrize("vx", [0.3, 1.0, 2.0, 3.7])
+@each_row("vx", [0.3, 1.0, 2.0, 3.7])
 def test_the_projectiles_three_gradients_agree(vx):
     """By hand d loss / d vx = (x_T - 6) * 3.0 with x_T = 3 vx."""
     module = example("projectile_hits_target")

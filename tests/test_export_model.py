@@ -10,6 +10,7 @@ import pytest
 from helpers.contracts import arms
 from helpers.engines import engine_of, needs
 from helpers.models import robot
+from helpers.table import each_row
 from typer.testing import CliRunner
 
 import drake_diff as dd
@@ -35,7 +36,7 @@ def rows_of(path):
         return list(csv.reader(file))
 
 
-@pytest.mark.parametrize("target", list(MODEL_FILE))
+@each_row("target", list(MODEL_FILE))
 def test_the_written_file_steps_as_the_hand_calculation_does(load, tmp_path, target):
     """m l^2 (v' - v) = h (u - m g l sin q - b v'): 1 kg at 0.5 m, b = 0.1 N m s, from the file alone."""
     files = export_model(load("pendulum.urdf"), tmp_path / "out", target=target, states=3)
@@ -163,8 +164,8 @@ def wrong_file(form):
     return lambda monkeypatch: monkeypatch.setattr(checks, "written", wrong)
 
 
-@pytest.mark.parametrize(
-    ("fault", "named"),
+@each_row(
+    "fault, named",
     [
         (wrong_length, "'pendulum: step' failed: Drake is .* 1e-12 is allowed"),
         (wrong_gravity, "'projectile: step' failed"),

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.browser import browsing
+from helpers.table import each_row
 from typer.testing import CliRunner
 
 import drake_diff as dd
@@ -138,8 +139,8 @@ def test_a_mass_on_a_slide_has_the_closed_form_of_its_recursion():
     assert not any(q.biased for q in found.qualities)
 
 
-@pytest.mark.parametrize(
-    ("theta", "value", "gradient", "bias"),
+@each_row(
+    "theta, value, gradient, bias",
     [
         (0.3, -0.00307709811, -0.01115833969, 0.0),
         (0.6, -0.00380439500, -0.00923031040, 0.00904499591),
@@ -228,7 +229,7 @@ def test_a_long_chaotic_horizon_makes_first_order_vary_and_zeroth_hardly():
     assert short[0] < short[1]
 
 
-@pytest.mark.parametrize("name", CASES)
+@each_row("name", CASES)
 def test_the_derivative_of_every_case_is_that_of_its_loss(name):
     """Away from jumps, by central differences; of the stiff contact, which SAP solves to 1e-6, in flight."""
     case = CASES[name]()
@@ -288,8 +289,8 @@ def test_the_page_needs_no_motion_to_draw_its_plots(tmp_path, browser):
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
+@each_row(
+    "changes, message",
     [
         ({"cases": []}, "cases: expected at least one"),
         ({"cases": ["cliff"]}, "one of bounce_k1e3"),
@@ -310,9 +311,7 @@ def test_bad_input_is_refused(changes, message):
         dd.studies.gradient_panel(**({"cases": [QUADRATIC]} | changes))
 
 
-@pytest.mark.parametrize(
-    "changes", [{"start": [np.nan]}, {"start": 1.0}, {"sigmas": ()}, {"rate": 0.0}, {"goal": float("nan")}]
-)
+@each_row("changes", [{"start": [np.nan]}, {"start": 1.0}, {"sigmas": ()}, {"rate": 0.0}, {"goal": float("nan")}])
 def test_a_case_that_cannot_be_is_refused(changes):
     with pytest.raises(InputError, match=f"quadratic.{next(iter(changes))}"):
         replace(QUADRATIC, **changes)

@@ -11,6 +11,7 @@ import pytest
 from helpers.models import MODELS
 from helpers.plants import block, craft, tilted
 from helpers.problems import DOUBLE_INTEGRATOR, OTHERS, lqr, pendulum, riccati
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
@@ -24,9 +25,9 @@ from drake_diff.optimize.solution import Status
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
-@pytest.mark.parametrize("case", OTHERS)
-@pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize("infeasible", [False, True])
+@each_row("case", OTHERS)
+@each_row("seed", [0, 1, 2])
+@each_row("infeasible", [False, True])
 def test_one_step_from_any_guess_is_the_riccati_recursions_optimum(case, seed, infeasible):
     """1e-12 relative: a sum of a few hundred rounded terms."""
     problem = lqr(*case, x0=(1.0, -0.5))
@@ -433,7 +434,7 @@ def test_swing_ups_from_random_inputs_reach_the_goal_or_say_that_they_do_not():
     assert reached >= 18
 
 
-@pytest.mark.parametrize("seed", range(5))
+@each_row("seed", range(5))
 def test_the_box_newton_step_satisfies_the_conditions_of_an_optimum(seed):
     random = np.random.default_rng(seed)
     root = random.standard_normal((5, 5))

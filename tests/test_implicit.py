@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS, Plant, add_slide, contact_properties, random_state, robot_file
 from helpers.plants import POINT, floating, in_the_air, limited_pendulum, springs_and_motors
+from helpers.table import each_row
 from pydrake.common.value import Value
 from pydrake.geometry import Box
 from pydrake.math import RigidTransform
@@ -60,8 +61,8 @@ def same_by_both(model, x, u=(), parameters=None, expected="implicit"):
     return found["implicit"]
 
 
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("seed", range(3))
+@each_row("name", NAMES)
+@each_row("seed", range(3))
 def test_every_model_of_this_repository(load, name, seed):
     model, random = load(name), np.random.default_rng(seed)
     x = in_the_air(model, random_state(model, random, 0.7))
@@ -76,8 +77,8 @@ def test_every_contact_approximation(load, approximation):
     same_by_both(model, [0.4, -0.9, 1.3, -0.6], [0.25, -0.15])
 
 
-@pytest.mark.parametrize(
-    ("name", "base"),
+@each_row(
+    "name, base",
     [("panda.urdf", "panda_link0"), ("ur5_robot.urdf", None), ("solo12.urdf", None), ("solo12.urdf", "base_link")],
 )
 def test_real_robots(tmp_path, name, base):
@@ -107,8 +108,8 @@ def test_a_real_robot_with_coupled_fingers_is_handed_over():
     assert dd.step(model, model.default_state, np.zeros(model.nu)) == pytest.approx(d.x_next, abs=0)
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("joint_type", [None, QuaternionFloatingJoint, RpyFloatingJoint, UniversalJoint])
+@each_row("seed", range(3))
+@each_row("joint_type", [None, QuaternionFloatingJoint, RpyFloatingJoint, UniversalJoint])
 def test_floating_bases_and_joints_of_many_degrees(joint_type, seed):
     model, random = floating(joint_type, seed), np.random.default_rng(seed)
     same_by_both(model, random_state(model, random, 0.5), random.standard_normal(1))
@@ -130,8 +131,8 @@ def test_a_quaternion_that_is_not_of_unit_norm():
     same_by_both(model, x, [0.2])
 
 
-@pytest.mark.parametrize("damping", [0.0, 0.2, 50.0])
-@pytest.mark.parametrize("gear", [1.0, -12.0])
+@each_row("damping", [0.0, 0.2, 50.0])
+@each_row("gear", [1.0, -12.0])
 def test_springs_damping_and_reflected_inertia(damping, gear):
     same_by_both(springs_and_motors(damping=damping, gear=gear), *POINT)
 
@@ -142,8 +143,8 @@ def test_pd_control_of_some_or_all_joints(kp):
     assert not np.allclose(d.A, dd.differentiate_step(springs_and_motors(), *POINT).A, atol=1e-3)
 
 
-@pytest.mark.parametrize("kp", [(0.0, 0.0, 0.0), (20.0, 5.0, 8.0), (0.0, 300.0, 200.0)])
-@pytest.mark.parametrize("u", [[30.0, -0.3, -0.2], [0.4, 900.0, -900.0], [-30.0, -900.0, 900.0]])
+@each_row("kp", [(0.0, 0.0, 0.0), (20.0, 5.0, 8.0), (0.0, 300.0, 200.0)])
+@each_row("u", [[30.0, -0.3, -0.2], [0.4, 900.0, -900.0], [-30.0, -900.0, 900.0]])
 def test_efforts_at_their_limits(kp, u):
     """A saturated input has no effect, and its controller adds neither stiffness nor damping."""
     model = springs_and_motors(limit=3.0, kp=kp)
@@ -205,7 +206,7 @@ def constrained(kind):
     return made.model()
 
 
-@pytest.mark.parametrize("kind", ["coupler", "distance", "ball", "weld"])
+@each_row("kind", ["coupler", "distance", "ball", "weld"])
 def test_constraints_are_handed_over(kind):
     model = constrained(kind)
     d = same_by_both(model, [0.3, 0.05, 0.2, -0.1], [0.4], parameters=("one.mass",), expected="autodiff")
@@ -349,7 +350,7 @@ def test_a_delay_changes_nothing_about_the_choice(load, without_pinocchio, monke
     assert delays  # it was asked
 
 
-@pytest.mark.parametrize("method", METHODS[1:])
+@each_row("method", METHODS[1:])
 def test_every_method_is_named_where_one_is_unknown(load, method):
     with pytest.raises(UnknownNameError, match=method):
         dd.differentiate_step(load("pendulum.urdf"), [0.1, 0.0], [0.0], method="guess")
@@ -379,7 +380,7 @@ def test_a_choice_made_without_parameters_holds_with_them(load):
     assert d.C[1] == pytest.approx([by_stiffness, by_rest, s * 0.01, 0, 0], rel=1e-9, abs=1e-14)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@each_row("seed", range(4))
 def test_values_given_by_mapping_are_differentiated_where_they_are(seed):
     model, random = springs_and_motors(kp=(0.0, 20.0, 0.0), gear=3.0), np.random.default_rng(seed)
     values = {}

@@ -7,6 +7,7 @@ import pytest
 from helpers.engines import ROBOTS, G, free_state
 from helpers.models import MODELS, random_state, robot
 from helpers.plants import POINT, floating, in_the_air, limited_pendulum, springs_and_motors
+from helpers.table import each_row
 from pydrake.multibody.tree import RpyFloatingJoint
 
 import drake_diff as dd
@@ -66,7 +67,7 @@ def test_a_thrown_body(load):
 # ---- AutoDiffXd ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each_row("name", NAMES)
 def test_every_model_of_this_repository(load, name):
     model, random = load(name), np.random.default_rng(5)
     xs = np.array([in_the_air(model, random_state(model, random, 0.7)) for _ in range(4)])
@@ -76,7 +77,7 @@ def test_every_model_of_this_repository(load, name):
     assert all(np.array_equal(a, b) for a, b in zip(free, equal(model, xs, us, x_next=known), strict=True))
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@each_row("name", ROBOTS)
 def test_real_robots(tmp_path, name):
     model, random = robot(name, tmp_path), np.random.default_rng(5)
     xs = np.array([free_state(model, random) for _ in range(3)])
@@ -96,7 +97,7 @@ def test_a_free_body_with_a_sprung_arm_turned_by_a_quaternion_of_any_norm(seed):
     np.testing.assert_allclose(d.A, by_differences.A, atol=1e-7)  # central differences with step 1e-5
 
 
-@pytest.mark.parametrize("kp", [(0.0, 0.0, 0.0), (20.0, 5.0, 8.0), (0.0, 30.0, 0.0), (3000.0, 900.0, 400.0)])
+@each_row("kp", [(0.0, 0.0, 0.0), (20.0, 5.0, 8.0), (0.0, 30.0, 0.0), (3000.0, 900.0, 400.0)])
 def test_springs_damping_gears_and_pd_control(kp):
     model = springs_and_motors(kp=kp, gear=-12.0)
     equal(model, np.array([POINT[0], np.zeros(6)]), np.array([POINT[1], [1.0, 2.0, 3.0]]))
@@ -238,8 +239,8 @@ def test_without_pinocchio_the_others_serve(load, without_pinocchio):
     assert "pip install 'drake-diff" in dd.differentiate_step(model, xs[0], us[0], method="analytic").reason
 
 
-@pytest.mark.parametrize(
-    ("xs", "us", "wanted"),
+@each_row(
+    "xs, us, wanted",
     [
         (np.zeros((4, 2)), np.zeros((2, 1)), r"xs: expected shape \(2 or 3, 2\)"),
         (np.zeros((2, 3)), np.zeros((2, 1)), r"xs: expected shape \(N, 2\)"),

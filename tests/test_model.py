@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 import pytest
 from helpers.models import MODELS, Plant, add_slide, contact_properties, robot_file
+from helpers.table import each_row
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.planning import RobotDiagramBuilder
@@ -25,7 +26,7 @@ def test_there_is_a_model_of_each_format():
     assert len(NAMES) == 11
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each_row("name", NAMES)
 def test_every_model_loads_without_a_warning_and_steps_and_differentiates(load, name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -94,8 +95,8 @@ def test_a_base_can_be_welded(load):
         load("projectile.sdf", weld_base="ball")
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "words"),
+@each_row(
+    "options, error, words",
     [
         ({"time_step": 0}, InputError, "time_step .*above 0, got 0"),
         ({"time_step": -0.01}, InputError, "time_step"),
@@ -206,7 +207,7 @@ BAD_FILES = {
 
 
 @pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
-@pytest.mark.parametrize("name", BAD_FILES)
+@each_row("name", BAD_FILES)
 def test_a_file_that_is_no_robot_is_refused_with_its_name_and_what_was_got(tmp_path, name):
     content, words = BAD_FILES[name]
     (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -222,8 +223,8 @@ def test_the_files_that_the_bad_ones_are_made_of_are_good(tmp_path, text):
     assert dd.load_model(tmp_path / name, time_step=0.01).nv in (1, 6, 7)
 
 
-@pytest.mark.parametrize(
-    ("path", "words"),
+@each_row(
+    "path, words",
     [
         ("missing.urdf", "expected a file that exists, got .*missing.urdf"),
         (".", "expected a file that exists, got a directory"),
@@ -282,8 +283,8 @@ def diagram_with(time_step=0.01, *, sampled=False, plants=1, drive=False):
     return builder.Build()
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
+@each_row(
+    "options, words",
     [
         ({"time_step": 0.0}, "continuous"),
         ({"sampled": True}, "use_sampled_output_ports=False"),

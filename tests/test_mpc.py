@@ -6,6 +6,7 @@ from helpers.loops import tracking
 from helpers.models import MODELS
 from helpers.plants import block
 from helpers.problems import DOUBLE_INTEGRATOR, OTHERS, lqr, riccati
+from helpers.table import each_row
 from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 
 import drake_diff as dd
@@ -31,8 +32,8 @@ def swung():
     return dd.solve(swing_up())
 
 
-@pytest.mark.parametrize("case", OTHERS)
-@pytest.mark.parametrize("horizon", [1, 4, 1000])
+@each_row("case", OTHERS)
+@each_row("horizon", [1, 4, 1000])
 def test_it_is_the_remaining_horizons_lqr_whatever_its_own_horizon(case, horizon):
     """From states far from any plan; 1e-9 of an input of about 5: the sums of a few dozen rounded terms."""
     problem, gains = lqr(*case), riccati(*case)[1]
@@ -172,8 +173,8 @@ def test_ctrl_c_is_no_bad_solve(swung, monkeypatch):
         mpc(np.zeros(4), 0.0)
 
 
-@pytest.mark.parametrize(
-    ("changes", "options", "said"),
+@each_row(
+    "changes, options, said",
     [
         ({}, {"horizon": 0}, "horizon"),
         ({}, {"replan_every": 0}, "replan_every"),

@@ -5,6 +5,7 @@ import pytest
 from helpers.models import MODELS
 from helpers.plants import block
 from helpers.problems import DOUBLE_INTEGRATOR, lqr
+from helpers.table import each_row
 from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 
 import drake_diff as dd
@@ -26,7 +27,7 @@ def pendulum(**changes):
     return dd.Problem(dd.load_model(MODELS / "pendulum.urdf", time_step=0.02), **fields)
 
 
-@pytest.mark.parametrize(("solver", "segments"), [("ipopt", 2), ("ipopt", 7), ("snopt", 20), ("ipopt", 100)])
+@each_row("solver, segments", [("ipopt", 2), ("ipopt", 7), ("snopt", 20), ("ipopt", 100)])
 def test_a_pendulum_swings_up_with_the_oracles_cost(solver, segments):
     """J = 8.826541704941 by an independent program; 100 segments are direct transcription. The goal is met to 1e-8."""
     solution = shoot(pendulum(), solver=solver, segments=segments)
@@ -37,8 +38,8 @@ def test_a_pendulum_swings_up_with_the_oracles_cost(solver, segments):
     assert len(solution.gradient_norms) == 101
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("segments", [1, 3, 20])
+@each_row("solver", SOLVERS)
+@each_row("segments", [1, 3, 20])
 def test_lqr_has_the_riccati_recursions_cost_from_states_that_are_no_rollout(solver, segments):
     """The double integrator; the cost is flat at its minimum, but for the defects, which are met to 1e-8."""
     problem = lqr(*DOUBLE_INTEGRATOR)
@@ -66,8 +67,8 @@ def test_an_acrobot_swings_up_from_rest_where_one_segment_fails():
     assert solution.defect < 1e-7
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("segments", [1, 4])
+@each_row("solver", SOLVERS)
+@each_row("segments", [1, 4])
 def test_a_mass_is_chosen_together_with_the_inputs(solver, segments):
     """The effort 12 m^2 / (1 - 1 / N^2) is least for the least mass allowed, 0.5 kg, in every segment."""
     problem = dd.Problem(
@@ -172,8 +173,8 @@ def test_a_goal_that_nothing_moves_is_found_before_it_runs():
     assert "whose goal is not reached" in solution.message
 
 
-@pytest.mark.parametrize(
-    ("changes", "options", "words"),
+@each_row(
+    "changes, options, words",
     [
         ({}, {"method": "ilqr", "segments": 2}, 'segments: expected 1 for method="ilqr", got 2'),
         ({}, {"segments": 101}, "at most num_steps, 100, got 101"),

@@ -6,6 +6,7 @@ import threading
 
 import numpy as np
 import pytest
+from helpers.table import each_row
 from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver
 
 from drake_diff.exceptions import GradientError, MissingDependencyError, SimulationError, UnknownNameError
@@ -135,9 +136,9 @@ def test_a_solve_works_outside_the_main_thread(solver):
     assert found[0].z == pytest.approx([1, -2], abs=1e-6)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize(
-    ("error", "outcome"),
+@each_row("solver", SOLVERS)
+@each_row(
+    "error, outcome",
     [(SimulationError, Outcome.DIVERGED), (GradientError, Outcome.NO_GRADIENT)],
 )
 def test_a_refusal_inside_the_callback_is_told_in_its_own_words(solver, error, outcome):

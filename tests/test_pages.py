@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from helpers.browser import browsing, errors
 from helpers.models import MODELS
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.artifact.live import scene_of_run
@@ -91,7 +92,7 @@ def is_harmless(page):
     return len(scripts) == 4 and not pictures and not any(a.startswith("on") for _, x in found for a in x)
 
 
-@pytest.mark.parametrize("name", PAGES)
+@each_row("name", PAGES)
 def test_no_text_becomes_an_element(pages, name):
     page = pages[name].read_text()
     assert is_harmless(page)
@@ -110,7 +111,7 @@ def test_an_element_that_got_into_a_page_is_noticed(pages):
 
 
 @browsing
-@pytest.mark.parametrize("name", PAGES)
+@each_row("name", PAGES)
 def test_a_hostile_name_is_read_and_not_run(pages, browser, name):
     from selenium.webdriver.support.ui import WebDriverWait
 
@@ -126,7 +127,7 @@ def test_a_hostile_name_is_read_and_not_run(pages, browser, name):
 
 
 @browsing
-@pytest.mark.parametrize("name", PAGES)
+@each_row("name", PAGES)
 def test_a_script_that_was_put_into_a_page_is_refused(pages, browser, tmp_path, name):
     page = tmp_path / "page.html"
     page.write_text(pages[name].read_text().replace("</header>", "</header><script>document.title = 'x'</script>", 1))

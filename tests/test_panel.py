@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff._base.statistics import success_rate
@@ -364,8 +365,8 @@ def test_an_exception_is_a_row_and_exit_status_1(write, tmp_path):
     assert [cell["errors"] for cell in summary["cells"]] == [0, 0, 1, 0, 0]
 
 
-@pytest.mark.parametrize(
-    ("answer", "row"),
+@each_row(
+    "answer, row",
     [
         ({"a": math.nan, "b": -math.inf, "c": np.float64(0.1)}, {"a": None, "b": None, "c": 0.1}),
         ({"a": np.bool_(True), "b": np.arange(2), "c": (1, {"d": math.nan})}, {"a": True, "b": [0, 1],
@@ -420,8 +421,8 @@ def test_cells_stand_beside_the_axes(tmp_path):
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
+@each_row(
+    "text, message",
     [
         ("evaluate =", "expected a panel in TOML, got TOMLDecodeError"),
         ("[axes]\nx = [1]", "expected the fields evaluate, seed, seeds, axes, fixed, cells, got no evaluate"),

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from helpers.models import MODELS, Plant, add_slide, contact_properties, random_state
+from helpers.table import each_row
 from pydrake.geometry import (
     AddCompliantHydroelasticProperties,
     AddRigidHydroelasticProperties,
@@ -262,8 +263,8 @@ def test_beside_an_inertia_the_mass_no_longer_moves_it(h, q, w, u):
         assert d.C[1, d.parameters.index("pole.mass")] == pytest.approx(by_mass, rel=SMOOTH)
 
 
-@pytest.mark.parametrize(("k", "rest"), [(20.0, 0.3), (0.0, -1.0), (150.0, 2.0)])
-@pytest.mark.parametrize(("h", "q", "w", "u"), PENDULA)
+@each_row("k, rest", [(20.0, 0.3), (0.0, -1.0), (150.0, 2.0)])
+@each_row("h, q, w, u", PENDULA)
 def test_a_pendulum_by_its_spring(h, q, w, u, k, rest):
     """(I + h b) w+ = I w + h (u - m g l sin q - k (q - rest))."""
     whole, b = 0.2 + 1.4 * 0.25, 0.3
@@ -331,10 +332,10 @@ def rotation(q):
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
 
 
-@pytest.mark.parametrize(
+@each_row(
     "central", [(0.2, 0.3, 0.4, 0.0, 0.0, 0.0), (1.0, 1.1, 0.9, 0.1, -0.2, 0.05), (0.02, 0.03, 0.025, 0.004, 0, 0.001)]
 )
-@pytest.mark.parametrize("seed", range(3))
+@each_row("seed", range(3))
 def test_a_spinning_body_by_its_inertia(seed, central):
     """Euler: w+ = w - h I^-1 (w x I w); by an entry E of I: h I^-1 (E I^-1 (w x I w) - w x E w), in the body."""
     random, h = np.random.default_rng(seed), 0.01
@@ -359,8 +360,8 @@ def test_a_spinning_body_by_its_inertia(seed, central):
     assert d.C[10:] == pytest.approx(0, abs=1e-12)  # a free fall knows no inertia
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("offset", [(0.0, 0.0, -0.8), (0.3, 0.1, -0.5), (0.0, 0.0, 0.0)])
+@each_row("seed", range(3))
+@each_row("offset", [(0.0, 0.0, -0.8), (0.3, 0.1, -0.5), (0.0, 0.0, 0.0)])
 def test_a_double_pendulum_by_its_link_length(seed, offset):
     """With the elbow at (ox, oy, oz) of the upper rod: M, bias and G are polynomials in ox and oz."""
     random, h = np.random.default_rng(seed), 0.005
@@ -407,8 +408,8 @@ def rod(mass, length):
     return SpatialInertia.MakeFromCentralInertia(mass, com, RotationalInertia(across, across, 0.0))
 
 
-@pytest.mark.parametrize(("p", "d"), [(20.0, 3.0), (400.0, 0.5), (3.0, 10.0)])
-@pytest.mark.parametrize(("h", "q", "w", "u"), PENDULA)
+@each_row("p, d", [(20.0, 3.0), (400.0, 0.5), (3.0, 10.0)])
+@each_row("h, q, w, u", PENDULA)
 def test_a_pd_pendulum_by_its_gains(h, q, w, u, p, d):
     """J w+ = I w + h (u - m g l sin q - p q), J = I + h d + h^2 p: by p -h (q + h w+) / J, by d -h w+ / J."""
     made = Plant(h)
@@ -473,11 +474,11 @@ SIDES = [(1e4, 1e4), (2e4, 6e3)]
 PRESSED = [(0.005, 0.003, -0.2), (0.005, 0.0005, -1.0), (0.002, 0.002, 0.1)]
 
 
-@pytest.mark.parametrize("approximation", ["lagged", "similar"])
-@pytest.mark.parametrize(("ours", "ground"), SIDES)
-@pytest.mark.parametrize(("h", "depth", "v"), PRESSED)
+@each_row("approximation", ["lagged", "similar"])
+@each_row("ours, ground", SIDES)
+@each_row("h, depth, v", PRESSED)
 def test_a_pressed_ball_by_stiffness_radius_and_mass(approximation, ours, ground, h, depth, v):
-    """A12: (m + h^2 k) v+ = m (v - g h) + h k depth with k = ours ground / (ours + ground)."""
+    """The spring at the end of the step: (m + h^2 k) v+ = m (v - g h) + h k depth with k = ours ground / (ours + ground)."""
     m = 1.3
     model = railed_ball(h, approximation, {"stiffness": ours}, {"stiffness": ground}, mass=m).model()
     k = ours * ground / (ours + ground)
@@ -511,9 +512,9 @@ def test_static_penetration_by_stiffness_and_mass(approximation, ours, ground):
     assert g.by_parameters == pytest.approx([by_k, G / k, -1], rel=1e-5)  # 300 contact steps
 
 
-@pytest.mark.parametrize("approximation", ["lagged", "similar"])
-@pytest.mark.parametrize(("d_ball", "d_ground"), [(2.0, 2.0), (5.0, 1.0)])
-@pytest.mark.parametrize(("h", "depth", "v"), PRESSED)
+@each_row("approximation", ["lagged", "similar"])
+@each_row("d_ball, d_ground", [(2.0, 2.0), (5.0, 1.0)])
+@each_row("h, depth, v", PRESSED)
 def test_a_pressed_ball_by_dissipation(approximation, d_ball, d_ground, h, depth, v):
     """With Hunt and Crossley: v+ = v - g h + h k (depth - h v+) (1 - d v+), d = (kB dA + kA dB) / (kA + kB)."""
     k_ball, k_ground = 1e4, 3e4
@@ -531,10 +532,10 @@ def test_a_pressed_ball_by_dissipation(approximation, d_ball, d_ground, h, depth
     assert d.C[1] == pytest.approx(by_d * parts, rel=CONTACT)
 
 
-@pytest.mark.parametrize(("t_ball", "t_ground"), [(0.01, 0.01), (0.02, 0.001)])
-@pytest.mark.parametrize(("h", "depth", "v"), PRESSED)
+@each_row("t_ball, t_ground", [(0.01, 0.01), (0.02, 0.001)])
+@each_row("h, depth, v", PRESSED)
 def test_a_pressed_ball_by_relaxation_time(t_ball, t_ground, h, depth, v):
-    """A14: (1 + h k (h + t)) v+ = v - g h + h k depth, t the sum of both sides'."""
+    """Damping k t p' in series with the spring, m = 1: (1 + h k (h + t)) v+ = v - g h + h k depth, t the sum of both sides'."""
     k = 5000.0
     sides = [{"stiffness": 2 * k, "relaxation_time": t} for t in (t_ball, t_ground)]
     model = railed_ball(h, "sap", *sides).model()
@@ -550,8 +551,8 @@ def test_a_pressed_ball_by_relaxation_time(t_ball, t_ground, h, depth, v):
     assert d.C[1] == pytest.approx([by_time, by_time, by_k], rel=CONTACT)
 
 
-@pytest.mark.parametrize(("mu_ball", "mu_ground"), [(0.5, 0.5), (0.8, 0.3)])
-@pytest.mark.parametrize(("u", "v0"), [(0.0, 1.0), (2.0, 0.0), (4.9, 0.0), (-6.5, 0.3)])
+@each_row("mu_ball, mu_ground", [(0.5, 0.5), (0.8, 0.3)])
+@each_row("u, v0", [(0.0, 1.0), (2.0, 0.0), (4.9, 0.0), (-6.5, 0.3)])
 def test_lagged_friction_step_by_friction(u, v0, mu_ball, mu_ground):
     """v+ = v0 + h u - mu g h v+ / r, r = sqrt(v+^2 + eps^2): by mu -g h v+ / r / D, mu = 2 ab / (a + b)."""
     h, k, eps = 0.01, 1e4, 1e-4
@@ -807,7 +808,7 @@ def same_motion(model, values, built, x, us):
     assert np.array_equal(dd.step(model, x, us[0]), before)
 
 
-@pytest.mark.parametrize("name", ARM_CHANGES)
+@each_row("name", ARM_CHANGES)
 def test_an_arm_with_a_value_given_is_the_arm_built_with_it(name):
     x, u = ARM_POINT
     same_motion(arm(), {name: ARM_CHANGES[name]}, arm(**{name: ARM_CHANGES[name]}), np.array(x), np.tile(u, (8, 1)))
@@ -821,8 +822,8 @@ def test_an_arm_with_all_values_given_is_the_arm_built_with_them():
     same_motion(arm(), values, arm(**ARM_CHANGES), np.array(x), np.tile(u, (8, 1)))
 
 
-@pytest.mark.parametrize("approximation", ["lagged", "sap", "similar"])
-@pytest.mark.parametrize("name", [name for name in BALL_CHANGES if "modulus" not in name])
+@each_row("approximation", ["lagged", "sap", "similar"])
+@each_row("name", [name for name in BALL_CHANGES if "modulus" not in name])
 def test_a_ball_with_a_value_given_is_the_ball_built_with_it(name, approximation):
     model, built = ball(approximation), ball(approximation, **{name: BALL_CHANGES[name]})
     if BALL_CHANGES[name] != 0:  # it must matter, where this approximation knows it at all
@@ -832,7 +833,7 @@ def test_a_ball_with_a_value_given_is_the_ball_built_with_it(name, approximation
     same_motion(model, {name: BALL_CHANGES[name]}, built, ball_state(model), np.zeros((8, 0)))
 
 
-@pytest.mark.parametrize("name", ["ball.hydroelastic_modulus", "ball.dissipation", "ball.friction", "ball.mass"])
+@each_row("name", ["ball.hydroelastic_modulus", "ball.dissipation", "ball.friction", "ball.mass"])
 def test_a_hydroelastic_ball_with_a_value_given_is_the_ball_built_with_it(name):
     made = [ball("lagged", "hydroelastic", **change) for change in ({}, {name: BALL_CHANGES[name]})]
     x = ball_state(made[0])
@@ -868,7 +869,7 @@ def test_a_box_has_no_radius():
     assert not [p.name for p in dd.list_parameters(made.model()) if p.name.endswith("radius")]
 
 
-@pytest.mark.parametrize("name", sorted(path.name for path in MODELS.iterdir()))
+@each_row("name", sorted(path.name for path in MODELS.iterdir()))
 def test_another_time_step_given_is_the_model_loaded_with_it(load, name):
     model, built = load(name), load(name, time_step=0.004)
     x = model.default_state
@@ -972,8 +973,8 @@ def test_every_parameter_of_an_arm_is_certified(method):
     dd.certify(model, *ARM_POINT, parameters=names, method=method).require()
 
 
-@pytest.mark.parametrize(
-    ("name", "x", "u"),
+@each_row(
+    "name, x, u",
     [
         ("acrobot.xml", [0.4, -0.9, 1.3, -0.6], [0.2]),
         ("cart_pole.urdf", [0.1, 0.7, -0.3, 1.1], [2.0]),
@@ -1008,8 +1009,8 @@ def test_unknown_names_list_those_that_exist(load):
         dd.step(load("mass_spring_damper.sdf"), [0, 0], [0], parameters={"block.weight": 1.0})
 
 
-@pytest.mark.parametrize(
-    ("parameters", "error", "words"),
+@each_row(
+    "parameters, error, words",
     [
         ({"pole.mass": -1.0}, InputError, r"pole\.mass: expected at least 0 kg"),
         ({"pole.mass": [1.0, 2.0]}, ShapeError, r"pole\.mass: expected shape \(1,\), got shape \(2,\)"),
@@ -1053,8 +1054,8 @@ def test_zero_is_refused_where_both_sides_are_needed(load, name):
         dd.certify(load("pendulum.urdf"), [0.3, 0.1], [0.2], parameters={name: 0.0})
 
 
-@pytest.mark.parametrize("name", ["ball.stiffness", "world.stiffness", "ball.mass", "ball.radius"])
-@pytest.mark.parametrize("approximation", ["lagged", "sap", "similar"])
+@each_row("name", ["ball.stiffness", "world.stiffness", "ball.mass", "ball.radius"])
+@each_row("approximation", ["lagged", "sap", "similar"])
 def test_a_value_of_zero_is_an_error_or_a_motion_but_not_the_end_of_the_process(name, approximation):
     """Drake raises SystemExit for a stiffness of zero under sap."""
     model = ball(approximation)
@@ -1076,8 +1077,8 @@ def random_inertia(random, size=1.0):
     return np.array([full[0, 0], full[1, 1], full[2, 2], full[0, 1], full[0, 2], full[1, 2]])
 
 
-@pytest.mark.parametrize("seed", range(10))
-@pytest.mark.parametrize("size", [1e-4, 1.0, 30.0])
+@each_row("seed", range(10))
+@each_row("size", [1e-4, 1.0, 30.0])
 def test_log_cholesky_coordinates_go_there_and_back(seed, size):
     inertia = random_inertia(np.random.default_rng(seed), size)
     assert from_log_cholesky(to_log_cholesky(inertia)) == pytest.approx(inertia, rel=1e-10, abs=1e-12 * size**2)
@@ -1085,7 +1086,7 @@ def test_log_cholesky_coordinates_go_there_and_back(seed, size):
     assert to_log_cholesky(from_log_cholesky(z)) == pytest.approx(z, rel=1e-9, abs=1e-10)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@each_row("seed", range(5))
 def test_the_derivative_of_log_cholesky_coordinates_agrees_with_differences(seed):
     z = np.random.default_rng(seed).standard_normal(6)
     value, jacobian = derivative_of_from_log_cholesky(z)
@@ -1093,7 +1094,7 @@ def test_the_derivative_of_log_cholesky_coordinates_agrees_with_differences(seed
     dd.certificates.certify_jacobian(lambda z: np.asarray(from_log_cholesky(z), dtype=float), z, jacobian).require()
 
 
-@pytest.mark.parametrize("seed", range(30))
+@each_row("seed", range(30))
 def test_all_coordinates_are_of_an_inertia_that_a_body_can_have(seed):
     """Positive definite, and each principal moment at most the sum of the other two."""
     inertia = from_log_cholesky(3 * np.random.default_rng(seed).standard_normal(6))

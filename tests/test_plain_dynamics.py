@@ -6,6 +6,7 @@ import types
 import numpy as np
 import pytest
 from helpers.models import MODELS
+from helpers.table import each_row
 from helpers.transcription import BLOCK, heavy_pendulum, own_derivatives, push
 
 import drake_diff as dd
@@ -81,8 +82,8 @@ def test_a_problem_of_plain_dynamics_says_that_it_has_no_model():
         _ = block_move().model
 
 
-@pytest.mark.parametrize(
-    ("changes", "options", "match"),
+@each_row(
+    "changes, options, match",
     [
         ({}, {"solver": "snopt"}, 'solver: expected "ipopt" for scheme="hermite_simpson"'),
         ({}, {"solver": "snopt", "scheme": "drake"}, 'dynamics: expected none for solver="snopt"'),

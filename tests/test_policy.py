@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from helpers.models import Plant, add_slide
+from helpers.table import each_row
 from pydrake.multibody.tree import RevoluteJoint, SpatialInertia, UnitInertia
 from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 
@@ -359,7 +360,7 @@ def test_a_function_with_parameters_is_differentiated_by_both():
     assert np.array_equal(policy(np.array([0.2, 9.0]), 2.0, [1.0, 0.0]), [0.2**2, 1.0])
 
 
-@pytest.mark.parametrize(
+@each_row(
     "constant",
     [
         lambda x, t: [0.5, 2],
@@ -414,7 +415,7 @@ NUMPY = {
 }
 
 
-@pytest.mark.parametrize("name", NUMPY)
+@each_row("name", NUMPY)
 def test_these_numpy_functions_take_autodiffxd(name):
     f, x = NUMPY[name], np.array([0.3, 0.6])
     _, by_x, _ = differentiate_policy(lambda x, t: f(x), x, 0.0, 2)
@@ -428,7 +429,7 @@ def into_floats(x, t):
     return u
 
 
-@pytest.mark.parametrize(
+@each_row(
     "policy",
     [
         lambda x, t: [float(x[0])],

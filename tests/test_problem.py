@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from helpers.models import MODELS
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
@@ -89,8 +90,8 @@ def test_a_nan_goal_is_free(load):
     assert problem.goal_error(np.array([9.0, 3.0, 9.0, 0.5])) == pytest.approx([0, 3 - np.pi, 0, 0.5])
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
+@each_row(
+    "changes, words",
     [
         ({"x0": [0, 0]}, r"x0: expected shape \(4,\), got shape \(2,\)"),
         ({"x0": [0, 0, 0, math.nan]}, r"x0\[3\]: expected a finite number, got nan"),
@@ -143,7 +144,7 @@ def test_bad_problems_are_named(load, changes, words):
     assert f": expected {error.value.expected}, got {error.value.got}" in str(error.value)
 
 
-@pytest.mark.parametrize(
+@each_row(
     "changes",
     [
         {"bounds": ([-1], [1])},
@@ -191,8 +192,8 @@ def test_controls_without_actuators_are_refused(load):
         dd.Problem(load("projectile.sdf"), x0=np.eye(13)[0], num_steps=3, final_cost=lambda x: x[4])
 
 
-@pytest.mark.parametrize(
-    ("Q", "words"),
+@each_row(
+    "Q, words",
     [
         ([[1.0, 2.0], [0.0, 1.0]], "a symmetric matrix"),
         ([[1.0, 0.0], [0.0, -1.0]], "a positive semidefinite matrix"),

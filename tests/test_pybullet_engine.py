@@ -10,6 +10,7 @@ from helpers.engines import free_state
 from helpers.forward_formula import formula, free_box, turned
 from helpers.models import MODELS, Plant, contact_properties, robot
 from helpers.plants import block_on_rails, tetrahedron_on_ground
+from helpers.table import each_row
 from pydrake.geometry import Box, Capsule, Cylinder, HalfSpace
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import SpatialInertia
@@ -61,7 +62,7 @@ def test_a_spinning_body_by_hand_turns_by_the_exponential_and_moves_by_its_cente
     np.testing.assert_allclose(after, expected, rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", ["double_pendulum.urdf", "cart_pole.urdf", "acrobot.xml", "mass_spring_damper.sdf"])
+@each_row("name", ["double_pendulum.urdf", "cart_pole.urdf", "acrobot.xml", "mass_spring_damper.sdf"])
 def test_without_damping_the_step_is_drakes(load, name):
     model = load(name)
     drake, engine, random = dd.engines.load_engine("drake", model), bullet(model), np.random.default_rng(0)
@@ -112,7 +113,7 @@ def test_each_step_depends_on_its_arguments_alone(load):
 # ---- the contract ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("change", sorted(CHANGES.keys() - {"armature", "gear"}))
+@each_row("change", sorted(CHANGES.keys() - {"armature", "gear"}))
 def test_a_change_is_found_and_named(tmp_path, monkeypatch, change):
     monkeypatch.setitem(PLAIN, "rotor", 0.0)  # Bullet has no armature, as is tested below
     changes, must, may, words = CHANGES[change]
@@ -164,7 +165,7 @@ def test_contacts_are_drakes_pairs_and_a_shape_that_is_not_built_is_named(load, 
 # ---- contact --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("z", "v"), [(0.098, -0.3), (0.098, 0.0), (0.0995, 0.3), (0.098, 0.5)])
+@each_row("z, v", [(0.098, -0.3), (0.098, 0.0), (0.0995, 0.3), (0.098, 0.5)])
 def test_one_step_of_landing_by_hand_is_an_implicit_spring(z, v):
     h, k, mu = 0.01, 1e4, 0.5
     model, _ = block_on_rails(h, mu)

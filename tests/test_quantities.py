@@ -5,6 +5,7 @@ import pytest
 from helpers.derivatives import differentiate
 from helpers.models import Plant, add_slide, contact_properties, random_state, ur5
 from helpers.plants import box_on_the_ground, craft
+from helpers.table import each_row
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.tree import FixedOffsetFrame, JacobianWrtVariable, SpatialInertia
 
@@ -79,7 +80,7 @@ def test_gradients_on_a_ur5_are_drakes_own_jacobians(seed):
     assert differentiate(dd.quantities.center_of_mass(model), x)[1][:, : model.nq] == pytest.approx(jacobian, abs=1e-13)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.0, 2.0, 3.0, 3.14, np.pi - 1e-7])
+@each_row("angle", [0.0, 1e-9, 1e-4, 1.0, 2.0, 3.0, 3.14, np.pi - 1e-7])
 def test_a_rotation_error_is_two_sines_of_half_the_angle_up_to_half_a_turn(angle):
     """A free body turned by `angle` from a goal about random axes; gradients against differences, value by angle."""
     model = craft()
@@ -174,8 +175,8 @@ def test_two_balls_push_each_other_with_opposite_forces():
     assert on_a == pytest.approx(-on_b, abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
+@each_row(
+    "make, words",
     [
         (lambda m: dd.quantities.frame_position(m, "hand"), r"frame: expected one of .*pole, world, got 'hand'"),
         (lambda m: dd.quantities.frame_position(m, "pole", relative_to="cart"), "got 'cart'"),
@@ -193,7 +194,7 @@ def test_what_does_not_exist_or_fit_is_named(load, make, words):
         make(load("pendulum.urdf"))
 
 
-@pytest.mark.parametrize("part", ["running_cost", "final_cost", "trajectory_cost", "constraints"])
+@each_row("part", ["running_cost", "final_cost", "trajectory_cost", "constraints"])
 def test_a_place_beside_an_offset_is_refused(load, part):
     """It would be that of the model's own link length, and its gradient by the length would be missing."""
     model = load("double_pendulum.urdf")

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.models import MODELS, ROOT
+from helpers.table import each_row
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import BaseModel, JsonValue, ValidationError
@@ -349,7 +350,7 @@ def test_a_record_has_exactly_these_metrics_and_invariants(record):
     assert [m.name for m in record.invariants] == [m.name for m in collocated.invariants] == names
 
 
-@pytest.mark.parametrize("coordinate", range(13))
+@each_row("coordinate", range(13))
 def test_one_coordinate_of_the_last_state_that_is_off_is_the_end_error(thrown, coordinate):
     xs = np.array(thrown.replay.xs)
     xs[-1, coordinate] = thrown.xs[-1, coordinate] + 0.25
@@ -396,7 +397,7 @@ EXAMPLES = [dd.save, dd.load_record, dd.verify, dd.read_trace, dd.record.certify
 EXAMPLES += [getattr(artifact, name) for name in artifact.__all__]
 
 
-@pytest.mark.parametrize("documented", EXAMPLES, ids=lambda documented: documented.__name__)
+@each_row("documented", EXAMPLES, ids=lambda documented: documented.__name__)
 def test_the_example_of_every_public_name_runs(documented, monkeypatch):
     monkeypatch.chdir(ROOT)
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)

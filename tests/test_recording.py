@@ -8,6 +8,7 @@ import pytest
 from helpers.contracts import arms
 from helpers.engines import engine_of, needs
 from helpers.models import MODELS
+from helpers.table import each_row
 from pydrake.math import RollPitchYaw
 from typer.testing import CliRunner
 
@@ -109,8 +110,8 @@ def explicit_damping(model, tmp_path):
     return engine_of("mujoco", model, path=path)
 
 
-@pytest.mark.parametrize(
-    ("change", "as_if", "term", "verdict"),
+@each_row(
+    "change, as_if, term, verdict",
     [
         ("explicit", "as if joint damping were explicit", "integrator", "other law"),
         ("half", "as if the time step were half", "time step", "other model"),
@@ -247,8 +248,8 @@ def changed(row, column, value):
     return rows
 
 
-@pytest.mark.parametrize(
-    ("header", "rows", "match"),
+@each_row(
+    "header, rows, match",
     [
         (HEADER, changed(1, 2, "nan"), r"line 3, column hinge_q: expected a finite number, got 'nan'"),
         (HEADER, changed(1, 2, "1.2.3"), r"line 3, column hinge_q: .* got '1\.2\.3'"),
@@ -442,8 +443,8 @@ def joints(names, position, velocity, effort):
     return lambda types: {"name": names, **values}
 
 
-@pytest.mark.parametrize(
-    ("fields", "match"),
+@each_row(
+    "fields, match",
     [
         (joints(["slide"], [1.0], [1.0], [1.0]), "position of hinge"),
         (joints(["slide", "hinge"], [1.0, 1.0], [], [1.0, 1.0]), "velocity of slide: .*got 0 of slide, hinge"),

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.model.parameters import select
@@ -59,8 +60,8 @@ def test_the_plants_own_step_gives_the_plan_back(write_urdf):
         np.testing.assert_allclose(motion.xs, plan.sample(1)[0], rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize(
-    ("fields", "clause"),
+@each_row(
+    "fields, clause",
     [
         ({"x_goal": [0.9, math.nan]}, "slide_x ends 0.15 from its goal, tolerance 0.0525"),
         ({"x_goal": [math.nan, 0.0]}, "slide_v ends"),
@@ -78,7 +79,7 @@ def test_a_plan_that_misses_what_is_asked_is_told(write_urdf, fields, clause):
     assert len(list(broken_variants(plan, replays(plan)))) == 2
 
 
-@pytest.mark.parametrize("i", range(4))
+@each_row("i", range(4))
 def test_one_coordinate_off_is_refused_and_named(load, i):
     """A cart-pole's own motion, asked to end at its own last state but for one coordinate, within one bound as well."""
     model, us = load("cart_pole.urdf"), np.linspace(2, -1, 15)[:, None]

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers.browser import browsing, errors, move_slider, open_page, view_of
 from helpers.models import MODELS
+from helpers.table import each_row
 from pydrake.planning import RobotDiagramBuilder
 
 import drake_diff as dd
@@ -86,8 +87,8 @@ def cursors(browser):
 
 
 @browsing
-@pytest.mark.parametrize(("size", "scheme"), [((1440, 900), "light"), ((390, 844), "dark")], ids=["laptop", "phone"])
-@pytest.mark.parametrize("name", ["swing_up", "thrown", "collocated", "limited", "not_finite", "no_replay"])
+@each_row("size, scheme", [((1440, 900), "light"), ((390, 844), "dark")], ids=["laptop", "phone"])
+@each_row("name", ["swing_up", "thrown", "collocated", "limited", "not_finite", "no_replay"])
 def test_a_report_opens_without_a_network_and_without_an_error(runs, browser, tmp_path, name, size, scheme):
     open_page(browser, runs / name / "report.html", size=size, scheme=scheme)
     assert browser.execute_script("return document.documentElement.scrollWidth") <= size[0]

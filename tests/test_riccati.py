@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.table import each_row
 
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic, slope_along, solve_riccati
 
@@ -99,9 +100,9 @@ def test_one_step_by_hand(bound, regularization, u, K, s, P, slope, curvature, g
     assert policy.expected == -slope - curvature / 2
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("size", [(6, 3, 2), (20, 4, 1), (1, 2, 3)])
-@pytest.mark.parametrize("free", [0.0, 1e6])
+@each_row("seed", range(3))
+@each_row("size", [(6, 3, 2), (20, 4, 1), (1, 2, 3)])
+@each_row("free", [0.0, 1e6])
 def test_the_policy_leads_to_the_minimum_of_the_whole_problem(seed, size, free):
     """1e-9 of the largest entry: 20 unstable steps magnify rounding."""
     p = problem(seed, *size, free=free)
@@ -110,9 +111,9 @@ def test_the_policy_leads_to_the_minimum_of_the_whole_problem(seed, size, free):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * max(1.0, np.abs(expected).max()))
 
 
-@pytest.mark.parametrize("gaps", [0.0, 1.0])
-@pytest.mark.parametrize("bound", [np.inf, 0.2])
-@pytest.mark.parametrize("regularization", [0.0, 0.3])
+@each_row("gaps", [0.0, 1.0])
+@each_row("bound", [np.inf, 0.2])
+@each_row("regularization", [0.0, 0.3])
 def test_what_is_promised_is_what_following_the_policy_costs(gaps, bound, regularization):
     """1e-10: sums of a hundred terms of size 10."""
     p = problem(gaps=gaps, bound=bound)

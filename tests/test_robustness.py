@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.loops import MASS, STEPS, H, plan, pushed_and_stopped
 from helpers.models import MODELS
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff._base.statistics import margin, success_rate
@@ -72,9 +73,7 @@ def test_the_interval_covers_what_it_says():
     assert coverage.min() > 0.85
 
 
-@pytest.mark.parametrize(
-    ("rates", "found"), [([100, 95, 94], 0.2), ([94, 100, 100], 0.0), ([100, 90, 100], 0.1), ([100, 99, 95], 0.3)]
-)
+@each_row("rates, found", [([100, 95, 94], 0.2), ([94, 100, 100], 0.0), ([100, 90, 100], 0.1), ([100, 99, 95], 0.3)])
 def test_a_margin_ends_at_the_first_level_that_fails(rates, found):
     assert margin([0.1, 0.2, 0.3], [success_rate(k, 100) for k in rates]) == found
     assert margin([0.3, 0.2, 0.1], [success_rate(k, 100) for k in rates[::-1]]) == found
@@ -121,8 +120,8 @@ def test_factors_are_uniform_and_the_plant_has_them(cart, setup):
         assert np.array_equal(p.value, before[p.name]), p.name
 
 
-@pytest.mark.parametrize(
-    ("file", "name", "owners"),
+@each_row(
+    "file, name, owners",
     [
         ("pendulum.urdf", "damping", {"hinge"}),
         ("pendulum.urdf", "gravity", {"model"}),
@@ -435,7 +434,7 @@ def test_small_changes_of_the_plant_move_it_as_predicted(cart):
         assert found.ratio == pytest.approx(1, abs=3 * 0.5 * np.sqrt(0.8 / 300) + 0.01)
 
 
-@pytest.mark.parametrize("name", ["mass", "inertia", "damping", "gravity"])
+@each_row("name", ["mass", "inertia", "damping", "gravity"])
 def test_predictions_of_one_parameter_alone_are_central_differences(name, tmp_path):
     """Of the whole closed loop by a factor 1 +- 1e-4, whose error is of its square: 1e-6 is far above.
 

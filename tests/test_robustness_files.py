@@ -12,6 +12,7 @@ import pytest
 from helpers.browser import browsing, errors, move_slider, open_page, view_of
 from helpers.loops import CART, H, plan, pushed_and_stopped
 from helpers.models import MODELS
+from helpers.table import each_row
 from typer.testing import CliRunner
 
 import drake_diff as dd
@@ -371,8 +372,8 @@ def test_panels_call_it_by_name(run):
     assert evaluate({**TRIAL, "run": str(run), "level": 0})["displacement"] == 0.0
 
 
-@pytest.mark.parametrize(
-    ("changes", "error", "said"),
+@each_row(
+    "changes, error, said",
     [
         ({"seed": None}, InputError, "trial: seed"),
         ({"seed": True}, InputError, "trial: seed"),

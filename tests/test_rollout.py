@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from helpers.models import MODELS, Plant, contact_properties
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError
@@ -153,8 +154,8 @@ def test_arrays_of_a_rollout_are_read_only(load):
         motion.xs[0, 0] = 1.0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "options", "words"),
+@each_row(
+    "arguments, options, words",
     [
         (([0.0],), {"us": [[0.0]]}, "x0: expected shape"),
         (([0.0, math.nan],), {"us": [[0.0]]}, "finite number"),

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 from helpers.models import Plant, contact_properties
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.derivatives.step import derivatives_along
@@ -66,8 +67,8 @@ def test_the_projectiles_jacobian_is_exact(load):
         assert g.by_x0[10:] == pytest.approx(np.eye(3)[i], abs=1e-12)
 
 
-@pytest.mark.parametrize("masses", [(1.0, 1.0), (1.0, 2.0)])
-@pytest.mark.parametrize("approximation", ["lagged", "sap"])
+@each_row("masses", [(1.0, 1.0), (1.0, 2.0)])
+@each_row("approximation", ["lagged", "sap"])
 def test_momentum_invariants_of_a_collision(masses, approximation):
     """Of any contact law: sum_i m_i dv_i/dv_j = m_j, dv/dx -> 0, dx/dx -> m_j, dx/dv -> m_j T."""
     h, count = 1e-3, 1000
@@ -156,8 +157,8 @@ def test_gradient_by_parameters_is_accumulated(write_urdf, load):
     assert g.by_parameters == pytest.approx([-(h**2) / m**2 * sum(range(1, count + 1))], rel=1e-10)
 
 
-@pytest.mark.parametrize(
-    ("loss", "error", "words"),
+@each_row(
+    "loss, error, words",
     [
         (lambda x: 1.0, GradientError, "plain number"),
         (lambda x: float(x[0].value()), GradientError, "plain number"),

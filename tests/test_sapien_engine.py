@@ -11,6 +11,7 @@ from helpers.engines import free_state
 from helpers.forward_formula import formula, free_box, turned
 from helpers.models import MODELS, Plant, contact_properties, robot
 from helpers.plants import block_on_rails, tetrahedron_on_ground
+from helpers.table import each_row
 from pydrake.geometry import Box, Capsule, Cylinder
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import PrismaticJoint, SpatialInertia
@@ -80,7 +81,7 @@ def test_a_tumbling_body_keeps_the_size_of_its_angular_momentum():
     assert np.abs(scaled - explicit).max() > 1e-5  # it could be told
 
 
-@pytest.mark.parametrize("name", ["double_pendulum.urdf", "cart_pole.urdf", "acrobot.xml", "mass_spring_damper.sdf"])
+@each_row("name", ["double_pendulum.urdf", "cart_pole.urdf", "acrobot.xml", "mass_spring_damper.sdf"])
 def test_the_step_is_drakes_and_so_is_the_energy(load, name):
     model = load(name)
     drake, engine, random = dd.engines.load_engine("drake", model), physx(model), np.random.default_rng(0)
@@ -139,7 +140,7 @@ def test_each_step_depends_on_its_arguments_alone(load):
 # ---- the contract ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("change", CHANGES)
+@each_row("change", CHANGES)
 def test_a_change_is_found_and_named(tmp_path, change):
     changes, must, may, words = CHANGES[change]
     reference = dd.engines.load_engine("drake", arms(tmp_path))

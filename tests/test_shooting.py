@@ -10,6 +10,7 @@ import pytest
 from helpers.models import MODELS
 from helpers.plants import block
 from helpers.problems import DOUBLE_INTEGRATOR, lqr
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.optimize.program import Limits
@@ -122,8 +123,8 @@ def test_the_last_sensitivity_is_had_without_all_the_others():
     assert peak < every.nbytes / 10
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("count", [2, 4, 10, 20])
+@each_row("solver", SOLVERS)
+@each_row("count", [2, 4, 10, 20])
 def test_the_block_moves_by_symplectic_eulers_optimum(solver, count):
     """The least effort of moving 1 kg by 1 m in 1 s is 12 / (1 - 1/N^2)."""
     model = block(time_step=1 / count)
@@ -228,7 +229,7 @@ def test_a_pendulum_too_weak_and_too_late_is_infeasible(solver):
     assert np.abs(solution.us).max() <= 0.5 + 1e-6
 
 
-@pytest.mark.parametrize(("row", "column"), [(i, j) for i in range(2) for j in range(3)])
+@each_row("row, column", [(i, j) for i in range(2) for j in range(3)])
 def test_a_step_derivative_that_is_one_percent_off_is_named(row, column, monkeypatch, without_pinocchio):
     """Each entry of [A B] of the pendulum; the wrong one is used by the solver and by the certificate alike."""
     module = sys.modules["drake_diff.derivatives.sources"]

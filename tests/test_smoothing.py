@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from helpers.models import Plant, contact_properties
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import GradientError, InputError, ShapeError, UnknownNameError
@@ -83,8 +84,8 @@ def smooth_ball(theta, g, d, height, sigma, **options):
     )
 
 
-@pytest.mark.parametrize(
-    ("theta", "value", "truth", "first", "bias"),
+@each_row(
+    "theta, value, truth, first, bias",
     [
         (0.3, -0.00307709811, -0.01115833969, -0.01115833969, 0),
         (0.6, -0.00380439500, -0.00923031040, -0.00018531449, 0.00904499591),
@@ -100,9 +101,7 @@ def test_the_quadrature_gives_the_published_ball_with_wall(theta, value, truth, 
     assert exact["first"] - exact["truth"] == pytest.approx(bias, abs=1e-10)
 
 
-@pytest.mark.parametrize(
-    "case", [(0.6, *SUH), (0.7, *SUH), (0.5, 3.7, 0.09, 0.03, 0.08), (0.45, 20, 0.02, 0.005, 0.03)]
-)
+@each_row("case", [(0.6, *SUH), (0.7, *SUH), (0.5, 3.7, 0.09, 0.03, 0.08), (0.45, 20, 0.02, 0.005, 0.03)])
 def test_the_bias_of_the_quadrature_is_what_the_jumps_make(case):
     """Bias = -sum over the jumps b of [J(b+) - J(b-)] times the density of b."""
     theta, g, d, height, sigma = case
@@ -114,8 +113,8 @@ def test_the_bias_of_the_quadrature_is_what_the_jumps_make(case):
     assert exact["first"] - exact["truth"] == pytest.approx(bias, abs=1e-8)
 
 
-@pytest.mark.parametrize(
-    ("case", "biased"),
+@each_row(
+    "case, biased",
     [
         ((0.3, *SUH), False),
         ((0.6, *SUH), True),
@@ -151,7 +150,7 @@ def heaviside(theta, sigma, **options):
     return smooth(lambda x: float(x[0] > 0), [theta], lambda x: [0.0], noise=Gaussian(sigma), **options)
 
 
-@pytest.mark.parametrize(("theta", "sigma"), [(0.0, 0.05), (0.02, 0.05), (-0.3, 0.4), (7.0, 11.0)])
+@each_row("theta, sigma", [(0.0, 0.05), (0.02, 0.05), (-0.3, 0.4), (7.0, 11.0)])
 def test_heaviside_is_biased_and_the_blend_follows_zeroth_order(theta, sigma):
     """First order is 0 always, the truth is the normal density of theta, F its distribution function."""
     truth = math.exp(-((theta / sigma) ** 2) / 2) / (sigma * math.sqrt(2 * math.pi))
@@ -246,7 +245,7 @@ def test_a_wrong_derivative_is_seen():
     assert smooth(lambda z: 2.0, [1.0], lambda z: [2.2], noise=Gaussian(0.1), samples=2).weight == 0
 
 
-@pytest.mark.parametrize(("u", "c"), [(0.1, 0.04), (-0.3, 0.04), (0.0, 2.0), (5.0, 30.0)])
+@each_row("u, c", [(0.1, 0.04), (-0.3, 0.04), (0.0, 2.0), (5.0, 30.0)])
 def test_barrier_noise_makes_the_log_barrier(u, c):
     """First by quadrature in w = sqrt(c) tan t, which makes the density cos(t) / 2; then sampled."""
     root, edge = math.sqrt(c), math.atan(-u / math.sqrt(c))
@@ -353,8 +352,8 @@ def one(z):
     return [1.0]
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
+@each_row(
+    "changes, message",
     [
         ({"method": "second"}, "expected one of blend, first, zeroth"),
         ({"samples": 1}, "at least 2"),
@@ -395,15 +394,15 @@ def test_zeroth_order_needs_a_derivative_where_noise_does_not_move():
         smooth(np.sum, [0.0, 0.0], noise=Gaussian([0.1, 0.0]), method="zeroth")
 
 
-@pytest.mark.parametrize("kind", [Gaussian, Barrier])
-@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf, True, "1", None, [], [0.0, 0.0], [0.1, -0.1], [np.nan]])
+@each_row("kind", [Gaussian, Barrier])
+@each_row("scale", [0.0, -1.0, np.nan, np.inf, True, "1", None, [], [0.0, 0.0], [0.1, -0.1], [np.nan]])
 def test_noise_of_no_size_is_refused(kind, scale):
     with pytest.raises(InputError, match=f"{kind.__name__}.(sigma|c)"):
         kind(scale)
 
 
-@pytest.mark.parametrize(
-    ("f", "jacobian", "message"),
+@each_row(
+    "f, jacobian, message",
     [
         (lambda z: np.nan, one, r"f\(\[0.0\]\) is \[nan\]"),
         (lambda z: np.inf if z[0] else 0.0, one, r"f\(\[.*\]\) is \[inf\]"),

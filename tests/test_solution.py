@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS
 from helpers.plants import block
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
@@ -48,9 +49,9 @@ def test_an_untouched_solution_measures_as_exact(method):
     assert s.bound_violation == 0.0
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("coordinate", [0, 1])
-@pytest.mark.parametrize("knot", [0, 1, N // 2, N - 1, N])
+@each_row("method", METHODS)
+@each_row("coordinate", [0, 1])
+@each_row("knot", [0, 1, N // 2, N - 1, N])
 def test_one_moved_knot_shows_in_its_own_intervals(method, coordinate, knot):
     """A first position can hide from no interval here, nor can a velocity: both ends of an interval are measured."""
     s = moved(solved(method), "xs", (knot, coordinate), MOVED)
@@ -74,8 +75,8 @@ def test_a_motion_shifted_as_a_whole_shows_at_its_start(method):
     assert shifted.initial_state_error == pytest.approx(MOVED, rel=1e-6)
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("index", [0, N // 2, N - 1])
+@each_row("method", METHODS)
+@each_row("index", [0, N // 2, N - 1])
 def test_one_moved_input_shows_in_the_defect(method, index):
     """A held input moves the velocity of 1 kg by h du; one at a knot a sixth of that, by Simpson's rule."""
     assert moved(solved(method), "us", index, 0.01).defect >= 0.99 * H * 0.01 / 6
@@ -90,9 +91,9 @@ def test_a_missed_goal_is_measured_in_its_own_unit(method):
     assert moved(solved(method), "xs", (N, 0), MOVED).goal_error == pytest.approx(MOVED, rel=1e-4)
 
 
-@pytest.mark.parametrize("method", ["collocation", "shooting"])
-@pytest.mark.parametrize(
-    ("name", "index", "to", "violation"),
+@each_row("method", ["collocation", "shooting"])
+@each_row(
+    "name, index, to, violation",
     [
         ("xs", (3, 0), 1.75, 0.25),
         ("xs", (3, 1), -3.5, 0.5),
@@ -112,8 +113,8 @@ def test_collocations_last_input_is_held_to_its_bound():
     assert moved(s, "u_final", 0, 100 - s.u_final[0]).bound_violation == pytest.approx(80, rel=1e-12)
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("order", [1, -1])
+@each_row("method", METHODS)
+@each_row("order", [1, -1])
 def test_the_worst_of_several_constraints_counts(method, order):
     """One holds and one is broken by a known excess, in either order: the other way round both would seem to hold."""
     s = solved(method)
@@ -136,16 +137,16 @@ def test_the_cost_is_computed_from_the_motion(method):
     assert dataclasses.replace(s, **fields).cost == pytest.approx(4 * (s.cost - final) + final, rel=1e-12)
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("method", METHODS)
+@each_row("bad", [math.nan, math.inf, -math.inf])
+@each_row("method", METHODS)
 def test_one_entry_of_a_state_that_is_no_number_makes_the_motion_infinitely_wrong(method, bad):
     s = moved(solved(method), "xs", (4, 1), bad)
     assert s.defect == s.bound_violation == s.integration_error == math.inf
     assert s.half_step_error == math.inf
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-@pytest.mark.parametrize("method", METHODS)
+@each_row("bad", [math.nan, math.inf])
+@each_row("method", METHODS)
 def test_one_input_that_is_no_number_makes_the_motion_infinitely_wrong(method, bad):
     s = moved(solved(method), "us", (4, 0), bad)
     assert s.defect == s.bound_violation == s.cost == s.integration_error == math.inf
@@ -160,8 +161,8 @@ def test_ends_that_are_no_numbers_are_infinitely_wrong(method):
         assert moved(s, "xs", (N, 0), math.nan).goal_error == math.inf
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("steps", [0, 1, N - 1])
+@each_row("method", METHODS)
+@each_row("steps", [0, 1, N - 1])
 def test_a_motion_that_ends_too_early_is_infinitely_wrong(method, steps):
     """Each of its intervals may be right: those that are missing are not."""
     s = solved(method)
@@ -222,7 +223,7 @@ def test_another_status_leaves_the_measures_as_they_were_taken(method):
     assert s.status is dd.Status.CONVERGED
 
 
-@pytest.mark.parametrize("name", ["xs", "us", "problem", "certificates", "cost"])
+@each_row("name", ["xs", "us", "problem", "certificates", "cost"])
 def test_what_a_measure_may_depend_on_is_not_told(name):
     with pytest.raises(InputError, match=f"expected one of iterations, .*, got '{name}'"):
         solved("ilqr").told(**{name: None})

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS, Plant, contact_properties
 from helpers.plants import pd_pendulum
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.derivatives.step import derivatives_along
@@ -31,8 +32,8 @@ def swing_up(load, count, cost=EFFORT, **changes):
     return dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=count, running_cost=cost, **changes)
 
 
-@pytest.mark.parametrize(("count", "cost"), [(20, 62.58516350539), (40, 59.79288912066)])
-@pytest.mark.parametrize("running_cost", [EFFORT, lambda x, u: u[0] ** 2])
+@each_row("count, cost", [(20, 62.58516350539), (40, 59.79288912066)])
+@each_row("running_cost", [EFFORT, lambda x, u: u[0] ** 2])
 def test_cart_pole_swing_up_by_collocation(load, count, cost, running_cost):
     """The optima that Drake's DirectCollocation finds with SNOPT."""
     solution = dd.solve(swing_up(load, count, running_cost), method="collocation", scheme="drake")
@@ -143,8 +144,8 @@ def solutions():
     return found
 
 
-@pytest.mark.parametrize("method", ["collocation", "shooting"])
-@pytest.mark.parametrize("knot", [1, 50, 100])
+@each_row("method", ["collocation", "shooting"])
+@each_row("knot", [1, 50, 100])
 def test_a_knot_moved_by_a_thousandth_shows_in_the_defect(solutions, method, knot):
     xs = np.array(solutions[method].xs)
     xs[knot, 0] += 1e-3
@@ -280,8 +281,8 @@ def test_ctrl_c_while_the_guess_is_improved_ends_the_solve(load):
     assert "iLQR: interrupted" in solution.message
 
 
-@pytest.mark.parametrize(
-    ("method", "solver"),
+@each_row(
+    "method, solver",
     [("collocation", "ipopt"), ("collocation", "snopt"), ("shooting", "ipopt"), ("shooting", "snopt")],
 )
 def test_the_solvers_own_table_is_kept(load, method, solver):
@@ -354,8 +355,8 @@ def test_collocation_through_the_ground_is_not_verified(tmp_path):
     assert "geometries overlap" in solution.message
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
+@each_row(
+    "options, words",
     [
         ({"method": "magic"}, "method: expected one of auto, collocation, ilqr, shooting, got 'magic'"),
         ({"solver": "magic"}, "solver: expected one of ipopt, snopt, got 'magic'"),
@@ -450,9 +451,9 @@ def acrobot_swing_up(load):
     return dd.Problem(model, x0=np.zeros(4), x_goal=[np.pi, 0, 0, 0], num_steps=80, running_cost=EFFORT, bounds=bounds)
 
 
-@pytest.mark.parametrize("solver", ["ipopt", "snopt"])
-@pytest.mark.parametrize(
-    ("error", "status"),
+@each_row("solver", ["ipopt", "snopt"])
+@each_row(
+    "error, status",
     [(SimulationError, Status.DIVERGED), (GradientError, Status.NO_GRADIENT)],
 )
 def test_a_step_refused_in_the_middle_of_a_solve_is_named(load, monkeypatch, solver, error, status):

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from helpers.models import Plant, contact_properties, random_state
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, SimulationError
@@ -72,10 +73,8 @@ def pendulum_step(q, w, u, h, l=0.5, b=0.1, m=1.0):  # noqa: E741
     return [q + h * w_next, w_next], A, [[h**2 * s / inertia], [h * s / inertia]], s
 
 
-@pytest.mark.parametrize("approximation", APPROXIMATIONS)
-@pytest.mark.parametrize(
-    ("h", "q", "w", "u"), [(0.01, 0.7, -1.2, 0.3), (0.003, -2.5, 4.0, -1.7), (0.05, 3.1, 0.0, 0.0)]
-)
+@each_row("approximation", APPROXIMATIONS)
+@each_row("h, q, w, u", [(0.01, 0.7, -1.2, 0.3), (0.003, -2.5, 4.0, -1.7), (0.05, 3.1, 0.0, 0.0)])
 def test_pendulum_step_and_jacobian(load, approximation, h, q, w, u):
     model = load("pendulum.urdf", time_step=h, contact_approximation=approximation)
     x_next, A, B, s = pendulum_step(q, w, u, h)
@@ -132,7 +131,7 @@ def test_mass_spring_damper_step_and_jacobian(load, x, v, u):
 ALL = ("pendulum.urdf", "cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "mass_spring_damper.sdf")
 
 
-@pytest.mark.parametrize("name", ALL)
+@each_row("name", ALL)
 def test_upper_half_of_the_jacobian_follows_from_the_lower(load, name):
     """Where dq/dt = v: A_top = [I 0] + h A_bottom, B_top = h B_bottom, det A = det dv+/dv."""
     model, random = load(name), np.random.default_rng(1)
@@ -161,9 +160,9 @@ def ball_on_ground(h, k, approximation, relaxation_time=None, mass=1.0):
 CONTACTS = [(0.003, -0.2), (0.003, 0.4), (0.0005, -1.0)]
 
 
-@pytest.mark.parametrize(("h", "k"), [(0.005, 5000.0), (0.002, 20000.0)])
-@pytest.mark.parametrize("approximation", ["lagged", "similar"])
-@pytest.mark.parametrize(("depth", "v"), CONTACTS)
+@each_row("h, k", [(0.005, 5000.0), (0.002, 20000.0)])
+@each_row("approximation", ["lagged", "similar"])
+@each_row("depth, v", CONTACTS)
 def test_point_contact_step_without_dissipation(h, k, approximation, depth, v):
     """v+ = (v - g h + h k x / m) / (1 + h^2 k / m) while that presses, else free fall."""
     model = ball_on_ground(h, k, approximation)
@@ -175,8 +174,8 @@ def test_point_contact_step_without_dissipation(h, k, approximation, depth, v):
     assert d.A[1] == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
 
-@pytest.mark.parametrize(("h", "k", "tau"), [(0.005, 5000.0, 0.02), (0.005, 5000.0, 0.0), (0.002, 8000.0, 0.007)])
-@pytest.mark.parametrize(("depth", "v"), CONTACTS)
+@each_row("h, k, tau", [(0.005, 5000.0, 0.02), (0.005, 5000.0, 0.0), (0.002, 8000.0, 0.007)])
+@each_row("depth, v", CONTACTS)
 def test_sap_contact_step(h, k, tau, depth, v):
     """Regularization R = 1 / (h k (h + tau)), bias x / (h + tau)."""
     model = ball_on_ground(h, k, "sap", relaxation_time=tau)
@@ -190,8 +189,8 @@ def test_sap_contact_step(h, k, tau, depth, v):
     assert d.A[1] == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
 
-@pytest.mark.parametrize("approximation", APPROXIMATIONS)
-@pytest.mark.parametrize(("k_ball", "k_ground"), [(1e4, 1e4), (2000.0, 6000.0)])
+@each_row("approximation", APPROXIMATIONS)
+@each_row("k_ball, k_ground", [(1e4, 1e4), (2000.0, 6000.0)])
 def test_static_penetration_is_weight_over_stiffness(approximation, k_ball, k_ground):
     """It is m g / k, after 8 s of settling; stiffnesses combine as springs in series."""
     plant = Plant(0.01, approximation)
@@ -214,7 +213,7 @@ def newton(f, slope, x):
     return x
 
 
-@pytest.mark.parametrize(("u", "v0"), [(0.0, 1.0), (2.0, 0.0), (4.9, 0.0), (6.0, 0.0), (-6.5, 0.3)])
+@each_row("u, v0", [(0.0, 1.0), (2.0, 0.0), (4.9, 0.0), (6.0, 0.0), (-6.5, 0.3)])
 def test_lagged_friction_step(u, v0):
     """v = v0 + h u / m - mu g h v / sqrt(v^2 + eps^2), by Newton's method here."""
     mu, h, k, eps = 0.5, 0.01, 1e4, 1e-4
@@ -261,8 +260,8 @@ def test_the_step_is_a_copy(load):
     assert np.array_equal(first, kept)
 
 
-@pytest.mark.parametrize(
-    ("x", "u", "words"),
+@each_row(
+    "x, u, words",
     [
         ([0.1], [0.0], r"x: expected shape \(2,\), got shape \(1,\)"),
         ([0.1, 0.0], [0.0, 1.0], r"u: expected shape \(1,\), got shape \(2,\)"),

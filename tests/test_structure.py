@@ -3,7 +3,7 @@
 import ast
 from pathlib import Path
 
-import pytest
+from helpers.table import each_row
 
 TESTS = Path(__file__).parent
 
@@ -27,7 +27,7 @@ def test_no_module_imports_a_test_module_or_conftest():
     assert not {path: names for path, names in found.items() if names}
 
 
-@pytest.mark.parametrize(
+@each_row(
     "line", ["import conftest", "from test_a import b", "from . import test_a", "def f():\n    import test_a as c"]
 )
 def test_such_an_import_is_found(tmp_path, line):

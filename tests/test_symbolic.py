@@ -9,6 +9,7 @@ import pydrake.math
 import pytest
 from helpers.models import MODELS, random_state, robot_file
 from helpers.plants import floating, random_tree
+from helpers.table import each_row
 from helpers.transcription import BLOCK, collocate, move, own_derivatives, solved
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.multibody.tree import QuaternionFloatingJoint
@@ -52,7 +53,7 @@ def traced(f, nx=2, nu=1):
     return trace(f, nx, probe, np.array([np.asarray(f(k[:nx], k[nx:]), dtype=float) for k in probe])), probe
 
 
-@pytest.mark.parametrize("form", FORMS)
+@each_row("form", FORMS)
 def test_a_function_in_ordinary_arithmetic_has_an_expression(form):
     f = FORMS[form]
     function, probe = traced(f)
@@ -76,7 +77,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("form", REFUSED)
+@each_row("form", REFUSED)
 def test_a_function_that_does_more_has_none_and_it_says_why(form):
     why, _ = traced(REFUSED[form])
     assert isinstance(why, Refusal)
@@ -101,7 +102,7 @@ def model_named(name):
 PLANTS = ["pendulum.urdf", "cart_pole.urdf", "acrobot.xml", "double_pendulum.urdf", "mass_spring_damper.sdf"]
 
 
-@pytest.mark.parametrize("name", [*PLANTS, "ur5_robot.urdf", "tree0", "tree1", "tree2"])
+@each_row("name", [*PLANTS, "ur5_robot.urdf", "tree0", "tree1", "tree2"])
 def test_a_plants_expression_and_its_derivative_are_drakes(name):
     """1e-9 of the largest entry: the trees' mass matrices have condition numbers up to 1e5."""
     model, random = model_named(name), np.random.default_rng(5)
@@ -163,7 +164,7 @@ def test_a_solve_computes_each_jacobian_once(monkeypatch):
     assert len(motion.result.iterations) <= len(calls) <= len(motion.result.iterations) + 2
 
 
-@pytest.mark.parametrize("left_out", ["damping", "stiffness", "reflected", "mass", "gravity"])
+@each_row("left_out", ["damping", "stiffness", "reflected", "mass", "gravity"])
 def test_a_plants_expression_that_leaves_something_out_is_refused(monkeypatch, left_out):
     model = random_tree(0)
     tree = symbolic_tree.tree_for(model)

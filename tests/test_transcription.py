@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from helpers.models import MODELS, random_state
 from helpers.plants import block, floating
+from helpers.table import each_row
 from helpers.transcription import BLOCK, collocate, effort, heavy_pendulum, move, own_derivatives, push, unit_inputs
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.multibody.tree import QuaternionFloatingJoint
@@ -39,7 +40,7 @@ def half_effort(x, u):
 # ------------------------------------------------------------------------------ exact discrete optima
 
 
-@pytest.mark.parametrize("count", [2, 5, 10, 20])
+@each_row("count", [2, 5, 10, 20])
 def test_the_blocks_move_has_each_schemes_own_optimum(count):
     by_trapezoid = move(count, scheme="trapezoid")
     assert 12 / by_trapezoid.cost == pytest.approx(1 - 4 / count**2 + 3 / count**3, rel=1e-9)
@@ -84,8 +85,8 @@ def test_the_cart_pole_from_its_file_swings_up(scheme, count, optimum):
 # ------------------------------------------------------------------------------ pendulums
 
 
-@pytest.mark.parametrize(
-    ("scheme", "count", "optimum"),
+@each_row(
+    "scheme, count, optimum",
     [
         ("trapezoid", 20, 8.876255),
         ("trapezoid", 40, 8.821279),
@@ -442,9 +443,9 @@ def test_what_cannot_be_is_infeasible():
 # ------------------------------------------------------------------------------ derivatives
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize("horizon", [2.0, (1.0, 3.0)])
-@pytest.mark.parametrize("form", ["symbolic", "called"])
+@each_row("scheme", SCHEMES)
+@each_row("horizon", [2.0, (1.0, 3.0)])
+@each_row("form", ["symbolic", "called"])
 def test_the_programs_derivatives_are_differences(scheme, horizon, form):
     """Gradient and Jacobian of its values, Hessian of theirs, with every kind of term; errors of differences 1e-7."""
     pendulum = heavy_pendulum(0.1)
@@ -512,7 +513,7 @@ def test_every_knot_is_evaluated_and_linearized_once_an_iterate():
     assert len(linearized) <= 1.05 * len(set(linearized)) + 1
 
 
-@pytest.mark.parametrize("name", ["cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "floating"])
+@each_row("name", ["cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "floating"])
 def test_a_plants_derivatives_are_those_of_its_equations_of_motion(load, name):
     model = floating(QuaternionFloatingJoint, 0) if name == "floating" else load(name)
     dynamics, equations, random = plant_dynamics(model), EquationsOfMotion(model), np.random.default_rng(0)
@@ -542,7 +543,7 @@ FORMS = {
 }
 
 
-@pytest.mark.parametrize("form", FORMS)
+@each_row("form", FORMS)
 def test_dynamics_of_many_knots_are_those_of_each(form):
     f, rng = FORMS[form], np.random.default_rng(0)
     dynamics, knots = Dynamics(f, 2, 2), rng.standard_normal((5, 4))
@@ -559,8 +560,8 @@ def test_dynamics_of_many_knots_are_those_of_each(form):
 # ------------------------------------------------------------------------------ bad input
 
 
-@pytest.mark.parametrize(
-    ("f", "message"),
+@each_row(
+    "f, message",
     [
         (3, "dynamics: expected a function of x and u"),
         (lambda x: x, "dynamics: expected a function .* got TypeError"),
@@ -580,8 +581,8 @@ def test_dynamics_without_derivatives_are_refused():
         Dynamics(lambda x, u: np.array([1.0, 2.0]), 2, 1)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
+@each_row(
+    "options, message",
     [
         ({"nx": 0}, "nx: expected a whole number"),
         ({"nu": 1.5}, "nu: expected a whole number"),
@@ -596,8 +597,8 @@ def test_bad_dynamics_are_named(options, message):
         Dynamics(push, **sizes)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
+@each_row(
+    "options, message",
     [
         ({"system": push}, "system: expected a Model or Dynamics, got function"),
         ({"x0": [0]}, r"x0: expected shape \(2,\)"),
@@ -661,8 +662,8 @@ def test_the_time_of_kellys_cart_pole(capsys):
     assert ours.options["derivatives"] == "symbolic, exact Hessian"
 
 
-@pytest.mark.parametrize("row", [0, 2, -1])
-@pytest.mark.parametrize("column", [0, 1])
+@each_row("row", [0, 2, -1])
+@each_row("column", [0, 1])
 def test_a_moved_knot_is_no_success(row, column):
     """Whatever the solver says, the motion is measured."""
     block = dd.Dynamics(lambda x, u: [x[1], u[0]], 2, 1)

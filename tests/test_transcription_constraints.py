@@ -7,6 +7,7 @@ import signal
 
 import numpy as np
 import pytest
+from helpers.table import each_row
 from helpers.transcription import BLOCK, collocate, effort, heavy_pendulum, move, own_derivatives, unit_inputs
 
 import drake_diff as dd
@@ -21,8 +22,8 @@ SWING = TASK | {"x_goal": [np.pi, 0], "num_steps": 20, "horizon": 2.0}
 # ------------------------------------------------------------------------------ waypoints
 
 
-@pytest.mark.parametrize("dynamics", [BLOCK, CALLED])
-@pytest.mark.parametrize("place", [0.5, 0.7, -0.2])
+@each_row("dynamics", [BLOCK, CALLED])
+@each_row("place", [0.5, 0.7, -0.2])
 def test_a_place_half_way(dynamics, place):
     """J = 12 + 192 (w - 1/2)^2: the move and a hump, whose inputs are orthogonal; two cubics, exact for the scheme."""
     motion = move(10, dynamics, waypoints={5: [place, np.nan]})
@@ -39,8 +40,8 @@ def test_a_refined_mesh_keeps_the_waypoints_place():
     assert motion.success
 
 
-@pytest.mark.parametrize(
-    ("waypoints", "message"),
+@each_row(
+    "waypoints, message",
     [
         ({0: [0, 0]}, "knots of waypoints: expected whole numbers from 1 to 9"),
         ({10: [0, 0]}, "knots of waypoints: expected whole numbers from 1 to 9"),
@@ -105,8 +106,8 @@ def test_a_given_first_state_need_not_keep_a_constraint():
     assert motion.transcribed.nodes[1:, 1].max() < 0.9 + 1e-7
 
 
-@pytest.mark.parametrize(
-    ("constraint", "message"),
+@each_row(
+    "constraint, message",
     [
         (3, "constraints: expected a Constraint or several, got int"),
         ([3], "constraints: expected a Constraint or several, got int"),
@@ -210,11 +211,11 @@ def test_the_iteration_table_is_the_solvers():
     assert whole.iterations[1].step <= 1
 
 
-@pytest.mark.parametrize(
-    ("error", "status"),
+@each_row(
+    "error, status",
     [(SimulationError, dd.Status.DIVERGED), (GradientError, dd.Status.NO_GRADIENT)],
 )
-@pytest.mark.parametrize("at", ["values", "linearize"])
+@each_row("at", ["values", "linearize"])
 def test_an_error_of_the_dynamics_ends_the_solve_and_is_told(error, status, at):
     own, calls = own_derivatives(heavy_pendulum(0.1)), []
     plain = getattr(own, at)

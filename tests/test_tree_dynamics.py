@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.models import Plant, robot_file
 from helpers.plants import pd_pendulum, random_tree
+from helpers.table import each_row
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.multibody.tree import (
     LinearSpringDamper,
@@ -39,7 +40,7 @@ def by_drake(model, x, a):
     return ExtractValue(tau).ravel(), ExtractGradient(tau), model.plant.CalcMassMatrix(model.double.context)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@each_row("seed", range(12))
 def test_a_random_tree_is_drakes_entry_by_entry(seed):
     model, random = random_tree(seed), np.random.default_rng(100 + seed)
     n = model.nv
@@ -154,7 +155,7 @@ def test_a_tree_that_is_not_drakes_is_not_used(monkeypatch):
     assert pytest.approx(b.A, abs=1e-10) == a.A
 
 
-@pytest.mark.parametrize("name", ["cart_pole.urdf", "acrobot.xml", "mass_spring_damper.sdf", "double_pendulum.urdf"])
+@each_row("name", ["cart_pole.urdf", "acrobot.xml", "mass_spring_damper.sdf", "double_pendulum.urdf"])
 def test_a_whole_rollout_in_one_call_is_the_one_by_autodiff(load, name):
     model = load(name)
     random = np.random.default_rng(0)

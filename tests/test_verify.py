@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.models import MODELS, ROOT
+from helpers.table import each_row
 
 import drake_diff as dd
 import drake_diff.artifact.save as evidence
@@ -190,8 +191,8 @@ def set_value(index, key, value):
     return change
 
 
-@pytest.mark.parametrize(
-    ("section", "change", "words"),
+@each_row(
+    "section, change, words",
     [
         ("metrics", set_value(0, "value", 0.1), "cost: recorded 0.1"),
         ("metrics", set_value(2, "value", 9e-6), "goal error: recorded 9e-06"),
@@ -262,7 +263,7 @@ def test_an_incomplete_run_is_undecided_and_a_failed_one_is_true(solution, tmp_p
     assert dd.verify(tmp_path / "b").holds
 
 
-@pytest.mark.parametrize("key", ["num_steps", "x0", "constraints", "running_cost", "optimize"])
+@each_row("key", ["num_steps", "x0", "constraints", "running_cost", "optimize"])
 def test_a_record_whose_problem_is_none_is_broken_not_an_accident(run, copy, key):
     record = dd.load_record(run)
     for problem in ({**record.problem, key: "?"}, {k: v for k, v in record.problem.items() if k != key}):
@@ -308,7 +309,7 @@ def test_every_kind_of_directory_is_known_read_and_listed(kinds):
         found.require()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@each_row("kind", KINDS)
 def test_a_changed_directory_of_any_kind_is_refused_and_the_file_named(kinds, kind, tmp_path):
     record = dd.load_record(kinds / kind)
     for name in (record.FILE, KINDS[kind]):

@@ -1,9 +1,9 @@
 """Models whose gradient is wrong, refused, or not there, each flagged for the right reason; and good ones."""
 
 import numpy as np
-import pytest
 from helpers.models import Plant, contact_properties
 from helpers.plants import offset_pendulum, pair, pd_pendulum
+from helpers.table import each_row
 from pydrake.geometry import AddCompliantHydroelasticProperties, Box, Capsule, Cylinder, HalfSpace, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import SpatialInertia
@@ -154,7 +154,7 @@ def _plain_ball(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("name", ZOO)
+@each_row("name", ZOO)
 def test_every_animal_is_flagged_for_the_right_reason(name, tmp_path):
     assert ZOO[name](tmp_path)
 
@@ -168,8 +168,8 @@ GOOD = {
 }
 
 
-@pytest.mark.parametrize("name", GOOD)
-@pytest.mark.parametrize("scale", [0.5, 1.0, 1.4])
+@each_row("name", GOOD)
+@each_row("scale", [0.5, 1.0, 1.4])
 def test_no_good_state_is_flagged(load, name, scale):
     """15 states by hand; `test_certification.py` has 160 sampled ones, contact among them."""
     x, u = GOOD[name]
@@ -179,8 +179,8 @@ def test_no_good_state_is_flagged(load, name, scale):
     assert not [f for f in dd.audit(model, *point) if f.severity == "error"]
 
 
-@pytest.mark.parametrize(("z", "vx", "vz"), [(0.3, 1.0, -1.0), (REST, 1.0, 0.0), (0.097, 0.5, -0.5), (0.0985, 0, 0.3)])
-@pytest.mark.parametrize("approximation", ["sap", "similar", "lagged"])
+@each_row("z, vx, vz", [(0.3, 1.0, -1.0), (REST, 1.0, 0.0), (0.097, 0.5, -0.5), (0.0985, 0, 0.3)])
+@each_row("approximation", ["sap", "similar", "lagged"])
 def test_no_good_contact_state_is_flagged(z, vx, vz, approximation):
     model = ball(approximation=approximation)
     dd.certify(model, [0.0, z, vx, vz], [0.3]).require()

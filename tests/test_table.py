@@ -1,0 +1,45 @@
+"""What one test of many rows promises: all are checked, each that fails is named, and none can spoil the next."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers.table import each_row
+
+TABLES = """
+from helpers.table import each_row
+
+@each_row("a, b", [(1, 1), (2, 3), (4, 5)])
+@each_row("c", "xy", ids=["ex", "why"])
+def test_product(a, b, c):
+    assert a == b or c == "y"
+
+@each_row("n", [1, 2, 3])
+def test_own(n, tmp_path, monkeypatch):
+    assert not list(tmp_path.iterdir()) and __name__ == "test_tables"
+    (tmp_path / "file").touch()
+    monkeypatch.setattr("test_tables.__name__", "another")
+"""
+
+
+def test_every_row_that_fails_is_named_and_the_others_are_checked(tmp_path):
+    (tmp_path / "test_tables.py").write_text(TABLES)
+    command = [sys.executable, "-m", "pytest", "-q", "--import-mode=prepend", "-p", "no:cacheprovider", str(tmp_path)]
+    run = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+    failed = [line.split("]")[0] for line in run.stdout.splitlines() if line.startswith("SUBFAILED")]
+    assert failed == ["SUBFAILED[1: 2, 3; ex", "SUBFAILED[2: 4, 5; ex"], run.stdout + run.stderr
+    assert "3 failed, 1 passed, 7 subtests passed" in run.stdout, run.stdout
+
+
+def test_a_table_that_checks_nothing_or_fits_nothing_is_refused():
+    with pytest.raises(ValueError, match="without rows"):
+        each_row("a", [])
+    with pytest.raises(ValueError, match="2 rows have 1 names"):
+        each_row("a", [1, 2], ids=["one"])
+    with pytest.raises(ValueError, match="shorter"):
+        each_row("a, b", [(1, 2), (1,)])
+    with pytest.raises(TypeError, match="test of its own"):
+        each_row("a", [pytest.param(1, marks=pytest.mark.slow)])
+    with pytest.raises(TypeError, match="takes no"):
+        each_row("a", [1])(lambda b: None)
