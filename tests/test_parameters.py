@@ -478,7 +478,7 @@ PRESSED = [(0.005, 0.003, -0.2), (0.005, 0.0005, -1.0), (0.002, 0.002, 0.1)]
 @each_row("ours, ground", SIDES)
 @each_row("h, depth, v", PRESSED)
 def test_a_pressed_ball_by_stiffness_radius_and_mass(approximation, ours, ground, h, depth, v):
-    """The spring at the end of the step: (m + h^2 k) v+ = m (v - g h) + h k depth with k = ours ground / (ours + ground)."""
+    """A spring implicit in its depth: (m + h^2 k) v+ = m (v - g h) + h k depth with k = ours ground / (ours + ground)."""
     m = 1.3
     model = railed_ball(h, approximation, {"stiffness": ours}, {"stiffness": ground}, mass=m).model()
     k = ours * ground / (ours + ground)
@@ -535,7 +535,7 @@ def test_a_pressed_ball_by_dissipation(approximation, d_ball, d_ground, h, depth
 @each_row("t_ball, t_ground", [(0.01, 0.01), (0.02, 0.001)])
 @each_row("h, depth, v", PRESSED)
 def test_a_pressed_ball_by_relaxation_time(t_ball, t_ground, h, depth, v):
-    """Damping k t p' in series with the spring, m = 1: (1 + h k (h + t)) v+ = v - g h + h k depth, t the sum of both sides'."""
+    """A damper k t beside the spring, m = 1: (1 + h k (h + t)) v+ = v - g h + h k depth, t the sum of both sides'."""
     k = 5000.0
     sides = [{"stiffness": 2 * k, "relaxation_time": t} for t in (t_ball, t_ground)]
     model = railed_ball(h, "sap", *sides).model()
