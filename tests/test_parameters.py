@@ -478,7 +478,7 @@ PRESSED = [(0.005, 0.003, -0.2), (0.005, 0.0005, -1.0), (0.002, 0.002, 0.1)]
 @each_row("ours, ground", SIDES)
 @each_row("h, depth, v", PRESSED)
 def test_a_pressed_ball_by_stiffness_radius_and_mass(approximation, ours, ground, h, depth, v):
-    """A spring implicit in its depth: (m + h^2 k) v+ = m (v - g h) + h k depth with k = ours ground / (ours + ground)."""
+    """An implicit spring: (m + h^2 k) v+ = m (v - g h) + h k depth with k = ours ground / (ours + ground)."""
     m = 1.3
     model = railed_ball(h, approximation, {"stiffness": ours}, {"stiffness": ground}, mass=m).model()
     k = ours * ground / (ours + ground)
