@@ -38,6 +38,7 @@ def saved(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_what_is_saved_is_what_was_asked_for(saved):
     found = json.loads(saved.read_text())
     assert found["format"] == 1
@@ -53,6 +54,7 @@ def test_what_is_saved_is_what_was_asked_for(saved):
     assert reasons["Drake differences", "step"] == "it is Drake's double step"
 
 
+@pytest.mark.slow
 def test_times_have_their_spread_and_the_base_is_one(saved):
     rows = json.loads(saved.read_text())["rows"]
     for row in rows:
@@ -64,6 +66,7 @@ def test_times_have_their_spread_and_the_base_is_one(saved):
             assert row["ratio"] == {"median": 1.0, "q1": 1.0, "q3": 1.0}
 
 
+@pytest.mark.slow
 def test_peers_give_one_answer_before_they_are_timed(saved):
     rows = [row for row in json.loads(saved.read_text())["rows"] if row["gap"] is not None]
     assert {"drake_diff", "Drake differences"} <= {row["peer"] for row in rows}
@@ -72,6 +75,7 @@ def test_peers_give_one_answer_before_they_are_timed(saved):
             assert row["gap"] < 1e-9  # of central differences with steps of 1e-5 and 1e-6; analytic ones are at 1e-16
 
 
+@pytest.mark.slow
 def test_equal_runs_do_not_differ(saved, part):
     run = json.loads(saved.read_text())
     found, alone = part("compare").changes(run, run)
@@ -80,6 +84,7 @@ def test_equal_runs_do_not_differ(saved, part):
     assert not any(one.changed for one in found)
 
 
+@pytest.mark.slow
 def test_a_peer_twice_as_slow_is_told(saved, tmp_path):
     old = json.loads(saved.read_text())
     steady = dict.fromkeys(("median", "q1", "q3"), 0.5)

@@ -29,7 +29,12 @@ def test_every_model_here_is_certified_at_every_sampled_state(load, name):
 
 
 @pytest.mark.parametrize(
-    ("name", "base"), [("panda.urdf", "panda_link0"), ("ur5_robot.urdf", None), ("solo12.urdf", None)]
+    ("name", "base"),
+    [
+        ("panda.urdf", "panda_link0"),
+        pytest.param("ur5_robot.urdf", None, marks=pytest.mark.slow),
+        ("solo12.urdf", None),
+    ],
 )
 def test_real_robots_are_certified(name, base):
     with warnings.catch_warnings():

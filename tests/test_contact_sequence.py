@@ -102,6 +102,7 @@ def at_a_jump(elastic):
     return push(elastic(damping=1.06, pusher=1.74, ball=0.586), gap=0.18, goal=0.93)
 
 
+@pytest.mark.slow
 def test_a_minimum_at_a_jump_meets_the_conditions_of_one_on_its_side(elastic):
     """Least effort: u is a combination of the slopes of goal and held distance by u, the latter's sign as its side.
 

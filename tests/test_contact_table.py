@@ -205,6 +205,7 @@ def test_wrong_gradients_are_those_without_the_jump(found):
         assert found.row(kind, "mujoco").gradient == pytest.approx(seen, rel=5e-3)  # 1 h omega of its softer spring
 
 
+@pytest.mark.slow
 def test_smaller_steps_mend_the_steps_damper_and_not_the_jump():
     """By the hand calculation, which is Drake's sap: without a damper the gradient tends to its law's, with one not."""
     gaps = {}
@@ -434,6 +435,7 @@ def test_sentences_and_json(found):
     assert read["rows"][0]["value"] == found.rows[0].value
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_table_and_writes_json(tmp_path):
     words = ["contact-table", "--engines", "drake:lagged", "--out", str(tmp_path / "table.json")]
     done = subprocess.run(

@@ -33,7 +33,7 @@ def test_the_cart_pole_swings_up_near_the_continuous_optimum():
     assert np.abs(solution.replay.xs[-1] - [1, np.pi, 0, 0]).max() < 1e-8  # the simulator itself arrives
 
 
-@each_row("vx", [0.3, 1.0, 2.0, 3.7])
+@each_row("vx", [0.3, 2.0, 3.7])  # short of the target, on it and beyond
 def test_the_projectiles_three_gradients_agree(vx):
     """By hand d loss / d vx = (x_T - 6) * 3.0 with x_T = 3 vx."""
     module = example("projectile_hits_target")

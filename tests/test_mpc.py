@@ -79,6 +79,7 @@ def test_a_goal_that_gravity_pulls_away_from_is_stayed_at_by_the_input_that_hold
         dd.loop.MPC(weak, horizon=20, plan=(np.zeros((51, 2)), np.zeros((50, 1))))
 
 
+@pytest.mark.slow
 def test_the_pushed_cart_pole_ends_upright(swung):
     """One push on the way that open loop does not survive, one when it stands; both within |u| <= 20."""
     problem, pushes = swung.problem, [dd.loop.Push("pole", [1.5, 0, 0], 0.8), dd.loop.Push("pole", [-0.5, 0, 0], 2.6)]

@@ -51,6 +51,7 @@ def test_lqr_has_the_riccati_recursions_cost_from_states_that_are_no_rollout(sol
     assert solution.cost == pytest.approx(12.948481280713864, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_an_acrobot_swings_up_from_rest_where_one_segment_fails():
     problem = dd.Problem(
         dd.load_model(MODELS / "acrobot.xml", time_step=0.05),

@@ -502,14 +502,14 @@ def test_static_penetration_by_stiffness_and_mass(approximation, ours, ground):
     """The depth is m g / k, so by k -m g / k^2, by m g / k, by the radius nothing: the ball is lifted by it."""
     extra = {"dissipation": 20.0, "relaxation_time": 0.1}
     sides = {"stiffness": ours, **extra}, {"stiffness": ground, **extra}
-    model, m = railed_ball(0.01, approximation, *sides, mass=1.5).model(), 1.5
+    model, m = railed_ball(0.05, approximation, *sides, mass=1.5).model(), 1.5
     k = ours * ground / (ours + ground)
     rest = [0.1 - m * G / k, 0.0]
     names = ("ball.stiffness", "ball.mass", "ball.radius")
-    g = dd.differentiate_rollout(model, rest, None, lambda x: 0.1 - x[0], num_steps=300, parameters=names)
+    g = dd.differentiate_rollout(model, rest, None, lambda x: 0.1 - x[0], num_steps=60, parameters=names)
     by_k = -m * G / k**2 * (ground / (ours + ground)) ** 2
     assert g.loss == pytest.approx(m * G / k, abs=1e-8)
-    assert g.by_parameters == pytest.approx([by_k, G / k, -1], rel=1e-5)  # 300 contact steps
+    assert g.by_parameters == pytest.approx([by_k, G / k, -1], rel=1e-5)  # 60 contact steps: 3 s
 
 
 @each_row("approximation", ["lagged", "similar"])
@@ -990,7 +990,7 @@ def test_every_parameter_of_a_file_is_certified(load, name, x, u):
     dd.certify(model, x, u, parameters=names).require()
 
 
-@pytest.mark.parametrize("approximation", ["lagged", "sap", "similar"])
+@pytest.mark.parametrize("approximation", ["lagged", "sap", pytest.param("similar", marks=pytest.mark.slow)])
 def test_every_parameter_of_a_sliding_ball_is_certified(approximation):
     model = ball(approximation)
     names = certifiable(model)

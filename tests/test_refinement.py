@@ -40,7 +40,7 @@ def height(x):
     return x[0]
 
 
-@pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e5])
+@pytest.mark.parametrize("stiffness", [1e3, pytest.param(1e4, marks=pytest.mark.slow), 1e5])
 def test_through_a_bounce_the_gradient_does_not_converge_and_is_called_that(bouncer, stiffness):
     """A rigid ball ends at 2 r - y0 - v0 T, so d y / d y0 = -1 and d y / d v0 = -T."""
     model = bouncer(stiffness, 1 / 480)
@@ -97,7 +97,7 @@ def test_the_gradient_of_a_projectile_is_the_same_at_every_step_size(load, h, co
     assert certificate.refinements[0].values[:, j] == pytest.approx([h * count] * 3, rel=1e-9)
 
 
-@pytest.mark.parametrize("h", [0.01, 0.005])
+@pytest.mark.parametrize("h", [0.01, pytest.param(0.005, marks=pytest.mark.slow)])
 def test_the_gradient_of_a_spring_tends_to_the_continuous_one(load, h):
     """x(T) of m x'' + c x' + k x = 0 by x(0): e^(-a T) (cos w T + a / w sin w T), a = c / 2 m; and by v(0)."""
     model, count = load("mass_spring_damper.sdf", time_step=h), round(0.5 / h)

@@ -414,7 +414,14 @@ def test_predictions_are_the_closed_form(regulator):
         assert sensitivity.predicted(name, 0.03) == pytest.approx(0.03 * value, rel=1e-9), name
 
 
-@pytest.mark.parametrize(("name", "level"), [("initial_state", 0.01), ("sensor_noise", 0.01), ("sensor_bias", 0.01)])
+@pytest.mark.parametrize(
+    ("name", "level"),
+    [
+        pytest.param("initial_state", 0.01, marks=pytest.mark.slow),
+        ("sensor_noise", 0.01),
+        pytest.param("sensor_bias", 0.01, marks=pytest.mark.slow),
+    ],
+)
 def test_what_is_measured_is_what_is_predicted(cart, name, level):
     """The loop is linear, so the mean square is exact; 2000 trials know it to their standard error, of which three."""
     found = dd.robustness(regulated(cart, 10), {name: [level]}, trials=2000, controller=feedback).cells[0]

@@ -331,6 +331,7 @@ def test_what_runs_away_is_kept(cart, tmp_path, levels):
     assert "drawn up to 1e+06 only" in replay
 
 
+@pytest.mark.slow
 def test_plants_with_contact_finer_steps_and_no_inputs_are_kept(thrown, tmp_path):
     levels = {"contact_approximation": [1], "time_step": [2], "friction": [0.4]}
     result = dd.robustness(thrown, levels, trials=2)
