@@ -1,13 +1,8 @@
 """Which term makes two engines' steps differ: inertia, bias, actuation, damping, time step, integrator, contact law.
 
-Where nothing touches every engine here takes some Euler step with its own M, bias, B u and damping. So both steps are
-written out from the terms that the engines give, one term of the other engine is put in at a time, and what that
-changes of the step is this term's effect. What no Euler step explains is the contact law's, where something touches,
-or the limit law's, where a joint is beyond a limit; else it is unexplained, and said to be.
-
-Of a recording there is nothing to ask. Each recorded step that is apart is tried as the reference's with one thing
-changed: another Euler step or time step, gravity turned round, damping or armature left out. A change that takes the
-recorded step, but for a hundredth of the gap, is named; else the step is unexplained.
+Both steps are written as Euler steps from the engines' own terms, one term of the other is put in at a time, and what
+that changes is the term's effect. A recording has no terms to ask for: its steps are tried as the reference's with one
+thing changed.
 """
 
 import json
@@ -87,10 +82,13 @@ def attribute(
         for M, bias, engine in zip(masses, biases, (one, two), strict=True)
     )
     after_a, after_b = (of_norm_one(coordinates, after, x) for after in steps)
-    scheme_a, scheme_b = (
-        _scheme(coordinates, x, terms, after, FITS[engine.contract.precision])
-        for engine, terms, after in ((one, a, after_a), (two, b, after_b))
-    )
+    schemes = []
+    for engine, terms, after in ((one, a, after_a), (two, b, after_b)):
+        misfits = {scheme: _size(after - euler(coordinates, x, terms, scheme)) for scheme in SCHEMES}
+        best = min(misfits, key=lambda scheme: misfits[scheme])
+        fits = misfits[best] <= FITS[engine.contract.precision] * max(1.0, _size(after))
+        schemes.append(best if fits else SCHEMES[0])  # where none gives the step, something else is at work
+    scheme_a, scheme_b = schemes
     base = euler(coordinates, x, a, scheme_a)
     effects = {
         name.replace("_", " "): _size(euler(coordinates, x, a._replace(**{name: getattr(b, name)}), scheme_a) - base)
@@ -149,13 +147,6 @@ def forces(contract: EngineContract, u: Array) -> tuple[Array, Array]:
     actuation = np.array(contract.actuation, dtype=float).reshape(len(contract.actuation), len(u))
     damping = [[0.0] * 6 if joint.kind == "quaternion_floating" else [joint.damping] for joint in contract.joints]
     return actuation @ np.clip(u, -limits, limits), np.array([number for joint in damping for number in joint])
-
-
-def _scheme(coordinates: Coordinates, x: Array, terms: Terms, after: Array, fits: float) -> EulerScheme:
-    """The scheme that gives the step; Drake's where none does, for then something else is at work."""
-    misfits = {scheme: _size(after - euler(coordinates, x, terms, scheme)) for scheme in SCHEMES}
-    best = min(misfits, key=lambda scheme: misfits[scheme])
-    return best if misfits[best] <= fits * max(1.0, _size(after)) else SCHEMES[0]
 
 
 def what_is_left(coordinates: Coordinates, one: Engine, two: Engine, x: Array, steps: tuple[Array, Array]) -> str:

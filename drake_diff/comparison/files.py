@@ -13,17 +13,8 @@ from drake_diff.logs.channels import input_channel, nanoseconds, state_channel, 
 from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.logs.messages import TYPES
 from drake_diff.model.model import Model
-from drake_diff.record.comparison import (
-    AttributionEvidence,
-    ComparisonClock,
-    ComparisonRecord,
-    EngineEvidence,
-    JacobianEvidence,
-    LineEvidence,
-    Numbers,
-    RefusedEvidence,
-    StateEvidence,
-)
+from drake_diff.record import comparison as records
+from drake_diff.record.comparison import ComparisonRecord
 from drake_diff.record.provenance import gradient_evidence, model_input, provenance_of, written_now
 
 TRACE, REPLAY, PAGE = "trace.mcap", "replay.html", "comparison.html"
@@ -79,10 +70,10 @@ def record_of(comparison: Comparison, name: str) -> ComparisonRecord:
     found = {
         "verdict": "pass" if comparison.holds else "fail",
         "sentence": str(comparison),
-        "states": [StateEvidence(name=s.name, x=s.x.tolist(), u=s.u.tolist()) for s in comparison.states],
+        "states": [records.StateEvidence(name=s.name, x=s.x.tolist(), u=s.u.tolist()) for s in comparison.states],
         "engines": [_engine(e) for e in comparison.engines],
-        "refused": [RefusedEvidence(**vars(refused)) for refused in comparison.refused],
-        "wall_clock": ComparisonClock(
+        "refused": [records.RefusedEvidence(**vars(refused)) for refused in comparison.refused],
+        "wall_clock": records.ComparisonClock(
             written_utc=written_now(),
             seconds_per_step={e.engine: e.seconds_per_step for e in comparison.engines},
             seconds_per_jacobian={e.engine: e.seconds_per_jacobian for e in comparison.engines},
@@ -95,38 +86,25 @@ def _begun(name: str, model: Model) -> ComparisonRecord:
     steps = {f"step, {precision}": value for precision, value in STEP_TOLERANCE.items()}
     jacobians = {f"jacobian, {precision}": value for precision, value in JACOBIAN_TOLERANCE.items()}
     return ComparisonRecord(
-        name=name,
-        verdict="incomplete",
+        name=name, verdict="incomplete",
         sentence="the comparison is still running, or it was killed or failed before its end",
-        tolerances={**steps, **jacobians},
-        model=model_input(model),
-        contract=model.contract.to_dict(),
-        time_step_s=model.time_step,
-        state_names=list(model.state_names),
-        input_names=list(model.input_names),
-        states=[],
-        engines=[],
-        refused=[],
-        provenance=provenance_of(),
-        wall_clock=ComparisonClock(written_utc=written_now()),
-    )
+        tolerances={**steps, **jacobians}, model=model_input(model), contract=model.contract.to_dict(),
+        time_step_s=model.time_step, state_names=list(model.state_names), input_names=list(model.input_names),
+        states=[], engines=[], refused=[], provenance=provenance_of(),
+        wall_clock=records.ComparisonClock(written_utc=written_now()),
+    )  # fmt: skip
 
 
-def _engine(e: Compared) -> EngineEvidence:
+def _engine(e: Compared) -> records.EngineEvidence:
     same = ("engine", "version", "precision", "verdict", "sentence", "final_gap", "rollout_gap", "gradient")
-    return EngineEvidence(
-        **{name: getattr(e, name) for name in same},
-        contract=[LineEvidence(**vars(line)) for line in e.lines],
-        status=e.motion.status,
-        steps=len(e.motion.us),
-        largest_step_gap=float(max(e.step_gaps, default=0.0)),
+    return records.EngineEvidence(
+        **{name: getattr(e, name) for name in same}, contract=[records.LineEvidence(**vars(line)) for line in e.lines],
+        status=e.motion.status, steps=len(e.motion.us), largest_step_gap=float(max(e.step_gaps, default=0.0)),
         first_apart_s=None if e.first_apart is None else float(e.motion.times[e.first_apart]),
-        first=_attribution(e.first),
-        largest=_attribution(e.largest),
-        energy_change_J=e.motion.energy_change,
+        first=_attribution(e.first), largest=_attribution(e.largest), energy_change_J=e.motion.energy_change,
         largest_penetration_m=None if e.motion.depth is None else float(np.max(e.motion.depth)),
         jacobians=[
-            JacobianEvidence(
+            records.JacobianEvidence(
                 **{name: getattr(j, name) for name in ("state", "method", "own")},
                 gap=float(gap),
                 jacobian=_rows(j.jacobian),
@@ -136,17 +114,17 @@ def _engine(e: Compared) -> EngineEvidence:
             for j, gap, law in zip(e.jacobians, e.jacobian_gaps, e.laws, strict=True)
         ],
         rollout_jacobian=None if e.rollout_jacobian is None else _rows(e.rollout_jacobian),
-    )
+    )  # fmt: skip
 
 
-def _attribution(a: Attribution) -> AttributionEvidence:
-    return AttributionEvidence(
+def _attribution(a: Attribution) -> records.AttributionEvidence:
+    return records.AttributionEvidence(
         gap=a.gap, responsible=a.responsible, effects=dict(a.effects), schemes=[str(s) for s in a.schemes],
         assumed=list(a.assumed),
     )  # fmt: skip
 
 
-def _rows(matrix: Array) -> list[Numbers]:
+def _rows(matrix: Array) -> list[records.Numbers]:
     return [[float(v) if np.isfinite(v) else None for v in row] for row in matrix]
 
 
@@ -169,10 +147,9 @@ def write_comparison_trace(path: Path, comparison: Comparison) -> None:
             Channel(f"{topic}/diagnostics", kind.cls, rows, {"units": kind.units}),
         ]
     times = comparison.reference.motion.times
+    # No frames of what was sampled otherwise.
     alike = {s: m for s, m in motions.items() if np.allclose(m.times, times[: len(m.times)])}
-    channels.append(
-        transform_channel(model, times, {f"{s}/": m.xs for s, m in alike.items()})
-    )  # none sampled otherwise
+    channels.append(transform_channel(model, times, {f"{s}/": m.xs for s, m in alike.items()}))
     write_mcap(path, channels, metadata, {})
 
 

@@ -19,13 +19,9 @@ MOST_PLOTS = 12  # of coordinates; those whose motions are furthest apart
 def write_comparison_page(path: Path, comparison: Comparison, record: ComparisonRecord, replay: Path) -> None:
     """Write the page of `comparison` with its `record` and the page `replay`, which has the engines as ghosts."""
     write_page(
-        path,
-        "comparison.html.j2",
-        record=record.model_dump(mode="json"),
-        data=comparison_data(comparison),
-        view=replay.read_text(encoding="utf-8"),
-        most_plots=MOST_PLOTS,
-    )
+        path, "comparison.html.j2", record=record.model_dump(mode="json"), data=comparison_data(comparison),
+        view=replay.read_text(encoding="utf-8"), most_plots=MOST_PLOTS,
+    )  # fmt: skip
 
 
 def comparison_data(comparison: Comparison) -> dict[str, Any]:

@@ -1,15 +1,11 @@
 """Recorded motions out of ROS 2 messages, in a bag or in one MCAP file, by the time in their headers.
 
-sensor_msgs/JointState (/joint_states, or the only one): positions and velocities of joints of one degree of freedom by
-name, efforts as the inputs of the actuators that drive them. nav_msgs/Odometry: the pose and, in the child frame, the
-twist of the one free body. Or geometry_msgs/PoseStamped and TwistStamped, whose header says the frame of the twist: the
-pose's, or the body.
-
-A bag that was cut short is refused; a byte that is another is found only where the writer left a checksum, which
-rosbags does not.
+sensor_msgs/JointState (/joint_states, or the only one) has joints by name, efforts being their actuators' inputs;
+nav_msgs/Odometry, or geometry_msgs/PoseStamped and TwistStamped, the one free body. A bag cut short is refused; another
+byte is found only where the writer left a checksum, which rosbags does not.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,37 +45,31 @@ def read_ros2(path: Path, model: Model) -> tuple[tuple[Array, Array, Array], Map
     except ImportError as error:
         raise MissingDependencyError("a ROS 2 bag needs rosbags: pip install 'drake-diff[ros2]'") from error
     store, found = get_typestore(Stores.ROS2_HUMBLE), _Found(str(path), describe(model))
-    raw, facts = (_bag(path), {}) if path.is_dir() else _mcap(path)
-    for topic, kind, data in raw:
-        if kind in USED:
-            message = store.deserialize_cdr(data, kind)
-            stamp = message.header.stamp
-            found.topics[kind].setdefault(topic, {})[stamp.sec * 1_000_000_000 + stamp.nanosec] = message
+    messages, facts = _messages(path)
+    for topic, kind, data in messages:
+        message = store.deserialize_cdr(data, kind)
+        stamp = message.header.stamp
+        found.topics[kind].setdefault(topic, {})[stamp.sec * 1_000_000_000 + stamp.nanosec] = message
     return found.motion(model), facts
 
 
-def _bag(path: Path) -> Iterator[tuple[str, str, bytes]]:
+def _messages(path: Path) -> tuple[list[tuple[str, str, bytes]], Mapping[str, str]]:
+    """Topic, type and bytes of what is used, and the metadata record "contract" of an MCAP file."""
+    from mcap.reader import make_reader
     from rosbags.rosbag2 import Reader
 
     try:
-        with Reader(path) as reader:
-            for connection, _, data in reader.messages():
-                yield connection.topic, connection.msgtype, data
-    except Exception as error:  # a damaged bag makes readers fail in many ways
-        raise ArtifactError(f"{path} is not a ROS 2 bag: {error}") from error
-
-
-def _mcap(path: Path) -> tuple[Iterator[tuple[str, str, bytes]], Mapping[str, str]]:
-    from mcap.reader import make_reader
-
-    try:
+        if path.is_dir():
+            with Reader(path) as bag:
+                return [(c.topic, c.msgtype, data) for c, _, data in bag.messages() if c.msgtype in USED], {}
         with path.open("rb") as file:
             reader = make_reader(file, validate_crcs=True)
-            rows = [(c.topic, s.name if s else "", m.data) for s, c, m in reader.iter_messages()]
+            rows = [(c.topic, s.name, m.data) for s, c, m in reader.iter_messages() if s and s.name in USED]
             metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
+            return rows, metadata.get("contract", {})
     except Exception as error:  # a damaged file makes readers fail in many ways
-        raise ArtifactError(f"{path} is not a complete MCAP file: {error}") from error
-    return iter(rows), metadata.get("contract", {})
+        what = "a ROS 2 bag" if path.is_dir() else "a complete MCAP file"
+        raise ArtifactError(f"{path} is not {what}: {error}") from error
 
 
 class _Found:

@@ -27,15 +27,7 @@ from drake_diff.engines.contract_match import match_contracts
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.interface import Engine
 from drake_diff.engines.load import ELSEWHERE, ENGINES, load_spec
-from drake_diff.engines.motion import (
-    EngineMotion,
-    JacobianAt,
-    jacobian_at,
-    measured,
-    move,
-    rollout_jacobian,
-    seconds,
-)  # fmt: skip
+from drake_diff.engines.motion import EngineMotion, JacobianAt, jacobian_at, measured, move, rollout_jacobian, seconds
 from drake_diff.exceptions import MissingDependencyError, ModelError, SimulationError
 from drake_diff.mechanics.description import describe
 from drake_diff.model.model import Model
@@ -127,10 +119,7 @@ def default_engines(model: Model) -> tuple[str, ...]:
 
 
 class _Panel:
-    """What is asked of each engine, and the reference's answers.
-
-    The probes are the motion's start, a state sampled free and one touching, and the motion's deepest overlap.
-    """
+    """What each engine is asked, at the motion's start and deepest overlap, a state sampled free and one touching."""
 
     def __init__(self, model: Model, reference: DrakeEngine, x0: Array, us: Array, seed: int):
         self.space, self.names, self.model = tangent_space(model), model.input_names, model
@@ -161,23 +150,15 @@ class _Panel:
             laws.append(law if law in (CONTACT_LAW, LIMIT_LAW) else "")
         both = zip(self.jacobians, jacobians, strict=True)
         return Compared(
-            engine=engine.name,
-            version=engine.version,
-            precision=precision,
-            lines=match_contracts(self.reference, engine),
-            motion=motion,
-            step_gaps=gaps,
+            engine=engine.name, version=engine.version, precision=precision,
+            lines=match_contracts(self.reference, engine), motion=motion, step_gaps=gaps,
             first=self._attribution(engine, motion, first_above(gaps, precision) or 0),
             largest=self._attribution(engine, motion, int(np.argmax(gaps)) if len(gaps) else 0),
-            final_gap=self._final_gap(motion.xs),
-            jacobians=jacobians,
-            laws=tuple(laws),
-            jacobian_gaps=frozen([_gap(a.jacobian, b.jacobian) for a, b in both]),
-            rollout_jacobian=product,
-            rollout_gap=rollout_gap,
-            seconds_per_step=seconds(lambda: engine.step(self.x0, self.us[0])),
+            final_gap=self._final_gap(motion.xs), jacobians=jacobians, laws=tuple(laws),
+            jacobian_gaps=frozen([_gap(a.jacobian, b.jacobian) for a, b in both]), rollout_jacobian=product,
+            rollout_gap=rollout_gap, seconds_per_step=seconds(lambda: engine.step(self.x0, self.us[0])),
             seconds_per_jacobian=seconds(lambda: engine.differentiate_step(self.x0, self.us[0])),
-        )
+        )  # fmt: skip
 
     def recorded(self, recording: Recording) -> Compared:
         motion = measured(self.reference, recording.times - recording.times[0], recording.xs, recording.us)
@@ -189,16 +170,10 @@ class _Panel:
             for k in (first_above(gaps, precision) or 0, int(np.argmax(gaps)))
         )
         return Compared(
-            engine=recording.name,
-            version=recording.version,
-            precision=precision,
-            lines=told_lines(recording, self.reference),
-            motion=motion,
-            step_gaps=gaps,
-            first=first,
-            largest=largest,
+            engine=recording.name, version=recording.version, precision=precision,
+            lines=told_lines(recording, self.reference), motion=motion, step_gaps=gaps, first=first, largest=largest,
             final_gap=self._final_gap(motion.xs, count),
-        )
+        )  # fmt: skip
 
     def _final_gap(self, xs: Array, count: int = 1) -> float:
         """On the tangent space, of the last of `xs`, `count` steps apart, that the reference's motion has too."""

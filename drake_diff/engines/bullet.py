@@ -1,12 +1,9 @@
 """Bullet by pybullet, in double precision, on multibodies built link by link from Drake's plant.
 
-Its step is semi-implicit Euler as Drake's, but joint damping is explicit, M a = ... - D v, a free body moves by the
-velocity of its centre of mass, and its quaternion turns by the exponential of h w'. It has no armature; springs are
-Drake's forces, given with those of the actuators.
-Bullet has friction and stiffness by link, and makes those of pairs: mu = mu_a mu_b and 1/k = 1/k_a + 1/k_b.
+It has no armature; springs are Drake's forces, given with those of the actuators. Friction and stiffness are those of
+links, and make those of pairs: mu = mu_a mu_b and 1/k = 1/k_a + 1/k_b. The contract tells how its step is not Drake's.
 """
 
-from collections.abc import Iterator
 from functools import partial
 from importlib.metadata import version
 from tempfile import NamedTemporaryFile
@@ -23,15 +20,7 @@ from drake_diff.engines.interface import DRAKES_STEP, EngineContract, StepJacobi
 from drake_diff.engines.urdf import bullet_urdf
 from drake_diff.exceptions import MissingDependencyError, NotOfferedError
 from drake_diff.mechanics.coordinates import Centers, rotation, unit
-from drake_diff.mechanics.description import (
-    Geometry,
-    JointContract,
-    PairContract,
-    RigidLink,
-    RigidLinks,
-    joint_contract,
-    split,
-)
+from drake_diff.mechanics.description import Geometry, JointContract, PairContract, RigidLink, joint_contract, split
 from drake_diff.model.model import Model
 
 try:
@@ -84,27 +73,29 @@ class PybulletEngine(RigidEngine):
             pose = (list(geometry.pose.translation()), list(_turn(geometry.pose.rotation().matrix())))
             self.owners[geometry.name] = (self.bullet.createMultiBody(0, shape, -1, *pose), -1)
         self._set_contacts()
-        # Centres of mass of the free bodies and their principal axes, as Bullet has them.
         bodies = {x.joint.v_start: self.places[i] for i, x in enumerate(self.tree.links) if x.free}
         found = [self.bullet.getDynamicsInfo(*bodies[v]) for _, v in self.coordinates.free]
         self.centers = Centers(self.coordinates, tuple(np.array(info[3]) for info in found))
-        self.principal = [rotation(np.array(info[4])[[3, 0, 1, 2]]) for info in found]
-        self.bases = [bodies[v][0] for _, v in self.coordinates.free]
+        axes = [rotation(np.array(info[4])[[3, 0, 1, 2]]) for info in found]
+        bases = [bodies[v][0] for _, v in self.coordinates.free]
+        # Of each free body its places in q and v, and what Bullet has: its base, centre of mass and principal axes.
+        self.free = tuple(zip(self.coordinates.free, bases, self.centers.centers, axes, strict=True))
+        self.joints = [(self.places[i], link) for i, link in enumerate(self.tree.links) if not link.free]
         self.untouched = self.bullet.saveState()
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
         x, u = self._point(x, u)
         self._set(x)
         force = self._effort(u) - self.stiffness * self._stretch(x[: self.nq])
-        for place, link in self._joints():
+        for place, link in self.joints:
             self.bullet.setJointMotorControl2(*place, p.TORQUE_CONTROL, force=float(force[link.joint.v_start]))
         islands = self.bullet.stepSimulation()
         used = max([0, *(island["numIterationsUsed"] for island in islands or ())])
         room = int(self.bullet.getPhysicsEngineParameters()["numSolverIterations"])
         q, v = np.zeros(self.nq), np.zeros(self.nv)
-        for place, link in self._joints():
+        for place, link in self.joints:
             q[link.joint.q_start], v[link.joint.v_start] = self.bullet.getJointState(*place)[:2]
-        for i, j, base, center, turned in self._free():
+        for (i, j), base, center, turned in self.free:
             position, turn = self.bullet.getBasePositionAndOrientation(base)
             R = rotation(np.array(turn)[[3, 0, 1, 2]]) @ turned.T
             q[i : i + 4] = RotationMatrix(R).ToQuaternion().wxyz()
@@ -138,7 +129,7 @@ class PybulletEngine(RigidEngine):
             at, body, joints = self._dofs(tree), self.places[tree.start][0], self._joint_positions(tree, q)
             # pybullet takes no empty list
             M[np.ix_(at, at)] = self.bullet.calculateMassMatrix(body, joints or [0.0])
-        for (i, j), turned in zip(self.coordinates.free, self.principal, strict=True):
+        for (i, j), _, _, turned in self.free:
             into = np.kron(np.eye(2), (rotation(q[i : i + 4]) @ turned).T)
             T[j : j + 6] = into @ T[j : j + 6]
         return np.asarray(T.T @ M @ T)
@@ -165,16 +156,14 @@ class PybulletEngine(RigidEngine):
         free = ", free bodies by v' of the centre of mass, quaternions by the exponential of h w'"
         euler = f"semi-implicit Euler, joint damping explicit{free if self.coordinates.free else ''}"
         return EngineContract(
-            **{**self._plant_fields(), "time_step": float(parameters["fixedTimeStep"])},
-            engine=self.name,
+            **{**self._plant_fields(), "time_step": float(parameters["fixedTimeStep"])}, engine=self.name,
             joints=tuple(_read_joint(self.bullet, self.places[i], self.tree.links[i]) for i in order),
             native_order=tuple(link.joint.joint for link in self.tree.links),
             state="position of the centre of mass, quaternion x y z w of the principal axes; velocity of a free body "
             "linear of its centre of mass then angular, in world",
             integrator=euler if np.any(self.damping) or self.coordinates.free else DRAKES_STEP,
             gravity=tuple(float(parameters[f"gravityAcceleration{axis}"]) for axis in "XYZ"),
-            contact_law=law if self.tree.pairs else "none",
-            contacts=_read_pairs(self.bullet, self.tree, self.owners),
+            contact_law=law if self.tree.pairs else "none", contacts=self._read_pairs(),
             limit_law="beyond the limit, impulses to a velocity back of at least 0.2 (Bullet's ERP) of the way / h",
             reasons={
                 "armature": "Bullet has no rotor inertia",
@@ -186,7 +175,7 @@ class PybulletEngine(RigidEngine):
                 "limit law": "Bullet's limits are rigid",
                 "solver tolerance": "Bullet runs a limited number of iterations and has no tolerance",
             },
-        )
+        )  # fmt: skip
 
     def _build(self, part: range) -> None:
         links = [(i, self.tree.links[i]) for i in part]
@@ -205,13 +194,10 @@ class PybulletEngine(RigidEngine):
         self.owners |= {g.name: self.places[i] for i, g in self.tree.geometries if i in part}
 
     def _set_contacts(self) -> None:
-        """Friction and stiffness of each link that touches are as near to those of Drake's pairs as they can come.
-
-        Where pairs disagree it is the least squares' solution, which the contract shows.
-        """
+        """Where pairs disagree, friction and stiffness of links are by least squares; the contract shows them."""
         for owner in set(self.owners.values()):
             self.bullet.setCollisionFilterGroupMask(*owner, 0, 0)
-        pairs = [(_owners_of(pair, self.owners), pair) for pair in self.tree.pairs]
+        pairs = [(self._owners_of(pair), pair) for pair in self.tree.pairs]
         for ((a, i), (b, j)), _ in pairs:
             self.bullet.setCollisionFilterPair(a, b, i, j, 1)
         friction = split([(x, np.log(max(pair.friction, SMALLEST))) for x, pair in pairs if pair.friction is not None])
@@ -224,14 +210,27 @@ class PybulletEngine(RigidEngine):
                 values |= {"contactStiffness": 1 / max(compliance[owner], SMALLEST), "contactDamping": 0.0}
             self.bullet.changeDynamics(*owner, **values)
 
-    def _joints(self) -> Iterator[tuple[Owner, RigidLink]]:
-        """Of hinges and slides, with Bullet's places."""
-        return ((self.places[i], link) for i, link in enumerate(self.tree.links) if not link.free)
+    def _owners_of(self, pair: PairContract) -> tuple[Owner, Owner]:
+        """The two links of a pair of geometries, the smaller first."""
+        a, b = sorted(self.owners[name] for name in pair.names)
+        return a, b
 
-    def _free(self) -> Iterator[tuple[int, int, int, Array, Array]]:
-        """Of each free body: its places in q and v, Bullet's base, the centre of mass and the principal axes."""
-        places = zip(self.coordinates.free, self.bases, self.centers.centers, self.principal, strict=True)
-        return ((i, j, base, center, turned) for (i, j), base, center, turned in places)
+    def _read_pairs(self) -> tuple[PairContract, ...]:
+        """Every pair of geometries whose links touch each other in Bullet: Drake's, then what comes with them."""
+        owners, links = self.owners, {self._owners_of(pair) for pair in self.tree.pairs}
+        found = [pair.names for pair in self.tree.pairs]
+        for a in owners:
+            for b in owners:
+                both = a < b and tuple(sorted((owners[a], owners[b]))) in links
+                if both and (a, b) not in found and (b, a) not in found:
+                    found.append((a, b))
+        contracts = []
+        for names in found:
+            one, two = (self.bullet.getDynamicsInfo(*owners[name]) for name in names)
+            k_one, k_two = float(one[9]), float(two[9])
+            stiffness = k_one * k_two / (k_one + k_two) if min(k_one, k_two) > 0 else None
+            contracts.append(PairContract(names, float(one[1] * two[1]), stiffness))
+        return tuple(contracts)
 
     def _dofs(self, part: range) -> list[int]:
         """Drake's places in v of a tree's velocities in Bullet's order."""
@@ -248,19 +247,13 @@ class PybulletEngine(RigidEngine):
     def _set(self, x: Array) -> None:
         self.bullet.restoreState(self.untouched)
         q, v = unit(self.coordinates, x[: self.nq]), self.centers.turn(x[: self.nq]) @ x[self.nq :]
-        for i, j, base, center, turned in self._free():
+        for (i, j), base, center, turned in self.free:
             R = rotation(q[i : i + 4])
             position = list(q[i + 4 : i + 7] + R @ center)
             self.bullet.resetBasePositionAndOrientation(base, position, list(_turn(R @ turned)))
             self.bullet.resetBaseVelocity(base, list(v[j + 3 : j + 6]), list(v[j : j + 3]))
-        for place, link in self._joints():
+        for place, link in self.joints:
             self.bullet.resetJointState(*place, float(q[link.joint.q_start]), float(v[link.joint.v_start]))
-
-
-def _owners_of(pair: PairContract, owners: dict[str, Owner]) -> tuple[Owner, Owner]:
-    """The two links of a pair of geometries, the smaller first."""
-    a, b = sorted(owners[name] for name in pair.names)
-    return a, b
 
 
 def _read_part(bullet: Any, place: Owner) -> tuple[float, Array, Array, Array]:
@@ -285,24 +278,6 @@ def _read_joint(bullet: Any, place: Owner, link: RigidLink) -> JointContract:
         name=name, kind=KINDS[info[2]], axis=R @ info[13], anchor=above + turned @ info[14], carried=carried,
         damping=float(info[6]), stiffness=link.joint.stiffness, rest=link.joint.rest, lower=lower, upper=upper,
     )  # fmt: skip
-
-
-def _read_pairs(bullet: Any, tree: RigidLinks, owners: dict[str, Owner]) -> tuple[PairContract, ...]:
-    """Every pair of geometries whose links touch each other in Bullet: Drake's, then what comes with them."""
-    links = {_owners_of(pair, owners) for pair in tree.pairs}
-    found = [pair.names for pair in tree.pairs]
-    for a in owners:
-        for b in owners:
-            both = a < b and tuple(sorted((owners[a], owners[b]))) in links
-            if both and (a, b) not in found and (b, a) not in found:
-                found.append((a, b))
-    contracts = []
-    for names in found:
-        one, two = (bullet.getDynamicsInfo(*owners[name]) for name in names)
-        k_one, k_two = float(one[9]), float(two[9])
-        stiffness = k_one * k_two / (k_one + k_two) if min(k_one, k_two) > 0 else None
-        contracts.append(PairContract(names, float(one[1] * two[1]), stiffness))
-    return tuple(contracts)
 
 
 def _shape(geometry: Geometry) -> dict[str, Any]:

@@ -1,11 +1,7 @@
 """CasADi expressions that adam-robotics builds from URDF, in Drake's semi-implicit Euler step; CasADi's Jacobians.
 
 adam has one tree on one floating base: a plant is handed to it as one tree for each free body, that being the base, and
-one for what stands on the world, whose base does not move. adam's base is a homogeneous transform and, in its "mixed"
-representation, (v, w) in world: Drake's v = (w, v_o) swapped. Gravity is given to it (its own is 9.80665 m/s^2).
-
-Of adam 0.5.0 slides are wrong: their motion has 12 entries for 6, which `_Joint` puts right, and they move along the
-parent's axes where the joint is turned against its parent, which no joint of `urdf` is.
+one for what stands on the world. Gravity is given to it (its own is 9.80665 m/s^2).
 """
 
 from importlib.metadata import version
@@ -96,12 +92,10 @@ class CasadiEngine(EulerEngine, PlantEngine):
     def contract(self) -> EngineContract:
         joints = {joint.name: joint for part in self.trees for joint in part.joints()}
         return EngineContract(
-            engine=self.name,
-            joints=tuple(joints[link.joint] for link in self.description.moving),
+            engine=self.name, joints=tuple(joints[link.joint] for link in self.description.moving),
             native_order=tuple(joints),
             state="homogeneous transform; velocity of a free body linear then angular, in world",
-            gravity=floats(self.gravity),
-            derivatives="by q and v, adam's expressions differentiated by CasADi",
+            gravity=floats(self.gravity), derivatives="by q and v, adam's expressions differentiated by CasADi",
             reasons={
                 "contact law": NO_CONTACT,
                 "contact pairs": NO_CONTACT,
@@ -109,7 +103,7 @@ class CasadiEngine(EulerEngine, PlantEngine):
                 "solver tolerance": "nothing is solved iteratively",
             },
             **self._plant_fields(),
-        )
+        )  # fmt: skip
 
 
 class _Tree:
@@ -208,7 +202,7 @@ class _Tree:
 
 
 class _Joint(StdJoint):  # type: ignore[misc]  # adam has no types
-    """With the motion that a slide has."""
+    """A slide's motion has 12 entries for 6 in adam 0.5.0, along the parent's axes: no joint of `urdf` is turned."""
 
     def motion_subspace(self) -> Any:
         if self.type != "prismatic":

@@ -300,12 +300,9 @@ class CartPole(ClosedForm):
 
 # The hand calculation of the file of that name in models/.
 BY_MODEL: dict[str, ClosedForm] = {
-    "projectile": Projectile(),
-    "mass_spring_damper": MassSpringDamper(),
-    "pendulum": Pendulum(),
-    "double_pendulum": DoublePendulum(),
-    "cart_pole": CartPole(),
-}
+    "projectile": Projectile(), "mass_spring_damper": MassSpringDamper(), "pendulum": Pendulum(),
+    "double_pendulum": DoublePendulum(), "cart_pole": CartPole(),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -409,19 +406,13 @@ class NumpyEngine(EulerEngine):
     @property
     def contract(self) -> EngineContract:
         return EngineContract(
-            engine=self.name,
-            joints=self.form.joints(),
-            native_order=self.form.joint_names,
-            inputs=self.form.input_names,
-            actuation=float_rows(self.form.actuation),
-            effort_limits=self.form.effort_limits,
-            time_step=self.time_step,
-            gravity=floats(self.form.gravity_vector),
-            contact_law=self.form.contact_law,
-            derivatives="by every entry of x and u",
+            engine=self.name, joints=self.form.joints(), native_order=self.form.joint_names,
+            inputs=self.form.input_names, actuation=float_rows(self.form.actuation),
+            effort_limits=self.form.effort_limits, time_step=self.time_step, gravity=floats(self.form.gravity_vector),
+            contact_law=self.form.contact_law, derivatives="by every entry of x and u",
             reasons={
                 "limit law": "the hand calculation has no joint limits",
                 "contact pairs": "the hand calculation has its one contact in its law",
                 "solver tolerance": "nothing is solved iteratively",
             },
-        )
+        )  # fmt: skip

@@ -7,6 +7,7 @@ from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -173,6 +174,12 @@ def _flush() -> None:
 def row(values: object) -> str:
     """Numbers as text, to the last digit."""
     return " ".join(repr(float(value)) for value in np.ravel(np.asarray(values, dtype=float)))
+
+
+def xml_text(root: ElementTree.Element) -> str:
+    """The document, indented."""
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def shape_of(geometry: Any) -> tuple[str, dict[str, list[float]]]:

@@ -103,6 +103,8 @@ class _Match:
     def __init__(self, a: Engine, b: Engine):
         self.engines = a, b
         self.one, self.two = self.contracts = a.contract, b.contract
+        sides = [side for c in self.contracts for j in c.joints for side in (j.lower, j.upper)]
+        self.limited = any(math.isfinite(side) for side in sides)
         self.precision: Precision = "float32" if "float32" in [c.precision for c in self.contracts] else "float64"
 
     def same(self, a: Any, b: Any) -> bool:
@@ -209,13 +211,9 @@ class _Match:
         return ContractLine(quantity, "equal", a) if a == b else ContractLine(quantity, "mapped", self.both(a, b))
 
     def limit_law(self) -> ContractLine:
-        if not self.limited():
+        if not self.limited:
             return ContractLine("limit law", "equal", "no joint is limited")
         return self.text("limit law", self.one.limit_law, self.two.limit_law)
-
-    def limited(self) -> bool:
-        """Whether any joint of either is."""
-        return any(math.isfinite(side) for c in self.contracts for j in c.joints for side in (j.lower, j.upper))
 
     def contact_pairs(self) -> ContractLine:
         quantity = "contact pairs"
@@ -239,7 +237,7 @@ class _Match:
         return self.same(a, b)
 
     def solver_tolerance(self) -> ContractLine:
-        if not self.limited() and not any(c.contacts for c in self.contracts):
+        if not self.limited and not any(c.contacts for c in self.contracts):
             return ContractLine("solver tolerance", "equal", "nothing to solve: neither contact nor limits")
         told = ("none" if c.solver_tolerance is None else f"{c.solver_tolerance:g}" for c in self.contracts)
         return self.text("solver tolerance", *told)
@@ -273,14 +271,8 @@ def _forces_by_joint(contract: EngineContract) -> dict[str, dict[str, float]]:
 
 def _random_state(kinds: list[str], random: np.random.Generator) -> tuple[Array, Array]:
     """q and v of joints of these kinds, in Drake's coordinates, quaternions of norm 1."""
-    q: list[float] = []
-    nv = 0
-    for kind in kinds:
-        if kind == "quaternion_floating":
-            quaternion = random.standard_normal(4)
-            q += [*(quaternion / np.linalg.norm(quaternion)), *random.standard_normal(3)]
-            nv += 6
-        else:
-            q.append(float(random.standard_normal()))
-            nv += 1
-    return np.array(q), random.standard_normal(nv)
+    free = [kind == "quaternion_floating" for kind in kinds]
+    parts = [random.standard_normal(7 if floats else 1) for floats in free]
+    for part in (part for part, floats in zip(parts, free, strict=True) if floats):
+        part[:4] /= np.linalg.norm(part[:4])
+    return np.concatenate(parts), random.standard_normal(len(kinds) + 5 * sum(free))

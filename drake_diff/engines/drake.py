@@ -64,17 +64,11 @@ class DrakeEngine:
         contact = self.model.contract.contact
         moving = self.description.moving
         return EngineContract(
-            engine=self.name,
-            joints=joint_contracts(self.description),
-            native_order=tuple(link.joint for link in moving),
-            inputs=self.model.input_names,
-            actuation=float_rows(self.description.actuation),
-            effort_limits=floats(self.description.effort_limits),
-            time_step=self.model.time_step,
-            gravity=floats(self.description.gravity),
+            engine=self.name, joints=joint_contracts(self.description),
+            native_order=tuple(link.joint for link in moving), inputs=self.model.input_names,
+            actuation=float_rows(self.description.actuation), effort_limits=floats(self.description.effort_limits),
+            time_step=self.model.time_step, gravity=floats(self.description.gravity),
             contact_law=f"{contact.model}, {contact.approximation}" if contact.collision_pairs else "none",
-            contacts=self.description.pairs,
-            solver_tolerance=contact.solver_relative_tolerance,
-            limit_law="implicit springs in the step's solver",
-            derivatives="by every entry of x and u",
-        )
+            contacts=self.description.pairs, solver_tolerance=contact.solver_relative_tolerance,
+            limit_law="implicit springs in the step's solver", derivatives="by every entry of x and u",
+        )  # fmt: skip

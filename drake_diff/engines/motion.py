@@ -132,16 +132,11 @@ def jacobian_at(
     # What the engine's solver leaves unsolved of a step in contact, relative.
     unsolved = (engine.contract.solver_tolerance or 0.0) if engine.contact_depth(x) else 0.0
     certificate = certify_displacement(
-        one_by_one(step),
-        jacobian,
-        rows=space.names,
-        columns=(*space.names, *names),
-        scale=np.ones(size),
+        one_by_one(step), jacobian, rows=space.names, columns=(*space.names, *names), scale=np.ones(size),
         minus=space.minus,
         solver_tolerance=max(unsolved, DIFFERENCES_LEAVE if "differences" in found.method else 0.0),
-        method=found.method,
-        subject=f"the Jacobian of {engine.name} at the {state} state",
-    )
+        method=found.method, subject=f"the Jacobian of {engine.name} at the {state} state",
+    )  # fmt: skip
     return JacobianAt(state, frozen(jacobian), found.method, certificate.verdict, certificate)
 
 

@@ -137,19 +137,15 @@ class NewtonEngine(RigidEngine):
         if self.coordinates.free:
             how.append("free bodies by v' of the centre of mass, quaternions by their rate, then of norm 1")
         return EngineContract(
-            **self._plant_fields(),
-            engine=self.name,
+            **self._plant_fields(), engine=self.name,
             joints=_read_joints(self.newton, self._at(self._zero()[: self.nq]), self.tree),
             native_order=tuple(self.newton.joint_label),
             state="position of the body's origin, quaternion x y z w after it; velocity of a free body linear of its "
             "centre of mass then angular, in world",
             integrator=", ".join(["semi-implicit Euler", *how]) if how else DRAKES_STEP,
-            gravity=floats(self._gravity()),
-            contact_law=law if self.pipeline else "none",
-            contacts=self.tree.pairs,
+            gravity=floats(self._gravity()), contact_law=law if self.pipeline else "none", contacts=self.tree.pairs,
             limit_law=f"explicit springs of {springs} and dampers of {dampers} (SI) beyond the limit",
-            derivatives="by every number of Newton's state, warp's tape backwards",
-            precision="float32",
+            derivatives="by every number of Newton's state, warp's tape backwards", precision="float32",
             reasons={
                 "integrator": "Newton's joint damping is explicit, and its free bodies move by their centres of mass",
                 "contact law": "Newton's SolverFeatherstone has explicit springs, dampers and viscous friction up to "
@@ -158,7 +154,7 @@ class NewtonEngine(RigidEngine):
                 "limit law": "Newton's limits have their own stiffness and damping",
                 "solver tolerance": "nothing is solved iteratively",
             },
-        )
+        )  # fmt: skip
 
     def _gravity(self) -> Array:
         return np.asarray(_numbers(self.newton.gravity)[0])

@@ -1,10 +1,7 @@
 """PhysX by SAPIEN on the CPU, in single precision, on articulations built link by link from Drake's plant.
 
 With PhysX's own solver (PGS, which SAPIEN's default TGS is not: it damps in sub-steps) the step of hinges and slides is
-Drake's, joint damping implicit. A free body moves by the velocity of its centre of mass and turns by the exponential
-of h w'; the explicit w' is scaled to the angular momentum that it had. Contacts and limits are rigid; PhysX has
-friction by shape and makes the pair's by the mean of the two. A new scene is built for each call, since PhysX keeps
-contacts from one step to the next.
+Drake's; the contract tells how that of free bodies is not. PhysX has friction by shape, and a pair's is the mean.
 """
 
 import warnings
@@ -130,18 +127,13 @@ class SapienEngine(RigidEngine):
             "exponential of h w', w' scaled to the angular momentum before"
         )
         return EngineContract(
-            **{**self._plant_fields(), "time_step": float(world.system.timestep)},
-            engine=self.name,
-            joints=tuple(joints[v] for v in sorted(joints)),
-            native_order=tuple(names),
+            **{**self._plant_fields(), "time_step": float(world.system.timestep)}, engine=self.name,
+            joints=tuple(joints[v] for v in sorted(joints)), native_order=tuple(names),
             state="position of the body's origin, quaternion w x y z after it; velocity of a free body linear of its "
             "centre of mass then angular, in world",
-            integrator=euler if self.coordinates.free else DRAKES_STEP,
-            gravity=floats(world.system.config.gravity),
-            contact_law="rigid, Coulomb's friction by patches" if self.pairs else "none",
-            contacts=tuple(contacts),
-            limit_law="rigid",
-            precision="float32",
+            integrator=euler if self.coordinates.free else DRAKES_STEP, gravity=floats(world.system.config.gravity),
+            contact_law="rigid, Coulomb's friction by patches" if self.pairs else "none", contacts=tuple(contacts),
+            limit_law="rigid", precision="float32",
             reasons={
                 "integrator": "PhysX moves free bodies by their centres of mass and turns them by the exponential",
                 "contact law": "PhysX's contacts are rigid",
@@ -150,10 +142,10 @@ class SapienEngine(RigidEngine):
                 "limit law": "PhysX's limits are rigid",
                 "solver tolerance": "PhysX runs a fixed number of iterations",
             },
-        )
+        )  # fmt: skip
 
     def _world(self, x: Array, force: Array) -> World:
-        """A scene at `x` (nx,), with `force` (nv,) on its joints."""
+        """A scene at `x` (nx,), with `force` (nv,) on its joints; new, as PhysX keeps contacts from step to step."""
         system = self._system()
         scene = sapien.Scene([system])
         system.timestep = self.time_step

@@ -81,9 +81,7 @@ class PinocchioEngine(EulerEngine, PlantEngine):
     @property
     def contract(self) -> EngineContract:
         return EngineContract(
-            engine=self.name,
-            joints=self._joints(),
-            native_order=tuple(self.pin.names)[1:],
+            engine=self.name, joints=self._joints(), native_order=tuple(self.pin.names)[1:],
             state="quaternion x y z w after the position; velocity of a free body linear then angular, in the body",
             gravity=floats(self.pin.gravity.linear),
             derivatives="by tangent vectors of q in the body, and by v in the body",
@@ -94,7 +92,7 @@ class PinocchioEngine(EulerEngine, PlantEngine):
                 "solver tolerance": "nothing is solved iteratively",
             },
             **self._plant_fields(),
-        )
+        )  # fmt: skip
 
     def _joints(self) -> tuple[JointContract, ...]:
         pin.forwardKinematics(self.pin, self.data, pin.neutral(self.pin))

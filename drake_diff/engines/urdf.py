@@ -6,14 +6,13 @@ neither is written. Bullet gets each link in the frame of its joint, with its in
 """
 
 from collections.abc import Sequence
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from drake_diff._base.arrays import Array
-from drake_diff.engines.common import principal, row, shape_of
+from drake_diff.engines.common import principal, row, shape_of, xml_text
 from drake_diff.engines.interface import UNLIMITED
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import rotation
@@ -42,13 +41,12 @@ def urdf(description: Description) -> str:
         # The first motor of a joint has its whole armature.
         SubElement(motor, "drake:rotor_inertia", value=row(armature.pop(joint, 0.0)))
         SubElement(motor, "drake:gear_ratio", value="1.0")
-    return _text(root)
+    return xml_text(root)
 
 
 def inertial_urdf(description: Description, base: str) -> str:
     """The URDF text, without geometry and motors, of the tree on the link `base`, a free body or "world"."""
-    root, _ = _tree(description, base, carried_by(description, base))
-    return _text(root)
+    return xml_text(_tree(description, base, carried_by(description, base))[0])
 
 
 def bullet_urdf(links: Sequence[tuple[int, RigidLink]], geometries: Sequence[tuple[int, Geometry]]) -> str:
@@ -75,7 +73,7 @@ def bullet_urdf(links: Sequence[tuple[int, RigidLink]], geometries: Sequence[tup
             limited = np.isfinite(link.joint.lower) or np.isfinite(link.joint.upper)
             sides = (link.joint.lower, link.joint.upper) if limited else (1.0, -1.0)  # upper below lower: no limit
             _add_freedom(joint, link.axis, link.joint.damping, UNLIMITED, sides)
-    return _text(root)
+    return xml_text(root)
 
 
 def carried_by(description: Description, base: str) -> tuple[Link, ...]:
@@ -132,11 +130,9 @@ def _tree(description: Description, base: str, links: tuple[Link, ...]) -> tuple
         kind = KINDS.get(link.kind) or ("revolute" if limited else "continuous")
         joint = _add_joint(root, link.joint, kind, (link.parent, link.body), zero.in_parent(link))
         if link.kind in ("revolute", "prismatic"):
-            effort = [
-                e for e, x in zip(description.effort_limits, description.actuated, strict=True) if x == link.joint
-            ]
+            own = [e for e, x in zip(description.effort_limits, description.actuated, strict=True) if x == link.joint]
             sides = None if kind == "continuous" else (link.lower, link.upper)
-            _add_freedom(joint, zero.axis(link), link.damping, min([UNLIMITED, *effort]), sides)
+            _add_freedom(joint, zero.axis(link), link.damping, min([UNLIMITED, *own]), sides)
     return root, elements
 
 
@@ -178,8 +174,3 @@ def _add_collision(body: Element, geometry: Geometry, X: RigidTransform) -> None
 def _place(element: Element, X: RigidTransform) -> None:
     rpy: Array = RollPitchYaw(X.rotation()).vector()
     SubElement(element, "origin", xyz=row(X.translation()), rpy=row(rpy))
-
-
-def _text(root: Element) -> str:
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="unicode")

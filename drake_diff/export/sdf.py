@@ -4,12 +4,11 @@ Link frames are those of `urdf`: at the joints, parallel to the world where q = 
 of actuators: the input of a joint has the joint's name, and an effort of 0 means that nothing drives it.
 """
 
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 from pydrake.math import RigidTransform
 
-from drake_diff.engines.common import row, shape_of
+from drake_diff.engines.common import row, shape_of, xml_text
 from drake_diff.engines.interface import UNLIMITED
 from drake_diff.engines.urdf import AtZero
 from drake_diff.mechanics.description import Description, Geometry, Link
@@ -41,8 +40,7 @@ def sdf(description: Description, time_step: float) -> str:
         links["world"] = SubElement(ground, "link", name=GROUND)
     for geometry in description.geometries:
         _add_geometry(links[geometry.body], geometry, zero.in_frame(geometry.body) @ geometry.pose, friction)
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="unicode")
+    return xml_text(root)
 
 
 def collision_name(geometry: str) -> str:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array
 from drake_diff.engines.interface import DRAKES_STEP, EngineContract, float_rows, floats, limit
 from drake_diff.engines.mujoco.coordinates import KINDS, MujocoCoordinates, name_of
 from drake_diff.exceptions import ModelError
@@ -38,7 +37,7 @@ def check_known(m: Any, flags: int) -> None:
 
 def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Description, **own: Any) -> EngineContract:
     """What `m` has, where `d` is at Drake's q = 0; `own` are the fields and `reasons` that MuJoCo and MJX differ in."""
-    left_out, pairs, limits = [], [], []
+    left_out, pairs, limits, B = [], [], [], np.zeros((len(native.dofs), len(native.actuator)))
     for pair in description.pairs:
         i = pair_index(m, pair.names)
         if i < 0:
@@ -47,7 +46,12 @@ def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Descri
             s = -float(m.pair_solref[i][0])
             stiffness = s * resting_stiffness(m, i) if s > 0 else None
             pairs.append(PairContract(pair.names, float(m.pair_friction[i][0]), stiffness))
-    for i in native.actuator:  # of MuJoCo's limits of control and force that which is reached first
+    for column, i in enumerate(native.actuator):
+        if int(m.actuator_trntype[i]) != JOINT_TRANSMISSION or np.any(m.actuator_biasprm[i]):
+            raise ModelError(f"actuator {name_of(m, m.name_actuatoradr[i])} of the MJCF is not a motor on a joint")
+        row = int(np.flatnonzero(native.dofs == m.jnt_dofadr[m.actuator_trnid[i][0]])[0])
+        B[row, column] = m.actuator_gainprm[i][0] * m.actuator_gear[i][0]
+        # Of MuJoCo's limits of control and force that which is reached first.
         by_force = float(m.actuator_forcerange[i][1]) if m.actuator_forcelimited[i] else np.inf
         by_control = float(m.actuator_ctrlrange[i][1]) if m.actuator_ctrllimited[i] else np.inf
         limits.append(min(by_force / abs(float(m.actuator_gainprm[i][0])), by_control))
@@ -72,18 +76,12 @@ def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Descri
         native_order=tuple(name_of(m, m.name_jntadr[j]) for j in range(m.njnt)),
         state="quaternion w x y z after the position; velocity of a free body linear in world, angular in the body",
         inputs=tuple(name_of(m, m.name_actuatoradr[i]) for i in native.actuator),
-        actuation=_read_actuation(m, native.dofs, native.actuator),
-        effort_limits=tuple(limits),
-        time_step=float(m.opt.timestep),
-        integrator=DRAKES_STEP if drakes and not free else euler,
-        gravity=floats(m.opt.gravity),
-        contact_law=law if touches(m) else "none",
-        contacts=tuple(pairs),
-        solver_tolerance=float(m.opt.tolerance),
-        limit_law="soft constraint of the step's solver",
-        reasons=reasons,
+        actuation=float_rows(B), effort_limits=tuple(limits),
+        time_step=float(m.opt.timestep), integrator=DRAKES_STEP if drakes and not free else euler,
+        gravity=floats(m.opt.gravity), contact_law=law if touches(m) else "none", contacts=tuple(pairs),
+        solver_tolerance=float(m.opt.tolerance), limit_law="soft constraint of the step's solver", reasons=reasons,
         **own,
-    )
+    )  # fmt: skip
 
 
 def touches(m: Any) -> bool:
@@ -107,17 +105,6 @@ def _read_joint(m: Any, d: Any, j: int) -> JointContract:
         armature=float(m.dof_armature[dof]), stiffness=float(np.ravel(m.jnt_stiffness[j])[0]) if single else 0.0,
         rest=float(m.qpos_spring[m.jnt_qposadr[j]]) if single else 0.0, lower=lower, upper=upper,
     )  # fmt: skip
-
-
-def _read_actuation(m: Any, dofs: Array, actuators: list[int]) -> tuple[tuple[float, ...], ...]:
-    """B (nv, nu) in Drake's order; ModelError for an actuator that does not drive one joint by a motor's law."""
-    B = np.zeros((len(dofs), len(actuators)))
-    for column, i in enumerate(actuators):
-        if int(m.actuator_trntype[i]) != JOINT_TRANSMISSION or np.any(m.actuator_biasprm[i]):
-            raise ModelError(f"actuator {name_of(m, m.name_actuatoradr[i])} of the MJCF is not a motor on a joint")
-        row = int(np.flatnonzero(dofs == m.jnt_dofadr[m.actuator_trnid[i][0]])[0])
-        B[row, column] = m.actuator_gainprm[i][0] * m.actuator_gear[i][0]
-    return float_rows(B)
 
 
 def pair_index(m: Any, names: tuple[str, str]) -> int:

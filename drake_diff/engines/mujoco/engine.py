@@ -1,9 +1,7 @@
 """MuJoCo, on MJCF generated from Drake's plant or on the user's own.
 
-With the integrator Euler joint damping is implicit, (M + h D) a = ..., and v' = v + h a: Drake's free step. What
-differs is a free body's quaternion, which MuJoCo turns by the exponential of h w' and Drake by its first term:
-`exponential_gap` is that difference. implicitfast is the same step here; implicit (velocity products in it), RK4 and
-Euler without eulerdamp are others, and the contract says so.
+With Euler or implicitfast joint damping is implicit, (M + h D) a = ..., and v' = v + h a: Drake's free step, but for a
+free body's quaternion (`exponential_gap`). The contract says where an MJCF asks for another.
 """
 
 from pathlib import Path

@@ -1,13 +1,12 @@
 """Drake's plant as MJCF: the same bodies, joints, actuators and collision pairs, numbers to the last digit."""
 
 from collections.abc import Mapping
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 from pydrake.math import RigidTransform
 
-from drake_diff.engines.common import principal, row, shape_of
+from drake_diff.engines.common import principal, row, shape_of, xml_text
 from drake_diff.engines.interface import UNLIMITED
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.description import Description, Geometry, Link
@@ -54,8 +53,7 @@ def mjcf(description: Description, time_step: float, solref: Mapping[Pair, tuple
                 element.set("friction", row([pair.friction] * 2 + [0.0] * 3))
             if solref and pair.names in solref:
                 element.set("solref", row(solref[pair.names]))
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="unicode")
+    return xml_text(root)
 
 
 def _place(element: Element, X: RigidTransform) -> None:

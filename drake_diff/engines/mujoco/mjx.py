@@ -1,12 +1,7 @@
 """MuJoCo MJX: MuJoCo's step written in JAX, on the same MJCF, in float64, differentiated forward by `jax.jacfwd`.
 
-JAX computes in float32 unless told otherwise; every call here stands in `jax.enable_x64`, and JAX's global settings
-stay as they are. What is compiled is compiled at the first call that needs it, once for models of one structure.
-
-The step is MuJoCo's, with its implicit joint damping and its turn of a free body's quaternion (`exponential_gap`). Two
-derivatives MJX does not have. Of a free body slower than 1e-8 rad/s it drops the turn, and with it the turn's
-derivative by the speed: that is put back, and the method says so. Where elliptic cones are solved and a pair does not
-slip at all, being at rest or apart, the line search takes the root of 0: NaN, which is a GradientError here.
+Two derivatives MJX does not have. Of a free body that does not turn it drops that by the angular velocity, which is put
+back. Where a pair with an elliptic cone does not slip at all, its line search takes the root of 0: a GradientError.
 """
 
 from importlib.metadata import version
@@ -35,7 +30,7 @@ except ImportError as error:
 PYRAMIDAL = {name: number for number, name in CONES.items()}["pyramidal"]
 # [N or N m] of M a - f, relative to f: MJX does not say whether its solver came to its end, which leaves 1e-12 or so.
 UNBALANCED = 1e-6
-STILL = 1e-8  # [rad/s] that MJX takes for 0
+STILL = 1e-8  # [rad/s] that MJX takes for 0, dropping the turn
 RK4 = 1  # mjtIntegrator
 
 
@@ -138,7 +133,7 @@ class MjxEngine(PlantEngine):
         return self._run(_terms_at, x, np.zeros(self.nu))
 
     def _run(self, function: Any, x: Array, u: Array) -> Any:
-        with jax.enable_x64(True):
+        with jax.enable_x64(True):  # JAX's own setting, float32 unless told otherwise, stays as it is
             native = np.concatenate([*self.native.to_native(x), self.native.control(u)])
             return jax.tree.map(np.asarray, function(self.mjx, self.data, native))
 
