@@ -10,17 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, finite_array, frozen
-from drake_diff.comparison.attribution import (
-    CONTACT_LAW,
-    LIMIT_LAW,
-    Attribution,
-    advanced,
-    attribute,
-    attribute_recorded,
-    precision_of,
-    told_lines,
-    what_is_left,
-)  # fmt: skip
+from drake_diff.comparison import attribution
 from drake_diff.comparison.recordings import Recording, check_recording, steps_between
 from drake_diff.comparison.result import STEP_TOLERANCE, Compared, Comparison, Probe, Refused, first_above
 from drake_diff.engines.contract_match import match_contracts
@@ -146,8 +136,8 @@ class _Panel:
         laws = []
         for x, u in ((probe.x, probe.u) for probe in self.probes):
             steps = self.reference.step(x, u), engine.step(x, u)
-            law = what_is_left(self.coordinates, self.reference, engine, x, steps)
-            laws.append(law if law in (CONTACT_LAW, LIMIT_LAW) else "")
+            law = attribution.what_is_left(self.coordinates, self.reference, engine, x, steps)
+            laws.append(law if law in (attribution.CONTACT_LAW, attribution.LIMIT_LAW) else "")
         both = zip(self.jacobians, jacobians, strict=True)
         return Compared(
             engine=engine.name, version=engine.version, precision=precision,
@@ -162,16 +152,16 @@ class _Panel:
 
     def recorded(self, recording: Recording) -> Compared:
         motion = measured(self.reference, recording.times - recording.times[0], recording.xs, recording.us)
-        count, precision = steps_between(recording, self.model.time_step), precision_of(recording)
+        count, precision = steps_between(recording, self.model.time_step), attribution.precision_of(recording)
         gaps = self._step_gaps(motion, count)
         xs, us, tolerance = motion.xs, motion.us, STEP_TOLERANCE[precision]
         first, largest = (
-            attribute_recorded(self.reference, xs[k], us[k], count, xs[k + 1], tolerance)
+            attribution.attribute_recorded(self.reference, xs[k], us[k], count, xs[k + 1], tolerance)
             for k in (first_above(gaps, precision) or 0, int(np.argmax(gaps)))
         )
         return Compared(
-            engine=recording.name, version=recording.version, precision=precision,
-            lines=told_lines(recording, self.reference), motion=motion, step_gaps=gaps, first=first, largest=largest,
+            engine=recording.name, version=recording.version, precision=precision, motion=motion, step_gaps=gaps,
+            lines=attribution.told_lines(recording, self.reference), first=first, largest=largest,
             final_gap=self._final_gap(motion.xs, count),
         )  # fmt: skip
 
@@ -188,13 +178,13 @@ class _Panel:
         """Relative to the state after the step where that is above 1; states are `count` steps apart."""
         gaps = []
         for x, u, after in zip(motion.xs, motion.us, motion.xs[1:], strict=False):
-            ours = advanced(self.reference, x, u, count)
+            ours = attribution.advanced(self.reference, x, u, count)
             gaps.append(np.abs(self.space.minus(after, ours)).max() / max(1.0, np.abs(ours).max()))
         return frozen(gaps)
 
-    def _attribution(self, engine: Engine, motion: EngineMotion, k: int) -> Attribution:
-        x, u = motion.xs[k], self.us[k]
-        return attribute(self.coordinates, self.reference, engine, x, u, (self.reference.step(x, u), engine.step(x, u)))
+    def _attribution(self, engine: Engine, motion: EngineMotion, k: int) -> attribution.Attribution:
+        x, u, one = motion.xs[k], self.us[k], self.reference
+        return attribution.attribute(self.coordinates, one, engine, x, u, (one.step(x, u), engine.step(x, u)))
 
 
 def _gap(reference: Array, other: Array) -> float:

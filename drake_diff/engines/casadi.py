@@ -115,9 +115,10 @@ class _Tree:
         self.base, self.root = base, base.body if base else "world"
         self.moving = [x for x in carried_by(description, self.root) if x.kind != "weld"]
         self.moving.sort(key=lambda x: x.v_start)
-        text = inertial_urdf(description, self.root)
         self.math = SpatialMath()
-        self.model = AdamModel.build(_Factory(text, self.math), [x.joint for x in self.moving])
+        self.model = AdamModel.build(
+            _Factory(inertial_urdf(description, self.root), self.math), [x.joint for x in self.moving]
+        )
         self.positions = [x.q_start for x in self.moving]
         at_base = [base.v_start + i for i in range(6)] if base else []
         self.dofs = at_base + [x.v_start for x in self.moving]
@@ -125,15 +126,13 @@ class _Tree:
 
     def dynamics(self, q: Any, v: Any, gravity: Array) -> tuple[Any, Any]:
         """M (n, n) and bias (n,) by `dofs`."""
-        n, world = len(self.moving), ca.SX.eye(6)
+        n, world, base_v = len(self.moving), ca.SX.eye(6), ca.SX.zeros(6)
         algorithms = RBDAlgorithms(self.model, self.math)  # of the "mixed" representation
         own_q, own_v = q[self.positions], v[self.dofs[len(self.dofs) - n :]]
         if self.base:
             i, W = self.base.v_start, _turn(self.base)
             world = ca.blockcat([[ca.SX(3, 3), W], [W, ca.SX(3, 3)]])  # from Drake's (w, v_o) to adam's (v, w)
             base_v = ca.mtimes(world, v[i : i + 6])
-        else:
-            base_v = ca.SX.zeros(6)
         H = self._base_pose(q)
         M, _ = algorithms.crba(H, own_q if n else ca.SX.zeros(1))  # adam reads one position though there be none
         bias = algorithms.rnea(H, own_q, base_v, own_v, np.append(gravity, np.zeros(3)))
@@ -202,7 +201,7 @@ class _Tree:
 
 
 class _Joint(StdJoint):  # type: ignore[misc]  # adam has no types
-    """A slide's motion has 12 entries for 6 in adam 0.5.0, along the parent's axes: no joint of `urdf` is turned."""
+    """In adam 0.5.0 a slide moves along its parent's axes, which `urdf` keeps, and its motion has 12 entries for 6."""
 
     def motion_subspace(self) -> Any:
         if self.type != "prismatic":

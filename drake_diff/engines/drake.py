@@ -62,10 +62,9 @@ class DrakeEngine:
     @property
     def contract(self) -> EngineContract:
         contact = self.model.contract.contact
-        moving = self.description.moving
         return EngineContract(
             engine=self.name, joints=joint_contracts(self.description),
-            native_order=tuple(link.joint for link in moving), inputs=self.model.input_names,
+            native_order=tuple(link.joint for link in self.description.moving), inputs=self.model.input_names,
             actuation=float_rows(self.description.actuation), effort_limits=floats(self.description.effort_limits),
             time_step=self.model.time_step, gravity=floats(self.description.gravity),
             contact_law=f"{contact.model}, {contact.approximation}" if contact.collision_pairs else "none",

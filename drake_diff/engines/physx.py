@@ -146,7 +146,16 @@ class SapienEngine(RigidEngine):
 
     def _world(self, x: Array, force: Array) -> World:
         """A scene at `x` (nx,), with `force` (nv,) on its joints; new, as PhysX keeps contacts from step to step."""
-        system = self._system()
+        # PhysX's configuration is one for the whole process, and read as a system and a link are made.
+        of_scene, of_body = physx.get_scene_config(), physx.get_body_config()
+        gravity = [float(g) for g in self.description.gravity]
+        try:
+            physx.set_scene_config(gravity=gravity, enable_tgs=False, enable_enhanced_determinism=True)
+            physx.set_body_config(solver_position_iterations=ITERATIONS, sleep_threshold=0.0)
+            system = physx.PhysxCpuSystem()
+        finally:
+            physx.set_scene_config(of_scene)
+            physx.set_body_config(of_body)
         scene = sapien.Scene([system])
         system.timestep = self.time_step
         links = self._links(scene)
@@ -162,18 +171,6 @@ class SapienEngine(RigidEngine):
         for tree, part in zip(trees, self.tree.trees, strict=True):
             self._place(tree, part, q, v, force)
         return World(system, scene, links, trees)
-
-    def _system(self) -> Any:
-        """PhysX's configuration is one for the whole process, and read as a system and a link are made."""
-        scene, body = physx.get_scene_config(), physx.get_body_config()
-        gravity = [float(g) for g in self.description.gravity]
-        try:
-            physx.set_scene_config(gravity=gravity, enable_tgs=False, enable_enhanced_determinism=True)
-            physx.set_body_config(solver_position_iterations=ITERATIONS, sleep_threshold=0.0)
-            return physx.PhysxCpuSystem()
-        finally:
-            physx.set_scene_config(scene)
-            physx.set_body_config(body)
 
     def _links(self, scene: Any) -> list[Any]:
         found: list[Any] = []

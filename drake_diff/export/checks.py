@@ -21,7 +21,7 @@ from drake_diff.engines.load import load_engine
 from drake_diff.engines.mujoco.mjcf import mjcf
 from drake_diff.engines.urdf import urdf
 from drake_diff.exceptions import DrakeDiffError, ModelWarning
-from drake_diff.export.sdf import collision_name, sdf
+from drake_diff.export.sdf import sdf
 from drake_diff.mechanics.description import Description
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.tangent import tangent_space
@@ -54,11 +54,6 @@ def written(form: str, description: Description, time_step: float) -> str:
     if form == "urdf":
         return urdf(description)
     return sdf(description, time_step) if form == "sdf" else mjcf(description, time_step)
-
-
-def named_in(form: str, geometry: str) -> str:
-    """The name that a geometry has in a file."""
-    return collision_name(geometry) if form == "sdf" else geometry
 
 
 def complaints(form: str, model: Model, text: str) -> list[str]:

@@ -16,8 +16,9 @@ from typing import Any
 from drake_diff._base.arrays import positive_int
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.exceptions import CertificateError, InputError, MissingDependencyError, ModelError, UnknownNameError
-from drake_diff.export.checks import SUFFIX, check_small_models, complaints, named_in, written
-from drake_diff.mechanics.description import Description, describe
+from drake_diff.export.checks import SUFFIX, check_small_models, complaints, written
+from drake_diff.export.sdf import collision_name
+from drake_diff.mechanics.description import describe
 from drake_diff.model.model import Model
 from drake_diff.model.sampling import ATTEMPTS, DEPTH, EFFORT, REACH, SPEED, sample_states
 
@@ -132,8 +133,16 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
     missing = complaints(form, model, text)
     if missing:
         raise ModelError(f"nothing is exported: {form} cannot represent this model; " + "; ".join(missing))
-    made_usd, about_usd = _usd(description) if target == "isaaclab" else ({}, "")
-    left_out = [g.name for g in description.geometries if named_in(form, g.name) not in text]
+    made_usd, about_usd = {}, ""
+    if target == "isaaclab":
+        try:
+            from drake_diff.export.usd import usd
+
+            made_usd, about_usd = {"model.usda": usd(description)}, "`model.usda` is the same model in USD, in float32."
+        except (MissingDependencyError, ModelError) as error:
+            about_usd = f"No USD is written: {error}. UrdfConverter makes one."
+    names = {g.name: collision_name(g.name) if form == "sdf" else g.name for g in description.geometries}
+    left_out = [own for own, name in names.items() if name not in text]
     contract = DrakeEngine(model).contract
     made = {"seed": seed, "count": states, "distribution": DISTRIBUTION}
     facts: dict[str, Any] = {**vars(contract), "h": repr(contract.time_step), "gravity": list(contract.gravity)}
@@ -155,16 +164,6 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
     for name, content in files.items():
         (directory / name).write_text(content)
     return [directory / name for name in files]
-
-
-def _usd(description: Description) -> tuple[dict[str, str], str]:
-    """The USD file, if one can be written, and what README.md says of it."""
-    try:
-        from drake_diff.export.usd import usd
-
-        return {"model.usda": usd(description)}, "`model.usda` is the same model in USD, in float32."
-    except (MissingDependencyError, ModelError) as error:
-        return {}, f"No USD is written: {error}. UrdfConverter makes one."
 
 
 def _table(header: list[str], rows: Iterable[Iterable[Any]]) -> str:

@@ -30,7 +30,6 @@ def usd(description: Description) -> str:
     """
     for link in description.links:
         if link.mass <= 0 or np.any(principal(link.inertia)[0] <= 0):
-            # Readers of USD take a 0 for a number that they are to compute from the shapes.
             raise ModelError(f"link {link.body}: USD cannot hold a mass or moment of inertia of 0")
         for name in (link.body, link.joint):
             if not Tf.IsValidIdentifier(name):

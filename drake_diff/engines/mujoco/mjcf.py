@@ -26,14 +26,12 @@ def mjcf(description: Description, time_step: float, solref: Mapping[Pair, tuple
     Raises ModelError for a free body whose joint's frames are not its own and the world's.
     """
     root = Element("mujoco", model="from_drake")
-    compiler = SubElement(root, "compiler", angle="radian", fusestatic="false")
-    compiler.set("boundmass", row(SMALLEST))
-    compiler.set("boundinertia", row(SMALLEST))
-    options = {"timestep": time_step, "tolerance": 1e-12, "impratio": FRICTION_IMPEDANCE_RATIO}
-    option = SubElement(root, "option", {name: row(value) for name, value in options.items()})
-    for name, text in {"integrator": "Euler", "cone": "elliptic", "gravity": row(description.gravity)}.items():
-        option.set(name, text)
-    SubElement(option, "flag", warmstart="disable")
+    smallest = row(SMALLEST)
+    SubElement(root, "compiler", angle="radian", fusestatic="false", boundmass=smallest, boundinertia=smallest)
+    numbers = {"timestep": time_step, "tolerance": 1e-12, "impratio": FRICTION_IMPEDANCE_RATIO}
+    option = {name: row(value) for name, value in numbers.items()}
+    option |= {"integrator": "Euler", "cone": "elliptic", "gravity": row(description.gravity)}
+    SubElement(SubElement(root, "option", option), "flag", warmstart="disable")
     bodies = {"world": SubElement(root, "worldbody")}
     for link in description.links:
         bodies[link.body] = _add_link(bodies[link.parent], link)
