@@ -10,6 +10,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff._base.differences import sweep_of
+from drake_diff.certificates.certificate import _jittery
 from drake_diff.exceptions import CertificateError, GradientError, ShapeError, UnknownNameError
 
 
@@ -253,3 +254,10 @@ def test_a_certificates_repr_is_short_and_its_html_is_escaped(load):
     rollout = dd.certify_rollout(load("pendulum.urdf"), [0.5, 0], np.zeros((2, 1)), lambda x: x[0], refine=True)
     assert len(repr(rollout).splitlines()) == 3  # the verdict, the worst entry, the refinement
     assert repr(rollout).startswith("RolloutCertificate of the rollout of ")
+
+
+@each_row("unit", [1e-6, 1.0, 1e6])
+def test_jitter_is_told_in_every_unit(unit):
+    """One entry that is another number beside the point; one that is too, below a millionth of its row's largest."""
+    a, beside = unit * np.array([[1.0, 1.0, 1e-8]]), unit * np.array([[1.0, 1.5, 3e-8]])
+    assert _jittery(a, beside, np.zeros((1, 3)), 0.0).tolist() == [[False, True, False]]

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from helpers.models import Plant, add_slide
 from helpers.table import each_row
+from pydrake.autodiffutils import InitializeAutoDiff
 from pydrake.multibody.tree import RevoluteJoint, SpatialInertia, UnitInertia
 from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 
 import drake_diff as dd
 from drake_diff.exceptions import GradientError, InputError, NonFiniteError, ShapeError
 from drake_diff.model.tangent import tangent_space
-from drake_diff.motion.policy import LQR, PD, TVLQR, ParametricPolicy, differentiate_policy, policy_parameters
+from drake_diff.motion.policy import LQR, PD, TVLQR, ParametricPolicy, _check, differentiate_policy, policy_parameters
 
 # The weights of the discrete double integrator with h = 0.1.
 Q, R = np.eye(2), np.array([[0.1]])
@@ -508,3 +509,12 @@ def test_a_long_tvlqr_is_differentiated_by_the_gains_that_act(write_urdf):
     assert by_x == pytest.approx(-tvlqr.gains[4000], rel=1e-14)
     assert np.array_equal(np.flatnonzero(by_p), [8000, 8001])
     assert np.array_equal(by_p[0, 8000:8002], [-1.0, -2.0])
+
+
+@each_row("u", [0.0, 1e-3, 1e4])
+def test_another_value_is_told_from_rounding_at_every_size_of_the_input(u):
+    """To 1e-9 of the input, or of 1 where that is more: what a sum in another order leaves is far below."""
+    allowed = 1e-9 * max(1.0, u)
+    _check(InitializeAutoDiff([u + 0.5 * allowed]), np.zeros((1, 1)), np.array([u]))
+    with pytest.raises(GradientError, match="not the policy with floats"):
+        _check(InitializeAutoDiff([u + 2 * allowed]), np.zeros((1, 1)), np.array([u]))

@@ -68,6 +68,7 @@ def test_a_straight_line_drifts_by_its_rise_and_the_line_under_an_oscillation_to
     assert drift(0.003 * n + np.sin(0.5 * n)) == pytest.approx(3.0, rel=1e-6)
     assert abs(drift(np.sin(0.5 * n))) < 1e-6
     assert drift(np.array([1.0, 1.5])) == 0.5
+    assert drift(np.array([0.0, 1.0, 0.0, 1.0])) == pytest.approx(0, abs=1e-15)  # two halves of one mean
 
 
 def test_free_fall_drifts_as_symplectic_euler_must(load):

@@ -9,7 +9,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
-from drake_diff.model.soft_contact import distances
+from drake_diff.model.soft_contact import distances, separations
 from drake_diff.model.step import set_state
 
 SOFT = dd.model.SoftContact(0.05, 200.0)
@@ -91,6 +91,17 @@ def test_distances_are_those_between_the_surfaces(load):
     twin = load("two_spheres.sdf").double
     set_state(twin, [0.1, 0.7, 0, 0])
     assert distances(twin) == {("pusher", "ball"): pytest.approx(0.4, abs=1e-14)}
+
+
+def test_a_floating_ball_leaves_the_ground_along_its_height(load):
+    """q = (quaternion, x, y, z): distance z - 0.1, its slope and the way out those of z, mobility 1/m."""
+    twin = load("sphere_on_ground.sdf").double
+    set_state(twin, [1, 0, 0, 0, 0.3, -0.2, 0.5, *np.zeros(6)])
+    (pair,) = separations(twin)
+    assert pair.distance == pytest.approx(0.4, abs=1e-14)
+    assert pair.gradient == pytest.approx(np.eye(7)[6], abs=1e-12)
+    assert pair.opening == pytest.approx(np.eye(7)[6], abs=1e-12)
+    assert pair.mobility == pytest.approx(1 / 1.0, rel=1e-12)  # its mass is 1 kg
 
 
 def test_what_cannot_be_softened_is_refused(load):

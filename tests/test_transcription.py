@@ -25,7 +25,7 @@ from drake_diff.exceptions import GradientError, InputError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.optimize.judge import complaints_about
 from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
-from drake_diff.optimize.transcription.collocation import violation_between_nodes
+from drake_diff.optimize.transcription.collocation import collocated, violation_between_nodes
 from drake_diff.optimize.transcription.expressions import knot_functions
 from drake_diff.optimize.transcription.program import TranscribedProgram
 
@@ -660,6 +660,18 @@ def test_the_time_of_kellys_cart_pole(capsys):
         )
     assert abs(ours.cost - 58.8077) < 1e-3 < abs(drake.cost - 58.8077)
     assert ours.options["derivatives"] == "symbolic, exact Hessian"
+
+
+@each_row("end, error", [(1.0, 1 / 6), (2.0, 1 / 3)])
+def test_the_trapezoids_error_of_a_parabola_is_a_part_of_the_cost_or_of_1(end, error):
+    """x = end t: end^2 / 2 by the rule, end^2 / 3 in truth; the difference is judged by max(1, end^2 / 2)."""
+    problem = dd.Problem(
+        dd.Dynamics(lambda x, u: [u[0]], 1, 1), x0=[0], num_steps=1, horizon=1.0, running_cost=lambda x, u: x[0] ** 2
+    )
+    found = collocated(
+        problem, "trapezoid", np.array([[0], [end]]), np.full((2, 1), end), None, 1.0, np.array([0.0, 1.0])
+    )
+    assert found.cost_errors == pytest.approx([error], rel=1e-12)
 
 
 @each_row("row", [0, 2, -1])
