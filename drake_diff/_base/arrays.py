@@ -75,9 +75,9 @@ def part(subject: str, value: float) -> float:
 
 
 def scale(subject: str, value: ArrayLike, size: int) -> Array:
-    """`value`, a number or (size,), as (size,)."""
+    """`value`, a number or (size,), as a read-only (size,)."""
     if np.ndim(value) == 0:
-        return np.full(size, finite_array(subject, value, ()))
+        return frozen(np.full(size, finite_array(subject, value, ())))
     return finite_array(subject, value, (size,))
 
 

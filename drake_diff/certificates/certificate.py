@@ -282,15 +282,12 @@ def _judge(
 def _not_smooth(
     forward: Array, backward: Array, a: Array, value_scale: Array, solver_tolerance: float
 ) -> NDArray[np.bool_]:
-    """Entries whose one-sided quotients do not approach each other as the step shrinks.
-
-    What an iterative solver leaves unsolved looks like a jump too, so a gap must also stand above that.
-    """
+    """Entries whose one-sided quotients do not approach each other as the step shrinks."""
     found = np.zeros(a.shape, dtype=bool)
     # A jump that is the same on both sides shows in no gap, but in quotients that grow without end.
     for gap, steepest in ((np.abs(forward - backward), 0.5), (np.abs(forward + backward) / 2, -0.5)):
         apart = _does_not_shrink(gap, a, 100 * ROUNDING * value_scale, steepest)
-        if solver_tolerance and apart.any():
+        if solver_tolerance and apart.any():  # what a solver leaves looks like a jump too: the gap must be larger
             apart &= _does_not_shrink(gap, a, solver_tolerance * value_scale, steepest)
         found |= apart
     return found
@@ -317,12 +314,9 @@ def _does_not_shrink(gap: Array, a: Array, noise: Array, steepest: float) -> NDA
 
 
 def _jittery(a: Array, beside: Array, reach: Array, solver_tolerance: float) -> NDArray[np.bool_]:
-    """Entries that are another number right beside the point; `reach` is the largest quotient seen around it.
-
-    A smooth entry changes by about 1e-9 of its derivative's slope, and by 1e-2 of it over the widest quotient; what
-    an iterative solver leaves unsolved changes from point to point.
-    """
+    """Entries that are another number right beside the point; `reach` is the largest quotient seen around it."""
     change, size = np.abs(a - beside), np.abs(a) + np.abs(beside)
     row_size = size.max(axis=1, keepdims=True, initial=0)
+    # A smooth entry changes by 1e-9 of its slope here, and by 1e-2 of it over the widest quotient.
     told = change > np.maximum(RESOLVED * reach, SOLVER_FACTOR * solver_tolerance * row_size)
     return told & (change > JITTER_CHANGE * size) & (size > NEGLIGIBLE * row_size)

@@ -68,7 +68,14 @@ class SmoothStep:
 
     def differentiate(self, xs: Array, us: Array) -> tuple[Array, Array]:
         """(N, nx, nx + nu) and x' (N, nx) of the steps from xs (N, nx) under us (N, nu), were they smooth."""
-        return self._free(xs, us) if self.coordinates.free else self._fixed(xs, us)
+        c = self.coordinates
+        if not c.free:
+            return self._fixed(xs, us)
+        q, v = xs[:, : c.nq], xs[:, c.nq :]
+        force, clipped = self._force(q, v, us)
+        native = self.into_native(q, v)
+        solved = self._accelerate(native.q_native, native.v_native, force)
+        return self.assemble(native, *self._velocities(native, solved, clipped))
 
     def _fixed(self, xs: Array, us: Array) -> tuple[Array, Array]:
         """Of hinges and slides, where N(q) = 1 and Pinocchio's velocities are Drake's."""
@@ -122,15 +129,6 @@ class SmoothStep:
         """(N, nv, nu) M^-1 B, 0 for clipped inputs."""
         columns = inverse.take(self.form.velocity, axis=2)
         return columns if clipped is None else columns * ~clipped[:, None]
-
-    def _free(self, xs: Array, us: Array) -> tuple[Array, Array]:
-        """Jacobians and x' (N, nx) with free bodies, whose velocities Pinocchio has in their own frames."""
-        c = self.coordinates
-        q, v = xs[:, : c.nq], xs[:, c.nq :]
-        force, clipped = self._force(q, v, us)
-        native = self.into_native(q, v)
-        solved = self._accelerate(native.q_native, native.v_native, force)
-        return self.assemble(native, *self._velocities(native, solved, clipped))
 
     def into_native(self, q: Array, v: Array) -> Native:
         """The states q (N, nq), v (N, nv) in Pinocchio's coordinates."""

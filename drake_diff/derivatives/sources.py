@@ -234,8 +234,11 @@ def _ask(order: tuple[Source, ...], steps: Steps, method: str, whys: list[str], 
         error, found = no_twin, Refusal(str(no_twin))
     if isinstance(found, Refusal):
         return _ask(order[1:], steps, method, [f"{why}not {source.name}: {found}; " for why in whys], error)
-    if steps.vector.parameters and source.name not in OF_ONE_KIND:
-        _difference_the_rest(steps, found)
+    differenced = steps.vector.differenced
+    if len(differenced) and source.name not in OF_ONE_KIND:  # what Drake's AutoDiffXd does not carry
+        columns = steps.model.nx + steps.model.nu + differenced
+        for k in sorted(set(range(len(steps))) - found.refused.keys()):
+            found.values[k][:, columns] = _parameter_differences(steps, k, differenced)
     chosen = Chosen(found.values, [source.name] * len(whys), [_reason(source, steps, method, why) for why in whys])
     if found.refused:
         left = np.array(sorted(found.refused))
@@ -258,13 +261,3 @@ def _reason(source: Source, steps: Steps, method: str, why: str) -> str:
     if source is IMPLICIT:
         return why + steps.model.cache("implicit trial", _Trial, of_structure=True).passed
     return why[:-2] if why else "the fastest for a model of this size"
-
-
-def _difference_the_rest(steps: Steps, found: Jacobians) -> None:
-    """Fill in the columns by parameters that Drake's AutoDiffXd does not carry."""
-    if not len(steps.vector.differenced):
-        return
-    columns = steps.model.nx + steps.model.nu + steps.vector.differenced
-    for k in range(len(steps)):
-        if k not in found.refused:
-            found.values[k][:, columns] = _parameter_differences(steps, k, steps.vector.differenced)

@@ -275,27 +275,15 @@ def _body(twin: Twin, body: Any) -> BodyTerms:
 
 
 def _joint(twin: Twin, joint: Any) -> JointTerms:
-    return JointTerms(
-        name=joint.name(),
-        type=joint.type_name(),
-        parent=joint.parent_body().name(),
-        child=joint.child_body().name(),
-        damping=_floats(joint.default_damping_vector()),
-        locked=bool(joint.is_locked(twin.context)),
-    )
+    between, damping = (joint.parent_body().name(), joint.child_body().name()), joint.default_damping_vector()
+    return JointTerms(joint.name(), joint.type_name(), *between, _floats(damping), bool(joint.is_locked(twin.context)))
 
 
 def _actuator(actuator: Any) -> ActuatorTerms:
     gains = actuator.get_controller_gains() if actuator.has_controller() else None
-    return ActuatorTerms(
-        name=actuator.name(),
-        joint=actuator.joint().name(),
-        effort_limit=float(actuator.effort_limit()),
-        gear_ratio=float(actuator.default_gear_ratio()),
-        rotor_inertia=float(actuator.default_rotor_inertia()),
-        kp=float(gains.p) if gains else None,
-        kd=float(gains.d) if gains else None,
-    )
+    kp, kd = (float(gains.p), float(gains.d)) if gains else (None, None)
+    limit, gear, rotor = actuator.effort_limit(), actuator.default_gear_ratio(), actuator.default_rotor_inertia()
+    return ActuatorTerms(actuator.name(), actuator.joint().name(), float(limit), float(gear), float(rotor), kp, kd)
 
 
 def _geometry(twin: Twin, geometry: Any) -> GeometryTerms:

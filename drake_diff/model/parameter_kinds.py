@@ -20,17 +20,8 @@ from typing import Any
 import numpy as np
 from pydrake.geometry import Capsule, Cylinder, ProximityProperties, Role, RoleAssign, Sphere
 from pydrake.math import RigidTransform_, RotationMatrix_
+from pydrake.multibody import tree
 from pydrake.multibody.plant import CoulombFriction
-from pydrake.multibody.tree import (
-    FixedOffsetFrame,
-    ForceElementIndex,
-    PdControllerGains,
-    PrismaticSpring_,
-    RevoluteSpring_,
-    RotationalInertia_,
-    SpatialInertia_,
-    WeldJoint,
-)
 
 from drake_diff._base.autodiff import plain
 from drake_diff.model.model import Model
@@ -91,18 +82,18 @@ def _joints(model: Model) -> dict[str, Any]:
 def _springs(plant: Any, kind: Any) -> dict[str, Any]:
     """The springs of a kind by their joint's label; of two springs on one joint neither can be named."""
     labels = {joint.index(): label for label, joint in labelled(joints(plant)).items()}
-    elements = [plant.get_force_element(ForceElementIndex(i)) for i in range(plant.num_force_elements())]
+    elements = [plant.get_force_element(tree.ForceElementIndex(i)) for i in range(plant.num_force_elements())]
     found = [(labels[e.joint().index()], e) for e in elements if isinstance(e, kind)]
     names = [label for label, _ in found]
     return {label: spring for label, spring in found if names.count(label) == 1}
 
 
-def _revolute_springs(model: Model) -> dict[str, Any]:
-    return _springs(model.plant, RevoluteSpring_[float])
+def _hinge_springs(model: Model) -> dict[str, Any]:
+    return _springs(model.plant, tree.RevoluteSpring_[float])
 
 
-def _prismatic_springs(model: Model) -> dict[str, Any]:
-    return _springs(model.plant, PrismaticSpring_[float]) if model.takes_forces else {}
+def _slide_springs(model: Model) -> dict[str, Any]:
+    return _springs(model.plant, tree.PrismaticSpring_[float]) if model.takes_forces else {}
 
 
 def _actuators(model: Model) -> dict[str, Any]:
@@ -135,10 +126,10 @@ def _read_inertia(body: Any) -> list[float] | None:
 def _write_inertia(twin: Twin, label: str, value: Values) -> None:
     body = twin.body(label)
     xx, yy, zz, xy, xz, yz = np.asarray(value).astype(twin.scalar)
-    central = RotationalInertia_[twin.scalar](Ixx=xx, Iyy=yy, Izz=zz, Ixy=xy, Ixz=xz, Iyz=yz)
+    central = tree.RotationalInertia_[twin.scalar](Ixx=xx, Iyy=yy, Izz=zz, Ixy=xy, Ixz=xz, Iyz=yz)
     mass, com = body.get_mass(twin.context), body.CalcCenterOfMassInBodyFrame(twin.context)
     body.SetSpatialInertiaInBodyFrame(
-        twin.context, SpatialInertia_[twin.scalar].MakeFromCentralInertia(mass, com, central)
+        twin.context, tree.SpatialInertia_[twin.scalar].MakeFromCentralInertia(mass, com, central)
     )
 
 
@@ -149,7 +140,7 @@ def _read_damping(joint: Any) -> Any:
 
 def _read_offset(joint: Any) -> Any:
     frame = joint.frame_on_parent()
-    if isinstance(joint, WeldJoint) or not isinstance(frame, FixedOffsetFrame):
+    if isinstance(joint, tree.WeldJoint) or not isinstance(frame, tree.FixedOffsetFrame):
         return None
     return frame.GetFixedPoseInBodyFrame().translation()
 
@@ -172,15 +163,15 @@ def _setter(element: Callable[[Twin, str], Any], name: str, *, vector: bool = Fa
     return write
 
 
-def _revolute_spring(twin: Twin, label: str) -> Any:
-    return _springs(twin.plant, RevoluteSpring_[twin.scalar])[label]
+def _hinge_spring(twin: Twin, label: str) -> Any:
+    return _springs(twin.plant, tree.RevoluteSpring_[twin.scalar])[label]
 
 
-def _prismatic_setter(field: str) -> Write:
+def _slide_setter(field: str) -> Write:
     def write(twin: Twin, label: str, value: Values) -> None:
         name = f"{label}.spring"
         if name not in twin.added:
-            twin.added[name] = SpringChange.none(_springs(twin.plant, PrismaticSpring_[twin.scalar])[label])
+            twin.added[name] = SpringChange.none(_springs(twin.plant, tree.PrismaticSpring_[twin.scalar])[label])
         setattr(twin.added[name], field, value[0])
 
     return write
@@ -191,7 +182,7 @@ def _gain(quantity: str, which: str, unit: tuple[str, str]) -> Kind:
         actuator = twin.actuator(label)
         gains = {"p": actuator.get_controller_gains().p, "d": actuator.get_controller_gains().d}
         gains[which] = float(value[0])
-        actuator.set_controller_gains(PdControllerGains(**gains))
+        actuator.set_controller_gains(tree.PdControllerGains(**gains))
 
     def read(actuator: Any) -> float | None:
         return float(getattr(actuator.get_controller_gains(), which)) if actuator.has_controller() else None
@@ -212,6 +203,8 @@ def _write_gravity(twin: Twin, label: str, value: Values) -> None:
 
 _set_center_of_mass = _setter(Twin.body, "SetCenterOfMassInBodyFrame", vector=True)
 _set_damping = _setter(Twin.joint, "SetDampingVector", vector=True)
+_set_stiffness, _set_rest_angle = _setter(_hinge_spring, "SetStiffness"), _setter(_hinge_spring, "SetNominalAngle")
+_set_rotor_inertia = _setter(Twin.actuator, "SetRotorInertia")
 
 # In the order of writing: what an earlier one moves along, a later one sets.
 MECHANISM_KINDS = (
@@ -224,41 +217,22 @@ MECHANISM_KINDS = (
     Kind("damping", AUTODIFF, _joints, DAMPING, _read_damping, _set_damping, positive=True),
     Kind("offset", AUTODIFF, _joints, "m", _read_offset, _write_offset),
     Kind(
-        "spring_stiffness",
-        AUTODIFF,
-        _revolute_springs,
-        "N m/rad",
-        get("default_stiffness"),
-        _setter(_revolute_spring, "SetStiffness"),
-        positive=True,
+        "spring_stiffness", AUTODIFF, _hinge_springs, "N m/rad", get("default_stiffness"), _set_stiffness, positive=True
     ),
-    Kind(
-        "spring_rest_angle",
-        AUTODIFF,
-        _revolute_springs,
-        "rad",
-        get("default_nominal_angle"),
-        _setter(_revolute_spring, "SetNominalAngle"),
-    ),
+    Kind("spring_rest_angle", AUTODIFF, _hinge_springs, "rad", get("default_nominal_angle"), _set_rest_angle),
     Kind(
         "spring_stiffness",
         CHAIN_RULE,
-        _prismatic_springs,
+        _slide_springs,
         "N/m",
         get("stiffness"),
-        _prismatic_setter("stiffness"),
+        _slide_setter("stiffness"),
         positive=True,
     ),
-    Kind("spring_rest_length", CHAIN_RULE, _prismatic_springs, "m", get("nominal_position"), _prismatic_setter("rest")),
+    Kind("spring_rest_length", CHAIN_RULE, _slide_springs, "m", get("nominal_position"), _slide_setter("rest")),
     Kind("gear_ratio", AUTODIFF, _actuators, "1", get("default_gear_ratio"), _setter(Twin.actuator, "SetGearRatio")),
     Kind(
-        "rotor_inertia",
-        AUTODIFF,
-        _actuators,
-        "kg m^2",
-        get("default_rotor_inertia"),
-        _setter(Twin.actuator, "SetRotorInertia"),
-        positive=True,
+        "rotor_inertia", AUTODIFF, _actuators, "kg m^2", get("default_rotor_inertia"), _set_rotor_inertia, positive=True
     ),
     _gain("kp", "p", ("N/m", "N m/rad")),
     _gain("kd", "d", DAMPING),

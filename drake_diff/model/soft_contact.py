@@ -158,14 +158,6 @@ def separations(twin: Twin) -> list[Separation]:
     return found
 
 
-def smallest_half_width(twin: Twin) -> float:
-    """[m] of the bounding boxes of what may collide; 0 where nothing has one."""
-    inspector = twin.inspector
-    ids = {i for pair in inspector.GetCollisionCandidates() for i in pair}
-    boxes = [inspector.GetObbInGeometryFrame(i) for i in ids]
-    return min((float(np.min(box.half_width())) for box in boxes if box is not None), default=0.0)
-
-
 def _distance_rate(plant: Any, context: Any, pair: Any, bodies: tuple[Any, Any]) -> Any:
     """(nv,) the derivative of the distance's rate by v: of the velocity at which the closest points part."""
     inspector = plant.get_geometry_query_input_port().Eval(context).inspector()

@@ -21,8 +21,9 @@ from pydrake.autodiffutils import ExtractValue
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import chain
 from drake_diff.exceptions import GradientError, InputError, ModelError, SimulationError
+from drake_diff.model.contact import thinnest_geometry
 from drake_diff.model.model import Model
-from drake_diff.model.soft_contact import Separation, SoftContact, distances, separations, smallest_half_width, softened
+from drake_diff.model.soft_contact import Separation, SoftContact, distances, separations, softened
 from drake_diff.model.step import advance, set_state
 from drake_diff.motion.rollout import roll_states
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
@@ -153,7 +154,7 @@ def default_schedule(problem: Problem) -> tuple[SoftContact, ...]:
     mass = min((1 / pair.mobility for pair in separations(model.double) if pair.mobility > 0), default=math.inf)
     if not math.isfinite(mass):
         raise InputError("x0", got="nothing that may collide can approach", expected="a pair that can")
-    reach = max(*distances(model.double).values(), smallest_half_width(model.double))
+    reach = max(*distances(model.double).values(), thinnest_geometry(model)[0] / 2)
     duration, stiffest = problem.num_steps * model.time_step, LARGEST_STIFFNESS * mass / model.time_step**2
     stages: list[SoftContact] = []
     sigma = reach / REACH
