@@ -518,3 +518,11 @@ def test_another_value_is_told_from_rounding_at_every_size_of_the_input(u):
     _check(InitializeAutoDiff([u + 0.5 * allowed]), np.zeros((1, 1)), np.array([u]))
     with pytest.raises(GradientError, match="not the policy with floats"):
         _check(InitializeAutoDiff([u + 2 * allowed]), np.zeros((1, 1)), np.array([u]))
+
+
+def test_the_gains_of_pd_are_read_only_however_they_are_given(load):
+    for gain in (10.0, [10.0]):
+        policy = dd.PD(load("pendulum.urdf"), kp=gain, kd=gain)
+        for array in (policy.kp, policy.kd, policy.parameters):
+            with pytest.raises(ValueError, match="read-only"):
+                array[0] = 0.0

@@ -164,21 +164,12 @@ def _derivatives_of(steps: Steps, chosen: Chosen) -> list[StepDerivatives]:
     model, vector = steps.model, steps.vector
     _check_derivatives(model, chosen.values)
     nx, end, names = model.nx, model.nx + model.nu, vector.names
-    return [
-        StepDerivatives(
-            frozen(x_next),
-            frozen(jacobian[:, :nx]),
-            frozen(jacobian[:, nx:end]),
-            frozen(jacobian[:, end:]),
-            names,
-            (used,) * len(names) if used in OF_ONE_KIND else vector.sources,
-            used,
-            reason,
-        )
-        for x_next, jacobian, used, reason in zip(
-            steps.x_next, chosen.values, chosen.methods, chosen.reasons, strict=True
-        )
-    ]
+    found, rows = [], zip(steps.x_next, chosen.values, chosen.methods, chosen.reasons, strict=True)
+    for x_next, jacobian, used, reason in rows:
+        A, B, C = frozen(jacobian[:, :nx]), frozen(jacobian[:, nx:end]), frozen(jacobian[:, end:])
+        sources = (used,) * len(names) if used in OF_ONE_KIND else vector.sources
+        found.append(StepDerivatives(frozen(x_next), A, B, C, names, sources, used, reason))
+    return found
 
 
 def smooth_jacobians(model: Model, xs: Array, us: Array, x_next: Array | None = None) -> Array | None:

@@ -77,21 +77,16 @@ def _build() -> dict[str, MessageType]:
     for name, fields in MESSAGES.items():
         message = file.message_type.add(name=name)
         for number, (field, ((kind, repeated), _)) in enumerate(fields.items(), start=1):
-            message.field.add(
-                name=field,
-                number=number,
-                type=getattr(FieldDescriptorProto, f"TYPE_{kind.upper()}"),
-                label=FieldDescriptorProto.LABEL_REPEATED if repeated else FieldDescriptorProto.LABEL_OPTIONAL,
-            )
+            label = FieldDescriptorProto.LABEL_REPEATED if repeated else FieldDescriptorProto.LABEL_OPTIONAL
+            code = getattr(FieldDescriptorProto, f"TYPE_{kind.upper()}")
+            message.field.add(name=field, number=number, type=code, label=label)
     pool = DescriptorPool()
     pool.Add(file)
-    return {
-        name: MessageType(
-            GetMessageClass(pool.FindMessageTypeByName(f"drake_diff.{name}")),
-            {field: unit for field, (_, unit) in fields.items() if unit},
-        )
-        for name, fields in MESSAGES.items()
-    }
+    found = {}
+    for name, fields in MESSAGES.items():
+        units = {field: unit for field, (_, unit) in fields.items() if unit}
+        found[name] = MessageType(GetMessageClass(pool.FindMessageTypeByName(f"drake_diff.{name}")), units)
+    return found
 
 
 TYPES = _build()

@@ -167,7 +167,7 @@ def _hinge_spring(twin: Twin, label: str) -> Any:
     return _springs(twin.plant, tree.RevoluteSpring_[twin.scalar])[label]
 
 
-def _slide_setter(field: str) -> Write:
+def _set_slide(field: str) -> Write:
     def write(twin: Twin, label: str, value: Values) -> None:
         name = f"{label}.spring"
         if name not in twin.added:
@@ -221,15 +221,9 @@ MECHANISM_KINDS = (
     ),
     Kind("spring_rest_angle", AUTODIFF, _hinge_springs, "rad", get("default_nominal_angle"), _set_rest_angle),
     Kind(
-        "spring_stiffness",
-        CHAIN_RULE,
-        _slide_springs,
-        "N/m",
-        get("stiffness"),
-        _slide_setter("stiffness"),
-        positive=True,
+        "spring_stiffness", CHAIN_RULE, _slide_springs, "N/m", get("stiffness"), _set_slide("stiffness"), positive=True
     ),
-    Kind("spring_rest_length", CHAIN_RULE, _slide_springs, "m", get("nominal_position"), _slide_setter("rest")),
+    Kind("spring_rest_length", CHAIN_RULE, _slide_springs, "m", get("nominal_position"), _set_slide("rest")),
     Kind("gear_ratio", AUTODIFF, _actuators, "1", get("default_gear_ratio"), _setter(Twin.actuator, "SetGearRatio")),
     Kind(
         "rotor_inertia", AUTODIFF, _actuators, "kg m^2", get("default_rotor_inertia"), _set_rotor_inertia, positive=True

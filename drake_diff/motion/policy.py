@@ -25,7 +25,7 @@ from drake_diff.derivatives.step import differentiate_step, linearize
 from drake_diff.exceptions import GradientError, InputError
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators
-from drake_diff.model.tangent import TangentSpace, tangent_space
+from drake_diff.model.tangent import tangent_space
 
 FIXED_POINT_TOLERANCE = 1e-6
 # How far x and the parameters are moved to see whether a plain number that a policy returns is a constant.
@@ -140,7 +140,7 @@ class LQR:
         drift = float(np.abs(self._space.minus(d.x_next, self.x_ref)).max(initial=0.0))
         if not drift <= FIXED_POINT_TOLERANCE:
             raise InputError("x_ref, u_ref", got=f"a step that moves by {drift:.3g}", expected="a fixed point")
-        A, B = _split(self._space, self._space.jacobian(self.x_ref, self.x_ref, d.A, d.B))
+        A, B = np.hsplit(self._space.jacobian(self.x_ref, self.x_ref, d.A, d.B), [self._space.size])
         try:
             gain, cost_to_go = DiscreteTimeLinearQuadraticRegulator(A=A, B=B, Q=Q, R=R)
         except (RuntimeError, SystemExit) as error:  # pydrake makes a failed demand of Drake's a SystemExit
@@ -193,13 +193,17 @@ class TVLQR:
         self.xs = finite_array("xs", xs, (len(self.us) + 1, model.nx))
         self.time_step = model.time_step
         self._space = tangent_space(model)
-        weights = _weight("Q", Q, self._space.size), _weight("R", R, model.nu, definite=True)
-        final = weights[0] if Qf is None else _weight("Qf", Qf, self._space.size)
+        Q, R = _weight("Q", Q, self._space.size), _weight("R", R, model.nu, definite=True)
         A, B, _ = linearize(model, self.xs, self.us)
-        points = zip(self.xs[:-1], self.xs[1:], A, B, strict=True)
-        steps = [_split(self._space, self._space.jacobian(*point)) for point in points]
-        gains, cost_to_go = _riccati(steps, *weights, final)
-        self.gains, self.cost_to_go = frozen(gains), frozen(cost_to_go)
+        gains, cost_to_go = [], [Q if Qf is None else _weight("Qf", Qf, self._space.size)]
+        for point in reversed(list(zip(self.xs[:-1], self.xs[1:], A, B, strict=True))):
+            A_k, B_k = np.hsplit(self._space.jacobian(*point), [self._space.size])
+            P = cost_to_go[-1]
+            BP = B_k.T @ P
+            gains.append(np.asarray(np.linalg.solve(R + BP @ B_k, BP @ A_k), dtype=float))
+            before = Q + A_k.T @ P @ (A_k - B_k @ gains[-1])
+            cost_to_go.append((before + before.T) / 2)
+        self.gains, self.cost_to_go = frozen(gains[::-1]), frozen(cost_to_go[::-1])
         self.parameters = frozen(self.gains.ravel())
 
     def __call__(self, x: Any, t: float, parameters: Any = None) -> Any:
@@ -292,23 +296,6 @@ def _check(numbers: Any, rows: Array, u: Array) -> None:
         )
     if not np.all(np.isfinite(rows)):
         raise GradientError("the derivative of the policy is not finite")
-
-
-def _split(space: TangentSpace, jacobian: Array) -> tuple[Array, Array]:
-    return jacobian[:, : space.size], jacobian[:, space.size :]
-
-
-def _riccati(steps: list[tuple[Array, Array]], Q: Array, R: Array, Qf: Array) -> tuple[Array, Array]:
-    gains: list[Array] = []
-    cost_to_go = [Qf]
-    for A, B in reversed(steps):
-        P = cost_to_go[-1]
-        BP = B.T @ P
-        gain = np.asarray(np.linalg.solve(R + BP @ B, BP @ A), dtype=float)
-        before = Q + A.T @ P @ (A - B @ gain)
-        gains.append(gain)
-        cost_to_go.append((before + before.T) / 2)
-    return np.array(gains[::-1]), np.array(cost_to_go[::-1])
 
 
 def _weight(name: str, value: ArrayLike, size: int, *, definite: bool = False) -> Array:

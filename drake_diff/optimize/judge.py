@@ -19,16 +19,8 @@ from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
 
 NO_EFFECT = 1e-12
 FINER = "pass refine=True, or take more steps (num_steps)"
-_STATUSES = {
-    Outcome.ITERATION_LIMIT: Status.ITERATION_LIMIT,
-    Outcome.TIME_LIMIT: Status.TIME_LIMIT,
-    Outcome.INFEASIBLE: Status.INFEASIBLE,
-    Outcome.UNBOUNDED: Status.DIVERGED,
-    Outcome.INTERRUPTED: Status.INTERRUPTED,
-    Outcome.DIVERGED: Status.DIVERGED,
-    Outcome.NO_GRADIENT: Status.NO_GRADIENT,
-    Outcome.FAILED: Status.FAILED,
-}
+_ALIKE = ("ITERATION_LIMIT", "TIME_LIMIT", "INFEASIBLE", "INTERRUPTED", "DIVERGED", "NO_GRADIENT", "FAILED")
+_STATUSES = {Outcome.UNBOUNDED: Status.DIVERGED, **{Outcome[name]: Status[name] for name in _ALIKE}}
 
 
 def judged(draft: Solution, result: NlpResult) -> Solution:

@@ -20,7 +20,7 @@ from drake_diff.derivatives.contact.kinematics import (
     Contacts,
     Topology,
     Weight,
-    diagonal_change,
+    diagonal_slope,
     mass_matrix,
     topology_of,
 )
@@ -108,7 +108,7 @@ class Solved:
     contacts: Contacts
     speeds: tuple[Array, Array]  # v and v' (M, nv) of each contact's state
     diagonal: Array  # (M, nv) of A
-    diagonal_change: Array  # (M, nv, nv)
+    diagonal_slope: Array  # (M, nv, nv)
     weight: Weight
     impulse: Impulse | HuntCrossleyImpulse
     push: Array  # (N, nv) sum_c J_c' g_c
@@ -160,7 +160,7 @@ def _at_the_solution(form: ContactForm, smooth: SmoothStep, steps: Steps, poses:
         contacts=contacts,
         speeds=speeds,
         diagonal=diagonal,
-        diagonal_change=diagonal_change(S, inertia, form.topology)[state],
+        diagonal_slope=diagonal_slope(S, inertia, form.topology)[state],
         weight=weight,
         impulse=impulse,
         push=_sum(state, (contacts.jacobian @ impulse.impulse[..., None])[..., 0], len(v_next)),
@@ -173,7 +173,7 @@ def _by_motion(at: Solved) -> Array:
     contacts, (v, v_next) = at.contacts, at.speeds
     point, normal, phi = contacts.displacement()
     velocity = contacts.velocity_change(v_next, point)
-    weight = contacts.weight_change(at.weight, at.diagonal, at.diagonal_change, point)
+    weight = contacts.weight_change(at.weight, at.diagonal, at.diagonal_slope, point)
     before = np.zeros(v.shape)
     if isinstance(at.impulse, HuntCrossleyImpulse):  # the only law that knows the normal velocity before the step
         along = contacts.velocity_change(v, point) @ contacts.touch.normal[:, :, None]

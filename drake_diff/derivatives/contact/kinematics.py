@@ -52,7 +52,7 @@ def mass_matrix(S: Array, inertia: Array, topology: Topology) -> Array:
     return np.asarray(topology.before * lower + above * lower.swapaxes(-1, -2))
 
 
-def diagonal_change(S: Array, inertia: Array, topology: Topology) -> Array:
+def diagonal_slope(S: Array, inertia: Array, topology: Topology) -> Array:
     """(N, nv, nv) d M_kk / d q_j, of motions (N, nv, 6) and the inertia (N, nv, 6, 6) that each j carries.
 
     Turning what j carries changes its kinetic energy as turning back the motion k before it does.

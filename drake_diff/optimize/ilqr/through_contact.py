@@ -336,12 +336,9 @@ def beginnings(problem: Problem, xs: Array) -> tuple[ContactHold, ...]:
     phi, names = np.array(distances), [s.bodies for s in separations(problem.model.double)]
     found = list[ContactHold]()
     for before, pair in np.argwhere((phi[:-1] >= 0) & (phi[1:] < 0)):
-        knots = ((int(before), True), (int(before) + 1, False))
-        found += [
-            ContactHold(int(pair), names[pair], k, apart)
-            for k, apart in knots
-            if k or not problem.initial_state_is_given
-        ]
+        for k, apart in ((int(before), True), (int(before) + 1, False)):
+            if k or not problem.initial_state_is_given:
+                found.append(ContactHold(int(pair), names[pair], k, apart))
     return tuple(found)
 
 
