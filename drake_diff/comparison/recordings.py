@@ -66,9 +66,8 @@ def check_recording(recording: Recording, model: Model) -> None:
     late = np.flatnonzero(np.diff(times) <= 0)
     if len(late):
         k = int(late[0]) + 1
-        raise InputError(
-            f"{subject}: time of sample {k}", got=f"{times[k]} s", expected=f"more than {times[k - 1]} s before it"
-        )
+        before = f"more than {times[k - 1]} s before it"
+        raise InputError(f"{subject}: time of sample {k}", got=f"{times[k]} s", expected=before)
     xs = finite_array(f"{subject}: xs", recording.xs, (len(times), model.nx))
     finite_array(f"{subject}: us", recording.us, (len(times) - 1, model.nu))
     for start in tangent_space(model).quaternions:

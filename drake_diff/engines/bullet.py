@@ -127,8 +127,7 @@ class PybulletEngine(RigidEngine):
         M, T = np.zeros((self.nv, self.nv)), self.centers.turn(q)
         for tree in self.tree.trees:
             at, body, joints = self._dofs(tree), self.places[tree.start][0], self._joint_positions(tree, q)
-            # pybullet takes no empty list
-            M[np.ix_(at, at)] = self.bullet.calculateMassMatrix(body, joints or [0.0])
+            M[np.ix_(at, at)] = self.bullet.calculateMassMatrix(body, joints or [0.0])  # it takes no empty list
         for (i, j), _, _, turned in self.free:
             into = np.kron(np.eye(2), (rotation(q[i : i + 4]) @ turned).T)
             T[j : j + 6] = into @ T[j : j + 6]

@@ -62,8 +62,7 @@ def move(engine: Engine, x0: Array, us: Array) -> EngineMotion:
             break
         if engine.status != "ok" and status == "ok":
             status = f"at t = {k * h:.4g} s: {engine.status}"
-    states = np.array(xs)
-    return measured(engine, np.array([k * h for k in range(len(xs))]), states, us[: len(xs) - 1], status)
+    return measured(engine, np.array([k * h for k in range(len(xs))]), np.array(xs), us[: len(xs) - 1], status)
 
 
 def measured(engine: Engine, times: Array, xs: Array, us: Array, status: str = "ok") -> EngineMotion:

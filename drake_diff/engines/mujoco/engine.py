@@ -25,8 +25,7 @@ try:
 except ImportError as error:
     raise MissingDependencyError("this engine needs MuJoCo: pip install 'drake-diff[engines]'") from error
 
-# MuJoCo's warnings after which a step means nothing.
-BAD = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
+BAD = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")  # warnings after which a step means nothing
 # What sticks slips beyond 1e-5 m/s or so, and a larger step would leave the mode: good to 1e-9.
 DIFFERENCE_STEP = 1e-6
 # Where nothing touches: at this step and at twice it, extrapolated, truncation is far below rounding's 1e-11.
