@@ -227,17 +227,19 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
     found: list[Solution] = []
     chain: list[dict[str, str]] = []
     for attempt, guess in _attempts(task.problem, asked, given, found):
+        link = {"method": attempt.method, "reason": attempt.reason}
+        chain.append(link)
         try:
             make = task.prepare(attempt, guess)
         except DrakeDiffError as error:
             if not found:
                 raise
-            chain.append({"method": attempt.method, "reason": attempt.reason, "ended": f"not possible: {error}"})
+            link["ended"] = f"not possible: {error}"
             continue
         found.append(make())
         last = found[-1]
         task.report.say(f"{attempt.method} ({attempt.reason}): {last.status.value}")
-        chain.append({"method": attempt.method, "reason": attempt.reason, "ended": last.status.value})
+        link["ended"] = last.status.value
         if last.status in ENDED:
             break
 
@@ -262,9 +264,9 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
         reason = "collocation was not verified: a guess for it"
         yield Attempt("ilqr", reason, max_iterations=GUESS_ITERATIONS), given
     if np.all(np.isfinite(found[-1].xs)):
-        begun = found[-1].xs, found[-1].us
         after = "collocation" if method == "collocation" else "shooting"
-        yield dataclasses.replace(asked, method=after, reason="from the motion that iLQR found"), begun
+        attempt = dataclasses.replace(asked, method=after, reason="from the motion that iLQR found")
+        yield attempt, (found[-1].xs, found[-1].us)
 
 
 def _check_attempt(problem: Problem, attempt: Attempt) -> str:
@@ -306,9 +308,8 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
             "horizon": problem.horizon,
             "refine": attempt.refinement,
         }
-        for name, value in left_out.items():
-            if value:
-                raise InputError(name, got="given", expected='none for solver="snopt": solver="ipopt" takes it')
+        for name in (name for name, value in left_out.items() if value):
+            raise InputError(name, got="given", expected='none for solver="snopt": solver="ipopt" takes it')
     return scheme
 
 
@@ -377,7 +378,7 @@ class Run:
 
     def collocate(self, guess: _Guess, refinement: MeshRefinement | None) -> Solution:
         """In CasADi; SNOPT, which that does not carry, in Drake's own DirectCollocation."""
-        problem, found = self.problem, dict[str, Any]()
+        problem, limits, report, found = self.problem, self.limits, self.report, dict[str, Any]()
         if self.solver == "snopt":
             jacobian: Any = EquationsOfMotion(problem.model).jacobian
         else:
@@ -388,13 +389,13 @@ class Run:
         except (GradientError, SimulationError) as error:
             return refused(self._draft(guess.xs, guess.us), error)
         if self.solver == "snopt":
-            result, xs, us, u_final = solve_collocation(
-                problem, guess.xs, guess.us, solver=self.solver, limits=self.limits, report=self.report
+            found_by_drake = solve_collocation(
+                problem, guess.xs, guess.us, solver="snopt", limits=limits, report=report
             )
+            result, xs, us, u_final = found_by_drake
         else:
             us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
             begun = guess.motion or (guess.xs, np.vstack([guess.us, us_end]))
-            limits, report = self.limits, self.report
             motion = transcription.solve(
                 begun, horizon=guess.horizon, limits=limits, report=report, refinement=refinement
             )
@@ -479,19 +480,8 @@ class Run:
     def _draft(self, xs: Array, us: Array, **found: Any) -> Solution:
         arrays = ("u_final", "us_mid", "mesh")
         found |= {name: frozen(found[name]) for name in arrays if found.get(name) is not None}
-        return Solution(
-            problem=self.problem,
-            method=self.method,
-            scheme=self.scheme,
-            solver=self.solver,
-            status=Status.FAILED,
-            message="",
-            xs=frozen(xs),
-            us=frozen(us),
-            options=self.options,
-            wall_time=time.monotonic() - self.start,
-            **found,
-        )
+        found |= {"scheme": self.scheme, "options": self.options, "wall_time": time.monotonic() - self.start}
+        return Solution(self.problem, self.method, self.solver, Status.FAILED, "", frozen(xs), frozen(us), **found)
 
     def _look_at(self, variables: ShootingVariables, z: Array) -> tuple[Array, Array, tuple[Certificate, ...], str]:
         """xs and us of z, certificates of some of its steps, and why the goal or cost is out of its reach."""

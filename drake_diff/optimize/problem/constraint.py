@@ -129,11 +129,7 @@ class Constraint:
         z = InitializeAutoDiff(np.concatenate([x, u])).ravel()
         with np.errstate(all="ignore"):  # what is not finite is refused below
             result = self._call(z[: len(x)], z[len(x) :])
-        values = np.array([v if isinstance(v, AutoDiffXd) else AutoDiffXd(float(v)) for v in result])
-        rows = gradient_rows(values, len(z))
-        plain = ExtractValue(values.reshape(-1, 1)).ravel()
-        if not any(isinstance(v, AutoDiffXd) for v in result):
-            raise GradientError(f"constraint {self.label} lost its derivatives: write it as {FORM}, without float()")
+        plain, rows = carried(result, len(z), f"constraint {self.label}", f"{FORM}, without float()")
         if not (np.all(np.isfinite(plain)) and np.all(np.isfinite(rows))):
             raise GradientError(f"constraint {self.label} or its derivative is not finite at x = {x.tolist()}")
         return plain, rows
@@ -165,6 +161,14 @@ class Constraint:
         if result.ndim > 1:
             raise InputError(f"constraint {self.label}", got=f"shape {result.shape}", expected="a number or shape (m,)")
         return np.atleast_1d(result)
+
+
+def carried(result: Array, width: int, subject: str, form: str) -> tuple[Array, Array]:
+    """The values (m,) of `result` (m,) and its Jacobian (m, width); GradientError where it carries no derivative."""
+    if not any(isinstance(v, AutoDiffXd) for v in result):
+        raise GradientError(f"{subject} lost its derivatives: write it as {form}")
+    full = np.array([v if isinstance(v, AutoDiffXd) else AutoDiffXd(float(v)) for v in result])
+    return ExtractValue(full.reshape(-1, 1)).ravel(), gradient_rows(full, width)
 
 
 def short(values: Any) -> str:

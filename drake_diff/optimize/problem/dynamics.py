@@ -8,16 +8,16 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
+from pydrake.autodiffutils import AutoDiffXd, InitializeAutoDiff
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
 from drake_diff._base.autodiff import gradient_rows
-from drake_diff.exceptions import GradientError, InputError, ShapeError
+from drake_diff.exceptions import InputError, ShapeError
 from drake_diff.mechanics.tree import tree_for
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.model import Model
 from drake_diff.model.step import set_state
-from drake_diff.optimize.problem.constraint import Bounds, plant_limits, resolve_bounds
+from drake_diff.optimize.problem.constraint import Bounds, carried, plant_limits, resolve_bounds
 
 PROBED = 3  # knots at which a function is tried before it is used
 ORDINARY = "a function of x and u in ordinary arithmetic and NumPy functions, without float()"
@@ -63,12 +63,15 @@ class Pointwise:
         """
         count, width = knots.shape
         if not self.takes_columns:
-            found = [self._rows(self._call(InitializeAutoDiff(k).ravel()), width) for k in knots]
+            found = [self._carried(InitializeAutoDiff(k).ravel(), width) for k in knots]
             return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
         seeds = np.repeat(np.eye(width), count, axis=0)
         columns = InitializeAutoDiff(value=knots.T.reshape(-1, 1), gradient=seeds).reshape(width, count)
-        value, rows = self._rows(self._call(columns, count), width)
+        value, rows = self._carried(columns, width, count)
         return value.reshape(self.rows, count).T, rows.reshape(self.rows, count, width).transpose(1, 0, 2)
+
+    def _carried(self, z: Any, width: int, *count: int) -> tuple[Array, Array]:
+        return carried(self._call(z, *count).ravel(), width, self.subject, ORDINARY)
 
     def _call(self, z: Any, *count: int) -> Any:
         with np.errstate(all="ignore"):  # a solver's trial point may leave the domain; it is told by NaN
@@ -76,13 +79,6 @@ class Pointwise:
         if result.shape != (*self.shape, *count) and not (self.shape == () and not count and result.shape == (1,)):
             raise ShapeError(f"{self.subject}: its result", got=result.shape, expected=(*self.shape, *count))
         return result
-
-    def _rows(self, result: Any, width: int) -> tuple[Array, Array]:
-        flat = result.ravel()
-        if not any(isinstance(v, AutoDiffXd) for v in flat):
-            raise GradientError(f"{self.subject} lost its derivatives: write it as {ORDINARY}")
-        full = np.array([v if isinstance(v, AutoDiffXd) else AutoDiffXd(float(v)) for v in flat])
-        return ExtractValue(full.reshape(-1, 1)).ravel(), gradient_rows(full, width)
 
 
 class Dynamics:

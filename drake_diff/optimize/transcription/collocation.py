@@ -87,7 +87,7 @@ class Collocated:
         """The scheme's own quadrature of the running cost, and the final cost."""
         weights = self.horizon * self.task.scheme.node_weights(self.mesh)
         final = 0.0 if self.task.final is None else float(self.task.final.values(self.nodes[-1:])[0, 0])
-        return float(weights @ self.task.rate.values(self.nodes)) + final
+        return float(weights @ self.task.rate.values(self.nodes)[:, 0]) + final
 
     @cached_property
     def defects(self) -> Array:
@@ -108,7 +108,7 @@ class Collocated:
     @property
     def cost_errors(self) -> Array:
         """(N,) the same of the running cost's quadrature, as a part of the whole cost (of 1 where that is less)."""
-        scheme, rates = self.task.scheme, self.task.rate.values(self.nodes)
+        scheme, rates = self.task.scheme, self.task.rate.values(self.nodes)[:, 0]
         quadrature = self._lengths * (scheme.per_interval(rates) @ scheme.weights)
         return _finite(np.abs(self._integrated[:, -1] - quadrature) / max(1.0, abs(self.cost)))
 
@@ -204,17 +204,16 @@ def violation_between_nodes(motion: Collocated) -> Excess:
         >>> round(excess.state, 5), excess.input
         (0.0001, 0.0)
     """
-    task, b = motion.task, motion.task.bounds
-    k = np.repeat(np.arange(len(motion.mesh) - 1), len(DENSE))
-    tau = np.tile(DENSE, len(motion.mesh) - 1)
+    task, b, count = motion.task, motion.task.bounds, len(motion.mesh) - 1
+    k, tau = np.repeat(np.arange(count), len(DENSE)), np.tile(DENSE, count)
     xs, us = motion._between(k, tau)
-    by_state = np.maximum(np.maximum(b.x_lower - xs, xs - b.x_upper), 0.0)
-    by_input = np.maximum(np.maximum(b.u_lower - us, us - b.u_upper), 0.0)
-    both = np.hstack([by_state, by_input])
+    beyond = [np.maximum(b.x_lower - xs, xs - b.x_upper), np.maximum(b.u_lower - us, us - b.u_upper)]
+    both = np.maximum(np.hstack(beyond), 0.0)
     at, column = np.unravel_index(int(np.argmax(both)), both.shape)
     name = (task.dynamics.state_names + task.dynamics.input_names)[column]
     time = motion.horizon * motion.mesh[k[at]] + tau[at] * motion._lengths[k[at]]
     where = f"{name} by {both[at, column]:.3g} at {time:.4g} s" if both[at, column] > 0 else "nowhere"
+    by_state, by_input = np.split(both, [task.dynamics.nx], axis=1)
     return Excess(float(np.max(by_state)), float(np.max(by_input)), where)
 
 

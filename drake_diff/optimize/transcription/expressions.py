@@ -311,7 +311,7 @@ class KnotFunctions:
 def knot_functions(task: OptimalControl) -> KnotFunctions:
     """The functions of `task`, each symbolic if it can be."""
     nx, width, probe = task.dynamics.nx, task.dynamics.nx + task.dynamics.nu, task.dynamics.probe()
-    final = task.final
+    rate, final = task.rate, task.final
 
     def choose(function: Any, values: Values, linearize: Linearize, rows: int) -> KnotFunction:
         with np.errstate(all="ignore"):
@@ -319,13 +319,6 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
         if isinstance(found, Refusal):
             return Called(found.reason, values, linearize, rows, width)
         return Symbolic(found)
-
-    def rate_values(knots: Array) -> Array:
-        return task.rate.values(knots)[:, None]
-
-    def rate_rows(knots: Array) -> tuple[Array, Array]:
-        values, gradients = task.rate.linearize(knots)
-        return values[:, None], gradients[:, None]
 
     def path(c: Constraint) -> KnotFunction:
         def values(knots: Array) -> Array:
@@ -339,7 +332,7 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
 
     return KnotFunctions(
         _dynamics(task.dynamics),
-        choose(task.rate, rate_values, rate_rows, 1),
+        choose(rate.f, rate.values, rate.linearize, 1),
         final if final is None else choose(final.f, final.values, final.linearize, 1),
         tuple(path(constraint) for constraint in task.problem.constraints),
     )

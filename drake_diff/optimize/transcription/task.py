@@ -89,32 +89,20 @@ SCHEMES = {
 DEFAULT_SCHEME = "hermite_simpson"
 
 
-class RunningRate:
-    """A running cost at many knots: none, a ConstantCost, a QuadraticCost, or a function (x, u) -> scalar."""
+class KnownRate:
+    """A ConstantCost or a QuadraticCost at many knots, as `Pointwise` gives those of any other function."""
 
-    def __init__(self, cost: Any, dynamics: Dynamics):
-        self.cost, self.nx = ConstantCost(0.0) if cost is None else cost, dynamics.nx
-        self._at: Pointwise | None = None
-        if not isinstance(self.cost, (ConstantCost, QuadraticCost)):
-            self._at = Pointwise("running_cost", cost, self.nx, (), dynamics.probe())
-
-    def __call__(self, x: Any, u: Any) -> Any:
-        """The rate at x (nx,), u (nu,): floats or what else goes through the cost."""
-        return self.cost(x, u)
+    def __init__(self, f: ConstantCost | QuadraticCost, nx: int):
+        self.f, self.nx = f, nx
 
     def values(self, knots: Array) -> Array:
-        """(K,) at `knots` (K, nx + nu)."""
-        if self._at is not None:
-            return self._at.values(knots)[:, 0]
-        return np.asarray(self.cost.along(knots[:, : self.nx], knots[:, self.nx :]))
+        """(K, 1) at `knots` (K, nx + nu)."""
+        return np.asarray(self.f.along(knots[:, : self.nx], knots[:, self.nx :]))[:, None]
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
-        """(K,) and the gradients (K, nx + nu)."""
-        if self._at is not None:
-            values, rows = self._at.linearize(knots)
-            return values[:, 0], rows[:, 0]
-        found = [differentiate_cost(self.cost, k[: self.nx], k[self.nx :]) for k in knots]
-        return np.array([v for v, _, _ in found]), np.array([np.concatenate(g) for _, *g in found])
+        """(K, 1) and the gradients (K, 1, nx + nu)."""
+        found = [differentiate_cost(self.f, k[: self.nx], k[self.nx :]) for k in knots]
+        return np.array([[v] for v, _, _ in found]), np.array([[np.concatenate(g)] for _, *g in found])
 
 
 class OptimalControl:
@@ -127,11 +115,16 @@ class OptimalControl:
         self.problem, self.scheme = problem, SCHEMES[scheme]
         self.dynamics, self.bounds = problem.dynamics, problem.bounds
         self.horizon: tuple[float, float] = problem.horizon or (problem.start_horizon,) * 2  # (lower, upper) [s]
-        self.rate = RunningRate(problem.running_cost, self.dynamics)
+        running, cost, nx = problem.running_cost, problem.final_cost, self.dynamics.nx
+        running = ConstantCost(0.0) if running is None else running
+        self.rate: KnownRate | Pointwise
+        if isinstance(running, (ConstantCost, QuadraticCost)):
+            self.rate = KnownRate(running, nx)
+        else:
+            self.rate = Pointwise("running_cost", running, nx, (), self.dynamics.probe())
         self.final: Pointwise | None = None  # of knots [x, u], whose inputs have no part in it
-        cost = problem.final_cost
         if cost is not None:
-            self.final = Pointwise("final_cost", lambda x, u: cost(x), self.dynamics.nx, (), self.dynamics.probe())
+            self.final = Pointwise("final_cost", lambda x, u: cost(x), nx, (), self.dynamics.probe())
 
     def nodes_of(self, constraint: Constraint, mesh: Array) -> Indices:
         """The nodes of `mesh` (N+1,) where `constraint` holds: its knots, or all nodes but a given first one."""
@@ -146,10 +139,9 @@ class OptimalControl:
         sides = [np.tile(np.concatenate(s), (count, 1)) for s in ((b.x_lower, b.u_lower), (b.x_upper, b.u_upper))]
         if self.scheme.input_is_linear:  # Drake bounds knots alone
             sides[0][1::2], sides[1][1::2] = -np.inf, np.inf
-        between = zip(self._nodes_at(self.problem.waypoints, mesh), self.problem.waypoints.values(), strict=True)
-        for node, wanted in ((0, self.problem.start), *between, (-1, self.problem.goal)):
-            for side in sides:
-                side[node, :nx] = np.where(np.isnan(wanted), side[node, :nx], wanted)
+        knots = self._nodes_at(range(self.problem.num_steps + 1), mesh)
+        for side, states in zip(sides, self.problem.state_limits(), strict=True):
+            side[knots, :nx] = states
         return sides[0], sides[1]
 
     def _nodes_at(self, knots: Iterable[int], mesh: Array) -> Indices:
