@@ -8,14 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.solvers import (
-    CommonSolverOption,
-    IpoptSolver,
-    MathematicalProgram,
-    SnoptSolver,
-    SolutionResult,
-    SolverOptions,
-)
+from pydrake import solvers
+from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver, SolutionResult
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, UnknownNameError
@@ -86,21 +80,18 @@ class _Callback:
             self.report.say(f"evaluation {self.evaluations:5d}  cost {cost:12.6g}  {spent}")
 
 
-def _options(solver: str, limits: Limits, print_file: Path) -> SolverOptions:
-    options = SolverOptions()
-    options.SetOption(CommonSolverOption.kPrintFileName, str(print_file))
+def _options(solver: str, limits: Limits, print_file: Path) -> solvers.SolverOptions:
+    options = solvers.SolverOptions()
+    options.SetOption(solvers.CommonSolverOption.kPrintFileName, str(print_file))
+    tolerance, most = limits.tolerance, limits.max_iterations
     if solver == "ipopt":
-        name = IpoptSolver.id()
-        options.SetOption(name, "tol", limits.tolerance)
-        options.SetOption(name, "constr_viol_tol", limits.tolerance)
-        options.SetOption(name, "max_iter", limits.max_iterations)
-        options.SetOption(name, "file_print_level", 5)  # else the file holds no table
+        name, own = IpoptSolver.id(), {"tol": tolerance, "constr_viol_tol": tolerance, "max_iter": most}
+        own["file_print_level"] = 5  # else the file holds no table
     else:
-        name = SnoptSolver.id()
-        options.SetOption(name, "Major feasibility tolerance", limits.tolerance)
-        options.SetOption(name, "Major optimality tolerance", limits.tolerance)
-        options.SetOption(name, "Major iterations limit", limits.max_iterations)
-        options.SetOption(name, "Iterations limit", 1000 * limits.max_iterations)
+        name, own = SnoptSolver.id(), {"Major iterations limit": most, "Iterations limit": 1000 * most}
+        own |= {"Major feasibility tolerance": tolerance, "Major optimality tolerance": tolerance}
+    for option, value in own.items():
+        options.SetOption(name, option, value)
     return options
 
 

@@ -227,19 +227,17 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
     found: list[Solution] = []
     chain: list[dict[str, str]] = []
     for attempt, guess in _attempts(task.problem, asked, given, found):
-        link = {"method": attempt.method, "reason": attempt.reason}
-        chain.append(link)
         try:
             make = task.prepare(attempt, guess)
         except DrakeDiffError as error:
             if not found:
                 raise
-            link["ended"] = f"not possible: {error}"
+            chain.append({"method": attempt.method, "reason": attempt.reason, "ended": f"not possible: {error}"})
             continue
         found.append(make())
         last = found[-1]
         task.report.say(f"{attempt.method} ({attempt.reason}): {last.status.value}")
-        link["ended"] = last.status.value
+        chain.append({"method": attempt.method, "reason": attempt.reason, "ended": last.status.value})
         if last.status in ENDED:
             break
 
@@ -264,9 +262,9 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
         reason = "collocation was not verified: a guess for it"
         yield Attempt("ilqr", reason, max_iterations=GUESS_ITERATIONS), given
     if np.all(np.isfinite(found[-1].xs)):
+        begun = found[-1].xs, found[-1].us
         after = "collocation" if method == "collocation" else "shooting"
-        attempt = dataclasses.replace(asked, method=after, reason="from the motion that iLQR found")
-        yield attempt, (found[-1].xs, found[-1].us)
+        yield dataclasses.replace(asked, method=after, reason="from the motion that iLQR found"), begun
 
 
 def _check_attempt(problem: Problem, attempt: Attempt) -> str:
@@ -308,8 +306,9 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
             "horizon": problem.horizon,
             "refine": attempt.refinement,
         }
-        for name in (name for name, value in left_out.items() if value):
-            raise InputError(name, got="given", expected='none for solver="snopt": solver="ipopt" takes it')
+        for name, value in left_out.items():
+            if value:
+                raise InputError(name, got="given", expected='none for solver="snopt": solver="ipopt" takes it')
     return scheme
 
 
@@ -389,10 +388,9 @@ class Run:
         except (GradientError, SimulationError) as error:
             return refused(self._draft(guess.xs, guess.us), error)
         if self.solver == "snopt":
-            found_by_drake = solve_collocation(
-                problem, guess.xs, guess.us, solver="snopt", limits=limits, report=report
+            result, xs, us, u_final = solve_collocation(
+                problem, guess.xs, guess.us, solver=self.solver, limits=limits, report=report
             )
-            result, xs, us, u_final = found_by_drake
         else:
             us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
             begun = guess.motion or (guess.xs, np.vstack([guess.us, us_end]))
@@ -415,15 +413,15 @@ class Run:
 
         With `stages`, which take the inputs of the guess alone, it need not have a gradient.
         """
+        limits, report = self.limits, self.report
 
         def search(rolled: Array, us: Array) -> tuple[NlpResult, Array, Array]:
             if stages:
-                limits, report = self.limits, self.report
                 result, xs_found, us, logs = solve_continuation(self.problem, us, stages, limits=limits, report=report)
                 self.options["continuation"] = [asdict(log) for log in logs]
                 return result, xs_found, us
             solve_method = solve_through_jumps if self.problem.model.contract.contact.collision_pairs else solve_ilqr
-            return solve_method(self.problem, xs if given else rolled, us, limits=self.limits, report=self.report)
+            return solve_method(self.problem, xs if given else rolled, us, limits=limits, report=report)
 
         return self._through_steps(xs, us, search, may_be_blind=bool(stages))
 

@@ -14,14 +14,13 @@ rule, which makes the optimum of order 2.
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost, differentiate_cost
-from drake_diff.optimize.problem.dynamics import Dynamics, Pointwise
+from drake_diff.optimize.problem.dynamics import Pointwise
 from drake_diff.optimize.problem.problem import Problem
 
 
