@@ -8,9 +8,9 @@ from helpers.models import MODELS, Plant, contact_properties
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.exceptions import InputError, ModelError
+from drake_diff.exceptions import InputError, ModelError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
-from drake_diff.model.step import set_state
+from drake_diff.model.step import advance, set_state
 from drake_diff.motion.rollout import Meter, drift
 
 
@@ -94,6 +94,13 @@ def test_a_policy_gives_what_its_inputs_give(load):
     closed = dd.rollout(model, [0, 0.3, 0, 0], policy=lambda x, t: [-2 * x[0] + np.sin(t)], num_steps=30)
     assert closed.us[5, 0] == pytest.approx(-2 * closed.xs[5, 0] + math.sin(0.05), rel=1e-14)
     assert np.array_equal(dd.rollout(model, [0, 0.3, 0, 0], closed.us).xs, closed.xs)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_step_under_an_input_that_is_not_finite_is_refused(load, value):
+    """A solver's trial may be such a one, and Drake would end the whole process there."""
+    with pytest.raises(SimulationError, match="an input is not finite"):
+        advance(load("cart_pole.urdf").double, np.zeros(4), np.array([value]))
 
 
 def test_efforts_are_what_the_limits_leave(load):

@@ -8,6 +8,7 @@ from pydrake.geometry import Box, Cylinder, Sphere
 from pydrake.multibody.tree import PdControllerGains
 
 import drake_diff as dd
+from drake_diff.derivatives.sources import check_parity
 from drake_diff.exceptions import CertificateError, GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.model.plant import actuators
 
@@ -148,3 +149,12 @@ def test_a_parameter_that_cannot_be_differenced_is_named_before_drake_ends_the_p
     model = load("double_pendulum.urdf")
     with pytest.raises(InputError, match=r"elbow\.damping: expected a value above 0"):
         dd.certify(model, np.zeros(4), np.zeros(2), parameters=("elbow.damping",))
+
+
+@pytest.mark.parametrize("value", [2.0 + 1e-6, np.nan])
+def test_one_coordinate_in_which_the_autodiff_step_leads_elsewhere_is_enough(value):
+    model = pd_pendulum()
+    double = np.array([1.0, 2.0])
+    check_parity(model, double + 1e-12, double)  # rounding
+    with pytest.raises(GradientError, match="the AutoDiffXd step is not the double step: hinge_w"):
+        check_parity(model, np.array([1.0, value]), double)

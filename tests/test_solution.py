@@ -108,6 +108,15 @@ def test_a_broken_bound_is_measured_by_its_excess(method, name, index, to, viola
     assert broken.bound_violation == pytest.approx(violation, rel=1e-12)
 
 
+@pytest.mark.parametrize("method", ["collocation", "shooting"])
+def test_the_worst_of_several_broken_bounds_counts(method):
+    """A position 0.25 m and an input 1 N beyond: the larger number, whichever stands first."""
+    s = solved(method)
+    broken = moved(moved(s, "xs", (3, 0), 1.75 - s.xs[3, 0]), "us", (0, 0), 21.0 - s.us[0, 0])
+    assert sorted(excess for excess, _ in broken.bound_excess.values()) == pytest.approx([0.25, 1.0], rel=1e-12)
+    assert broken.bound_violation == pytest.approx(1.0, rel=1e-12)
+
+
 def test_collocations_last_input_is_held_to_its_bound():
     s = solved("collocation")
     assert moved(s, "u_final", 0, 100 - s.u_final[0]).bound_violation == pytest.approx(80, rel=1e-12)
