@@ -42,12 +42,13 @@ class Analytic:
 
     def differentiate(self, steps: Steps) -> Jacobians | Refusal:
         """All in one call."""
-        if any(p.kind.quantity not in QUANTITIES for p in steps.vector.parameters):
+        parameters = steps.vector.parameters
+        if parameters and any(p.kind.quantity not in QUANTITIES for p in parameters):
             return Refusal("derivatives by parameters other than of contact are asked for")
         smooth = analytic_of(steps.model)
         if isinstance(smooth, Refusal):
             return smooth
-        if not steps.some_touch and not steps.vector.parameters:
+        if not parameters and not steps.some_touch:
             values, known = smooth(steps)
             return Jacobians(values, _refusals(known, "contact, a limit or a constraint acts"))
         values, known = np.zeros((len(steps), steps.model.nx, steps.width)), np.zeros(len(steps), dtype=bool)

@@ -234,11 +234,12 @@ def _ask(order: tuple[Source, ...], steps: Steps, method: str, whys: list[str], 
         error, found = no_twin, Refusal(str(no_twin))
     if isinstance(found, Refusal):
         return _ask(order[1:], steps, method, [f"{why}not {source.name}: {found}; " for why in whys], error)
-    differenced = steps.vector.differenced
-    if len(differenced) and source.name not in OF_ONE_KIND:  # what Drake's AutoDiffXd does not carry
-        columns = steps.model.nx + steps.model.nu + differenced
+    vector = steps.vector
+    # What Drake's AutoDiffXd does not carry; without parameters not even that is asked, at every single step.
+    if vector.parameters and len(vector.differenced) and source.name not in OF_ONE_KIND:
+        columns = steps.model.nx + steps.model.nu + vector.differenced
         for k in sorted(set(range(len(steps))) - found.refused.keys()):
-            found.values[k][:, columns] = _parameter_differences(steps, k, differenced)
+            found.values[k][:, columns] = _parameter_differences(steps, k, vector.differenced)
     chosen = Chosen(found.values, [source.name] * len(whys), [_reason(source, steps, method, why) for why in whys])
     if found.refused:
         left = np.array(sorted(found.refused))
