@@ -224,7 +224,7 @@ class TVLQR:
 
 
 def _range(values: Array) -> str:
-    low, high = values.min(), values.max()
+    low, high = float(np.min(values)), float(np.max(values))
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 

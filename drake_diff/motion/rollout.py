@@ -52,8 +52,8 @@ class Rollout(ShowsItsRepr):
         return (
             f"Rollout of {len(self.us)} steps, {self.times[-1]:g} s: energy {energy[0]:.4g} to {energy[-1]:.4g} J, of "
             f"which {error:.2g} J are unaccounted for\n"
-            f"  deepest penetration {self.penetration.max():.3g} m, largest constraint violation "
-            f"{self.constraint_violation.max():.3g}, {sum(map(bool, self.contacts))} steps with contact"
+            f"  deepest penetration {np.max(self.penetration):.3g} m, largest constraint violation "
+            f"{np.max(self.constraint_violation):.3g}, {sum(map(bool, self.contacts))} steps with contact"
         )
 
     @property
