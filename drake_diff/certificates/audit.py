@@ -91,9 +91,10 @@ def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) 
         ShapeError, NonFiniteError: a bad x or u. Whatever Drake refuses is a finding instead.
 
     Example:
-        >>> dd.audit(dd.load_model("models/pendulum.urdf", time_step=0.01))
-        info identity_frame (hinge): the frame on the parent is exactly the identity, ...
-          -> nothing to do with drake_diff; ...
+        >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
+        >>> dd.audit(model, [0, 0, 0, 0], [50.0])[0]
+        error saturated_effort (force): its effort is at the limit 20 (u is 50): there the derivative by u is exactly 0
+          -> stay inside the limit (the bounds of a Problem do), or raise it in the file
     """
     x = model.default_state if x is None else x
     place = Place(model, *check_point(model, x, np.zeros(model.nu) if u is None and model.nu else u))
