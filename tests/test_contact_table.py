@@ -8,7 +8,7 @@ from math import cos, exp, log, radians, sin, sqrt
 
 import numpy as np
 import pytest
-from helpers.engines import needs
+from helpers.engines import Doctored, needs
 from helpers.table import each_row
 from hypothesis import given
 from hypothesis import strategies as st
@@ -313,18 +313,6 @@ def test_creep_of_regularized_friction_does_not_know_gravity():
     assert row.verdict == "own law's"
 
 
-class Other:
-    """An engine with something of it changed."""
-
-    def __init__(self, engine, **changes):
-        self._engine = engine
-        for name, value in changes.items():
-            setattr(self, name, value)
-
-    def __getattr__(self, name):
-        return getattr(self._engine, name)
-
-
 def test_wrong_zero_and_missing_gradients_are_told():
     def scaled(factor):
         def load(model):
@@ -334,7 +322,7 @@ def test_wrong_zero_and_missing_gradients_are_told():
                 found = drake.differentiate_step(x, u)
                 return found._replace(A=factor * np.asarray(found.A))
 
-            return Other(drake, differentiate_step=differentiate)
+            return Doctored(drake, differentiate_step=differentiate)
 
         return load
 
@@ -342,13 +330,13 @@ def test_wrong_zero_and_missing_gradients_are_told():
         def none(x, u):
             raise NotOfferedError("forward only")
 
-        return Other(dd.engines.load_engine("drake", model, contact="lagged"), differentiate_step=none)
+        return Doctored(dd.engines.load_engine("drake", model, contact="lagged"), differentiate_step=none)
 
     def infinite(model):
         def differentiate(x, u):
             raise GradientError("it is not finite")
 
-        return Other(dd.engines.load_engine("drake", model, contact="lagged"), differentiate_step=differentiate)
+        return Doctored(dd.engines.load_engine("drake", model, contact="lagged"), differentiate_step=differentiate)
 
     slide = (CASES["slide"],)
     assert contact_table((scaled(1.0),), slide).rows[0].gradient_verdict == "right"
@@ -364,7 +352,7 @@ def test_an_engine_of_an_unknown_law_is_judged_by_the_rigid_answer_alone():
     def unknown(approximation):
         def load(model):
             drake = dd.engines.load_engine("drake", model, contact=approximation)
-            return Other(drake, contract=replace(drake.contract, contact_law="springs of its own"))
+            return Doctored(drake, contract=replace(drake.contract, contact_law="springs of its own"))
 
         return load
 
@@ -384,7 +372,7 @@ def test_an_engine_that_breaks_off_says_so():
                 raise SimulationError("the solver gave up")
             return drake.step(x, u)
 
-        return Other(drake, step=step)
+        return Doctored(drake, step=step)
 
     row = contact_table((weak,), (CASES["slide"],)).rows[0]
     assert row.verdict == "broke off"
