@@ -17,7 +17,7 @@ from .artifact.trace import read_trace as read_trace
 from .artifact.verify import verify as verify
 from .certificates.audit import audit as audit
 from .certificates.certify import certify as certify
-from .certificates.certify import certify_rollout as certify_rollout
+from .certificates.rollout import certify_rollout as certify_rollout
 from .comparison.recordings import Recording as Recording
 from .comparison.side_by_side import compare as compare
 from .derivatives.step import differentiate_step as differentiate_step

@@ -222,7 +222,7 @@ def test_a_smooth_rollout_is_certified_and_a_wrong_loss_gradient_is_not(load, mo
         g = original(*args, **options)
         return dataclasses.replace(g, by_us=g.by_us * np.where(np.arange(20) == 7, 1.01, 1.0)[:, None])
 
-    monkeypatch.setattr(sys.modules["drake_diff.certificates.certify"], "differentiate_rollout", one_percent_off)
+    monkeypatch.setattr(sys.modules["drake_diff.certificates.rollout"], "differentiate_rollout", one_percent_off)
     wrong = dd.certify_rollout(model, np.zeros(4), us, loss)
     assert wrong.verdict == "disagree"
     assert wrong.worst.column == "force[7]"

@@ -1,0 +1,123 @@
+"""Robots of example-robot-data, made elsewhere, with a motor in each joint and, if asked for, feet and a ground.
+
+Their meshes are skipped, so that a foot is a sphere at the end of each chain.
+"""
+
+import warnings
+
+import numpy as np
+from pydrake.geometry import HalfSpace, Sphere
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import BodyIndex, JointActuatorIndex, JointIndex, PdControllerGains
+from pydrake.systems.framework import DiagramBuilder
+
+import drake_diff as dd
+from drake_diff.exceptions import ModelWarning
+from drake_diff.model.load_file import read_into
+
+from .models import contact_properties, robot_file
+
+# Name of the file, and whether it stands on a floating base.
+ROBOTS = {
+    "solo12.urdf": True,
+    "a1.urdf": True,
+    "go2.urdf": True,
+    "laikago.urdf": True,
+    "bolt.urdf": True,
+    "simple_humanoid.urdf": True,
+    "ur5_robot.urdf": False,
+    "panda.urdf": False,
+    "z1.urdf": False,
+    "kinova.urdf": False,
+    "xarm7.urdf": False,
+    "finger_edu.urdf": False,
+    "so100.urdf": False,
+    "allegro_left_hand.urdf": False,
+}
+FOOT = 0.02  # [m] the radius of each
+
+
+def example_robot(
+    name,
+    time_step=0.002,
+    *,
+    approximation="lagged",
+    feet=False,
+    stiffness=2e4,
+    dissipation=0.5,
+    friction=0.6,
+    gains=None,
+):
+    """The robot of that file; `gains` (kp, kd) gives every motor a PD controller inside the plant."""
+    builder = DiagramBuilder()
+    config = MultibodyPlantConfig(
+        time_step=time_step,
+        contact_model="point",
+        discrete_contact_approximation=approximation,
+        use_sampled_output_ports=False,
+    )
+    plant, _ = AddMultibodyPlant(config, builder)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        read_into(plant, robot_file(name))
+    driven = {plant.get_joint_actuator(JointActuatorIndex(i)).joint().name() for i in range(plant.num_actuators())}
+    joints = [plant.get_joint(JointIndex(i)) for i in range(plant.num_joints())]
+    for joint in joints:
+        if joint.num_velocities() == 1 and joint.name() not in driven:
+            plant.AddJointActuator(f"motor_{joint.name()}", joint)
+    if gains is not None:
+        for i in range(plant.num_actuators()):
+            plant.get_mutable_joint_actuator(JointActuatorIndex(i)).set_controller_gains(
+                PdControllerGains(p=float(gains[0]), d=float(gains[1]))
+            )
+    parents = {joint.parent_body().name() for joint in joints}
+    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
+    base = next((b for b in bodies if b.name() not in {j.child_body().name() for j in joints}), None)
+    if base is not None and not ROBOTS[name]:
+        plant.WeldFrames(plant.world_frame(), base.body_frame())
+    if feet:
+        properties = contact_properties(2 * stiffness, dissipation, friction, 0.01)
+        for body in bodies:
+            if body.name() not in parents:
+                plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(FOOT), f"{body.name()}_foot", properties)
+        plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", properties)
+    plant.Finalize()
+    return dd.model_from_diagram(builder.Build())
+
+
+def state_in_range(model, random, speed=0.5):
+    """(nx,) joints from the middle half of their range (+-1 rad where there is none), base 1 m up, nearly upright."""
+    plant = model.plant
+    q = model.default_state[: model.nq].copy()
+    for i in range(plant.num_joints()):
+        joint = plant.get_joint(JointIndex(i))
+        if joint.num_positions() != 1:
+            continue
+        lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
+        if not (np.isfinite(lower) and np.isfinite(upper) and upper > lower):
+            lower, upper = -1.0, 1.0
+        q[joint.position_start()] = (lower + upper) / 2 + (upper - lower) / 4 * random.uniform(-1, 1)
+    x = np.concatenate([q, speed * random.standard_normal(model.nv)])
+    for body in (plant.get_body(b) for b in plant.GetFloatingBaseBodies()):
+        start = body.floating_positions_start()
+        turn = np.array([1.0, *(0.1 * random.standard_normal(3))])
+        x[start : start + 4] = turn / np.linalg.norm(turn)
+        x[start + 4 : start + 7] = [0.0, 0.0, 1.0]
+    return x
+
+
+def state_in_contact(model, random, depth=1e-3, speed=0.2):
+    """A state in which the lowest foot of a floating robot is `depth` [m] in the ground."""
+    plant = model.plant
+    x = state_in_range(model, random, speed)
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, x[: model.nq])
+    heights = [
+        plant.EvalBodyPoseInWorld(context, plant.get_body(BodyIndex(i))).translation()[2]
+        for i in range(1, plant.num_bodies())
+        if plant.GetCollisionGeometriesForBody(plant.get_body(BodyIndex(i)))
+    ]
+    (base,) = plant.GetFloatingBaseBodies()
+    x[plant.get_body(base).floating_positions_start() + 6] -= min(heights) - FOOT + depth
+    return x
