@@ -90,6 +90,7 @@ def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
             initial_guess=str(options.get("initial_guess", "not known yet")),
             initial_guess_sha256=options.get("initial_guess_sha256"),
             seed=int(options["seed"]) if "seed" in options else None,
+            search=solution.search.arguments if solution is not None and solution.search is not None else None,
         ),
         "problem": describe_problem(problem),
         "contract": problem.model.contract.to_dict() if problem.has_model else {},

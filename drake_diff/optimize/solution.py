@@ -25,7 +25,7 @@ from drake_diff.optimize.transcription.collocation import Collocated, collocated
 # Between two knots the transcription is a cubic; further than this [state units] from an accurate integration
 # its motion is not the model's.
 INTEGRATION_TOLERANCE = 1e-2
-TOLD = ("status", "message", "iterations", "solver_message", "options")  # fields that no measure depends on
+TOLD = ("status", "message", "iterations", "solver_message", "options", "search")  # fields that no measure depends on
 
 
 class Status(enum.Enum):
@@ -67,6 +67,17 @@ _SENTENCES = {
 }
 
 
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What `solve` was called with, so that it can be called again.
+
+    `arguments` are its keyword arguments as plain data, `guess` is the `initial_guess` that was given.
+    """
+
+    arguments: dict[str, Any]
+    guess: Any = None
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Solution(ShowsItsRepr):
     """The motion that `solve` found, how it was found, and what it measures on Drake's double plant.
@@ -91,6 +102,7 @@ class Solution(ShowsItsRepr):
         gradient_norms: (N+1,) |d cost / d x_k|, where the method has it.
         options: what was asked of the solver, and what it chose.
         wall_time: [s] what the solve took.
+        search: the arguments of `solve`, None of a solution that it did not make.
 
     Example:
         >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
@@ -120,6 +132,7 @@ class Solution(ShowsItsRepr):
     options: dict[str, Any] = field(default_factory=dict)
     solver_message: str = ""
     wall_time: float = 0.0
+    search: Search | None = None
 
     def __str__(self) -> str:
         measures = f"cost {self.cost:.6g}, defect {self.defect:.2g}, goal error {self.goal_error:.2g}"

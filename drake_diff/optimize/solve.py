@@ -2,8 +2,9 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from hashlib import sha256
 from typing import Any
 
@@ -23,7 +24,7 @@ from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report
 from drake_diff.optimize.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
 from drake_diff.optimize.shooting import RolloutCost, ShootingVariables, check_segments, roll_segments, solve_shooting
-from drake_diff.optimize.solution import Solution, Status
+from drake_diff.optimize.solution import Search, Solution, Status
 from drake_diff.optimize.transcription.collocation import Collocated, MeshRefinement, Transcription
 from drake_diff.optimize.transcription.drake import solve_collocation
 from drake_diff.optimize.transcription.task import DEFAULT_SCHEME, SCHEMES, OptimalControl
@@ -40,7 +41,7 @@ ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
 PREFERENCE = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED, Status.INTERRUPTED, Status.TIME_LIMIT)
 
 Progress = Callable[[str], None]
-Search = Callable[[Array, Array], tuple[NlpResult, Array, Array]]
+Searcher = Callable[[Array, Array], tuple[NlpResult, Array, Array]]
 
 
 def solve(
@@ -141,9 +142,28 @@ def solve(
     asked = Attempt(method, "asked for", scheme, solver, segments, continuation, refinement if refine else None)
     if method == "auto" and continuation is not None:
         asked = dataclasses.replace(asked, method="ilqr", reason="a continuation is asked for")
-    elif method == "auto" and segments == 1:
-        return _solve_in_chain(task, asked, initial_guess)
-    return task.prepare(asked, initial_guess)()
+    in_chain = asked.method == "auto" and segments == 1
+    make = partial(_solve_in_chain, task, asked, initial_guess) if in_chain else task.prepare(asked, initial_guess)
+    solution = make()
+    arguments: dict[str, Any] = {
+        "method": method,
+        "scheme": scheme,
+        "solver": solver,
+        "max_iterations": limits.max_iterations,
+        "time_limit": None if time_limit is None else limits.time_limit,
+        "tolerance": limits.tolerance,
+        "seed": int(seed),
+        "segments": int(segments),
+        "continuation": continuation if continuation is None or continuation == "auto" else _plain_stages(continuation),
+        "refine": bool(refine),
+        "error_tolerance": refinement.tolerance,
+        "max_num_steps": refinement.most,
+    }
+    return solution.told(search=Search(arguments, initial_guess))
+
+
+def _plain_stages(stages: Sequence[SoftContact]) -> list[dict[str, float]]:
+    return [asdict(stage) for stage in stages]
 
 
 @dataclass(frozen=True)
@@ -450,7 +470,7 @@ class Run:
         return self._through_steps(xs, us, search, segmented=segments > 1)
 
     def _through_steps(
-        self, xs: Array, us: Array, search: Search, *, segmented: bool = False, may_be_blind: bool = False
+        self, xs: Array, us: Array, search: Searcher, *, segmented: bool = False, may_be_blind: bool = False
     ) -> Solution:
         """Certify, search, certify again, on Drake's own steps; at rollouts, or at the states as they are."""
         variables = ShootingVariables(self.problem, around=xs if segmented else None)

@@ -16,12 +16,16 @@ class Claim(Part):
 
 
 class Inputs(Part):
-    """What the run started from, besides `problem`, which holds the initial state."""
+    """What the run started from, besides `problem`, which holds the initial state.
+
+    `search` are the arguments of `solve`, so that it can be called again; null where they are not known.
+    """
 
     initial_guess: str
     initial_guess_sha256: str | None  # of the bytes of xs (N+1, nx), then us (N, nu), as doubles
     seed: int | None
     random_generator: str = "numpy.random.default_rng"
+    search: FiniteTable | None = None
 
 
 class Solver(Part):
