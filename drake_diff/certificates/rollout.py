@@ -5,25 +5,27 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, finite_array
-from drake_diff._base.differences import one_by_one
-from drake_diff.certificates.certificate import VERDICTS, Certificate, certify_displacement, jitter
-from drake_diff.certificates.certify import move, solver_tolerance, state_scale
+from drake_diff._base.arrays import finite_array, positive_int
+from drake_diff.certificates.certificate import JITTER, VERDICTS, Certificate, certify_displacement, jitter
+from drake_diff.certificates.certify import solver_tolerance
+from drake_diff.certificates.displaced import Displaced
+from drake_diff.certificates.feedback import check_memory, fresh, wrong_derivative
 from drake_diff.certificates.refinement import (
     REFINEMENTS,
     STIFFENING,
     Refinement,
     at_finer_steps,
-    flat_gradient,
     in_stiffer_contact,
     judge_levels,
 )
 from drake_diff.derivatives.sources import check_method
+from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import Parameters, ParameterVector, applied, select
-from drake_diff.model.tangent import tangent_space
-from drake_diff.motion.gradient import Loss, RolloutGradient, differentiate_rollout, evaluate_loss
-from drake_diff.motion.rollout import check_inputs, roll_states
+from drake_diff.model.parameters import Parameters, select
+from drake_diff.motion.gradient import Loss, RolloutGradient
+from drake_diff.motion.rollout import Policy, check_inputs
+
+ELSEWHERE = 1e-3  # of the scale: how far from the motion a policy is led before it is asked again
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -39,9 +41,10 @@ class RolloutCertificate(Certificate):
 
     gradient: RolloutGradient = field(kw_only=True)
     refinements: tuple[Refinement, ...] = ()
+    cause: str = ""  # why entries disagree, where that is known
 
     def _lines(self) -> list[str]:
-        return [*super()._lines(), *map(str, self.refinements)]
+        return [*super()._lines(), *map(str, self.refinements), *([self.cause] if self.cause else [])]
 
 
 def certify_rollout(
@@ -50,33 +53,42 @@ def certify_rollout(
     us: ArrayLike | None,
     loss: Loss,
     *,
+    policy: Policy | None = None,
     parameters: Parameters = (),
     num_steps: int | None = None,
     refine: bool = False,
     refine_stiffness: bool = False,
     method: str = "auto",
+    gradient: RolloutGradient | None = None,
 ) -> RolloutCertificate:
     """Compare the gradient of a rollout's loss with differences of whole rollouts, 26 for each column.
+
+    Under a policy the rollouts are of the closed loop: it is asked with plain numbers, and each rollout has a copy of
+    it with a memory of its own.
 
     Args:
         model: the model that is rolled out.
         x0: (nx,) the first state.
-        us: (N, nu) [N or N m] the inputs; None where the model has none.
+        us: (N, nu) [N or N m] the inputs; None where the model has none, and under a policy.
         loss: a function of (xs, us) or of the last state, written so that AutoDiffXd flows through it.
+        policy: u = policy(x, t) in place of `us`, as in `differentiate_rollout`.
         parameters: names, or values by name, of the parameters to differentiate by too.
         num_steps: N, where `us` is None.
         refine: take the gradient again at h/2 and h/4, under the same inputs.
         refine_stiffness: take it again at 4 and 16 times every contact stiffness that the model states.
         method: as in `differentiate_step`.
+        gradient: what to certify, instead of what `differentiate_rollout` gives.
 
     Returns:
-        The certificate of one row, the loss; its columns are x0 (on the tangent space), u[k] step by step, and the
-        parameters. Entries that agree with differences and do not converge are "not_converged".
+        The certificate of one row, the loss; its columns are x0 (on the tangent space), u[k] step by step or the
+        policy's parameters, and the model's. Entries that agree and do not converge are "not_converged".
 
     Raises:
-        InputError: the time step or a stiffness is refined and a parameter at once, or no stiffness is stated.
+        InputError: the time step or a stiffness is refined and a parameter at once, or no stiffness is stated; or
+            both `us` and `policy` are given.
         ModelError: `refine` of a model that has but one time step.
-        GradientError, SimulationError: the rollout, or its derivative, is refused.
+        GradientError: the rollout has no gradient, or the policy remembers what it was asked before.
+        SimulationError: Drake cannot take a step.
 
     Source:
         Suh, Simchowitz, Zhang and Tedrake, "Do differentiable simulators give better policy gradients?", 2022.
@@ -88,51 +100,49 @@ def certify_rollout(
         ('agree', ('hinge_q[0]', 'hinge_w[0]', 'motor[0]', 'motor[1]'))
     """
     check_method(method)
-    us = check_inputs(model, us, num_steps)
-    x0 = finite_array("x0", x0, (model.nx,))
-    vector, space = select(model, parameters), tangent_space(model)
-    steps = np.maximum(1.0, np.abs(us.ravel()))
-    scale = np.concatenate([state_scale(space, x0), steps, vector.difference_scale()])
-    end = model.nx + us.size
-
-    def moved(displacement: Array) -> tuple[Array, Array, ParameterVector]:
-        point = np.concatenate([x0, us.ravel(), vector.values])
-        point = move(space, model.nx, point, scale * displacement)
-        return point[: model.nx], point[model.nx : end].reshape(us.shape), vector.at(point[end:])
-
-    def f(displacement: Array) -> Array:
-        x, inputs, values = moved(displacement)
-        with applied(values) as set_model:
-            return np.array([evaluate_loss(loss, roll_states(set_model, x, inputs), inputs)])
-
-    def gradient_at(displacement: Array) -> RolloutGradient:
-        x, inputs, values = moved(displacement)
-        return differentiate_rollout(model, x, inputs, loss, parameters=values, method=method)
-
-    gradient = gradient_at(np.zeros(len(scale)))
-    inputs = tuple(f"{name}[{k}]" for k in range(len(us)) for name in model.input_names)
-    columns = tuple(f"{name}[0]" for name in space.names) + inputs + vector.names
+    if us is not None and policy is not None:
+        raise InputError("certify_rollout", got="us and policy", expected="one of them")
+    if policy is not None and (refine or refine_stiffness):
+        raise InputError("policy", got="a policy and refinement", expected="refinement under given inputs")
+    x0, vector = finite_array("x0", x0, (model.nx,)), select(model, parameters)
+    if policy is None:
+        inputs = check_inputs(model, us, num_steps)
+    else:
+        inputs = np.empty((positive_int("num_steps", num_steps), 0))
+    moved = Displaced(model, x0, inputs, loss, fresh(policy), vector, method)
+    scale, columns = moved.scale, moved.columns
+    beside = None
+    if gradient is None:
+        gradient = moved.gradient(np.zeros(len(scale)))
+        beside = moved.flat(moved.gradient(jitter(np.ones(len(scale)))))[None] * scale
+    if policy is not None:
+        elsewhere = fresh(moved.policy)
+        moved.roll(jitter(np.full(len(scale), ELSEWHERE / JITTER)), elsewhere)
+        check_memory(elsewhere, gradient, vector.time_step(vector.values))
     refinements = []
     for wanted, by, levels, refined in (
         (refine, "time step", tuple(model.time_step / m for m in REFINEMENTS), at_finer_steps),
         (refine_stiffness, "stiffness, times", tuple(map(float, STIFFENING)), in_stiffer_contact),
     ):
         if wanted:
-            values = [flat_gradient(space, gradient, us.shape), *refined(model, x0, us, loss, vector, method)]
-            refinements.append(judge_levels(by, levels, columns, np.array(values), space.size, us.shape))
+            values = [moved.flat(gradient), *refined(model, x0, inputs, loss, vector, method)]
+            refinements.append(judge_levels(by, levels, columns, np.array(values), moved.space.size, inputs.shape))
     certificate = certify_displacement(
-        one_by_one(f),
-        flat_gradient(space, gradient, us.shape)[None] * scale,
+        moved.losses,
+        moved.flat(gradient)[None] * scale,
         rows=("loss",),
         columns=columns,
         scale=scale,
-        beside=flat_gradient(space, gradient_at(jitter(np.ones(len(scale)))), us.shape)[None] * scale,
-        solver_tolerance=max(solver_tolerance(model, x, u) for x, u in zip(gradient.xs[:-1], us, strict=True)),
+        beside=beside,
+        solver_tolerance=max(solver_tolerance(model, x, u) for x, u in zip(gradient.xs[:-1], gradient.us, strict=True)),
         method=" + ".join(dict.fromkeys((*gradient.methods, *gradient.parameter_sources))),
         subject=f"the rollout of {model.name}",
     )
     codes = np.array(certificate.codes)
     for found in refinements:
         codes[0] = np.where(found.converged, codes[0], np.maximum(codes[0], VERDICTS.index("not_converged")))
+    cause = ""
+    if policy is not None and certificate.verdict != "agree":
+        cause = wrong_derivative(moved.policy, moved.space, gradient, vector.time_step(vector.values))
     parts = {name: getattr(certificate, name) for name in Certificate.__dataclass_fields__} | {"codes": codes}
-    return RolloutCertificate(**parts, gradient=gradient, refinements=tuple(refinements))
+    return RolloutCertificate(**parts, gradient=gradient, refinements=tuple(refinements), cause=cause)
