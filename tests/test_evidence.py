@@ -59,7 +59,10 @@ def test_the_record_says_what_the_solution_measures(run, swing_up):
     assert values["goal error"] == swing_up.goal_error
     assert values["defect"] == 0.0
     assert record.problem["x_goal"] == [np.pi, 0.0]
-    assert len(record.gradient.norms) == 41
+    assert record.gradient.final_state_norms == swing_up.final_state_norms.tolist()
+    assert record.gradient.lagrangian_norms == swing_up.optimality.state_norms.tolist()
+    assert min(record.gradient.lagrangian_norms) > 0  # an effort cost with a hard goal: the multipliers' part
+    assert record.gradient.stationarity.value < 1e-6
     assert {c.verdict for c in record.gradient.certificates} == {"agree"}
     assert record.failures == []
 

@@ -35,7 +35,7 @@ def test_a_pendulum_swings_up_with_the_oracles_cost(solver, segments):
     assert solution.cost == pytest.approx(8.826541704941, rel=1e-8)
     assert solution.options["segments"] == segments
     assert solution.defect < 1e-8
-    assert len(solution.gradient_norms) == 101
+    assert len(solution.optimality.state_norms) == 101
 
 
 @each_row("solver", SOLVERS)

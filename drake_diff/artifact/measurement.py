@@ -12,6 +12,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.refusal import Refusal
 from drake_diff.artifact.sections import units_of
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
 from drake_diff.model.contact import thinnest_geometry
@@ -248,6 +249,12 @@ def _failures(solution: Solution, metrics: Sequence[Metric]) -> Iterator[Failure
     if broken:
         message = f"{', '.join(broken)}: the solution says success, its metrics do not hold"
         yield _failure("evaluation_error", "metric_does_not_hold", message, "metrics", "metrics")
+
+
+def gradient_norms(solution: Solution) -> tuple[Array | None, Array | None]:
+    """(N+1,) |d x_N / d x_k| and |d L / d x_k|, None where they are not known."""
+    ends, found = solution.final_state_norms, solution.optimality
+    return None if isinstance(ends, Refusal) else ends, None if isinstance(found, Refusal) else found.state_norms
 
 
 def replay_evidence(r: Replay) -> ReplayEvidence:

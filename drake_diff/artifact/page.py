@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.artifact.measurement import Column, Measurement
+from drake_diff.artifact.measurement import Column, Measurement, gradient_norms
 from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.pages.meshcat import write_replay
 from drake_diff.pages.scene import BLUE, scene_of
@@ -117,12 +117,14 @@ def _replay_plots(m: Measurement) -> Iterator[Plot]:
 
 
 def _solver_plots(m: Measurement) -> Iterator[Plot]:
-    norms, rows = m.solution.gradient_norms, m.solution.iterations
-    if norms is not None:
+    named = (("|d x_N / d x_k|", "x / x", "final"), ("|d L / d x_k|, L the Lagrangian", "cost / x", "Lagrangian"))
+    for (title, unit, name), norms in zip(named, gradient_norms(m.solution), strict=True):
+        if norms is None:
+            continue
         zero = not np.any(norms > 0)
-        note = "0 at every knot: the cost does not depend on the states" if zero else "0 is not on a log scale"
-        lines = [Line("norm", norms)]
-        yield Plot("gradient norm |d cost / d x_k|", "cost / x", m.solution.times, lines, log=not zero, note=note)
+        note = "0 at every knot" if zero else "0 is not on a log scale"
+        yield Plot(title, unit, m.times, [Line(name, norms)], log=not zero, note=note)
+    rows = m.solution.iterations
     if not rows:
         return
     at, cost = [row.iteration for row in rows], [row.objective for row in rows]

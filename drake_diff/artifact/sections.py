@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.refusal import Refusal
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import select
 from drake_diff.model.plant import FLOATING, joints
@@ -68,6 +69,15 @@ LIMITATIONS = [
     "a cost is that of a local optimum at best",
     "certificates hold at the states that they name, replays in the variants that they name",
 ]
+FINAL_STATE_NORM = "|d x_N / d x_k|, the largest singular value, through the plant's steps after knot k"
+LAGRANGIAN_NORM = (
+    "|d L / d x_k| in the cost's unit per the state's, by knot k: L is the cost plus multipliers times the goal, "
+    "bounds and constraints that the plan lies on, and x_k changes all later states"
+)
+STATIONARITY = (
+    "the largest |d L / d z| of an optimized variable that no bound holds, over the largest sum of magnitudes that one "
+    "is made of: 0 at an optimum; multipliers by least squares, not the solver's"
+)
 COSTS = ("running_cost", "final_cost", "trajectory_cost")
 LIMITS = ("x_lower", "x_upper", "u_lower", "u_upper")
 GAPS = {"lower": -np.inf, "upper": np.inf}  # what null is, of a bound
@@ -204,7 +214,8 @@ def _gradient(solution: Solution) -> GradientEvidence:
     units = (*units_of(problem), *(p.unit for p in vector.parameters for _ in p.value))
     sources = (*[methods] * (problem.nx + problem.nu), *vector.sources)
     columns = zip(names, units, sources, strict=True)
-    norms = [] if solution.gradient_norms is None else finite_list(solution.gradient_norms)
+    ends, found = solution.final_state_norms, solution.optimality
+    ratio = None if isinstance(found, Refusal) or not math.isfinite(found.ratio) else found.ratio
     return GradientEvidence(
         differentiated=list(problem.optimize),
         columns=[GradientColumn(name=name, unit=unit, source=source) for name, unit, source in columns],
@@ -212,8 +223,11 @@ def _gradient(solution: Solution) -> GradientEvidence:
         regularization=regularization,
         solver_tolerance=tolerance,
         horizon=Quantity(value=solution.horizon, unit="s"),
-        norm_definition="|d cost / d x_k| in the cost's unit per the state's, by knot k",
-        norms=norms,
+        final_state_norm_definition=f"none: {ends}" if isinstance(ends, Refusal) else FINAL_STATE_NORM,
+        final_state_norms=[] if isinstance(ends, Refusal) else finite_list(ends),
+        lagrangian_norm_definition=f"none: {found}" if isinstance(found, Refusal) else LAGRANGIAN_NORM,
+        lagrangian_norms=[] if isinstance(found, Refusal) else finite_list(found.state_norms),
+        stationarity=Quantity(value=ratio, unit="1", reason=str(found) if isinstance(found, Refusal) else STATIONARITY),
         certificates=[gradient_evidence(c) for c in solution.certificates],
     )
 

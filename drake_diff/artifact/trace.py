@@ -14,7 +14,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff.artifact.measurement import Measurement
+from drake_diff.artifact.measurement import Measurement, gradient_norms
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.exceptions import ArtifactError
 from drake_diff.logs.channels import Shown, input_channel, motion_channels, nanoseconds, state_channel
@@ -107,9 +107,13 @@ def _solver_channels(m: Measurement) -> Iterator[Channel]:
     checks = [_gradient_check(c) for c in solution.certificates]
     yield _table("/gradient/check", TYPES["GradientCheck"], checks, "certificate")
     kind = TYPES["GradientNorm"]
-    norms = [] if solution.gradient_norms is None else solution.gradient_norms.tolist()
-    timed = enumerate(zip(solution.times[: len(norms)], norms, strict=True))
-    rows = [(nanoseconds(t), kind.cls(step=k, norm=norm)) for k, (t, norm) in timed]
+    norms = [np.full(len(m.times), np.nan) if n is None else n for n in gradient_norms(solution)]
+    known = any(np.any(np.isfinite(n)) for n in norms)
+    by_knot = enumerate(zip(*norms, strict=True)) if known else ()
+    rows = [
+        (nanoseconds(float(m.times[k])), kind.cls(step=k, final_state=end, lagrangian=slope))
+        for k, (end, slope) in by_knot
+    ]
     yield Channel("/gradient/norm", kind.cls, rows, {"units": kind.units})
     kind = TYPES["Replay"]
     yield _table("/replays", kind, [_fields(kind, replay) for replay in m.replays], "replay")

@@ -42,7 +42,11 @@ MESSAGES: dict[str, dict[str, tuple[tuple[str, bool], str]]] = {
         **dict.fromkeys(("worst_derivative", "worst_difference", "worst_tolerance"), (NUMBER, ROW_PER_COLUMN)),
         "mode_changes": (TEXTS, ""),
     },
-    "GradientNorm": {"step": (WHOLE, "1"), "norm": (NUMBER, "1 per state unit")},
+    "GradientNorm": {  # |d x_N / d x_k| and |d L / d x_k|; NaN where it is not known
+        "step": (WHOLE, "1"),
+        "final_state": (NUMBER, "state unit per state unit"),
+        "lagrangian": (NUMBER, "1 per state unit"),
+    },
     "Plan": {
         "scheme": (TEXT, ""),
         "num_steps": (WHOLE, "1"),

@@ -264,8 +264,8 @@ class RolloutCost:
         if z.dtype == float:
             return self.variables.attempt(lambda: self.value(z), np.nan)
         at = ExtractValue(z.reshape(-1, 1)).ravel()
-        missing = np.nan, np.full(len(at), np.nan), None
-        value, gradient, _ = self.variables.attempt(lambda: self.differentiate(at), missing)
+        missing = np.nan, np.full(len(at), np.nan)
+        value, gradient = self.variables.attempt(lambda: self.differentiate(at), missing)
         return chain(value, gradient, z)
 
     def value(self, z: Array) -> float:
@@ -276,9 +276,13 @@ class RolloutCost:
             total += self.time_step * sum(float(self.running(x, u)) for x, u in zip(xs, us, strict=False))
         return total + (0.0 if self.trajectory is None else float(self.trajectory(xs, us)))
 
-    def differentiate(self, z: Array) -> tuple[float, Array, Array]:
-        """(value, gradient by z, gradients by every state (n+1, nx)) at z."""
-        linearization = self.variables.linearization(z)
+    def differentiate(self, z: Array) -> tuple[float, Array]:
+        """(value, gradient by z) at z."""
+        total, by_xs, by_us = self.partials(z)
+        return total, self.variables.gradient(z, accumulate(self.variables.linearization(z), by_xs, by_us))
+
+    def partials(self, z: Array) -> tuple[float, Array, Array]:
+        """(value, its derivatives by the states (n+1, nx) and the inputs (n, nu) themselves, the steps apart) at z."""
         xs, us, h = self.variables.states(z), self.variables.unpack(z)[1], self.time_step
         by_xs, by_us, total = np.zeros_like(xs), np.zeros_like(us), 0.0
         if self.running is not None:
@@ -292,8 +296,7 @@ class RolloutCost:
         if self.trajectory is not None:
             value, added_xs, added_us = differentiate_loss(self.trajectory, xs, us)
             total, by_xs, by_us = total + value, by_xs + added_xs, by_us + added_us
-        totals = accumulate(linearization, by_xs, by_us)
-        return total, self.variables.gradient(z, totals), totals.states
+        return total, by_xs, by_us
 
 
 @dataclass(frozen=True, eq=False)

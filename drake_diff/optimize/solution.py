@@ -12,14 +12,18 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.refusal import Refusal
 from drake_diff.certificates.certificate import Certificate
-from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
+from drake_diff.derivatives.step import derivatives_along
+from drake_diff.exceptions import GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.model.step import advance
 from drake_diff.motion.rollout import Rollout, roll_states
+from drake_diff.optimize.optimality import Optimality, final_state_norms, optimality
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration
 from drake_diff.optimize.replay import Plan, Replay, held, replays
+from drake_diff.optimize.shooting import ShootingVariables
 from drake_diff.optimize.transcription.collocation import Collocated, collocated
 
 # Between two knots the transcription is a cubic; further than this [state units] from an accurate integration
@@ -99,7 +103,6 @@ class Solution(ShowsItsRepr):
         parameters: (np,) the values that were found for the problem's parameters.
         iterations: the solver's own table.
         certificates: of the derivatives that the solver used, at some knots of the guess and of the result.
-        gradient_norms: (N+1,) |d cost / d x_k|, where the method has it.
         options: what was asked of the solver, and what it chose.
         wall_time: [s] what the solve took.
         search: the arguments of `solve`, None of a solution that it did not make.
@@ -128,7 +131,6 @@ class Solution(ShowsItsRepr):
     parameters: Array | None = None
     iterations: tuple[Iteration, ...] = ()
     certificates: tuple[Certificate, ...] = ()
-    gradient_norms: Array | None = None
     options: dict[str, Any] = field(default_factory=dict)
     solver_message: str = ""
     wall_time: float = 0.0
@@ -321,6 +323,39 @@ class Solution(ShowsItsRepr):
         """The largest distance of xs[0] from the problem's x0, free entries apart."""
         fixed = ~self.problem.initial_state_mask
         return _largest(np.abs(self.xs[0] - self.problem.x0)[fixed])
+
+    @cached_property
+    def final_state_norms(self) -> Array | Refusal:
+        """(N+1,) |d x_N / d x_k| at the problem's own knots, by the plant's steps from the plan's states; else why not.
+
+        Where they grow going back, early inputs decide all; where they vanish, nothing that is early matters.
+        """
+        if not self.problem.has_model:
+            return Refusal("plain dynamics have no discrete step")
+        if not self._is_whole or not np.all(np.isfinite(self.xs)):
+            return Refusal("the plan is not finite")
+        try:
+            xs, us = self.plan.sample(1)
+            with applied(select(self.plan.model_at(1), self.vector.to_dict())) as model:
+                return final_state_norms(derivatives_along(model, xs[0], us, xs=xs[:-1]))
+        except (GradientError, ModelError, SimulationError) as error:
+            return Refusal(f"a step or its derivative is refused: {error}")
+
+    @cached_property
+    def optimality(self) -> Optimality | Refusal:
+        """How far a discrete plan is from a stationary point, by our own multipliers; why not, where that is not known.
+
+        Collocation has another Lagrangian, that of its scheme: its multipliers are the solver's.
+        """
+        if self.scheme != "step":
+            return Refusal("of discrete steps alone: the Lagrangian of a collocation is that of its scheme")
+        if not self._is_whole or not np.all(np.isfinite(self.xs)):
+            return Refusal("the plan is not finite")
+        variables = ShootingVariables(self.problem, around=np.asarray(self.xs))
+        try:
+            return optimality(self.problem, variables, variables.pack(self.xs[0], self.us, self.vector.values))
+        except (GradientError, SimulationError) as error:
+            return Refusal(f"a step or a derivative is refused: {error}")
 
     @cached_property
     def plan(self) -> Plan:

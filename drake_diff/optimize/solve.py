@@ -23,7 +23,7 @@ from drake_diff.optimize.judge import ended, judged, refused, why_blind
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report
 from drake_diff.optimize.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
-from drake_diff.optimize.shooting import RolloutCost, ShootingVariables, check_segments, roll_segments, solve_shooting
+from drake_diff.optimize.shooting import ShootingVariables, check_segments, roll_segments, solve_shooting
 from drake_diff.optimize.solution import Search, Solution, Status
 from drake_diff.optimize.transcription.collocation import Collocated, MeshRefinement, Transcription
 from drake_diff.optimize.transcription.drake import solve_collocation
@@ -487,11 +487,10 @@ class Run:
             xs, us, after, blindness = self._look_at(variables, z)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(xs, us, certificates=before), error)
-        norms = np.linalg.norm(RolloutCost(self.problem, variables).differentiate(z)[2], axis=1)
         values = variables.parameters(z).values
         if result.note:
             self.options["contact_sequence"] = result.note
-        found = {"certificates": before + after, "gradient_norms": frozen(norms), "parameters": values}
+        found = {"certificates": before + after, "parameters": values}
         solution = judged(self._draft(xs, us, **found), result)
         return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
 

@@ -71,8 +71,11 @@ class GradientEvidence(Part):
     regularization: str
     solver_tolerance: Quantity
     horizon: Quantity
-    norm_definition: str
-    norms: list[float | None] = Field(default_factory=list)  # by knot; null where one is not finite
+    final_state_norm_definition: str  # or why there are none
+    final_state_norms: list[float | None] = Field(default_factory=list)  # by knot; null where one is not finite
+    lagrangian_norm_definition: str  # or why there are none
+    lagrangian_norms: list[float | None] = Field(default_factory=list)  # the same
+    stationarity: Quantity
     certificates: list[Certified] = Field(default_factory=list)
 
 

@@ -1,0 +1,125 @@
+"""Costates, multipliers and the sensitivity of a plan's end against closed forms, and plans that are no optimum."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from helpers.models import MODELS
+from helpers.plants import block
+from helpers.table import each_row
+
+import drake_diff as dd
+from drake_diff._base.refusal import Refusal
+
+H, N = 0.1, 10
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+
+
+def move(**changes):
+    return dd.Problem(
+        block(time_step=H), **{"x0": [0, 0], "x_goal": [1, 0], "num_steps": N, "running_cost": EFFORT} | changes
+    )
+
+
+def exact_costates():
+    """(N+1, 2) of the least effort from rest at 0 to rest at 1, by symplectic Euler: x' = A x + B u.
+
+    x_N = sum_k A^(N-1-k) B u_k = G u is the goal, u = G' (G G')^-1 goal, and 2 h u + G' mu = 0.
+    """
+    A, B = np.array([[1, H], [0, 1]]), np.array([H**2, H])
+    powers = [np.linalg.matrix_power(A, N - k) for k in range(N + 1)]
+    G = np.array([powers[k + 1] @ B for k in range(N)]).T
+    mu = -2 * H * np.linalg.solve(G @ G.T, [1.0, 0.0])
+    return np.array([power.T @ mu for power in powers]), np.array([np.linalg.norm(power, 2) for power in powers])
+
+
+@pytest.mark.parametrize("method", ["shooting", "ilqr"])
+def test_effort_with_a_hard_goal_has_the_costates_of_the_closed_form(method):
+    """Both solvers meet first-order optimality to 1e-8 of the cost's scale."""
+    solution = dd.solve(move(), method=method)
+    costates, ends = exact_costates()
+    assert solution.final_state_norms == pytest.approx(ends, rel=1e-9)
+    assert solution.optimality.state_norms == pytest.approx(np.linalg.norm(costates, axis=1), rel=1e-5)
+    assert solution.optimality.multipliers == pytest.approx(costates[-1], rel=1e-5)
+    assert solution.optimality.ratio < 1e-6
+
+
+def test_without_constraints_the_costate_is_the_costs_own_gradient():
+    """Final cost x_N: d cost / d x_0 is the first row of A^N, whatever the inputs."""
+    problem = move(x_goal=None, final_cost=lambda x: x[0])
+    solution = dataclasses.replace(dd.solve(problem, method="ilqr"), us=np.zeros((N, 1)), xs=np.zeros((N + 1, 2)))
+    found = solution.optimality
+    assert found.multipliers.size == 0
+    assert found.state_norms[0] == pytest.approx(np.hypot(1, N * H), rel=1e-12)
+    assert found.state_norms[-1] == pytest.approx(1.0, rel=1e-12)
+    assert found.gradient == pytest.approx(N * H**2, rel=1e-12)  # by u_0: h^2 N
+    assert found.ratio == pytest.approx(1.0, rel=1e-12)
+
+
+@each_row("seed", [0, 1, 2])
+def test_a_plan_that_reaches_the_goal_by_a_detour_is_no_stationary_point(seed):
+    """Inputs moved within the null space of the goal: the goal is met, the effort is more than it need be."""
+    solution = dd.solve(move(), method="shooting")
+    A, B = np.array([[1, H], [0, 1]]), np.array([H**2, H])
+    G = np.array([np.linalg.matrix_power(A, N - 1 - k) @ B for k in range(N)]).T
+    detour = np.random.default_rng(seed).standard_normal(N)
+    detour -= np.linalg.pinv(G) @ (G @ detour)
+    us = solution.us + 1e-2 * detour[:, None]
+    moved = dataclasses.replace(solution, us=us, xs=dd.rollout(solution.problem.model, [0, 0], us).xs)
+    assert moved.goal_error < 1e-12
+    assert moved.optimality.gradient == pytest.approx(2 * H * 1e-2 * np.abs(detour).max(), rel=0.2)
+    assert moved.optimality.ratio > 1e-4
+
+
+def test_a_bound_may_push_inwards_only():
+    """At u = 1 = u_upper the cost (u - 2)^2 pushes outwards: optimal. At u = 1 = u_lower it pulls away: it is not."""
+    cost = dd.QuadraticCost(R=[[1.0]], u_ref=[2.0])
+    found = []
+    for side in ("u_upper", "u_lower"):
+        problem = move(x_goal=None, running_cost=cost, bounds=dd.Bounds(**{side: [1.0]}), us=np.ones((N, 1)))
+        us = np.ones((N, 1))
+        solution = dd.solve(problem, method="ilqr", initial_guess=(np.zeros((N + 1, 2)), us))
+        solution = dataclasses.replace(solution, us=us, xs=dd.rollout(problem.model, [0, 0], us).xs)
+        found.append(solution.optimality.gradient)
+    assert found == pytest.approx([0.0, 2 * H * (2 - 1)], abs=1e-12)
+
+
+@each_row("side", [1, -1])
+def test_a_state_on_a_bound_pushes_only_inwards(side):
+    """Speed 0.5 all the way, the cost wants 2: a bound above may hold it there, a bound below may not."""
+    limit = {"x_upper": [np.inf, 0.5]} if side > 0 else {"x_lower": [-np.inf, 0.5]}
+    problem = move(
+        x0=[0, 0.5],
+        x_goal=None,
+        running_cost=None,
+        final_cost=lambda x: (x[1] - 2.0) ** 2,
+        bounds=dd.Bounds(**limit),
+    )
+    us = np.zeros((N, 1))
+    xs = dd.rollout(problem.model, [0, 0.5], us).xs
+    solution = dataclasses.replace(dd.solve(problem, method="ilqr"), us=us, xs=xs)
+    gradient = solution.optimality.gradient
+    assert gradient == pytest.approx(0 if side > 0 else 2 * 1.5 * H, abs=1e-9)
+
+
+def test_collocation_has_sensitivities_and_says_why_it_has_no_costates():
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[0.5, 0], num_steps=20, running_cost=EFFORT)
+    solution = dd.solve(problem, method="collocation")
+    us = solution.plan.sample(1)[1]
+    d = [dd.differentiate_step(model, x, u).A for x, u in zip(solution.xs[1:-1], us[1:], strict=True)]
+    assert solution.final_state_norms[1] == pytest.approx(np.linalg.norm(np.linalg.multi_dot(d[::-1]), 2), rel=1e-9)
+    assert isinstance(solution.optimality, Refusal)
+
+
+def test_plain_dynamics_have_neither():
+    system = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+    problem = dd.Problem(system, x0=[0, 0], x_goal=[1, 0], num_steps=5, horizon=1.0, running_cost=EFFORT)
+    solution = dd.solve(problem)
+    assert isinstance(solution.final_state_norms, Refusal)
+    assert isinstance(solution.optimality, Refusal)
+
+
+def test_parameters_and_a_free_start_are_variables_too(thrown):
+    """The ball reaches the place at the cost of none: the optimum is a zero of the residual, so nothing is left."""
+    assert thrown.optimality.gradient < 1e-6
