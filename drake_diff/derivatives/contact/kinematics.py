@@ -72,6 +72,13 @@ class Weight:
     part: Array
 
 
+def weigh(J: Array, diagonal: Array) -> Weight:
+    """Of Jacobians' transposes J (M, nv, 3) and the diagonal (M, nv) of A."""
+    W = J.swapaxes(-1, -2) @ (J / diagonal[..., None])
+    size = np.sqrt((W * W).sum(axis=(1, 2)))
+    return Weight(size / 3, W / (3 * size)[:, None, None])
+
+
 @dataclass(frozen=True, eq=False)
 class Contacts:
     """M contacts, and the motions of the degrees of freedom there."""
@@ -98,10 +105,7 @@ class Contacts:
 
     def weight(self, diagonal: Array) -> Weight:
         """With the diagonal (M, nv) of A."""
-        J = self.jacobian
-        W = J.swapaxes(-1, -2) @ (J / diagonal[..., None])
-        size = np.sqrt((W * W).sum(axis=(1, 2)))
-        return Weight(size / 3, W / (3 * size)[:, None, None])
+        return weigh(self.jacobian, diagonal)
 
     def displacement(self) -> tuple[Array, Array, Array]:
         """How p (M, nv, 3), the normal (M, nv, 3) and phi (M, nv) move with each degree of freedom."""

@@ -53,6 +53,11 @@ def read_material(twin: Twin, pairs: ContactPairs) -> Material:
     inspector, geometries = twin.inspector, {i for ids in pairs.ids for i in ids}
     read = {i: [proximity_property(inspector, i, quantity) for quantity in QUANTITIES] for i in geometries}
     sides = np.array([[read[i] for i in ids] for ids in pairs.ids], dtype=float).reshape(len(pairs.ids), 2, 4)
+    return combine(sides)
+
+
+def combine(sides: Array) -> Material:
+    """Of the two sides (P, 2, 4) of pairs."""
     mu, k, tau, d = np.moveaxis(sides, -1, 0)
     b = k[:, 1] / k.sum(axis=1)
     return Material(sides, 2 * _harmonic(mu), _harmonic(k), tau.sum(axis=1), b * d[:, 0] + (1 - b) * d[:, 1], b)

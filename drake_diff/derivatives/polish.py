@@ -1,0 +1,314 @@
+"""Drake's discrete step solved to rounding.
+
+Where contact, joint limits, PD controllers or couplers act, Drake's step solves a convex problem and stops at
+
+    |D (A (v' - v*) - j)| <= 1e-6 max(|D A v'|, |D j|),    D = diag(A)^-1/2, j = J' g the impulses
+
+(Castro, Permenter and Han, "An unconstrained convex formulation of compliant contact", 2022), which is the noise of its
+differences. `polished_steps` states the same problem again (see `convex_step`), with Drake's own mass matrix, forces
+and contacts, checks that Drake's solution solves it within this very tolerance, and solves it to rounding from there.
+Where Drake's does not, the problem is not Drake's and a Refusal says by how much.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.multibody.tree import JacobianWrtVariable
+
+from drake_diff._base.arrays import Array, cross
+from drake_diff._base.refusal import Refusal
+from drake_diff.derivatives.contact.kinematics import weigh
+from drake_diff.derivatives.contact.laws import Cone, HuntCrossley
+from drake_diff.derivatives.contact.material import QUANTITIES, combine
+from drake_diff.derivatives.convex_step import SOLVED, ContactImpulses, ConvexSteps
+from drake_diff.derivatives.implicit import Form, form_of
+from drake_diff.derivatives.joint_impulses import Controllers, gather, limit_impulses
+from drake_diff.model.contract import SAP_RELATIVE_TOLERANCE
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import ParameterVector, applied
+from drake_diff.model.plant import joints, proximity_property
+from drake_diff.model.step import advance, set_state
+
+STICTION_TOLERANCE = 1e-4  # [m/s] Drake's default, which it does not give back: another one is refused by the check
+# Drake's A, v* and J are ours to rounding, and so is what it compared with its tolerance.
+DRAKES_STOP = SAP_RELATIVE_TOLERANCE * (1 + 1e-3)
+FREE_STEP = 1e-9  # of the momentum: what no impulse reaches is not solved for, so that only rounding is left
+
+
+@dataclass(frozen=True, eq=False)
+class Polished:
+    """N steps solved to rounding; those that are refused hold NaN."""
+
+    x_next: Array  # (N, nx)
+    drake: Array  # (N, nx) where Drake's own steps lead
+    left: Array  # (N,) what Drake's own leaves of the momentum, which is to be at most 1e-6; NaN where not known
+    refused: Mapping[int, Refusal]
+
+
+def polished_step(model: Model, vector: ParameterVector, x: Array, u: Array) -> Array | Refusal:
+    """(nx,) the step from x (nx,) under u (nu,) to rounding, `vector` being applied; or why it is not had.
+
+    Raises SimulationError where Drake cannot take the step.
+    """
+    found = polished_steps(model, vector, x[None], u[None])
+    return found.refused.get(0, found.x_next[0])
+
+
+def polished_steps(
+    model: Model, vector: ParameterVector, xs: Array, us: Array, values: Array | None = None
+) -> Polished:
+    """The steps from each of xs (N, nx) under each of us (N, nu); many in one call cost far less than one by one.
+
+    `values` (N, np) are the parameters of each step, those of `vector`, which is applied, where it is None.
+
+    Raises SimulationError where Drake cannot take a step.
+    """
+    if values is None or not vector.parameters:
+        return _polish(model, vector, xs, us, None)
+    times = np.array([vector.time_step(row) for row in values])
+    if np.all(times == model.time_step):
+        return _polish(model, vector, xs, us, values)
+    x_next, drake, left = np.empty_like(xs), np.empty_like(xs), np.empty(len(xs))
+    refused: dict[int, Refusal] = {}
+    for h in np.unique(times):
+        which = np.flatnonzero(times == h)
+        points = xs[which], us[which], values[which]
+        if h == model.time_step:
+            part = _polish(model, vector, *points)
+        else:
+            with applied(vector.at(points[2][0])) as other:
+                part = _polish(other, vector.at(points[2][0]), *points)
+        x_next[which], drake[which], left[which] = part.x_next, part.drake, part.left
+        refused |= {int(which[k]): why for k, why in part.refused.items()}
+    return Polished(x_next, drake, left, refused)
+
+
+def _polish(model: Model, vector: ParameterVector, xs: Array, us: Array, values: Array | None) -> Polished:
+    """Of one time step."""
+    form = form_of(model)
+    why = form.excluded
+    drake, refused = np.empty_like(xs), {}
+    read: list[_Read] = []
+    settings: _Settings | None = None
+    try:
+        for k, (x, u) in enumerate(zip(xs, us, strict=True)):
+            if values is not None:
+                vector.write(model.double, values[k])
+            drake[k] = advance(model.double, x, u)
+            if not why:
+                if settings is None or values is not None:
+                    settings = _settings(model, form)
+                found = _read(model, settings, k)
+                if isinstance(found, Refusal):
+                    refused[k] = found
+                else:
+                    read.append(found)
+    finally:
+        if values is not None:
+            vector.write(model.double, vector.values)
+    x_next, left = np.full_like(xs, np.nan), np.full(len(xs), np.nan)
+    if why:
+        return Polished(x_next, drake, left, {k: Refusal(why) for k in range(len(xs))})
+    if read:
+        which = np.array([r.step for r in read], dtype=np.intp)
+        problems = _problems(model, form, read, xs[which], us[which])
+        v_next, left[which], whys = _solved(problems, drake[which, model.nq :])
+        refused |= {int(which[i]): Refusal(why) for i, why in whys.items()}
+        x_next[which] = _states(model, xs[which], v_next)
+    x_next[list(refused)] = np.nan
+    return Polished(x_next, drake, left, refused)
+
+
+@dataclass(frozen=True, eq=False)
+class _Settings:
+    """What parameters may change between steps."""
+
+    damping: Array  # (nv,)
+    kp: Array  # (nu,)
+    kd: Array
+    material: dict[Any, Array]  # by geometry, read when it touches
+
+
+def _settings(model: Model, form: Form) -> _Settings:
+    return _Settings(np.asarray(model.double.damping()), *form.gains(), {})
+
+
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """What Drake says of one step."""
+
+    step: int
+    settings: _Settings
+    mass: Array  # (nv, nv)
+    bias: Array  # (nv,) the force that no acceleration needs, less those that act
+    contacts: list[tuple[Array, ...]]  # J' (nv, 3), normal (3,), phi, material (4,)
+
+
+def _read(model: Model, settings: _Settings, k: int) -> _Read | Refusal:
+    """Of the step that was taken last on the double twin."""
+    twin, plant = model.double, model.plant
+    contacts: list[tuple[Array, ...]] = []
+    if model.contract.contact.collision_pairs:
+        found = _contacts(model, settings)
+        if isinstance(found, Refusal):
+            return found
+        contacts = found
+    mass = plant.CalcMassMatrix(twin.context)
+    return _Read(k, settings, mass, twin.inverse_dynamics(np.zeros(model.nv)), contacts)
+
+
+def _contacts(model: Model, settings: _Settings) -> list[tuple[Array, ...]] | Refusal:
+    """Of each point of contact in Drake's last step: see `_Read`."""
+    plant, context = model.plant, model.double.context
+    results = plant.get_contact_results_output_port().Eval(context)
+    if results.num_hydroelastic_contacts():
+        return Refusal("hydroelastic contact acts")
+    jacobians: dict[Any, tuple[Array, Array]] = {}
+
+    def jacobian(index: Any, point: Array) -> Array:
+        """(nv, 3) the velocity of a body's point by the degrees of freedom."""
+        if index not in jacobians:
+            body, world = plant.get_body(index), plant.world_frame()
+            spatial = plant.CalcJacobianSpatialVelocity(
+                context, JacobianWrtVariable.kV, body.body_frame(), np.zeros(3), world, world
+            )
+            jacobians[index] = spatial.T, plant.EvalBodyPoseInWorld(context, body).translation()
+        motions, origin = jacobians[index]
+        return np.asarray(motions[:, 3:] + cross(motions[:, :3], point - origin))
+
+    found: list[tuple[Array, ...]] = []
+    for i in range(results.num_point_pair_contacts()):
+        info = results.point_pair_contact_info(i)
+        pair, point = info.point_pair(), info.contact_point()
+        sides = [_material(model, settings, geometry) for geometry in (pair.id_A, pair.id_B)]
+        for side in sides:
+            if isinstance(side, Refusal):
+                return side
+        J = jacobian(info.bodyA_index(), point) - jacobian(info.bodyB_index(), point)
+        found.append((J, np.array(pair.nhat_BA_W), np.array(-pair.depth), np.array(sides)))
+    return found
+
+
+def _material(model: Model, settings: _Settings, geometry: Any) -> Array | Refusal:
+    """(4,) the QUANTITIES of a geometry."""
+    if geometry not in settings.material:
+        inspector = model.double.inspector
+        read = [proximity_property(inspector, geometry, quantity) for quantity in QUANTITIES]
+        for quantity, value in zip(QUANTITIES, read, strict=True):
+            if value is None:
+                return Refusal(f"geometry {inspector.GetName(geometry)} has no {quantity} of its own")
+        settings.material[geometry] = np.array(read, dtype=float)
+    return settings.material[geometry]
+
+
+def _problems(model: Model, form: Form, read: list[_Read], xs: Array, us: Array) -> ConvexSteps:
+    """The convex problems of N steps."""
+    h, nq, diagonal = model.time_step, model.nq, np.arange(model.nv)
+    controlled = np.array([a.has_controller() for a in form.actuators], dtype=bool)
+    A = np.array([r.mass for r in read])
+    A[:, diagonal, diagonal] += h * np.array([r.settings.damping for r in read])
+    inputs = np.where(controlled, 0.0, np.clip(us, -form.limit, form.limit))  # a controller's are clipped with its own
+    force = inputs @ form.actuation.T - np.array([r.bias for r in read])
+    v, weights = xs[:, nq:], A[:, diagonal, diagonal]
+    free = v + h * np.linalg.solve(A, force[..., None])[..., 0]
+    positions, limits = _single(model)
+    q = xs[:, positions]
+    parts = limit_impulses(limits, q, v, free, weights, h)
+    if controlled.any():
+        which = np.flatnonzero(controlled)
+        kp, kd = (np.array([getattr(r.settings, name)[which] for r in read]) for name in ("kp", "kd"))
+        pd = Controllers(form.velocity[which], kp, kd, form.reference[:, which], form.limit[which])
+        parts.append(pd.impulses(q, us[:, which], weights, h))
+    return ConvexSteps(A, free, _contact_impulses(model, read, v, weights), gather(parts, model.nv), _same_tree(model))
+
+
+def _single(model: Model) -> tuple[NDArray[np.intp], Array]:
+    """The index in q (nv,) of each degree of freedom that is a joint of its own, and its limits (2, nv).
+
+    Of others, as of free bodies, these are 0 and infinite.
+    """
+
+    def read() -> tuple[NDArray[np.intp], Array]:
+        positions, limits = np.zeros(model.nv, dtype=np.intp), np.array([[-np.inf], [np.inf]]) * np.ones(model.nv)
+        for joint in joints(model.plant):
+            if joint.num_positions() == joint.num_velocities() == 1:
+                i = joint.velocity_start()
+                positions[i] = joint.position_start()
+                limits[:, i] = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
+        return positions, limits
+
+    return model.cache("single joints", read, of_structure=True)
+
+
+def _same_tree(model: Model) -> NDArray[np.bool_]:
+    """(nv, nv) whether two degrees of freedom belong to one tree: Drake solves for all of a tree, or none."""
+
+    def read() -> NDArray[np.bool_]:
+        world, inboard = model.plant.world_body().index(), {j.child_body().index(): j for j in joints(model.plant)}
+        root = np.empty(model.nv, dtype=np.intp)
+        for joint in joints(model.plant):
+            below = joint
+            while below.parent_body().index() != world:
+                below = inboard[below.parent_body().index()]
+            start = joint.velocity_start()
+            root[start : start + joint.num_velocities()] = int(below.index())
+        return np.asarray(root[:, None] == root)
+
+    return model.cache("same tree", read, of_structure=True)
+
+
+def _contact_impulses(model: Model, read: list[_Read], v: Array, weights: Array) -> ContactImpulses | None:
+    found = [(i, *contact) for i, r in enumerate(read) for contact in r.contacts]
+    if not found:
+        return None
+    at, jacobians, normals, depths, materials = zip(*found, strict=True)
+    problem, J, normal, phi = np.array(at, dtype=np.intp), np.array(jacobians), np.array(normals), np.array(depths)
+    material = combine(np.array(materials))
+    weight, h = weigh(J, weights[problem]).value, model.time_step
+    contact, velocity = model.contract.contact, np.zeros_like(normal)
+    law: Cone | HuntCrossley
+    if contact.approximation == "sap":
+        rigid = float(model.plant.get_sap_near_rigid_threshold())
+        stiffness = material.friction, material.stiffness, material.time
+        law = Cone(velocity, normal, phi, weight, *stiffness, time_step=h, near_rigid=rigid)
+    else:
+        before = ((v[problem][:, None, :] @ J)[:, 0] * normal).sum(axis=1)
+        stiffness = material.friction, material.stiffness, material.dissipation
+        lagged = contact.approximation == "lagged"
+        law = HuntCrossley(velocity, before, normal, phi, weight, *stiffness, h, STICTION_TOLERANCE, lagged)
+    return ContactImpulses(problem, J, law)
+
+
+def _solved(problems: ConvexSteps, drake: Array) -> tuple[Array, Array, dict[int, str]]:
+    """v' (N, nv) to rounding, what Drake's v' (N, nv) leaves of the momentum (N,), and those that are refused."""
+    at, solved = problems.at(drake), problems.taking_part()
+    missing = problems.norm(at.missing * solved), problems.norm(at.missing * ~solved)
+    had = problems.scale(drake * solved, at.given), problems.scale(drake, at.given)
+    left, elsewhere = (np.divide(m, p, out=np.zeros_like(m), where=m > 0) for m, p in zip(missing, had, strict=True))
+    v_next, rest = problems.solve(drake)
+    whys = {}
+    for i in np.flatnonzero(~(left <= DRAKES_STOP)):
+        whys[int(i)] = (
+            f"Drake's step leaves {left[i]:.2g} of the momentum in the equation known here, its solver stops at "
+            f"{SAP_RELATIVE_TOLERANCE:g}: the equation is not Drake's"
+        )
+    for i in np.flatnonzero(~(elsewhere <= FREE_STEP)):
+        whys[int(i)] = f"Drake's step without impulses differs by {elsewhere[i]:.2g} of the momentum"
+    for i in np.flatnonzero(~(rest <= SOLVED)):
+        whys.setdefault(int(i), f"Newton's method leaves {rest[i]:.2g} of the momentum, expected at most {SOLVED:g}")
+    return v_next, left, whys
+
+
+def _states(model: Model, xs: Array, v_next: Array) -> Array:
+    """(N, nx) q' = q + h N(q) v' and v'."""
+    if model.plant.IsVelocityEqualToQDot():
+        rates = v_next
+    else:
+        rates = np.empty((len(xs), model.nq))
+        for k, (x, v) in enumerate(zip(xs, v_next, strict=True)):
+            set_state(model.double, x)
+            rates[k] = model.plant.MapVelocityToQDot(model.double.context, v)
+    return np.concatenate([xs[:, : model.nq] + model.time_step * rates, v_next], axis=1)
