@@ -96,6 +96,16 @@ def test_a_state_bound_is_kept_at_the_knots():
     assert solution.xs[:, 1].max() == pytest.approx(1.2, abs=1e-6)
 
 
+@each_row("solver", ["ipopt", "snopt"])
+def test_a_state_bound_is_kept_between_the_knots(solver):
+    """Bryson and Denham: x <= 1/9 from (0, 1) to (0, -1) within 1 s costs 4 at least, 3.98 with knots alone bounded."""
+    fields = {"x0": [0, 1], "x_goal": [0, -1], "running_cost": dd.QuadraticCost(R=[[0.5]])}
+    solution = collocate(move(bounds=dd.Bounds(x_upper=[1 / 9, 9]), **fields), solver=solver)
+    assert solution.success, solution.message
+    assert solution.transcribed.at(np.linspace(0, 1, 5001))[0][:, 0].max() < 1 / 9 + 1e-7
+    assert 4 < solution.cost < 4.2
+
+
 def test_a_free_goal_entry_is_left_free():
     """min of the effort to reach x = 1 at any speed in continuous time: 3 d^2 / T^3 with u = 3 (1 - t)."""
     solution = collocate(move(40, x_goal=[1, math.nan]))

@@ -339,6 +339,7 @@ PLAN_METRICS = [
 REPLAY_METRICS = ["replay end error", "half-step end error", "energy drift", "energy oscillation", "energy scale"]
 REPLAY_METRICS += ["penetration", "joint limit violation"]
 COLLOCATION_METRICS = ["integration error", "state excess between nodes", "input excess between nodes"]
+COLLOCATION_METRICS += ["constraint excess between nodes", "excess between nodes"]
 
 
 def test_a_record_has_exactly_these_metrics_and_invariants(record):

@@ -197,9 +197,12 @@ def _metrics_of_the_plan(s: Solution, states: Sequence[Column], inputs: Sequence
     definition = "largest distance of a knot from an accurate integration from the knot before"
     yield measured("integration error", definition, s.integration_error, x, INTEGRATION_TOLERANCE)
     between = violation_between_nodes(s.transcribed)
-    for name, value, unit in (("state", between.state, x), ("input", between.input, _unit(inputs))):
-        definition = f"largest excess of the {name} over its bounds between the nodes, where no solver keeps them"
+    excesses = ("state", between.state, x), ("input", between.input, _unit(inputs))
+    for name, value, unit in (*excesses, ("constraint", between.constraint, "the constraint's")):
+        definition = f"largest excess of the {name} over its bounds between the nodes, as the dynamics move there"
         yield measured(f"{name} excess between nodes", definition, value, unit)
+    definition = "the worst of these as a part of its tolerance, 1e-3 of its range along the plan or 1e-5"
+    yield measured("excess between nodes", definition, between.worst, "1", 1.0)
     if s.integrated is not None and not s.problem.has_model:
         definition = "largest distance of the final state from where the equations lead from the first, unstable or not"
         yield measured("open-loop end error", definition, float(np.abs(s.integrated[-1] - s.xs[-1]).max()), x)

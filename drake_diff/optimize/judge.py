@@ -16,6 +16,7 @@ from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, NlpResult, Outcom
 from drake_diff.optimize.replay import broken_variants
 from drake_diff.optimize.shooting import ShootingVariables, final_sensitivity
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
+from drake_diff.optimize.transcription.collocation import Collocated, violation_between_nodes
 
 NO_EFFECT = 1e-12
 FINER = "pass refine=True, or take more steps (num_steps)"
@@ -57,13 +58,8 @@ def complaints_about(solution: Solution) -> Iterator[str]:
     yield from _infeasibilities(solution)
     if not np.isfinite(solution.cost):
         yield "the cost is not finite"
-    if solution.transcribed is not None and not solution.integration_error <= INTEGRATION_TOLERANCE:
-        knot = int(np.argmax(solution.integration_errors))
-        finer = "take a smaller time step" if solution.problem.horizon is None else FINER
-        yield (
-            f"an accurate integration from knot {knot} misses the next by {solution.integration_error:.3g}, "
-            f"tolerance {INTEGRATION_TOLERANCE:g}: {finer}"
-        )
+    if solution.transcribed is not None:
+        yield from _between_nodes(solution, solution.transcribed)
     if solution.transcribed is not None and solution.problem.has_model:
         model, depths = solution.problem.model, []
         for x in solution.xs:
@@ -76,6 +72,21 @@ def complaints_about(solution: Solution) -> Iterator[str]:
         if certificate.verdict != "agree":
             yield f"a gradient certificate says {certificate.verdict}: {certificate.worst}"
             break
+
+
+def _between_nodes(solution: Solution, motion: Collocated) -> Iterator[str]:
+    """Where the motion between nodes is not that of the dynamics, or not within its bounds and constraints."""
+    finer = "take a smaller time step" if solution.problem.horizon is None else FINER
+    tolerance = INTEGRATION_TOLERANCE * np.minimum(solution.problem.ranges(motion.xs), 1.0)
+    if not np.all(motion.gaps <= tolerance):
+        knot, i = np.unravel_index(int(np.argmax(motion.gaps / tolerance)), motion.gaps.shape)
+        yield (
+            f"an accurate integration from knot {knot} misses the next by {motion.gaps[knot, i]:.3g} in "
+            f"{solution.problem.state_names[i]}, tolerance {tolerance[i]:.3g}: {finer}"
+        )
+    broken = violation_between_nodes(motion).broken
+    if broken:
+        yield f"{'; '.join(broken)}: take more, shorter steps (num_steps)"
 
 
 def _infeasibilities(solution: Solution) -> Iterator[str]:

@@ -22,7 +22,7 @@ from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import TVLQR
 from drake_diff.motion.rollout import Policy, Rollout, rollout
-from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 
 # Of a coordinate's range in the plan: how far from goal, bound or waypoint a replay may be. Discretizations differ by
 # O(h), so nothing tight can be asked of h against h/2; a plan that is wrong is wrong by the order of its range.
@@ -30,8 +30,6 @@ STATE_TOLERANCE = 0.05
 SMALLEST_ENERGY = 1e-9  # [J] less is rounding
 ENERGY_TOLERANCE = 0.1  # of the energy that the motion exchanges: what neither actuators nor damping account for
 PENETRATION_PART = 0.25  # of the thinnest geometry's thickness: beyond half of it contact may push out the other way
-SMALLEST_PART = 0.2  # of the largest range of its kind (positions, velocities): a coordinate's own is at least that
-SMALLEST_RANGE = 1e-3
 OTHER_APPROXIMATION = {"sap": "lagged", "similar": "sap", "lagged": "sap", "tamsi": "sap"}
 FINEST = 16  # intervals are cut into at most that many steps
 EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in TVLQR, over that of the states
@@ -79,12 +77,8 @@ class Plan:
 
     @cached_property
     def scale(self) -> Array:
-        """(nx,) the range of each state along the plan, see SMALLEST_PART."""
-        ranges, nq = np.ptp(self.sample(1)[0], axis=0), self.problem.model.nq
-        for kind in (slice(0, nq), slice(nq, None)):
-            least = max(SMALLEST_PART * float(np.max(ranges[kind], initial=0.0)), SMALLEST_RANGE)
-            ranges[kind] = np.maximum(ranges[kind], least)
-        return np.asarray(ranges)
+        """(nx,) the range of each state along the plan, see `Problem.ranges`."""
+        return self.problem.ranges(self.sample(1)[0])
 
     @cached_property
     def open_loop(self) -> Rollout | None:

@@ -19,6 +19,8 @@ from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
 OPTIMIZABLE = ("controls", "initial_state", "parameters")
 # A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
 SMALLEST_PART = 1e-3
+SMALLEST_RANGE = 1e-3  # of a number along a motion: less counts as this, in its unit
+SMALLEST_SHARE = 0.2  # of the largest range of its kind (positions, velocities): a state's own is at least that
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -257,6 +259,14 @@ class Problem(ShowsItsRepr):
             distance = np.abs(xs[where[knot]] - wanted)[~np.isnan(wanted)]
             found[f"waypoint at knot {knot}"] = (float(np.max(distance, initial=0.0)), int(where[knot]))
         return found
+
+    def ranges(self, xs: Array) -> Array:
+        """(nx,) the range of each state along xs (M, nx), a tolerance's scale; see SMALLEST_RANGE, SMALLEST_SHARE."""
+        ranges = np.ptp(xs, axis=0)
+        parts = [slice(0, self.model.nq), slice(self.model.nq, None)] if self.has_model else []
+        for kind in parts:
+            ranges[kind] = np.maximum(ranges[kind], SMALLEST_SHARE * np.max(ranges[kind], initial=0.0))
+        return np.maximum(ranges, SMALLEST_RANGE)
 
     def goal_error(self, x: Array) -> Array:
         """(nx,) the distance of `x` from the goal, 0 where the goal is free."""

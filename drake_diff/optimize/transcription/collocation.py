@@ -7,6 +7,7 @@ too coarse for the best input, only a finer one tells.
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -14,23 +15,33 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, frozen
-from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report
+from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
+from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Limits, NlpResult, Outcome, Report
 from drake_diff.optimize.transcription.task import OptimalControl
 
 SUBSTEPS = 10  # of the Runge-Kutta method that measures an interval
-DENSE = np.linspace(0, 1, 21)[1:-1]  # where bounds are looked at between two knots
+DENSE = np.linspace(0, 1, 41)[1:-1]  # where the input is looked at between two knots
+# Of a number's range along the motion: how far beyond its bound it may be between nodes. The solver keeps the scheme's
+# polynomials of states and inputs within; what the dynamics do in between differs from these by the integration error.
+EXCESS_TOLERANCE = 1e-3
 MOST_PIECES = 4  # of one interval in one round of refinement
 FOUND = (Outcome.SOLVED, Outcome.INACCURATE)
 
 
 @dataclass(frozen=True)
 class Excess:
-    """The largest excess over a bound of a state and of an input between the nodes, and where the larger one is."""
+    """The largest excess over a bound of a state, an input and a constraint between the nodes.
+
+    The tolerance of each is 1e-3 of its range along the motion, or 1e-5 where that is more. `worst` is the largest
+    excess as a part of its tolerance, `where` that is, and `broken` has a clause for each that is above.
+    """
 
     state: float
     input: float
+    constraint: float
+    worst: float
     where: str
+    broken: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,14 +114,19 @@ class Collocated:
 
         Ten steps of the classical Runge-Kutta method, in the worst coordinate's unit.
         """
-        return _finite(np.max(np.abs(self._integrated[:, :-1] - self.xs[1:]), axis=1))
+        return np.asarray(np.max(self.gaps, axis=1))
+
+    @property
+    def gaps(self) -> Array:
+        """(N, nx) the same of each state."""
+        return _finite(np.abs(self._integrated[-1, :, :-1] - self.xs[1:]))
 
     @property
     def cost_errors(self) -> Array:
         """(N,) the same of the running cost's quadrature, as a part of the whole cost (of 1 where that is less)."""
         scheme, rates = self.task.scheme, self.task.rate.values(self.nodes)[:, 0]
         quadrature = self._lengths * (scheme.per_interval(rates) @ scheme.weights)
-        return _finite(np.abs(self._integrated[:, -1] - quadrature) / max(1.0, abs(self.cost)))
+        return _finite(np.abs(self._integrated[-1, :, -1] - quadrature) / max(1.0, abs(self.cost)))
 
     def at(self, times: Any) -> tuple[Array, Array]:
         """xs (S, nx) and us (S, nu) at `times` (S,) [s] by the scheme's own polynomials."""
@@ -129,6 +145,10 @@ class Collocated:
         k = np.clip(np.searchsorted(self.mesh, fractions, side="right") - 1, 0, len(self.mesh) - 2)
         return k, (fractions - self.mesh[k]) / np.diff(self.mesh)[k]
 
+    def _times(self, k: Indices, tau: Array) -> Array:
+        """[s] (S,) of the places `tau` in the intervals `k`."""
+        return np.asarray(self.horizon * self.mesh[k] + tau * self._lengths[k])
+
     def _between(self, k: Any, tau: Array) -> tuple[Array, Array]:
         """xs and us in the intervals `k` (S,) at `tau` (S,) of each."""
         scheme, nx = self.task.scheme, self.task.dynamics.nx
@@ -142,23 +162,23 @@ class Collocated:
         z = np.append(self.xs[0], 0.0)[None]
         found = [z[0]]
         for k in range(len(self.mesh) - 1):
-            z = self._integrate(np.array([k]), z)
+            z = self._integrate(np.array([k]), z)[-1]
             found.append(z[0])
         return np.array(found)[:, : self.task.dynamics.nx]
 
     @cached_property
     def _integrated(self) -> Array:
-        """(N, nx + 1) where each knot leads within its interval, and what that costs."""
+        """(11, N, nx + 1) where each knot leads within its interval, in ten steps, and what that costs."""
         every = np.arange(len(self.mesh) - 1)
         return self._integrate(every, np.column_stack([self.xs[:-1], np.zeros(len(every))]))
 
     def _integrate(self, k: Indices, z: Array) -> Array:
-        """(S, nx + 1) where `z` at the starts of the intervals `k` (S,) leads at their ends: states, and the cost."""
+        """(11, S, nx + 1) where `z` at the starts of the intervals `k` (S,) leads in ten steps: states and cost."""
         dynamics, rates, nx = self.task.dynamics, self.task.rate, self.task.dynamics.nx
-        dt = self._lengths[k, None] / SUBSTEPS
+        dt, found = self._lengths[k, None] / SUBSTEPS, [z]
 
         def rate(z: Array, step: float) -> Array:
-            knots = np.hstack([z[:, :nx], self._between(k, np.full(len(k), step / SUBSTEPS))[1]])
+            knots = np.hstack([z[:, :nx], self._applied(k, np.full(len(k), step / SUBSTEPS))])
             return np.column_stack([dynamics.values(knots), rates.values(knots)])
 
         with np.errstate(all="ignore"):
@@ -167,7 +187,13 @@ class Collocated:
                 k2 = rate(z + dt / 2 * k1, i + 0.5)
                 k3 = rate(z + dt / 2 * k2, i + 0.5)
                 z = z + dt / 6 * (k1 + 2 * k2 + 2 * k3 + rate(z + dt * k3, i + 1))
-        return z
+                found.append(z)
+        return np.array(found)
+
+    def _applied(self, k: Indices, tau: Array) -> Array:
+        """(S, nu) the inputs in the intervals `k` at `tau` as the plant applies them: cut off at its own limits."""
+        limits = self.task.dynamics.bounds
+        return np.clip(self._between(k, tau)[1], limits.u_lower, limits.u_upper)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,36 +211,91 @@ def _finite(values: Array) -> Array:
 
 
 def violation_between_nodes(motion: Collocated) -> Excess:
-    """How far a collocated motion leaves its bounds between the nodes, where the solver enforces nothing.
+    """How far a collocated motion leaves its bounds and constraints between the nodes.
 
-    A cost below the optimum of the problem with its bounds goes together with an excess here.
+    The states are those that an accurate integration from each knot passes through, under the input as the plant
+    applies it, cut off at its own limits. A cost below the optimum of the problem goes together with an excess here.
 
     Args:
         motion: `Solution.transcribed` of a solution by collocation.
 
     Returns:
-        An `Excess`: the largest of a `state` and of an `input` over a bound, each in its own unit, at 19 points within
-        each interval, and `where` the larger one is.
+        An `Excess`: the largest of a `state`, an `input` and a `constraint` over a bound, each in its own unit, `where`
+        the worst is, and what is `broken` by more than its tolerance. States and constraints are looked at in 9 places
+        within each interval, inputs in 39; a constraint that holds at some knots only is left out.
 
     Example:
-        >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1, x_upper=[1 / 9, np.inf])
-        >>> effort = dd.QuadraticCost(R=[[0.5]])
-        >>> problem = dd.Problem(block, x0=[0, 1], x_goal=[0, -1], num_steps=10, horizon=1.0, running_cost=effort)
-        >>> excess = dd.optimize.violation_between_nodes(dd.solve(problem).transcribed)
-        >>> round(excess.state, 5), excess.input
-        (0.0001, 0.0)
+        >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+        >>> effort, slow = dd.QuadraticCost(R=[[0.5]]), dd.Constraint(lambda x: x[1], upper=1.3, name="slow")
+        >>> problem = dd.Problem(
+        ...     block, x0=[0, 0], x_goal=[1, 0], num_steps=4, horizon=1.0, running_cost=effort, constraints=slow
+        ... )
+        >>> solution = dd.solve(problem)
+        >>> excess = dd.optimize.violation_between_nodes(solution.transcribed)
+        >>> excess.state, excess.input, round(excess.constraint, 3), solution.status.value
+        (0.0, 0.0, 0.004, 'converged_not_verified')
     """
     task, b, count = motion.task, motion.task.bounds, len(motion.mesh) - 1
+    inside, states, inputs = np.arange(1, SUBSTEPS) / SUBSTEPS, task.dynamics.state_names, task.dynamics.input_names
+    k, tau = np.tile(np.arange(count), len(inside)), np.repeat(inside, count)
+    xs, applied = motion._integrated[1:-1, :, :-1].reshape(len(k), -1), motion._applied(k, tau)
+    times, ranges = motion._times(k, tau), task.problem.ranges(motion.xs)
+    found = [_beyond("state", states, xs, b.x_lower, b.x_upper, ranges, times)]
+    for c in task.problem.constraints:
+        if c.knots is None:
+            rows = np.flatnonzero((k > 0) | (tau > 0.5) | (not task.problem.initial_state_is_given))
+            with np.errstate(all="ignore"):
+                values = np.array([c(xs[i], applied[i]) for i in rows])
+            extent = np.maximum(np.ptp(np.nan_to_num(values), axis=0), SMALLEST_RANGE)
+            names = (c.label,) * values.shape[1]
+            found.append(_beyond("constraint", names, values, c.lower, c.upper, extent, times[rows]))
     k, tau = np.repeat(np.arange(count), len(DENSE)), np.tile(DENSE, count)
-    xs, us = motion._between(k, tau)
-    beyond = [np.maximum(b.x_lower - xs, xs - b.x_upper), np.maximum(b.u_lower - us, us - b.u_upper)]
-    both = np.maximum(np.hstack(beyond), 0.0)
-    at, column = np.unravel_index(int(np.argmax(both)), both.shape)
-    name = (task.dynamics.state_names + task.dynamics.input_names)[column]
-    time = motion.horizon * motion.mesh[k[at]] + tau[at] * motion._lengths[k[at]]
-    where = f"{name} by {both[at, column]:.3g} at {time:.4g} s" if both[at, column] > 0 else "nowhere"
-    by_state, by_input = np.split(both, [task.dynamics.nx], axis=1)
-    return Excess(float(np.max(by_state)), float(np.max(by_input)), where)
+    us = motion._between(k, tau)[1]
+    extent = np.maximum(np.ptp(us, axis=0), SMALLEST_RANGE)
+    found.append(_beyond("input", inputs, us, b.u_lower, b.u_upper, extent, motion._times(k, tau)))
+    every = [each for kind in found for each in kind]
+    largest = {kind: max((e.excess for e in every if e.kind == kind), default=0.0) for kind in KINDS}
+    worst = max(every, key=lambda e: e.excess / e.tolerance)
+    where = f"{worst.name} by {worst.excess:.3g} at {worst.time:.4g} s" if worst.excess > 0 else "nowhere"
+    return Excess(
+        **largest,
+        worst=worst.excess / worst.tolerance,
+        where=where,
+        broken=tuple(str(e) for e in every if not e.excess <= e.tolerance),
+    )
+
+
+KINDS = ("state", "input", "constraint")
+
+
+@dataclass(frozen=True)
+class _Beyond:
+    """The largest excess of one number over its bounds, and when."""
+
+    kind: str
+    name: str
+    excess: float
+    tolerance: float
+    time: float
+
+    def __str__(self) -> str:
+        return (
+            f"between the nodes {self.name} is {self.excess:.3g} beyond its bound at {self.time:.4g} s, "
+            f"tolerance {self.tolerance:.3g}"
+        )
+
+
+def _beyond(
+    kind: str, names: Sequence[str], values: Array, lower: Array, upper: Array, ranges: Array, times: Array
+) -> list[_Beyond]:
+    """One for each column of `values` (S, n); what is no number is infinitely far."""
+    excess = np.maximum(np.maximum(lower - values, values - upper), 0.0)
+    excess = np.where(np.isfinite(values), excess, np.inf)
+    tolerance, at = np.maximum(EXCESS_TOLERANCE * ranges, FEASIBILITY_TOLERANCE), np.argmax(excess, axis=0)
+    return [
+        _Beyond(kind, name, float(excess[k, i]), float(tolerance[i]), float(times[k]))
+        for i, (name, k) in enumerate(zip(names, at, strict=True))
+    ]
 
 
 def collocated(

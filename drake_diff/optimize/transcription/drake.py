@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.autodiffutils import ExtractValue
 from pydrake.solvers import MathematicalProgram
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.autodiff import chain
 from drake_diff.model.equations import ContinuousSystem, EquationsOfMotion
 from drake_diff.optimize.drake_program import solve_program
@@ -37,6 +37,7 @@ def solve_collocation(
         program.AddBoundingBoxConstraint(lower, upper, variables)
     for variables in inputs:
         program.AddBoundingBoxConstraint(b.u_lower, b.u_upper, variables)
+    _add_hull(problem, program, states, inputs)
     _add_costs(problem, program, states, inputs)
     guess, steps = np.zeros(program.num_vars()), [drake.time_step(k) for k in range(count)]
     for variables, values in zip([*states, *inputs, *steps], [*xs, *us, us[-1], *[[h]] * count], strict=True):
@@ -47,6 +48,29 @@ def solve_collocation(
         for variables in (states, inputs)
     )
     return result, xs, us[:-1], us[-1]
+
+
+def _add_hull(problem: Problem, program: MathematicalProgram, states: list[Any], inputs: list[Any]) -> None:
+    """Keep the inner Bernstein coefficients of bounded states, x + h f / 3 and x - h f / 3, within their bounds too."""
+    b, count, h = problem.bounds, problem.num_steps, problem.model.time_step
+    bounded = np.flatnonzero((np.isfinite(b.x_lower) | np.isfinite(b.x_upper)) & (b.x_lower < b.x_upper))
+    equations = EquationsOfMotion(problem.model)
+    for k, (x, u) in enumerate(zip(states, inputs, strict=True) if len(bounded) else ()):
+        signs = np.array([1.0] * (k < count) + [-1.0] * (k > 0))
+        lower, upper = (np.tile(side[bounded], len(signs)) for side in (b.x_lower, b.x_upper))
+        program.AddConstraint(_Hull(equations, bounded, h / 3 * signs), lower, upper, vars=np.concatenate([x, u]))
+
+
+class _Hull:
+    """x + step f(x, u) of the states `bounded`, for each of `steps` [s], of floats or AutoDiffXd [x, u]."""
+
+    def __init__(self, equations: EquationsOfMotion, bounded: Indices, steps: Array):
+        self.equations, self.bounded, self.steps = equations, bounded, steps
+
+    def __call__(self, z: Any) -> Any:
+        nx = self.equations.model.nx
+        rates = self.equations.values(z[None])[0] if z.dtype == float else self.equations.autodiff(z[:nx], z[nx:])
+        return np.concatenate([z[self.bounded] + step * rates[self.bounded] for step in self.steps])
 
 
 def _add_costs(problem: Problem, program: MathematicalProgram, states: list[Any], inputs: list[Any]) -> None:

@@ -5,7 +5,8 @@ With the rates F and their Jacobians J at all nodes, each computed once, the res
     g = S z - T D F,    dg = S - T D J,    d^2 (lambda' g) = -T sum_k d^2 (nu_k' f),    nu = D' lambda
 
 with constant sparse S and D from the scheme's states and slopes, so that the Hessian has one block a node, and a column
-for a free final time T. Path constraints add rows to g and terms to the blocks of their nodes.
+for a free final time T. The Bernstein coefficients of bounded states are rows of the same form, those of bounded inputs
+linear ones. Path constraints add rows to g and terms to the blocks of their nodes.
 """
 
 import math
@@ -72,10 +73,16 @@ class TranscribedProgram:
     @cached_property
     def sides(self) -> tuple[Array, Array]:
         """(lower, upper) of g: 0 for the defects, then each path constraint's own, node by node."""
-        before, after = np.zeros(self.num_defects), np.zeros(0 if self._linear is None else self._linear.shape[0])
-        lower = [np.tile(constraint.lower, len(at)) for _, at, constraint in self.paths]
-        upper = [np.tile(constraint.upper, len(at)) for _, at, constraint in self.paths]
-        return np.concatenate([before, *lower, after]), np.concatenate([before, *upper, after])
+        found = []
+        for links, path, linear in zip(
+            ([b.lower for b in self._links], [b.upper for b in self._links]),
+            ([c.lower for _, _, c in self.paths], [c.upper for _, _, c in self.paths]),
+            self._linear_sides,
+            strict=True,
+        ):
+            paths = [np.tile(side, len(at)) for side, (_, at, _) in zip(path, self.paths, strict=True)]
+            found.append(np.concatenate([*links, *paths, linear]))
+        return found[0], found[1]
 
     @cached_property
     def nlp(self) -> dict[str, Any]:
@@ -103,28 +110,51 @@ class TranscribedProgram:
         return found
 
     def _set_links(self) -> None:
-        """Which node enters which defect (nx rows), by its state and by its rate, and the matrices S and D of that."""
-        scheme, lengths = self.task.scheme, np.diff(self.mesh)
-        groups, nodes = scheme.states.shape
-        k, i, j = (a.ravel() for a in np.indices((len(lengths), groups, nodes)))
-        self.defect, self.node = k * groups + i, k * scheme.nodes + j
-        self.state, self.slope = scheme.states[i, j], lengths[k] * scheme.slopes[i, j]
-        self.num_defects = len(lengths) * groups * self.nx
-        each = np.arange(self.nx)
-        rows, self.rate_index = (a[:, None] * self.nx + each for a in (self.defect, self.node))
-        self.link_rows, columns = rows, self.node[:, None] * self.width + each
-        self._S = _sparse(rows, columns, self.state[:, None], (self.num_defects, self.z.numel()))
-        self._D = _sparse(rows, self.rate_index, self.slope[:, None], (self.num_defects, self.every.size * self.nx))
-        self.link_columns = columns
-        self._linear = None
-        if not scheme.input_is_linear:
+        """The defects and the Bernstein coefficients of bounded states, and those of bounded inputs."""
+        scheme, b = self.task.scheme, self.task.bounds
+        bounded = np.flatnonzero((np.isfinite(b.x_lower) | np.isfinite(b.x_upper)) & (b.x_lower < b.x_upper))
+        defects = _Links(self, 0, scheme.states, scheme.slopes, np.arange(self.nx))
+        hull = _Links(self, defects.count, scheme.hull_states, scheme.hull_slopes, bounded)
+        hull.set_limits(b.x_lower[bounded], b.x_upper[bounded])
+        self._relax_what_is_given(hull)
+        self._links, self.num_links = (defects, hull), defects.count + hull.count
+        rows, columns, states, slopes, rates = (
+            np.concatenate([np.broadcast_to(getattr(each, name), each.rows.shape).ravel() for each in self._links])
+            for name in ("rows", "columns", "state", "slope", "rates")
+        )
+        self._S = _sparse(rows, columns, states, (self.num_links, self.z.numel()))
+        self._D = _sparse(rows, rates, slopes, (self.num_links, self.every.size * self.nx))
+        self._linear: Any = None
+        self._linear_sides = np.zeros(0), np.zeros(0)
+        inputs = np.arange(self.task.dynamics.nu)
+        if scheme.input_is_linear:  # 2 u_mid - u_0 - u_1 = 0 in all intervals
+            self._add_linear(inputs, (2.0, -1.0, -1.0), np.zeros(len(inputs)), np.zeros(len(inputs)))
+        elif scheme.nodes == 2:  # the parabola's inner Bernstein coefficient
+            free = (np.isfinite(b.u_lower) | np.isfinite(b.u_upper)) & (b.u_lower < b.u_upper)
+            self._add_linear(inputs[free], (2.0, -0.5, -0.5), b.u_lower[free], b.u_upper[free])
+
+    def _add_linear(self, inputs: Indices, weights: tuple[float, float, float], lower: Array, upper: Array) -> None:
+        """Rows that keep each interval's weighted sum of the `inputs` at its middle, start and end within limits."""
+        if not len(inputs):
             return
-        # 2 u_mid - u_0 - u_1 = 0 in all intervals
-        middle = np.arange(1, self.every.size, 2)[:, None] * self.width + np.arange(self.nx, self.width)
+        middle = np.arange(1, self.every.size, 2)[:, None] * self.width + self.nx + inputs
         rows = np.arange(middle.size).reshape(middle.shape)
         columns = np.stack([middle, middle - self.width, middle + self.width])
-        values = np.array([2.0, -1, -1])[:, None, None]
+        values = np.array(weights)[:, None, None]
         self._linear = _sparse(rows, columns, values, (middle.size, self.z.numel()))
+        self._linear_sides = np.tile(lower, len(middle)), np.tile(upper, len(middle))
+
+    def _relax_what_is_given(self, hull: "_Links") -> None:
+        """No limit for a coefficient of given numbers alone: nothing that is searched for can keep it."""
+        count = self.every.size * self.width
+        lower, upper = (side[:count].reshape(-1, self.width) for side in (self.lower, self.upper))
+        rows, columns = self.functions.dynamics.jacobian_at
+        for node in (0, self.every[-1]):
+            given = lower[node] == upper[node]
+            for place, state in enumerate(hull.each):
+                if given[state] and np.all(given[columns[rows == state]]):
+                    at = hull.rows[(hull.node == node) & (hull.state[:, 0] != 0), place] - hull.first
+                    hull.lower[at], hull.upper[at] = -np.inf, np.inf
 
     def _gradient(self) -> Any:
         total, last = _Sum((self.z.numel(), 1)), self.every[-1:]
@@ -139,15 +169,18 @@ class TranscribedProgram:
 
     def _jacobian(self) -> Any:
         f, total = self.functions.dynamics, _Sum((self.nlp["g"].numel(), self.z.numel()))
-        total.add(self.link_rows, self.link_columns, self.state[:, None], ca.DM(1), 0)
         rows, columns = f.jacobian_at
-        index = self.node[:, None] * len(rows) + np.arange(len(rows))
-        at = self.defect[:, None] * self.nx + rows, self.node[:, None] * self.width + columns
-        total.add(*at, -self.slope[:, None], self.time * self.rate_rows, index)
-        if self.free:
-            source = ca.vec(self.rates)
-            total.add(self.link_rows, self.z.numel() - 1, -self.slope[:, None], source, self.rate_index)
-        first = self.num_defects
+        for links in self._links:
+            total.add(links.rows, links.columns, links.state, ca.DM(1), 0)
+            place = np.full(self.nx, -1)
+            place[links.each] = np.arange(len(links.each))
+            kept = np.flatnonzero(place[rows] >= 0)
+            index = links.node[:, None] * len(rows) + kept
+            at = links.starts[:, None] + place[rows[kept]], links.node[:, None] * self.width + columns[kept]
+            total.add(*at, -links.slope, self.time * self.rate_rows, index)
+            if self.free:
+                total.add(links.rows, self.z.numel() - 1, -links.slope, ca.vec(self.rates), links.rates)
+        first = self.num_links
         for path, nodes, _ in self.paths:
             b = _Blocks(path.jacobian_at, nodes, self.width)
             source = path.jacobian(self.knots[:, nodes.tolist()])
@@ -161,7 +194,7 @@ class TranscribedProgram:
     def _hessian(self, sigma: Any, multipliers: Any) -> Any:
         """The upper triangle of d^2 (sigma f + multipliers' g) / dz^2."""
         f, rate, total = self.functions.dynamics, self.functions.rate, _Sum((self.z.numel(), self.z.numel()))
-        nu = ca.mtimes(self._D.T, multipliers[: self.num_defects])
+        nu = ca.mtimes(self._D.T, multipliers[: self.num_links])
         weights = ca.DM(self.weights).T
         terms: list[tuple[Any, Indices, Any]] = [
             (f, self.every, -self.time * ca.reshape(nu, self.nx, self.every.size)),
@@ -169,7 +202,7 @@ class TranscribedProgram:
         ]
         if self.functions.final is not None:
             terms.append((self.functions.final, self.every[-1:], sigma))
-        first = self.num_defects
+        first = self.num_links
         for path, nodes, _ in self.paths:
             last = first + path.rows * len(nodes)
             terms.append((path, nodes, ca.reshape(multipliers[first:last], path.rows, len(nodes))))
@@ -267,6 +300,29 @@ class _IterateCallback(ca.Callback):  # type: ignore[misc]
         stop = self.watch.stopped_by is not None or self.error is not None or self.program.functions.error is not None
         np.frombuffer(results[0], float)[:] = float(stop)
         return 0
+
+
+class _Links:
+    """Rows states @ x - T h slopes @ f of each interval and row of a tableau, for the states `each`.
+
+    One entry of node, state and slope for each interval, row and node of it; `starts` are where their rows begin.
+    """
+
+    def __init__(self, program: TranscribedProgram, first: int, states: Array, slopes: Array, each: Indices):
+        lengths, (groups, nodes) = np.diff(program.mesh), states.shape
+        k, i, j = (a.ravel() for a in np.indices((len(lengths), groups, nodes)))
+        self.first, self.each, self.count = first, each, len(lengths) * groups * len(each)
+        self.node = k * program.task.scheme.nodes + j
+        self.state, self.slope = states[i, j][:, None], (lengths[k] * slopes[i, j])[:, None]
+        self.starts = first + (k * groups + i) * len(each)
+        self.rows = self.starts[:, None] + np.arange(len(each))
+        self.columns, self.rates = (self.node[:, None] * size + each for size in (program.width, program.nx))
+        self.lower, self.upper = np.zeros(self.count), np.zeros(self.count)
+
+    def set_limits(self, lower: Array, upper: Array) -> None:
+        """The same limits of the states `each` in all rows."""
+        times = self.count // max(len(self.each), 1)
+        self.lower, self.upper = np.tile(lower, times), np.tile(upper, times)
 
 
 class _Blocks:

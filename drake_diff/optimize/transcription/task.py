@@ -9,6 +9,10 @@ Methods for Optimal Control", ch. 4; Kelly, SIAM Review 59(4), 2017). Hermite-Si
 states are variables, so that bounds hold there too. Order: 2 and 4. "drake" is what Drake's DirectCollocation
 transcribes: Hermite-Simpson with the mean of its neighbours for the midpoint's input, and the cost by the trapezoid
 rule, which makes the optimum of order 2.
+
+A polynomial lies within the range of its Bernstein coefficients, so that bounds of these bound the whole motion:
+of a cubic the inner two are x_0 + h f_0 / 3 and x_1 - h f_1 / 3, of a parabola the inner one is x_0 + h f_0 / 2 or, by
+its values, 2 u_mid - (u_0 + u_1) / 2. Bounds of the nodes alone let an input between them be 1/8 above.
 """
 
 from collections.abc import Iterable
@@ -26,12 +30,17 @@ from drake_diff.optimize.problem.problem import Problem
 
 @dataclass(frozen=True, eq=False)
 class Scheme:
-    """A tableau: rows of `states` and `slopes` (r, s+1), and the `basis` (s+1, d+1): polynomials in tau, 0 to 1."""
+    """A tableau: rows of `states` and `slopes` (r, s+1), and the `basis` (s+1, d+1): polynomials in tau, 0 to 1.
+
+    The inner Bernstein coefficients of a state are hull_states @ x - h hull_slopes @ f, each (p, s+1).
+    """
 
     order: int
     states: Array
     slopes: Array
     basis: Array
+    hull_states: Array
+    hull_slopes: Array
     input_is_linear: bool = False
 
     @property
@@ -79,10 +88,19 @@ _SIMPSON = (
     np.array([[-1.0, 0, 1], [-0.5, 1, -0.5]]),
     np.array([[1.0, 4, 1], [0.75, 0, -0.75]]) / 6,
     np.array([[1.0, -3, 2], [0, 4, -4], [0, -1, 2]]),
+    np.array([[1.0, 0, 0], [0, 0, 1]]),
+    np.array([[-1.0, 0, 0], [0, 0, 1]]) / 3,
+)
+_TRAPEZOID = (
+    np.array([[-1.0, 1]]),
+    np.array([[0.5, 0.5]]),
+    np.array([[1.0, -1], [0, 1]]),
+    np.array([[1.0, 0]]),
+    np.array([[-0.5, 0]]),
 )
 SCHEMES = {
     "hermite_simpson": Scheme(4, *_SIMPSON),
-    "trapezoid": Scheme(2, np.array([[-1.0, 1]]), np.array([[0.5, 0.5]]), np.array([[1.0, -1], [0, 1]])),
+    "trapezoid": Scheme(2, *_TRAPEZOID),
     "drake": Scheme(2, *_SIMPSON, input_is_linear=True),
 }
 DEFAULT_SCHEME = "hermite_simpson"
