@@ -2,26 +2,20 @@
 
 import numpy as np
 import pytest
-from helpers.models import Plant, contact_properties
+from helpers.bounces import RADIUS, Bounce
+from helpers.models import MODELS, Plant, contact_properties
+from helpers.table import each_row
+from pydrake.geometry import Sphere
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 
 import drake_diff as dd
+from drake_diff.certificates.refinement import REFINEMENTS, beside_slopes, judge_levels
+from drake_diff.certificates.slopes import Direction, Motions, Slope, directions
 from drake_diff.exceptions import CertificateError, InputError, ModelError
-
-BALL = """<sdf version="1.9"><model name="bouncer"><link name="ball"><inertial><mass>{mass}</mass>
-<inertia><ixx>1</ixx><iyy>1</iyy><izz>1</izz></inertia></inertial><collision name="skin">
-<geometry><sphere><radius>0.1</radius></sphere></geometry>
-<drake:proximity_properties xmlns:drake="http://drake.mit.edu">
-<drake:point_contact_stiffness>{stiffness}</drake:point_contact_stiffness>
-<drake:hunt_crossley_dissipation>0</drake:hunt_crossley_dissipation></drake:proximity_properties></collision></link>
-<link name="floor"><collision name="top"><geometry><plane><normal>0 0 1</normal></plane></geometry>
-<drake:proximity_properties xmlns:drake="http://drake.mit.edu">
-<drake:point_contact_stiffness>{stiffness}</drake:point_contact_stiffness>
-<drake:hunt_crossley_dissipation>0</drake:hunt_crossley_dissipation></drake:proximity_properties></collision></link>
-<joint name="weld" type="fixed"><parent>world</parent><child>floor</child></joint>
-<joint name="slide" type="prismatic"><parent>world</parent><child>ball</child>
-<axis><xyz>0 0 1</xyz><limit><effort>0</effort></limit></axis>
-</joint>
-</model></sdf>"""
+from drake_diff.model.parameters import select
+from drake_diff.motion.continuous import ContinuousMotion
 
 
 @pytest.fixture
@@ -29,9 +23,8 @@ def bouncer(tmp_path):
     """A ball on a vertical slide over a floor, without gravity and without dissipation."""
 
     def make(stiffness, time_step, mass=1.0):
-        path = tmp_path / "bouncer.sdf"
-        path.write_text(BALL.format(stiffness=2 * stiffness, mass=mass))  # two in series: half of each
-        return dd.load_model(path, time_step=time_step, contact_approximation="lagged", gravity=(0, 0, 0))
+        ball = Bounce(stiffness, mass=mass, gravity=0.0)
+        return ball.model(tmp_path / "bouncer.sdf", "lagged", time_step)
 
     return make
 
@@ -40,7 +33,7 @@ def height(x):
     return x[0]
 
 
-@pytest.mark.parametrize("stiffness", [1e3, pytest.param(1e4, marks=pytest.mark.slow), 1e5])
+@pytest.mark.parametrize("stiffness", [*(pytest.param(k, marks=pytest.mark.slow) for k in (1e3, 1e4)), 1e5])
 def test_through_a_bounce_the_gradient_does_not_converge_and_is_called_that(bouncer, stiffness):
     """A rigid ball ends at 2 r - y0 - v0 T, so d y / d y0 = -1 and d y / d v0 = -T."""
     model = bouncer(stiffness, 1 / 480)
@@ -70,6 +63,143 @@ def test_where_the_step_resolves_the_contact_the_limit_is_the_compliant_closed_f
     assert refinement.levels == (h, h / 2, h / 4)
     # h w = 0.004: touchdown falls anywhere in a step, so the limit has an error of that order times the steps' phase.
     assert refinement.limit == pytest.approx([-1.0, -(h * count - np.pi / omega)], rel=0.05)
+
+
+DROP, FALL = (0.6, 0.0), 0.5  # touches the floor after 0.319 s at 3.13 m/s
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "tau", "h"), [(1e4, 0.01, 2e-3), pytest.param(1e4, 0.005, 1e-3, marks=pytest.mark.slow)]
+)
+def test_a_gradient_that_converges_to_the_slope_of_the_teeth_is_refused(tmp_path, stiffness, tau, h):
+    """The force of `sap` jumps by k tau v at the touch: the loss is a sawtooth, the gradient the slope of a tooth."""
+    ball = Bounce(stiffness, relaxation_time=tau)
+    model = ball.model(tmp_path / "bouncer.sdf", "sap", h)
+    certificate = dd.certify_rollout(model, DROP, None, height, num_steps=round(FALL / h), refine=True)
+    refinement, (truth, uncertain) = certificate.refinements[0], ball.slopes("sap", DROP, FALL)
+    assert uncertain < 1e-4
+    assert np.ptp(refinement.values[:, 0]) < 0.08 * abs(refinement.values[0, 0])  # it converges, to something else
+    assert abs(refinement.values[2, 0] - truth[0]) > 3
+    assert certificate.verdict == "not_converged"
+    for along, exact in zip(refinement.compared, truth, strict=True):
+        # 8 teeth to each side leave a part of the difference of 4 between a tooth's slope and the mean one.
+        assert along.slope.secant == pytest.approx(exact, abs=0.25)
+        assert along.slope.continuous == pytest.approx(exact, abs=1e-3)
+        assert along.disagree == ("the slope over many steps' way", "the continuous motion's")
+    assert "the gradient is not the slope over many steps' way and not the continuous motion's" in str(certificate)
+
+
+def test_the_line_through_the_loss_is_as_wide_as_the_way_of_eight_steps(tmp_path):
+    """A touch is a step later where the start is v h higher, or v h / t faster upwards, after a fall of t."""
+    h, parts = 1e-3, REFINEMENTS[-1]
+    model = Bounce(1e4).model(tmp_path / "bouncer.sdf", "sap", h)
+    us, nothing = np.zeros((400, 0)), select(model, ())
+    motions = Motions(model, np.array(DROP), us, height, nothing, parts)
+    by_z, by_v = (motions.slope(along).width for along in directions(model, np.array(DROP), us, nothing))
+    fall = np.sqrt(2 * (DROP[0] - RADIUS) / 9.81)
+    assert by_z == pytest.approx(8 * 9.81 * fall * h / parts, rel=2e-3)  # the touch is seen at the end of a step
+    assert by_v == pytest.approx(by_z / fall, rel=2e-3)
+
+
+@pytest.mark.parametrize("approximation", ["sap", "lagged"])
+def test_the_continuous_motion_is_that_of_the_contact_law(tmp_path, approximation):
+    """Event by event in another way: to 1e-6 of the height, over several bounces."""
+    ball = Bounce(2e3, relaxation_time=4e-3, dissipation=0.2, mass=0.7)
+    model = ball.model(tmp_path / "bouncer.sdf", approximation, 0.01)
+    found = ContinuousMotion(model).states(np.array([0.5, -0.5]), np.zeros((100, 0)))[-1]
+    assert found == pytest.approx(ball.end(approximation, (0.5, -0.5), 1.0), abs=1e-5)
+
+
+@pytest.mark.slow
+def test_the_continuous_motion_of_a_tossed_cube_is_that_of_drakes_own_continuous_plant():
+    """Drake's law of friction below the slip tolerance is another one: 1e-3 of the way, and of its slope."""
+    x0 = np.zeros(13)
+    x0[[0, 1, 6, 11, 12]] = np.cos(np.pi / 6), np.sin(np.pi / 6), 0.2, -0.1, -2.0
+    motion = ContinuousMotion(tossed_cube(0.01).model())
+    plant = tossed_cube(0.0)
+    plant.plant.Finalize()
+    plant.plant.set_stiction_tolerance(1e-3)
+    diagram = plant.builder.Build()
+    config = SimulatorConfig(
+        integration_scheme="runge_kutta3", max_step_size=0.01, accuracy=1e-8, use_error_control=True
+    )
+
+    def drakes(x):
+        simulator = Simulator(diagram)
+        ApplySimulatorConfig(config, simulator)
+        context = plant.plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+        plant.plant.SetPositionsAndVelocities(context, x)
+        simulator.AdvanceTo(1.0)
+        return plant.plant.GetPositionsAndVelocities(context)[5]
+
+    def ours(x):
+        return motion.states(x, np.zeros((100, 0)))[-1][5]
+
+    assert ours(x0) == pytest.approx(drakes(x0), abs=1e-3)
+    up = 1e-3 * np.eye(13)[12]
+    slope = (drakes(x0 + up) - drakes(x0 - up)) / 2e-3
+    assert (ours(x0 + up) - ours(x0 - up)) / 2e-3 == pytest.approx(slope, abs=1e-3)
+    assert abs(slope) > 0.1
+
+
+def tossed_cube(h):
+    """Of 0.1 m and 0.1 kg, spheres at its corners, on the ground, under little gravity."""
+    plant = Plant(h, "lagged", gravity=2.0)
+    cube = plant.plant.AddRigidBody("cube", SpatialInertia.SolidBoxWithMass(0.1, 0.1, 0.1, 0.1))
+    properties = contact_properties(4e3, 0.5, 0.5)
+    for i, corner in enumerate(np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T):
+        pose = RigidTransform(0.045 * corner)
+        plant.plant.RegisterCollisionGeometry(cube, pose, Sphere(0.005), f"corner{i}", properties)
+    plant.ground(properties)
+    return plant
+
+
+def test_a_smooth_motion_has_all_three_slopes_and_says_them(load):
+    certificate = dd.certify_rollout(
+        load("pendulum.urdf"), [0.5, 0.3], np.full((30, 1), 0.2), height, refine=True, parameters=("pole.mass",)
+    ).require()
+    along = certificate.refinements[0].compared
+    assert [c.slope.direction.name for c in along] == ["hinge_q[0]", "hinge_w[0]", "motor at all times", "pole.mass"]
+    for c in along:  # an error of first order in h / 4 = 2.5 ms, at 4.4 rad/s
+        assert c.slope.secant == pytest.approx(c.slope.continuous, rel=0.02)
+        assert c.disagree == ()
+    assert "the loss itself rises by" in str(certificate)
+    assert "the continuous motion's slope is" in str(certificate)
+
+
+def test_where_there_is_no_continuous_motion_it_is_said_why(tmp_path):
+    gains = '<actuator name="motor"><drake:controller_gains p="2" d="0.2"/></actuator>'
+    text = (MODELS / "pendulum.urdf").read_text().replace('<actuator name="motor"/>', gains)
+    held = tmp_path / "held.urdf"
+    held.write_text(text.replace("<robot ", '<robot xmlns:drake="http://drake.mit.edu" '))
+    model = dd.load_model(held, time_step=0.01)
+    refinement = dd.certify_rollout(model, [0.5, 0.3], np.zeros((30, 1)), height, refine=True).refinements[0]
+    assert all(np.isnan(c.slope.continuous) and np.isfinite(c.slope.secant) for c in refinement.compared)
+    assert "no slope of the continuous motion: PD controllers have none" in str(refinement)
+    assert refinement.converged.all()
+
+
+@each_row(
+    "secant, continuous, spread, disagree",
+    [
+        (1.0, 1.0, 0.0, ()),
+        (1.05, 0.95, 0.01, ()),
+        (np.nan, 1.0, 0.0, ()),
+        (1.0, np.nan, np.nan, ()),
+        (0.85, 1.0, 0.0, ("the slope over many steps' way",)),
+        (1.0, 1.2, 0.0, ("the continuous motion's",)),
+        (-1.0, -1.0, 0.0, ("the slope over many steps' way", "the continuous motion's")),
+        (1.0, 1.0, 0.2, ("compared with a continuous motion, which has no slope here",)),
+        (np.nan, np.nan, np.nan, ("compared with anything",)),
+    ],
+)
+def test_a_gradient_of_one_is_compared_with_the_slopes(secant, continuous, spread, disagree):
+    levels = judge_levels("time step", (1.0, 0.5, 0.25), ["z"], np.ones((3, 1)), 1, (5, 0))
+    assert levels.converged.all()
+    slope = Slope(Direction("z", slice(0, 1), 1.0, np.ones(1), 1.0), secant, 0.1, continuous, spread, ())
+    found = beside_slopes(levels, [slope])
+    assert found.compared[0].disagree == disagree
+    assert found.converged.all() == (not disagree)
 
 
 def test_stiffening_a_bounce_does_not_converge_at_a_fixed_step(bouncer):

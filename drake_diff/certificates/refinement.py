@@ -1,17 +1,24 @@
-"""The gradient at finer time steps or in stiffer contact.
+"""The gradient at finer time steps or in stiffer contact, and beside the slope of the motion itself.
 
 Both AutoDiffXd and difference quotients can be wrong about the physics: through a compliant bounce the gradient of the
 discrete motion can be 10 to 400 times that of the motion it stands for. So a rollout's gradient may also be taken at h,
 h/2 and h/4, or at k, 4 k and 16 k of the contact stiffness (a compliant contact is off by 1/sqrt(k)).
+
+That a gradient converges does not make it right. Contact begins at the first step that overlaps, with a force that is
+not small (k tau v in `sap`): what is lost of it grows along a step and starts again at the next, and the loss is a
+sawtooth of the start. Its teeth shrink with h and keep their slope, which is what derivatives see at every h. So the
+gradient is compared with two slopes that no tooth is in: of a line through the loss over many teeth, and of the motion
+in continuous time.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, frozen
+from drake_diff.certificates.slopes import Motions, Slope, directions
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, list_parameters, select
@@ -24,11 +31,29 @@ CONTRACTION = 0.75  # halfway between 1/2, which first order promises, and 1, no
 TRUSTED = 0.1  # how far from its limit a gradient may be, relative to it
 STILL = 1e-2  # changes below this part tell no rate
 NEGLIGIBLE = 1e-3  # entries below this part of the largest are judged by its measure
+SPREAD = 0.05  # how far apart two differences of the continuous motion may be, relative to their size
+Columns = tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """The gradient along one direction at the levels (3,), beside the slopes of the motion itself."""
+
+    gradient: Array
+    slope: Slope
+    disagree: tuple[str, ...]  # which of the slopes the first of them is not
+
+    def __str__(self) -> str:
+        said = f"; the gradient is not {' and not '.join(self.disagree)}" if self.disagree else ""
+        return f"along {self.slope.direction.name} {_row(self.gradient)}, {self.slope}{said}"
 
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """A gradient (n,) at three levels of the time step [s] or of the stiffness (a factor), and its limit."""
+    """A gradient (n,) at three levels of the time step [s] or of the stiffness (a factor), and its limit.
+
+    By the time step it is also compared with the motion's own slopes, along single directions.
+    """
 
     by: str
     levels: tuple[float, ...]
@@ -36,6 +61,7 @@ class Refinement:
     values: Array  # (3, n)
     limit: Array  # (n,)
     converged: NDArray[np.bool_]  # (n,)
+    compared: tuple[Compared, ...] = ()
 
     @property
     def worst(self) -> int:
@@ -45,15 +71,25 @@ class Refinement:
 
     def __str__(self) -> str:
         j = self.worst
-        values = ", ".join(f"{value:.4g}" for value in self.values[:, j])
         levels = ", ".join(f"{level:.4g}" for level in self.levels)
         if self.converged.all():
-            return f"converges with {self.by} ({levels}): by {self.columns[j]} {values}, limit {self.limit[j]:.4g}"
-        count = int((~self.converged).sum())
-        return (
-            f"not converged: do not optimize with this; with {self.by} ({levels}) the gradient by "
-            f"{self.columns[j]} is {values}" + (f" ({count} of {len(self.columns)} entries)" if count > 1 else "")
-        )
+            said = f"converges with {self.by} ({levels}): by {self.columns[j]} {_row(self.values[:, j])}, "
+            parts = [f"{said}limit {self.limit[j]:.4g}"]
+        else:
+            count = int((~self.converged).sum())
+            parts = [
+                f"not converged: do not optimize with this; with {self.by} ({levels}) the gradient by "
+                f"{self.columns[j]} is {_row(self.values[:, j])}"
+                + (f" ({count} of {len(self.columns)} entries)" if count > 1 else "")
+            ]
+        # The one that disagrees most, else the one of the column above.
+        of_worst = [c for c in self.compared if j in range(len(self.columns))[c.slope.direction.columns]]
+        parts += [str(c) for c in ([c for c in self.compared if c.disagree] or of_worst)[:1]]
+        return "; ".join(parts)
+
+
+def _row(values: Array) -> str:
+    return ", ".join(f"{value:.4g}" for value in values)
 
 
 def flat_gradient(space: TangentSpace, g: RolloutGradient, shape: tuple[int, ...]) -> Array:
@@ -92,6 +128,27 @@ def in_stiffer_contact(
         yield flat_gradient(tangent_space(model), g, us.shape)
 
 
+def refine_by_time_step(
+    model: Model, x0: Array, us: Array, loss: Loss, vector: ParameterVector, method: str, first: Array, columns: Columns
+) -> Refinement:
+    """The gradient `first` (n,) at h, at h/2 and h/4, beside the slopes of the loss itself."""
+    values = np.array([first, *at_finer_steps(model, x0, us, loss, vector, method)])
+    levels = tuple(model.time_step / m for m in REFINEMENTS)
+    found = judge_levels("time step", levels, columns, values, tangent_space(model).size, us.shape)
+    motions = Motions(model, x0, us, loss, vector, REFINEMENTS[-1])
+    compared = [motions.slope(direction) for direction in directions(model, x0, us, vector)]
+    return beside_slopes(found, compared)
+
+
+def refine_by_stiffness(
+    model: Model, x0: Array, us: Array, loss: Loss, vector: ParameterVector, method: str, first: Array, columns: Columns
+) -> Refinement:
+    """The gradient `first` (n,) at k, at 4 k and 16 k."""
+    values = np.array([first, *in_stiffer_contact(model, x0, us, loss, vector, method)])
+    levels = tuple(map(float, STIFFENING))
+    return judge_levels("stiffness, times", levels, columns, values, tangent_space(model).size, us.shape)
+
+
 def judge_levels(
     by: str, levels: tuple[float, ...], columns: Sequence[str], values: Array, first: int, shape: tuple[int, ...]
 ) -> Refinement:
@@ -113,3 +170,29 @@ def judge_levels(
     near = np.abs(values[0] - limit) <= TRUSTED * scale
     converged = ((contracts & near) | still) & np.all(np.isfinite(values), axis=0)
     return Refinement(by, levels, tuple(columns), frozen(values), frozen(limit), converged)
+
+
+def beside_slopes(found: Refinement, slopes: Sequence[Slope]) -> Refinement:
+    """`found`, in which only what agrees with every slope of the loss that there is, and with one at least, converges.
+
+    The gradient at the first level has to be within 10 % of both; of inputs at all times, of the sum of their sizes.
+    """
+    sizes, converged, compared = np.abs(found.values).max(axis=0), found.converged.copy(), []
+    for slope in slopes:
+        columns = slope.direction.columns
+        along = found.values[:, columns].sum(axis=1)
+        size = max(float(sizes[columns].sum()), NEGLIGIBLE * float(sizes.max(initial=0.0)))
+        disagree = []
+        if np.isfinite(slope.secant) and abs(along[0] - slope.secant) > TRUSTED * max(size, abs(slope.secant)):
+            disagree.append("the slope over many steps' way")
+        if np.isfinite(slope.continuous):
+            size = max(size, abs(slope.continuous))
+            if not abs(along[0] - slope.continuous) <= TRUSTED * size:
+                disagree.append("the continuous motion's")
+            elif slope.spread > SPREAD * size:
+                disagree.append("compared with a continuous motion, which has no slope here")
+        if np.isnan(slope.secant) and np.isnan(slope.continuous):
+            disagree.append("compared with anything")
+        converged[columns] &= not disagree
+        compared.append(Compared(frozen(along), slope, tuple(disagree)))
+    return replace(found, converged=converged, compared=tuple(compared))

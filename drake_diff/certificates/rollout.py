@@ -10,14 +10,7 @@ from drake_diff.certificates.certificate import JITTER, VERDICTS, Certificate, c
 from drake_diff.certificates.certify import solver_tolerance
 from drake_diff.certificates.displaced import Displaced
 from drake_diff.certificates.feedback import check_memory, fresh, wrong_derivative
-from drake_diff.certificates.refinement import (
-    REFINEMENTS,
-    STIFFENING,
-    Refinement,
-    at_finer_steps,
-    in_stiffer_contact,
-    judge_levels,
-)
+from drake_diff.certificates.refinement import Refinement, refine_by_stiffness, refine_by_time_step
 from drake_diff.derivatives.sources import check_method
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
@@ -74,7 +67,9 @@ def certify_rollout(
         policy: u = policy(x, t) in place of `us`, as in `differentiate_rollout`.
         parameters: names, or values by name, of the parameters to differentiate by too.
         num_steps: N, where `us` is None.
-        refine: take the gradient again at h/2 and h/4, under the same inputs.
+        refine: take the gradient again at h/2 and h/4, under the same inputs, and compare it with the slopes of the
+            loss over the way of many steps and of the motion in continuous time, along each state, each input by as
+            much at all times, and each parameter.
         refine_stiffness: take it again at 4 and 16 times every contact stiffness that the model states.
         method: as in `differentiate_step`.
         gradient: what to certify, instead of what `differentiate_rollout` gives.
@@ -119,14 +114,11 @@ def certify_rollout(
         elsewhere = fresh(moved.policy)
         moved.roll(jitter(np.full(len(scale), ELSEWHERE / JITTER)), elsewhere)
         check_memory(elsewhere, gradient, vector.time_step(vector.values))
-    refinements = []
-    for wanted, by, levels, refined in (
-        (refine, "time step", tuple(model.time_step / m for m in REFINEMENTS), at_finer_steps),
-        (refine_stiffness, "stiffness, times", tuple(map(float, STIFFENING)), in_stiffer_contact),
-    ):
-        if wanted:
-            values = [moved.flat(gradient), *refined(model, x0, inputs, loss, vector, method)]
-            refinements.append(judge_levels(by, levels, columns, np.array(values), moved.space.size, inputs.shape))
+    refinements = [
+        refined(model, x0, inputs, loss, vector, method, moved.flat(gradient), columns)
+        for wanted, refined in ((refine, refine_by_time_step), (refine_stiffness, refine_by_stiffness))
+        if wanted
+    ]
     certificate = certify_displacement(
         moved.losses,
         moved.flat(gradient)[None] * scale,
