@@ -153,7 +153,7 @@ def test_a_models_mesh_is_refined_and_its_plan_replayed(load, tmp_path):
     verification = dd.verify(tmp_path / "run")
     assert verification.verdict == "undecided"  # for the constraint's function alone
     assert verification.complaints == ()
-    assert len(verification.comparisons) > 20
+    assert verification.checked > 800
     assert record.problem["num_steps"] == 20
     again = dd.read_trace(tmp_path / "run" / "trace.mcap").plan
     assert np.array_equal(again["mesh"], fine.mesh)

@@ -284,7 +284,7 @@ def test_momentum_of_what_is_held_to_the_world_is_none_with_a_reason(record):
 def test_a_problem_comes_back_from_its_record(record):
     problem = pendulum(waypoints={20: [np.nan, 1.0]}, bounds=dd.Bounds([-9, -99], [9, 99], [-30], [30]))
     described = describe_problem(problem)
-    again = rebuild_problem(record.model_copy(update={"problem": described}), problem.model, np.zeros((40, 1)))
+    again = rebuild_problem(record.model_copy(update={"problem": described}), problem.model, np.zeros((40, 1)), None)
     assert describe_problem(again) == described
 
 

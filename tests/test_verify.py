@@ -68,18 +68,17 @@ def copy(run, tmp_path):
     return Path(shutil.copytree(run, tmp_path / "copy"))
 
 
-def test_a_run_holds_and_every_number_comes_out_again_to_the_last_bit(run):
+def test_a_run_holds_and_comes_out_again_to_the_last_bit(run):
     found = dd.verify(run).require()
-    assert found.verdict == "holds"
-    assert len(found.comparisons) > 30
-    assert all(c.recorded == c.again for c in found.comparisons)
+    assert (found.verdict, found.rounded) == ("holds", ())
+    assert found.checked > 800
 
 
 def test_the_reference_run_of_this_repository_holds():
-    """On other versions of Drake and NumPy too: `notes` says which it was recorded with."""
+    """On other versions of Drake or NumPy it is not called a lie: `notes` says which it was recorded with."""
     found = dd.verify(ROOT / "artifacts" / "pendulum_swing_up")
     assert found.complaints == ()
-    assert found.holds
+    assert found.holds or found.notes
     assert found.record.verdict == "pass"
 
 
@@ -169,7 +168,7 @@ def test_a_number_edited_and_hashed_again_is_not_what_the_trace_carries(run, cop
     found = dd.verify(copy)
     assert found.verdict == "broken"
     assert any("trace.mcap: the record that it carries" in problem for problem in found.complaints)
-    assert any("half-step end error: recorded 1e-07" in problem for problem in found.complaints)
+    assert any("metrics[half-step end error].value: recorded 1e-07" in problem for problem in found.complaints)
 
 
 def lying(section, change):
@@ -194,16 +193,24 @@ def set_value(index, key, value):
 @each_row(
     "section, change, words",
     [
-        ("metrics", set_value(0, "value", 0.1), "cost: recorded 0.1"),
-        ("metrics", set_value(2, "value", 9e-6), "goal error: recorded 9e-06"),
-        ("metrics", set_value(2, "tolerance", 1.0), "the tolerance of goal error"),
-        ("metrics", set_value(8, "value", 0.0), "half-step end error: recorded 0"),
-        ("metrics", set_value(3, "definition", "another"), "bound violation (defined otherwise"),
-        ("invariants", set_value(0, "value", 0.0), "invariant free-motion energy drift: recorded 0"),
-        ("replays", set_value(2, "goal_error", 0.0), "replay in steps of 0.01 s, open loop: goal_error"),
-        ("replays", lambda part: part.pop(), "number of replays"),
-        ("contract", lambda part: part["bodies"][0].update(mass=2.0), "contract, bodies[0].mass: recorded 2.0"),
-        ("model", lambda part: part["options"].update(time_step=0.01), "contract, time_step"),
+        ("metrics", set_value(0, "value", 0.1), "metrics[cost].value: recorded 0.1"),
+        ("metrics", set_value(2, "value", 9e-6), "metrics[goal error].value: recorded 9e-06"),
+        ("metrics", set_value(2, "tolerance", 1.0), "metrics[goal error].tolerance: recorded 1"),
+        ("metrics", set_value(8, "value", 0.0), "metrics[half-step end error].value: recorded 0"),
+        ("metrics", set_value(3, "definition", "another"), "metrics[bound violation].definition: recorded another"),
+        ("metrics", lambda part: part.pop(3), "record.json: metrics: recorded"),
+        ("invariants", set_value(0, "value", 0.0), "invariants[free-motion energy drift].value: recorded 0"),
+        ("invariants", lambda part: part.clear(), "record.json: invariants: recorded []"),
+        ("replays", set_value(2, "goal_error", 0.0), "replays[2].goal_error: recorded 0"),
+        ("replays", lambda part: part.pop(), "record.json: replays: recorded"),
+        ("contract", lambda part: part["bodies"][0].update(mass=2.0), "contract.bodies[pole].mass: recorded 2"),
+        ("model", lambda part: part["options"].update(time_step=0.01), "contract.time_step"),
+        ("solver", lambda part: part.update(solver="ipopt"), "solver.solver: recorded ipopt, again snopt"),
+        ("gradient", lambda part: part["certificates"].pop(), "gradient.certificates: recorded"),
+        ("inputs", lambda part: part.update(seed=3), "inputs.seed: recorded 3, again 0"),
+        ("claim", lambda part: part.update(statement="it is safe"), "claim.statement: recorded it is safe"),
+        ("events", lambda part: part.pop(0), "record.json: events: recorded"),
+        ("units", lambda part: part.update(mass="g"), "units.mass: recorded g, again kg"),
     ],
 )
 def test_a_whole_artifact_that_lies_is_found_by_running_it_again(
@@ -225,12 +232,16 @@ def test_a_forged_motion_in_the_trace_is_found_although_all_hashes_are_right(sol
     attached = reproducible(record.model_dump(mode="json")).encode()
     write_trace(copy / "trace.mcap", forged, {"record.json": ("application/json", attached)})
     record.write(copy)
-    (complaint,) = dd.verify(copy).complaints
-    assert complaint.startswith("trace.mcap: /state, its largest distance from the motion run again: recorded 0")
+    assert any(line.startswith(f"trace.mcap: /state v[0] of message {row}") for line in dd.verify(copy).complaints)
 
 
 def test_a_verification_prints_what_it_found(run, copy):
-    assert repr(dd.verify(run)).splitlines()[0] == f"Verification of {run}: holds"
+    head, *lines = repr(dd.verify(run)).splitlines()
+    assert head.startswith(f"Verification of {run}: holds, run again, all ")
+    assert (
+        "  claimed: from hinge_q 0, hinge_w 0 to hinge_q 1, hinge_w 0 in 20 intervals of 0.02 s, horizon 0.4 s" in lines
+    )
+    assert any("not checked: wall_clock" in line for line in lines)
     (copy / "<b>").write_text("x")
     found = dd.verify(copy)
     assert "<b>: record.json does not list it" in repr(found)
@@ -242,7 +253,6 @@ def test_a_plan_of_another_run_is_found_although_all_hashes_are_right(run, other
     dd.load_record(copy).write(copy)
     found = dd.verify(copy)
     assert any("/planned/state is not what plan.npz has" in problem for problem in found.complaints)
-    assert any("goal error" in problem for problem in found.complaints)
 
 
 def test_links_and_files_outside_are_not_followed(run, copy, tmp_path):
@@ -304,7 +314,7 @@ def test_every_kind_of_directory_is_known_read_and_listed(kinds):
     assert {line.name: line.kind for line in list_runs(kinds)} == {kind: kind for kind in KINDS}
     found = dd.verify(kinds / "comparison")
     assert str(found) == "intact: the files are as they were written; the numbers were not taken again"
-    assert found.not_rerun == ("not run again: the engines",)
+    assert found.unchecked == ("every number: the engines were not run again",)
     with pytest.raises(ArtifactError, match="were not taken again"):
         found.require()
 
@@ -328,7 +338,7 @@ def test_a_certification_that_lies_is_found_by_certifying_again(kinds, tmp_path)
     record = dd.load_record(kinds / "certification")
     state = record.states[0]
     for lie, words in (
-        ({"largest": state.largest * (1 + 1e-5)}, "state 0: largest entry"),
+        ({"largest": state.largest * (1 + 1e-5)}, "states[0].largest"),
         ({"x": [x + 1e-3 for x in state.x]}, "states[0].x[0]"),
         ({"gradient": state.gradient.model_copy(update={"entries": 99})}, "states[0].gradient.entries"),
     ):
@@ -374,7 +384,7 @@ def test_a_model_from_a_diagram_cannot_be_run_again(solution, tmp_path):
     assert "not run again: the system is a user's own diagram" in str(found)
 
 
-def test_a_users_constraint_is_undecided_and_a_users_cost_is_told(tmp_path):
+def test_a_users_constraint_or_cost_is_undecided_and_what_rests_on_it_is_told(tmp_path):
     def slow(x):
         return x[1]
 
@@ -382,11 +392,12 @@ def test_a_users_constraint_is_undecided_and_a_users_cost_is_told(tmp_path):
     found = dd.verify(tmp_path / "a")
     assert (found.verdict, found.complaints) == ("undecided", ())
     assert "slow is a user's function" in str(found)
+    assert any("metrics[constraint violation]" in line for line in found.unchecked)
     dd.save(swing_up(final_cost=lambda x: x[0] ** 2), tmp_path / "b")
     found = dd.verify(tmp_path / "b")
-    assert found.holds
-    assert any("final_cost" in line for line in found.not_rerun)
-    assert "cost" not in {c.name for c in found.comparisons}
+    assert (found.verdict, found.complaints) == ("undecided", ())
+    assert "final_cost" in str(found)
+    assert any("metrics[cost]" in line for line in found.unchecked)
 
 
 def test_collocation_and_found_parameters_are_run_again(tmp_path):

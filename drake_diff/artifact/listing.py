@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drake_diff.artifact.verify import differences
+from drake_diff.artifact.differences import differences
 from drake_diff.exceptions import ArtifactError
 from drake_diff.record.read import kind_of
 from drake_diff.record.sealed import SealedRecord

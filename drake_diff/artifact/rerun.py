@@ -9,6 +9,7 @@ import io
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,45 +17,66 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import frozen
+from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.files import write_whole
 from drake_diff.artifact.sections import rebuild_problem
-from drake_diff.exceptions import ArtifactError, InputError, ModelError, ModelWarning
+from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, ModelError, ModelWarning
 from drake_diff.model.load_file import FORMATS
 from drake_diff.model.model import Model, load_model
-from drake_diff.optimize.solution import Solution, Status
+from drake_diff.model.soft_contact import SoftContact
+from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.solution import Search, Solution, Status
+from drake_diff.optimize.solve import solve
 from drake_diff.record.parts import ModelInput
 from drake_diff.record.provenance import file_evidence, named_files
 from drake_diff.record.solve import EvidenceRecord
 
 PLAN = "plan.npz"
 REQUIRED, OPTIONAL = ("xs", "us", "parameters"), ("us_mid", "u_final", "mesh", "free_horizon")  # of a Solution
+START = "start_us"  # the first guess of the inputs that the problem has
+GUESS = "guess_"  # before the name of an array of the guess that `solve` was given
+GUESSED = ("xs", "us", "us_mid", "u_final", "mesh", "horizon", "num_steps")
 
 
 def write_plan(path: Path, solution: Solution) -> None:
-    """Write the arrays of `solution`: the same ones give the same bytes."""
+    """Write the arrays of `solution` and those that its search started from: the same ones give the same bytes."""
+    problem = solution.problem
     given: dict[str, Any] = {"xs": solution.xs, "us": solution.us, "parameters": solution.vector.values}
     given |= {name: getattr(solution, name) for name in OPTIONAL}
+    given[START] = problem.us if problem.optimizes_controls and np.any(problem.us) else None
+    guess = None if solution.search is None else solution.search.guess
+    if isinstance(guess, Solution):
+        found = {name: getattr(guess, name) for name in ("xs", "us", "us_mid", "u_final", "mesh", "horizon")}
+        found["num_steps"] = guess.problem.num_steps
+    else:
+        found = {} if guess is None else dict(zip(("xs", "us", "horizon"), guess, strict=False))
+    given |= {GUESS + name: value for name, value in found.items()}
     buffer = io.BytesIO()
     arrays: dict[str, Any] = {name: np.asarray(v, dtype=float) for name, v in sorted(given.items()) if v is not None}
     np.savez(buffer, **arrays)
     write_whole(path, buffer.getvalue())
 
 
-def read_plan(path: Path) -> dict[str, Any]:
-    """The fields of a `Solution` that are in `path`. ArtifactError where it is missing or not such a file."""
+def read_plan(path: Path) -> dict[str, Array]:
+    """The arrays in `path`, by their names. ArtifactError where it is missing or not such a file."""
+    known = {*REQUIRED, *OPTIONAL, START, *(GUESS + name for name in GUESSED)}
     try:
         with np.load(path, allow_pickle=False) as file:
-            unknown, missing = set(file.files).difference(REQUIRED, OPTIONAL), set(REQUIRED).difference(file.files)
+            unknown, missing = set(file.files).difference(known), set(REQUIRED).difference(file.files)
             if unknown or missing:
                 raise ArtifactError(f"{path}: unknown arrays {sorted(unknown)}, missing {sorted(missing)}")
-            found: dict[str, Any] = {name: frozen(file[name]) for name in file.files}
-            if "free_horizon" in found:
-                found["free_horizon"] = float(found["free_horizon"])
+            return {name: frozen(file[name]) for name in file.files}
     except ArtifactError:
         raise
     except Exception as error:  # NumPy's reader fails in many ways on what is no such file
         raise ArtifactError(f"{path} is not a plan: {type(error).__name__}: {error}") from error
+
+
+def plan_fields(plan: dict[str, Array]) -> dict[str, Any]:
+    """Those of the arrays of a plan that are fields of a `Solution`."""
+    found: dict[str, Any] = {name: plan[name] for name in (*REQUIRED, *OPTIONAL) if name in plan}
+    if "free_horizon" in found:
+        found["free_horizon"] = float(found["free_horizon"])
     return found
 
 
@@ -105,26 +127,85 @@ def _load(path: Path, options: dict[str, Any]) -> Model:
         raise ArtifactError(f"record.json: the model cannot be loaded with the recorded options: {error}") from error
 
 
-def resolve(record: EvidenceRecord, model: Model, plan: dict[str, Any]) -> Solution:
-    """The solution of a record, to be measured again. ArtifactError where plan and problem do not go together."""
+def resolve(record: EvidenceRecord, model: Model, plan: dict[str, Array]) -> Solution:
+    """The solution of a record, to be measured again; what the search came to is as the record tells it.
+
+    ArtifactError where plan and problem do not go together.
+    """
     solver = record.solver
     if solver is None:
         raise ArtifactError("record.json: it has no solver")
+    _check_shapes(record, model, plan)
+    with _refusing_a_problem():
+        return Solution(
+            problem=rebuild_problem(record, model, plan["us"], plan.get(START)),
+            method=solver.method,
+            solver=solver.solver,
+            status=Status(solver.status),
+            message=solver.message,
+            scheme=solver.scheme,
+            **plan_fields(plan),
+        )
+
+
+def solve_again(record: EvidenceRecord, model: Model, plan: dict[str, Array]) -> Solution:
+    """What `solve` comes to when it is called as the record says, from the guess that the plan has.
+
+    It gets all the time that it needs. ArtifactError where that is no problem that can be solved.
+    """
+    search = record.inputs.search
+    if search is None:
+        raise ArtifactError("record.json: it does not say what solve was called with")
+    _check_shapes(record, model, plan)
+    with _refusing_a_problem():
+        arguments: dict[str, Any] = dict(search)
+        kind, stages = arguments.pop("initial_guess"), arguments["continuation"]
+        if isinstance(stages, list):
+            arguments["continuation"] = [SoftContact(**stage) for stage in stages]
+        problem = rebuild_problem(record, model, plan["us"], plan.get(START))
+        limit, guess = arguments.pop("time_limit"), _rebuild_guess(problem, kind, plan)
+        found = solve(problem, initial_guess=guess, **arguments)
+    asked = {**(found.search.arguments if found.search else {}), "time_limit": limit}
+    return found.told(options=found.options | {"time_limit": limit}, search=Search(asked, guess))
+
+
+def _rebuild_guess(problem: Problem, kind: Any, plan: dict[str, Array]) -> Any:
+    """The `initial_guess` whose kind a record tells; see `inputs.search`."""
+    given = {name: plan[GUESS + name] for name in GUESSED if GUESS + name in plan}
+    if kind is None and not given:
+        return None
+    if kind == "arrays":
+        return tuple(given[name] for name in ("xs", "us", "horizon") if name in given)
+    fields: dict[str, Any] = {name: given[name] for name in ("xs", "us", "us_mid", "u_final", "mesh") if name in given}
+    like = replace(problem, num_steps=int(given["num_steps"]), us=None, waypoints={}, constraints=())
+    horizon = float(given["horizon"])
+    return Solution(
+        problem=like,
+        method="",
+        solver="",
+        status=Status.FAILED,
+        message="a guess",
+        scheme=str(kind),
+        free_horizon=None if horizon == like.start_horizon else horizon,
+        **fields,
+    )
+
+
+def _check_shapes(record: EvidenceRecord, model: Model, plan: dict[str, Array]) -> None:
     count, xs, us = record.problem.get("num_steps"), plan["xs"], plan["us"]
     if "mesh" in plan:
         count = len(plan["mesh"]) - 1
     if us.shape != (count, model.nu) or xs.shape != (len(us) + 1, model.nx):
         got = f"xs {xs.shape}, us {us.shape}"
         raise ArtifactError(f"{PLAN}: expected {count} steps of {model.nx} states and {model.nu} inputs, got {got}")
+
+
+@contextmanager
+def _refusing_a_problem() -> Iterator[None]:
     try:
-        return Solution(
-            problem=rebuild_problem(record, model, us),
-            method=solver.method,
-            solver=solver.solver,
-            status=Status(solver.status),
-            message=solver.message,
-            scheme=solver.scheme,
-            **plan,
-        )
-    except (InputError, ValueError, KeyError, TypeError) as error:
-        raise ArtifactError(f"record.json: its problem cannot be rebuilt: {error}") from error
+        yield
+    except ModelError:  # what the model cannot do: see `rebuilt`
+        raise
+    except (DrakeDiffError, ValueError, KeyError, TypeError, AttributeError) as error:
+        told = f"{type(error).__name__}: {error}"
+        raise ArtifactError(f"record.json: its problem cannot be rebuilt: {told}") from error

@@ -3,6 +3,7 @@
 record.json is complete last, so that a run that is killed leaves a record that says so.
 """
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.parts import Event
 from drake_diff.record.provenance import provenance_of, written_now
-from drake_diff.record.sealed import WallClock, reproducible
+from drake_diff.record.sealed import WallClock, canonical, reproducible
 from drake_diff.record.solve import EvidenceRecord
 
 TRACE, REPLAY, REPORT = "trace.mcap", "replay.html", "report.html"
@@ -57,18 +58,24 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
         >>> record.verdict, sorted(record.files)
         ('pass', ['plan.npz', 'record.schema.json', 'replay.html', 'report.html', 'trace.mcap'])
     """
+    folder = Path(directory)
+    begin(folder, solution.problem)
+    write_plan(folder / PLAN, solution)  # what is measured next may take long
+    measurement = measure(solution)
+    record = record_of(measurement, folder)
+    write_files(folder, measurement, record)
+    return record.write(folder)
+
+
+def write_files(folder: Path, measurement: Measurement, record: EvidenceRecord) -> None:
+    """Write `FILES`, all but the record and its schema."""
     from drake_diff.artifact.page import write_pages
     from drake_diff.artifact.trace import write_trace  # what a script that saves nothing need not load
 
-    folder = Path(directory)
-    begin(folder, solution.problem)
-    write_plan(folder / PLAN, solution)
-    measurement = measure(solution)
-    record = record_of(measurement, folder)
-    fields = record.model_dump(mode="json")
+    fields = json.loads(canonical(record.model_dump(mode="json")))  # in the order in which the record is written
+    write_plan(folder / PLAN, measurement.solution)
     write_trace(folder / TRACE, measurement, {record.FILE: ("application/json", reproducible(fields).encode())})
     write_pages(folder / REPLAY, folder / REPORT, measurement, fields)
-    return record.write(folder)
 
 
 def save_failure(error: Exception, directory: str | Path, problem: Problem) -> EvidenceRecord:

@@ -100,7 +100,7 @@ def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
             initial_guess=str(options.get("initial_guess", "not known yet")),
             initial_guess_sha256=options.get("initial_guess_sha256"),
             seed=int(options["seed"]) if "seed" in options else None,
-            search=solution.search.arguments if solution is not None and solution.search is not None else None,
+            search=None if solution is None else _search(solution),
         ),
         "problem": describe_problem(problem),
         "contract": problem.model.contract.to_dict() if problem.has_model else {},
@@ -109,6 +109,15 @@ def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
         "action": _action(problem, time_step, options.get("time_limit")),
         "model": model_input(problem.model) if problem.has_model else ModelInput(file=None, options=None),
     }
+
+
+def _search(solution: Solution) -> dict[str, Any] | None:
+    """What `solve` was called with; its guess by kind: null for none, "arrays", or the scheme of a solution."""
+    if solution.search is None:
+        return None
+    guess = solution.search.guess
+    kind = None if guess is None else guess.scheme if isinstance(guess, Solution) else "arrays"
+    return {**solution.search.arguments, "initial_guess": kind}
 
 
 def found(solution: Solution) -> dict[str, Any]:
@@ -280,8 +289,12 @@ def unknown_functions(record: EvidenceRecord) -> tuple[list[str], list[str]]:
     return costs, [str(c.get("name")) for c in constraints if isinstance(c, dict)]
 
 
-def rebuild_problem(record: EvidenceRecord, model: Model, us: Array) -> Problem:
-    """The problem of a record on `model`, without the user's functions; `us` (N, nu) are the inputs of the plan."""
+def rebuild_problem(record: EvidenceRecord, model: Model, us: Array, start_us: Array | None) -> Problem:
+    """The problem of a record on `model`, without the user's functions.
+
+    `us` (N, nu) are the inputs of the plan, which the problem has where they are not optimized; `start_us` (N, nu) its
+    first guess of them where they are, if it has one.
+    """
     p: dict[str, Any] = dict(record.problem)
     bounds = {name: _numbers(p[name], GAPS[name[2:]]) for name in LIMITS}
     starts = np.array([entry.start for entry in record.parameters])
@@ -305,7 +318,7 @@ def rebuild_problem(record: EvidenceRecord, model: Model, us: Array) -> Problem:
         bounds=Bounds(**bounds),
         optimize=p["optimize"],
         initial_state_mask=mask if mask.any() else None,
-        us=None if "controls" in p["optimize"] else us,
+        us=start_us if "controls" in p["optimize"] else us,
         parameters={parameter.name: starts[s] for parameter, s in pairs},
         parameter_bounds={
             parameter.name: (lower[s], upper[s]) for parameter, s in pairs if parameter.kind.quantity != "inertia"

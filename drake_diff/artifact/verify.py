@@ -1,6 +1,5 @@
-"""`verify`: is a directory what was written, and do its numbers come out again? `recalled` takes a run up again."""
+"""`verify`: make a directory again and compare all of it. `recalled` takes a run up again."""
 
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -10,93 +9,84 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff.artifact.measurement import Measurement, measure, replay_evidence
+from drake_diff.artifact.again import SAME_PLAN, SEARCH_TOPICS, SEARCHED, Again, is_below, made_again
+from drake_diff.artifact.claim import claims_of
+from drake_diff.artifact.differences import (
+    Compared,
+    Difference,
+    compare_bytes,
+    compare_fields,
+    compare_text,
+    compare_traces,
+)
 from drake_diff.artifact.rerun import PLAN, read_plan, rebuilt, resolve
-from drake_diff.artifact.save import TRACE
-from drake_diff.artifact.sections import unknown_functions
-from drake_diff.artifact.trace import Trace, read_trace
-from drake_diff.exceptions import ArtifactError, ModelError
+from drake_diff.artifact.save import FILES, TRACE
+from drake_diff.artifact.trace import CONFIGURATION, Trace, read_trace
+from drake_diff.exceptions import ArtifactError, MissingDependencyError, ModelError
 from drake_diff.optimize.solution import Solution
-from drake_diff.record.certification import CertificationRecord, CertifiedState, certify_model
-from drake_diff.record.parts import Metric
+from drake_diff.record.certification import CertificationRecord, certify_model
+from drake_diff.record.parts import FileEvidence
 from drake_diff.record.provenance import provenance_of
 from drake_diff.record.read import KINDS, kind_of
-from drake_diff.record.sealed import SealedRecord, canonical, own_sha256, read_fields, reproducible
-from drake_diff.record.solve import EvidenceRecord, ReplayEvidence
+from drake_diff.record.sealed import SCHEMA_VERSION, SealedRecord, canonical, own_sha256, read_fields, reproducible
+from drake_diff.record.solve import EvidenceRecord
 
-# How far a number computed again may be from the recorded one, of it or of its tolerance: BLAS and libm round
-# differently from machine to machine; and where both are next to nothing.
-RELATIVE, ABSOLUTE = 1e-6, 1e-9
-CERTIFICATES = "not run again: the gradient certificates"
 R = TypeVar("R", bound=SealedRecord)
-NOT_TAKEN = "the numbers were not taken again"
-NOT_RERUN = {"comparison": "the engines", "robustness": "the trials"}
-
-
-@dataclass(frozen=True)
-class Recomputed:
-    """A recorded number and the same computed again; `holds` where they are no further apart than `allowed`."""
-
-    name: str
-    recorded: float | None
-    again: float | None
-    unit: str
-    allowed: float
-    holds: bool
-    file: str = EvidenceRecord.FILE
-
-    def __str__(self) -> str:
-        words = f"{self.name}: recorded {_shown(self.recorded)} {self.unit}, again {_shown(self.again)}"
-        return words if self.holds else f"{words}, allowed {self.allowed:.2g} apart"
-
-
-def _shown(value: float | None) -> str:
-    return "none" if value is None else f"{value:.9g}"
+# What nothing can make again, in every record, by key.
+UNCHECKED = (
+    "wall_clock: when the record was made, and how long that took",
+    "provenance: the versions, the commit, the machine and the command that made it",
+    "name and contract.source: what it was called, and where the model file was",
+)
+NOT_RERUN = {"comparison": "the engines were not run again", "robustness": "the trials were not run again"}
 
 
 @dataclass(frozen=True, repr=False)
 class Verification(ShowsItsRepr):
     """What `verify` found in a directory.
 
-    `verdict` is "holds" where every file is as it was written and every number came out again; "intact" where every
-    file is as it was written and no number was taken again; "undecided" where what the record's verdict rests on could
-    not be run again; "broken" where something is not what it was.
+    `verdict` is "holds" where every file is as it was written and all of it came out again; "intact" where every file
+    is as it was written and nothing was made again; "undecided" where what the record's verdict rests on could not be
+    made again; "broken" where something is not what it was.
 
     That a record holds says that it is true, not that the run was a success: that is `record.verdict`.
 
     Attributes:
         directory: What was verified.
         record: The record in it; None where it cannot be read.
-        problems: A sentence for each file that is not as it was written, and for what does not fit together.
-        comparisons: Every recorded number beside the one that was computed again.
-        not_rerun: What was not run again.
-        undecided: What of it the record's verdict rests on.
+        complaints: A sentence for each file that is not as it was written, and for each value that did not come out.
+        undecided: Why what the record's verdict rests on could not be made again.
+        claimed: What the record says was asked and came out. A weaker claim can be just as true.
+        unchecked: What was not checked, by key.
+        rounded: What differs by no more than machines round differently.
+        checked: How many values of record, trace and pages were compared with those made again.
         notes: Versions that differ from those of the record.
 
     Example:
         >>> found = dd.verify("artifacts/pendulum_swing_up").require()
-        >>> found.comparisons[2].name, found.comparisons[2].holds
-        ('goal error', True)
+        >>> found.verdict, found.complaints, found.checked > 1000
+        ('holds', (), True)
     """
 
     directory: Path
     record: SealedRecord | None
-    problems: tuple[str, ...] = ()  # each names the file
-    comparisons: tuple[Recomputed, ...] = ()
-    not_rerun: tuple[str, ...] = ()
-    undecided: tuple[str, ...] = ()  # what of `not_rerun` the record's verdict rests on
+    complaints: tuple[str, ...] = ()
+    undecided: tuple[str, ...] = ()
+    claimed: tuple[str, ...] = ()
+    unchecked: tuple[str, ...] = ()
+    rounded: tuple[str, ...] = ()
+    checked: int = 0
     notes: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> Literal["holds", "intact", "undecided", "broken"]:
         """What can be said of the directory as a whole."""
-        if self.problems or not all(c.holds for c in self.comparisons):
+        if self.complaints:
             return "broken"
         if self.undecided:
             return "undecided"
-        return "holds" if self.comparisons else "intact"
+        return "holds" if self.checked else "intact"
 
     @property
     def holds(self) -> bool:
@@ -104,20 +94,25 @@ class Verification(ShowsItsRepr):
         return self.verdict == "holds"
 
     @property
-    def complaints(self) -> tuple[str, ...]:
-        """A sentence for each thing that does not hold."""
-        broken = tuple(f"{c.file}: {c}" for c in self.comparisons if not c.holds)
-        return self.problems + broken
-
-    @property
     def sentence(self) -> str:
         """What the verdict rests on."""
-        held = sum(c.holds for c in self.comparisons)
         if self.verdict == "holds":
-            return f"{held} numbers are the recorded ones"
+            return f"run again, all {self.checked} values came out" + (" but for rounding" if self.rounded else "")
         if self.verdict == "intact":
-            return f"the files are as they were written; {NOT_TAKEN}"
+            return "the files are as they were written; the numbers were not taken again"
         return "; ".join(self.complaints or self.undecided)
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """What was found, for a reader: what was claimed, what was not checked, what is wrong."""
+        return (
+            *(f"claimed: {line}" for line in self.claimed),
+            *(f"not checked: {line}" for line in self.unchecked),
+            *(f"undecided: {line}" for line in self.undecided),
+            *(f"broken: {line}" for line in self.complaints),
+            *(f"rounded: {line}" for line in self.rounded),
+            *self.notes,
+        )
 
     def require(self) -> "Verification":
         """This verification where it holds; ArtifactError, with what does not, where it does not."""
@@ -129,23 +124,29 @@ class Verification(ShowsItsRepr):
         return f"{self.verdict}: {self.sentence}"
 
     def __repr__(self) -> str:
-        lines = [f"Verification of {self.directory}: {self.verdict}", *(self.complaints or (self.sentence,))]
-        return "\n  ".join(dict.fromkeys((*lines, *self.not_rerun, *self.notes)))
+        told = self.sentence if self.verdict in ("holds", "intact") else f"{len(self.complaints)} problems"
+        if self.verdict == "undecided":
+            told = "what the verdict rests on could not be made again"
+        return "\n  ".join((f"Verification of {self.directory}: {self.verdict}, {told}", *self.lines))
 
 
 def verify(directory: str | Path) -> Verification:
-    """Check a directory's schema, hashes and files, then run it again from them and compare every number.
+    """Check a directory's schema, hashes and files, then make it again and compare all of it.
 
-    Any flipped byte, edited number, missing or extra file is found, and the message names the file. A solve is replayed
-    and measured again, a certification certified again. Comparisons and robustness trials are not run again: their
-    verdict is at best "intact". What cannot be run again (a model that came from a diagram, constraints that are a
-    user's functions) makes the verdict "undecided".
+    A solve is run again as its record says `solve` was called; its plan is measured again, and record, trace and pages
+    are written again and compared, texts exactly and numbers as far as machines round alike. A certification is taken
+    again. So whoever changes a value and all hashes with it is found, and the message names the value. A record of an
+    easier task is as true as any: `claimed` says what was asked.
+
+    Comparisons and robustness trials are not run again: their verdict is at best "intact". What cannot be run again (a
+    model that came from a diagram, a user's functions, a search that a time limit ended) makes the verdict "undecided",
+    and so does another version of Drake where numbers differ. It takes as long as the solve did.
 
     Args:
         directory: What `save`, `save_comparison`, `save_robustness` or `certify_model` wrote.
 
     Returns:
-        A `Verification`, with a complaint for each thing that does not hold.
+        A `Verification`: the verdict, what was claimed, what was not checked, and what does not hold.
 
     Raises:
         ArtifactError: There is no such directory.
@@ -161,28 +162,26 @@ def verify(directory: str | Path) -> Verification:
     kind = kind_of(folder)
     if kind is None:
         names = ", ".join(known.FILE for known in KINDS)
-        return Verification(folder, None, problems=(f"there is no record: none of {names}",))
+        return Verification(folder, None, complaints=(f"there is no record: none of {names}",))
     try:
         record, problems = _read_checked(folder, kind)
     except ArtifactError as error:
-        return Verification(folder, None, problems=(str(error),), not_rerun=("not run again: there is no record",))
+        return Verification(folder, None, complaints=(str(error),))
+    found = Verification(folder, record, problems, claimed=claims_of(record), notes=_other_versions(record))
     if problems:
-        return Verification(folder, record, problems, not_rerun=("not run again: it is damaged",))
+        return replace(found, unchecked=("anything else: it is damaged",))
     if record.state == "incomplete" or (isinstance(record, EvidenceRecord) and record.solver is None):
-        why = f"not run again: {record.sentence}"
-        return Verification(folder, record, not_rerun=(why,), undecided=(why,))
+        return replace(found, undecided=(f"there is nothing to run again: {record.sentence}",))
     try:
         if isinstance(record, EvidenceRecord):
-            return _solve_again(folder, record)
+            return _solve_again(found, record)
         if isinstance(record, CertificationRecord):
-            return _certify_again(folder, record)
-    except ModelError as error:
-        why = f"not run again: {error}"
-        return Verification(folder, record, not_rerun=(why,), undecided=(why,), notes=_other_versions(record))
+            return _certify_again(found, record)
+    except (ModelError, MissingDependencyError) as error:
+        return replace(found, undecided=(f"not run again: {error}",), unchecked=("everything but the hashes",))
     except ArtifactError as error:
-        problems, notes = (str(error),), _other_versions(record)
-        return Verification(folder, record, problems, not_rerun=("not run again",), notes=notes)
-    return Verification(folder, record, not_rerun=(f"not run again: {NOT_RERUN[record.kind]}",))
+        return _judged(found, [str(error)], [])
+    return replace(found, unchecked=(f"every number: {NOT_RERUN[record.kind]}",))
 
 
 @contextmanager
@@ -213,6 +212,8 @@ def _read_checked(folder: Path, kind: type[R]) -> tuple[R, tuple[str, ...]]:
         record = kind.parse(folder / kind.FILE, fields)
         if canonical(fields).encode() != (folder / kind.FILE).read_bytes():
             problems.append(f"{kind.FILE}: its bytes are not those that drake_diff writes for its content")
+        if fields.get("schema_version") == SCHEMA_VERSION and fields != record.model_dump(mode="json"):
+            problems.append(f"{kind.FILE}: a field is missing, or has another type than drake_diff writes")
         if own_sha256(fields) != fields.get("record_sha256"):
             problems.append(f"{kind.FILE}: its content does not match its record_sha256: something in it was changed")
     except RecursionError as error:
@@ -234,134 +235,105 @@ def _damage_of_files(folder: Path, record: SealedRecord) -> Iterator[str]:
             yield f"{name}: {record.FILE} does not list it"
         else:
             data = path.read_bytes()
-            if (described.path, described.bytes, described.sha256) != (name, len(data), sha256(data).hexdigest()):
+            if described != FileEvidence(path=name, bytes=len(data), sha256=sha256(data).hexdigest()):
                 yield f"{name}: its {len(data)} bytes are not those that {record.FILE} describes"
 
 
-def _solve_again(folder: Path, record: EvidenceRecord) -> Verification:
-    costs, constraints = unknown_functions(record)
+def _solve_again(found: Verification, record: EvidenceRecord) -> Verification:
+    """Everything in the directory of a solve beside the same made again."""
+    folder = found.directory
     plan, trace = read_plan(folder / PLAN), read_trace(folder / TRACE)
-    problems = list(_odd_trace(trace, plan, record))
+    problems = [*_odd_files(record), *_odd_trace(trace, plan, record)]
     with rebuilt(record.model, record.contract.get("source"), trace.attachments) as model:
-        problems += _odd_contract(record, model.contract.to_dict())
-        again = measure(resolve(record, model, plan))
-        skip = ["cost"] * bool(costs) + ["constraint violation"] * bool(constraints)
-        invariants = compare_metrics(record.invariants, again.invariants, ())
-        comparisons = [
-            *compare_metrics(record.metrics, again.metrics, skip),
-            *(replace(found, name=f"invariant {found.name}") for found in invariants),
-            *compare_replays(record.replays, [replay_evidence(r) for r in again.replays], not constraints),
-            _compare_motion(trace.xs, again),
-        ]
-    undecided = tuple(f"not run again: constraint {name} is a user's function" for name in constraints)
-    not_rerun = (*(f"not run again: {cost} is a user's function" for cost in costs), *undecided, CERTIFICATES)
-    told = (not_rerun, undecided, _other_versions(record))
-    return Verification(folder, record, tuple(problems), tuple(comparisons), *told)
+        again = made_again(record, model, plan)
+    fields, unchecked = Compared(record.FILE), [*UNCHECKED]
+    compare_fields(fields, record.model_dump(mode="json"), again.fields)
+    compared = [fields]
+    for name in FILES:
+        if name not in record.files:
+            unchecked += [f"{name}: the directory has none"] * (name in again.files)
+            continue
+        if name not in again.files:
+            unchecked.append(f"{name}: it has what was not run again")
+            continue
+        one, recorded = Compared(name), (folder / name).read_bytes()
+        if name == TRACE:
+            skip = SEARCH_TOPICS if again.unrepeated else ()
+            alike = (record.FILE, CONFIGURATION) if again.unrepeated else (record.FILE,)
+            compare_traces(one, recorded, again.files[name], alike=alike, skip=skip)
+        elif name == PLAN:
+            compare_bytes(one, recorded, again.files[name])
+        else:
+            compare_text(one, recorded, again.files[name])
+        compared.append(one)
+    return _told_of_a_solve(found, again, problems, compared, unchecked)
 
 
-def _certify_again(folder: Path, record: CertificationRecord) -> Verification:
+def _odd_files(record: EvidenceRecord) -> Iterator[str]:
+    """What `save` does not write, and a schema that is not the record's."""
+    schema = record.schema_file()
+    for name in sorted(record.files.keys() - {*FILES, schema}):
+        yield f"{name}: no file of a solve"
+    described = record.files.get(schema)
+    if described is None or described.sha256 != sha256(record.published_schema()).hexdigest():
+        yield f"{schema}: it is not the schema {record.schema_version} of this drake_diff"
+
+
+def _told_of_a_solve(
+    found: Verification, again: Again, problems: list[str], compared: Sequence[Compared], unchecked: list[str]
+) -> Verification:
+    """The verdict on what differs, by what it rests on."""
+    undecided = [f"the search was not run again: {why}" for why in again.unrepeated]
+    if again.missing:
+        unchecked.append(f"what rests on the search: {', '.join(again.missing)}")
+    if again.apart > SAME_PLAN:
+        undecided.append(f"the search, run again, ends at another plan, {again.apart:.2g} of its largest number away")
+    differing = [d for one in compared for d in one.differing]
+    rounds_otherwise = again.apart > 0 or any(d.allowed for d in differing)
+    rounded = []
+    for d in differing:
+        if is_below(d.key, again.missing) and d.file == EvidenceRecord.FILE:
+            continue
+        if d.allowed:
+            rounded.append(str(d))
+        elif rounds_otherwise and _is_searched(d):
+            undecided.append(f"{d}, which rests on the steps that the search takes on this machine")
+        else:
+            problems.append(str(d))
+    checked = sum(one.count for one in compared)
+    told = replace(found, unchecked=tuple(unchecked), rounded=tuple(rounded), checked=checked)
+    return _judged(told, problems, undecided)
+
+
+def _is_searched(d: Difference) -> bool:
+    """Whether a difference is in what the search tells of itself, or in a page, which shows that too."""
+    if d.file == EvidenceRecord.FILE:
+        return is_below(d.key, SEARCHED)
+    return d.file != TRACE or d.key.startswith((*SEARCH_TOPICS, "part ", "message "))
+
+
+def _judged(found: Verification, problems: Sequence[str], undecided: Sequence[str]) -> Verification:
+    """With problems, which are none but a reason for doubt where another version of Drake made the record."""
+    if found.notes and problems:
+        why = f"{'; '.join(found.notes)}, which may be why: "
+        return replace(found, undecided=(*undecided, *(why + problem for problem in problems)))
+    return replace(found, complaints=tuple(problems), undecided=tuple(undecided))
+
+
+def _certify_again(found: Verification, record: CertificationRecord) -> Verification:
     """The same states from the same seed, each certified again."""
     with rebuilt(record.model, record.contract.get("source"), None) as model:
-        problems = _odd_contract(record, model.contract.to_dict())
         again = certify_model(
             model, states=len(record.states), seed=record.seed, parameters=record.parameters, method=record.method
         )
-    comparisons: list[Recomputed] = []
-    for i, (was, now) in enumerate(zip(record.states, again.states, strict=True)):
-        found = differences(_what_is_certified(was), _what_is_certified(now), f"states[{i}]")
-        problems += [f"{record.FILE}: {key}: recorded {old}, again {new}" for key, old, new in found]
-        largest = compare_numbers(f"state {i}: largest entry", was.largest, now.largest, "")
-        comparisons.append(replace(largest, file=record.FILE))
-    return Verification(folder, record, tuple(problems), tuple(comparisons), notes=_other_versions(record))
-
-
-def _what_is_certified(state: CertifiedState) -> dict[str, Any]:
-    """The state and its certificate, but for what is only told in words and may round to other digits."""
-    found = state.model_dump(mode="json", exclude={"refusal", "largest", "mode_changes"})
-    if found["gradient"] is not None:
-        del found["gradient"]["worst"]
-    return found
-
-
-def compare_metrics(recorded: Sequence[Metric], again: Sequence[Metric], skip: Sequence[str]) -> Iterator[Recomputed]:
-    """Every recorded metric but those in `skip` with the one of its name."""
-    found = {metric.name: metric for metric in again}
-    for metric in recorded:
-        other = found.get(metric.name)
-        if metric.name in skip:
-            continue
-        if other is None or (other.definition, other.unit) != (metric.definition, metric.unit):
-            name = f"{metric.name} (defined otherwise in this version)"
-            yield Recomputed(name, metric.value, None, metric.unit, 0.0, False)
-            continue
-        compared = compare_numbers(metric.name, metric.value, other.value, metric.unit, metric.tolerance or 0.0)
-        if compared.holds and other.tolerance != metric.tolerance:
-            name = f"the tolerance of {metric.name}"
-            yield Recomputed(name, metric.tolerance, other.tolerance, metric.unit, 0.0, False)
-        yield compared
-
-
-def compare_numbers(
-    name: str, recorded: float | None, again: float | None, unit: str, scale: float = 0.0
-) -> Recomputed:
-    """Two numbers; none and none are the same. `scale` is that of the differences that do not matter."""
-    allowed = RELATIVE * max(abs(recorded or 0.0), scale) + ABSOLUTE
-    holds = recorded is None and again is None
-    if recorded is not None and again is not None:
-        holds = abs(recorded - again) <= allowed
-    return Recomputed(name, recorded, again, unit, allowed, holds)
-
-
-def compare_replays(
-    recorded: Sequence[ReplayEvidence], again: Sequence[ReplayEvidence], judged: bool
-) -> Iterator[Recomputed]:
-    """Every replay with the one of its variant and control; `judged` compares whether it holds too."""
-    found = {(r.variant, r.control): r for r in again}
-    if len(found) != len(recorded):
-        yield compare_numbers("number of replays", len(recorded), len(found), "1")
-    for replay in recorded:
-        name = f"replay {replay.variant}, {replay.control}"
-        other = found.get((replay.variant, replay.control))
-        if other is None:
-            yield Recomputed(name, 1.0, None, "1", 0.0, False)
-            continue
-        for key, unit in (("goal_error", ""), ("bound_violation", ""), ("energy_error_J", "J"), ("penetration_m", "m")):
-            yield compare_numbers(f"{name}: {key}", getattr(replay, key), getattr(other, key), unit)
-        if judged:
-            yield compare_numbers(f"{name}: holds", float(replay.holds), float(other.holds), "1")
-
-
-def differences(recorded: Any, again: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """(key, recorded, again) wherever two JSON values differ; numbers by more than rounding."""
-    if isinstance(recorded, dict) and isinstance(again, dict):
-        for key in sorted(recorded.keys() | again.keys()):
-            yield from differences(recorded.get(key), again.get(key), f"{path}.{key}" if path else key)
-    elif isinstance(recorded, list) and isinstance(again, list) and len(recorded) == len(again):
-        for i, (a, b) in enumerate(zip(recorded, again, strict=True)):
-            yield from differences(a, b, f"{path}[{i}]")
-    elif _is_number(recorded) and _is_number(again):
-        if not math.isclose(recorded, again, rel_tol=ABSOLUTE, abs_tol=ABSOLUTE):
-            yield path, recorded, again
-    elif recorded != again:
-        yield path, recorded, again
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _compare_motion(recorded: Array, again: Measurement) -> Recomputed:
-    """The motion in the trace with the plant's own."""
-    motion, name = again.motion, "/state, its largest distance from the motion run again"
-    unit = again.state_unit
-    if motion is None:
-        found = compare_numbers(name, float(len(recorded)), 0.0, unit)
-    elif recorded.shape != motion.xs.shape:
-        found = compare_numbers(name, 0.0, None, unit)
-    else:
-        distance, scale = np.abs(recorded - motion.xs).max(), np.abs(motion.xs).max()
-        found = compare_numbers(name, 0.0, float(distance), unit, scale=float(scale))
-    return replace(found, file=TRACE)
+    given = {name: getattr(record, name) for name in ("name", "provenance", "wall_clock", "files", "record_sha256")}
+    contract = {**again.contract, "source": record.contract.get("source")}
+    fields = Compared(record.FILE)
+    made = again.model_copy(update={**given, "contract": contract})
+    compare_fields(fields, record.model_dump(mode="json"), made.model_dump(mode="json"))
+    problems = [str(d) for d in fields.differing if not d.allowed]
+    rounded = tuple(str(d) for d in fields.differing if d.allowed)
+    return _judged(replace(found, unchecked=UNCHECKED, rounded=rounded, checked=fields.count), problems, [])
 
 
 def _odd_trace(trace: Trace, plan: dict[str, Any], record: EvidenceRecord) -> Iterator[str]:
@@ -374,12 +346,13 @@ def _odd_trace(trace: Trace, plan: dict[str, Any], record: EvidenceRecord) -> It
             yield f"{TRACE}: /planned/{topic} is not what {PLAN} has"
 
 
-def _odd_contract(record: EvidenceRecord | CertificationRecord, again: dict[str, Any]) -> list[str]:
+def _odd_contract(record: EvidenceRecord, again: dict[str, Any]) -> Iterator[str]:
     """Where the rebuilt model is another than the recorded contract; where the file was, and notes, do not matter."""
     apart = ("source", "notes")
     old, new = ({key: value for key, value in c.items() if key not in apart} for c in (record.contract, again))
-    told = f"{record.FILE}: contract"
-    return [f"{told}, {key}: recorded {was}, the model has {now}" for key, was, now in differences(old, new)]
+    compared = Compared(record.FILE)
+    compare_fields(compared, {"contract": old}, {"contract": new})
+    yield from (str(d) for d in compared.differing if not d.allowed)
 
 
 def _other_versions(record: SealedRecord) -> tuple[str, ...]:

@@ -1,0 +1,69 @@
+"""What a record claims, in a few lines: a weaker claim can be just as true, so that a reader has to see it."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from drake_diff.artifact.differences import shown
+from drake_diff.artifact.sections import COSTS, LIMITS
+from drake_diff.record.certification import CertificationRecord
+from drake_diff.record.sealed import SealedRecord
+from drake_diff.record.solve import EvidenceRecord
+
+MOST = 8  # entries of a list: of a longer one the others are counted
+
+
+def claims_of(record: SealedRecord) -> tuple[str, ...]:
+    """The lines: the verdict, the model and how it was loaded, and what was asked."""
+    file = record.model.file
+    options = ", ".join(f"{k} {shown(v)}" for k, v in sorted((record.model.options or {}).items()) if v is not None)
+    model = (
+        "a user's own diagram or function" if file is None else f"{file.path} ({(file.sha256 or '')[:12]}), {options}"
+    )
+    lines = [f"{record.verdict}: {record.sentence}", f"of the model {model}"]
+    if isinstance(record, EvidenceRecord):
+        lines += _of_a_solve(record)
+    elif isinstance(record, CertificationRecord):
+        parameters = ", ".join(record.parameters) or "no parameter"
+        asked = f"{len(record.states)} states of seed {record.seed}, by {record.method}, with {parameters}"
+        lines.append(f"certificates at {asked}")
+    return tuple(lines)
+
+
+def _of_a_solve(record: EvidenceRecord) -> Iterator[str]:
+    p: dict[str, Any] = dict(record.problem)
+    names, inputs = p.get("state_names"), p.get("input_names")
+    free = p.get("free_horizon_s")
+    horizon = f"{listed(free)} s" if isinstance(free, list) else f"{shown(p.get('horizon_s'))} s"
+    to = named(names, p.get("x_goal")) or "no goal"
+    count = f"{p.get('num_steps')} intervals of {shown(p.get('time_step_s'))} s, horizon {horizon}"
+    yield f"from {named(names, p.get('x0'))} to {to} in {count}"
+    bounds = [(side, named(of, p.get(side))) for side, of in zip(LIMITS, (names, names, inputs, inputs), strict=True)]
+    yield "bounds: " + ("; ".join(f"{side} {told}" for side, told in bounds if told) or "none")
+    if p.get("waypoints"):
+        yield f"waypoints {shown(p['waypoints'])}"
+    for c in p.get("constraints") or ():
+        yield f"constraint {shown(c)}"
+    yield "; ".join(f"{name.replace('_', ' ')} {shown(p.get(name))}" for name in COSTS if p.get(name) is not None)
+    started = [f"{e.name} from {e.start:.9g} within [{shown(e.lower)}, {shown(e.upper)}]" for e in record.parameters]
+    mask = p.get("initial_state_free")
+    moved = [str(name) for name, free in zip(names or (), mask if isinstance(mask, list) else (), strict=False) if free]
+    started += [f"the first {', '.join(moved)}"] if moved else []
+    yield f"optimized: {', '.join(map(str, p.get('optimize') or ()))}" + "".join(f"; {line}" for line in started)
+    tolerances = ", ".join(f"{m.name} {m.tolerance:g} {m.unit}" for m in record.metrics if m.tolerance is not None)
+    yield f"within {tolerances}"
+    search = ", ".join(f"{k} {shown(v)}" for k, v in sorted((record.inputs.search or {}).items()) if v is not None)
+    yield f"by solve with {search or 'arguments that are not recorded'}"
+
+
+def named(names: Any, values: Any) -> str:
+    """Values with their names where there is one: "hinge_q 3.14"."""
+    if not isinstance(values, list) or not isinstance(names, list):
+        return shown(values)
+    return listed([f"{name} {shown(v)}" for name, v in zip(names, values, strict=False) if v is not None])
+
+
+def listed(values: Sequence[Any]) -> str:
+    """A list on one line, the first few of it."""
+    texts = [v if isinstance(v, str) else shown(v) for v in values]
+    more = f" and {len(texts) - MOST} more" if len(texts) > MOST else ""
+    return ", ".join(texts[:MOST]) + more

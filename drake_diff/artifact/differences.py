@@ -1,0 +1,295 @@
+"""Where two records, traces or pages differ: texts exactly, numbers by more than machines round differently.
+
+BLAS and libm round differently from machine to machine. A number that was measured on a motion may be a millionth of
+itself, and 1e-9, away from the same number taken again; one that is read out of a file 1e-9 of itself. A number within
+a text is such a number too. Whatever differs at all is told, whether it is allowed or not.
+"""
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from hashlib import sha256
+from io import BytesIO
+from itertools import zip_longest
+from typing import Any
+
+from mcap import records as kinds
+from mcap.data_stream import ReadDataStream
+from mcap.stream_reader import breakup_chunk
+from mcap_protobuf.decoder import DecoderFactory
+
+from drake_diff.logs.mcap_file import CHUNK, records
+
+RELATIVE, ABSOLUTE = 1e-6, 1e-9
+READ = (1e-9, 1e-15)  # the same of what is read out of a file and not computed along a motion
+READ_SECTIONS = ("action", "claim", "contract", "inputs", "model", "observation", "problem", "units")
+NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
+BLOB = re.compile(r"[A-Za-z0-9+/=_-]{40,}")  # hashes, and what a page draws: base64
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A value that is not the one that was computed again; `allowed` where machines may round so differently."""
+
+    file: str
+    key: str
+    recorded: Any
+    again: Any
+    allowed: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.key}: recorded {shown(self.recorded)}, again {shown(self.again)}"
+
+
+@dataclass
+class Compared:
+    """How many values were compared in a file, and those that differ."""
+
+    file: str
+    count: int = 0
+    differing: list[Difference] = field(default_factory=list)
+
+    def differ(self, key: str, recorded: Any, again: Any, *, allowed: bool = False) -> None:
+        """Note a difference."""
+        self.differing.append(Difference(self.file, key, recorded, again, allowed))
+
+
+def shown(value: Any) -> str:
+    """A value in a few words."""
+    if value is None:
+        return "none"
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    text = value if isinstance(value, str) else json.dumps(value, default=str, sort_keys=True)
+    return text if len(text) <= 120 else f"{text[:117]}..."
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a number; a flag is none."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def is_near(recorded: float, again: float, relative: float = RELATIVE, absolute: float = ABSOLUTE) -> bool:
+    """Whether two numbers are as near as machines round; NaN is NaN, and infinities are themselves."""
+    if not (math.isfinite(recorded) and math.isfinite(again)):
+        return recorded == again or (recorded != recorded and again != again)
+    return abs(recorded - again) <= relative * max(abs(recorded), abs(again)) + absolute
+
+
+def is_near_text(recorded: str, again: str) -> bool:
+    """Whether two texts are the same but for numbers in them that are near."""
+    if NUMBER.split(recorded) != NUMBER.split(again):
+        return False
+    pairs = zip(NUMBER.findall(recorded), NUMBER.findall(again), strict=True)
+    return all(a == b or is_near(float(a), float(b)) for a, b in pairs)
+
+
+def differences(recorded: Any, again: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """(key, recorded, again) wherever two JSON values differ at all; entries of a list by their name, if they have one.
+
+    A key that only one of them has is null in the other.
+    """
+    if isinstance(recorded, dict) and isinstance(again, dict):
+        for key in sorted(recorded.keys() | again.keys()):
+            yield from differences(recorded.get(key), again.get(key), f"{path}.{key}" if path else str(key))
+    elif isinstance(recorded, list) and isinstance(again, list):
+        names, others = _labels(recorded), _labels(again)
+        if names == others:
+            for name, a, b in zip(names, recorded, again, strict=True):
+                yield from differences(a, b, f"{path}[{name}]")
+        elif len(names) == len(others) or all(name.isdigit() for name in (*names, *others)):
+            yield path, recorded, again
+        else:
+            yield path, names, others
+    elif type(recorded) is not type(again) or recorded != again:
+        yield path, recorded, again
+
+
+def _labels(entries: Sequence[Any]) -> list[str]:
+    """A name for each entry of a list: its own where all have one and no two the same, else its index."""
+    names = [entry.get("name") if isinstance(entry, dict) else None for entry in entries]
+    if all(isinstance(name, str) for name in names) and len(set(names)) == len(names):
+        return [str(name) for name in names]
+    return [str(i) for i in range(len(entries))]
+
+
+def compare_fields(compared: Compared, recorded: Mapping[str, Any], again: Mapping[str, Any]) -> None:
+    """Two JSON objects, value by value."""
+    compared.count += sum(1 for _ in leaves(again))
+    for key, old, new in differences(dict(recorded), dict(again)):
+        limits = READ if key.split(".")[0] in READ_SECTIONS else (RELATIVE, ABSOLUTE)
+        near = is_number(old) and is_number(new) and is_near(old, new, *limits)
+        near = near or (isinstance(old, str) and isinstance(new, str) and is_near_text(old, new))
+        compared.differ(key, old, new, allowed=near)
+
+
+def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """(path, value) of every value in a JSON value that has no others in it, empty lists and objects included."""
+    parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    if not parts or not value:
+        yield path, value
+    for key, part in parts:
+        yield from leaves(part, f"{path}.{key}" if path else str(key))
+
+
+def compare_bytes(compared: Compared, recorded: bytes, again: bytes) -> None:
+    """Two files of bytes, exactly."""
+    compared.count += 1
+    if recorded != again:
+        compared.differ("its bytes", sha256(recorded).hexdigest()[:16], sha256(again).hexdigest()[:16])
+
+
+def compare_text(compared: Compared, recorded: bytes, again: bytes) -> None:
+    """Two pages. Where only digits and drawings differ, that is allowed: what is drawn there is not compared."""
+    compared.count += 1
+    if recorded == again:
+        return
+    old, new = recorded.decode(errors="replace"), again.decode(errors="replace")
+    at = next((i for i, (a, b) in enumerate(zip(old, new, strict=False)) if a != b), min(len(old), len(new)))
+    near = is_near_text(BLOB.sub("", old), BLOB.sub("", new))
+    key = f"the text from character {at} on" if not near else "digits and drawings"
+    compared.differ(key, old[at : at + 60], new[at : at + 60], allowed=near)
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """What an MCAP file holds, but for how it is cut into chunks: in order, summary included."""
+
+    order: list[tuple[Any, ...]]  # of the messages: topic, log time, publish time, sequence
+    messages: dict[str, list[bytes]]  # by topic
+    schemas: dict[str, Any]  # by topic
+    others: list[tuple[Any, ...]]
+
+
+def _parts(data: bytes, skip: tuple[str, ...]) -> _Parts:
+    order: list[tuple[Any, ...]] = []
+    messages: dict[str, list[bytes]] = {}
+    others: list[tuple[Any, ...]] = []
+    schemas: dict[int, Any] = {}
+    channels: dict[int, Any] = {}
+    for opcode, body in records(data):
+        kind = READERS.get(opcode)
+        if kind is None:
+            if opcode not in FRAMING:
+                others.append((opcode, body))
+            continue
+        record = kind.read(ReadDataStream(BytesIO(body)))
+        for part in breakup_chunk(record, validate_crc=True) if opcode == CHUNK else [record]:
+            if isinstance(part, kinds.Message):
+                topic = channels[part.channel_id].topic
+                if topic.startswith(skip):
+                    continue
+                order.append((topic, part.log_time, part.publish_time, part.sequence))
+                messages.setdefault(topic, []).append(part.data)
+                continue
+            if isinstance(part, kinds.Schema):
+                schemas[part.id] = part
+            elif isinstance(part, kinds.Channel):
+                channels[part.id] = part
+            if skip and isinstance(part, kinds.Statistics):
+                continue
+            # in how many chunks the messages are depends on how well they compress
+            others.append((type(part).__name__, *(v for k, v in vars(part).items() if k != "chunk_count")))
+    return _Parts(order, messages, {c.topic: schemas[c.schema_id] for c in channels.values()}, others)
+
+
+READERS: dict[int, Any] = {
+    0x01: kinds.Header,
+    0x03: kinds.Schema,
+    0x04: kinds.Channel,
+    0x05: kinds.Message,
+    CHUNK: kinds.Chunk,
+    0x09: kinds.Attachment,
+    0x0B: kinds.Statistics,
+    0x0C: kinds.Metadata,
+}
+FRAMING = (0x02, 0x07, 0x08, 0x0A, 0x0D, 0x0E, 0x0F)  # footer, indexes, offsets, end: where things are in the file
+
+
+def compare_traces(
+    compared: Compared, recorded: bytes, again: bytes, *, alike: Sequence[str] = (), skip: Sequence[str] = ()
+) -> None:
+    """Two MCAP files: attachments, metadata, schemas and channels exactly, every message field by field, their order.
+
+    Of the attachments named in `alike` only that they are there is compared. Messages of topics that begin as one of
+    `skip` are not compared.
+    """
+    before = len(compared.differing)
+    old, new = (_parts(data, tuple(skip)) for data in (recorded, again))
+    compared.count += len(new.order) + len(new.others)
+    mine, theirs = ([_told(other, alike) for other in parts.others] for parts in (old, new))
+    for i, (one, other) in enumerate(zip_longest(mine, theirs)):
+        if one != other:
+            compared.differ(f"part {i}, {(one or other)[0]}", repr(one), repr(other))
+    if old.order != new.order:
+        at = next((i for i, (a, b) in enumerate(zip_longest(old.order, new.order)) if a != b), 0)
+        pair = (str(side[at]) if at < len(side) else "none" for side in (old.order, new.order))
+        compared.differ(f"message {at}", *pair)
+    for topic, messages in new.messages.items():
+        theirs_too = old.messages.get(topic, [])
+        if len(theirs_too) == len(messages) and theirs_too != messages:
+            _compare_messages(compared, topic, new.schemas[topic], theirs_too, messages)
+    if len(compared.differing) == before and old == new and not skip:
+        compare_bytes(compared, recorded, again)  # what stands beside the data: indexes, empty space
+
+
+def _told(part: tuple[Any, ...], alike: Sequence[str]) -> tuple[Any, ...]:
+    """A part of a file to compare, without the data of an attachment that is compared elsewhere."""
+    if part[0] == "Attachment" and any(value in alike for value in part[1:] if isinstance(value, str)):
+        return tuple(value for value in part if not isinstance(value, bytes))
+    return part
+
+
+def _compare_messages(
+    compared: Compared, topic: str, schema: Any, recorded: Sequence[bytes], again: Sequence[bytes]
+) -> None:
+    """The messages of one channel, field by field; a number may be off by a part of the largest of its field."""
+    decode = DecoderFactory().decoder_for("protobuf", schema)
+    if decode is None:
+        compared.differ(topic, "no protobuf", "protobuf")
+        return
+    rows = [dict(_flat(decode(data))) for data in again]
+    largest: dict[str, float] = {}
+    for key, value in (pair for row in rows for pair in row.items()):
+        if isinstance(value, float) and math.isfinite(value):
+            largest[_column(key)] = max(largest.get(_column(key), 0.0), abs(value))
+    for i, row in enumerate(rows):
+        if recorded[i] == again[i]:
+            continue
+        found, old = len(compared.differing), dict(_flat(decode(recorded[i])))
+        for key in sorted(old.keys() | row.keys()):
+            a, b = old.get(key), row.get(key)
+            if not (a == b or (a != a and b != b)):
+                near = _is_near_value(a, b, largest.get(_column(key), 0.0))
+                compared.differ(f"{topic} {key} of message {i}", a, b, allowed=near)
+        if len(compared.differing) == found:
+            compared.differ(f"{topic}, the bytes of message {i}", recorded[i].hex()[:40], again[i].hex()[:40])
+
+
+def _is_near_value(recorded: Any, again: Any, largest: float) -> bool:
+    """Whether two fields are near, numbers in a column whose largest one is `largest`."""
+    if isinstance(recorded, str) and isinstance(again, str):
+        return is_near_text(recorded, again)
+    both = isinstance(recorded, float) and isinstance(again, float)
+    return both and is_near(recorded, again, absolute=ABSOLUTE + RELATIVE * largest)
+
+
+def _column(key: str) -> str:
+    return re.sub(r"\[\d+\]", "", key)
+
+
+def _flat(message: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """(path, value) of every field of a protobuf message, lists entry by entry."""
+    for described in message.DESCRIPTOR.fields:
+        name = f"{path}.{described.name}" if path else described.name
+        value = getattr(message, described.name)
+        repeated = described.default_value == []  # `is_repeated` came with protobuf 6
+        if described.cpp_type != described.CPPTYPE_MESSAGE:
+            yield from ((f"{name}[{i}]", v) for i, v in enumerate(value)) if repeated else ((name, value),)
+        elif repeated:
+            for i, part in enumerate(value):
+                yield from _flat(part, f"{name}[{i}]")
+        elif message.HasField(described.name):
+            yield from _flat(value, name)
