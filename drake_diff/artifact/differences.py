@@ -11,16 +11,10 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
-from io import BytesIO
 from itertools import zip_longest
 from typing import Any
 
-from mcap import records as kinds
-from mcap.data_stream import ReadDataStream
-from mcap.stream_reader import breakup_chunk
-from mcap_protobuf.decoder import DecoderFactory
-
-from drake_diff.logs.mcap_file import CHUNK, records
+from drake_diff.logs.mcap_parts import fields_by, parts_of
 
 RELATIVE, ABSOLUTE = 1e-6, 1e-9
 READ = (1e-9, 1e-15)  # the same of what is read out of a file and not computed along a motion
@@ -153,61 +147,6 @@ def compare_text(compared: Compared, recorded: bytes, again: bytes) -> None:
     compared.differ(key, old[at : at + 60], new[at : at + 60], allowed=near)
 
 
-@dataclass(frozen=True)
-class _Parts:
-    """What an MCAP file holds, but for how it is cut into chunks: in order, summary included."""
-
-    order: list[tuple[Any, ...]]  # of the messages: topic, log time, publish time, sequence
-    messages: dict[str, list[bytes]]  # by topic
-    schemas: dict[str, Any]  # by topic
-    others: list[tuple[Any, ...]]
-
-
-def _parts(data: bytes, skip: tuple[str, ...]) -> _Parts:
-    order: list[tuple[Any, ...]] = []
-    messages: dict[str, list[bytes]] = {}
-    others: list[tuple[Any, ...]] = []
-    schemas: dict[int, Any] = {}
-    channels: dict[int, Any] = {}
-    for opcode, body in records(data):
-        kind = READERS.get(opcode)
-        if kind is None:
-            if opcode not in FRAMING:
-                others.append((opcode, body))
-            continue
-        record = kind.read(ReadDataStream(BytesIO(body)))
-        for part in breakup_chunk(record, validate_crc=True) if opcode == CHUNK else [record]:
-            if isinstance(part, kinds.Message):
-                topic = channels[part.channel_id].topic
-                if topic.startswith(skip):
-                    continue
-                order.append((topic, part.log_time, part.publish_time, part.sequence))
-                messages.setdefault(topic, []).append(part.data)
-                continue
-            if isinstance(part, kinds.Schema):
-                schemas[part.id] = part
-            elif isinstance(part, kinds.Channel):
-                channels[part.id] = part
-            if skip and isinstance(part, kinds.Statistics):
-                continue
-            # in how many chunks the messages are depends on how well they compress
-            others.append((type(part).__name__, *(v for k, v in vars(part).items() if k != "chunk_count")))
-    return _Parts(order, messages, {c.topic: schemas[c.schema_id] for c in channels.values()}, others)
-
-
-READERS: dict[int, Any] = {
-    0x01: kinds.Header,
-    0x03: kinds.Schema,
-    0x04: kinds.Channel,
-    0x05: kinds.Message,
-    CHUNK: kinds.Chunk,
-    0x09: kinds.Attachment,
-    0x0B: kinds.Statistics,
-    0x0C: kinds.Metadata,
-}
-FRAMING = (0x02, 0x07, 0x08, 0x0A, 0x0D, 0x0E, 0x0F)  # footer, indexes, offsets, end: where things are in the file
-
-
 def compare_traces(
     compared: Compared, recorded: bytes, again: bytes, *, alike: Sequence[str] = (), skip: Sequence[str] = ()
 ) -> None:
@@ -217,7 +156,7 @@ def compare_traces(
     `skip` are not compared.
     """
     before = len(compared.differing)
-    old, new = (_parts(data, tuple(skip)) for data in (recorded, again))
+    old, new = (parts_of(data, tuple(skip)) for data in (recorded, again))
     compared.count += len(new.order) + len(new.others)
     mine, theirs = ([_told(other, alike) for other in parts.others] for parts in (old, new))
     for i, (one, other) in enumerate(zip_longest(mine, theirs)):
@@ -246,11 +185,8 @@ def _compare_messages(
     compared: Compared, topic: str, schema: Any, recorded: Sequence[bytes], again: Sequence[bytes]
 ) -> None:
     """The messages of one channel, field by field; a number may be off by a part of the largest of its field."""
-    decode = DecoderFactory().decoder_for("protobuf", schema)
-    if decode is None:
-        compared.differ(topic, "no protobuf", "protobuf")
-        return
-    rows = [dict(_flat(decode(data))) for data in again]
+    fields = fields_by(schema)
+    rows = [fields(data) for data in again]
     largest: dict[str, float] = {}
     for key, value in (pair for row in rows for pair in row.items()):
         if isinstance(value, float) and math.isfinite(value):
@@ -258,7 +194,7 @@ def _compare_messages(
     for i, row in enumerate(rows):
         if recorded[i] == again[i]:
             continue
-        found, old = len(compared.differing), dict(_flat(decode(recorded[i])))
+        found, old = len(compared.differing), fields(recorded[i])
         for key in sorted(old.keys() | row.keys()):
             a, b = old.get(key), row.get(key)
             if not (a == b or (a != a and b != b)):
@@ -278,18 +214,3 @@ def _is_near_value(recorded: Any, again: Any, largest: float) -> bool:
 
 def _column(key: str) -> str:
     return re.sub(r"\[\d+\]", "", key)
-
-
-def _flat(message: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """(path, value) of every field of a protobuf message, lists entry by entry."""
-    for described in message.DESCRIPTOR.fields:
-        name = f"{path}.{described.name}" if path else described.name
-        value = getattr(message, described.name)
-        repeated = described.default_value == []  # `is_repeated` came with protobuf 6
-        if described.cpp_type != described.CPPTYPE_MESSAGE:
-            yield from ((f"{name}[{i}]", v) for i, v in enumerate(value)) if repeated else ((name, value),)
-        elif repeated:
-            for i, part in enumerate(value):
-                yield from _flat(part, f"{name}[{i}]")
-        elif message.HasField(described.name):
-            yield from _flat(value, name)
