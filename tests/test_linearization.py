@@ -1,19 +1,22 @@
 """Many steps linearized in one call, by Pinocchio where that is certified: closed forms, AutoDiffXd, and refusals."""
 
+import warnings
 from dataclasses import replace
+from importlib.metadata import files
 
 import numpy as np
 import pytest
 from helpers.engines import ROBOTS, G, free_state
-from helpers.models import MODELS, random_state, robot
+from helpers.models import MODELS, random_state, robot, robot_file
 from helpers.plants import POINT, floating, in_the_air, limited_pendulum, springs_and_motors
+from helpers.robots import state_in_range
 from helpers.table import each_row
 from pydrake.multibody.tree import RpyFloatingJoint
 
 import drake_diff as dd
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of, build_analytic, certified
-from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.exceptions import InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
 from drake_diff.model.parameters import applied, select
 
 NAMES = sorted(path.name for path in MODELS.iterdir())
@@ -229,6 +232,50 @@ def test_a_model_that_pinocchio_is_not_given_says_why():
     for twin in (locked.double, locked.autodiff):
         twin.plant.GetJointByName("hinge1").Lock(twin.context)
     assert analytic_of(locked) == Refusal("a joint is locked")
+
+
+def example_robots():
+    """Every robot of example-robot-data that Drake reads and steps, at a state within its limits."""
+    random = np.random.default_rng(0)
+    for file in sorted(str(f) for f in files("example-robot-data") if str(f).endswith((".urdf", ".sdf"))):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ModelWarning)
+                model = dd.load_model(robot_file(file.rsplit("/", 1)[1]), time_step=0.002)
+            x = state_in_range(model, random)
+            dd.step(model, x, np.zeros(model.nu))
+        except (ModelError, SimulationError):
+            continue
+        yield model, x, random.standard_normal(model.nu)
+
+
+def same_where_autodiff_works(model, x, u):
+    """Whether it does; `auto` must have the same to rounding then, and else name what was refused."""
+    found = dd.differentiate_step(model, x, u)
+    try:
+        exact = dd.differentiate_step(model, x, u, method="autodiff")
+    except (ModelError, SimulationError):
+        assert "not " in found.reason
+        return False
+    for ours, theirs in ((found.A, exact.A), (found.B, exact.B)):
+        # Masses of 1e-6 kg beside 10 kg, as some of these robots have, magnify rounding.
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-8 * np.abs(exact.A).max(), err_msg=model.name)
+    return True
+
+
+@each_row("name", ["icub.urdf", "icub_reduced.urdf"])
+def test_an_inertia_that_pinocchio_does_not_take_is_named_and_the_next_source_taken(name):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        model = dd.load_model(robot_file(name), time_step=0.002)
+    assert "Pinocchio does not take the inertia of r_hip_2" in analytic_of(model).reason
+    assert same_where_autodiff_works(model, state_in_range(model, np.random.default_rng(0)), np.zeros(0))
+
+
+@pytest.mark.slow
+def test_auto_serves_wherever_autodiff_does_and_is_the_same():
+    served = [same_where_autodiff_works(*robot) for robot in example_robots()]
+    assert served.count(True) >= 30
 
 
 def test_without_pinocchio_the_others_serve(load, without_pinocchio):

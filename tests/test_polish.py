@@ -14,9 +14,10 @@ from scipy.optimize import bisect
 
 import drake_diff as dd
 from drake_diff._base.refusal import Refusal
-from drake_diff.derivatives import joint_impulses, polish
+from drake_diff.derivatives import joint_impulses, polish, sources
 from drake_diff.derivatives.contact import laws
 from drake_diff.derivatives.polish import polished_step, polished_steps
+from drake_diff.exceptions import GradientError
 from drake_diff.model.parameters import applied, select
 
 H = 0.005
@@ -261,6 +262,30 @@ def test_parameters_of_each_step():
         np.testing.assert_array_equal(many.drake[k], dd.step(model, x, parameters=given))
         np.testing.assert_allclose(many.x_next[k], many.drake[k], atol=1e-6)  # Drake's tolerance, of 1 kg and 1 m/s
     assert np.abs(many.x_next - before).max(axis=1).min() > 1e-6
+
+
+# ---- parity ----------------------------------------------------------------------------------------------------------
+
+
+def test_parity_knows_the_solvers_tolerance_and_no_more(monkeypatch):
+    """An AutoDiffXd step that its solver left 1e-8 m/s beside the double one is it; 1e-4 m/s beside, or q', is not."""
+    model = ball(stiffness=1e4, dissipation=2.0)
+    x, u, right = np.array([0.0, 0.0985, 1.0, -0.3]), np.zeros(0), sources.advance
+
+    def beside(by):
+        def step(twin, x, u):
+            end = right(twin, x, u)
+            return end + by if twin is model.autodiff else end
+
+        monkeypatch.setattr(sources, "advance", step)
+        return dd.differentiate_step(model, x, u, method="autodiff")
+
+    exact = beside(np.zeros(4))
+    v = 1e-8 * np.array([0, 0, 1.0, -0.5])
+    np.testing.assert_array_equal(beside(v + np.r_[H * v[2:], 0, 0]).A, exact.A)
+    for wrong in (1e4 * (v + np.r_[H * v[2:], 0, 0]), v + np.array([1e-7, 0, 0, 0])):
+        with pytest.raises(GradientError, match="the AutoDiffXd step is not the double step"):
+            beside(wrong)
 
 
 # ---- refusals --------------------------------------------------------------------------------------------------------

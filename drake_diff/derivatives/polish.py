@@ -86,6 +86,25 @@ def polished_steps(
     return Polished(x_next, drake, left, refused)
 
 
+def solves_the_step(model: Model, x: Array, u: Array, end: Array) -> bool:
+    """Whether `end` (nx,) solves the step from x (nx,) under u (nu,) within the tolerance of Drake's solver.
+
+    False where the step's equation is not known, or is not Drake's.
+    """
+    form = form_of(model)
+    if form.excluded:
+        return False
+    drake = advance(model.double, x, u)
+    read = _read(model, _settings(model, form), 0)
+    if isinstance(read, Refusal):
+        return False
+    v_next = np.array([drake[model.nq :], end[model.nq :]])
+    problems = _problems(model, form, [read, read], np.array([x, x]), np.array([u, u]))
+    _, _, refused = _solved(problems, v_next)
+    moved = _states(model, x[None], v_next[1:])[0] - end
+    return not refused and bool(np.all(np.abs(moved) <= FREE_STEP * np.maximum(1.0, np.abs(end))))
+
+
 def _polish(model: Model, vector: ParameterVector, xs: Array, us: Array, values: Array | None) -> Polished:
     """Of one time step."""
     form = form_of(model)

@@ -20,7 +20,10 @@ acceleration_derivatives = pin.computeABADerivatives
 
 
 def build(links: tuple[Link, ...], gravity: Array) -> tuple[Any, float]:
-    """The pin.Model, and the potential energy of what is fixed to the world."""
+    """The pin.Model, and the potential energy of what is fixed to the world.
+
+    Raises ModelError where Pinocchio takes no such inertia, or orders the joints otherwise.
+    """
     model, fixed = pin.Model(), 0.0
     model.gravity.linear = gravity
     carrier: dict[str, tuple[int, Any]] = {"world": (0, pin.SE3.Identity())}
@@ -35,7 +38,11 @@ def build(links: tuple[Link, ...], gravity: Array) -> tuple[Any, float]:
             joint = kind(link.axis / np.linalg.norm(link.axis)) if kind else pin.JointModelFreeFlyer()
             carrier[link.body] = (model.addJoint(parent, joint, frame, link.joint), in_frame)
         number, pose = carrier[link.body]
-        model.appendBodyToJoint(number, pin.Inertia(link.mass, link.center_of_mass, link.inertia), pose)
+        try:
+            inertia = pin.Inertia(link.mass, link.center_of_mass, link.inertia)
+        except RuntimeError as error:
+            raise ModelError(f"Pinocchio does not take the inertia of {link.body}: {error}") from error
+        model.appendBodyToJoint(number, inertia, pose)
         if number == 0:
             fixed -= link.mass * float(gravity @ pose.act(link.center_of_mass))
     starts = [x.v_start for x in links if x.kind != "weld"]
