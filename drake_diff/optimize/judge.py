@@ -5,20 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array
-from drake_diff.exceptions import GradientError, ModelError
+from drake_diff.exceptions import GradientError
 from drake_diff.model.contact import penetration
-from drake_diff.model.soft_contact import distances
 from drake_diff.model.step import set_state
-from drake_diff.optimize.problem.cost import differentiate_final_cost
-from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, NlpResult, Outcome
 from drake_diff.optimize.replay import broken_variants
-from drake_diff.optimize.shooting import ShootingVariables, final_sensitivity
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
 from drake_diff.optimize.transcription.collocation import Collocated, violation_between_nodes
 
-NO_EFFECT = 1e-12
 FINER = "pass refine=True, or take more steps (num_steps)"
 _ALIKE = ("ITERATION_LIMIT", "TIME_LIMIT", "INFEASIBLE", "INTERRUPTED", "DIVERGED", "NO_GRADIENT", "FAILED")
 _STATUSES = {Outcome.UNBOUNDED: Status.DIVERGED, **{Outcome[name]: Status[name] for name in _ALIKE}}
@@ -111,42 +105,3 @@ def _spans(knots: Any) -> str:
     """Whole numbers as ranges: "0-11, 14"."""
     runs = np.split(knots, np.flatnonzero(np.diff(knots) > 1) + 1)
     return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs if len(run))
-
-
-def why_blind(problem: Problem, variables: ShootingVariables, z: Array) -> str:
-    """Which part of the goal, or the final cost, no variable in z has an effect on; empty if there is none."""
-    last = final_sensitivity(variables, z)
-    x_final = variables.states(z)[-1]
-    effect = np.abs(last).max(axis=1, initial=0.0)
-    wrong = np.abs(problem.goal_error(x_final)) > FEASIBILITY_TOLERANCE
-    deaf = np.flatnonzero(wrong & (effect < NO_EFFECT))
-    if len(deaf):
-        name = problem.model.state_names[deaf[0]]
-        return f"no variable moves {name}, whose goal is not reached{_what_is_apart(problem, variables.states(z))}"
-    if problem.final_cost is not None:
-        _, slope = differentiate_final_cost(problem.final_cost, x_final)
-        if np.abs(slope).max() > NO_EFFECT and np.abs(slope @ last).max(initial=0.0) < NO_EFFECT:
-            apart = _what_is_apart(problem, variables.states(z))
-            return f"no variable changes the final cost, although the final state does{apart}"
-    return ""
-
-
-def _what_is_apart(problem: Problem, xs: Array) -> str:
-    """Which bodies that may collide never touch along xs (N+1, nx), and what to do; empty if there are none."""
-    model, nearest = problem.model, dict[tuple[str, str], tuple[float, int]]()
-    try:
-        for k, x in enumerate(xs):
-            set_state(model.double, x)
-            for pair, distance in distances(model.double).items():
-                nearest[pair] = min((distance, k), nearest.get(pair, (np.inf, k)))
-    except ModelError:  # Drake knows no distance of some pair
-        return ""
-    apart = {pair: found for pair, found in nearest.items() if found[0] > 0}
-    if not apart:
-        return ""
-    told = "; ".join(
-        f"{a} and {b} stay {d:.3g} m apart or more, nearest at knot {k}" for (a, b), (d, k) in apart.items()
-    )
-    head = "nothing touches" if len(apart) == len(nearest) else "some bodies never touch"
-    advice = '; use method="ilqr" and continuation="auto"' if problem.optimizes_controls else ""
-    return f": at knots 0-{len(xs) - 1} {head} ({told}){advice}"

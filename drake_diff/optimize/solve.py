@@ -19,9 +19,10 @@ from drake_diff.model.soft_contact import SoftContact
 from drake_diff.optimize.drake_program import SOLVERS
 from drake_diff.optimize.ilqr.ilqr import check_problem, is_unconstrained, solve_ilqr
 from drake_diff.optimize.ilqr.through_contact import check_schedule, solve_continuation, solve_through_jumps
-from drake_diff.optimize.judge import ended, judged, refused, why_blind
+from drake_diff.optimize.judge import ended, judged, refused
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report
+from drake_diff.optimize.reach import out_of_reach, why_blind
 from drake_diff.optimize.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
 from drake_diff.optimize.shooting import ShootingVariables, check_segments, roll_segments, solve_shooting
 from drake_diff.optimize.solution import Search, Solution, Status
@@ -37,6 +38,7 @@ ACCELERATION_ROUNDING = 1e-12
 GUESS_NOISE = 1e-3  # of the largest input: breaks the symmetry of a guess that is a stationary point
 GUESS_ITERATIONS = 100  # of an attempt that is to find a guess for the next one
 ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
+FOUND = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
 # The order in which a chain that ends without a verified motion prefers what it has.
 PREFERENCE = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED, Status.INTERRUPTED, Status.TIME_LIMIT)
 
@@ -261,9 +263,9 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
         if last.status in ENDED:
             break
 
-    def preference(solution: Solution) -> tuple[int, float]:
+    def preference(solution: Solution) -> tuple[int, float, float]:
         rank = PREFERENCE.index(solution.status) if solution.status in PREFERENCE else len(PREFERENCE)
-        return rank, solution.defect + solution.goal_error
+        return rank, solution.defect + solution.goal_error, solution.cost
 
     best = min(found, key=preference)
     return best.told(options=best.options | {"chain": chain})
@@ -426,7 +428,7 @@ class Run:
                 found["mesh"] = motion.mesh if len(us) > problem.num_steps else None
         if np.all(np.isfinite(xs)):
             certificates += self._certify_equations(jacobian, xs, us)
-        return judged(self._draft(xs, us, u_final=u_final, certificates=certificates, **found), result)
+        return self._judge(self._draft(xs, us, u_final=u_final, certificates=certificates, **found), result)
 
     def sweep(self, xs: Array, us: Array, *, given: bool, stages: tuple[SoftContact, ...]) -> Solution:
         """iLQR; from the states of a `given` guess, which need not be a rollout, else from the rollout of `us`.
@@ -491,8 +493,24 @@ class Run:
         if result.note:
             self.options["contact_sequence"] = result.note
         found = {"certificates": before + after, "parameters": values}
-        solution = judged(self._draft(xs, us, **found), result)
+        solution = self._judge(self._draft(xs, us, **found), result)
         return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
+
+    def _judge(self, draft: Solution, result: NlpResult) -> Solution:
+        """`judged`, and no success where the cost asks for a motion that nothing here could have begun."""
+        solution, problem = judged(draft, result), self.problem
+        if solution.status not in FOUND or not problem.has_model:
+            return solution
+        xs, us = solution.plan.sample(1)
+        variables = ShootingVariables(problem, around=xs)
+        try:
+            found = out_of_reach(problem, variables, variables.pack(xs[0], us, solution.vector.values))
+        except (GradientError, SimulationError) as error:
+            detail = f"whether the cost asks for what nothing moves cannot be told: {error}"
+            return ended(solution, Status.CONVERGED_NOT_VERIFIED, detail)
+        if found.silent:
+            return ended(solution, Status.NO_GRADIENT, found.silent)
+        return solution.told(message=f"{solution.message}; {found.constant}") if found.constant else solution
 
     def _draft(self, xs: Array, us: Array, **found: Any) -> Solution:
         arrays = ("u_final", "us_mid", "mesh")

@@ -17,7 +17,7 @@ from functools import cache
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.exceptions import InputError, SimulationError
+from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.ilqr.constraints import GROWTH, LARGEST_PENALTY, AugmentedLagrangian
@@ -77,13 +77,14 @@ def solve_ilqr(
 
     After `patience` steps in a row that are shorter than SHORT the search ends as inaccurate: it crawls along a jump.
     Before that it regularizes where steps are short, as the model reaches too far. `least_penalty` is what constraints
-    weigh from the start. Raises GradientError if a derivative is refused, SimulationError if a step from the guess is.
+    weigh from the start. A motion on the way that cannot be stepped or differentiated is a step that is too long, which
+    the message counts; raises GradientError or SimulationError if the guess is such a motion.
     """
     search = _Search(problem, xs, us, limits, report, patience)
     search.constraints.penalty = max(search.constraints.penalty, least_penalty)
     with ctrl_c() as interrupted:
         outcome = search.run(interrupted)
-    message = f"iLQR: {outcome.value} after {len(search.rows) - 1} steps"
+    message = f"iLQR: {outcome.value} after {len(search.rows) - 1} steps{search.told_of_refusals}"
     motion = search.motion
     return NlpResult(motion.us.ravel(), outcome, message, tuple(search.rows)), motion.xs, motion.us
 
@@ -135,7 +136,13 @@ class _Search:
         self.regularization = 0.0
         self.gains = math.inf, math.inf  # of the merit, by the last two steps of this minimization
         self.stalled = False
+        self.refusals, self.refusal = 0, ""  # trial motions that could not be differentiated, and why the last
         self.rows = [Iteration(0, self.cost, self._infeasibility(), math.nan, math.nan)]
+
+    @property
+    def told_of_refusals(self) -> str:
+        count = self.refusals
+        return f"; {count} trial motion{'s' * (count > 1)} backed off from: {self.refusal}" if count else ""
 
     def run(self, interrupted: threading.Event) -> Outcome:
         """Minimize once; if there are constraints, again and again for better multipliers."""
@@ -175,7 +182,7 @@ class _Search:
 
     def _expand(self) -> LinearQuadratic:
         new, old = self.motion, self.expanded
-        if new is not old or self.jacobians is None:
+        if self.jacobians is None:
             self.jacobians = jacobians_along(self.problem, new)
         model = expand(self.problem, new, self.jacobians, self.constraints)
         self.curvature.update(model, np.hstack([new.xs[:-1] - old.xs[:-1], new.us - old.us]))
@@ -202,6 +209,7 @@ class _Search:
             return Outcome.SOLVED
         if len(self.rows) > self.limits.max_iterations:
             return Outcome.ITERATION_LIMIT
+        refusals = self.refusals
         while self.regularization <= LARGEST_REGULARIZATION:
             policies = (solve(one, self.regularization) for one in models)
             policy = next((p for p in policies if p is not None and p.expected >= 0), None)
@@ -216,7 +224,7 @@ class _Search:
                 break  # no step that can be told from none: the cost has a kink or a jump here, as contact makes them
             self.regularization = self._tightened()
         self.regularization = 0.0
-        return Outcome.INACCURATE
+        return Outcome.NO_GRADIENT if self.refusals > refusals else Outcome.INACCURATE
 
     def _tightened(self) -> float:
         return max(8 * self.regularization, SMALLEST_REGULARIZATION)
@@ -238,7 +246,12 @@ class _Search:
             except SimulationError:
                 continue  # too long a step: a shorter one is tried next
             if found <= merit + SUFFICIENT_DECREASE * size * slope:
-                self.motion, self.cost = motion, cost
+                try:
+                    jacobians = jacobians_along(self.problem, motion)
+                except (GradientError, SimulationError) as error:
+                    self.refusals, self.refusal = self.refusals + 1, str(error)
+                    continue
+                self.motion, self.cost, self.jacobians = motion, cost, jacobians
                 self.gains = self.gains[1], merit - found
                 self.rows.append(Iteration(len(self.rows), cost, self._infeasibility(), policy.gradient, size))
                 if self.report:

@@ -114,7 +114,13 @@ def solve_continuation(
                 return NlpResult(us.ravel(), outcome, message, ()), xs, us, tuple(logs)
         left = replace(limits, time_limit=deadline - time.monotonic())
         xs = roll_states(problem.model, x0, us)
-        result, xs, us = solve_through_jumps(problem, xs, us, limits=left, report=report)
+        try:
+            result, xs, us = solve_through_jumps(problem, xs, us, limits=left, report=report)
+        except (GradientError, SimulationError) as error:
+            log(None, None, f"refused: {error}", 0, None, None, None)
+            outcome = Outcome.NO_GRADIENT if isinstance(error, GradientError) else Outcome.DIVERGED
+            message = f"iLQR: the motion that the stages lead to is refused on the true plant: {error}"
+            return NlpResult(us.ravel(), outcome, message, ()), xs, us, tuple(logs)
         log(None, None, *_told(problem, result, xs, us))
         if result.outcome in (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.INFEASIBLE):
             xs, us, done = restore_goal(
