@@ -318,7 +318,7 @@ def test_a_solution_is_a_warm_start(load):
 
 
 def test_auto_chooses_and_says_why(load):
-    assert dd.solve(swing_up(load, 20)).options["method_reason"] == "the model is smooth"
+    assert dd.solve(swing_up(load, 40)).options["method_reason"] == "the model is smooth"
     model = load("sphere_on_ground.sdf")
     free = np.zeros(13, dtype=bool)
     free[10] = True
