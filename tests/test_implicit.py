@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.models import MODELS, Plant, add_slide, contact_properties, random_state, robot_file
-from helpers.plants import POINT, floating, in_the_air, limited_pendulum, springs_and_motors
+from helpers.plants import POINT, constrained, floating, in_the_air, limited_pendulum, springs_and_motors
 from helpers.table import each_row
 from pydrake.common.value import Value
 from pydrake.geometry import Box
@@ -187,23 +187,6 @@ def test_contact_is_handed_over_even_where_it_carries_almost_nothing(load):
     x[6] = 0.1 - 1e-7
     d = same_by_both(model, x, (), expected="autodiff")
     assert abs(d.A[12, 6]) > 1  # -h k / m / (1 + h^2 k / m), not 0
-
-
-def constrained(kind):
-    made = Plant(0.01)
-    plant = made.plant
-    bodies = [plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(1.0, 0.1)) for name in ("one", "two")]
-    rails = [add_slide(plant, b.name(), plant.world_frame(), b, "x") for b in bodies]
-    if kind == "coupler":
-        plant.AddCouplerConstraint(rails[0], rails[1], 2.0)
-    elif kind == "distance":
-        plant.AddDistanceConstraint(bodies[0], [0, 0, 0], bodies[1], [0, 0.5, 0], 0.6)
-    elif kind == "ball":
-        plant.AddBallConstraint(bodies[0], [0, 0, 0], bodies[1], [0.3, 0, 0])
-    elif kind == "weld":
-        plant.AddWeldConstraint(bodies[0], RigidTransform(), bodies[1], RigidTransform([0.3, 0, 0]))
-    plant.AddJointActuator("push", rails[0])
-    return made.model()
 
 
 @each_row("kind", ["coupler", "distance", "ball", "weld"])

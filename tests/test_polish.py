@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.models import Plant, add_slide, contact_properties
-from helpers.plants import limited_pendulum, pair, springs_and_motors
+from helpers.plants import block, constrained, limited_pendulum, pair, springs_and_motors
 from helpers.robots import FOOT, example_robot, state_in_range
 from helpers.table import each_row
 from pydrake.geometry import Box
@@ -16,6 +16,7 @@ import drake_diff as dd
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives import joint_impulses, polish, sources
 from drake_diff.derivatives.contact import laws
+from drake_diff.derivatives.couplers import couplers_of
 from drake_diff.derivatives.polish import polished_step, polished_steps
 from drake_diff.exceptions import GradientError
 from drake_diff.model.parameters import applied, select
@@ -167,6 +168,26 @@ def test_a_pd_controller_within_its_effort_at_its_limit_and_too_stiff_for_the_st
         exact = v + H * np.sign(effort) * limit / A
     assert polished(model, [q, v], [u])[1] == pytest.approx(exact, rel=1e-12)
     assert (lowered < 1) == (gains[0] == 1e9)
+
+
+@each_row("u", [0.0, 3.0])
+def test_two_blocks_whose_rails_are_coupled(u):
+    """q_0 = 2 q_1 with masses 1 and 1: A (v' - v*) = (1, -2) g, g = (-d / 2h - (v_0' - 2 v_1')) / R, R = b (1 + 4)."""
+    model, h, j = block(blocks=2, couple=True), 0.1, np.array([1.0, -2.0])
+    q, v = np.array([0.3, 0.05]), np.array([0.2, -0.1])
+    free = v + h * np.array([u, 0.0])
+    exact = free + j * (-(j @ q) / (2 * h) - j @ free) / (NEAR_RIGID * 5 + 5)
+    assert polished(model, [*q, *v], [u])[2:] == pytest.approx(exact, rel=1e-12)
+    found = couplers_of(model)
+    np.testing.assert_allclose(found.direction, [[1, -2]], rtol=1e-12)
+
+
+def test_a_hand_whose_fingers_are_coupled_and_controlled():
+    model, random = example_robot("panda.urdf", gains=(100.0, 3.0)), np.random.default_rng(1)
+    xs = np.array([state_in_range(model, random) for _ in range(10)])
+    found = polished_steps(model, select(model, ()), xs, random.standard_normal((10, model.nu)))
+    assert {str(why) for why in found.refused.values()} <= {"hydroelastic contact acts"}
+    assert np.nanmax(np.abs(found.x_next - found.drake)) < 1e-6
 
 
 # ---- AutoDiffXd ------------------------------------------------------------------------------------------------------
@@ -326,6 +347,11 @@ def test_a_stiction_tolerance_that_is_not_the_usual_one_is_refused():
     made.ball("ball", 1.0, 0.1, properties, "x", "z")
     made.ground(properties)
     assert "the equation is not Drake's" in why_not(made.model(), [0.0, 0.0985, 1e-3, 0.0])
+
+
+@each_row("kind", ["distance", "ball", "weld"])
+def test_a_constraint_that_is_no_coupler_is_refused(kind):
+    assert "a constraint acts" in why_not(constrained(kind), [0.3, 0.05, 0.2, -0.1], [0.4])
 
 
 def test_what_is_not_known_is_named():

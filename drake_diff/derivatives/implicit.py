@@ -157,6 +157,7 @@ class Form:
     """What of a model does not change from step to step."""
 
     excluded: str  # why the form describes no step of the model; empty where it may
+    driven: str  # the same, but for constraints
     actuators: list[Any]
     velocity: NDArray[np.int64]  # (nu,) the index in v of the joint that an input drives, and in q
     position: NDArray[np.int64]
@@ -198,8 +199,10 @@ def _read_form(model: Model) -> Form:
     for instance, target in model.pd_targets.items():
         driven = [i for i, a in enumerate(found) if a.model_instance() == instance]
         references[:, driven] = np.asarray(target).reshape(2, len(driven))
+    why = _why_driven(model)
     return Form(
-        excluded=_why_excluded(model),
+        excluded="constraints act at every step" if model.plant.num_constraints() else why,
+        driven=why,
         actuators=found,
         velocity=velocity,
         position=np.array([a.joint().position_start() for a in found], dtype=int),
@@ -212,11 +215,9 @@ def _read_form(model: Model) -> Form:
     )
 
 
-def _why_excluded(model: Model) -> str:
-    """What in the model the form leaves out wherever it is; empty where there is nothing."""
+def _why_driven(model: Model) -> str:
+    """What acts on the model, beside constraints, that the form leaves out wherever it is; empty where nothing does."""
     plant = model.plant
-    if plant.num_constraints():
-        return "constraints act at every step"
     for port in (plant.get_applied_generalized_force_input_port(), plant.get_applied_spatial_force_input_port()):
         if is_driven(model.diagram, model.path, port):
             return f"the diagram feeds {port.get_name()}"

@@ -24,6 +24,7 @@ from drake_diff.derivatives.contact.kinematics import weigh
 from drake_diff.derivatives.contact.laws import Cone, HuntCrossley
 from drake_diff.derivatives.contact.material import QUANTITIES, combine
 from drake_diff.derivatives.convex_step import SOLVED, ContactImpulses, ConvexSteps
+from drake_diff.derivatives.couplers import Couplers, couplers_of
 from drake_diff.derivatives.implicit import Form, form_of
 from drake_diff.derivatives.joint_impulses import Controllers, gather, limit_impulses
 from drake_diff.model.contract import SAP_RELATIVE_TOLERANCE
@@ -92,7 +93,7 @@ def solves_the_step(model: Model, x: Array, u: Array, end: Array) -> bool:
     False where the step's equation is not known, or is not Drake's.
     """
     form = form_of(model)
-    if form.excluded:
+    if _unknown(model, form):
         return False
     drake = advance(model.double, x, u)
     read = _read(model, _settings(model, form), 0)
@@ -108,7 +109,7 @@ def solves_the_step(model: Model, x: Array, u: Array, end: Array) -> bool:
 def _polish(model: Model, vector: ParameterVector, xs: Array, us: Array, values: Array | None) -> Polished:
     """Of one time step."""
     form = form_of(model)
-    why = form.excluded
+    why = _unknown(model, form)
     drake, refused = np.empty_like(xs), {}
     read: list[_Read] = []
     settings: _Settings | None = None
@@ -139,6 +140,12 @@ def _polish(model: Model, vector: ParameterVector, xs: Array, us: Array, values:
         x_next[which] = _states(model, xs[which], v_next)
     x_next[list(refused)] = np.nan
     return Polished(x_next, drake, left, refused)
+
+
+def _unknown(model: Model, form: Form) -> str:
+    """What acts in every step of the model that its equation here does not have; empty where nothing does."""
+    couplers = couplers_of(model) if model.plant.num_constraints() else None
+    return couplers.reason if isinstance(couplers, Refusal) else form.driven
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,6 +248,9 @@ def _problems(model: Model, form: Form, read: list[_Read], xs: Array, us: Array)
         kp, kd = (np.array([getattr(r.settings, name)[which] for r in read]) for name in ("kp", "kd"))
         pd = Controllers(form.velocity[which], kp, kd, form.reference[:, which], form.limit[which])
         parts.append(pd.impulses(q, us[:, which], weights, h))
+    couplers = couplers_of(model) if model.plant.num_constraints() else None
+    if isinstance(couplers, Couplers):
+        parts.append(couplers.impulses(q, weights, h))
     return ConvexSteps(A, free, _contact_impulses(model, read, v, weights), gather(parts, model.nv), _same_tree(model))
 
 

@@ -99,6 +99,23 @@ def limited_pendulum(lower=-1.0, upper=1.0):
     return made.model()
 
 
+def constrained(kind):
+    made = Plant(0.01)
+    plant = made.plant
+    bodies = [plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(1.0, 0.1)) for name in ("one", "two")]
+    rails = [add_slide(plant, b.name(), plant.world_frame(), b, "x") for b in bodies]
+    if kind == "coupler":
+        plant.AddCouplerConstraint(rails[0], rails[1], 2.0)
+    elif kind == "distance":
+        plant.AddDistanceConstraint(bodies[0], [0, 0, 0], bodies[1], [0, 0.5, 0], 0.6)
+    elif kind == "ball":
+        plant.AddBallConstraint(bodies[0], [0, 0, 0], bodies[1], [0.3, 0, 0])
+    elif kind == "weld":
+        plant.AddWeldConstraint(bodies[0], RigidTransform(), bodies[1], RigidTransform([0.3, 0, 0]))
+    plant.AddJointActuator("push", rails[0])
+    return made.model()
+
+
 def springs_and_motors(*, limit=np.inf, kp=(0.0, 0.0, 0.0), gear=1.0, damping=0.2):
     """A sprung cart, a sprung pole on it and a pole on that, all driven, PD-controlled where a gain is given."""
     made = Plant(0.01)

@@ -1,0 +1,127 @@
+"""The couplers of a plant, q_0 = ratio q_1 + offset, read from Drake's own steps as it gives them in no other way.
+
+With no other constraint than one coupler the step's problem is quadratic and Drake solves it to rounding. The impulse
+A (v' - v*) of such a step lies along (1, -ratio) of the two joints; its size says how far the joints are off.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.multibody.tree import MultibodyForces
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.refusal import Refusal
+from drake_diff.derivatives.joint_impulses import NEAR_RIGID, JointImpulses
+from drake_diff.model.model import Model
+from drake_diff.model.plant import joints
+
+STATES_TRIED = 60
+PROBES = 3  # two to read, one more to check
+SAME = 1e-8  # of the largest entry: what Drake's solver leaves of a quadratic problem is rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Couplers:
+    """K couplers."""
+
+    direction: Array  # (K, nv)
+    offset: Array  # (K,)
+
+    def impulses(self, q: Array, diagonal: Array, h: float) -> JointImpulses:
+        """Of N states: q (N, nv) of each degree of freedom, `diagonal` (N, nv) that of A."""
+        count, (rows, nv) = len(q), self.direction.shape
+        off = (q @ self.direction.T - self.offset).ravel()
+        w = (1 / diagonal @ (self.direction**2).T).ravel()
+        infinite = np.full(count * rows, np.inf)
+        direction = np.broadcast_to(self.direction, (count, rows, nv)).reshape(-1, nv)
+        problem = np.repeat(np.arange(count), rows)
+        return JointImpulses(problem, direction, -off / (2 * h), NEAR_RIGID * w, -infinite, infinite)
+
+
+def couplers_of(model: Model) -> Couplers | Refusal:
+    """Those that act in the model's steps; a Refusal where a constraint is none, or could not be read."""
+
+    def read() -> Couplers | Refusal:
+        found = []
+        for constraint in model.plant.GetConstraintIds():
+            if not model.plant.GetConstraintActiveStatus(model.double.context, constraint):
+                continue
+            coupler = _read(model, constraint)
+            if isinstance(coupler, Refusal):
+                return coupler
+            found.append(coupler)
+        directions, offsets = [d for d, _ in found], [o for _, o in found]
+        return Couplers(np.array(directions).reshape(-1, model.nv), np.array(offsets, dtype=float))
+
+    return model.cache("couplers", read, of_structure=True)
+
+
+def _read(model: Model, constraint: Any) -> tuple[Array, float] | Refusal:
+    """The direction (nv,) and the offset of one."""
+    plant, random = model.plant, np.random.default_rng(0)
+    context = plant.GetMyMutableContextFromRoot(model.diagram.CreateDefaultContext())
+    for other in plant.GetConstraintIds():
+        plant.SetConstraintActiveStatus(context, other, other == constraint)
+    if model.nu:
+        plant.get_actuation_input_port().FixValue(context, np.zeros(model.nu))
+    probes: list[tuple[Array, Array, Array, Array]] = []
+    position, velocity = _single(model)
+    for _ in range(STATES_TRIED):
+        probe = _probe(model, context, random)
+        if probe is not None:
+            probes.append(probe)
+        if len(probes) == PROBES:
+            break
+    else:
+        return Refusal(
+            "a constraint acts, which could not be read: in all but "
+            f"{len(probes)} of {STATES_TRIED} states geometries touch"
+        )
+    impulse = probes[0][2]
+    coupled = np.flatnonzero(np.abs(impulse) > SAME * np.abs(impulse).max())
+    if len(coupled) != 2 or not np.isin(coupled, velocity).all():
+        return Refusal("a constraint acts that couples no two joints")
+    direction = np.zeros(model.nv)
+    direction[coupled] = impulse[coupled] / impulse[coupled[0]]
+    q = np.zeros((PROBES, model.nv))
+    q[:, velocity] = np.array([p[0] for p in probes])[:, position]
+    offsets = []
+    for k, (_, v_next, impulse, A) in enumerate(probes):
+        R = NEAR_RIGID * float((direction**2 / np.diag(A)).sum())
+        offsets.append(float(direction @ q[k] + 2 * model.time_step * (R * impulse[coupled[0]] + direction @ v_next)))
+        if not np.abs(impulse - impulse[coupled[0]] * direction).max() <= SAME * np.abs(impulse).max():
+            return Refusal("a constraint acts that couples no two joints")
+    if not np.ptp(offsets) <= SAME:
+        return Refusal("a constraint acts between two joints that is no coupler")
+    return direction, float(np.mean(offsets))
+
+
+def _probe(model: Model, context: Any, random: np.random.Generator) -> tuple[Array, Array, Array, Array] | None:
+    """q, v', A (v' - v*) and A of one step from rest, None where geometries touch."""
+    plant, h = model.plant, model.time_step
+    lower, upper = (
+        np.clip(side, -1.0, 1.0) for side in (plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits())
+    )
+    q = np.array(plant.GetPositions(context))
+    position, _ = _single(model)
+    q[position] = (lower + random.uniform(0.3, 0.7, len(q)) * (upper - lower))[position]
+    plant.SetPositions(context, q)
+    plant.SetVelocities(context, np.zeros(model.nv))
+    port = plant.get_geometry_query_input_port()
+    if port.HasValue(context) and port.Eval(context).HasCollisions():
+        return None
+    v_next = np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())[model.nq :]
+    forces = MultibodyForces(plant)
+    plant.CalcForceElementsContribution(context, forces)
+    bias = plant.CalcInverseDynamics(context, np.zeros(model.nv), forces)
+    A = plant.CalcMassMatrix(context) + h * np.diag(model.double.damping())
+    return q, v_next, A @ v_next + h * bias, A
+
+
+def _single(model: Model) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The indices in q and in v of the joints with one of each."""
+    found = [j for j in joints(model.plant) if j.num_positions() == j.num_velocities() == 1]
+    positions, velocities = [j.position_start() for j in found], [j.velocity_start() for j in found]
+    return np.array(positions, dtype=np.intp), np.array(velocities, dtype=np.intp)
