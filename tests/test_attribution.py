@@ -101,14 +101,6 @@ def test_mujocos_explicit_damping_is_found(tmp_path, options, told):
     assert found.responsible == "integrator" if "explicit" in told else found.gap < 1e-10
 
 
-def test_runge_kutta_is_no_euler_and_is_the_integrators_doing(tmp_path):
-    model = arms(tmp_path)
-    path = tmp_path / "own.xml"
-    path.write_text(mjcf(describe(model), model.time_step).replace('integrator="Euler"', 'integrator="RK4"'))
-    found = of(engine_of("drake", model), engine_of("mujoco", model, path=path), *arm_state(model))
-    assert found.responsible == "integrator"
-
-
 def test_a_turning_body_differs_by_the_exponential(load):
     model = load("sphere_on_ground.sdf")
     drake, mujoco = engine_of("drake", model), engine_of("mujoco", model)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.contracts import arms
 from helpers.engines import Doctored, engine_of, needs
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.comparison.result import JACOBIAN_TOLERANCE, STEP_TOLERANCE
@@ -71,16 +72,19 @@ def test_contact_laws_are_told_apart_and_the_free_part_is_not(load):
     model = load("sphere_on_ground.sdf")
     x0 = np.array(model.default_state)
     x0[6] = 0.4
-    found = by_name(dd.compare(model, ("drake:lagged", "mujoco", "pinocchio"), x0=x0, num_steps=60))
+    compared = dd.compare(model, ("drake:lagged", "mujoco", "pinocchio"), x0=x0, num_steps=60)
+    found = by_name(compared)
     fall = int(np.sqrt(2 * 0.3 / G) / model.time_step)
     for name in ("drake (lagged, autodiff)", "mujoco", "pinocchio"):
         e = found[name]
-        assert e.verdict == "other law"
+        assert e.verdict == ("other model" if name == "pinocchio" else "other law")
         assert abs(e.first_apart - fall) <= 2
         assert e.largest.responsible == "contact law"
         assert "contact law" in [line.quantity for line in e.told]
         assert max(e.step_gaps[: fall - 2]) < STEP_TOLERANCE["float64"]
-    # Nothing holds the ball in Pinocchio, as its contract tells.
+    # Nothing holds the ball in Pinocchio, as its contract tells: it is not the same model.
+    assert not compared.holds
+    assert [line.quantity for line in found["pinocchio"].broken] == ["contact pairs"]
     assert found["pinocchio"].motion.xs[-1, 6] < 0
     assert found["pinocchio"].motion.depth.max() == 0
     assert 0 < found["drake (sap, autodiff)"].motion.depth.max() < 0.05
@@ -218,17 +222,19 @@ def test_a_float32_engine_has_its_own_tolerance(load):
         assert by_name(dd.compare(model, (other,), num_steps=5))["single"].verdict == verdict
 
 
-def test_another_jacobian_in_contact_is_another_law_and_not_unexplained(load):
-    """The motion never touches; at the sampled contact state Pinocchio, which has no contact, has another Jacobian."""
-    needs("pinocchio")
+@each_row("name, verdict", [("pinocchio", "other model"), ("mujoco", "other law")])
+def test_another_jacobian_in_contact_is_not_unexplained(load, name, verdict):
+    """The motion never touches; at the sampled contact state Pinocchio has no contact, and MuJoCo another law of it."""
+    needs(name)
     model = load("sphere_on_ground.sdf")
     x0 = np.array(model.default_state)
     x0[6] = 3.0
-    e = by_name(dd.compare(model, ("pinocchio",), x0=x0, num_steps=5, seed=4))["pinocchio"]
+    e = by_name(dd.compare(model, (name,), x0=x0, num_steps=5, seed=4))[name]
     assert e.first_apart is None
-    assert e.verdict == "other law"
-    assert [e.laws[i] for i in e.other_states] == ["contact law"]
-    assert [e.jacobians[i].state for i in e.other_states] == ["contact"]
+    assert e.verdict == verdict
+    of_states = {e.jacobians[i].state: e.laws[i] for i in e.other_states}
+    # MuJoCo turns by the exponential.
+    assert of_states == {"contact": "contact law"} | ({} if name == "pinocchio" else {"free": "integrator"})
 
 
 def test_another_jacobian_in_contact_that_no_contract_tells_of_is_unexplained(load):

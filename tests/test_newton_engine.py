@@ -174,7 +174,7 @@ def test_a_swapped_quaternion_or_velocity_frame_is_found(wrong, monkeypatch):
 def test_contacts_are_drakes_pairs_and_a_shape_that_is_not_built_is_named(load, tmp_path):
     model = load("sphere_on_ground.sdf")
     assert different(dd.engines.load_engine("drake", model), newton(model)).keys() == {
-        "integrator", "contact law", "solver tolerance", "scalar type"}  # fmt: skip
+        "integrator", "contact law", "dissipation", "solver tolerance", "scalar type"}  # fmt: skip
     model = tetrahedron_on_ground(tmp_path)
     assert "body_shape" in different(dd.engines.load_engine("drake", model), newton(model))["contact pairs"]
 

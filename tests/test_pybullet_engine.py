@@ -157,7 +157,7 @@ def test_contacts_are_drakes_pairs_and_a_shape_that_is_not_built_is_named(load, 
     for name in ("sphere_on_ground.sdf", "sliding_block.sdf", "two_spheres.sdf"):
         model = load(name)
         found = different(dd.engines.load_engine("drake", model), bullet(model)).keys()
-        assert found <= {*OWN, "contact law", "bias(q, v)"}, name
+        assert found <= {*OWN, "contact law", "dissipation", "bias(q, v)"}, name
     model = tetrahedron_on_ground(tmp_path)
     assert "body_shape" in different(dd.engines.load_engine("drake", model), bullet(model))["contact pairs"]
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.comparison.recordings import Recording
-from drake_diff.engines.contract_match import SAME_NUMBER, ContractLine, match_contracts
+from drake_diff.engines.contract_line import SAME_NUMBER, ContractLine
+from drake_diff.engines.contract_match import match_contracts
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.interface import Engine, EngineContract, Precision
 from drake_diff.exceptions import InputError, NotOfferedError
@@ -25,6 +26,11 @@ from drake_diff.model.step import set_state
 INTEGRATOR, CONTACT_LAW, LIMIT_LAW, UNEXPLAINED = "integrator", "contact law", "limit law", "unexplained"
 # How well a scheme must give a step to be the engine's, relative to the state: rounding, and no force.
 FITS: dict[Precision, float] = {"float64": 1e-9, "float32": 1e-4}
+
+# Steps by which Drake's limits look ahead: its solver takes those within this many steps at the joint's speed.
+WINDOW = 2.0
+# Of the largest generalized force: below it are what solvers leave, 1e-6, and rounding.
+PUSHED = 1e-3
 
 
 class EulerScheme(NamedTuple):
@@ -95,9 +101,9 @@ def attribute(
         for name in Terms._fields
     }
     effects[INTEGRATOR] = _size(euler(coordinates, x, a, scheme_b) - base)
-    left = _size((after_b - euler(coordinates, x, b, scheme_b)) - (after_a - base))
-    what = what_is_left(coordinates, one, two, x, steps)
-    effects[what] = max(left, effects.get(what, 0.0))
+    left = (after_b - euler(coordinates, x, b, scheme_b)) - (after_a - base)
+    what = what_is_left(coordinates, one, two, x, steps, left)
+    effects[what] = max(_size(left), effects.get(what, 0.0))
     ranked = dict(sorted(effects.items(), key=lambda item: -item[1]))
     gap = _size(after_b - after_a)
     return Attribution(gap, ranked, next(iter(ranked)) if gap else "", (scheme_a, scheme_b), (*no_mass, *no_bias))
@@ -149,20 +155,58 @@ def forces(contract: EngineContract, u: Array) -> tuple[Array, Array]:
     return actuation @ np.clip(u, -limits, limits), np.array([number for joint in damping for number in joint])
 
 
-def what_is_left(coordinates: Coordinates, one: Engine, two: Engine, x: Array, steps: tuple[Array, Array]) -> str:
-    """What makes steps differ that no Euler step explains: a law that is at work at one of the states, if any."""
-    states = (x, *steps)
-    for engine in (one, two):
-        try:
-            if any(engine.contact_depth(state) > 0 for state in states):
-                return CONTACT_LAW
-        except NotOfferedError:
-            continue
-    joints = ([j for j in e.contract.joints if j.kind != "quaternion_floating"] for e in (one, two))
-    singles = [pair for own in joints for pair in zip(own, coordinates.single, strict=True)]
-    if any(not j.lower <= state[i] <= j.upper for j, (i, _) in singles for state in states):
+def what_is_left(
+    coordinates: Coordinates, one: Engine, two: Engine, x: Array, steps: tuple[Array, Array], left: Array | None = None
+) -> str:
+    """What makes `steps` differ that no Euler step explains: a law that is at work, if any.
+
+    `left` (nx,) is that difference, that of the steps where it is not given. A joint's limit pushes this joint alone,
+    and Drake's acts up to WINDOW steps ahead of it; what touches pushes all joints that it moves.
+    """
+    after_a, after_b = (of_norm_one(coordinates, after, x) for after in steps)
+    push = _push(coordinates, one, x, after_b - after_a if left is None else left, after_a)
+    joints = _joints_near_limits(coordinates, (one, two), x, (after_a, after_b))
+    if push and not push <= joints:  # something pushes joints that are at no limit
+        joints = set()
+    if _touching((one, two), (x, *steps)) and not (push and joints and len(push) < coordinates.nv):
+        return CONTACT_LAW
+    if joints and (push or left is None):
         return LIMIT_LAW
     return UNEXPLAINED if one.contract.integrator == two.contract.integrator else INTEGRATOR
+
+
+def _push(coordinates: Coordinates, one: Engine, x: Array, left: Array, after: Array) -> set[int]:
+    """The velocities on which the force acts that changes the velocity by `left`; none where that is rounding."""
+    change = left[coordinates.nq :]
+    if _size(change) <= FITS[one.contract.precision] * max(1.0, _size(after)):
+        return set()
+    force = np.abs(one.mass_matrix(x[: coordinates.nq]) @ change)
+    return {int(j) for j in np.flatnonzero(force > PUSHED * np.max(force))}
+
+
+def _touching(engines: tuple[Engine, Engine], states: tuple[Array, ...]) -> bool:
+    for engine in engines:
+        try:
+            if any(engine.contact_depth(state) > 0 for state in states):
+                return True
+        except NotOfferedError:
+            continue
+    return False
+
+
+def _joints_near_limits(
+    coordinates: Coordinates, engines: tuple[Engine, Engine], x: Array, after: tuple[Array, Array]
+) -> set[int]:
+    """The velocities of the joints that pass a limit, or would within WINDOW steps at the largest of their speeds."""
+    found = set()
+    for engine in engines:
+        joints = [joint for joint in engine.contract.joints if joint.kind != "quaternion_floating"]
+        for joint, (i, j) in zip(joints, coordinates.single, strict=True):
+            speed = max(abs(float(state[coordinates.nq + j])) for state in (x, *after))
+            reach = WINDOW * engine.contract.time_step * speed
+            if not all(joint.lower <= state[i] - reach and state[i] + reach <= joint.upper for state in (x, *after)):
+                found.add(j)
+    return found
 
 
 def _size(difference: Array) -> float:

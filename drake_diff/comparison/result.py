@@ -11,7 +11,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.jupyter import preformatted
 from drake_diff.comparison.attribution import NOT_TOLD, Attribution
-from drake_diff.engines.contract_match import ContractLine
+from drake_diff.engines.contract_line import ContractLine
 from drake_diff.engines.interface import Precision
 from drake_diff.engines.motion import AGREES, BROKE_OFF, EngineMotion, JacobianAt
 from drake_diff.model.model import Model
@@ -22,6 +22,12 @@ Gradient = Literal["its own step's", "not its own step's", "undecided", "none"]
 STEP_TOLERANCE: dict[Precision, float] = {"float64": 1e-10, "float32": 1e-4}
 # Relative to the largest entry: what differences of a step, which some engines offer as its derivative, leave.
 JACOBIAN_TOLERANCE: dict[Precision, float] = {"float64": 1e-8, "float32": 1e-2}
+# What the contact law, whatever its form, is applied to.
+OF_CONTACT = (
+    "shapes", "poses", "contact pairs", "friction", "stiffness", "dissipation", "contact margin", "other contact terms",
+)  # fmt: skip
+# Of these what an engine must have: where it lacks them and they are at work, it simulates another model.
+MUST_HAVE = ("shapes", "poses", "contact pairs")
 # By term of a step: the lines of a contract that can explain it.
 TELLS: Mapping[str, tuple[str, ...]] = {
     "inertia": ("mass", "center of mass", "inertia", "frames", "armature", "joint types", "joint order and names"),
@@ -30,13 +36,12 @@ TELLS: Mapping[str, tuple[str, ...]] = {
     "damping": ("damping", "integrator"),
     "time step": ("time step",),
     "integrator": ("integrator",),
-    "contact law": ("contact law", "contact pairs", "solver tolerance"),
+    "contact law": ("contact law", *OF_CONTACT, "solver tolerance"),
     "limit law": ("limit law", "position limits"),
 }
-# What is the engine's own whatever the model.
+# What is the engine's own whatever the model: the form of its laws.
 LAWS = (
-    "integrator", "scalar type", "derivative convention", "limit law", "contact law", "contact pairs",
-    "solver tolerance", "reset",
+    "integrator", "scalar type", "derivative convention", "limit law", "contact law", "solver tolerance", "reset",
 )  # fmt: skip
 
 
@@ -72,7 +77,7 @@ class Compared:
     final_gap: float  # of the last state that both have, on the tangent space
     jacobians: tuple[JacobianAt, ...] = ()
     jacobian_gaps: Array = field(default_factory=lambda: frozen([]))  # per state, of the reference's largest entry
-    laws: tuple[str, ...] = ()  # per state, of contact or limits where one is at work there, else ""
+    laws: tuple[str, ...] = ()  # per state, that which is at work there (contact, a limit, the integrator), else ""
     rollout_jacobian: Array | None = None
     rollout_gap: float | None = None  # relative to the reference's largest entry; None where one of the two broke off
     seconds_per_step: float | None = None
@@ -85,8 +90,12 @@ class Compared:
 
     @property
     def broken(self) -> tuple[ContractLine, ...]:
-        """The lines that are different without being the engine's doing: it simulates another model."""
-        return tuple(line for line in self.different if not line.reason and line.quantity not in LAWS)
+        """The lines that make it another model.
+
+        They differ without being the engine's doing, or the engine lacks what contact acts on, and contact is at work.
+        """
+        at_work = {self.first.responsible, self.largest.responsible, *(self.laws[i] for i in self.other_states)}
+        return tuple(line for line in self.different if _breaks(line, "contact law" in at_work))
 
     @cached_property
     def first_apart(self) -> int | None:
@@ -148,10 +157,12 @@ class Compared:
             return f"the same simulation: each of {within}{jacobians if self.jacobians else ''}{but}"
         if self.verdict == "other model":
             lines = [f"{line.quantity}: {line.detail}" for line in self.broken] or [self.first.as_if]
-            return (
-                f"another model ({'; '.join(lines)}); a step differs by up to {_largest(self.step_gaps)}, "
-                f"most by its {self.largest.responsible}"
-            )
+            told = f"another model ({'; '.join(lines)})"
+            if self.first_apart is None:
+                return f"{told}, though each of {within}"
+            since = f"the same for {self.motion.times[self.first_apart]:.4g} s, then " if self.first_apart else ""
+            by = f"most by its {self.largest.responsible}"
+            return f"{told}; {since}a step differs by up to {_largest(self.step_gaps)}, {by}"
         if self.verdict == "unexplained":
             return self._unexplained()
         if self.first_apart is None:
@@ -260,6 +271,12 @@ class Comparison:
         trust += [f"{_list(blind)} {'offer' if len(blind) > 1 else 'offers'} none"] if blind else []
         found = f"{'; '.join(parts or ['no engine was compared'])}. {'; '.join(trust)}."
         return f"{found}{note if after_contact else ''}"
+
+
+def _breaks(line: ContractLine, touched: bool) -> bool:
+    """Whether a line that is different makes another model, where contact is at work or not."""
+    lacking = touched and line.quantity in MUST_HAVE and line.reason != NOT_TOLD
+    return lacking or (not line.reason and line.quantity not in LAWS)
 
 
 def first_above(gaps: Array, precision: Precision) -> int | None:

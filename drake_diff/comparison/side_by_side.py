@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff.comparison import attribution
 from drake_diff.comparison.recordings import Recording, check_recording, steps_between
-from drake_diff.comparison.result import STEP_TOLERANCE, Compared, Comparison, Probe, Refused, first_above
+from drake_diff.comparison.result import MUST_HAVE, STEP_TOLERANCE, Compared, Comparison, Probe, Refused, first_above
+from drake_diff.engines.contact_match import contact_lines
+from drake_diff.engines.contract_line import Match
 from drake_diff.engines.contract_match import match_contracts
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.interface import Engine
@@ -46,8 +48,8 @@ def compare(
     Args:
         model: the model; Drake with its settings is the reference.
         engines: names for `load_engine`, "drake:similar" or "drake:lagged:implicit" for Drake with other settings, or
-            `Engine` objects. Without it: every engine there is, and Drake's other contact approximations where
-            something can touch.
+            `Engine` objects. Without it: every engine there is that has all of the model's contacts, and Drake's other
+            contact approximations where something can touch.
         recordings: motions recorded elsewhere, from `read_recording`. Each recorded step is compared with as many
             steps of Drake as lie between its samples; a recording has no Jacobians.
         x0: start (nx,); without it the first recording's, or else a random state that touches nothing.
@@ -87,7 +89,10 @@ def compare(
     refused: list[Refused] = []
     for wanted in default_engines(model) if engines is None else engines:
         try:
-            loaded.append(load_spec(wanted, model) if isinstance(wanted, str) else wanted)
+            engine = load_spec(wanted, model) if isinstance(wanted, str) else wanted
+            if engines is None:
+                _check_contact(reference, engine)
+            loaded.append(engine)
         except (MissingDependencyError, ModelError) as error:
             refused.append(Refused(str(wanted), str(error), isinstance(error, ModelError)))
     panel = _Panel(model, reference, start, inputs, seed)
@@ -106,6 +111,14 @@ def default_engines(model: Model) -> tuple[str, ...]:
     own = model.contract.contact
     others = [a for a in ("sap", "similar", "lagged") if own.collision_pairs and a != own.approximation]
     return (*(f"drake:{a}" for a in others), *(name for name in ENGINES if name != "drake"), *ELSEWHERE)
+
+
+def _check_contact(reference: Engine, engine: Engine) -> None:
+    """ModelError for an engine that has no contact, or not of all pairs: nobody asked for it by name."""
+    lines = contact_lines(Match(reference, engine))
+    lacking = [line for line in lines if line.quantity in MUST_HAVE and line.verdict == "different" and line.reason]
+    if lacking:
+        raise ModelError(f"it does not have the model's contacts ({lacking[0].reason}); name it to compare it even so")
 
 
 class _Panel:
@@ -137,7 +150,7 @@ class _Panel:
         for x, u in ((probe.x, probe.u) for probe in self.probes):
             steps = self.reference.step(x, u), engine.step(x, u)
             law = attribution.what_is_left(self.coordinates, self.reference, engine, x, steps)
-            laws.append(law if law in (attribution.CONTACT_LAW, attribution.LIMIT_LAW) else "")
+            laws.append("" if law == attribution.UNEXPLAINED else law)
         both = zip(self.jacobians, jacobians, strict=True)
         return Compared(
             engine=engine.name, version=engine.version, precision=precision,

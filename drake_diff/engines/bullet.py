@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from pydrake.math import RotationMatrix
 
 from drake_diff._base.arrays import Array
-from drake_diff.engines.common import RigidEngine, shape_of, without_lines
+from drake_diff.engines.common import RigidEngine, geometry_contracts, shape_of, without_lines
 from drake_diff.engines.interface import DRAKES_STEP, EngineContract, StepJacobian, limit
 from drake_diff.engines.urdf import bullet_urdf
 from drake_diff.exceptions import MissingDependencyError, NotOfferedError
@@ -162,15 +162,18 @@ class PybulletEngine(RigidEngine):
             "linear of its centre of mass then angular, in world",
             integrator=euler if np.any(self.damping) or self.coordinates.free else DRAKES_STEP,
             gravity=tuple(float(parameters[f"gravityAcceleration{axis}"]) for axis in "XYZ"),
-            contact_law=law if self.tree.pairs else "none", contacts=self._read_pairs(),
+            contact_law=law if self.tree.pairs else "none",
+            geometries=geometry_contracts(self.description), contacts=self._read_pairs(),
             limit_law="beyond the limit, impulses to a velocity back of at least 0.2 (Bullet's ERP) of the way / h",
             reasons={
                 "armature": "Bullet has no rotor inertia",
                 "integrator": "Bullet's joint damping is explicit; its free bodies move by their centres of mass and "
                 "turn by the exponential of h w'",
                 "contact law": "Bullet's contact is a spring and a damper in the constraints of its impulses",
-                "contact pairs": "Bullet has friction and stiffness by link, not by pair; "
-                f"not built: {list(self.tree.left_out)}",
+                "contact pairs": "Bullet lets links touch, not geometries; " f"not built: {list(self.tree.left_out)}",
+                "friction": "Bullet has friction by link, not by pair",
+                "stiffness": "Bullet has stiffness by link, not by pair",
+                "dissipation": "Bullet's contacts are built without dampers",
                 "limit law": "Bullet's limits are rigid",
                 "solver tolerance": "Bullet runs a limited number of iterations and has no tolerance",
             },

@@ -4,20 +4,28 @@ import os
 import sys
 import tempfile
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.math import RotationMatrix
+from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff.engines.interface import StepJacobian, float_rows, floats
 from drake_diff.exceptions import SimulationError
 from drake_diff.mechanics.coordinates import Centers, Coordinates, euler_jacobian, euler_step, zero
-from drake_diff.mechanics.description import describe, rigid_links
+from drake_diff.mechanics.description import (
+    Description,
+    GeometryContract,
+    PairContract,
+    describe,
+    rigid_links,
+    without_welds,
+)
 from drake_diff.model.model import Model
 
 
@@ -194,6 +202,48 @@ def shape_of(geometry: Any) -> tuple[str, dict[str, list[float]]]:
     if kind == "Ellipsoid":
         return kind, {"radii": [shape.a(), shape.b(), shape.c()]}
     return kind, {"normal": [0.0, 0.0, 1.0]} if kind == "HalfSpace" else {}
+
+
+def geometry_contracts(description: Description) -> tuple[GeometryContract, ...]:
+    """Each geometry of a kind that engines are given, where q = 0."""
+    moving, on, _ = without_welds(description.links)
+    frames: list[RigidTransform] = []
+    for link in moving:
+        frames.append(link.on_parent if link.parent < 0 else frames[link.parent] @ link.on_parent)
+    found = []
+    for g in description.geometries:
+        place, pose = on[g.body]
+        pose = pose @ g.pose if place < 0 else frames[place] @ pose @ g.pose
+        kind, sizes = shape_of(g)
+        carrier = "world" if place < 0 else moving[place].joint.joint
+        if sizes:
+            lengths = () if kind == "HalfSpace" else floats(np.concatenate(list(sizes.values())))
+            X = (pose.translation(), pose.rotation().matrix())
+            found.append(geometry_contract(g.name, carrier, kind, lengths, *X))
+    return tuple(found)
+
+
+def without_damping(pair: PairContract) -> PairContract:
+    """Of an engine whose contacts have friction and stiffness of the model, and dampers of their own or none."""
+    return replace(pair, dissipation=None, relaxation_time=None)
+
+
+def geometry_contract(
+    name: str, carrier: str, kind: str, sizes: Sequence[float], position: Array, R: Array
+) -> GeometryContract:
+    """From the centre (3,) and the axes R (3, 3) in world; what is round or flat is so about its z axis."""
+    directions = np.zeros(0)
+    if kind == "HalfSpace":
+        directions, position = R[:, 2], R[:, 2] * (R[:, 2] @ position)
+    elif kind in ("Cylinder", "Capsule"):
+        directions = _upper_half(np.outer(R[:, 2], R[:, 2]))
+    elif kind in ("Box", "Ellipsoid"):
+        directions = _upper_half(R @ np.diag(np.square(sizes)) @ R.T)
+    return GeometryContract(name, carrier, kind, floats(sizes), floats(position), floats(directions))
+
+
+def _upper_half(matrix: Array) -> Array:
+    return np.asarray(matrix[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
 
 
 def principal(inertia: Array) -> tuple[Array, Array]:

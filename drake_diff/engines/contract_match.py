@@ -2,21 +2,17 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.engines.interface import Engine, EngineContract, Precision
+from drake_diff.engines.contact_match import contact_lines
+from drake_diff.engines.contract_line import NOTHING, SAME_NUMBER, ContractLine, Match, values_told
+from drake_diff.engines.interface import Engine, EngineContract
 from drake_diff.exceptions import NotOfferedError
 from drake_diff.mechanics.description import JointContract
 
-Verdict = Literal["equal", "mapped", "different"]
-# Two libraries' sums over a tree differ by rounding, magnified by cancellation; a wrong number differs by far more.
-SAME_NUMBER: dict[Precision, float] = {"float64": 1e-9, "float32": 1e-5}
-# Below any inertia that matters: what MuJoCo gives a point mass, 2e-15 kg m^2, and rounding of zeros.
-NOTHING: dict[Precision, float] = {"float64": 1e-12, "float32": 1e-6}
 RANDOM_STATES = 5
 JOINT_NUMBERS: dict[str, Callable[[JointContract], tuple[Any, ...]]] = {
     "joint types": lambda j: (j.kind,),
@@ -29,30 +25,6 @@ JOINT_NUMBERS: dict[str, Callable[[JointContract], tuple[Any, ...]]] = {
     "springs": lambda j: (j.stiffness, j.rest if j.stiffness else 0.0),
     "position limits": lambda j: (j.lower, j.upper),
 }
-
-
-@dataclass(frozen=True, repr=False)
-class ContractLine:
-    """One thing that two engines must share, and whether they do.
-
-    Attributes:
-        quantity: what is compared, such as "mass" or "contact law".
-        verdict: "equal", "mapped" (the same in other coordinates; `detail` says how) or "different".
-        detail: the common value, or both values, their place, and the reason where there is one.
-        reason: why an engine cannot have what the other has; empty where the model itself differs.
-
-    Example:
-        >>> print(dd.engines.ContractLine("time step", "equal", "0.01 [s]"))
-        equal     time step: 0.01 [s]
-    """
-
-    quantity: str
-    verdict: Verdict
-    detail: str
-    reason: str = ""
-
-    def __repr__(self) -> str:
-        return f"{self.verdict:9} {self.quantity}: {self.detail}"
 
 
 def match_contracts(a: Engine, b: Engine) -> tuple[ContractLine, ...]:
@@ -89,7 +61,7 @@ def match_contracts(a: Engine, b: Engine) -> tuple[ContractLine, ...]:
         match.state(),
         match.limit_law(),
         match.text("contact law", one.contact_law, two.contact_law),
-        match.contact_pairs(),
+        *contact_lines(match),
         match.solver_tolerance(),
         match.text("reset", one.reset, two.reset),
         match.scalar_type(),
@@ -97,46 +69,21 @@ def match_contracts(a: Engine, b: Engine) -> tuple[ContractLine, ...]:
     )
 
 
-class _Match:
-    """The lines of two engines' contracts, `one` and `two`, compared in the coarser arithmetic of both."""
-
+class _Match(Match):
     def __init__(self, a: Engine, b: Engine):
-        self.engines = a, b
-        self.one, self.two = self.contracts = a.contract, b.contract
+        super().__init__(a, b)
         sides = [side for c in self.contracts for j in c.joints for side in (j.lower, j.upper)]
         self.limited = any(math.isfinite(side) for side in sides)
-        self.precision: Precision = "float32" if "float32" in [c.precision for c in self.contracts] else "float64"
-
-    def same(self, a: Any, b: Any) -> bool:
-        if isinstance(a, str) or isinstance(b, str) or not (math.isfinite(a) and math.isfinite(b)):
-            return bool(a == b)
-        return abs(a - b) <= max(NOTHING[self.precision], SAME_NUMBER[self.precision] * max(abs(a), abs(b)))
-
-    def both(self, a: object, b: object) -> str:
-        return f"{self.one.engine}: {a}; {self.two.engine}: {b}"
-
-    def different(self, quantity: str, what: str) -> ContractLine:
-        """With the reason of the engine that has one."""
-        reason = self.one.reasons.get(quantity) or self.two.reasons.get(quantity) or ""
-        return ContractLine(quantity, "different", f"{what}; {reason}" if reason else what, reason)
-
-    def text(self, quantity: str, a: str, b: str) -> ContractLine:
-        return ContractLine(quantity, "equal", a) if a == b else self.different(quantity, self.both(a, b))
-
-    def numbers(self, quantity: str, a: tuple[Any, ...], b: tuple[Any, ...], unit: str = "") -> ContractLine:
-        if len(a) == len(b) and all(map(self.same, a, b)):
-            return ContractLine(quantity, "equal", f"{_values(a)} {unit}".strip())
-        return self.different(quantity, f"{self.both(_values(a), _values(b))} {unit}".strip())
 
     def order(self) -> ContractLine:
         quantity = "joint order and names"
         a, b = (tuple(j.name for j in contract.joints) for contract in self.contracts)
         if a != b:
             return self.numbers(quantity, a, b)
-        inside = [_values(contract.native_order) for contract in self.contracts]
+        inside = [values_told(contract.native_order) for contract in self.contracts]
         if inside[0] != inside[1]:
             return ContractLine(quantity, "mapped", f"by name, from {self.both(*inside)}")
-        return ContractLine(quantity, "equal", _values(a))
+        return ContractLine(quantity, "equal", values_told(a))
 
     def joints(self, quantity: str, read: Callable[[JointContract], tuple[Any, ...]]) -> ContractLine:
         """By name, so that another order is reported once and not in every line."""
@@ -215,27 +162,6 @@ class _Match:
             return ContractLine("limit law", "equal", "no joint is limited")
         return self.text("limit law", self.one.limit_law, self.two.limit_law)
 
-    def contact_pairs(self) -> ContractLine:
-        quantity = "contact pairs"
-        a, b = ({pair.names: pair for pair in c.contacts} for c in self.contracts)
-        if a.keys() != b.keys():
-            only = sorted(str(names) for names in a.keys() ^ b.keys())
-            return self.different(quantity, f"{self.both(len(a), len(b))}; only in one: {only}")
-        wrong = [
-            f"{names}: friction {x.friction} and {y.friction} [1], stiffness {x.stiffness} and {y.stiffness} [N/m]"
-            for names, x, y in ((names, a[names], b[names]) for names in a)
-            if not all(map(self.same_of_contact, (x.friction, x.stiffness), (y.friction, y.stiffness)))
-        ]
-        if wrong:
-            return self.different(quantity, "; ".join(wrong))
-        return ContractLine(quantity, "equal", f"{len(a)} pairs, friction and stiffness at rest" if a else "none")
-
-    def same_of_contact(self, a: float | None, b: float | None) -> bool:
-        """A value that neither gives is the same default only where the contact law is the same."""
-        if a is None or b is None:
-            return a is b and self.one.contact_law == self.two.contact_law
-        return self.same(a, b)
-
     def solver_tolerance(self) -> ContractLine:
         if not self.limited and not any(c.contacts for c in self.contracts):
             return ContractLine("solver tolerance", "equal", "nothing to solve: neither contact nor limits")
@@ -255,11 +181,6 @@ class _Match:
         if "none" in told:
             return ContractLine(quantity, "different", self.both(*told), "it offers no derivatives")
         return ContractLine(quantity, "mapped", self.both(*told))
-
-
-def _values(values: tuple[Any, ...]) -> str:
-    shown = [value if isinstance(value, str) else f"{value:.10g}" for value in values]
-    return shown[0] if len(shown) == 1 else "(" + ", ".join(shown) + ")"
 
 
 def _forces_by_joint(contract: EngineContract) -> dict[str, dict[str, float]]:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import Array, finite_array
 from drake_diff.derivatives.sources import check_method
 from drake_diff.derivatives.step import differentiate_step
+from drake_diff.engines.common import geometry_contracts
 from drake_diff.engines.interface import EngineContract, StepJacobian, float_rows, floats
 from drake_diff.mechanics.description import Description, describe, joint_contracts
 from drake_diff.model.contact import penetration
@@ -68,6 +69,8 @@ class DrakeEngine:
             actuation=float_rows(self.description.actuation), effort_limits=floats(self.description.effort_limits),
             time_step=self.model.time_step, gravity=floats(self.description.gravity),
             contact_law=f"{contact.model}, {contact.approximation}" if contact.collision_pairs else "none",
-            contacts=self.description.pairs, solver_tolerance=contact.solver_relative_tolerance,
-            limit_law="implicit springs in the step's solver", derivatives="by every entry of x and u",
+            geometries=geometry_contracts(self.description), contacts=self.description.pairs,
+            solver_tolerance=contact.solver_relative_tolerance,
+            limit_law="implicit springs in the step's solver, from two steps before the limit on",
+            derivatives="by every entry of x and u",
         )  # fmt: skip

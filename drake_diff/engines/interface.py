@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array
-from drake_diff.mechanics.description import JointContract, PairContract
+from drake_diff.mechanics.description import GeometryContract, JointContract, PairContract
 
 Precision = Literal["float64", "float32"]
 DRAKES_STEP = "semi-implicit Euler, joint damping implicit, q' = q + h N(q) v'"
@@ -32,7 +32,8 @@ class EngineContract:
     integrator: str = DRAKES_STEP
     gravity: tuple[float, ...]
     contact_law: str = "none"
-    contacts: tuple[PairContract, ...] = ()
+    geometries: tuple[GeometryContract, ...] = ()
+    contacts: tuple[PairContract, ...] = ()  # the names are those of `geometries`
     solver_tolerance: float | None = None  # relative; None where nothing is solved iteratively
     limit_law: str = "none"
     reset: str = EACH_CALL

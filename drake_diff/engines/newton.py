@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 
 from drake_diff._base.arrays import Array, frozen
-from drake_diff.engines.common import RigidEngine, shape_of, without_lines
+from drake_diff.engines.common import RigidEngine, geometry_contracts, shape_of, without_damping, without_lines
 from drake_diff.engines.interface import DRAKES_STEP, UNLIMITED, EngineContract, StepJacobian, floats, limit
 from drake_diff.exceptions import MissingDependencyError, NotOfferedError
 from drake_diff.mechanics.coordinates import Centers, rotation, unit
@@ -143,7 +143,8 @@ class NewtonEngine(RigidEngine):
             state="position of the body's origin, quaternion x y z w after it; velocity of a free body linear of its "
             "centre of mass then angular, in world",
             integrator=", ".join(["semi-implicit Euler", *how]) if how else DRAKES_STEP,
-            gravity=floats(self._gravity()), contact_law=law if self.pipeline else "none", contacts=self.tree.pairs,
+            gravity=floats(self._gravity()), contact_law=law if self.pipeline else "none",
+            geometries=geometry_contracts(self.description), contacts=tuple(map(without_damping, self.tree.pairs)),
             limit_law=f"explicit springs of {springs} and dampers of {dampers} (SI) beyond the limit",
             derivatives="by every number of Newton's state, warp's tape backwards", precision="float32",
             reasons={
@@ -151,6 +152,7 @@ class NewtonEngine(RigidEngine):
                 "contact law": "Newton's SolverFeatherstone has explicit springs, dampers and viscous friction up to "
                 "Coulomb's, each with its own numbers",
                 "contact pairs": f"contact pairs are missing: {list(self.tree.left_out)}" if self.tree.left_out else "",
+                "dissipation": "Newton's contacts have their own dampers",
                 "limit law": "Newton's limits have their own stiffness and damping",
                 "solver tolerance": "nothing is solved iteratively",
             },

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_diff._base.arrays import Array
-from drake_diff.engines.common import RigidEngine, principal, shape_of
+from drake_diff.engines.common import RigidEngine, geometry_contracts, principal, shape_of
 from drake_diff.engines.interface import DRAKES_STEP, EngineContract, StepJacobian, floats
 from drake_diff.exceptions import MissingDependencyError, ModelError, NotOfferedError
 from drake_diff.mechanics.coordinates import Centers, rotation, unit
@@ -132,13 +132,15 @@ class SapienEngine(RigidEngine):
             state="position of the body's origin, quaternion w x y z after it; velocity of a free body linear of its "
             "centre of mass then angular, in world",
             integrator=euler if self.coordinates.free else DRAKES_STEP, gravity=floats(world.system.config.gravity),
-            contact_law="rigid, Coulomb's friction by patches" if self.pairs else "none", contacts=tuple(contacts),
+            contact_law="rigid, Coulomb's friction by patches" if self.pairs else "none",
+            geometries=geometry_contracts(self.description), contacts=tuple(contacts),
             limit_law="rigid", precision="float32",
             reasons={
                 "integrator": "PhysX moves free bodies by their centres of mass and turns them by the exponential",
                 "contact law": "PhysX's contacts are rigid",
-                "contact pairs": "PhysX's contacts have no stiffness"
-                + (f", and contact pairs are missing: {left_out}" if left_out else ""),
+                "contact pairs": f"contact pairs are missing: {left_out}" if left_out else "",
+                "stiffness": "PhysX's contacts are rigid: they have no stiffness",
+                "dissipation": "PhysX's contacts are rigid: they have no damping",
                 "limit law": "PhysX's limits are rigid",
                 "solver tolerance": "PhysX runs a fixed number of iterations",
             },

@@ -49,12 +49,34 @@ class JointContract:
 
 
 @dataclass(frozen=True)
+class GeometryContract:
+    """A geometry that can touch others, in the world frame where q = 0 (a free body at the origin, unturned).
+
+    `position` is its centre, and of a half space the point of its plane that is nearest to the origin. `directions` has
+    no more than the shape: nothing of a sphere, the normal of a half space, a a' of the axis a of a cylinder or capsule
+    and R diag(sizes^2) R' of a box or ellipsoid (3 by 3, its upper half: xx yy zz xy xz yz).
+    """
+
+    name: str
+    carrier: str  # the moving joint that carries it, or "world"
+    kind: str  # as Drake names shapes, such as Sphere
+    sizes: tuple[float, ...]  # [m]
+    position: tuple[float, ...]  # [m]
+    directions: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class PairContract:
-    """Two geometries that may touch; None is a value that the model does not give."""
+    """Two geometries that may touch; None is a value that the model does not give, or that the engine does not have."""
 
     names: tuple[str, str]
     friction: float | None
-    stiffness: float | None  # [N/m], of both sides together
+    stiffness: float | None  # [N/m] of both sides together, where it rests
+    dissipation: float | None = None  # Hunt and Crossley's [s/m]: similar and lagged contact
+    relaxation_time: float | None = None  # [s] damping by stiffness: sap contact
+    critical_time: float | None = None  # [s] the relaxation time at which the engine's own law is damped critically
+    margin: float = 0.0  # [m] how far apart they begin to push each other
+    more: tuple[tuple[str, float], ...] = ()  # what Drake's contact does not have, by name
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,17 +274,32 @@ def _geometries(model: Model, body_names: dict[Any, str]) -> tuple[tuple[Geometr
         pose, shape = inspector.GetPoseInFrame(geometry), inspector.GetShape(geometry)
         found.append(Geometry(names[geometry], body, pose, shape))
     pairs = []
-    for a, b in sorted(inspector.GetCollisionCandidates(), key=lambda ids: (names[ids[0]], names[ids[1]])):
-        friction, stiffness = (_combined(inspector, (a, b), quantity) for quantity in ("friction", "stiffness"))
-        pairs.append(PairContract((names[a], names[b]), None if friction is None else 2 * friction, stiffness))
+    for ids in sorted(inspector.GetCollisionCandidates(), key=lambda ids: (names[ids[0]], names[ids[1]])):
+        pairs.append(_pair(inspector, ids, (names[ids[0]], names[ids[1]])))
     return tuple(found), tuple(pairs)
 
 
-def _combined(inspector: Any, pair: Sequence[Any], quantity: str) -> float | None:
-    """a b / (a + b) of the two sides: Drake's rule for stiffness, and half of its rule for friction."""
-    a, b = (proximity_property(inspector, geometry, quantity) for geometry in pair)
-    if a is None or b is None:
-        return None
+def _pair(inspector: Any, ids: Sequence[Any], names: tuple[str, str]) -> PairContract:
+    """What Drake makes of two sides: see `derivatives.contact.material`."""
+    quantities = ("friction", "stiffness", "dissipation", "relaxation_time")
+    read = {name: [proximity_property(inspector, i, name) for i in ids] for name in quantities}
+    known = {name: (float(a), float(b)) for name, (a, b) in read.items() if a is not None and b is not None}
+    friction, stiffness = (_harmonic(known[name]) if name in known else None for name in ("friction", "stiffness"))
+    dissipation = None
+    if stiffness and "dissipation" in known:
+        (k_a, k_b), (d_a, d_b) = known["stiffness"], known["dissipation"]
+        dissipation = (k_b * d_a + k_a * d_b) / (k_a + k_b)
+    return PairContract(
+        names,
+        friction=None if friction is None else 2 * friction,
+        stiffness=stiffness,
+        dissipation=dissipation,
+        relaxation_time=sum(known["relaxation_time"]) if "relaxation_time" in known else None,
+    )
+
+
+def _harmonic(sides: tuple[float, float]) -> float:
+    a, b = sides
     return a * b / (a + b) if a + b else 0.0
 
 

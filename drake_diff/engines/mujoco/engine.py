@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import Array, frozen
 from drake_diff.engines.common import PlantEngine
 from drake_diff.engines.interface import EngineContract, StepJacobian
-from drake_diff.engines.mujoco.contract import check_known, pair_index, read_contract, resting_stiffness
+from drake_diff.engines.mujoco.contract import check_known, read_contract
 from drake_diff.engines.mujoco.coordinates import MujocoCoordinates
 from drake_diff.engines.mujoco.mjcf import mjcf
 from drake_diff.exceptions import MissingDependencyError, ModelError, SimulationError
@@ -131,21 +131,17 @@ def mujoco_model(description: Description, time_step: float, path: str | Path | 
             model = mujoco.MjModel.from_xml_path(str(path))
         except ValueError as error:
             raise ModelError(f"MuJoCo cannot read {path}: {error}") from error
-    flags = mujoco.mjtDisableBit
-    check_known(model, int(flags.mjDSBL_WARMSTART | flags.mjDSBL_EULERDAMP))
+    check_known(model)
     return text, model
 
 
 def generated(description: Description, time_step: float) -> str:
-    """The MJCF whose contacts have Drake's stiffness where they rest: see `resting_stiffness`."""
-    bare = _compile(mjcf(description, time_step))
-    solref = {}
-    for pair in description.pairs:
-        i = pair_index(bare, pair.names)
-        if i >= 0 and pair.stiffness:
-            s = pair.stiffness / resting_stiffness(bare, i)
-            solref[pair.names] = (-s, -2 * float(np.sqrt(s)))  # critical, where nothing else holds the pair
-    return mjcf(description, time_step, solref)
+    """The MJCF that is compared and exported; ModelError where MuJoCo cannot have the model."""
+    bare = mjcf(description, time_step)
+    if not description.pairs:
+        return bare
+    m = _compile(bare)
+    return mjcf(description, time_step, {m.body(b).name: float(m.body_invweight0[b][0]) for b in range(m.nbody)})
 
 
 def _compile(text: str) -> Any:

@@ -16,14 +16,17 @@ SMALLEST = 2e-15
 # Constant impedance of contacts: near enough to rigid for friction to hold, far enough for a spring to be one.
 IMPEDANCE = 0.9
 FRICTION_IMPEDANCE_RATIO = 100.0  # so that what sticks creeps little
-Pair = tuple[str, str]
 
 
-def mjcf(description: Description, time_step: float, solref: Mapping[Pair, tuple[float, float]] | None = None) -> str:
-    """The MJCF text. `solref` gives pairs of geometries MuJoCo's (-stiffness, -damping); others keep MuJoCo's own.
+def mjcf(description: Description, time_step: float, inverse_masses: Mapping[str, float] | None = None) -> str:
+    """The MJCF text, whose contacts have Drake's stiffness where they rest (see `contacts`) and are damped critically.
 
-    Geometries that are no sphere, box, cylinder, capsule, ellipsoid or half space are left out, with their pairs.
-    Raises ModelError for a free body whose joint's frames are not its own and the world's.
+    `inverse_masses` are what MuJoCo takes for 1 / mass of each body, which only it knows; `generated` asks it. Without
+    them contacts have MuJoCo's own stiffness, which is another model's. Geometries that are no sphere, box, cylinder,
+    capsule, ellipsoid or half space are left out, with their pairs.
+
+    Raises:
+        ModelError: a free body whose joint's frames are not its own and the world's.
     """
     root = Element("mujoco", model="from_drake")
     smallest = row(SMALLEST)
@@ -35,7 +38,7 @@ def mjcf(description: Description, time_step: float, solref: Mapping[Pair, tuple
     bodies = {"world": SubElement(root, "worldbody")}
     for link in description.links:
         bodies[link.body] = _add_link(bodies[link.parent], link)
-    known = {g.name for g in description.geometries if _add_geometry(bodies[g.body], g)}
+    body_of = {g.name: g.body for g in description.geometries if _add_geometry(bodies[g.body], g)}
     actuators, contacts = SubElement(root, "actuator"), SubElement(root, "contact")
     for i, (name, joint) in enumerate(zip(description.inputs, description.actuated, strict=True)):
         motor = SubElement(actuators, "motor", name=name, joint=joint, gear="1")
@@ -44,13 +47,14 @@ def mjcf(description: Description, time_step: float, solref: Mapping[Pair, tuple
             motor.set("forcelimited", "true")
             motor.set("forcerange", row([-limit, limit]))
     for pair in description.pairs:
-        if set(pair.names) <= known:
+        if set(pair.names) <= body_of.keys():
             element = SubElement(contacts, "pair", geom1=pair.names[0], geom2=pair.names[1], condim="3")
             element.set("solimp", row([IMPEDANCE, IMPEDANCE, 0.001]))
             if pair.friction is not None:
                 element.set("friction", row([pair.friction] * 2 + [0.0] * 3))
-            if solref and pair.names in solref:
-                element.set("solref", row(solref[pair.names]))
+            if inverse_masses and pair.stiffness:
+                s = pair.stiffness * (1 - IMPEDANCE) * sum(inverse_masses[body_of[name]] for name in pair.names)
+                element.set("solref", row([-s, -2 * np.sqrt(s)]))
     return xml_text(root)
 
 
