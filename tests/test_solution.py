@@ -11,9 +11,12 @@ from helpers.plants import block
 from helpers.table import each_row
 
 import drake_diff as dd
+from drake_diff.artifact import measure
 from drake_diff.exceptions import InputError
+from drake_diff.optimize.replay import judged_replay, told_of_controls
 
 METHODS = ("collocation", "shooting", "ilqr")
+OPEN, CLOSED = "open loop", "TVLQR"
 N, H = 10, 0.1
 MOVED = 1e-3
 
@@ -241,3 +244,55 @@ def test_what_a_measure_may_depend_on_is_not_told(name):
 @pytest.mark.parametrize("method", METHODS)
 def test_what_the_verdict_measured_is_not_measured_again(method):
     assert {"cost", "defects", "plan", "replays"} <= vars(solved.__wrapped__(method)).keys()
+
+
+def of_replays(good):
+    """What is told of a discrete plan of which the replays in `good` (by control) hold."""
+    s = solved("ilqr")
+    found = []
+    for variant in ("in steps of 0.1 s", "in steps of 0.05 s"):
+        for control in (OPEN, CLOSED):
+            failures = () if control in good else (f"x ends far off {variant} by {control}",)
+            found.append(dataclasses.replace(s.replays[0], variant=variant, control=control, failures=failures))
+    return told_of_controls(s.plan, found), judged_replay(s.plan, found)
+
+
+def test_a_plan_that_holds_under_every_control_says_so():
+    told, shown = of_replays({OPEN, CLOSED})
+    assert told == "on the plant open loop and under TVLQR"
+    assert shown.control == OPEN
+
+
+def test_where_nothing_holds_there_is_no_motion_that_was_judged():
+    assert of_replays(set())[1] is None
+
+
+@each_row("holding, failing", [(OPEN, CLOSED), (CLOSED, OPEN)])
+def test_the_control_that_does_not_hold_is_in_the_first_sentence_with_why(holding, failing):
+    words = {OPEN: "open loop", CLOSED: "under TVLQR"}
+    told, shown = of_replays({holding})
+    why = f"in steps of 0.1 s, x ends far off in steps of 0.1 s by {failing}"
+    assert told == f"on the plant {words[holding]}, not {words[failing]}: {why}"
+    assert shown.control == holding
+
+
+def test_a_success_that_only_feedback_holds_says_so_wherever_it_is_told(tmp_path):
+    """A cart-pole swung up: what half a step changes grows on the way up, and open loop ends elsewhere."""
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
+    effort = dd.QuadraticCost(R=[[1.0]])
+    problem = dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=100, running_cost=effort)
+    solution = dd.solve(problem)
+    assert solution.success, solution.message
+    assert not any(r.holds for r in solution.replays if r.control == OPEN)
+    first = solution.message.split(";")[0]
+    assert "on the plant under TVLQR, not open loop: in steps of 0.02 s, hinge_w ends" in first
+    assert "converged under TVLQR, not open loop" in str(solution)
+    assert "not open loop" in repr(solution)
+    record = dd.save(solution, tmp_path / "run")
+    assert record.sentence == solution.message
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "motion TVLQR, in steps of 0.01 s, in which the plan holds; open loop it does not" in page
+    shown, control = measure(solution).shown
+    assert control == "TVLQR, in steps of 0.01 s"
+    assert shown is solution.judged_replay.motion
+    assert np.abs(shown.xs[-1] - [1, np.pi, 0, 0]).max() < 0.2  # the motion that is drawn is the one that arrives

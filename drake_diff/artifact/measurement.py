@@ -111,6 +111,14 @@ class Measurement(ShowsItsRepr):
         """The unit of the worst of all states: "rad or rad/s"."""
         return _unit((*self.positions, *self.velocities))
 
+    @property
+    def shown(self) -> tuple[Rollout | None, str]:
+        """The motion that the verdict rests on, and what it is; the open-loop one where none holds."""
+        judged = self.solution.judged_replay
+        if judged is None or judged.motion is None or judged.motion is self.motion:
+            return self.motion, "open loop"
+        return judged.motion, f"{judged.control}, {judged.variant}"
+
     def __str__(self) -> str:
         broken = [m.name for m in (*self.metrics, *self.invariants) if m.verdict in ("fail", "undecided")]
         decided = sum(m.verdict != "info" for m in (*self.metrics, *self.invariants))

@@ -23,16 +23,19 @@ def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str,
     Plain dynamics have nothing to draw in 3D, and so no page `replay`. The bytes are the same for the same solution,
     but for the paragraph of wall-clock times.
     """
-    plots, view = list(plots_of(m)), ""
+    plots, view, ghosts = list(plots_of(m)), "", None
+    motion, control = m.shown
     if m.solution.problem.has_model:
-        xs, ghosts = m.xs, None
-        if m.motion is None:  # the plan alone; states of it that are not finite are drawn at x0
+        times, xs = m.times, m.xs
+        if motion is None:  # the plan alone; states of it that are not finite are drawn at x0
             xs = np.where(np.all(np.isfinite(xs), axis=1)[:, None], xs, m.solution.problem.x0)
-        else:  # beside a plan in continuous time
-            xs = m.motion.xs
-            ghosts = {"plan": (m.xs, BLUE)} if m.solution.transcribed is not None else None
-        contacts = () if m.motion is None else m.motion.contacts
-        scene = scene_of(m.solution.problem.model, m.times, xs, contacts=contacts, ghosts=ghosts)
+        else:  # beside a plan that is not the motion itself
+            times, xs = motion.times, motion.xs
+            planned = m.solution.plan.sample(_parts(m))[0]
+            drawn = bool(np.all(np.isfinite(planned))) and not np.array_equal(planned, xs)
+            ghosts = {"plan": (planned, BLUE)} if drawn else None
+        contacts = () if motion is None else motion.contacts
+        scene = scene_of(m.solution.problem.model, times, xs, contacts=contacts, ghosts=ghosts)
         write_replay(replay, scene, title=f"{record['name']}: {m.solution.status.value}")
         view = replay.read_text(encoding="utf-8")
     data = page_data(float(m.times[-1]), plots, m.solution.certificates)
@@ -43,9 +46,10 @@ def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str,
         data=data,
         view=view,
         cost=m.solution.cost,
-        replayed=m.motion is not None,
-        has_plan=m.solution.transcribed is not None,
-        has_contacts=m.motion is not None and any(m.motion.contacts),
+        replayed=motion is not None,
+        control=control,
+        has_plan=ghosts is not None,
+        has_contacts=motion is not None and any(motion.contacts),
     )
 
 
@@ -54,16 +58,17 @@ def plots_of(m: Measurement) -> Iterator[Plot]:
     yield from _state_plots(m, "positions", 0, m.positions)
     yield from _state_plots(m, "velocities", len(m.positions), m.velocities)
     yield from _input_plots(m)
-    if m.motion is not None:
-        times, energy = m.motion.times, Line("total", m.motion.energy)
-        parts = [Line("kinetic", m.motion.kinetic_energy), Line("potential", m.motion.potential_energy), energy]
+    motion = m.shown[0]
+    if motion is not None:
+        times, energy = motion.times, Line("total", motion.energy)
+        parts = [Line("kinetic", motion.kinetic_energy), Line("potential", motion.potential_energy), energy]
         yield Plot("energy", "J", times, parts)
         note = "what neither actuators nor damping account for: the time stepping's error, and what contact takes"
-        yield Plot("unexplained energy", "J", times, [Line("error", m.motion.energy_error)], note=note)
+        yield Plot("unexplained energy", "J", times, [Line("error", motion.energy_error)], note=note)
         note = "nothing can touch"
         if math.isfinite(m.penetration_limit):
             note = f"limit {m.penetration_limit:.3g} m, a quarter of {m.thinnest}"
-        overlap = [Line("largest overlap", m.motion.penetration)]
+        overlap = [Line("largest overlap", motion.penetration)]
         yield Plot("penetration", "m", times, overlap, limits=(None, m.penetration_limit), note=note)
     yield from _replay_plots(m)
     yield from _solver_plots(m)
@@ -71,7 +76,8 @@ def plots_of(m: Measurement) -> Iterator[Plot]:
 
 def _state_plots(m: Measurement, title: str, start: int, columns: Sequence[Column]) -> Iterator[Plot]:
     """The columns of one unit together; those of plain dynamics, whose units are not known, are "states"."""
-    motion = m.integrated if m.motion is None else m.motion.xs
+    shown = m.shown[0]
+    motion = m.integrated if shown is None else shown.xs[:: _parts(m)]
     differs = motion is not None and not np.array_equal(motion, m.xs)
     for unit in dict.fromkeys(c.unit for c in columns):
         alike = [(start + i, c) for i, c in enumerate(columns) if c.unit == unit]
@@ -84,14 +90,20 @@ def _state_plots(m: Measurement, title: str, start: int, columns: Sequence[Colum
             yield Plot(title if m.velocities else "states", unit, m.times, lines, limits=limits)
 
 
+def _parts(m: Measurement) -> int:
+    """How many steps of the motion that is shown make one of the plan's intervals."""
+    motion = m.shown[0]
+    return 1 if motion is None else (len(motion.xs) - 1) // (len(m.xs) - 1)
+
+
 def _input_plots(m: Measurement) -> Iterator[Plot]:
     """A plot for each input: the limits of two differ as a rule."""
-    held = len(m.us) < len(m.times)
+    held, motion = len(m.us) < len(m.times), m.shown[0]
     for i, c in enumerate(m.inputs):
-        planned = Line("plan" if m.motion is not None else c.name, _as_long(m.us[:, i], m.times), held=held)
+        planned = Line("plan" if motion is not None else c.name, _as_long(m.us[:, i], m.times), held=held)
         lines = [planned]
-        if m.motion is not None:
-            applied = m.motion.us[:, i]
+        if motion is not None:
+            applied = motion.us[:: _parts(m), i]
             same = held and np.array_equal(applied, m.us[:, i])
             ours = Line(c.name, _as_long(applied, m.times), held=True)
             lines = [ours] if same else [ours, replace(planned, dashed=True)]

@@ -57,6 +57,7 @@ def write_trace(path: Path, m: Measurement, attachments: Mapping[str, tuple[str,
         "model": problem.name,
         "time_axis": "simulated; tables: 1 ms per row",
         "motion": "missing: it could not be stepped" if m.motion is None else "the discrete plant, open loop",
+        "verdict_rests_on": m.shown[1],
     }
     shown = Shown(problem.model, solution.time_step, m.xs, m.motion) if problem.has_model else None
     # The solver's tables and the plan are made before the parameters are applied: its replays use the plant too.

@@ -9,7 +9,7 @@ from drake_diff.exceptions import GradientError
 from drake_diff.model.contact import penetration
 from drake_diff.model.step import set_state
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, NlpResult, Outcome
-from drake_diff.optimize.replay import broken_variants
+from drake_diff.optimize.replay import broken_variants, told_of_controls
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
 from drake_diff.optimize.transcription.collocation import Collocated, violation_between_nodes
 
@@ -32,6 +32,8 @@ def judged(draft: Solution, result: NlpResult) -> Solution:
     if not complaints and draft.problem.has_model:
         complaints += broken_variants(draft.plan, draft.replays)
     status = Status.CONVERGED_NOT_VERIFIED if complaints else Status.CONVERGED
+    if not complaints and draft.problem.has_model:
+        complaints = [told_of_controls(draft.plan, draft.replays)]
     return ended(draft, status, "; ".join([*complaints, *[result.note] * bool(result.note)]), **fields)
 
 

@@ -132,15 +132,54 @@ def _holds(found: Sequence[Replay]) -> bool:
     return any(r.holds for r in found)
 
 
-def broken_variants(plan: Plan, found: Sequence[Replay]) -> Iterator[str]:
-    """A clause for each variant of the plant in which the plan does not hold, whatever the control."""
+def _deciding(plan: Plan, found: Sequence[Replay]) -> list[str]:
+    """The variants in which the plan has to hold."""
     variants = list(dict.fromkeys(r.variant for r in found))
     if plan.continuous:
         variants = variants[-2:] if len(variants) > 1 else []  # the two finest; one alone says nothing
-    for variant in variants:
+    return variants
+
+
+def broken_variants(plan: Plan, found: Sequence[Replay]) -> Iterator[str]:
+    """A clause for each variant of the plant in which the plan does not hold, whatever the control."""
+    for variant in _deciding(plan, found):
         tried = [r for r in found if r.variant == variant]
         if not _holds(tried):
             yield f"replayed {variant} it does not hold: " + "; ".join(f"{r.control}, {r.failures[0]}" for r in tried)
+
+
+def told_of_controls(plan: Plan, found: Sequence[Replay]) -> str:
+    """Under which control a plan that holds does so, and under which it does not; empty where nothing was replayed."""
+    if not found:
+        return ""
+    decides = _deciding(plan, found) or [found[0].variant]
+    controls = list(dict.fromkeys(r.control for r in found))
+    good = [c for c in controls if all(r.holds for r in found if r.control == c and r.variant in decides)]
+    if not good:
+        held = (r for r in found if r.holds and r.variant in decides)
+        return "on the plant, " + ", ".join(f"{r.variant} {_words(r.control)}" for r in held) + "; nowhere under both"
+    told = "on the plant " + " and ".join(map(_words, good))
+    for control in controls:
+        failed = [r for r in found if r.control == control and not r.holds]
+        if control not in good:
+            told += f", not {_words(control)}: {failed[0].variant}, {failed[0].failures[0]}"
+        elif failed:  # a collocated plan in steps that are too coarse for it
+            told += f"; {_words(control)} {failed[0].variant} it does not: {failed[0].failures[0]}"
+    return told
+
+
+def judged_replay(plan: Plan, found: Sequence[Replay]) -> Replay | None:
+    """The motion that a verdict rests on: open loop where that holds, else under TVLQR; None where neither does."""
+    decides = _deciding(plan, found)
+    for control in dict.fromkeys(r.control for r in found):
+        tried = [r for r in found if r.control == control]
+        if all(r.holds for r in tried if r.variant in decides):
+            return next((r for r in tried if r.holds), None)
+    return None
+
+
+def _words(control: str) -> str:
+    return control if control == "open loop" else f"under {control}"
 
 
 def _replay_in(

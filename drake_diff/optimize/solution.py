@@ -22,7 +22,7 @@ from drake_diff.motion.rollout import Rollout, roll_states
 from drake_diff.optimize.optimality import Optimality, final_state_norms, optimality
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration
-from drake_diff.optimize.replay import Plan, Replay, held, replays
+from drake_diff.optimize.replay import Plan, Replay, held, judged_replay, replays
 from drake_diff.optimize.shooting import ShootingVariables
 from drake_diff.optimize.transcription.collocation import Collocated, collocated
 
@@ -57,7 +57,7 @@ class Status(enum.Enum):
 
 
 _SENTENCES = {
-    Status.CONVERGED: "the solver converged, and every measure that was taken again holds",
+    Status.CONVERGED: "the solver converged and the plan holds",
     Status.CONVERGED_NOT_VERIFIED: "the solver stopped at a solution, but a measure or a certificate does not hold",
     Status.ITERATION_LIMIT: "the iteration limit came first; raise max_iterations or start from a better guess",
     Status.TIME_LIMIT: "the time limit came first; raise time_limit or start from a better guess",
@@ -138,7 +138,10 @@ class Solution(ShowsItsRepr):
 
     def __str__(self) -> str:
         measures = f"cost {self.cost:.6g}, defect {self.defect:.2g}, goal error {self.goal_error:.2g}"
-        return f"{self.problem.name} by {self.method}: {self.status.value}, {measures}"
+        control = ""
+        if self.success and "replays" in vars(self) and (shown := self.judged_replay) is not None:
+            control = "" if shown.control == "open loop" else f" under {shown.control}, not open loop"
+        return f"{self.problem.name} by {self.method}: {self.status.value}{control}, {measures}"
 
     def __repr__(self) -> str:
         how = ", ".join(name for name in (self.scheme, self.solver) if name not in ("step", ""))
@@ -380,6 +383,11 @@ class Solution(ShowsItsRepr):
         None of plain dynamics, which have no such variants.
         """
         return replays(self.plan) if self.problem.has_model else ()
+
+    @property
+    def judged_replay(self) -> Replay | None:
+        """The replay that a success rests on: open loop where that holds, else under TVLQR; None where neither does."""
+        return judged_replay(self.plan, self.replays) if self.problem.has_model else None
 
     @cached_property
     def half_step_error(self) -> float:
