@@ -114,6 +114,9 @@ def test_a_push_that_drakes_solver_does_not_notice():
     exact = h / (1 + 0.5 * 9.81 * h / 1e-4)
     assert slope(lambda u: dd.step(model, x, [u])[2], 0.0, 5e-6) == 0.0
     assert slope(lambda u: polished(model, x, [u])[2], 0.0, 5e-6) == pytest.approx(exact, rel=1e-9)
+    d = dd.differentiate_step(model, x, [0.0], method="finite_difference")
+    assert d.reason == "asked for; of the step solved to rounding"
+    assert d.B[2, 0] == pytest.approx(exact, abs=1e-10)  # rounding of 1e-17 / 3e-7
 
 
 def slide(*, limits=None, gains=None, effort=np.inf, damping=0.0, mass=2.0):
@@ -246,6 +249,16 @@ def test_a_box_in_point_contact_which_autodiff_does_not_have():
     x[6], x[10:13] = 0.06, [0.5, 0.1, -0.1]
     assert np.abs(polished(model, x) - dd.step(model, x)).max() < 1e-6
     assert len(dd.rollout(model, x, num_steps=1).contacts[0]) == 1
+    d = dd.differentiate_step(model, x)
+    assert d.method == "finite_difference"
+    assert d.reason.endswith("of the step solved to rounding")
+
+
+def test_differences_say_where_the_step_is_not_had_to_rounding():
+    model, x = pair(Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), hydroelastic=True, height=0.095)
+    x[:4] = np.array([1, 0.02, 0.03, 0.1]) / np.linalg.norm([1, 0.02, 0.03, 0.1])
+    d = dd.differentiate_step(model, x, method="finite_difference")
+    assert d.reason == "asked for; of Drake's own step, hydroelastic contact acts"
 
 
 # ---- many at once, and parameters ------------------------------------------------------------------------------------

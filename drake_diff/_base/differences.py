@@ -60,15 +60,15 @@ def richardson(central: Array) -> Array:
     return central[1:] + (central[1:] - central[:-1]) / (RATIO_SQUARED - 1)
 
 
-def plateau(f: Function, size: int, *, at_zero: Array) -> Array:
+def plateau(f: Many, size: int) -> Array:
     """(m, n) the derivative of `f` at 0, by the step sizes at which its difference quotients depend least on the step.
 
     Each entry is judged on its own, as no one step suits all: a solver leaves small changes unsolved, and large ones
     change the contact. It is the middle one of the three neighbouring Richardson values that lie closest together.
     """
-    central = np.array([central_differences(f, size, h, at_zero=at_zero) for h in SWEEP])
-    values = richardson(central)
+    sweep = sweep_of(f, size, SWEEP)
+    values = richardson((sweep.forward + sweep.backward) / 2)
     windows = np.array([values[s : s + 3] for s in range(len(values) - 2)])
-    rounding = ROUNDING * np.maximum(1.0, np.abs(at_zero))[None, :, None] / np.array(SWEEP[2:-1])[:, None, None]
+    rounding = ROUNDING * np.maximum(1.0, np.abs(sweep.centre))[None, :, None] / np.array(SWEEP[2:-1])[:, None, None]
     best = np.argmin(windows.max(axis=1) - windows.min(axis=1) + rounding, axis=0)
     return np.asarray(np.take_along_axis(windows[:, 1], best[None], axis=0)[0])

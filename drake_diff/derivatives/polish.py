@@ -45,6 +45,7 @@ class Polished:
 
     x_next: Array  # (N, nx)
     drake: Array  # (N, nx) where Drake's own steps lead
+    acts: NDArray[np.bool_]  # (N,) whether an impulse may act, so that Drake's solver has something to solve
     left: Array  # (N,) what Drake's own leaves of the momentum, which is to be at most 1e-6; NaN where not known
     refused: Mapping[int, Refusal]
 
@@ -72,7 +73,7 @@ def polished_steps(
     times = np.array([vector.time_step(row) for row in values])
     if np.all(times == model.time_step):
         return _polish(model, vector, xs, us, values)
-    x_next, drake, left = np.empty_like(xs), np.empty_like(xs), np.empty(len(xs))
+    x_next, drake, left, acts = np.empty_like(xs), np.empty_like(xs), np.empty(len(xs)), np.zeros(len(xs), dtype=bool)
     refused: dict[int, Refusal] = {}
     for h in np.unique(times):
         which = np.flatnonzero(times == h)
@@ -82,9 +83,9 @@ def polished_steps(
         else:
             with applied(vector.at(points[2][0])) as other:
                 part = _polish(other, vector.at(points[2][0]), *points)
-        x_next[which], drake[which], left[which] = part.x_next, part.drake, part.left
+        x_next[which], drake[which], left[which], acts[which] = part.x_next, part.drake, part.left, part.acts
         refused |= {int(which[k]): why for k, why in part.refused.items()}
-    return Polished(x_next, drake, left, refused)
+    return Polished(x_next, drake, acts, left, refused)
 
 
 def solves_the_step(model: Model, x: Array, u: Array, end: Array) -> bool:
@@ -130,16 +131,18 @@ def _polish(model: Model, vector: ParameterVector, xs: Array, us: Array, values:
         if values is not None:
             vector.write(model.double, vector.values)
     x_next, left = np.full_like(xs, np.nan), np.full(len(xs), np.nan)
+    acts = np.zeros(len(xs), dtype=bool)
     if why:
-        return Polished(x_next, drake, left, {k: Refusal(why) for k in range(len(xs))})
+        return Polished(x_next, drake, acts, left, {k: Refusal(why) for k in range(len(xs))})
     if read:
         which = np.array([r.step for r in read], dtype=np.intp)
         problems = _problems(model, form, read, xs[which], us[which])
+        acts[which] = problems.taking_part().any(axis=1)
         v_next, left[which], whys = _solved(problems, drake[which, model.nq :])
         refused |= {int(which[i]): Refusal(why) for i, why in whys.items()}
         x_next[which] = _states(model, xs[which], v_next)
     x_next[list(refused)] = np.nan
-    return Polished(x_next, drake, left, refused)
+    return Polished(x_next, drake, acts, left, refused)
 
 
 def _unknown(model: Model, form: Form) -> str:

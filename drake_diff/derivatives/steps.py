@@ -1,7 +1,7 @@
 """N discrete steps of a model, the one argument of every source of derivatives; and what a source answers."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -99,10 +99,12 @@ class Jacobians:
     """(N, nx, nx + nu + np) the derivatives of N steps by [x; u; parameters].
 
     `refused` has the steps that the source does not know, and why; what stands in `values` for them means nothing.
+    `notes` has what there is to say of others.
     """
 
     values: Array
     refused: Mapping[int, DrakeDiffError]
+    notes: Mapping[int, str] = field(default_factory=dict)
 
 
 class Source(Protocol):
