@@ -11,10 +11,12 @@ from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 
 import drake_diff as dd
+from drake_diff.certificates import slopes
 from drake_diff.certificates.refinement import REFINEMENTS, beside_slopes, judge_levels
 from drake_diff.certificates.slopes import Direction, Motions, Slope, directions
-from drake_diff.exceptions import CertificateError, InputError, ModelError
+from drake_diff.exceptions import CertificateError, InputError, ModelError, SimulationError
 from drake_diff.model.parameters import select
+from drake_diff.motion import continuous
 from drake_diff.motion.continuous import ContinuousMotion
 
 
@@ -179,6 +181,26 @@ def test_where_there_is_no_continuous_motion_it_is_said_why(tmp_path):
     assert refinement.converged.all()
 
 
+def test_a_motion_that_is_too_stiff_for_error_control_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(continuous, "EVALUATIONS", 300)
+    model = Bounce(1e4, relaxation_time=0.01).model(tmp_path / "bouncer.sdf", "sap", 2e-3)
+    with pytest.raises(SimulationError, match="too stiff: 300 evaluations do not reach its end"):
+        ContinuousMotion(model).states(np.array(DROP), np.zeros((250, 0)))
+    monkeypatch.undo()
+    monkeypatch.setattr(slopes, "ALL_EVALUATIONS", 100)
+    us, nothing = np.zeros((50, 0)), select(model, ())
+    motions = Motions(model, np.array(DROP), us, height, nothing, 4)
+    assert "evaluations are more than 1e+02" in str(motions.slope(next(directions(model, np.array(DROP), us, nothing))))
+
+
+@each_row("kind, converges", [("position [rad]", True), ("position [m]", False)])
+def test_an_entry_is_judged_by_the_size_of_those_of_its_kind(kind, converges):
+    """0.02, 0.01 and 0.005 are an error of first order that matters little beside ones, and all of it alone."""
+    values = np.array([[1.0, 0.02], [1.0, 0.01], [1.0, 0.005]])
+    found = judge_levels("time step", (1.0, 0.5, 0.25), ["a", "b"], values, ["position [rad]", kind])
+    assert found.converged.tolist() == [True, converges]
+
+
 @each_row(
     "secant, continuous, spread, disagree",
     [
@@ -194,7 +216,7 @@ def test_where_there_is_no_continuous_motion_it_is_said_why(tmp_path):
     ],
 )
 def test_a_gradient_of_one_is_compared_with_the_slopes(secant, continuous, spread, disagree):
-    levels = judge_levels("time step", (1.0, 0.5, 0.25), ["z"], np.ones((3, 1)), 1, (5, 0))
+    levels = judge_levels("time step", (1.0, 0.5, 0.25), ["z"], np.ones((3, 1)), ["position [m]"])
     assert levels.converged.all()
     slope = Slope(Direction("z", slice(0, 1), 1.0, np.ones(1), 1.0), secant, 0.1, continuous, spread, ())
     found = beside_slopes(levels, [slope])

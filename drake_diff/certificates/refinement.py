@@ -60,13 +60,14 @@ class Refinement:
     columns: tuple[str, ...]
     values: Array  # (3, n)
     limit: Array  # (n,)
+    scale: Array  # (n,) what the errors of each entry are parts of
     converged: NDArray[np.bool_]  # (n,)
     compared: tuple[Compared, ...] = ()
 
     @property
     def worst(self) -> int:
         """The column whose first value is furthest from its limit, those that have converged last."""
-        distance = np.abs(self.values[0] - self.limit) / np.maximum(np.abs(self.values).max(axis=0), 1e-300)
+        distance = np.abs(self.values[0] - self.limit) / np.maximum(self.scale, 1e-300)
         return int(np.argmax(distance + 1e6 * ~self.converged))
 
     def __str__(self) -> str:
@@ -134,7 +135,7 @@ def refine_by_time_step(
     """The gradient `first` (n,) at h, at h/2 and h/4, beside the slopes of the loss itself."""
     values = np.array([first, *at_finer_steps(model, x0, us, loss, vector, method)])
     levels = tuple(model.time_step / m for m in REFINEMENTS)
-    found = judge_levels("time step", levels, columns, values, tangent_space(model).size, us.shape)
+    found = judge_levels("time step", levels, columns, values, kinds_of(model, len(us), vector))
     motions = Motions(model, x0, us, loss, vector, REFINEMENTS[-1])
     compared = [motions.slope(direction) for direction in directions(model, x0, us, vector)]
     return beside_slopes(found, compared)
@@ -146,30 +147,39 @@ def refine_by_stiffness(
     """The gradient `first` (n,) at k, at 4 k and 16 k."""
     values = np.array([first, *in_stiffer_contact(model, x0, us, loss, vector, method)])
     levels = tuple(map(float, STIFFENING))
-    return judge_levels("stiffness, times", levels, columns, values, tangent_space(model).size, us.shape)
+    return judge_levels("stiffness, times", levels, columns, values, kinds_of(model, len(us), vector))
+
+
+def kinds_of(model: Model, count: int, vector: ParameterVector) -> list[str]:
+    """(n,) the kind of each column of a gradient of `count` steps: what is of one kind has one unit."""
+    contract, space = model.contract, tangent_space(model)
+    units = [f"position [{term.unit}]" for term in contract.positions]
+    units += [f"velocity [{term.unit}]" for term in contract.velocities]
+    kinds = [unit for i, unit in enumerate(units) if i not in space.quaternions]
+    return kinds + count * [f"input [{term.unit}]" for term in contract.inputs] + list(vector.names)
 
 
 def judge_levels(
-    by: str, levels: tuple[float, ...], columns: Sequence[str], values: Array, first: int, shape: tuple[int, ...]
+    by: str, levels: tuple[float, ...], columns: Sequence[str], values: Array, kinds: Sequence[str]
 ) -> Refinement:
-    """Which columns of `values` (3, n) converge; from `first` on are those by the inputs, of `shape` (N, nu).
+    """Which columns of `values` (3, n) converge.
 
     An error of first order makes the changes d1 and d2 halve, and the limit is g3 + d2. An entry has converged if
-    |d2| <= 0.75 |d1| and its first value is within 10 % of the limit, or if both changes are below 1 %.
+    |d2| <= 0.75 |d1| and its first value is within 10 % of the limit, or if both changes are below 1 %: of the largest
+    of its own values, or of the root mean square of all entries of its kind, as the others matter more than it then.
     """
     d1, d2 = np.diff(values, axis=0)
     limit = values[2] + d2
     size = np.maximum(np.abs(values).max(axis=0), np.abs(limit))
     scale = np.maximum(size, NEGLIGIBLE * float(size.max(initial=0.0)))
-    inputs = slice(first, first + shape[0] * shape[1])
-    if shape[1]:  # one input's entries are one function of time, which may pass through zero
-        by_input = size[inputs].reshape(shape)
-        scale[inputs] = np.maximum(by_input, np.sqrt((by_input**2).mean(axis=0))).ravel()
+    for kind in set(kinds):
+        alike = np.array(kinds) == kind
+        scale[alike] = np.maximum(scale[alike], np.sqrt((size[alike] ** 2).mean()))
     contracts = np.abs(d2) <= CONTRACTION * np.abs(d1)
     still = np.maximum(np.abs(d1), np.abs(d2)) <= STILL * scale
     near = np.abs(values[0] - limit) <= TRUSTED * scale
     converged = ((contracts & near) | still) & np.all(np.isfinite(values), axis=0)
-    return Refinement(by, levels, tuple(columns), frozen(values), frozen(limit), converged)
+    return Refinement(by, levels, tuple(columns), frozen(values), frozen(limit), frozen(scale), converged)
 
 
 def beside_slopes(found: Refinement, slopes: Sequence[Slope]) -> Refinement:
@@ -177,11 +187,11 @@ def beside_slopes(found: Refinement, slopes: Sequence[Slope]) -> Refinement:
 
     The gradient at the first level has to be within 10 % of both; of inputs at all times, of the sum of their sizes.
     """
-    sizes, converged, compared = np.abs(found.values).max(axis=0), found.converged.copy(), []
+    converged, compared = found.converged.copy(), []
     for slope in slopes:
         columns = slope.direction.columns
         along = found.values[:, columns].sum(axis=1)
-        size = max(float(sizes[columns].sum()), NEGLIGIBLE * float(sizes.max(initial=0.0)))
+        size = float(found.scale[columns].sum())
         disagree = []
         if np.isfinite(slope.secant) and abs(along[0] - slope.secant) > TRUSTED * max(size, abs(slope.secant)):
             disagree.append("the slope over many steps' way")

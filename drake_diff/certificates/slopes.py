@@ -29,6 +29,7 @@ TEETH = 8.0  # to each side
 ALIKE = 30.0  # what needs so many times the narrowest tooth's width is hardly moved by the direction
 WIDEST = 0.25  # of a state's or a parameter's own scale
 WIDTH, NARROW = 1e-3, 1e-4  # of the scale, where no tooth is known: of the line, and of the continuous motion
+ALL_EVALUATIONS = 2_000_000  # of the equations of motion in continuous time for all directions, about a minute
 PILOT = 1e-6  # of the scale: how far a direction is followed to see what it moves
 
 
@@ -99,6 +100,7 @@ class Motions:
         except DrakeDiffError as error:
             missing.append(f"no line through the loss: {error}")
         try:
+            self._check_continuous()
             widths = np.array([WIDTH, NARROW]) * direction.scale
             over = [(self._continuous(direction, w) - self._continuous(direction, -w)) / (2 * w) for w in widths]
             continuous, spread = over[1], abs(over[1] - over[0])
@@ -122,6 +124,23 @@ class Motions:
         x0, us, values = self._at(direction, s)
         with applied(values) as model:
             return evaluate_loss(self.loss, ContinuousMotion(model).states(x0, us), us)
+
+    def _check_continuous(self) -> None:
+        """Raise SimulationError or ModelError where the motion itself has no continuous form, or a too long one."""
+        if self._why_not_continuous:
+            raise SimulationError(self._why_not_continuous)
+
+    @cached_property
+    def _why_not_continuous(self) -> str:
+        count = 4 * (tangent_space(self.model).size + self.us.shape[1] + len(self.vector.values))
+        try:
+            with applied(self.vector) as model:
+                motion = ContinuousMotion(model)
+                motion.states(self.x0, self.us)
+        except DrakeDiffError as error:
+            return str(error)
+        taken = count * motion.used
+        return "" if taken <= ALL_EVALUATIONS else f"{taken:.2g} evaluations are more than {ALL_EVALUATIONS:.0e}"
 
     def _secant(self, direction: Direction, width: float) -> float:
         """By least squares of an odd cubic through the loss at `FRACTIONS` of the width."""

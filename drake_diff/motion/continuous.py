@@ -63,6 +63,7 @@ class ContinuousMotion:
         if any(is_driven(model.diagram, model.path, port) for port in ports):
             raise ModelError("forces that the diagram adds have none here")
         self.model, self.twin = model, model.double
+        self.used = 0  # evaluations of the equations of motion by the last call of `states`
         self.touches = bool(contact.collision_pairs)
         self.is_sap = contact.approximation == "sap"
         self.actuation = plant.MakeActuationMatrix()
@@ -77,12 +78,14 @@ class ContinuousMotion:
 
         SimulationError where it has no end: it reaches a joint limit, or is too stiff for `EVALUATIONS`.
         """
-        xs, dt, left = np.empty((len(us) + 1, self.model.nx)), self.model.time_step, EVALUATIONS
-        xs[0] = x0
+        xs, dt = np.empty((len(us) + 1, self.model.nx)), self.model.time_step
+        xs[0], self.used = x0, 0
         for k, u in enumerate(us):
             force = self.actuation @ np.clip(u, -self.limits, self.limits)
-            xs[k + 1], dt, used = integrate(partial(self.rates, force), xs[k], self.model.time_step, dt, left)
-            left -= used
+            xs[k + 1], dt, used = integrate(
+                partial(self.rates, force), xs[k], self.model.time_step, dt, EVALUATIONS - self.used
+            )
+            self.used += used
             q = xs[k + 1, : self.model.nq]
             if np.any(q < self.lower) or np.any(q > self.upper):
                 raise SimulationError("it reaches a joint limit, which has none")

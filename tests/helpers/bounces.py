@@ -86,12 +86,13 @@ class Bounce:
             left -= dt
         return RADIUS - x, -v
 
-    def slopes(self, approximation, start, duration, width=1e-5):
-        """d height / d (height, rate) of the start, and how far they are from those over ten times the width."""
-        found = []
+    def slopes(self, approximation, start, duration, loss=lambda z, v: z, width=1e-5):
+        """d loss(height, rate) / d (height, rate) of the start; and how far those over ten times `width` are."""
+
+        def end(z, v):
+            return loss(*self.end(approximation, (z, v), duration))
+
+        (z, v), found = start, []
         for w in (width, 10 * width):
-            z, v = start
-            by_z = self.end(approximation, (z + w, v), duration)[0] - self.end(approximation, (z - w, v), duration)[0]
-            by_v = self.end(approximation, (z, v + w), duration)[0] - self.end(approximation, (z, v - w), duration)[0]
-            found.append((by_z / (2 * w), by_v / (2 * w)))
+            found.append(((end(z + w, v) - end(z - w, v)) / (2 * w), (end(z, v + w) - end(z, v - w)) / (2 * w)))
         return found[0], max(abs(a - b) for a, b in zip(*found, strict=True))
