@@ -1,7 +1,9 @@
 """`verify`: whatever is changed in a run directory is found, a lie in a whole one too, and nothing else is refused."""
 
 import dataclasses
+import functools
 import json
+import math
 import os
 import random
 import shutil
@@ -10,16 +12,20 @@ import subprocess
 import sys
 import time
 from hashlib import sha256
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.models import MODELS, ROOT
 from helpers.table import each_row
+from mcap.reader import NonSeekingReader
+from mcap.writer import Writer
 
 import drake_diff as dd
 import drake_diff.artifact.save as evidence
 from drake_diff.artifact import measure
+from drake_diff.artifact.differences import is_near, is_near_text
 from drake_diff.artifact.listing import list_runs
 from drake_diff.artifact.save import begin
 from drake_diff.artifact.trace import write_trace
@@ -28,6 +34,7 @@ from drake_diff.record.sealed import reproducible
 from drake_diff.record.solve import EvidenceRecord
 
 FILES = ("plan.npz", "record.json", "record.schema.json", "replay.html", "trace.mcap")
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 EVIL = """<robot name="&lt;script&gt;alert(1)&lt;/script&gt;"><link name="[red]a[/]"><inertial><mass value="1"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
 <visual><geometry><mesh filename="{mesh}"/></geometry></visual></link>
@@ -235,6 +242,131 @@ def test_a_forged_motion_in_the_trace_is_found_although_all_hashes_are_right(sol
     assert any(line.startswith(f"trace.mcap: /state v[0] of message {row}") for line in dd.verify(copy).complaints)
 
 
+def test_a_run_that_stopped_far_from_its_goal_cannot_say_that_it_converged(solution, tmp_path, monkeypatch):
+    """Failing metrics gone, status and verdict changed, the record carried by the trace, all hashes right."""
+    stopped = dd.solve(dataclasses.replace(solution.problem, x_goal=[2.2, 0]), method="ilqr", max_iterations=1)
+    assert stopped.goal_error > 1e-2
+    honest = evidence.record_of
+
+    def forged(measurement, folder):
+        fields = honest(measurement, folder).model_dump()
+        fields["metrics"] = [m for m in fields["metrics"] if m["verdict"] != "fail"]
+        fields["replays"] = [{**r, "holds": True, "failures": []} for r in fields["replays"]]
+        fields["failures"] = []
+        fields["events"] = [e for e in fields["events"] if e["kind"] != "failure"]
+        fields["solver"] = {**fields["solver"], "status": "converged"}
+        return EvidenceRecord.model_validate({**fields, "verdict": "pass"})
+
+    monkeypatch.setattr(evidence, "record_of", forged)
+    assert dd.save(stopped, tmp_path / "run").verdict == "pass"
+    found = dd.verify(tmp_path / "run")
+    assert found.verdict == "broken"
+    for words in ("metrics: recorded", "solver.status: recorded converged", "verdict: recorded pass", "failures"):
+        assert any(f"record.json: {words}" in complaint for complaint in found.complaints), found.complaints
+
+
+def test_exchanged_pages_are_found_although_all_hashes_are_right_and_a_file_more_is_told(run, other_run, copy):
+    for name in ("replay.html", "report.html"):
+        honest = (copy / name).read_bytes()
+        changed = honest.replace(b"pendulum", b"pendulun", 1)
+        for forged in ((other_run / name).read_bytes(), changed, honest + b" "):
+            assert forged != honest
+            (copy / name).write_bytes(forged)
+            dd.load_record(copy).write(copy)
+            found = dd.verify(copy)
+            assert found.verdict == "broken"
+            assert [line.split(":")[0] for line in found.complaints] == [name]
+        (copy / name).write_bytes(honest)
+    (copy / "certificate.pdf").write_text("all is well")
+    dd.load_record(copy).write(copy)
+    assert "certificate.pdf: nothing that drake_diff writes there" in dd.verify(copy).require().unchecked
+
+
+def test_pages_that_are_gone_are_told(run, copy):
+    (copy / "report.html").unlink()
+    dd.load_record(copy).write(copy)
+    found = dd.verify(copy).require()
+    assert "report.html: the directory has none" in found.unchecked
+
+
+@each_row("dropped, told", [("message", "message 3"), ("metadata", "part"), ("attachment", "part")])
+def test_a_trace_with_something_left_out_is_found(copy, dropped, told):
+    """Written again by the mcap package alone, as whole as before."""
+    data, out = (copy / "trace.mcap").read_bytes(), BytesIO()
+    writer = Writer(out, enable_data_crcs=True)
+    writer.start(profile="", library="drake_diff")
+    for record in NonSeekingReader(BytesIO(data)).iter_metadata():
+        writer.add_metadata(record.name, {**record.metadata, **({"status": "best"} if dropped == "metadata" else {})})
+    for a in NonSeekingReader(BytesIO(data)).iter_attachments():
+        content = b"{}" if (dropped, a.name) == ("attachment", "configuration.json") else a.data
+        writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, content)
+    summary = NonSeekingReader(BytesIO(data)).get_summary()
+    schemas, channels = {}, {}
+    for number, channel in sorted(summary.channels.items()):
+        schema = summary.schemas[channel.schema_id]
+        schemas[schema.id] = schemas.get(schema.id) or writer.register_schema(schema.name, "protobuf", schema.data)
+        channels[number] = writer.register_channel(channel.topic, "protobuf", schemas[schema.id], channel.metadata)
+    for i, (_, channel, m) in enumerate(NonSeekingReader(BytesIO(data)).iter_messages()):
+        if (dropped, i) != ("message", 3):
+            writer.add_message(channels[channel.id], m.log_time, m.data, m.publish_time, m.sequence)
+    writer.finish()
+    (copy / "trace.mcap").write_bytes(out.getvalue())
+    dd.load_record(copy).write(copy)
+    found = dd.verify(copy)
+    assert found.verdict == "broken"
+    assert any(line.startswith(f"trace.mcap: {told}") for line in found.complaints), found.complaints
+
+
+def test_another_version_of_drake_is_a_reason_for_doubt_not_a_lie(run, copy):
+    record = dd.load_record(copy)
+    older = record.provenance.model_copy(update={"packages": {**record.provenance.packages, "drake": "1.40.0"}})
+    metric = record.metrics[0].model_copy(update={"value": 1.0})
+    record.model_copy(update={"provenance": older, "metrics": [metric, *record.metrics[1:]]}).write(copy)
+    found = dd.verify(copy)
+    assert (found.verdict, found.complaints) == ("undecided", ())
+    assert found.undecided[0].startswith("recorded with drake 1.40.0, run again with")
+    assert any("metrics[cost].value: recorded 1, again" in line for line in found.undecided)
+
+
+def test_a_search_that_a_time_limit_or_the_user_ended_cannot_be_found_again(solution, tmp_path):
+    for status in (dd.Status.TIME_LIMIT, dd.Status.INTERRUPTED):
+        dd.save(solution.told(status=status), tmp_path / status.value)
+        found = dd.verify(tmp_path / status.value)
+        assert (found.verdict, found.complaints) == ("undecided", ())
+        assert "the search was not run again" in str(found)
+
+
+@each_row(
+    "recorded, again, near",
+    [
+        ("ends 1.20000001 rad off at knot 3", "ends 1.20000002 rad off at knot 3", True),
+        ("ends 1.2 rad off", "ends 1.1 rad off", False),
+        ("knot 3", "knot 4", False),
+        ("defect 3e-12", "defect 5e-13", True),
+        ("link_1 touches", "link_2 touches", False),
+        ("pass", "fail", False),
+    ],
+)
+def test_numbers_in_texts_are_numbers(recorded, again, near):
+    assert is_near_text(recorded, again) == near
+
+
+@each_row(
+    "recorded, again, near",
+    [
+        (1.0, 1.0 + 2e-6, False),
+        (1.0, 1.0 + 5e-7, True),
+        (1e-3, 1e-3 * (1 + 3e-6), False),
+        (0.0, 2e-9, False),
+        (0.0, 5e-10, True),
+        (math.nan, math.nan, True),
+        (math.inf, 1e300, False),
+    ],
+)
+def test_a_millionth_is_what_machines_round_differently(recorded, again, near):
+    assert is_near(recorded, again) == near
+
+
 def test_a_verification_prints_what_it_found(run, copy):
     head, *lines = repr(dd.verify(run)).splitlines()
     assert head.startswith(f"Verification of {run}: holds, run again, all ")
@@ -349,11 +481,18 @@ def test_a_certification_that_lies_is_found_by_certifying_again(kinds, tmp_path)
         assert any("certification.json" in complaint and words in complaint for complaint in found.complaints)
 
 
-def test_a_certification_of_a_model_that_changed_is_undecided(tmp_path):
+def test_a_certification_carries_its_model_and_one_whose_mesh_changed_is_undecided(tmp_path):
     path = Path(shutil.copy(MODELS / "pendulum.urdf", tmp_path))
     dd.record.certify_model(dd.load_model(path, time_step=0.02), states=1, directory=tmp_path / "certified")
-    path.write_text(path.read_text() + "<!-- -->")
-    found = dd.verify(tmp_path / "certified")
+    path.unlink()
+    assert dd.verify(tmp_path / "certified").require().holds
+    (tmp_path / "tetra.obj").write_text(TETRAHEDRON)
+    (tmp_path / "m.urdf").write_text(EVIL.format(mesh="tetra.obj"))
+    model = dd.load_model(tmp_path / "m.urdf", time_step=0.02)
+    dd.record.certify_model(model, states=1, directory=tmp_path / "meshed")
+    assert dd.verify(tmp_path / "meshed").require().holds
+    (tmp_path / "tetra.obj").write_text(TETRAHEDRON + "\n")
+    found = dd.verify(tmp_path / "meshed")
     assert (found.verdict, found.complaints) == ("undecided", ())
     assert "is not what it was" in str(found)
 
@@ -400,6 +539,61 @@ def test_a_users_constraint_or_cost_is_undecided_and_what_rests_on_it_is_told(tm
     assert any("metrics[cost]" in line for line in found.unchecked)
 
 
+def test_quantities_of_the_toolkit_are_recorded_and_run_again(tmp_path):
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    tip = dd.quantities.frame_position(model, "pole", point=[0, 0, -0.5])
+    fast = dd.quantities.frame_velocity(model, "pole", point=[0, 0, -0.5])
+    constraints = [
+        dd.Constraint(tip, lower=[-1, -1, -1], upper=[1, 1, 0], knots=[10, -1]),
+        dd.Constraint(fast, lower=-9, upper=9, name="slow enough"),
+        dd.Constraint(dd.quantities.center_of_mass(model), upper=1),
+        dd.Constraint(dd.quantities.frame_rotation_error(model, "pole", np.eye(3)), upper=2, lower=-2),
+        dd.Constraint(dd.quantities.contact_force(model, "pole"), upper=2, lower=-2),
+    ]
+    record = dd.save(swing_up(model, constraints=constraints), tmp_path / "run")
+    assert dd.verify(tmp_path / "run").require().holds
+    told = record.problem["constraints"][0]
+    assert told["quantity"] == {"frame_position": {"frame": "pole", "point": [0, 0, -0.5], "relative_to": "world"}}
+    assert (told["knots"], told["every_knot"]) == ([10, 20], False)
+    lowered = {**told, "upper": [1, 1, -0.49]}  # which the plan breaks
+    problem = {**record.problem, "constraints": [lowered, *record.problem["constraints"][1:]]}
+    record.model_copy(update={"problem": problem}).write(tmp_path / "run")
+    assert not dd.verify(tmp_path / "run").holds
+
+
+def test_a_function_that_wraps_a_quantity_is_a_users(tmp_path):
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    tip = dd.quantities.frame_position(model, "pole")
+
+    @functools.wraps(tip)
+    def doubled(x):
+        return 2 * tip(x)
+
+    dd.save(swing_up(model, constraints=dd.Constraint(doubled, upper=9)), tmp_path / "run")
+    assert dd.verify(tmp_path / "run").verdict == "undecided"
+
+
+def test_a_given_guess_and_the_problems_own_are_run_again(solution, tmp_path):
+    """Arrays, a solution on another mesh, first inputs of the problem, and stages of a continuation."""
+    model = solution.problem.model
+    cost = dd.QuadraticCost(R=[[1.0]])
+    free = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=cost, horizon=(0.3, 0.5))
+    coarse = dd.solve(dataclasses.replace(free, num_steps=10, us=None), method="collocation")
+    stage = dd.model.SoftContact(distance=0.1, stiffness=10.0)
+    ball = dd.load_model(MODELS / "box_push.sdf", time_step=0.02)
+    push = dd.Problem(ball, x0=np.zeros(10), num_steps=3, running_cost=dd.QuadraticCost(R=np.eye(2)))
+    runs = {
+        "arrays": dd.solve(solution.problem, method="ilqr", initial_guess=(solution.xs, solution.us)),
+        "solution": dd.solve(free, method="collocation", initial_guess=coarse),
+        "inputs": swing_up(us=np.full((20, 1), 0.5)),
+        "auto": dd.solve(solution.problem, initial_guess=solution, max_iterations=3),
+        "stages": dd.solve(push, continuation=[stage], max_iterations=2),
+    }
+    for name, run in runs.items():
+        dd.save(run, tmp_path / name)
+        assert dd.verify(tmp_path / name).require().rounded == (), name
+
+
 def test_collocation_and_found_parameters_are_run_again(tmp_path):
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     cost = dd.QuadraticCost(R=[[1.0]])
@@ -421,7 +615,7 @@ def test_collocation_and_found_parameters_are_run_again(tmp_path):
 
 
 def test_a_mesh_is_hashed_and_a_changed_one_is_not_run(tmp_path):
-    (tmp_path / "tetra.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    (tmp_path / "tetra.obj").write_text(TETRAHEDRON)
     (tmp_path / "m.urdf").write_text(EVIL.format(mesh="tetra.obj"))
     record = dd.save(swing_up(dd.load_model(tmp_path / "m.urdf", time_step=0.02)), tmp_path / "run")
     assert [f.path for f in record.model.named] == ["tetra.obj"]

@@ -113,16 +113,16 @@ def _written(solution: Solution, record: EvidenceRecord, apart: float) -> Again:
 
 
 def _as_given(again: EvidenceRecord, record: EvidenceRecord) -> EvidenceRecord:
-    """With what nothing can make again as `record` says it, and the model's file where it was."""
-    source, was = again.contract.get("source"), record.contract.get("source")
-    contract = {**again.contract, "source": was}
-    contract["notes"] = [str(n).replace(str(source), str(was)) for n in _listed(again.contract.get("notes"))]
+    """With what nothing can make again as `record` says it."""
+    contract = contract_as(again.contract, record.contract)
     given = {name: getattr(record, name) for name in (*GIVEN, "files", "record_sha256")}
     return again.model_copy(update={**given, "contract": contract})
 
 
-def _listed(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else []
+def contract_as(again: Mapping[str, Any], recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """The contract of a model that was loaded again, with its file where it was; its notes name that place too."""
+    source, was = str(again.get("source")), recorded.get("source")
+    return {**again, "source": was, "notes": [str(note).replace(source, str(was)) for note in again["notes"]]}
 
 
 def _without_the_search(told: Solution, record: EvidenceRecord, unrepeated: tuple[str, ...]) -> Again:
@@ -142,8 +142,3 @@ def _without_the_search(told: Solution, record: EvidenceRecord, unrepeated: tupl
 def is_below(key: str, sections: Sequence[str]) -> bool:
     """Whether a key of a record is one of `sections`, or in one."""
     return any(key == part or key.startswith((f"{part}.", f"{part}[")) for part in sections)
-
-
-def without(fields: Mapping[str, Any], sections: Sequence[str]) -> dict[str, Any]:
-    """The fields of a record but whole sections of it."""
-    return {key: value for key, value in fields.items() if key not in sections}

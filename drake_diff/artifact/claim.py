@@ -43,7 +43,7 @@ def _of_a_solve(record: EvidenceRecord) -> Iterator[str]:
         yield f"waypoints {shown(p['waypoints'])}"
     for c in p.get("constraints") or ():
         yield f"constraint {shown(c)}"
-    yield "; ".join(f"{name.replace('_', ' ')} {shown(p.get(name))}" for name in COSTS if p.get(name) is not None)
+    yield from (f"{name.replace('_', ' ')} {shown(p[name])}" for name in COSTS if p.get(name) is not None)
     started = [f"{e.name} from {e.start:.9g} within [{shown(e.lower)}, {shown(e.upper)}]" for e in record.parameters]
     mask = p.get("initial_state_free")
     moved = [str(name) for name, free in zip(names or (), mask if isinstance(mask, list) else (), strict=False) if free]
@@ -56,10 +56,14 @@ def _of_a_solve(record: EvidenceRecord) -> Iterator[str]:
 
 
 def named(names: Any, values: Any) -> str:
-    """Values with their names where there is one: "hinge_q 3.14"."""
+    """Values with their names where there is one: "hinge_q 3.14"; of many those that are not 0."""
     if not isinstance(values, list) or not isinstance(names, list):
         return shown(values)
-    return listed([f"{name} {shown(v)}" for name, v in zip(names, values, strict=False) if v is not None])
+    given = [(str(name), v) for name, v in zip(names, values, strict=False) if v is not None]
+    if len(given) <= MOST:
+        return listed([f"{name} {shown(v)}" for name, v in given])
+    told = [f"{name} {shown(v)}" for name, v in given if v != 0]
+    return ", ".join([*told, f"the other {len(given) - len(told)} given ones 0"])
 
 
 def listed(values: Sequence[Any]) -> str:

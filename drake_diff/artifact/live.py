@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_diff.artifact.save import TRACE
+from drake_diff.artifact.rerun import TRACE
 from drake_diff.exceptions import ArtifactError, ModelError
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.load_file import FORMATS, read_into

@@ -32,6 +32,7 @@ from drake_diff.record.provenance import file_evidence, named_files
 from drake_diff.record.solve import EvidenceRecord
 
 PLAN = "plan.npz"
+TRACE = "trace.mcap"
 REQUIRED, OPTIONAL = ("xs", "us", "parameters"), ("us_mid", "u_final", "mesh", "free_horizon")  # of a Solution
 START = "start_us"  # the first guess of the inputs that the problem has
 GUESS = "guess_"  # before the name of an array of the guess that `solve` was given
@@ -82,9 +83,9 @@ def plan_fields(plan: dict[str, Array]) -> dict[str, Any]:
 
 @contextmanager
 def rebuilt(given: ModelInput, source: Any, attachments: dict[str, bytes] | None) -> Iterator[Model]:
-    """The model of a record, for as long as the block runs, from the `attachments` of a trace.
+    """The model of a record, for as long as the block runs, from the files `attachments` that the directory carries.
 
-    Where there is no trace, or the model names other files, it is built from `source`, if all of them are unchanged.
+    Where there are none, or the model names other files, it is built from `source`, if all of them are unchanged.
 
     Raises ModelError, saying why, where it cannot be built again, ArtifactError where the artifact is damaged.
     """
@@ -95,7 +96,7 @@ def rebuilt(given: ModelInput, source: Any, attachments: dict[str, bytes] | None
         return
     name, data = given.file.path, attachments.get(given.file.path)
     if data is None or sha256(data).hexdigest() != given.file.sha256:
-        raise ArtifactError(f"trace.mcap: it does not carry the model file {name} that record.json describes")
+        raise ArtifactError(f"{TRACE}: the model file {name} in it is not the one that the record describes")
     if Path(name).name != name or not name.endswith(FORMATS):
         raise ArtifactError(f"record.json: {name!r} is not the name of a model file")
     with TemporaryDirectory() as folder:

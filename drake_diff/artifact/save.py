@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from drake_diff.artifact.measurement import Measurement, failure_of, measure, replay_evidence
-from drake_diff.artifact.rerun import PLAN, write_plan
+from drake_diff.artifact.rerun import PLAN, TRACE, write_plan
 from drake_diff.artifact.sections import asked, found
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
@@ -17,7 +17,7 @@ from drake_diff.record.provenance import provenance_of, written_now
 from drake_diff.record.sealed import WallClock, canonical, reproducible
 from drake_diff.record.solve import EvidenceRecord
 
-TRACE, REPLAY, REPORT = "trace.mcap", "replay.html", "report.html"
+REPLAY, REPORT = "replay.html", "report.html"
 FILES = (PLAN, TRACE, REPLAY, REPORT)  # what `save` writes besides the record and its schema
 
 

@@ -13,8 +13,9 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import select
 from drake_diff.model.plant import FLOATING, joints
-from drake_diff.optimize.problem.constraint import Bounds
-from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost
+from drake_diff.model.quantities import description_of, made_from
+from drake_diff.optimize.problem.constraint import Bounds, Constraint
+from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.parts import ModelInput, Quantity
@@ -255,7 +256,14 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
         "x_goal": finite_list(problem.goal),
         "waypoints": {str(k): finite_list(x) for k, x in problem.waypoints.items()},
         "constraints": [
-            {"name": c.label, "lower": finite_list(c.lower), "upper": finite_list(c.upper), "knots": at}
+            {
+                "name": c.label,
+                "lower": finite_list(c.lower),
+                "upper": finite_list(c.upper),
+                "knots": at,
+                "every_knot": c.knots is None,
+                "quantity": description_of(c.function),  # null: a user's function
+            }
             for c, at in zip(problem.constraints, knots, strict=True)
         ],
         "free_horizon_s": None if problem.horizon is None else list(problem.horizon),
@@ -278,6 +286,10 @@ def _cost(cost: Any) -> Any:
     if isinstance(cost, QuadraticCost):
         parts = {name: getattr(cost, name) for name in ("Q", "R", "x_ref", "u_ref")}
         return {"QuadraticCost": {name: np.asarray(v).tolist() for name, v in parts.items() if v is not None}}
+    if isinstance(cost, CostToGo):
+        return {
+            "CostToGo": {name: np.asarray(getattr(cost, name)).tolist() for name in ("x_ref", "gradient", "hessian")}
+        }
     return None if cost is None else getattr(cost, "__qualname__", type(cost).__name__)
 
 
@@ -286,7 +298,8 @@ def unknown_functions(record: EvidenceRecord) -> tuple[list[str], list[str]]:
     costs = [f"{name} {record.problem[name]}" for name in COSTS if isinstance(record.problem.get(name), str)]
     listed = record.problem.get("constraints")
     constraints: list[Any] = listed if isinstance(listed, list) else []
-    return costs, [str(c.get("name")) for c in constraints if isinstance(c, dict)]
+    unknown = [c for c in constraints if isinstance(c, dict) and c.get("quantity") is None]
+    return costs, [str(c.get("name")) for c in unknown]
 
 
 def rebuild_problem(record: EvidenceRecord, model: Model, us: Array, start_us: Array | None) -> Problem:
@@ -314,6 +327,7 @@ def rebuild_problem(record: EvidenceRecord, model: Model, us: Array, start_us: A
         final_cost=final,
         x_goal=goal,
         waypoints={int(k): _numbers(x, np.nan) for k, x in p["waypoints"].items()},
+        constraints=[_rebuild_constraint(c, model) for c in p["constraints"] if c["quantity"] is not None],
         horizon=p["free_horizon_s"],
         bounds=Bounds(**bounds),
         optimize=p["optimize"],
@@ -326,6 +340,13 @@ def rebuild_problem(record: EvidenceRecord, model: Model, us: Array, start_us: A
     )
 
 
+def _rebuild_constraint(c: dict[str, Any], model: Model) -> Constraint:
+    function = made_from(model, c["quantity"])
+    lower, upper = (_numbers(c[side], gap) for side, gap in GAPS.items())
+    knots = None if c["every_knot"] else c["knots"]
+    return Constraint(function, lower=lower, upper=upper, knots=knots, name=c["name"])
+
+
 def _numbers(values: Any, missing: float) -> Array:
     """(n,) numbers, `missing` where there is none."""
     return np.array([missing if v is None else v for v in values], dtype=float)
@@ -336,4 +357,6 @@ def _rebuild_cost(cost: Any) -> Any:
         return None  # none, or the user's function
     if "ConstantCost" in cost:
         return ConstantCost(cost["ConstantCost"]["rate"])
+    if "CostToGo" in cost:
+        return CostToGo(**{name: np.array(value, dtype=float) for name, value in cost["CostToGo"].items()})
     return QuadraticCost(**cost["QuadraticCost"])

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff.artifact.again import SAME_PLAN, SEARCH_TOPICS, SEARCHED, Again, is_below, made_again
+from drake_diff.artifact.again import SAME_PLAN, SEARCH_TOPICS, SEARCHED, Again, contract_as, is_below, made_again
 from drake_diff.artifact.claim import claims_of
 from drake_diff.artifact.differences import (
     Compared,
@@ -20,8 +20,8 @@ from drake_diff.artifact.differences import (
     compare_text,
     compare_traces,
 )
-from drake_diff.artifact.rerun import PLAN, read_plan, rebuilt, resolve
-from drake_diff.artifact.save import FILES, TRACE
+from drake_diff.artifact.rerun import PLAN, TRACE, read_plan, rebuilt, resolve
+from drake_diff.artifact.save import FILES
 from drake_diff.artifact.trace import CONFIGURATION, Trace, read_trace
 from drake_diff.exceptions import ArtifactError, MissingDependencyError, ModelError
 from drake_diff.optimize.solution import Solution
@@ -32,6 +32,7 @@ from drake_diff.record.read import KINDS, kind_of
 from drake_diff.record.sealed import SCHEMA_VERSION, SealedRecord, canonical, own_sha256, read_fields, reproducible
 from drake_diff.record.solve import EvidenceRecord
 
+MOST = 16  # lines of a kind that are printed
 R = TypeVar("R", bound=SealedRecord)
 # What nothing can make again, in every record, by key.
 UNCHECKED = (
@@ -39,6 +40,7 @@ UNCHECKED = (
     "provenance: the versions, the commit, the machine and the command that made it",
     "name and contract.source: what it was called, and where the model file was",
 )
+GIVEN = "problem, model and inputs.search: they are what was asked; a record that asks for less can be just as true"
 NOT_RERUN = {"comparison": "the engines were not run again", "robustness": "the trials were not run again"}
 
 
@@ -105,14 +107,19 @@ class Verification(ShowsItsRepr):
     @property
     def lines(self) -> tuple[str, ...]:
         """What was found, for a reader: what was claimed, what was not checked, what is wrong."""
-        return (
-            *(f"claimed: {line}" for line in self.claimed),
-            *(f"not checked: {line}" for line in self.unchecked),
-            *(f"undecided: {line}" for line in self.undecided),
-            *(f"broken: {line}" for line in self.complaints),
-            *(f"rounded: {line}" for line in self.rounded),
-            *self.notes,
-        )
+        groups = {
+            "claimed": self.claimed,
+            "not checked": self.unchecked,
+            "undecided": self.undecided,
+            "broken": self.complaints,
+            "rounded": self.rounded,
+            "note": self.notes,
+        }
+        told = []
+        for word, found in groups.items():
+            told += [f"{word}: {line}" for line in found[:MOST]]
+            told += [f"{word}: and {len(found) - MOST} more"] * (len(found) > MOST)
+        return tuple(told)
 
     def require(self) -> "Verification":
         """This verification where it holds; ArtifactError, with what does not, where it does not."""
@@ -243,10 +250,10 @@ def _solve_again(found: Verification, record: EvidenceRecord) -> Verification:
     """Everything in the directory of a solve beside the same made again."""
     folder = found.directory
     plan, trace = read_plan(folder / PLAN), read_trace(folder / TRACE)
-    problems = [*_odd_files(record), *_odd_trace(trace, plan, record)]
+    problems = [*_odd_schema(record), *_odd_trace(trace, plan, record)]
     with rebuilt(record.model, record.contract.get("source"), trace.attachments) as model:
         again = made_again(record, model, plan)
-    fields, unchecked = Compared(record.FILE), [*UNCHECKED]
+    fields, unchecked = Compared(record.FILE), [*UNCHECKED, GIVEN, *_others(record, FILES)]
     compare_fields(fields, record.model_dump(mode="json"), again.fields)
     compared = [fields]
     for name in FILES:
@@ -269,11 +276,15 @@ def _solve_again(found: Verification, record: EvidenceRecord) -> Verification:
     return _told_of_a_solve(found, again, problems, compared, unchecked)
 
 
-def _odd_files(record: EvidenceRecord) -> Iterator[str]:
-    """What `save` does not write, and a schema that is not the record's."""
+def _others(record: SealedRecord, known: Sequence[str]) -> Iterator[str]:
+    """Files that were in the directory and are none that drake_diff writes there."""
+    for name in sorted(record.files.keys() - {*known, record.schema_file()}):
+        yield f"{name}: nothing that drake_diff writes there"
+
+
+def _odd_schema(record: SealedRecord) -> Iterator[str]:
+    """A schema that is not the record's."""
     schema = record.schema_file()
-    for name in sorted(record.files.keys() - {*FILES, schema}):
-        yield f"{name}: no file of a solve"
     described = record.files.get(schema)
     if described is None or described.sha256 != sha256(record.published_schema()).hexdigest():
         yield f"{schema}: it is not the schema {record.schema_version} of this drake_diff"
@@ -291,6 +302,8 @@ def _told_of_a_solve(
     differing = [d for one in compared for d in one.differing]
     rounds_otherwise = again.apart > 0 or any(d.allowed for d in differing)
     rounded = []
+    if 0 < again.apart <= SAME_PLAN:
+        rounded.append(f"{PLAN}: that of the search, run again, is {again.apart:.2g} of its largest number away")
     for d in differing:
         if is_below(d.key, again.missing) and d.file == EvidenceRecord.FILE:
             continue
@@ -313,27 +326,31 @@ def _is_searched(d: Difference) -> bool:
 
 
 def _judged(found: Verification, problems: Sequence[str], undecided: Sequence[str]) -> Verification:
-    """With problems, which are none but a reason for doubt where another version of Drake made the record."""
+    """With problems, which are none but a reason for doubt where other versions made the record."""
     if found.notes and problems:
-        why = f"{'; '.join(found.notes)}, which may be why: "
-        return replace(found, undecided=(*undecided, *(why + problem for problem in problems)))
+        why = f"{'; '.join(found.notes)}: that may be why {len(problems)} things differ"
+        return replace(found, undecided=(*undecided, why, *problems))
     return replace(found, complaints=tuple(problems), undecided=tuple(undecided))
 
 
 def _certify_again(found: Verification, record: CertificationRecord) -> Verification:
     """The same states from the same seed, each certified again."""
-    with rebuilt(record.model, record.contract.get("source"), None) as model:
+    carried = record.model.file.path if record.model.file is not None else ""
+    data = (found.directory / carried).read_bytes() if carried in record.files else None
+    attachments = None if data is None else {carried: data}
+    with rebuilt(record.model, record.contract.get("source"), attachments) as model:
         again = certify_model(
             model, states=len(record.states), seed=record.seed, parameters=record.parameters, method=record.method
         )
     given = {name: getattr(record, name) for name in ("name", "provenance", "wall_clock", "files", "record_sha256")}
-    contract = {**again.contract, "source": record.contract.get("source")}
+    contract = contract_as(again.contract, record.contract)
     fields = Compared(record.FILE)
     made = again.model_copy(update={**given, "contract": contract})
     compare_fields(fields, record.model_dump(mode="json"), made.model_dump(mode="json"))
-    problems = [str(d) for d in fields.differing if not d.allowed]
+    problems = [*_odd_schema(record), *(str(d) for d in fields.differing if not d.allowed)]
+    unchecked = (*UNCHECKED, *_others(record, (carried,)))
     rounded = tuple(str(d) for d in fields.differing if d.allowed)
-    return _judged(replace(found, unchecked=UNCHECKED, rounded=rounded, checked=fields.count), problems, [])
+    return _judged(replace(found, unchecked=unchecked, rounded=rounded, checked=fields.count), problems, [])
 
 
 def _odd_trace(trace: Trace, plan: dict[str, Any], record: EvidenceRecord) -> Iterator[str]:

@@ -36,6 +36,8 @@ BALANCE = PLACE | {"mass", "center_of_mass"}
 ORIGIN = (0.0, 0.0, 0.0)
 ROTATION_TOLERANCE = 1e-9  # of R' R = I: a goal written down with fewer digits would be another rotation
 
+RECORDED = "recorded_as"  # the attribute of a function of this module by which a record knows it
+
 OfState = Callable[[Any], Any]
 OfStateAndInput = Callable[[Any, Any], Any]
 
@@ -69,7 +71,7 @@ def frame_position(model: Model, frame: str, point: ArrayLike = ORIGIN, relative
         pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
         return pose.translation() + pose.rotation().matrix() @ p
 
-    return position
+    return _recorded(position, "frame_position", frame=frame, point=p.tolist(), relative_to=relative_to)
 
 
 def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_to: str = "world") -> OfState:
@@ -110,7 +112,7 @@ def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_t
         pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
         return 2 * _quaternion(pose.rotation().matrix() @ goal.T)[1:]
 
-    return error
+    return _recorded(error, "frame_rotation_error", frame=frame, R_goal=goal.tolist(), relative_to=relative_to)
 
 
 def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfState:
@@ -142,7 +144,7 @@ def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfSta
         arm = moving.CalcPose(twin.context, world).rotation().matrix() @ p
         return moving.CalcSpatialVelocity(twin.context, world, world).Shift(arm).translational()
 
-    return velocity
+    return _recorded(velocity, "frame_velocity", frame=frame, point=p.tolist())
 
 
 def center_of_mass(model: Model) -> OfState:
@@ -169,7 +171,7 @@ def center_of_mass(model: Model) -> OfState:
         twin, _ = _at(model, BALANCE, x)
         return np.array(twin.plant.CalcCenterOfMassPositionInWorld(twin.context))
 
-    return center
+    return _recorded(center, "center_of_mass")
 
 
 def contact_force(model: Model, body: str) -> OfStateAndInput:
@@ -210,7 +212,35 @@ def contact_force(model: Model, body: str) -> OfStateAndInput:
             total = total + sign * on_a
         return total
 
-    return force
+    return _recorded(force, "contact_force", body=body)
+
+
+def _recorded(function: Any, name: str, **arguments: Any) -> Any:
+    """`function` with what made it, so that a record can tell it and make it again: see `made_from`."""
+    setattr(function, RECORDED, (function, {name: arguments}))
+    return function
+
+
+def description_of(function: Any) -> dict[str, Any] | None:
+    """The name and the arguments of the function of this module that made `function`; None where none did."""
+    made, description = getattr(function, RECORDED, (None, None))
+    return description if made is function else None  # a function that wraps one has its attributes, not its values
+
+
+def made_from(model: Model, description: Any) -> OfState | OfStateAndInput:
+    """The function that `description_of` described, on `model`. InputError where it describes none."""
+    kinds: dict[str, Any] = {
+        "frame_position": frame_position,
+        "frame_rotation_error": frame_rotation_error,
+        "frame_velocity": frame_velocity,
+        "center_of_mass": center_of_mass,
+        "contact_force": contact_force,
+    }
+    if isinstance(description, dict) and len(description) == 1:
+        ((name, arguments),) = description.items()
+        if name in kinds and isinstance(arguments, dict):
+            return kinds[name](model, **arguments)
+    raise InputError("quantity", got=repr(description), expected=f"one of {', '.join(kinds)} with its arguments")
 
 
 def _at(model: Model, depends_on: frozenset[str], x: Any, *inputs: Any) -> tuple[Twin, list[Any]]:

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from drake_diff._base.arrays import positive_int
+from drake_diff._base.files import write_whole
 from drake_diff.certificates.certify import certify
 from drake_diff.derivatives.sources import check_method
 from drake_diff.exceptions import GradientError, InputError, SimulationError
@@ -84,8 +85,8 @@ def certify_model(
         seed: Seed of the states.
         parameters: Names of parameters whose derivatives are certified too.
         method: How the derivative is taken: "auto", "autodiff", "implicit", "analytic" or "finite_difference".
-        directory: Where to write certification.json; nothing is written without one. The record there says
-            "incomplete" until the last state is done.
+        directory: Where to write certification.json and a copy of the model file; nothing is written without one. The
+            record there says "incomplete" until the last state is done.
 
     Returns:
         A `CertificationRecord`, whose verdict is "pass" only where every certificate agrees.
@@ -127,7 +128,11 @@ def certify_model(
     agree = sum(state.verdict == "agree" for state in found)
     sentence = f"{agree} of {len(found)} sampled states have a certified derivative"
     made = record("pass" if agree == len(found) else "fail", sentence, found)
-    return made.sealed() if directory is None else made.write(Path(directory))
+    if directory is None:
+        return made.sealed()
+    if model.source is not None and made.model.file is not None:
+        write_whole(Path(directory) / model.source.name, model.source.read_bytes())  # to certify it again
+    return made.write(Path(directory))
 
 
 def _certify_state(model: Model, state: SampledState, parameters: Parameters, method: str) -> CertifiedState:

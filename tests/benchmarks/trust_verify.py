@@ -1,0 +1,309 @@
+"""`verify` against a forger who may edit everything in a run directory and hash it again.
+
+The runs are small ones of several kinds, some of them failures. A forger picks one, changes something by chance, and
+seals the directory as a true one is sealed: the trace carries the changed record, and every hash is renewed. A forgery
+is accepted where `verify` says "holds" and does not name what was changed as not checked or as rounding.
+"""
+
+import copy
+import json
+import shutil
+import tempfile
+from collections import Counter
+from hashlib import sha256
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from helpers.models import MODELS
+from mcap.reader import NonSeekingReader
+from mcap.writer import CompressionType, Writer
+from trust import Figure
+
+import drake_diff as dd
+
+COUNT = 1000
+APART = ("wall_clock", "files", "record_sha256")
+# By the words of `Verification.unchecked`: what nothing can make again, and what was asked.
+UNCHECKED = ("wall_clock", "provenance", "name", "contract.source")
+ASKED = ("problem.", "model.", "inputs.search.")
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+
+
+def pendulum(**changes):
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    return dd.Problem(model, **{"x0": [0, 0], "x_goal": [1, 0], "num_steps": 20, "running_cost": EFFORT, **changes})
+
+
+def sliding(place):
+    """A block that is thrown onto a floor and slides to `place`, at a speed that is found."""
+    model = dd.load_model(MODELS / "sliding_block.sdf", time_step=0.01)
+    x0, goal, free = np.zeros(13), np.full(13, np.nan), np.zeros(13, dtype=bool)
+    x0[[0, 6, 10]], goal[4], free[10] = (1, 0.1, 1), place, True
+    given = {"x0": x0, "x_goal": goal, "initial_state_mask": free}
+    return dd.Problem(model, num_steps=10, optimize=("initial_state",), **given)
+
+
+def save_runs(folder, rng):
+    """Successes and failures, smooth and in contact, by all three methods, with goals by chance."""
+    goal = float(rng.uniform(0.3, 1.5))
+    weak = dd.Bounds(u_lower=[-2], u_upper=[2])
+    tasks = {
+        "shooting": (pendulum(x_goal=[goal, 0]), {"method": "shooting"}),
+        "ilqr": (pendulum(x_goal=[goal, 0]), {"method": "ilqr"}),
+        "collocation": (pendulum(x_goal=[goal, 0], horizon=(0.3, 0.6)), {"method": "collocation"}),
+        "far": (pendulum(x_goal=[goal + 1.2, 0], bounds=weak), {"method": "ilqr", "max_iterations": 5}),
+        "stopped": (pendulum(x_goal=[3, 0]), {"method": "shooting", "max_iterations": 1}),
+        "sliding": (sliding(float(rng.uniform(0.05, 0.08))), {"method": "shooting"}),
+    }
+    for name, (problem, options) in tasks.items():
+        dd.save(dd.solve(problem, **options), folder / name)
+    return list(tasks)
+
+
+def canonical(fields):
+    return json.dumps(fields, sort_keys=True, indent=2) + "\n"
+
+
+def seal(folder, fields, *, attach=True):
+    """Write `fields` as the record, with the hashes of all other files and its own; the trace carries it too."""
+    if attach:
+        carried = canonical({k: v for k, v in fields.items() if k not in APART}).encode()
+        rewrite(folder / "trace.mcap", attachments={"record.json": carried})
+    files = {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    files.pop("record.json")
+    fields["files"] = {
+        name: {"path": name, "bytes": len(data), "sha256": sha256(data).hexdigest(), "reason": None}
+        for name, data in sorted(files.items())
+    }
+    fields["record_sha256"] = ""
+    fields["record_sha256"] = sha256(canonical(fields).encode()).hexdigest()
+    (folder / "record.json").write_text(canonical(fields))
+
+
+def rewrite(path, *, attachments=None, message=None, metadata=None, drop=None):
+    """Write a trace again with some attachments, message, metadata changed, or messages dropped."""
+    data, out = path.read_bytes(), BytesIO()
+    writer = Writer(
+        out, chunk_size=64 * 1024, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True
+    )
+    writer.start(profile="", library="drake_diff")
+    for record in NonSeekingReader(BytesIO(data)).iter_metadata():
+        writer.add_metadata(record.name, {**record.metadata, **(metadata or {})})
+    for a in NonSeekingReader(BytesIO(data)).iter_attachments():
+        content = (attachments or {}).get(a.name, a.data)
+        writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, content)
+    schemas, channels = {}, {}
+    summary = NonSeekingReader(BytesIO(data)).get_summary()
+    for number, channel in sorted(summary.channels.items()):
+        schema = summary.schemas[channel.schema_id]
+        if schema.id not in schemas:
+            schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+        encoding = channel.message_encoding
+        channels[number] = writer.register_channel(channel.topic, encoding, schemas[schema.id], channel.metadata)
+    for i, (_, channel, m) in enumerate(NonSeekingReader(BytesIO(data)).iter_messages()):
+        if i != drop:
+            times = {"log_time": m.log_time, "publish_time": m.publish_time, "sequence": m.sequence}
+            content = message(i, channel, m) if message else m.data
+            writer.add_message(channels[channel.id], data=content, **times)
+    writer.finish()
+    path.write_bytes(out.getvalue())
+
+
+def leaves(value, path=()):
+    """(path, value) of every value of a record that has no others in it."""
+    parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    if not isinstance(value, (dict, list)):
+        yield path, value
+    for key, part in parts:
+        yield from leaves(part, (*path, key))
+
+
+def changed(value, rng):
+    """Another value of the same type: a number by 0.1 % to 100 % or by a small step, a text by a word."""
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, int):
+        return value + int(rng.integers(1, 4))
+    if isinstance(value, float):
+        sign = rng.choice([-1, 1])
+        return float(value * (1 + sign * 10 ** rng.uniform(-3, 0)) if value else sign * 10 ** rng.uniform(-3, 0))
+    return "changed" if value is None else value + rng.choice([" ", " not", "x"])
+
+
+def edit_leaf(folder, fields, rng):
+    """One value of the record, anywhere but in its list of files, which is made again."""
+    found = [(p, v) for p, v in leaves(fields) if p[0] not in ("files", "record_sha256")]
+    path, value = found[rng.integers(len(found))]
+    part = fields
+    for key in path[:-1]:
+        part = part[key]
+    part[path[-1]] = changed(value, rng)
+    return ".".join(str(key) for key in path)
+
+
+def delete_part(folder, fields, rng):
+    """An entry of a list, or a whole list, of what was found."""
+    lists = ("metrics", "invariants", "events", "replays", "failures", "parameters")
+    places = [(fields, name) for name in lists if fields[name]]
+    places += [(fields["gradient"], name) for name in ("certificates", "columns") if fields["gradient"][name]]
+    part, name = places[rng.integers(len(places))]
+    if rng.random() < 0.3:
+        part[name] = []
+    else:
+        part[name].pop(int(rng.integers(len(part[name]))))
+    return f"{name}, deleted"
+
+
+def claim_success(folder, fields, rng):
+    """A failure told as a success; of a success a better one."""
+    how = rng.choice(["delete", "zero", "tolerance"])
+    tolerated = [m for m in fields["metrics"] if m["tolerance"] is not None]
+    failing = [m for m in tolerated if m["verdict"] != "pass"] or tolerated[:1]
+    for metric in failing:
+        if how == "delete":
+            fields["metrics"].remove(metric)
+        elif how == "zero":
+            metric.update(value=0.0, verdict="pass", reason=None)
+        else:
+            metric.update(tolerance=1e3, verdict="pass", value=metric["value"] or 0.0, reason=None)
+    for replay in fields["replays"]:
+        replay.update(holds=True, failures=[], goal_error=0.0)
+    for certificate in fields["gradient"]["certificates"]:
+        certificate["verdict"] = "agree"
+    fields["solver"].update(status="converged", message="the solver converged", iterations=9)
+    fields.update(verdict="pass", sentence="the solver converged, and every measure that was taken again holds")
+    fields["events"] = [e for e in fields["events"] if e["kind"] != "failure"]
+    fields["failures"] = []
+    if rng.random() < 0.3:  # a better goal error beside it, which no failure had
+        fields["metrics"][0]["value"] = 0.0
+    return f"success, {how}"
+
+
+def edit_channel(folder, fields, rng):
+    """One byte that matters of one message of the trace: the message is decoded first, so that it stays one."""
+    path = folder / "trace.mcap"
+    count = sum(1 for _ in NonSeekingReader(BytesIO(path.read_bytes())).iter_messages())
+    chosen, told = int(rng.integers(count)), []
+
+    def message(i, channel, m):
+        if i != chosen or len(m.data) < 9:
+            return m.data
+        data = bytearray(m.data)
+        data[int(rng.integers(1, len(data)))] ^= 1 << int(rng.integers(8))
+        told.append(channel.topic)
+        return bytes(data)
+
+    rewrite(path, message=message)
+    return f"trace.mcap: {told[0]}" if told else None
+
+
+def edit_trace(folder, fields, rng):
+    """A message left out, metadata, or the configuration."""
+    how = rng.choice(["drop", "status", "configuration"])
+    changes = {
+        "drop": {"drop": int(rng.integers(40))},
+        "status": {"metadata": {"status": "converged, and better"}},
+        "configuration": {"attachments": {"configuration.json": b"{}\n"}},
+    }
+    rewrite(folder / "trace.mcap", **changes[how])
+    return f"trace.mcap, {how}"
+
+
+def change_page(folder, fields, rng):
+    """A page of another run, or other words in it."""
+    name = rng.choice(["report.html", "replay.html"])
+    page = folder / name
+    if rng.random() < 0.5:
+        others = [p for p in folder.parent.parent.glob(f"runs/*/{name}") if p.read_bytes() != page.read_bytes()]
+        shutil.copy(others[rng.integers(len(others))], page)
+        return f"{name}, exchanged"
+    text = page.read_text()
+    at = int(rng.integers(len(text) // 2, len(text) - 10))
+    page.write_text(text[:at] + rng.choice(["1", "a", " "]) + text[at + 1 :])
+    return f"{name}, a letter" if page.read_text() != text else None
+
+
+def edit_plan(folder, fields, rng):
+    """A number of the plan, or the plan of another run, and the trace as it was."""
+    with np.load(folder / "plan.npz") as file:
+        arrays = {name: np.array(file[name]) for name in file.files}
+    name = rng.choice([name for name, values in arrays.items() if values.size])
+    arrays[name].flat[int(rng.integers(arrays[name].size))] += 10 ** rng.uniform(-4, 0)
+    np.savez(folder / "plan.npz", **arrays)
+    return f"plan.npz, {name}"
+
+
+def add_file(folder, fields, rng):
+    (folder / rng.choice(["certificate.pdf", "notes.txt", "trace2.mcap"])).write_text("all is well")
+    return "a file more"
+
+
+# How often each is tried.
+FORGERIES = {edit_leaf: 9, delete_part: 2, claim_success: 3, edit_channel: 3, edit_trace: 1, change_page: 2}
+FORGERIES |= {edit_plan: 1, add_file: 1}
+
+
+EDITS = ("edit_leaf", "edit_channel")  # some are of what nothing can make again, or within rounding
+
+
+def is_told(what, found):
+    """Whether an accepted change is one that the report names: not checked, asked, or rounding."""
+    names = (*UNCHECKED, *ASKED)
+    listed = " ".join(found.unchecked)
+    return (what.startswith(names) and what.split(".")[0] in listed) or any(what in line for line in found.rounded)
+
+
+def measure(seed, count):
+    rng = np.random.default_rng(seed)
+    tried, refused, told, missed = Counter(), Counter(), Counter(), []
+    with tempfile.TemporaryDirectory() as place:
+        runs = Path(place) / "runs"
+        names = save_runs(runs, rng)
+        untouched = [dd.verify(runs / name) for name in names]
+        weights = np.array(list(FORGERIES.values())) / sum(FORGERIES.values())
+        while sum(tried.values()) < count:
+            forge = list(FORGERIES)[rng.choice(len(weights), p=weights)]
+            folder = Path(place) / "forged" / str(rng.choice(names))
+            shutil.copytree(runs / folder.name, folder)
+            before = json.loads((folder / "record.json").read_text())
+            fields = copy.deepcopy(before)
+            what = forge(folder, fields, rng)
+            if what is not None:
+                seal(folder, fields)
+                found = dd.verify(folder)
+                tried[forge.__name__] += 1
+                if not found.holds:
+                    refused[forge.__name__] += 1
+                elif is_told(what, found):
+                    told[forge.__name__] += 1
+                else:
+                    missed.append(f"{folder.name}: {what}")
+            shutil.rmtree(folder)
+    for line in missed:
+        print(f"  accepted: {line}")
+    alarms = sum(not found.holds or bool(found.rounded) for found in untouched)
+    names = [forge.__name__ for forge in FORGERIES if tried[forge.__name__]]
+    accepted = {name: tried[name] - refused[name] - told[name] for name in names}
+    words = {name: name.replace("_", " ") for name in names}
+    return [
+        *(
+            Figure(
+                f"{words[name]}: refused, or named as unchecked or rounding",
+                tried[name] - accepted[name],
+                tried[name],
+                1.0,
+                True,
+            )
+            for name in names
+        ),
+        Figure(
+            "edits of values and channels that were refused",
+            sum(refused[n] for n in EDITS),
+            sum(tried[n] for n in EDITS),
+            0.9,
+            True,
+        ),
+        Figure("forged claims accepted", sum(accepted.values()), sum(tried.values()), 0.0, False),
+        Figure("untouched runs that do not hold to the last bit", alarms, len(untouched), 0.0, False),
+    ]
