@@ -1,14 +1,19 @@
 """Certificates of rollouts, open and closed loop: what they must find, and refuse."""
 
+import dataclasses
+import math
+
 import numpy as np
 import pytest
+from helpers.robots import example_robot, state_in_contact
 from helpers.table import each_row
 from pydrake.autodiffutils import AutoDiffXd
 
 import drake_diff as dd
 from drake_diff._base.autodiff import chain_rows, plain
+from drake_diff.certificates.directions import FIRST, MISS, QUANTILE, Probe, weights
 from drake_diff.certificates.feedback import fresh
-from drake_diff.exceptions import GradientError, InputError
+from drake_diff.exceptions import CertificateError, GradientError, InputError
 from drake_diff.motion.policy import ParametricPolicy
 
 X0, N = np.array([0.1, 0.4, -0.2, 0.3]), 30  # of the cart-pole
@@ -126,3 +131,121 @@ def test_the_copy_of_a_policy_shares_its_model_and_no_memory(load):
 def test_a_policy_and_inputs_are_one_too_many(load):
     with pytest.raises(InputError, match="us and policy"):
         dd.certify_rollout(load("cart_pole.urdf"), X0, np.zeros((3, 1)), end, policy=lambda x, t: [0.0])
+
+
+# --- by random directions ---------------------------------------------------------------------------------------------
+
+
+def linear(gradient, offset=0.0):
+    return lambda displacements: offset + displacements @ gradient
+
+
+def test_the_quantiles_are_those_of_chi_squared():
+    """Closed forms: 1 - e^(-x/2) (1 + x/2) and erf(sqrt(x/2)) - sqrt(2x/pi) e^(-x/2) (1 + x/3); to four digits."""
+    four, five = QUANTILE[4], QUANTILE[5]
+    assert 1 - math.exp(-four / 2) * (1 + four / 2) == pytest.approx(MISS / 2, rel=1e-3)
+    by_five = math.erf(math.sqrt(five / 2)) - math.sqrt(2 * five / math.pi) * math.exp(-five / 2) * (1 + five / 3)
+    assert by_five == pytest.approx(MISS / 2, rel=1e-3)
+
+
+def test_an_error_is_seldom_larger_than_the_bound():
+    """The bound fails for 1 of 2000 seeds, 5 of 10,000; more than 12 of them with a probability of 0.2 %."""
+    random, kinds, missed = np.random.default_rng(0), np.zeros(12, dtype=np.intp), 0
+    for seed in range(10_000):
+        true = random.standard_normal(12)
+        error = np.zeros(12)
+        error[: 1 + seed % 12] = 1.0
+        stated = true * (1 + 0.3 * error)
+        weight = weights(np.abs(stated), kinds)
+        gaps = Probe(linear(true), stated, weight, seed).gaps(0.0, 1e-4, FIRST)
+        missed += gaps.bound < np.linalg.norm((stated - true) * weight)
+    assert 0 < missed <= 12
+
+
+@each_row("scale, offset", [(1.0, 0.0), (1e-12, 0.0), (1e8, 0.0), (1.0, 1e3)])
+def test_an_entry_that_is_1_percent_wrong_is_found_and_named_at_every_scale_of_the_loss(load, scale, offset):
+    model, us = load("cart_pole.urdf"), np.random.default_rng(1).standard_normal((N, 1))
+
+    def loss(xs, us):
+        return scale * (offset + end(xs, us))
+
+    right = dd.certify_rollout(model, X0, us, loss, sampled=True).require()
+    assert right.rollouts <= 20
+    assert right.power < 1e-3
+    for j in (1, 4 + 7):
+        g = right.gradient
+        by = [g.by_x0.copy(), g.by_us.copy()]
+        by[0 if j < 4 else 1].ravel()[j if j < 4 else j - 4] *= 1.01
+        wrong = dd.certify_rollout(
+            model, X0, us, loss, sampled=True, gradient=dataclasses.replace(g, by_x0=by[0], by_us=by[1])
+        )
+        assert wrong.verdict == "disagree"
+        assert f"by {right.columns[j]} alone it would be explained" in str(wrong)
+        with pytest.raises(CertificateError, match="disagree"):
+            wrong.require()
+
+
+def test_an_offset_that_drowns_the_gradient_is_undecided_and_not_agreed(load):
+    """Beside 1e14 a loss of 1 has two digits, and its differences none; where all is 0, nothing can be wrong."""
+    us = np.zeros((N, 1))
+    certificate = dd.certify_rollout(load("cart_pole.urdf"), X0, us, lambda xs, us: 1e14 + end(xs, us), sampled=True)
+    assert certificate.verdict == "undecided"
+    assert (
+        dd.certify_rollout(load("cart_pole.urdf"), X0, us, lambda x: 1e14 + 0 * x[0], sampled=True).verdict == "agree"
+    )
+
+
+@each_row("function", [detached_parameter, detached_state, by_hand(0.08)])
+def test_a_wrong_policy_is_found_by_random_directions_too(load, function):
+    certificate = certified(load("cart_pole.urdf"), function, sampled=True)
+    assert certificate.verdict == "disagree"
+    assert "the policy states a wrong derivative" in str(certificate)
+    assert certified(load("cart_pole.urdf"), feedback, sampled=True).require().rollouts <= 20
+
+
+def test_a_block_that_is_zero_is_found_though_it_is_small(load):
+    """The inputs' gradient is 1e-3 of the states', and left out."""
+    model, us = load("cart_pole.urdf"), np.zeros((N, 1))
+    g = dd.certify_rollout(model, X0, us, lambda x: x @ x, sampled=True).require().gradient
+    assert np.abs(g.by_us).max() < 1e-2 * np.abs(g.by_x0).max()
+    none = dataclasses.replace(g, by_us=np.zeros_like(g.by_us))
+    assert dd.certify_rollout(model, X0, us, lambda x: x @ x, sampled=True, gradient=none).verdict == "disagree"
+
+
+def test_a_rollout_that_starts_at_touchdown_is_refused_by_random_directions_too(load):
+    model = load("sphere_on_ground.sdf", time_step=0.005)
+    x = model.default_state
+    x[6], x[12] = 0.1, -1.0
+    for seed in range(5):
+        found = dd.certify_rollout(model, x, None, lambda x: x[12], num_steps=3, sampled=True, seed=seed)
+        assert found.verdict == "discontinuous"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("approximation", ["sap", "lagged"])
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_quadrupeds_plan_of_100_knots_is_certified_in_20_rollouts(approximation, closed):
+    """Four feet on the ground; 1,239 columns, or 63 under PD control, friction among them; 1 % in one is not missed."""
+    model, random = example_robot("solo12.urdf", approximation=approximation, feet=True), np.random.default_rng(3)
+    x0 = state_in_contact(model, random)
+    us = None if closed else 0.5 * random.standard_normal((100, model.nu))
+    policy = dd.PD(model, kp=3.0, kd=0.1, x_ref=x0) if closed else None
+    weight = random.uniform(0.5, 1.5, model.nx)
+    options = {
+        "policy": policy,
+        "num_steps": 100,
+        "parameters": ("FL_FOOT.friction", "base_link.mass"),
+        "sampled": True,
+    }
+
+    def loss(xs, us):
+        return 0.002 * ((xs - x0) ** 2 @ weight).sum() + 1e-3 * (us**2).sum()
+
+    certificate = dd.certify_rollout(model, x0, us, loss, **options).require()
+    assert certificate.rollouts <= 20
+    g = certificate.gradient
+    for name in ("by_x0", "by_policy" if closed else "by_us", "by_parameters"):
+        values = np.array(getattr(g, name))
+        values.ravel()[np.argmax(np.abs(values))] *= 1.01
+        wrong = dataclasses.replace(g, **{name: values})
+        assert dd.certify_rollout(model, x0, us, loss, gradient=wrong, **options).verdict == "disagree"

@@ -1,14 +1,16 @@
 """The rollouts that a certificate takes: the loss at displaced first states, inputs and parameters."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, finite_array
-from drake_diff.certificates.certify import move, state_scale
+from drake_diff._base.arrays import Array, Indices, finite_array
+from drake_diff.certificates.certify import move, solver_tolerance, state_scale
 from drake_diff.certificates.feedback import fresh, with_parameters
+from drake_diff.derivatives.polish import Polished, polished_steps
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied
 from drake_diff.model.step import advance
@@ -16,7 +18,12 @@ from drake_diff.model.tangent import TangentSpace, tangent_space
 from drake_diff.motion.gradient import Loss, RolloutGradient, differentiate_rollout, evaluate_loss
 from drake_diff.motion.policy import policy_parameters
 
+MANY = 256  # rollouts whose steps are solved at once
 Point = tuple[Array, Array, Array, ParameterVector]  # x0 (nx,), us (N, nu), the policy's parameters, the model's
+
+
+class NotSolvedError(Exception):
+    """A step is not known to rounding; it says why."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +66,15 @@ class Displaced:
             inputs = tuple(f"policy[{i}]" for i in range(len(policy_parameters(self.policy))))
         return tuple(f"{name}[0]" for name in self.space.names) + inputs + self.vector.names
 
+    @property
+    def kinds(self) -> Indices:
+        """(n,) which columns are of a kind: positions, velocities, one input, the policy's or one model parameter."""
+        of_x0 = [0] * self.model.nv + [1] * self.model.nv
+        given = [2 + i for _ in self.us for i in range(self.us.shape[1])] + [2] * len(policy_parameters(self.policy))
+        first = 2 + max(1, self.us.shape[1])
+        of_model = [first + i for i, p in enumerate(self.vector.parameters) for _ in p.value]
+        return np.array([*of_x0, *given, *of_model], dtype=np.intp)
+
     def at(self, displacement: Array) -> Point:
         """What is rolled out at a displacement (n,)."""
         point = move(self.space, self.model.nx, np.concatenate([self.x0, self._values]), self.scale * displacement)
@@ -80,23 +96,70 @@ class Displaced:
         by_x0 = g.by_x0 @ self.space.derivative_of_plus(g.xs[0])
         return np.concatenate([by_x0, g.by_us.ravel() if self.policy is None else g.by_policy, g.by_parameters])
 
-    def roll(self, displacement: Array, policy: Any = None) -> float:
-        """The loss of the double plant's rollout at a displacement (n,), under `policy` or one without a memory."""
+    def losses(self, displacements: Array, policy: Any = None) -> Array:
+        """(K, 1) of the double plant's rollouts at displacements (K, n); `policy` is one that may keep its memory."""
+        return np.array([[self._roll(d, policy)] for d in displacements])
+
+    def _roll(self, displacement: Array, policy: Any) -> float:
         x0, us, parameters, values = self.at(displacement)
-        if self.policy is not None:
-            policy = with_parameters(fresh(self.policy) if policy is None else policy, parameters)
+        ask = self._inputs(us, parameters, policy)
         xs, inputs = np.empty((len(us) + 1, self.model.nx)), np.empty((len(us), self.model.nu))
         xs[0] = x0
         with applied(values) as model:
             for k in range(len(us)):
-                inputs[k] = us[k] if policy is None else _ask(policy, xs[k], k * model.time_step, model.nu)
+                inputs[k] = ask(xs[k], k, model.time_step)
                 xs[k + 1] = advance(model.double, xs[k], inputs[k])
         return evaluate_loss(self.loss, xs, inputs)
 
-    def losses(self, displacements: Array) -> Array:
-        """(K, 1) of displacements (K, n)."""
-        return np.array([[self.roll(d)] for d in displacements])
+    def left_by_drake(self, g: RolloutGradient) -> tuple[Array, float]:
+        """(N, size) what Drake's own steps along the motion of `g` leave unsolved, and the worst, of the momentum.
+
+        Raises NotSolvedError where a step is not known to rounding.
+        """
+        with applied(self.vector) as model:
+            found = polished_steps(model, self.vector, g.xs[:-1], g.us)
+        _check_solved(found)
+        left = [self.space.minus(*pair) for pair in zip(found.drake, found.x_next, strict=True)]
+        return np.array(left), float(np.max(found.left))
+
+    def solved_losses(self, left: Array, displacements: Array) -> Array:
+        """(K, 1) as `losses`, of rollouts whose every step is solved to rounding and then moved by `left` (N, size).
+
+        That is what Drake's own steps leave unsolved along the motion, so that this is where the rollouts start from,
+        and differences are of the steps' equation there. Raises NotSolvedError as `left_by_drake`.
+        """
+        parts = np.array_split(displacements, -(-len(displacements) // MANY))
+        return np.vstack([self._solved(left, part) for part in parts])
+
+    def _solved(self, left: Array, displacements: Array) -> Array:
+        count, size = len(self.us), len(displacements)
+        points = [self.at(d) for d in displacements]
+        asks = [self._inputs(us, parameters, None) for _, us, parameters, _ in points]
+        values = np.array([vector.values for *_, vector in points])
+        times = [self.vector.time_step(row) for row in values]
+        xs, inputs = np.empty((size, count + 1, self.model.nx)), np.empty((size, count, self.model.nu))
+        xs[:, 0] = [x0 for x0, *_ in points]
+        with applied(self.vector) as model:
+            for k in range(count):
+                inputs[:, k] = [ask(x, k, h) for ask, x, h in zip(asks, xs[:, k], times, strict=True)]
+                found = polished_steps(model, self.vector, xs[:, k], inputs[:, k], values)
+                _check_solved(found)
+                xs[:, k + 1] = [self.space.plus(x_next, left[k]) for x_next in found.x_next]
+        return np.array([[evaluate_loss(self.loss, *motion)] for motion in zip(xs, inputs, strict=True)])
+
+    def solver_tolerance(self, g: RolloutGradient) -> float:
+        """How accurately the steps along the motion of `g` are solved by Drake; 0 where they are known to rounding."""
+        with applied(self.vector) as model:
+            return max(solver_tolerance(model, x, u) for x, u in zip(g.xs[:-1], g.us, strict=True))
+
+    def _inputs(self, us: Array, parameters: Array, policy: Any) -> Callable[[Array, int, float], Array]:
+        """The input (nu,) at a state, a step and a time step [s]."""
+        if self.policy is None:
+            return lambda x, k, h: us[k]
+        asked, nu = with_parameters(fresh(self.policy) if policy is None else policy, parameters), self.model.nu
+        return lambda x, k, h: finite_array("policy(x, t)", asked(x.copy(), k * h), (nu,))
 
 
-def _ask(policy: Any, x: Array, t: float, nu: int) -> Array:
-    return finite_array("policy(x, t)", policy(x.copy(), t), (nu,))
+def _check_solved(found: Polished) -> None:
+    for k, refusal in found.refused.items():
+        raise NotSolvedError(f"{refusal} (step {k})" if len(found.refused) < len(found.left) else str(refusal))

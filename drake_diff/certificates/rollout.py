@@ -1,16 +1,16 @@
 """Certify the gradient of a whole rollout before it is used."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import finite_array, positive_int
 from drake_diff.certificates.certificate import JITTER, VERDICTS, Certificate, certify_displacement, jitter
-from drake_diff.certificates.certify import solver_tolerance
 from drake_diff.certificates.displaced import Displaced
 from drake_diff.certificates.feedback import check_memory, fresh, wrong_derivative
 from drake_diff.certificates.refinement import Refinement, refine_by_stiffness, refine_by_time_step
+from drake_diff.certificates.sampled import SampledCertificate, certify_sampled
 from drake_diff.derivatives.sources import check_method
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
@@ -53,7 +53,9 @@ def certify_rollout(
     refine_stiffness: bool = False,
     method: str = "auto",
     gradient: RolloutGradient | None = None,
-) -> RolloutCertificate:
+    sampled: bool = False,
+    seed: int = 0,
+) -> RolloutCertificate | SampledCertificate:
     """Compare the gradient of a rollout's loss with differences of whole rollouts, 26 for each column.
 
     Under a policy the rollouts are of the closed loop: it is asked with plain numbers, and each rollout has a copy of
@@ -73,14 +75,17 @@ def certify_rollout(
         refine_stiffness: take it again at 4 and 16 times every contact stiffness that the model states.
         method: as in `differentiate_step`.
         gradient: what to certify, instead of what `differentiate_rollout` gives.
+        sampled: take at most 20 rollouts, along random directions, whatever the number of columns.
+        seed: of these directions.
 
     Returns:
         The certificate of one row, the loss; its columns are x0 (on the tangent space), u[k] step by step or the
-        policy's parameters, and the model's. Entries that agree and do not converge are "not_converged".
+        policy's parameters, and the model's. Entries that agree and do not converge are "not_converged". Where
+        `sampled`, a certificate of all columns together, which says how small an error it would have noticed.
 
     Raises:
-        InputError: the time step or a stiffness is refined and a parameter at once, or no stiffness is stated; or
-            both `us` and `policy` are given.
+        InputError: both `us` and `policy` are given; what is sampled, or under a policy, is to be refined; the time
+            step or a stiffness is refined and a parameter at once, or no stiffness is stated.
         ModelError: `refine` of a model that has but one time step.
         GradientError: the rollout has no gradient, or the policy remembers what it was asked before.
         SimulationError: Drake cannot take a step.
@@ -97,23 +102,27 @@ def certify_rollout(
     check_method(method)
     if us is not None and policy is not None:
         raise InputError("certify_rollout", got="us and policy", expected="one of them")
-    if policy is not None and (refine or refine_stiffness):
-        raise InputError("policy", got="a policy and refinement", expected="refinement under given inputs")
+    if (policy is not None or sampled) and (refine or refine_stiffness):
+        raise InputError("refine", got="refinement of a closed loop or of a sample", expected="it of given inputs")
     x0, vector = finite_array("x0", x0, (model.nx,)), select(model, parameters)
     if policy is None:
         inputs = check_inputs(model, us, num_steps)
     else:
         inputs = np.empty((positive_int("num_steps", num_steps), 0))
     moved = Displaced(model, x0, inputs, loss, fresh(policy), vector, method)
-    scale, columns = moved.scale, moved.columns
+    scale, columns, subject = moved.scale, moved.columns, f"the rollout of {model.name}"
     beside = None
     if gradient is None:
         gradient = moved.gradient(np.zeros(len(scale)))
-        beside = moved.flat(moved.gradient(jitter(np.ones(len(scale)))))[None] * scale
+        if not sampled:
+            beside = moved.flat(moved.gradient(jitter(np.ones(len(scale)))))[None] * scale
     if policy is not None:
         elsewhere = fresh(moved.policy)
-        moved.roll(jitter(np.full(len(scale), ELSEWHERE / JITTER)), elsewhere)
+        moved.losses(jitter(np.full(len(scale), ELSEWHERE / JITTER))[None], elsewhere)
         check_memory(elsewhere, gradient, vector.time_step(vector.values))
+    if sampled:
+        sample = certify_sampled(moved, gradient, seed, 0 if policy is None else 1, subject)
+        return replace(sample, cause=_cause(moved, gradient, sample.verdict))
     refinements = [
         refined(model, x0, inputs, loss, vector, method, moved.flat(gradient), columns)
         for wanted, refined in ((refine, refine_by_time_step), (refine_stiffness, refine_by_stiffness))
@@ -126,15 +135,21 @@ def certify_rollout(
         columns=columns,
         scale=scale,
         beside=beside,
-        solver_tolerance=max(solver_tolerance(model, x, u) for x, u in zip(gradient.xs[:-1], gradient.us, strict=True)),
+        solver_tolerance=moved.solver_tolerance(gradient),
         method=" + ".join(dict.fromkeys((*gradient.methods, *gradient.parameter_sources))),
-        subject=f"the rollout of {model.name}",
+        subject=subject,
     )
     codes = np.array(certificate.codes)
     for found in refinements:
         codes[0] = np.where(found.converged, codes[0], np.maximum(codes[0], VERDICTS.index("not_converged")))
-    cause = ""
-    if policy is not None and certificate.verdict != "agree":
-        cause = wrong_derivative(moved.policy, moved.space, gradient, vector.time_step(vector.values))
     parts = {name: getattr(certificate, name) for name in Certificate.__dataclass_fields__} | {"codes": codes}
-    return RolloutCertificate(**parts, gradient=gradient, refinements=tuple(refinements), cause=cause)
+    return RolloutCertificate(
+        **parts, gradient=gradient, refinements=tuple(refinements), cause=_cause(moved, gradient, certificate.verdict)
+    )
+
+
+def _cause(moved: Displaced, gradient: RolloutGradient, verdict: str) -> str:
+    """What is wrong with the policy's own derivative, where a gradient does not agree."""
+    if moved.policy is None or verdict == "agree":
+        return ""
+    return wrong_derivative(moved.policy, moved.space, gradient, moved.vector.time_step(moved.vector.values))

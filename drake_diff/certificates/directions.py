@@ -1,0 +1,145 @@
+"""The check of a gradient by a few rollouts along random directions, and how small an error it would have noticed.
+
+Differences along a direction v tell the gap (g - g*)' v between the gradient g that is stated and the true one. Let e
+be the error in units in which each entry that matters weighs the same, and z = v in these units a vector of independent
+normal numbers. Then each gap is e' z plus what the differences themselves leave, and whatever that is, m gaps are in
+sum of squares below q |e|^2 with probability at most P(chi^2_m <= q). So |e| <= U = sqrt(sum gap^2 / q) but for that
+probability: no model of the noise is needed, a noisy difference merely makes U large.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_diff._base.arrays import Array
+
+MISS = 1e-3  # the probability that an error is missed
+# Where the distribution of chi^2 with 4 and with 5 degrees of freedom is MISS / 2: each of two step sizes may agree.
+QUANTILE = {4: 0.06392, 5: 0.15810}
+LIMIT = 1e-2  # the error of an entry that must be noticed
+# An entry matters that is at least LEAST of the largest of its kind. A kind matters whose largest is at least FLOOR of
+# the largest of all, each entry times the scale of its column.
+LEAST, FLOOR = 1e-2, 1e-4
+FIRST, SECOND = 5, 4  # directions at the first step size, and at the second
+STEP = 1e-6
+FINER, COARSER = 1e-2, 1e2  # the second step size over the first: of a step that is solved for, and of another
+ROUNDING = 1e-14  # of a loss along a rollout
+WIDEST = 1e-2
+TINY = 1e-100
+UNCHANGED = 0.3  # of what a corner or jump leaves unchanged
+STEADY = 0.25  # gaps at two step sizes that differ by this part, or less, are an error and not the differences' own
+ALONE = 1e-3  # of the squared gaps may be left by the one entry that explains them
+
+
+@dataclass(frozen=True, eq=False)
+class Gaps:
+    """At one step size, of m directions, in the unit in which an entry that matters is 1."""
+
+    step: float
+    stated: Array  # (m,) the slope along each direction
+    gap: Array  # (m,) that less the differences'
+    bend: Array  # (m,) half of what the quotients of both sides differ by
+    rounding: float  # what the loss's rounding makes of a gap
+
+    def __len__(self) -> int:
+        return len(self.gap)
+
+    def __str__(self) -> str:
+        at = int(np.argmax(np.abs(self.gap)))
+        stated, found = self.stated[at], self.stated[at] - self.gap[at]
+        return (
+            f"along direction {at} the gradient states {stated:.6g} and differences say {found:.6g}, in units of an "
+            "entry that matters"
+        )
+
+    @property
+    def bound(self) -> float:
+        """U: the error is smaller than this, but for a probability of MISS / 2, as two step sizes are tried."""
+        return _bound(self.gap)
+
+    @property
+    def kink(self) -> float:
+        """The same of the slope's jump at the point."""
+        return _bound(self.bend)
+
+
+def weights(contribution: Array, kinds: NDArray[np.intp]) -> Array:
+    """(n,) what makes an entry that matters 1; `contribution` (n,) are the entries' sizes, `kinds` (n,) their kinds."""
+    of_kind = np.zeros(int(np.max(kinds)) + 1)
+    np.maximum.at(of_kind, kinds, contribution)
+    floor = max(FLOOR * float(np.max(contribution)), TINY)
+    return 1 / np.maximum(np.maximum(contribution, LEAST * of_kind[kinds]), floor)
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """Rollouts along random directions around one point; `f` takes displacements (K, n) and gives losses (K,)."""
+
+    f: Callable[[Array], Array]
+    derivative: Array  # (n,)
+    weight: Array  # (n,)
+    seed: int
+
+    @property
+    def reach(self) -> float:
+        """What the directions are shortened by, so that no entry is moved by more than its scale times a normal."""
+        return 1 / float(np.max(self.weight))
+
+    def normals(self, count: int) -> Array:
+        """(count, n) the same ones first."""
+        return np.random.default_rng(self.seed).standard_normal((FIRST, len(self.weight)))[:count]
+
+    def step(self, loss: float, factor: float = 1.0) -> float:
+        """A step size at which the rounding of a loss of this size is no more than a tenth of what is allowed."""
+        return float(np.clip(factor * STEP, 10 * ROUNDING * abs(loss) / (LIMIT * self.reach), WIDEST))
+
+    def gaps(self, loss: float, step: float, count: int) -> Gaps:
+        """Of the first `count` directions, `loss` being the one at the point."""
+        z = self.normals(count)
+        v = self.reach * self.weight * z
+        values = self.f(np.vstack([step * v, -step * v]))
+        ahead, behind = values[:count], values[count:]
+        unit = step * self.reach
+        stated = (v @ self.derivative) / self.reach
+        bend = ((ahead - loss) - (loss - behind)) / (2 * unit)
+        return Gaps(step, stated, stated - (ahead - behind) / (2 * unit), bend, ROUNDING * abs(loss) / unit)
+
+    def alone(self, gaps: Gaps) -> tuple[int, float] | None:
+        """The entry whose error alone explains the gaps, and that error; None where no single one does."""
+        z = self.normals(len(gaps))
+        size = (z**2).sum(axis=0)
+        error = (gaps.gap @ z) / size
+        left = gaps.gap @ gaps.gap - error**2 * size
+        j = int(np.argmin(left))
+        return (j, float(error[j] / self.weight[j])) if left[j] <= ALONE * (gaps.gap @ gaps.gap) else None
+
+
+def judge(first: Gaps, second: Gaps | None, doubt: float) -> tuple[str, str]:
+    """The verdict and its reason; `doubt` is the root mean square of gaps that a solver's early stop may leave."""
+    if second is None:
+        return ("agree" if max(first.bound, first.kink) <= LIMIT else "undecided"), ""
+    fine, coarse = sorted((first, second), key=lambda gaps: gaps.step)
+    least = max(doubt, 100 * fine.rounding)
+    for far, near, shrinks, why in (
+        (coarse.gap, fine.gap, coarse.step / fine.step, "the loss jumps: its quotients grow as the step shrinks"),
+        (coarse.bend, fine.bend, 1.0, "the loss has a corner: the slopes to both sides do not approach each other"),
+    ):
+        if _size(near) > max(least, UNCHANGED * shrinks * _size(far)) and fine.kink > LIMIT:
+            return "discontinuous", why
+    if min(first.bound, second.bound) <= LIMIT:
+        return "agree", ""
+    both = min(len(fine), len(coarse))
+    near, far = fine.gap[:both], coarse.gap[:both]
+    if _size(near - far) <= STEADY * min(_size(near), _size(far)) and _size(far) > max(doubt, coarse.rounding):
+        return "disagree", "the gap is the same at both step sizes"
+    return "undecided", "what the differences leave is more than what must be noticed"
+
+
+def _bound(values: Array) -> float:
+    return float(np.sqrt(values @ values / QUANTILE[len(values)]))
+
+
+def _size(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
