@@ -83,6 +83,54 @@ def test_the_cart_pole_from_its_file_swings_up(scheme, count, optimum):
     assert dynamics.bounds.u_upper == pytest.approx([20])
 
 
+def cart_poles_rates(z):
+    """Kelly's eq. 6.1 and 6.2 of z = [x, q, v, w, u] in CasADi."""
+    s, c, w, u = ca.sin(z[1]), ca.cos(z[1]), z[3], z[4]
+    cart = (0.15 * s * w**2 + u + 2.943 * c * s) / (1 + 0.3 * s**2)
+    return ca.vertcat(z[2], z[3], cart, -(0.15 * c * s * w**2 + u * c + 12.753 * s) / (0.5 + 0.15 * s**2))
+
+
+def by_radau(start, count):
+    """The least effort by Radau's collocation at three points of each interval, and inputs that are parabolas there."""
+    tau = [0.0, *ca.collocation_points(3, "radau")]
+    slopes, _, weights = ca.collocation_coeff(tau[1:])
+    h, x = 2.0 / count, ca.SX.sym("x", 4, 3 * count + 1)
+    u = ca.SX.sym("u", 1, 3 * count)
+    g, cost = [x[:, 0], x[:, -1] - ca.DM([1, np.pi, 0, 0])], 0
+    for k in range(count):
+        at = x[:, 3 * k : 3 * k + 4]
+        f = ca.horzcat(*[cart_poles_rates(ca.vertcat(at[:, j + 1], u[3 * k + j])) for j in range(3)])
+        g.append(ca.vec(at @ slopes - h * f))
+        cost += h * ca.dot(weights.T, ca.horzcat(*[u[3 * k + j] ** 2 for j in range(3)]))
+    z, free = ca.veccat(x, u), 4 * (3 * count + 1)
+    options = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "ipopt.tol": 1e-9}
+    solver = ca.nlpsol("radau", "ipopt", {"x": z, "f": cost, "g": ca.veccat(*g)}, options)
+    times = np.append(0.0, (np.arange(count)[:, None] + np.array(tau[1:])).ravel() / count)
+    bound = np.append(np.tile([2, np.inf, np.inf, np.inf], 3 * count + 1), np.full(3 * count, 20))
+    guess = np.append([start(t) for t in times], np.zeros(3 * count))
+    found = solver(x0=guess, lbx=-bound, ubx=bound, lbg=0, ubg=0)
+    return float(found["f"]), np.asarray(found["x"])[:free].reshape(-1, 4)
+
+
+@each_row("dip, optimum", [(0.0, 58.8077), (-1.5, 57.9448)])
+def test_the_cart_pole_has_two_swing_ups_within_all_bounds(dip, optimum):
+    """Which is found is the guess's doing: a straight line's is not the best. Another transcription agrees on both."""
+
+    def start(t):
+        aside = 0.5 * (dip != 0) * np.sin(np.pi * t)
+        return np.array([t + aside, np.pi * t + dip * np.sin(np.pi * t), 0, 0])
+
+    by_another, _ = by_radau(start, 40)
+    assert by_another == pytest.approx(optimum, abs=1e-3)
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04)
+    guess = np.array([start(t) for t in np.linspace(0, 1, 51)]), np.zeros((50, 1))
+    problem = dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], running_cost=EFFORT, num_steps=50)
+    ours = dd.solve(problem, method="collocation", initial_guess=guess)
+    assert ours.success, ours.message
+    assert ours.cost == pytest.approx(optimum, abs=1e-3)
+    assert violation_between_nodes(ours.transcribed).worst == 0
+
+
 # ------------------------------------------------------------------------------ pendulums
 
 
@@ -350,24 +398,75 @@ def test_friction_with_a_push_only():
 # ------------------------------------------------------------------------------ many states and scales
 
 
+HOVER = 0.486 * 9.81 / 2  # [N] of each rotor
+
+
+def fly(x, u):
+    """A planar quadrotor of 0.486 kg, 0.25 m from rotor to rotor's middle, 0.00383 kg m^2."""
+    push = (u[0] + u[1]) / 0.486
+    return np.array(
+        [x[3], x[4], x[5], -push * np.sin(x[2]), push * np.cos(x[2]) - 9.81, 0.25 * (u[0] - u[1]) / 0.00383]
+    )
+
+
+@each_row("scheme, follows", [("trapezoid", False), ("hermite_simpson", True)])
+def test_a_plan_that_its_dynamics_do_not_follow_is_no_success(scheme, follows):
+    """Each interval of the trapezoid is right to 1 %, all together are not: rotors at their limit have nothing left."""
+    count, goal = 25, np.array([0.782, 0.966, 0, 0, 0, 0])
+    found = collocate(
+        Dynamics(fly, 6, 2, u_lower=[0.5, 0.5], u_upper=[5.18, 5.18]),
+        x0=np.zeros(6),
+        x_goal=goal,
+        num_steps=count,
+        horizon=1.2,
+        running_cost=lambda x, u: (u[0] - HOVER) ** 2 + (u[1] - HOVER) ** 2,
+        initial_guess=(np.linspace(np.zeros(6), goal, count + 1), np.full((count + 1, 2), HOVER)),
+        scheme=scheme,
+    )
+    off = np.abs(found.transcribed.led("TVLQR")[-1] - found.xs[-1]) / np.ptp(found.xs, axis=0)
+    assert found.success is follows, found.message
+    assert bool(np.max(off) < 0.01) is follows
+    assert np.all(found.transcribed.gaps < 0.01 * np.minimum(np.ptp(found.xs, axis=0), 1))
+    if not follows:
+        assert "integrated accurately from its first state the plan does not hold: open loop, x" in found.message
+        assert "; TVLQR, x" in found.message
+
+
+def test_feedback_follows_what_open_loop_loses():
+    """An unstable motion, x' = 3 x + u from 1 to 0 in 3 s: open loop an error grows by exp(9), and TVLQR holds it."""
+    unstable = Dynamics(lambda x, u: [3 * x[0] + u[0]], 1, 1)
+    found = collocate(unstable, x0=[1], x_goal=[0], num_steps=30, horizon=3.0, running_cost=effort)
+    assert abs(found.transcribed.led("open loop")[-1, 0]) > 100 * abs(found.transcribed.led("TVLQR")[-1, 0])
+    off = dataclasses.replace(found, xs=found.xs + 1e-5)  # no defect that counts, but 0.08 at the end
+    assert found.success
+    assert abs(off.transcribed.led("open loop")[-1, 0]) > 0.01
+    assert abs(off.transcribed.led("TVLQR")[-1, 0]) < 1e-4
+
+
+def test_feedback_asks_for_no_more_than_the_bounds_allow():
+    """From 1 m/s backwards, a block whose input is at its limit cannot catch up with its plan."""
+    limits = {"u_lower": [-1.0], "u_upper": [1.0]}
+    asked = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 20, "horizon": 2.01, "running_cost": effort}
+    for problem in (
+        dd.Problem(Dynamics(push, 2, 1, **limits), **asked),
+        dd.Problem(BLOCK, **asked, bounds=unit_inputs()),
+    ):
+        found = dd.solve(problem)
+        xs = np.array(found.xs)
+        xs[0, 1] = -1.0
+        assert abs(dataclasses.replace(found, xs=xs).transcribed.led("TVLQR")[-1, 0] - 1) > 0.3
+
+
 def test_the_planar_quadrotors_side_step():
-    m, r, inertia, hover = 0.486, 0.25, 0.00383, 0.486 * 9.81 / 2
-
-    def fly(x, u):
-        push = (u[0] + u[1]) / m
-        return np.array(
-            [x[3], x[4], x[5], -push * np.sin(x[2]), push * np.cos(x[2]) - 9.81, r * (u[0] - u[1]) / inertia]
-        )
-
     count, goal = 40, np.array([1.0, 0, 0, 0, 0, 0])
-    guess = np.linspace(np.zeros(6), goal, count + 1), np.full((count + 1, 2), hover)
+    guess = np.linspace(np.zeros(6), goal, count + 1), np.full((count + 1, 2), HOVER)
     motion = move(
         count,
         Dynamics(fly, 6, 2, u_lower=[0, 0], u_upper=[12, 12]),
         x0=np.zeros(6),
         x_goal=goal,
         horizon=1.5,
-        running_cost=lambda x, u: (u[0] - hover) ** 2 + (u[1] - hover) ** 2,
+        running_cost=lambda x, u: (u[0] - HOVER) ** 2 + (u[1] - HOVER) ** 2,
         initial_guess=guess,
     )
     assert motion.cost == pytest.approx(0.01673444, rel=1e-5)
@@ -715,7 +814,7 @@ def test_the_time_of_kellys_cart_pole(capsys):
             f"\n50 intervals: Hermite-Simpson {end - middle:.2f} s (J {ours.cost:.6f}), dd.solve "
             f"{middle - start:.2f} s (J {drake.cost:.6f}), ratio {(end - middle) / (middle - start):.2f}"
         )
-    assert abs(ours.cost - 58.8077) < 1e-3 < abs(drake.cost - 58.8077)
+    assert abs(ours.cost - 58.8077) < 1e-3 < abs(drake.cost - 58.8077)  # of this guess's own local optimum
     assert ours.options["derivatives"] == "symbolic, exact Hessian"
 
 

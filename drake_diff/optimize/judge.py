@@ -9,7 +9,7 @@ from drake_diff.exceptions import GradientError
 from drake_diff.model.contact import penetration
 from drake_diff.model.step import set_state
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, NlpResult, Outcome
-from drake_diff.optimize.replay import broken_variants, told_of_controls
+from drake_diff.optimize.replay import broken_variants, told_of_controls, told_of_tolerance
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
 from drake_diff.optimize.transcription.collocation import Collocated, violation_between_nodes
 
@@ -29,11 +29,16 @@ def judged(draft: Solution, result: NlpResult) -> Solution:
         complaints.insert(0, f"the solver could not reach its tolerance ({result.message})")
     if not np.all(np.isfinite(draft.xs)):
         return ended(draft, Status.DIVERGED, "; ".join(complaints), **fields)
+    held: list[str] = []
+    if not complaints and draft.transcribed is not None:
+        follows, told = _followed(draft, draft.transcribed)
+        (held if follows else complaints).append(told)
     if not complaints and draft.problem.has_model:
         complaints += broken_variants(draft.plan, draft.replays)
     status = Status.CONVERGED_NOT_VERIFIED if complaints else Status.CONVERGED
-    if not complaints and draft.problem.has_model:
-        complaints = [told_of_controls(draft.plan, draft.replays)]
+    if not complaints:
+        every = [f(draft.plan, draft.replays) for f in (told_of_controls, told_of_tolerance)]
+        complaints = [each for each in (*every, *held) if each]
     return ended(draft, status, "; ".join([*complaints, *[result.note] * bool(result.note)]), **fields)
 
 
@@ -83,6 +88,34 @@ def _between_nodes(solution: Solution, motion: Collocated) -> Iterator[str]:
     broken = violation_between_nodes(motion).broken
     if broken:
         yield f"{'; '.join(broken)}: take more, shorter steps (num_steps)"
+
+
+def _followed(solution: Solution, motion: Collocated) -> tuple[bool, str]:
+    """Whether the dynamics follow the plan from its first state to its last, open loop or under TVLQR, and how well."""
+    b, names, ranges = solution.problem.bounds, solution.problem.state_names, solution.problem.ranges(motion.xs)
+    told = []
+    for control in ("open loop", "TVLQR"):
+        xs = motion.led(control)
+        excess = np.max(np.maximum(np.maximum(b.x_lower - xs, xs - b.x_upper), 0.0)[1:], axis=0)
+        end = np.nan_to_num(np.abs(xs[-1] - motion.xs[-1]), nan=np.inf)
+        excess = np.nan_to_num(excess, nan=np.inf)
+        i, j = (int(np.argmax(off / ranges)) for off in (end, excess))
+        if max(end[i] / ranges[i], excess[j] / ranges[j]) <= INTEGRATION_TOLERANCE:
+            how = control if control == "open loop" else f"under {control}"
+            return True, (
+                f"integrated accurately {how}, {names[i]} ends {end[i]:.2g} from the plan, {end[i] / ranges[i]:.1%} of "
+                f"its range, of {INTEGRATION_TOLERANCE:.0%} allowed"
+            )
+        bound = excess[j] / ranges[j] > end[i] / ranges[i]
+        told.append(
+            f"{control}, {names[j]} is {excess[j]:.3g} beyond its bound"
+            if bound
+            else f"{control}, {names[i]} ends {end[i]:.3g} from the plan"
+        )
+    return False, (
+        f"integrated accurately from its first state the plan does not hold: {'; '.join(told)}; tolerance "
+        f"{INTEGRATION_TOLERANCE:.0%} of each state's range: {FINER}"
+    )
 
 
 def _infeasibilities(solution: Solution) -> Iterator[str]:

@@ -23,6 +23,7 @@ from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import TVLQR
 from drake_diff.motion.rollout import Policy, Rollout, rollout
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
+from drake_diff.optimize.transcription.collocation import EFFORT_WEIGHT, FINAL_WEIGHT
 
 # Of a coordinate's range in the plan: how far from goal, bound or waypoint a replay may be. Discretizations differ by
 # O(h), so nothing tight can be asked of h against h/2; a plan that is wrong is wrong by the order of its range.
@@ -32,7 +33,6 @@ ENERGY_TOLERANCE = 0.1  # of the energy that the motion exchanges: what neither 
 PENETRATION_PART = 0.25  # of the thinnest geometry's thickness: beyond half of it contact may push out the other way
 OTHER_APPROXIMATION = {"sap": "lagged", "similar": "sap", "lagged": "sap", "tamsi": "sap"}
 FINEST = 16  # intervals are cut into at most that many steps
-EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in TVLQR, over that of the states
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -152,7 +152,9 @@ def told_of_controls(plan: Plan, found: Sequence[Replay]) -> str:
     """Under which control a plan that holds does so, and under which it does not; empty where nothing was replayed."""
     if not found:
         return ""
-    decides = _deciding(plan, found) or [found[0].variant]
+    decides = _deciding(plan, found)
+    if not decides:
+        return "on the plant nothing was replayed in finer steps, which a diagram does not allow"
     controls = list(dict.fromkeys(r.control for r in found))
     good = [c for c in controls if all(r.holds for r in found if r.control == c and r.variant in decides)]
     if not good:
@@ -166,6 +168,26 @@ def told_of_controls(plan: Plan, found: Sequence[Replay]) -> str:
         elif failed:  # a collocated plan in steps that are too coarse for it
             told += f"; {_words(control)} {failed[0].variant} it does not: {failed[0].failures[0]}"
     return told
+
+
+def told_of_tolerance(plan: Plan, found: Sequence[Replay]) -> str:
+    """How far from its goal a plan ends where it has to hold, and what is allowed; empty where nothing has to."""
+    decides = _deciding(plan, found)
+    allowed = f"{STATE_TOLERANCE:.0%} of each state's range in the plan"
+    if not decides or np.all(np.isnan(plan.problem.goal)):
+        return f"bounds are kept to {allowed}" if decides else ""
+    worst: tuple[float, str] = (-1.0, "")
+    for variant in decides:
+        ends = [r.motion.xs[-1] for r in found if r.variant == variant and r.holds and r.motion is not None]
+        misses = [np.abs(plan.problem.goal_error(x)) / plan.scale for x in ends]
+        if misses:
+            off = min(misses, key=lambda miss: float(np.max(miss)))
+            i = int(np.argmax(off))
+            told = (
+                f"{plan.problem.state_names[i]} ends {off[i] * plan.scale[i]:.2g} from its goal {variant}, {off[i]:.1%}"
+            )
+            worst = max(worst, (float(off[i]), told))
+    return f"at worst {worst[1]} of its range, of {allowed} allowed"
 
 
 def judged_replay(plan: Plan, found: Sequence[Replay]) -> Replay | None:

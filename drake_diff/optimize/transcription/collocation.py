@@ -24,6 +24,7 @@ DENSE = np.linspace(0, 1, 41)[1:-1]  # where the input is looked at between two 
 # Of a number's range along the motion: how far beyond its bound it may be between nodes. The solver keeps the scheme's
 # polynomials of states and inputs within; what the dynamics do in between differs from these by the integration error.
 EXCESS_TOLERANCE = 1e-3
+EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in TVLQR, over that of the states
 MOST_PIECES = 4  # of one interval in one round of refinement
 FOUND = (Outcome.SOLVED, Outcome.INACCURATE)
 
@@ -156,15 +157,43 @@ class Collocated:
         moved = np.einsum("sj,sjx->sx", scheme.integrated(tau), scheme.per_interval(self._rates)[k])
         return self.xs[k] + self._lengths[k, None] * moved, np.einsum("sj,sju->su", scheme.at(tau), us)
 
-    @property
+    @cached_property
     def open_loop(self) -> Array:
         """(N+1, nx) where the dynamics lead from the first state under the scheme's input; NaN once they diverge."""
+        return self._open_loop[::SUBSTEPS]
+
+    def led(self, control: str) -> Array:
+        """(10 N + 1, nx) the same at every substep, by "open loop", or by "TVLQR" about the motion."""
+        return self._open_loop if control == "open loop" else self._led(self._gains())
+
+    @cached_property
+    def _open_loop(self) -> Array:
+        return self._led(None)
+
+    def _led(self, gains: Array | None) -> Array:
         z = np.append(self.xs[0], 0.0)[None]
-        found = [z[0]]
+        found = [z]
         for k in range(len(self.mesh) - 1):
-            z = self._integrate(np.array([k]), z)[-1]
-            found.append(z[0])
-        return np.array(found)[:, : self.task.dynamics.nx]
+            path = self._integrate(np.array([k]), z, None if gains is None else gains[k])
+            found.append(path[1:, 0])
+            z = path[-1]
+        return np.concatenate(found)[:, : self.task.dynamics.nx]
+
+    def _gains(self) -> Array:
+        """(N, nu, nx) of each interval, by Riccati's recursion with Bryson's weights, as a replay's TVLQR has them."""
+        nx, nu = self.task.dynamics.nx, self.task.dynamics.nu
+        effort = np.maximum(np.max(np.abs(self.us), axis=0), SMALLEST_RANGE)
+        Q, R = np.diag(1 / self.task.problem.ranges(self.xs) ** 2), EFFORT_WEIGHT * np.diag(1 / effort**2)
+        by_knot = self.task.dynamics.linearize(np.hstack([self.xs, self.us])[:-1])[1]
+        P, gains = FINAL_WEIGHT * Q, np.empty((len(by_knot), nu, nx))
+        for k in range(len(by_knot) - 1, -1, -1):
+            h = self._lengths[k]
+            implicit = np.eye(nx) - h / 2 * by_knot[k][:, :nx]  # the step by the implicit midpoint rule
+            A = np.linalg.solve(implicit, np.eye(nx) + h / 2 * by_knot[k][:, :nx])
+            B = np.linalg.solve(implicit, h * by_knot[k][:, nx:])
+            gains[k] = np.linalg.solve(h * R + B.T @ P @ B, B.T @ P @ A)
+            P = h * Q + A.T @ P @ (A - B @ gains[k])
+        return gains
 
     @cached_property
     def _integrated(self) -> Array:
@@ -172,13 +201,21 @@ class Collocated:
         every = np.arange(len(self.mesh) - 1)
         return self._integrate(every, np.column_stack([self.xs[:-1], np.zeros(len(every))]))
 
-    def _integrate(self, k: Indices, z: Array) -> Array:
-        """(11, S, nx + 1) where `z` at the starts of the intervals `k` (S,) leads in ten steps: states and cost."""
+    def _integrate(self, k: Indices, z: Array, gains: Array | None = None) -> Array:
+        """(11, S, nx + 1) where `z` at the starts of the intervals `k` (S,) leads in ten steps: states and cost.
+
+        With `gains` (nu, nx), under feedback about the motion too.
+        """
         dynamics, rates, nx = self.task.dynamics, self.task.rate, self.task.dynamics.nx
         dt, found = self._lengths[k, None] / SUBSTEPS, [z]
 
         def rate(z: Array, step: float) -> Array:
-            knots = np.hstack([z[:, :nx], self._applied(k, np.full(len(k), step / SUBSTEPS))])
+            tau = np.full(len(k), step / SUBSTEPS)
+            us, b = self._applied(k, tau), self.task.bounds
+            if gains is not None:
+                us = us + (self._between(k, tau)[0] - z[:, :nx]) @ gains.T
+                us = self._cut_off(np.clip(us, b.u_lower, b.u_upper))
+            knots = np.hstack([z[:, :nx], us])
             return np.column_stack([dynamics.values(knots), rates.values(knots)])
 
         with np.errstate(all="ignore"):
@@ -191,9 +228,13 @@ class Collocated:
         return np.array(found)
 
     def _applied(self, k: Indices, tau: Array) -> Array:
-        """(S, nu) the inputs in the intervals `k` at `tau` as the plant applies them: cut off at its own limits."""
+        """(S, nu) the inputs in the intervals `k` at `tau` as the plant applies them."""
+        return self._cut_off(self._between(k, tau)[1])
+
+    def _cut_off(self, us: Array) -> Array:
+        """`us` (S, nu) at the plant's own limits."""
         limits = self.task.dynamics.bounds
-        return np.clip(self._between(k, tau)[1], limits.u_lower, limits.u_upper)
+        return np.clip(us, limits.u_lower, limits.u_upper)
 
 
 @dataclass(frozen=True, eq=False)
