@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.models import Plant, add_slide, contact_properties
 from helpers.plants import block, constrained, limited_pendulum, pair, springs_and_motors
-from helpers.robots import FOOT, example_robot, state_in_range
+from helpers.robots import FOOT, ROBOTS, example_robot, state_in_contact, state_in_range
 from helpers.table import each_row
 from pydrake.geometry import Box
 from pydrake.multibody.tree import BodyIndex, PdControllerGains, SpatialInertia
@@ -381,3 +381,35 @@ def test_a_robot_in_the_air_with_controllers():
     found = polished_steps(model, select(model, ()), xs, random.standard_normal((20, model.nu)))
     assert not found.refused
     assert np.abs(found.x_next - found.drake).max() < 1e-9  # without limits the problem is quadratic: one step
+
+
+# ---- many robots -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("approximation", ["lagged", "similar", "sap"])
+def test_robots_in_contact_are_never_refused_and_planted_materials_nearly_always(approximation, monkeypatch):
+    """288 random states of walking robots: Drake's steps are within its tolerance, and 1 % of stiffness is noticed.
+
+    Where a foot leaves the ground in the step, or presses with less than 1e-6 of the momentum, nobody can notice.
+    """
+    random, right = np.random.default_rng(7), polish.combine
+    noticed, states, worst = 0, 0, 0.0
+    for name in (name for name, floating in ROBOTS.items() if floating):
+        for time_step, stiffness in ((5e-4, 1e6), (1e-3, 1e4), (2e-3, 1e5), (5e-3, 1e3)):
+            options = {"approximation": approximation, "feet": True, "stiffness": stiffness}
+            model = example_robot(name, time_step, **options)
+            xs = np.array([state_in_contact(model, random, depth=10 ** random.uniform(-4, -2)) for _ in range(12)])
+            us = random.standard_normal((12, model.nu))
+            found = polished_steps(model, select(model, ()), xs, us)
+            assert not found.refused
+            worst = max(worst, np.abs(found.x_next - found.drake).max())
+            assert found.left.max() <= 1e-6
+            with monkeypatch.context() as planted:
+                planted.setattr(
+                    polish, "combine", lambda sides: replace(m := right(sides), stiffness=1.01 * m.stiffness)
+                )
+                noticed += len(polished_steps(model, select(model, ()), xs, us).refused)
+            states += 12
+    assert states == 288
+    assert 1e-7 < worst < 1e-3  # what the solver's stop is worth
+    assert noticed >= 0.7 * states

@@ -112,11 +112,10 @@ class ConvexSteps:
         had = (self.A @ v[..., None])[..., 0]
         return np.asarray(np.maximum(self.norm(had), self.norm(given)))
 
-    def solve(self, v: Array) -> tuple[Array, Array]:
-        """v' (N, nv) to rounding, started from v (N, nv), and what is missing there (N,), of the momentum."""
+    def solve(self, v: Array, at: Balance) -> tuple[Array, Array]:
+        """v' (N, nv) to rounding, from v (N, nv) with its balance, and what is left (N,), of the momentum."""
         v, left = np.array(v), np.full(len(v), np.inf)
         open_, problems = np.arange(len(v)), self
-        at = self.at(v)
         for _ in range(MAX_STEPS):
             size = problems.norm(at.missing)
             own = v[open_]

@@ -173,7 +173,7 @@ class _Read:
     settings: _Settings
     mass: Array  # (nv, nv)
     bias: Array  # (nv,) the force that no acceleration needs, less those that act
-    contacts: list[tuple[Array, ...]]  # J' (nv, 3), normal (3,), phi, material (4,)
+    contacts: list[tuple[Array, ...]]  # of both bodies `_motions`; the point, normal, phi, and material (2, 4)
 
 
 def _read(model: Model, settings: _Settings, k: int) -> _Read | Refusal:
@@ -195,30 +195,32 @@ def _contacts(model: Model, settings: _Settings) -> list[tuple[Array, ...]] | Re
     results = plant.get_contact_results_output_port().Eval(context)
     if results.num_hydroelastic_contacts():
         return Refusal("hydroelastic contact acts")
-    jacobians: dict[Any, tuple[Array, Array]] = {}
-
-    def jacobian(index: Any, point: Array) -> Array:
-        """(nv, 3) the velocity of a body's point by the degrees of freedom."""
-        if index not in jacobians:
-            body, world = plant.get_body(index), plant.world_frame()
-            spatial = plant.CalcJacobianSpatialVelocity(
-                context, JacobianWrtVariable.kV, body.body_frame(), np.zeros(3), world, world
-            )
-            jacobians[index] = spatial.T, plant.EvalBodyPoseInWorld(context, body).translation()
-        motions, origin = jacobians[index]
-        return np.asarray(motions[:, 3:] + cross(motions[:, :3], point - origin))
-
+    motions: dict[Any, tuple[Array, Array]] = {}
     found: list[tuple[Array, ...]] = []
     for i in range(results.num_point_pair_contacts()):
         info = results.point_pair_contact_info(i)
-        pair, point = info.point_pair(), info.contact_point()
+        pair = info.point_pair()
         sides = [_material(model, settings, geometry) for geometry in (pair.id_A, pair.id_B)]
         for side in sides:
             if isinstance(side, Refusal):
                 return side
-        J = jacobian(info.bodyA_index(), point) - jacobian(info.bodyB_index(), point)
-        found.append((J, np.array(pair.nhat_BA_W), np.array(-pair.depth), np.array(sides)))
+        moves: list[Array] = []
+        for index in (info.bodyA_index(), info.bodyB_index()):
+            if index not in motions:
+                motions[index] = _motions(model, plant.get_body(index))
+            moves += motions[index]
+        found.append((*moves, info.contact_point(), pair.nhat_BA_W, np.array(-pair.depth), np.array(sides)))
     return found
+
+
+def _motions(model: Model, body: Any) -> tuple[Array, Array]:
+    """(6, nv) the velocity [angular; linear] of a body's origin by the degrees of freedom, and where that is (3,)."""
+    plant, context = model.plant, model.double.context
+    if body.index() == plant.world_body().index():
+        return np.zeros((6, model.nv)), np.zeros(3)
+    frame, world = body.body_frame(), plant.world_frame()
+    moves = plant.CalcJacobianSpatialVelocity(context, JacobianWrtVariable.kV, frame, np.zeros(3), world, world)
+    return moves, plant.EvalBodyPoseInWorld(context, body).translation()
 
 
 def _material(model: Model, settings: _Settings, geometry: Any) -> Array | Refusal:
@@ -296,9 +298,13 @@ def _contact_impulses(model: Model, read: list[_Read], v: Array, weights: Array)
     found = [(i, *contact) for i, r in enumerate(read) for contact in r.contacts]
     if not found:
         return None
-    at, jacobians, normals, depths, materials = zip(*found, strict=True)
-    problem, J, normal, phi = np.array(at, dtype=np.intp), np.array(jacobians), np.array(normals), np.array(depths)
-    material = combine(np.array(materials))
+    at, *columns = zip(*found, strict=True)
+    moves_a, origin_a, moves_b, origin_b, point, normal, phi, sides = (np.array(column) for column in columns)
+    problem, J = (
+        np.array(at, dtype=np.intp),
+        _at_point(moves_a, point - origin_a) - _at_point(moves_b, point - origin_b),
+    )
+    material = combine(sides)
     weight, h = weigh(J, weights[problem]).value, model.time_step
     contact, velocity = model.contract.contact, np.zeros_like(normal)
     law: Cone | HuntCrossley
@@ -314,13 +320,19 @@ def _contact_impulses(model: Model, read: list[_Read], v: Array, weights: Array)
     return ContactImpulses(problem, J, law)
 
 
+def _at_point(motions: Array, from_origin: Array) -> Array:
+    """(M, nv, 3) the velocity of points of bodies by the degrees of freedom, of `_motions` (M, 6, nv)."""
+    moves = motions.swapaxes(1, 2)
+    return np.asarray(moves[..., 3:] + cross(moves[..., :3], from_origin[:, None, :]))
+
+
 def _solved(problems: ConvexSteps, drake: Array) -> tuple[Array, Array, dict[int, str]]:
     """v' (N, nv) to rounding, what Drake's v' (N, nv) leaves of the momentum (N,), and those that are refused."""
     at, solved = problems.at(drake), problems.taking_part()
     missing = problems.norm(at.missing * solved), problems.norm(at.missing * ~solved)
     had = problems.scale(drake * solved, at.given), problems.scale(drake, at.given)
     left, elsewhere = (np.divide(m, p, out=np.zeros_like(m), where=m > 0) for m, p in zip(missing, had, strict=True))
-    v_next, rest = problems.solve(drake)
+    v_next, rest = problems.solve(drake, at)
     whys = {}
     for i in np.flatnonzero(~(left <= DRAKES_STOP)):
         whys[int(i)] = (
