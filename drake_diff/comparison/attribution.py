@@ -180,7 +180,8 @@ def _push(coordinates: Coordinates, one: Engine, x: Array, left: Array, after: A
     change = left[coordinates.nq :]
     if _size(change) <= FITS[one.contract.precision] * max(1.0, _size(after)):
         return set()
-    force = np.abs(one.mass_matrix(x[: coordinates.nq]) @ change)
+    _, damping = forces(one.contract, np.zeros(len(one.contract.inputs)))  # implicit in Drake's step
+    force = np.abs((one.mass_matrix(x[: coordinates.nq]) + one.contract.time_step * np.diag(damping)) @ change)
     return {int(j) for j in np.flatnonzero(force > PUSHED * np.max(force))}
 
 

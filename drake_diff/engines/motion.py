@@ -16,7 +16,7 @@ from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.differences import central_differences, one_by_one
 from drake_diff.certificates.certificate import Certificate, certify_displacement
 from drake_diff.engines.interface import Engine, Precision
-from drake_diff.exceptions import NotOfferedError, SimulationError
+from drake_diff.exceptions import GradientError, NotOfferedError, SimulationError
 from drake_diff.model.tangent import TangentSpace
 
 BROKE_OFF = "broke off"
@@ -28,6 +28,7 @@ DIFFERENCE_STEP: dict[Precision, float] = {"float64": 1e-5, "float32": 1e-2}
 # allows a hundred times what it is told was left unsolved.
 DIFFERENCES_LEAVE = 1e-10
 AGREES = "agree"
+NO_DERIVATIVE = (NotOfferedError, GradientError, SimulationError)  # the last: shapes that AutoDiffXd refuses
 SINGLE = 1e-2  # of the largest entry: as far as differences of single precision tell
 
 
@@ -79,10 +80,10 @@ def measured(engine: Engine, times: Array, xs: Array, us: Array, status: str = "
 
 
 def seconds(call: Callable[[], Any]) -> float | None:
-    """The median time of `call`, its first run, which may compile, left out; None where it is not offered."""
+    """The median time of `call`, its first run, which may compile, left out; None where there is none."""
     try:
         call()
-    except NotOfferedError:
+    except NO_DERIVATIVE:
         return None
     taken: list[float] = []
     while len(taken) < TIMED and sum(taken) < LONGEST:
@@ -121,8 +122,9 @@ def jacobian_at(
 
     try:
         found = engine.differentiate_step(x, u)
-    except NotOfferedError:
-        method = f"central differences of its steps, {DIFFERENCE_STEP[precision]:g} wide"
+    except NO_DERIVATIVE as error:
+        why = "" if isinstance(error, NotOfferedError) else f" ({error})"
+        method = f"central differences of its steps, {DIFFERENCE_STEP[precision]:g} wide{why}"
         return JacobianAt(state, frozen(quotients()), method, None, None)
     jacobian = space.jacobian(x, engine.step(x, u), found.A, found.B)
     if precision == "float32":
@@ -145,7 +147,7 @@ def rollout_jacobian(engine: Engine, space: TangentSpace, motion: EngineMotion) 
     for x, u, x_next in zip(motion.xs, motion.us, motion.xs[1:], strict=False):
         try:
             found = engine.differentiate_step(x, u)
-        except NotOfferedError:
+        except NO_DERIVATIVE:
             return None
         product = space.jacobian(x, x_next, found.A) @ product
     return frozen(product)
