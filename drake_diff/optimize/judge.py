@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import GradientError
 from drake_diff.model.contact import penetration
 from drake_diff.model.step import set_state
@@ -14,7 +15,11 @@ from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
 from drake_diff.optimize.transcription.collocation import Collocated, violation_between_nodes
 
 FINER = "pass refine=True, or take more steps (num_steps)"
+REFINED = "raise max_num_steps, or take more steps (num_steps)"  # where it was refined
 _ALIKE = ("ITERATION_LIMIT", "TIME_LIMIT", "INFEASIBLE", "INTERRUPTED", "DIVERGED", "NO_GRADIENT", "FAILED")
+# Where the solver stopped short of its own tolerance, or gave up: our own measures say at what.
+STOPPED = (Outcome.INACCURATE, Outcome.INFEASIBLE, Outcome.ITERATION_LIMIT, Outcome.NO_GRADIENT, Outcome.FAILED)
+STATIONARY = 1e-6  # of the terms of the Lagrangian's gradient: what is left to gain is of its square
 _STATUSES = {Outcome.UNBOUNDED: Status.DIVERGED, **{Outcome[name]: Status[name] for name in _ALIKE}}
 
 
@@ -22,10 +27,12 @@ def judged(draft: Solution, result: NlpResult) -> Solution:
     """The draft with the status that the solver's outcome and our own measures allow."""
     fields = {"iterations": result.iterations, "solver_message": result.message}
     complaints = list(complaints_about(draft))
-    if result.outcome in _STATUSES:
+    outcome, notes = (result.outcome, ()) if complaints else _by_our_measures(draft, result)
+    notes = (*notes, *[result.note] * bool(result.note))
+    if outcome in _STATUSES:
         detail = "; ".join([result.message, *complaints])
-        return ended(draft, _STATUSES[result.outcome], detail, **fields)
-    if result.outcome is Outcome.INACCURATE:
+        return ended(draft, _STATUSES[outcome], detail, **fields)
+    if outcome is Outcome.INACCURATE:
         complaints.insert(0, f"the solver could not reach its tolerance ({result.message})")
     if not np.all(np.isfinite(draft.xs)):
         return ended(draft, Status.DIVERGED, "; ".join(complaints), **fields)
@@ -39,7 +46,26 @@ def judged(draft: Solution, result: NlpResult) -> Solution:
     if not complaints:
         every = [f(draft.plan, draft.replays) for f in (told_of_controls, told_of_tolerance)]
         complaints = [each for each in (*every, *held) if each]
-    return ended(draft, status, "; ".join([*complaints, *[result.note] * bool(result.note)]), **fields)
+    return ended(draft, status, "; ".join([*complaints, *notes]), **fields)
+
+
+def _by_our_measures(draft: Solution, result: NlpResult) -> tuple[Outcome, tuple[str, ...]]:
+    """The outcome of a solve whose plan keeps all that was asked, and how that differs from what the solver says."""
+    if result.outcome not in STOPPED:
+        return result.outcome, ()
+    ratio = _stationarity(draft, result)
+    if not ratio <= STATIONARY:
+        unknown = result.outcome is Outcome.ITERATION_LIMIT
+        return result.outcome if unknown else Outcome.INACCURATE, ()
+    told = f"what was asked is kept, and the Lagrangian's gradient is {ratio:.1g} of its terms"
+    return Outcome.SOLVED, (f"by our own measures, where the solver says {result.message!r}: {told}",)
+
+
+def _stationarity(draft: Solution, result: NlpResult) -> float:
+    """What is left of the Lagrangian's gradient, over its largest term; inf where that is not known."""
+    found = draft.optimality
+    ratio = result.stationarity if isinstance(found, Refusal) else found.ratio
+    return ratio if np.isfinite(ratio) else float("inf")
 
 
 def refused(draft: Solution, error: Exception) -> Solution:
@@ -78,6 +104,8 @@ def complaints_about(solution: Solution) -> Iterator[str]:
 def _between_nodes(solution: Solution, motion: Collocated) -> Iterator[str]:
     """Where the motion between nodes is not that of the dynamics, or not within its bounds and constraints."""
     finer = "take a smaller time step" if solution.problem.horizon is None else FINER
+    if "refinements" in solution.options:
+        finer = REFINED
     tolerance = INTEGRATION_TOLERANCE * np.minimum(solution.problem.ranges(motion.xs), 1.0)
     if not np.all(motion.gaps <= tolerance):
         knot, i = np.unravel_index(int(np.argmax(motion.gaps / tolerance)), motion.gaps.shape)

@@ -90,6 +90,8 @@ class NlpResult:
     message: str
     iterations: tuple[Iteration, ...]
     note: str = ""  # what a claim of a minimum is limited to, if it is
+    # What multipliers of rows that hold leave of the Lagrangian's gradient, over its largest term; NaN if not known.
+    stationarity: float = math.nan
 
 
 class Watch:

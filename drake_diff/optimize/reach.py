@@ -260,7 +260,7 @@ def _is_coupled(model: Model) -> bool:
 
 
 def _what_is_apart(problem: Problem, xs: Array) -> str:
-    """Which bodies that may collide never touch along xs (N+1, nx), and what to do; empty if there are none."""
+    """Which bodies that may collide never touch along xs (N+1, nx); empty if there are none."""
     model, nearest = problem.model, dict[tuple[str, str], tuple[float, int]]()
     try:
         for k, x in enumerate(xs):
@@ -276,5 +276,4 @@ def _what_is_apart(problem: Problem, xs: Array) -> str:
         f"{a} and {b} stay {d:.3g} m apart or more, nearest at knot {k}" for (a, b), (d, k) in apart.items()
     )
     head = "nothing touches" if len(apart) == len(nearest) else "some bodies never touch"
-    advice = '; use method="ilqr" and continuation="auto"' if problem.optimizes_controls else ""
-    return f": at knots 0-{len(xs) - 1} {head} ({told}){advice}"
+    return f": at knots 0-{len(xs) - 1} {head} ({told})"

@@ -37,7 +37,7 @@ class Status(enum.Enum):
 
     Example:
         >>> dd.Status("iteration_limit").sentence
-        'the iteration limit came first; raise max_iterations or start from a better guess'
+        'the iteration limit came first'
     """
 
     CONVERGED = "converged"
@@ -52,20 +52,19 @@ class Status(enum.Enum):
 
     @property
     def sentence(self) -> str:
-        """What it means, and what to try."""
+        """What it means; a solution's message says what to try."""
         return _SENTENCES[self]
 
 
 _SENTENCES = {
     Status.CONVERGED: "the solver converged and the plan holds",
     Status.CONVERGED_NOT_VERIFIED: "the solver stopped at a solution, but a measure or a certificate does not hold",
-    Status.ITERATION_LIMIT: "the iteration limit came first; raise max_iterations or start from a better guess",
-    Status.TIME_LIMIT: "the time limit came first; raise time_limit or start from a better guess",
-    Status.INFEASIBLE: "the solver found no motion that keeps every bound and reaches the goal; relax a bound, "
-    "give it more steps, or start from another guess",
-    Status.DIVERGED: "the motion left every finite number; use a smaller time step or a better guess",
-    Status.NO_GRADIENT: "nothing that may change has an effect on the goal or the cost, or its derivative must not "
-    "be used; start from a guess that does",
+    Status.ITERATION_LIMIT: "the iteration limit came first",
+    Status.TIME_LIMIT: "the time limit came first",
+    Status.INFEASIBLE: "the solver found no motion that keeps every bound and reaches the goal",
+    Status.DIVERGED: "the motion left every finite number",
+    Status.NO_GRADIENT: "part of the goal or the cost is out of reach of all that may change, or a derivative must not "
+    "be used",
     Status.INTERRUPTED: "the run was interrupted; this is the best motion so far",
     Status.FAILED: "the solver failed",
 }

@@ -16,6 +16,7 @@ from drake_diff.certificates.certify import certify
 from drake_diff.exceptions import DrakeDiffError, GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.soft_contact import SoftContact
+from drake_diff.optimize.advice import advice
 from drake_diff.optimize.drake_program import SOLVERS
 from drake_diff.optimize.ilqr.ilqr import check_problem, is_unconstrained, solve_ilqr
 from drake_diff.optimize.ilqr.through_contact import check_schedule, solve_continuation, solve_through_jumps
@@ -161,7 +162,23 @@ def solve(
         "error_tolerance": refinement.tolerance,
         "max_num_steps": refinement.most,
     }
-    return solution.told(search=Search(arguments, initial_guess))
+    tried = {link["method"] for link in solution.options.get("chain", ())} | {solution.method}
+    told = advice(
+        solution, arguments, [other for other in METHODS[1:] if other not in tried and _takes(problem, other)]
+    )
+    message = f"{solution.message}; {told}" if told else solution.message
+    return solution.told(message=message, search=Search(arguments, initial_guess))
+
+
+def _takes(problem: Problem, method: str) -> bool:
+    """Whether `method` can be asked for `problem`, and says anything of its contact."""
+    if method == "collocation" and problem.has_model and problem.model.contract.contact.collision_pairs:
+        return False
+    try:
+        _check_attempt(problem, Attempt(method, ""))
+    except DrakeDiffError:
+        return False
+    return True
 
 
 def _plain_stages(stages: Sequence[SoftContact]) -> list[dict[str, float]]:
@@ -260,6 +277,8 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
         last = found[-1]
         task.report.say(f"{attempt.method} ({attempt.reason}): {last.status.value}")
         chain.append({"method": attempt.method, "reason": attempt.reason, "ended": last.status.value})
+        if attempt.continuation is not None:
+            chain[-1]["continuation"] = "auto"
         if last.status in ENDED:
             break
 

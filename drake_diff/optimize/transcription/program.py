@@ -18,7 +18,16 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.exceptions import DrakeDiffError, GradientError, SimulationError
-from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch, ctrl_c
+from drake_diff.optimize.program import (
+    FEASIBILITY_TOLERANCE,
+    Iteration,
+    Limits,
+    NlpResult,
+    Outcome,
+    Report,
+    Watch,
+    ctrl_c,
+)
 from drake_diff.optimize.transcription.expressions import KnotFunctions
 from drake_diff.optimize.transcription.task import OptimalControl
 
@@ -256,8 +265,32 @@ def solve_ipopt(
     if watch.stopped_by is not None:
         return NlpResult(watch.best_of(guess), watch.stopped_by, f"stopped: {watch.stopped_by.value}", table)
     words = str(stats["return_status"])
-    outcome = OUTCOMES.get(words, Outcome.FAILED)
-    return NlpResult(np.asarray(found["x"]).ravel(), outcome, f"IPOPT: {words.replace('_', ' ')}", table)
+    outcome, left = OUTCOMES.get(words, Outcome.FAILED), _stationarity(program, options, found)
+    z = np.asarray(found["x"]).ravel()
+    return NlpResult(z, outcome, f"IPOPT: {words.replace('_', ' ')}", table, stationarity=left)
+
+
+def _stationarity(program: TranscribedProgram, derivatives: Any, found: Any) -> float:
+    """What IPOPT's multipliers leave of the Lagrangian's gradient, those of what does not hold the plan left out."""
+    z, slope = found["x"], ca.DM(derivatives["grad_f"](found["x"], [])[1])
+    rows, jacobian = derivatives["jac_g"](z, [])
+    of_rows, of_variables = (
+        _holding(np.asarray(multiplier).ravel(), np.asarray(value).ravel(), *sides)
+        for multiplier, value, sides in (
+            (found["lam_g"], rows, program.sides),
+            (found["lam_x"], z, (program.lower, program.upper)),
+        )
+    )
+    left = slope + ca.mtimes(jacobian.T, ca.DM(of_rows)) + ca.DM(of_variables)
+    terms = ca.fabs(slope) + ca.mtimes(ca.fabs(jacobian.T), ca.DM(abs(of_rows))) + ca.DM(abs(of_variables))
+    gradient, largest = (float(np.max(np.abs(np.asarray(each)), initial=0.0)) for each in (left, terms))
+    return gradient / largest if largest > 0 else 0.0
+
+
+def _holding(multipliers: Array, values: Array, lower: Array, upper: Array) -> Array:
+    """The multipliers (m,) of what lies on the side that they push from, 0 of all others."""
+    on_lower, on_upper = values <= lower + FEASIBILITY_TOLERANCE, values >= upper - FEASIBILITY_TOLERANCE
+    return np.where(on_upper, np.maximum(multipliers, 0.0), 0.0) + np.where(on_lower, np.minimum(multipliers, 0.0), 0.0)
 
 
 class _IterateCallback(ca.Callback):  # type: ignore[misc]
