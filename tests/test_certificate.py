@@ -9,7 +9,8 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff._base.differences import sweep_of
-from drake_diff.certificates.certificate import _jittery
+from drake_diff.certificates.judgement import judge
+from drake_diff.certificates.neighbourhood import look_around
 from drake_diff.exceptions import CertificateError, GradientError, ShapeError, UnknownNameError
 
 
@@ -51,7 +52,7 @@ def test_all_points_in_one_call_give_the_same_certificate():
         assert one.verdict == together.verdict == verdict
         assert np.array_equal(one.codes, together.codes)
         assert np.array_equal(one.difference, together.difference)
-    assert calls == [1 + 13 * 2 * 5] * 2
+    assert calls == [1 + 13 * 2 * 5 + 2 * 4 * 8] * 2  # the point, the sweep, four spacings along a line
 
 
 @pytest.mark.parametrize("minus", [np.subtract, lambda a, b: a - b])
@@ -240,7 +241,9 @@ def test_a_certificates_repr_is_short_and_its_html_is_escaped(load):
     f, jacobian = smooth(20)
     names = [f"<i>{i}</i>" for i in range(20)]
     certificate = dd.certificates.certify_jacobian(f, np.zeros(20), jacobian(np.zeros(20)), rows=names)
-    assert repr(certificate).startswith("Certificate of the derivative: agree (400 agree of 400 entries, given)\n")
+    assert repr(certificate).startswith(
+        "Certificate of the derivative: agree (400 agree of 400 entries, given, would have noticed 0.0006 %)\n"
+    )
     assert len(repr(certificate).splitlines()) == 2
     assert str(certificate) == repr(certificate).split(": ", 1)[1].replace("\n  ", "; ")
     assert "&lt;i&gt;" in certificate._repr_html_()
@@ -254,4 +257,5 @@ def test_a_certificates_repr_is_short_and_its_html_is_escaped(load):
 def test_jitter_is_told_in_every_unit(unit):
     """One entry that is another number beside the point; one that is too, below a millionth of its row's largest."""
     a, beside = unit * np.array([[1.0, 1.0, 1e-8]]), unit * np.array([[1.0, 1.5, 3e-8]])
-    assert _jittery(a, beside, np.zeros((1, 3)), 0.0).tolist() == [[False, True, False]]
+    found = judge(look_around(lambda d: d @ a.T, 3), a, beside)
+    assert found.reasons == {(0, 1): f"1e-9 beside the point the derivative is {1.5 * unit:.6g}"}

@@ -1,51 +1,45 @@
 """Compare a derivative with difference quotients, entry by entry, and say whether it may be used.
 
-The function is differenced at 13 step sizes, half a decade apart. With C(h) the central quotient and r = sqrt(10),
-Richardson's D(h) = C(h/r) + (C(h/r) - C(h)) / (r^2 - 1) has an error of order h^4. Three neighbouring D that lie close
-together are a plateau, and their spread is its uncertainty. What the verdicts mean stands in `Certificate`.
+What the differences say is in `neighbourhood`, the verdict in `judgement`, and what it means in `Certificate`.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_diff._base.arrays import Array, finite_array, frozen
-from drake_diff._base.differences import ROUNDING, Difference, Function, Many, one_by_one, richardson, sweep_of
+from drake_diff._base.differences import Difference, Function, Many, one_by_one
 from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff.certificates.judgement import VERDICTS, Scales, judge
+from drake_diff.certificates.neighbourhood import Neighbourhood, look_around
 from drake_diff.exceptions import CertificateError, GradientError, ShapeError
 from drake_diff.model.contact import Pair
 
-STEPS = tuple(10.0 ** (-k / 2) for k in range(4, 17))  # 1e-2 ... 1e-8
-RELATIVE_TOLERANCE = 1e-6
-RESOLVED = 1e-4
-# Entries below this part of their row's largest, or below NOTHING, need not be resolved, only consistent.
-NEGLIGIBLE, NOTHING = 1e-6, 1e-9
-# An iterative solver stops early, and the derivative shows it: measured up to 60 times its tolerance, by row.
-SOLVER_FACTOR = 100.0
-DOUBTFUL = 10.0  # a gap up to this many times that may still be the solver's: undecided, which does not pass
 JITTER = 1e-9
-JITTER_CHANGE = 0.1
-VERDICTS = ("agree", "undecided", "not_converged", "disagree", "discontinuous")  # from good to bad
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry of a derivative, the differences' value of it, and the gap that is allowed between them."""
+    """One entry of a derivative, the differences' value of it, the gap that is allowed, and what would be noticed."""
 
     row: str
     column: str
     derivative: float
     difference: float
     tolerance: float
+    noticeable: float  # the smallest error that would have been noticed
     verdict: str
+    reason: str = ""  # of "discontinuous": which kind, with numbers
 
     def __str__(self) -> str:
+        why = f" ({self.reason})" if self.reason else ""
         return (
             f"d {self.row} / d {self.column}: derivative {self.derivative:.9g}, differences {self.difference:.9g}, "
-            f"tolerance {self.tolerance:.2g}: {self.verdict}"
+            f"tolerance {self.tolerance:.2g}, would have noticed {self.noticeable:.2g}: {self.verdict}{why}"
         )
 
 
@@ -72,22 +66,25 @@ class ModeChange:
 class Certificate(ShowsItsRepr):
     """One derivative (m, n), compared with difference quotients; `codes` (m, n) are indices into VERDICTS.
 
+    How far the differences can be trusted is measured at the point: by how much they depend on their step, and by how
+    much the function's values scatter. From that comes `noticeable`, the smallest error of each entry that would have
+    been noticed. It is weighed by `size`: the entry itself, but no less than a millionth of the largest entry of its
+    row and of its column, the columns being moved by 1 SI unit, or by the variable's magnitude where that is more.
     The verdict of an entry is
 
-    - "agree": it lies on a plateau that is known to 1e-4 of it. The step of an iterative solver is allowed 100 times
-      the solver's tolerance, relative to the entry and to the largest of its row;
-    - "undecided": the differences do not resolve it. Undecided does not pass;
+    - "agree": it is the differences' value, and an error of 1 % of `size` would have been noticed;
+    - "undecided": the differences do not tell 1 %. Undecided does not pass;
     - "not_converged": it agrees, but a rollout's gradient changes at a finer time step or in stiffer contact;
-    - "disagree": there are plateaus, and it misses all of them by more than ten times what is allowed;
-    - "discontinuous": forward and backward quotients do not approach each other as h shrinks (a kink), or grow apart
-      as 1/h (a jump), or the derivative is another one 1e-9 beside the point.
+    - "disagree": it is another value than the differences';
+    - "discontinuous": the function has a corner, a jump or stairs at the point, or the derivative is another one 1e-9
+      beside it; the entry's `reason` says which.
 
     Example:
         >>> certificate = dd.certificates.certify_jacobian(np.sin, [0.0], [[1.01]], rows=["y"], columns=["x"])
         >>> certificate.verdict
         'disagree'
         >>> print(certificate.worst)
-        d y / d x: derivative 1.01, differences 1, tolerance ...: disagree
+        d y / d x: derivative 1.01, differences 1, tolerance ..., would have noticed ...: disagree
     """
 
     rows: tuple[str, ...]
@@ -95,15 +92,28 @@ class Certificate(ShowsItsRepr):
     derivative: Array
     difference: Array
     tolerance: Array
+    noticeable: Array
+    size: Array
     codes: NDArray[np.int64]
+    reasons: dict[tuple[int, int], str]  # of the entries that are discontinuous
     method: str
     subject: str
+    around: Neighbourhood  # in displacements of which one changes a column by its `scale`
+    scale: Array  # (n,)
+    stopped: float  # how early the solver stopped where the derivative was taken, as a part of the momentum
+    second: Scales | None  # units of rows and columns by which entries are weighed as well
+    told: str = ""  # whose differences these are, where it is not plain
     mode_changes: tuple[ModeChange, ...] = ()  # of contact, within 1e-4 of the point
 
     @property
     def verdict(self) -> str:
         """The worst verdict of all entries."""
         return VERDICTS[int(np.max(self.codes))] if self.codes.size else "agree"
+
+    @property
+    def power(self) -> float:
+        """The smallest error, as a part of what it is weighed by, that would have been noticed in every entry."""
+        return float(np.max(self.noticeable / self.size, initial=0.0))
 
     @cached_property
     def entries(self) -> tuple[Entry, ...]:
@@ -112,16 +122,27 @@ class Certificate(ShowsItsRepr):
 
     @property
     def worst(self) -> Entry:
-        """The entry with the worst verdict; among equals, the one furthest beyond its tolerance."""
-        excess = np.abs(self.derivative - self.difference) / self.tolerance
+        """The entry with the worst verdict; among equals, the one that is most wrong, or least known, for its size."""
+        gap = np.abs(self.derivative - self.difference)
+        excess = np.where(gap > self.tolerance, gap, self.noticeable) / self.size
         rank = self.codes + excess / (1 + excess)
         i, j = np.unravel_index(int(np.argmax(np.where(np.isnan(rank), np.inf, rank))), rank.shape)
         return self.entry(int(i), int(j))
 
     def entry(self, row: int, column: int) -> Entry:
         """The entry at (`row`, `column`)."""
-        a, d, t = (float(values[row, column]) for values in (self.derivative, self.difference, self.tolerance))
-        return Entry(self.rows[row], self.columns[column], a, d, t, VERDICTS[self.codes[row, column]])
+        numbers = (self.derivative, self.difference, self.tolerance, self.noticeable)
+        a, d, t, n = (float(values[row, column]) for values in numbers)
+        verdict, reason = VERDICTS[self.codes[row, column]], self.reasons.get((row, column), "")
+        return Entry(self.rows[row], self.columns[column], a, d, t, n, verdict, reason)
+
+    def of(self, derivative: ArrayLike) -> "Certificate":
+        """The certificate of another `derivative` (m, n) at this point, by the same differences."""
+        a = finite_array("derivative", derivative, self.derivative.shape) * self.scale
+        named = {
+            name: getattr(self, name) for name in ("rows", "columns", "method", "subject", "told", "stopped", "second")
+        }
+        return certificate_of(self.around, a, None, scale=self.scale, **named)
 
     def count(self, verdict: str) -> int:
         """How many entries have this verdict."""
@@ -135,8 +156,10 @@ class Certificate(ShowsItsRepr):
 
     def _lines(self) -> list[str]:
         counts = ", ".join(f"{self.count(v)} {v}" for v in VERDICTS if self.count(v))
-        lines = [f"{self.verdict} ({counts} of {self.codes.size} entries, {self.method})"]
+        noticed = f", would have noticed {100 * self.power:.1g} %" if self.verdict == "agree" else ""
+        lines = [f"{self.verdict} ({counts} of {self.codes.size} entries, {self.method}{noticed})"]
         lines += [f"worst: {self.worst}"] if self.codes.size else []
+        lines += [self.told] if self.told else []
         if self.mode_changes:
             more = f" and {len(self.mode_changes) - 1} more" if len(self.mode_changes) > 1 else ""
             lines.append(f"contact changes nearby: {self.mode_changes[0]}{more}")
@@ -196,6 +219,9 @@ def certify_jacobian(
     if callable(jacobian):
         beside = np.asarray(jacobian(x + jitter(scale)), dtype=float) * scale
     many = f if batched else one_by_one(lambda at: np.asarray(f(at), dtype=float))
+    unsolved: Array | float = 0.0
+    if solver_tolerance:
+        unsolved = solver_tolerance * np.maximum(1.0, np.abs(np.asarray(many(x[None]), dtype=float)[0]))
     return certify_displacement(
         lambda d: many(x + scale * d),
         at_x * scale,
@@ -203,7 +229,8 @@ def certify_jacobian(
         scale=scale,
         rows=tuple(rows or (f"f[{i}]" for i in range(at_x.shape[0]))),
         columns=tuple(columns or (f"x[{i}]" for i in range(len(x)))),
-        solver_tolerance=solver_tolerance,
+        unsolved=unsolved,
+        stopped=solver_tolerance,
         method=method,
         subject=subject,
     )
@@ -218,105 +245,49 @@ def certify_displacement(
     scale: Array,
     beside: Array | None = None,
     minus: Difference = np.subtract,
-    solver_tolerance: float = 0.0,
+    unsolved: Array | float = 0.0,
+    stopped: float = 0.0,
+    told: str = "",
     method: str = "given",
     subject: str = "the derivative",
 ) -> Certificate:
     """Certify `derivative` (m, n) of `f` at 0, a function of scaled displacements (K, n) with values (K, m).
 
     `beside` is the derivative at a point 1e-9 away; `scale` (n,) takes the scaling out of what is reported;
-    `minus` subtracts two values of `f`, on a tangent space if need be.
+    `minus` subtracts two values of `f`, on a tangent space if need be; `unsolved` (m,) is how wrong a value of `f` may
+    be because a solver stopped early, and `stopped` is how early, relative: see `judge`; `told` says whose differences
+    these are.
     """
     if derivative.shape != (len(rows), len(columns)):
         raise ShapeError("derivative", got=derivative.shape, expected=(len(rows), len(columns)))
     if not np.all(np.isfinite(derivative)):
         raise GradientError(f"{subject} is not finite: {derivative}")
-    sweep = sweep_of(f, len(columns), STEPS, minus=minus)
-    centre, forward, backward = sweep.centre, sweep.forward, sweep.backward
-    values = np.abs(minus(centre, np.zeros_like(centre))) if minus is np.subtract else np.ones(len(rows))
-    value_scale = np.maximum(1.0, values)
-    difference, tolerance, codes = _judge(derivative, (forward + backward) / 2, value_scale, solver_tolerance)
-    jumps = _not_smooth(forward, backward, derivative, value_scale, solver_tolerance)
-    if beside is not None:
-        reach = np.maximum(np.abs(forward), np.abs(backward)).max(axis=0, initial=0)
-        jumps |= _jittery(derivative, beside, reach, solver_tolerance)
-    codes[jumps] = VERDICTS.index("discontinuous")
-    a, d, t = (frozen(numbers / scale) for numbers in (derivative, difference, tolerance))
-    return Certificate(rows, columns, a, d, t, codes, method, subject)
+    around = look_around(f, len(columns), minus, unsolved)
+    named: dict[str, Any] = {"rows": rows, "columns": columns, "method": method, "subject": subject, "told": told}
+    return certificate_of(around, derivative, beside, scale=scale, stopped=stopped, **named)
+
+
+def certificate_of(
+    around: Neighbourhood,
+    derivative: Array,
+    beside: Array | None,
+    *,
+    scale: Array,
+    stopped: float = 0.0,
+    second: Scales | None = None,
+    **named: Any,
+) -> Certificate:
+    """The verdict on a `derivative` (m, n) by the scaled displacements; see `judge`."""
+    found = judge(around, derivative, beside, stopped, second)
+    numbers = (derivative, found.difference, found.tolerance, found.noticeable, found.size)
+    a, d, t, noticeable, size = (frozen(some / scale) for some in numbers)
+    return Certificate(
+        derivative=a, difference=d, tolerance=t, noticeable=noticeable, size=size, codes=found.codes,
+        reasons=found.reasons, around=around, scale=scale, stopped=stopped, second=second, **named,
+    )  # fmt: skip
 
 
 def jitter(scale: Array) -> Array:
     """(n,) entries between a half and all of 1e-9 `scale` (n,), of either sign, always the same ones."""
     random, size = np.random.default_rng(0), len(scale)
     return JITTER * scale * (random.uniform(0.5, 1.0, size) * random.choice([-1.0, 1.0], size))
-
-
-def _judge(
-    a: Array, central: Array, value_scale: Array, solver_tolerance: float
-) -> tuple[Array, Array, NDArray[np.int64]]:
-    """The differences' value, the tolerance and the verdict of every entry, kinks and jumps aside."""
-    values = richardson(central)
-    windows = np.array([values[s - 1 : s + 2] for s in range(1, len(values) - 1)])
-    middle = windows[:, 1]
-    rounding = ROUNDING * value_scale[None, :, None] / np.array(STEPS[2:-1])[:, None, None]
-    uncertainty = windows.max(axis=1) - windows.min(axis=1) + rounding
-    magnitude = np.maximum(np.abs(a), np.abs(middle))
-    row_size = np.abs(a).max(axis=1, keepdims=True, initial=0)
-    unsolved = SOLVER_FACTOR * solver_tolerance * (row_size + magnitude)
-    allowed = RELATIVE_TOLERANCE * magnitude + 3 * uncertainty + unsolved
-    resolved = uncertainty <= RESOLVED * magnitude + unsolved
-    best = uncertainty <= 10 * np.min(uncertainty, axis=0, initial=np.inf)
-    vanishing = (magnitude <= np.maximum(NEGLIGIBLE * row_size, NOTHING)) & best
-    gap = np.abs(a - middle)
-    agrees = (gap <= allowed) & (resolved | vanishing)
-    contradicts = resolved.any(axis=0) & ~(resolved & (gap <= allowed + DOUBTFUL * unsolved)).any(axis=0)
-    codes = np.where(contradicts, VERDICTS.index("disagree"), VERDICTS.index("undecided"))
-    codes[agrees.any(axis=0)] = VERDICTS.index("agree")
-    # Report the step that tells most: the best of the agreeing ones, else the least uncertain.
-    rank = np.where(agrees.any(axis=0)[None] & ~agrees, np.inf, uncertainty)
-    best = np.argmin(rank, axis=0)[None]
-    picked = [np.take_along_axis(values, best, axis=0)[0] for values in (middle, allowed)]
-    return picked[0], picked[1], codes
-
-
-def _not_smooth(
-    forward: Array, backward: Array, a: Array, value_scale: Array, solver_tolerance: float
-) -> NDArray[np.bool_]:
-    """Entries whose one-sided quotients do not approach each other as the step shrinks."""
-    found = np.zeros(a.shape, dtype=bool)
-    # A jump that is the same on both sides shows in no gap, but in quotients that grow without end.
-    for gap, steepest in ((np.abs(forward - backward), 0.5), (np.abs(forward + backward) / 2, -0.5)):
-        apart = _does_not_shrink(gap, a, 100 * ROUNDING * value_scale, steepest)
-        if solver_tolerance and apart.any():  # what a solver leaves looks like a jump too: the gap must be larger
-            apart &= _does_not_shrink(gap, a, solver_tolerance * value_scale, steepest)
-        found |= apart
-    return found
-
-
-def _does_not_shrink(gap: Array, a: Array, noise: Array, steepest: float) -> NDArray[np.bool_]:
-    """Entries whose gap, over the four smallest steps at which it stands above `noise`, goes as h^`steepest` or less.
-
-    The gap of a smooth entry shrinks as h, that of a kink at the point stays, that of a jump grows as 1/h.
-    """
-    tells = gap * np.array(STEPS)[:, None, None] > noise[None, :, None]
-    significant = RESOLVED * np.maximum(np.abs(a), NEGLIGIBLE * np.abs(a).max(axis=1, keepdims=True, initial=0))
-    found = np.zeros(a.shape, dtype=bool)
-    i, j = np.nonzero(tells[3:].any(axis=0))
-    last = len(STEPS) - 1 - np.argmax(tells[::-1, i, j], axis=0)
-    gaps = gap[last + np.arange(-3, 1)[:, None], i, j]
-    # Where a kink of this size would still tell at the next smaller step, and does not: it is not at the point.
-    ends_early = gaps[-1] * np.array([*STEPS[1:], 0.0])[last] > 2 * noise[i]
-    told = ~ends_early & (gaps[-1] > significant[i, j]) & (gaps.min(axis=0, initial=np.inf) > 0)
-    # The slope of the line through the four points; their steps are half a decade apart.
-    slope = np.array([1.5, 0.5, -0.5, -1.5]) @ np.log(gaps[:, told]) / (5 * np.log(10) / 2)
-    found[i[told], j[told]] = slope < steepest
-    return found
-
-
-def _jittery(a: Array, beside: Array, reach: Array, solver_tolerance: float) -> NDArray[np.bool_]:
-    """Entries that are another number right beside the point; `reach` is the largest quotient seen around it."""
-    change, size = np.abs(a - beside), np.abs(a) + np.abs(beside)
-    row_size = size.max(axis=1, keepdims=True, initial=0)
-    # A smooth entry changes by 1e-9 of its slope here, and by 1e-2 of it over the widest quotient.
-    told = change > np.maximum(RESOLVED * reach, SOLVER_FACTOR * solver_tolerance * row_size)
-    return told & (change > JITTER_CHANGE * size) & (size > NEGLIGIBLE * row_size)

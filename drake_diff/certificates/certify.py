@@ -1,20 +1,22 @@
 """Certify the derivative of one step before it is used: every entry against differences of the double step."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.differences import one_by_one
-from drake_diff.certificates.certificate import Certificate, ModeChange, certify_displacement, jitter
+from drake_diff.certificates.certificate import Certificate, ModeChange, certificate_of, jitter
+from drake_diff.certificates.neighbourhood import Neighbourhood, look_around
+from drake_diff.derivatives.polish import polished_steps
 from drake_diff.derivatives.sources import check_method, step_at
 from drake_diff.derivatives.step import StepDerivatives, step_jacobians
 from drake_diff.model.contact import SEPARATED, active_modes
 from drake_diff.model.contract import SAP_RELATIVE_TOLERANCE
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import Parameters, applied, select
+from drake_diff.model.parameters import Parameters, ParameterVector, applied, select
 from drake_diff.model.plant import actuators
 from drake_diff.model.step import advance, check_point
 from drake_diff.model.tangent import TangentSpace, tangent_space
@@ -63,13 +65,11 @@ def certify(
     x, u = check_point(model, x, u)
     vector = select(model, parameters)
     with applied(vector) as model:
-        space, end = tangent_space(model), model.nx + model.nu
+        space = tangent_space(model)
         point = np.concatenate([x, u, vector.values])
         scale = np.concatenate([state_scale(space, x), np.maximum(1.0, np.abs(u)), vector.difference_scale()])
 
-        def f(displacement: Array) -> Array:
-            moved = move(space, model.nx, point, scale * displacement)
-            return step_at(model, vector, moved[: model.nx], moved[model.nx : end], moved[end:])
+        step = StepAround(model, vector, space, point, scale)
 
         def on_tangent(at: Array, d: StepDerivatives) -> Array:
             return space.jacobian(at[: model.nx], d.x_next, d.A, d.B, d.C) * scale
@@ -80,21 +80,87 @@ def certify(
             d_beside = step_jacobians(model, vector, jittered[: model.nx], jittered[model.nx :], method)
             beside = on_tangent(jittered, d_beside)
         derivative = on_tangent(point, d)
-        certificate = certify_displacement(
-            one_by_one(f),
+        around, told, left = step.look_around()
+        certificate = certificate_of(
+            around,
             derivative,
+            beside,
+            scale=scale,
             rows=space.names,
             columns=space.names + model.input_names + vector.names,
-            scale=scale,
-            beside=beside,
-            minus=space.minus,
-            solver_tolerance=solver_tolerance(model, x, u),
             method=" + ".join(dict.fromkeys((d.method, *d.sources))),
             subject=f"the step of {model.name}",
+            told=told,
+            stopped=left,
+            second=in_steps(model, space, len(scale)),
         )
         if not model.contract.contact.collision_pairs:
             return certificate
-        return replace(certificate, mode_changes=_find_mode_changes(model, space, f, derivative, scale))
+        return replace(certificate, mode_changes=_find_mode_changes(model, space, step.drake, derivative, scale))
+
+
+class _RefusedError(Exception):
+    """A step that is not known to rounding."""
+
+
+@dataclass(frozen=True)
+class StepAround:
+    """A step's end as a function of scaled displacements of [x; u; parameters] from `point` (nx + nu + np,)."""
+
+    model: Model
+    vector: ParameterVector
+    space: TangentSpace
+    point: Array
+    scale: Array
+
+    def _moved(self, displacement: Array) -> Array:
+        return move(self.space, self.model.nx, self.point, self.scale * displacement)
+
+    def drake(self, displacement: Array) -> Array:
+        """(nx,) where Drake's own step leads, on the double twin, which is left there."""
+        moved, nx, end = self._moved(displacement), self.model.nx, self.model.nx + self.model.nu
+        return step_at(self.model, self.vector, moved[:nx], moved[nx:end], moved[end:])
+
+    def look_around(self) -> tuple[Neighbourhood, str, float]:
+        """The differences of the step, to rounding if that can be had, whose steps they are of, and what Drake's own
+        step leaves at the point, of the momentum."""
+        model, space, n = self.model, self.space, len(self.scale)
+        tolerance = solver_tolerance(model, self.point[: model.nx], self.point[model.nx : model.nx + model.nu])
+        if not tolerance:
+            return look_around(one_by_one(self.drake), n, space.minus), "", 0.0
+        left = []
+
+        def solved(displacements: Array) -> Array:
+            moved, nx, end = np.array([self._moved(d) for d in displacements]), model.nx, model.nx + model.nu
+            found = polished_steps(model, self.vector, moved[:, :nx], moved[:, nx:end], moved[:, end:])
+            for refusal in found.refused.values():
+                raise _RefusedError(str(refusal))
+            left.append(float(found.left[0]))
+            left.append(float(np.max(found.left)))
+            return found.x_next
+
+        try:
+            solved(np.zeros((1, n)))  # what is never known is told by the first
+            around = look_around(solved, n, space.minus)
+        except _RefusedError as why:
+            x_next = self.drake(np.zeros(n))
+            size = np.delete(np.maximum(1.0, np.abs(x_next)), list(space.quaternions))
+            around = look_around(one_by_one(self.drake), n, space.minus, tolerance * size)
+            return around, differences_of_drake(str(why)), tolerance
+        return around, differences_of_solved(max(left)), left[0]
+
+
+def differences_of_solved(left: float) -> str:
+    """Whose differences those are of which Drake's own steps left at most `left` of the momentum."""
+    return (
+        f"differences of the step's equation solved to rounding, which Drake's own steps keep to {left:.1g} of the "
+        f"momentum (its solver stops at {SAP_RELATIVE_TOLERANCE:g})"
+    )
+
+
+def differences_of_drake(why: str) -> str:
+    """Whose differences they are where the steps are not known to rounding, and `why`."""
+    return f"differences of Drake's own steps, which end at {SAP_RELATIVE_TOLERANCE:g} of the momentum: {why}"
 
 
 def _find_mode_changes(
@@ -133,6 +199,27 @@ def solver_tolerance(model: Model, x: Array, u: Array) -> float:
     pd = any(actuator.has_controller() for actuator in actuators(plant))
     solves = model.double.touches() or near_limit or pd or plant.num_constraints()
     return SAP_RELATIVE_TOLERANCE if solves else 0.0
+
+
+def unsolved(model: Model, x_next: Array) -> Array:
+    """(size,) how wrong a step that ends at `x_next` (nx,) may be because SAP stopped at 1e-6 of the momentum.
+
+    Velocities in the norm by which SAP compares momenta, positions by what these do in a step. The double twin is at
+    the step; the momentum that gravity gives in it is among what SAP compares with.
+    """
+    plant, context = model.plant, model.double.context
+    mass, v = plant.CalcMassMatrix(context), x_next[model.nq :]
+    weight = np.sqrt(np.diag(mass))
+    given = model.time_step * np.asarray(plant.CalcGravityGeneralizedForces(context))
+    momentum = max(float(np.linalg.norm(p / weight)) for p in (mass @ v, given))
+    speed = SAP_RELATIVE_TOLERANCE * momentum / weight
+    return np.concatenate([model.time_step * speed, speed])
+
+
+def in_steps(model: Model, space: TangentSpace, n: int) -> tuple[Array, Array]:
+    """The units of the state (size,), and of `n` columns that begin with it, where time is counted in steps."""
+    state = np.where(np.arange(space.size) < space.size - model.nv, 1.0, 1 / model.time_step)
+    return state, np.concatenate([state, np.ones(n - space.size)])
 
 
 def state_scale(space: TangentSpace, x: Array) -> Array:

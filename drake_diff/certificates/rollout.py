@@ -1,14 +1,18 @@
 """Certify the gradient of a whole rollout before it is used."""
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import finite_array, positive_int
-from drake_diff.certificates.certificate import JITTER, VERDICTS, Certificate, certify_displacement, jitter
-from drake_diff.certificates.displaced import Displaced
+from drake_diff._base.arrays import Array, finite_array, positive_int
+from drake_diff._base.differences import Many
+from drake_diff.certificates.certificate import JITTER, Certificate, certify_displacement, jitter
+from drake_diff.certificates.certify import differences_of_drake, differences_of_solved
+from drake_diff.certificates.displaced import Displaced, NotSolvedError
 from drake_diff.certificates.feedback import check_memory, fresh, wrong_derivative
+from drake_diff.certificates.judgement import VERDICTS
 from drake_diff.certificates.refinement import Refinement, refine_by_stiffness, refine_by_time_step
 from drake_diff.certificates.sampled import SampledCertificate, certify_sampled
 from drake_diff.derivatives.sources import check_method
@@ -128,17 +132,8 @@ def certify_rollout(
         for wanted, refined in ((refine, refine_by_time_step), (refine_stiffness, refine_by_stiffness))
         if wanted
     ]
-    certificate = certify_displacement(
-        moved.losses,
-        moved.flat(gradient)[None] * scale,
-        rows=("loss",),
-        columns=columns,
-        scale=scale,
-        beside=beside,
-        solver_tolerance=moved.solver_tolerance(gradient),
-        method=" + ".join(dict.fromkeys((*gradient.methods, *gradient.parameter_sources))),
-        subject=subject,
-    )
+    method = " + ".join(dict.fromkeys((*gradient.methods, *gradient.parameter_sources)))
+    certificate = _certified(moved, gradient, beside, method, subject)
     codes = np.array(certificate.codes)
     for found in refinements:
         codes[0] = np.where(found.converged, codes[0], np.maximum(codes[0], VERDICTS.index("not_converged")))
@@ -146,6 +141,27 @@ def certify_rollout(
     return RolloutCertificate(
         **parts, gradient=gradient, refinements=tuple(refinements), cause=_cause(moved, gradient, certificate.verdict)
     )
+
+
+def _certified(
+    moved: Displaced, gradient: RolloutGradient, beside: Array | None, method: str, subject: str
+) -> Certificate:
+    """The certificate by rollouts whose steps are solved to rounding, else by Drake's own."""
+    derivative, tolerance = moved.flat(gradient)[None] * moved.scale, moved.solver_tolerance(gradient)
+
+    def by(losses: Many, told: str, unsolved: float, stopped: float) -> Certificate:
+        return certify_displacement(
+            losses, derivative, rows=("loss",), columns=moved.columns, scale=moved.scale, beside=beside,
+            unsolved=unsolved, stopped=stopped, told=told, method=method, subject=subject,
+        )  # fmt: skip
+
+    if not tolerance:
+        return by(moved.losses, "", 0.0, 0.0)
+    try:
+        left, worst = moved.left_by_drake(gradient)
+        return by(partial(moved.solved_losses, left), differences_of_solved(worst), 0.0, worst)
+    except NotSolvedError as why:
+        return by(moved.losses, differences_of_drake(str(why)), tolerance * abs(gradient.loss), tolerance)
 
 
 def _cause(moved: Displaced, gradient: RolloutGradient, verdict: str) -> str:

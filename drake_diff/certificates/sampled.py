@@ -7,6 +7,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff.certificates.certify import differences_of_drake, differences_of_solved
 from drake_diff.certificates.directions import COARSER, FINER, FIRST, LIMIT, MISS, SECOND, Gaps, Probe, judge, weights
 from drake_diff.certificates.displaced import Displaced, NotSolvedError
 from drake_diff.exceptions import CertificateError
@@ -97,12 +98,9 @@ def certify_sampled(moved: Displaced, g: RolloutGradient, seed: int, spent: int,
             budget.spent += 1
             probe = Probe(budget.counting(lambda d: moved.solved_losses(left, d)[:, 0]), derivative, weight, seed)
             first, second = _two(probe, g.loss, budget, FINER)
-            told = (
-                f"differences of the steps' equation solved to rounding, which Drake's own steps keep to {worst:.1g} "
-                f"of the momentum (its solver stops at {tolerance:g})"
-            )
+            told = differences_of_solved(worst)
         except NotSolvedError as why:
-            told = f"differences of Drake's own steps, which end at {tolerance:g} of the momentum: {why}"
+            told = differences_of_drake(str(why))
             probe = drake
     doubt = DOUBT * float(np.linalg.norm(derivative * weight)) if probe is drake and tolerance else 0.0
     if first is None:

@@ -56,7 +56,7 @@ def certify(
     show(plain(file.name, "bold"), f"{model}, contact {model.contract.contact.model}")
     names = tuple(names_in(parameters) or ())
     record: Any = certify_model(model, states=states, seed=seed, parameters=names, method=method, directory=directory)
-    rows = table("state", "motion", "contacts", "entries", "largest", "from", "verdict")
+    rows = table("state", "motion", "contacts", "entries", "largest", "from", "noticed", "verdict")
     for i, state in enumerate(record.states):
         modes = list(state.contact_modes.values())
         gradient, near = state.gradient, f", {len(state.mode_changes)} near" if state.mode_changes else ""
@@ -67,6 +67,7 @@ def certify(
             str(gradient.entries) if gradient else "",
             "" if state.largest is None else f"{state.largest:.4g}",
             gradient.method if gradient else "",
+            f"{100 * gradient.power:.1g} %" if gradient else "",
             plain(state.verdict + near, "green" if state.verdict == "agree" else "red"),
         )
     show(rows)

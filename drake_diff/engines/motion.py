@@ -135,7 +135,7 @@ def jacobian_at(
     certificate = certify_displacement(
         one_by_one(step), jacobian, rows=space.names, columns=(*space.names, *names), scale=np.ones(size),
         minus=space.minus,
-        solver_tolerance=max(unsolved, DIFFERENCES_LEAVE if "differences" in found.method else 0.0),
+        unsolved=unsolved, stopped=max(unsolved, DIFFERENCES_LEAVE if "differences" in found.method else 0.0),
         method=found.method, subject=f"the Jacobian of {engine.name} at the {state} state",
     )  # fmt: skip
     return JacobianAt(state, frozen(jacobian), found.method, certificate.verdict, certificate)

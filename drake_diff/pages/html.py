@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drake_diff._base.files import write_whole
-from drake_diff.certificates.certificate import VERDICTS, Certificate
+from drake_diff.certificates.certificate import Certificate
+from drake_diff.certificates.judgement import VERDICTS
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -77,6 +78,9 @@ class Plot:
     note: str = ""
 
 
+ENTRY = ("derivative", "difference", "tolerance", "noticeable")
+
+
 def page_data(duration: float, plots: Iterable[Plot], certificates: Iterable[Certificate] = ()) -> dict[str, Any]:
     """All that `report.js` draws, for JSON: `plots` and a heat map of each of `certificates`, over `duration` [s]."""
     drawn = []
@@ -85,7 +89,7 @@ def page_data(duration: float, plots: Iterable[Plot], certificates: Iterable[Cer
         drawn.append({**vars(p), "x": numbers(p.x), "series": series, "limits": numbers(p.limits)})
     maps = []
     for c in certificates:
-        entries = {name: numbers(getattr(c, name).ravel()) for name in ("derivative", "difference", "tolerance")}
+        entries = {name: numbers(getattr(c, name).ravel()) for name in ENTRY}
         told = {"subject": c.subject, "method": c.method, "verdict": c.verdict}
         maps.append({**told, "rows": [*c.rows], "columns": [*c.columns], "codes": c.codes.ravel().tolist(), **entries})
     return {"duration": duration, "plots": drawn, "certificates": maps, "verdicts": list(VERDICTS)}

@@ -127,6 +127,8 @@ class Certified(Part):
     entries: int
     counts: dict[str, int]
     worst: str | None
+    power: float  # the smallest error that every entry's differences would have noticed, as a part of the entry
+    told: str  # whose differences they are
 
 
 class Provenance(Part):

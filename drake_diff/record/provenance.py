@@ -17,7 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_diff.certificates.certificate import VERDICTS, Certificate
+from drake_diff.certificates.certificate import Certificate
+from drake_diff.certificates.judgement import VERDICTS
 from drake_diff.model.load_file import FORMATS
 from drake_diff.model.model import Model
 from drake_diff.record.parts import Certified, FileEvidence, ModelInput, Provenance
@@ -38,6 +39,8 @@ def gradient_evidence(certificate: Certificate) -> Certified:
         entries=int(certificate.codes.size),
         counts={v: certificate.count(v) for v in VERDICTS},
         worst=str(certificate.worst) if certificate.codes.size else None,
+        power=certificate.power,
+        told=certificate.told,
     )
 
 

@@ -147,7 +147,7 @@
     const say = (k) => {
       const i = Math.floor(k / n), j = k % n;
       told.textContent = `d ${c.rows[i]} / d ${c.columns[j]}: derivative ${c.derivative[k]}, differences ` +
-        `${c.difference[k]}, tolerance ${shorten(c.tolerance[k])}: ${data.verdicts[c.codes[k]]}`;
+        `${c.difference[k]}, tolerance ${shorten(c.tolerance[k])}, would have noticed ${shorten(c.noticeable[k])}: ${data.verdicts[c.codes[k]]}`;
     };
     c.codes.forEach((code, k) => {
       const x = k % n, y = Math.floor(k / n), cell = svg("rect", { x, y, width: 1, height: 1, fill: `var(--v${code})` });

@@ -1,0 +1,166 @@
+"""What a function does around a point: its difference quotients, how much its values scatter, and where it is broken.
+
+The function is differenced at 13 step sizes, half a decade apart. With C(h) the central quotient and r = sqrt(10),
+Richardson's D(h) = C(h/r) + (C(h/r) - C(h)) / (r^2 - 1) has an error of order h^4. Three neighbouring D that lie close
+together are a plateau.
+
+How far they can be trusted is measured: along one random line the function is taken at eight equal steps to each side
+of the point, 1e-9, 1e-7, 1e-5 and 1e-3 apart. High differences of eight values vanish where the function is smooth, so
+that what is left is scatter (More and Wild, "Estimating computational noise", 2011). What is far more at larger
+spacings is a corner, a jump or a staircase; halving the interval tells which.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import comb
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.differences import RATIO_SQUARED, Difference, Many
+
+STEPS = tuple(10.0 ** (-k / 2) for k in range(4, 17))  # 1e-2 ... 1e-8
+SPACINGS = (1e-9, 1e-7, 1e-5, 1e-3)  # of the values along a line
+VALUES = 8  # at each spacing, to each side
+ORDERS = (4, 5, 6)  # of the differences that tell scatter
+TINY = 1e-300  # no number that means anything is smaller
+LAST_PLACE = 1.1e-16  # half a unit in the last place of 1
+SAFETY = 3.0  # scatter is a standard deviation, from a few values
+TOLD = 30.0  # times the scatter: a corner or jump that can be told from it
+FINE, FLAT = 1e-5, 1e-2  # see `_stairs`
+SHRINKS = 0.7  # or more at a corner; 0.56 of |x|^1.5, which has none, 0.32 of what is smooth
+NEAR = 2  # spacings at which what is no scatter, but a corner or stairs, is as a rule not met
+HALVINGS = 24
+STAIRS = 3  # jumps to each side, each in another interval, make a staircase: one alone is a contact's onset
+
+
+@dataclass(frozen=True)
+class Neighbourhood:
+    """The difference quotients of a function R^n -> R^m around a point, and the scatter of its values."""
+
+    centre: Array  # the value at the point
+    size: Array  # (m,) the values' magnitude, which rounding goes by
+    forward: Array  # (s, m, n) one-sided quotients at STEPS
+    backward: Array  # (s, m, n)
+    scatter: Array  # (m,) of a value, over 1e-6, or what a solver leaves
+    finest: Array  # (m,) over 1e-8
+    stairs: dict[int, str]  # rows that jump to both sides of the point, and how
+
+    def plateaus(self) -> tuple[Array, Array]:
+        """(w, m, n) the middle one of three neighbouring Richardson values, from wide steps to small, and how far it
+        may be off: the spread of the three, the scatter and what the solver left, over the step.
+        """
+        central = (self.forward + self.backward) / 2
+        values = central[1:] + (central[1:] - central[:-1]) / (RATIO_SQUARED - 1)
+        three = np.array([values[w : w + 3] for w in range(len(values) - 2)])
+        steps = np.array(STEPS)[:, None, None]
+        # An entry's own values scatter no more than they change at all: many entries are zero, and solved exactly.
+        change = (steps * np.maximum(np.abs(self.forward), np.abs(self.backward))).max(axis=0)
+        noise = np.maximum(np.minimum(SAFETY * self.scatter[:, None], 2 * change), LAST_PLACE * self.size[:, None])
+        doubt = noise / steps[2:-1] + self._corners()
+        return three[:, 1], three.max(axis=1) - three.min(axis=1) + doubt
+
+    def _corners(self) -> Array:
+        """(w, m, n) half the gap between one-sided quotients where it does not shrink with the step.
+
+        A smooth function's is smaller by r at the next step. Beside a corner it stays, and central quotients have a
+        plateau at the mean of two slopes.
+        """
+        gap = np.abs(self.forward - self.backward)[1:-1]
+        shrinks = gap[1:] <= SHRINKS * gap[:-1]
+        return np.asarray(np.where(shrinks, 0.0, gap[1:] / 2))
+
+
+def look_around(f: Many, n: int, minus: Difference = np.subtract, unsolved: Array | float = 0.0) -> Neighbourhood:
+    """Take `f`, a function of displacements (K, n) with values (K, m), around 0.
+
+    `unsolved` (m,) is how wrong a value may be at most because a solver stopped early: such jumps are no stairs.
+    """
+    steps = np.array(STEPS)[:, None, None]
+    sides = np.stack([steps * np.eye(n), -steps * np.eye(n)]).reshape(-1, n)
+    direction, lines = _line(n), np.multiply.outer([1.0, -1.0], np.multiply.outer(SPACINGS, np.arange(1, VALUES + 1)))
+    values = f(np.vstack([np.zeros((1, n)), sides, lines.reshape(-1, 1) * direction]))
+    centre = values[0]
+
+    def apart(some: Array) -> Array:
+        return some - centre if minus is np.subtract else np.array([minus(value, centre) for value in some])
+
+    changes = apart(np.asarray(values[1:], dtype=float))
+    rows = changes.shape[1]
+    ahead, behind = changes[: len(sides)].reshape(2, len(STEPS), n, rows).swapaxes(2, 3) / steps
+    size = np.abs(centre) if minus is np.subtract else np.ones(rows)
+    along = changes[len(sides) :].reshape(2, len(SPACINGS), VALUES, rows)
+    rounding = LAST_PLACE * (size + np.abs(along).max(axis=2))
+    by_spacing = np.maximum(_scatter(along), rounding)  # (2, spacings, m)
+    unsolved = np.broadcast_to(unsolved, rows)
+    scatter = np.maximum(by_spacing[:, :NEAR].max(axis=(0, 1)), unsolved / SAFETY)
+    finest = np.maximum(by_spacing[:, 0].max(axis=0), unsolved / SAFETY)
+    stairs = _stairs(lambda t: apart(f(np.multiply.outer(t, direction))), along, by_spacing, rounding, unsolved)
+    return Neighbourhood(centre, size, ahead, -behind, scatter, finest, stairs)
+
+
+def _line(n: int) -> Array:
+    """(n,) a direction with no small entry."""
+    random = np.random.default_rng(1)
+    return np.asarray(random.uniform(0.5, 1.0, n) * random.choice([-1.0, 1.0], n))
+
+
+def _scatter(values: Array) -> Array:
+    """(..., m) the standard deviation of equally spaced `values` (..., k, m) around a smooth curve."""
+    found = []
+    for order in ORDERS:
+        differences = np.diff(values, order, axis=-2)
+        found.append((differences**2).mean(axis=-2) / comb(2 * order, order))
+    return np.asarray(np.sqrt(np.median(found, axis=0)))
+
+
+def _stairs(
+    along_line: Callable[[Array], Array], along: Array, scatter: Array, rounding: Array, unsolved: Array
+) -> dict[int, str]:
+    """Rows of `along` (2, spacings, values, m) that jump in at least three intervals to each side of the point.
+
+    `along_line` gives the changes (k, m) at k places of the line, `scatter` is (2, spacings, m).
+    """
+    slope = (along[0, 0, -1] - along[1, 0, -1]) / (2 * VALUES * SPACINGS[0])
+    found: dict[int, str] = {}
+    for k in range(1, len(SPACINGS)):
+        finest = np.maximum(scatter[:, 0].max(axis=0), rounding[:, k].max(axis=0)) + TINY
+        least, both = np.maximum(TOLD * finest, unsolved), scatter[:, k].min(axis=0)
+        if SPACINGS[k] > FINE:  # where contact's onsets are as close, only what is flat between its jumps is stairs
+            risen = np.abs(along[:, k]).max(axis=(0, 1))
+            both = np.where(np.abs(slope) * VALUES * SPACINGS[k] <= FLAT * risen, both, 0.0)
+        row = int(np.argmax(both / finest))
+        if row in found or not both[row] > least[row]:
+            continue
+        jumps = [
+            _jumps(along_line, row, sign, k, along[s, k, :, row], slope[row], least[row])
+            for s, sign in enumerate((1, -1))
+        ]
+        if all(len(some) >= STAIRS for some in jumps):
+            (up, here), (down, there) = jumps[0][0], jumps[1][0]
+            found[row] = (
+                f"it jumps by {up:.2g} at {here:.2g} and by {down:.2g} at {there:.2g} of a line through the point"
+            )
+    return found
+
+
+def _jumps(
+    along_line: Callable[[Array], Array], row: int, sign: int, k: int, values: Array, slope: float, least: float
+) -> list[tuple[float, float]]:
+    """Up to three jumps of a row and where, each found by halving one of the intervals between `values` (k,)."""
+    places, heights = sign * SPACINGS[k] * np.arange(VALUES + 1), np.concatenate([[0.0], values])
+    off = np.abs(np.diff(heights) - slope * np.diff(places))
+    found: list[tuple[float, float]] = []
+    for i in np.argsort(-off, kind="stable")[:STAIRS]:
+        ends, ends_at = places[i : i + 2].copy(), heights[i : i + 2].copy()
+        for _ in range(HALVINGS):
+            middle = ends.mean()
+            value = along_line(np.array([middle]))[0, row]
+            halves = np.abs(np.diff([ends_at[0], value, ends_at[1]]) - slope * (ends[1] - ends[0]) / 2)
+            later = int(halves[1] > halves[0])
+            ends[1 - later], ends_at[1 - later] = middle, value
+        jump = ends_at[1] - ends_at[0]
+        if not abs(jump) > max(least, off[i] / 100):
+            break
+        found.append((float(jump), float(ends.mean())))
+    return found
