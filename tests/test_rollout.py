@@ -1,6 +1,7 @@
 """Rollouts: what is measured along them, in closed form where there is one."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from drake_diff.exceptions import InputError, ModelError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.step import advance, set_state
 from drake_diff.motion.rollout import Meter, drift
+from drake_diff.optimize.replay import _broken_balance
 
 
 @pytest.fixture
@@ -87,6 +89,41 @@ def test_work_and_dissipation_close_the_energy_balance(write_urdf, load):
     damped = dd.rollout(load("mass_spring_damper.sdf"), [0.1, 1.0], np.zeros((300, 1)))
     assert damped.dissipation[-1] > 0.5 * damped.energy[0]
     assert abs(damped.energy_error[-1]) < 0.02 * damped.energy[0]  # what the explicit spring does at h w = 0.05
+
+
+@pytest.mark.parametrize("approximation", ["lagged", "similar", "sap"])
+def test_what_slides_to_a_stop_loses_mu_m_g_d_to_contact_and_no_energy_is_unexplained(load, approximation):
+    """A block of 2 kg on four spheres, mu = 0.4, from 1 m/s: all of m v^2 / 2 = mu m g d is what friction did."""
+    model = load("sliding_block.sdf", time_step=0.001, contact_approximation=approximation)
+    x = np.array(model.default_state)
+    x[6], x[10] = 0.05 - 2 * 9.81 / 4 / 1e4, 1.0
+    motion = dd.rollout(model, x, num_steps=600)
+    way = motion.xs[-1, 4] - motion.xs[0, 4]
+    assert abs(motion.xs[-1, 10]) < 1e-3
+    assert motion.contact_work[-1] == pytest.approx(-1.0, abs=2e-4)  # it creeps on by the regularization's 1e-4 m/s
+    assert motion.contact_work[-1] == pytest.approx(-0.4 * 2 * 9.81 * way, rel=0.01)  # Euler: v h / 2 of the way
+    assert abs(motion.energy_drift) < 1e-4
+    assert not list(_broken_balance(motion))
+    # Without the contact's own work a joule would be missing, and told of.
+    unexplained = replace(motion, contact_work=np.zeros(601))
+    (said,) = _broken_balance(unexplained)
+    assert "go nowhere" in said
+    doubled = replace(motion, contact_work=2 * motion.contact_work)
+    (said,) = _broken_balance(doubled)
+    assert "come from nowhere" in said
+
+
+def test_what_a_joint_limit_takes_is_the_limits_work(load):
+    """A cart runs into its limit at 2 m/s, its pole upright: what is lost is the limit's, but for the time stepping."""
+    model = load("cart_pole.urdf")
+    motion = dd.rollout(model, [1.8, np.pi, 2.0, 0.0], np.zeros((100, 1)))
+    assert np.all(motion.contact_work == 0)
+    assert motion.limit_work[-1] < -1.0
+    lost = motion.energy[0] - motion.energy[-1]
+    assert -motion.limit_work[-1] == pytest.approx(lost, abs=0.1 * motion.energy_exchanged)
+    assert not list(_broken_balance(motion))
+    untold = replace(motion, limit_work=np.zeros(101))
+    assert np.abs(untold.energy_error).max() > 10 * np.abs(motion.energy_error).max()
 
 
 def test_a_policy_gives_what_its_inputs_give(load):

@@ -22,7 +22,7 @@ from drake_diff.model.plant import FLOATING, bodies, joints
 from drake_diff.model.step import set_state
 from drake_diff.motion.rollout import Rollout, drift, smooth_mean
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
-from drake_diff.optimize.replay import PENETRATION_PART, Replay
+from drake_diff.optimize.replay import PENETRATION_PART, Replay, energy_tolerance
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
 from drake_diff.optimize.transcription.collocation import violation_between_nodes
 from drake_diff.record.parts import Event, Failure, Label, Metric
@@ -145,7 +145,7 @@ def measure(solution: Solution) -> Measurement:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
         >>> problem = dd.Problem(model, x0=[0.1, 0], num_steps=5, running_cost=dd.QuadraticCost(R=[[1.0]]))
         >>> print(measure(dd.solve(problem, method="shooting")))
-        converged: 5 of 5 bounds are kept
+        converged: 6 of 6 bounds are kept
     """
     problem, motion, knots, us = solution.problem, solution.replay, solution.knots, solution.inputs_at_knots
     names, b = (*problem.state_names, *problem.input_names), problem.bounds
@@ -223,7 +223,7 @@ def _metrics_of_the_replay(
     measures = (
         ("replay end error", f"largest distance of the final state {here} from the plan's", x),
         ("half-step end error", "the same, in steps half as long", x),
-        ("energy drift", f"lasting energy that actuators and damping do not explain, {here}", "J"),
+        ("energy drift", f"lasting energy that no force explains (actuators, damping, contact, limits), {here}", "J"),
         ("energy oscillation", f"largest oscillation of that energy about its drift, {here}", "J"),
         ("energy scale", f"range of kinetic plus potential energy {here}", "J"),
         ("penetration", f"largest overlap of two geometries {here}", "m"),
@@ -235,14 +235,17 @@ def _metrics_of_the_replay(
         values = [
             float(np.abs(motion.xs[-1] - solution.xs[-1]).max()),
             solution.half_step_error,
-            motion.energy_drift,
+            abs(motion.energy_drift),
             motion.energy_oscillation,
             float(np.ptp(motion.energy)),
             float(np.max(motion.penetration)),
             float(np.max(motion.constraint_violation)),
         ]
+    bounds = {}
+    if motion is not None and np.all(np.isfinite(motion.constraint_violation)):  # else constraints may have taken it
+        bounds["energy drift"] = energy_tolerance(motion)
     for (name, definition, unit), value in zip(measures, values, strict=True):
-        yield measured(name, definition, value, unit, reason=reason)
+        yield measured(name, definition, value, unit, bounds.get(name), reason=reason)
 
 
 def _failures(solution: Solution, metrics: Sequence[Metric]) -> Iterator[Failure]:

@@ -13,6 +13,7 @@ from drake_diff.exceptions import InputError
 from drake_diff.model.contact import ContactPoint, contacts_of_the_step, penetration
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
+from drake_diff.model.plant import instances, joints
 from drake_diff.model.step import advance, set_state
 from drake_diff.model.tangent import tangent_space
 
@@ -23,9 +24,10 @@ Policy = Callable[[Array, float], ArrayLike]
 class Rollout(ShowsItsRepr):
     """N steps of the double plant and what was measured along them; `rollout` makes one. Arrays are read-only.
 
-    The energy balance of the discrete plant is `energy_error` = energy - energy[0] - work + dissipation: with
-    midpoint velocities work and dissipation are exact where M is constant, so that what remains is the error of
-    the time stepping, and what contact, joint limits and constraints took or gave.
+    The energy balance of the discrete plant is `energy_error` = energy - energy[0] - work + dissipation
+    - contact_work - limit_work: the work of a force f in a step is h f (v + v') / 2, which is exact where M is
+    constant, so that what remains is the error of the time stepping, and what constraints (couplers, balls, welds)
+    took or gave.
 
     Example:
         >>> dd.rollout(dd.load_model("models/pendulum.urdf", time_step=0.01), [0.5, 0], np.zeros((100, 1)))
@@ -41,6 +43,8 @@ class Rollout(ShowsItsRepr):
     potential_energy: Array  # (N+1,) [J], gravity and springs
     work: Array  # (N+1,) [J], done by the actuators since the start
     dissipation: Array  # (N+1,) [J], taken by joint damping since the start
+    contact_work: Array  # (N+1,) [J], done by contact, normal forces and friction, since the start
+    limit_work: Array  # (N+1,) [J], done by joint limits since the start
     penetration: Array  # (N+1,) [m], the largest overlap of two geometries
     # (N+1,) beyond joint limits [m or rad], or of a quaternion's unit norm [1]; inf for a plant with constraints
     # (couplers, balls, welds, distances), whose violation pydrake does not tell.
@@ -63,13 +67,20 @@ class Rollout(ShowsItsRepr):
 
     @property
     def energy_error(self) -> Array:
-        """(N+1,) [J]: energy that neither actuators nor damping account for."""
-        return frozen(self.energy - self.energy[0] - self.work + self.dissipation)
+        """(N+1,) [J]: energy that neither actuators nor damping, contact or joint limits account for."""
+        given = self.work - self.dissipation + self.contact_work + self.limit_work
+        return frozen(self.energy - self.energy[0] - given)
 
     @property
     def energy_drift(self) -> float:
         """[J]: the lasting part of `energy_error`, its oscillation averaged out (see `drift`)."""
         return drift(self.energy_error)
+
+    @property
+    def energy_exchanged(self) -> float:
+        """[J]: the ranges of kinetic and potential energy, and of what actuators, damping, contact and limits did."""
+        flows = (self.work, self.dissipation, self.contact_work, self.limit_work)
+        return sum(float(np.ptp(flow)) for flow in (self.kinetic_energy, self.potential_energy, *flows))
 
     @property
     def energy_oscillation(self) -> float:
@@ -161,6 +172,12 @@ class Meter:
         self.states: list[tuple[Array, float, float, float]] = []
         self.ends: list[Array] = []
         self.efforts: list[Array] = []
+        self.pushes: list[tuple[Array, Array]] = []  # of contact and of joint limits, (nv,) each
+        lower, upper = self.plant.GetPositionLowerLimits(), self.plant.GetPositionUpperLimits()
+        # Of each joint with limits its places in q and v, and the limits.
+        self.limited = [
+            (i, j, lower[i], upper[i]) for i, j in _single(self.plant) if np.isfinite(lower[i]) or np.isfinite(upper[i])
+        ]
         self.contacts: list[tuple[ContactPoint, ...]] = []
 
     def measure_state(self, x: Array) -> None:
@@ -176,6 +193,31 @@ class Meter:
         self.ends.append(x_next)
         self.efforts.append(np.array(self.plant.get_net_actuation_output_port().Eval(self.context)))
         self.contacts.append(contacts_of_the_step(self.model) if self.can_touch else ())
+        contact = self._contact_force() if self.contacts[-1] else np.zeros(self.model.nv)
+        self.pushes.append((contact, self._limit_force(x, x_next, contact)))
+
+    def _contact_force(self) -> Array:
+        """(nv,) the generalized force of all contacts in the last step."""
+        found = np.zeros(self.model.nv)
+        for i in instances(self.plant):
+            if self.plant.num_velocities(i):
+                force = self.plant.get_generalized_contact_forces_output_port(i).Eval(self.context)
+                self.plant.SetVelocitiesInArray(i, force, found)
+        return found
+
+    def _limit_force(self, x: Array, x_next: Array, contact: Array) -> Array:
+        """(nv,) what joints near a limit needed for the step beyond all other forces: the limit alone gives it."""
+        nq, h, found = self.model.nq, self.model.time_step, np.zeros(self.model.nv)
+        v, after = x[nq:], x_next[nq:]
+        near = []
+        for i, j, lower, upper in self.limited:  # Drake's limits act from two steps before on
+            reach = 2 * h * max(abs(v[j]), abs(after[j]))
+            if not lower <= min(x[i], x_next[i]) - reach or not max(x[i], x_next[i]) + reach <= upper:
+                near.append(j)
+        if near:
+            needed = self.model.double.inverse_dynamics((after - v) / h) + self.damping * (after - v)
+            found[near] = (needed - self.actuation @ self.efforts[-1] - contact)[near]
+        return found
 
     def result(self, xs: Array, us: Array) -> Rollout:
         """The rollout with states xs (N+1, nx) and us (N, nu)."""
@@ -185,6 +227,8 @@ class Meter:
         middle = (at[:-1, nq:] + after) / 2
         work = h * np.einsum("ki,ki->k", middle, efforts @ self.actuation.T)
         dissipation = h * np.einsum("ki,ki->k", middle, self.damping * after)
+        pushes = np.array(self.pushes).reshape(len(us), 2, self.model.nv)
+        by_contact, by_limits = h * np.einsum("ki,kfi->fk", middle, pushes)
         return Rollout(
             times=frozen(self.model.time_step * np.arange(len(xs))),
             xs=frozen(xs),
@@ -194,6 +238,8 @@ class Meter:
             potential_energy=frozen(potential),
             work=frozen(np.append(0.0, np.cumsum(work))),
             dissipation=frozen(np.append(0.0, np.cumsum(dissipation))),
+            contact_work=frozen(np.append(0.0, np.cumsum(by_contact))),
+            limit_work=frozen(np.append(0.0, np.cumsum(by_limits))),
             penetration=frozen(deepest),
             constraint_violation=frozen(self._violations(at[:, :nq])),
             contacts=tuple(self.contacts),
@@ -208,6 +254,12 @@ class Meter:
         for start in tangent_space(self.model).quaternions:
             found = np.maximum(found, np.abs(np.linalg.norm(qs[:, start : start + 4], axis=1) - 1))
         return np.asarray(found)
+
+
+def _single(plant: Any) -> list[tuple[int, int]]:
+    """The places in q and v of each joint of one degree of freedom."""
+    found = [joint for joint in joints(plant) if joint.num_positions() == joint.num_velocities() == 1]
+    return [(joint.position_start(), joint.velocity_start()) for joint in found]
 
 
 def smooth_mean(series: Array) -> float:

@@ -52,7 +52,7 @@ def motion_of(model: dd.Model, count: int) -> Rollout:
         return random.normal(size=shape)
 
     us = series(count, model.nu)
-    energies = [series(count + 1) for _ in range(6)]
+    energies = [series(count + 1) for _ in range(8)]
     times = TIME_STEP * np.arange(count + 1)
     return Rollout(times, series(count + 1, model.nx), us, us, *energies, contacts=((),) * count)
 
