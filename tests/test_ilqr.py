@@ -11,10 +11,11 @@ import pytest
 from helpers.models import MODELS
 from helpers.plants import block, craft, tilted
 from helpers.problems import DOUBLE_INTEGRATOR, OTHERS, lqr, pendulum, riccati
+from helpers.robots import example_robot, state_in_range
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
 from drake_diff.optimize.ilqr.expansion import Motion, expand, jacobians_along
 from drake_diff.optimize.ilqr.ilqr import _Search, costs_to_go, solve_ilqr
@@ -565,3 +566,66 @@ def test_a_cost_without_a_best_input_has_no_cost_to_go():
     object.__setattr__(problem.running_cost, "R", np.array([[-1e4]]))
     with pytest.raises(InputError, match="curvature"):
         costs_to_go(problem, np.zeros((21, 2)), np.zeros((20, 1)))
+
+
+def without_derivatives(monkeypatch, refuses, error=GradientError):
+    """Every motion of which `refuses(xs)` holds has no Jacobians; gives the list of those that were asked for."""
+    from drake_diff.optimize.ilqr import ilqr
+
+    true, seen = ilqr.jacobians_along, []
+
+    def jacobians_along(problem, motion):
+        seen.append(motion.xs)
+        if refuses(motion.xs):
+            raise error("no derivative here")
+        return true(problem, motion)
+
+    monkeypatch.setattr(ilqr, "jacobians_along", jacobians_along)
+    return seen
+
+
+@pytest.mark.parametrize("error", [GradientError, SimulationError])
+def test_a_motion_without_a_derivative_is_a_step_that_was_too_long(monkeypatch, error):
+    """A swing-up whose motions on the way go faster than guess and optimum ever do: halfway there derivatives end."""
+    limit = [np.inf]
+    seen = without_derivatives(monkeypatch, lambda xs: np.abs(xs[:, 1]).max() > limit[0], error)
+    problem = pendulum(running_cost=dd.QuadraticCost(R=[[1.0]]), final_cost=None, x_goal=[np.pi, 0], num_steps=60)
+    free = dd.solve(problem, method="ilqr")
+    assert free.success, free.message
+    needed, fastest = np.abs(free.xs[:, 1]).max(), max(np.abs(xs[:, 1]).max() for xs in seen)
+    assert fastest > 1.02 * needed
+    limit[0] = (needed + fastest) / 2
+    solution = dd.solve(problem, method="ilqr")
+    assert solution.success, solution.message
+    assert "backed off from: no derivative here" in solution.solver_message
+    assert solution.cost == pytest.approx(free.cost, rel=1e-8)
+
+
+def test_where_no_way_goes_on_the_motion_so_far_is_kept_and_the_reason_told(monkeypatch):
+    problem = pendulum()
+    still = np.zeros((101, 2))
+    without_derivatives(monkeypatch, lambda xs: np.abs(xs - still).max() > 0)
+    solution = dd.solve(problem, method="ilqr")
+    assert solution.status is dd.Status.NO_GRADIENT
+    assert "backed off from: no derivative here" in solution.message
+    assert np.array_equal(solution.xs, still)
+    assert len(solution.iterations) == 1
+
+
+@pytest.mark.parametrize("name", ["finger_edu.urdf", "ur5_robot.urdf"])
+@pytest.mark.parametrize("approximation", ["sap", "lagged"])
+def test_an_arm_that_starts_beside_a_joint_limit_leaves_it(name, approximation):
+    """10 mrad from a limit, gravity on: the limit acts on the way, and SAP stops early; the arm is to leave it."""
+    model = example_robot(name, 0.01, approximation=approximation)
+    random = np.random.default_rng(3)
+    x0 = state_in_range(model, random, 0.0)
+    lower = model.plant.GetPositionLowerLimits()
+    j = int(np.flatnonzero(np.isfinite(lower))[0])
+    x0[j] = lower[j] + 0.01
+    wanted = np.array(x0)
+    wanted[j] += 0.2
+    Q = np.diag(np.repeat([1.0, 0.1], [model.nq, model.nv]))
+    cost = dd.QuadraticCost(Q=Q, x_ref=wanted, R=1e-3 * np.eye(model.nu))
+    solution = dd.solve(dd.Problem(model, x0=x0, num_steps=40, running_cost=cost), method="ilqr", max_iterations=100)
+    assert solution.success, solution.message
+    assert solution.xs[-1, j] > lower[j] + 0.05

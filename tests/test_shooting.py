@@ -13,7 +13,8 @@ from helpers.problems import DOUBLE_INTEGRATOR, lqr
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.optimize.program import Limits
+from drake_diff.exceptions import GradientError, SimulationError
+from drake_diff.optimize.program import Limits, Outcome
 from drake_diff.optimize.shooting import (
     RolloutCost,
     ShootingVariables,
@@ -319,3 +320,42 @@ def test_fixed_inputs_act_while_the_initial_state_is_free():
     assert solution.success, solution.message
     assert solution.xs[0] == pytest.approx([0, 0.725], abs=1e-6)
     assert np.array_equal(solution.us, np.full((10, 1), 0.5))
+
+
+@pytest.mark.parametrize("error", [GradientError, SimulationError])
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_point_without_a_derivative_is_a_step_that_was_too_long(monkeypatch, solver, error):
+    """A swing-up whose trial points go faster than guess and optimum ever do: halfway there derivatives end."""
+    true, limit, fastest = ShootingVariables.linearization, [np.inf], []
+
+    def linearization(self, z):
+        found = true(self, z)
+        fastest.append(max(abs(d.x_next[1]) for d in found))
+        if fastest[-1] > limit[0]:
+            raise error("no derivative here")
+        return found
+
+    monkeypatch.setattr(ShootingVariables, "linearization", linearization)
+    problem = pendulum(num_steps=60)
+    free = shoot(problem, solver=solver)
+    needed = np.abs(free.xs[:, 1]).max()
+    assert max(fastest) > 1.2 * needed
+    limit[0] = (needed + max(fastest)) / 2
+    solution = shoot(problem, solver=solver)
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(free.cost, rel=1e-6)
+    assert "backed off from points that were refused" in solution.solver_message
+    assert solution.solver_message.endswith("the last: no derivative here")
+    assert ("started again" in solution.solver_message) == (solver == "snopt")  # IPOPT's own line search is told
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_guess_without_a_derivative_is_the_end(monkeypatch, solver):
+    def linearization(self, z):
+        raise GradientError("no derivative here")
+
+    monkeypatch.setattr(ShootingVariables, "linearization", linearization)
+    guess, limits = (np.zeros((11, 2)), np.zeros((10, 1))), Limits(50, 60.0, 1e-8)
+    result = solve_shooting(pendulum(num_steps=10), *guess, solver=solver, limits=limits, report=None)[0]
+    assert result.outcome is Outcome.NO_GRADIENT
+    assert "no derivative here" in result.message

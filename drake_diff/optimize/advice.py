@@ -34,7 +34,7 @@ def _remedies(solution: Solution, arguments: dict[str, Any], other_methods: Sequ
         yield "wider bounds or a longer horizon"
     if status is Status.DIVERGED:
         yield "a smaller time step"
-    if status in (Status.INFEASIBLE, Status.CONVERGED_NOT_VERIFIED, Status.FAILED, Status.ITERATION_LIMIT):
+    if status is not Status.NO_GRADIENT:
         yield from (f'method="{method}"' for method in other_methods)
     if status is Status.NO_GRADIENT and touching:
         yield "an initial_guess in which the bodies touch"

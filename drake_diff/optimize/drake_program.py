@@ -16,6 +16,7 @@ from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, Unknow
 from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report, Watch, ctrl_c
 
 SOLVERS = ("ipopt", "snopt")
+SNOPT_STEP_LIMIT = 2.0  # its own default: by how much of itself the point may change in a step
 
 
 class _Stop(Exception):  # noqa: N818  (a signal, not an error)
@@ -23,9 +24,15 @@ class _Stop(Exception):  # noqa: N818  (a signal, not an error)
 
 
 def solve_program(
-    program: MathematicalProgram, guess: Array, *, solver: str, limits: Limits, report: Report | None = None
+    program: MathematicalProgram,
+    guess: Array,
+    *,
+    solver: str,
+    limits: Limits,
+    report: Report | None = None,
+    longest: float = 1.0,
 ) -> NlpResult:
-    """Solve `program` from `guess` (n,) with "ipopt" or "snopt".
+    """Solve `program` from `guess` (n,) with "ipopt" or "snopt", which takes steps of at most `longest` its default.
 
     `report` gets a line of progress a few times a second. Ctrl-C ends the solve with the best iterate so far.
     """
@@ -40,9 +47,10 @@ def solve_program(
         callback = _Callback(program, watch, report)
         program.AddVisualizationCallback(callback, program.decision_variables())
         try:
-            result = engine.Solve(program, guess, _options(solver, limits, print_file))
+            result = engine.Solve(program, guess, _options(solver, limits, print_file, longest))
         except (DrakeDiffError, RuntimeError, _Stop) as error:
             outcome, message = _explain_exception(watch, error)
+            callback.look_back()
             return NlpResult(watch.best_of(guess), outcome, message, _read_table(solver, print_file))
         outcome, message = _explain(solver, result)
         z = result.GetSolution(program.decision_variables())
@@ -55,15 +63,27 @@ class _Callback:
     def __init__(self, program: MathematicalProgram, watch: Watch, report: Report | None):
         self.program, self.watch, self.report = program, watch, report
         self.evaluations = 0
+        self.current: Array | None = None
+        self.before: Array | None = None  # the last point but this at which everything could be evaluated
 
     def __call__(self, z: Array) -> None:
         self.evaluations += 1
+        if self.current is None or not np.array_equal(z, self.current):
+            self.before, self.current = self.current, np.array(z)
         if self.evaluations == 1:
             self.watch.offer(z, math.inf, 0.0)  # better than none: what it costs has not been asked yet
         if self.watch.look_up():
             self._look(z)
         if self.watch.stopped_by is not None:
             raise _Stop
+
+    def look_back(self) -> None:
+        """Keep the point before the one that ended the solve, if it is the best."""
+        if self.before is not None:
+            try:
+                self._look(self.before)
+            except DrakeDiffError:
+                return  # nor can it be evaluated: the best that was seen stays
 
     def _look(self, z: Array) -> None:
         cost = sum(float(self.program.EvalBinding(binding, z)[0]) for binding in self.program.GetAllCosts())
@@ -80,7 +100,7 @@ class _Callback:
             self.report.say(f"evaluation {self.evaluations:5d}  cost {cost:12.6g}  {spent}")
 
 
-def _options(solver: str, limits: Limits, print_file: Path) -> solvers.SolverOptions:
+def _options(solver: str, limits: Limits, print_file: Path, longest: float) -> solvers.SolverOptions:
     options = solvers.SolverOptions()
     options.SetOption(solvers.CommonSolverOption.kPrintFileName, str(print_file))
     tolerance, most = limits.tolerance, limits.max_iterations
@@ -89,6 +109,7 @@ def _options(solver: str, limits: Limits, print_file: Path) -> solvers.SolverOpt
         own["file_print_level"] = 5  # else the file holds no table
     else:
         name, own = SnoptSolver.id(), {"Major iterations limit": most, "Iterations limit": 1000 * most}
+        own |= {"Major step limit": SNOPT_STEP_LIMIT * longest}
         own |= {"Major feasibility tolerance": tolerance, "Major optimality tolerance": tolerance}
     for option, value in own.items():
         options.SetOption(name, option, value)

@@ -55,8 +55,8 @@ def _by_our_measures(draft: Solution, result: NlpResult) -> tuple[Outcome, tuple
         return result.outcome, ()
     ratio = _stationarity(draft, result)
     if not ratio <= STATIONARY:
-        unknown = result.outcome is Outcome.ITERATION_LIMIT
-        return result.outcome if unknown else Outcome.INACCURATE, ()
+        goes_on = result.outcome in (Outcome.ITERATION_LIMIT, Outcome.NO_GRADIENT)  # the words say why it did not
+        return result.outcome if goes_on else Outcome.INACCURATE, ()
     told = f"what was asked is kept, and the Lagrangian's gradient is {ratio:.1g} of its terms"
     return Outcome.SOLVED, (f"by our own measures, where the solver says {result.message!r}: {told}",)
 

@@ -5,6 +5,7 @@ In multiple shooting (Bock and Plitt, "A multiple shooting algorithm for direct 
 what a late input does need not be seen through all the steps before it. One segment is single shooting.
 """
 
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -19,16 +20,18 @@ from pydrake.solvers import MathematicalProgram
 from drake_diff._base.arrays import Array, positive_int
 from drake_diff._base.autodiff import chain, chain_rows
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
-from drake_diff.exceptions import InputError, SimulationError
+from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.parameters import ParameterCoordinates, ParameterVector, applied
 from drake_diff.motion.gradient import Totals, accumulate, differentiate_loss
 from drake_diff.motion.rollout import roll_states
 from drake_diff.optimize.drake_program import solve_program
 from drake_diff.optimize.problem.cost import differentiate_cost, differentiate_final_cost
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import Limits, NlpResult, Report
+from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report
 
 DEFAULT_SOLVER = "snopt"
+HALVINGS = 10
+BACK_OFFS, SHORTER = 5, 8.0  # times that a search goes on with shorter steps, and by how much each
 
 
 def check_segments(problem: Problem, method: str, segments: int) -> None:
@@ -47,13 +50,49 @@ def solve_shooting(
     """Solve `problem` from the guess xs (N+1, nx), us (N, nu); gives (result, xs, us).
 
     Of xs only the states that segments start from count. The result's z is that of `ShootingVariables` of the whole
-    motion. Raises GradientError or SimulationError if a step or its derivative is refused.
+    motion. A point that cannot be stepped or differentiated is a step that was too long: the solver goes on from the
+    best point before it with shorter ones, which the message counts. Raises GradientError or SimulationError if the
+    motion that it ends with is such a point.
     """
-    # IPOPT shortens a step whose end it cannot evaluate; SNOPT, in Drake, has no way to be told.
-    motion = SegmentedMotion(problem, segments, tolerate_failure=solver == "ipopt")
-    result = solve_program(motion.program(), motion.pack(xs, us), solver=solver, limits=limits, report=report)
-    whole = replace(result, z=result.z[: motion.whole.size])
+    begin, start, backed, why = time.monotonic(), SegmentedMotion(problem, segments).pack(xs, us), 0, ""
+    table: list[Iteration] = []
+    while True:
+        # IPOPT shortens a step whose end it cannot evaluate; SNOPT, in Drake, has no way to be told.
+        motion = SegmentedMotion(problem, segments, tolerate_failure=solver == "ipopt", careful=backed > 0)
+        spent = time.monotonic() - begin
+        left = replace(
+            limits, time_limit=limits.time_limit - spent, max_iterations=max(1, limits.max_iterations - len(table))
+        )
+        longest = SHORTER**-backed
+        result = solve_program(motion.program(), start, solver=solver, limits=left, report=report, longest=longest)
+        table += result.iterations
+        why = motion.refusal or why
+        refused = (Outcome.NO_GRADIENT, Outcome.DIVERGED, *[Outcome.FAILED] * bool(motion.refusal))
+        if result.outcome not in refused or backed == BACK_OFFS:
+            break
+        known = _towards(problem, segments, start, result.z)
+        if known is None:  # not even the guess can be differentiated
+            result = replace(result, outcome=Outcome.NO_GRADIENT)
+            break
+        backed, start = backed + 1, known
+    again = f", started again {backed} time{'s' * (backed > 1)}" if backed else ""
+    told = f"; backed off from points that were refused{again}, the last: {why}" if why else ""
+    numbered = tuple(replace(row, iteration=i) for i, row in enumerate(table))
+    whole = replace(result, z=result.z[: motion.whole.size], message=result.message + told, iterations=numbered)
     return whole, motion.states(result.z), motion.whole.unpack(whole.z)[1]
+
+
+def _towards(problem: Problem, segments: int, start: Array, z: Array) -> Array | None:
+    """The point nearest to z, on halves of the way from `start` to it, at which all steps can be differentiated."""
+    motion = SegmentedMotion(problem, segments, careful=True)
+    for part in (*0.5 ** np.arange(HALVINGS), 0.0):
+        point = start + part * (z - start)
+        try:
+            motion.states(point)
+        except (GradientError, SimulationError):
+            continue
+        return point
+    return None
 
 
 def roll_segments(problem: Problem, xs: Array, us: Array, segments: int) -> Array:
@@ -65,14 +104,19 @@ def roll_segments(problem: Problem, xs: Array, us: Array, segments: int) -> Arra
 class SegmentedMotion:
     """z = [that of the whole motion's ShootingVariables; the states that segments 1, 2, ... start from]."""
 
-    def __init__(self, problem: Problem, count: int, *, tolerate_failure: bool = False):
+    def __init__(self, problem: Problem, count: int, *, tolerate_failure: bool = False, careful: bool = False):
         ends = np.linspace(0, problem.num_steps, count + 1).astype(int)
         self.problem, self.whole = problem, ShootingVariables(problem)
         self.segments = [
-            ShootingVariables(problem, steps=range(a, b), tolerate_failure=tolerate_failure)
+            ShootingVariables(problem, steps=range(a, b), tolerate_failure=tolerate_failure, careful=careful)
             for a, b in pairwise(ends.tolist())
         ]
         self.size = self.whole.size + (count - 1) * problem.model.nx
+
+    @property
+    def refusal(self) -> str:
+        """Why a point could not be evaluated, the last one; empty if all could."""
+        return next((segment.refusal for segment in self.segments if segment.refusal), "")
 
     def start_of(self, number: int) -> NDArray[np.int_]:
         """Where in z the free entries are of the state that segment `number` starts from."""
@@ -128,7 +172,8 @@ class ShootingVariables:
     """z = [free entries of the first state; us; parameters in their coordinates] and its rollout of n steps.
 
     `steps` are those of a segment, all if None; the first state of a later segment is free in every entry. Given
-    `around` (n+1, nx), the states are these instead of a rollout. Steps are linearized once for each z.
+    `around` (n+1, nx), the states are these instead of a rollout. Steps are linearized once for each z. If `careful`, a
+    z that cannot be differentiated has no value either, so that a line search does not stop there.
     """
 
     def __init__(
@@ -138,8 +183,10 @@ class ShootingVariables:
         steps: range | None = None,
         around: Array | None = None,
         tolerate_failure: bool = False,
+        careful: bool = False,
     ):
-        self.problem, self.around, self.tolerate_failure = problem, around, tolerate_failure
+        self.problem, self.around, self.tolerate_failure, self.careful = problem, around, tolerate_failure, careful
+        self.refusal = ""  # why a z could not be evaluated, the last one
         self.steps = range(problem.num_steps) if steps is None else steps
         begins, nx = self.steps.start == 0, problem.model.nx
         self.free = np.flatnonzero(problem.initial_state_mask) if begins else np.arange(nx)
@@ -203,7 +250,8 @@ class ShootingVariables:
         """`evaluate()`, or `failed` (NaN) where the simulation fails and the solver takes that for too long a step."""
         try:
             return evaluate()
-        except SimulationError:
+        except (GradientError, SimulationError) as error:
+            self.refusal = str(error)
             if self.tolerate_failure:
                 return failed
             raise
@@ -212,6 +260,8 @@ class ShootingVariables:
         """(n+1, nx) the states of the rollout of z, or those given."""
         if self.around is not None:
             return self.around
+        if self.careful:
+            self.linearization(z)
         x0, us = self.unpack(z)
         if z.tobytes() == self._at:
             return np.vstack([x0, [d.x_next for d in self._linearization]])
