@@ -249,3 +249,53 @@ def test_a_quadrupeds_plan_of_100_knots_is_certified_in_20_rollouts(approximatio
         values.ravel()[np.argmax(np.abs(values))] *= 1.01
         wrong = dataclasses.replace(g, **{name: values})
         assert dd.certify_rollout(model, x0, us, loss, gradient=wrong, **options).verdict == "disagree"
+
+
+# --- staircases -------------------------------------------------------------------------------------------------------
+
+
+def rounded(values, step):
+    """To whole steps, with the derivative of what is not rounded, or a plain number."""
+    return step * np.round(plain(values) / step)
+
+
+@each_row("step", [1e-5, 1e-3, 0.1, 1.0])
+def test_a_staircase_in_the_loss_is_discontinuous(load, step):
+    """Its derivative by AutoDiffXd is 0, or that of the line through the stairs; both are told from the loss alone."""
+    model, us = load("cart_pole.urdf"), np.zeros((3, 1))
+    for loss in (
+        lambda x: x @ x + rounded(x, step)[1],
+        lambda x: x @ x + x[1] + rounded(x, step)[1] - plain(x)[1],
+    ):
+        for sampled in (False, True):
+            found = dd.certify_rollout(model, X0, us, loss, sampled=sampled)
+            assert found.verdict == "discontinuous"
+            assert "the loss is a staircase" in str(found)
+
+
+@each_row("step", [1e-5, 0.05])
+def test_a_table_as_a_policy_is_discontinuous(load, step):
+    table = np.sin(step * np.arange(-200_000, 200_000))
+
+    def policy(x, t, p):
+        return np.array([-p @ x + table[int(np.floor(float(plain(x)[1]) / step)) + 200_000]])
+
+    for sampled in (False, True):
+        found = certified(load("cart_pole.urdf"), policy, sampled=sampled)
+        assert found.verdict == "discontinuous"
+        assert "the policy is a staircase: at t = 0 s, of 16 parts of a line through x" in str(found)
+
+
+def test_a_switch_far_away_clipping_and_single_precision_are_no_staircase(load):
+    def policy(x, t, p):
+        far = 5.0 if plain(x)[0] > 0.7 else 0.0  # one jump, which the motion does not meet
+        return np.clip(np.array([-p @ x + far]), -3.0, 3.0)
+
+    def single(x, t, p):
+        """As a network of float32 would: the value is rounded, the derivative its own."""
+        u = np.array([-np.tanh(p @ x)])
+        return u + (plain(u).astype(np.float32).astype(float) - plain(u))
+
+    certified(load("cart_pole.urdf"), policy).require()
+    certified(load("cart_pole.urdf"), policy, sampled=True).require()
+    assert "staircase" not in str(certified(load("cart_pole.urdf"), single, sampled=True))

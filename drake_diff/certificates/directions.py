@@ -21,15 +21,15 @@ QUANTILE = {4: 0.06392, 5: 0.15810}
 LIMIT = 1e-2  # the error of an entry that must be noticed
 # An entry matters that is at least LEAST of the largest of its kind. A kind matters whose largest is at least FLOOR of
 # the largest of all, each entry times the scale of its column.
-LEAST, FLOOR = 1e-2, 1e-4
+LEAST, FLOOR = 1e-2, 1e-6
 FIRST, SECOND = 5, 4  # directions at the first step size, and at the second
 STEP = 1e-6
-FINER, COARSER = 1e-2, 1e2  # the second step size over the first: of a step that is solved for, and of another
+# The second step size over the first: finer where the loss bends by more than BENT of its slope, else coarser.
+FINER, COARSER, BENT = 1e-1, 10.0, 1e-2
 ROUNDING = 1e-14  # of a loss along a rollout
 WIDEST = 1e-2
 TINY = 1e-100
-UNCHANGED = 0.3  # of what a corner or jump leaves unchanged
-STEADY = 0.25  # gaps at two step sizes that differ by this part, or less, are an error and not the differences' own
+STEADY = 0.25  # numbers at two step sizes that differ by this part, or less, are not the differences' own
 ALONE = 1e-3  # of the squared gaps may be left by the one entry that explains them
 
 
@@ -91,9 +91,20 @@ class Probe:
         """(count, n) the same ones first."""
         return np.random.default_rng(self.seed).standard_normal((FIRST, len(self.weight)))[:count]
 
-    def step(self, loss: float, factor: float = 1.0) -> float:
-        """A step size at which the rounding of a loss of this size is no more than a tenth of what is allowed."""
-        return float(np.clip(factor * STEP, 10 * ROUNDING * abs(loss) / (LIMIT * self.reach), WIDEST))
+    def first(self, loss: float, count: int) -> Gaps:
+        """At the usual step size, but no smaller than the rounding of a loss of this size allows."""
+        return self.gaps(loss, float(np.clip(STEP, self._least(loss), WIDEST)), count)
+
+    def second(self, loss: float, first: Gaps, count: int) -> Gaps | None:
+        """At another step size; None where there is none."""
+        bent = _size(first.bend) > BENT * _size(first.stated)
+        step = FINER * first.step if bent else COARSER * first.step
+        step = step if step >= self._least(loss) else COARSER * first.step
+        return self.gaps(loss, step, count) if step <= WIDEST else None
+
+    def _least(self, loss: float) -> float:
+        """Where rounding is a tenth of what is allowed."""
+        return 10 * ROUNDING * abs(loss) / (LIMIT * self.reach)
 
     def gaps(self, loss: float, step: float, count: int) -> Gaps:
         """Of the first `count` directions, `loss` being the one at the point."""
@@ -119,26 +130,34 @@ class Probe:
 def judge(first: Gaps, second: Gaps | None, doubt: float) -> tuple[str, str]:
     """The verdict and its reason; `doubt` is the root mean square of gaps that a solver's early stop may leave."""
     if second is None:
-        return ("agree" if max(first.bound, first.kink) <= LIMIT else "undecided"), ""
+        return (
+            ("agree", "") if max(first.bound, first.kink) <= LIMIT else ("undecided", "no second step size is possible")
+        )
     fine, coarse = sorted((first, second), key=lambda gaps: gaps.step)
-    least = max(doubt, 100 * fine.rounding)
-    for far, near, shrinks, why in (
-        (coarse.gap, fine.gap, coarse.step / fine.step, "the loss jumps: its quotients grow as the step shrinks"),
-        (coarse.bend, fine.bend, 1.0, "the loss has a corner: the slopes to both sides do not approach each other"),
+    grown, told = coarse.step / fine.step, max(doubt, 100 * fine.rounding)
+    for near, far, why in (
+        (fine.bend, coarse.bend, "the loss has a corner: the slopes to both sides do not approach each other"),
+        (fine.bend, grown * coarse.bend, "the loss jumps: its quotients grow as the step shrinks"),
+        (fine.gap, grown * coarse.gap, "the loss jumps: its quotients grow as the step shrinks"),
     ):
-        if _size(near) > max(least, UNCHANGED * shrinks * _size(far)) and fine.kink > LIMIT:
+        if fine.kink > LIMIT and _steady(near, far) and _size(near) > told:
             return "discontinuous", why
     if min(first.bound, second.bound) <= LIMIT:
         return "agree", ""
-    both = min(len(fine), len(coarse))
-    near, far = fine.gap[:both], coarse.gap[:both]
-    if _size(near - far) <= STEADY * min(_size(near), _size(far)) and _size(far) > max(doubt, coarse.rounding):
+    if _steady(fine.gap, coarse.gap) and _size(coarse.gap) > max(doubt, coarse.rounding):
         return "disagree", "the gap is the same at both step sizes"
     return "undecided", "what the differences leave is more than what must be noticed"
 
 
 def _bound(values: Array) -> float:
     return float(np.sqrt(values @ values / QUANTILE[len(values)]))
+
+
+def _steady(near: Array, far: Array) -> bool:
+    """Whether two step sizes tell the same of the directions that they share."""
+    both = min(len(near), len(far))
+    near, far = near[:both], far[:both]
+    return _size(near - far) <= STEADY * min(_size(near), _size(far))
 
 
 def _size(values: Array) -> float:

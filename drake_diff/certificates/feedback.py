@@ -23,6 +23,7 @@ from drake_diff.motion.policy import ParametricPolicy, active_parameters, differ
 SHARED = ("pydrake.", "drake_diff.model.")  # packages whose objects a copy shares with the original: models and plants
 STEPS = (1e-4, 1e-6)  # of the differences of a policy; a derivative must miss both
 MISSED = 1e-3  # of the row's largest entry
+LEAST = 1e-6  # of the input: a smaller derivative is not told from rounding
 ASKED = 5  # times along the motion at which the derivative is compared
 
 
@@ -117,11 +118,12 @@ def wrong_derivative(policy: Any, space: TangentSpace, g: RolloutGradient, time_
                 "policy(x, t)", with_parameters(policy, values)(space.plus(x, d[: space.size]), t), (nu,)
             )
 
-        _, by_x, by_parameters = differentiate_policy(policy, x, t, nu)
+        u, by_x, by_parameters = differentiate_policy(policy, x, t, nu)
         stated = np.hstack([by_x @ space.derivative_of_plus(x), by_parameters[:, acting] * scale])
         found = [central_differences(moved, len(columns), h) for h in STEPS]
         size = np.maximum(np.abs(stated), np.abs(found[-1])).max(axis=1, initial=0.0, keepdims=True)
-        gap = np.minimum(*(np.abs(stated - some) for some in found)) / np.where(size > 0, size, 1.0)
+        size = np.maximum(size, LEAST * np.maximum(1.0, np.abs(u))[:, None])
+        gap = np.minimum(*(np.abs(stated - some) for some in found)) / size
         if gap.max(initial=0.0) > MISSED:
             i, j = np.unravel_index(int(np.argmax(gap)), gap.shape)
             unit = np.concatenate([np.ones(space.size), scale])[j]

@@ -15,6 +15,7 @@ from drake_diff.certificates.feedback import check_memory, fresh, wrong_derivati
 from drake_diff.certificates.judgement import VERDICTS
 from drake_diff.certificates.refinement import Refinement, refine_by_stiffness, refine_by_time_step
 from drake_diff.certificates.sampled import SampledCertificate, certify_sampled
+from drake_diff.certificates.stairs import stairs_of_loss, stairs_of_policy
 from drake_diff.derivatives.sources import check_method
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
@@ -114,19 +115,17 @@ def certify_rollout(
     else:
         inputs = np.empty((positive_int("num_steps", num_steps), 0))
     moved = Displaced(model, x0, inputs, loss, fresh(policy), vector, method)
-    scale, columns, subject = moved.scale, moved.columns, f"the rollout of {model.name}"
-    beside = None
+    columns, subject = moved.columns, f"the rollout of {model.name}"
+    here, beside = np.zeros(len(columns)), None
     if gradient is None:
-        gradient = moved.gradient(np.zeros(len(scale)))
+        gradient = moved.gradient(here)
         if not sampled:
-            beside = moved.flat(moved.gradient(jitter(np.ones(len(scale)))))[None] * scale
-    if policy is not None:
-        elsewhere = fresh(moved.policy)
-        moved.losses(jitter(np.full(len(scale), ELSEWHERE / JITTER))[None], elsewhere)
-        check_memory(elsewhere, gradient, vector.time_step(vector.values))
+            beside = moved.flat(moved.gradient(jitter(here + 1)))[None] * moved.scale
+    stairs = _checked(moved, gradient)
     if sampled:
         sample = certify_sampled(moved, gradient, seed, 0 if policy is None else 1, subject)
-        return replace(sample, cause=_cause(moved, gradient, sample.verdict))
+        cause = _cause(moved, gradient, sample.verdict)
+        return replace(sample, cause=cause) if not stairs else replace(sample, verdict="discontinuous", reason=stairs)
     refinements = [
         refined(model, x0, inputs, loss, vector, method, moved.flat(gradient), columns)
         for wanted, refined in ((refine, refine_by_time_step), (refine_stiffness, refine_by_stiffness))
@@ -137,10 +136,26 @@ def certify_rollout(
     codes = np.array(certificate.codes)
     for found in refinements:
         codes[0] = np.where(found.converged, codes[0], np.maximum(codes[0], VERDICTS.index("not_converged")))
-    parts = {name: getattr(certificate, name) for name in Certificate.__dataclass_fields__} | {"codes": codes}
+    reasons = dict(certificate.reasons)
+    if stairs:
+        codes[:] = VERDICTS.index("discontinuous")
+        reasons = {(0, j): stairs for j in range(len(columns))}
+    parts = {name: getattr(certificate, name) for name in Certificate.__dataclass_fields__}
+    parts |= {"codes": codes, "reasons": reasons}
     return RolloutCertificate(
         **parts, gradient=gradient, refinements=tuple(refinements), cause=_cause(moved, gradient, certificate.verdict)
     )
+
+
+def _checked(moved: Displaced, gradient: RolloutGradient) -> str:
+    """How the loss or the policy is a staircase, empty where they are none; a policy that remembers is refused."""
+    stairs = stairs_of_loss(moved.loss, gradient, moved.space)
+    if moved.policy is None:
+        return stairs
+    elsewhere, time_step = fresh(moved.policy), moved.vector.time_step(moved.vector.values)
+    moved.losses(jitter(np.full(len(moved.scale), ELSEWHERE / JITTER))[None], elsewhere)
+    check_memory(elsewhere, gradient, time_step)
+    return stairs or stairs_of_policy(moved.policy, gradient, moved.space, time_step)
 
 
 def _certified(

@@ -8,7 +8,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.certificates.certify import differences_of_drake, differences_of_solved
-from drake_diff.certificates.directions import COARSER, FINER, FIRST, LIMIT, MISS, SECOND, Gaps, Probe, judge, weights
+from drake_diff.certificates.directions import FIRST, LIMIT, MISS, SECOND, Gaps, Probe, judge, weights
 from drake_diff.certificates.displaced import Displaced, NotSolvedError
 from drake_diff.exceptions import CertificateError
 from drake_diff.motion.gradient import RolloutGradient
@@ -22,7 +22,7 @@ class SampledCertificate(ShowsItsRepr):
     """A rollout's gradient (n,), compared with differences along random directions.
 
     An entry matters that is at least 1 % of the largest of its kind: positions, velocities, each input, the policy's
-    parameters, each parameter of the model; where all of a kind are below 1e-4 of the largest entry, at least that.
+    parameters, each parameter of the model; where all of a kind are below 1e-6 of the largest entry, at least that.
     Entries are compared after each is multiplied by the scale of its column: 1 in SI units, or the magnitude of what
     is moved where that is more. The verdict is
 
@@ -97,14 +97,14 @@ def certify_sampled(moved: Displaced, g: RolloutGradient, seed: int, spent: int,
             left, worst = moved.left_by_drake(g)
             budget.spent += 1
             probe = Probe(budget.counting(lambda d: moved.solved_losses(left, d)[:, 0]), derivative, weight, seed)
-            first, second = _two(probe, g.loss, budget, FINER)
+            first, second = _two(probe, g.loss, budget)
             told = differences_of_solved(worst)
         except NotSolvedError as why:
             told = differences_of_drake(str(why))
             probe = drake
     doubt = DOUBT * float(np.linalg.norm(derivative * weight)) if probe is drake and tolerance else 0.0
     if first is None:
-        first, second = _two(drake, g.loss, budget, FINER if tolerance else COARSER)
+        first, second = _two(drake, g.loss, budget)
     verdict, reason = judge(first, second, doubt)
     if verdict == "agree" and probe is not drake and second is None and budget.left >= 2 * SECOND:
         own = drake.gaps(g.loss, first.step, SECOND)
@@ -149,10 +149,9 @@ class _Budget:
         return counted
 
 
-def _two(probe: Probe, loss: float, budget: _Budget, other: float) -> tuple[Gaps, Gaps | None]:
+def _two(probe: Probe, loss: float, budget: _Budget) -> tuple[Gaps, Gaps | None]:
     """The gaps at the usual step size and, where these do not agree and there is something left, at another."""
-    first = probe.gaps(loss, probe.step(loss), FIRST if budget.left >= 2 * (FIRST + SECOND) else SECOND)
-    step = probe.step(loss, other)
-    if judge(first, None, 0.0)[0] == "agree" or budget.left < 2 * SECOND or step == first.step:
+    first = probe.first(loss, FIRST if budget.left >= 2 * (FIRST + SECOND) else SECOND)
+    if judge(first, None, 0.0)[0] == "agree" or budget.left < 2 * SECOND:
         return first, None
-    return first, probe.gaps(loss, step, SECOND)
+    return first, probe.second(loss, first, SECOND)
