@@ -16,6 +16,7 @@ from pydrake.multibody.tree import RpyFloatingJoint
 import drake_diff as dd
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of, build_analytic, certified
+from drake_diff.derivatives.polish import polished_step
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
 from drake_diff.model.parameters import applied, select
 
@@ -273,8 +274,12 @@ def test_an_inertia_that_pinocchio_does_not_take_is_named_and_the_next_source_ta
 
 
 @pytest.mark.slow
-def test_auto_serves_wherever_autodiff_does_and_is_the_same():
-    served = [same_where_autodiff_works(*robot) for robot in example_robots()]
+def test_auto_serves_wherever_autodiff_does_and_every_step_is_had_to_rounding():
+    served = []
+    for model, x, u in example_robots():
+        served.append(same_where_autodiff_works(model, x, u))
+        solved = polished_step(model, select(model, ()), x, u)
+        assert not isinstance(solved, Refusal), f"{model.name}: {solved}"
     assert served.count(True) >= 30
 
 

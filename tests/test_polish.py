@@ -8,7 +8,8 @@ from helpers.models import Plant, add_slide, contact_properties
 from helpers.plants import block, constrained, limited_pendulum, pair, springs_and_motors
 from helpers.robots import FOOT, ROBOTS, example_robot, state_in_contact, state_in_range
 from helpers.table import each_row
-from pydrake.geometry import Box
+from pydrake.geometry import Box, Sphere
+from pydrake.math import RigidTransform
 from pydrake.multibody.tree import BodyIndex, PdControllerGains, SpatialInertia
 from scipy.optimize import bisect
 
@@ -252,6 +253,34 @@ def test_a_box_in_point_contact_which_autodiff_does_not_have():
     d = dd.differentiate_step(model, x)
     assert d.method == "finite_difference"
     assert d.reason.endswith("of the step solved to rounding")
+
+
+def test_parts_of_one_body_that_overlap_take_no_part():
+    """Two spheres on the world and one on the ball's slide, the three in one another: the first pair moves nothing."""
+    made, properties = Plant(H, "sap"), contact_properties(2e4, 0.0, 0.5, 0.01)
+    made.ball("ball", 1.0, 0.1, properties, "z")
+    post = made.plant.AddRigidBody("post", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    made.plant.WeldFrames(made.plant.world_frame(), post.body_frame(), RigidTransform([0, 0.5, 0]))
+    made.shape(post, Sphere(0.1), properties)
+    made.shape(made.plant.world_body(), Sphere(0.1), properties, RigidTransform([0, 0.45, 0]))
+    made.ground(properties)
+    model = made.model()
+    assert np.abs(polished(model, [0.099, -0.1]) - dd.step(model, [0.099, -0.1])).max() < 1e-6
+
+
+def test_a_link_far_lighter_than_what_carries_it():
+    """Sums of the momentum are 1e6 times what they amount to, and rounding is that much larger."""
+    made = Plant(H, "sap")
+    heavy = made.plant.AddRigidBody("heavy", SpatialInertia.SolidSphereWithMass(100.0, 0.1))
+    light = made.plant.AddRigidBody("light", SpatialInertia.SolidSphereWithMass(1e-6, 0.1))
+    first = add_slide(made.plant, "first", made.plant.world_frame(), heavy, "x")
+    second = add_slide(made.plant, "second", heavy.body_frame(), light, "x")
+    for joint in (first, second):
+        joint.set_position_limits([0.0], [0.0])
+    model, random = made.model(), np.random.default_rng(0)
+    for _ in range(20):
+        x = np.r_[0.02 * random.standard_normal(2), random.standard_normal(2)]
+        assert np.abs(polished(model, x) - dd.step(model, x)).max() < 1e-3
 
 
 def test_differences_say_where_the_step_is_not_had_to_rounding():

@@ -20,9 +20,8 @@ from drake_diff.derivatives.contact.laws import Cone, HuntCrossley
 from drake_diff.derivatives.joint_impulses import JointImpulses
 
 Indices = NDArray[np.intp]
-# Of the momentum: rounding of the sums and of stiff impulses. What is solved to this takes one more step and ends.
-ROUNDING = 1e-13
-SOLVED = 1e-11
+ROUNDING = 64 * float(np.finfo(float).eps)  # of the sums
+SOLVED = 1e-12  # of the momentum; from there on steps are taken as long as they halve what is missing
 MAX_STEPS = 60
 BISECTIONS = 30
 
@@ -65,14 +64,14 @@ class ConvexSteps:
     """N problems."""
 
     A: Array  # (N, nv, nv)
-    free: Array  # (N, nv) v*
+    momentum: Array  # (N, nv) A v*, which is better known than v* where A is ill conditioned
     contacts: ContactImpulses | None
     joints: JointImpulses
     same_tree: NDArray[np.bool_]  # (nv, nv)
 
     def part(self, which: Indices) -> "ConvexSteps":
         """Some of the problems."""
-        position = np.full(len(self.free), -1, dtype=np.intp)
+        position = np.full(len(self.A), -1, dtype=np.intp)
         position[which] = np.arange(len(which))
         contacts, joints = self.contacts, self.joints
         own = np.flatnonzero(position[joints.problem] >= 0)
@@ -80,11 +79,11 @@ class ConvexSteps:
         if contacts is not None:
             own = np.flatnonzero(position[contacts.problem] >= 0)
             contacts = contacts.part(own, position[contacts.problem[own]])
-        return ConvexSteps(self.A[which], self.free[which], contacts, joints, self.same_tree)
+        return ConvexSteps(self.A[which], self.momentum[which], contacts, joints, self.same_tree)
 
     def taking_part(self) -> NDArray[np.bool_]:
         """(N, nv) the degrees of freedom of the trees that an impulse may reach, which Drake solves for."""
-        reached = np.zeros(self.free.shape, dtype=bool)
+        reached = np.zeros(self.momentum.shape, dtype=bool)
         if self.contacts is not None:
             np.logical_or.at(reached, self.contacts.problem, (self.contacts.jacobian != 0).any(axis=2))
         np.logical_or.at(reached, self.joints.problem, self.joints.direction != 0)
@@ -100,8 +99,8 @@ class ConvexSteps:
         j, (pull, stiffness) = self.joints.direction, self.joints.at(v)
         np.add.at(given, self.joints.problem, j * pull[:, None])
         np.add.at(curvature, self.joints.problem, (j * stiffness[:, None])[:, :, None] * j[:, None, :])
-        gained = (self.A @ (v - self.free)[..., None])[..., 0]
-        return Balance(gained - given, given, curvature)
+        had = (self.A @ v[..., None])[..., 0]
+        return Balance(had - self.momentum - given, given, curvature)
 
     def norm(self, momentum: Array) -> Array:
         """(N,) that of Drake's solver, |diag(A)^-1/2 p| of p (N, nv)."""
@@ -112,19 +111,26 @@ class ConvexSteps:
         had = (self.A @ v[..., None])[..., 0]
         return np.asarray(np.maximum(self.norm(had), self.norm(given)))
 
-    def solve(self, v: Array, at: Balance) -> tuple[Array, Array]:
-        """v' (N, nv) to rounding, from v (N, nv) with its balance, and what is left (N,), of the momentum."""
-        v, left = np.array(v), np.full(len(v), np.inf)
+    def rounding(self, v: Array, at: Balance) -> Array:
+        """(N,) what of the momentum rounding may leave at v (N, nv): of sums, and of stiff impulses.
+
+        The sums may be far larger than what they amount to, as where a heavy tree has a light link.
+        """
+        of_sums = (np.abs(at.curvature) @ np.abs(v)[..., None])[..., 0] + np.abs(self.momentum)
+        return np.maximum(SOLVED * self.scale(v, at.given), ROUNDING * self.norm(of_sums)) + np.finfo(float).tiny
+
+    def solve(self, v: Array, at: Balance) -> tuple[Array, NDArray[np.bool_]]:
+        """v' (N, nv) to rounding from v (N, nv) with its balance, and whether it was reached (N,)."""
+        v, reached = np.array(v), np.zeros(len(v), dtype=bool)
         open_, problems = np.arange(len(v)), self
         for _ in range(MAX_STEPS):
-            size = problems.norm(at.missing)
             own = v[open_]
-            scale = problems.scale(own, at.given) + np.finfo(float).tiny
+            size = problems.norm(at.missing)
             step = np.array(-np.linalg.solve(at.curvature, at.missing[..., None])[..., 0], dtype=float)
             ahead = problems.at(own + step)
             ahead_size = problems.norm(ahead.missing)
-            near = size <= SOLVED * scale
-            last = near & ((size <= ROUNDING * scale) | (ahead_size > size / 2))  # as far as rounding lets it
+            near = size <= problems.rounding(own, at)
+            last = near & (ahead_size >= size / 2)  # as far as rounding lets it
             slope = (ahead.missing * step).sum(axis=1)
             search = ~near & (slope > 0) & (ahead_size > size / 2)  # beyond the minimum along the step
             if search.any():
@@ -132,16 +138,15 @@ class ConvexSteps:
                 step[which] *= _along(problems.part(which), own[which], step[which])[:, None]
             better = ~last | (ahead_size < size)
             v[open_[better]] = (own + step)[better]
-            left[open_[last]] = (np.minimum(size, ahead_size) / scale)[last]
+            reached[open_[last]] = True
             if last.all():
-                return v, left
+                break
             if search.any() or last.any():
                 open_, problems = open_[~last], problems.part(np.flatnonzero(~last))
                 at = problems.at(v[open_])
             else:
                 at = ahead
-        left[open_] = problems.norm(at.missing) / (problems.scale(v[open_], at.given) + np.finfo(float).tiny)
-        return v, left
+        return v, reached
 
 
 def _along(problems: ConvexSteps, v: Array, step: Array) -> Array:
