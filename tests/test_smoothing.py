@@ -143,7 +143,8 @@ def test_the_reported_variances_are_those_of_one_sample_divided_by_their_number(
     assert SAMPLES * found.first_variance.item() == pytest.approx(7.7544e-6, rel=0.05)
     assert SAMPLES * found.zeroth_variance.item() == pytest.approx(5.60554e-3, rel=0.05)
     assert SAMPLES * found.value_variance.item() == pytest.approx(exact["value_variance"], rel=0.05)
-    assert SAMPLES * found.bias_error.item() ** 2 == pytest.approx(exact["bias_variance"], rel=0.05)
+    plain = smooth_ball(0.7, *SUH, method="first")  # not corrected
+    assert SAMPLES * plain.bias_error.item() ** 2 == pytest.approx(exact["bias_variance"], rel=0.05)
 
 
 def heaviside(theta, sigma, **options):
@@ -160,8 +161,10 @@ def test_heaviside_is_biased_and_the_blend_follows_zeroth_order(theta, sigma):
     assert within(found.value, (1 + math.erf(theta / sigma / math.sqrt(2))) / 2, found.value_variance)
     assert within(found.zeroth, truth, found.zeroth_variance)
     assert found.biased.all()
-    assert found.weight * np.abs(found.bias) == pytest.approx(3 * found.bias_error, rel=1e-12)
-    assert np.abs(found.jacobian - found.zeroth) == pytest.approx(3 * found.bias_error, rel=1e-12)
+    assert within(found.jacobian, truth, found.variance)
+    # a^2 (b^2 + e^2), e being that of a bias whose farthest sample came three times.
+    assert found.bias_square >= found.weight**2 * (found.bias**2 + found.bias_error**2)
+    assert found.bias_square == pytest.approx(found.weight**2 * (found.bias**2 + found.bias_error**2), rel=1e-3)
     assert heaviside(theta, sigma, samples=5000, method="first").jacobian == 0
 
 
@@ -178,9 +181,8 @@ def test_first_order_of_a_linear_function_is_exact():
     assert not found.first_variance.any()
     assert within(found.zeroth, A, found.zeroth_variance)
     assert within(found.value, A @ x, found.value_variance)
-    assert np.array_equal(found.jacobian, A)
-    assert np.all(found.weight == 1)
-    assert not found.variance.any()
+    assert found.jacobian == pytest.approx(A, abs=1e-13)  # zeroth order corrected by a line is exact, too
+    assert np.all(found.variance < 1e-26)
     assert not found.biased.any()
 
 
@@ -195,22 +197,70 @@ def test_quadratic_function():
     assert count * found.first_variance == pytest.approx(4 * sigma**2, rel=0.05)
     assert count * found.zeroth_variance == pytest.approx(8 * x**2 + 15 * sigma**2, rel=0.05)
     assert not found.biased.any()
-    both = found.first_variance + found.zeroth_variance
-    assert found.weight == pytest.approx(found.zeroth_variance / both, rel=1e-12)
+    # Of samples 2 (x + w) and, corrected by the line 2 x w, w^3 / sigma^2 + 2 x: 4, 15 and 6 sigma^2 in variance and
+    # covariance, so e^2 is 7, and a = (15 - 6) / (2 * 7) where b is chance: E[b^2] = e^2 makes it less, 9 / 21.
+    assert count * found.bias_error**2 == pytest.approx(7 * sigma**2, rel=0.1)
+    assert 9 / 28 < found.weight < 9 / 14
 
 
-def test_the_variance_of_the_blend_is_that_of_many_blends():
-    """Both orders use the same samples: without their covariance the variance would be 30 % too small here."""
-    sigma, x = 0.5, 0.2
-    runs = [
-        smooth(lambda z: z[0] ** 2, [x], lambda z: 2 * z, noise=Gaussian(sigma), samples=100, seed=seed)
-        for seed in range(400)
-    ]
-    blends = np.array([run.jacobian.item() for run in runs])
-    reported = np.mean([run.variance.item() for run in runs])
-    naive = np.mean([(1 / (1 / run.first_variance + 1 / run.zeroth_variance)).item() for run in runs])
-    assert reported == pytest.approx(blends.var(ddof=1), rel=0.2)
-    assert naive < 0.75 * reported
+STEP = (lambda z: float(z[0] > 0)), (lambda z: [0.0])
+SLOPED = (lambda z: z[0] + float(z[0] > 0)), (lambda z: [1.0])
+KINK = (lambda z: abs(z[0])), (lambda z: [float(np.sign(z[0]))])
+SQUARE = (lambda z: z[0] ** 2), (lambda z: 2 * z)
+SINE = (lambda z: math.sin(z[0])), (lambda z: np.cos(z))
+ROUGH = (lambda z: z[0] + 0.1 * math.sin(1e4 * z[0])), (lambda z: [1 + 1e3 * math.cos(1e4 * z[0])])
+
+
+def density(t):
+    return math.exp(-t * t / 2) / math.sqrt(2 * math.pi)
+
+
+@pytest.mark.parametrize(("samples", "least"), [(30, 0.8), pytest.param(100, 0.9, marks=pytest.mark.slow)])
+def test_three_standard_errors_of_a_blend_cover_the_truth(samples, least):
+    """How often, over seeds: of a normal estimate 99.7 %, of few samples of which some are rare and large, less.
+
+    The least is beside the kink, 87 and 94 %; 200 runs know it to 2 %, and the bounds are three of these below. All
+    others are above 89 and 95 %. Closed forms: the density of a
+    step, 2 Phi - 1 of |x|, 2 x, exp(-sigma^2 / 2) cos x; what oscillates fast averages to 0. The error that is stated
+    is that which there is, to a half.
+    """
+    sigma, runs = 0.5, 200
+    cases = {
+        "a step at x": (STEP, 0.0, density(0) / sigma),
+        "a step beside x": (STEP, -0.5, density(1) / sigma),
+        "a step on a slope": (SLOPED, 0.1, 1 + density(0.2) / sigma),
+        "a kink at x": (KINK, 0.0, 0.0),
+        "a kink beside x": (KINK, 0.5, math.erf(1 / math.sqrt(2))),
+        "a square": (SQUARE, 0.7, 1.4),
+        "a sine": (SINE, 0.4, math.cos(0.4) * math.exp(-(sigma**2) / 2)),
+        "what is rough": (ROUGH, 0.4, 1.0),
+    }
+    for name, ((f, slope), x, truth) in cases.items():
+        found = [smooth(f, [x], slope, noise=Gaussian(sigma), samples=samples, seed=seed) for seed in range(runs)]
+        errors = np.array([run.jacobian.item() - truth for run in found])
+        stated = np.array([run.variance.item() for run in found])
+        assert np.mean(np.abs(errors) <= 3 * np.sqrt(stated)) >= least, name
+        assert 1 / 2 < np.mean(errors**2) / np.mean(stated) < 3 / 2, name
+
+
+def test_the_variance_of_a_blend_says_more_than_that_of_first_order_where_f_jumps():
+    """First order is 0 and varies by 0: a blend that believed it would be off by the whole density, and state 0."""
+    found = heaviside(0.0, 0.5, samples=30, seed=4)
+    assert (found.first, found.first_variance) == (0, 0)
+    assert found.bias_square > 0
+    assert abs(found.jacobian - density(0) / 0.5) <= 3 * np.sqrt(found.variance)
+    plain = heaviside(0.0, 0.5, samples=30, seed=4, method="first")
+    assert (plain.variance, plain.bias_square, plain.weight) == (0, 0, 1)
+
+
+def test_a_blend_of_a_nearly_linear_function_is_nearly_exact():
+    """x + 0.01 x^3: zeroth order, whose sample is w x^2 / sigma^2, has an error of sqrt(2 / 30)."""
+    found = smooth(lambda z: z[0] + 0.01 * z[0] ** 3, [0.3], lambda z: 1 + 0.03 * z**2, noise=Gaussian(0.1), samples=30)
+    truth = 1 + 0.03 * (0.3**2 + 0.1**2)
+    assert abs(found.zeroth - truth) > 0.05
+    assert abs(found.jacobian - truth) < 1e-3
+    assert within(found.jacobian, truth, found.variance, 3)
+    assert found.variance < 1e-6
 
 
 def test_vector_function_of_which_one_entry_jumps():
@@ -234,7 +284,7 @@ def test_vector_function_of_which_one_entry_jumps():
     assert str(found).splitlines() == [
         "blend of first and zeroth order, 3 x 2, 20000 samples of Gaussian(sigma = 0.2 to 0.3), seed 0",
         f"standard errors up to {np.sqrt(found.variance.max()):.2g}; first order is biased in 1 of 6 entries, "
-        f"its weight is {found.weight.min():.2g} to 1",
+        f"its weight is {found.weight.min():.2g} to {found.weight.max():.2g}",
     ]
 
 
@@ -320,7 +370,7 @@ def test_zeroth_order_needs_no_derivative():
 def test_the_same_seed_gives_the_same_bytes_and_arrays_are_read_only():
     runs = [smooth_ball_quick(seed) for seed in (5, 5, 6)]
     fields = [name for name, value in vars(runs[0]).items() if isinstance(value, np.ndarray)]
-    assert len(fields) == 12
+    assert len(fields) == 13
     for name in fields:
         assert getattr(runs[0], name).tobytes() == getattr(runs[1], name).tobytes(), name
         assert not getattr(runs[0], name).flags.writeable, name

@@ -4,13 +4,17 @@ Suh et al. 2022, "Do differentiable simulators give better policy gradients?", w
     first order   mean of df/dx(x + w)                         misses what f jumps by: its mean is then biased
     zeroth order  mean of (f(x + w) - f(x)) s(w)^T,            unbiased for any f, of a larger variance as a rule;
                   s = -d log p / d w                           f(x) changes no mean, for E[s] = 0, but the variance
-    blend         a * first + (1 - a) * zeroth, entry by entry, with v1 and v0 the variances of the two means,
-                  b = first - zeroth and e the standard error of b (from the differences of each sample, for both
-                  orders use the same samples):
-                      a = v0 / (v0 + v1), but at most 3 e / |b|
-The first term makes a^2 v1 + (1 - a)^2 v0 smallest. The second acts only where |b| > 3 e, that is where first order
-is biased: it keeps what first order can add to the bias, a |b|, within 3 e. It is their constraint
-a |b| <= gamma - epsilon with the distance gamma - epsilon set to 3 e, so it shrinks like 1 / sqrt(samples).
+    blend         a * first + (1 - a) * rest, entry by entry:
+                  rest  zeroth, or zeroth less (df/dx(x) w) s(w)^T - df/dx(x), which is 0 but for chance: the one that
+                        varies less. Both are unbiased; the second is nearly exact where f is nearly linear
+                  a     the weight that makes the squared error smallest that can be vouched for,
+                        (variance of the blend) + a^2 (b^2 + e^2),  b = first - rest, e its standard error
+The second term is what first order's bias may add: the samples say that it is b to within e, and never that it is 0,
+however little first order itself varies (that of a jump does not vary at all). So it counts in the blend's `variance`,
+and three of its standard errors cover the truth. With v0, v1 and c the variances of rest and first and their
+covariance, a = (v0 - c) / (2 e^2 + b^2), which shrinks like 1 / samples where there is a bias. (Suh et al. choose a by
+a bound on a |b| for an accuracy that is given.) Of few samples the rare and large ones are missing as a rule, so the
+variances of a blend count the farthest sample three times. No estimate knows of a jump that no sample crosses.
 """
 
 from collections.abc import Callable
@@ -32,6 +36,8 @@ Flags = NDArray[np.bool_]
 METHODS = ("first", "zeroth", "blend")
 # Standard errors beyond which a difference is no chance: 0.3 % of the entries of an unbiased f exceed it.
 CONFIDENCE = 3.0
+ROUNDING = 1e-12
+FARTHEST = 2.0  # how often the farthest sample counts once more in what a blend vouches for
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,12 +116,13 @@ class Smoothed(ShowsItsRepr):
     """F(x) and dF/dx from `samples` samples; `smooth` makes one. All variances are of the means, not of one sample.
 
     `value` (m,) with `value_variance` (m,); `jacobian` (m, n) with `variance` (m, n) is what `method` chose:
-    `weight` (m, n) of `first`, the rest of `zeroth`, each with its variance. `bias` (m, n) = first - zeroth is
-    the estimated bias of first order, `bias_error` its standard error, and `biased` whether |bias| > 3 bias_error:
-    True is a bias (or a wrong derivative) to 0.3 %, but False only means that these samples do not show one. Where
-    `biased`, a blend may be off by up to 3 bias_error beyond what `variance` says. `first`, `first_variance`, `bias`,
-    `bias_error` and `biased` are None where there was no derivative. A column that noise does not move has no
-    zeroth order: first order stands in `zeroth` there, with weight 1 and bias 0.
+    `weight` (m, n) of `first`, the rest of `zeroth` (a blend corrects it, see the top of this module), each with its
+    variance. `bias` (m, n), first order less that rest, is the estimated bias of first order, `bias_error` its standard
+    error, and `biased` whether |bias| > 3 bias_error: True is a bias (or a wrong derivative) to 0.3 %, but False only
+    means that these samples do not show one. A blend's `variance` counts `bias_square` (m, n), what that bias may add
+    to its squared error; the other orders count none, and it is 0. `first`, `first_variance`, `bias`, `bias_error` and
+    `biased` are None where there was no derivative. A column that noise does not move has no zeroth order: first order
+    stands in `zeroth` there, with weight 1 and bias 0.
 
     Example:
         >>> from drake_diff.motion import Gaussian
@@ -128,6 +135,7 @@ class Smoothed(ShowsItsRepr):
     value_variance: Array
     jacobian: Array
     variance: Array
+    bias_square: Array
     weight: Array
     zeroth: Array
     zeroth_variance: Array
@@ -167,7 +175,7 @@ def smooth(
 ) -> Smoothed:
     """F(x) = E[f(x + w)] and dF/dx of any function f, with what first and zeroth order are worth there.
 
-    Calls f `samples` + 1 times and `jacobian` `samples` times; keeps sums, not samples.
+    Calls f `samples` + 1 times and `jacobian` `samples` times, once more for a blend; keeps sums, not samples.
 
     Args:
         f: (n,) -> (m,), or a number (m = 1).
@@ -203,31 +211,34 @@ def smooth(
     if positive_int("samples", samples) < 2:
         raise InputError("samples", got=samples, expected="at least 2: one has no variance")
     samples, seed = int(samples), count("seed", seed, 0)
-    means, variances = _moments(f, x, jacobian, noise, moved, samples, seed)
-    (value, zeroth, *derivative), (value_variance, zeroth_variance, *derivative_variance) = means, variances
+    sums = _moments(f, x, jacobian, noise, moved, samples, seed, corrects=method == "blend")
     common: dict[str, Any] = {"method": method, "samples": samples, "seed": seed, "noise": noise}
-    common |= {"value": frozen(value), "value_variance": frozen(value_variance)}
-    common |= {"zeroth": frozen(zeroth), "zeroth_variance": frozen(zeroth_variance)}
+    common |= {"value": frozen(sums["value"].mean), "value_variance": frozen(sums["value"].variance)}
+    common |= {"zeroth": frozen(sums["zeroth"].mean), "zeroth_variance": frozen(sums["zeroth"].variance)}
+    nothing = frozen(np.zeros_like(sums["zeroth"].mean))
     if jacobian is None:
-        weight = frozen(np.zeros_like(zeroth))
-        return Smoothed(**common, jacobian=common["zeroth"], variance=common["zeroth_variance"], weight=weight)
-    first, bias = derivative
-    first_variance, bias_variance = derivative_variance
-    bias_error = np.sqrt(bias_variance)
-    weight = _weight(method, first_variance, zeroth_variance, bias, bias_error)
-    weight[:, ~moved] = 1.0
-    covariance = (first_variance + zeroth_variance - bias_variance) / 2
-    spread = weight**2 * first_variance + (1 - weight) ** 2 * zeroth_variance
-    biased = np.abs(bias) > CONFIDENCE * bias_error
+        estimate: dict[str, Any] = {"jacobian": common["zeroth"], "variance": common["zeroth_variance"]}
+        return Smoothed(**common, **estimate, bias_square=nothing, weight=nothing)
+    first, bias = sums["first"], sums["bias"]
+    if method == "blend":
+        jacobian_, variance, bias_square, weight, bias = _blend(sums, moved)
+    else:
+        chosen = sums[method]
+        jacobian_, variance, bias_square = chosen.mean, chosen.variance, nothing
+        weight = np.full(nothing.shape, float(method == "first"))
+        weight[:, ~moved] = 1.0
+    bias_error = np.sqrt(bias.variance)
+    biased = np.abs(bias.mean) > CONFIDENCE * bias_error + ROUNDING * np.abs(first.mean)
     biased.setflags(write=False)
     return Smoothed(
         **common,
-        jacobian=frozen(weight * first + (1 - weight) * zeroth),
-        variance=frozen(np.maximum(spread + 2 * weight * (1 - weight) * covariance, 0)),
+        jacobian=frozen(jacobian_),
+        variance=frozen(variance),
+        bias_square=frozen(bias_square),
         weight=frozen(weight),
-        first=frozen(first),
-        first_variance=frozen(first_variance),
-        bias=frozen(bias),
+        first=frozen(first.mean),
+        first_variance=frozen(first.variance),
+        bias=frozen(bias.mean),
         bias_error=frozen(bias_error),
         biased=biased,
     )
@@ -319,6 +330,36 @@ def _moved(noise: Noise, size: int) -> Flags:
     return np.array(np.broadcast_to(scale > 0, (size,)))
 
 
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """The mean of samples, the variance of that mean, and the same if the farthest sample had come three times."""
+
+    mean: Array
+    variance: Array
+    cautious: Array
+
+    def where(self, chosen: Flags, other: "Sums") -> "Sums":
+        """`other` in the entries that are not `chosen`."""
+        return Sums(*(np.where(chosen, getattr(self, name), getattr(other, name)) for name in vars(self)))
+
+
+def _blend(sums: dict[str, Sums], moved: Flags) -> tuple[Array, Array, Array, Array, Sums]:
+    """The blend, its variance, what of that is for the bias, the weight of first order, and the bias."""
+    first, plain = sums["first"], sums["zeroth"].variance <= sums["corrected"].variance
+    rest = sums["zeroth"].where(plain, sums["corrected"])
+    bias = sums["bias"].where(plain, sums["corrected bias"])
+    v0, v1, spread = rest.cautious, first.cautious, bias.cautious
+    covariance = (v0 + v1 - spread) / 2
+    possible = bias.mean**2 + spread  # the mean square of a bias of which these samples say b +- e
+    loss = spread + possible
+    weight = np.clip(np.divide(v0 - covariance, loss, out=np.ones_like(loss), where=loss > 0), 0.0, 1.0)
+    weight[:, ~moved] = 1.0
+    scatter = weight**2 * v1 + (1 - weight) ** 2 * v0 + 2 * weight * (1 - weight) * covariance
+    bias_square = weight**2 * possible
+    blend = weight * first.mean + (1 - weight) * rest.mean
+    return blend, np.maximum(scatter, 0.0) + bias_square, bias_square, weight, bias
+
+
 def _moments(
     f: Callable[[Array], Any],
     x: Array,
@@ -327,29 +368,43 @@ def _moments(
     moved: Flags,
     samples: int,
     seed: int,
-) -> list[list[Array]]:
-    """The means of value (m,), zeroth and, with a jacobian, first, first - zeroth (m, n); their variances (Welford)."""
+    *,
+    corrects: bool,
+) -> dict[str, Sums]:
+    """Of value (m,), zeroth and, with a jacobian, first and bias (m, n), and those corrected; Welford's sums."""
     centre = _evaluate("f", f, x.copy(), ("m",))
     rows, size = len(centre), len(x)
     if not (rows and size):
         raise InputError("x and f(x)", got=f"{size} and {rows} entries", expected="at least one of each")
-    mean, squares = np.zeros(()), np.zeros(())
+    slope = _evaluate("jacobian", jacobian, x.copy(), (rows, size)) if jacobian and corrects else None
+    mean, squares, low, high = np.zeros(()), np.zeros(()), np.array(np.inf), np.array(-np.inf)
     for n, w in enumerate(noise.sample(np.random.default_rng(seed), (samples, size)), start=1):
-        value = _evaluate("f", f, x + w, (rows,))
+        value, score = _evaluate("f", f, x + w, (rows,)), noise.score(w)
         first = None if jacobian is None else _evaluate("jacobian", jacobian, x + w, (rows, size))
         with np.errstate(over="ignore", invalid="ignore"):  # refused below
-            zeroth = np.outer(value - centre, noise.score(w))
+            zeroth = np.outer(value - centre, score)
             parts = [value, zeroth.ravel()]
             if first is not None:
                 zeroth[:, ~moved] = first[:, ~moved]
                 parts = [value, zeroth.ravel(), first.ravel(), (first - zeroth).ravel()]
-            change = np.concatenate(parts) - mean
+                if slope is not None:
+                    corrected = np.outer(value - centre - slope @ w, score) + slope
+                    corrected[:, ~moved] = first[:, ~moved]
+                    parts += [corrected.ravel(), (first - corrected).ravel()]
+            sample = np.concatenate(parts)
+            change = sample - mean
             mean = mean + change / n
             squares = squares + change * change * ((n - 1) / n)
-    variance = squares / ((samples - 1) * samples)
-    if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(variance))):
+            low, high = np.minimum(low, sample), np.maximum(high, sample)
+    with np.errstate(over="ignore", invalid="ignore"):
+        variance = squares / ((samples - 1) * samples)
+        cautious = variance + FARTHEST * np.maximum(high - mean, mean - low) ** 2 / samples**2
+    if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(cautious))):
         raise GradientError("the mean or the variance of the samples is not finite: f or its derivative is too large")
-    return [[flat[:rows], *flat[rows:].reshape(-1, rows, size)] for flat in (mean, variance)]
+    found, names = (mean, variance, cautious), ("zeroth", "first", "bias", "corrected", "corrected bias")
+    shaped = zip(*(flat[rows:].reshape(-1, rows, size) for flat in found), strict=True)
+    sums = {name: Sums(*kind) for name, kind in zip(names, shaped, strict=False)}
+    return sums | {"value": Sums(*(flat[:rows] for flat in found))}
 
 
 def _evaluate(subject: str, function: Callable[[Array], Any], point: Array, shape: tuple[int | str, ...]) -> Array:
@@ -366,12 +421,3 @@ def _evaluate(subject: str, function: Callable[[Array], Any], point: Array, shap
     if not np.isfinite(values).all():
         raise GradientError(f"{subject}({at.tolist()}) is {values.tolist()}: it must be finite wherever noise leads")
     return values
-
-
-def _weight(method: str, first_variance: Array, zeroth_variance: Array, bias: Array, bias_error: Array) -> Array:
-    """(m, n): the weight of first order, see the top of this module; 1 where neither order varies and they agree."""
-    if method != "blend":
-        return np.full(bias.shape, float(method == "first"))
-    total, size, allowed = first_variance + zeroth_variance, np.abs(bias), CONFIDENCE * bias_error
-    least = np.divide(zeroth_variance, total, out=np.ones_like(total), where=total > 0)
-    return np.minimum(least, np.divide(allowed, size, out=np.ones_like(size), where=size > allowed))

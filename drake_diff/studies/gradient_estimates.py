@@ -253,10 +253,10 @@ def _estimate(case: GradientCase, order: str, x: Array, sigma: float, samples: i
         return frozen(case.derivative(x.copy())), frozen(np.zeros(len(x)))
     derivative = None if order == "zeroth" else case.derivative
     found = smooth(case.f, x, derivative, noise=Gaussian(sigma), samples=samples, seed=seed, method=order)
-    return frozen(found.jacobian[0]), frozen(found.variance[0])
+    return frozen(found.jacobian[0]), frozen((found.variance - found.bias_square)[0])  # the scatter alone
 
 
 def _calls(order: str, samples: int) -> tuple[int, int]:
     """How often an estimate calls f and its derivative; zeroth order subtracts f at x itself, one call more."""
-    both = {"point": (0, 1), "first": (0, samples), "zeroth": (samples + 1, 0), "blend": (samples + 1, samples)}
+    both = {"point": (0, 1), "first": (0, samples), "zeroth": (samples + 1, 0), "blend": (samples + 1, samples + 1)}
     return both[order]

@@ -90,8 +90,8 @@ def gradient_panel(
     for name, value in (("samples", samples), ("reference_samples", reference_samples), ("batch", batch)):
         if positive_int(name, value) < 2:
             raise InputError(name, got=value, expected="at least 2: one has no variance")
-    if budget < 2 * batch + 1:
-        raise InputError("budget", got=budget, expected=f"at least {2 * batch + 1}, one step of a blend")
+    if budget < 2 * batch + 2:
+        raise InputError("budget", got=budget, expected=f"at least {2 * batch + 2}, one step of a blend")
     asked = None if sigmas is None else checked_sigmas("sigmas", sigmas)
     found = []
     for case in [_case_of(case) for case in (CASES if cases is None else cases)]:
