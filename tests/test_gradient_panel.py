@@ -191,7 +191,7 @@ def test_a_push_below_friction_has_no_derivative_to_follow():
 def qualities(case, sigma, samples, seeds):
     """The traces of first and zeroth order alone."""
     found = dd.studies.gradient_panel(
-        [case], ["first", "zeroth"], [sigma], samples=samples, seeds=seeds, reference_samples=50, budget=21
+        [case], ["first", "zeroth"], [sigma], samples=samples, seeds=seeds, reference_samples=50, budget=22
     )
     return [found.cases[0].at(order, sigma).trace for order in ("first", "zeroth")]
 
@@ -213,7 +213,7 @@ def test_on_stiff_ground_the_jumps_of_the_step_turn_the_sign_of_first_order():
     weights = np.exp(-((w / sigma) ** 2) / 2)
     gradient = np.sum(weights * f * w) / np.sum(weights) / sigma**2
     found = dd.studies.gradient_panel(
-        [case], sigmas=[sigma], samples=20, seeds=3, budget=21, reference_samples=300
+        [case], sigmas=[sigma], samples=20, seeds=3, budget=22, reference_samples=300
     ).cases[0]
     assert abs(found.truths[0].gradient[0] - gradient) < 5 * found.truths[0].standard_error[0]
     first, zeroth = found.at("first", sigma), found.at("zeroth", sigma)
@@ -303,7 +303,7 @@ def test_the_page_needs_no_motion_to_draw_its_plots(tmp_path, browser):
         ({"seeds": 0}, "seeds"),
         ({"batch": 1}, "batch"),
         ({"reference_samples": 1}, "reference_samples"),
-        ({"budget": 20}, "budget: expected at least 21"),
+        ({"budget": 20}, "budget: expected at least 22"),
     ],
 )
 def test_bad_input_is_refused(changes, message):
@@ -319,7 +319,7 @@ def test_a_case_that_cannot_be_is_refused(changes):
 
 def test_results_print_in_a_few_lines():
     evil = make("<script>", lambda x: A * x**2 / 2, lambda x: A * x, lambda x, s: A * x)
-    panel = dd.studies.gradient_panel([evil], ["first"], seeds=2, budget=21)
+    panel = dd.studies.gradient_panel([evil], ["first"], seeds=2, budget=22)
     assert repr(evil) == "GradientCase('<script>': <script>; 1 variable, sigmas (0.5,))"
     assert repr(panel).splitlines()[0] == "GradientPanel(1 case, 2 seeds of 30 samples)"
     assert repr(panel.cases[0]).startswith("CasePanel(<script>)\n  least mean squared error")
