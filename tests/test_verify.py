@@ -405,6 +405,27 @@ def test_an_incomplete_run_is_undecided_and_a_failed_one_is_true(solution, tmp_p
     assert dd.verify(tmp_path / "b").holds
 
 
+@each_row(
+    "key, value",
+    [
+        ("time_limit", "soon"),
+        ("time_limit", -1.0),
+        ("method", "magic"),
+        ("initial_guess", "arrays"),
+        ("continuation", [{"distance": 1.0}]),
+        ("tolerance", None),
+        ("more", 1),
+    ],
+)
+def test_a_record_whose_search_is_none_is_broken_not_an_accident(run, copy, key, value):
+    record = dd.load_record(copy)
+    search = {**record.inputs.search, key: value}
+    record.model_copy(update={"inputs": record.inputs.model_copy(update={"search": search})}).write(copy)
+    found = dd.verify(copy)
+    assert found.verdict == "broken"
+    assert any("its problem cannot be rebuilt" in complaint for complaint in found.complaints), found.complaints
+
+
 @each_row("key", ["num_steps", "x0", "constraints", "running_cost", "optimize"])
 def test_a_record_whose_problem_is_none_is_broken_not_an_accident(run, copy, key):
     record = dd.load_record(run)

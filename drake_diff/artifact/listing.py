@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drake_diff.artifact.differences import differences
+from drake_diff.artifact.differences import READ, differences, is_near, is_number
 from drake_diff.exceptions import ArtifactError
 from drake_diff.record.read import kind_of
 from drake_diff.record.sealed import SealedRecord
@@ -162,4 +162,8 @@ def _differences(
 ) -> tuple[ChangedEntry, ...]:
     one, other = first.model_dump(mode="json"), second.model_dump(mode="json")
     found = differences({s: one[s] for s in sections}, {s: other[s] for s in sections})
-    return tuple(ChangedEntry(*entry) for entry in found if not entry[0].startswith(apart))
+    return tuple(
+        ChangedEntry(key, was, now)
+        for key, was, now in found
+        if not (key.startswith(apart) or (is_number(was) and is_number(now) and is_near(was, now, *READ)))
+    )

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, frozen
+from drake_diff._base.arrays import Array, frozen, positive_float
 from drake_diff._base.files import write_whole
 from drake_diff.artifact.sections import rebuild_problem
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, ModelError, ModelWarning
@@ -165,6 +165,7 @@ def solve_again(record: EvidenceRecord, model: Model, plan: dict[str, Array]) ->
             arguments["continuation"] = [SoftContact(**stage) for stage in stages]
         problem = rebuild_problem(record, model, plan["us"], plan.get(START))
         limit, guess = arguments.pop("time_limit"), _rebuild_guess(problem, kind, plan)
+        limit = None if limit is None else positive_float("time_limit [s]", limit)
         found = solve(problem, initial_guess=guess, **arguments)
     asked = {**(found.search.arguments if found.search else {}), "time_limit": limit}
     return found.told(options=found.options | {"time_limit": limit}, search=Search(asked, guess))
