@@ -143,12 +143,15 @@ def compare_runs(a: str | Path, b: str | Path) -> RunComparison:
             refused.append(f"{name}: only {'the first' if name in ours else 'the second'} run has it")
             continue
         one, other = ours[name], theirs[name]
-        keys = ("definition", "unit", "direction", "tolerance")
+        keys = ("definition", "unit", "direction")
         odd = next((key for key in keys if getattr(one, key) != getattr(other, key)), None)
         if odd is not None:
             refused.append(f"{name}: its {odd} differs: {getattr(one, odd)!r} and {getattr(other, odd)!r}")
-        elif (one.value, one.verdict) != (other.value, other.verdict):
+            continue
+        if (one.value, one.verdict) != (other.value, other.verdict):
             found.append(ChangedEntry(f"{name} [{one.unit}]", one.value, other.value))
+        if one.tolerance != other.tolerance:  # some follow from the motion
+            found.append(ChangedEntry(f"tolerance of {name} [{one.unit}]", one.tolerance, other.tolerance))
     return RunComparison(
         configuration=_differences(first, second, CONFIGURATION, NO_CHOICE),
         versions=_differences(first, second, ("schema_version", "provenance"), ("provenance.command",)),

@@ -18,7 +18,7 @@ from drake_diff.artifact.measurement import Measurement, gradient_norms
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.exceptions import ArtifactError
 from drake_diff.logs.channels import Shown, input_channel, motion_channels, nanoseconds, state_channel
-from drake_diff.logs.mcap_file import Channel, read_mcap, write_mcap
+from drake_diff.logs.mcap_file import Channel, McapLog, read_mcap, write_mcap
 from drake_diff.logs.messages import TYPES, MessageType
 from drake_diff.model.parameters import applied
 from drake_diff.record.sealed import canonical
@@ -234,6 +234,13 @@ def read_trace(path: str | Path) -> Trace:
     plan = log.arrays("/planned/plan")
     if len(plan["horizon"]) != 1:
         raise ArtifactError(f"{path}: expected one message of /planned/plan, got {len(plan['horizon'])}")
+    try:
+        return _trace(log, plan)
+    except (LookupError, ValueError) as error:
+        raise ArtifactError(f"{path}: its channels do not fit together: {error}") from error
+
+
+def _trace(log: McapLog, plan: dict[str, Any]) -> Trace:
     planned, middles = log.arrays("/planned/state"), "/planned/input_mid"
     return Trace(
         times=frozen(planned["time"]),

@@ -23,7 +23,7 @@ from drake_diff.artifact.differences import (
 from drake_diff.artifact.rerun import PLAN, TRACE, read_plan, rebuilt, resolve
 from drake_diff.artifact.save import FILES
 from drake_diff.artifact.trace import CONFIGURATION, Trace, read_trace
-from drake_diff.exceptions import ArtifactError, MissingDependencyError, ModelError
+from drake_diff.exceptions import ArtifactError, DrakeDiffError, MissingDependencyError, ModelError
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.certification import CertificationRecord, certify_model
 from drake_diff.record.parts import FileEvidence
@@ -179,6 +179,11 @@ def verify(directory: str | Path) -> Verification:
         return replace(found, unchecked=("anything else: it is damaged",))
     if record.state == "incomplete" or (isinstance(record, EvidenceRecord) and record.solver is None):
         return replace(found, undecided=(f"there is nothing to run again: {record.sentence}",))
+    return _run_again(found, record)
+
+
+def _run_again(found: Verification, record: SealedRecord) -> Verification:
+    """The directory beside the same made again, where it can be."""
     try:
         if isinstance(record, EvidenceRecord):
             return _solve_again(found, record)
@@ -188,6 +193,9 @@ def verify(directory: str | Path) -> Verification:
         return replace(found, undecided=(f"not run again: {error}",), unchecked=("everything but the hashes",))
     except ArtifactError as error:
         return _judged(found, [str(error)], [])
+    except (ArithmeticError, AttributeError, DrakeDiffError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        # what a forger put together need not fit in any way
+        return _judged(found, [f"it cannot be made again: {type(error).__name__}: {error}"], [])
     return replace(found, unchecked=(f"every number: {NOT_RERUN[record.kind]}",))
 
 
