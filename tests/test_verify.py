@@ -553,6 +553,11 @@ def test_a_users_constraint_or_cost_is_undecided_and_what_rests_on_it_is_told(tm
     assert (found.verdict, found.complaints) == ("undecided", ())
     assert "slow is a user's function" in str(found)
     assert any("metrics[constraint violation]" in line for line in found.unchecked)
+    broken = swing_up(constraints=dd.Constraint(slow, upper=20.0))
+    broken = dataclasses.replace(broken, xs=np.add(broken.xs, [0.0, 30.0]))  # in the plan and in every replay
+    dd.save(broken, tmp_path / "c")
+    found = dd.verify(tmp_path / "c")
+    assert (found.verdict, found.complaints) == ("undecided", ())
     dd.save(swing_up(final_cost=lambda x: x[0] ** 2), tmp_path / "b")
     found = dd.verify(tmp_path / "b")
     assert (found.verdict, found.complaints) == ("undecided", ())

@@ -26,7 +26,7 @@ from drake_diff.record.solve import EvidenceRecord
 GIVEN = ("name", "provenance", "wall_clock")
 # What the search tells of itself: it rests on the search, and not on the plan that it found alone.
 SEARCHED = ("events", "failures", "gradient", "inputs", "sentence", "solver", "verdict")
-SEARCH_TOPICS = ("/solver/", "/gradient/", "/events", "record ")
+SEARCH_TOPICS = ("/solver/", "/gradient/", "/events", "/replays")
 # What a constraint that is a user's function decides, beside the search.
 CONSTRAINED = ("metrics[constraint violation]", "problem.constraints")
 JUDGED = ("holds", "failures")  # of each replay
