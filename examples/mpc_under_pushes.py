@@ -27,7 +27,7 @@ def cart_pole() -> tuple[dd.loop.MPC, dd.Problem, dd.loop.Loop, int]:
         model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=100, running_cost=dd.QuadraticCost(R=[[1.0]])
     )
     pushes = [dd.loop.Push("pole", [1.5, 0, 0], 0.8), dd.loop.Push("pole", [-0.5, 0, 0], 2.6)]
-    loop = dd.loop.Loop(pushes=pushes, latency_budget=model.time_step)
+    loop = dd.loop.Loop(pushes=pushes)
     return dd.loop.MPC(problem, horizon=30, max_iterations=2), problem, loop, 300
 
 
@@ -38,7 +38,7 @@ def panda(path: Path) -> tuple[dd.loop.MPC, dd.Problem, dd.loop.Loop, int]:
     x0 = goal - 0.3 * np.eye(14)[0]
     cost = dd.QuadraticCost(Q=np.diag([1.0] * 7 + [0.1] * 7), R=1e-6 * np.eye(7), x_ref=goal)
     problem = dd.Problem(model, x0=x0, x_goal=goal, num_steps=50, running_cost=cost)
-    loop = dd.loop.Loop(pushes=[dd.loop.Push("panda_hand", [2.0, 2.0, 0.0], 0.4)], latency_budget=model.time_step)
+    loop = dd.loop.Loop(pushes=[dd.loop.Push("panda_hand", [2.0, 2.0, 0.0], 0.4)])
     guess = np.linspace(x0, goal, 51), np.tile(holding(model, goal), (50, 1))
     return dd.loop.MPC(problem, horizon=10, plan=guess, max_iterations=1), problem, loop, 100
 
@@ -68,7 +68,7 @@ def told(name: str, run: dd.loop.ClosedLoop, problem: dd.Problem) -> str:
     if median > period:
         pace = f"{median / period:.1f} times slower than real time"
     elif worst > period:
-        pace = f"in real time but for {run.late} of {len(run.latencies)} steps"
+        pace = f"in real time but for {np.sum(run.latencies > period)} of {len(run.latencies)} steps"
     else:
         pace = "in real time"
     return (

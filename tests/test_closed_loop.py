@@ -1,5 +1,8 @@
 """Loops against closed forms: delays, lags, rates, noise, pushes; and what is done where the controller fails."""
 
+import re
+import time
+
 import numpy as np
 import pytest
 from helpers.loops import MASS, H
@@ -266,19 +269,40 @@ def test_a_loop_is_shown_in_a_few_lines(cart):
     assert len(shown.splitlines()) == 4
 
 
-def test_latency_is_measured_and_changes_nothing(cart):
-    import time
+def test_a_late_answer_is_not_used_and_the_last_command_is_held(cart):
+    """It is late in the steps 3, 4 and 7, whose answers nobody waits for; the plant is that of the commands held."""
 
+    def answers(x, t):
+        k = round(t / H)
+        if k in (3, 4, 7):
+            time.sleep(0.3)
+        return np.array([10.0 * k])
+
+    found = closed_loop(cart, answers, [0.0, 0.0], 9, Loop(latency_budget=0.15))
+    held = [0, 10, 20, 20, 20, 50, 60, 60, 80]
+    assert found.commands[:, 0].tolist() == held
+    assert np.array_equal(found.motion.xs, dd.rollout(cart, [0.0, 0.0], np.array(held, dtype=float)[:, None]).xs)
+    assert found.late == 3
+    assert [status for status in found.controller_status if status != "ok"] == ["late"] * 3
+    assert [(event.kind, round(event.t / H)) for event in found.events] == [("late", 3), ("late", 4), ("late", 7)]
+    took = r"the controller took 0\.[3-9]\d* s, expected at most 0\.15 s: the last command is held"
+    assert all(re.fullmatch(took, event.message) for event in found.events)
+
+
+def test_where_the_first_answer_is_late_nothing_is_applied(cart):
     def slow(x, t):
         time.sleep(0.003)
-        return np.zeros(1)
+        return np.ones(1)
 
     found = closed_loop(cart, slow, [0.0, 1.0], 5, Loop(latency_budget=0.002))
     assert found.late == 5
     assert found.latencies.min() >= 0.003
-    quick = closed_loop(cart, lambda x, t: np.zeros(1), [0.0, 1.0], 5, Loop(latency_budget=0.5))
-    assert quick.late == 0
-    assert np.array_equal(found.motion.xs, quick.motion.xs)
+    assert not found.applied.any()
+    free = closed_loop(cart, slow, [0.0, 1.0], 5)  # no budget: it is waited for
+    assert free.late == 0
+    assert free.applied.all()
+    with pytest.raises(InputError, match=r"Loop\.latency_budget"):
+        closed_loop(cart, slow, [0.0, 1.0], 5, Loop(latency_budget=0.0))
 
 
 @each_row(

@@ -1,5 +1,6 @@
 """Perturbations, rates, labels and predictions against closed forms: the double integrator written out."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ import drake_diff as dd
 from drake_diff._base.statistics import margin, success_rate
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.model.parameters import list_parameters
+from drake_diff.optimize.replay import track
 from drake_diff.trials.perturbation import PERTURBATIONS, Setup, parameters_of, perturbed
 from drake_diff.trials.run import TOLD, Sensitivity, levels_of, trial_seed
 from drake_diff.trials.trial import Task, run_trial
@@ -249,6 +251,62 @@ def test_a_plan_that_fails_by_itself_is_a_planning_error(cart):
     trial = run_trial(task, {"mass": 0.02}, 0)
     assert trial.label == "planning_error"
     assert "unperturbed it fails too" in trial.reason
+
+
+def bad_controller(kind, random):
+    """(a maker of TVLQR or of the plan's inputs, spoilt by a random amount; the loop around it)."""
+    amount = random.uniform(0.5, 2.0)
+
+    def make(plan, model, xs, us):
+        good = track(plan, model, xs, us)
+
+        def command(x, t):
+            k = min(round(t / H), len(us) - 1)
+            if kind == "wrong sign":
+                return us[k] + amount * 400.0 * (x - xs[k])[:1]
+            if kind == "no number":
+                return good(x, t) * (np.nan if t > 0.1 * amount else 1.0)
+            if kind == "saturates":
+                return np.clip(good(x, t), -40.0 * amount, 40.0 * amount)
+            if kind == "does nothing":
+                return np.zeros(1)
+            if kind == "too slow":
+                time.sleep(0.02 if t > 0.1 * amount else 0.0)
+                return good(x, t)
+            return good(x, t)
+
+        return command
+
+    loop = dd.loop.Loop(latency_budget=0.01) if kind == "too slow" else dd.loop.Loop()
+    return make, replace(loop, fallback=dd.loop.Fallback("hold")) if kind == "no number" else loop
+
+
+def planted(cart, kind, random):
+    """The label of one trial in which `kind` of failure was planted."""
+    size, seed = random.uniform(1.0, 2.0), int(random.integers(1000))
+    good, plain = pushed_and_stopped(cart).plan, {"mass": 1e-6}
+    if kind == "plan":
+        return run_trial(Task(pushed_and_stopped(cart, factor=0.4 * size).plan, "tvlqr"), plain, seed).label
+    if kind == "sensor":
+        sensor = dd.loop.Sensor(bias=[size * random.choice([-1, 1]), 0.0])
+        return run_trial(Task(good, "tvlqr", dd.loop.Loop(sensor=sensor)), plain, seed).label
+    if kind == "start":
+        return run_trial(Task(good, "open_loop"), {"initial_state": size}, seed).label
+    make, loop = bad_controller(kind, random)
+    return run_trial(Task(good, make, loop), {"mass": 0.05} if kind == "wrong sign" else plain, seed).label
+
+
+def test_each_kind_of_failure_that_is_planted_gets_its_label(cart):
+    """Rows are what was planted, columns the labels: all on the diagonal, but for what succeeds anyway."""
+    expected = dict.fromkeys(("wrong sign", "no number", "saturates", "does nothing", "too slow"), "control_error")
+    expected |= {"plan": "planning_error", "sensor": "perception_error", "start": "state_error"}
+    random, matrix = np.random.default_rng(5), {}
+    for kind, label in expected.items():
+        count = 3 if kind == "too slow" else 8
+        found = [planted(cart, kind, random) for _ in range(count)]
+        matrix[kind] = {name: found.count(name) for name in set(found)}
+        assert set(found) - {None} == {label}, matrix
+        assert found.count(label) >= count - 2, matrix  # of which a few are small enough to succeed
 
 
 def test_a_late_actuator_is_a_control_error(cart):

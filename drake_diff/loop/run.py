@@ -3,7 +3,8 @@
     x_k -> sensor -> estimator -> controller -> actuator -> plant -> x_(k+1)
 
 The controller has its own period, a whole number of the plant's steps. All randomness comes from one seed. The time
-that the controller takes is measured, but what is simulated does not depend on it.
+that the controller takes is measured. What is simulated depends on it only where a latency budget is given: an answer
+that comes after it is not used, and the last command is held.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +27,7 @@ from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.rollout import Meter, Rollout
 
 Controller = Callable[[Array, float], Any]  # u (nu,) = controller(x (nx,), t [s])
-OK = "ok"
+OK, LATE = "ok", "late"
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,8 @@ class Loop:
         fallback: what takes over where the controller fails; None ends the run there.
         pushes: blows to the plant.
         substeps: how many of the plant's steps one step of the controller takes.
-        latency_budget: [s] that the controller may take for an answer; only counted, see `ClosedLoop.late`.
+        latency_budget: [s] that the controller may take for an answer. Where it takes longer, its last command in time
+            is held (at first nothing is applied), and the event says so. None waits for every answer.
 
     Example:
         >>> dd.loop.Loop(sensor=dd.loop.Sensor(noise=0.01), substeps=2).substeps
@@ -76,7 +78,7 @@ class Loop:
 
 
 class LoopEvent(NamedTuple):
-    """Something that happened at simulated time `t` [s]: fallback, recovery, push or failure."""
+    """Something that happened at simulated time `t` [s]: fallback, recovery, push, late or failure."""
 
     t: float
     kind: str
@@ -104,7 +106,7 @@ class ClosedLoop(ShowsItsRepr):
     estimates: Array  # (N, nx)
     commands: Array  # (N, nu)
     applied: Array  # (N, nu)
-    controller_status: tuple[str, ...]  # "ok", or why the fallback was in charge
+    controller_status: tuple[str, ...]  # "ok", "late", or why the fallback was in charge
     events: tuple[LoopEvent, ...]
     latencies: Array  # (N,) [s] that the controller took, on this machine
     latency_budget: float | None
@@ -193,6 +195,8 @@ class _LoopRun:
     def __init__(self, model: Model, controller: Controller, loop: Loop, random: np.random.Generator):
         self.model, self.controller, self.loop = model, controller, loop
         self.period = count("Loop.substeps", loop.substeps, 1) * model.time_step
+        if loop.latency_budget is not None:
+            positive_float("Loop.latency_budget [s]", loop.latency_budget)
         self.read = loop.sensor.start(tangent_space(model), random)
         self.drive = loop.actuator.start(model.nu, self.period)
         self.pushes = []  # (the plant's step, body, impulse)
@@ -278,6 +282,11 @@ class _LoopRun:
             command, status, taken = None, f"nothing was seen for {self.unseen} steps", 0.0
         else:
             command, status, taken = self._command(estimate, t)
+            budget = self.loop.latency_budget
+            if command is not None and budget is not None and taken > budget:
+                told = f"the controller took {taken:.3g} s, expected at most {budget:.3g} s: the last command is held"
+                self.events.append(LoopEvent(t, "late", told))
+                command, status = np.zeros(self.model.nu) if last is None else last, LATE
         if command is not None and not self.in_charge:
             self.events.append(LoopEvent(t, "recovery", "the controller is followed again"))
         elif command is None and self.in_charge and fallback is not None:

@@ -2,9 +2,12 @@
 
 The label of a failure is found by running the trial again with one thing put right at a time, in this order:
 
-    planning_error    unperturbed, it fails too
+    planning_error    unperturbed it fails too, whatever follows the plan. Where a perfect sensor helps there, it is a
+                      perception_error; where a perfect actuator does, or TVLQR or the plan's own inputs in the
+                      controller's place, a control_error
     perception_error  with a perfect sensor it succeeds
     control_error     with a perfect actuator it succeeds
+    control_error     of a user's own controller: TVLQR or the plan's own inputs in its place succeed
     state_error       with the plant and the start as planned, and no pushes, it succeeds
     control_error     no single thing helps: the controller is not up to all of them together
     evaluation_error  the result cannot be judged
@@ -135,10 +138,27 @@ class Task:
             return MPC(self.plan.problem, horizon=MPC_HORIZON, plan=(self.xs, self.us))
         return OpenLoop(self.us, model.time_step)
 
-    def run(self, setup: Setup, seed: int) -> Judgement:
-        """One run of `setup`, judged."""
+    def followed_by(self, setup: Setup, seed: int) -> str:
+        """What follows the plan in `setup` in the controller's place, without a fallback or budget; "" if nothing does.
+
+        The controller is at fault where it fails and this does not.
+        """
+        bare = replace(setup, loop=replace(setup.loop, fallback=None, latency_budget=None))
+        for name, make in (("the plan's own inputs", lambda model: OpenLoop(self.us, model.time_step)),
+                           ("TVLQR", lambda model: track(self.plan, model, self.xs, self.us))):  # fmt: skip
+            try:
+                with applied(select(self.model, self.plan.vector.to_dict())) as model:
+                    policy = make(model)
+            except DrakeDiffError:
+                continue  # a plan without inputs or derivatives has no TVLQR: it follows nothing
+            if self.run(bare, seed, policy).success:
+                return name
+        return ""
+
+    def run(self, setup: Setup, seed: int, policy: Controller | None = None) -> Judgement:
+        """One run of `setup`, judged; under `policy` in the controller's place, if it is given."""
         with applied(select(setup.model, setup.parameters)) as model:
-            found = closed_loop(model, self.policy, setup.x0, len(self.us), setup.loop, seed=seed)
+            found = closed_loop(model, policy or self.policy, setup.x0, len(self.us), setup.loop, seed=seed)
             depth = () if found.ended else tuple(too_deep(model, found.motion))
         last = found.motion.xs[-1]
         goal = self.plan.problem.goal_error(last) if self.judged_by == "the goal" else last - self.xs[-1]
@@ -168,7 +188,14 @@ def _label(task: Task, setup: Setup, seed: int, outcome: Judgement) -> tuple[Lab
     if part := outcome.run.failed_part:
         return RAISED[part], f"the {part} itself failed"
     if not task.nominal.success:
-        return "planning_error", f"unperturbed it fails too: {task.nominal.failures[0]}"
+        why = f"unperturbed it fails too: {task.nominal.failures[0]}"
+        if task.run(replace(task.setup, loop=replace(task.loop, sensor=Sensor(), estimator=Hold())), 0).success:
+            return "perception_error", f"{why}; with a perfect sensor it succeeds"
+        if task.run(replace(task.setup, loop=replace(task.loop, actuator=Actuator())), 0).success:
+            return "control_error", f"{why}; with a perfect actuator it succeeds"
+        if other := task.followed_by(task.setup, 0):
+            return "control_error", f"{why}; {other} in the controller's place succeeds"
+        return "planning_error", why
     loop, planned = setup.loop, task.setup
     seeing = replace(setup, loop=replace(loop, sensor=Sensor(), estimator=Hold()))
     acting = replace(setup, loop=replace(loop, actuator=Actuator()))
@@ -180,6 +207,9 @@ def _label(task: Task, setup: Setup, seed: int, outcome: Judgement) -> tuple[Lab
     )
     for label, why, fixed in fixes:
         try:
+            own = label == "state_error" and not isinstance(task.controller, str)
+            if own and (other := task.followed_by(setup, seed)):
+                return "control_error", f"{other} in the controller's place succeeds"
             if task.run(fixed, seed).success:
                 return label, why
         except ModelError as error:
