@@ -296,6 +296,8 @@ def test_a_switch_far_away_clipping_and_single_precision_are_no_staircase(load):
         u = np.array([-np.tanh(p @ x)])
         return u + (plain(u).astype(np.float32).astype(float) - plain(u))
 
+    held = dd.PD(load("acrobot.xml"), kp=5.0, kd=0.5, x_ref=X0)  # whose u is nothing but rounding at x0
+    dd.certify_rollout(load("acrobot.xml"), X0, None, end, policy=held, num_steps=N).require()
     certified(load("cart_pole.urdf"), policy).require()
     certified(load("cart_pole.urdf"), policy, sampled=True).require()
     assert "staircase" not in str(certified(load("cart_pole.urdf"), single, sampled=True))

@@ -20,7 +20,7 @@ STAIRS = 3  # jumps in as many cells: fewer are a switch, which the motion may n
 QUARTERINGS = 10
 SETTLED = 2  # after so many a smooth function's cells differ by 1/256, those of a corner by 1/16
 KEPT = 0.125  # and those of a jump by as much as before
-ROUNDED = 1e-12  # of the largest value: a jump that is told
+ROUNDED, PART = 1e-12, 1e-6  # of the largest value, and of what they differ by: a jump that is told
 SINGLE = 5e-7  # of an input: single precision is no staircase
 OUTSIDE = (ValueError, ArithmeticError, LookupError)  # what a function may raise where it is not defined
 
@@ -81,7 +81,7 @@ def _stairs(f: Callable[[float], float], least: float) -> tuple[float, float, in
             ends = np.linspace(-length, length, CELLS + 1)
             try:
                 values = np.array([f(float(s)) for s in ends])
-                told = max(least, ROUNDED * float(np.max(np.abs(values))))
+                told = max(least, ROUNDED * float(np.max(np.abs(values))), PART * float(np.ptp(values)))
                 if not np.max(np.abs(np.diff(values, 3))) > told:  # which is nothing where a function is smooth
                     continue
                 jumps = [found for i in range(CELLS) if (found := _jump(f, ends[i : i + 2], values[i : i + 2], told))]
