@@ -65,7 +65,8 @@ def differentiate_step(
               which they were certified equal to autodiff. What they do not cover goes on as by "auto", and so do
               derivatives by parameters other than friction, stiffness, dissipation and relaxation time;
             - "implicit": from the equation of a smooth step; autodiff where contact or a limit acts;
-            - "finite_difference": central differences of the double step;
+            - "finite_difference": central differences of the double step, solved to rounding where contact, joint
+              limits, PD controllers or couplers act and their equation is known, which the reason says;
             - "auto": the fastest of them that is exact here, by the model's size and what acts: analytic, else
               implicit, else autodiff, and differences where Drake refuses AutoDiffXd. For one step in contact of
               fewer than eight degrees of freedom autodiff comes first.
