@@ -31,7 +31,7 @@ def problem(num_steps: int = 100) -> dd.Problem:
 
 def main() -> None:
     """Shooting through the discrete step against collocation of the continuous motion, cost J in N^2 s."""
-    print("the continuous problem has a local optimum of J = 58.8077 here, and another of 57.9448")
+    print("the best motion known of the continuous problem has J = 57.9448; from u = 0 another is found, of 58.8077")
     for num_steps in (50, 100):
         for method in ("collocation", "shooting"):
             solution = dd.solve(problem(num_steps), method=method, solver="ipopt")

@@ -174,6 +174,7 @@ def test_missing_and_impossible_engines_are_listed_with_the_reason(load, monkeyp
     assert "drake-diff[absent]" in told["absent"].reason
     assert told["numpy"].installed
     assert "no hand calculation" in told["numpy"].reason
+    assert not found.holds  # nothing was compared
 
 
 def test_the_same_seed_gives_the_same_motion(load):

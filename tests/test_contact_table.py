@@ -1,6 +1,7 @@
 """The textbook contact cases: closed forms, each engine against them, and engines that are doctored."""
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -9,6 +10,7 @@ from math import cos, exp, log, radians, sin, sqrt
 import numpy as np
 import pytest
 from helpers.engines import Doctored, needs
+from helpers.models import ROOT
 from helpers.table import each_row
 from hypothesis import given
 from hypothesis import strategies as st
@@ -443,3 +445,58 @@ def test_every_engine_that_is_here_is_told_of():
         assert " ".join(lines_of(found, engine))
         for row in found.rows:
             assert row.why or row.verdict == "rigid answer"
+
+
+DOCUMENTED = {
+    "depth at rest": ("rest", "value"),
+    "stopping distance": ("stop", "value"),
+    "derivative of that distance": ("stop", "gradient"),
+    "speed after sliding": ("slide", "value"),
+    "creep": ("hold", "value"),
+    "speed after rolling": ("roll", "value"),
+    "rebound height": ("damped bounce", "value"),
+    "derivative of the height": ("damped bounce", "gradient"),
+}
+SMALLEST_TOLD = (
+    1e-6  # of the rigid answer: what is nearer to it is left by solvers, and differs from version to version
+)
+
+
+def test_the_table_in_the_documents_is_this_table(found):
+    text = (ROOT / "docs" / "contact.md").read_text()
+    table = [line.split("|")[2:-1] for line in text.splitlines() if re.match(r"\| [\w ]", line)][:8]
+    labels = [line.split("|")[1].strip() for line in text.splitlines() if re.match(r"\| [\w ]", line)][:8]
+    for label, cells in zip(labels, table, strict=True):
+        case, what = next(found_at for start, found_at in DOCUMENTED.items() if label.startswith(start))
+        for engine, cell in zip(found.engines, cells[1:], strict=True):
+            row, told = found.row(case, engine), cell.replace("*", "").strip()
+            number, digits = float(re.match(r"[-+.e\d]+", told)[0]), last_digit(told)
+            if told.endswith("%"):
+                right = 100 * (row.value / row.rigid - 1)
+                digits = max(digits, 100 * SMALLEST_TOLD)
+            else:
+                right = row.value if what == "value" else row.gradient
+            assert number == pytest.approx(right, abs=0.51 * digits + 1e-12), (label, engine, told, right)
+    told = re.search(
+        r"closed forms are ([-.\d]+), ([-.\d]+), ([-.\d]+) and ([-.\d]+)\.", text.replace("\n", " ")
+    ).groups()
+    laws = [found.row("damped bounce", engine).law_gradient for engine in found.engines]
+    assert [float(number) for number in told] == pytest.approx(laws, abs=0.0051)
+
+
+def test_what_the_documents_say_of_physx_and_newton():
+    needs("mujoco")
+    for module in ("sapien", "newton"):
+        pytest.importorskip(module)
+    table = contact_table(("sapien", "newton"))
+    physx, newton = table.engines
+    assert 1 - table.row("stop", physx).value / table.row("stop", physx).rigid == pytest.approx(0.005, abs=5e-4)
+    assert table.row("bounce", physx).value == 0
+    assert 1 - table.row("bounce", newton).value / table.row("bounce", newton).rigid == pytest.approx(0.76, abs=5e-3)
+    assert table.row("hold", newton).value == pytest.approx(0.02, abs=5e-4)
+
+
+def last_digit(told):
+    """What one unit of the last digit of a number's text is worth."""
+    mantissa, _, exponent = re.match(r"[-+]?([.\d]+)(e?)([-+]?\d*)", told).groups()
+    return 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))

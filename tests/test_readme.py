@@ -1,5 +1,7 @@
 """The README's code prints what the README says, and what the documents name is there."""
 
+import importlib
+import json
 import re
 import subprocess
 import sys
@@ -58,3 +60,111 @@ def test_the_panel_in_the_documents_runs(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert len(Path(tmp_path, "out", "table.csv").read_text().splitlines()) == 7  # a header and six cells
+
+
+# What a number in the documents' prose is called by: names and versions, steps of h, codes of a licence.
+NAMES = re.compile(r"Python 3\.1\d|\(3\.11, and 3\.12|ROS\s2|h/\d+|BSD-3|ICML 2022|\^2|_?invweight0")
+SAP = "drake_diff.model.contract:SAP_RELATIVE_TOLERANCE"
+TABLE = "tests/test_contact_table.py::test_the_table_in_the_documents_is_this_table"
+TURN = "tests/test_engines.py::test_mujoco_differs_on_free_bodies_by_the_quaternions_exponential_alone"
+RESTING = "tests/test_contact_contract.py::test_the_stiffness_that_is_read_is_that_on_which_a_weight_rests_in_mujoco"
+FORWARD = "tests/test_contact_table.py::test_what_the_documents_say_of_physx_and_newton"
+BLEND = "tests/test_smoothing.py::test_what_the_blend_keeps_of_the_bias_shrinks_with_more_samples"
+CODES = {
+    "0": "tests/test_cli.py::test_a_run_that_holds_prints_its_checks_and_exits_with_0",
+    "1": "tests/test_cli.py::test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact",
+    "2": "tests/test_cli.py::test_a_missing_script_exits_with_2",
+    "3": "tests/test_readme.py::test_what_is_not_installed_exits_with_3",
+    "4": "tests/test_cli.py::test_a_bug_in_the_script_exits_with_4_and_its_traceback",
+}
+# Of each number the constant that it is ("module:NAME", of 5 % as a part), or the test that fails without it.
+SOURCES = {
+    "README.md": {**CODES, "97": "tests/test_readme.py::test_the_network_of_the_example_has_97_weights", "1e-6": SAP},
+    "CONTRIBUTING.md": {},
+    "docs/benchmarks.md": {},
+    "docs/contact.md": {
+        "1": "tests/test_contact_table.py::test_values_by_hand_and_by_drake_alone",
+        "1e4": "tests/test_contact_table.py::test_values_by_hand_and_by_drake_alone",
+        "1e-6": SAP,
+        **dict.fromkeys(("0.42", "0.29", "-0.13"), TABLE),
+        **dict.fromkeys(("0.5", "76", "0.02"), FORWARD),
+        "30": BLEND,
+        "0.01": "tests/test_gradient_panel.py::test_on_stiff_ground_the_jumps_of_the_step_turn_the_sign_of_first_order",
+    },
+    "docs/engines.md": {
+        "1e-13": "tests/test_engines.py::test_the_hand_calculation_is_drake",
+        "1e-12": "tests/test_engines.py::test_pinocchio_is_drake",
+        "1e-10": "tests/test_engines.py::test_mujoco_is_drake_where_no_body_is_free",
+        "1e-11": "tests/test_mjx_engine.py::test_mjx_is_drake_where_no_body_is_free",
+        "8": TURN,
+        "4e-6": "tests/test_newton_engine.py::",
+        "1e-6": "tests/test_sapien_engine.py::",
+        "1": RESTING,
+    },
+    "docs/limitations.md": {
+        "0.01": "tests/test_bounce_oracles.py::test_a_resolved_collision_has_the_compliant_gradient",
+        "1e-6": SAP,
+        "8": TURN,
+        "5": "drake_diff.optimize.replay:STATE_TOLERANCE",
+        "30": BLEND,
+    },
+    "docs/logs.md": {
+        "1": "tests/test_verify.py::",
+        "1e-6": "drake_diff.artifact.differences:RELATIVE",
+        "1e-9": "drake_diff.artifact.differences:ABSOLUTE",
+    },
+    "docs/panels.md": {
+        "95": "tests/test_robustness.py::test_intervals_are_the_published_ones",
+        "20": "tests/test_readme.py::test_the_reference_run_steps_by_20_ms",
+        "0": "tests/test_panel.py::",
+    },
+}  # fmt: skip
+
+
+def prose(path):
+    """The text without code, links, and the tables of docs/contact.md, which have tests or a command of their own."""
+    text = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", " ", path.read_text(), flags=re.DOTALL)
+    if path.name == "contact.md":
+        text = "\n".join(line for line in text.splitlines() if not line.startswith("|"))
+    return NAMES.sub(" ", text)
+
+
+@each_row("path", [path for path in DOCUMENTS if path.name != "trust.md"], ids=lambda path: path.name)
+def test_every_number_of_the_documents_has_a_source(path):
+    """docs/trust.md has figures of its own, with the command and the seed that make them."""
+    sources = SOURCES[str(path.relative_to(ROOT))]
+    numbers = set(re.findall(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?!\w)", prose(path)))
+    assert numbers <= sources.keys(), f"no source of {sorted(numbers - sources.keys())}"
+    assert sources.keys() <= numbers, f"no longer in the text: {sorted(sources.keys() - numbers)}"
+    for number, source in sources.items():
+        if "::" in source:
+            file, test = source.split("::")
+            assert f"def {test}" in (ROOT / file).read_text(), source
+        else:
+            module, name = source.split(":")
+            value = getattr(importlib.import_module(module), name)
+            assert float(number) in (value, 100 * value), source
+
+
+def test_the_optimum_of_the_continuous_swing_up_is_no_claim_of_the_documents():
+    """58.8077 is a local optimum; 57.9448 is less (see test_transcription)."""
+    assert not [path.name for path in DOCUMENTS if "58.8077" in path.read_text()]
+
+
+def test_the_network_of_the_example_has_97_weights():
+    text = (ROOT / "examples" / "neural_network_policy.py").read_text()
+    hidden = int(re.search(r"HIDDEN, STEP_SIZE = \S+ (\d+),", text)[1])
+    assert "[4 * HIDDEN, HIDDEN, HIDDEN]" in text  # of 4 inputs; one more bias for the output
+    assert 4 * hidden + hidden + hidden + 1 == 97
+
+
+def test_the_reference_run_steps_by_20_ms():
+    record = json.loads((ROOT / "artifacts" / "pendulum_swing_up" / "record.json").read_text())
+    assert record["contract"]["time_step"] == 0.02
+
+
+def test_what_is_not_installed_exits_with_3(tmp_path):
+    script = "import sys; sys.modules['mujoco'] = None\nfrom drake_diff.cli.main import main\nmain()"
+    command = [sys.executable, "-c", script, "export-model", str(ROOT / "models" / "hopper.sdf"), "--to", "mjcf"]
+    done = subprocess.run([*command, "--out", str(tmp_path / "out")], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 3, done.stdout + done.stderr

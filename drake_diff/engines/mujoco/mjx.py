@@ -31,7 +31,6 @@ PYRAMIDAL = {name: number for number, name in CONES.items()}["pyramidal"]
 # [N or N m] of M a - f, relative to f: MJX does not say whether its solver came to its end, which leaves 1e-12 or so.
 UNBALANCED = 1e-6
 STILL = 1e-8  # [rad/s] that MJX takes for 0, dropping the turn
-RK4 = 1  # mjtIntegrator
 
 
 class MjxEngine(PlantEngine):
@@ -80,10 +79,6 @@ class MjxEngine(PlantEngine):
         _, qvel = self.native.to_native(x_next)
         starts = [j for _, j in self.native.coordinates.free]
         still = [d for d in (self.native.dofs[j : j + 3] for j in starts) if np.all(np.abs(qvel[d]) <= STILL)]
-        if still and int(self.model.opt.integrator) == RK4:
-            raise GradientError(
-                "MJX loses the derivative of a rotation that starts from rest, and with RK4 it cannot be restored"
-            )
         h = float(self.model.opt.timestep)
         for dofs in still:
             A[dofs], B[dofs] = h * A[self.nv + dofs], h * B[self.nv + dofs]
