@@ -103,6 +103,7 @@ SOURCES = {
     },
     "docs/limitations.md": {
         "0.01": "tests/test_bounce_oracles.py::test_a_resolved_collision_has_the_compliant_gradient",
+        "1": "tests/test_rollout_certificate.py::",
         "1e-6": SAP,
         "8": TURN,
         "5": "drake_diff.optimize.replay:STATE_TOLERANCE",
