@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from helpers.plants import block as rail_block
 from helpers.table import each_row
 
 import drake_diff as dd
@@ -176,6 +177,25 @@ def test_a_collocated_plan_is_replayed_in_finer_steps_until_two_hold(write_urdf)
     assert variants[:2] == ["in steps of 0.25 s", "in steps of 0.125 s"]
     assert not solution.replays[0].holds
     assert all(any(r.holds for r in solution.replays if r.variant == v) for v in variants[-2:])
+
+
+def test_a_verdict_names_how_far_the_plan_ends_from_its_goal_and_what_is_allowed(write_urdf):
+    """A block moved in steps of 0.05 s: held inputs in half the steps lead elsewhere by the closed form of the sums."""
+    problem = block(write_urdf, x_goal=[1, 0])
+    solution = dd.solve(problem, method="shooting")
+    assert solution.success, solution.message
+    us = np.repeat(solution.us[:, 0], 2)
+    vs = np.cumsum(us * H / 2)
+    off = abs(np.sum(vs) * H / 2 - 1)  # symplectic Euler by hand; the speed ends at 0 exactly
+    controlled = [r for r in solution.replays if r.variant == "in steps of 0.025 s"]
+    assert min(r.goal_error for r in controlled) <= off + 1e-9
+    assert controlled[0].goal_error == pytest.approx(off, rel=1e-6)
+    assert "% of its range, of 5% of each state's range in the plan allowed" in solution.message
+    assert "slide_x ends" in solution.message
+    assert "diagram" not in solution.message
+    from_diagram = dd.solve(dd.Problem(rail_block(), x0=[0, 0], x_goal=[1, 0], num_steps=10), method="shooting")
+    assert "in steps of 0.1 s" in from_diagram.message
+    assert "a diagram allows no other step" in from_diagram.message
 
 
 def test_a_solve_whose_replay_fails_is_no_success(load):

@@ -11,6 +11,7 @@ import pytest
 from helpers.models import MODELS, Plant, contact_properties
 from helpers.plants import pd_pendulum
 from helpers.table import each_row
+from pydrake.geometry import Sphere
 
 import drake_diff as dd
 from drake_diff.derivatives.step import derivatives_along
@@ -340,6 +341,21 @@ def test_pd_control_is_left_to_the_discrete_methods():
     solution = dd.solve(problem)
     assert solution.method == "ilqr"
     assert solution.success, solution.message
+
+
+def test_collocation_through_a_ball_between_two_knots_is_not_verified():
+    """From 1 m before a fixed ball to 1 m behind it in three intervals, whose knots are 0.4 m away or more."""
+    plant = Plant(0.25)
+    plant.ball("ball", 1.0, 0.1, contact_properties(1e4), "x")
+    plant.shape(plant.plant.world_body(), Sphere(0.1), contact_properties(1e4))
+    plant.plant.AddJointActuator("push", plant.plant.GetJointByName("ball_x"))
+    problem = dd.Problem(plant.model(), x0=[-1, 0], num_steps=3, running_cost=EFFORT, x_goal=[1, 0])
+    solution = dd.solve(problem, method="collocation")
+    assert np.abs(solution.xs[:, 0]).min() > 0.4
+    assert solution.status is Status.CONVERGED_NOT_VERIFIED
+    assert "geometries overlap by 0.2 m at 0.375 s" in solution.message
+    aside = dd.solve(dataclasses.replace(problem, x_goal=[-0.3, 0]), method="collocation")
+    assert "geometries overlap" not in aside.message
 
 
 def test_collocation_through_the_ground_is_not_verified(tmp_path):

@@ -12,7 +12,7 @@ from drake_diff.model.step import set_state
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, NlpResult, Outcome
 from drake_diff.optimize.replay import broken_variants, told_of_controls, told_of_tolerance
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
-from drake_diff.optimize.transcription.collocation import Collocated, violation_between_nodes
+from drake_diff.optimize.transcription.collocation import SUBSTEPS, Collocated, violation_between_nodes
 
 FINER = "pass refine=True, or take more steps (num_steps)"
 REFINED = "raise max_num_steps, or take more steps (num_steps)"  # where it was refined
@@ -88,17 +88,26 @@ def complaints_about(solution: Solution) -> Iterator[str]:
     if solution.transcribed is not None:
         yield from _between_nodes(solution, solution.transcribed)
     if solution.transcribed is not None and solution.problem.has_model:
-        model, depths = solution.problem.model, []
-        for x in solution.xs:
-            set_state(model.double, x)
-            depths.append(penetration(model))
-        if max(depths) > 0:
-            knot = int(np.argmax(depths))
-            yield f"geometries overlap by {max(depths):.3g} m at knot {knot}, and collocation leaves contact out"
+        yield from _overlaps(solution, solution.transcribed)
     for certificate in solution.certificates:
         if certificate.verdict != "agree":
             yield f"a gradient certificate says {certificate.verdict}: {certificate.worst}"
             break
+
+
+def _overlaps(solution: Solution, motion: Collocated) -> Iterator[str]:
+    """Where geometries touch, at knots or between them."""
+    model, depths = solution.problem.model, []
+    if not model.contract.contact.collision_pairs:
+        return
+    times, between = motion.between_knots
+    xs = np.vstack([motion.xs, between])
+    for x in xs[np.isfinite(xs).all(axis=1)]:
+        set_state(model.double, x)
+        depths.append(penetration(model))
+    if max(depths) > 0:
+        when = np.append(solution.times, times)[np.isfinite(xs).all(axis=1)][int(np.argmax(depths))]
+        yield f"geometries overlap by {max(depths):.3g} m at {when:.4g} s, and collocation leaves contact out"
 
 
 def _between_nodes(solution: Solution, motion: Collocated) -> Iterator[str]:
@@ -119,26 +128,26 @@ def _between_nodes(solution: Solution, motion: Collocated) -> Iterator[str]:
 
 
 def _followed(solution: Solution, motion: Collocated) -> tuple[bool, str]:
-    """Whether the dynamics follow the plan from its first state to its last, open loop or under TVLQR, and how well."""
+    """Whether the dynamics follow the plan from its first knot to its last, open loop or under TVLQR, and how well."""
     b, names, ranges = solution.problem.bounds, solution.problem.state_names, solution.problem.ranges(motion.xs)
     told = []
     for control in ("open loop", "TVLQR"):
         xs = motion.led(control)
         excess = np.max(np.maximum(np.maximum(b.x_lower - xs, xs - b.x_upper), 0.0)[1:], axis=0)
-        end = np.nan_to_num(np.abs(xs[-1] - motion.xs[-1]), nan=np.inf)
+        apart = np.nan_to_num(np.max(np.abs(xs[::SUBSTEPS] - motion.xs), axis=0), nan=np.inf)
         excess = np.nan_to_num(excess, nan=np.inf)
-        i, j = (int(np.argmax(off / ranges)) for off in (end, excess))
-        if max(end[i] / ranges[i], excess[j] / ranges[j]) <= INTEGRATION_TOLERANCE:
+        i, j = (int(np.argmax(off / ranges)) for off in (apart, excess))
+        if max(apart[i] / ranges[i], excess[j] / ranges[j]) <= INTEGRATION_TOLERANCE:
             how = control if control == "open loop" else f"under {control}"
             return True, (
-                f"integrated accurately {how}, {names[i]} ends {end[i]:.2g} from the plan, {end[i] / ranges[i]:.1%} of "
-                f"its range, of {INTEGRATION_TOLERANCE:.0%} allowed"
+                f"integrated accurately {how}, {names[i]} is at most {apart[i]:.2g} from the plan, "
+                f"{apart[i] / ranges[i]:.1%} of its range, of {INTEGRATION_TOLERANCE:.0%} allowed"
             )
-        bound = excess[j] / ranges[j] > end[i] / ranges[i]
+        bound = excess[j] / ranges[j] > apart[i] / ranges[i]
         told.append(
             f"{control}, {names[j]} is {excess[j]:.3g} beyond its bound"
             if bound
-            else f"{control}, {names[i]} ends {end[i]:.3g} from the plan"
+            else f"{control}, {names[i]} is {apart[i]:.3g} from the plan"
         )
     return False, (
         f"integrated accurately from its first state the plan does not hold: {'; '.join(told)}; tolerance "

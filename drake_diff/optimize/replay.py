@@ -187,7 +187,8 @@ def told_of_tolerance(plan: Plan, found: Sequence[Replay]) -> str:
                 f"{plan.problem.state_names[i]} ends {off[i] * plan.scale[i]:.2g} from its goal {variant}, {off[i]:.1%}"
             )
             worst = max(worst, (float(off[i]), told))
-    return f"at worst {worst[1]} of its range, of {allowed} allowed"
+    only = "" if len(decides) > 1 else ", and a diagram allows no other step"
+    return f"at worst {worst[1]} of its range, of {allowed} allowed{only}"
 
 
 def judged_replay(plan: Plan, found: Sequence[Replay]) -> Replay | None:

@@ -123,6 +123,13 @@ class Collocated:
         return _finite(np.abs(self._integrated[-1, :, :-1] - self.xs[1:]))
 
     @property
+    def between_knots(self) -> tuple[Array, Array]:
+        """(9 N,) times [s] within the intervals, and the states (9 N, nx) that the knots before them lead to."""
+        count, inside = len(self.mesh) - 1, np.arange(1, SUBSTEPS) / SUBSTEPS
+        times = self._times(np.tile(np.arange(count), len(inside)), np.repeat(inside, count))
+        return times, self._integrated[1:-1, :, :-1].reshape(len(times), -1)
+
+    @property
     def cost_errors(self) -> Array:
         """(N,) the same of the running cost's quadrature, as a part of the whole cost (of 1 where that is less)."""
         scheme, rates = self.task.scheme, self.task.rate.values(self.nodes)[:, 0]
@@ -279,8 +286,7 @@ def violation_between_nodes(motion: Collocated) -> Excess:
     task, b, count = motion.task, motion.task.bounds, len(motion.mesh) - 1
     inside, states, inputs = np.arange(1, SUBSTEPS) / SUBSTEPS, task.dynamics.state_names, task.dynamics.input_names
     k, tau = np.tile(np.arange(count), len(inside)), np.repeat(inside, count)
-    xs, applied = motion._integrated[1:-1, :, :-1].reshape(len(k), -1), motion._applied(k, tau)
-    times, ranges = motion._times(k, tau), task.problem.ranges(motion.xs)
+    applied, ranges, (times, xs) = motion._applied(k, tau), task.problem.ranges(motion.xs), motion.between_knots
     found = [_beyond("state", states, xs, b.x_lower, b.x_upper, ranges, times)]
     for c in task.problem.constraints:
         if c.knots is None:
