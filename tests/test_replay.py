@@ -114,8 +114,8 @@ def test_the_tolerance_is_five_percent_of_the_range(write_urdf):
 def test_energy_out_of_nothing_is_told(load):
     """Semi-implicit Euler of an oscillator is unstable beyond h w = 2: the swing grows without a motor's work."""
     model = load("pendulum.urdf", time_step=0.55)  # w = sqrt(g / l) = 4.4: h w = 2.4
-    problem = dd.Problem(model, x0=[0.02, 0], num_steps=12, final_cost=lambda x: x[0])
-    plan = plan_of(problem, np.zeros((12, 1)))
+    problem = dd.Problem(model, x0=[0.02, 0], num_steps=4, final_cost=lambda x: x[0])  # later it is no small swing
+    plan = plan_of(problem, np.zeros((4, 1)))
     found = by_name(replays(plan), "in steps of 0.55 s", "open loop")
     assert any("J of energy come from nowhere" in failure for failure in found.failures), found
 

@@ -383,6 +383,9 @@ def plan_of(solution, build):
     """What the referee gets: functions of time out of the solution's own arrays, as it documents them."""
     problem, times, xs, us = solution.problem, solution.times, solution.xs, solution.us
     ends, middle, b = solution.inputs_at_knots, solution.us_mid, problem.bounds
+    top = np.array(b.x_upper)
+    for constraint in problem.constraints:  # of speeds, all of them
+        top[1] = min(top[1], constraint.upper[0])
 
     def u(t):
         k = min(max(int(np.searchsorted(times, t, side="right")) - 1, 0), len(us) - 1)
@@ -404,7 +407,7 @@ def plan_of(solution, build):
         "x": lambda t: np.array([np.interp(t, at, column) for column in dense.T]),
         "goal": np.full(problem.nx, np.nan) if problem.x_goal is None else np.array(problem.x_goal),
         "nq": problem.model.nq if problem.has_model else 0,
-        "x_lower": b.x_lower, "x_upper": b.x_upper, "u_lower": b.u_lower, "u_upper": b.u_upper,
+        "x_lower": b.x_lower, "x_upper": top, "u_lower": b.u_lower, "u_upper": b.u_upper,
     }  # fmt: skip
 
 
@@ -416,7 +419,8 @@ def case(seed, number):
     if not solution.success:
         return task, solution, "", 0.0
     plan, h = plan_of(solution, build), solution.time_step
-    found = [judge(plan, step, NAMED) for step in ((0.0,) if solution.scheme != "step" else (h, h / 2))]
+    steps = (0.0,) if solution.scheme != "step" else (h, h / 2, h / 8)
+    found = [judge(plan, step, NAMED) for step in steps]
     return task, solution, next((why for why, _ in found if why), ""), max(miss for _, miss in found)
 
 
