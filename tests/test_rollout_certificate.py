@@ -13,7 +13,9 @@ import drake_diff as dd
 from drake_diff._base.autodiff import chain_rows, plain
 from drake_diff.certificates.directions import FIRST, MISS, QUANTILE, Probe, weights
 from drake_diff.certificates.feedback import fresh
+from drake_diff.certificates.stairs import stairs_of_policy
 from drake_diff.exceptions import CertificateError, GradientError, InputError
+from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import ParametricPolicy
 
 X0, N = np.array([0.1, 0.4, -0.2, 0.3]), 30  # of the cart-pole
@@ -296,8 +298,15 @@ def test_a_switch_far_away_clipping_and_single_precision_are_no_staircase(load):
         u = np.array([-np.tanh(p @ x)])
         return u + (plain(u).astype(np.float32).astype(float) - plain(u))
 
-    held = dd.PD(load("acrobot.xml"), kp=5.0, kd=0.5, x_ref=X0)  # whose u is nothing but rounding at x0
-    dd.certify_rollout(load("acrobot.xml"), X0, None, end, policy=held, num_steps=N).require()
     certified(load("cart_pole.urdf"), policy).require()
     certified(load("cart_pole.urdf"), policy, sampled=True).require()
     assert "staircase" not in str(certified(load("cart_pole.urdf"), single, sampled=True))
+
+
+def test_an_input_that_is_nothing_but_rounding_is_no_staircase(load):
+    """Feedback around x0 itself: near it u is a rounded difference of numbers of size 1."""
+    model, random = load("acrobot.xml"), np.random.default_rng(3)
+    for x0, gain in zip(random.standard_normal((5, 4)), 0.3 * random.standard_normal((5, 1, 4)), strict=True):
+        policy = ParametricPolicy(lambda x, t, p, x0=x0: np.tanh(p[None] @ (x - x0)), gain[0])
+        g = dd.differentiate_rollout(model, x0, None, end, policy=policy, num_steps=3)
+        assert stairs_of_policy(policy, g, tangent_space(model), model.time_step) == ""
