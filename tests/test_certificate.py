@@ -4,14 +4,19 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers.models import random_state
+from helpers.models import Plant, contact_properties, random_state
+from helpers.robots import example_robot, state_in_range
 from helpers.table import each_row
+from pydrake.multibody.tree import PdControllerGains
 
 import drake_diff as dd
 from drake_diff._base.differences import sweep_of
+from drake_diff._base.refusal import Refusal
 from drake_diff.certificates.judgement import judge
 from drake_diff.certificates.neighbourhood import look_around
+from drake_diff.derivatives.polish import Polished
 from drake_diff.exceptions import CertificateError, GradientError, ShapeError, UnknownNameError
+from drake_diff.model.plant import joints
 
 
 def smooth(n, seed=0):
@@ -259,3 +264,157 @@ def test_jitter_is_told_in_every_unit(unit):
     a, beside = unit * np.array([[1.0, 1.0, 1e-8]]), unit * np.array([[1.0, 1.5, 3e-8]])
     found = judge(look_around(lambda d: d @ a.T, 3), a, beside)
     assert found.reasons == {(0, 1): f"1e-9 beside the point the derivative is {1.5 * unit:.6g}"}
+
+
+STAIRS = {
+    "round to 7 digits": lambda x: np.round(x, 7),
+    "round to 5 digits": lambda x: np.round(x, 5),
+    "round to 3 digits": lambda x: np.round(x, 3),
+    "steps of 3e-5": lambda x: 3e-5 * np.floor(x / 3e-5),
+    "a table": lambda x: np.sin(np.linspace(0, 1, 2000))[(1999 * x).astype(int)],
+    "on a slope": lambda x: x + np.round(x, 5),
+    "small": lambda x: 1e-12 * np.round(x, 5),
+}
+
+
+@each_row("name", list(STAIRS))
+def test_stairs_are_discontinuous_whatever_is_claimed_and_the_jumps_are_told(name):
+    for claimed in (0.0, 1.0):
+        certificate = dd.certificates.certify_jacobian(STAIRS[name], [0.3123412], [[claimed]])
+        assert certificate.verdict == "discontinuous"
+        assert "it jumps by" in str(certificate)
+
+
+@each_row(
+    "f, reason",
+    [
+        (np.abs, "the slope has a corner: 1 ahead, -1 behind"),
+        (np.sign, "the value jumps by 2"),
+        (lambda x: 1e-12 * np.maximum(x, 0), "the slope has a corner: 1e-12 ahead, -0 behind"),
+    ],
+)
+def test_the_reason_of_a_discontinuity_is_told_with_numbers(f, reason):
+    certificate = dd.certificates.certify_jacobian(f, [0.0], [[0.0]])
+    assert certificate.verdict == "discontinuous"
+    assert reason in certificate.worst.reason
+    assert reason in str(certificate)
+
+
+@each_row("f", [lambda v: np.abs(v) ** 1.5, lambda v: v**2, lambda v: v - v * np.abs(v)])
+def test_drag_at_rest_has_a_slope_and_is_certified(f):
+    """One-sided quotients part as the root of their step, or as it: there is no corner."""
+    slope = float(f(1e-12) - f(-1e-12)) / 2e-12
+    assert verdict(f, slope) == "agree"
+    assert verdict(f, slope + 1e-3) == "disagree"
+
+
+@each_row("scale", [1e-12, 1e-8, 1.0, 1e8])
+def test_a_function_is_judged_alike_in_every_unit(scale):
+    f = lambda x: scale * np.sin(3 * x)  # noqa: E731
+    right = 3 * scale * np.cos(0.9)
+    assert verdict(f, right, x=0.3) == "agree"
+    assert verdict(f, 1.001 * right, x=0.3) == "disagree"
+
+
+def test_the_scatter_of_the_values_says_how_small_an_error_would_be_noticed():
+    """Values that scatter by e leave the slope open by about e over the widest step, 1e-2."""
+    powers = []
+    for scatter in (1e-12, 1e-9, 1e-7, 1e-4):
+        f = lambda x, e=scatter: np.sin(x) + e * np.sin(1e12 * x)  # noqa: E731
+        certificate = dd.certificates.certify_jacobian(f, [0.3], [[np.cos(0.3)]])
+        entry = certificate.worst
+        powers.append(certificate.power)
+        assert abs(entry.difference - np.cos(0.3)) <= entry.noticeable
+        assert certificate.verdict == ("agree" if certificate.power <= 0.01 else "undecided")
+        for error in (2 * entry.noticeable, -2 * entry.noticeable):
+            assert certificate.of([[np.cos(0.3) + error]]).verdict != "agree"
+    assert powers[0] < 1e-5 < powers[1] < powers[2] < 0.01 < powers[3]
+    assert "would have noticed" in str(certificate.of([[1.0]]))
+
+
+def sliding(approximation, gains=None):
+    """A ball of 1 kg on slides along x and z that slides on ground of 1e6 N/m, pushed along both."""
+    plant = Plant(0.001, approximation)
+    plant.ball("ball", 1.0, 0.1, contact_properties(2e6, 0.1, 0.5, 0.01), "x", "z")
+    plant.ground(contact_properties(2e6, 0.1, 0.5, 0.01))
+    for axis in "xz":
+        actuator = plant.plant.AddJointActuator(f"push_{axis}", plant.plant.GetJointByName(f"ball_{axis}"))
+        if gains:
+            actuator.set_controller_gains(PdControllerGains(p=gains[0], d=gains[1]))
+    return plant.model()
+
+
+@each_row(
+    "approximation, gains",
+    [("lagged", None), ("sap", None), ("similar", None), ("sap", (10.0, 1.0)), ("lagged", (1e3, 10.0))],
+)
+def test_no_wrong_derivative_by_the_inputs_of_a_sliding_ball_is_passed(approximation, gains):
+    """1 mN for 1 ms moves the ball by 1e-6 m/s, about where Drake's solver stops."""
+    model = sliding(approximation, gains)
+    x, u = [0.0, 0.1 - 1e-5, 1.0, 0.01], [0.3, -0.2]
+    d = dd.differentiate_step(model, x, u)
+    right = dd.certify(model, x, u).require()
+    assert right.power <= 0.01
+    for B in (-d.B, 0 * d.B, d.B[:, ::-1], 1.1 * d.B, 1.01 * d.B, 0.99 * d.B):
+        wrong = dd.certify(model, x, u, derivatives=dataclasses.replace(d, B=B))
+        assert wrong.verdict == "disagree"
+        assert wrong.worst.column.startswith("push")
+
+
+def test_the_same_differences_judge_another_derivative():
+    f, jacobian = smooth(5)
+    x = np.random.default_rng(1).standard_normal(5)
+    wrong = jacobian(x)
+    wrong[2, 3] *= 1.01
+    first = dd.certificates.certify_jacobian(f, x, jacobian(x))
+    again, anew = first.of(wrong), dd.certificates.certify_jacobian(f, x, wrong)
+    assert np.array_equal(again.codes, anew.codes)
+    assert again.worst == anew.worst
+    with pytest.raises(ShapeError, match="derivative"):
+        first.of(wrong[:2])
+
+
+@each_row("name", ["z1.urdf", "panda.urdf", "go2.urdf"])
+def test_1_percent_near_a_joint_limit_and_under_pd_control_is_found_and_named(name):
+    random = np.random.default_rng(3)
+    model = example_robot(name, 0.002, gains=(50.0, 1.0))
+    x = state_in_range(model, random)
+    joint = next(j for j in joints(model.plant) if j.num_positions() == 1 and j.position_upper_limits()[0] < 10)
+    x[joint.position_start()] = joint.position_upper_limits()[0] - 0.01
+    certificate = dd.certify(model, x, random.standard_normal(model.nu)).require()
+    assert "solved to rounding" in str(certificate)
+    size = np.abs(certificate.derivative) >= certificate.size
+    for i, j in random.choice(np.argwhere(size), 10, replace=False):
+        wrong = certificate.derivative.copy()
+        wrong[i, j] *= random.choice([0.99, 1.01])
+        found = certificate.of(wrong)
+        assert found.verdict == "disagree"
+        assert (found.worst.row, found.worst.column) == (found.rows[i], found.columns[j])
+
+
+def test_steps_that_are_not_known_to_rounding_are_said_to_be_drakes_own_and_hide_less(monkeypatch):
+    """Nothing is known to be better than the solver's tolerance then, and what it would hide is undecided."""
+
+    def refused(model, vector, xs, us, values):
+        n = len(xs)
+        refusals = dict.fromkeys(range(n), Refusal("not today"))
+        return Polished(xs, xs, np.ones(n, dtype=bool), np.full(n, np.nan), refusals)
+
+    monkeypatch.setattr("drake_diff.certificates.certify.polished_steps", refused)
+    model = sliding("lagged")
+    certificate = dd.certify(model, [0.0, 0.1 - 1e-3, 1.0, 0.01], [0.3, -0.2])
+    assert certificate.verdict == "undecided"
+    assert "differences of Drake's own steps, which end at 1e-06 of the momentum: not today" in str(certificate)
+
+
+def test_differences_that_are_certified_by_differences_are_said_to_share_the_method(load):
+    certificate = dd.certify(load("pendulum.urdf"), [0.5, 0.1], [0.1], method="finite_difference")
+    assert "the two share a method" in str(certificate)
+    assert "the two share a method" not in str(dd.certify(load("pendulum.urdf"), [0.5, 0.1], [0.1]))
+
+
+def test_motors_in_the_air_are_not_called_discontinuous():
+    """A third of these states was, by differences of 1e-12 between values that are all rounding."""
+    model, random = example_robot("solo12.urdf"), np.random.default_rng(0)
+    for _ in range(6):
+        dd.certify(model, state_in_range(model, random), random.standard_normal(model.nu)).require()

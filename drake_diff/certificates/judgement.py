@@ -12,7 +12,7 @@ VERDICTS = ("agree", "undecided", "not_converged", "disagree", "discontinuous") 
 POWER = 1e-2  # of an entry: an error as large as this must be noticed
 EXACT = 1e-6  # of an entry: no derivative need be better
 TRUSTED = 3.0  # times the uncertainty of a plateau
-EARLY, STOPPED = 1000.0, 4e-3  # see `judge`
+EARLY, STOPPED, DOUBTFUL = 1000.0, 4e-3, 9e-3  # see `judge`
 DOUBTLESS = 10.0  # times the tolerance: a gap that large is an error though the differences do not tell 1 %
 NEGLIGIBLE = 1e-4  # of the largest of the row and of the column
 UNSEEN = 1e-8  # of the largest of the row, whatever the column's
@@ -49,19 +49,22 @@ def judge(
     """Judge the derivative `a` (m, n); `beside` (m, n) is what it is 1e-9 away, if that is known.
 
     `stopped` says how early, of the momentum, a solver stopped whose solution `a` was taken at. That much of the
-    largest entry of the row is allowed, a thousand times, but no more than 0.4 % of the entry. `second` are the units
-    (m,) of the rows and (n,) of the columns by which entries are weighed as well: see `_matters`.
+    largest entry of the row is allowed, a thousand times, but no more than 0.4 % of the entry; up to 0.9 % of it, that
+    much is no error for certain. `second` are the units (m,) of the rows and (n,) of the columns by which entries are
+    weighed as well: see `_matters`.
     """
     difference, doubt = _nearest(around, a, second)
     size, least = _matters(around, a, difference, second)
-    early = np.minimum(EARLY * stopped * np.abs(difference).max(axis=1, keepdims=True, initial=0), STOPPED * size)
-    tolerance = EXACT * np.abs(difference) + TRUSTED * doubt + POWER * least / 100 + early
+    early = EARLY * stopped * np.abs(difference).max(axis=1, keepdims=True, initial=0)
+    tolerance = EXACT * np.abs(difference) + TRUSTED * doubt + POWER * least / 100
+    doubtful = tolerance + np.minimum(early, DOUBTFUL * size)
+    tolerance += np.minimum(early, STOPPED * size)
     gap = np.abs(a - difference)
     noticeable = tolerance + gap
     tells = TRUSTED * doubt <= POWER * size
     codes = np.full(a.shape, VERDICTS.index("undecided"))
     codes[(gap <= tolerance) & (noticeable <= POWER * size)] = VERDICTS.index("agree")
-    codes[(gap > tolerance) & (tells | (gap > DOUBTLESS * tolerance))] = VERDICTS.index("disagree")
+    codes[(gap > doubtful) & (tells | (gap > DOUBTLESS * tolerance))] = VERDICTS.index("disagree")
     reasons = _broken(around, a, difference, size)
     for j, why in _stairs(around, size).items():
         reasons.setdefault(j, why)

@@ -27,6 +27,7 @@ TINY = 1e-300  # no number that means anything is smaller
 LAST_PLACE = 1.1e-16  # half a unit in the last place of 1
 SAFETY = 3.0  # scatter is a standard deviation, from a few values
 TOLD = 30.0  # times the scatter: a corner or jump that can be told from it
+VISIBLE = 1e-10  # of a value: smaller stairs are its rounding, magnified
 FINE, FLAT = 1e-5, 1e-2  # see `_stairs`
 SHRINKS = 0.7  # or more at a corner; 0.56 of |x|^1.5, which has none, 0.32 of what is smooth
 NEAR = 2  # spacings at which what is no scatter, but a corner or stairs, is as a rule not met
@@ -125,7 +126,8 @@ def _stairs(
     found: dict[int, str] = {}
     for k in range(1, len(SPACINGS)):
         finest = np.maximum(scatter[:, 0].max(axis=0), rounding[:, k].max(axis=0)) + TINY
-        least, both = np.maximum(TOLD * finest, unsolved), scatter[:, k].min(axis=0)
+        values = 2 * rounding[:, k].max(axis=0) / LAST_PLACE
+        least, both = np.maximum(np.maximum(TOLD * finest, unsolved), VISIBLE * values), scatter[:, k].min(axis=0)
         if SPACINGS[k] > FINE:  # where contact's onsets are as close, only what is flat between its jumps is stairs
             risen = np.abs(along[:, k]).max(axis=(0, 1))
             both = np.where(np.abs(slope) * VALUES * SPACINGS[k] <= FLAT * risen, both, 0.0)
