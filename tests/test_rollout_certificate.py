@@ -310,3 +310,11 @@ def test_an_input_that_is_nothing_but_rounding_is_no_staircase(load):
         policy = ParametricPolicy(lambda x, t, p, x0=x0: np.tanh(p[None] @ (x - x0)), gain[0])
         g = dd.differentiate_rollout(model, x0, None, end, policy=policy, num_steps=3)
         assert stairs_of_policy(policy, g, tangent_space(model), model.time_step) == ""
+
+
+def test_a_wrong_derivative_of_a_policy_is_refused_though_the_loss_hardly_feels_it(load):
+    """Three steps under a small gain: 8 % of one of its derivatives are below 1 % of every entry that matters."""
+    policy = ParametricPolicy(by_hand(0.08), 0.02 * GAINS)
+    found = dd.certify_rollout(load("cart_pole.urdf"), X0, None, end, policy=policy, num_steps=3, sampled=True)
+    assert found.verdict == "disagree"
+    assert "the policy states a wrong derivative" in str(found)

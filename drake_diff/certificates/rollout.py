@@ -124,8 +124,12 @@ def certify_rollout(
     stairs = _checked(moved, gradient)
     if sampled:
         sample = certify_sampled(moved, gradient, seed, 0 if policy is None else 1, subject)
-        cause = _cause(moved, gradient, sample.verdict)
-        return replace(sample, cause=cause) if not stairs else replace(sample, verdict="discontinuous", reason=stairs)
+        if stairs:
+            return replace(sample, verdict="discontinuous", reason=stairs)
+        cause = _cause(moved, gradient, "")  # which few rollouts may not tell: it is asked for whatever they say
+        return replace(
+            sample, cause=cause, verdict="disagree" if cause and sample.verdict == "agree" else sample.verdict
+        )
     refinements = [
         refined(model, x0, inputs, loss, vector, method, moved.flat(gradient), columns)
         for wanted, refined in ((refine, refine_by_time_step), (refine_stiffness, refine_by_stiffness))
