@@ -494,9 +494,9 @@ def test_a_step_refused_in_the_middle_of_a_solve_is_named(load, monkeypatch, sol
 
 
 def test_a_motion_that_leaves_every_finite_number_is_no_success(load):
-    """Whether the state or its derivative overflows first is a matter of rounding."""
+    """Whether the state overflows, its derivative does, or the search backs off to its last iteration is rounding."""
     solution = dd.solve(acrobot_swing_up(load), method="shooting", solver="snopt", max_iterations=50)
-    assert solution.status in (Status.DIVERGED, Status.NO_GRADIENT)
+    assert solution.status in (Status.DIVERGED, Status.NO_GRADIENT, Status.ITERATION_LIMIT)
     assert "Traceback" not in solution.message
     assert np.all(np.isfinite(solution.xs))
 

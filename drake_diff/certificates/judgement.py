@@ -17,7 +17,7 @@ DOUBTLESS = 10.0  # times the tolerance: a gap that large is an error though the
 NEGLIGIBLE = 1e-4  # of the largest of the row and of the column
 UNSEEN = 1e-8  # of the largest of the row, whatever the column's
 VISIBLE = 1e-12  # of a value: a smaller jump is rounding
-ROUNDED = 1e-10  # of a value: more is not its rounding
+ROUNDED = 1e-6  # of the largest of the row: rounding excuses no more
 VANISHING = 1e-5  # of the quotient over the widest step
 RESOLVED = 1e-4  # of an entry: a smaller corner is none
 CORNER, JUMP = 0.25, -0.5  # one-sided quotients part as h^CORNER or less at a corner, and grow as h^JUMP at a jump
@@ -103,7 +103,8 @@ def _matters(around: Neighbourhood, a: Array, difference: Array, second: Scales 
       magnitude where that is more. Where `second` says what the units are with time counted in steps, an entry must be
       negligible both so and in seconds: h in x' = x + h v is small in seconds, h k / m in v' in steps, and both matter;
     - 1e-5 of its own quotient over the widest step, a hundredth of that scale, where the slope is zero at the point;
-    - what the widest step would leave in the rounding of the value, as it is measured, up to 1e-10 of the value.
+    - what the smallest step of the widest plateau leaves of the rounding of the value, which is measured, up to 1e-6
+      of the largest entry of the row.
     """
     found = np.abs(difference)
     small = _small(found)
@@ -111,7 +112,8 @@ def _matters(around: Neighbourhood, a: Array, difference: Array, second: Scales 
         unit = second[0][:, None] / second[1]
         small = np.minimum(small, unit * _small(found / unit))
     small = np.maximum(small, UNSEEN * found.max(axis=1, keepdims=True, initial=0))
-    rounding = np.minimum(TOLD * around.finest, ROUNDED * around.size)[:, None] / STEPS[0] / POWER
+    rounding = (TOLD * around.finest / STEPS[3] / POWER)[:, None]
+    rounding = np.minimum(rounding, ROUNDED * found.max(axis=1, keepdims=True, initial=0))
     widest = VANISHING * np.maximum(np.abs(around.forward[0]), np.abs(around.backward[0]))
     least = np.maximum(np.maximum(small, widest), rounding) + TINY
     return np.maximum(np.maximum(np.abs(a), found), least), least

@@ -160,13 +160,13 @@ def told_of_controls(plan: Plan, found: Sequence[Replay]) -> str:
     if not good:
         held = (r for r in found if r.holds and r.variant in decides)
         return "on the plant, " + ", ".join(f"{r.variant} {_words(r.control)}" for r in held) + "; nowhere under both"
-    told = "on the plant " + " and ".join(map(_words, good))
+    told = "on the plant " + " and ".join(map(_words, good)) + (f" {decides[0]} or less" if plan.continuous else "")
     for control in controls:
         failed = [r for r in found if r.control == control and not r.holds]
         if control not in good:
             told += f", not {_words(control)}: {failed[0].variant}, {failed[0].failures[0]}"
         elif failed:  # a collocated plan in steps that are too coarse for it
-            told += f"; {_words(control)} {failed[0].variant} it does not: {failed[0].failures[0]}"
+            told += f"; {_words(control)} {failed[0].variant}, which are longer, not: {failed[0].failures[0]}"
     return told
 
 

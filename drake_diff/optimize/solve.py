@@ -34,8 +34,6 @@ from drake_diff.optimize.transcription.task import DEFAULT_SCHEME, SCHEMES, Opti
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": "riccati"}
 CERTIFIED_KNOTS = 5
-# Relative; forces are rounded at 1e-16 of their own size, and a wrist's small inertia turns that into accelerations.
-ACCELERATION_ROUNDING = 1e-12
 GUESS_NOISE = 1e-3  # of the largest input: breaks the symmetry of a guess that is a stationary point
 GUESS_ITERATIONS = 100  # of an attempt that is to find a guess for the next one
 ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
@@ -556,7 +554,6 @@ class Run:
                 batched=True,
                 rows=tuple(f"d({name})/dt" for name in problem.state_names),
                 columns=problem.state_names + problem.input_names,
-                solver_tolerance=ACCELERATION_ROUNDING,
                 method="continuous time",
                 subject=f"the equations of motion of {problem.name}",
             )
