@@ -85,12 +85,14 @@ def sliding(model, tilt, height):
     return x
 
 
-def check_the_derivative(model, x, tolerance):
+def check_the_derivative(model, x, tolerance, verdict="agree"):
     """Autodiff certifies and equals central differences of 4th order, relative to its largest entry."""
     A = dd.differentiate_step(model, x, method="autodiff").A
     dd.step(model, x)
     assert contacts_of_the_step(model)
-    assert dd.certify(model, x, method="autodiff").verdict == "agree"
+    certificate = dd.certify(model, x, method="autodiff")
+    assert certificate.verdict == verdict
+    assert certificate.count("disagree") == certificate.count("discontinuous") == 0
     h = 1e-6 * np.eye(len(x))
     near = np.array([dd.step(model, x + e) - dd.step(model, x - e) for e in h])
     far = np.array([dd.step(model, x + 2 * e) - dd.step(model, x - 2 * e) for e in h])
@@ -119,7 +121,8 @@ def test_a_sliding_box_on_corner_spheres_is_differentiated_by_autodiff():
 def test_a_sliding_hydroelastic_box_is_differentiated_by_autodiff(contact_model):
     model = box_on_ground("hydroelastic", contact_model)
     x = sliding(model, (0.3, -0.25), 0.09)
-    check_the_derivative(model, x, 1e-6)  # measured 1.4e-9
+    # Such a step is not had to rounding, so a certificate decides nothing where the solver's tolerance hides 1 %.
+    check_the_derivative(model, x, 1e-6, "undecided")  # measured 1.4e-9
 
 
 def test_the_box_rests_on_four_springs():

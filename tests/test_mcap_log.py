@@ -115,7 +115,7 @@ def test_every_message_has_a_unit_for_every_number():
     for name, fields in MESSAGES.items():
         for field, ((kind, _), unit) in fields.items():
             assert (kind == "string") == (unit == ""), f"{name}.{field}"
-    assert math.isclose(TYPES["GradientNorm"].cls(step=3, norm=0.1).norm, 0.1)
+    assert math.isclose(TYPES["GradientNorm"].cls(step=3, lagrangian=0.1).lagrangian, 0.1)
 
 
 DOUBLES = st.floats(allow_nan=True, allow_infinity=True)

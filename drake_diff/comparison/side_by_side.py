@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff._base.refusal import Refusal
 from drake_diff.comparison import attribution
 from drake_diff.comparison.recordings import Recording, check_recording, steps_between
 from drake_diff.comparison.result import MUST_HAVE, STEP_TOLERANCE, Compared, Comparison, Probe, Refused, first_above
@@ -143,9 +144,10 @@ class _Panel:
         jacobians = self.jacobians if is_reference else self._jacobians(engine)
         product = self.product if is_reference else rollout_jacobian(engine, self.space, motion)
         gaps, precision = self._step_gaps(motion), engine.contract.precision
+        has = None if isinstance(product, Refusal) else product
         rollout_gap = None  # where one of the two has no derivative, or broke off before the other
-        if product is not None and self.product is not None and len(motion.us) == len(self.motion.us):
-            rollout_gap = _gap(self.product, product)
+        if has is not None and not isinstance(self.product, Refusal) and len(motion.us) == len(self.motion.us):
+            rollout_gap = _gap(self.product, has)
         laws = []
         for x, u in ((probe.x, probe.u) for probe in self.probes):
             steps = self.reference.step(x, u), engine.step(x, u)
@@ -158,7 +160,7 @@ class _Panel:
             first=self._attribution(engine, motion, first_above(gaps, precision) or 0),
             largest=self._attribution(engine, motion, int(np.argmax(gaps)) if len(gaps) else 0),
             final_gap=self._final_gap(motion.xs), jacobians=jacobians, laws=tuple(laws),
-            jacobian_gaps=frozen([_gap(a.jacobian, b.jacobian) for a, b in both]), rollout_jacobian=product,
+            jacobian_gaps=frozen([_gap(a.jacobian, b.jacobian) for a, b in both]), rollout_jacobian=has,
             rollout_gap=rollout_gap, seconds_per_step=seconds(lambda: engine.step(self.x0, self.us[0])),
             seconds_per_jacobian=seconds(lambda: engine.differentiate_step(self.x0, self.us[0])),
         )  # fmt: skip

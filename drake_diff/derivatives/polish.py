@@ -2,7 +2,7 @@
 
 Where contact, joint limits, PD controllers or couplers act, Drake's step solves a convex problem and stops at
 
-    |D (A (v' - v*) - j)| <= 1e-6 max(|D A v'|, |D j|),    D = diag(A)^-1/2, j = J' g the impulses
+    |D (A (v' - v*) - j)| <= 1e-14 + 1e-6 max(|D A v'|, |D j|),    D = diag(A)^-1/2, j = J' g the impulses
 
 (Castro, Permenter and Han, "An unconstrained convex formulation of compliant contact", 2022), which is the noise of its
 differences. `polished_steps` states the same problem again (see `convex_step`), with Drake's own mass matrix, forces
@@ -36,6 +36,7 @@ from drake_diff.model.step import advance, set_state
 STICTION_TOLERANCE = 1e-4  # [m/s] Drake's default, which it does not give back: another one is refused by the check
 # Drake's A, v* and J are ours to rounding, and so is what it compared with its tolerance.
 DRAKES_STOP = SAP_RELATIVE_TOLERANCE * (1 + 1e-3)
+AT_REST = 1e-14 / SAP_RELATIVE_TOLERANCE  # [J^1/2] 1e-14 is its absolute tolerance
 FREE_STEP = 1e-9  # of the momentum: what no impulse reaches is not solved for, so that only rounding is left
 
 
@@ -102,7 +103,7 @@ def solves_the_step(model: Model, x: Array, u: Array, end: Array) -> bool:
         return False
     v_next = np.array([drake[model.nq :], end[model.nq :]])
     problems = _problems(model, form, [read, read], np.array([x, x]), np.array([u, u]))
-    _, _, refused = _solved(problems, v_next)
+    _, _, refused = _solved(problems, np.array([x, x])[:, model.nq :], v_next)
     moved = _states(model, x[None], v_next[1:])[0] - end
     return not refused and bool(np.all(np.abs(moved) <= FREE_STEP * np.maximum(1.0, np.abs(end))))
 
@@ -138,7 +139,7 @@ def _polish(model: Model, vector: ParameterVector, xs: Array, us: Array, values:
         which = np.array([r.step for r in read], dtype=np.intp)
         problems = _problems(model, form, read, xs[which], us[which])
         acts[which] = problems.taking_part().any(axis=1)
-        v_next, left[which], whys = _solved(problems, drake[which, model.nq :])
+        v_next, left[which], whys = _solved(problems, xs[which, model.nq :], drake[which, model.nq :])
         refused |= {int(which[i]): Refusal(why) for i, why in whys.items()}
         x_next[which] = _states(model, xs[which], v_next)
     x_next[list(refused)] = np.nan
@@ -336,11 +337,15 @@ def _at_point(motions: Array, from_origin: Array) -> Array:
     return np.asarray(moves[..., 3:] + cross(moves[..., :3], from_origin[:, None, :]))
 
 
-def _solved(problems: ConvexSteps, drake: Array) -> tuple[Array, Array, dict[int, str]]:
-    """v' (N, nv) to rounding, what Drake's v' (N, nv) leaves of the momentum (N,), and those that are refused."""
+def _solved(problems: ConvexSteps, before: Array, drake: Array) -> tuple[Array, Array, dict[int, str]]:
+    """v' (N, nv) to rounding, what Drake's v' (N, nv) leaves of the momentum (N,), and those that are refused.
+
+    Without impulses the step is a sum, rounded by its larger terms: from `before` (N, nv) it may end at rest.
+    """
     at, solved = problems.at(drake), problems.taking_part()
     missing = problems.norm(at.missing * solved), problems.norm(at.missing * ~solved)
-    had = problems.scale(drake * solved, at.given), problems.scale(drake, at.given)
+    moving = np.maximum(problems.scale(before, at.given), problems.scale(drake, at.given))
+    had = problems.scale(drake * solved, at.given) + AT_REST, moving
     left, elsewhere = (np.divide(m, p, out=np.zeros_like(m), where=m > 0) for m, p in zip(missing, had, strict=True))
     v_next, reached = problems.solve(drake, at)
     whys = {}

@@ -14,6 +14,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.differences import central_differences, one_by_one
+from drake_diff._base.refusal import Refusal
 from drake_diff.certificates.certificate import Certificate, certify_displacement
 from drake_diff.engines.interface import Engine, Precision
 from drake_diff.exceptions import GradientError, NotOfferedError, SimulationError
@@ -141,13 +142,15 @@ def jacobian_at(
     return JacobianAt(state, frozen(jacobian), found.method, certificate.verdict, certificate)
 
 
-def rollout_jacobian(engine: Engine, space: TangentSpace, motion: EngineMotion) -> Array | None:
-    """(size, size) d x_N / d x_0 along the engine's own motion; None where it offers no derivative."""
+def rollout_jacobian(engine: Engine, space: TangentSpace, motion: EngineMotion) -> Array | Refusal:
+    """(size, size) d x_N / d x_0 along the engine's own motion; or why one of its steps has no derivative."""
     product = np.eye(space.size)
     for x, u, x_next in zip(motion.xs, motion.us, motion.xs[1:], strict=False):
         try:
             found = engine.differentiate_step(x, u)
-        except NO_DERIVATIVE:
-            return None
+        except NotOfferedError:
+            return Refusal("the engine has no derivative of a step in contact")
+        except NO_DERIVATIVE as error:
+            return Refusal(str(error))
         product = space.jacobian(x, x_next, found.A) @ product
     return frozen(product)

@@ -9,13 +9,14 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.refusal import Refusal
 from drake_diff.comparison.result import Refused
 from drake_diff.comparison.side_by_side import default_engines
 from drake_diff.engines.closed_form import NumpyEngine, SphereOnGround
 from drake_diff.engines.interface import Engine
 from drake_diff.engines.load import load_spec
 from drake_diff.engines.motion import EngineMotion, move, rollout_jacobian
-from drake_diff.exceptions import GradientError, MissingDependencyError, ModelError, SimulationError, UnknownNameError
+from drake_diff.exceptions import MissingDependencyError, ModelError, UnknownNameError
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
 from drake_diff.studies.contact_cases import QUANTITIES, ContactCase, Kind, contact_cases
@@ -205,7 +206,7 @@ class _Run:
         self.motion = move(engine, case.x0, np.zeros((case.num_steps, 0)))
         self.xs = self.motion.xs
         self.complete = len(self.motion.us) == case.num_steps
-        self.no_gradient = "the engine has no derivative of a step in contact"
+        self.no_gradient = ""  # why, where it has none
         self._products: dict[int, Array | None] = {}
         single = engine.contract.precision != "float64"
         found = TOLERANCES[case.kind]
@@ -217,10 +218,10 @@ class _Run:
         m = self.motion
         if n not in self._products:
             cut = EngineMotion(m.times[: n + 1], m.xs[: n + 1], m.us[:n], None, None, m.status)
-            try:
-                self._products[n] = rollout_jacobian(self.engine, self.space, cut)
-            except (GradientError, SimulationError) as error:
-                self.no_gradient, self._products[n] = str(error), None
+            product = rollout_jacobian(self.engine, self.space, cut)
+            if isinstance(product, Refusal):
+                self.no_gradient = product.reason
+            self._products[n] = None if isinstance(product, Refusal) else product
         found = self._products[n]
         return None if found is None else np.asarray(found[self._place(name)])
 
