@@ -124,7 +124,7 @@ def wrong_derivative(policy: Any, space: TangentSpace, g: RolloutGradient, time_
         size = np.maximum(np.abs(stated), np.abs(found[-1])).max(axis=1, initial=0.0, keepdims=True)
         size = np.maximum(size, LEAST * np.maximum(1.0, np.abs(u))[:, None])
         gap = np.minimum(*(np.abs(stated - some) for some in found)) / size
-        if gap.max(initial=0.0) > MISSED:
+        if np.max(gap, initial=0.0) > MISSED:
             i, j = np.unravel_index(int(np.argmax(gap)), gap.shape)
             unit = np.concatenate([np.ones(space.size), scale])[j]
             return (

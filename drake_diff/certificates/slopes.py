@@ -156,7 +156,7 @@ class Motions:
         width = WIDTH * direction.scale
         if self._touches:
             teeth = self._teeth(direction)
-            told = teeth[teeth <= ALIKE * teeth.min(initial=np.inf)]
+            told = teeth[teeth <= ALIKE * np.min(teeth, initial=np.inf)]
             width = max(width, TEETH * float(np.max(told, initial=0.0)))
         if width > direction.widest:
             why = f"{TEETH:g} steps' way is +-{width:.2g}" if width > WIDTH * direction.scale else f"+-{width:.2g}"
