@@ -229,3 +229,35 @@ def test_clocks_are_taken_off_again(part):
     assert clock.seconds[layers.DRAKE] > 0
     assert plant.EvalUniquePeriodicDiscreteUpdate == method
     assert derivatives.gradient_rows is function
+
+
+def test_a_figure_of_trust_tells_its_interval_and_what_it_misses(part):
+    """Wilson's interval of 0 of 10 ends at z^2 / (10 + z^2) = 27.75 %, z = 1.96."""
+    figure = part("trust").Figure
+    assert str(figure("false alarms", 0, 10, 0.01, False)) == (
+        "false alarms: 0 of 10, 0.00 % (0.00 to 27.75 %), asked at most 1 %"
+    )
+    missed = figure("errors found", 98, 100, 0.99, True)
+    assert not missed.holds
+    assert str(missed).endswith("asked at least 99 %: MISSED")
+
+
+def test_trust_counts_a_part_and_refuses_one_that_it_does_not_have(tmp_path):
+    trust = [
+        sys.executable,
+        SUITE / "trust.py",
+        "--seed",
+        "3",
+        "--count",
+        "2",
+        "--out",
+        tmp_path / "out.json",
+        "--only",
+    ]
+    done = subprocess.run([*trust, "certificate"], capture_output=True, text=True)
+    (figures,) = json.loads((tmp_path / "out.json").read_text())["parts"].values()
+    assert done.returncode == (0 if all(f["holds"] for f in figures) else 1), done.stderr
+    assert any(f["found"] == f["of"] > 0 for f in figures)
+    done = subprocess.run([*trust, "hope"], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "unknown part 'hope'" in done.stderr
