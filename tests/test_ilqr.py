@@ -314,18 +314,21 @@ def test_input_bounds_with_a_goal_give_the_optimum_of_ipopt(bounds):
 
 
 def test_cart_pole_swing_up_from_rest():
-    """The optimum of examples/cart_pole_swing_up.py at 50 steps: 58.6088 by SNOPT and IPOPT."""
+    """The optimum of examples/cart_pole_swing_up.py at 50 steps: 58.6088 by SNOPT and IPOPT.
+
+    In steps of 0.04 s it is no motion of the plant: in finer ones it ends elsewhere.
+    """
     model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04)
     problem = dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=50, running_cost=EFFORT)
     solution = dd.solve(problem, method="ilqr")
-    assert solution.success, solution.message
-    assert solution.cost == pytest.approx(58.6088133284, rel=1e-8)
     line = np.linspace(0, 1, 51)[:, None] * problem.x_goal
     from_a_line = dd.solve(problem, method="ilqr", initial_guess=(line, np.zeros((50, 1))))
-    assert from_a_line.success, from_a_line.message
-    assert from_a_line.cost == pytest.approx(58.6088133284, rel=1e-8)
     again = dd.solve(problem, method="ilqr", initial_guess=solution)
-    assert again.success, again.message
+    for found in (solution, from_a_line, again):
+        assert found.status.value == "converged_not_verified"
+        assert "replayed in steps of 0.005 s it does not hold" in found.message
+        assert found.goal_error < 1e-6
+        assert found.cost == pytest.approx(58.6088133284, rel=1e-8)
     assert len(again.iterations) < 12  # a good guess is not left
 
 

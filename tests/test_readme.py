@@ -118,6 +118,7 @@ SOURCES = {
         "1": "tests/test_rollout_certificate.py::",
         "1e-6": SAP,
         "8": TURN,
+        "3": "drake_diff.optimize.replay:FEEDBACK_TOLERANCE",
         "5": "drake_diff.optimize.replay:STATE_TOLERANCE",
     },
     "docs/logs.md": {
