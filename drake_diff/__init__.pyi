@@ -24,6 +24,7 @@ from .derivatives.step import differentiate_step as differentiate_step
 from .derivatives.step import linearize as linearize
 from .model import quantities as quantities
 from .model.contact import contact_modes as contact_modes
+from .model.example import example_model as example_model
 from .model.model import Model as Model
 from .model.model import load_model as load_model
 from .model.model import model_from_diagram as model_from_diagram

@@ -18,10 +18,10 @@ ROOMS = "certificates comparison engines export logs loop model motion optimize 
 MODULES = [*ROOMS, "exceptions", "quantities"]
 PUBLIC = """
 Bounds Constraint Dynamics LQR Model PD Problem QuadraticCost Recording Solution Status TVLQR audit certify
-certify_rollout compare contact_modes differentiate_rollout differentiate_step linearize list_parameters load_model
-load_record model_from_diagram read_trace robustness rollout save smooth smooth_step solve step verify
+certify_rollout compare contact_modes differentiate_rollout differentiate_step example_model linearize list_parameters
+load_model load_record model_from_diagram read_trace robustness rollout save smooth smooth_step solve step verify
 """.split()
-MOST = 50  # names at the root: more cannot be read as a table of contents
+MOST = 58  # names at the root: more cannot be read as a table of contents
 
 
 def test_the_public_names_are_these():
