@@ -115,7 +115,11 @@ def test_a_base_can_be_welded(load):
         ({"weld_base": "base"}, UnknownNameError, "link: expected one of pole, got 'base'"),
         ({"weld_base": "pole"}, ModelError, "weld_base to be a link without a joint"),
         ({"ground": -1.0}, InputError, "ground"),
-        ({"ground": "rough"}, InputError, "ground: expected a friction coefficient of at least 0, got 'rough'"),
+        (
+            {"ground": "rough"},
+            InputError,
+            "ground: expected a friction coefficient of at least 0, or True, got 'rough'",
+        ),
         ({"gravity": (0, 0)}, ShapeError, "gravity"),
     ],
 )
@@ -378,7 +382,7 @@ def test_a_vector_is_the_same_change_as_list_tuple_or_array(load, gravity):
 
 
 def test_a_change_that_load_model_does_not_know_is_refused(load):
-    with pytest.raises(UnknownNameError, match=r"one of contact_approximation.*got 'friction'"):
+    with pytest.raises(UnknownNameError, match=r"one of actuators.*contact_approximation.*got 'friction'"):
         load("pendulum.urdf").changed(friction=1.0)
 
 

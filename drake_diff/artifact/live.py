@@ -121,7 +121,7 @@ def _load(attachments: dict[str, bytes], source: Any) -> tuple[Any, Any, tuple[s
 def _plant(path: Path) -> tuple[Any, Any, tuple[str, ...]]:
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=0.01)
-    notes = read_into(plant, path)
+    notes = read_into(plant, path).notes
     plant.Finalize()
     diagram = builder.Build()
     root = diagram.CreateDefaultContext()

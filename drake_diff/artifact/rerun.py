@@ -113,7 +113,9 @@ def _source_if_unchanged(given: ModelInput, source: Path) -> Path:
         raise ModelError(f"the model's file {source} is gone, and the artifact has no copy that could be used")
     if file_evidence(source, given.file.path) != given.file:
         raise ModelError(f"the model's file {source} is not what it was")
-    changed = [was.path for was in given.named if was not in named_files(source)]
+    packages = (given.options or {}).get("packages")
+    now = named_files(source, packages if isinstance(packages, dict) else None)
+    changed = [was.path for was in given.named if was not in now]
     if changed:
         raise ModelError(f"the model names {changed[0]}, which is not what it was")
     return source

@@ -8,8 +8,9 @@ pairs, chosen before the plant is finalized.
 import logging
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 from pydrake import geometry as pg
 from pydrake.math import RigidTransform
-from pydrake.multibody.parsing import Parser
+from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import ContactModel, MultibodyPlant
 
 from drake_diff._base.arrays import Array
@@ -32,8 +33,28 @@ DRAKES_REFUSALS = (RuntimeError, ValueError, SystemExit)  # SystemExit is a fail
 logging.getLogger("drake").addFilter(lambda r: "not currently supported for deformable contact" not in r.getMessage())
 
 
-def read_into(plant: MultibodyPlant, path: Path) -> tuple[str, ...]:
-    """Add the model in `path` to `plant` and return what the user should know of it, a sentence each.
+@dataclass(frozen=True)
+class FileRead:
+    """What the user should know of a file that was read, a sentence each, and where its packages are."""
+
+    notes: tuple[str, ...]
+    packages: PackageMap
+
+
+def as_packages(value: Mapping[str, str | Path] | None) -> dict[str, str] | None:
+    """The argument `packages` as it is kept; InputError where a folder is missing."""
+    if value is None:
+        return None
+    if not isinstance(value, Mapping):
+        raise InputError("packages", got=repr(value), expected="the folder of each package by its name")
+    for name, folder in value.items():
+        if not Path(folder).is_dir():
+            raise InputError(f"packages[{name!r}]", got=str(folder), expected="a folder that exists")
+    return {str(name): str(folder) for name, folder in value.items()}
+
+
+def read_into(plant: MultibodyPlant, path: Path, packages: Mapping[str, str] | None = None) -> FileRead:
+    """Add the model in `path` to `plant`; `packages` are folders by the name that package:// uses.
 
     Raises InputError where the file is missing or of an unknown kind, ModelError where Drake refuses it.
     """
@@ -43,15 +64,17 @@ def read_into(plant: MultibodyPlant, path: Path) -> tuple[str, ...]:
     if not path.name.endswith(FORMATS):
         raise InputError("model file", got=str(path), expected="a name that ends in " + ", ".join(FORMATS))
     parser = Parser(plant)
+    for name, folder in (packages or {}).items():
+        parser.package_map().Add(name, folder)
     notes: list[str] = []
     with _drake_warnings(notes):
         try:
             # package://NAME/ is the nearest folder called NAME above the file.
-            packages = re.findall(r"(?:package|model)://([^/\"<>\s]+)/", path.read_text(errors="replace"))
-            for name in sorted(set(packages)):
-                folder = next((p for p in path.resolve().parents if p.name == name), None)
-                if folder is not None and not parser.package_map().Contains(name):
-                    parser.package_map().Add(name, str(folder))
+            named = re.findall(r"(?:package|model)://([^/\"<>\s]+)/", path.read_text(errors="replace"))
+            for name in sorted(set(named)):
+                above = next((p for p in path.resolve().parents if p.name == name), None)
+                if above is not None and not parser.package_map().Contains(name):
+                    parser.package_map().Add(name, str(above))
             reduced = _without_unusable_meshes(path, notes)
             if reduced is None:
                 parser.AddModels(str(path))
@@ -62,7 +85,7 @@ def read_into(plant: MultibodyPlant, path: Path) -> tuple[str, ...]:
             raise ModelError(f"{path}: expected text in UTF-8, got {got}") from error
         except (*DRAKES_REFUSALS, ET.ParseError) as error:
             raise ModelError(f"{path}: expected a robot model that Drake can read; Drake says: {error}") from error
-    return tuple(notes)
+    return FileRead(tuple(notes), PackageMap(parser.package_map()))
 
 
 @contextmanager
@@ -175,7 +198,7 @@ def replace_collision_geometry(plant: MultibodyPlant, scene_graph: pg.SceneGraph
 
 def _to_corner_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
     inspector = scene_graph.model_inspector()
-    found = _collision_geometries(plant, scene_graph)
+    found = collision_geometries(plant, scene_graph)
     welded = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
     fixed = [int(body.index()) in welded for body, _ in found]
     # Pairs that a file or a user lets pass through each other: Drake keeps its filters by geometry, so the spheres
@@ -202,7 +225,7 @@ def _to_corner_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tup
     return tuple(notes)
 
 
-def _collision_geometries(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> list[tuple[Any, Any]]:
+def collision_geometries(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> list[tuple[Any, Any]]:
     """The body and the id of every rigid geometry of the plant that has the proximity role.
 
     Not by plant.GetCollisionGeometriesForBody: its ids live in the plant's own list, which moves when it grows.
@@ -265,7 +288,7 @@ def _to_hydroelastic(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple
         expected = 'hydroelastic or hydroelastic_with_fallback, since contact_geometry is "hydroelastic"'
         raise InputError("contact_model", got="point", expected=expected)
     inspector, notes = scene_graph.model_inspector(), []
-    for body, geometry in _collision_geometries(plant, scene_graph):
+    for body, geometry in collision_geometries(plant, scene_graph):
         name = f"{inspector.GetName(geometry)} on {body.name()}"
         properties = pg.ProximityProperties(inspector.GetProximityProperties(geometry))
         if properties.HasProperty("hydroelastic", "compliance_type"):

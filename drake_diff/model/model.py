@@ -1,7 +1,7 @@
 """A robot file or a Drake diagram as a discrete plant, with its contexts and its AutoDiffXd twin."""
 
 import warnings
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.autodiffutils import AutoDiffXd
-from pydrake.geometry import AddContactMaterial, HalfSpace, ProximityProperties
-from pydrake.math import RigidTransform
-from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.parsing import PackageMap
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
@@ -19,17 +19,34 @@ from drake_diff._base.arrays import finite_array, positive_float
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, UnknownNameError
 from drake_diff.model.contract import Contract, read_contract
-from drake_diff.model.load_file import CONTACT_MODELS, DRAKES_REFUSALS, ROUTES, read_into, replace_collision_geometry
+from drake_diff.model.file_facts import joint_facts
+from drake_diff.model.load_file import (
+    CONTACT_MODELS,
+    DRAKES_REFUSALS,
+    ROUTES,
+    as_packages,
+    read_into,
+    replace_collision_geometry,
+)
 from drake_diff.model.plant import (
     actuators,
-    bodies,
     follow,
     instances,
     instances_with_joints,
     is_driven,
-    named,
     path_to_the_plant,
     scene_graph_beside,
+)
+from drake_diff.model.repairs import (
+    add_actuators,
+    add_ground,
+    as_actuated,
+    as_ground,
+    as_names,
+    fix,
+    hold_base,
+    take_away_contact,
+    weld_link,
 )
 from drake_diff.model.twin import AddedForce, Twin
 
@@ -54,7 +71,7 @@ class Model(ShowsItsRepr):
         plant, diagram: Drake's own MultibodyPlant and Diagram.
         contract: What the model promises, to print: units, limits, masses, contact.
         source: The file it was loaded from, or None.
-        notes: What was left out of the file, a sentence each.
+        notes: What was left out of the file, and what was added to it, a sentence each.
 
     Example:
         >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
@@ -81,7 +98,7 @@ class Model(ShowsItsRepr):
         self.contact_geometry = contact_geometry  # the route around refused pairs that the user chose
         self.options: dict[str, Any] | None = None  # what `load_model` was called with, None of a user's diagram
         self._rebuild = rebuild
-        self._others: dict[frozenset[tuple[str, Any]], Model] = {}  # the same model with something changed
+        self._others: dict[frozenset[tuple[str, Hashable]], Model] = {}  # the same model with something changed
         self._cache: dict[Hashable, Any] = {}
         # What parameters in its contexts are, for the time being, not the model's own: see `parameters.applied`.
         self.other_quantities: frozenset[str] = frozenset()
@@ -141,11 +158,8 @@ class Model(ShowsItsRepr):
         """
         if self._rebuild is None:
             raise ModelError("a model made from a diagram cannot be changed: build the diagram again, changed")
-        try:  # lists and arrays have no hash; a vector is the same change however it is written
-            key = frozenset(
-                (option, tuple(np.ravel(value).tolist()) if isinstance(value, (list, tuple, np.ndarray)) else value)
-                for option, value in change.items()
-            )
+        try:
+            key = frozenset((option, _key(value)) for option, value in change.items())
         except (TypeError, ValueError):
             return self._rebuild(**change)  # which says what is wrong with it
         if key not in self._others:
@@ -259,8 +273,13 @@ def load_model(
     contact_approximation: str = "sap",
     contact_geometry: str | None = None,
     weld_base: str | None = None,
-    ground: float | None = None,
+    ground: float | bool | None = None,
     gravity: ArrayLike | None = None,
+    actuators: str | Sequence[str] | Mapping[str, float] | None = None,
+    base: str | None = None,
+    fix_joints: Sequence[str] = (),
+    packages: Mapping[str, str | Path] | None = None,
+    contact: bool = True,
 ) -> Model:
     """The robot in a URDF, SDF, MJCF (.xml) or .dmd.yaml file as a discrete model.
 
@@ -273,13 +292,22 @@ def load_model(
             point contact. "corner_spheres" puts spheres in the place of boxes, cylinders and capsules that move;
             "hydroelastic" makes all geometries compliant (it needs a hydroelastic `contact_model`); "differences"
             says that differences are wanted. None takes differences too, but `audit` calls the pair an error.
-        weld_base: The link to fix to the world.
-        ground: Adds a half space z <= 0 with this friction coefficient.
+        weld_base: The link to fix to the world, as `base` does for any frame.
+        ground: Adds a half space z <= 0 with this friction coefficient; True takes Drake's usual 0.5.
         gravity: (3,) [m/s^2], in place of Drake's (0, 0, -9.81).
+        actuators: The joints to drive beside those that the file drives: "all" revolute and prismatic joints that mimic
+            no other, a list of names, or an effort limit [N or N m] by name. Else the limit is the file's own, and
+            where that is 0 or not given there is none. A file without transmissions or actuators has no input.
+        base: "weld" fixes what floats and has joints to the world, where the file puts it; the name of a frame fixes
+            that frame at the world's origin; "free" refuses a file that holds its base.
+        fix_joints: The joints to replace by welds, at their default positions.
+        packages: The folder of each package:// that the file names, by the name of the package. Without it that is the
+            nearest folder of that name above the file. Nothing is ever downloaded.
+        contact: False takes every collision shape away.
 
     Returns:
-        The Model. What was left out of the file (such as meshes in formats that Drake cannot use) is a ModelWarning
-        and stays in `Model.notes`.
+        The Model. What was left out of the file (such as meshes in formats that Drake cannot use) and what was added
+        is a ModelWarning and stays in `Model.notes`.
 
     Raises:
         InputError: The file is missing or of an unknown kind, or an option is wrong.
@@ -295,6 +323,8 @@ def load_model(
     _check_choice("contact_approximation", contact_approximation, CONTACT_APPROXIMATIONS)
     if contact_geometry is not None:
         _check_choice("contact_geometry", contact_geometry, ROUTES)
+    if not isinstance(contact, bool):
+        raise InputError("contact", got=repr(contact), expected="True or False")
     try:
         source = Path(path)
     except TypeError as error:
@@ -307,30 +337,33 @@ def load_model(
     )
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(config, builder)
-    notes = read_into(plant, source)
-    if notes:
-        warnings.warn("\n  ".join([f"{source.name}:", *notes]), ModelWarning, stacklevel=2)
-    _change_plant(plant, source, weld_base=weld_base, ground=ground)
-    if contact_geometry is not None:
-        notes += replace_collision_geometry(plant, scene_graph, contact_geometry)
-    if gravity is not None:
-        gravity = tuple(finite_array("gravity [m/s^2]", gravity, (3,)).tolist())
-        plant.mutable_gravity_field().set_gravity_vector(gravity)
-    try:
-        plant.Finalize()
-        diagram = builder.Build()
-    except DRAKES_REFUSALS as error:
-        raise ModelError(f"{source}: expected a model that Drake can finalize; Drake says: {error}") from error
-
     options: dict[str, Any] = {
         "time_step": time_step,
         "contact_model": contact_model,
         "contact_approximation": contact_approximation,
         "contact_geometry": contact_geometry,
         "weld_base": weld_base,
-        "ground": ground,
-        "gravity": gravity,
+        "ground": as_ground(ground),
+        "gravity": None if gravity is None else tuple(finite_array("gravity [m/s^2]", gravity, (3,)).tolist()),
+        "actuators": as_actuated(actuators),
+        "base": base,
+        "fix_joints": as_names("fix_joints", fix_joints),
+        "packages": as_packages(packages),
+        "contact": contact,
     }
+    read = read_into(plant, source, options["packages"])
+    notes = read.notes + _repaired(plant, scene_graph, source, read.packages, options)
+    if notes:
+        warnings.warn("\n  ".join([f"{source.name}:", *notes]), ModelWarning, stacklevel=2)
+    if contact_geometry is not None:
+        notes += replace_collision_geometry(plant, scene_graph, contact_geometry)
+    if gravity is not None:
+        plant.mutable_gravity_field().set_gravity_vector(options["gravity"])
+    try:
+        plant.Finalize()
+        diagram = builder.Build()
+    except DRAKES_REFUSALS as error:
+        raise ModelError(f"{source}: expected a model that Drake can finalize; Drake says: {error}") from error
 
     def rebuild(**changes: Any) -> Model:
         for option in changes.keys() - options.keys():
@@ -372,26 +405,42 @@ def model_from_diagram(diagram: Diagram) -> Model:
     return Model(diagram, source=None)
 
 
+def _key(value: Any) -> Hashable:
+    """An option's value with a hash: a vector is the same change however it is written, True is not 1."""
+    if isinstance(value, Mapping):
+        return frozenset((name, _key(entry)) for name, entry in value.items())
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return tuple(np.ravel(value).tolist())
+    hash(value)
+    return type(value) is bool, value
+
+
 def _check_choice(subject: str, value: str, known: tuple[str, ...]) -> None:
     if value not in known:
         raise UnknownNameError(subject, got=value, known=known)
 
 
-def _change_plant(plant: MultibodyPlant, source: Path, *, weld_base: str | None, ground: float | None) -> None:
-    if weld_base is not None:
-        link = named("link", bodies(plant), weld_base)
-        try:
-            plant.WeldFrames(plant.world_frame(), link.body_frame())
-        except DRAKES_REFUSALS as error:
-            expected = "expected weld_base to be a link without a joint to its parent"
-            raise ModelError(f"{source}: {expected}: {error}") from error
-    if ground is None:
-        return
-    if isinstance(ground, bool) or not isinstance(ground, (int, float, np.number)) or not 0 <= ground < np.inf:
-        raise InputError("ground", got=repr(ground), expected="a friction coefficient of at least 0")
-    properties = ProximityProperties()
-    AddContactMaterial(friction=CoulombFriction(float(ground), float(ground)), properties=properties)
-    plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", properties)
+def _repaired(
+    plant: MultibodyPlant, scene_graph: SceneGraph, source: Path, packages: PackageMap, options: dict[str, Any]
+) -> tuple[str, ...]:
+    """Change the plant as `options` say; a sentence for each change. ModelError names the file."""
+    base, weld_base, asked = options["base"], options["weld_base"], options["actuators"]
+    if base is not None and weld_base is not None:
+        raise InputError("base", got=f"{base!r} and weld_base={weld_base!r}", expected="one of them")
+    if options["ground"] is not None and not options["contact"]:
+        raise InputError("ground", got="contact=False too", expected="contact, without which nothing stands on it")
+    try:
+        notes = fix(plant, options["fix_joints"])
+        if asked is not None:
+            facts = joint_facts(source, packages)
+            notes += add_actuators(plant, asked, facts.efforts, facts.followers)
+        if weld_base is not None:
+            weld_link(plant, weld_base)
+        notes += hold_base(plant, base)
+        notes += () if options["contact"] else take_away_contact(plant, scene_graph)
+        return notes + add_ground(plant, options["ground"])
+    except ModelError as error:
+        raise ModelError(str(error) if str(error).startswith(str(source)) else f"{source}: {error}") from error
 
 
 def _check_plant(model: Model) -> None:

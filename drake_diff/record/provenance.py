@@ -9,11 +9,13 @@ import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -49,8 +51,17 @@ def model_input(model: Model) -> ModelInput:
     source, options = model.source, model.options
     if source is None or options is None:
         return ModelInput(file=None, options=None)
-    plain = {key: v if v is None or isinstance(v, str) else np.asarray(v).tolist() for key, v in options.items()}
-    return ModelInput(file=file_evidence(source, source.name), named=named_files(source), options=plain)
+    packages = options["packages"]
+    return ModelInput(
+        file=file_evidence(source, source.name),
+        named=named_files(source, packages),
+        options={key: _plain(value) for key, value in options.items() if value is not None and value != ()},
+    )
+
+
+def _plain(value: Any) -> Any:
+    """An option of `load_model` for JSON."""
+    return value if isinstance(value, str | bool | dict) else np.asarray(value).tolist()
 
 
 def written_now() -> str:
@@ -92,8 +103,8 @@ def file_evidence(path: Path, name: str) -> FileEvidence:
     return FileEvidence(path=name, bytes=len(data), sha256=sha256(data).hexdigest())
 
 
-def named_files(path: Path) -> list[FileEvidence]:
-    """What the model file at `path` names, by the name it has there, sorted.
+def named_files(path: Path, packages: Mapping[str, Any] | None = None) -> list[FileEvidence]:
+    """What the model file at `path` names, by the name it has there, sorted; `packages` as `load_model` takes them.
 
     Where they cannot be read out of it (Drake's parser forgives more than Python's) its own name has the reason.
     """
@@ -106,7 +117,7 @@ def named_files(path: Path) -> list[FileEvidence]:
         if not name.lower().endswith(READABLE):
             found.append(_unread(name, "not read: its name is not that of a mesh or a robot file"))
             continue
-        target = _resolve(path, name, folder)
+        target = _resolve(path, name, folder, packages or {})
         try:
             found.append(file_evidence(target, name) if target and target.is_file() else _unread(name, "no such file"))
         except OSError as error:
@@ -131,10 +142,12 @@ def _names(path: Path) -> set[tuple[str, str]]:
     return {(name, start) for name, start in found if name and not name.endswith(LIBRARIES)}
 
 
-def _resolve(path: Path, name: str, folder: str) -> Path | None:
+def _resolve(path: Path, name: str, folder: str, packages: Mapping[str, Any]) -> Path | None:
     """Where `name` leads, by the rules of `model_file.read_into`."""
     package = re.match(r"(?:package|model)://([^/]+)/(.*)", name, re.DOTALL)
     if package:
+        if package[1] in packages:
+            return Path(str(packages[package[1]])) / package[2]
         above = next((p for p in path.resolve().parents if p.name == package[1]), None)
         return None if above is None else above / package[2]
     if "\0" in name or "\0" in folder:

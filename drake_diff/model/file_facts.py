@@ -1,0 +1,78 @@
+"""What robot files say of joints that Drake's plant does not keep: effort limits without an actuator, and mimicry."""
+
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydrake.common.yaml import yaml_load
+from pydrake.multibody.parsing import PackageMap
+
+from drake_diff.exceptions import ModelError
+
+Key = tuple[str, str]  # the names of a model instance and of a joint in it
+
+
+@dataclass(frozen=True)
+class JointFacts:
+    """`efforts` [N or N m] are the limits that the files give, `followers` the joints that mimic another one."""
+
+    efforts: dict[Key, float] = field(default_factory=dict)
+    followers: set[Key] = field(default_factory=set)
+
+
+def joint_facts(path: Path, packages: PackageMap) -> JointFacts:
+    """What the file at `path` and the models that a .dmd.yaml adds say of their joints.
+
+    Raises ModelError where a file that Drake could read is no XML or YAML for Python.
+    """
+    found = JointFacts()
+    _read(path, packages, None, found)
+    return found
+
+
+def _read(path: Path, packages: PackageMap, instance: str | None, found: JointFacts) -> None:
+    try:
+        if path.name.endswith(".dmd.yaml"):
+            _read_directives(yaml_load(filename=str(path)), packages, instance, found)
+            return
+        root = ET.fromstring(path.read_text())
+    except (ET.ParseError, OSError, RuntimeError, UnicodeDecodeError) as error:
+        raise ModelError(f"{path}: the limits of its joints cannot be read: {error}") from error
+    if root.tag == "robot":
+        name: str = instance or root.get("name") or ""
+        for joint in root.findall("joint"):
+            limit, mimic = joint.find("limit"), joint.find("mimic")
+            effort = None if limit is None else limit.get("effort")
+            _keep(found, (name, joint.get("name", "")), effort, follows=mimic is not None)
+    for model in root.findall("model"):  # of SDF
+        _read_sdf(model, instance or model.get("name") or "", found)
+
+
+def _read_sdf(model: ET.Element, name: str, found: JointFacts) -> None:
+    for joint in model.findall("joint"):
+        mimics = any(element.tag.endswith("mimic") for element in joint.iter())
+        _keep(found, (name, joint.get("name", "")), joint.findtext("axis/limit/effort"), follows=mimics)
+    for inner in model.findall("model"):
+        _read_sdf(inner, f"{name}::{inner.get('name', '')}", found)
+
+
+def _keep(found: JointFacts, key: Key, effort: str | None, *, follows: bool) -> None:
+    if follows:
+        found.followers.add(key)
+    try:
+        found.efforts[key] = float(effort or 0)
+    except ValueError:
+        found.efforts[key] = 0.0  # it would only be read by an actuator, which has no limit then, and says so
+
+
+def _read_directives(content: Any, packages: PackageMap, namespace: str | None, found: JointFacts) -> None:
+    for directive in content.get("directives", []):
+        model, more = directive.get("add_model"), directive.get("add_directives")
+        if model:
+            name = model["name"] if namespace is None else f"{namespace}::{model['name']}"
+            _read(Path(packages.ResolveUrl(model["file"])), packages, name, found)
+        elif more:
+            inner = more.get("model_namespace")
+            scope = "::".join(part for part in (namespace, inner) if part) or None
+            _read(Path(packages.ResolveUrl(more["file"])), packages, scope, found)

@@ -1,0 +1,269 @@
+"""What a robot file leaves out, given by arguments of `load_model`: motors, a base that is held, joints that are not.
+
+Each function changes a plant before it is finalized, in the same way for every file format, and returns a sentence for
+each thing that it did.
+"""
+
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from pydrake import geometry as pg
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+from pydrake.multibody.tree import FrameIndex, PrismaticJoint, RevoluteJoint, WeldJoint
+
+from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.model.load_file import DRAKES_REFUSALS, collision_geometries
+from drake_diff.model.plant import actuators, bodies, joints, labelled, named
+
+GROUND_FRICTION = 0.5  # of ground=True: what Drake's SceneGraph gives to geometry without a friction of its own
+Actuated = str | tuple[str, ...] | dict[str, float | None] | None
+
+
+def as_actuated(value: Any) -> Actuated:
+    """The argument `actuators` as it is kept: None, "all", names, or efforts [N or N m] by name.
+
+    Raises InputError where it is something else.
+    """
+    if value is None or value == "all":
+        return value
+    if isinstance(value, Mapping):
+        return {str(name): _effort(str(name), effort) for name, effort in value.items()}
+    return as_names("actuators", value, 'None, "all", names of joints, or an effort limit for each name')
+
+
+def _effort(name: str, effort: Any) -> float | None:
+    """The limit, None where there is none: a record holds no infinity."""
+    if effort is None or effort == np.inf:
+        return None
+    if isinstance(effort, bool) or not isinstance(effort, (int, float, np.number)) or not effort > 0:
+        expected = "an effort limit above 0 [N or N m], or None"
+        raise InputError(f"actuators[{name!r}]", got=repr(effort), expected=expected)
+    return float(effort)
+
+
+def as_names(subject: str, value: Any, expected: str = "names of joints") -> tuple[str, ...]:
+    """`value` as a tuple of names; InputError where it is not a list of them."""
+    if isinstance(value, str) or not isinstance(value, Collection) or not all(isinstance(n, str) for n in value):
+        raise InputError(subject, got=repr(value), expected=expected)
+    return tuple(value)
+
+
+def can_be_driven(joint: Any) -> bool:
+    """Whether Drake can put an actuator on a joint: revolute and prismatic ones."""
+    return isinstance(joint, (RevoluteJoint, PrismaticJoint))
+
+
+def add_actuators(
+    plant: MultibodyPlant,
+    asked: Actuated,
+    limits: Mapping[tuple[str, str], float],
+    followers: Collection[tuple[str, str]],
+) -> tuple[str, ...]:
+    """Add an actuator to each joint of `asked` that has none; a sentence for what was done.
+
+    `limits` are the effort limits that the files give and `followers` the joints that copy another one, both by the
+    names of model instance and joint. An actuator is called like its joint. A limit of 0 or none is no limit.
+    """
+    if asked is None:
+        return ()
+    driven = {actuator.joint().index(): actuator for actuator in actuators(plant)}
+    possible = {name: joint for name, joint in labelled(joints(plant)).items() if can_be_driven(joint)}
+    copies = {name for name, joint in possible.items() if _key(plant, joint) in followers}
+    names: Iterable[str] = asked
+    if asked == "all":
+        names = [name for name, joint in possible.items() if joint.index() not in driven and name not in copies]
+    added: list[tuple[str, float]] = []
+    unlimited: list[str] = []
+    notes: list[str] = []
+    for name in names:
+        if name not in possible:
+            raise UnknownNameError("actuators: revolute or prismatic joint", got=name, known=possible)
+        if name in copies:
+            raise InputError("actuators", got=repr(name), expected=f"no joint that mimics another, as {name} does")
+        joint = possible[name]
+        given = asked[name] if isinstance(asked, dict) else limits.get(_key(plant, joint))
+        limit = given if given is not None and given > 0 else np.inf
+        if joint.index() in driven:
+            notes += _limit_again(driven[joint.index()], limit) if isinstance(asked, dict) else []
+            continue
+        plant.AddJointActuator(joint.name(), joint, limit)
+        if np.isfinite(limit):
+            added.append((name, limit))
+        else:
+            unlimited.append(name)
+    if added:
+        told = ", ".join(f"{name} ({limit:g})" for name, limit in added)
+        whose = "given" if isinstance(asked, dict) else "that the file gives"
+        notes.append(f"{len(added)} actuators added, with the effort limits {whose}: {told}.")
+    if unlimited:
+        why = "as asked" if isinstance(asked, dict) else "as the file gives none or 0"
+        told = ", ".join(unlimited)
+        notes.append(f"{len(unlimited)} actuators added without an effort limit, {why}: {told}.")
+    return tuple(notes)
+
+
+def _key(plant: MultibodyPlant, joint: Any) -> tuple[str, str]:
+    return str(plant.GetModelInstanceName(joint.model_instance())), str(joint.name())
+
+
+def _limit_again(actuator: Any, limit: float) -> list[str]:
+    was = float(actuator.effort_limit())
+    if was == limit:
+        return []
+    actuator.set_effort_limit(limit)
+    return [f"The effort limit of {actuator.name()} became {limit:g}; the file says {was:g}."]
+
+
+def hold_base(plant: MultibodyPlant, base: str | None) -> tuple[str, ...]:
+    """Weld what floats to the world ("weld"), see that something floats ("free"), or weld the frame of that name.
+
+    Raises UnknownNameError where there is no such frame, ModelError where the base is not as it is asked for.
+    """
+    if base is None:
+        return ()
+    if not isinstance(base, str):
+        raise InputError("base", got=repr(base), expected='None, "weld", "free" or the name of a frame')
+    trees = floating_trees(plant)
+    if base == "free":
+        if not trees:
+            raise ModelError('base="free": nothing floats, ' + _what_holds(plant))
+        return ()
+    if base == "weld":
+        with_joints = [tree for tree in trees if _can_move(plant, tree)]
+        if trees and not with_joints:
+            names = ", ".join(tree[0].name() for tree in trees)
+            raise ModelError(f'base="weld": nothing could move any more, as no joint hangs on what floats: {names}')
+        notes = []
+        for root, *_ in with_joints:
+            pose = plant.GetDefaultFloatingBaseBodyPose(root)
+            plant.WeldFrames(plant.world_frame(), root.body_frame(), pose)
+            notes.append(f"The base {root.name()} was welded to the world.")
+        return tuple(notes)
+    frame = frame_named(plant, "base: frame", base)
+    try:
+        plant.WeldFrames(plant.world_frame(), frame)
+    except DRAKES_REFUSALS as error:
+        raise ModelError(f"base={base!r}: {_plain(error)}") from error
+    if not any(frame.body() in tree for tree in trees):
+        raise ModelError(f"base={base!r}: expected a frame of something that floats; " + _what_holds(plant))
+    return (f"The frame {base} was welded to the world.",)
+
+
+def weld_link(plant: MultibodyPlant, name: str) -> None:
+    """Weld the link called `name` to the world; ModelError where it is tied to something."""
+    link = named("link", bodies(plant), name)
+    try:
+        plant.WeldFrames(plant.world_frame(), link.body_frame())
+    except DRAKES_REFUSALS as error:
+        expected = "expected weld_base to be a link without a joint to its parent"
+        raise ModelError(f"{expected}: {error}") from error
+
+
+def frame_named(plant: MultibodyPlant, subject: str, name: str) -> Any:
+    """The frame called `name`, or "instance::name"; UnknownNameError lists those that exist."""
+    frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
+    found = labelled([f for f in frames if f.name() and f.body().index() != plant.world_body().index()])
+    if name not in found:
+        raise UnknownNameError(subject, got=name, known=found)
+    return found[name]
+
+
+def floating_trees(plant: MultibodyPlant) -> list[list[Any]]:
+    """The bodies that no chain of joints ties to the world, those that hang together in one list, its root first."""
+    group = {int(body.index()): {int(body.index())} for body in [plant.world_body(), *bodies(plant)]}
+    children = set()
+    for joint in joints(plant):
+        a, b = (int(body.index()) for body in (joint.parent_body(), joint.child_body()))
+        children.add(b)
+        if group[a] is not group[b]:
+            group[a] |= group[b]
+            for index in group[b]:
+                group[index] = group[a]
+    found: dict[int, list[Any]] = {}
+    for body in bodies(plant):
+        if int(plant.world_body().index()) not in group[int(body.index())]:
+            found.setdefault(id(group[int(body.index())]), []).append(body)
+    return [sorted(tree, key=lambda body: int(body.index()) in children) for tree in found.values()]
+
+
+def _can_move(plant: MultibodyPlant, tree: list[Any]) -> bool:
+    indices = {body.index() for body in tree}
+    return any(joint.num_velocities() and joint.child_body().index() in indices for joint in joints(plant))
+
+
+def _what_holds(plant: MultibodyPlant) -> str:
+    world = plant.world_body().index()
+    held = [j for j in joints(plant) if world in (j.parent_body().index(), j.child_body().index())]
+    told = ", ".join(f"{j.name()} ({j.type_name()}) holds {j.child_body().name()}" for j in held)
+    return f"as the file ties it to the world: {told or 'there is no body'}"
+
+
+def fix(plant: MultibodyPlant, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Replace the joints called `names` by welds at their default positions; a sentence that says so."""
+    known = {name: joint for name, joint in labelled(joints(plant)).items() if joint.num_velocities()}
+    told = []
+    for name in names:
+        if name not in known:
+            raise UnknownNameError("fix_joints: joint that can move", got=name, known=known)
+        joint = known[name]
+        if not can_be_driven(joint):
+            kind = f"a {joint.type_name()} joint, {name}"
+            raise InputError("fix_joints", got=kind, expected="revolute or prismatic joints")
+        if plant.num_constraints():
+            raise ModelError(
+                f"fix_joints={name!r}: Drake cannot take a joint out of a model with constraints, and this one has "
+                f"{plant.num_constraints()} (mimic joints, MJCF's equalities): fix the joint in the file"
+            )
+        for actuator in [a for a in actuators(plant) if a.joint().index() == joint.index()]:
+            plant.RemoveJointActuator(actuator)
+        q = float(joint.default_positions()[0])
+        parent, child = joint.frame_on_parent(), joint.frame_on_child()
+        axis = np.asarray(joint.revolute_axis() if isinstance(joint, RevoluteJoint) else joint.translation_axis())
+        moved = RigidTransform(_turn(axis, q)) if isinstance(joint, RevoluteJoint) else RigidTransform(q * axis)
+        try:
+            plant.RemoveJoint(joint)
+        except DRAKES_REFUSALS as error:
+            raise ModelError(f"fix_joints={name!r}: {_plain(error)}") from error
+        plant.AddJoint(WeldJoint(joint.name(), parent, child, moved))
+        told.append(f"{name} at {q:g}")
+    return (f"{len(told)} joints fixed: {', '.join(told)}.",) if told else ()
+
+
+def _turn(axis: Any, angle: float) -> Any:
+    return RotationMatrix(AngleAxis(angle, axis))
+
+
+def take_away_contact(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
+    """Let nothing collide: every collision shape loses that role and is drawn no more."""
+    found = collision_geometries(plant, scene_graph)
+    for _, geometry in found:
+        scene_graph.RemoveRole(plant.get_source_id(), geometry, pg.Role.kProximity)
+    return (f"{len(found)} collision shapes taken away: nothing touches.",) if found else ()
+
+
+def as_ground(value: Any) -> float | bool | None:
+    """The argument `ground` as it is kept: None, True or a friction coefficient; InputError where it is no such."""
+    if value is None or value is True:
+        return value
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not 0 <= value < np.inf:
+        raise InputError("ground", got=repr(value), expected="a friction coefficient of at least 0, or True")
+    return float(value)
+
+
+def add_ground(plant: MultibodyPlant, ground: float | bool | None) -> tuple[str, ...]:
+    """Add the half space z <= 0 with this friction coefficient, or with the usual one (True)."""
+    if ground is None:
+        return ()
+    friction = GROUND_FRICTION if ground is True else float(ground)
+    properties = pg.ProximityProperties()
+    pg.AddContactMaterial(friction=CoulombFriction(friction, friction), properties=properties)
+    plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), pg.HalfSpace(), "ground", properties)
+    return (f"A ground was added at z = 0, with friction {friction:g}.",) if ground is True else ()
+
+
+def _plain(error: BaseException) -> str:
+    """What Drake says, without the name of its own function."""
+    return str(error).split("(): ", 1)[-1].strip()

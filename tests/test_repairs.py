@@ -1,0 +1,239 @@
+"""What a file leaves out and `load_model` adds when asked: motors, a base, fixed joints, packages, a ground."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+from helpers.models import MODELS, robot_file
+from helpers.table import each_row
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+
+INERTIAL = (
+    '<inertial><origin xyz="0 0 -0.5"/><mass value="1"/>'
+    '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+BALL = '<collision><origin xyz="0 0 -1"/><geometry><sphere radius="0.1"/></geometry></collision>'
+
+
+def joint(name, parent, child, kind="revolute", limit='<limit effort="7" velocity="1" lower="-2" upper="2"/>', more=""):
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><axis xyz="0 1 0"/>'
+        f'<origin xyz="0 0 -1"/>{limit}{more}</joint>'
+    )
+
+
+def robot(*joints, links="base upper lower"):
+    """A two-link arm as a textbook writes it: no world, no transmission."""
+    parts = [f'<link name="{name}">{INERTIAL}{BALL if name == "lower" else ""}</link>' for name in links.split()]
+    return f'<robot name="arm">{"".join(parts)}{"".join(joints)}</robot>'
+
+
+SHOULDER, ELBOW = joint("shoulder", "base", "upper"), joint("elbow", "upper", "lower")
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(text=None, name="arm.urdf"):
+        (tmp_path / name).write_text(text or robot(SHOULDER, ELBOW))
+        return tmp_path / name
+
+    return write
+
+
+def load(path, **options):
+    """The model, and what was warned of."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = dd.load_model(path, **{"time_step": 0.01, **options})
+    return model, "\n".join(str(w.message) for w in caught)
+
+
+def test_by_default_nothing_is_invented(write):
+    model, told = load(write())
+    assert (model.nq, model.nv, model.nu, told) == (9, 8, 0, "")
+
+
+def test_a_textbook_arm_becomes_one_that_can_be_driven(write):
+    """The step of the repaired arm is that of the same arm written with a world and transmissions."""
+    model, told = load(write(), actuators="all", base="weld", ground=True)
+    assert (model.nq, model.nu, model.input_names) == (2, 2, ("shoulder", "elbow"))
+    assert [a.effort_limit for a in model.contract.actuators] == [7.0, 7.0]
+    assert model.notes == (
+        "2 actuators added, with the effort limits that the file gives: shoulder (7), elbow (7).",
+        "The base base was welded to the world.",
+        "A ground was added at z = 0, with friction 0.5.",
+    )
+    assert told == "arm.urdf:\n  " + "\n  ".join(model.notes)
+    assert model.contract.notes == model.notes
+    drives = "".join(
+        f'<transmission><type>transmission_interface/SimpleTransmission</type><joint name="{name}">'
+        f'<hardwareInterface>EffortJointInterface</hardwareInterface></joint><actuator name="{name}"/></transmission>'
+        for name in ("shoulder", "elbow")
+    )
+    whole = robot(SHOULDER, ELBOW).replace(
+        "</robot>", joint("hold", "world", "base", "fixed", "") + drives + "</robot>"
+    )
+    other, _ = load(write(whole.replace('<origin xyz="0 0 -1"/></joint><tr', "</joint><tr"), "whole.urdf"), ground=0.5)
+    x, u = [0.3, -0.4, 0.5, 0.6], [1.0, -2.0]
+    np.testing.assert_array_equal(dd.step(model, x, u), dd.step(other, x, u))
+
+
+def test_a_joint_without_a_limit_or_with_one_of_zero_gets_none_and_that_is_told(write):
+    zero = joint("elbow", "upper", "lower", limit='<limit effort="0" velocity="0" lower="-1" upper="1"/>')
+    model, _ = load(write(robot(joint("shoulder", "base", "upper", "continuous", ""), zero)), actuators="all")
+    assert [math.isinf(a.effort_limit) for a in model.contract.actuators] == [True, True]
+    assert model.notes == ("2 actuators added without an effort limit, as the file gives none or 0: shoulder, elbow.",)
+
+
+def test_actuators_by_name_and_by_effort(write):
+    path = write()
+    model, _ = load(path, actuators=["elbow"])
+    assert [(a.joint, a.effort_limit) for a in model.contract.actuators] == [("elbow", 7.0)]
+    model, _ = load(path, actuators={"elbow": 3, "shoulder": None})
+    assert [(a.joint, a.effort_limit) for a in model.contract.actuators] == [("elbow", 3.0), ("shoulder", math.inf)]
+    again, told = load(MODELS / "cart_pole.urdf", actuators={"slide": 5})
+    assert [a.effort_limit for a in again.contract.actuators] == [5.0]
+    assert told.endswith("The effort limit of force became 5; the file says 20.")
+    same, told = load(MODELS / "cart_pole.urdf", actuators=["slide"])
+    assert (same.nu, told) == (1, "")
+
+
+def test_actuators_can_be_added_after_loading(write):
+    model, _ = load(write(), base="weld")
+    driven = model.changed(actuators={"elbow": 3})
+    assert (model.nu, driven.nu, driven.nq) == (0, 1, 2)
+    assert driven.changed(time_step=0.002).nu == 1
+    assert model.changed(actuators={"elbow": 3}) is driven
+    assert model.changed(actuators={"elbow": 4}) is not driven
+    assert model.changed(ground=True) is not model.changed(ground=1.0)
+
+
+def test_what_copies_another_joint_is_not_driven(write):
+    finger = joint("elbow", "upper", "lower", more='<mimic joint="shoulder" multiplier="1"/>')
+    path = write(robot(SHOULDER, finger))
+    assert load(path, actuators="all")[0].input_names == ("shoulder",)
+    with pytest.raises(InputError, match="no joint that mimics another, as elbow does, got 'elbow'"):
+        load(path, actuators=["elbow"])
+
+
+BLOCK = '<link name="{}"><inertial><mass>1</mass></inertial></link>'
+SDF = (
+    '<sdf version="1.9"><model name="outer"><link name="a"><inertial><mass>1</mass></inertial></link>'
+    '<model name="inner"><link name="b"><inertial><mass>1</mass></inertial></link></model>'
+    '<joint name="j" type="revolute"><parent>a</parent><child>inner::b</child><axis><xyz>0 1 0</xyz>'
+    "<limit><effort>{}</effort></limit></axis></joint></model></sdf>"
+)
+MJCF = (
+    '<mujoco model="m"><worldbody><body name="a" pos="0 0 2"><freejoint/><geom type="sphere" size="0.1" mass="1"/>'
+    '<body name="b" pos="0 0 1"><joint name="j" axis="0 1 0"/><geom type="sphere" size="0.1" mass="1"/></body></body>'
+    "</worldbody></mujoco>"
+)
+
+
+@each_row("name, text", [("m.sdf", SDF.format(0)), ("m.xml", MJCF), ("m.dmd.yaml", "")])
+def test_the_repairs_are_the_same_in_every_format(tmp_path, name, text):
+    if name == "m.dmd.yaml":
+        (tmp_path / "arms").mkdir(exist_ok=True)
+        (tmp_path / "arms" / "arm.urdf").write_text(robot(joint("j", "base", "upper"), links="base upper"))
+        text = "directives:\n- add_model:\n    name: left\n    file: package://arms/arm.urdf\n"
+        text += "- add_model:\n    name: right\n    file: package://arms/arm.urdf\n"
+    (tmp_path / name).write_text(text)
+    packages = {"arms": tmp_path / "arms"} if text.startswith("directives") else None
+    count = 2 if packages else 1
+    passive, _ = load(tmp_path / name, packages=packages)
+    assert (passive.nq, passive.nu) == (8 * count, 0)
+    model, _ = load(tmp_path / name, actuators="all", base="weld", packages=packages)
+    assert (model.nq, model.nu) == (count, count)
+    expected = 7.0 if packages else math.inf  # of arm.urdf
+    assert [a.effort_limit for a in model.contract.actuators] == [expected] * count
+    fixed, _ = load(tmp_path / name, fix_joints=["left::j" if packages else "j"], packages=packages)
+    assert fixed.nq == 8 * count - 1
+
+
+def test_a_welded_base_stays_where_the_file_puts_it(tmp_path):
+    (tmp_path / "m.xml").write_text(MJCF)
+    model, _ = load(tmp_path / "m.xml", base="weld")
+    context = model.plant.CreateDefaultContext()
+    height = model.plant.EvalBodyPoseInWorld(context, model.plant.GetBodyByName("a")).translation()[2]
+    assert height == 2.0
+
+
+def test_any_frame_can_be_the_base(write):
+    """Held at its foot the chain is turned around; the base moves as its joints do."""
+    model, _ = load(write(), base="lower")
+    assert model.nq == 2
+    context = model.plant.CreateDefaultContext()
+    at = model.plant.EvalBodyPoseInWorld(context, model.plant.GetBodyByName("base")).translation()
+    np.testing.assert_allclose(at, [0, 0, 2], atol=1e-15)
+
+
+def test_a_fixed_joint_is_held_where_it_is_by_default(write):
+    model, told = load(write(), base="weld", fix_joints=["elbow"])
+    assert model.position_names == ("shoulder_q",)
+    assert "1 joints fixed: elbow at 0." in told
+    assert model.contract.bodies[0].mass == 1.0  # a pendulum of two bodies: m g l about the shoulder, at rest
+    weight = model.double.plant.CalcGravityGeneralizedForces
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, [0.3])
+    expected = -9.81 * (0.5 + 1.5) * math.sin(0.3)
+    assert weight(context)[0] == pytest.approx(expected, rel=1e-12)
+
+
+def test_without_contact_nothing_touches(write):
+    assert len(load(write())[0].contract.geometries) == 1
+    model, told = load(write(), contact=False)
+    assert model.contract.geometries == ()
+    assert "1 collision shapes taken away: nothing touches." in told
+
+
+@each_row(
+    "options, error, words",
+    [
+        ({"actuators": "some"}, InputError, 'actuators: expected None, "all", names of joints'),
+        ({"actuators": ["wrist"]}, UnknownNameError, "one of elbow, shoulder, got 'wrist'"),
+        ({"actuators": {"elbow": 0}}, InputError, "an effort limit above 0"),
+        ({"actuators": {"elbow": True}}, InputError, "an effort limit above 0"),
+        ({"actuators": {"elbow": "strong"}}, InputError, "an effort limit above 0"),
+        ({"actuators": 3}, InputError, "actuators: expected"),
+        ({"base": "hand"}, UnknownNameError, "base: frame: expected one of base, .*got 'hand'"),
+        ({"base": 1}, InputError, "base"),
+        ({"base": "weld", "weld_base": "base"}, InputError, "base: expected one of them"),
+        ({"fix_joints": ["wrist"]}, UnknownNameError, "joint that can move: expected one of elbow, shoulder"),
+        ({"fix_joints": "elbow"}, InputError, "fix_joints: expected names of joints, got 'elbow'"),
+        ({"packages": {"arm": "/nowhere"}}, InputError, r"packages\['arm'\]: expected a folder that exists"),
+        ({"packages": "arm"}, InputError, "packages: expected the folder of each package"),
+        ({"ground": False}, InputError, "ground"),
+        ({"ground": 0.5, "contact": False}, InputError, "ground: expected contact"),
+        ({"contact": "no"}, InputError, "contact: expected True or False, got 'no'"),
+    ],
+)
+def test_bad_repairs_are_named(write, options, error, words):
+    with pytest.raises(error, match=words):
+        load(write(), **options)
+
+
+def test_a_base_that_is_held_is_not_free_and_needs_no_weld(write):
+    path = write(robot(joint("shoulder", "world", "upper"), ELBOW, links="upper lower"))
+    with pytest.raises(ModelError, match=r"arm.urdf: base=\"free\": nothing floats.*shoulder \(revolute\) holds upper"):
+        load(path, base="free")
+    model, told = load(path, base="weld")
+    assert (model.nq, told) == (2, "")
+    with pytest.raises(ModelError, match="expected a frame of something that floats"):
+        load(path, base="lower")
+    assert load(write(), base="free")[0].nq == 9
+
+
+def test_what_has_no_joint_cannot_be_welded_away():
+    with pytest.raises(ModelError, match="nothing could move any more"):
+        load(MODELS / "projectile.sdf", base="weld")
+
+
+@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+def test_real_robots_are_repaired():
+    solo = dd.load_model(robot_file("solo12.urdf"), time_step=0.005, actuators="all", ground=True)
+    assert solo.nu == 12
+    z1 = dd.load_model(robot_file("z1.urdf"), time_step=0.005, actuators="all")
+    assert z1.nu == z1.nv
