@@ -1,0 +1,161 @@
+"""How far the pieces of a robot are from a ball, from a box and from each other, as functions of the state.
+
+Each is a function of x (nx,) in ordinary arithmetic, for floats, AutoDiffXd and symbols, with one number a row, and for
+many states at once `values`, and `linearize` with exact derivatives: the slope of a distance is that of its nearest
+points, held where they are on their pieces.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, Indices
+from drake_diff.exceptions import InputError
+from drake_diff.mechanics.cover import Piece
+from drake_diff.mechanics.distance import along_segment, along_segments, away_from_box, length, to_box
+from drake_diff.mechanics.placing import Placing
+from drake_diff.model.model import Model
+from drake_diff.model.quantities import PLACE
+
+BALL_PART = 0.1  # of a capsule's radius: how far the balls that it becomes beside a box stick out of it
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """Pieces of a robot, in rows."""
+
+    at: Indices  # (m,) the link of each
+    start: Array  # (m, 3) [m] in its frame
+    end: Array  # (m, 3)
+    radius: Array  # (m,) [m]
+    squared: Array  # (m,) [m^2] the squared lengths
+
+    def ends(self, frames: tuple[Any, Any]) -> tuple[Any, Any]:
+        """(..., m, 3) where the segments start and end in the world."""
+        R, p = frames[0][..., self.at, :, :], frames[1][..., self.at, :]
+        return (R @ self.start[..., None])[..., 0] + p, (R @ self.end[..., None])[..., 0] + p
+
+
+def in_rows(pieces: Sequence[Piece]) -> Pieces:
+    """The same, in rows."""
+    return Pieces(
+        np.array([p.link for p in pieces], dtype=np.intp),
+        np.array([p.start for p in pieces]).reshape(-1, 3),
+        np.array([p.end for p in pieces]).reshape(-1, 3),
+        np.array([p.radius for p in pieces]),
+        np.array([p.squared for p in pieces]),
+    )
+
+
+class Clearance:
+    """Signed distances [m] of a robot's pieces; `labels` (m,) tell what each row is of."""
+
+    def __init__(self, model: Model, placing: Placing, labels: Sequence[str]):
+        self.model, self.placing, self.labels = model, placing, tuple(labels)
+
+    def __call__(self, x: Any) -> Any:
+        """(m,) [m] at x (nx,)."""
+        for quantity in sorted(self.model.other_quantities & PLACE):
+            raise InputError("parameters", got=quantity, expected="only such as distances do not depend on")
+        return self._distances(self.placing(np.asarray(x)[: self.model.nq]))
+
+    def values(self, xs: Array) -> Array:
+        """(K, m) [m] at xs (K, nx)."""
+        return np.asarray(self._distances(self.placing(xs[:, : self.model.nq])), dtype=float)
+
+    def linearize(self, xs: Array) -> tuple[Array, Array]:
+        """(K, m) [m], and their derivatives by the state (K, m, nx), at xs (K, nx)."""
+        q = xs[:, : self.model.nq]
+        frames = self.placing(q)
+        return np.asarray(self._distances(frames)), self._slopes(q, frames)
+
+    def _distances(self, frames: tuple[Any, Any]) -> Any:
+        raise NotImplementedError
+
+    def _slopes(self, q: Array, frames: tuple[Array, Array]) -> Array:
+        raise NotImplementedError
+
+
+class FromBall(Clearance):
+    """Of capsules from a ball at `center` (3,) of a `radius` [m]."""
+
+    def __init__(self, model: Model, placing: Placing, pieces: Sequence[Piece], center: Array, radius: float):
+        super().__init__(model, placing, [p.body for p in pieces])
+        self.pieces, self.center, self.radius = in_rows(pieces), center, radius
+
+    def _nearest(self, frames: tuple[Any, Any]) -> Any:
+        """(..., m, 3)"""
+        start, end = self.pieces.ends(frames)
+        return start + along_segment(start, end, self.center, self.pieces.squared)[..., None] * (end - start)
+
+    def _distances(self, frames: tuple[Any, Any]) -> Any:
+        return length(self._nearest(frames) - self.center) - (self.pieces.radius + self.radius)
+
+    def _slopes(self, q: Array, frames: tuple[Array, Array]) -> Array:
+        points = self._nearest(frames)
+        apart = points - self.center
+        return self.placing.pushes(q, frames, self.pieces.at, points, apart / length(apart)[..., None])
+
+
+class FromBox(Clearance):
+    """Of balls from a box, at `center` (3,), turned by `rotation` (3, 3), of `half` its edges (3,) [m].
+
+    Capsules become balls, see `balls_of`.
+    """
+
+    def __init__(
+        self, model: Model, placing: Placing, pieces: Sequence[Piece], center: Array, rotation: Array, half: Array
+    ):
+        balls = [ball for piece in pieces for ball in balls_of(piece)]
+        super().__init__(model, placing, [p.body for p in balls])
+        self.pieces, self.center, self.rotation, self.half = in_rows(balls), center, rotation, half
+
+    def _within(self, frames: tuple[Any, Any]) -> tuple[Any, Any]:
+        """(..., m, 3) the balls' centres in the world and in the box's frame."""
+        points, _ = self.pieces.ends(frames)
+        return points, (points - self.center) @ self.rotation
+
+    def _distances(self, frames: tuple[Any, Any]) -> Any:
+        return to_box(self._within(frames)[1], self.half) - self.pieces.radius
+
+    def _slopes(self, q: Array, frames: tuple[Array, Array]) -> Array:
+        points, local = self._within(frames)
+        return self.placing.pushes(q, frames, self.pieces.at, points, away_from_box(local, self.half) @ self.rotation.T)
+
+
+class OfPairs(Clearance):
+    """Of two capsules from each other, a row for each pair."""
+
+    def __init__(self, model: Model, placing: Placing, pairs: Sequence[tuple[Piece, Piece]]):
+        super().__init__(model, placing, [f"{a.body} and {b.body}" for a, b in pairs])
+        self.first, self.second = in_rows([a for a, _ in pairs]), in_rows([b for _, b in pairs])
+
+    def _nearest(self, frames: tuple[Any, Any]) -> tuple[Any, Any]:
+        one, other = self.first.ends(frames), self.second.ends(frames)
+        s, t = along_segments(one, other, self.first.squared, self.second.squared)
+        return one[0] + s[..., None] * (one[1] - one[0]), other[0] + t[..., None] * (other[1] - other[0])
+
+    def _distances(self, frames: tuple[Any, Any]) -> Any:
+        a, b = self._nearest(frames)
+        return length(a - b) - (self.first.radius + self.second.radius)
+
+    def _slopes(self, q: Array, frames: tuple[Array, Array]) -> Array:
+        a, b = self._nearest(frames)
+        way = (a - b) / length(a - b)[..., None]
+        first = self.placing.pushes(q, frames, self.first.at, a, way)
+        return first - self.placing.pushes(q, frames, self.second.at, b, way)
+
+
+def balls_of(piece: Piece) -> list[Piece]:
+    """Balls that contain a capsule and stick out of it by a tenth of its radius; a ball is itself."""
+    half_length = float(np.sqrt(piece.squared)) / 2
+    if half_length == 0:
+        return [piece]
+    within = np.sqrt((1 + BALL_PART) ** 2 - 1) * piece.radius  # on both sides, a ball contains that much of the tube
+    count = int(np.ceil(half_length / within))
+    radius = float(np.hypot(piece.radius, half_length / count))
+    excess = piece.excess + radius - piece.radius
+    centers = [piece.start + part * (piece.end - piece.start) for part in np.linspace(0, 1, count + 1)]
+    return [replace(piece, start=c, end=c, radius=radius, excess=excess) for c in centers]

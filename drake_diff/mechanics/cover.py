@@ -1,0 +1,254 @@
+"""What of a robot keeps clear of things: spheres and capsules that contain the shapes of its bodies.
+
+A body's collision shapes are covered, or those that are only drawn where it has none. A sphere and a capsule are taken
+as they are. Of other shapes a few capsules contain all, and stick out by what `Piece.excess` says. A body without any
+shape gets capsules from its joint to the next ones, a skeleton: that contains nothing for certain, and is told.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from pydrake.geometry import Box, Capsule, Convex, Cylinder, Ellipsoid, HalfSpace, Mesh, Role, Sphere
+from pydrake.math import RigidTransform
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import ModelError
+from drake_diff.mechanics.placing import Placing
+from drake_diff.model.model import Model
+from drake_diff.model.plant import bodies, joints, labelled
+
+MOST_STRIPS = 4  # side by side, that cover a box
+MOST_SLABS = 4  # one after the other, that cover a hull or a mesh
+WORTH_A_SLAB = 0.8  # of the volume: more slabs have to save that much
+CYLINDER_PART = 0.5  # of a cylinder's radius: how far before its ends a segment ends; it sticks out sideways by 12 %
+BONE_PART, BONE_RADII = 0.2, (0.01, 0.06)  # of its length, and the limits [m]: the radius of a skeleton's capsule
+ROUNDING = 1e-9  # [m] added to a radius that is computed from corners
+WAYS = np.random.default_rng(0).standard_normal((400, 3))  # in which a cover and what it covers are compared
+WAYS = np.vstack([np.eye(3), -np.eye(3), WAYS / np.linalg.norm(WAYS, axis=1)[:, None]])
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A capsule of a `radius` [m] around the segment from `start` to `end` (3,) [m]; a sphere where they are one."""
+
+    body: str
+    link: int  # its place among the links of a Placing, -1 for the world
+    start: Array  # in the link's frame
+    end: Array
+    radius: float
+    excess: float  # [m] how far it sticks out of what it covers, at most; of a skeleton 0
+    source: str  # "sphere", "capsule", "around a box", ..., "skeleton"
+
+    @property
+    def squared(self) -> float:
+        """[m^2] the segment's length, squared."""
+        return float(np.sum((self.end - self.start) ** 2))
+
+
+@dataclass(frozen=True)
+class Cover:
+    """The pieces of all bodies; `bare` are bodies that have none, `notes` say what is not exact, a sentence each."""
+
+    pieces: tuple[Piece, ...]
+    bare: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def cover_of(model: Model, placing: Placing) -> Cover:
+    """The cover of the shapes that `model` has."""
+    return model.cache("cover", lambda: _cover(model, placing))
+
+
+def _cover(model: Model, placing: Placing) -> Cover:
+    inspector, pieces, bare = model.double.inspector, list[Piece](), []
+    for label, body in labelled(bodies(model.plant)).items():
+        link, pose = placing.on[label]
+        found = [] if inspector is None else list(_of_shapes(model, inspector, body))
+        found = found or list(_skeleton(model, body))
+        pieces += [replace(p, body=label, link=link, start=pose @ p.start, end=pose @ p.end) for p in found]
+    for place, rigid in enumerate(placing.links):
+        if all(p.link != place for p in pieces):
+            bare.append(rigid.joint.body)
+    return Cover(tuple(pieces), tuple(bare), tuple(_notes(pieces, bare)))
+
+
+def _notes(pieces: Sequence[Piece], bare: Sequence[str]) -> Iterator[str]:
+    names = dict.fromkeys(p.body for p in pieces)
+    bones = [b for b in names if any(p.body == b and p.source == "skeleton" for p in pieces)]
+    if bones:
+        radii = [p.radius for p in pieces if p.source == "skeleton"]
+        yield (
+            f"{', '.join(bones)}: no shape that could be read, kept clear as capsules from joint to joint, of radius "
+            f"{min(radii):.3g} to {max(radii):.3g} m"
+        )
+    around = [(max(p.excess for p in pieces if p.body == b), b) for b in names]
+    wide = [f"{b} by {excess:.2g} m" for excess, b in around if excess > ROUNDING]
+    if wide:
+        yield f"kept clear as capsules that stick out of their shapes: {', '.join(wide)}"
+    if bare:
+        yield f"{', '.join(bare)}: no shape, no mass and no next joint, not kept clear of anything"
+
+
+def _of_shapes(model: Model, inspector: Any, body: Any) -> Iterator[Piece]:
+    """Of the body's collision shapes, or of those that are drawn where there are none, in the body's frame."""
+    frame = model.plant.GetBodyFrameIdIfExists(body.index())
+    if frame is None:
+        return
+    for role in (Role.kProximity, Role.kIllustration):
+        geometries = inspector.GetGeometries(frame, role)
+        found = [p for g in geometries for p in _around(inspector.GetShape(g), inspector.GetPoseInFrame(g))]
+        if found:
+            yield from found
+            return
+
+
+def _around(shape: Any, pose: RigidTransform) -> Iterator[Piece]:
+    """The pieces that contain a shape at `pose`; none of a half space, which no robot is made of."""
+    if isinstance(shape, HalfSpace):
+        return
+    for start, end, radius, excess in pieces_around(shape):
+        kind = type(shape).__name__.lower()
+        source = kind if excess == 0 else f"around a {kind}"
+        yield Piece("", -1, pose @ start, pose @ end, radius, excess, source)
+
+
+def pieces_around(shape: Any) -> list[tuple[Array, Array, float, float]]:
+    z = np.array([0.0, 0.0, 1.0])
+    if isinstance(shape, Sphere):
+        return [(np.zeros(3), np.zeros(3), shape.radius(), 0.0)]
+    if isinstance(shape, Capsule):
+        half = shape.length() / 2
+        return [(-half * z, half * z, shape.radius(), 0.0)]
+    if isinstance(shape, Cylinder):
+        half, r = shape.length() / 2, shape.radius()
+        short = min(half, CYLINDER_PART * r)
+        radius = float(np.hypot(r, short))
+        return [((short - half) * z, (half - short) * z, radius, max(radius - r, radius - short))]
+    if isinstance(shape, Box):
+        return _around_box(np.asarray(shape.size()))
+    if isinstance(shape, Ellipsoid):  # a capsule of the second axis, whose curvature at the tips is less
+        axes = np.array([shape.a(), shape.b(), shape.c()])
+        longest = int(np.argmax(axes))
+        radius = float(np.max(np.delete(axes, longest)))
+        end = (axes[longest] - radius) * np.eye(3)[longest]
+        return [(-end, end, radius, _beyond(-end, end, radius, np.linalg.norm(WAYS * axes, axis=1)))]
+    if isinstance(shape, (Mesh, Convex)):
+        hull = shape.GetConvexHull()
+        return around_points(np.array([hull.vertex(i) for i in range(hull.num_vertices())]))
+    raise ModelError(f"shape {type(shape).__name__}: expected one that Drake's files can have")
+
+
+def _around_box(size: Array) -> list[tuple[Array, Array, float, float]]:
+    """Capsules along the longest edge, as many side by side as the second is longer than the third."""
+    c, b, a = np.argsort(size)
+    count = int(np.clip(np.ceil(size[b] / max(size[c], 1e-12) / 1.5), 1, MOST_STRIPS))
+    corner, short = np.hypot(size[b] / count, size[c]) / 2, size[c] / 2
+    radius, end = float(np.hypot(corner, short)) + ROUNDING, (size[a] / 2 - short) * np.eye(3)[a]
+    places = ((np.arange(count) + 0.5) / count - 0.5) * size[b]
+    sideways = size[b] / 2 / count  # by which the outermost lie inside
+    excess = max(radius - short, radius - sideways)
+    return [(place * np.eye(3)[b] - end, place * np.eye(3)[b] + end, radius, excess) for place in places]
+
+
+def around_points(points: Array) -> list[tuple[Array, Array, float, float]]:
+    """Capsules that contain the convex hull of `points` (P, 3), one after the other along their longest direction."""
+    center = np.mean(points, axis=0)
+    axis = np.linalg.svd(points - center, full_matrices=False)[2][0]
+    best: list[tuple[Array, Array, float, float]] = []
+    for count in range(1, MOST_SLABS + 1):
+        found = [_around_slab(slab) for slab in _slabs(points, axis, count)]
+        if best and _volume(found) > WORTH_A_SLAB * _volume(best):
+            break
+        best = found
+    return best
+
+
+def _volume(pieces: Sequence[tuple[Array, Array, float, float]]) -> float:
+    return sum(np.pi * r**2 * (float(np.linalg.norm(b - a)) + 4 / 3 * r) for a, b, r, _ in pieces)
+
+
+def _slabs(points: Array, axis: Array, count: int) -> list[Array]:
+    """The hull of `points` cut across `axis` into `count` equal slabs: the corners of each."""
+    if count == 1:
+        return [points]
+    heights = points @ axis
+    found = []
+    for low, high in pairwise(np.linspace(np.min(heights), np.max(heights), count + 1)):
+        corners = [points[(heights >= low) & (heights <= high)]]
+        for level in (low, high):  # where the lines between the corners on both sides cross: no fewer than the hull's
+            below, above = np.flatnonzero(heights < level), np.flatnonzero(heights > level)
+            if len(below) and len(above):
+                part = (level - heights[below, None]) / (heights[above] - heights[below, None])
+                crossing = points[below, None] + part[..., None] * (points[above] - points[below, None])
+                corners.append(crossing.reshape(-1, 3))
+        found.append(np.vstack(corners))
+    return found
+
+
+def _around_slab(points: Array) -> tuple[Array, Array, float, float]:
+    """The slimmest of some capsules that contain `points`, and how far it sticks out of their hull."""
+    center = (np.min(points, axis=0) + np.max(points, axis=0)) / 2
+    turned = np.linalg.svd(points - center, full_matrices=False)[2]
+    axes = [*np.eye(3), *turned]
+    tried = [_capsule_along(points, axis) for axis in axes]
+    start, end, radius = min(tried, key=lambda c: _volume([(*c, 0.0)]))
+    return start, end, radius, _beyond(start, end, radius, np.max(WAYS @ points.T, axis=1))
+
+
+def _beyond(start: Array, end: Array, radius: float, reach: Array) -> float:
+    """[m] how far a capsule sticks out of a convex shape that it contains, which reaches `reach` (W,) in each of WAYS.
+
+    The largest distance between two convex sets is the largest difference of how far they reach in any direction.
+    """
+    excess = np.max(np.maximum(WAYS @ start, WAYS @ end) + radius - reach)
+    return max(float(excess), ROUNDING)
+
+
+def _capsule_along(points: Array, axis: Array) -> tuple[Array, Array, float]:
+    """A capsule along `axis` that contains `points` (P, 3)."""
+    across = np.linalg.svd(axis[None])[2][1:]  # (2, 3)
+    flat, heights = points @ across.T, points @ axis
+    middle = _circle(flat)
+    off = np.linalg.norm(flat - middle, axis=1)
+    radius = float(np.max(off)) + ROUNDING
+    spare = np.sqrt(np.maximum(radius**2 - off**2, 0.0))
+    low, high = float(np.min(heights + spare)), float(np.max(heights - spare))
+    if low > high:  # a sphere: its centre anywhere in between contains all
+        low = high = (low + high) / 2
+    foot = middle @ across
+    start, end = foot + low * axis, foot + high * axis
+    along = np.clip(heights, low, high)[:, None] * axis + foot
+    return start, end, max(radius, float(np.max(np.linalg.norm(points - along, axis=1))) + ROUNDING)
+
+
+def _circle(points: Array) -> Array:
+    """(2,) nearly the centre of the smallest circle around `points` (P, 2): steps to the farthest, ever shorter."""
+    center = (np.min(points, axis=0) + np.max(points, axis=0)) / 2
+    for k in range(1, 201):  # Badoiu and Clarkson (2003)
+        far = points[int(np.argmax(np.sum((points - center) ** 2, axis=1)))]
+        center = center + (far - center) / (k + 1)
+    return np.asarray(center)
+
+
+def _skeleton(model: Model, body: Any) -> Iterator[Piece]:
+    """Capsules from where a body is carried to the joints that it carries, or to its centre of mass, in its frame.
+
+    None of a body that the world carries, and none of a frame: no mass and nothing to carry.
+    """
+    if model.plant.IsAnchored(body):
+        return
+    start, ends = np.zeros(3), []
+    for joint in joints(model.plant):
+        if joint.child_body().index() == body.index():
+            start = joint.frame_on_child().GetFixedPoseInBodyFrame().translation()
+        elif joint.parent_body().index() == body.index():
+            ends.append(joint.frame_on_parent().GetFixedPoseInBodyFrame().translation())
+    ends = [end for end in ends if np.linalg.norm(end - start) > ROUNDING]
+    if not ends and body.default_mass() > 0:
+        ends = [np.asarray(body.default_com())]
+    for end in ends:
+        radius = float(np.clip(BONE_PART * np.linalg.norm(end - start), *BONE_RADII))
+        yield Piece("", -1, start, end, radius, 0.0, "skeleton")

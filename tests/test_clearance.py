@@ -1,0 +1,240 @@
+"""Distances of a robot's pieces: against closed forms, against Drake's own queries, and their derivatives."""
+
+import itertools
+
+import numpy as np
+import pytest
+from helpers.robots import example_robot, state_in_range
+from helpers.table import each_row
+from pydrake.autodiffutils import InitializeAutoDiff
+from pydrake.geometry import AddContactMaterial, Box, Capsule, Cylinder, Ellipsoid, ProximityProperties, Sphere
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlantConfig
+from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.framework import DiagramBuilder
+
+import drake_diff as dd
+from drake_diff._base.refusal import Refusal
+from drake_diff.exceptions import InputError
+from drake_diff.mechanics import placing
+from drake_diff.mechanics.clearance import FromBall, FromBox, OfPairs, balls_of
+from drake_diff.mechanics.cover import Piece, around_points, cover_of, pieces_around
+from drake_diff.mechanics.description import read_links
+from drake_diff.mechanics.distance import along_segment, along_segments, length, to_box
+from drake_diff.mechanics.placing import placing_of
+from drake_diff.model.parameters import applied, select
+
+ROBOTS = ("ur5_robot.urdf", "panda.urdf", "a1.urdf")  # hinges; hinges and slides; a free base
+CLOSED = 1e-9  # [m] of metres: closed forms on both sides
+# [m] For a pair of capsules Drake has no closed form: its library searches, and stops above the least distance. Ours is
+# compared with a finer search below.
+ITERATED = 1e-4
+SLOPES = 1e-11  # of slopes up to 2: both exact
+
+
+class Two:
+    """Two shapes in Drake, and their signed distance by its QueryObject."""
+
+    def __init__(self, *shapes):
+        builder = DiagramBuilder()
+        self.plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.01), builder)
+        self.bodies, ids = [], []
+        for i, shape in enumerate(shapes):
+            body = self.plant.AddRigidBody(f"body {i}", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+            properties = ProximityProperties()
+            AddContactMaterial(friction=CoulombFriction(0.0, 0.0), properties=properties)
+            self.bodies.append(body)
+            ids.append(self.plant.RegisterCollisionGeometry(body, RigidTransform(), shape, f"shape {i}", properties))
+        self.plant.Finalize()
+        diagram = builder.Build()
+        self.context = self.plant.GetMyMutableContextFromRoot(root := diagram.CreateDefaultContext())
+        self.root, self.ids = root, ids
+
+    def distance(self, *poses):
+        for body, pose in zip(self.bodies, poses, strict=True):
+            self.plant.SetFreeBodyPose(self.context, body, pose)
+        query = self.plant.get_geometry_query_input_port().Eval(self.context)
+        return query.ComputeSignedDistancePairClosestPoints(*self.ids).distance
+
+
+def random_pose(random, reach=0.6):
+    return RigidTransform(RollPitchYaw(random.uniform(-np.pi, np.pi, 3)), random.uniform(-reach, reach, 3))
+
+
+def ends(pose, half):
+    return pose @ np.array([0, 0, -half]), pose @ np.array([0, 0, half])
+
+
+def test_a_capsule_from_a_ball_is_what_drake_says():
+    random, two = np.random.default_rng(0), Two(Capsule(0.07, 0.4), Sphere(0.12))
+    for _ in range(300):
+        capsule, ball = random_pose(random), random_pose(random)
+        a, b = ends(capsule, 0.2)
+        t = along_segment(a, b, ball.translation(), np.array(0.16))
+        found = length(a + t * (b - a) - ball.translation()) - 0.19
+        assert abs(found - two.distance(capsule, ball)) <= CLOSED
+
+
+def test_a_ball_from_a_box_is_what_drake_says_outside_and_inside():
+    random, size = np.random.default_rng(1), np.array([0.5, 0.3, 0.8])
+    two, inside = Two(Sphere(0.05), Box(*size)), 0
+    for _ in range(500):
+        ball, box = random_pose(random), random_pose(random, reach=0.2)
+        found = to_box(box.inverse() @ ball.translation(), size / 2) - 0.05
+        assert abs(found - two.distance(ball, box)) <= CLOSED
+        inside += found < -0.05
+    assert inside > 20
+
+
+def test_two_capsules_are_what_drake_says():
+    random, two = np.random.default_rng(2), Two(Capsule(0.05, 0.5), Capsule(0.03, 0.3))
+    compared = 0
+    for _ in range(300):
+        poses = random_pose(random), random_pose(random)
+        one, other = ends(poses[0], 0.25), ends(poses[1], 0.15)
+        s, t = along_segments(one, other, np.array(0.25), np.array(0.09))
+        found = length(one[0] + s * (one[1] - one[0]) - other[0] - t * (other[1] - other[0])) - 0.08
+        if found > 0:
+            assert -CLOSED <= two.distance(*poses) - found <= ITERATED
+            compared += 1
+    assert compared > 200
+
+
+def test_two_segments_are_as_near_as_a_search_over_both_finds():
+    random = np.random.default_rng(3)
+    for k in range(200):
+        one, other = random.uniform(-1, 1, (2, 3)), random.uniform(-1, 1, (2, 3))
+        if k % 4 == 0:  # parallel, some of them side by side
+            other[1] = other[0] + random.uniform(-2, 2) * (one[1] - one[0])
+        if k % 5 == 0:
+            other[1] = other[0]  # a point
+        squared = [np.sum((b - a) ** 2) for a, b in (one, other)]
+        s, t = along_segments(tuple(one), tuple(other), *map(np.asarray, squared))
+        found = np.linalg.norm(one[0] + s * (one[1] - one[0]) - other[0] - t * (other[1] - other[0]))
+        # for each place on one of them the nearest on the other in closed form, and that on a fine grid
+        places = one[0] + np.linspace(0, 1, 4001)[:, None] * (one[1] - one[0])
+        along = np.clip((places - other[0]) @ (other[1] - other[0]) / max(squared[1], 1e-300), 0, 1)
+        best = np.min(np.linalg.norm(places - other[0] - along[:, None] * (other[1] - other[0]), axis=1))
+        assert best - 1e-3 <= found <= best + 1e-9, k  # the grid is that much too far at most
+
+
+@each_row("robot", ROBOTS)
+def test_distances_of_a_robot_have_exact_derivatives(robot):
+    model, random = example_robot(robot, 0.02), np.random.default_rng(4)
+    links = placing_of(model)
+    pieces = cover_of(model, links).pieces
+    turned = RollPitchYaw(0.3, -0.5, 0.7).ToRotationMatrix().matrix()
+    pairs = [(a, b) for a, b in itertools.combinations(pieces, 2) if a.link != b.link][:40]
+    for clearance in (
+        FromBall(model, links, pieces, np.array([0.4, 0.1, 0.5]), 0.1),
+        FromBox(model, links, pieces, np.array([0.4, 0.1, 0.5]), turned, np.array([0.1, 0.2, 0.3])),
+        OfPairs(model, links, pairs),
+    ):
+        xs = np.array([state_in_range(model, random) for _ in range(3)])
+        values, slopes = clearance.linearize(xs)
+        assert np.array_equal(values, clearance.values(xs))
+        for x, row, slope in zip(xs, values, slopes, strict=True):
+            exact = clearance(InitializeAutoDiff(x).ravel())
+            assert np.allclose([e.value() for e in exact], row, rtol=0, atol=1e-13)
+            assert np.abs(np.array([e.derivatives() for e in exact]) - slope).max() <= SLOPES
+            way = random.standard_normal(model.nx)
+            rate = (clearance(x + 1e-6 * way) - clearance(x - 1e-6 * way)) / 2e-6
+            assert np.abs(slope @ way - rate).max() <= 1e-6
+
+
+def test_where_links_are_is_refused_where_the_tree_is_another(monkeypatch):
+    model = example_robot("ur5_robot.urdf", 0.02)
+
+    def one_axis_turned_around(plant, springs):
+        links = read_links(plant, springs)
+        hinge = next(link for link in links if link.joint == "elbow_joint")
+        hinge.axis[:] = -hinge.axis
+        return links
+
+    monkeypatch.setattr(placing, "read_links", one_axis_turned_around)
+    found = placing_of(model)
+    assert isinstance(found, Refusal)
+    assert "not where Drake has them" in str(found)
+
+
+def inside(pieces, points):
+    """Whether each of `points` (P, 3) is in one of the pieces (start, end, radius, excess)."""
+    found = np.zeros(len(points), dtype=bool)
+    for start, end, radius, _ in pieces:
+        squared = np.sum((end - start) ** 2)
+        t = along_segment(start, end, points, np.array(squared))
+        found |= np.linalg.norm(points - start - t[:, None] * (end - start), axis=1) <= radius
+    return found
+
+
+def within(shape, random, count):
+    """Random points of a shape, many of them on its surface."""
+    part = random.uniform(0, 1, (count, 1)) ** 0.1
+    if isinstance(shape, Box):
+        points = random.uniform(-1, 1, (count, 3))
+        return points / np.max(np.abs(points), axis=1)[:, None] * part * np.array(shape.size()) / 2
+    if isinstance(shape, Cylinder):
+        angle, height = random.uniform(0, 2 * np.pi, count), random.uniform(-1, 1, count)
+        ring = shape.radius() * np.column_stack([np.cos(angle), np.sin(angle)]) * part
+        return np.column_stack(
+            [ring, np.where(random.random(count) < 0.5, np.sign(height), height) * shape.length() / 2]
+        )
+    points = random.standard_normal((count, 3))
+    return points / np.linalg.norm(points, axis=1)[:, None] * part * np.array([shape.a(), shape.b(), shape.c()])
+
+
+def test_a_cover_contains_its_shape_and_sticks_out_by_no_more_than_it_says():
+    random = np.random.default_rng(5)
+    for _ in range(40):
+        a, b, c = 10 ** random.uniform(-2.5, 0, 3)
+        for shape in (Box(a, b, c), Cylinder(a, b), Ellipsoid(a, b, c)):
+            pieces = pieces_around(shape)
+            points = within(shape, random, 2000)
+            assert inside(pieces, points * (1 - 1e-12)).all(), shape
+            if isinstance(shape, Box):  # exact for a box: the farthest of its cover's points from it
+                out = [
+                    to_box(place + radius * way, np.array(shape.size()) / 2) <= excess + 1e-6
+                    for start, end, radius, excess in pieces
+                    for place in (start, end)
+                    for way in (*np.eye(3), *-np.eye(3))
+                ]
+                assert all(out), shape
+
+
+def test_capsules_around_points_contain_their_hull():
+    random = np.random.default_rng(6)
+    for k in range(20):
+        points = random.standard_normal((40, 3)) * 10 ** random.uniform(-2, 0, 3)
+        weights = random.dirichlet(np.full(len(points), 0.3), 2000)
+        pieces = around_points(points)
+        assert inside(pieces, weights @ points).all(), k
+        assert inside(pieces, points).all(), k
+
+
+def test_balls_of_a_capsule_contain_it():
+    random = np.random.default_rng(7)
+    for _ in range(50):
+        start, end, radius = *random.uniform(-1, 1, (2, 3)), random.uniform(0.01, 1)
+        balls = balls_of(Piece("", 0, start, end, radius, 0.0, "capsule"))
+        ways = random.standard_normal((500, 3))
+        ways *= radius / np.linalg.norm(ways, axis=1)[:, None]
+        points = start + random.uniform(0, 1, (500, 1)).round(1) * (end - start) + ways
+        assert inside([(b.start, b.end, b.radius + 1e-12, 0) for b in balls], points).all()
+        assert all(b.radius <= 1.1 * radius + 1e-12 for b in balls)
+
+
+def test_a_robot_without_readable_shapes_is_a_skeleton_and_says_so():
+    model = example_robot("xarm7.urdf", 0.02)
+    cover = cover_of(model, placing_of(model))
+    assert {p.source for p in cover.pieces} == {"skeleton"}
+    assert "no shape that could be read" in cover.notes[0]
+    assert all(f"link{i}" in cover.notes[0] for i in range(1, 8))
+
+
+def test_parameters_that_move_links_are_refused():
+    model = dd.load_model("models/double_pendulum.urdf", time_step=0.01)
+    links = placing_of(model)
+    clearance = FromBall(model, links, cover_of(model, links).pieces, np.zeros(3), 0.1)
+    names = [p.name for p in dd.list_parameters(model) if p.name.endswith(".offset")]
+    with applied(select(model, names)) as other, pytest.raises(InputError, match="offset"):
+        clearance(np.zeros(other.nx))
