@@ -1,4 +1,4 @@
-"""What users ask `solve` for: minimum time, waypoints, path constraints, limits, each against a closed form."""
+"""What users ask `solve` for, by collocation: minimum time, waypoints, path constraints, each against a closed form."""
 
 import math
 
@@ -129,21 +129,3 @@ def test_what_a_constraint_is_exceeded_by_between_the_nodes_is_in_the_record(wri
     assert solution.success is holds
     assert metrics["state excess between nodes"].value == 0
     assert metrics["input excess between nodes"].value == 0
-
-
-@pytest.mark.parametrize("method", ["shooting", "ilqr"])
-@pytest.mark.parametrize("limit", [2.0, 0.03])
-def test_a_plan_at_the_limits_of_its_motor_is_verified(write_urdf, method, limit):
-    """6 d / T^2 is the largest input of least effort, 4 d / T^2 the least limit that will do: 4.5 d / T^2 acts."""
-    count, h = 30, 0.04
-    distance = limit * (count * h) ** 2 / 4.5
-    model = write_urdf(limit=limit, time_step=h)
-    effort = dd.QuadraticCost(R=np.eye(1) / limit**2)
-    problem = dd.Problem(model, x0=[0, 0], x_goal=[distance, 0], num_steps=count, running_cost=effort)
-    solution = dd.solve(problem, method=method)
-    assert solution.success, solution.message
-    np.testing.assert_allclose(np.abs(solution.us[[0, -1], 0]), limit, rtol=1e-9)
-    assert solution.us.max() <= limit
-    told = [certificate.told for certificate in solution.certificates[-5:]]
-    assert "certified beside the limit of its effort" in told[0]
-    assert "certified beside the limit of its effort" in told[-1]

@@ -381,8 +381,8 @@ def _invariants(vector: ParameterVector, motion: Rollout | None, unit: str) -> I
         for name, own in INVARIANTS.items():
             yield measured(name, ON_THE_PLANT, np.inf, own or unit, reason=NO_REPLAY)
         return
-    plant, positions = vector.model.plant, motion.xs[:, : vector.model.nq]
-    limits = (positions <= plant.GetPositionLowerLimits()) | (positions >= plant.GetPositionUpperLimits())
+    positions, (lower, upper) = motion.xs[:, : vector.model.nq], vector.model.position_limits
+    limits = (positions <= lower) | (positions >= upper)
     # A limit is implicit: it acts in the step before it is met.
     held = np.array([bool(c) for c in motion.contacts]) | np.any(limits, axis=1)[1:]
     free = int(np.argmax(held)) if held.any() else len(held)  # steps from the start with nothing in the way

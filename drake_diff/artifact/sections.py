@@ -179,11 +179,9 @@ def _frames(model: Model) -> list[str]:
     for joint in joints(model.plant):
         if joint.type_name() not in FLOATING:
             own = f"axes of {joint.name()}, {joint.parent_body().name()} to {joint.child_body().name()}"
-            for start, count in (
-                (joint.position_start(), joint.num_positions()),
-                (model.nq + joint.velocity_start(), joint.num_velocities()),
-            ):
-                found[start : start + count] = [own] * count
+            q, v = model.places(joint)
+            for i in [*q, *(model.nq + j for j in v)]:
+                found[i] = own
     return found
 
 

@@ -308,8 +308,7 @@ def _identity_frame(place: Place) -> Found:
 
 
 def _joint_limit(place: Place) -> Found:
-    plant, names = place.model.plant, place.model.position_names
-    limits = zip(plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits(), strict=True)
+    names, limits = place.model.position_names, zip(*place.model.position_limits, strict=True)
     for name, q, (low, high) in zip(names, place.x[: place.model.nq], limits, strict=True):
         if q <= low + AT_LIMIT or q >= high - AT_LIMIT:
             message = f"{q:.9g} is at or beyond its limits [{low:g}, {high:g}]: the derivative is that of one side"
@@ -332,13 +331,11 @@ def _saturated_effort(place: Place) -> Found:
         effort = np.array(plant.get_net_actuation_output_port().Eval(twin.context))
     set_state(twin, np.concatenate([place.x[: model.nq], np.zeros(model.nv)]))
     # The effort nearest to what no acceleration at rest takes.
-    hold = np.linalg.lstsq(plant.MakeActuationMatrix(), twin.inverse_dynamics(np.zeros(model.nv)), rcond=None)[0]
+    hold = np.linalg.lstsq(model.actuation, twin.inverse_dynamics(np.zeros(model.nv)), rcond=None)[0]
     for actuator, u, now, rest in zip(actuators(plant), place.u, effort, hold, strict=True):
         limit = float(actuator.effort_limit())
         if abs(now) >= limit:
-            corner = abs(u) == limit and not actuator.has_controller()
-            slope = "that of the inside, and 0 outside" if corner else "exactly 0"
-            message = f"its effort is at the limit {limit:g} (u is {u:.6g}): there the derivative by u is {slope}"
+            message = f"its effort is at the limit {limit:g} (u is {u:.6g}): there the derivative by u is exactly 0"
             yield Finding("error", "saturated_effort", actuator.name(), message, remedy)
         elif abs(rest) > limit:
             message = f"to hold x at rest takes {rest:.6g} (without contact), beyond the limit {limit:g}"

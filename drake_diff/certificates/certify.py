@@ -196,11 +196,10 @@ def solver_tolerance(model: Model, x: Array, u: Array) -> float:
     plant = model.plant
     advance(model.double, x, u)
     q, reach = x[: model.nq], LIMIT_REACH + 2 * model.time_step * np.abs(x[model.nq :]).max(initial=0)
-    near_limit = np.any(q < plant.GetPositionLowerLimits() + reach) or np.any(
-        q > plant.GetPositionUpperLimits() - reach
-    )
+    lower, upper = model.position_limits
+    near_limit = np.any(q < lower + reach) or np.any(q > upper - reach)
     pd = any(actuator.has_controller() for actuator in actuators(plant))
-    solves = model.double.touches() or near_limit or pd or plant.num_constraints()
+    solves = model.double.touches() or near_limit or pd or model.num_constraints
     return SAP_RELATIVE_TOLERANCE if solves else 0.0
 
 
@@ -211,9 +210,9 @@ def unsolved(model: Model, x_next: Array) -> Array:
     the step; the momentum that gravity gives in it is among what SAP compares with.
     """
     plant, context = model.plant, model.double.context
-    mass, v = plant.CalcMassMatrix(context), x_next[model.nq :]
+    mass, v = model.double.mass_matrix(), x_next[model.nq :]
     weight = np.sqrt(np.diag(mass))
-    given = model.time_step * np.asarray(plant.CalcGravityGeneralizedForces(context))
+    given = model.time_step * model.double.own_force(np.asarray(plant.CalcGravityGeneralizedForces(context)))
     momentum = max(float(np.linalg.norm(p / weight)) for p in (mass @ v, given))
     speed = SAP_RELATIVE_TOLERANCE * momentum / weight
     return np.concatenate([model.time_step * speed, speed])

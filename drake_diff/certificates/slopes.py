@@ -201,8 +201,7 @@ class Motions:
         twin, nq = self._finer.double, self.model.nq
         set_state(twin, x)
         if ahead:
-            rate = np.asarray(twin.plant.MapVelocityToQDot(twin.context, x[nq:])).ravel()
-            twin.plant.SetPositions(twin.context, x[:nq] + self._finer.time_step * rate)
+            set_state(twin, np.concatenate([x[:nq] + self._finer.time_step * twin.rates(x[nq:]), x[nq:]]))
         try:
             pairs = twin.plant.get_geometry_query_input_port().Eval(twin.context).ComputePointPairPenetration()
         except RuntimeError as error:

@@ -87,7 +87,7 @@ def analytic_of(model: Model) -> SmoothStep | Refusal:
 
 def certified(model: Model, smooth: SmoothStep) -> SmoothStep | Refusal:
     """`smooth` where it is Drake's step and AutoDiffXd's derivative at three random states, else why not."""
-    here = model.plant.GetPositionsAndVelocities(model.double.context)
+    here = model.double.state()
     try:
         why = _first_difference(model, smooth)
         return Refusal(why) if why else smooth
@@ -141,7 +141,7 @@ def _random_point(model: Model, coordinates: Coordinates, random: np.random.Gene
 
     Limits wider than FAR are as good as none: what is far from 0 is not what a derivative can be checked at.
     """
-    lower, upper = model.plant.GetPositionLowerLimits(), model.plant.GetPositionUpperLimits()
+    lower, upper = model.position_limits
     middle = np.clip(0.0, lower, upper)
     lower, upper = np.maximum(lower, middle - FAR), np.minimum(upper, middle + FAR)
     q = lower + random.uniform(0.25, 0.75, model.nq) * (upper - lower)

@@ -15,6 +15,7 @@ from pydrake.multibody.tree import MultibodyForces
 from drake_diff._base.arrays import Array
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.joint_impulses import NEAR_RIGID, JointImpulses
+from drake_diff.model.mimic import joints_of_mimics
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
 
@@ -43,6 +44,9 @@ class Couplers:
 def couplers_of(model: Model) -> Couplers | Refusal:
     """Those that act in the model's steps; a Refusal where a constraint is none, or could not be read."""
 
+    if model.coupling is not None:
+        return model.cache("couplers", lambda: _known(model), of_structure=True)
+
     def read() -> Couplers | Refusal:
         found = []
         for constraint in model.plant.GetConstraintIds():
@@ -56,6 +60,15 @@ def couplers_of(model: Model) -> Couplers | Refusal:
         return Couplers(np.array(directions).reshape(-1, model.nv), np.array(offsets, dtype=float))
 
     return model.cache("couplers", read, of_structure=True)
+
+
+def _known(model: Model) -> Couplers:
+    """Those of mimic joints that are reduced, in the velocities of the whole plant."""
+    pairs = joints_of_mimics(model.plant, model.coupling.mimics if model.coupling is not None else ())
+    directions = np.zeros((len(pairs), model.plant.num_velocities()))
+    for row, (mimic, follower, leader) in zip(directions, pairs, strict=True):
+        row[follower.velocity_start()], row[leader.velocity_start()] = 1.0, -mimic.ratio
+    return Couplers(directions, np.array([mimic.offset for mimic, _, _ in pairs]))
 
 
 def _read(model: Model, constraint: Any) -> tuple[Array, float] | Refusal:

@@ -75,7 +75,7 @@ def takes_many(model: Model) -> bool:
 
 def _by_tree(form: "Form", tree: TreeDynamics, steps: Steps) -> tuple[Array, Array]:
     """(N, nx, nx + nu) the derivatives of N steps, and (N,) the force that is not accounted for, as a part."""
-    n, h, damping = steps.model.nv, steps.model.time_step, tree.damping
+    n, h, damping = steps.model.nv, steps.model.time_step, tree.own_damping
     q, v, v_next = steps.xs[:, :n], steps.xs[:, n:], steps.x_next[:, n:]
     effort, free, (kp, kd) = form.effort(q, v_next, steps.us, h)
     d = tree(tree.place(steps.model, q), q, v, (v_next - v) / h)
@@ -120,7 +120,7 @@ def _by_autodiff(form: "Form", steps: Steps, k: int, jacobian: Array) -> float:
         rows = rows + gradient_rows(model.autodiff.damping() * change, len(variables))
     pressed = form.actuation * free  # (nv, nu) what an input that is not at its limit does
     by_point = np.concatenate([rows[:, :nx], -pressed, rows[:, nx:]], axis=1)
-    by_next = model.plant.CalcMassMatrix(twin.context) / h
+    by_next = model.double.mass_matrix() / h
     by_next[form.diagonal] += damping
     by_point[:, nq:nx] -= by_next  # through (v' - v) / h and D (v' - v)
     if form.pd:
@@ -146,9 +146,9 @@ def _positions(model: Model, form: "Form", v_next: Array, velocities: Array, num
         return np.asarray(moved)
     own = np.eye(model.nq, velocities.shape[1])
     twin = model.autodiff
-    q_dot = np.asarray(twin.plant.MapVelocityToQDot(twin.context, np.array([AutoDiffXd(v) for v in v_next])))
+    q_dot = twin.rates(np.array([AutoDiffXd(v) for v in v_next]))
     own[:, : model.nx] += model.time_step * gradient_rows(q_dot, model.nx + num_parameters)[:, : model.nx]
-    n = np.array([model.plant.MapVelocityToQDot(model.double.context, e) for e in np.eye(model.nv)]).T
+    n = np.array([model.double.rates(e) for e in np.eye(model.nv)]).T
     return np.asarray(own + model.time_step * n @ velocities)
 
 
@@ -169,16 +169,13 @@ class Form:
     q_dot_is_v: bool
 
     def effort(self, q: Array, v_next: Array, u: Array, h: float) -> tuple[Array, NDArray[np.bool_], Any]:
-        """(..., nu) what the inputs are before they are clipped, whether they are not beyond their limits, and kp, kd.
-
-        Exactly at a limit the derivative is that of the inside, as AutoDiffXd's is: there plans end up, and stay.
-        """
+        """(..., nu) what the inputs are before they are clipped, whether they are free of their limits, and kp, kd."""
         kp, kd = self.gains()
         effort = u
         if self.pd:
             moved = q[..., self.position] + h * v_next[..., self.velocity] - self.reference[0]
             effort = u - kp * moved - kd * (v_next[..., self.velocity] - self.reference[1])
-        return effort, np.abs(effort) <= self.limit, (kp, kd)
+        return effort, np.abs(effort) < self.limit, (kp, kd)
 
     def gains(self) -> tuple[Array, Array]:
         """kp (nu,) and kd (nu,), zero where there is no controller; they may change as parameters do."""
@@ -196,20 +193,21 @@ def form_of(model: Model) -> Form:
 def _read_form(model: Model) -> Form:
     found = actuators(model.plant)
     velocity = np.array([a.joint().velocity_start() for a in found], dtype=int)
-    actuation = np.zeros((model.nv, len(found)))
-    actuation[velocity, np.arange(len(found))] = 1.0
+    position = np.array([a.joint().position_start() for a in found], dtype=int)
+    if model.coupling is not None:  # of inputs with PD control only, which such a model has not
+        velocity, position = model.coupling.of_v[velocity], model.coupling.of_q[position]
     references = np.zeros((2, len(found)))
     for instance, target in model.pd_targets.items():
         driven = [i for i, a in enumerate(found) if a.model_instance() == instance]
         references[:, driven] = np.asarray(target).reshape(2, len(driven))
     why = _why_driven(model)
     return Form(
-        excluded="constraints act at every step" if model.plant.num_constraints() else why,
+        excluded="constraints act at every step" if model.num_constraints else why,
         driven=why,
         actuators=found,
         velocity=velocity,
-        position=np.array([a.joint().position_start() for a in found], dtype=int),
-        actuation=actuation,
+        position=position,
+        actuation=model.actuation,
         limit=np.array([a.effort_limit() for a in found], dtype=float),
         reference=references,
         diagonal=np.diag_indices(model.nv),
@@ -226,6 +224,8 @@ def _why_driven(model: Model) -> str:
             return f"the diagram feeds {port.get_name()}"
     if any(joint.is_locked(model.double.context) for joint in joints(plant)):
         return "a joint is locked"
+    if model.coupling is not None and any(a.has_controller() for a in actuators(plant)):
+        return "PD control acts on reduced coordinates"
     instances = {a.model_instance() for a in actuators(plant) if a.has_controller()}
     targets = [plant.get_desired_state_input_port(instance) for instance in instances]
     driven = any(is_driven(model.diagram, model.path, port) for port in targets)

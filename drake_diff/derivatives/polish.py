@@ -94,24 +94,51 @@ def solves_the_step(model: Model, x: Array, u: Array, end: Array) -> bool:
 
     False where the step's equation is not known, or is not Drake's.
     """
-    form = form_of(model)
-    if _unknown(model, form):
-        return False
+    form, couplers = form_of(model), couplers_of(model)
+    if model.coupling is not None or isinstance(couplers, Refusal) or form.driven:
+        return False  # of reduced coordinates what Drake's solver leaves in the others is not known from `end`
     drake = advance(model.double, x, u)
     read = _read(model, _settings(model, form), 0)
     if isinstance(read, Refusal):
         return False
     v_next = np.array([drake[model.nq :], end[model.nq :]])
-    problems = _problems(model, form, [read, read], np.array([x, x]), np.array([u, u]))
+    problems = _problems(model, form, [read, read], np.array([x, x]), np.array([u, u]), couplers)
     _, _, refused = _solved(problems, np.array([x, x])[:, model.nq :], v_next)
     moved = _states(model, x[None], v_next[1:])[0] - end
     return not refused and bool(np.all(np.abs(moved) <= FREE_STEP * np.maximum(1.0, np.abs(end))))
 
 
 def _polish(model: Model, vector: ParameterVector, xs: Array, us: Array, values: Array | None) -> Polished:
-    """Of one time step."""
+    """Of one time step. Reduced coordinates are read from the step of the whole plant, as in `advance`."""
+    if model.coupling is None:
+        return _polish_whole(model, vector, xs, us, values, couplers_of(model))
+    whole = _polish_whole(model.whole, vector, model.coupling.state(xs), us, values, couplers_of(model))
+    drake, x_next = np.empty_like(xs), np.full_like(xs, np.nan)
+    try:
+        for k, x in enumerate(xs):
+            if values is not None:
+                vector.write(model.double, values[k])
+            set_state(model.double, x)
+            drake[k] = model.double.next_state(whole.drake[k])
+            if k not in whole.refused:
+                x_next[k] = model.double.next_state(whole.x_next[k])
+    finally:
+        if values is not None:
+            vector.write(model.double, vector.values)
+    return Polished(x_next, drake, whole.acts, whole.left, whole.refused)
+
+
+def _polish_whole(
+    model: Model,
+    vector: ParameterVector,
+    xs: Array,
+    us: Array,
+    values: Array | None,
+    couplers: Couplers | Refusal,
+) -> Polished:
+    """With all coordinates of the plant."""
     form = form_of(model)
-    why = _unknown(model, form)
+    why = couplers.reason if isinstance(couplers, Refusal) else form.driven
     drake, refused = np.empty_like(xs), {}
     read: list[_Read] = []
     settings: _Settings | None = None
@@ -137,19 +164,13 @@ def _polish(model: Model, vector: ParameterVector, xs: Array, us: Array, values:
         return Polished(x_next, drake, acts, left, {k: Refusal(why) for k in range(len(xs))})
     if read:
         which = np.array([r.step for r in read], dtype=np.intp)
-        problems = _problems(model, form, read, xs[which], us[which])
+        problems = _problems(model, form, read, xs[which], us[which], couplers)
         acts[which] = problems.taking_part().any(axis=1)
         v_next, left[which], whys = _solved(problems, xs[which, model.nq :], drake[which, model.nq :])
         refused |= {int(which[i]): Refusal(why) for i, why in whys.items()}
         x_next[which] = _states(model, xs[which], v_next)
     x_next[list(refused)] = np.nan
     return Polished(x_next, drake, acts, left, refused)
-
-
-def _unknown(model: Model, form: Form) -> str:
-    """What acts in every step of the model that its equation here does not have; empty where nothing does."""
-    couplers = couplers_of(model) if model.plant.num_constraints() else None
-    return couplers.reason if isinstance(couplers, Refusal) else form.driven
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +257,9 @@ def _material(model: Model, settings: _Settings, geometry: Any) -> Array | Refus
     return settings.material[geometry]
 
 
-def _problems(model: Model, form: Form, read: list[_Read], xs: Array, us: Array) -> ConvexSteps:
+def _problems(
+    model: Model, form: Form, read: list[_Read], xs: Array, us: Array, couplers: Couplers | Refusal
+) -> ConvexSteps:
     """The convex problems of N steps."""
     h, nq, diagonal = model.time_step, model.nq, np.arange(model.nv)
     controlled = np.array([a.has_controller() for a in form.actuators], dtype=bool)
@@ -255,8 +278,7 @@ def _problems(model: Model, form: Form, read: list[_Read], xs: Array, us: Array)
         kp, kd = (np.array([getattr(r.settings, name)[which] for r in read]) for name in ("kp", "kd"))
         pd = Controllers(form.velocity[which], kp, kd, form.reference[:, which], form.limit[which])
         parts.append(pd.impulses(q, us[:, which], weights, h))
-    couplers = couplers_of(model) if model.plant.num_constraints() else None
-    if isinstance(couplers, Couplers):
+    if isinstance(couplers, Couplers) and len(couplers.offset):
         parts.append(couplers.impulses(q, weights, h))
     return ConvexSteps(
         A, momentum, _contact_impulses(model, read, v, weights), gather(parts, model.nv), _same_tree(model)
@@ -369,5 +391,5 @@ def _states(model: Model, xs: Array, v_next: Array) -> Array:
         rates = np.empty((len(xs), model.nq))
         for k, (x, v) in enumerate(zip(xs, v_next, strict=True)):
             set_state(model.double, x)
-            rates[k] = model.plant.MapVelocityToQDot(model.double.context, v)
+            rates[k] = model.double.rates(v)
     return np.concatenate([xs[:, : model.nq] + model.time_step * rates, v_next], axis=1)

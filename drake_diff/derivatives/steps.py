@@ -60,7 +60,7 @@ class Steps:
         Setting a state makes Drake forget what it computed in it, so that is done only where it must be.
         """
         twin, x = self.model.double, self.xs[k]
-        if twin.plant.GetPositionsAndVelocities(twin.context).tobytes() != x.tobytes():
+        if twin.state().tobytes() != x.tobytes():
             set_state(twin, x)
 
 

@@ -53,7 +53,7 @@ class DrakeEngine:
     def mass_matrix(self, q: ArrayLike) -> Array:
         q = finite_array("q", q, (self.model.nq,))
         set_state(self.model.double, np.concatenate([q, np.zeros(self.model.nv)]))
-        return np.asarray(self.model.plant.CalcMassMatrix(self.model.double.context))
+        return np.asarray(self.model.double.mass_matrix())
 
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
         q, v = finite_array("q", q, (self.model.nq,)), finite_array("v", v, (self.model.nv,))

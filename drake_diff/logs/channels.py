@@ -117,11 +117,12 @@ def _told(parts: Mapping[str, Sequence[Coordinate]]) -> dict[str, Any]:
 
 def _joint_states(shown: Shown, topic: str, xs: Array, efforts: Array | None) -> Channel:
     """foxglove.JointStates of every joint with one degree of freedom; efforts where an actuator drives it."""
-    plant = shown.model.plant
+    plant, coupling = shown.model.plant, shown.model.coupling
     single = [j for j in joints(plant) if j.num_positions() == 1 and j.num_velocities() == 1]
     driven = {a.joint().index(): i for i, a in enumerate(actuators(plant))}
     places = [
-        (j.name(), j.position_start(), shown.model.nq + j.velocity_start(), driven.get(j.index())) for j in single
+        (j.name(), j.position_start(), plant.num_positions() + j.velocity_start(), driven.get(j.index()))
+        for j in single
     ]
 
     def rows() -> Rows:
@@ -129,6 +130,7 @@ def _joint_states(shown: Shown, topic: str, xs: Array, efforts: Array | None) ->
         for k, (t, x) in enumerate(zip(shown.times(len(xs)), xs.tolist(), strict=True)):
             message = JointStates()
             _stamp(message.timestamp, t)
+            x = x if coupling is None else coupling.state(np.array(x)).tolist()  # joints that follow others, too
             for name, position, velocity, actuator in places:
                 state = message.joints.add(name=name, position=x[position], velocity=x[velocity])
                 if actuator is not None and k < len(applied):

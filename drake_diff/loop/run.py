@@ -332,7 +332,7 @@ class _LoopRun:
                     context, JacobianWrtVariable.kV, body.body_frame(), body.CalcCenterOfMassInBodyFrame(context),
                     plant.world_frame(), plant.world_frame(),
                 )  # fmt: skip
-                dv = np.linalg.solve(plant.CalcMassMatrix(context), J.T @ impulse)
+                dv = np.linalg.solve(self.model.double.mass_matrix(), self.model.double.own_force(J.T @ impulse))
                 x = np.concatenate([x[: self.model.nq], x[self.model.nq :] + dv])
                 told = f"{body.name()} is pushed by {np.linalg.norm(impulse):.3g} N s"
                 self.events.append(LoopEvent(k * self.model.time_step, "push", told))

@@ -55,7 +55,7 @@ def symbolic_plant(model: Model) -> PlantFunctions | Refusal:
             found = tree_of(model)
             return found if isinstance(found, Refusal) else Refusal("its tree differs from Drake's inverse dynamics")
         equations, random = EquationsOfMotion(model), np.random.default_rng(1)
-        here = model.plant.GetPositionsAndVelocities(model.double.context)
+        here = model.double.state()
         functions = _functions(tree, model, ca.DM(equations.actuation))
         probe = random.standard_normal((2, model.nx + model.nu))
         wanted = np.array([equations(row[: model.nx], row[model.nx :]) for row in probe])
@@ -70,13 +70,19 @@ def _functions(tree: TreeDynamics, model: Model, actuation: Any) -> PlantFunctio
     n, width = model.nv, model.nx + model.nu
     knot, weights, mu, a = (ca.SX.sym(s, k) for s, k in (("knot", width), ("w", 2 * n), ("mu", n), ("a", n)))
     q, v, u = knot[:n], knot[n : 2 * n], knot[2 * n :]
-    links, order = _links(tree, model), sorted(range(n), key=lambda k: tree.ancestors[k].sum())  # parents first
-    frames = [_frame(link, tree.hinge[k], q[k]) for k, link in enumerate(links)]
-    factors = ca.ldl(_mass(links, frames, tree.hinge, order) + ca.diag(tree.reflected))
+    coupling, all_q, all_v, E = tree.coupling, q, v, ca.DM.eye(n)
+    if coupling is not None:
+        E = ca.sparsify(ca.DM(coupling.spread))
+        all_q, all_v = E @ q + ca.DM(coupling.offset), E @ v
+    links = _links(tree, model)
+    order = sorted(range(len(links)), key=lambda k: tree.ancestors[k].sum())  # parents first
+    frames = [_frame(link, tree.hinge[k], all_q[k]) for k, link in enumerate(links)]
+    factors = ca.ldl(E.T @ (_mass(links, frames, tree.hinge, order) + ca.diag(tree.reflected)) @ E)
 
     def residual(a: Any) -> Any:
-        motion = _inverse_dynamics(links, frames, tree.hinge, order, v, a, tree.gravity) + ca.DM(tree.reflected) * a
-        return motion + ca.DM(tree.stiffness) * (q - ca.DM(tree.rest)) + ca.DM(tree.damping) * v
+        a = E @ a
+        motion = _inverse_dynamics(links, frames, tree.hinge, order, all_v, a, tree.gravity) + ca.DM(tree.reflected) * a
+        return E.T @ (motion + ca.DM(tree.stiffness) * (all_q - ca.DM(tree.rest)) + ca.DM(tree.damping) * all_v)
 
     solved = ca.ldl_solve(actuation @ u - residual(ca.SX.zeros(n)), *factors)
     r = residual(a)
@@ -112,7 +118,7 @@ class _Link:
 
 def _links(tree: TreeDynamics, model: Model) -> list[_Link]:
     """The bodies in the order of the joints."""
-    poses = tree.place(model, np.zeros((1, len(tree.mass))))[0]
+    poses = tree.place_all(model, np.zeros((1, len(tree.mass))))[0]
     turns = [_with_z(axis) for axis in tree.axis]
     frames = [(p[:, :3] @ t, p[:, :3] @ o + p[:, 3]) for p, t, o in zip(poses, turns, tree.origin, strict=True)]
     links: list[_Link] = []

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from drake_diff._base.arrays import Array, Indices, cross, skew
 from drake_diff._base.refusal import Refusal
 from drake_diff.mechanics.description import RigidLink, read_links, without_welds
+from drake_diff.model.mimic import Coupling
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
 from drake_diff.model.step import set_state
@@ -31,10 +32,11 @@ class Placing:
     on: dict[str, tuple[int, Any]]  # body -> (place among the links, pose on it)
     carried: NDArray[np.bool_]  # (L, L): whether link j carries link i, or is i
     nx: int
+    coupling: Coupling | None  # where q has the independent coordinates alone
 
     def __call__(self, q: Any) -> tuple[Any, Any]:
         """Rotations (..., L + 1, 3, 3) and origins (..., L + 1, 3) of the links, the world last, at q (..., nq)."""
-        q = np.asarray(q)
+        q = self._all(np.asarray(q))
         zero = 0.0 * q[..., :1]  # of the same kind of number as all else
         world, origin = np.eye(3) + zero[..., None], np.zeros(3) + zero
         turns: list[Any] = []
@@ -64,7 +66,8 @@ class Placing:
         `ways` (K, m, 3), for q (K, nq) and the `frames` there.
         """
         turns, places = frames
-        found = np.zeros((*points.shape[:2], self.nx))
+        q = self._all(q)
+        found = np.zeros((*points.shape[:2], max(self.nx, q.shape[1])))
         for j, link in enumerate(self.links):
             rows = np.flatnonzero((at >= 0) & self.carried[np.maximum(at, 0), j])
             if not len(rows):
@@ -80,7 +83,16 @@ class Placing:
             axis = (turns[:, j] @ link.axis)[:, None]
             moving = cross(axis, arm) if link.joint.kind == "revolute" else np.broadcast_to(axis, way.shape)
             found[:, rows, start] = np.sum(moving * way, axis=-1)
-        return found
+        if self.coupling is None:
+            return found
+        own = np.zeros((*points.shape[:2], self.nx))
+        for i, (k, ratio) in enumerate(zip(self.coupling.of_q, self.coupling.ratio_q, strict=True)):
+            own[:, :, k] += ratio * found[:, :, i]
+        return own
+
+    def _all(self, q: Any) -> Any:
+        """The positions (..., n) of all joints."""
+        return q if self.coupling is None else self.coupling.positions(q)
 
 
 def _times(matrix: Any, vector: Any) -> Any:
@@ -120,8 +132,8 @@ def placing_of(model: Model) -> Placing | Refusal:
         for i, link in enumerate(links):
             if link.parent >= 0:
                 carried[i] |= carried[link.parent]
-        placing = Placing(tuple(links), on, carried, model.nx)
-        here, random = model.plant.GetPositionsAndVelocities(model.double.context), np.random.default_rng(0)
+        placing = Placing(tuple(links), on, carried, model.nx, model.coupling)
+        here, random = model.double.state(), np.random.default_rng(0)
         same = all(_is_same(model, placing, random.standard_normal(model.nq)) for _ in range(2))
         set_state(model.double, here)
         return placing if same else Refusal("its links are not where Drake has them")
@@ -131,7 +143,7 @@ def placing_of(model: Model) -> Placing | Refusal:
 
 def _is_same(model: Model, placing: Placing, q: Array) -> bool:
     turns, places = placing(q)
-    model.plant.SetPositions(model.double.context, q)
+    set_state(model.double, np.concatenate([q, np.zeros(model.nv)]))
     for label, (place, pose) in placing.on.items():
         body = model.plant.world_body() if label == "world" else model.double.body(label)
         wanted = model.plant.EvalBodyPoseInWorld(model.double.context, body).GetAsMatrix34()

@@ -26,6 +26,7 @@ from drake_diff._base.arrays import Array, cross, skew
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.refusal import Refusal
 from drake_diff.mechanics.description import read_links, springs_of, without_welds
+from drake_diff.model.mimic import Coupling
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
 from drake_diff.model.step import set_state
@@ -58,9 +59,14 @@ class TreeDynamics:
     rest: Array  # (n,) [m or rad]
     damping: Array  # (n,)
     reflected: Array  # (n,) rotor inertia times gear ratio squared
+    coupling: Coupling | None  # where q, v and a are of the independent coordinates alone, and tau is along them
 
     def place(self, model: Model, q: Array) -> Array:
-        """(N, n, 3, 4) the children's poses at q (N, n), from Drake; the double context is left at the last."""
+        """(N, n, 3, 4) the children's poses at q (N, nq), from Drake; the double context is left at the last."""
+        return self.place_all(model, q if self.coupling is None else self.coupling.positions(q))
+
+    def place_all(self, model: Model, q: Array) -> Array:
+        """The same at the positions q (N, n) of all joints."""
         plant, context = model.plant, model.double.context
         poses = np.empty((*q.shape, 3, 4))
         for k, positions in enumerate(q):
@@ -70,7 +76,21 @@ class TreeDynamics:
         return poses
 
     def __call__(self, poses: Array, q: Array, v: Array, a: Array) -> InverseDynamics:
-        """Inverse dynamics at poses (N, n, 3, 4), q, v and a (each (N, n))."""
+        """Inverse dynamics at poses (N, n, 3, 4), q, v and a (each (N, nv))."""
+        if self.coupling is None:
+            return self._of_all(poses, q, v, a)
+        q, v, a = self.coupling.positions(q), self.coupling.velocities(v), self.coupling.velocities(a)
+        found, E = self._of_all(poses, q, v, a), self.coupling.spread
+        return InverseDynamics(found.tau @ E, *(E.T @ by @ E for by in (found.by_q, found.by_v, found.mass)))
+
+    @property
+    def own_damping(self) -> Array:
+        """(nv,) `damping` along the independent coordinates."""
+        coupling = self.coupling
+        return self.damping if coupling is None else np.asarray(coupling.forces(coupling.ratio_v * self.damping))
+
+    def _of_all(self, poses: Array, q: Array, v: Array, a: Array) -> InverseDynamics:
+        """Of all n joints."""
         S = self._motions(poses)
         inertia = self._inertias(poses)
         own, carried = np.eye(len(self.mass), dtype=bool), self.ancestors.astype(float)
@@ -192,6 +212,7 @@ def tree_of(model: Model) -> TreeDynamics | Refusal:
         rest=np.array([link.joint.rest for link in links]),
         damping=np.array([link.joint.damping for link in links]),
         reflected=np.array([link.joint.armature for link in links]),
+        coupling=model.coupling,
     )
 
 
@@ -210,7 +231,7 @@ def tree_for(model: Model) -> TreeDynamics | None:
         tree = tree_of(model)
         if isinstance(tree, Refusal):
             return None
-        random, here = np.random.default_rng(0), model.plant.GetPositionsAndVelocities(model.double.context)
+        random, here = np.random.default_rng(0), model.double.state()
         states = random.standard_normal((2, model.nx))
         same = all(_is_same(model, tree, x, random.standard_normal(model.nv)) for x in states)
         set_state(model.double, here)

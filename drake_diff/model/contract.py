@@ -239,15 +239,15 @@ def read_contract(
         scalar_types=("double", "AutoDiffXd"),
         gravity=_floats(plant.gravity_field().gravity_vector()),
         frame="world, z up; v of a floating body is w_WB then v_WBo, expressed in world",
-        positions=_terms(positions, _units(plant, 0), plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()),
-        velocities=_terms(velocities, _units(plant, 1), plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits()),
+        positions=_terms(positions, _units(twin, 0), *twin.position_limits),
+        velocities=_terms(velocities, _units(twin, 1), *twin.velocity_limits),
         inputs=_terms(inputs, efforts, plant.GetEffortLowerLimits(), plant.GetEffortUpperLimits()),
         bodies=tuple(_body(twin, body) for body in bodies(plant)),
         joints=tuple(_joint(twin, joint) for joint in joints(plant)),
         actuators=tuple(_actuator(actuator) for actuator in actuators(plant)),
         geometries=tuple(_geometry(twin, geometry) for geometry in geometries),
         contact=contact,
-        constraints=plant.num_constraints(),
+        constraints=plant.num_constraints() if twin.coupling is None else 0,
         notes=notes,
     )
 
@@ -257,13 +257,16 @@ def _terms(names: Any, units: Any, lower: Any, upper: Any) -> tuple[CoordinateTe
     return tuple(CoordinateTerms(*row) for row in rows)
 
 
-def _units(plant: Any, which: int) -> list[str]:
+def _units(twin: Twin, which: int) -> list[str]:
     """Units of q (which = 0) or v (which = 1), joint by joint."""
+    plant = twin.plant
     units = ["?"] * (plant.num_velocities() if which else plant.num_positions())
     for joint in joints(plant):
         start = joint.velocity_start() if which else joint.position_start()
         for i, unit in enumerate(_UNITS.get(joint.type_name(), ((), ()))[which]):
             units[start + i] = unit
+    if twin.coupling is not None:
+        return [units[i] for i in (twin.coupling.own_v if which else twin.coupling.own_q)]
     return units
 
 

@@ -32,10 +32,10 @@ class EquationsOfMotion:
     def __init__(self, model: Model):
         if model.pd_targets or any(a.has_controller() for a in actuators(model.plant)):
             raise ModelError("collocation: PD-controlled actuators have no continuous form; use method='shooting'")
-        if model.plant.num_constraints():
+        if model.num_constraints:
             raise ModelError("collocation: the model's constraints have no continuous form; use method='shooting'")
         self.model = model
-        self.actuation = model.plant.MakeActuationMatrix()
+        self.actuation = model.actuation
         self.plain_rates = model.plant.IsVelocityEqualToQDot()
 
     def __call__(self, x: Array, u: Array) -> Array:
@@ -51,9 +51,9 @@ class EquationsOfMotion:
         rest, mass = np.zeros((len(knots), model.nv)), np.tile(np.eye(model.nv), (len(knots), 1, 1))
         for k in np.flatnonzero(finite).tolist():
             x = knots[k, : model.nx]
-            twin.plant.SetPositionsAndVelocities(twin.context, x)
+            twin.set_state(x)
             rest[k] = twin.inverse_dynamics(still)
-            mass[k] = twin.plant.CalcMassMatrix(twin.context)
+            mass[k] = twin.mass_matrix()
             rates[k, : model.nq] = x[model.nq :] if self.plain_rates else self.q_dot(twin, x)
         force = knots[:, model.nx :] @ self.actuation.T - rest
         rates[finite, model.nq :] = np.linalg.solve(mass, force[..., None])[finite, :, 0]
@@ -77,13 +77,13 @@ class EquationsOfMotion:
     def q_dot(self, twin: Twin, x: Any) -> Any:
         """(nq,) N(q) v of x (nx,), whose positions are the twin's."""
         v = x[self.model.nq :]
-        return np.asarray(twin.plant.MapVelocityToQDot(twin.context, v)).ravel()
+        return twin.rates(v)
 
     def acceleration(self, u: Array) -> tuple[Array, Array]:
         """(dv/dt (nv,), M (nv, nv)) under u (nu,) in the double context's state."""
         twin = self.model.double
         rest = twin.inverse_dynamics(np.zeros(self.model.nv))
-        mass = twin.plant.CalcMassMatrix(twin.context)
+        mass = twin.mass_matrix()
         return np.linalg.solve(mass, self.actuation @ u - rest), mass
 
 

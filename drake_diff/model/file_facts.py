@@ -14,11 +14,30 @@ Key = tuple[str, str]  # the names of a model instance and of a joint in it
 
 
 @dataclass(frozen=True)
+class Mimic:
+    """q of `follower` = ratio * q of `leader` + offset, joints of one model instance, by their names.
+
+    `in_drake` says whether Drake's parser makes a constraint of it.
+    """
+
+    instance: str
+    follower: str
+    leader: str
+    ratio: float
+    offset: float
+    in_drake: bool
+
+    def __str__(self) -> str:
+        more = f" + {self.offset:g}" if self.offset else ""
+        return f"{self.follower} = {self.ratio:g} {self.leader}{more}"
+
+
+@dataclass(frozen=True)
 class JointFacts:
     """`efforts` [N or N m] are the limits that the files give, `followers` the joints that mimic another one."""
 
     efforts: dict[Key, float] = field(default_factory=dict)
-    followers: set[Key] = field(default_factory=set)
+    followers: dict[Key, Mimic] = field(default_factory=dict)
 
 
 def joint_facts(path: Path, packages: PackageMap) -> JointFacts:
@@ -38,28 +57,44 @@ def _read(path: Path, packages: PackageMap, instance: str | None, found: JointFa
             return
         root = ET.fromstring(path.read_text())
     except (ET.ParseError, OSError, RuntimeError, UnicodeDecodeError) as error:
-        raise ModelError(f"{path}: the limits of its joints cannot be read: {error}") from error
-    if root.tag == "robot":
-        name: str = instance or root.get("name") or ""
-        for joint in root.findall("joint"):
-            limit, mimic = joint.find("limit"), joint.find("mimic")
-            effort = None if limit is None else limit.get("effort")
-            _keep(found, (name, joint.get("name", "")), effort, follows=mimic is not None)
-    for model in root.findall("model"):  # of SDF
-        _read_sdf(model, instance or model.get("name") or "", found)
+        raise ModelError(f"{path}: its joints cannot be read: {error}") from error
+    try:
+        if root.tag == "robot":
+            _read_urdf(root, instance or root.get("name") or "", found)
+        for model in root.findall("model"):  # of SDF
+            _read_sdf(model, instance or model.get("name") or "", found)
+    except ValueError as error:
+        raise ModelError(f"{path}: its mimic joints cannot be read: {error}") from error
+
+
+def _read_urdf(robot: ET.Element, name: str, found: JointFacts) -> None:
+    for joint in robot.findall("joint"):
+        limit, mimic = joint.find("limit"), joint.find("mimic")
+        key = (name, joint.get("name", ""))
+        _keep(found, key, None if limit is None else limit.get("effort"))
+        if mimic is not None:
+            ratio, offset = float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0))
+            found.followers[key] = Mimic(*key, mimic.get("joint", ""), ratio, offset, in_drake=True)
 
 
 def _read_sdf(model: ET.Element, name: str, found: JointFacts) -> None:
     for joint in model.findall("joint"):
-        mimics = any(element.tag.endswith("mimic") for element in joint.iter())
-        _keep(found, (name, joint.get("name", "")), joint.findtext("axis/limit/effort"), follows=mimics)
+        key = (name, joint.get("name", ""))
+        _keep(found, key, joint.findtext("axis/limit/effort"))
+        own = next((element for element in joint if element.tag.endswith("}mimic")), None)
+        mimic = joint.find("axis/mimic")
+        if own is not None:  # Drake's element
+            ratio, offset = float(own.get("multiplier", 1)), float(own.get("offset", 0))
+            found.followers[key] = Mimic(*key, own.get("joint", ""), ratio, offset, in_drake=True)
+        elif mimic is not None:  # SDF's, which Drake does not read
+            ratio = float(mimic.findtext("multiplier") or 1)
+            offset = float(mimic.findtext("offset") or 0) - ratio * float(mimic.findtext("reference") or 0)
+            found.followers[key] = Mimic(*key, mimic.get("joint", ""), ratio, offset, in_drake=False)
     for inner in model.findall("model"):
         _read_sdf(inner, f"{name}::{inner.get('name', '')}", found)
 
 
-def _keep(found: JointFacts, key: Key, effort: str | None, *, follows: bool) -> None:
-    if follows:
-        found.followers.add(key)
+def _keep(found: JointFacts, key: Key, effort: str | None) -> None:
     try:
         found.efforts[key] = float(effort or 0)
     except ValueError:

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,7 +20,7 @@ from drake_diff._base.arrays import finite_array, positive_float
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, UnknownNameError
 from drake_diff.model.contract import Contract, read_contract
-from drake_diff.model.file_facts import joint_facts
+from drake_diff.model.file_facts import JointFacts, Mimic, joint_facts
 from drake_diff.model.load_file import (
     CONTACT_MODELS,
     DRAKES_REFUSALS,
@@ -28,6 +29,7 @@ from drake_diff.model.load_file import (
     read_into,
     replace_collision_geometry,
 )
+from drake_diff.model.mimic import Coupling, check_mimic, couple, coupling_of, fix_mimics, uncoupled
 from drake_diff.model.plant import (
     actuators,
     follow,
@@ -90,6 +92,7 @@ class Model(ShowsItsRepr):
         contact_geometry: str | None = None,
         rebuild: "Callable[..., Model] | None" = None,
         forces: tuple[AddedForce, ...] = (),
+        coupling: Coupling | None = None,
     ):
         self.diagram = diagram
         self.forces = forces  # they act beside the plant's own
@@ -100,19 +103,27 @@ class Model(ShowsItsRepr):
         self._rebuild = rebuild
         self._others: dict[frozenset[tuple[str, Hashable]], Model] = {}  # the same model with something changed
         self._cache: dict[Hashable, Any] = {}
+        self._whole: Model | None = None
         # What parameters in its contexts are, for the time being, not the model's own: see `parameters.applied`.
         self.other_quantities: frozenset[str] = frozenset()
         self.path = path_to_the_plant(diagram)
         self.plant: MultibodyPlant = follow(diagram, self.path)
         _check_plant(self)
-        self.nq: int = self.plant.num_positions()
-        self.nv: int = self.plant.num_velocities()
+        self.coupling = coupling  # where the state has the independent coordinates of the plant alone
+        self.nq: int = self.plant.num_positions() if coupling is None else len(coupling.own_q)
+        self.nv: int = self.plant.num_velocities() if coupling is None else len(coupling.own_v)
         self.nx = self.nq + self.nv
         self.nu: int = self.plant.num_actuators()
         self.time_step: float = self.plant.time_step()
         prefix = len(instances_with_joints(self.plant)) > 1  # only where names could clash
-        self.position_names: tuple[str, ...] = tuple(self.plant.GetPositionNames(add_model_instance_prefix=prefix))
-        self.velocity_names: tuple[str, ...] = tuple(self.plant.GetVelocityNames(add_model_instance_prefix=prefix))
+        positions = self.plant.GetPositionNames(add_model_instance_prefix=prefix)
+        velocities = self.plant.GetVelocityNames(add_model_instance_prefix=prefix)
+        if coupling is not None:
+            positions, velocities = (
+                [a[i] for i in of] for a, of in ((positions, coupling.own_q), (velocities, coupling.own_v))
+            )
+        self.position_names: tuple[str, ...] = tuple(positions)
+        self.velocity_names: tuple[str, ...] = tuple(velocities)
         self.state_names = self.position_names + self.velocity_names
         self.input_names = tuple(actuator.name() for actuator in actuators(self.plant))
 
@@ -133,7 +144,54 @@ class Model(ShowsItsRepr):
     def default_state(self) -> np.ndarray:
         """(nx,) the state that the file or diagram starts in."""
         context = self.plant.GetMyContextFromRoot(self.diagram.CreateDefaultContext())
-        return np.asarray(self.plant.GetPositionsAndVelocities(context))
+        state = np.asarray(self.plant.GetPositionsAndVelocities(context))
+        return state if self.coupling is None else np.asarray(self.coupling.own_state(state))
+
+    @property
+    def position_limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper (nq,) each [m or rad]; those of joints that follow a coordinate hold for it, too."""
+        return self.double.position_limits
+
+    @property
+    def velocity_limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper (nv,) each [m/s or rad/s]."""
+        return self.double.velocity_limits
+
+    @property
+    def whole(self) -> "Model":
+        """The model with all of the plant's coordinates, on the same contexts; itself where none is left out."""
+        if self.coupling is None:
+            return self
+        if self._whole is None:
+            self._whole = Model(self.diagram, source=self.source, notes=self.notes, forces=self.forces)
+            self._whole.double = replace(self.double, coupling=None)
+        self._whole.other_quantities = self.other_quantities
+        return self._whole
+
+    @property
+    def actuation(self) -> np.ndarray:
+        """B (nv, nu): the generalized force by the inputs."""
+        B = np.asarray(self.plant.MakeActuationMatrix())
+        return B if self.coupling is None else self.coupling.spread.T @ B
+
+    @property
+    def num_constraints(self) -> int:
+        """How many act in the plant beside those that the reduced state keeps to by itself."""
+        return int(self.plant.num_constraints()) if self.coupling is None else 0
+
+    def places(self, joint: Any) -> tuple[range, range]:
+        """Where the coordinates of a joint are in q and in v; empty of a joint that only follows another."""
+        i, j = joint.position_start(), joint.velocity_start()
+        if self.coupling is None:
+            return range(i, i + joint.num_positions()), range(j, j + joint.num_velocities())
+        q, v = (
+            np.flatnonzero((own >= start) & (own < start + count))
+            for own, start, count in (
+                (self.coupling.own_q, i, joint.num_positions()),
+                (self.coupling.own_v, j, joint.num_velocities()),
+            )
+        )
+        return tuple(range(int(p[0]), int(p[-1]) + 1) if len(p) else range(0) for p in (q, v))  # type: ignore[return-value]
 
     def at_time_step(self, time_step: float) -> "Model":
         """The same model at another time step [s]. ModelError where it came from a diagram, which has but one."""
@@ -234,7 +292,7 @@ class Model(ShowsItsRepr):
         for instance, target in self.pd_targets.items():
             plant.get_desired_state_input_port(instance).FixValue(context, target)
         scene_graph = scene_graph_beside(diagram, self.path)
-        return Twin(scalar, diagram, plant, scene_graph, root, context, defaults, self.forces)
+        return Twin(scalar, diagram, plant, scene_graph, root, context, defaults, self.forces, self.coupling)
 
     @cached_property
     def pd_targets(self) -> dict[Any, np.ndarray]:
@@ -280,6 +338,7 @@ def load_model(
     fix_joints: Sequence[str] = (),
     packages: Mapping[str, str | Path] | None = None,
     contact: bool = True,
+    mimic: str | None = None,
 ) -> Model:
     """The robot in a URDF, SDF, MJCF (.xml) or .dmd.yaml file as a discrete model.
 
@@ -304,6 +363,10 @@ def load_model(
         packages: The folder of each package:// that the file names, by the name of the package. Without it that is the
             nearest folder of that name above the file. Nothing is ever downloaded.
         contact: False takes every collision shape away.
+        mimic: What becomes of joints that follow others, as a gripper's second finger does, and which Drake holds
+            together by constraints: "reduce" takes the followers out of the state, whose equations are then those of
+            the independent coordinates; "fix" welds followers and leaders where they are. None keeps all in the state,
+            as Drake does; collocation and other engines refuse such a model.
 
     Returns:
         The Model. What was left out of the file (such as meshes in formats that Drake cannot use) and what was added
@@ -325,6 +388,7 @@ def load_model(
         _check_choice("contact_geometry", contact_geometry, ROUTES)
     if not isinstance(contact, bool):
         raise InputError("contact", got=repr(contact), expected="True or False")
+    check_mimic(mimic)
     try:
         source = Path(path)
     except TypeError as error:
@@ -350,9 +414,11 @@ def load_model(
         "fix_joints": as_names("fix_joints", fix_joints),
         "packages": as_packages(packages),
         "contact": contact,
+        "mimic": mimic,
     }
     read = read_into(plant, source, options["packages"])
-    notes = read.notes + _repaired(plant, scene_graph, source, read.packages, options)
+    repairs, mimics = _repaired(plant, scene_graph, source, read.packages, options)
+    notes = read.notes + repairs
     if notes:
         warnings.warn("\n  ".join([f"{source.name}:", *notes]), ModelWarning, stacklevel=2)
     if contact_geometry is not None:
@@ -364,13 +430,16 @@ def load_model(
         diagram = builder.Build()
     except DRAKES_REFUSALS as error:
         raise ModelError(f"{source}: expected a model that Drake can finalize; Drake says: {error}") from error
+    coupling = coupling_of(plant, mimics)
 
     def rebuild(**changes: Any) -> Model:
         for option in changes.keys() - options.keys():
             raise UnknownNameError("option of load_model", got=option, known=options)
         return load_model(source, **{**options, **changes})
 
-    model = Model(diagram, source=source, notes=notes, contact_geometry=contact_geometry, rebuild=rebuild)
+    model = Model(
+        diagram, source=source, notes=notes, contact_geometry=contact_geometry, rebuild=rebuild, coupling=coupling
+    )
     model.options = options
     return model
 
@@ -422,23 +491,27 @@ def _check_choice(subject: str, value: str, known: tuple[str, ...]) -> None:
 
 def _repaired(
     plant: MultibodyPlant, scene_graph: SceneGraph, source: Path, packages: PackageMap, options: dict[str, Any]
-) -> tuple[str, ...]:
-    """Change the plant as `options` say; a sentence for each change. ModelError names the file."""
+) -> tuple[tuple[str, ...], tuple[Mimic, ...]]:
+    """Change the plant as `options` say: a sentence for each change, and what is reduced. ModelError names the file."""
     base, weld_base, asked = options["base"], options["weld_base"], options["actuators"]
     if base is not None and weld_base is not None:
         raise InputError("base", got=f"{base!r} and weld_base={weld_base!r}", expected="one of them")
     if options["ground"] is not None and not options["contact"]:
         raise InputError("ground", got="contact=False too", expected="contact, without which nothing stands on it")
+    choice = options["mimic"]
     try:
-        notes = fix(plant, options["fix_joints"])
+        facts = JointFacts() if asked is None and choice is None else joint_facts(source, packages)
+        mimics = () if choice is None else uncoupled(plant, facts.followers.values())
+        notes = fix_mimics(plant, mimics) if choice == "fix" else ()
+        notes += fix(plant, options["fix_joints"])
+        notes += couple(plant, mimics) if choice == "reduce" else ()
         if asked is not None:
-            facts = joint_facts(source, packages)
             notes += add_actuators(plant, asked, facts.efforts, facts.followers)
         if weld_base is not None:
             weld_link(plant, weld_base)
         notes += hold_base(plant, base)
         notes += () if options["contact"] else take_away_contact(plant, scene_graph)
-        return notes + add_ground(plant, options["ground"])
+        return notes + add_ground(plant, options["ground"]), mimics if choice == "reduce" else ()
     except ModelError as error:
         raise ModelError(str(error) if str(error).startswith(str(source)) else f"{source}: {error}") from error
 

@@ -215,25 +215,28 @@ def fix(plant: MultibodyPlant, names: tuple[str, ...]) -> tuple[str, ...]:
         if plant.num_constraints():
             raise ModelError(
                 f"fix_joints={name!r}: Drake cannot take a joint out of a model with constraints, and this one has "
-                f"{plant.num_constraints()} (mimic joints, MJCF's equalities): fix the joint in the file"
+                f"{plant.num_constraints()} (mimic joints, MJCF's equalities): "
+                "give mimic=, or fix the joint in the file"
             )
-        for actuator in [a for a in actuators(plant) if a.joint().index() == joint.index()]:
-            plant.RemoveJointActuator(actuator)
         q = float(joint.default_positions()[0])
-        parent, child = joint.frame_on_parent(), joint.frame_on_child()
-        axis = np.asarray(joint.revolute_axis() if isinstance(joint, RevoluteJoint) else joint.translation_axis())
-        moved = RigidTransform(_turn(axis, q)) if isinstance(joint, RevoluteJoint) else RigidTransform(q * axis)
         try:
-            plant.RemoveJoint(joint)
+            weld(plant, joint, q)
         except DRAKES_REFUSALS as error:
             raise ModelError(f"fix_joints={name!r}: {_plain(error)}") from error
-        plant.AddJoint(WeldJoint(joint.name(), parent, child, moved))
         told.append(f"{name} at {q:g}")
     return (f"{len(told)} joints fixed: {', '.join(told)}.",) if told else ()
 
 
-def _turn(axis: Any, angle: float) -> Any:
-    return RotationMatrix(AngleAxis(angle, axis))
+def weld(plant: MultibodyPlant, joint: Any, q: float) -> None:
+    """Put a weld in the place of a revolute or prismatic joint at the position q; its actuators go."""
+    for actuator in [a for a in actuators(plant) if a.joint().index() == joint.index()]:
+        plant.RemoveJointActuator(actuator)
+    name, parent, child = joint.name(), joint.frame_on_parent(), joint.frame_on_child()
+    axis = np.asarray(joint.revolute_axis() if isinstance(joint, RevoluteJoint) else joint.translation_axis())
+    turned = RotationMatrix(AngleAxis(q, axis)) if isinstance(joint, RevoluteJoint) else None
+    moved = RigidTransform(turned, np.zeros(3)) if turned is not None else RigidTransform(q * axis)
+    plant.RemoveJoint(joint)
+    plant.AddJoint(WeldJoint(name, parent, child, moved))
 
 
 def take_away_contact(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:

@@ -76,9 +76,9 @@ def _touching(model: Model, random: np.random.Generator) -> Array | None:
 
 def _any(model: Model, random: np.random.Generator) -> Array:
     """A state within the limits, 5 % of the range apart from them; around the default where there are none."""
-    plant, nq = model.plant, model.nq
+    nq = model.nq
     x = np.array(model.default_state)
-    lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
+    lower, upper = model.position_limits
     limited = np.isfinite(lower) & np.isfinite(upper)
     lower, upper = np.where(limited, lower, 0), np.where(limited, upper, 0)
     reach = np.array([np.pi if coordinate.unit == "rad" else REACH for coordinate in model.contract.positions])
@@ -88,8 +88,7 @@ def _any(model: Model, random: np.random.Generator) -> Array:
         x[start : start + 4] = random.standard_normal(4)
         x[start : start + 4] /= np.linalg.norm(x[start : start + 4])
         x[start + 6] += REACH
-    lowest, highest = plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits()
-    x[nq:] = np.clip(SPEED * random.standard_normal(model.nv), lowest, highest)
+    x[nq:] = np.clip(SPEED * random.standard_normal(model.nv), *model.velocity_limits)
     return x
 
 

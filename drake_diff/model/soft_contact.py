@@ -119,6 +119,7 @@ def softened(model: Model, contact: SoftContact) -> Model:
         contact_geometry=model.contact_geometry,
         rebuild=rebuild if model.can_rebuild else None,
         forces=(*model.forces, contact),
+        coupling=model.coupling,
     )
     contact.force(soft.plant, soft.double.context)  # refuses what has no distance
     return soft
@@ -146,13 +147,15 @@ class Separation:
 
 def separations(twin: Twin) -> list[Separation]:
     """Every pair of geometries that may collide, always in the same order, in the context's state."""
-    plant, context, found = twin.plant, twin.context, []
-    mass = plant.CalcMassMatrix(context)
+    plant, context, found, coupling = twin.plant, twin.context, [], twin.coupling
+    mass = twin.mass_matrix()
     to_v = np.array([plant.MapQDotToVelocity(context, e) for e in np.eye(plant.num_positions())]).T
+    if coupling is not None:
+        to_v = to_v[np.ix_(coupling.own_v, coupling.own_q)]
     for pair, (a, b) in _pairs(plant, context):
-        rate = _distance_rate(plant, context, pair, (a, b))
+        rate = twin.own_force(_distance_rate(plant, context, pair, (a, b)))
         v = np.linalg.solve(mass, rate)
-        opening = plant.MapVelocityToQDot(context, v / max(rate @ v, np.finfo(float).tiny))
+        opening = twin.rates(v / max(rate @ v, np.finfo(float).tiny))
         names = (a.name(), b.name())
         found.append(Separation(names, float(pair.distance), rate @ to_v, opening, float(rate @ v)))
     return found

@@ -57,7 +57,7 @@ def set_state(twin: Twin, x: Any) -> None:
     """
     if not _is_finite(np.asarray(x)):
         raise SimulationError(f"a state is not finite: {x}")
-    twin.plant.SetPositionsAndVelocities(twin.context, x)
+    twin.set_state(x)
 
 
 def advance(twin: Twin, x: Any, u: Any) -> Any:
@@ -74,7 +74,7 @@ def advance(twin: Twin, x: Any, u: Any) -> Any:
         plant.get_applied_generalized_force_input_port().FixValue(context, twin.added_force())
     try:
         # value() is a view that the next step overwrites.
-        x_next = np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())
+        x_next = twin.next_state(np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value()))
     except (RuntimeError, SystemExit) as error:  # SystemExit: a condition in Drake, such as a stiffness above 0
         raise SimulationError(f"Drake cannot take this step: {error}") from error
     if not _is_finite(x_next):

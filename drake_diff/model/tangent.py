@@ -86,7 +86,7 @@ class TangentSpace:
 def tangent_space(model: Model) -> TangentSpace:
     """The tangent space of the state of `model`."""
     free = [joint for joint in joints(model.plant) if joint.type_name() == "quaternion_floating"]
-    starts = sorted(joint.position_start() for joint in free)
+    starts = sorted(model.places(joint)[0].start for joint in free)
     names = list(model.state_names)
     for start in reversed(starts):
         stem = names[start].removesuffix("_qw")

@@ -7,6 +7,8 @@ from typing import Any, Protocol
 import numpy as np
 from pydrake.multibody.tree import MultibodyForces_
 
+from drake_diff._base.arrays import Array
+from drake_diff.model.mimic import Coupling
 from drake_diff.model.plant import actuators, bodies, joints, labelled
 
 
@@ -81,6 +83,7 @@ class Twin:
     context: Any  # the plant's, inside root_context
     defaults: Any  # a root context that nobody touches
     own: tuple[AddedForce, ...] = ()  # the model's own beside Drake's, which no parameter changes
+    coupling: Coupling | None = None  # where x has the independent coordinates of the plant alone
     added: dict[str, AddedForce] = field(default_factory=dict)  # for parameters that Drake does not have
 
     def body(self, label: str) -> Any:
@@ -107,10 +110,65 @@ class Twin:
 
     def damping(self) -> Any:
         """(nv,) the joint damping coefficients in the context [N s/m or N m s/rad]."""
+        found = self._joint_damping()
+        if self.coupling is not None:
+            found = self.coupling.forces(self.coupling.ratio_v * found)
+        return found
+
+    def _joint_damping(self) -> Any:
         found = np.zeros(self.plant.num_velocities()).astype(self.scalar)
         for velocities, joint in self._moving_joints:
             found[velocities] = joint.GetDampingVector(self.context)
         return found
+
+    @property
+    def position_limits(self) -> tuple[Array, Array]:
+        """Lower and upper (nq,) each; of independent coordinates those that all joints' limits allow."""
+        limits = np.array(self.plant.GetPositionLowerLimits()), np.array(self.plant.GetPositionUpperLimits())
+        return limits if self.coupling is None else self.coupling.limits(*limits)
+
+    @property
+    def velocity_limits(self) -> tuple[Array, Array]:
+        """Lower and upper (nv,) each."""
+        limits = np.array(self.plant.GetVelocityLowerLimits()), np.array(self.plant.GetVelocityUpperLimits())
+        return limits if self.coupling is None else self.coupling.limits(*limits, of_velocities=True)
+
+    def set_state(self, x: Any) -> None:
+        """Put the state x (nx,) into the context."""
+        self.plant.SetPositionsAndVelocities(self.context, x if self.coupling is None else self.coupling.state(x))
+
+    def state(self) -> Any:
+        """(nx,) of the context."""
+        state = self.plant.GetPositionsAndVelocities(self.context)
+        return state if self.coupling is None else self.coupling.own_state(state)
+
+    def next_state(self, end: Any) -> Any:
+        """(nx,) of the plant's state after the step from the context's state, of which Drake made `end`."""
+        if self.coupling is None:
+            return end
+        plant, nq = self.plant, self.plant.num_positions()
+        A = plant.CalcMassMatrix(self.context) + np.diag(plant.time_step() * self._joint_damping())
+        v = self.coupling.next_velocities(A, end[nq:])
+        q = plant.GetPositions(self.context) + plant.time_step() * self._rates(self.coupling.velocities(v))
+        return np.concatenate([q[self.coupling.own_q], v])
+
+    def rates(self, v: Any) -> Any:
+        """(nq,) dq/dt at the context's positions and the velocities v (nv,)."""
+        if self.coupling is None:
+            return self._rates(v)
+        return self._rates(self.coupling.velocities(v))[self.coupling.own_q]
+
+    def _rates(self, v: Any) -> Any:
+        return np.asarray(self.plant.MapVelocityToQDot(self.context, v)).ravel()
+
+    def mass_matrix(self) -> Any:
+        """(nv, nv) in the context's state."""
+        mass = self.plant.CalcMassMatrix(self.context)
+        return mass if self.coupling is None else self.coupling.spread.T @ mass @ self.coupling.spread
+
+    def own_force(self, force: Any) -> Any:
+        """(nv,) of a generalized force on the plant's own velocities."""
+        return force if self.coupling is None else self.coupling.forces(force)
 
     @property
     def inspector(self) -> Any:
@@ -129,9 +187,13 @@ class Twin:
 
     def inverse_dynamics(self, acceleration: Any) -> Any:
         """(nv,) M a + bias less gravity, springs, damping and added forces, at the context's state."""
+        if self.coupling is not None:
+            acceleration = self.coupling.velocities(acceleration)
         self.plant.CalcForceElementsContribution(self.context, self._workspace)  # which overwrites it
         needed = self.plant.CalcInverseDynamics(self.context, acceleration, self._workspace)
-        return needed - self.added_force() if self.forces else needed  # AutoDiffXd's `forces` are a copy: not writable
+        if self.forces:  # AutoDiffXd's are a copy: not writable
+            needed = needed - self.added_force()
+        return needed if self.coupling is None else self.coupling.forces(needed)
 
     @property
     def forces(self) -> tuple[AddedForce, ...]:
@@ -139,7 +201,7 @@ class Twin:
         return (*self.own, *self.added.values())
 
     def added_force(self) -> Any:
-        """(nv,) the generalized force of `forces` in the state of the context."""
+        """The generalized force of `forces` in the state of the context, on the plant's own velocities."""
         return sum(force.force(self.plant, self.context) for force in self.forces)
 
     def reset(self) -> None:

@@ -57,7 +57,7 @@ class ContinuousMotion:
             raise ModelError(f"{contact.model} contact has none here")
         if any(actuator.has_controller() for actuator in actuators(plant)):
             raise ModelError("PD controllers have none")
-        if plant.num_constraints():
+        if model.num_constraints:
             raise ModelError("constraints have none")
         ports = (plant.get_applied_generalized_force_input_port(), plant.get_applied_spatial_force_input_port())
         if any(is_driven(model.diagram, model.path, port) for port in ports):
@@ -66,11 +66,11 @@ class ContinuousMotion:
         self.used = 0  # evaluations of the equations of motion by the last call of `states`
         self.touches = bool(contact.collision_pairs)
         self.is_sap = contact.approximation == "sap"
-        self.actuation = plant.MakeActuationMatrix()
+        self.actuation = model.actuation
         self.limits = np.array([actuator.effort_limit() for actuator in actuators(plant)]).reshape(model.nu)
         self.plain_rates = plant.IsVelocityEqualToQDot()
         self.still = np.zeros(model.nv)
-        self.lower, self.upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
+        self.lower, self.upper = model.position_limits
         self.materials: dict[tuple[Any, Any], tuple[float, ...]] = {}
 
     def states(self, x0: Array, us: Array) -> Array:
@@ -99,8 +99,8 @@ class ContinuousMotion:
         total = force - twin.inverse_dynamics(self.still)
         if self.touches:
             total = total + self.contact_force(v)
-        q_dot = v if self.plain_rates else np.asarray(twin.plant.MapVelocityToQDot(twin.context, v)).ravel()
-        return np.concatenate([q_dot, np.linalg.solve(twin.plant.CalcMassMatrix(twin.context), total)])
+        q_dot = v if self.plain_rates else twin.rates(v)
+        return np.concatenate([q_dot, np.linalg.solve(twin.mass_matrix(), total)])
 
     def contact_force(self, v: Array) -> Array:
         """(nv,) of all contacts in the context's state, whose velocity is `v` (nv,)."""
@@ -114,12 +114,14 @@ class ContinuousMotion:
         for pair in pairs:
             mu, k, d, tau, part = self.material(query.inspector(), pair.id_A, pair.id_B)
             point = part * np.asarray(pair.p_WCa) + (1 - part) * np.asarray(pair.p_WCb)
-            jacobian = np.zeros((3, self.model.nv))
+            jacobian = np.zeros((3, plant.num_velocities()))
             for sign, geometry in ((1, pair.id_A), (-1, pair.id_B)):
                 body = plant.GetBodyFromFrameId(query.inspector().GetFrameId(geometry))
                 p_BC = plant.CalcPointsPositions(context, world, point.reshape(3, 1), body.body_frame())
                 J = plant.CalcJacobianTranslationalVelocity(context, by_v, body.body_frame(), p_BC, world, world)
                 jacobian += sign * J
+            if self.model.coupling is not None:
+                jacobian = jacobian @ self.model.coupling.spread
             normal, relative = np.asarray(pair.nhat_BA_W), jacobian @ v
             rate = -float(normal @ relative)
             push = k * (pair.depth + tau * rate) if self.is_sap else k * pair.depth * max(0.0, 1 + d * rate)

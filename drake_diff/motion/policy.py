@@ -96,8 +96,12 @@ class PD:
         self.x_ref = finite_array("x_ref", model.default_state if x_ref is None else x_ref, (model.nx,))
         self.kp, self.kd = scale("kp", kp, model.nu), scale("kd", kd, model.nu)
         self.parameters = frozen(np.concatenate([self.kp, self.kd]))
-        self._positions = [joint.position_start() for joint in joints]
-        self._velocities = [model.nq + joint.velocity_start() for joint in joints]
+        places = [model.places(joint) for joint in joints]
+        if not all(len(q) for q, _ in places):
+            follower = next(joint.name() for joint, (q, _) in zip(joints, places, strict=True) if not len(q))
+            raise InputError("model", got=f"an actuator on {follower}, which follows another joint", expected="none")
+        self._positions = [q.start for q, _ in places]
+        self._velocities = [model.nq + v.start for _, v in places]
 
     def __call__(self, x: Any, t: float, parameters: Any = None) -> Any:
         gains = self.parameters if parameters is None else parameters

@@ -168,15 +168,15 @@ class Meter:
         inspector = model.double.inspector
         self.can_touch = inspector is not None and bool(inspector.GetCollisionCandidates())
         self.damping = model.double.damping()
-        self.actuation = self.plant.MakeActuationMatrix()
+        self.actuation = model.actuation
         self.states: list[tuple[Array, float, float, float]] = []
         self.ends: list[Array] = []
         self.efforts: list[Array] = []
         self.pushes: list[tuple[Array, Array]] = []  # of contact and of joint limits, (nv,) each
-        lower, upper = self.plant.GetPositionLowerLimits(), self.plant.GetPositionUpperLimits()
+        lower, upper = model.position_limits
         # Of each joint with limits its places in q and v, and the limits.
         self.limited = [
-            (i, j, lower[i], upper[i]) for i, j in _single(self.plant) if np.isfinite(lower[i]) or np.isfinite(upper[i])
+            (i, j, lower[i], upper[i]) for i, j in _single(model) if np.isfinite(lower[i]) or np.isfinite(upper[i])
         ]
         self.contacts: list[tuple[ContactPoint, ...]] = []
 
@@ -198,12 +198,12 @@ class Meter:
 
     def _contact_force(self) -> Array:
         """(nv,) the generalized force of all contacts in the last step."""
-        found = np.zeros(self.model.nv)
+        found = np.zeros(self.plant.num_velocities())
         for i in instances(self.plant):
             if self.plant.num_velocities(i):
                 force = self.plant.get_generalized_contact_forces_output_port(i).Eval(self.context)
                 self.plant.SetVelocitiesInArray(i, force, found)
-        return found
+        return np.asarray(self.model.double.own_force(found))
 
     def _limit_force(self, x: Array, x_next: Array, contact: Array) -> Array:
         """(nv,) what joints near a limit needed for the step beyond all other forces: the limit alone gives it."""
@@ -247,19 +247,19 @@ class Meter:
 
     def _violations(self, qs: Array) -> Array:
         """(N+1,) at the positions qs (N+1, nq)."""
-        if self.plant.num_constraints():
+        if self.model.num_constraints:
             return np.full(len(qs), np.inf)  # pydrake does not tell where a coupler, ball, weld or distance should be
-        lower, upper = self.plant.GetPositionLowerLimits(), self.plant.GetPositionUpperLimits()
+        lower, upper = self.model.position_limits
         found = np.maximum(lower - qs, qs - upper).max(axis=1, initial=0.0)
         for start in tangent_space(self.model).quaternions:
             found = np.maximum(found, np.abs(np.linalg.norm(qs[:, start : start + 4], axis=1) - 1))
         return np.asarray(found)
 
 
-def _single(plant: Any) -> list[tuple[int, int]]:
+def _single(model: Model) -> list[tuple[int, int]]:
     """The places in q and v of each joint of one degree of freedom."""
-    found = [joint for joint in joints(plant) if joint.num_positions() == joint.num_velocities() == 1]
-    return [(joint.position_start(), joint.velocity_start()) for joint in found]
+    found = [model.places(joint) for joint in joints(model.plant)]
+    return [(q.start, v.start) for q, v in found if len(q) == len(v) == 1]
 
 
 def smooth_mean(series: Array) -> float:

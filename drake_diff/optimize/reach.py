@@ -215,10 +215,10 @@ class _Trees:
         self.of_states = [-1] * model.nx
         for joint in joints(plant):
             number = self.number.get(int(joint.child_body().index()), -1)
-            q, v = joint.position_start(), model.nq + joint.velocity_start()
-            self.of_states[q : q + joint.num_positions()] = [number] * joint.num_positions()
-            self.of_states[v : v + joint.num_velocities()] = [number] * joint.num_velocities()
-        driven = np.flatnonzero(np.any(plant.MakeActuationMatrix() != 0, axis=1))
+            q, v = model.places(joint)
+            for i in [*q, *(model.nq + j for j in v)]:
+                self.of_states[i] = number
+        driven = np.flatnonzero(np.any(model.actuation != 0, axis=1))
         self.driven = {self.of_states[model.nq + i] for i in driven.tolist()}
         self.may_touch = tuple(self._candidates(model))
 

@@ -3,7 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from hashlib import sha256
 from typing import Any
@@ -15,8 +15,6 @@ from drake_diff.certificates.certificate import Certificate, certify_jacobian
 from drake_diff.certificates.certify import certify
 from drake_diff.exceptions import DrakeDiffError, GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.model.equations import EquationsOfMotion
-from drake_diff.model.model import Model
-from drake_diff.model.plant import actuators
 from drake_diff.model.soft_contact import SoftContact
 from drake_diff.optimize.advice import advice
 from drake_diff.optimize.drake_program import SOLVERS
@@ -35,8 +33,6 @@ from drake_diff.optimize.transcription.task import DEFAULT_SCHEME, SCHEMES, Opti
 
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": "riccati"}
-EFFORT_ROOM = 0.02  # [N or N m], or of the input: twice the widest step of a certificate's differences
-EFFORT_PART = 0.5  # of the limit at most, however small that is
 CERTIFIED_KNOTS = 5
 GUESS_NOISE = 1e-3  # of the largest input: breaks the symmetry of a guess that is a stationary point
 GUESS_ITERATIONS = 100  # of an attempt that is to find a guess for the next one
@@ -543,13 +539,8 @@ class Run:
         """xs and us of z, certificates of some of its steps, and why the goal or cost is out of its reach."""
         us = variables.unpack(z)[1]
         xs, parameters = variables.states(z), variables.parameters(z).to_dict()
-        inside, told = _inside_efforts(self.problem.model, us)
-        certificates = []
-        for k in _certified(us):
-            certificate = certify(self.problem.model, xs[k], inside[k], parameters=parameters)
-            told_here = "; ".join(text for text in (certificate.told, told[k]) if text)
-            certificates.append(replace(certificate, told=told_here))
-        return xs, us, tuple(certificates), why_blind(self.problem, variables, z)
+        certificates = tuple(certify(self.problem.model, xs[k], us[k], parameters=parameters) for k in _certified(us))
+        return xs, us, certificates, why_blind(self.problem, variables, z)
 
     def _certify_equations(self, jacobian: Any, xs: Array, us: Array) -> tuple[Certificate, ...]:
         """Certificates, at some knots, of the Jacobian that the solver gets against the equations themselves."""
@@ -568,21 +559,6 @@ class Run:
             )
             for k in _certified(us)
         )
-
-
-def _inside_efforts(model: Model, us: Array) -> tuple[Array, list[str]]:
-    """us (N, nu) with those at a motor's limit moved inside, for certificates, and for each knot which were.
-
-    Drake cuts inputs off at the limit, which is a corner. A Problem's bounds keep a plan on the inner side of it, where
-    the derivative that the solver uses holds; there the differences have room.
-    """
-    limits = np.array([np.inf if a.has_controller() else a.effort_limit() for a in actuators(model.plant)])
-    room = np.minimum(EFFORT_ROOM * np.maximum(1.0, np.abs(us)), EFFORT_PART * limits)
-    inside = np.minimum(np.maximum(us, room - limits), limits - room)
-    names = np.array(model.input_names)
-    told = [", ".join(names[moved]) + " certified beside the limit of its effort" if moved.any() else ""
-            for moved in inside != us]  # fmt: skip
-    return inside, told
 
 
 def _certified(us: Array) -> Array:

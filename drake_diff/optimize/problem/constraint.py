@@ -11,6 +11,7 @@ from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 from drake_diff._base.arrays import Array, array_with_gaps, frozen
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff.exceptions import GradientError, InputError
+from drake_diff.model.model import Model
 
 FORM = "a function of x, or of x and u, in ordinary arithmetic that gives a number or numbers (m,)"
 
@@ -198,13 +199,14 @@ def resolve_bounds(
     return Bounds(**found)
 
 
-def plant_limits(plant: Any) -> dict[str, Array]:
-    """A plant's own limits, by the fields' names of `Bounds`."""
+def plant_limits(model: Model) -> dict[str, Array]:
+    """A model's own limits, by the fields' names of `Bounds`."""
+    (q_lower, q_upper), (v_lower, v_upper) = model.position_limits, model.velocity_limits
     return {
-        "x_lower": np.concatenate([plant.GetPositionLowerLimits(), plant.GetVelocityLowerLimits()]),
-        "x_upper": np.concatenate([plant.GetPositionUpperLimits(), plant.GetVelocityUpperLimits()]),
-        "u_lower": np.asarray(plant.GetEffortLowerLimits()),
-        "u_upper": np.asarray(plant.GetEffortUpperLimits()),
+        "x_lower": np.concatenate([q_lower, v_lower]),
+        "x_upper": np.concatenate([q_upper, v_upper]),
+        "u_lower": np.asarray(model.plant.GetEffortLowerLimits()),
+        "u_upper": np.asarray(model.plant.GetEffortUpperLimits()),
     }
 
 

@@ -186,7 +186,7 @@ def plant_dynamics(model: Model) -> Dynamics:
         PlantKnots(model),
         model.nx,
         model.nu,
-        **plant_limits(model.plant),
+        **plant_limits(model),
         state_names=model.state_names,
         input_names=model.input_names,
     )

@@ -94,7 +94,7 @@ class Problem(ShowsItsRepr):
         self._set("optimize", _check_optimize(self.nu, self.optimize))
         if isinstance(system, Model):
             self._set("parameters", select(system, self.parameters))
-            own = plant_limits(system.plant)
+            own = plant_limits(system)
         else:
             given = self.parameters.names if isinstance(self.parameters, ParameterVector) else self.parameters
             if given:
