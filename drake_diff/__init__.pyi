@@ -41,6 +41,7 @@ from .optimize.problem.constraint import Bounds as Bounds
 from .optimize.problem.constraint import Constraint as Constraint
 from .optimize.problem.cost import QuadraticCost as QuadraticCost
 from .optimize.problem.dynamics import Dynamics as Dynamics
+from .optimize.problem.goals import FrameGoal as FrameGoal
 from .optimize.problem.problem import Problem as Problem
 from .optimize.solution import Solution as Solution
 from .optimize.solution import Status as Status

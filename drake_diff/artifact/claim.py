@@ -41,6 +41,8 @@ def _of_a_solve(record: EvidenceRecord) -> Iterator[str]:
     yield "bounds: " + ("; ".join(f"{side} {told}" for side, told in bounds if told) or "none")
     if p.get("waypoints"):
         yield f"waypoints {shown(p['waypoints'])}"
+    for goal in p.get("goals") or ():
+        yield f"goal {shown(goal)}"
     for c in p.get("constraints") or ():
         yield f"constraint {shown(c)}"
     yield from (f"{name.replace('_', ' ')} {shown(p[name])}" for name in COSTS if p.get(name) is not None)

@@ -10,12 +10,14 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.refusal import Refusal
+from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import select
 from drake_diff.model.plant import FLOATING, joints
 from drake_diff.model.quantities import description_of, made_from
 from drake_diff.optimize.problem.constraint import Bounds, Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost
+from drake_diff.optimize.problem.goals import FrameGoal, Goal
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.parts import ModelInput, Quantity
@@ -41,6 +43,7 @@ UNITS = {
     "free_horizon_s": "s",
     "x0, x_goal, x_lower, x_upper, waypoints": "those of `observation.variables`, entry by entry",
     "u_lower, u_upper": "those of `action.commands`, entry by entry",
+    "goals": "m and rad, and per s of velocities",
     "constraints": "those of what the constraint's function returns",
     "Q, R, rate": "cost per s and squared unit of the state or input; as a final cost without the s; rate: cost per s",
     "time_step": "s",
@@ -83,6 +86,7 @@ COSTS = ("running_cost", "final_cost", "trajectory_cost")
 LIMITS = ("x_lower", "x_upper", "u_lower", "u_upper")
 GAPS = {"lower": -np.inf, "upper": np.inf}  # what null is, of a bound
 GUESS = ("initial_guess", "initial_guess_sha256")
+GOALS: dict[str, Any] = {kind.__name__: kind for kind in (FrameGoal,)}  # by the name that a record has
 
 
 def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
@@ -90,10 +94,11 @@ def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
     time_step = problem.time_step if solution is None else solution.time_step
     options = {} if solution is None else solution.options
     goal = "" if np.all(np.isnan(problem.goal)) else " and ends in x_goal"
+    goals = ", goals" if problem.goals else ""
     equations = "Drake's equations" if problem.has_model else "the given equations"
     statement = (
         f"{problem.name}, by {equations}, starts in x0{goal} after {problem.num_steps} intervals, and "
-        f"keeps bounds and constraints at every knot; optimized: {', '.join(problem.optimize)}"
+        f"keeps bounds{goals} and constraints at every knot; optimized: {', '.join(problem.optimize)}"
     )
     return {
         "claim": Claim(statement=statement, limitations=LIMITATIONS),
@@ -264,6 +269,7 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
             }
             for c, at in zip(problem.constraints, knots, strict=True)
         ],
+        "goals": [goal.to_dict() for goal in problem.goals],
         "free_horizon_s": None if problem.horizon is None else list(problem.horizon),
         **{name: finite_list(getattr(problem.bounds, name)) for name in LIMITS},
         "optimize": list(problem.optimize),
@@ -315,7 +321,8 @@ def rebuild_problem(record: EvidenceRecord, model: Model, us: Array, start_us: A
     mask = np.array(p["initial_state_free"], dtype=bool)
     running, final = _rebuild_cost(p["running_cost"]), _rebuild_cost(p["final_cost"])
     goal = _numbers(p["x_goal"], np.nan)
-    if running is None and final is None and np.all(np.isnan(goal)):
+    goals = [_rebuild_goal(each) for each in p["goals"]]
+    if running is None and final is None and np.all(np.isnan(goal)) and not goals:
         final = QuadraticCost(Q=np.zeros((model.nx, model.nx)))  # a Problem wants a cost or a goal
     return Problem(
         model,
@@ -326,6 +333,7 @@ def rebuild_problem(record: EvidenceRecord, model: Model, us: Array, start_us: A
         x_goal=goal,
         waypoints={int(k): _numbers(x, np.nan) for k, x in p["waypoints"].items()},
         constraints=[_rebuild_constraint(c, model) for c in p["constraints"] if c["quantity"] is not None],
+        goals=goals,
         horizon=p["free_horizon_s"],
         bounds=Bounds(**bounds),
         optimize=p["optimize"],
@@ -343,6 +351,14 @@ def _rebuild_constraint(c: dict[str, Any], model: Model) -> Constraint:
     lower, upper = (_numbers(c[side], gap) for side, gap in GAPS.items())
     knots = None if c["every_knot"] else c["knots"]
     return Constraint(function, lower=lower, upper=upper, knots=knots, name=c["name"])
+
+
+def _rebuild_goal(told: Any) -> Goal:
+    if not (isinstance(told, dict) and len(told) == 1 and next(iter(told)) in GOALS):
+        raise InputError("goal", got=repr(told)[:80], expected=f"one of {', '.join(GOALS)} with its values")
+    ((kind, values),) = told.items()
+    found: Goal = GOALS[kind](**values)
+    return found
 
 
 def _numbers(values: Any, missing: float) -> Array:

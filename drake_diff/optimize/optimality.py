@@ -112,7 +112,7 @@ def _rows(problem: Problem, xs: Array, us: Array) -> Iterator[_Row]:
     for k, i in np.argwhere((xs <= lower + FEASIBILITY_TOLERANCE) | (xs >= upper - FEASIBILITY_TOLERANCE)):
         if k:
             yield _Row(int(k), np.eye(problem.nx)[i], none, *_signs(xs[k, i], lower[k, i], upper[k, i]))
-    for constraint in problem.constraints:
+    for constraint in problem.kept:
         for k in problem.knots_of(constraint, input_at_end=False):
             values, by_xu = constraint.differentiate(xs[k], us[min(k, len(us) - 1)])
             for value, slopes, least, most in zip(values, by_xu, constraint.lower, constraint.upper, strict=True):

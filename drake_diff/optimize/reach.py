@@ -171,7 +171,7 @@ class _Plan:
 
     def asks_of_what_moves(self) -> bool:
         """Whether a goal, constraint or the cost is about a coordinate that something moves."""
-        if np.any(~np.isnan(self.problem.goal) & self.moved) or self.problem.waypoints or self.problem.constraints:
+        if np.any(~np.isnan(self.problem.goal) & self.moved) or self.problem.waypoints or self.problem.kept:
             return True
         by_xs = RolloutCost(self.problem, self.variables).partials(self.z)[1]
         curved = (np.diag(self._hessian(k))[: self.problem.nx] for k in (1, len(self.xs) - 1))

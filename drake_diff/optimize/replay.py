@@ -318,15 +318,16 @@ def too_deep(model: Model, motion: Rollout) -> Iterator[str]:
 
 def _broken_constraints(plan: Plan, xs: Array, us: Array) -> Iterator[str]:
     """Of the constraints and waypoints, by a replay's states xs (N+1, nx) and us (N, nu) at the plan's knots."""
-    problem, ranges = plan.problem, {}
+    problem, tolerances = plan.problem, dict[str, float]()
     planned_xs, planned_us = plan.sample(1)
     for c in problem.constraints:  # its range is that along the whole plan: at a single knot it has none
         with np.errstate(all="ignore"):
             values = np.array([c(x, u) for x, u in zip(planned_xs, [*planned_us, planned_us[-1]], strict=True)])
         values = values[np.isfinite(values).all(axis=1)]
-        ranges[c.label] = max(float(np.ptp(values, axis=0).max()), SMALLEST_RANGE)
+        tolerances[c.label] = STATE_TOLERANCE * max(float(np.ptp(values, axis=0).max()), SMALLEST_RANGE)
+    tolerances |= {c.label: c.allowance for c in problem.kept_goals}  # a goal says itself how near is near enough
     for name, (excess, knot) in problem.constraint_excess(xs, us).items():
-        tolerance = STATE_TOLERANCE * ranges.get(name, float(np.max(plan.scale)))
+        tolerance = tolerances.get(name, STATE_TOLERANCE * float(np.max(plan.scale)))
         if not excess <= tolerance:
             yield f"{name} is broken by {excess:.3g} at knot {knot}, tolerance {tolerance:.3g}"
 

@@ -395,7 +395,7 @@ def limits_of_constraints(problem: Problem, variables: ShootingVariables) -> Row
     first, nx, nu = variables.steps.start, problem.model.nx, problem.model.nu
     knots = range(first, variables.steps.stop + variables.is_last)
     given = problem.initial_state_is_given
-    here = [(k - first, c) for c in problem.constraints for k in c.at_knots(problem.num_steps, given) if k in knots]
+    here = [(k - first, c) for c in problem.kept for k in c.at_knots(problem.num_steps, given) if k in knots]
 
     def values(z: Array) -> Array:
         xs, us = variables.states(z), variables.unpack(z)[1]

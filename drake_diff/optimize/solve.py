@@ -342,6 +342,7 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
             "dynamics": not problem.has_model,
             "waypoints": problem.waypoints,
             "constraints": problem.constraints,
+            "goals": problem.goals,
             "horizon": problem.horizon,
             "refine": attempt.refinement,
         }

@@ -33,7 +33,7 @@ class AugmentedLagrangian:
         self.problem = problem
         lower, upper = problem.state_limits()
         lower[0], upper[0] = -np.inf, np.inf
-        self.groups = [_Rows(problem, constraint) for constraint in problem.constraints]
+        self.groups = [_Rows(problem, constraint) for constraint in problem.kept]
         self.lower = np.concatenate([lower.ravel(), *(g.lower for g in self.groups)])
         self.upper = np.concatenate([upper.ravel(), *(g.upper for g in self.groups)])
         ends = np.cumsum([lower.size, *(g.size for g in self.groups)]).tolist()

@@ -15,6 +15,7 @@ from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, sel
 from drake_diff.optimize.problem.constraint import Constraint, check_inside, plant_limits, resolve_bounds, short
 from drake_diff.optimize.problem.cost import ConstantCost, FinalCost, QuadraticCost
 from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
+from drake_diff.optimize.problem.goals import Goal, GoalConstraint
 
 OPTIMIZABLE = ("controls", "initial_state", "parameters")
 # A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
@@ -40,6 +41,8 @@ class Problem(ShowsItsRepr):
         x_goal: (nx,) final state, a hard equality; NaN entries are free.
         waypoints: mapping from knots (1 ... N-1) to states (nx,), with NaN where free.
         constraints: a `Constraint`, or several.
+        goals: a goal in the robot's own words, such as a `FrameGoal`, or several; each keeps what it says of a motion
+            of the model.
         horizon: [s] time from the first state to the last, in N equal intervals, for collocation: a number, or
             (lower, upper) for a free final time. Plain dynamics need one.
         bounds: `Bounds`; where it says nothing, those of the model or the dynamics apply.
@@ -76,6 +79,7 @@ class Problem(ShowsItsRepr):
     x_goal: Any = None
     waypoints: Any = None  # becomes a dict
     constraints: Any = ()  # becomes a tuple of Constraints
+    goals: Any = ()  # becomes a tuple of Goals
     horizon: Any = None  # becomes a pair, or stays None
     bounds: Any = None  # Bounds
     optimize: Sequence[str] = ("controls",)
@@ -115,6 +119,8 @@ class Problem(ShowsItsRepr):
             self._set("x_goal", self._check_state("x_goal", self.x_goal))
         self._set("waypoints", self._check_waypoints())
         self._set("constraints", self._check_constraints())
+        self._set("goals", self._check_goals())
+        self._check_kept()
         if self.horizon is not None:
             self._set("horizon", _check_horizon(self.horizon))
         elif not self.has_model:
@@ -141,6 +147,7 @@ class Problem(ShowsItsRepr):
         if self.waypoints:
             lines.append(f"waypoints at knots {', '.join(map(str, self.waypoints))}")
         lines += [f"constraint: {constraint!r}" for constraint in self.constraints]
+        lines += [f"goal: {goal!r}" for goal in self.goals]
         named = f" ({', '.join(self.parameters.names)})" if self.parameters.names else ""
         lines.append(f"optimize: {', '.join(self.optimize)}{named}")
         return "\n  ".join(lines)
@@ -196,6 +203,17 @@ class Problem(ShowsItsRepr):
         """[s] the model's time step; for plain dynamics an interval of `start_horizon`."""
         return self.system.time_step if isinstance(self.system, Model) else self.start_horizon / self.num_steps
 
+    @cached_property
+    def kept(self) -> tuple[Constraint, ...]:
+        """All that a motion has to keep beside its bounds: the constraints, and those that the goals come to."""
+        return (*self.constraints, *self.kept_goals)
+
+    @cached_property
+    def kept_goals(self) -> tuple[GoalConstraint, ...]:
+        """What the goals come to on the model."""
+        bound = [constraint for goal in self.goals for constraint in goal.bind(self.model)]
+        return tuple(cast(GoalConstraint, constraint.resolved(self.x0, np.zeros(self.nu))) for constraint in bound)
+
     @property
     def optimizes_controls(self) -> bool:
         return "controls" in self.optimize
@@ -249,7 +267,7 @@ class Problem(ShowsItsRepr):
         """
         found: dict[str, tuple[float, int]] = {}
         where = np.arange(len(xs)) if knots is None else knots
-        for c in self.constraints:
+        for c in self.kept:
             at = self.knots_of(c, input_at_end=len(us) == len(xs))
             every = range(at[0], len(us) if c.takes_input else len(xs))  # from 1 where the first state is given
             rows: Any = every if c.knots is None else where[list(at)]
@@ -342,15 +360,28 @@ class Problem(ShowsItsRepr):
         for constraint in given:
             if not isinstance(constraint, Constraint):
                 raise InputError("constraints", got=type(constraint).__name__, expected="a Constraint or several")
-            self.knots_of(constraint, input_at_end=not self.has_model)
         return tuple(constraint.resolved(self.x0, np.zeros(self.nu)) for constraint in given)
+
+    def _check_goals(self) -> tuple[Goal, ...]:
+        given = self.goals if isinstance(self.goals, (tuple, list)) else (self.goals,)
+        for goal in given:
+            if not isinstance(goal, Goal):
+                raise InputError("goals", got=type(goal).__name__, expected="a goal such as FrameGoal, or several")
+        if given and not self.has_model:
+            raise InputError("goals", got="given", expected="none for plain dynamics: a goal is a model's")
+        return tuple(given)
+
+    def _check_kept(self) -> None:
+        """Bind the goals, which checks their names, and look at the knots of all that is kept."""
+        for constraint in self.kept:
+            self.knots_of(constraint, input_at_end=not self.has_model)
 
     def _check_costs(self) -> None:
         if isinstance(self.running_cost, (int, float)) and self.horizon is not None:
             self._set("running_cost", ConstantCost(positive_float("running_cost", self.running_cost)))
         costs = (self.running_cost, self.final_cost, self.trajectory_cost)
-        if all(cost is None for cost in costs) and np.all(np.isnan(self.goal)):
-            raise InputError("problem", got="no cost and no goal", expected="a cost, an x_goal, or both")
+        if all(cost is None for cost in costs) and np.all(np.isnan(self.goal)) and not self.goals:
+            raise InputError("problem", got="no cost and no goal", expected="a cost, an x_goal or goals")
         for name in ("running_cost", "final_cost", "trajectory_cost"):
             cost = getattr(self, name)
             if cost is not None and not callable(cost):
@@ -364,7 +395,7 @@ class Problem(ShowsItsRepr):
             return
         x, u = self.x0, np.zeros(self.nu)
         with applied(self.parameters), np.errstate(all="ignore"):
-            for constraint in self.constraints:
+            for constraint in self.kept:
                 constraint(x, u)
             if self.running_cost is not None:
                 self.running_cost(x, u)

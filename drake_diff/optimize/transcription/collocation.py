@@ -288,7 +288,7 @@ def violation_between_nodes(motion: Collocated) -> Excess:
     k, tau = np.tile(np.arange(count), len(inside)), np.repeat(inside, count)
     applied, ranges, (times, xs) = motion._applied(k, tau), task.problem.ranges(motion.xs), motion.between_knots
     found = [_beyond("state", states, xs, b.x_lower, b.x_upper, ranges, times)]
-    for c in task.problem.constraints:
+    for c in task.problem.kept:
         if c.knots is None:
             rows = np.flatnonzero((k > 0) | (tau > 0.5) | (not task.problem.initial_state_is_given))
             with np.errstate(all="ignore"):

@@ -334,7 +334,7 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
         _dynamics(task.dynamics),
         choose(rate.f, rate.values, rate.linearize, 1),
         final if final is None else choose(final.f, final.values, final.linearize, 1),
-        tuple(path(constraint) for constraint in task.problem.constraints),
+        tuple(path(constraint) for constraint in task.problem.kept),
     )
 
 

@@ -64,7 +64,7 @@ class TranscribedProgram:
         self.z = ca.MX.sym("z", len(self.lower))
         self.knots = ca.reshape(self.z[: self.every.size * self.width], self.width, self.every.size)
         self.time = self.z[-1] if self.free else ca.MX(task.horizon[0])
-        paths = zip(functions.paths, task.problem.constraints, strict=True)
+        paths = zip(functions.paths, task.problem.kept, strict=True)
         self.paths = [(f, task.nodes_of(constraint, mesh), constraint) for f, constraint in paths]
         self.rates, self.costs = functions.dynamics.values(self.knots), functions.rate.values(self.knots)
         self.rate_rows, self.cost_rows = functions.dynamics.jacobian(self.knots), functions.rate.jacobian(self.knots)
