@@ -22,7 +22,7 @@ from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, Sim
 from drake_diff.model.load_file import MEETS_A_SPHERE, autodiff_supports
 from drake_diff.model.model import Model
 from drake_diff.model.parameter_kinds import IDENTITY_OFFSET
-from drake_diff.model.plant import PROXIMITY, actuators, instances, is_driven, joints
+from drake_diff.model.plant import PROXIMITY, actuators, instances, joints
 from drake_diff.model.step import advance, check_point, set_state
 
 PARALLEL = 1e-6  # [rad] between face normals
@@ -283,8 +283,8 @@ def _pd_gains(place: Place) -> Found:
         if not with_gains:
             continue
         message = "Drake's conversion to AutoDiffXd drops these PD gains; drake_diff puts them back"
-        if is_driven(place.model.diagram, place.model.path, plant.get_desired_state_input_port(instance)):
-            message += "; their target is what your diagram feeds the desired state port, not differentiated by x or u"
+        if place.model.feeds(plant.get_desired_state_input_port(instance)):
+            message += "; their target is what your diagram feeds the desired state port"
         else:
             target = ", ".join(f"{value:g}" for value in place.model.pd_targets[instance])
             message += f"; their target [q; v] is fixed at ({target}), the default position at rest"
@@ -325,14 +325,19 @@ def _saturated_effort(place: Place) -> Found:
             yield Finding("error", "saturated_effort", "actuators", message, "give the joint an effort above 0")
     if not model.nu:
         return
-    effort = place.u  # [N or N m] what the actuators apply: u with PD control, clamped; u alone if no step succeeds
+    own = [actuators(plant)[i] for i in model.inputs.actuator[model.inputs.actuator >= 0]]
+    u_own = place.u[model.inputs.actuator >= 0]
+    effort = u_own  # [N or N m] what the actuators apply: u with PD control, clamped; u alone if no step succeeds
     if place.step_error is None:
         advance(twin, place.x, place.u)
-        effort = np.array(plant.get_net_actuation_output_port().Eval(twin.context))
+        net = np.array(plant.get_net_actuation_output_port().Eval(twin.context))
+        effort = net[model.inputs.actuator[model.inputs.actuator >= 0]]
     set_state(twin, np.concatenate([place.x[: model.nq], np.zeros(model.nv)]))
+    twin.set_input(place.u)
     # The effort nearest to what no acceleration at rest takes.
-    hold = np.linalg.lstsq(model.actuation, twin.inverse_dynamics(np.zeros(model.nv)), rcond=None)[0]
-    for actuator, u, now, rest in zip(actuators(plant), place.u, effort, hold, strict=True):
+    B = model.actuation[:, model.inputs.actuator >= 0]
+    hold = np.linalg.lstsq(B, twin.inverse_dynamics(np.zeros(model.nv)), rcond=None)[0]
+    for actuator, u, now, rest in zip(own, u_own, effort, hold, strict=True):
         limit = float(actuator.effort_limit())
         if abs(now) >= limit:
             message = f"its effort is at the limit {limit:g} (u is {u:.6g}): there the derivative by u is exactly 0"

@@ -70,9 +70,11 @@ def directions(model: Model, x0: Array, us: Array, vector: ParameterVector) -> I
     end, eye = space.size + us.size, np.eye(space.size + us.size + len(vector.values))
     for j, (name, scale) in enumerate(zip(space.names, state_scale(space, x0), strict=True)):
         yield Direction(f"{name}[0]", slice(j, j + 1), scale, eye[j], WIDEST * scale)
-    for j, actuator in enumerate(actuators(model.plant)):
+    limits = [actuator.effort_limit() for actuator in actuators(model.plant)]
+    cut = np.where(model.inputs.actuator >= 0, model.inputs.of_actuators(limits), np.inf)
+    for j, limit in enumerate(cut.tolist()):
         columns = slice(space.size + j, space.size + (count - 1) * nu + j + 1, nu)
-        room = float(np.abs(actuator.effort_limit() - np.abs(us[:, j])).min())  # what is cut off is no line
+        room = float(np.abs(limit - np.abs(us[:, j])).min())  # what is cut off is no line
         scale = max(1.0, float(np.abs(us[:, j]).max()))
         yield Direction(f"{model.input_names[j]} at all times", columns, scale, eye[columns].sum(axis=0), room)
     for j, (name, scale) in enumerate(zip(vector.names, vector.difference_scale(), strict=True)):

@@ -83,6 +83,8 @@ def _read(model: Model, constraint: Any) -> tuple[Array, float] | Refusal:
         filters.Apply(CollisionFilterDeclaration().ExcludeWithin(everything))
     for other in plant.GetConstraintIds():
         plant.SetConstraintActiveStatus(context, other, other == constraint)
+    if model.systems_act:
+        return Refusal(f"a constraint acts, and {model.systems_act}")
     if model.nu:
         plant.get_actuation_input_port().FixValue(context, np.zeros(model.nu))
     try:

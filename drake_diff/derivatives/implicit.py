@@ -30,7 +30,7 @@ from drake_diff.exceptions import DrakeDiffError
 from drake_diff.mechanics.tree import TreeDynamics, tree_for
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import write_autodiff
-from drake_diff.model.plant import actuators, is_driven, joints
+from drake_diff.model.plant import actuators, joints
 from drake_diff.model.step import set_state
 
 # Rounding of the forces that balance, relative to the largest of them. What a solver leaves is larger.
@@ -157,9 +157,9 @@ class Form:
     """What of a model does not change from step to step."""
 
     excluded: str  # why the form describes no step of the model; empty where it may
-    driven: str  # the same, but for constraints
+    driven: str  # the same, but for constraints and what the diagram's systems exert
     actuators: list[Any]
-    velocity: NDArray[np.int64]  # (nu,) the index in v of the joint that an input drives, and in q
+    velocity: NDArray[np.int64]  # (nu,) the index in v of the joint that an input drives, and in q; 0 of other inputs
     position: NDArray[np.int64]
     actuation: Array  # (nv, nu)
     limit: Array
@@ -180,7 +180,7 @@ class Form:
     def gains(self) -> tuple[Array, Array]:
         """kp (nu,) and kd (nu,), zero where there is no controller; they may change as parameters do."""
         if not self.pd:
-            return np.zeros(len(self.actuators)), np.zeros(len(self.actuators))
+            return np.zeros(len(self.limit)), np.zeros(len(self.limit))
         gains = [a.get_controller_gains() if a.has_controller() else None for a in self.actuators]
         return np.array([g.p if g else 0.0 for g in gains]), np.array([g.d if g else 0.0 for g in gains])
 
@@ -191,9 +191,10 @@ def form_of(model: Model) -> Form:
 
 
 def _read_form(model: Model) -> Form:
-    found = actuators(model.plant)
-    velocity = np.array([a.joint().velocity_start() for a in found], dtype=int)
-    position = np.array([a.joint().position_start() for a in found], dtype=int)
+    found, inputs = actuators(model.plant), model.inputs
+    joined = [(a.joint().velocity_start(), a.joint().position_start(), a.effort_limit()) for a in found]
+    at = inputs.of_actuators(np.reshape(joined, (len(found), 3)))
+    velocity, position = at[:, 0].astype(int), at[:, 1].astype(int)
     if model.coupling is not None:  # of inputs with PD control only, which such a model has not
         velocity, position = model.coupling.of_v[velocity], model.coupling.of_q[position]
     references = np.zeros((2, len(found)))
@@ -202,13 +203,13 @@ def _read_form(model: Model) -> Form:
         references[:, driven] = np.asarray(target).reshape(2, len(driven))
     why = _why_driven(model)
     return Form(
-        excluded="constraints act at every step" if model.num_constraints else why,
+        excluded="constraints act at every step" if model.num_constraints else why or model.systems_act,
         driven=why,
         actuators=found,
         velocity=velocity,
         position=position,
         actuation=model.actuation,
-        limit=np.array([a.effort_limit() for a in found], dtype=float),
+        limit=np.where(inputs.actuator >= 0, at[:, 2], np.inf),
         reference=references,
         diagonal=np.diag_indices(model.nv),
         pd=any(a.has_controller() for a in found),
@@ -219,14 +220,12 @@ def _read_form(model: Model) -> Form:
 def _why_driven(model: Model) -> str:
     """What acts on the model, beside constraints, that the form leaves out wherever it is; empty where nothing does."""
     plant = model.plant
-    for port in (plant.get_applied_generalized_force_input_port(), plant.get_applied_spatial_force_input_port()):
-        if is_driven(model.diagram, model.path, port):
-            return f"the diagram feeds {port.get_name()}"
     if any(joint.is_locked(model.double.context) for joint in joints(plant)):
         return "a joint is locked"
-    if model.coupling is not None and any(a.has_controller() for a in actuators(plant)):
+    controlled = [a for a in actuators(plant) if a.has_controller()]
+    if model.coupling is not None and controlled:
         return "PD control acts on reduced coordinates"
-    instances = {a.model_instance() for a in actuators(plant) if a.has_controller()}
-    targets = [plant.get_desired_state_input_port(instance) for instance in instances]
-    driven = any(is_driven(model.diagram, model.path, port) for port in targets)
-    return "the diagram feeds PD targets" if driven else ""
+    if controlled and not model.inputs.plain:
+        return "PD controllers act beside the diagram's own inputs"
+    targets = {a.model_instance(): plant.get_desired_state_input_port(a.model_instance()) for a in controlled}
+    return "the diagram feeds PD targets" if any(model.feeds(port) for port in targets.values()) else ""

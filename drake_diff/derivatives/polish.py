@@ -262,7 +262,9 @@ def _problems(
 ) -> ConvexSteps:
     """The convex problems of N steps."""
     h, nq, diagonal = model.time_step, model.nq, np.arange(model.nv)
-    controlled = np.array([a.has_controller() for a in form.actuators], dtype=bool)
+    controlled = np.full(model.nu, False)
+    if form.pd:
+        controlled[:] = [a.has_controller() for a in form.actuators]
     A = np.array([r.mass for r in read])
     A[:, diagonal, diagonal] += h * np.array([r.settings.damping for r in read])
     inputs = np.where(controlled, 0.0, np.clip(us, -form.limit, form.limit))  # a controller's are clipped with its own

@@ -175,6 +175,7 @@ def describe_tree(model: Model) -> Description:
         found.append(f"{plant.num_constraints()} constraints (couplers, balls, welds, distances)")
     if model.forces:
         found.append("forces are added to Drake's")
+    found += [model.systems_act] if model.systems_act else []
     springs = springs_of(plant)
     if found or isinstance(springs, Refusal):
         reasons = [*found, str(springs)] if isinstance(springs, Refusal) else found

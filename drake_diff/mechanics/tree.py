@@ -179,6 +179,8 @@ def tree_of(model: Model) -> TreeDynamics | Refusal:
     plant = model.plant
     if model.forces:
         return Refusal("forces are added to Drake's")
+    if model.systems_act:
+        return Refusal(model.systems_act)
     moving = sorted((j for j in joints(plant) if j.num_velocities()), key=lambda j: j.velocity_start())
     for joint in moving:
         if joint.type_name() not in ("revolute", "prismatic"):

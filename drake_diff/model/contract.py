@@ -213,14 +213,13 @@ def read_contract(
     *,
     name: str,
     source: str | None,
-    coordinates: tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]],
+    coordinates: tuple[tuple[str, ...], tuple[str, ...]],
     contact_geometry: str | None,
     notes: tuple[str, ...],
 ) -> Contract:
-    """The contract of the plant in `twin`; `coordinates` are the names of q, v and u."""
+    """The contract of the plant in `twin`; `coordinates` are the names of q and v."""
     plant, inspector = twin.plant, twin.inspector
-    positions, velocities, inputs = coordinates
-    efforts = ["N" if a.joint().type_name() == "prismatic" else "N m" for a in actuators(plant)]
+    (positions, velocities), inputs = coordinates, twin.inputs
     geometries = [] if inspector is None else inspector.GetAllGeometryIds(Role.kProximity)
     contact_models = {"kPoint": "point", "kHydroelastic": "hydroelastic"}
     contact = ContactTerms(
@@ -241,7 +240,7 @@ def read_contract(
         frame="world, z up; v of a floating body is w_WB then v_WBo, expressed in world",
         positions=_terms(positions, _units(twin, 0), *twin.position_limits),
         velocities=_terms(velocities, _units(twin, 1), *twin.velocity_limits),
-        inputs=_terms(inputs, efforts, plant.GetEffortLowerLimits(), plant.GetEffortUpperLimits()),
+        inputs=_terms(inputs.names, inputs.units, inputs.lower, inputs.upper),
         bodies=tuple(_body(twin, body) for body in bodies(plant)),
         joints=tuple(_joint(twin, joint) for joint in joints(plant)),
         actuators=tuple(_actuator(actuator) for actuator in actuators(plant)),

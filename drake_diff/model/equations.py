@@ -1,8 +1,9 @@
 """The plant's equations of motion in continuous time, for collocation: a Drake System made from the discrete plant.
 
-    M(q) dv/dt = B u + forces(q, v) - C(q, v) v,    dq/dt = N(q) v,
+    M(q) dv/dt = B u + forces(q, v, u) - C(q, v) v,    dq/dt = N(q) v,
 
-with Drake's own mass matrix, force elements (gravity, springs), joint damping and bias. Contact, joint limits,
+with Drake's own mass matrix, force elements (gravity, springs), joint damping and bias, and what the diagram's systems
+exert, which alone depends on u. Contact, joint limits,
 PD control and constraints are not in it: they exist only in the discrete step. With r(q, v, dv/dt, u) the residual
 by inverse dynamics, d(dv/dt) = -M^-1 dr at fixed dv/dt, so AutoDiffXd never factors a matrix.
 """
@@ -36,6 +37,7 @@ class EquationsOfMotion:
             raise ModelError("collocation: the model's constraints have no continuous form; use method='shooting'")
         self.model = model
         self.actuation = model.actuation
+        self.systems = bool(model.inputs.fed)  # whose forces depend on x and u
         self.plain_rates = model.plant.IsVelocityEqualToQDot()
 
     def __call__(self, x: Array, u: Array) -> Array:
@@ -52,6 +54,8 @@ class EquationsOfMotion:
         for k in np.flatnonzero(finite).tolist():
             x = knots[k, : model.nx]
             twin.set_state(x)
+            if self.systems:
+                twin.set_input(knots[k, model.nx :])
             rest[k] = twin.inverse_dynamics(still)
             mass[k] = twin.mass_matrix()
             rates[k, : model.nq] = x[model.nq :] if self.plain_rates else self.q_dot(twin, x)
@@ -65,6 +69,8 @@ class EquationsOfMotion:
         acceleration, mass = self.acceleration(ExtractValue(u).ravel())
         twin = self.model.autodiff
         set_state(twin, x)
+        if self.systems:
+            twin.set_input(u)
         constant = np.array([AutoDiffXd(a) for a in acceleration])
         residual = twin.inverse_dynamics(constant) - self.actuation @ u
         return np.concatenate([self.q_dot(twin, x), acceleration - np.linalg.inv(mass) @ residual])
@@ -82,6 +88,8 @@ class EquationsOfMotion:
     def acceleration(self, u: Array) -> tuple[Array, Array]:
         """(dv/dt (nv,), M (nv, nv)) under u (nu,) in the double context's state."""
         twin = self.model.double
+        if self.systems:
+            twin.set_input(u)
         rest = twin.inverse_dynamics(np.zeros(self.model.nv))
         mass = twin.mass_matrix()
         return np.linalg.solve(mass, self.actuation @ u - rest), mass

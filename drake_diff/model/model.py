@@ -18,9 +18,10 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_diff._base.arrays import finite_array, positive_float
 from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff.exceptions import InputError, ModelError, ModelWarning, UnknownNameError
+from drake_diff.exceptions import InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
 from drake_diff.model.contract import Contract, read_contract
 from drake_diff.model.file_facts import JointFacts, Mimic, joint_facts
+from drake_diff.model.inputs import TIMES, BodyForce, add_body_forces, check_body_forces, read_inputs
 from drake_diff.model.load_file import (
     CONTACT_MODELS,
     DRAKES_REFUSALS,
@@ -35,7 +36,6 @@ from drake_diff.model.plant import (
     follow,
     instances,
     instances_with_joints,
-    is_driven,
     path_to_the_plant,
     scene_graph_beside,
 )
@@ -61,10 +61,10 @@ NAMES_SHOWN = 12  # in repr: a robot arm's state is shown whole
 class Model(ShowsItsRepr):
     """A finalized discrete plant, ready to be stepped and differentiated.
 
-    Make one with `load_model` or `model_from_diagram`. The state is Drake's, `x = [q; v]`, and the input `u` is the
-    plant's actuation, all in SI units. A Model keeps its contexts between calls and sets all of x, u and the
-    parameters on each call, so results do not depend on the order of calls; for the same reason one Model serves one
-    thread.
+    Make one with `load_model` or `model_from_diagram`. The state is Drake's, `x = [q; v]`, and the input `u` the
+    plant's actuation, forces on bodies and what a diagram exports, all in SI units. A Model keeps its contexts between
+    calls and sets all of x, u and the parameters on each call, so results do not depend on the order of calls; for the
+    same reason one Model serves one thread.
 
     Attributes:
         nq, nv, nx, nu: Numbers of positions, velocities, states (nq + nv) and inputs.
@@ -93,6 +93,7 @@ class Model(ShowsItsRepr):
         rebuild: "Callable[..., Model] | None" = None,
         forces: tuple[AddedForce, ...] = (),
         coupling: Coupling | None = None,
+        body_forces: tuple[BodyForce, ...] = (),
     ):
         self.diagram = diagram
         self.forces = forces  # they act beside the plant's own
@@ -113,7 +114,10 @@ class Model(ShowsItsRepr):
         self.nq: int = self.plant.num_positions() if coupling is None else len(coupling.own_q)
         self.nv: int = self.plant.num_velocities() if coupling is None else len(coupling.own_v)
         self.nx = self.nq + self.nv
-        self.nu: int = self.plant.num_actuators()
+        self.body_forces = body_forces
+        self.inputs = read_inputs(diagram, self.plant, body_forces)
+        self.nu: int = len(self.inputs.names)
+        self.notes += tuple(f"the exported input {name} does not reach the plant" for name in self.inputs.left_out)
         self.time_step: float = self.plant.time_step()
         prefix = len(instances_with_joints(self.plant)) > 1  # only where names could clash
         positions = self.plant.GetPositionNames(add_model_instance_prefix=prefix)
@@ -125,7 +129,7 @@ class Model(ShowsItsRepr):
         self.position_names: tuple[str, ...] = tuple(positions)
         self.velocity_names: tuple[str, ...] = tuple(velocities)
         self.state_names = self.position_names + self.velocity_names
-        self.input_names = tuple(actuator.name() for actuator in actuators(self.plant))
+        self.input_names = self.inputs.names
 
     @property
     def has_other_parameters(self) -> bool:
@@ -170,7 +174,12 @@ class Model(ShowsItsRepr):
 
     @property
     def actuation(self) -> np.ndarray:
-        """B (nv, nu): the generalized force by the inputs."""
+        """B (nv, nu): the generalized force by the inputs; 0 of those that systems of the diagram hand on."""
+        return self.inputs.of_actuators(self.by_effort.T).T
+
+    @property
+    def by_effort(self) -> np.ndarray:
+        """(nv, actuators): the generalized force by the efforts of all actuators."""
         B = np.asarray(self.plant.MakeActuationMatrix())
         return B if self.coupling is None else self.coupling.spread.T @ B
 
@@ -236,12 +245,30 @@ class Model(ShowsItsRepr):
     @cached_property
     def takes_forces(self) -> bool:
         """Whether generalized forces can be added: nothing in the diagram feeds that port."""
-        return not is_driven(self.diagram, self.path, self.plant.get_applied_generalized_force_input_port())
+        return not self.feeds(self.plant.get_applied_generalized_force_input_port())
+
+    def feeds(self, port: Any) -> bool:
+        """Whether the diagram's own systems feed an input port of the plant, or it is itself an input of the model."""
+        return int(port.get_index()) in self.inputs.fed
+
+    @property
+    def systems_act(self) -> str:
+        """Which forces the diagram's own systems exert on the plant; empty where none does."""
+        plant = self.plant
+        ports = [plant.get_applied_generalized_force_input_port(), plant.get_applied_spatial_force_input_port()]
+        found = [f"the diagram feeds {port.get_name()}" for port in ports if self.feeds(port)]
+        return ", ".join(found + ["the diagram drives actuators"] * bool(self.inputs.fed_actuators))
 
     @cached_property
     def double(self) -> Twin:
-        """The plant that everything is measured on."""
-        return self._twin(float, self.diagram, self.plant)
+        """The plant that everything is measured on.
+
+        Raises ModelError where what the diagram's systems exert cannot be told, or depends on time.
+        """
+        twin = self._twin(float, self.diagram, self.plant)
+        if self.inputs.systems and not self.body_forces:
+            _check_time(self, twin)
+        return twin
 
     @cached_property
     def autodiff(self) -> Twin:
@@ -267,7 +294,7 @@ class Model(ShowsItsRepr):
             self.double,
             name=self.name,
             source=str(self.source) if self.source else None,
-            coordinates=(self.position_names, self.velocity_names, self.input_names),
+            coordinates=(self.position_names, self.velocity_names),
             contact_geometry=self.contact_geometry,
             notes=self.notes,
         )
@@ -292,7 +319,12 @@ class Model(ShowsItsRepr):
         for instance, target in self.pd_targets.items():
             plant.get_desired_state_input_port(instance).FixValue(context, target)
         scene_graph = scene_graph_beside(diagram, self.path)
-        return Twin(scalar, diagram, plant, scene_graph, root, context, defaults, self.forces, self.coupling)
+        twin = Twin(
+            scalar, diagram, plant, scene_graph, root, context, defaults, self.inputs, self.forces, self.coupling
+        )
+        if self.inputs.ports:
+            twin.set_input(np.zeros(self.nu).astype(scalar))
+        return twin
 
     @cached_property
     def pd_targets(self) -> dict[Any, np.ndarray]:
@@ -305,7 +337,7 @@ class Model(ShowsItsRepr):
         for instance in instances(self.plant):
             driven = [a for a in actuators(self.plant) if a.model_instance() == instance]
             port = self.plant.get_desired_state_input_port(instance)
-            if any(a.has_controller() for a in driven) and not is_driven(self.diagram, self.path, port):
+            if any(a.has_controller() for a in driven) and not self.feeds(port):
                 positions = [float(q) for a in driven for q in a.joint().default_positions()]
                 targets[instance] = np.array(positions + [0.0] * len(positions))
         return targets
@@ -339,6 +371,7 @@ def load_model(
     packages: Mapping[str, str | Path] | None = None,
     contact: bool = True,
     mimic: str | None = None,
+    body_forces: Sequence[BodyForce | Mapping[str, Any]] = (),
 ) -> Model:
     """The robot in a URDF, SDF, MJCF (.xml) or .dmd.yaml file as a discrete model.
 
@@ -367,6 +400,7 @@ def load_model(
             together by constraints: "reduce" takes the followers out of the state, whose equations are then those of
             the independent coordinates; "fix" welds followers and leaders where they are. None keeps all in the state,
             as Drake does; collocation and other engines refuse such a model.
+        body_forces: `dd.model.BodyForce`s: propellers and thrusters, each an input [N] after the actuators.
 
     Returns:
         The Model. What was left out of the file (such as meshes in formats that Drake cannot use) and what was added
@@ -389,6 +423,7 @@ def load_model(
     if not isinstance(contact, bool):
         raise InputError("contact", got=repr(contact), expected="True or False")
     check_mimic(mimic)
+    body_forces = check_body_forces(body_forces)
     try:
         source = Path(path)
     except TypeError as error:
@@ -415,6 +450,7 @@ def load_model(
         "packages": as_packages(packages),
         "contact": contact,
         "mimic": mimic,
+        "body_forces": body_forces,
     }
     read = read_into(plant, source, options["packages"])
     repairs, mimics = _repaired(plant, scene_graph, source, read.packages, options)
@@ -427,6 +463,7 @@ def load_model(
         plant.mutable_gravity_field().set_gravity_vector(options["gravity"])
     try:
         plant.Finalize()
+        add_body_forces(builder, plant, body_forces)
         diagram = builder.Build()
     except DRAKES_REFUSALS as error:
         raise ModelError(f"{source}: expected a model that Drake can finalize; Drake says: {error}") from error
@@ -438,7 +475,13 @@ def load_model(
         return load_model(source, **{**options, **changes})
 
     model = Model(
-        diagram, source=source, notes=notes, contact_geometry=contact_geometry, rebuild=rebuild, coupling=coupling
+        diagram,
+        source=source,
+        notes=notes,
+        contact_geometry=contact_geometry,
+        rebuild=rebuild,
+        coupling=coupling,
+        body_forces=body_forces,
     )
     model.options = options
     return model
@@ -447,18 +490,24 @@ def load_model(
 def model_from_diagram(diagram: Diagram) -> Model:
     """A Model of a user's own Drake diagram (a RobotDiagram, or any Diagram) with exactly one discrete plant in it.
 
-    The plant may sit at any depth. drake_diff drives its actuation input itself, so that must not be connected.
+    The plant may sit at any depth. The input u has one entry for each entry of the vector input ports that the diagram
+    exports and that reach the plant, in the order of the ports: the command of a Propeller, the input of a Gain, of a
+    system of your own. Where the plant's actuation is exported, the actuators stand there; where nothing is connected
+    to it, they come first. Of what a RobotDiagram exports by itself the actuation alone is an input. Derivatives by
+    autodiff need systems with an AutoDiffXd form, which those of Drake have, and yours by
+    `pydrake.systems.scalar_conversion.TemplateSystem`.
 
     Args:
         diagram: A pydrake Diagram, built.
 
     Returns:
-        The model; systems other than the plant keep their default state.
+        The model. Its `notes` name exported ports that do not reach the plant.
 
     Raises:
         InputError: `diagram` is no Diagram.
-        ModelError: The plant is continuous, not finalized, has sampled output ports, or has its actuation input
-            connected inside the diagram; the message says what to change.
+        ModelError: The plant is continuous, not finalized, or has sampled output ports; its actuation input is
+            connected inside the diagram and there is no other input; or a system that acts on the plant has a state
+            of its own or depends on time. The message says what to change.
 
     Example:
         >>> from pydrake.planning import RobotDiagramBuilder
@@ -471,7 +520,35 @@ def model_from_diagram(diagram: Diagram) -> Model:
     """
     if not isinstance(diagram, Diagram):
         raise InputError("diagram", got=type(diagram).__name__, expected="a pydrake Diagram")
-    return Model(diagram, source=None)
+    model = Model(diagram, source=None)
+    if model.inputs.systems or model.inputs.ports:
+        model.double  # noqa: B018  which refuses systems that depend on time, or that cannot be evaluated
+    return model
+
+
+def _check_time(model: Model, twin: Twin) -> None:
+    random, root = np.random.default_rng(0), twin.root_context
+    twin.set_state(twin.state() + np.append(np.zeros(model.nq), 0.1 * random.standard_normal(model.nv)))
+    twin.set_input(random.uniform(0.2, 0.8, model.nu))
+    targets = [twin.plant.get_desired_state_input_port(i) for i in instances(model.plant)]
+    targets = [port for port in targets if model.feeds(port)]
+
+    def exerted(time: float) -> np.ndarray:
+        root.SetTime(time)
+        return np.concatenate([twin.systems_force(), *(port.Eval(twin.context) for port in targets)])
+
+    try:
+        start = exerted(0.0)
+        changed = next((t for t in TIMES if not np.array_equal(start, exerted(t), equal_nan=True)), None)
+    except (RuntimeError, SimulationError) as error:
+        raise ModelError(f"the diagram's systems cannot be evaluated: {error}") from error
+    if changed is not None:
+        raise ModelError(
+            f"what the systems {', '.join(model.inputs.systems)} exert on the plant depends on time ({changed:g} s is "
+            "not 0 s), which a step of x and u does not know: export it as an input, and give it by u"
+        )
+    twin.reset()
+    twin.set_input(np.zeros(model.nu))
 
 
 def _key(value: Any) -> Hashable:
@@ -517,7 +594,7 @@ def _repaired(
 
 
 def _check_plant(model: Model) -> None:
-    plant, diagram, path = model.plant, model.diagram, model.path
+    plant = model.plant
     where = f"{model.source}: " if model.source else ""
     if not plant.is_finalized():
         raise ModelError("the plant is not finalized: call plant.Finalize() before building the diagram")
@@ -530,10 +607,3 @@ def _check_plant(model: Model) -> None:
         )
     if plant.num_velocities() == 0:
         raise ModelError(f"{where}the model cannot move: it has no joints and no free body")
-    inputs = [plant.get_actuation_input_port()]
-    inputs += [plant.get_actuation_input_port(i) for i in instances(plant) if plant.num_actuators(i)]
-    if any(is_driven(diagram, path, port) for port in inputs):
-        raise ModelError(
-            "the plant's actuation input is connected inside the diagram, but drake_diff has to set it: "
-            "leave it free or export it"
-        )

@@ -118,19 +118,3 @@ def follow(diagram: Any, path: DiagramPath) -> Any:
     for i in path:
         system = system.GetSystems()[i]
     return system
-
-
-def is_driven(diagram: Diagram, path: DiagramPath, port: Any) -> bool:
-    """Whether something inside `diagram` feeds an input port of the subsystem at `path`, at any level."""
-    level, index = follow(diagram, path[:-1]), port.get_index()
-    system = follow(diagram, path)
-    for destination, destination_port in level.connection_map():
-        if destination is system and destination_port == index:
-            return True
-    if len(path) == 1:
-        return False  # exported by the outermost diagram at most: free
-    for i in range(level.num_input_ports()):
-        for exported_system, exported_port in level.GetInputPortLocators(level.get_input_port(i).get_index()):
-            if exported_system is system and exported_port == index:
-                return is_driven(diagram, path[:-1], level.get_input_port(i))
-    return False

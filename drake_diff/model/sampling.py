@@ -17,6 +17,7 @@ DEPTH = (1e-4, 1e-3)  # [m] how deep geometries of a contact state overlap
 BISECTIONS = 40
 SPEED = 0.5  # [m/s or rad/s] standard deviation, within the velocity limits
 REACH = 1.0  # [m] of a slide, or of a free body, without limits
+ONE_WAY = 2.0  # [N or N m] how far from 0 on inputs are taken that have one sign only
 EFFORT = 0.2  # part of the effort limit; of 1 N or N m where there is none
 
 
@@ -32,15 +33,21 @@ class SampledState:
 def sample_states(model: Model, count: int, seed: int = 0) -> list[SampledState]:
     """`count` states, every other one touching where contact can be found; the same seed gives the same states."""
     random = np.random.default_rng(seed)
-    limit = np.minimum(np.abs(model.plant.GetEffortLowerLimits()), np.abs(model.plant.GetEffortUpperLimits()))
+    lower, upper = model.inputs.lower, model.inputs.upper
+    limit = np.minimum(np.abs(lower), np.abs(upper))
     effort = EFFORT * np.where(limit < 1e6, limit, 1.0)
+    middle = np.zeros(model.nu)
+    for i in np.flatnonzero((lower >= 0) | (upper <= 0)).tolist():  # a force that cannot change its sign
+        near = lower[i] if lower[i] >= 0 else upper[i]
+        far = float(np.clip(near + ONE_WAY * (1 if lower[i] >= 0 else -1), lower[i], upper[i]))
+        middle[i], effort[i] = (near + far) / 2, EFFORT * abs(far - near)
     touches = model.contract.contact.collision_pairs > 0
     found: list[SampledState] = []
     for i in range(count):
         x = _touching(model, random) if touches and i % 2 else None
         kind = FREE if x is None else CONTACT
         x = _free(model, random) if x is None else x
-        found.append(SampledState(kind, frozen(x), frozen(effort * random.uniform(-1, 1, model.nu))))
+        found.append(SampledState(kind, frozen(x), frozen(middle + effort * random.uniform(-1, 1, model.nu))))
     return found
 
 

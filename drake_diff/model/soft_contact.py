@@ -120,6 +120,7 @@ def softened(model: Model, contact: SoftContact) -> Model:
         rebuild=rebuild if model.can_rebuild else None,
         forces=(*model.forces, contact),
         coupling=model.coupling,
+        body_forces=model.body_forces,
     )
     contact.force(soft.plant, soft.double.context)  # refuses what has no distance
     return soft

@@ -21,7 +21,7 @@ def step(
     Args:
         model: The model.
         x: (nx,) the state [q; v].
-        u: (nu,) [N or N m] the input, constant over the step; may be left out where there are no actuators.
+        u: (nu,) [N or N m] the input, constant over the step; may be left out where there is none.
         parameters: Names (see `list_parameters`) and the values that replace the model's own for this step.
 
     Returns:
@@ -69,7 +69,7 @@ def advance(twin: Twin, x: Any, u: Any) -> Any:
     set_state(twin, x)
     if not _is_finite(np.asarray(u)):
         raise SimulationError(f"an input is not finite: {u}")
-    plant.get_actuation_input_port().FixValue(context, u)
+    twin.set_input(u)
     if twin.forces:
         plant.get_applied_generalized_force_input_port().FixValue(context, twin.added_force())
     try:

@@ -8,8 +8,10 @@ import numpy as np
 from pydrake.multibody.tree import MultibodyForces_
 
 from drake_diff._base.arrays import Array
+from drake_diff.exceptions import SimulationError
+from drake_diff.model.inputs import Inputs
 from drake_diff.model.mimic import Coupling
-from drake_diff.model.plant import actuators, bodies, joints, labelled
+from drake_diff.model.plant import actuators, bodies, instances, joints, labelled
 
 
 class AddedForce(Protocol):
@@ -82,6 +84,7 @@ class Twin:
     root_context: Any
     context: Any  # the plant's, inside root_context
     defaults: Any  # a root context that nobody touches
+    inputs: Inputs
     own: tuple[AddedForce, ...] = ()  # the model's own beside Drake's, which no parameter changes
     coupling: Coupling | None = None  # where x has the independent coordinates of the plant alone
     added: dict[str, AddedForce] = field(default_factory=dict)  # for parameters that Drake does not have
@@ -185,15 +188,81 @@ class Twin:
         """Whether any two geometries that may collide do, in the context's state; no step is taken."""
         return bool(self.plant.get_geometry_query_input_port().Eval(self.context).HasCollisions())
 
+    def set_input(self, u: Any) -> None:
+        """Put the input `u` (nu,), floats or AutoDiffXd, into the context."""
+        if self.inputs.plain:
+            self.plant.get_actuation_input_port().FixValue(self.context, u)
+            return
+        for number, where in self.inputs.ports:
+            self.diagram.get_input_port(number).FixValue(self.root_context, u[where])
+        which = self.inputs.actuator >= 0
+        if which.any():
+            effort = np.zeros(self.plant.num_actuators()).astype(self.scalar)
+            effort[self.inputs.actuator[which]] = u[which]
+            self.plant.get_actuation_input_port().FixValue(self.context, effort)
+
+    def applied_force(self) -> Any:
+        """(nv,) the generalized force that the diagram's systems apply beside the actuators.
+
+        It is that at the context's state and input, which holds over a step.
+        """
+        plant, context, fed = self.plant, self.context, self.inputs.fed
+        found = np.zeros(plant.num_velocities()).astype(self.scalar)
+        port = plant.get_applied_generalized_force_input_port()
+        if int(port.get_index()) in fed:
+            found = found + port.Eval(context)
+        port = plant.get_applied_spatial_force_input_port()
+        if int(port.get_index()) in fed:
+            forces, world = MultibodyForces_[self.scalar](plant), plant.world_frame()
+            for one in port.Eval(context):
+                body = plant.get_body(one.body_index)
+                place = plant.EvalBodyPoseInWorld(context, body).rotation().multiply(one.p_BoBq_B)
+                body.AddInForce(context, p_BP_E=place, F_Bp_E=one.F_Bq_W, frame_E=world, forces=forces)
+            found = found + plant.CalcGeneralizedForces(context, forces)
+        return self.own_force(found)
+
+    def systems_force(self) -> Any:
+        """(nv,) `applied_force`, and that of the actuators which the diagram's systems drive, within their limits.
+
+        Raises SimulationError where a system cannot be evaluated.
+        """
+        try:
+            return self.applied_force() + self._driven_force()
+        except RuntimeError as error:
+            raise SimulationError(f"what the diagram's systems exert cannot be told: {error}") from error
+
+    def _driven_force(self) -> Any:
+        """(nv,) of the actuators that the diagram's systems drive."""
+        total, plant, fed = np.zeros(self.plant.num_velocities()).astype(self.scalar), self.plant, self.inputs.fed
+        whole = plant.get_actuation_input_port()
+        parts = {i: plant.get_actuation_input_port(i) for i in instances(plant)}
+        driven = set(self.inputs.fed_actuators)
+        for i, actuator in enumerate(actuators(plant) if driven else ()):
+            if i not in driven:
+                continue
+            effort, part = 0.0, parts[actuator.model_instance()]
+            if int(whole.get_index()) in fed:
+                effort = effort + whole.Eval(self.context)[i]
+            if int(part.get_index()) in fed:
+                own = [a for a in actuators(plant) if a.model_instance() == actuator.model_instance()]
+                effort = effort + part.Eval(self.context)[[a.index() for a in own].index(actuator.index())]
+            limit = float(actuator.effort_limit())
+            total[actuator.joint().velocity_start()] += max(-limit, min(limit, effort))
+        return self.own_force(total)
+
     def inverse_dynamics(self, acceleration: Any) -> Any:
-        """(nv,) M a + bias less gravity, springs, damping and added forces, at the context's state."""
+        """(nv,) M a + bias less gravity, springs, damping, added forces and what the diagram's systems exert.
+
+        It is that at the context's state, and input where systems depend on it.
+        """
         if self.coupling is not None:
             acceleration = self.coupling.velocities(acceleration)
         self.plant.CalcForceElementsContribution(self.context, self._workspace)  # which overwrites it
         needed = self.plant.CalcInverseDynamics(self.context, acceleration, self._workspace)
         if self.forces:  # AutoDiffXd's are a copy: not writable
             needed = needed - self.added_force()
-        return needed if self.coupling is None else self.coupling.forces(needed)
+        needed = self.own_force(needed)
+        return needed - self.systems_force() if self.inputs.fed else needed
 
     @property
     def forces(self) -> tuple[AddedForce, ...]:

@@ -21,7 +21,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model.model import Model
-from drake_diff.model.plant import actuators, is_driven, proximity_property
+from drake_diff.model.plant import actuators, proximity_property
 from drake_diff.model.step import set_state
 
 TOLERANCE = 1e-9  # of each step, relative to max(1, |x|)
@@ -47,7 +47,7 @@ class ContinuousMotion:
     """The continuous motion of a model, as it is now: parameters that are applied act.
 
     Raises ModelError, which says why, where it has none: contact that is no point contact or states no stiffness, PD
-    controllers, constraints, forces that a diagram adds.
+    controllers, constraints.
     """
 
     def __init__(self, model: Model):
@@ -59,15 +59,12 @@ class ContinuousMotion:
             raise ModelError("PD controllers have none")
         if model.num_constraints:
             raise ModelError("constraints have none")
-        ports = (plant.get_applied_generalized_force_input_port(), plant.get_applied_spatial_force_input_port())
-        if any(is_driven(model.diagram, model.path, port) for port in ports):
-            raise ModelError("forces that the diagram adds have none here")
         self.model, self.twin = model, model.double
         self.used = 0  # evaluations of the equations of motion by the last call of `states`
         self.touches = bool(contact.collision_pairs)
         self.is_sap = contact.approximation == "sap"
         self.actuation = model.actuation
-        self.limits = np.array([actuator.effort_limit() for actuator in actuators(plant)]).reshape(model.nu)
+        self.limits = model.inputs.of_actuators([actuator.effort_limit() for actuator in actuators(plant)])
         self.plain_rates = plant.IsVelocityEqualToQDot()
         self.still = np.zeros(model.nv)
         self.lower, self.upper = model.position_limits
@@ -81,6 +78,7 @@ class ContinuousMotion:
         xs, dt = np.empty((len(us) + 1, self.model.nx)), self.model.time_step
         xs[0], self.used = x0, 0
         for k, u in enumerate(us):
+            self.twin.set_input(u)
             force = self.actuation @ np.clip(u, -self.limits, self.limits)
             xs[k + 1], dt, used = integrate(
                 partial(self.rates, force), xs[k], self.model.time_step, dt, EVALUATIONS - self.used

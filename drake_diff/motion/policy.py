@@ -91,6 +91,9 @@ class PD:
 
     def __init__(self, model: Model, kp: ArrayLike, kd: ArrayLike, x_ref: ArrayLike | None = None):
         joints = [actuator.joint() for actuator in actuators(model.plant)]
+        if not model.inputs.plain:
+            got = f"the inputs {', '.join(model.input_names)}"
+            raise InputError("model", got=got, expected="one whose inputs are its actuators")
         if not joints:
             raise InputError("model", got="no actuators", expected="at least one")
         self.x_ref = finite_array("x_ref", model.default_state if x_ref is None else x_ref, (model.nx,))

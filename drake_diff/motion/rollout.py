@@ -38,10 +38,10 @@ class Rollout(ShowsItsRepr):
     times: Array  # (N+1,) [s]
     xs: Array  # (N+1, nx)
     us: Array  # (N, nu), as commanded
-    efforts: Array  # (N, nu), as applied: clipped at the effort limits, PD control included
+    efforts: Array  # (N, actuators), as applied: clipped at the effort limits, PD control included
     kinetic_energy: Array  # (N+1,) [J]
     potential_energy: Array  # (N+1,) [J], gravity and springs
-    work: Array  # (N+1,) [J], done by the actuators since the start
+    work: Array  # (N+1,) [J], done by actuators, body forces and a diagram's systems since the start
     dissipation: Array  # (N+1,) [J], taken by joint damping since the start
     contact_work: Array  # (N+1,) [J], done by contact, normal forces and friction, since the start
     limit_work: Array  # (N+1,) [J], done by joint limits since the start
@@ -67,7 +67,7 @@ class Rollout(ShowsItsRepr):
 
     @property
     def energy_error(self) -> Array:
-        """(N+1,) [J]: energy that neither actuators nor damping, contact or joint limits account for."""
+        """(N+1,) [J]: energy that neither inputs and systems nor damping, contact or limits account for."""
         given = self.work - self.dissipation + self.contact_work + self.limit_work
         return frozen(self.energy - self.energy[0] - given)
 
@@ -168,10 +168,11 @@ class Meter:
         inspector = model.double.inspector
         self.can_touch = inspector is not None and bool(inspector.GetCollisionCandidates())
         self.damping = model.double.damping()
-        self.actuation = model.actuation
+        self.actuation = model.by_effort
         self.states: list[tuple[Array, float, float, float]] = []
         self.ends: list[Array] = []
         self.efforts: list[Array] = []
+        self.applied: list[Array] = []  # (nv,) by body forces and the diagram's systems
         self.pushes: list[tuple[Array, Array]] = []  # of contact and of joint limits, (nv,) each
         lower, upper = model.position_limits
         # Of each joint with limits its places in q and v, and the limits.
@@ -192,6 +193,8 @@ class Meter:
         self.measure_state(x)
         self.ends.append(x_next)
         self.efforts.append(np.array(self.plant.get_net_actuation_output_port().Eval(self.context)))
+        fed = self.model.inputs.fed
+        self.applied.append(self.model.double.applied_force() if fed else np.zeros(self.model.nv))
         self.contacts.append(contacts_of_the_step(self.model) if self.can_touch else ())
         contact = self._contact_force() if self.contacts[-1] else np.zeros(self.model.nv)
         self.pushes.append((contact, self._limit_force(x, x_next, contact)))
@@ -216,16 +219,21 @@ class Meter:
                 near.append(j)
         if near:
             needed = self.model.double.inverse_dynamics((after - v) / h) + self.damping * (after - v)
-            found[near] = (needed - self.actuation @ self.efforts[-1] - contact)[near]
+            driven = self.actuation @ self.efforts[-1]
+            if self.model.inputs.fed_actuators:  # which inverse dynamics has, too
+                driven += self.applied[-1] - self.model.double.systems_force()
+            found[near] = (needed - driven - contact)[near]
         return found
 
     def result(self, xs: Array, us: Array) -> Rollout:
         """The rollout with states xs (N+1, nx) and us (N, nu)."""
         at, kinetic, potential, deepest = (np.array(column) for column in zip(*self.states, strict=True))
-        nq, h, efforts = self.model.nq, self.model.time_step, np.array(self.efforts).reshape(us.shape)
+        nq, h = self.model.nq, self.model.time_step
+        efforts = np.array(self.efforts).reshape(len(us), self.actuation.shape[1])
         after = np.array(self.ends).reshape(len(us), self.model.nx)[:, nq:]
         middle = (at[:-1, nq:] + after) / 2
-        work = h * np.einsum("ki,ki->k", middle, efforts @ self.actuation.T)
+        applied = np.array(self.applied).reshape(len(us), self.model.nv)
+        work = h * np.einsum("ki,ki->k", middle, efforts @ self.actuation.T + applied)
         dissipation = h * np.einsum("ki,ki->k", middle, self.damping * after)
         pushes = np.array(self.pushes).reshape(len(us), 2, self.model.nv)
         by_contact, by_limits = h * np.einsum("ki,kfi->fk", middle, pushes)

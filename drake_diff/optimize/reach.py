@@ -220,6 +220,8 @@ class _Trees:
                 self.of_states[i] = number
         driven = np.flatnonzero(np.any(model.actuation != 0, axis=1))
         self.driven = {self.of_states[model.nq + i] for i in driven.tolist()}
+        if model.systems_act:  # which may reach any of them
+            self.driven = set(self.of_states)
         self.may_touch = tuple(self._candidates(model))
 
     def _join(self, a: int, b: int) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.certificates.judgement import VERDICTS
+from drake_diff.model.inputs import BodyForce
 from drake_diff.model.load_file import FORMATS
 from drake_diff.model.model import Model
 from drake_diff.record.parts import Certified, FileEvidence, ModelInput, Provenance
@@ -61,6 +62,8 @@ def model_input(model: Model) -> ModelInput:
 
 def _plain(value: Any) -> Any:
     """An option of `load_model` for JSON."""
+    if isinstance(value, tuple) and isinstance(value[0], BodyForce):
+        return [force.to_dict() for force in value]
     return value if isinstance(value, str | bool | dict) else np.asarray(value).tolist()
 
 

@@ -205,8 +205,8 @@ def plant_limits(model: Model) -> dict[str, Array]:
     return {
         "x_lower": np.concatenate([q_lower, v_lower]),
         "x_upper": np.concatenate([q_upper, v_upper]),
-        "u_lower": np.asarray(model.plant.GetEffortLowerLimits()),
-        "u_upper": np.asarray(model.plant.GetEffortUpperLimits()),
+        "u_lower": model.inputs.lower,
+        "u_upper": model.inputs.upper,
     }
 
 

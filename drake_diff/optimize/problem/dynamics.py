@@ -224,16 +224,22 @@ class PlantKnots:
         set_state(model.double, x)
         acceleration, mass = equations.acceleration(u)
         q_dot = equations.q_dot(model.double, x)
-        variables = InitializeAutoDiff(x).ravel()
-        set_state(twin, variables)
+        systems = equations.systems  # whose forces depend on u
+        variables = InitializeAutoDiff(np.concatenate([x, u]) if systems else x).ravel()
+        set_state(twin, variables[: model.nx])
+        if systems:
+            twin.set_input(variables[model.nx :])
         constant = np.array([AutoDiffXd(a) for a in acceleration])
         residual = twin.inverse_dynamics(constant)
         rows = np.zeros((model.nx, model.nx + model.nu))
         if equations.plain_rates:
             rows[: model.nq, model.nq : model.nx] = np.eye(model.nq)
         else:
-            rows[: model.nq, : model.nx] = gradient_rows(equations.q_dot(twin, variables), model.nx)
-        by_knot = np.concatenate([gradient_rows(residual, model.nx), -equations.actuation], axis=1)
+            q_dot_rows = gradient_rows(equations.q_dot(twin, variables[: model.nx]), len(variables))
+            rows[: model.nq, : model.nx] = q_dot_rows[:, : model.nx]
+        by_knot = np.zeros((model.nv, model.nx + model.nu))
+        by_knot[:, : len(variables)] = gradient_rows(residual, len(variables))
+        by_knot[:, model.nx :] -= equations.actuation
         rows[model.nq :] = -np.linalg.solve(mass, by_knot)
         return np.concatenate([q_dot, acceleration]), rows
 

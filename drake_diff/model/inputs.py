@@ -1,0 +1,350 @@
+"""What the input u of a model is: its plant's actuators, forces on bodies, and what a user's diagram exports.
+
+A diagram's own systems (propellers, wings, gains, thrusters) act on the plant through its input ports. Vector inputs
+that the diagram exports and that reach the plant are entries of u, in the order of the exports. Actuators that nothing
+in the diagram drives are entries, too: where the diagram exports them, else first.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant, Propeller, PropellerInfo
+from pydrake.planning import RobotDiagram
+from pydrake.systems.framework import Diagram, DiagramBuilder, InputPortIndex, OutputPortIndex, PortDataType
+
+from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.model.plant import actuators, bodies, instances, joints, labelled
+
+BODY_FORCES = "body_forces"  # the exported port of those that `load_model` adds
+UNKNOWN = "?"  # the unit of an input that only its own system knows
+# [s] when what the diagram's systems exert is compared with the start: 0.01 ... 10, and far later.
+Row = tuple[str, str, float, float, int]  # name, unit, lower, upper and which actuator, -1 for none
+TIMES = (*np.linspace(0.01, 10.0, 100).tolist(), 37.1, 1003.7)
+
+
+@dataclass(frozen=True)
+class BodyForce:
+    """A force on a body as an input of a model: a propeller, a thruster, a jet. `load_model(body_forces=...)` takes it.
+
+    The input f [N] pushes at a point of the body along a direction fixed in it, with a moment of `moment_ratio` f
+    about that direction. It is Drake's `Propeller` with a thrust ratio of 1.
+
+    Args:
+        name: What the input is called.
+        body: The link that it pushes, "instance::link" where two model instances have one of that name.
+        point: (3,) [m] where, in the link's frame.
+        direction: (3,) along what, in the link's frame; its length does not matter.
+        moment_ratio: [m] moment about `direction` per force: positive turns by the right-hand rule.
+        lower: [N] the least force. A bound of problems on the model: steps and rollouts do not clip.
+        upper: [N] the greatest.
+
+    Raises:
+        InputError: A number is not finite, the direction is zero, or the limits leave nothing.
+
+    Example:
+        >>> rotor = dd.model.BodyForce("rotor", "ball", direction=(0, 0, 1), upper=20.0)
+        >>> model = dd.load_model("models/projectile.sdf", time_step=0.01, body_forces=[rotor])
+        >>> model.input_names
+        ('rotor',)
+    """
+
+    name: str
+    body: str
+    point: ArrayLike = (0.0, 0.0, 0.0)
+    direction: ArrayLike = (0.0, 0.0, 1.0)
+    moment_ratio: float = 0.0
+    lower: float = 0.0
+    upper: float = float("inf")
+
+    def __post_init__(self) -> None:
+        for text in ("name", "body"):
+            if not isinstance(getattr(self, text), str) or not getattr(self, text):
+                raise InputError(f"BodyForce.{text}", got=repr(getattr(self, text)), expected="a name")
+        for vector in ("point", "direction"):
+            numbers = finite_array(f"BodyForce {self.name}, {vector}", getattr(self, vector), (3,))
+            object.__setattr__(self, vector, tuple(numbers.tolist()))
+        if not np.any(self.direction):
+            raise InputError(f"BodyForce {self.name}, direction", got=self.direction, expected="not zero")
+        ratio = finite_array(f"BodyForce {self.name}, moment_ratio", [self.moment_ratio], (1,))
+        object.__setattr__(self, "moment_ratio", float(ratio[0]))
+        infinite = {"lower": -np.inf, "upper": np.inf}
+        for side, none in infinite.items():  # a record writes an infinite limit as None
+            given = getattr(self, side)
+            object.__setattr__(self, side, none if given is None else _limit(f"BodyForce {self.name}, {side}", given))
+        if not self.lower < self.upper:
+            got = f"[{self.lower:g}, {self.upper:g}]"
+            raise InputError(f"BodyForce {self.name}", got=got, expected="lower below upper")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Its fields for JSON; an infinite limit is None."""
+        found = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {key: _plain(value) for key, value in found.items()}
+
+
+def _limit(subject: str, given: Any) -> float:
+    if isinstance(given, bool) or not isinstance(given, (int, float, np.number)) or np.isnan(given):
+        raise InputError(subject, got=repr(given), expected="a number, in N")
+    return float(given)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return list(value)
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def check_body_forces(given: Sequence[BodyForce | Mapping[str, Any]]) -> tuple[BodyForce, ...]:
+    """What `load_model` was given, or what a record has of it, as BodyForces of different names."""
+    if isinstance(given, (str, Mapping, BodyForce)) or not isinstance(given, Sequence):
+        raise InputError("body_forces", got=type(given).__name__, expected="a list of dd.model.BodyForce")
+    found: list[BodyForce] = []
+    for one in given:
+        if isinstance(one, Mapping):
+            known = {field.name for field in fields(BodyForce)}
+            for key in one.keys() - known:
+                raise UnknownNameError("field of a BodyForce", got=key, known=known)
+            for key in {"name", "body"} - one.keys():
+                raise InputError("body_forces", got=f"one without {key}", expected="name and body")
+            one = BodyForce(**one)
+        if not isinstance(one, BodyForce):
+            raise InputError("body_forces", got=type(one).__name__, expected="a list of dd.model.BodyForce")
+        if any(one.name == other.name for other in found):
+            raise InputError("body_forces", got=f"{one.name} twice", expected="each name once")
+        found.append(one)
+    return tuple(found)
+
+
+def add_body_forces(builder: DiagramBuilder, plant: MultibodyPlant, forces: Sequence[BodyForce]) -> None:
+    """One Propeller with an exported command for each of `forces`; the plant is finalized, the diagram not built.
+
+    Raises UnknownNameError, which lists the links, or InputError where a name is an actuator's.
+    """
+    if not forces:
+        return
+    links, driven, propellers = labelled(bodies(plant)), {a.name() for a in actuators(plant)}, []
+    for force in forces:
+        if force.body not in links:
+            raise UnknownNameError(f"body of the BodyForce {force.name}", got=force.body, known=links)
+        if force.name in driven:
+            raise InputError("body_forces", got=force.name, expected="no name of an actuator")
+        pose = RigidTransform(RotationMatrix.MakeFromOneVector(np.array(force.direction), 2), np.array(force.point))
+        propellers.append(PropellerInfo(links[force.body].index(), pose, 1.0, force.moment_ratio))
+    system = builder.AddNamedSystem(BODY_FORCES, Propeller(propellers))
+    builder.Connect(plant.get_body_poses_output_port(), system.get_body_poses_input_port())
+    builder.Connect(system.get_spatial_forces_output_port(), plant.get_applied_spatial_force_input_port())
+    builder.ExportInput(system.get_command_input_port(), BODY_FORCES)
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """What each entry of u (nu,) is, and which input ports of the plant the diagram's systems feed."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    lower: Array  # (nu,)
+    upper: Array
+    actuator: NDArray[np.intp]  # (nu,) which actuator an entry drives, -1 where it is one of a port
+    ports: tuple[tuple[int, slice], ...]  # the diagram's own ports that are inputs, and where they stand in u
+    fed: frozenset[int]  # the plant's input ports that systems feed, or that are inputs themselves
+    fed_actuators: tuple[int, ...]  # those that are no entries of u, as a system drives them
+    systems: tuple[str, ...]  # the names of the systems that act on the plant
+    left_out: tuple[str, ...]  # exported ports that do not reach the plant
+
+    @property
+    def plain(self) -> bool:
+        """Whether u is the plant's actuation and nothing else: all actuators, in order."""
+        return not self.ports and not self.fed_actuators
+
+    def of_actuators(self, rows: Any) -> Array:
+        """(nu, ...) of numbers for each actuator, (actuators, ...), those for each input; 0 where it is no actuator."""
+        rows = np.asarray(rows, dtype=float)
+        if self.plain:
+            return rows
+        found = np.zeros((len(self.names), *rows.shape[1:]))
+        found[self.actuator >= 0] = rows[self.actuator[self.actuator >= 0]]
+        return found
+
+
+class _Wiring:
+    """What feeds each input port of the leaves of a diagram: a leaf, the number of the diagram's own port, or None."""
+
+    def __init__(self, diagram: Diagram):
+        self.leaves: list[Any] = []
+        self.sources: dict[tuple[int, int], Any] = {}
+        self._kept: list[Any] = []  # so that no two systems of Python's have one id
+        self._read(diagram, list(range(diagram.num_input_ports())))
+
+    def _read(self, diagram: Any, outside: list[Any]) -> None:
+        systems, connections = diagram.GetSystems(), diagram.connection_map()
+        self._kept += [systems, connections]
+        inside = {(id(system), int(port)): source for (system, port), source in connections.items()}
+        exported = {}
+        for i, source in enumerate(outside):
+            for system, port in diagram.GetInputPortLocators(InputPortIndex(i)):
+                exported[id(system), int(port)] = source
+        for system in systems:
+            fed = []
+            for i in range(system.num_input_ports()):
+                key = (id(system), i)
+                fed.append(_leaf(*inside[key]) if key in inside else exported.get(key))
+            if isinstance(system, Diagram):
+                self._read(system, fed)
+            else:
+                self.leaves.append(system)
+                self.sources.update({(id(system), i): source for i, source in enumerate(fed)})
+
+    def consumers(self, port: int) -> list[tuple[Any, int]]:
+        """The leaves, and which of their input ports, that an input port of the diagram feeds."""
+        by_id = {id(leaf): leaf for leaf in self.leaves}
+        return [
+            (by_id[of], i) for (of, i), source in self.sources.items() if isinstance(source, int) and source == port
+        ]
+
+    def behind(self, plant: Any, ports: Sequence[int]) -> tuple[list[Any], set[int]]:
+        """The systems, but plant and scene graph, and the diagram's own ports that input ports of `plant` depend on."""
+        found: list[Any] = []
+        reached: set[int] = set()
+        waiting = [self.sources[id(plant), i] for i in ports]
+        while waiting:
+            source = waiting.pop()
+            if isinstance(source, int):
+                reached.add(source)
+            elif source not in (None, plant, *found) and not isinstance(source, SceneGraph):
+                found.append(source)
+                waiting += [self.sources[id(source), i] for i in range(source.num_input_ports())]
+        return found, reached
+
+
+def _leaf(system: Any, port: Any) -> Any:
+    """The leaf whose output a subsystem's output port is."""
+    while isinstance(system, Diagram):
+        system, port = system.get_output_port_locator(OutputPortIndex(int(port)))
+    return system
+
+
+def read_inputs(diagram: Diagram, plant: Any, forces: Sequence[BodyForce] = ()) -> Inputs:
+    """The inputs of a diagram with one plant; `forces` are those of its port `BODY_FORCES`.
+
+    Raises ModelError where a system that acts on the plant has a state of its own, or where the plant's actuation is
+    fed inside and there are no other inputs.
+    """
+    wiring = _Wiring(diagram)
+    whole = int(plant.get_actuation_input_port().get_index())
+    parts = {int(plant.get_actuation_input_port(i).get_index()): i for i in instances(plant)}
+    generalized = int(plant.get_applied_generalized_force_input_port().get_index())
+    targets = [int(plant.get_desired_state_input_port(i).get_index()) for i in instances(plant)]
+    acting = [whole, *parts, generalized, int(plant.get_applied_spatial_force_input_port().get_index()), *targets]
+    systems, reached = wiring.behind(plant, acting)
+    _check_states(systems)
+    own = [generalized, *targets] if isinstance(diagram, RobotDiagram) else []  # which it exports in any case
+    vectors: list[tuple[int, Any, set[int]]] = []
+    places: list[int] = []  # before which of them the actuators stand
+    left_out: list[str] = []
+    for number in range(diagram.num_input_ports()):
+        port, consumers = diagram.get_input_port(number), wiring.consumers(number)
+        if port.get_data_type() != PortDataType.kVectorValued or not port.size():
+            continue
+        into = {i for leaf, i in consumers if leaf is plant}
+        alone = all(leaf is plant for leaf, _ in consumers)
+        if alone and into and into <= {whole, *parts}:
+            places.append(len(vectors))
+        elif number not in reached:
+            left_out.append(port.get_name())
+        elif not (alone and into <= set(own)):
+            vectors.append((number, port, into))
+    chosen = {number for number, _, _ in vectors}
+    fed = frozenset(i for i in acting if _is_fed(wiring.sources[id(plant), i], chosen))
+    driven = [i for i, a in enumerate(actuators(plant)) if whole in fed or _own_port(a, parts) in fed]
+    rows = _rows_of_actuators(plant, [i for i in range(plant.num_actuators()) if i not in driven])
+    found: list[Row] = []
+    ports: list[tuple[int, slice]] = []
+    first = min(places, default=0)
+    for number, port, into in vectors:
+        if len(ports) == first:
+            found += rows
+        ports.append((number, slice(len(found), len(found) + port.size())))
+        found += _rows_of_port(plant, port, into, generalized, forces)
+    if len(ports) == first:
+        found += rows
+    if not ports and (whole in fed or driven):
+        raise ModelError(
+            "the plant's actuation input is connected inside the diagram, but drake_diff has to set it: leave it free "
+            "or export it, or export the input of the system that feeds it"
+        )
+    names, units, lower, upper, index = zip(*found, strict=True) if found else ((),) * 5
+    return Inputs(
+        names=_told_apart(names),
+        units=units,
+        lower=frozen(lower),
+        upper=frozen(upper),
+        actuator=np.array(index, dtype=np.intp),
+        ports=tuple(ports),
+        fed=fed,
+        fed_actuators=tuple(driven),
+        systems=tuple(str(system.get_name()) for system in systems),
+        left_out=tuple(left_out),
+    )
+
+
+def _is_fed(source: Any, chosen: set[int]) -> bool:
+    return source in chosen if isinstance(source, int) else source is not None
+
+
+def _own_port(actuator: Any, parts: Mapping[int, Any]) -> int:
+    """The actuation port of its model instance."""
+    return next(port for port, instance in parts.items() if instance == actuator.model_instance())
+
+
+def _check_states(systems: Sequence[Any]) -> None:
+    for system in systems:
+        kinds = {
+            "continuous": system.num_continuous_states(),
+            "discrete": system.num_discrete_state_groups(),
+            "abstract": system.num_abstract_states(),
+        }
+        for kind, count in kinds.items():
+            if count:
+                raise ModelError(
+                    f"the system {system.get_name()!r} in the diagram acts on the plant and has a {kind} state of its "
+                    "own, which is not part of the state x: [q; v] of the plant; use a system without a state, or "
+                    "bodies and joints that move as it does"
+                )
+
+
+def _rows_of_actuators(plant: Any, which: list[int]) -> list[Row]:
+    found = actuators(plant)
+    lower, upper = plant.GetEffortLowerLimits(), plant.GetEffortUpperLimits()
+    units = ["N" if a.joint().type_name() == "prismatic" else "N m" for a in found]
+    return [(found[i].name(), units[i], float(lower[i]), float(upper[i]), i) for i in which]
+
+
+def _rows_of_port(plant: Any, port: Any, into: set[int], generalized: int, forces: Sequence[BodyForce]) -> list[Row]:
+    if forces and port.get_name() == BODY_FORCES:
+        return [(force.name, "N", force.lower, force.upper, -1) for force in forces]
+    size, name = port.size(), port.get_name()
+    units = [UNKNOWN] * size
+    if into == {generalized}:
+        units = _force_units(plant)
+    names = [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
+    return [(n, unit, -np.inf, np.inf, -1) for n, unit in zip(names, units, strict=True)]
+
+
+def _force_units(plant: Any) -> list[str]:
+    """Of the generalized force on each velocity."""
+    units = [UNKNOWN] * plant.num_velocities()
+    known = {"revolute": ["N m"], "prismatic": ["N"], "quaternion_floating": ["N m"] * 3 + ["N"] * 3}
+    for joint in joints(plant):
+        for i, unit in enumerate(known.get(joint.type_name(), [])):
+            units[joint.velocity_start() + i] = unit
+    return units
+
+
+def _told_apart(names: Sequence[str]) -> tuple[str, ...]:
+    """The names, those of ports that an actuator has too with the number of the input."""
+    return tuple(name if names.index(name) == i else f"{name} (u[{i}])" for i, name in enumerate(names))
