@@ -167,7 +167,9 @@ class Model(ShowsItsRepr):
         if self.coupling is None:
             return self
         if self._whole is None:
-            self._whole = Model(self.diagram, source=self.source, notes=self.notes, forces=self.forces)
+            self._whole = Model(
+                self.diagram, source=self.source, notes=self.notes, forces=self.forces, body_forces=self.body_forces
+            )
             self._whole.double = replace(self.double, coupling=None)
         self._whole.other_quantities = self.other_quantities
         return self._whole
@@ -463,11 +465,11 @@ def load_model(
         plant.mutable_gravity_field().set_gravity_vector(options["gravity"])
     try:
         plant.Finalize()
-        add_body_forces(builder, plant, body_forces)
-        diagram = builder.Build()
     except DRAKES_REFUSALS as error:
         raise ModelError(f"{source}: expected a model that Drake can finalize; Drake says: {error}") from error
     coupling = coupling_of(plant, mimics)
+    add_body_forces(builder, plant, body_forces)
+    diagram = builder.Build()
 
     def rebuild(**changes: Any) -> Model:
         for option in changes.keys() - options.keys():
