@@ -192,8 +192,6 @@ BAD_FILES = {
     "type.urdf": (urdf("continuous", "wobbly"), "wobbly"),
     "child.urdf": (urdf('child link="b"', 'child link="c"'), "'c'"),
     "twice.urdf": (urdf('link name="b"', 'link name="a"'), "'a'"),
-    "mesh_missing.urdf": (shape('<mesh filename="gone.obj"/>'), r"gone\.obj"),
-    "package_missing.urdf": (shape('<mesh filename="package://gone/m.obj"/>'), "package 'gone'"),
     "nothing_moves.urdf": ('<robot name="r"/>', "cannot move"),
     "version.sdf": (sdf().replace("1.7", "99"), "99"),
     "mass_of_letters.sdf": (sdf("<inertial><mass>heavy</mass></inertial>"), "mass"),

@@ -23,10 +23,10 @@ from pydrake.multibody.plant import ContactModel, MultibodyPlant
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.model.meshes import put_meshes, read_meshes
 from drake_diff.model.plant import bodies
 
 FORMATS = (".urdf", ".sdf", ".xml", ".mjcf", ".dmd.yaml")
-USABLE_MESHES = (".obj", ".vtk", ".gltf", ".glb")
 DRAKES_REFUSALS = (RuntimeError, ValueError, SystemExit)  # SystemExit is a failed condition in Drake's C++
 
 # Drake says of every half space that deformable bodies will not touch it, which no model here has.
@@ -53,8 +53,12 @@ def as_packages(value: Mapping[str, str | Path] | None) -> dict[str, str] | None
     return {str(name): str(folder) for name, folder in value.items()}
 
 
-def read_into(plant: MultibodyPlant, path: Path, packages: Mapping[str, str] | None = None) -> FileRead:
+def read_into(
+    plant: MultibodyPlant, path: Path, packages: Mapping[str, str] | None = None, meshes: str = "skip"
+) -> FileRead:
     """Add the model in `path` to `plant`; `packages` are folders by the name that package:// uses.
+
+    `meshes` is what becomes of collision meshes: see `load_model`.
 
     Raises InputError where the file is missing or of an unknown kind, ModelError where Drake refuses it.
     """
@@ -75,11 +79,13 @@ def read_into(plant: MultibodyPlant, path: Path, packages: Mapping[str, str] | N
                 above = next((p for p in path.resolve().parents if p.name == name), None)
                 if above is not None and not parser.package_map().Contains(name):
                     parser.package_map().Add(name, str(above))
-            reduced = _without_unusable_meshes(path, notes)
-            if reduced is None:
+            found = read_meshes(path, parser.package_map(), meshes)
+            notes += found.notes()
+            if found.text is None:
                 parser.AddModels(str(path))
             else:
-                parser.AddModelsFromString(reduced, path.suffix.lstrip("."))
+                parser.AddModelsFromString(found.text, path.suffix.lstrip("."))
+            notes += put_meshes(plant, parser.scene_graph(), found)
         except UnicodeDecodeError as error:
             got = f"byte {error.object[error.start]:#04x} at position {error.start}"
             raise ModelError(f"{path}: expected text in UTF-8, got {got}") from error
@@ -105,46 +111,6 @@ def _drake_warnings(notes: list[str]) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         logger.propagate = propagate
-
-
-def _without_unusable_meshes(path: Path, notes: list[str]) -> str | None:
-    """The file's text without the visuals and collisions whose mesh format Drake cannot use.
-
-    None where there are none, or where the format names its meshes in another way (MJCF: Drake warns itself).
-    """
-    text = path.read_text()
-    if path.suffix not in (".urdf", ".sdf") or not re.search(r"\.(dae|stl|ply|off)\b", text, re.IGNORECASE):
-        return None
-    for prefix, namespace in re.findall(r'xmlns:(\w+)="([^"]+)"', text):
-        if not re.fullmatch(r"ns\d+", prefix):  # such names ElementTree keeps for itself
-            ET.register_namespace(prefix, namespace)  # else drake:... tags come out as ns0:...
-    root = ET.fromstring(text)
-    skipped: list[str] = []
-    for parent in root.iter():
-        for kind in ("visual", "collision"):
-            for element in parent.findall(kind):
-                uris = [mesh.get("filename") or (mesh.findtext("uri") or "").strip() for mesh in element.iter("mesh")]
-                unusable = [uri for uri in uris if not uri.lower().endswith(USABLE_MESHES)]
-                if unusable:
-                    parent.remove(element)
-                    skipped += [f"{parent.get('name', '?')} {kind} {uri}" for uri in unusable]
-    if not skipped:
-        return None
-    for mesh in root.iter("mesh"):  # a model given as text has no folder to start relative names from
-        _make_absolute(mesh, path)
-    notes.append(f"{len(skipped)} meshes skipped, Drake uses only {' '.join(USABLE_MESHES)}: " + "; ".join(skipped))
-    return ET.tostring(root, encoding="unicode")
-
-
-def _make_absolute(mesh: ET.Element, path: Path) -> None:
-    uri = mesh.find("uri")
-    name = mesh.get("filename") or (uri.text if uri is not None else "") or ""
-    if name and "://" not in name and not Path(name).is_absolute():
-        absolute = (path.parent / name).resolve().as_uri()
-        if uri is not None:
-            uri.text = absolute
-        else:
-            mesh.set("filename", absolute)
 
 
 ROUTES = ("corner_spheres", "hydroelastic", "differences")

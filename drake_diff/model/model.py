@@ -30,6 +30,7 @@ from drake_diff.model.load_file import (
     read_into,
     replace_collision_geometry,
 )
+from drake_diff.model.meshes import TREATMENTS
 from drake_diff.model.mimic import Coupling, check_mimic, couple, coupling_of, fix_mimics, uncoupled
 from drake_diff.model.plant import (
     actuators,
@@ -374,6 +375,7 @@ def load_model(
     contact: bool = True,
     mimic: str | None = None,
     body_forces: Sequence[BodyForce | Mapping[str, Any]] = (),
+    meshes: str = "skip",
 ) -> Model:
     """The robot in a URDF, SDF, MJCF (.xml) or .dmd.yaml file as a discrete model.
 
@@ -403,6 +405,9 @@ def load_model(
             the independent coordinates; "fix" welds followers and leaders where they are. None keeps all in the state,
             as Drake does; collocation and other engines refuse such a model.
         body_forces: `dd.model.BodyForce`s: propellers and thrusters, each an input [N] after the actuators.
+        meshes: What becomes of collision meshes of a URDF or SDF. "skip" leaves out those in formats that Drake cannot
+            use; "convex" takes the convex hull of each, from STL, DAE, OBJ, PLY and OFF files too; "spheres" takes a
+            few spheres inside each hull, whose contact AutoDiffXd can differentiate. What is drawn stays as it is.
 
     Returns:
         The Model. What was left out of the file (such as meshes in formats that Drake cannot use) and what was added
@@ -422,6 +427,7 @@ def load_model(
     _check_choice("contact_approximation", contact_approximation, CONTACT_APPROXIMATIONS)
     if contact_geometry is not None:
         _check_choice("contact_geometry", contact_geometry, ROUTES)
+    _check_choice("meshes", meshes, TREATMENTS)
     if not isinstance(contact, bool):
         raise InputError("contact", got=repr(contact), expected="True or False")
     check_mimic(mimic)
@@ -453,8 +459,9 @@ def load_model(
         "contact": contact,
         "mimic": mimic,
         "body_forces": body_forces,
+        "meshes": meshes,
     }
-    read = read_into(plant, source, options["packages"])
+    read = read_into(plant, source, options["packages"], meshes)
     repairs, mimics = _repaired(plant, scene_graph, source, read.packages, options)
     notes = read.notes + repairs
     if notes:

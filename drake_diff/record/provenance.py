@@ -23,11 +23,13 @@ from drake_diff.certificates.certificate import Certificate
 from drake_diff.certificates.judgement import VERDICTS
 from drake_diff.model.inputs import BodyForce
 from drake_diff.model.load_file import FORMATS
+from drake_diff.model.meshes import in_any_case
 from drake_diff.model.model import Model
 from drake_diff.record.parts import Certified, FileEvidence, ModelInput, Provenance
 
 MESHES = (".obj", ".mtl", ".vtk", ".gltf", ".glb", ".bin", ".stl", ".dae", ".ply", ".off", ".msh", ".png", ".jpg")
 LIBRARIES = (".so", ".dll", ".dylib")  # plugins of Gazebo, which Drake does not read
+UNSAID = (None, (), "skip")  # options of `load_model` that change nothing are not recorded
 READABLE = (*MESHES, *FORMATS)
 WRITERS = ("mcap", "mcap-protobuf-support", "protobuf", "foxglove-schemas-protobuf", "pydantic")
 PACKAGES = ("drake", "drake-diff", "numpy", "casadi", *WRITERS)
@@ -56,7 +58,7 @@ def model_input(model: Model) -> ModelInput:
     return ModelInput(
         file=file_evidence(source, source.name),
         named=named_files(source, packages),
-        options={key: _plain(value) for key, value in options.items() if value is not None and value != ()},
+        options={key: _plain(value) for key, value in options.items() if value not in UNSAID},
     )
 
 
@@ -121,6 +123,7 @@ def named_files(path: Path, packages: Mapping[str, Any] | None = None) -> list[F
             found.append(_unread(name, "not read: its name is not that of a mesh or a robot file"))
             continue
         target = _resolve(path, name, folder, packages or {})
+        target = target and (in_any_case(target.absolute()) or target)
         try:
             found.append(file_evidence(target, name) if target and target.is_file() else _unread(name, "no such file"))
         except OSError as error:

@@ -1,0 +1,326 @@
+"""The meshes that a URDF or SDF names: looked for on the disk, and collision meshes made into what Drake can use.
+
+Drake takes collision meshes as OBJ, VTK and glTF alone. Its parser is given a tiny sphere in the place of each other
+one, so that pose, friction and filters are read as always; then that sphere's shape is changed. Nothing is written.
+"""
+
+import re
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from pydrake import geometry as pg
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import PackageMap
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_diff.exceptions import ModelError
+from drake_diff.model.sphere_fit import Spheres, fit_spheres
+from drake_diff.model.triangles import READ_BY_TRIMESH, Hull, hull_of_file
+
+TREATMENTS = ("skip", "convex", "spheres")
+USABLE_MESHES = (".obj", ".vtk", ".gltf", ".glb")  # by Drake
+DOWNLOADED = "drake_models"  # the package that Drake's parser would fetch from the network
+PLACEHOLDER = 1.2345678e-9  # [m] the radius of the first; no file has such a sphere
+MOST_TOLD = 12  # in a note; links with the same file and scale count once
+
+Scale = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class CollisionMesh:
+    """A collision mesh that is to become something else."""
+
+    link: str
+    path: Path
+    scale: Scale
+
+
+@dataclass
+class FileMeshes:
+    """The meshes of one robot file: what its text became, and what is to be put in the place of placeholders.
+
+    `text` is None where Drake can read the file as it is. `wanted` has the collision meshes by their placeholder's
+    radius [m].
+    """
+
+    treatment: str
+    text: str | None = None
+    wanted: dict[float, CollisionMesh] = field(default_factory=dict)
+    skipped: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+    unusable: list[str] = field(default_factory=list)
+
+    def notes(self) -> list[str]:
+        """What the user should know of meshes that are not used, a sentence each."""
+        told = []
+        if self.skipped:
+            told.append(
+                f"{len(self.skipped)} collision meshes skipped, Drake uses only {' '.join(USABLE_MESHES)}: "
+                f'{_listed(self.skipped)}. meshes="convex" or meshes="spheres" takes them.'
+            )
+        if self.missing:
+            told.append(
+                f"{len(self.missing)} meshes skipped, no file found: {_listed(self.missing)}. Links without a shape "
+                "are drawn as a skeleton; packages={name: folder} says where a package is."
+            )
+        if self.unusable:
+            told.append(f"{len(self.unusable)} meshes skipped, they cannot be used: {_listed(self.unusable)}.")
+        return told
+
+
+def _listed(names: list[str]) -> str:
+    more = f"; and {len(names) - MOST_TOLD} more" if len(names) > MOST_TOLD else ""
+    return "; ".join(names[:MOST_TOLD]) + more
+
+
+def read_meshes(path: Path, packages: PackageMap, treatment: str) -> FileMeshes:
+    """What is to become of the meshes of the robot file at `path`. Of formats other than URDF and SDF that is nothing.
+
+    Raises ParseError where the file is no XML, ModelError where a scale is no number.
+    """
+    found = FileMeshes(treatment)
+    text = path.read_text()
+    foreign = re.search(r"\.(dae|stl|ply|off)\b", text, re.IGNORECASE)
+    if path.suffix not in (".urdf", ".sdf") or not (foreign or "<mesh" in text):
+        return found
+    try:
+        root = _parsed(text)
+    except ET.ParseError:
+        if foreign or treatment != "skip":
+            raise
+        return found  # Drake's parser forgives more than Python's
+    places = [(parent, e) for parent in root.iter() for e in parent if e.tag in ("visual", "collision")]
+    changed = False
+    try:
+        for parent, element in places:
+            if element.find(".//mesh") is not None:
+                changed |= _change(found, parent, element, _place(_uri(next(element.iter("mesh"))), path, packages))
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+    if changed:
+        for element in root.iter():  # a model given as text has no folder to start relative names from
+            _make_absolute(element, path)
+        found.text = ET.tostring(root, encoding="unicode")
+    return found
+
+
+def _parsed(text: str) -> ET.Element:
+    for prefix, namespace in re.findall(r'xmlns:(\w+)="([^"]+)"', text):
+        if not re.fullmatch(r"ns\d+", prefix):  # such names ElementTree keeps for itself
+            ET.register_namespace(prefix, namespace)  # else drake:... tags come out as ns0:...
+    return ET.fromstring(text)
+
+
+def _change(found: FileMeshes, parent: ET.Element, element: ET.Element, place: Path | None) -> bool:
+    """Do to a visual or collision what its mesh needs; whether the text is another one now."""
+    mesh = next(element.iter("mesh"))
+    uri, link = _uri(mesh), parent.get("name", "?")
+    if f"//{DOWNLOADED}/" in uri:
+        return False
+    file, told = _file(place), f"{link} {element.tag} {uri}"
+    scale = _scale(mesh, told)
+    ending = Path(uri).suffix.lower()
+    if file is None:
+        found.missing.append(told)
+        parent.remove(element)
+    elif ending not in (*USABLE_MESHES, *READ_BY_TRIMESH):
+        found.unusable.append(f"{told} (a format that is not known)")
+        parent.remove(element)
+    elif element.tag == "visual" or (found.treatment == "skip" and ending in USABLE_MESHES):
+        if place is not None and place.is_file() and ":///" not in uri.removeprefix("file"):
+            return False  # Drake finds it too
+        _set_uri(mesh, file)
+    elif found.treatment == "skip":
+        found.skipped.append(told)
+        parent.remove(element)
+    else:
+        wanted = CollisionMesh(link, file, scale)
+        try:
+            _became(wanted, found.treatment)
+        except ModelError as error:
+            found.unusable.append(f"{told} ({error})")
+            parent.remove(element)
+            return True
+        radius = PLACEHOLDER * (1 + len(found.wanted))
+        found.wanted[radius] = wanted
+        _put_sphere(parent, element, mesh, radius, file.stem)
+    return True
+
+
+def _uri(mesh: ET.Element) -> str:
+    return (mesh.get("filename") or mesh.findtext("uri") or "").strip()
+
+
+def _scale(mesh: ET.Element, told: str) -> Scale:
+    text = mesh.get("scale") or mesh.findtext("scale") or "1"
+    try:
+        numbers = [float(number) for number in text.split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (1, 3) or not all(np.isfinite(numbers)) or 0 in numbers:
+        raise ModelError(f"{told}: expected a scale of one or three numbers that are not 0, got {text!r}")
+    return numbers[0], numbers[-1 if len(numbers) == 1 else 1], numbers[-1]
+
+
+def _put_sphere(parent: ET.Element, element: ET.Element, mesh: ET.Element, radius: float, stem: str) -> None:
+    """A placeholder where the mesh was, in the words of the format."""
+    geometry = next(g for g in element.iter() if mesh in list(g))
+    sphere = ET.Element("sphere")
+    if "filename" in mesh.attrib:
+        sphere.set("radius", repr(radius))
+    else:
+        ET.SubElement(sphere, "radius").text = repr(radius)
+    geometry[list(geometry).index(mesh)] = sphere
+    if not element.get("name"):  # Drake would call it a sphere
+        names = {other.get("name") for other in parent.findall("collision")}
+        element.set("name", next(n for n in (stem, *(f"{stem}_{i}" for i in range(len(names)))) if n not in names))
+
+
+def _set_uri(mesh: ET.Element, file: Path) -> None:
+    name, uri = f"file://{file}", mesh.find("uri")
+    if uri is not None:
+        uri.text = name
+    else:
+        mesh.set("filename", name)
+
+
+def _make_absolute(element: ET.Element, path: Path) -> None:
+    """A relative name of a mesh or of an included model, from the root of the disk."""
+    if element.tag not in ("mesh", "include"):
+        return
+    uri = _uri(element)
+    if uri and "://" not in uri and (path.parent / uri).exists():
+        _set_uri(element, (path.parent / uri).resolve())
+
+
+def find_file(uri: str, path: Path, packages: PackageMap) -> Path | None:
+    """The file that a robot file at `path` calls `uri`, whatever letters are capital; None where there is none."""
+    return _file(_place(uri, path, packages))
+
+
+def _file(place: Path | None) -> Path | None:
+    return None if place is None else in_any_case(place) or in_any_case(Path(unquote(str(place))))
+
+
+def _place(uri: str, path: Path, packages: PackageMap) -> Path | None:
+    """Where `uri` leads, letter by letter; None where that is not on this disk."""
+    package = re.match(r"(?:package|model)://+([^/]+)/(.*)", uri, re.DOTALL)
+    if not package:
+        start, name = path.parent.absolute(), uri.removeprefix("file://")
+    elif packages.Contains(package[1]) and package[1] != DOWNLOADED:
+        start, name = Path(packages.GetPath(package[1])), package[2]
+    else:  # what `read_into` has not seen: package:///NAME/
+        above = next((p for p in path.resolve().parents if p.name == package[1]), None)
+        if above is None:
+            return None
+        start, name = above, package[2]
+    return None if "://" in name or "\0" in name or not name else start / name
+
+
+def in_any_case(path: Path) -> Path | None:
+    """The file at an absolute `path`, or the first whose name differs in upper and lower case alone."""
+    try:
+        if path.is_file():
+            return path.resolve()
+        here = Path(path.anchor)
+        for part in path.parts[1:]:
+            step = here / part
+            if part != ".." and not step.exists():
+                same = [other.name for other in here.iterdir() if other.name.lower() == part.lower()]
+                if not same:
+                    return None
+                step = here / min(same)
+            here = step
+        return here.resolve() if here.is_file() else None
+    except OSError:  # a folder that may not be read, a name that is too long
+        return None
+
+
+def _became(mesh: CollisionMesh, treatment: str) -> tuple[Hull, Spheres | None]:
+    """The hull of a mesh, and the spheres inside it where these are asked for. ModelError where there is no hull."""
+    hull = hull_of_file(mesh.path, mesh.scale)
+    return hull, _spheres(hull, mesh.path.name) if treatment == "spheres" else None
+
+
+@lru_cache(maxsize=256)  # by the hull itself, which is kept too
+def _spheres(hull: Hull, label: str) -> Spheres:
+    return fit_spheres(hull, label)
+
+
+def put_meshes(plant: MultibodyPlant, scene_graph: pg.SceneGraph, meshes: FileMeshes) -> list[str]:
+    """Change the placeholders in `plant` to hulls or spheres; a sentence for what was done.
+
+    To be called before anything else is added and the plant is finalized. Masses and inertias stay as they are.
+    """
+    if not meshes.wanted:
+        return []
+    inspector = scene_graph.model_inspector()
+    known = list(inspector.GetAllGeometryIds(pg.Role.kProximity))
+    for geometry in tuple(known):
+        shape = inspector.GetShape(geometry)
+        mesh = meshes.wanted.get(shape.radius()) if isinstance(shape, pg.Sphere) else None
+        if mesh is None:
+            continue
+        hull, spheres = _became(mesh, meshes.treatment)
+        filtered = [g for g in known if inspector.CollisionFiltered(g, geometry)]
+        if spheres is None:
+            scene_graph.ChangeShape(plant.get_source_id(), geometry, hull.shape(mesh.path.name))
+            became = [geometry]
+        else:
+            became = _put_spheres(plant, scene_graph, geometry, spheres)
+        if filtered:  # Drake keeps filters by geometry, and forgets those of one whose shape changes
+            between = pg.CollisionFilterDeclaration().ExcludeBetween(pg.GeometrySet(became), pg.GeometrySet(filtered))
+            scene_graph.collision_filter_manager().Apply(between)
+        known += became[1:]
+    return [_told(meshes)]
+
+
+def _put_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph, geometry: Any, spheres: Spheres) -> list[Any]:
+    """The ids of the spheres that the placeholder became, its own among them."""
+    inspector = scene_graph.model_inspector()
+    body = plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
+    X_BG = RigidTransform(inspector.GetPoseInFrame(geometry))
+    properties = pg.ProximityProperties(inspector.GetProximityProperties(geometry))
+    name = inspector.GetName(geometry).removeprefix(f"{plant.GetModelInstanceName(body.model_instance())}::")
+    first, *more = (X_BG @ RigidTransform(centre) for centre in spheres.centres)
+    scene_graph.ChangeShape(plant.get_source_id(), geometry, pg.Sphere(spheres.radius), first)
+    return [geometry] + [
+        plant.RegisterCollisionGeometry(body, pose, pg.Sphere(spheres.radius), f"{name}_{i}", properties)
+        for i, pose in enumerate(more, start=2)
+    ]
+
+
+def _told(meshes: FileMeshes) -> str:
+    """One sentence for all meshes, and one for each kind of link, those that are met worst first."""
+    kinds: dict[tuple[Path, Scale], list[str]] = {}
+    for mesh in meshes.wanted.values():
+        kinds.setdefault((mesh.path, mesh.scale), []).append(mesh.link)
+    became = {kind: _became(CollisionMesh("", *kind), meshes.treatment) for kind in kinds}
+    lost = max(hull.lost for hull, _ in became.values())
+    less = (
+        f" Of fine meshes only part of the corners is used: they reach up to {lost:.2g} m farther." if lost > 0 else ""
+    )
+    if meshes.treatment == "convex":
+        corners = [len(hull.corners) for hull, _ in became.values()]
+        return (
+            f"{len(meshes.wanted)} collision meshes became their convex hulls, of {min(corners)} to {max(corners)} "
+            f"corners; what is hollow is filled. AutoDiffXd refuses point contact with them.{less}"
+        )
+    fits = sorted(((s, k) for k, (_, s) in became.items() if s is not None), key=lambda f: -f[0].ground_gap)
+    count = sum(len(spheres.centres) * len(kinds[kind]) for spheres, kind in fits)
+    lines = [
+        f"{kind[0].name} ({', '.join(kinds[kind])}): {len(s.centres)} of radius {s.radius:.2g} m, gaps "
+        f"{s.ground_gap:.2g} and {s.open_gap:.2g} m"
+        for s, kind in fits[:MOST_TOLD]
+    ]
+    rest = f"; and {len(fits) - MOST_TOLD} kinds of link with smaller gaps" if len(fits) > MOST_TOLD else ""
+    return (
+        f"{len(meshes.wanted)} collision meshes became {count} spheres inside their convex hulls. The first gap is how "
+        "much later a flat ground is met at most, the second how far the hull's surface is from the spheres: "
+        f"{'; '.join(lines)}{rest}.{less}"
+    )

@@ -1,0 +1,349 @@
+"""Triangle meshes of robots: read by trimesh, made smaller for a page, wrapped in a convex hull.
+
+trimesh is imported when the first mesh is read. What a mesh file names (textures, other files) is not opened, except
+an OBJ's list of materials beside it.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Convex
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import ModelError
+
+READ_BY_TRIMESH = (".stl", ".dae", ".obj", ".ply", ".off")
+LARGEST_FILE = 2**29  # [bytes] of a mesh file that is read
+MOST_COLOURS = 12  # of one mesh; all others become one, their average
+MOST_CORNERS = 1000  # of a convex hull
+MOST_POINTS = 20_000  # that all have a say in a hull; of more, only those farthest out
+FEW_DIRECTIONS = 40  # in which the farthest points span a first hull; what is inside it is inside the whole
+SMALL_PART = 16  # cells along the diagonal of a mesh that it keeps at least, however small it is in the robot
+JOINED = 2.0**-20  # of a mesh's size: vertices that are closer are one
+SEARCHES = 8  # for the cell that keeps a robot's faces below their limit
+PLAIN = (0.6, 0.6, 0.62)  # of what has no colour
+
+Integers = NDArray[np.int64]
+Colour = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """A mesh: `vertices` (n, 3) [m], `faces` (m, 3) of their indices, `colours` (m, 3) in 0..1 or None."""
+
+    vertices: Array
+    faces: Integers
+    colours: Array | None = None
+
+    def parts(self) -> "list[tuple[Triangles, Colour | None]]":
+        """The faces of each colour as a mesh of its own; all of them with None where the mesh has no colours."""
+        if self.colours is None:
+            return [(self, None)]
+        found, which = np.unique(self.colours, axis=0, return_inverse=True)
+        parts: list[tuple[Triangles, Colour | None]] = []
+        for i, (r, g, b) in enumerate(found.tolist()):
+            used, faces = np.unique(self.faces[which.ravel() == i], return_inverse=True)
+            parts.append((Triangles(self.vertices[used], faces.reshape(-1, 3)), (r, g, b)))
+        return parts
+
+
+@dataclass(frozen=True, eq=False)
+class Hull:
+    """A convex hull: `corners` (n, 3) [m], and its faces as planes, `normals` (f, 3) @ x <= `offsets` (f,) inside.
+
+    `triangles` (t, 3) are its faces by their corners. `lost` [m] is how far points of the mesh are outside.
+    """
+
+    corners: Array
+    normals: Array
+    offsets: Array
+    triangles: Integers
+    lost: float
+
+    def shape(self, label: str) -> Convex:
+        """The hull as a shape of Drake; a label has one line."""
+        return Convex(points=self.corners.T, label=" ".join(label.split()))
+
+
+def read_mesh(path: Path) -> Triangles:
+    """The mesh in an STL, DAE, OBJ, PLY or OFF file, in metres, in the file's own axes.
+
+    The unit that a DAE states is used. Its `up_axis` is not: RViz, MoveIt, Gazebo and Pinocchio do not use it either,
+    and robots are made for them. Raises ModelError where the file has no triangle that can be read.
+    """
+    return _read(path, *_state(path))
+
+
+def _state(path: Path) -> tuple[int, int]:
+    """When the file was changed, and how large it is; ModelError where it is missing or too large."""
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise ModelError(f"{path}: the mesh cannot be read: {error.strerror}") from error
+    if state.st_size > LARGEST_FILE:
+        raise ModelError(f"{path}: expected a mesh of at most {LARGEST_FILE} bytes, got {state.st_size}")
+    return state.st_mtime_ns, state.st_size
+
+
+@lru_cache(maxsize=4)  # the links of a robot often share a file; all of them would be much to keep
+def _read(path: Path, _changed: int, _size: int) -> Triangles:
+    import trimesh
+
+    kind = path.suffix.lower()
+    try:
+        data, beside = BytesIO(path.read_bytes()), _Materials(path.parent)
+        scene: Any = trimesh.load_scene(data, file_type=kind[1:], resolver=beside, process=False)
+        found = [_part(scene, node, coloured=kind != ".stl") for node in scene.graph.nodes_geometry]
+    except Exception as error:  # a reader of strangers' files raises whatever it runs into
+        told = str(error) or type(error).__name__
+        raise ModelError(f"{path}: expected a mesh that can be read; trimesh says: {told}") from error
+    parts = [part for part in found if part is not None and len(part.faces)]
+    if not parts:
+        raise ModelError(f"{path}: expected a mesh of triangles")
+    starts = np.cumsum([0] + [len(part.vertices) for part in parts])
+    colours = None
+    if any(part.colours is not None for part in parts):
+        each = [np.tile(PLAIN, (len(part.faces), 1)) if part.colours is None else part.colours for part in parts]
+        colours = _few_colours(np.concatenate(each))
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
+    return _joined(vertices, faces, colours)
+
+
+class _Materials:
+    """Gives trimesh the list of materials beside an OBJ file and nothing else: a stranger's file can name any file."""
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+
+    def get(self, name: str) -> bytes:
+        path = self._folder / Path(name).name
+        if path.suffix.lower() != ".mtl" or not path.is_file():
+            raise ValueError(f"{name} is not opened")
+        return path.read_bytes()
+
+
+def _part(scene: Any, node: str, *, coloured: bool) -> Triangles | None:
+    """A mesh of a scene in the scene's frame, in metres; None for what is no mesh (lines, points)."""
+    X, name = scene.graph[node]
+    mesh = scene.geometry[name]
+    if getattr(mesh, "faces", None) is None:
+        return None
+    if not np.all(np.isfinite(mesh.vertices)):
+        raise ValueError("a vertex is not finite")
+    unit = re.fullmatch(r"(\S+) \* meters", str(mesh.metadata.get("units")))  # of a DAE; "meters" where it is 1
+    metre = float(unit[1]) if unit else 1.0
+    vertices = metre * (np.asarray(mesh.vertices, dtype=float) @ X[:3, :3].T + X[:3, 3])
+    faces = np.asarray(mesh.faces, dtype=np.int64)
+    return Triangles(vertices, faces, _colours(mesh.visual, len(faces)) if coloured else None)
+
+
+def _colours(visual: Any, count: int) -> Array | None:
+    """(count, 3) the colour of each face, None where the file has none. What is translucent is drawn opaque."""
+    if visual.kind in ("vertex", "face"):
+        return np.asarray(visual.face_colors, dtype=float)[:, :3] / 255
+    if visual.kind == "texture":
+        return np.tile(np.asarray(visual.material.main_color, dtype=float)[:3] / 255, (count, 1))
+    return None
+
+
+def _few_colours(colours: Array) -> Array:
+    """The same colours where they are few; else the commonest, and the average of the others in place of these."""
+    found, which, counts = np.unique(colours, axis=0, return_inverse=True, return_counts=True)
+    if len(found) <= MOST_COLOURS:
+        return colours
+    rest = np.sort(np.argsort(-counts, kind="stable")[MOST_COLOURS - 1 :])
+    found[rest] = np.average(found[rest], axis=0, weights=counts[rest])
+    return np.asarray(found[which.ravel()])
+
+
+def scaled(mesh: Triangles, scale: Sequence[float]) -> Triangles:
+    """The mesh with each axis multiplied by its factor of `scale` (3,)."""
+    faces = mesh.faces[:, ::-1] if np.prod(scale) < 0 else mesh.faces  # a mirror image is turned inside out
+    return Triangles(mesh.vertices * np.asarray(scale, dtype=float), faces, mesh.colours)
+
+
+def with_fewer_faces(meshes: Sequence[Triangles], limit: int) -> tuple[Triangles, ...]:
+    """The meshes of a robot with `limit` faces together, or a little more where it has many small parts.
+
+    Vertices in one cell of a grid become one (Lindstrom, "Out-of-core simplification of large polygonal models",
+    2000): the point closest to the planes of the faces that met there, so that edges stay sharp. The cell is the same
+    for the whole robot, but for parts that would lose their shape.
+    """
+    if sum(len(mesh.faces) for mesh in meshes) <= limit:
+        return tuple(meshes)
+    cell = float(np.sqrt(2 * sum(float(np.sum(_areas(mesh)[1])) for mesh in meshes) / limit))
+    found = [_clusters(mesh, cell) for mesh in meshes]
+    for _ in range(SEARCHES):
+        count = sum(len(kept) for _, kept, _ in found)
+        if 0.8 * limit <= count <= limit:
+            break
+        cell *= float(np.sqrt(max(count, 1) / (0.9 * limit)))  # faces go with 1 / cell^2
+        found = [_clusters(mesh, cell) for mesh in meshes]
+    return tuple(_clustered(mesh, *clusters) for mesh, clusters in zip(meshes, found, strict=True))
+
+
+def _areas(mesh: Triangles) -> tuple[Array, Array]:
+    """Unit normals (m, 3) and areas (m,) of the faces; a zero normal where a face has no area."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    twice = np.linalg.norm(normals, axis=1)
+    return normals / np.where(twice > 0, twice, 1.0)[:, None], twice / 2
+
+
+def _joined(vertices: Array, faces: Integers, colours: Array | None) -> Triangles:
+    """The mesh with vertices as one that are closer than a millionth of its size, which files write once per face."""
+    size = float(np.max(np.ptp(vertices, axis=0)))
+    _, first, which = _cells(vertices, size * JOINED if size > 0 else 1.0)
+    return Triangles(vertices[first], which[faces], colours)
+
+
+def _cells(vertices: Array, cell: float) -> tuple[int, Integers, Integers]:
+    """How many cells of a grid hold vertices, the first vertex in each, and the cell of each vertex."""
+    at = np.floor((vertices - np.min(vertices, axis=0)) / cell + 0.5).astype(np.int64)
+    shape = np.max(at, axis=0) + 1
+    key = (at[:, 0] * shape[1] + at[:, 1]) * shape[2] + at[:, 2]
+    _, first, which = np.unique(key, return_index=True, return_inverse=True)
+    return len(first), first, which.ravel()
+
+
+def _clusters(mesh: Triangles, cell: float) -> tuple[Integers, Integers, float]:
+    """The cluster of each vertex, the faces that stay faces, and the cell that was used."""
+    diagonal = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    cell = max(min(cell, diagonal / SMALL_PART), diagonal * JOINED)
+    count, _, where = _cells(mesh.vertices, cell)
+    a, b, c = np.sort(where[mesh.faces], axis=1).T
+    apart = np.flatnonzero((a != b) & (b != c))
+    _, edge = np.unique(a[apart] * count + b[apart], return_inverse=True)
+    _, first = np.unique(edge.ravel() * count + c[apart], return_index=True)
+    return where, apart[np.sort(first)], cell
+
+
+def _clustered(mesh: Triangles, where: Integers, kept: Integers, cell: float) -> Triangles:
+    vertices = _representatives(mesh, where, cell)
+    used, faces = np.unique(where[mesh.faces[kept]], return_inverse=True)
+    colours = None if mesh.colours is None else mesh.colours[kept]
+    return Triangles(vertices[used], faces.reshape(-1, 3), colours)
+
+
+def _representatives(mesh: Triangles, where: Integers, cell: float) -> Array:
+    """(k, 3) for each cluster the point of least squared distance from its faces' planes, near its mean."""
+    count = int(np.max(where)) + 1
+    number = np.bincount(where, minlength=count)[:, None]
+    means = np.stack([np.bincount(where, mesh.vertices[:, i], count) for i in range(3)], axis=1) / number
+    normals, areas = _areas(mesh)
+    A, b = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    for corner in range(3):
+        cluster = where[mesh.faces[:, corner]]
+        height = np.sum(normals * (mesh.vertices[mesh.faces[:, corner]] - means[cluster]), axis=1)
+        for i in range(3):
+            b[:, i] += np.bincount(cluster, areas * height * normals[:, i], count)
+            for j in range(i, 3):
+                A[:, i, j] += np.bincount(cluster, areas * normals[:, i] * normals[:, j], count)
+    for i in range(3):
+        A[:, i, :i] = A[:, :i, i]
+    trace = np.trace(A, axis1=1, axis2=2)
+    A += (0.01 * trace + np.where(trace > 0, 0.0, 1.0))[:, None, None] * np.eye(3)
+    shift = np.linalg.solve(A, b[..., None])[..., 0]
+    return means + np.clip(shift, -cell, cell)
+
+
+def directions(count: int) -> Array:
+    """(count, 3) unit vectors evenly over the sphere, along a spiral of golden angles."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+
+
+def hull_of_file(path: Path, scale: tuple[float, float, float]) -> Hull:
+    """The convex hull of a mesh file, each axis multiplied by its factor.
+
+    Raises ModelError where it cannot be read or encloses no volume.
+    """
+    state = _state(path)
+    return _hull_of_file(path, scale, *state)
+
+
+@lru_cache(maxsize=256)  # a model is built again for every other time step
+def _hull_of_file(path: Path, scale: tuple[float, float, float], changed: int, size: int) -> Hull:
+    if path.suffix.lower() in READ_BY_TRIMESH:
+        return hull_of(read_mesh(path).vertices * np.asarray(scale), path.name)
+    try:
+        mesh = Convex(path, np.asarray(scale)).GetConvexHull()
+    except RuntimeError as error:
+        raise ModelError(f"{path}: expected a mesh that Drake can read; Drake says: {error}") from error
+    return hull_of(np.array([mesh.vertex(i) for i in range(mesh.num_vertices())]), path.name)
+
+
+def hull_of(points: Array, label: str) -> Hull:
+    """The convex hull of `points` (n, 3), of at most MOST_CORNERS corners, by Drake.
+
+    Of more than MOST_POINTS points only those are taken that are farthest out in MOST_CORNERS directions. Raises
+    ModelError where the points lie in one plane.
+    """
+    if len(points) > MOST_POINTS:
+        points = _outside(points, _drakes_hull(_farthest(points, FEW_DIRECTIONS), label))
+    hull = _drakes_hull(points if len(points) <= MOST_POINTS else _farthest(points, MOST_CORNERS), label)
+    if len(hull.corners) > MOST_CORNERS:
+        hull = _drakes_hull(_farthest(hull.corners, MOST_CORNERS), label)
+    return replace(hull, lost=max(0.0, float(np.max(_distance(points, hull)))))
+
+
+def _outside(points: Array, hull: Hull) -> Array:
+    """Those of the points that are not inside the hull, its corners included."""
+    size = float(np.max(np.ptp(hull.corners, axis=0)))
+    return points[_distance(points, hull) > -JOINED * size]
+
+
+def _distance(points: Array, hull: Hull) -> Array:
+    """(n,) how far each point is outside the plane that it is farthest out of, negative inside the hull."""
+    planes = np.append(hull.normals, -hull.offsets[:, None], axis=1).T
+    return np.concatenate(
+        [np.max(np.append(part, np.ones((len(part), 1)), axis=1) @ planes, axis=1) for part in _split(points)]
+    )
+
+
+def _split(points: Array) -> list[Array]:
+    """The points in parts of a size that products with many vectors are fast for."""
+    return np.array_split(points, 1 + len(points) // 500)
+
+
+def _farthest(points: Array, count: int) -> Array:
+    """Those points that are farthest out along some of `count` directions."""
+    among = directions(count)
+    best, reach, start = np.zeros(count, dtype=np.int64), np.full(count, -np.inf), 0
+    for part in _split(points):
+        along = among @ part.T
+        winner = np.argmax(along, axis=1)
+        farther = along[np.arange(count), winner]
+        best, reach = np.where(farther > reach, winner + start, best), np.maximum(farther, reach)
+        start += len(part)
+    return points[np.unique(best)]
+
+
+def _drakes_hull(points: Array, label: str) -> Hull:
+    try:
+        mesh = Convex(points=points.T, label=" ".join(label.split())).GetConvexHull()
+    except RuntimeError as error:
+        raise ModelError(f"{label}: expected a mesh that encloses a volume; Drake says: {error}") from error
+    corners = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
+    faces = [mesh.element(e) for e in range(mesh.num_elements())]
+    normals = np.array([mesh.face_normal(e) for e in range(len(faces))])
+    offsets = np.max(corners @ normals.T, axis=0)
+    size = float(np.max(np.ptp(corners, axis=0)))
+    if float(np.min(offsets - np.min(corners @ normals.T, axis=0))) <= JOINED * size:
+        raise ModelError(f"{label}: expected a mesh that encloses a volume, got a flat one")
+    triangles = [
+        [face.vertex(0), face.vertex(i), face.vertex(i + 1)]
+        for face in faces
+        for i in range(1, face.num_vertices() - 1)
+    ]
+    return Hull(corners, normals, offsets, np.array(triangles, dtype=np.int64), 0.0)

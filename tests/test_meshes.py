@@ -1,0 +1,361 @@
+"""Collision meshes of robot files as convex hulls or spheres: closed forms, what is told, and what is refused."""
+
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.models import robot_file
+from helpers.table import each_row
+from pydrake.geometry import CalcVolume, Convex, Role, Sphere
+
+import drake_diff as dd
+from drake_diff.exceptions import ModelError, ModelWarning, SimulationError, UnknownNameError
+from drake_diff.model import triangles
+from drake_diff.model.sphere_fit import MOST_SPHERES, fit_spheres
+from drake_diff.model.triangles import MOST_CORNERS, hull_of, read_mesh
+
+EDGES = np.array([0.2, 0.3, 0.5])
+ROUNDING = 1e-6  # the numbers of an STL have 32 bits, and pycollada keeps those of a DAE so
+
+
+def box_as_dae(edges, metre, up):
+    """A box about the origin as COLLADA whose lengths are in units of `metre` [m]."""
+    box = trimesh.creation.box(edges / metre)
+    points, faces = box.vertices, box.faces
+    return f"""<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="{metre}" name="u"/><up_axis>{up}</up_axis></asset>
+<library_effects><effect id="e"><profile_COMMON><technique sid="t"><lambert><diffuse><color>1 0.5 0 1</color></diffuse>
+</lambert></technique></profile_COMMON></effect></library_effects>
+<library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="pa" count="24">{" ".join(map(str, points.ravel()))}</float_array>
+<technique_common><accessor source="#pa" count="8" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles material="s" count="12"><input semantic="VERTEX" source="#v" offset="0"/>
+<p>{" ".join(map(str, faces.ravel()))}</p></triangles>
+</mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="scene"><node id="n"><instance_geometry url="#g"><bind_material>
+<technique_common><instance_material symbol="s" target="#m"/></technique_common></bind_material></instance_geometry>
+</node></visual_scene></library_visual_scenes><scene><instance_visual_scene url="#scene"/></scene></COLLADA>"""
+
+
+def urdf(mesh, more="", origin="0 0 0"):
+    return f"""<robot name="r" xmlns:drake="http://drake.mit.edu"><link name="base"/>
+<joint name="slide" type="prismatic"><parent link="base"/><child link="foot"/><axis xyz="0 0 1"/>
+<limit lower="-9" upper="9" effort="100" velocity="100"/></joint>
+<link name="foot"><inertial><mass value="2"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><origin xyz="{origin}"/><geometry>{mesh}</geometry>
+<drake:proximity_properties><drake:mu_static value="0.3"/><drake:mu_dynamic value="0.3"/>
+<drake:point_contact_stiffness value="1e6"/></drake:proximity_properties></collision></link>{more}</robot>"""
+
+
+def load(path, meshes="convex", **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        return dd.load_model(path, time_step=0.01, meshes=meshes, base="base", **options)
+
+
+def shapes_of(model):
+    """The collision shapes that are no ground, with their poses on the body."""
+    inspector = model.double.inspector
+    found = inspector.GetAllGeometryIds(Role.kProximity)
+    return [(inspector.GetShape(g), inspector.GetPoseInFrame(g)) for g in found if "ground" not in inspector.GetName(g)]
+
+
+def saved(folder, name, text):
+    (folder / name).write_text(text)
+    return folder / name
+
+
+@each_row(
+    "ending, scale",
+    [("stl", "1"), ("STL", "2 0.5 3"), ("obj", "1 1 1"), ("ply", "0.1"), ("off", "1 -1 1")],
+)
+def test_a_box_becomes_a_hull_of_its_volume(tmp_path, ending, scale):
+    trimesh.creation.box(EDGES).export(tmp_path / f"box.{ending.lower()}")
+    model = load(saved(tmp_path, "r.urdf", urdf(f'<mesh filename="box.{ending}" scale="{scale}"/>')))
+    [(shape, _)] = shapes_of(model)
+    factors = np.broadcast_to([float(n) for n in scale.split()], 3)
+    assert isinstance(shape, Convex)
+    assert CalcVolume(shape) == pytest.approx(np.prod(EDGES) * abs(np.prod(factors)), rel=ROUNDING)
+    hull = shape.GetConvexHull()
+    corners = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
+    np.testing.assert_allclose(np.ptp(corners, axis=0), EDGES * abs(factors), rtol=ROUNDING)
+
+
+@each_row("metre, up", [(0.01, "Z_UP"), (0.01, "Y_UP"), (1.0, "Y_UP"), (0.0254, "X_UP")])
+def test_a_dae_has_its_unit_and_as_in_rviz_no_axis_that_is_up(tmp_path, metre, up):
+    saved(tmp_path, "box.dae", box_as_dae(EDGES, metre, up))
+    model = load(saved(tmp_path, "r.urdf", urdf('<mesh filename="box.dae"/>')))
+    [(shape, _)] = shapes_of(model)
+    assert CalcVolume(shape) == pytest.approx(np.prod(EDGES), rel=ROUNDING)
+    mesh = read_mesh(tmp_path / "box.dae")
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), EDGES, rtol=ROUNDING)
+    np.testing.assert_allclose(mesh.colours, np.tile([1, 0.5, 0], (12, 1)), atol=1 / 255)  # trimesh keeps bytes
+
+
+@each_row(
+    "uri",
+    [
+        "meshes/my box.stl",
+        "meshes/my%20box.stl",
+        "Meshes/My BOX.STL",
+        "package://robot/meshes/my box.stl",
+        "model://robot/meshes/my box.stl",
+        "package://robot/MESHES/my box.stl",
+        "file://{folder}/robot/meshes/my box.stl",
+        "../robot/meshes/my box.stl",
+    ],
+)
+def test_a_mesh_is_found_by_any_of_its_names(tmp_path, uri):
+    (tmp_path / "robot/meshes").mkdir(parents=True)
+    trimesh.creation.box(EDGES).export(tmp_path / "robot/meshes/my box.stl")
+    text = urdf(f'<mesh filename="{uri.format(folder=tmp_path)}"/>')
+    [(shape, _)] = shapes_of(load(saved(tmp_path / "robot", "r.urdf", text)))
+    assert CalcVolume(shape) == pytest.approx(np.prod(EDGES), rel=ROUNDING)
+
+
+def test_a_package_may_be_anywhere(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    trimesh.creation.box(EDGES).export(tmp_path / "elsewhere/box.stl")
+    path = saved(tmp_path, "r.urdf", urdf('<mesh filename="package://mine/box.stl"/>'))
+    assert not shapes_of(load(path))
+    [(shape, _)] = shapes_of(load(path, packages={"mine": tmp_path / "elsewhere"}))
+    assert CalcVolume(shape) == pytest.approx(np.prod(EDGES), rel=ROUNDING)
+
+
+SDF = """<sdf version="1.9"><model name="r"><link name="base"/><link name="foot"><inertial><mass>2</mass></inertial>
+<pose>0 0 1 0 0 0</pose>
+<collision name="sole"><pose>0.1 0.2 0.3 0 0 1.5707963267948966</pose><geometry><mesh><uri>{uri}</uri>
+<scale>1 2 1</scale></mesh></geometry></collision>
+<visual name="seen"><geometry><mesh><uri>{uri}</uri></mesh></geometry></visual></link>
+<joint name="slide" type="prismatic"><parent>base</parent><child>foot</child><axis><xyz>0 0 1</xyz></axis></joint>
+</model></sdf>"""
+
+
+def test_sdf_has_its_own_words_for_the_same(tmp_path):
+    trimesh.creation.box(EDGES).export(tmp_path / "box.stl")
+    path = saved(tmp_path, "r.sdf", SDF.format(uri="box.stl"))
+    [(shape, pose)] = shapes_of(load(path))
+    assert CalcVolume(shape) == pytest.approx(2 * np.prod(EDGES), rel=ROUNDING)
+    np.testing.assert_allclose(pose.translation(), [0.1, 0.2, 0.3])
+    found = shapes_of(load(path, "spheres"))
+    centres = np.array([pose.translation() for _, pose in found])
+    radius = found[0][0].radius()
+    half = EDGES * [1, 2, 1] / 2
+    turned = half[[1, 0, 2]]  # by a quarter turn about z
+    reach = np.max(np.abs(centres - [0.1, 0.2, 0.3]), axis=0) + radius
+    np.testing.assert_allclose(reach, turned, rtol=1e-6)  # the corner spheres touch each face: the solver's tolerance
+
+
+def test_a_ball_becomes_one_sphere_of_its_size(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
+    ball.export(tmp_path / "ball.stl")
+    inside = np.min(np.sum(ball.triangles_center * ball.face_normals, axis=1))  # the distance of the closest face
+    model = load(saved(tmp_path, "r.urdf", urdf('<mesh filename="ball.stl"/>', origin="0 0 0.3")), "spheres")
+    [(shape, pose)] = shapes_of(model)
+    assert isinstance(shape, Sphere)
+    assert shape.radius() == pytest.approx(inside, rel=1e-5)
+    np.testing.assert_allclose(pose.translation(), [0, 0, 0.3], atol=1e-5)
+
+
+def test_a_box_becomes_eight_spheres_that_touch_its_faces():
+    hull = hull_of(np.array(trimesh.creation.box(EDGES).vertices), "box")
+    spheres = fit_spheres(hull, "box")
+    r = 0.1 * 0.5  # half of the largest sphere inside
+    assert spheres.radius == pytest.approx(r, rel=1e-5)
+    corners = {tuple(np.sign(centre)) for centre in spheres.centres}
+    assert len(corners) == len(spheres.centres) == 8
+    np.testing.assert_allclose(np.abs(spheres.centres), np.tile(EDGES / 2 - r, (8, 1)), rtol=1e-5)
+    # A plane square to a box's diagonal meets the corner; the sphere there is (sqrt(3) - 1) r behind. A thousandth:
+    # the gap is measured in 2000 directions, which are 3 degrees apart.
+    assert spheres.ground_gap == pytest.approx((np.sqrt(3) - 1) * r, rel=2e-3)
+
+
+def test_a_rod_becomes_a_row():
+    rod = trimesh.creation.capsule(height=0.3, radius=0.02, count=[32, 32])
+    spheres = fit_spheres(hull_of(np.array(rod.vertices), "rod"), "rod")
+    assert 2 < len(spheres.centres) < MOST_SPHERES
+    np.testing.assert_allclose(spheres.centres[:, :2], 0, atol=0.002)  # the slack of spheres 5 % smaller
+    assert np.ptp(spheres.centres[:, 2]) == pytest.approx(0.3, abs=0.006)
+    assert spheres.open_gap < spheres.radius
+
+
+def test_spheres_are_inside_and_their_gaps_are_true():
+    random = np.random.default_rng(17)
+    for _ in range(12):
+        points = random.standard_normal((random.integers(5, 60), 3)) * random.uniform(0.02, 1, 3)
+        hull = hull_of(points, "cloud")
+        spheres = fit_spheres(hull, "cloud")
+        assert 1 <= len(spheres.centres) <= MOST_SPHERES
+        assert np.max(spheres.centres @ hull.normals.T + spheres.radius - hull.offsets) <= 1e-9  # rounding
+        ways = random.standard_normal((500, 3))
+        ways /= np.linalg.norm(ways, axis=1)[:, None]
+        gaps = np.max(points @ ways.T, axis=0) - np.max(spheres.centres @ ways.T, axis=0) - spheres.radius
+        # Between two of the directions that are measured, 3 degrees apart, a gap changes by 3 % of the size.
+        assert np.max(gaps) <= spheres.ground_gap + 0.03 * np.max(np.ptp(points, axis=0))
+        apart = np.linalg.norm(hull.corners[:, None] - spheres.centres, axis=2).min(axis=1) - spheres.radius
+        assert np.max(apart) <= spheres.open_gap + 1e-9
+
+
+@each_row("treatment", ["convex", "spheres"])
+def test_a_foot_rests_at_its_height(tmp_path, treatment):
+    trimesh.creation.box(EDGES).export(tmp_path / "box.stl")
+    path = saved(tmp_path, "r.urdf", urdf('<mesh filename="box.stl"/>'))
+    model = load(path, treatment, ground=0.5)
+    rollout = dd.rollout(model, [EDGES[2] / 2 + 0.01, 0.0], np.zeros((300, 0)))
+    # Drake makes a ground without a stiffness of its own so hard that things sink in by less than a millimetre.
+    assert EDGES[2] / 2 - 1e-3 < rollout.xs[-1, 0] < EDGES[2] / 2
+    assert abs(rollout.xs[-1, 1]) < 1e-6
+
+
+def test_spheres_are_differentiated_and_hulls_are_refused(tmp_path):
+    trimesh.creation.box(EDGES).export(tmp_path / "box.stl")
+    path = saved(tmp_path, "r.urdf", urdf('<mesh filename="box.stl"/>'))
+    x = [EDGES[2] / 2 - 1e-4, 0.0]
+    model = load(path, "spheres", ground=0.5)
+    assert dd.differentiate_step(model, x, [], method="autodiff").method == "autodiff"
+    assert dd.certify(model, x, []).verdict == "agree"
+    with pytest.raises(SimulationError, match="Convex"):
+        dd.differentiate_step(load(path, ground=0.5), x, [], method="autodiff")
+
+
+def test_all_spheres_have_what_the_file_gives_to_the_mesh(tmp_path):
+    trimesh.creation.box(EDGES).export(tmp_path / "box.stl")
+    other = """<link name="hand"><inertial><mass value="1"/>
+    <inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision name="c"><geometry><sphere radius="0.1"/></geometry></collision></link>
+    <joint name="lift" type="prismatic"><parent link="base"/><child link="hand"/><axis xyz="0 0 1"/></joint>
+    <drake:collision_filter_group name="g"><drake:member link="foot"/><drake:member link="hand"/>
+    <drake:ignored_collision_filter_group name="g"/></drake:collision_filter_group>"""
+    model = load(saved(tmp_path, "r.urdf", urdf('<mesh filename="box.stl"/>', other)), "spheres")
+    inspector = model.double.inspector
+    found = list(inspector.GetAllGeometryIds(Role.kProximity))
+    feet = [g for g in found if "box" in inspector.GetName(g)]
+    [hand] = [g for g in found if g not in feet]
+    assert len(feet) == 8
+    assert all(inspector.CollisionFiltered(g, hand) for g in feet)
+    frictions = [inspector.GetProximityProperties(g).GetProperty("material", "coulomb_friction") for g in feet]
+    assert {friction.static_friction() for friction in frictions} == {0.3}
+
+
+def test_what_the_file_says_of_mass_stays():
+    path = robot_file("panda.urdf")
+    models = [load_quietly(path, meshes) for meshes in ("skip", "convex", "spheres")]
+    inertias = [[body.default_spatial_inertia().CopyToFullMatrix6() for body in bodies_of(m)] for m in models]
+    np.testing.assert_array_equal(inertias[0], inertias[1])
+    np.testing.assert_array_equal(inertias[0], inertias[2])
+    assert len(shapes_of(models[1])) - len(shapes_of(models[0])) == 9  # the links and the hand have a mesh each
+
+
+def load_quietly(path, meshes):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        return dd.load_model(path, time_step=0.01, meshes=meshes)
+
+
+def bodies_of(model):
+    from drake_diff.model.plant import bodies
+
+    return bodies(model.plant)
+
+
+def test_the_same_file_gives_the_same_bytes_in_another_process(tmp_path):
+    code = (
+        "import sys; from pathlib import Path; from drake_diff.model.triangles import *\n"
+        "from drake_diff.model.sphere_fit import fit_spheres\n"
+        "h = hull_of_file(Path(sys.argv[1]), (1.0, 1.0, 1.0)); s = fit_spheres(h, 'x')\n"
+        "print(h.corners.tobytes().hex(), s.centres.tobytes().hex(), s.radius)"
+    )
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
+    mesh.vertices *= [1, 2, 3]
+    mesh.export(tmp_path / "m.stl")
+    run = subprocess.run([sys.executable, "-c", code, tmp_path / "m.stl"], capture_output=True, text=True, check=True)
+    hull = triangles.hull_of_file(tmp_path / "m.stl", (1.0, 1.0, 1.0))
+    spheres = fit_spheres(hull, "x")
+    assert run.stdout.split() == [hull.corners.tobytes().hex(), spheres.centres.tobytes().hex(), str(spheres.radius)]
+
+
+def test_a_changed_model_has_the_same_shapes(tmp_path):
+    trimesh.creation.box(EDGES).export(tmp_path / "box.stl")
+    model = load(saved(tmp_path, "r.urdf", urdf('<mesh filename="box.stl"/>')), "spheres")
+    other = model.at_time_step(0.002)
+    assert model.options["meshes"] == other.options["meshes"] == "spheres"
+    for (a, at), (b, there) in zip(shapes_of(model), shapes_of(other), strict=True):
+        assert (a.radius(), *at.translation()) == (b.radius(), *there.translation())
+
+
+@pytest.mark.slow
+def test_a_mesh_of_a_million_faces_keeps_a_thousand_corners(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=8, radius=0.05)
+    assert len(ball.faces) > 1e6
+    ball.export(tmp_path / "ball.stl")
+    hull = triangles.hull_of_file(tmp_path / "ball.stl", (1.0, 1.0, 1.0))
+    assert len(hull.corners) <= MOST_CORNERS
+    # A thousand points on a ball are about 0.12 rad apart: the cap over a triangle of that side has the height
+    # R (1 - cos(0.12 / sqrt(3))) = 0.0024 R, and twice as much where they are spread unevenly.
+    assert 0 < hull.lost < 0.005 * 0.05
+    middle = np.linalg.norm(hull.corners, axis=1)
+    np.testing.assert_allclose(middle, 0.05, rtol=ROUNDING)
+
+
+BROKEN = {
+    "empty.stl": b"",
+    "text.stl": b"solid nothing\nendsolid nothing\n",
+    "half.dae": b"<COLLADA><asset>",
+    "flat.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 3 4\n",
+    "infinite.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 inf\nf 1 2 3\nf 2 3 4\n",
+    "lines.ply": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    b"end_header\n0 0 0\n",
+    "ogre.mesh": b"0",
+}
+
+
+@each_row("name, treatment", [(name, treatment) for name in BROKEN for treatment in ("convex", "spheres")])
+def test_a_mesh_that_is_none_is_told_and_left_out(tmp_path, name, treatment):
+    (tmp_path / name).write_bytes(BROKEN[name])
+    path = saved(tmp_path, "r.urdf", urdf(f'<mesh filename="{name}"/>'))
+    with pytest.warns(ModelWarning, match=f"(?s)1 meshes skipped, they cannot be used: foot collision {name}"):
+        model = dd.load_model(path, time_step=0.01, meshes=treatment)
+    assert not shapes_of(model)
+    assert any(name in note for note in model.notes)
+
+
+@each_row(
+    "uri", ["gone.stl", "gone.obj", "package://nowhere/gone.dae", "https://example.org/a.stl", "/etc/passwd/a.stl"]
+)
+def test_a_mesh_that_is_missing_is_told_and_left_out(tmp_path, uri):
+    path = saved(tmp_path, "r.urdf", urdf(f'<mesh filename="{uri}"/>'))
+    for treatment in ("skip", "convex", "spheres"):
+        with pytest.warns(ModelWarning, match=f"(?s)1 meshes skipped, no file found: foot collision {uri}"):
+            model = dd.load_model(path, time_step=0.01, meshes=treatment)
+        assert not shapes_of(model)
+
+
+@each_row("scale", ["0 1 1", "1 2", "large", "nan", "1 inf 1"])
+def test_a_scale_that_is_none_is_refused(tmp_path, scale):
+    trimesh.creation.box(EDGES).export(tmp_path / "box.stl")
+    path = saved(tmp_path, "r.urdf", urdf(f'<mesh filename="box.stl" scale="{scale}"/>'))
+    with pytest.raises(ModelError, match=r"box\.stl.*scale of one or three numbers"):
+        dd.load_model(path, time_step=0.01, meshes="convex")
+
+
+def test_another_treatment_is_refused():
+    with pytest.raises(UnknownNameError, match="convex"):
+        dd.load_model(robot_file("panda.urdf"), time_step=0.01, meshes="hull")
+
+
+def test_a_mesh_names_no_other_file_that_is_opened(tmp_path, monkeypatch):
+    (tmp_path / "secret.txt").write_text("x")
+    text = "mtllib ../secret.txt\nmtllib secret.txt\n" + BROKEN["flat.obj"].decode() + "v 0 0 1\nf 1 2 5\nf 2 3 5\n"
+    opened = []
+    real = type(tmp_path).read_bytes
+    monkeypatch.setattr(type(tmp_path), "read_bytes", lambda path: opened.append(path.name) or real(path))
+    mesh = read_mesh(saved(tmp_path, "m.obj", text))
+    assert len(mesh.faces) == 4
+    assert opened == ["m.obj"]
