@@ -15,6 +15,7 @@ from drake_diff.pages.meshcat import write_replay
 from drake_diff.pages.scene import BLUE, scene_of
 
 SERIES_PER_PLOT = 6  # more lines cannot be told apart
+PHYSICS, SEARCH = "Energy and contact", "Search"
 
 
 def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str, Any]) -> None:
@@ -55,39 +56,35 @@ def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str,
 
 def plots_of(m: Measurement) -> Iterator[Plot]:
     """What the report plots, over time and over the solver's iterations."""
-    yield from _state_plots(m, "positions", 0, m.positions)
-    yield from _state_plots(m, "velocities", len(m.positions), m.velocities)
+    yield from _state_plots(m, "Positions", 0, m.positions)
+    yield from _state_plots(m, "Velocities", len(m.positions), m.velocities)
     yield from _input_plots(m)
     motion = m.shown[0]
     if motion is not None:
         times, energy = motion.times, Line("total", motion.energy)
         parts = [Line("kinetic", motion.kinetic_energy), Line("potential", motion.potential_energy), energy]
-        yield Plot("energy", "J", times, parts)
+        yield Plot("energy", "J", times, parts, group=PHYSICS)
         note = "what neither actuators nor damping account for: the time stepping's error, and what contact takes"
-        yield Plot("unexplained energy", "J", times, [Line("error", motion.energy_error)], note=note)
+        yield Plot("unexplained energy", "J", times, [Line("error", motion.energy_error)], note=note, group=PHYSICS)
         note = "nothing can touch"
         if math.isfinite(m.penetration_limit):
             note = f"limit {m.penetration_limit:.3g} m, a quarter of {m.thinnest}"
         overlap = [Line("largest overlap", motion.penetration)]
-        yield Plot("penetration", "m", times, overlap, limits=(None, m.penetration_limit), note=note)
+        yield Plot("penetration", "m", times, overlap, limits=(None, m.penetration_limit), note=note, group=PHYSICS)
     yield from _replay_plots(m)
     yield from _solver_plots(m)
 
 
-def _state_plots(m: Measurement, title: str, start: int, columns: Sequence[Column]) -> Iterator[Plot]:
-    """The columns of one unit together; those of plain dynamics, whose units are not known, are "states"."""
+def _state_plots(m: Measurement, group: str, start: int, columns: Sequence[Column]) -> Iterator[Plot]:
+    """A plot for each column: the motion, and the plan where it is another. Plain dynamics have "states" alone."""
     shown = m.shown[0]
     motion = m.integrated if shown is None else shown.xs[:: _parts(m)]
     differs = motion is not None and not np.array_equal(motion, m.xs)
-    for unit in dict.fromkeys(c.unit for c in columns):
-        alike = [(start + i, c) for i, c in enumerate(columns) if c.unit == unit]
-        for first in range(0, len(alike), SERIES_PER_PLOT):
-            part = alike[first : first + SERIES_PER_PLOT]
-            lines = [] if motion is None else [Line(c.name, motion[:, i]) for i, c in part]
-            if motion is None or differs:
-                lines += [Line(f"{c.name}, plan", m.xs[:, i], dashed=differs) for i, c in part]
-            limits = (part[0][1].lower, part[0][1].upper) if len(part) == 1 else (None, None)
-            yield Plot(title if m.velocities else "states", unit, m.times, lines, limits=limits)
+    for i, c in enumerate(columns, start):
+        lines = [] if motion is None else [Line("motion", motion[:, i])]
+        if motion is None or differs:
+            lines.append(Line("plan", m.xs[:, i], dashed=differs))
+        yield Plot(c.name, c.unit, m.times, lines, limits=(c.lower, c.upper), group=group if m.velocities else "States")
 
 
 def _parts(m: Measurement) -> int:
@@ -97,17 +94,17 @@ def _parts(m: Measurement) -> int:
 
 
 def _input_plots(m: Measurement) -> Iterator[Plot]:
-    """A plot for each input: the limits of two differ as a rule."""
+    """A plot for each input, as a part of its limit where it has one."""
     held, motion = len(m.us) < len(m.times), m.shown[0]
     for i, c in enumerate(m.inputs):
-        planned = Line("plan" if motion is not None else c.name, _as_long(m.us[:, i], m.times), held=held)
+        planned = Line("plan", _as_long(m.us[:, i], m.times), held=held)
         lines = [planned]
         if motion is not None:
             applied = motion.us[:: _parts(m), i]
             same = held and np.array_equal(applied, m.us[:, i])
-            ours = Line(c.name, _as_long(applied, m.times), held=True)
+            ours = Line("motion", _as_long(applied, m.times), held=True)
             lines = [ours] if same else [ours, replace(planned, dashed=True)]
-        yield Plot(f"input {c.name}", c.unit, m.times, lines, limits=(c.lower, c.upper))
+        yield Plot(f"input {c.name}", c.unit, m.times, lines, limits=(c.lower, c.upper), percent=True, group="Inputs")
 
 
 def _as_long(values: Array, times: Array) -> Array:
@@ -125,7 +122,7 @@ def _replay_plots(m: Measurement) -> Iterator[Plot]:
     note = "the largest difference of a state, in its own unit, in each replay; 0 is not on a log scale"
     for first in range(0, len(lines), SERIES_PER_PLOT):
         part = lines[first : first + SERIES_PER_PLOT]
-        yield Plot("distance from the plan", "q, v", m.times, part, log=True, note=note)
+        yield Plot("distance from the plan", "q, v", m.times, part, log=True, note=note, group="Replays")
 
 
 def _solver_plots(m: Measurement) -> Iterator[Plot]:
@@ -135,16 +132,16 @@ def _solver_plots(m: Measurement) -> Iterator[Plot]:
             continue
         zero = not np.any(norms > 0)
         note = "0 at every knot" if zero else "0 is not on a log scale"
-        yield Plot(title, unit, m.times, [Line(name, norms)], log=not zero, note=note)
+        yield Plot(title, unit, m.times, [Line(name, norms)], log=not zero, note=note, group=SEARCH)
     rows = m.solution.iterations
     if not rows:
         return
     at, cost = [row.iteration for row in rows], [row.objective for row in rows]
     positive = all(c > 0 for c in cost if math.isfinite(c))
-    yield Plot("cost per iteration", "1", at, [Line("cost", cost)], axis="iteration", log=positive)
+    yield Plot("cost per iteration", "1", at, [Line("cost", cost)], axis="iteration", log=positive, group=SEARCH)
     violations = [
         Line("constraint violation", [row.primal_infeasibility for row in rows]),
         Line("optimality", [row.dual_infeasibility for row in rows]),
     ]
     note = "as the solver prints it; 0 is not on a log scale"
-    yield Plot("violation per iteration", "1", at, violations, axis="iteration", log=True, note=note)
+    yield Plot("violation per iteration", "1", at, violations, axis="iteration", log=True, note=note, group=SEARCH)

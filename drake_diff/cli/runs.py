@@ -144,9 +144,11 @@ def list_all(
 def compare_runs(
     a: Annotated[Path, typer.Argument(metavar="A", help="A run directory.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
+    out: Annotated[Path | None, typer.Option("--out", metavar="PAGE", dir_okay=False, help="Page to write.")] = None,
 ) -> None:
     """Show what differs between the runs A and B: configuration, versions, metrics.
 
+    With --out, a page shows both plans in one replay and in the same plots as well.
     Exit status 1 if the two define a metric differently; such metrics are not compared.
     """
     from drake_diff.artifact.listing import compare_runs as compare
@@ -162,6 +164,11 @@ def compare_runs(
             show(rows)
     for line in found.refused:
         show(plain(f"not compared: {line}", "red"))
+    if out is not None:
+        from drake_diff.artifact.runs_page import write_runs_page
+
+        write_runs_page(out, a, b)
+        show(f"wrote {out}")
     raise typer.Exit(0 if found.comparable else 1)
 
 

@@ -43,9 +43,9 @@ def _gap_plots(comparison: Comparison) -> Iterator[Plot]:
         distance = np.abs(e.motion.xs - np.array(columns).T).max(axis=1)
         distances.append(Line(e.engine, _on(ours.times, e.motion, distance)))
     note = "of one step to Drake's from the same state, relative to the state; 0 is not on a log scale"
-    yield Plot("gap of each step", "1", ours.times, steps, log=True, note=note)
+    yield Plot("gap of each step", "1", ours.times, steps, log=True, note=note, group="Gaps")
     note = "the largest difference of a state, in its own unit"
-    yield Plot("distance from Drake's motion", "q, v", ours.times, distances, log=True, note=note)
+    yield Plot("distance from Drake's motion", "q, v", ours.times, distances, log=True, note=note, group="Gaps")
 
 
 def _measure_plots(comparison: Comparison) -> Iterator[Plot]:
@@ -57,8 +57,9 @@ def _measure_plots(comparison: Comparison) -> Iterator[Plot]:
         if e.motion.depth is not None:
             depths.append(Line(e.engine, _on(times, e.motion, e.motion.depth)))
     note = "kinetic and potential, less that at the start; inputs, damping and contact change it too"
-    yield Plot("energy", "J", times, energies, note=note)
-    yield Plot("penetration", "m", times, depths, note="the deepest overlap that the engine finds")
+    yield Plot("energy", "J", times, energies, note=note, group="Energy and contact")
+    note = "the deepest overlap that the engine finds"
+    yield Plot("penetration", "m", times, depths, note=note, group="Energy and contact")
 
 
 def _coordinate_plots(comparison: Comparison) -> Iterator[Plot]:
@@ -69,7 +70,7 @@ def _coordinate_plots(comparison: Comparison) -> Iterator[Plot]:
     spread = [float(np.nanmax(np.nanmax(xs, axis=0) - np.nanmin(xs, axis=0))) for xs in found]
     for i in sorted(np.argsort(spread)[::-1][:MOST_PLOTS]):
         lines = [Line(e.engine, x) for e, x in zip(comparison.engines, found[i], strict=True)]
-        yield Plot(model.state_names[i], units[i], times, lines)
+        yield Plot(model.state_names[i], units[i], times, lines, group="Coordinates")
 
 
 def _on(times: Array, motion: EngineMotion, values: Array) -> Array:

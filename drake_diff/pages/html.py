@@ -15,8 +15,11 @@ from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from drake_diff._base.files import write_whole
 from drake_diff.certificates.certificate import Certificate
@@ -54,9 +57,11 @@ class Plot:
         series: The lines; a name shows in the legend.
         axis: What x is: "time" [s] follows the slider, any other word is a label.
         place: Where on the page: that of the template's macro `plots`.
+        group: What is shown together, one group at a time where a place has several; a group has one legend.
         log: Whether y has a logarithmic scale; what is not above 0 is left out.
         levels: Whether x are the few levels of something, each a tick on a logarithmic scale.
-        limits: The lower and upper limit of y, None or infinite where there is none; what is beyond is shaded.
+        limits: The lower and upper limit of y, None or infinite where there is none: dashed, what is beyond is shaded.
+        percent: Whether to draw y as a part of its limit, where it has one on either side.
         range: The range of y, where it is not to follow the data.
         marks: "lines", "points" or "both".
         band: Whether to shade between the last two series.
@@ -69,9 +74,11 @@ class Plot:
     series: Sequence[Line]
     axis: str = "time"
     place: str = "plots"
+    group: str = ""
     log: bool = False
     levels: bool = False
     limits: Sequence[float | None] = (None, None)
+    percent: bool = False
     range: Sequence[float] | None = None
     marks: str = "lines"
     band: bool = False
@@ -79,20 +86,62 @@ class Plot:
 
 
 ENTRY = ("derivative", "difference", "tolerance", "noticeable")
+MOST_POINTS = 1200  # of a plot: of a longer one the lowest and highest of each stretch are kept
+MOST_ENTRIES = 1000  # of a certificate, whose numbers are in the page; of a larger one those nearest to failing
 
 
 def page_data(duration: float, plots: Iterable[Plot], certificates: Iterable[Certificate] = ()) -> dict[str, Any]:
     """All that `report.js` draws, for JSON: `plots` and a heat map of each of `certificates`, over `duration` [s]."""
-    drawn = []
-    for p in plots:
-        series = [{**vars(line), "y": numbers(line.y)} for line in p.series]
-        drawn.append({**vars(p), "x": numbers(p.x), "series": series, "limits": numbers(p.limits)})
-    maps = []
-    for c in certificates:
-        entries = {name: numbers(getattr(c, name).ravel()) for name in ENTRY}
-        told = {"subject": c.subject, "method": c.method, "verdict": c.verdict}
-        maps.append({**told, "rows": [*c.rows], "columns": [*c.columns], "codes": c.codes.ravel().tolist(), **entries})
-    return {"duration": duration, "plots": drawn, "certificates": maps, "verdicts": list(VERDICTS)}
+    maps = [_map_of(c) for c in certificates]
+    return {"duration": duration, "plots": [_drawn(p) for p in plots], "certificates": maps, "verdicts": list(VERDICTS)}
+
+
+def _drawn(plot: Plot) -> dict[str, Any]:
+    """A plot for JSON, `points` of how many its series have; what is left out lies within what is drawn."""
+    x, ys = numbers(plot.x), [numbers(line.y) for line in plot.series]
+    kept = _kept(ys, len(x)) if plot.marks == "lines" else range(len(x))
+    series = [{**vars(line), "y": [y[i] for i in kept]} for line, y in zip(plot.series, ys, strict=True)]
+    told = {"x": [x[i] for i in kept], "points": len(x), "series": series, "limits": numbers(plot.limits)}
+    return {**vars(plot), **told}
+
+
+def _kept(ys: Sequence[Sequence[float | None]], count: int) -> Sequence[int]:
+    """Which of `count` points to draw, MOST_POINTS at most: both ends, and each series' extremes in every stretch."""
+    stretches = MOST_POINTS // (2 * max(1, len(ys)) + 1)
+    if count <= MOST_POINTS:
+        return range(count)
+    ends = [count * k // stretches for k in range(stretches + 1)]
+    kept = {0, count - 1}
+    for start, end in pairwise(ends):
+        for y in ys:
+            known = [(value, i) for i, value in enumerate(y[start:end], start) if value is not None]
+            kept |= {min(known)[1], max(known)[1]} if known else {start}  # a gap stays one
+    return sorted(kept)
+
+
+def _map_of(c: Certificate) -> dict[str, Any]:
+    """A certificate for JSON: all verdicts, and the numbers of the entries `told`, by their index, worst first."""
+    codes = c.codes.ravel()
+    gap = np.abs(c.difference - c.derivative).ravel() / np.maximum(c.tolerance.ravel(), 1e-300)
+    gap = np.nan_to_num(gap, nan=np.inf, posinf=np.inf)
+    told = np.lexsort((np.arange(len(codes)), -gap, -codes))[:MOST_ENTRIES]
+    told = np.arange(len(codes)) if len(codes) <= MOST_ENTRIES else told
+    entries = {name: numbers(getattr(c, name).ravel()[told]) for name in ENTRY}
+    subject = {
+        "subject": c.subject,
+        "method": c.method,
+        "verdict": c.verdict,
+        "rows": [*c.rows],
+        "columns": [*c.columns],
+    }
+    return {**subject, "codes": "".join(str(code) for code in codes), "told": told.tolist(), **entries}
+
+
+def _pooled(data: Mapping[str, Any]) -> dict[str, Any]:
+    """`data` for the page, in which each x stands once, in `xs`, and plots say which it is."""
+    xs: dict[tuple[Any, ...], int] = {}
+    plots = [{**plot, "x": xs.setdefault(tuple(plot["x"]), len(xs))} for plot in data.get("plots", ())]
+    return {**data, "plots": plots, "xs": [list(x) for x in xs]}
 
 
 def numbers(values: Iterable[Any]) -> list[float | None]:
@@ -120,7 +169,14 @@ def write_page(
     embedded = {key: value for key, value in record.items() if key not in APART}
     scripts = [asset(name) for name in SCRIPTS]
     hashes = script_hashes(view, *(f"<script>{script}</script>" for script in scripts))
-    values = {"record": record, "embedded": embedded, "data": data, "view": view, "scripts": scripts, "hashes": hashes}
+    values = {
+        "record": record,
+        "embedded": embedded,
+        "data": _pooled(data),
+        "view": view,
+        "scripts": scripts,
+        "hashes": hashes,
+    }
     write_whole(path, render(template, **values, **facts).encode())
 
 

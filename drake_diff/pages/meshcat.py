@@ -3,6 +3,7 @@
 import html
 import logging
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +24,16 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.files import write_whole
-from drake_diff.pages.html import content_policy
-from drake_diff.pages.scene import ARROW_PART, Drawn, Scene
+from drake_diff.pages.html import asset, content_policy
+from drake_diff.pages.scene import ARROW_PART, Drawn, Poses, Scene
 
 # Drake prints the port that it listens on, but nobody is meant to connect to it.
 logging.getLogger("drake").addFilter(lambda record: "Meshcat listening" not in record.getMessage())
 
+VIEWPORT = '<meta name="viewport" content="width=device-width, initial-scale=1">'
 FRAMES_PER_SECOND = 64.0
+MOST_POSES = 9000  # of all bodies in all frames, at 140 bytes each: between two frames the viewer interpolates
+FEWEST_FRAMES = 60
 REPETITIONS = 5
 RED, TRAIL = Rgba(0.85, 0.2, 0.1, 1), Rgba(0.93, 0.55, 0.1, 1)
 LINES = Rgba(0.72, 0.75, 0.79, 1)
@@ -49,7 +53,8 @@ def write_replay(path: Path, scene: Scene, *, title: str = "") -> None:
     draw(meshcat, scene)
     name = f"<title>{html.escape(title)}</title>"
     page = re.sub(r"<title>.*?</title>", lambda _: name, meshcat.StaticHtml(), count=1)
-    page = page.replace("<head>", f"<head>\n  {content_policy(page)}", 1)
+    page = page.replace("</html>", f"<script>{asset('replay.js')}</script>\n</html>", 1)
+    page = page.replace("<head>", f"<head>\n  {VIEWPORT}\n  {content_policy(page)}", 1)
     write_whole(path, page.encode())
 
 
@@ -71,13 +76,16 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
         meshcat.SetObject(f"{path}/tip/cone", MeshcatCone(8 * radius, 3 * radius, 3 * radius), RED)
         turned = RollPitchYaw(np.pi, 0.0, 0.0)
         meshcat.SetTransform(f"{path}/tip/cone", RigidTransform(turned, [0.0, 0.0, 4 * radius]))
-    frames = frames_of(scene.times)
+    shaped = {shape.body for shape in scene.shapes}
+    motions = {"motion": _only(scene.poses, shaped)} | {g.name: _only(g.poses, shaped) for g in scene.ghosts}
+    posed = sum(len(poses) for poses in motions.values()) + 3 * slots
+    frames = frames_of(scene.times, max(FEWEST_FRAMES, MOST_POSES // max(1, posed)))
     rate = (len(frames) - 1) / float(scene.times[-1])
     meshcat.StartRecording(frames_per_second=rate, set_visualizations_while_recording=False)
     for time, k in frames:
-        _place(meshcat, scene, k, slots, time)
+        _place(meshcat, scene, motions, k, slots, time)
     meshcat.StopRecording()
-    _place(meshcat, scene, 0, slots, None)  # what is seen before play
+    _place(meshcat, scene, motions, 0, slots, None)  # what is seen before play
     animation = meshcat.get_mutable_recording()
     animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
     animation.set_repetitions(REPETITIONS)
@@ -86,10 +94,10 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
     meshcat.Flush()
 
 
-def frames_of(times: Array) -> list[tuple[float, int]]:
-    """(time, index of the state) of each frame, evenly apart, the first and the last state included."""
+def frames_of(times: Array, most: int = MOST_POSES) -> list[tuple[float, int]]:
+    """(time, index of the state) of `most` frames or fewer, evenly apart, the first and the last state included."""
     steps = len(times) - 1
-    count = min(steps, max(1, int(np.ceil(times[-1] * FRAMES_PER_SECOND))))
+    count = min(steps, max(1, int(np.ceil(times[-1] * FRAMES_PER_SECOND))), most)
     return [(float(times[-1]) * k / count, round(k * steps / count)) for k in range(count + 1)]
 
 
@@ -139,9 +147,16 @@ def _draw_tube(meshcat: Meshcat, path: str, points: Array, radius: float) -> Non
     meshcat.SetTriangleMesh(path, vertices.T, np.array(faces, dtype=np.int32).T, TRAIL)
 
 
-def _place(meshcat: Meshcat, scene: Scene, k: int, slots: int, time: float | None) -> None:
+def _only(poses: Poses, shaped: set[str]) -> Poses:
+    """Of the bodies that have a shape."""
+    return {path: found for path, found in poses.items() if path in shaped}
+
+
+def _place(
+    meshcat: Meshcat, scene: Scene, motions: Mapping[str, Poses], k: int, slots: int, time: float | None
+) -> None:
     """Bodies and ghosts as in state k, and arrows of the forces in the step from there, or in the last step."""
-    for root, poses in (("motion", scene.poses), *((ghost.name, ghost.poses) for ghost in scene.ghosts)):
+    for root, poses in motions.items():
         for path, found in poses.items():
             meshcat.SetTransform(f"{root}/{path}", found[k], time_in_recording=time)
     contacts = scene.forces[min(k, len(scene.forces) - 1)] if scene.forces else ()

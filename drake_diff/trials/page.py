@@ -68,7 +68,7 @@ def _trial_plots(task: Task, trial: Trial) -> Iterator[Plot]:
             Line("plan", planned[:, i], dashed=True),
         ]
         limits = (problem.bounds.x_lower[i], problem.bounds.x_upper[i])
-        yield Plot(model.state_names[i], units[i], times, lines, limits=limits)
+        yield Plot(model.state_names[i], units[i], times, lines, limits=limits, group="States")
     planned_us = _padded(np.repeat(task.us, (count - 1) // len(task.us), axis=0), count)
     commands, applied = held(run.commands), held(run.applied)
     for i, c in enumerate(model.contract.inputs):
@@ -78,13 +78,13 @@ def _trial_plots(task: Task, trial: Trial) -> Iterator[Plot]:
             Line("plan", planned_us[:, i], dashed=True, held=True),
         ]
         limits = (problem.bounds.u_lower[i], problem.bounds.u_upper[i])
-        yield Plot(f"input {c.name}", c.unit, times, lines, limits=limits)
+        yield Plot(f"input {c.name}", c.unit, times, lines, limits=limits, percent=True, group="Inputs")
     others = list(dict.fromkeys(status for status in run.controller_status if status != "ok"))
     events = [f"{e.t:.4g} s: {e.message}" for e in run.events]
     note = "; ".join([*others[:3], *events[:6]]) or "nothing happened"
     ok = held(np.array([[float(status == "ok")] for status in run.controller_status]).reshape(-1, 1))
     status = [Line("status", ok[:, 0], held=True)]
-    yield Plot("controller status", "1: ok", times, status, range=[-0.1, 1.1], note=note)
+    yield Plot("controller status", "1: ok", times, status, range=[-0.1, 1.1], note=note, group="Inputs")
 
 
 def _padded(rows: Array, count: int) -> Array:
