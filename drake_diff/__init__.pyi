@@ -41,7 +41,11 @@ from .optimize.problem.constraint import Bounds as Bounds
 from .optimize.problem.constraint import Constraint as Constraint
 from .optimize.problem.cost import QuadraticCost as QuadraticCost
 from .optimize.problem.dynamics import Dynamics as Dynamics
+from .optimize.problem.goals import CenterOfMassGoal as CenterOfMassGoal
 from .optimize.problem.goals import FrameGoal as FrameGoal
+from .optimize.problem.goals import FrameVelocityGoal as FrameVelocityGoal
+from .optimize.problem.goals import JointGoal as JointGoal
+from .optimize.problem.goals import KeepLevel as KeepLevel
 from .optimize.problem.problem import Problem as Problem
 from .optimize.solution import Solution as Solution
 from .optimize.solution import Status as Status

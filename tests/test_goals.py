@@ -1,46 +1,413 @@
 """Goals in a robot's own words: what they check, what they come to, and that the motions found keep them."""
 
+import shutil
+
 import numpy as np
 import pytest
-from helpers.models import MODELS
+from helpers.models import MODELS, robot_file
+from helpers.robots import example_robot, state_in_range
 from helpers.table import each_row
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import (
+    BallRpyJoint,
+    BodyIndex,
+    FixedOffsetFrame,
+    PlanarJoint,
+    PrismaticJoint,
+    RevoluteJoint,
+    RpyFloatingJoint,
+    SpatialInertia,
+    UnitInertia,
+)
+from pydrake.systems.framework import DiagramBuilder
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
+from drake_diff.optimize.problem.goals import AIMED
+from drake_diff.optimize.transcription.expressions import Symbolic, trace
+
+UPPER, LOWER = 0.8, 0.5  # [m] of double_pendulum.urdf
+EFFORT = dd.QuadraticCost(R=np.eye(2))
 
 
 @pytest.fixture(scope="module")
 def arm():
-    return dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.05)
+    return dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.05, gravity=[0, 0, 0])
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+
+
+def tip(**changes):
+    return dd.FrameGoal(**({"frame": "lower", "point": [0, 0, -LOWER], "position": [-0.6, None, -0.7]} | changes))
+
+
+def reach(model, **changes):
+    """From hanging bent to the target of `tip`, at rest."""
+    start, stop = {"shoulder": 0.3, "elbow": 0.4}, {"shoulder_w": 0, "elbow_w": 0}
+    given = {"x0": start, "x_goal": stop, "num_steps": 20, "goals": tip(), "running_cost": EFFORT}
+    return dd.Problem(model, **given | changes)
+
+
+KINDS = {
+    "frame": (dd.FrameGoal, {"frame": "tip", "position": [0, 0, 1]}),
+    "velocity": (dd.FrameVelocityGoal, {"frame": "tip"}),
+    "joint": (dd.JointGoal, {"values": {"a": 1}}),
+    "mass": (dd.CenterOfMassGoal, {"position": [0, 0, 1]}),
+    "level": (dd.KeepLevel, {"frame": "tip"}),
+}
 
 
 @each_row(
-    "given, error, words",
+    "kind, given, error, words",
     [
-        ({"frame": "tip"}, InputError, "no position and no rotation"),
-        ({"frame": "tip", "position": [None, None, np.nan]}, InputError, "no position"),
-        ({"frame": "tip", "position": [0.0, 1.0]}, ShapeError, "position"),
-        ({"frame": "tip", "position": [0.0, 1.0, np.inf]}, InputError, "finite"),
-        ({"frame": "tip", "position": 3.0}, InputError, "3 numbers"),
-        ({"frame": 3, "position": [0, 0, 0]}, InputError, "a name"),
-        ({"frame": "tip", "position": [0, 0, 0], "tolerance": 0.0}, InputError, "above 0"),
-        ({"frame": "tip", "position": [0, 0, 0], "knots": 0.5}, InputError, "whole numbers"),
-        ({"frame": "tip", "rotation": [0, 0, 0, 0.5]}, InputError, "norm"),
-        ({"frame": "tip", "rotation": np.eye(2)}, ShapeError, "rotation"),
+        ("frame", {"position": None}, InputError, "no position and no rotation"),
+        ("frame", {"position": [None, None, np.nan]}, InputError, "no position"),
+        ("frame", {"position": [0.0, 1.0]}, ShapeError, "position"),
+        ("frame", {"position": [0.0, 1.0, np.inf]}, InputError, "finite"),
+        ("frame", {"position": 3.0}, InputError, "3 numbers"),
+        ("frame", {"frame": 3}, InputError, "a name"),
+        ("frame", {"tolerance": 0.0}, InputError, "above 0"),
+        ("frame", {"knots": 0.5}, InputError, "whole numbers"),
+        ("frame", {"knots": 3, "weight": 1.0}, InputError, "the last one, -1, or None"),
+        ("frame", {"weight": -1.0}, InputError, "above 0"),
+        ("frame", {"rotation": [0, 0, 0, 0.5]}, InputError, "norm"),
+        ("frame", {"rotation": np.eye(2)}, ShapeError, "rotation"),
+        ("velocity", {"velocity": [None, None, None]}, InputError, "a velocity"),
+        ("velocity", {"angular_velocity": [0, 0]}, ShapeError, "angular_velocity"),
+        ("joint", {"values": {}}, InputError, "a value for each name"),
+        ("joint", {"values": {"a": np.nan}}, InputError, "JointGoal a"),
+        ("mass", {"position": [None] * 3}, InputError, "a position"),
+        ("level", {"axis": [0, 0, 0]}, InputError, "a direction"),
+        ("level", {"tolerance": -1}, InputError, "above 0"),
     ],
 )
-def test_a_frame_goal_refuses(given, error, words):
+def test_goals_refuse(kind, given, error, words):
+    goal, good = KINDS[kind]
+    goal(**good)
     with pytest.raises(error, match=words):
-        dd.FrameGoal(**given)
+        goal(**good | given)
 
 
-def test_an_unknown_frame_lists_those_that_exist(arm):
-    with pytest.raises(UnknownNameError, match="upper"):
-        dd.Problem(arm, x0=np.zeros(4), num_steps=5, goals=dd.FrameGoal("hand", [0.1, 0, 0]))
+@each_row(
+    "goal, words",
+    [
+        (dd.FrameGoal("hand", [0.1, 0, 0]), "lower.*upper.*world"),
+        (dd.FrameVelocityGoal("hand"), "lower.*upper"),
+        (dd.KeepLevel("hand"), "lower.*upper"),
+        (dd.JointGoal({"wrist": 1.0}), "elbow, elbow_q, elbow_w, shoulder"),
+    ],
+)
+def test_an_unknown_name_lists_those_that_exist(arm, goal, words):
+    with pytest.raises(UnknownNameError, match=words):
+        reach(arm, goals=goal)
 
 
-def test_a_goal_is_made_again_from_its_values():
-    goal = dd.FrameGoal("hand", [0.1, None, 0.3], [0.0, 1.0, 0.0, 0.0], tolerance=0.02, knots=[3, -1])
-    ((kind, values),) = goal.to_dict().items()
-    assert getattr(dd, kind)(**values) == goal
-    assert goal.rotation == ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+@each_row(
+    "goals, words",
+    [
+        (dd.Constraint(lambda x: x[0], upper=1), "a goal such as FrameGoal"),
+        (dd.FrameGoal("lower", [0.1, 0.2, -0.5]), "entry 1 is 0 wherever"),  # it swings in x and z
+        (dd.FrameGoal("lower", [0.1, 0, -0.5], knots=21), "from -21 to 20"),
+        (dd.KeepLevel("upper", tolerance=0.2), "upper is at most 0.3 rad from upright"),  # x0 leans by 0.3 rad
+        (dd.JointGoal({"elbow": 1.0, "elbow_q": 1.0}), "they are the same"),
+    ],
+)
+def test_a_problem_refuses_goals_that_its_model_cannot_have(arm, goals, words):
+    with pytest.raises(InputError, match=words):
+        reach(arm, goals=goals)
+
+
+def test_plain_dynamics_have_no_goals():
+    block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+    with pytest.raises(InputError, match="none for plain dynamics"):
+        dd.Problem(block, x0=[0, 0], num_steps=4, horizon=1.0, goals=dd.JointGoal({"x0": 1.0}))
+
+
+def test_goals_are_made_again_from_their_values():
+    for goal in (
+        dd.FrameGoal("hand", [0.1, None, 0.3], [0.0, 1.0, 0.0, 0.0], tolerance=0.02, knots=[3, -1]),
+        dd.FrameVelocityGoal("hand", None, angular_velocity=[None, 0, 1]),
+        dd.JointGoal({"elbow": 1, "wrist": 0.5}, weight=2.0),
+        dd.CenterOfMassGoal([0, None, 1], knots=None),
+        dd.KeepLevel("tray", axis=[1, 0, 0]),
+    ):
+        ((kind, values),) = goal.to_dict().items()
+        assert getattr(dd, kind)(**values) == goal
+    assert dd.FrameGoal("hand", rotation=[0, 1, 0, 0]).rotation == ((1, 0, 0), (0, -1, 0), (0, 0, -1))
+
+
+def test_what_a_page_draws_is_where_the_goal_is():
+    ball, axes = dd.FrameGoal("hand", [0.1, 0.2, 0.3], np.eye(3)).marks()
+    assert (ball.shape, ball.position, axes.shape, axes.frame) == ("sphere", (0.1, 0.2, 0.3), "axes", "world")
+    (slab,) = tip().marks()
+    assert (slab.shape, slab.size) == ("box", (0.01, 1.0, 0.01))
+    (up,) = dd.KeepLevel("tray").marks()
+    assert (up.shape, up.frame) == ("arrow", "tray")
+
+
+@each_row(
+    "method, options",
+    [
+        ("collocation", {"scheme": "hermite_simpson"}),
+        ("collocation", {"scheme": "trapezoid"}),
+        ("collocation", {"scheme": "drake"}),
+        ("shooting", {}),
+        ("shooting", {"solver": "ipopt"}),
+        ("shooting", {"segments": 4}),
+        ("ilqr", {}),
+    ],
+)
+def test_a_two_link_arm_ends_at_the_angles_of_the_law_of_cosines(arm, method, options):
+    solution = dd.solve(reach(arm), method=method, progress=False, **options)
+    x, z = -0.6, -0.7
+    bend = np.arccos((x**2 + z**2 - UPPER**2 - LOWER**2) / (2 * UPPER * LOWER))
+    found = []
+    for elbow in (bend, -bend):  # a hinge about +y swings what hangs down to -x
+        inner = np.arctan2(LOWER * np.sin(elbow), UPPER + LOWER * np.cos(elbow))
+        found.append([np.arctan2(-x, -z) - inner, elbow])
+    off = min(np.max(np.abs(solution.xs[-1][:2] - angles)) for angles in found)
+    # The plan may use a tenth of 5 mm; an angle changes by at most 1 / (0.5 sin bend) rad a metre.
+    assert off < AIMED * 5e-3 / (LOWER * np.sin(bend))
+    assert solution.constraint_violation < 1e-5
+
+
+def test_the_verdict_says_in_metres_how_far_the_hand_ends(arm):
+    solution = dd.solve(reach(arm), progress=False)
+    assert solution.success
+    assert "the plan holds: lower ends " in solution.message
+    assert "from its target, of 5 mm allowed" in solution.message
+
+
+def test_a_hand_that_replays_miss_is_no_success(arm):
+    """Steps of 50 ms move the end by more than 1 um, however well the plan itself ends."""
+    solution = dd.solve(reach(arm, goals=tip(tolerance=1e-6)), method="collocation", progress=False)
+    assert solution.status is dd.Status.CONVERGED_NOT_VERIFIED
+    assert "from its target, tolerance 0.001 mm" in solution.message
+
+
+def test_a_goal_out_of_reach_is_named(arm):
+    far = dd.solve(reach(arm, goals=tip(position=[-2.0, None, 0.0])), method="collocation", progress=False)
+    assert not far.success
+    assert "a goal within reach (lower ends " in far.message
+
+
+TWO_SLIDES = """<robot name="two"><link name="a">{mass}</link><link name="b">{mass}</link>
+<joint name="slide_a" type="prismatic"><parent link="world"/><child link="a"/><axis xyz="1 0 0"/></joint>
+<joint name="slide_b" type="prismatic"><parent link="world"/><child link="b"/><axis xyz="0 1 0"/></joint>
+<transmission><type>transmission_interface/SimpleTransmission</type><joint name="slide_a">
+<hardwareInterface>EffortJointInterface</hardwareInterface></joint><actuator name="m"/></transmission></robot>"""
+
+
+def test_a_goal_that_nothing_moves_is_named(tmp_path):
+    """A slide without a motor, beside one that has one."""
+    file = tmp_path / "two.urdf"
+    mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    file.write_text(TWO_SLIDES.format(mass=mass))
+    model = dd.load_model(file, time_step=0.02)
+    for frame, moved in (("a", True), ("b", False)):
+        goal = dd.FrameGoal(frame, [0.1, None, None] if moved else [None, 0.1, None])
+        problem = dd.Problem(model, x0={}, num_steps=10, goals=goal, running_cost=dd.QuadraticCost(R=[[1.0]]))
+        solution = dd.solve(problem, method="shooting", progress=False)
+        assert ("no variable moves b position, and b ends 0.1 m from its target" in solution.message) != moved
+        assert (solution.status is dd.Status.NO_GRADIENT) != moved
+
+
+def test_a_weight_makes_a_goal_a_cost(arm):
+    """The plan is that of the same cost written out."""
+    where = dd.quantities.frame_position(arm, "lower", [0, 0, -LOWER])
+
+    def written_out(x):
+        off = where(x) - np.array([-0.6, 0, -0.7])
+        return 30.0 * (off[0] ** 2 + off[2] ** 2)
+
+    soft = reach(arm, goals=tip(weight=30.0))
+    own = reach(arm, goals=(), final_cost=written_out)
+    assert soft.kept_goals == ()
+    found, wanted = (dd.solve(p, method="collocation", progress=False) for p in (soft, own))
+    assert found.options["derivatives"] == wanted.options["derivatives"] == "symbolic, exact Hessian"
+    assert found.cost == pytest.approx(wanted.cost, rel=1e-8)
+    np.testing.assert_allclose(found.xs, wanted.xs, atol=1e-6)  # two runs of IPOPT to 1e-8
+
+
+def test_a_level_link_stays_level_and_a_free_one_does_not(arm):
+    """The cost pulls the upper link to 1 rad."""
+    pulled = dd.QuadraticCost(Q=np.diag([20.0, 0, 1, 1]), R=np.eye(2), x_ref=[1.0, 0, 0, 0])
+    tilt = dd.quantities.frame_tilt(arm, "upper")
+    free, level = (
+        dd.solve(reach(arm, goals=goals, running_cost=pulled), method="collocation", progress=False)
+        for goals in ([], dd.KeepLevel("upper", tolerance=0.4))
+    )
+    largest = [max(np.linalg.norm(tilt(x)) for x in s.xs) for s in (free, level)]
+    assert largest[0] > 0.6
+    assert 0.2 < largest[1] <= 0.4
+    assert level.success
+    assert "upper is at most" in level.message
+
+
+@each_row(
+    "given, words",
+    [
+        ({"x0": {"knee": 1.0}}, "x0: expected one of elbow, elbow_q"),
+        ({"x_goal": {"knee": 1.0}}, "x_goal: expected one of elbow"),
+        ({"bounds": {"knee": (0, 1)}}, "one of elbow, elbow_motor"),
+        ({"bounds": {"elbow": 1.0}}, "lower, upper"),
+        ({"waypoints": {3: {"knee": 1.0}}}, "one of elbow"),
+        ({"x0": {"elbow": 3.0}, "bounds": {"elbow": (-1, 1)}}, "x0, elbow_q"),
+    ],
+)
+def test_names_that_do_not_fit_are_refused(arm, given, words):
+    with pytest.raises(InputError, match=words):
+        reach(arm, **given)
+
+
+def test_states_and_bounds_by_name_are_those_by_place(arm):
+    named = reach(
+        arm,
+        x0={"elbow": 0.4},
+        x_goal={"elbow_q": 1.0},
+        bounds={"elbow": (-1, None), "shoulder_w": (None, 2.0), "elbow_motor": (-3, 3)},
+        waypoints={5: {"shoulder": 0.1}},
+    )
+    np.testing.assert_array_equal(named.x0, [0, 0.4, 0, 0])
+    np.testing.assert_array_equal(named.x_goal, [np.nan, 1.0, np.nan, np.nan])
+    np.testing.assert_array_equal(named.waypoints[5], [0.1, np.nan, np.nan, np.nan])
+    np.testing.assert_array_equal(named.bounds.x_lower, [-np.inf, -1, -np.inf, -np.inf])
+    np.testing.assert_array_equal(named.bounds.x_upper, [np.inf, np.inf, 2, np.inf])
+    assert (named.bounds.u_lower[1], named.bounds.u_upper[1]) == (-3, 3)
+
+
+def quantities_of(model, random):
+    """One of each kind, of the body that is last in the tree."""
+    body = model.plant.get_body(BodyIndex(model.plant.num_bodies() - 1)).name()
+    R = RollPitchYaw(random.uniform(-1, 1, 3)).ToRotationMatrix().matrix()
+    q, point = dd.quantities, random.standard_normal(3)
+    found = [q.frame_position(model, body, point), q.frame_rotation_error(model, body, R)]
+    found += [q.frame_velocity(model, body, point), q.frame_angular_velocity(model, body)]
+    found += [q.frame_tilt(model, body, point), q.center_of_mass(model)]
+    base = model.plant.get_body(BodyIndex(2)).name()
+    return [*found, q.frame_position(model, body, point, base), q.frame_rotation_error(model, body, R, base)]
+
+
+def check_symbols(model, states, random):
+    """Symbols have the values and Jacobians of AutoDiffXd, and these are those of differences."""
+    knots = np.hstack([states, np.zeros((len(states), model.nu))])
+    for f in quantities_of(model, random):
+        wanted = np.array([f(x) for x in states])
+        function = Symbolic(trace(lambda x, u, f=f: f(x), model.nx, knots, wanted))  # values to 1e-10, or it refuses
+        constraint = dd.Constraint(f, lower=0.0)
+        for x, knot in zip(states, knots, strict=True):
+            jacobian = constraint.differentiate(x, knot[model.nx :])[1]
+            largest = max(1.0, np.max(np.abs(jacobian)))
+            np.testing.assert_allclose(function.jacobian_of(knot), jacobian, rtol=0, atol=1e-12 * largest)  # rounding
+            way = random.standard_normal(model.nx)
+            slope = (f(x + 1e-6 * way) - f(x - 1e-6 * way)) / 2e-6
+            # Central differences of 1e-6 leave 1e-16 / 1e-6 of rounding and 1e-12 of curvature.
+            np.testing.assert_allclose(jacobian[:, : model.nx] @ way, slope, rtol=0, atol=1e-8 * largest)
+
+
+@pytest.mark.parametrize("name", ["ur5_robot.urdf", "solo12.urdf"])
+def test_goals_have_the_same_derivatives_by_symbols_and_by_autodiff(name):
+    """A fixed and a floating base, whose quaternion is of another length than 1 in one of the states."""
+    model, random = example_robot(name), np.random.default_rng(0)
+    states = np.array([state_in_range(model, random) for _ in range(3)])
+    if name == "solo12.urdf":
+        states[2, :4] *= 1.1
+    check_symbols(model, states, random)
+
+
+def test_a_frame_on_a_joint_that_follows_another_is_placed_too():
+    """The Panda's second finger, whose coordinate is not in the state."""
+    model, random = (
+        dd.load_model(robot_file("panda.urdf"), time_step=0.01, actuators="all", mimic="reduce"),
+        np.random.default_rng(0),
+    )
+    assert model.nq == model.plant.num_positions() - 1
+    check_symbols(model, random.uniform(-0.5, 0.5, (2, model.nx)), random)
+    with pytest.raises(UnknownNameError, match="panda_finger_joint1,"):
+        dd.Problem(model, x0={"panda_finger_joint2": 0.01}, num_steps=3, x_goal={})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["kinova.urdf", "panda.urdf", "simple_humanoid.urdf", "allegro_left_hand.urdf"])
+def test_more_robots_have_the_same_derivatives(name):
+    model, random = example_robot(name), np.random.default_rng(1)
+    check_symbols(model, np.array([state_in_range(model, random) for _ in range(3)]), random)
+
+
+def test_joints_of_every_kind_are_placed_as_drake_does():
+    """A chain of all kinds with turned frames; the last joint is met from its child."""
+    builder, random = DiagramBuilder(), np.random.default_rng(3)
+    plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.01, use_sampled_output_ports=False), builder)
+    weight = SpatialInertia(1.0, [0.1, 0.2, 0.3], UnitInertia.SolidSphere(1.0))
+    before = plant.world_body()
+
+    def pose():
+        return RigidTransform(RollPitchYaw(random.uniform(-1, 1, 3)), random.uniform(-1, 1, 3))
+
+    for i, kind in enumerate((RpyFloatingJoint, PlanarJoint, BallRpyJoint, PrismaticJoint, RevoluteJoint)):
+        body = plant.AddRigidBody(f"body_{i}", weight)
+        pair = (body, pose(), before, pose()) if i == 4 else (before, pose(), body, pose())
+        axis = [random.uniform(-1, 1, 3)] if kind in (PrismaticJoint, RevoluteJoint) else []
+        arguments = {"damping": np.zeros(3)} if kind is PlanarJoint else {}
+        plant.AddJoint(kind(f"joint_{i}", *_frames(plant, f"joint_{i}", *pair), *axis, **arguments))
+        before = body
+    plant.Finalize()
+    model = dd.model_from_diagram(builder.Build())
+    check_symbols(model, random.uniform(-1, 1, (3, model.nx)), random)
+
+
+def _frames(plant, name, parent, on_parent, child, on_child):
+    pairs = ((f"{name}_parent", parent, on_parent), (f"{name}_child", child, on_child))
+    return [plant.AddFrame(FixedOffsetFrame(n, body.body_frame(), pose)) for n, body, pose in pairs]
+
+
+def test_half_a_turn_away_is_no_gap_in_the_derivatives(pendulum):
+    """From hanging to upright is half a turn, where a rotation's axis may have either sign."""
+    f = dd.quantities.frame_rotation_error(pendulum, "pole", np.diag([-1.0, 1.0, -1.0]))
+    probe = np.array([[0.3, 0, 0.0], [1.0, 0, 0], [2.0, 0, 0]])
+    function = Symbolic(trace(lambda x, u: f(x), 2, probe, np.array([f(k[:2]) for k in probe])))
+    at = np.zeros(3)
+    assert np.all(np.isfinite(function.jacobian_of(at)))
+    np.testing.assert_allclose(np.linalg.norm(f(at[:2])), 2.0, rtol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def run(pendulum, tmp_path_factory):
+    goals = [dd.FrameGoal("pole", [-0.25, None, None], point=[0, 0, -0.5]), dd.FrameVelocityGoal("pole")]
+    problem = dd.Problem(
+        pendulum, x0={}, num_steps=20, goals=goals, running_cost=dd.QuadraticCost(R=[[1.0]]), x_goal={"hinge_w": 0.0}
+    )
+    solution = dd.solve(problem, method="collocation", progress=False)
+    assert solution.success, solution.message
+    directory = tmp_path_factory.mktemp("runs") / "pole"
+    dd.save(solution, directory)
+    return directory
+
+
+def test_verify_binds_the_goals_again_and_holds(run):
+    found = dd.verify(run).require()
+    assert found.verdict == "holds"
+    assert any("goal" in line and "FrameGoal" in line for line in found.claimed)
+
+
+@each_row(
+    "lie",
+    [
+        {"position": [-0.26, None, None]},  # where the hand does not end
+        {"tolerance": 0.5},  # what would take anything: the search then ends elsewhere
+        {"frame": "nowhere"},
+        {"knots": [3]},
+    ],
+)
+def test_a_goal_that_was_moved_is_found_although_the_record_is_whole(run, tmp_path, lie):
+    copy = shutil.copytree(run, tmp_path / "copy")
+    record = dd.load_record(copy)
+    first, second = record.problem["goals"]
+    goals = [{"FrameGoal": first["FrameGoal"] | lie}, second]
+    record.model_copy(update={"problem": dict(record.problem) | {"goals": goals}}).write(copy)
+    found = dd.verify(copy)
+    assert not found.holds

@@ -17,7 +17,7 @@ from drake_diff.model.plant import FLOATING, joints
 from drake_diff.model.quantities import description_of, made_from
 from drake_diff.optimize.problem.constraint import Bounds, Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost
-from drake_diff.optimize.problem.goals import FrameGoal, Goal
+from drake_diff.optimize.problem.goals import CenterOfMassGoal, FrameGoal, FrameVelocityGoal, Goal, JointGoal, KeepLevel
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.parts import ModelInput, Quantity
@@ -86,7 +86,10 @@ COSTS = ("running_cost", "final_cost", "trajectory_cost")
 LIMITS = ("x_lower", "x_upper", "u_lower", "u_upper")
 GAPS = {"lower": -np.inf, "upper": np.inf}  # what null is, of a bound
 GUESS = ("initial_guess", "initial_guess_sha256")
-GOALS: dict[str, Any] = {kind.__name__: kind for kind in (FrameGoal,)}  # by the name that a record has
+# By the names that a record has.
+GOALS: dict[str, Any] = {
+    kind.__name__: kind for kind in (FrameGoal, FrameVelocityGoal, JointGoal, CenterOfMassGoal, KeepLevel)
+}
 
 
 def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:

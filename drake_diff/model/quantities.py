@@ -1,7 +1,8 @@
 """Functions of the state that tasks are written with: positions, rotations, velocities and contact forces.
 
 Each takes a model and names, checks them at once, and returns a function of x (nx,), or of x and u (nu,), for floats
-and for AutoDiffXd, to use in costs and in a `dd.Constraint`.
+and for AutoDiffXd, to use in costs and in a `dd.Constraint`. Those of the state alone, contact apart, also take the
+symbols of a collocation, which so has their exact second derivatives.
 
 They belong to the model's own parameters and have no derivative by any. Where other parameters are applied that they
 depend on (joint offsets; masses and centres of mass; for contact forces all), they raise InputError, and so does a
@@ -26,6 +27,7 @@ from drake_diff._base.arrays import finite_array
 from drake_diff._base.autodiff import plain
 from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
 from drake_diff.model.contact import body_of, contact_forces
+from drake_diff.model.kinematics import Kinematics, kinematics_of, product
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
 from drake_diff.model.step import advance, set_state
@@ -34,6 +36,7 @@ from drake_diff.model.twin import Twin
 PLACE = frozenset({"offset"})  # the parameters that frames depend on
 BALANCE = PLACE | {"mass", "center_of_mass"}
 ORIGIN = (0.0, 0.0, 0.0)
+UP = (0.0, 0.0, 1.0)
 ROTATION_TOLERANCE = 1e-9  # of R' R = I: a goal written down with fewer digits would be another rotation
 
 RECORDED = "recorded_as"  # the attribute of a function of this module by which a record knows it
@@ -67,6 +70,10 @@ def frame_position(model: Model, frame: str, point: ArrayLike = ORIGIN, relative
     here, base, p = _frame_index(model, frame), _frame_index(model, relative_to), finite_array("point", point, (3,))
 
     def position(x: Any) -> Any:
+        if _is_symbolic(x):
+            tree, there = _tree_of(model, PLACE), model.plant.get_frame(base)
+            carrier, origin = tree.frame(x, model.plant.get_frame(here)), tree.frame(x, there)
+            return origin.R.T @ (carrier.p + carrier.R @ p - origin.p)
         twin, _ = _at(model, PLACE, x)
         pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
         return pose.translation() + pose.rotation().matrix() @ p
@@ -108,6 +115,11 @@ def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_t
         raise InputError("R_goal", got=got, expected="a rotation matrix")
 
     def error(x: Any) -> Any:
+        if _is_symbolic(x):
+            tree = _tree_of(model, PLACE)
+            turned, origin = (tree.quaternion(x, model.plant.get_frame(i)) for i in (here, base))
+            relative = product(product(_conjugate(origin), turned), _conjugate(_quaternion(goal)))
+            return 2 * relative[0].sign() * relative[1:]
         twin, _ = _at(model, PLACE, x)
         pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
         return 2 * _quaternion(pose.rotation().matrix() @ goal.T)[1:]
@@ -139,12 +151,87 @@ def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfSta
     here, p = _frame_index(model, frame), finite_array("point", point, (3,))
 
     def velocity(x: Any) -> Any:
+        if _is_symbolic(x):
+            return _tree_of(model, PLACE).frame(x, model.plant.get_frame(here), speeds=True).shifted(np.eye(3), p).v
         twin, _ = _at(model, PLACE, x)
         world, moving = twin.plant.world_frame(), twin.plant.get_frame(here)
         arm = moving.CalcPose(twin.context, world).rotation().matrix() @ p
         return moving.CalcSpatialVelocity(twin.context, world, world).Shift(arm).translational()
 
     return _recorded(velocity, "frame_velocity", frame=frame, point=p.tolist())
+
+
+def frame_angular_velocity(model: Model, frame: str) -> OfState:
+    """The angular velocity of a frame in the world, as a function of the state.
+
+    Args:
+        model: The model.
+        frame: The frame; a body's name will do.
+
+    Returns:
+        x (nx,) -> (3,) [rad/s].
+
+    Raises:
+        UnknownNameError: There is no such frame.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> turning = dd.quantities.frame_angular_velocity(model, "pole")
+        >>> turning([0.0, 2.0]).round(6)
+        array([0., 2., 0.])
+    """
+    here = _frame_index(model, frame)
+
+    def velocity(x: Any) -> Any:
+        if _is_symbolic(x):
+            return _tree_of(model, PLACE).frame(x, model.plant.get_frame(here), speeds=True).w
+        twin, _ = _at(model, PLACE, x)
+        return twin.plant.get_frame(here).CalcSpatialVelocityInWorld(twin.context).rotational()
+
+    return _recorded(velocity, "frame_angular_velocity", frame=frame)
+
+
+def frame_tilt(model: Model, frame: str, axis: ArrayLike = UP) -> OfState:
+    """How far an axis of a frame leans from upright, as a function of the state: 2 sin(angle / 2) towards x and y.
+
+    0 where the axis points up, along the world's z; near it the small angles that it leans by [rad], and of norm 2
+    where it points down.
+
+    Args:
+        model: The model.
+        frame: The frame; a body's name will do.
+        axis: (3,) what is to point up, in `frame`; of any length.
+
+    Returns:
+        x (nx,) -> (2,) [rad, for small ones].
+
+    Raises:
+        UnknownNameError: There is no such frame.
+        ShapeError, InputError: `axis` is not (3,), or 0.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> tilt = dd.quantities.frame_tilt(model, "pole")
+        >>> tilt([0.01, 0.0]).round(6)
+        array([0.01, 0.  ])
+    """
+    here, a = _frame_index(model, frame), finite_array("axis", axis, (3,))
+    if not np.linalg.norm(a) > 0:
+        raise InputError("axis", got=a.tolist(), expected="a direction")
+    a = a / np.linalg.norm(a)
+
+    def tilt(x: Any) -> Any:
+        if _is_symbolic(x):
+            R = _tree_of(model, PLACE).frame(x, model.plant.get_frame(here)).R
+        else:
+            twin, _ = _at(model, PLACE, x)
+            R = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.world_frame()).rotation().matrix()
+            if not plain([1 + (R @ a)[2]])[0] > 0:  # upside down: it leans every way
+                return np.array([2.0, 0.0]) + 0 * (R @ a)[:2]
+        pointing = R @ a
+        return pointing[:2] / np.sqrt((1 + pointing[2]) / 2)
+
+    return _recorded(tilt, "frame_tilt", frame=frame, axis=a.tolist())
 
 
 def center_of_mass(model: Model) -> OfState:
@@ -168,6 +255,8 @@ def center_of_mass(model: Model) -> OfState:
         raise ModelError("the bodies have no mass, and so no centre of mass")
 
     def center(x: Any) -> Any:
+        if _is_symbolic(x):
+            return _tree_of(model, BALANCE).center_of_mass(x)
         twin, _ = _at(model, BALANCE, x)
         return np.array(twin.plant.CalcCenterOfMassPositionInWorld(twin.context))
 
@@ -233,6 +322,8 @@ def made_from(model: Model, description: Any) -> OfState | OfStateAndInput:
         "frame_position": frame_position,
         "frame_rotation_error": frame_rotation_error,
         "frame_velocity": frame_velocity,
+        "frame_angular_velocity": frame_angular_velocity,
+        "frame_tilt": frame_tilt,
         "center_of_mass": center_of_mass,
         "contact_force": contact_force,
     }
@@ -248,9 +339,7 @@ def _at(model: Model, depends_on: frozenset[str], x: Any, *inputs: Any) -> tuple
 
     InputError where parameters are applied that the result would depend on.
     """
-    for quantity in sorted(model.other_quantities & depends_on):
-        expected = "only such as the functions of dd.quantities do not depend on"
-        raise InputError("parameters", got=quantity, expected=expected)
+    _check_parameters(model, depends_on)
     given = [np.asarray(array) for array in (x, *inputs)]
     for name, array, size in zip(("x", "u"), given, (model.nx, model.nu), strict=False):
         if array.shape != (size,):
@@ -262,6 +351,29 @@ def _at(model: Model, depends_on: frozenset[str], x: Any, *inputs: Any) -> tuple
         numbers = [np.array([v if isinstance(v, AutoDiffXd) else AutoDiffXd(v) for v in array]) for array in given]
     set_state(twin, numbers[0])
     return twin, numbers
+
+
+def _check_parameters(model: Model, depends_on: frozenset[str]) -> None:
+    for quantity in sorted(model.other_quantities & depends_on):
+        expected = "only such as the functions of dd.quantities do not depend on"
+        raise InputError("parameters", got=quantity, expected=expected)
+
+
+def _is_symbolic(x: Any) -> bool:
+    """Whether entries of `x` are neither numbers nor AutoDiffXd: what Drake cannot place."""
+    array = np.asarray(x)
+    known = (AutoDiffXd, int, float, np.number)
+    return array.dtype == object and not all(isinstance(entry, known) for entry in array.ravel())
+
+
+def _tree_of(model: Model, depends_on: frozenset[str]) -> Kinematics:
+    """What places frames for other scalars than Drake's."""
+    _check_parameters(model, depends_on)
+    return kinematics_of(model)
+
+
+def _conjugate(q: Any) -> Any:
+    return q * np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def _frame_index(model: Model, name: str) -> FrameIndex:

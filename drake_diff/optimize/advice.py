@@ -32,6 +32,7 @@ def _remedies(solution: Solution, arguments: dict[str, Any], other_methods: Sequ
         yield f"time_limit above {arguments['time_limit']:g} s"
     if status is Status.INFEASIBLE:
         yield "wider bounds or a longer horizon"
+        yield from _nearer_goals(solution)
     if status is Status.DIVERGED:
         yield "a smaller time step"
     if status is not Status.NO_GRADIENT:
@@ -40,6 +41,15 @@ def _remedies(solution: Solution, arguments: dict[str, Any], other_methods: Sequ
         yield "an initial_guess in which the bodies touch"
     else:
         yield "another initial_guess"
+
+
+def _nearer_goals(solution: Solution) -> Iterator[str]:
+    """The goals that the plan does not come near to."""
+    for c in solution.problem.kept_goals:
+        knots = solution.problem.knots_of(c, input_at_end=False)
+        miss = max(c.miss(solution.xs[solution.knots[k]]) for k in knots)
+        if not miss <= c.tolerance:
+            yield f"a goal within reach ({c.told(miss)} here)"
 
 
 def _may_continue(solution: Solution, other_methods: Sequence[str]) -> bool:

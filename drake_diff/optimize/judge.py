@@ -10,7 +10,7 @@ from drake_diff.exceptions import GradientError
 from drake_diff.model.contact import penetration
 from drake_diff.model.step import set_state
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, NlpResult, Outcome
-from drake_diff.optimize.replay import broken_variants, told_of_controls, told_of_tolerance
+from drake_diff.optimize.replay import broken_variants, told_of_controls, told_of_goals, told_of_tolerance
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
 from drake_diff.optimize.transcription.collocation import SUBSTEPS, Collocated, violation_between_nodes
 
@@ -44,7 +44,7 @@ def judged(draft: Solution, result: NlpResult) -> Solution:
         complaints += broken_variants(draft.plan, draft.replays)
     status = Status.CONVERGED_NOT_VERIFIED if complaints else Status.CONVERGED
     if not complaints:
-        every = [f(draft.plan, draft.replays) for f in (told_of_controls, told_of_tolerance)]
+        every = [f(draft.plan, draft.replays) for f in (told_of_goals, told_of_controls, told_of_tolerance)]
         complaints = [each for each in (*every, *held) if each]
     return ended(draft, status, "; ".join([*complaints, *notes]), **fields)
 

@@ -56,9 +56,21 @@ def why_blind(problem: Problem, variables: ShootingVariables, z: Array) -> str:
     wrong = np.abs(problem.goal_error(variables.states(z)[-1])) > FEASIBILITY_TOLERANCE
     deaf = np.flatnonzero(wrong & (effect < NO_EFFECT))
     if not len(deaf):
-        return ""
+        missed = next(_unmoved_goals(problem, variables.states(z)[-1], last), "")
+        return missed and f"{missed}{_what_is_apart(problem, variables.states(z))}"
     name = problem.model.state_names[deaf[0]]
     return f"no variable moves {name}, whose goal is not reached{_what_is_apart(problem, variables.states(z))}"
+
+
+def _unmoved_goals(problem: Problem, end: Array, last: Array) -> Iterator[str]:
+    """The goals at the end that are not reached there and that no variable changes, by `last` (nx, n) of them."""
+    for c in problem.kept_goals:
+        if problem.num_steps in problem.knots_of(c, input_at_end=False):
+            none = np.zeros(problem.nu)
+            values, rows = c.differentiate(end, none)
+            wrong = np.maximum(c.lower - values, values - c.upper) > FEASIBILITY_TOLERANCE
+            if np.any(wrong & (np.abs(rows[:, : problem.nx] @ last).max(axis=1, initial=0.0) < NO_EFFECT)):
+                yield f"no variable moves {c.label}, and {c.told(c.miss(end))}"
 
 
 def out_of_reach(problem: Problem, variables: ShootingVariables, z: Array) -> OutOfReach:
@@ -160,13 +172,13 @@ class _Plan:
         """(nx + nu, nx + nu) of what state and input of knot k cost, a `trajectory_cost` apart."""
         problem, (nx, nu) = self.problem, (self.problem.nx, self.problem.nu)
         if k < len(self.us):
-            running = problem.running_cost
+            running = problem.total_running_cost
             if running is None:
                 return np.zeros((nx + nu, nx + nu))
             return problem.model.time_step * running_cost_hessian(running, self.xs[k], self.us[k])
         hessian = np.zeros((nx + nu, nx + nu))
-        if problem.final_cost is not None:
-            hessian[:nx, :nx] = final_cost_hessian(problem.final_cost, self.xs[k])
+        if problem.total_final_cost is not None:
+            hessian[:nx, :nx] = final_cost_hessian(problem.total_final_cost, self.xs[k])
         return hessian
 
     def asks_of_what_moves(self) -> bool:

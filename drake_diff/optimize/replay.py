@@ -22,6 +22,7 @@ from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import TVLQR
 from drake_diff.motion.rollout import Policy, Rollout, rollout
+from drake_diff.optimize.problem.goals import GoalConstraint, in_words
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.transcription.collocation import EFFORT_WEIGHT, FINAL_WEIGHT
 
@@ -176,6 +177,33 @@ def told_of_controls(plan: Plan, found: Sequence[Replay]) -> str:
     return told
 
 
+def told_of_goals(plan: Plan, found: Sequence[Replay]) -> str:
+    """How far from each goal the plan is where it has to hold, at worst, and what is allowed; empty without goals."""
+    told = []
+    for c in plan.problem.kept_goals:
+        misses = []
+        for variant in _deciding(plan, found):
+            kept = [r.motion for r in found if r.variant == variant and r.holds and r.motion is not None]
+            misses += [min(_miss(c, motion, plan) for motion in kept)] * bool(kept)
+        if misses:
+            told.append(f"{c.told(max(misses))}, of {in_words(c.tolerance, c.unit)} allowed")
+    return "; ".join(told)
+
+
+def _miss(c: GoalConstraint, motion: Rollout, plan: Plan) -> float:
+    """The largest distance of a replay from a goal at the knots of the plan."""
+    parts = (len(motion.xs) - 1) // plan.problem.num_steps
+    return max(c.miss(motion.xs[parts * k]) for k in plan.problem.knots_of(c, input_at_end=False))
+
+
+def _missed_goals(plan: Plan, motion: Rollout) -> Iterator[str]:
+    """The goals that a replay is further from than their tolerance."""
+    for c in plan.problem.kept_goals:
+        miss = _miss(c, motion, plan)
+        if not miss <= c.tolerance:
+            yield f"{c.told(miss)}, tolerance {in_words(c.tolerance, c.unit)}"
+
+
 def told_of_tolerance(plan: Plan, found: Sequence[Replay]) -> str:
     """How far from its goal a plan ends where it has to hold, and what is allowed; empty where nothing has to."""
     decides = _deciding(plan, found)
@@ -269,6 +297,7 @@ def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, kn
         failures=(
             *missed_goal(plan, plan.problem.goal_error(motion.xs[-1]), goal_tolerance(control)),
             *left_bounds(plan, motion),
+            *_missed_goals(plan, motion),
             *_broken_constraints(plan, motion.xs[::parts], motion.us[::parts]),
             *_broken_balance(motion),
             *too_deep(model, motion),
@@ -325,10 +354,10 @@ def _broken_constraints(plan: Plan, xs: Array, us: Array) -> Iterator[str]:
             values = np.array([c(x, u) for x, u in zip(planned_xs, [*planned_us, planned_us[-1]], strict=True)])
         values = values[np.isfinite(values).all(axis=1)]
         tolerances[c.label] = STATE_TOLERANCE * max(float(np.ptp(values, axis=0).max()), SMALLEST_RANGE)
-    tolerances |= {c.label: c.allowance for c in problem.kept_goals}  # a goal says itself how near is near enough
+    goals = {c.label for c in problem.kept_goals}.difference(tolerances)  # they say themselves how near is near enough
     for name, (excess, knot) in problem.constraint_excess(xs, us).items():
         tolerance = tolerances.get(name, STATE_TOLERANCE * float(np.max(plan.scale)))
-        if not excess <= tolerance:
+        if not (name in goals or excess <= tolerance):
             yield f"{name} is broken by {excess:.3g} at knot {knot}, tolerance {tolerance:.3g}"
 
 

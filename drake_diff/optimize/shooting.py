@@ -301,8 +301,8 @@ class RolloutCost:
     """What the steps of z add to the objective, as a function of floats or AutoDiffXd, by reverse accumulation."""
 
     def __init__(self, problem: Problem, variables: ShootingVariables):
-        self.variables, self.time_step, self.running = variables, problem.model.time_step, problem.running_cost
-        self.final = problem.final_cost if variables.is_last else None
+        self.variables, self.time_step, self.running = variables, problem.model.time_step, problem.total_running_cost
+        self.final = problem.total_final_cost if variables.is_last else None
         self.trajectory = problem.trajectory_cost
 
     @property

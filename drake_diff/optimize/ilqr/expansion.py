@@ -62,9 +62,9 @@ def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: Augm
     model, xs, us = problem.model, motion.xs, motion.us
     gradients, hessians = _expand_running_cost(problem, xs, us)
     final_gradient, final_hessian = np.zeros(model.nx), np.zeros((model.nx, model.nx))
-    if problem.final_cost is not None:
-        final_gradient = differentiate_final_cost(problem.final_cost, xs[-1])[1]
-        final_hessian = final_cost_hessian(problem.final_cost, xs[-1])
+    if problem.total_final_cost is not None:
+        final_gradient = differentiate_final_cost(problem.total_final_cost, xs[-1])[1]
+        final_hessian = final_cost_hessian(problem.total_final_cost, xs[-1])
     if constraints.any:
         gradient, curvature = constraints.differentiate(xs, us)
         gradients += gradient[:-1]
@@ -88,7 +88,7 @@ def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: Augm
 
 def _expand_running_cost(problem: Problem, xs: Array, us: Array) -> tuple[Array, Array]:
     """(gradients (N, nx + nu), Hessians (N, nx + nu, nx + nu)) of h times the running cost."""
-    h, (nx, nu), cost = problem.model.time_step, (xs.shape[1], us.shape[1]), problem.running_cost
+    h, (nx, nu), cost = problem.model.time_step, (xs.shape[1], us.shape[1]), problem.total_running_cost
     gradients, hessians = np.zeros((len(us), nx + nu)), np.zeros((len(us), nx + nu, nx + nu))
     if isinstance(cost, QuadraticCost):
         x_ref = np.zeros(nx) if cost.x_ref is None else cost.x_ref

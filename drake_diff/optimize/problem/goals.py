@@ -4,11 +4,11 @@ A goal is a few plain values and holds no model. The `Problem` binds it to its o
 comes out are `GoalConstraint`s, which every method takes as it takes any `Constraint`. A record has the values, and
 `verify` binds them again. `marks` is what a page draws.
 
-A plan keeps a goal to half of its tolerance, and each replay on which the verdict rests to the whole of it: steps of
-another length end a little elsewhere.
+A plan aims at the middle of a goal's tolerance (see AIMED), and each replay on which the verdict rests has all of it:
+steps of another length end a little elsewhere.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, MISSING, dataclass, fields
 from typing import Any
 
@@ -17,12 +17,23 @@ import numpy as np
 from drake_diff._base.arrays import Array, array_with_gaps, finite_array, positive_float
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
-from drake_diff.model.quantities import frame_position, frame_rotation_error
+from drake_diff.model.quantities import (
+    UP,
+    center_of_mass,
+    frame_angular_velocity,
+    frame_position,
+    frame_rotation_error,
+    frame_tilt,
+    frame_velocity,
+)
 from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.names import coordinates
 
 LAST = (-1,)
-PLANNED_PART = 0.5  # of a tolerance: what a plan uses of it, and leaves the rest to the replays
+AIMED = 0.1  # of a tolerance: what a plan may use of it; the rest is for what steps of other lengths do to it
+USED = 0.9  # the same of a tolerance that is there to be used
 SAME_ROTATION = 1e-3  # of a quaternion's norm from 1: typed by hand, it is made one
+SMALLEST_BALL = 0.015  # [m] the radius of what is drawn
 GREEN = (0.18, 0.49, 0.2, 0.8)  # red, green, blue, opacity
 
 Numbers = tuple[float | None, ...]  # None where free
@@ -38,31 +49,46 @@ class Mark:
     label: str
     shape: str
     size: tuple[float, ...]
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [m] in `frame`
+    position: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m] in `frame`
     rotation: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     frame: str = "world"
+    in_world: bool = False  # whether `rotation` and the arrow are those of the world's axes, wherever the frame turns
     colour: tuple[float, float, float, float] = GREEN
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GoalConstraint(Constraint):
-    """A constraint that a goal comes to, which tells in the goal's own words how far a motion is from it.
+    """A constraint of the state that a goal comes to, which tells in the goal's own words how far a motion is from it.
 
-    `allowance` is how far beyond its bounds a replay may be, `unit` that of all its numbers. `told` takes the largest
-    `miss` of a motion: the distance from the middle of the bounds, or, where only one side is bounded, from that side.
+    A plan keeps its bounds, a replay may `miss` what is wanted by `tolerance`; both are in `unit`. `words` makes a
+    clause of such a distance: "hand ends 0.3 mm from its target". `norm` is the order of the norm of several rows.
     """
 
-    allowance: float = 0.0
+    tolerance: float = 0.0
     unit: str = "m"
-    words: Callable[[str], str] = (
-        str  # what is told of a length or an angle, such as "hand ends 0.3 mm from its target"
-    )
+    words: Callable[[str], str] = str
+    norm: float = 2.0
+    measured: Any = None  # a function of the state whose norm the miss is, where the bounded one is another
 
-    def miss(self, x: Array, u: Array) -> float:
-        """How far x (nx,), u (nu,) is from what is wanted, one number in `unit`; inf where it is no number."""
-        values, both = self(x, u), np.isfinite(self.lower) & np.isfinite(self.upper)
-        off = np.linalg.norm((values - (self.lower + self.upper) / 2)[both]) if np.any(both) else self.excess(x, u)
-        return float(off) if np.isfinite(off) else float("inf")
+    @property
+    def wanted(self) -> Array:
+        """(m,) the middle of the bounds, NaN of a row that has one at most."""
+        both = np.isfinite(self.lower) & np.isfinite(self.upper)
+        return np.where(both, np.where(both, self.lower, 0.0) / 2 + np.where(both, self.upper, 0.0) / 2, np.nan)
+
+    def miss(self, x: Array) -> float:
+        """How far x (nx,) is from what is wanted; inf where it is no number.
+
+        The distance from the middle of the bounds, and from the one that there is where there is one.
+        """
+        if self.measured is not None:
+            off = float(np.linalg.norm(self.measured(x)))
+            return off if np.isfinite(off) else float("inf")
+        values, wanted = np.asarray(self.function(x), dtype=float), self.wanted
+        one = np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
+        apart = np.where(np.isnan(wanted), one, values - wanted)
+        off = float(np.linalg.norm(apart, ord=self.norm))
+        return off if np.isfinite(off) else float("inf")
 
     def told(self, miss: float) -> str:
         """A clause about a motion whose largest `miss` this is."""
@@ -77,7 +103,12 @@ def in_words(value: float, unit: str) -> str:
 
 
 class Goal:
-    """The base of all goals: frozen dataclasses of plain values, which a `Problem` binds to its model."""
+    """The base of all goals: frozen dataclasses of plain values, which a `Problem` binds to its model.
+
+    One that has a `weight` is not kept: the weighted square of what it misses is added to the cost instead.
+    """
+
+    weight: float | None
 
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
         """What has to hold of a motion of `model`; UnknownNameError where it has no such frame or joint."""
@@ -92,7 +123,7 @@ class Goal:
         return {type(self).__name__: {name: _plain(value) for name, value in self._given()}}
 
     def __repr__(self) -> str:
-        told = ", ".join(f"{name}={_plain(value)}" for name, value in self._given())
+        told = ", ".join(f"{name}={_plain(value)!r}" for name, value in self._given())
         return f"{type(self).__name__}({told})"
 
     def _given(self) -> list[tuple[str, Any]]:
@@ -116,9 +147,11 @@ class FrameGoal(Goal):
         position: (3,) [m] in the world, where `point` is to be; None or NaN where an entry is free.
         rotation: The frame's own in the world: a rotation matrix (3, 3), or a quaternion (4,) as w, x, y, z.
         point: (3,) [m] in `frame`, what is at `position`: its origin, or a tool that it carries.
-        tolerance: [m] how far from `position` it may be, in x, in y and in z.
-        rotation_tolerance: [rad] how far it may be turned away, about x, about y and about z.
+        tolerance: [m] how far from `position` it may be; free entries do not count.
+        rotation_tolerance: [rad] how far it may be turned away.
         knots: The knots at which it holds, as those of a `Constraint`; the last one where not given, None for all.
+        weight: With one, it is no longer kept: weight times the square of what is missed [m, rad] is added to the cost,
+            at the last knot, or with knots=None per second all along.
 
     Raises:
         InputError: Neither a position nor a rotation, or values that are none.
@@ -131,7 +164,7 @@ class FrameGoal(Goal):
         Problem of pendulum: 2 states, 1 input, 20 steps in 1 s
           from x0 = [0., 0.]
           running cost: QuadraticCost(R=[[1.]])
-          goal: FrameGoal(frame=pole, position=[-0.3, None, None], point=[0.0, 0.0, -0.5])
+          goal: FrameGoal(frame='pole', position=[-0.3, None, None], point=[0.0, 0.0, -0.5])
           optimize: controls
     """
 
@@ -140,9 +173,10 @@ class FrameGoal(Goal):
     rotation: Any = None  # becomes a tuple of rows
     _: KW_ONLY
     point: Any = (0.0, 0.0, 0.0)
-    tolerance: float = 1e-3
+    tolerance: float = 5e-3
     rotation_tolerance: float = 1e-2
     knots: Any = LAST
+    weight: float | None = None
 
     def __post_init__(self) -> None:
         position = None if self.position is None else with_gaps("FrameGoal.position", self.position, 3)
@@ -156,39 +190,299 @@ class FrameGoal(Goal):
             tolerance=positive_float("FrameGoal.tolerance [m]", self.tolerance),
             rotation_tolerance=positive_float("FrameGoal.rotation_tolerance [rad]", self.rotation_tolerance),
             knots=checked_knots("FrameGoal.knots", self.knots),
+            weight=checked_weight("FrameGoal", self.weight, self.knots),
         )
 
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
-        found, at_end = [], self.knots == LAST
+        found = []
         if self.position is not None:
-            where = frame_position(model, self.frame, self.point)
-
-            def at_place(off: str) -> str:
-                return f"{self.frame} {'ends' if at_end else 'is at most'} {off} from its target"
-
-            wanted = np.array([np.nan if p is None else p for p in self.position])
-            found.append(within(where, wanted, self.tolerance, "m", f"{self.frame} position", self.knots, at_place))
+            where, words = (
+                frame_position(model, self.frame, self.point),
+                told(self.frame, "from its target", self.knots),
+            )
+            name = f"{self.frame} position"
+            found.append(within(where, _gaps(self.position), self.tolerance, "m", name, self.knots, words))
         if self.rotation is not None:
             turned = frame_rotation_error(model, self.frame, np.array(self.rotation))
-
-            def as_turned(off: str) -> str:
-                return f"{self.frame} {'ends' if at_end else 'is at most'} {off} turned from its target"
-
-            name, tolerance = f"{self.frame} rotation", self.rotation_tolerance
-            found.append(within(turned, np.zeros(3), tolerance, "rad", name, self.knots, as_turned))
+            name, words = f"{self.frame} rotation", told(self.frame, "turned from its target", self.knots)
+            found.append(within(turned, np.zeros(3), self.rotation_tolerance, "rad", name, self.knots, words))
         return tuple(found)
 
     def marks(self) -> tuple[Mark, ...]:
-        label, place = f"target of {self.frame}", tuple(p or 0.0 for p in self.position or (0.0,) * 3)
-        found = []
+        label, found = f"target of {self.frame}", tuple[Mark, ...]()
         if self.position is not None:
-            free = [p is None for p in self.position]
-            edges = tuple(1.0 if f else 2 * self.tolerance for f in free)
-            ball = Mark(label, "sphere", (max(self.tolerance, 0.015),), place)  # type: ignore[arg-type]
-            found.append(Mark(label, "box", edges, place) if any(free) else ball)  # type: ignore[arg-type]
+            found = _place(label, self.position, self.tolerance)
         if self.rotation is not None:
-            found.append(Mark(label, "axes", (0.1,), place, self.rotation))  # type: ignore[arg-type]
+            place = tuple(p or 0.0 for p in self.position or (0.0,) * 3)
+            found = (*found, Mark(label, "axes", (0.1,), place, self.rotation))
+        return found
+
+
+@dataclass(frozen=True, repr=False)
+class FrameVelocityGoal(Goal):
+    """A point of a robot moves at a velocity: at the end, or at other knots. With nothing but a frame: it stands.
+
+    Args:
+        frame: The frame that carries the point; a body's name will do.
+        velocity: (3,) [m/s] in the world; None or NaN where an entry is free.
+        angular_velocity: (3,) [rad/s] of the frame in the world; free where it or an entry is None.
+        point: (3,) [m] in `frame`, what moves at `velocity`.
+        tolerance: [m/s] how far from `velocity` it may be; free entries do not count.
+        angular_tolerance: [rad/s] the same of `angular_velocity`.
+        knots: The knots at which it holds, as those of a `Constraint`; the last one where not given, None for all.
+        weight: With one it is part of the cost and not kept, as that of a `FrameGoal`.
+
+    Raises:
+        InputError: Values that are none.
+        UnknownNameError: By the Problem: its model has no such frame; the message lists those that exist.
+
+    Example:
+        >>> dd.FrameVelocityGoal("hand", [0.5, None, None])
+        FrameVelocityGoal(frame='hand', velocity=[0.5, None, None])
+    """
+
+    frame: str
+    velocity: Any = (0.0, 0.0, 0.0)  # becomes Numbers
+    _: KW_ONLY
+    angular_velocity: Any = (None, None, None)  # becomes Numbers
+    point: Any = (0.0, 0.0, 0.0)
+    tolerance: float = 1e-2
+    angular_tolerance: float = 5e-2
+    knots: Any = LAST
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        free = (None, None, None)
+        velocity, turning = (free if v is None else v for v in (self.velocity, self.angular_velocity))
+        self._set(
+            frame=name_of("FrameVelocityGoal.frame", self.frame),
+            velocity=with_gaps("FrameVelocityGoal.velocity", velocity, 3),
+            angular_velocity=with_gaps("FrameVelocityGoal.angular_velocity", turning, 3),
+            point=tuple(finite_array("FrameVelocityGoal.point", self.point, (3,)).tolist()),
+            tolerance=positive_float("FrameVelocityGoal.tolerance [m/s]", self.tolerance),
+            angular_tolerance=positive_float("FrameVelocityGoal.angular_tolerance [rad/s]", self.angular_tolerance),
+            knots=checked_knots("FrameVelocityGoal.knots", self.knots),
+            weight=checked_weight("FrameVelocityGoal", self.weight, self.knots),
+        )
+        if all(v is None for v in (*self.velocity, *self.angular_velocity)):
+            raise InputError("FrameVelocityGoal", got="nothing but free entries", expected="a velocity")
+
+    def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
+        found, words = [], told(self.frame, "from the velocity that is wanted", self.knots)
+        if any(v is not None for v in self.velocity):
+            moving, name = frame_velocity(model, self.frame, self.point), f"{self.frame} velocity"
+            found.append(within(moving, _gaps(self.velocity), self.tolerance, "m/s", name, self.knots, words))
+        if any(v is not None for v in self.angular_velocity):
+            turning, name = frame_angular_velocity(model, self.frame), f"{self.frame} angular velocity"
+            wanted = _gaps(self.angular_velocity)
+            found.append(within(turning, wanted, self.angular_tolerance, "rad/s", name, self.knots, words))
         return tuple(found)
+
+    def marks(self) -> tuple[Mark, ...]:
+        if not any(self.velocity):
+            return ()
+        along = tuple(v or 0.0 for v in self.velocity)
+        return (Mark(f"velocity of {self.frame}", "arrow", along, self.point, frame=self.frame, in_world=True),)
+
+
+@dataclass(frozen=True, repr=False)
+class JointGoal(Goal):
+    """Joints are at positions, or move at speeds: at the end, or at other knots.
+
+    At the last knot `x_goal` says the same as a hard equality; this one has a tolerance, in the plan and its replays.
+
+    Args:
+        values: The value wanted of each coordinate by its name: one of the model's `state_names`, or a joint's name
+            where the joint has one position, which it then is. In the coordinates' units: m, rad, m/s, rad/s.
+        tolerance: How far from its value each may be, in its own unit.
+        knots: The knots at which it holds, as those of a `Constraint`; the last one where not given, None for all.
+        weight: With one it is part of the cost and not kept, as that of a `FrameGoal`.
+
+    Raises:
+        InputError: Values that are none.
+        UnknownNameError: By the Problem: its model has no such coordinate; the message lists those that exist.
+
+    Example:
+        >>> dd.JointGoal({"elbow": 1.0})
+        JointGoal(values={'elbow': 1.0})
+    """
+
+    values: Any  # becomes a dict
+    _: KW_ONLY
+    tolerance: float = 1e-2
+    knots: Any = LAST
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.values, Mapping) or not self.values:
+            raise InputError("JointGoal", got=repr(self.values)[:80], expected="a value for each name")
+        self._set(
+            values={
+                name_of("JointGoal", name): float(finite_array(f"JointGoal {name}", value, ()))
+                for name, value in self.values.items()
+            },
+            tolerance=positive_float("JointGoal.tolerance", self.tolerance),
+            knots=checked_knots("JointGoal.knots", self.knots),
+            weight=checked_weight("JointGoal", self.weight, self.knots),
+        )
+
+    def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
+        wanted, contract = coordinates(model, "JointGoal", self.values), model.contract
+        units = [coordinate.unit for coordinate in contract.positions + contract.velocities]
+        found = []
+        for unit in dict.fromkeys(units[i] for i in wanted):
+            here = [i for i in wanted if units[i] == unit]
+            names = [model.state_names[i] for i in here]
+            label = ", ".join(names) if len(names) < 4 else f"{names[0]} and {len(names) - 1} more"
+            words, target = told(label, "from the goal", self.knots), np.array([wanted[i] for i in here])
+            found.append(
+                within(_Entries(tuple(here)), target, self.tolerance, unit, label, self.knots, words, norm=np.inf)
+            )
+        return tuple(found)
+
+
+@dataclass(frozen=True, repr=False)
+class CenterOfMassGoal(Goal):
+    """The centre of mass of all bodies of the model is at a position: at the end, or at other knots.
+
+    Args:
+        position: (3,) [m] in the world; None or NaN where an entry is free.
+        tolerance: [m] how far from it it may be; free entries do not count.
+        knots: The knots at which it holds, as those of a `Constraint`; the last one where not given, None for all.
+        weight: With one it is part of the cost and not kept, as that of a `FrameGoal`.
+
+    Raises:
+        InputError: Values that are none.
+        ModelError: By the Problem: its model's bodies have no mass.
+
+    Example:
+        >>> dd.CenterOfMassGoal([0.0, None, None], knots=None)
+        CenterOfMassGoal(position=[0.0, None, None], knots=None)
+    """
+
+    position: Any  # becomes Numbers
+    _: KW_ONLY
+    tolerance: float = 5e-3
+    knots: Any = LAST
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        position = with_gaps("CenterOfMassGoal.position", self.position, 3)
+        if not any(p is not None for p in position):
+            raise InputError("CenterOfMassGoal", got="nothing but free entries", expected="a position")
+        self._set(
+            position=position,
+            tolerance=positive_float("CenterOfMassGoal.tolerance [m]", self.tolerance),
+            knots=checked_knots("CenterOfMassGoal.knots", self.knots),
+            weight=checked_weight("CenterOfMassGoal", self.weight, self.knots),
+        )
+
+    def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
+        name = "centre of mass"
+        words = told(f"the {name}", "from its target", self.knots)
+        wanted = _gaps(self.position)
+        return (within(center_of_mass(model), wanted, self.tolerance, "m", name, self.knots, words),)
+
+    def marks(self) -> tuple[Mark, ...]:
+        return _place("target of the centre of mass", self.position, self.tolerance)
+
+
+@dataclass(frozen=True, repr=False)
+class KeepLevel(Goal):
+    """An axis of a frame stays upright, as that of a tray with a full glass on it: at all knots, or at some.
+
+    Args:
+        frame: The frame; a body's name will do.
+        axis: (3,) what points up, along the world's z, in `frame`; of any length.
+        tolerance: [rad] how far it may lean.
+        knots: The knots at which it holds, as those of a `Constraint`; all where not given.
+        weight: With one it is part of the cost and not kept, as that of a `FrameGoal`.
+
+    Raises:
+        InputError: Values that are none.
+        UnknownNameError: By the Problem: its model has no such frame; the message lists those that exist.
+
+    Example:
+        >>> dd.KeepLevel("tray", tolerance=0.1)
+        KeepLevel(frame='tray', tolerance=0.1)
+    """
+
+    frame: str
+    _: KW_ONLY
+    axis: Any = UP
+    tolerance: float = 5e-2
+    knots: Any = None
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        axis = tuple(finite_array("KeepLevel.axis", self.axis, (3,)).tolist())
+        if not any(axis):
+            raise InputError("KeepLevel.axis", got=list(axis), expected="a direction")
+        self._set(
+            frame=name_of("KeepLevel.frame", self.frame),
+            axis=axis,
+            tolerance=positive_float("KeepLevel.tolerance [rad]", self.tolerance),
+            knots=checked_knots("KeepLevel.knots", self.knots),
+            weight=checked_weight("KeepLevel", self.weight, self.knots),
+        )
+
+    def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
+        leans, words = frame_tilt(model, self.frame, self.axis), told(self.frame, "from upright", self.knots)
+        return (
+            GoalConstraint(
+                _Squared(leans, self.tolerance),
+                upper=USED**2 * self.tolerance,
+                knots=self.knots,
+                name=f"{self.frame} level",
+                tolerance=self.tolerance,
+                unit="rad",
+                words=words,
+                measured=leans,
+            ),
+        )
+
+    def marks(self) -> tuple[Mark, ...]:
+        return (Mark(f"{self.frame} level", "arrow", tuple(0.15 * a for a in _unit(self.axis)), frame=self.frame),)
+
+
+@dataclass(frozen=True)
+class _Entries:
+    """x (nx,) -> those of its entries."""
+
+    which: tuple[int, ...]
+
+    def __call__(self, x: Any) -> Any:
+        return np.asarray(x)[list(self.which)]
+
+
+@dataclass(frozen=True)
+class _Squared:
+    """x (nx,) -> the square of the length of `vector`, over `unit`: smooth where that is 0, of slope 2 at `unit`."""
+
+    vector: Callable[[Any], Any]
+    unit: float
+
+    def __call__(self, x: Any) -> Any:
+        found = self.vector(x)
+        return found @ found / self.unit
+
+
+@dataclass(frozen=True, eq=False)
+class WithGoals:
+    """A cost with the weighted squares of what goals miss, of x (nx,) and, as a running cost, of u (nu,)."""
+
+    own: Any  # the user's cost, or None
+    goals: tuple[tuple[float, GoalConstraint], ...]
+
+    def __call__(self, x: Any, *u: Any) -> Any:
+        total = 0.0 * x[0] if self.own is None else self.own(x, *u)
+        for weight, goal in self.goals:
+            if goal.measured is None:
+                off = (np.asarray(goal.function(x)) - goal.wanted)[~np.isnan(goal.wanted)]
+            else:
+                off = goal.measured(x)
+            total = total + weight * (off @ off)
+        return total
 
 
 def within(
@@ -199,11 +493,52 @@ def within(
     name: str,
     knots: Any,
     words: Callable[[str], str],
+    *,
+    part: float = AIMED,
+    norm: float = 2.0,
 ) -> GoalConstraint:
-    """`function` (m,) of the state within `tolerance` of `wanted` (m,), NaN where free; see PLANNED_PART."""
-    planned = PLANNED_PART * tolerance
-    lower, upper = (np.where(np.isnan(wanted), np.sign(side) * np.inf, wanted + side) for side in (-planned, planned))
-    return GoalConstraint(function, lower, upper, knots, name, allowance=tolerance - planned, unit=unit, words=words)
+    """`function` (m,) of the state within `tolerance` of `wanted` (m,), NaN where free; a plan uses `part` of it.
+
+    Its rows then have bounds of their own, the largest cube within that distance.
+    """
+    sides = np.count_nonzero(np.isfinite(wanted)) ** (1 / norm)
+    half = part * tolerance / sides
+    lower, upper = (np.where(np.isnan(wanted), np.sign(side) * np.inf, wanted + side) for side in (-half, half))
+    return GoalConstraint(function, lower, upper, knots, name, tolerance=tolerance, unit=unit, words=words, norm=norm)
+
+
+def told(what: str, off: str, knots: Any) -> Callable[[str], str]:
+    """The words of a distance: "hand ends 0.3 mm from its target"."""
+    ends = "ends" if knots == LAST else "is at most"
+    return lambda distance: f"{what} {ends} {distance} {off}"
+
+
+def _place(label: str, position: Any, tolerance: float) -> tuple[Mark, ...]:
+    """A ball at a position, or a slab where some of its entries are free."""
+    at, free = tuple(p or 0.0 for p in position), [p is None for p in position]
+    if any(free):
+        return (Mark(label, "box", tuple(1.0 if f else 2 * tolerance for f in free), at),)
+    return (Mark(label, "sphere", (max(tolerance, SMALLEST_BALL),), at),)
+
+
+def _gaps(numbers: Any) -> Array:
+    return np.array([np.nan if v is None else v for v in numbers], dtype=float)
+
+
+def _unit(axis: Any) -> list[float]:
+    return (np.array(axis) / np.linalg.norm(axis)).tolist()
+
+
+def checked_weight(subject: str, weight: Any, knots: Any) -> float | None:
+    """`weight` where it is None or above 0, and the goal is one of the last knot or of all."""
+    if weight is None:
+        return None
+    at = checked_knots(f"{subject}.knots", knots)
+    if at not in (None, LAST):
+        raise InputError(
+            f"{subject}.knots with a weight", got=list(at or ()), expected="the last one, -1, or None: all"
+        )
+    return positive_float(f"{subject}.weight", weight)
 
 
 def with_gaps(subject: str, values: Any, size: int) -> Numbers:

@@ -1,6 +1,6 @@
 """What is to be optimized, checked when it is made; contains no solver."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import Any, cast
@@ -15,12 +15,14 @@ from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, sel
 from drake_diff.optimize.problem.constraint import Constraint, check_inside, plant_limits, resolve_bounds, short
 from drake_diff.optimize.problem.cost import ConstantCost, FinalCost, QuadraticCost
 from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
-from drake_diff.optimize.problem.goals import Goal, GoalConstraint
+from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGoals, in_words
+from drake_diff.optimize.problem.names import bounds_of, state_of
 
 OPTIMIZABLE = ("controls", "initial_state", "parameters")
 # A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
 SMALLEST_PART = 1e-3
 SMALLEST_RANGE = 1e-3  # of a number along a motion: less counts as this, in its unit
+TRIED, NO_SLOPE = 3, 1e-9  # states at which a goal's slopes are looked at, and what counts as none: rounding
 SMALLEST_SHARE = 0.2  # of the largest range of its kind (positions, velocities): a state's own is at least that
 
 
@@ -33,19 +35,21 @@ class Problem(ShowsItsRepr):
 
     Args:
         system: a Model, or `Dynamics` x' = f(x, u), which only method="collocation" takes.
-        x0: (nx,) the initial state.
+        x0: (nx,) the initial state; or a mapping from names of coordinates to values, the model's default elsewhere. A
+            name is one of `state_names`, or that of a joint with one position, which it then is.
         num_steps: number N of intervals, of model.time_step each where no `horizon` is given.
         running_cost: a function (x, u) -> scalar, a QuadraticCost, or, with `horizon`, a number [per s]: with 1.0 the
             cost is the time itself.
         final_cost: a function x -> scalar, or a QuadraticCost.
-        x_goal: (nx,) final state, a hard equality; NaN entries are free.
-        waypoints: mapping from knots (1 ... N-1) to states (nx,), with NaN where free.
+        x_goal: (nx,) final state, a hard equality; NaN entries are free. Or a mapping as `x0`, the rest free.
+        waypoints: mapping from knots (1 ... N-1) to states (nx,), with NaN where free, or mappings as `x_goal`.
         constraints: a `Constraint`, or several.
         goals: a goal in the robot's own words, such as a `FrameGoal`, or several; each keeps what it says of a motion
             of the model.
         horizon: [s] time from the first state to the last, in N equal intervals, for collocation: a number, or
             (lower, upper) for a free final time. Plain dynamics need one.
-        bounds: `Bounds`; where it says nothing, those of the model or the dynamics apply.
+        bounds: `Bounds`, or a mapping from names of coordinates or inputs to (lower, upper); where they say nothing,
+            those of the model or the dynamics apply.
         optimize: what may change: "controls", "initial_state", "parameters", or several of them.
         initial_state_mask: (nx,) booleans, True where "initial_state" may change; x0 is its first guess there.
         us: (N, nu) inputs where they are not optimized, their first guess where they are; 0 if not given.
@@ -93,7 +97,8 @@ class Problem(ShowsItsRepr):
         system = self.system
         if not isinstance(system, (Model, Dynamics)):
             raise InputError("system", got=type(system).__name__, expected="a Model or Dynamics")
-        self._set("x0", finite_array("x0", self.x0, (self.nx,)))
+        x0 = state_of(system, "x0", self.x0, system.default_state if isinstance(system, Model) else np.zeros(self.nx))
+        self._set("x0", finite_array("x0", x0, (self.nx,)))
         self._set("num_steps", positive_int("num_steps", self.num_steps))
         self._set("optimize", _check_optimize(self.nu, self.optimize))
         if isinstance(system, Model):
@@ -106,7 +111,7 @@ class Problem(ShowsItsRepr):
             self._set("parameters", ParameterVector(cast(Model, None), (), frozen([])))  # none of no model
             own = vars(system.bounds)
         self._check_parameters()
-        bounds = resolve_bounds(self.bounds, own, self.state_names, self.input_names)
+        bounds = resolve_bounds(bounds_of(system, self.bounds), own, self.state_names, self.input_names)
         self._set("bounds", bounds)
         self._set("initial_state_mask", self._check_mask())
         shape = (self.num_steps, self.nu)
@@ -210,9 +215,27 @@ class Problem(ShowsItsRepr):
 
     @cached_property
     def kept_goals(self) -> tuple[GoalConstraint, ...]:
-        """What the goals come to on the model."""
-        bound = [constraint for goal in self.goals for constraint in goal.bind(self.model)]
-        return tuple(cast(GoalConstraint, constraint.resolved(self.x0, np.zeros(self.nu))) for constraint in bound)
+        """What the goals without a weight come to on the model."""
+        return tuple(constraint for goal in self.goals if goal.weight is None for constraint in self._bound(goal))
+
+    def _bound(self, goal: Goal) -> Iterator[GoalConstraint]:
+        for constraint in goal.bind(self.model):
+            yield cast(GoalConstraint, constraint.resolved(self.x0, np.zeros(self.nu)))
+
+    @cached_property
+    def total_running_cost(self) -> Any:
+        """The running cost, with that of goals that have a weight all along; None where there is none."""
+        return self._with_goals(self.running_cost, None)
+
+    @cached_property
+    def total_final_cost(self) -> Any:
+        """The final cost, with that of goals that have a weight at the end; None where there is none."""
+        return self._with_goals(self.final_cost, LAST)
+
+    def _with_goals(self, own: Any, knots: Any) -> Any:
+        soft = [goal for goal in self.goals if goal.weight is not None and goal.knots == knots]
+        terms = tuple((cast(float, goal.weight), constraint) for goal in soft for constraint in self._bound(goal))
+        return WithGoals(own, terms) if terms else own
 
     @property
     def optimizes_controls(self) -> bool:
@@ -296,13 +319,14 @@ class Problem(ShowsItsRepr):
 
         Inputs (N+1, nu) are at the knots, and the running cost is integrated by the trapezoid rule.
         """
-        total = 0.0 if self.final_cost is None else float(self.final_cost(xs[-1]))
-        if self.running_cost is not None:
+        running, final = self.total_running_cost, self.total_final_cost
+        total = 0.0 if final is None else float(final(xs[-1]))
+        if running is not None:
             before = xs[: len(inputs)]
-            if isinstance(self.running_cost, QuadraticCost):
-                rates = self.running_cost.along(before, inputs)
+            if isinstance(running, QuadraticCost):
+                rates = running.along(before, inputs)
             else:
-                rates = np.array([float(self.running_cost(x, u)) for x, u in zip(before, inputs, strict=True)])
+                rates = np.array([float(running(x, u)) for x, u in zip(before, inputs, strict=True)])
             if len(inputs) == len(xs):
                 rates[0], rates[-1] = rates[0] / 2, rates[-1] / 2
             total += self.time_step * float(np.sum(rates))
@@ -340,7 +364,8 @@ class Problem(ShowsItsRepr):
 
     def _check_state(self, subject: str, given: Any) -> Array:
         """`given` (nx,), NaN where free, within the bounds."""
-        state = array_with_gaps(subject, given, (self.nx,))
+        named = state_of(self.system, subject, given, np.full(self.nx, np.nan))
+        state = array_with_gaps(subject, named, (self.nx,))
         if np.any(np.isinf(state)):
             raise InputError(subject, got=state, expected="finite numbers, NaN where free")
         check_inside(subject, state, self.bounds.x_lower, self.bounds.x_upper, self.state_names)
@@ -375,6 +400,27 @@ class Problem(ShowsItsRepr):
         """Bind the goals, which checks their names, and look at the knots of all that is kept."""
         for constraint in self.kept:
             self.knots_of(constraint, input_at_end=not self.has_model)
+        for constraint in self.kept_goals:
+            miss = constraint.miss(self.x0) if constraint.knots is None and self.initial_state_is_given else 0.0
+            if miss > constraint.tolerance:
+                allowed = in_words(constraint.tolerance, constraint.unit)
+                raise InputError(
+                    f"x0 and goal {constraint.label}", got=constraint.told(miss), expected=f"at most {allowed}"
+                )
+            fixed = self._fixed_values(constraint)
+            apart = np.maximum(constraint.lower - fixed, fixed - constraint.upper)
+            for i in np.flatnonzero(apart > NO_SLOPE)[:1]:
+                told = f"{constraint.wanted[i]:.6g}, but its entry {i} is {fixed[i]:.6g} wherever {self.name} goes"
+                raise InputError(f"goal {constraint.label}", got=told, expected="what some joint can change")
+
+    def _fixed_values(self, constraint: GoalConstraint) -> Array:
+        """(m,) the values of a goal's rows that no coordinate changes at any of some states, NaN of all others."""
+        random, none = np.random.default_rng(0), np.zeros(self.nu)
+        states = self.x0 + random.standard_normal((TRIED, self.nx))
+        found = [constraint.differentiate(x, none) for x in states]
+        values, slopes = np.array([v for v, _ in found]), np.array([np.max(np.abs(j), axis=1) for _, j in found])
+        still = (np.max(slopes, axis=0) <= NO_SLOPE) & (np.ptp(values, axis=0) <= NO_SLOPE)
+        return np.where(still, values[0], np.nan)
 
     def _check_costs(self) -> None:
         if isinstance(self.running_cost, (int, float)) and self.horizon is not None:
@@ -397,10 +443,10 @@ class Problem(ShowsItsRepr):
         with applied(self.parameters), np.errstate(all="ignore"):
             for constraint in self.kept:
                 constraint(x, u)
-            if self.running_cost is not None:
-                self.running_cost(x, u)
-            if self.final_cost is not None:
-                self.final_cost(x)
+            if self.total_running_cost is not None:
+                self.total_running_cost(x, u)
+            if self.total_final_cost is not None:
+                self.total_final_cost(x)
             if self.trajectory_cost is not None:
                 self.trajectory_cost(np.tile(x, (self.num_steps + 1, 1)), self.us)
 

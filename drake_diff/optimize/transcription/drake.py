@@ -74,7 +74,7 @@ class _Hull:
 
 
 def _add_costs(problem: Problem, program: MathematicalProgram, states: list[Any], inputs: list[Any]) -> None:
-    running, final, nx = problem.running_cost, problem.final_cost, problem.nx
+    running, final, nx = problem.total_running_cost, problem.total_final_cost, problem.nx
     h, count = problem.time_step, problem.num_steps
 
     def differentiate_running(z: Array) -> tuple[float, Array]:

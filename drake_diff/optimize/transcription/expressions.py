@@ -45,6 +45,10 @@ class Symbol:
     def __abs__(self) -> "Symbol":
         return Symbol(ca.fabs(self.sx))
 
+    def sign(self) -> "Symbol":
+        """1 where it is not negative, else -1."""
+        return Symbol(ca.if_else(self.sx < 0, -1.0, 1.0))
+
     def __bool__(self) -> bool:
         raise TypeError("it branches on its numbers")
 

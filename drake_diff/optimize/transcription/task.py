@@ -132,7 +132,7 @@ class OptimalControl:
         self.problem, self.scheme = problem, SCHEMES[scheme]
         self.dynamics, self.bounds = problem.dynamics, problem.bounds
         self.horizon: tuple[float, float] = problem.horizon or (problem.start_horizon,) * 2  # (lower, upper) [s]
-        running, cost, nx = problem.running_cost, problem.final_cost, self.dynamics.nx
+        running, cost, nx = problem.total_running_cost, problem.total_final_cost, self.dynamics.nx
         running = ConstantCost(0.0) if running is None else running
         self.rate: KnownRate | Pointwise
         if isinstance(running, (ConstantCost, QuadraticCost)):
