@@ -155,6 +155,27 @@ def mjcf(joint="", geom='size="0.1"', more=""):
 
 LIMITED = '<limit lower="1" upper="-1" effort="1" velocity="1"/></joint>'
 BAD_FILES = {
+    # These two ended the process, one by reading what is not there, one when memory ended.
+    "transmission_empty.urdf": (
+        urdf("</joint>", '</joint>\n<transmission>\n\n<type/><joint name="j"/><actuator name="m"/></transmission>'),
+        r"transmission_empty.urdf:4: <type> of a <transmission> is empty: write SimpleTransmission in it",
+    ),
+    "circle.xml": (mjcf(more='<include file="circle.xml"/>'), r"it includes itself: circle.xml -> circle.xml"),
+    # What Drake would download is not asked for.
+    "drake_models.urdf": (
+        shape('<mesh filename="package://drake_models/a.obj"/>'),
+        r"unknown package 'drake_models'.*packages=\{'drake_models': folder\}\); drake_diff downloads nothing",
+    ),
+    "drake_models.dmd.yaml": (
+        "directives:\n- add_model:\n    name: x\n    file: package://drake_models/a.urdf\n",
+        r"packages=\{'drake_models': folder\}\); drake_diff downloads nothing",
+    ),
+    # What Drake names no line for.
+    "line_of_limits.urdf": (
+        urdf("</joint>", f"\n{LIMITED}").replace("continuous", "revolute"),
+        r'see .*line_of_limits.urdf:2: <limit lower="1" upper="-1"',
+    ),
+    "line_of_radius.urdf": (shape('\n\n<sphere radius="-1"/>'), r'line_of_radius.urdf:3: <sphere radius="-1">'),
     # The first six are refused by a condition in Drake's C++, which pydrake raises as SystemExit: it ended the process.
     "limits_crossed.urdf": (urdf("</joint>", LIMITED).replace("continuous", "revolute"), "limit"),
     "radius_negative.urdf": (shape('<sphere radius="-1"/>'), "radius"),
@@ -180,9 +201,9 @@ BAD_FILES = {
     "broken_with_meshes.urdf": ("<robot> hand.stl <link", "not well-formed|unclosed"),
     "no_robot.urdf": ("<html/>", "robot tag"),
     "no_robot.xml": ("<html/>", "mujoco tag"),
-    "nothing.urdf": ("", "EMPTY_DOCUMENT"),
-    "nothing.sdf": ("", "EMPTY_DOCUMENT"),
-    "nothing.xml": ("", "EMPTY_DOCUMENT"),
+    "nothing.urdf": ("", "line 1: no XML: no element found"),
+    "nothing.sdf": ("", "line 1: no XML: no element found"),
+    "nothing.xml": ("", "line 1: no XML: no element found"),
     "nothing.dmd.yaml": ("", "top level element"),
     "binary.urdf": (bytes(range(256)), "text in UTF-8, got byte 0x80 at position 128"),
     "binary.sdf": (bytes(range(256)), "UTF-8"),

@@ -85,7 +85,11 @@ def test_a_joint_without_a_limit_or_with_one_of_zero_gets_none_and_that_is_told(
     zero = joint("elbow", "upper", "lower", limit='<limit effort="0" velocity="0" lower="-1" upper="1"/>')
     model, _ = load(write(robot(joint("shoulder", "base", "upper", "continuous", ""), zero)), actuators="all")
     assert [math.isinf(a.effort_limit) for a in model.contract.actuators] == [True, True]
-    assert model.notes == ("2 actuators added without an effort limit, as the file gives none or 0: shoulder, elbow.",)
+    assert model.notes == (
+        "2 actuators added without an effort limit, as the file gives none or 0: shoulder, elbow.",
+        "Limits of 0 of driven joints taken as none: elbow (velocity).",
+    )
+    assert model.contract.velocities[-1].upper == math.inf
 
 
 def test_actuators_by_name_and_by_effort(write):
@@ -237,3 +241,63 @@ def test_real_robots_are_repaired():
     assert solo.nu == 12
     z1 = dd.load_model(robot_file("z1.urdf"), time_step=0.005, actuators="all")
     assert z1.nu == z1.nv
+
+
+def test_a_joint_is_fixed_beside_those_that_mimic(write):
+    finger = joint("elbow", "upper", "lower", more='<mimic joint="shoulder" multiplier="1"/>')
+    path = write(robot(SHOULDER, finger))
+    model, _ = load(path, base="weld", fix_joints=["elbow"])
+    assert (model.position_names, model.contract.constraints) == (("shoulder_q",), 0)
+    assert "2 joints fixed: shoulder at 0, elbow at 0." in load(path, fix_joints=["shoulder", "elbow"])[0].notes
+    with pytest.raises(ModelError, match="fix_joints='shoulder': elbow mimics it: fix elbow too"):
+        load(path, fix_joints=["shoulder"])
+
+
+def test_slips_that_say_nothing_of_the_robot_are_mended_and_told(write):
+    black = '<material name="black"><color rgba="0 0 0 {}"/></material>'
+    still = joint("elbow", "upper", "lower", "fixed", "", '<mimic joint="shoulder"/>')
+    turning = joint("shoulder", "base", "upper", "continuous", '<limit effort="1" velocity="1" lower="0" upper="0"/>')
+    text = robot(turning, still).replace(' name="arm"', "").replace("</robot>", black.format(1) + "</robot>")
+    text = text.replace(
+        "<collision>", "<visual><geometry><sphere radius='1'/></geometry>" + black.format(0.9) + "</visual><collision>"
+    )
+    model, _told = load(write(text), base="weld")
+    assert model.notes[:4] == (
+        "The robot has no name in the file: it is called arm.",
+        "Materials: black is defined in two ways, of which the first is drawn.",
+        "Limits of continuous joints left out, lower and upper are the same: shoulder.",
+        "The joint elbow is fixed, so that it mimics nothing.",
+    )
+    assert (model.name, model.contract.positions[0].upper) == ("arm", math.inf)
+
+
+def test_packages_are_found_above_the_file_beside_it_and_where_they_are_said_to_be(tmp_path):
+    mesh = BALL.replace('<sphere radius="0.1"/>', '<mesh filename="package://shapes/tri.obj"/>')
+    text = robot(SHOULDER, ELBOW).replace(BALL, mesh)
+    obj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+    for folder in ("arm/urdf", "elsewhere", "shapes"):
+        (tmp_path / folder).mkdir(parents=True)
+    path = tmp_path / "arm" / "urdf" / "arm.urdf"
+    path.write_text(text)
+    (tmp_path / "elsewhere" / "tri.obj").write_text(obj)
+    model, _ = load(path, packages={"shapes": tmp_path / "elsewhere"})
+    assert [g.shape for g in model.contract.geometries] == ["Mesh"]
+    lost, told = load(path)
+    assert lost.contract.geometries == ()
+    assert "no file found: lower collision package://shapes/tri.obj. " in told
+    assert "packages={name: folder}" in told
+    (tmp_path / "shapes" / "tri.obj").write_text(obj)
+    (tmp_path / "shapes" / "package.xml").write_text("<package><name>shapes</name></package>")
+    assert load(path)[0].contract.geometries == model.contract.geometries
+
+
+def test_messages_name_the_lines_of_the_file_though_meshes_were_taken_out(write):
+    visual = '<visual>\n<geometry>\n<mesh filename="a.stl"/></geometry>\n</visual>'
+    ignored = '\n<safety_controller k_velocity="1"/>'
+    path = write(
+        robot(SHOULDER, joint("elbow", "upper", "lower", more=ignored)).replace("<inertial>", visual + "<inertial>")
+    )
+    line = path.read_text().split("<safety")[0].count("\n") + 1
+    _model, told = load(path)
+    assert f"{path}:{line}: warning: The tag 'safety_controller'" in told
+    assert "literal-string" not in told

@@ -1,6 +1,6 @@
-"""What robot files say of joints that Drake's plant does not keep: effort limits without an actuator, and mimicry."""
+"""What robot files say that Drake's plant does not keep: limits without an actuator, mimicry, masses, what collides."""
 
-import xml.etree.ElementTree as ET
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,8 +9,10 @@ from pydrake.common.yaml import yaml_load
 from pydrake.multibody.parsing import PackageMap
 
 from drake_diff.exceptions import ModelError
+from drake_diff.model.xml_text import Element, XmlText
 
-Key = tuple[str, str]  # the names of a model instance and of a joint in it
+LIMITS = ("effort", "velocity", "lower", "upper")
+Key = tuple[str, str]  # the names of a model instance and of a joint or link in it
 
 
 @dataclass(frozen=True)
@@ -33,75 +35,139 @@ class Mimic:
 
 
 @dataclass(frozen=True)
-class JointFacts:
-    """`efforts` [N or N m] are the limits that the files give, `followers` the joints that mimic another one."""
+class JointSays:
+    """Of a joint: its type, and its limits as written (None where it has none)."""
 
-    efforts: dict[Key, float] = field(default_factory=dict)
+    type: str
+    effort: float | None
+    velocity: float | None
+    lower: float | None
+    upper: float | None
+
+
+@dataclass(frozen=True)
+class LinkSays:
+    """Of a link: mass [kg] and the trace of its inertia [kg m^2], None where not given, and its collision shapes.
+
+    `defaults` is whether the format has a mass and an inertia of its own for a link without: SDF has 1 and 1.
+    """
+
+    mass: float | None
+    trace: float | None
+    collisions: int
+    defaults: bool
+
+
+@dataclass(frozen=True)
+class FileFacts:
+    """What the files say, joints and links by the names of their model instance and their own.
+
+    `followers` are the joints that mimic another one.
+    """
+
+    joints: dict[Key, JointSays] = field(default_factory=dict)
+    links: dict[Key, LinkSays] = field(default_factory=dict)
     followers: dict[Key, Mimic] = field(default_factory=dict)
 
 
-def joint_facts(path: Path, packages: PackageMap) -> JointFacts:
-    """What the file at `path` and the models that a .dmd.yaml adds say of their joints.
+def file_facts(path: Path, packages: PackageMap) -> FileFacts:
+    """What the file at `path`, and the models that a .dmd.yaml adds, say of links and joints. Of MJCF that is nothing.
 
-    Raises ModelError where a file that Drake could read is no XML or YAML for Python.
+    Of what is no XML that is nothing too. Raises ModelError where a file that Drake could read is no YAML for Python.
     """
-    found = JointFacts()
+    found = FileFacts()
     _read(path, packages, None, found)
     return found
 
 
-def _read(path: Path, packages: PackageMap, instance: str | None, found: JointFacts) -> None:
+def _read(path: Path, packages: PackageMap, instance: str | None, found: FileFacts) -> None:
     try:
         if path.name.endswith(".dmd.yaml"):
             _read_directives(yaml_load(filename=str(path)), packages, instance, found)
             return
-        root = ET.fromstring(path.read_text())
-    except (ET.ParseError, OSError, RuntimeError, UnicodeDecodeError) as error:
-        raise ModelError(f"{path}: its joints cannot be read: {error}") from error
-    try:
-        if root.tag == "robot":
-            _read_urdf(root, instance or root.get("name") or "", found)
-        for model in root.findall("model"):  # of SDF
-            _read_sdf(model, instance or model.get("name") or "", found)
-    except ValueError as error:
-        raise ModelError(f"{path}: its mimic joints cannot be read: {error}") from error
+        root = XmlText(path.read_bytes()).root
+    except ModelError:
+        return  # a note says that the file is no XML
+    except (OSError, RuntimeError) as error:
+        raise ModelError(f"{path}: what it says of joints and links cannot be read: {error}") from error
+    if root.tag == "robot":
+        _read_urdf(root, instance or root.get("name") or path.stem, found)
+    for model in root.findall("model"):  # of SDF
+        _read_sdf(model, instance or model.get("name"), found)
 
 
-def _read_urdf(robot: ET.Element, name: str, found: JointFacts) -> None:
+def _read_urdf(robot: Element, name: str, found: FileFacts) -> None:
     for joint in robot.findall("joint"):
-        limit, mimic = joint.find("limit"), joint.find("mimic")
-        key = (name, joint.get("name", ""))
-        _keep(found, key, None if limit is None else limit.get("effort"))
-        if mimic is not None:
-            ratio, offset = float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0))
-            found.followers[key] = Mimic(*key, mimic.get("joint", ""), ratio, offset, in_drake=True)
+        limit, mimic, key = joint.find("limit"), joint.find("mimic"), (name, joint.get("name"))
+        says = {kind: None if limit is None else _number(limit.get(kind)) for kind in LIMITS}
+        found.joints[key] = JointSays(joint.get("type"), **says)
+        if mimic is not None and joint.get("type") != "fixed":
+            found.followers[key] = _drakes_mimic(key, mimic)
+    for link in robot.findall("link"):
+        found.links[name, link.get("name")] = _link_of_urdf(link)
 
 
-def _read_sdf(model: ET.Element, name: str, found: JointFacts) -> None:
+def _drakes_mimic(key: Key, mimic: Element) -> Mimic:
+    ratio, offset = (_number(mimic.get(name, default)) for name, default in (("multiplier", "1"), ("offset", "0")))
+    return Mimic(*key, mimic.get("joint"), _or_nan(ratio), _or_nan(offset), in_drake=True)
+
+
+def _or_nan(number: float | None) -> float:
+    return math.nan if number is None else number
+
+
+def _link_of_urdf(link: Element) -> LinkSays:
+    mass, inertia = link.find("inertial", "mass"), link.find("inertial", "inertia")
+    diagonal = [_number(inertia.get(name, "0")) for name in ("ixx", "iyy", "izz")] if inertia else []
+    return LinkSays(
+        None if mass is None else _number(mass.get("value")), _sum(diagonal), len(link.findall("collision")), False
+    )
+
+
+def _read_sdf(model: Element, name: str, found: FileFacts) -> None:
     for joint in model.findall("joint"):
-        key = (name, joint.get("name", ""))
-        _keep(found, key, joint.findtext("axis/limit/effort"))
-        own = next((element for element in joint if element.tag.endswith("}mimic")), None)
-        mimic = joint.find("axis/mimic")
+        limits = {kind: _text(joint, "axis", "limit", kind) for kind in LIMITS}
+        key = (name, joint.get("name"))
+        found.joints[key] = JointSays(joint.get("type"), **limits)
+        own = next((element for element in joint.children if element.tag.endswith(":mimic")), None)
+        mimic = joint.find("axis", "mimic")
         if own is not None:  # Drake's element
-            ratio, offset = float(own.get("multiplier", 1)), float(own.get("offset", 0))
-            found.followers[key] = Mimic(*key, own.get("joint", ""), ratio, offset, in_drake=True)
+            found.followers[key] = _drakes_mimic(key, own)
         elif mimic is not None:  # SDF's, which Drake does not read
-            ratio = float(mimic.findtext("multiplier") or 1)
-            offset = float(mimic.findtext("offset") or 0) - ratio * float(mimic.findtext("reference") or 0)
-            found.followers[key] = Mimic(*key, mimic.get("joint", ""), ratio, offset, in_drake=False)
+            ratio, offset, at = (
+                default if mimic.find(part) is None else _or_nan(_text(mimic, part))
+                for part, default in (("multiplier", 1.0), ("offset", 0.0), ("reference", 0.0))
+            )
+            found.followers[key] = Mimic(*key, mimic.get("joint"), ratio, offset - ratio * at, in_drake=False)
+    for link in model.findall("link"):
+        mass, inertial = _text(link, "inertial", "mass"), link.find("inertial")
+        automatic = inertial is not None and inertial.get("auto") in ("true", "1")
+        given = link.find("inertial", "inertia") is not None
+        diagonal = [_text(link, "inertial", "inertia", kind) for kind in ("ixx", "iyy", "izz")] if given else []
+        says = LinkSays(mass, _sum(diagonal), len(link.findall("collision")), not automatic)
+        found.links[name, link.get("name")] = says
     for inner in model.findall("model"):
-        _read_sdf(inner, f"{name}::{inner.get('name', '')}", found)
+        _read_sdf(inner, f"{name}::{inner.get('name')}", found)
 
 
-def _keep(found: JointFacts, key: Key, effort: str | None) -> None:
+def _text(element: Element, *path: str) -> float | None:
+    there = element.find(*path)
+    return None if there is None else _number(there.text)
+
+
+def _number(text: str) -> float | None:
     try:
-        found.efforts[key] = float(effort or 0)
+        return float(text)
     except ValueError:
-        found.efforts[key] = 0.0  # it would only be read by an actuator, which has no limit then, and says so
+        return None  # Drake refuses what it reads and cannot make a number of
 
 
-def _read_directives(content: Any, packages: PackageMap, namespace: str | None, found: JointFacts) -> None:
+def _sum(numbers: list[float | None]) -> float | None:
+    given = [number for number in numbers if number is not None]
+    return sum(given) if numbers and len(given) == len(numbers) else None
+
+
+def _read_directives(content: Any, packages: PackageMap, namespace: str | None, found: FileFacts) -> None:
     for directive in content.get("directives", []):
         model, more = directive.get("add_model"), directive.get("add_directives")
         if model:

@@ -6,8 +6,6 @@ pairs, chosen before the plant is finalized.
 """
 
 import logging
-import re
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,8 +21,9 @@ from pydrake.multibody.plant import ContactModel, MultibodyPlant
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.model.meshes import put_meshes, read_meshes
+from drake_diff.model.meshes import make_absolute, put_meshes, read_meshes
 from drake_diff.model.plant import bodies
+from drake_diff.model.robot_text import add_packages, fix_in_text, refusal, text_of
 
 FORMATS = (".urdf", ".sdf", ".xml", ".mjcf", ".dmd.yaml")
 DRAKES_REFUSALS = (RuntimeError, ValueError, SystemExit)  # SystemExit is a failed condition in Drake's C++
@@ -35,10 +34,11 @@ logging.getLogger("drake").addFilter(lambda r: "not currently supported for defo
 
 @dataclass(frozen=True)
 class FileRead:
-    """What the user should know of a file that was read, a sentence each, and where its packages are."""
+    """What the user should know of a file that was read, a sentence each, where its packages are, and what it fixed."""
 
     notes: tuple[str, ...]
     packages: PackageMap
+    fixed: tuple[str, ...]
 
 
 def as_packages(value: Mapping[str, str | Path] | None) -> dict[str, str] | None:
@@ -54,11 +54,16 @@ def as_packages(value: Mapping[str, str | Path] | None) -> dict[str, str] | None
 
 
 def read_into(
-    plant: MultibodyPlant, path: Path, packages: Mapping[str, str] | None = None, meshes: str = "skip"
+    plant: MultibodyPlant,
+    path: Path,
+    packages: Mapping[str, str] | None = None,
+    meshes: str = "skip",
+    fixed: tuple[str, ...] = (),
 ) -> FileRead:
     """Add the model in `path` to `plant`; `packages` are folders by the name that package:// uses.
 
-    `meshes` is what becomes of collision meshes: see `load_model`.
+    `meshes` is what becomes of collision meshes: see `load_model`. The joints called `fixed` are made fixed ones where
+    Drake could not do so later, in a file with mimic joints.
 
     Raises InputError where the file is missing or of an unknown kind, ModelError where Drake refuses it.
     """
@@ -68,30 +73,28 @@ def read_into(
     if not path.name.endswith(FORMATS):
         raise InputError("model file", got=str(path), expected="a name that ends in " + ", ".join(FORMATS))
     parser = Parser(plant)
-    for name, folder in (packages or {}).items():
-        parser.package_map().Add(name, folder)
     notes: list[str] = []
+    xml = None
     with _drake_warnings(notes):
         try:
-            # package://NAME/ is the nearest folder called NAME above the file.
-            named = re.findall(r"(?:package|model)://([^/\"<>\s]+)/", path.read_text(errors="replace"))
-            for name in sorted(set(named)):
-                above = next((p for p in path.resolve().parents if p.name == name), None)
-                if above is not None and not parser.package_map().Contains(name):
-                    parser.package_map().Add(name, str(above))
-            found = read_meshes(path, parser.package_map(), meshes)
+            xml = text_of(path, notes)
+            done = () if xml is None else fix_in_text(xml, path, fixed)
+            add_packages(parser.package_map(), path, packages)
+            found = read_meshes(xml, path, parser.package_map(), meshes)
             notes += found.notes()
-            if found.text is None:
-                parser.AddModels(str(path))
+            if xml is not None and xml.changed:
+                make_absolute(xml, path)
+                parser.AddModelsFromString(str(xml), path.suffix.lstrip("."))
             else:
-                parser.AddModelsFromString(found.text, path.suffix.lstrip("."))
+                parser.AddModels(str(path))
             notes += put_meshes(plant, parser.scene_graph(), found)
         except UnicodeDecodeError as error:
             got = f"byte {error.object[error.start]:#04x} at position {error.start}"
             raise ModelError(f"{path}: expected text in UTF-8, got {got}") from error
-        except (*DRAKES_REFUSALS, ET.ParseError) as error:
-            raise ModelError(f"{path}: expected a robot model that Drake can read; Drake says: {error}") from error
-    return FileRead(tuple(notes), PackageMap(parser.package_map()))
+        except DRAKES_REFUSALS as error:
+            raise ModelError(refusal(path, error, xml, notes)) from error
+    told = tuple(note.replace("<literal-string>" + path.suffix, str(path)) for note in notes)
+    return FileRead(told, PackageMap(parser.package_map()), done)
 
 
 @contextmanager

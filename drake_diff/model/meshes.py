@@ -5,12 +5,12 @@ one, so that pose, friction and filters are read as always; then that sphere's s
 """
 
 import re
-import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
+from xml.sax.saxutils import escape
 
 import numpy as np
 from pydrake import geometry as pg
@@ -21,6 +21,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_diff.exceptions import ModelError
 from drake_diff.model.sphere_fit import Spheres, fit_spheres
 from drake_diff.model.triangles import READ_BY_TRIMESH, Hull, hull_of_file
+from drake_diff.model.xml_text import Element, XmlText
 
 TREATMENTS = ("skip", "convex", "spheres")
 USABLE_MESHES = (".obj", ".vtk", ".gltf", ".glb")  # by Drake
@@ -42,14 +43,12 @@ class CollisionMesh:
 
 @dataclass
 class FileMeshes:
-    """The meshes of one robot file: what its text became, and what is to be put in the place of placeholders.
+    """The meshes of one robot file: what is to be put in the place of placeholders, and what is left out.
 
-    `text` is None where Drake can read the file as it is. `wanted` has the collision meshes by their placeholder's
-    radius [m].
+    `wanted` has the collision meshes by their placeholder's radius [m].
     """
 
     treatment: str
-    text: str | None = None
     wanted: dict[float, CollisionMesh] = field(default_factory=dict)
     skipped: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
@@ -78,86 +77,65 @@ def _listed(names: list[str]) -> str:
     return "; ".join(names[:MOST_TOLD]) + more
 
 
-def read_meshes(path: Path, packages: PackageMap, treatment: str) -> FileMeshes:
-    """What is to become of the meshes of the robot file at `path`. Of formats other than URDF and SDF that is nothing.
+def read_meshes(xml: XmlText | None, path: Path, packages: PackageMap, treatment: str) -> FileMeshes:
+    """Change what `xml`, the text of the robot file at `path`, says of meshes. Of formats but URDF and SDF nothing.
 
-    Raises ParseError where the file is no XML, ModelError where a scale is no number.
+    Raises ModelError where a scale is no number.
     """
     found = FileMeshes(treatment)
-    text = path.read_text()
-    foreign = re.search(r"\.(dae|stl|ply|off)\b", text, re.IGNORECASE)
-    if path.suffix not in (".urdf", ".sdf") or not (foreign or "<mesh" in text):
+    if xml is None or xml.root.tag not in ("robot", "sdf"):
         return found
-    try:
-        root = _parsed(text)
-    except ET.ParseError:
-        if foreign or treatment != "skip":
-            raise
-        return found  # Drake's parser forgives more than Python's
-    places = [(parent, e) for parent in root.iter() for e in parent if e.tag in ("visual", "collision")]
-    changed = False
-    try:
-        for parent, element in places:
-            if element.find(".//mesh") is not None:
-                changed |= _change(found, parent, element, _place(_uri(next(element.iter("mesh"))), path, packages))
-    except ModelError as error:
-        raise ModelError(f"{path}: {error}") from error
-    if changed:
-        for element in root.iter():  # a model given as text has no folder to start relative names from
-            _make_absolute(element, path)
-        found.text = ET.tostring(root, encoding="unicode")
+    for element in xml.root.iter("visual", "collision"):
+        mesh = next(element.iter("mesh"), None)
+        if mesh is not None:
+            try:
+                _change(found, xml, element, mesh, _place(_uri(mesh), path, packages))
+            except ModelError as error:
+                raise ModelError(f"{path}:{mesh.line}: {error}") from error
     return found
 
 
-def _parsed(text: str) -> ET.Element:
-    for prefix, namespace in re.findall(r'xmlns:(\w+)="([^"]+)"', text):
-        if not re.fullmatch(r"ns\d+", prefix):  # such names ElementTree keeps for itself
-            ET.register_namespace(prefix, namespace)  # else drake:... tags come out as ns0:...
-    return ET.fromstring(text)
-
-
-def _change(found: FileMeshes, parent: ET.Element, element: ET.Element, place: Path | None) -> bool:
-    """Do to a visual or collision what its mesh needs; whether the text is another one now."""
-    mesh = next(element.iter("mesh"))
-    uri, link = _uri(mesh), parent.get("name", "?")
-    if f"//{DOWNLOADED}/" in uri:
-        return False
+def _change(found: FileMeshes, xml: XmlText, element: Element, mesh: Element, place: Path | None) -> None:
+    """Do to a visual or collision what its mesh needs."""
+    uri, link = _uri(mesh), element.parent.get("name", "?") if element.parent else "?"
+    if f"//{DOWNLOADED}/" in uri and not place:
+        return
     file, told = _file(place), f"{link} {element.tag} {uri}"
     scale = _scale(mesh, told)
     ending = Path(uri).suffix.lower()
     if file is None:
         found.missing.append(told)
-        parent.remove(element)
+        xml.remove(element)
     elif ending not in (*USABLE_MESHES, *READ_BY_TRIMESH):
         found.unusable.append(f"{told} (a format that is not known)")
-        parent.remove(element)
+        xml.remove(element)
     elif element.tag == "visual" or (found.treatment == "skip" and ending in USABLE_MESHES):
-        if place is not None and place.is_file() and ":///" not in uri.removeprefix("file"):
-            return False  # Drake finds it too
-        _set_uri(mesh, file)
+        if place is None or not place.is_file() or ":///" in uri.removeprefix("file"):  # Drake would not find it
+            set_uri(xml, mesh, f"file://{file}")
     elif found.treatment == "skip":
         found.skipped.append(told)
-        parent.remove(element)
+        xml.remove(element)
     else:
         wanted = CollisionMesh(link, file, scale)
         try:
             _became(wanted, found.treatment)
         except ModelError as error:
             found.unusable.append(f"{told} ({error})")
-            parent.remove(element)
-            return True
+            xml.remove(element)
+            return
         radius = PLACEHOLDER * (1 + len(found.wanted))
         found.wanted[radius] = wanted
-        _put_sphere(parent, element, mesh, radius, file.stem)
-    return True
+        _put_sphere(xml, element, mesh, radius, file.stem)
 
 
-def _uri(mesh: ET.Element) -> str:
-    return (mesh.get("filename") or mesh.findtext("uri") or "").strip()
+def _uri(mesh: Element) -> str:
+    uri = mesh.find("uri")
+    return (mesh.get("filename") or (uri.text if uri else "")).strip()
 
 
-def _scale(mesh: ET.Element, told: str) -> Scale:
-    text = mesh.get("scale") or mesh.findtext("scale") or "1"
+def _scale(mesh: Element, told: str) -> Scale:
+    child = mesh.find("scale")
+    text = mesh.get("scale") or (child.text if child else "") or "1"
     try:
         numbers = [float(number) for number in text.split()]
     except ValueError:
@@ -167,35 +145,34 @@ def _scale(mesh: ET.Element, told: str) -> Scale:
     return numbers[0], numbers[-1 if len(numbers) == 1 else 1], numbers[-1]
 
 
-def _put_sphere(parent: ET.Element, element: ET.Element, mesh: ET.Element, radius: float, stem: str) -> None:
+def _put_sphere(xml: XmlText, element: Element, mesh: Element, radius: float, stem: str) -> None:
     """A placeholder where the mesh was, in the words of the format."""
-    geometry = next(g for g in element.iter() if mesh in list(g))
-    sphere = ET.Element("sphere")
-    if "filename" in mesh.attrib:
-        sphere.set("radius", repr(radius))
-    else:
-        ET.SubElement(sphere, "radius").text = repr(radius)
-    geometry[list(geometry).index(mesh)] = sphere
-    if not element.get("name"):  # Drake would call it a sphere
-        names = {other.get("name") for other in parent.findall("collision")}
-        element.set("name", next(n for n in (stem, *(f"{stem}_{i}" for i in range(len(names)))) if n not in names))
+    of_urdf, of_sdf = f'<sphere radius="{radius!r}"/>', f"<sphere><radius>{radius!r}</radius></sphere>"
+    xml.replace(mesh, of_urdf if xml.root.tag == "robot" else of_sdf)
+    if not element.get("name") and element.parent is not None:  # Drake would call it a sphere
+        names = {other.get("name") for other in element.parent.findall("collision")}
+        name = next(n for n in (stem, *(f"{stem}_{i}" for i in range(len(names) + 1))) if n not in names)
+        xml.set(element, "name", name)
 
 
-def _set_uri(mesh: ET.Element, file: Path) -> None:
-    name, uri = f"file://{file}", mesh.find("uri")
+def set_uri(xml: XmlText, element: Element, name: str) -> None:
+    """Give a mesh or an include another file."""
+    uri = element.find("uri")
     if uri is not None:
-        uri.text = name
+        xml.fill(uri, escape(name))
     else:
-        mesh.set("filename", name)
+        xml.set(element, "filename", name)
 
 
-def _make_absolute(element: ET.Element, path: Path) -> None:
-    """A relative name of a mesh or of an included model, from the root of the disk."""
-    if element.tag not in ("mesh", "include"):
-        return
-    uri = _uri(element)
-    if uri and "://" not in uri and (path.parent / uri).exists():
-        _set_uri(element, (path.parent / uri).resolve())
+def make_absolute(xml: XmlText, path: Path) -> None:
+    """Lead relative names of meshes and of included models from the root of the disk.
+
+    A model that is given to Drake as text has no folder to start from.
+    """
+    for element in xml.root.iter("mesh", "include"):
+        uri = _uri(element)
+        if uri and "://" not in uri and (path.parent / uri).exists():
+            set_uri(xml, element, f"file://{(path.parent / uri).resolve()}")
 
 
 def find_file(uri: str, path: Path, packages: PackageMap) -> Path | None:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.autodiffutils import AutoDiffXd
 from pydrake.geometry import SceneGraph
-from pydrake.multibody.parsing import PackageMap
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Diagram, DiagramBuilder
@@ -20,7 +19,7 @@ from drake_diff._base.arrays import finite_array, positive_float
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
 from drake_diff.model.contract import Contract, read_contract
-from drake_diff.model.file_facts import JointFacts, Mimic, joint_facts
+from drake_diff.model.file_facts import FileFacts, Mimic, file_facts
 from drake_diff.model.inputs import TIMES, BodyForce, add_body_forces, check_body_forces, read_inputs
 from drake_diff.model.load_file import (
     CONTACT_MODELS,
@@ -102,6 +101,7 @@ class Model(ShowsItsRepr):
         self.notes = notes
         self.contact_geometry = contact_geometry  # the route around refused pairs that the user chose
         self.options: dict[str, Any] | None = None  # what `load_model` was called with, None of a user's diagram
+        self.file_facts = FileFacts()  # what the file says that the plant does not keep
         self._rebuild = rebuild
         self._others: dict[frozenset[tuple[str, Hashable]], Model] = {}  # the same model with something changed
         self._cache: dict[Hashable, Any] = {}
@@ -461,8 +461,10 @@ def load_model(
         "body_forces": body_forces,
         "meshes": meshes,
     }
-    read = read_into(plant, source, options["packages"], meshes)
-    repairs, mimics = _repaired(plant, scene_graph, source, read.packages, options)
+    fixed = options["fix_joints"] if mimic is None else ()  # else the followers are free of each other later
+    read = read_into(plant, source, options["packages"], meshes, fixed)
+    facts = file_facts(source, read.packages)
+    repairs, mimics = _repaired(plant, scene_graph, source, facts, read.fixed, options)
     notes = read.notes + repairs
     if notes:
         warnings.warn("\n  ".join([f"{source.name}:", *notes]), ModelWarning, stacklevel=2)
@@ -493,6 +495,7 @@ def load_model(
         body_forces=body_forces,
     )
     model.options = options
+    model.file_facts = facts
     return model
 
 
@@ -576,7 +579,12 @@ def _check_choice(subject: str, value: str, known: tuple[str, ...]) -> None:
 
 
 def _repaired(
-    plant: MultibodyPlant, scene_graph: SceneGraph, source: Path, packages: PackageMap, options: dict[str, Any]
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    source: Path,
+    facts: FileFacts,
+    fixed: tuple[str, ...],
+    options: dict[str, Any],
 ) -> tuple[tuple[str, ...], tuple[Mimic, ...]]:
     """Change the plant as `options` say: a sentence for each change, and what is reduced. ModelError names the file."""
     base, weld_base, asked = options["base"], options["weld_base"], options["actuators"]
@@ -586,13 +594,11 @@ def _repaired(
         raise InputError("ground", got="contact=False too", expected="contact, without which nothing stands on it")
     choice = options["mimic"]
     try:
-        facts = JointFacts() if asked is None and choice is None else joint_facts(source, packages)
         mimics = () if choice is None else uncoupled(plant, facts.followers.values())
         notes = fix_mimics(plant, mimics) if choice == "fix" else ()
-        notes += fix(plant, options["fix_joints"])
+        notes += fix(plant, options["fix_joints"], fixed)
         notes += couple(plant, mimics) if choice == "reduce" else ()
-        if asked is not None:
-            notes += add_actuators(plant, asked, facts.efforts, facts.followers)
+        notes += add_actuators(plant, asked, facts)
         if weld_base is not None:
             weld_link(plant, weld_base)
         notes += hold_base(plant, base)

@@ -4,7 +4,7 @@ Each function changes a plant before it is finalized, in the same way for every 
 each thing that it did.
 """
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import FrameIndex, PrismaticJoint, RevoluteJoint, WeldJoint
 
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.model.file_facts import FileFacts
 from drake_diff.model.load_file import DRAKES_REFUSALS, collision_geometries
 from drake_diff.model.plant import actuators, bodies, joints, labelled, named
 
@@ -56,40 +57,28 @@ def can_be_driven(joint: Any) -> bool:
     return isinstance(joint, (RevoluteJoint, PrismaticJoint))
 
 
-def add_actuators(
-    plant: MultibodyPlant,
-    asked: Actuated,
-    limits: Mapping[tuple[str, str], float],
-    followers: Collection[tuple[str, str]],
-) -> tuple[str, ...]:
+def add_actuators(plant: MultibodyPlant, asked: Actuated, facts: FileFacts) -> tuple[str, ...]:
     """Add an actuator to each joint of `asked` that has none; a sentence for what was done.
 
-    `limits` are the effort limits that the files give and `followers` the joints that copy another one, both by the
-    names of model instance and joint. An actuator is called like its joint. A limit of 0 or none is no limit.
+    An actuator is called like its joint. Its effort limit is the file's, if none is given; one of 0 is none, and so
+    are a velocity limit of 0 and a range from 0 to 0 of such a joint, which a file has whose author left them open.
     """
     if asked is None:
         return ()
     driven = {actuator.joint().index(): actuator for actuator in actuators(plant)}
-    possible = {name: joint for name, joint in labelled(joints(plant)).items() if can_be_driven(joint)}
-    copies = {name for name, joint in possible.items() if _key(plant, joint) in followers}
-    names: Iterable[str] = asked
-    if asked == "all":
-        names = [name for name, joint in possible.items() if joint.index() not in driven and name not in copies]
     added: list[tuple[str, float]] = []
     unlimited: list[str] = []
+    opened: list[str] = []
     notes: list[str] = []
-    for name in names:
-        if name not in possible:
-            raise UnknownNameError("actuators: revolute or prismatic joint", got=name, known=possible)
-        if name in copies:
-            raise InputError("actuators", got=repr(name), expected=f"no joint that mimics another, as {name} does")
-        joint = possible[name]
-        given = asked[name] if isinstance(asked, dict) else limits.get(_key(plant, joint))
+    for name, joint in _chosen(plant, asked, facts).items():
+        says = facts.joints.get(_key(plant, joint))
+        given = asked[name] if isinstance(asked, dict) else None if says is None else says.effort
         limit = given if given is not None and given > 0 else np.inf
         if joint.index() in driven:
             notes += _limit_again(driven[joint.index()], limit) if isinstance(asked, dict) else []
             continue
         plant.AddJointActuator(joint.name(), joint, limit)
+        opened += [f"{name} ({what})" for what in _open(joint)]
         if np.isfinite(limit):
             added.append((name, limit))
         else:
@@ -99,10 +88,37 @@ def add_actuators(
         whose = "given" if isinstance(asked, dict) else "that the file gives"
         notes.append(f"{len(added)} actuators added, with the effort limits {whose}: {told}.")
     if unlimited:
-        why = "as asked" if isinstance(asked, dict) else "as the file gives none or 0"
         told = ", ".join(unlimited)
+        why = "as asked" if isinstance(asked, dict) else "as the file gives none or 0"
         notes.append(f"{len(unlimited)} actuators added without an effort limit, {why}: {told}.")
+    if opened:
+        notes.append(f"Limits of 0 of driven joints taken as none: {', '.join(opened)}.")
     return tuple(notes)
+
+
+def _chosen(plant: MultibodyPlant, asked: str | Collection[str], facts: FileFacts) -> dict[str, Any]:
+    """The joints that are asked for, by name; UnknownNameError or InputError where one cannot be driven."""
+    possible = {name: joint for name, joint in labelled(joints(plant)).items() if can_be_driven(joint)}
+    copies = {name for name, joint in possible.items() if _key(plant, joint) in facts.followers}
+    if asked == "all":
+        driven = [actuator.joint().index() for actuator in actuators(plant)]
+        return {name: j for name, j in possible.items() if j.index() not in driven and name not in copies}
+    for name in asked:
+        if name not in possible:
+            raise UnknownNameError("actuators: revolute or prismatic joint", got=name, known=possible)
+        if name in copies:
+            raise InputError("actuators", got=repr(name), expected=f"no joint that mimics another, as {name} does")
+    return {name: possible[name] for name in asked}
+
+
+def _open(joint: Any) -> Iterator[str]:
+    """Take the limits of 0 from a joint that is to move; what they were of."""
+    if joint.velocity_upper_limits()[0] == 0 == joint.velocity_lower_limits()[0]:
+        joint.set_velocity_limits([-np.inf], [np.inf])
+        yield "velocity"
+    if joint.position_upper_limits()[0] == 0 == joint.position_lower_limits()[0]:
+        joint.set_position_limits([-np.inf], [np.inf])
+        yield "position"
 
 
 def _key(plant: MultibodyPlant, joint: Any) -> tuple[str, str]:
@@ -201,11 +217,14 @@ def _what_holds(plant: MultibodyPlant) -> str:
     return f"as the file ties it to the world: {told or 'there is no body'}"
 
 
-def fix(plant: MultibodyPlant, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Replace the joints called `names` by welds at their default positions; a sentence that says so."""
+def fix(plant: MultibodyPlant, names: tuple[str, ...], done: Collection[str] = ()) -> tuple[str, ...]:
+    """Replace the joints called `names` by welds at their default positions; a sentence that says so.
+
+    Those that are `done` were made fixed in the file's text.
+    """
     known = {name: joint for name, joint in labelled(joints(plant)).items() if joint.num_velocities()}
-    told = []
-    for name in names:
+    told = [f"{name} at 0" for name in done]
+    for name in [name for name in names if name not in done]:
         if name not in known:
             raise UnknownNameError("fix_joints: joint that can move", got=name, known=known)
         joint = known[name]

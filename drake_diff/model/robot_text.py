@@ -1,0 +1,228 @@
+"""A robot file's text before Drake reads it, and Drake's words about it after.
+
+What would end the process inside Drake is refused here, a few slips that say nothing about the robot are mended, and
+the packages that the file and the files in it name are looked for on the disk. Nothing is downloaded and no file is
+written. Every line keeps its number, so that messages name lines of the file itself.
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from pydrake.multibody.parsing import PackageMap
+
+from drake_diff.exceptions import ModelError
+from drake_diff.model.xml_text import Element, XmlText
+
+MOVING = ("revolute", "continuous", "prismatic")  # the types of joints that can be fixed
+INCLUDED = re.compile(r"^\s*-?\s*file:\s*[\"']?([^\s\"']+)", re.MULTILINE)  # in a .dmd.yaml
+DOWNLOADED = "drake_models"  # the package that Drake would fetch over the network
+IN_CPP = re.compile(r"Failure at \S+ in \w+\(\): ")
+LITERAL = re.compile(r"<literal-string>\.\w+")
+
+
+def text_of(path: Path, notes: list[str]) -> XmlText | None:
+    """The XML of the robot file at `path`, its slips mended, each with a sentence in `notes`; None of a .dmd.yaml.
+
+    Raises ModelError, with the line, where it is no XML or Drake would not survive it.
+    """
+    path.read_text()  # which says what byte is no text
+    refuse_circles(path, ())
+    if path.name.endswith(".dmd.yaml"):
+        return None
+    try:
+        xml = XmlText(path.read_bytes())
+    except ModelError as error:  # Drake forgives more; where it does not, this line is what is wrong
+        notes.append(f"{path}, {error}: only what Drake reads of it is known.")
+        return None
+    if xml.root.tag != "robot":
+        return xml
+    for transmission in xml.root.findall("transmission"):
+        kind = transmission.find("type")
+        if kind is not None and not kind.text.strip():
+            raise ModelError(f"{path}:{kind.line}: <type> of a <transmission> is empty: write SimpleTransmission in it")
+    if not xml.root.get("name"):
+        xml.set(xml.root, "name", path.stem)
+        notes.append(f"The robot has no name in the file: it is called {path.stem}.")
+    notes += _one_colour_for_each_material(xml)
+    notes += _continuous_without_limits(xml)
+    for mimic in [mimic for joint in xml.root.findall("joint") for mimic in joint.findall("mimic")]:
+        if mimic.parent is not None and mimic.parent.get("type") == "fixed":
+            xml.remove(mimic)
+            notes.append(f"The joint {mimic.parent.get('name')} is fixed, so that it mimics nothing.")
+    return xml
+
+
+def _one_colour_for_each_material(xml: XmlText) -> list[str]:
+    """Drake refuses a material that is defined in two ways or in none, which only changes what is drawn."""
+    known: dict[str, str] = {}
+    told: dict[str, None] = {}
+    top = xml.root.findall("material")
+    for material in [*top, *(m for m in xml.root.iter("material") if m.parent is not xml.root)]:
+        name, colour, texture = material.get("name"), material.find("color"), material.find("texture")
+        given = " ".join(colour.get("rgba").split()) if colour else texture.get("filename") if texture else ""
+        if not name or (name in known and given in ("", known[name])):
+            continue
+        if given and name not in known:
+            known[name] = given
+        elif given:
+            xml.fill(material, "")
+            told[f"{name} is defined in two ways, of which the first is drawn"] = None
+        else:
+            xml.remove(material)
+            told[f"{name} is not defined"] = None
+    return [f"Materials: {'; '.join(told)}."] if told else []
+
+
+def _continuous_without_limits(xml: XmlText) -> list[str]:
+    """URDF gives a continuous joint no limits; where a file writes 0 and 0 all the same, Drake would hold the joint."""
+    told = []
+    for joint in [j for j in xml.root.findall("joint") if j.get("type") == "continuous"]:
+        limit = joint.find("limit")
+        if limit and limit.get("lower") and limit.get("lower") == limit.get("upper"):
+            told.append(joint.get("name"))
+            xml.drop(limit, "lower")
+            xml.drop(limit, "upper")
+    return [f"Limits of continuous joints left out, lower and upper are the same: {', '.join(told)}."] if told else []
+
+
+def fix_in_text(xml: XmlText, path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Make joints of a URDF fixed ones, at zero, if any of its joints mimics another; those that were made so.
+
+    Drake could not take a joint out of such a model later. Raises ModelError where a joint mimics a fixed one.
+    """
+    there = {joint.get("name"): joint for joint in xml.root.findall("joint")}
+    followers = {name: mimic.get("joint") for name, joint in there.items() if (mimic := joint.find("mimic"))}
+    if xml.root.tag != "robot" or not followers:
+        return ()
+    found = [name for name in names if name in there and there[name].get("type") in MOVING]
+    for follower, leader in followers.items():
+        if leader in found and follower not in found:
+            raise ModelError(f"{path}: fix_joints={leader!r}: {follower} mimics it: fix {follower} too")
+    for name in found:
+        xml.set(there[name], "type", "fixed")
+        for mimic in there[name].findall("mimic"):
+            xml.remove(mimic)
+    return tuple(found)
+
+
+def included(path: Path) -> Iterator[str]:
+    """The robot files that the one at `path` includes, as it names them."""
+    if path.name.endswith(".dmd.yaml"):
+        yield from INCLUDED.findall(path.read_text(errors="replace"))
+        return
+    try:
+        root = XmlText(path.read_bytes()).root
+    except ModelError:
+        return  # Drake has the word
+    for include in root.iter("include"):
+        uri = include.find("uri")
+        name = include.get("file") or (uri.text.strip() if uri else "")
+        if name:
+            yield name
+
+
+def refuse_circles(path: Path, above: tuple[Path, ...]) -> None:
+    """Raise ModelError where a file includes itself, by way of others too: Drake would read on until memory ends."""
+    here = path.resolve()
+    if here in above:
+        circle = " -> ".join(p.name for p in (*above[above.index(here) :], here))
+        raise ModelError(f"{above[0]}: it includes itself: {circle}")
+    for name in included(path):
+        target = path.parent / name.removeprefix("file://")
+        if "://" not in name.removeprefix("file://") and target.is_file():
+            refuse_circles(target, (*above, here))
+
+
+def add_packages(packages: PackageMap, path: Path, given: Mapping[str, str] | None) -> None:
+    """Tell Drake where packages are: as `given`, else the nearest folder of that name above the file.
+
+    That folder may also stand beside one above the file, as in a workspace of ROS, if it has a package.xml. The
+    package that Drake would download is taken out of the map, so that it is an unknown one.
+    """
+    if packages.Contains(DOWNLOADED):
+        packages.Remove(DOWNLOADED)
+    for name, folder in (given or {}).items():
+        if packages.Contains(name):
+            packages.Remove(name)
+        packages.Add(name, folder)
+    seen: set[Path] = set()
+    waiting = [path.resolve()]
+    while waiting:
+        file = waiting.pop()
+        if file in seen or not file.is_file():
+            continue
+        seen.add(file)
+        for name in sorted(set(re.findall(r"(?:package|model)://([^/\"'<>\s]+)/", file.read_text(errors="replace")))):
+            found = None if packages.Contains(name) else package_above(file, name)
+            if found is not None:
+                packages.Add(name, str(found))
+        waiting += [target for uri in included(file) if (target := _target(packages, file, uri)) is not None]
+
+
+def _target(packages: PackageMap, file: Path, uri: str) -> Path | None:
+    """Where an included file is; None where its package is not known."""
+    package = re.match(r"(?:package|model)://([^/]+)/(.*)", uri)
+    if package is None:
+        return (file.parent / uri.removeprefix("file://")).resolve()
+    return Path(packages.GetPath(package[1]), package[2]).resolve() if packages.Contains(package[1]) else None
+
+
+def package_above(file: Path, name: str) -> Path | None:
+    """The folder of the package of that name, by where it stands to a file; None where there is none."""
+    for parent in file.resolve().parents:
+        if parent.name == name:
+            return parent
+        beside = parent / name
+        if (beside / "package.xml").is_file():
+            return beside
+    return None
+
+
+def refusal(path: Path, error: BaseException, xml: XmlText | None, notes: list[str]) -> str:
+    """What Drake says of the file, with its name, the line if that can be known, and what to do if that is known."""
+    said = IN_CPP.sub("", LITERAL.sub(str(path), str(error))).strip()
+    said = said.replace(f"{path}:{path}", str(path))
+    known = re.search(re.escape(str(path)) + r":\d+", said)
+    line = "" if known or xml is None else "".join(f"; see {path}:{at}: {what}" for at, what in _suspects(xml, said))
+    unknown = re.search(r"unknown package '([^']+)'", said)
+    remedy = ""
+    if unknown:
+        remedy = f". Say where it is: load_model(..., packages={{{unknown[1]!r}: folder}})"
+        if unknown[1] == DOWNLOADED:
+            remedy += "; drake_diff downloads nothing, pydrake's PackageMap().GetPath('drake_models') does"
+    elif xml is None and notes and notes[0].startswith(f"{path}, line"):
+        remedy = f". Correct {notes[0].split(': only')[0]}"
+    return f"{path}: expected a robot model that Drake can read; Drake says: {said}{line}{remedy}"
+
+
+def _suspects(xml: XmlText, said: str) -> list[tuple[int, str]]:
+    """The first element that what Drake said can be about, with its line: Drake names none for a wrong value."""
+    value = re.search(r"attribute (\w+) got (.*)", said)
+    for element in xml.root.iter():
+        shown = f"<{element.tag} " + " ".join(f'{k}="{v}"' for k, v in element.attributes.items()) + ">"
+        if value and element.attributes.get(value[1]) == value[2].strip():
+            return [(element.line, shown)]
+        if not value and any(_wrong(element, word) for word in re.findall(r"\w+", said)):
+            return [(element.line, shown)]
+    return []
+
+
+def _wrong(element: Element, word: str) -> bool:
+    """Whether a number of an element cannot be right, where Drake's message has this word."""
+    if word.endswith(("limits", "lower")):
+        low, high = element.get("lower"), element.get("upper")
+        if element.get("range"):
+            low, _, high = element.get("range").partition(" ")
+        return _above(low, high) or _above("0", element.get("velocity", "0"))
+    if word in ("radius", "length", "size", "mass"):
+        text = element.get(word) or element.get("size" if word == "radius" else "value" if element.tag == word else "")
+        return any(_above("0", part) for part in text.split())
+    return False
+
+
+def _above(a: str, b: str) -> bool:
+    try:
+        return float(a) > float(b)
+    except ValueError:
+        return False

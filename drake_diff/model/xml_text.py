@@ -1,0 +1,152 @@
+"""The text of an XML file with the places of its elements, so that it can be changed and every line keeps its number.
+
+Python's ElementTree forgets comments, prefixes and lines, and refuses prefixes that nobody declared. Drake forgives
+those, and its messages name lines.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
+
+from drake_diff.exceptions import ModelError
+
+
+@dataclass(eq=False)
+class Element:
+    """An element: its tag with the prefix that the file gives it, attributes, children, and where its text stands.
+
+    `start`, `inside` and `end` are positions in bytes: of its "<", behind its start tag, and behind its end tag.
+    """
+
+    tag: str
+    attributes: dict[str, str]
+    parent: "Element | None"
+    line: int
+    start: int
+    inside: int = 0
+    end: int = 0
+    text: str = ""
+    children: "list[Element]" = field(default_factory=list)
+
+    def get(self, name: str, default: str = "") -> str:
+        return self.attributes.get(name, default)
+
+    def find(self, *path: str) -> "Element | None":
+        """The first child of that tag, its first child of the next tag, and so on."""
+        found: Element | None = self
+        for tag in path:
+            found = None if found is None else next((c for c in found.children if c.tag == tag), None)
+        return found
+
+    def findall(self, tag: str) -> "list[Element]":
+        return [child for child in self.children if child.tag == tag]
+
+    def iter(self, *tags: str) -> "Iterator[Element]":
+        """This element and all below it, in the order of the file; of those tags where some are given."""
+        if not tags or self.tag in tags:
+            yield self
+        for child in self.children:
+            yield from child.iter(*tags)
+
+
+class XmlText:
+    """An XML file's text that can be changed in place.
+
+    Raises ModelError, with the line, where the text is no XML.
+    """
+
+    def __init__(self, data: bytes):
+        self.data = data
+        # Drake takes a comment with -- in it, which no XML may have; lines and positions stay.
+        self._tags = re.sub(rb"<!--.*?-->", lambda found: re.sub(rb"[^\n]", b" ", found[0]), data, flags=re.DOTALL)
+        self._changes: list[tuple[int, int, bytes]] = []
+        self._open: list[Element] = []
+        self._roots: list[Element] = []
+        parser = expat.ParserCreate()
+        parser.buffer_text = True
+        parser.StartElementHandler = lambda tag, attributes: self._begin(parser, tag, attributes)
+        parser.EndElementHandler = lambda _: self._close(parser)
+        parser.CharacterDataHandler = self._add_text
+        try:
+            parser.Parse(self._tags, True)
+        except expat.ExpatError as error:
+            raise ModelError(f"line {error.lineno}: no XML: {expat.ErrorString(error.code)}") from error
+        self.root: Element = self._roots[0]
+
+    def _begin(self, parser: Any, tag: str, attributes: dict[str, str]) -> None:
+        parent = self._open[-1] if self._open else None
+        start = parser.CurrentByteIndex
+        element = Element(tag, attributes, parent, parser.CurrentLineNumber, start, self._behind_tag(start))
+        (self._roots if parent is None else parent.children).append(element)
+        self._open.append(element)
+
+    def _close(self, parser: Any) -> None:
+        element = self._open.pop()
+        empty = self.data[element.inside - 2 : element.inside] == b"/>"
+        element.end = element.inside if empty else self._behind_tag(parser.CurrentByteIndex)
+
+    def _add_text(self, text: str) -> None:
+        if self._open:
+            self._open[-1].text += text
+
+    def _behind_tag(self, start: int) -> int:
+        """The position behind the tag that begins at `start`: its ">" outside of quotes."""
+        found = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>").match(self._tags, start)
+        return found.end() if found else len(self._tags)
+
+    def remove(self, element: Element) -> None:
+        """Take an element out; its lines stay, empty."""
+        self._replace(element.start, element.end, b"")
+
+    def replace(self, element: Element, text: str) -> None:
+        """Put XML text in the place of an element."""
+        self._replace(element.start, element.end, text.encode())
+
+    def set(self, element: Element, name: str, value: str) -> None:
+        """Give an attribute another value, or add it."""
+        element.attributes[name] = value
+        tag = self.data[element.start : element.inside]
+        new = quoteattr(value).encode()
+        found = re.search(rb"\s" + re.escape(name.encode()) + rb"\s*=\s*(\"[^\"]*\"|'[^']*')", tag)
+        if found:
+            self._replace(element.start + found.start(1), element.start + found.end(1), new)
+        else:
+            at = element.start + 1 + len(element.tag.encode())
+            self._replace(at, at, b" " + name.encode() + b"=" + new)
+
+    def drop(self, element: Element, name: str) -> None:
+        """Take an attribute out, if it is there."""
+        tag = self.data[element.start : element.inside]
+        found = re.search(rb"\s" + re.escape(name.encode()) + rb"\s*=\s*(\"[^\"]*\"|'[^']*')", tag)
+        if found:
+            self._replace(element.start + found.start(), element.start + found.end(), b"")
+
+    def fill(self, element: Element, content: str) -> None:
+        """Put XML text in the place of all that is inside an element."""
+        if self.data[element.inside - 2 : element.inside] == b"/>":
+            end = f"</{element.tag}>"
+            self._replace(element.inside - 2, element.inside, f">{content}{end}".encode())
+            return
+        close = self._tags.rindex(b"</", element.inside, element.end)
+        self._replace(element.inside, close, content.encode())
+
+    def _replace(self, start: int, end: int, new: bytes) -> None:
+        lost = self.data.count(b"\n", start, end) - new.count(b"\n")
+        self._changes.append((start, end, new + b"\n" * max(lost, 0)))
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything was changed."""
+        return bool(self._changes)
+
+    def __str__(self) -> str:
+        """The text with all changes; of two in one place the outer one counts."""
+        parts, at = [], 0
+        for start, end, new in sorted(self._changes, key=lambda change: (change[0], -change[1])):
+            if start >= at:
+                parts += [self.data[at:start], new]
+                at = end
+        return (b"".join(parts) + self.data[at:]).decode()
