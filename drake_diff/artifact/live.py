@@ -14,8 +14,10 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_diff.artifact.marks import drawn_goals
 from drake_diff.artifact.rerun import TRACE
-from drake_diff.exceptions import ArtifactError, ModelError
+from drake_diff.artifact.sections import rebuild_goal
+from drake_diff.exceptions import ArtifactError, DrakeDiffError, ModelError
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.load_file import FORMATS, read_into
 from drake_diff.model.plant import bodies
@@ -23,6 +25,7 @@ from drake_diff.pages.meshcat import draw
 from drake_diff.pages.scene import (
     BLUE,
     ContactForce,
+    Drawn,
     Ghost,
     Scene,
     ball,
@@ -66,12 +69,14 @@ def scene_of_run(directory: str | Path) -> tuple[Scene, tuple[str, ...]]:
         moving = {f"{plant.GetModelInstanceName(b.model_instance())}::{b.name()}": b for b in moving_bodies(plant)}
         paths = {name: body_path(body) for name, body in moving.items()}
         shapes = tuple(shapes_of(plant, context, bodies(plant)))
+        told, unread = _goals(plant, context, record)
+        notes = (*notes, *unread)
     except ModelError as error:
         notes = (f"the model cannot be loaded, so a ball stands for each body: {error}",)
         names = [name for name in poses if not name.startswith(GHOST)]
         paths = {name: meshcat_path(i, name) for i, name in enumerate(names)}
         moving = {}
-        shapes = tuple(ball(path) for path in paths.values())
+        shapes, told = tuple(ball(path) for path in paths.values()), ()
     motion = {path: poses[name] for name, path in paths.items() if name in poses}
     plan = {path: poses[GHOST + name] for name, path in paths.items() if GHOST + name in poses}
     return Scene(
@@ -81,7 +86,17 @@ def scene_of_run(directory: str | Path) -> tuple[Scene, tuple[str, ...]]:
         ghosts=(Ghost("plan", plan, BLUE),) if plan else (),
         forces=tuple(contacts.get(time, ()) for time, _ in rows[:-1]),
         trail=longest_path(motion, tuple(moving.values())),
+        marks=told,
     ), notes
+
+
+def _goals(plant: Any, context: Any, record: EvidenceRecord) -> tuple[tuple[Drawn, ...], tuple[str, ...]]:
+    """The goals that a record tells of, as shapes, and why they are not there where they cannot be read."""
+    problem: dict[str, Any] = dict(record.problem)
+    try:
+        return drawn_goals(plant, context, [rebuild_goal(told) for told in problem.get("goals") or ()]), ()
+    except (DrakeDiffError, TypeError) as error:
+        return (), (f"the goals are not drawn: {error}",)
 
 
 def _poses(messages: Iterator[Any]) -> dict[str, list[RigidTransform]]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff.artifact.marks import drawn_goals, labels_of
 from drake_diff.artifact.measurement import Column, Measurement, gradient_norms
 from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.pages.meshcat import write_replay
@@ -36,7 +37,9 @@ def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str,
             drawn = bool(np.all(np.isfinite(planned))) and not np.array_equal(planned, xs)
             ghosts = {"plan": (planned, BLUE)} if drawn else None
         contacts = () if motion is None else motion.contacts
-        scene = scene_of(m.solution.problem.model, times, xs, contacts=contacts, ghosts=ghosts)
+        model = m.solution.problem.model
+        marks = drawn_goals(model.plant, model.double.context, m.solution.problem.goals)
+        scene = scene_of(model, times, xs, contacts=contacts, ghosts=ghosts, marks=marks)
         write_replay(replay, scene, title=f"{record['name']}: {m.solution.status.value}")
         view = replay.read_text(encoding="utf-8")
     data = page_data(float(m.times[-1]), plots, m.solution.certificates)
@@ -50,6 +53,7 @@ def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str,
         replayed=motion is not None,
         control=control,
         has_plan=ghosts is not None,
+        goals=labels_of(m.solution.problem.goals),
         has_contacts=motion is not None and any(motion.contacts),
     )
 

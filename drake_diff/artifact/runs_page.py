@@ -131,8 +131,8 @@ def _replay(folders: Sequence[Path], names: Sequence[str]) -> tuple[str, str]:
         page = Path(folder) / "replay.html"
         write_replay(page, _together(*(scene for scene, _ in scenes)), title=f"{names[0]} and {names[1]}")
         view = page.read_text(encoding="utf-8")
-    seen = f"The plans of both runs: {names[0]} in its own colours, {names[1]} translucent orange. "
-    return view, " ".join([seen, *dict.fromkeys(notes)])
+    seen = f"The plans of both runs: {names[0]} in its own colours, {names[1]} translucent orange"
+    return view, "; ".join([seen, *dict.fromkeys(notes)])
 
 
 def _together(first: Scene, second: Scene) -> Scene:
@@ -144,7 +144,9 @@ def _together(first: Scene, second: Scene) -> Scene:
     poses |= {f"second.{path}": found for path, found in _resampled(second, times).items()}
     others = tuple(replace(d, body=f"second.{d.body}", colour=SECOND) for d in second.shapes if d.body)
     trail = longest_path(_resampled(first, times))
-    return Scene(shapes=(*first.shapes, *others), times=times, poses=poses, ghosts=(), forces=(), trail=trail)
+    marks = tuple(mark for mark in (*first.marks, *second.marks) if not mark.body)
+    shapes = (*first.shapes, *others)
+    return Scene(shapes=shapes, times=times, poses=poses, ghosts=(), forces=(), trail=trail, marks=marks)
 
 
 def _resampled(scene: Scene, times: Array) -> Poses:

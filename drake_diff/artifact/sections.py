@@ -324,7 +324,7 @@ def rebuild_problem(record: EvidenceRecord, model: Model, us: Array, start_us: A
     mask = np.array(p["initial_state_free"], dtype=bool)
     running, final = _rebuild_cost(p["running_cost"]), _rebuild_cost(p["final_cost"])
     goal = _numbers(p["x_goal"], np.nan)
-    goals = [_rebuild_goal(each) for each in p["goals"]]
+    goals = [rebuild_goal(each) for each in p["goals"]]
     if running is None and final is None and np.all(np.isnan(goal)) and not goals:
         final = QuadraticCost(Q=np.zeros((model.nx, model.nx)))  # a Problem wants a cost or a goal
     return Problem(
@@ -356,7 +356,8 @@ def _rebuild_constraint(c: dict[str, Any], model: Model) -> Constraint:
     return Constraint(function, lower=lower, upper=upper, knots=knots, name=c["name"])
 
 
-def _rebuild_goal(told: Any) -> Goal:
+def rebuild_goal(told: Any) -> Goal:
+    """A goal from what a record tells of it; InputError where that is none."""
     if not (isinstance(told, dict) and len(told) == 1 and next(iter(told)) in GOALS):
         raise InputError("goal", got=repr(told)[:80], expected=f"one of {', '.join(GOALS)} with its values")
     ((kind, values),) = told.items()

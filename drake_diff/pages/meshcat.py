@@ -65,6 +65,8 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
         for ghost in scene.ghosts:
             if drawn.body in ghost.poses:
                 _draw_shape(meshcat, f"{ghost.name}/{drawn.body}/{i}", drawn, ghost.colour, scene.size)
+    for i, mark in enumerate(scene.marks):
+        _draw_shape(meshcat, f"motion/{mark.body or WORLD}/mark{i}", mark, mark.colour, scene.size)
     radius = THICKNESS * scene.size
     _draw_tube(meshcat, "trail", scene.trail, radius)
     slots = max((len(step) for step in scene.forces), default=0)  # so many arrows, of which a frame shows some
@@ -76,7 +78,7 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
         meshcat.SetObject(f"{path}/tip/cone", MeshcatCone(8 * radius, 3 * radius, 3 * radius), RED)
         turned = RollPitchYaw(np.pi, 0.0, 0.0)
         meshcat.SetTransform(f"{path}/tip/cone", RigidTransform(turned, [0.0, 0.0, 4 * radius]))
-    shaped = {shape.body for shape in scene.shapes}
+    shaped = {shape.body for shape in (*scene.shapes, *scene.marks)}
     motions = {"motion": _only(scene.poses, shaped)} | {g.name: _only(g.poses, shaped) for g in scene.ghosts}
     posed = sum(len(poses) for poses in motions.values()) + 3 * slots
     frames = frames_of(scene.times, max(FEWEST_FRAMES, MOST_POSES // max(1, posed)))

@@ -24,6 +24,7 @@ GREY, BLUE = Rgba(0.6, 0.6, 0.62, 1), Rgba(0.15, 0.4, 0.95, 0.3)
 BALL = 0.05  # [m] radius of what stands for a body without geometry
 LOOKED_AT = 60  # at most so many poses of a motion are looked at for its bounding box
 ARROW_PART = 0.2  # of the scene's size: how long the arrow of `Scene.reference_force` is
+LARGEST_MARK = 0.5  # [m] so much of a goal or an obstacle has to be in view
 SMALLEST_SIZE = 0.3  # [m] the camera comes no closer
 
 Poses = Mapping[str, Sequence[RigidTransform]]
@@ -66,7 +67,7 @@ class Ghost:
 class Scene:
     """A motion to be drawn: `poses` of every moving body at `times` (N+1,) [s], `forces` in each of the N steps.
 
-    `trail` (N+1, 3) [m] is the path of the point that is followed.
+    `trail` (N+1, 3) [m] is the path of the point that is followed, `marks` are goals and obstacles.
     """
 
     shapes: tuple[Drawn, ...]
@@ -75,6 +76,7 @@ class Scene:
     ghosts: tuple[Ghost, ...]
     forces: tuple[tuple[ContactForce, ...], ...]
     trail: Array
+    marks: tuple[Drawn, ...] = ()
 
     @cached_property
     def box(self) -> tuple[Array, Array]:
@@ -88,6 +90,10 @@ class Scene:
                     centre = pose @ drawn.centre
                     lows.append(centre - drawn.radius)
                     highs.append(centre + drawn.radius)
+        for mark in self.marks:
+            if not mark.body:
+                lows.append(mark.centre - min(mark.radius, LARGEST_MARK))
+                highs.append(mark.centre + min(mark.radius, LARGEST_MARK))
         return np.min(lows, axis=0), np.max(highs, axis=0)
 
     @cached_property
@@ -112,6 +118,7 @@ def scene_of(
     contacts: Sequence[Sequence[ContactPoint]] = (),
     ghosts: Mapping[str, tuple[Array, Rgba]] | None = None,
     frame: str | None = None,
+    marks: Sequence[Drawn] = (),
 ) -> Scene:
     """The scene of a motion of `model`.
 
@@ -122,6 +129,7 @@ def scene_of(
         contacts: The contacts in each of the N steps, drawn as arrows.
         ghosts: States (N+1, nx) and colour by name; a ghost that would hide behind the motion is left out.
         frame: The name of the frame or body whose origin leaves a trail; by default the centre of mass that moves most.
+        marks: Goals and obstacles.
 
     Raises:
         UnknownNameError: If there is no such frame.
@@ -139,6 +147,7 @@ def scene_of(
         ghosts=tuple(Ghost(name, found, (ghosts or {})[name][1]) for name, found in of_ghosts.items()),
         forces=tuple(tuple(ContactForce(c.point, c.force) for c in step) for step in contacts),
         trail=trail,
+        marks=tuple(marks),
     )
 
 

@@ -1,0 +1,72 @@
+"""Goals and obstacles as shapes of a scene."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from pydrake.geometry import Box, Cylinder, MeshcatCone, Rgba, Sphere
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.tree import FrameIndex
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import UnknownNameError
+from drake_diff.optimize.problem.goals import Goal, Mark
+from drake_diff.pages.scene import Drawn, body_path
+
+AXES = (Rgba(0.8, 0.15, 0.1, 0.9), Rgba(0.1, 0.6, 0.15, 0.9), Rgba(0.1, 0.3, 0.85, 0.9))  # x, y, z
+THIN = 0.03  # of an axis or an arrow: its radius
+
+
+def drawn_goals(plant: Any, context: Any, goals: Iterable[Goal]) -> tuple[Drawn, ...]:
+    """What the `goals` mark, on the bodies of `plant` or in its world; UnknownNameError where it has no such frame."""
+    marks = [mark for goal in goals for mark in goal.marks()]
+    frames: dict[str, Any] = {}
+    for frame in (plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())):
+        frames.setdefault(frame.name(), frame)
+    found: list[Drawn] = []
+    for mark in marks:
+        if mark.frame not in frames:
+            raise UnknownNameError("frame", got=mark.frame, known=tuple(frames))
+        frame = frames[mark.frame]
+        body, pose = frame.body(), frame.CalcPoseInBodyFrame(context)
+        path = "" if plant.IsAnchored(body) else body_path(body)
+        if not path:
+            pose = plant.EvalBodyPoseInWorld(context, body) @ pose
+        found += _shapes(mark, path, pose)
+    return tuple(found)
+
+
+def _shapes(mark: Mark, path: str, pose: RigidTransform) -> list[Drawn]:
+    """The shapes of one mark, whose frame is at `pose` on the body of that path."""
+    at = pose @ RigidTransform(RotationMatrix(np.array(mark.rotation)), mark.position)
+    colour = Rgba(*mark.colour)
+    if mark.shape == "sphere":
+        return [_drawn(path, Sphere(mark.size[0]), at, colour, mark.size[0])]
+    if mark.shape == "box":
+        return [_drawn(path, Box(*mark.size), at, colour, float(np.linalg.norm(mark.size)) / 2)]
+    if mark.shape == "axes":
+        parts = zip(np.eye(3) * mark.size[0], AXES, strict=True)
+        return [drawn for along, shade in parts for drawn in _arrow(path, at, along, shade)[:1]]
+    return _arrow(path, at, np.array(mark.size), colour)
+
+
+def _arrow(path: str, at: RigidTransform, along: Array, colour: Rgba) -> list[Drawn]:
+    """A shaft from the origin of `at` along a vector (3,) [m], and its tip; nothing along a vector of length 0."""
+    length = float(np.linalg.norm(along))
+    if length == 0.0:
+        return []
+    turned = at @ RigidTransform(RotationMatrix.MakeFromOneVector(along, 2), np.zeros(3))
+    radius = THIN * length
+    middle, end = (turned @ RigidTransform([0.0, 0.0, part * length]) for part in (0.5, 1.0))
+    tip = end @ RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.0, 0.0, 4 * radius])  # a cone's apex is its origin
+    shaft = _drawn(path, Cylinder(radius, length), middle, colour, length / 2)
+    return [shaft, _drawn(path, MeshcatCone(8 * radius, 3 * radius, 3 * radius), tip, colour, 4 * radius)]
+
+
+def _drawn(path: str, shape: Any, pose: RigidTransform, colour: Rgba, radius: float) -> Drawn:
+    return Drawn(path, shape, pose, colour, np.asarray(pose.translation()), radius)
+
+
+def labels_of(goals: Sequence[Goal]) -> list[str]:
+    """What the marks of the `goals` are called, each once."""
+    return list(dict.fromkeys(mark.label for goal in goals for mark in goal.marks()))
