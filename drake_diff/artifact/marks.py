@@ -1,6 +1,7 @@
 """Goals and obstacles as shapes of a scene."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -32,13 +33,20 @@ def drawn_goals(plant: Any, context: Any, goals: Iterable[Goal]) -> tuple[Drawn,
         path = "" if plant.IsAnchored(body) else body_path(body)
         if not path:
             pose = plant.EvalBodyPoseInWorld(context, body) @ pose
-        found += _shapes(mark, path, pose)
+        if not mark.in_world:
+            found += _shapes(mark, path, pose @ RigidTransform(mark.position))
+            continue
+        place = pose @ np.array(mark.position)  # on the body, which may turn as it likes
+        if path:
+            found += [replace(shape, origin=place) for shape in _shapes(mark, path, RigidTransform())]
+        else:
+            found += _shapes(mark, path, RigidTransform(place))
     return tuple(found)
 
 
 def _shapes(mark: Mark, path: str, pose: RigidTransform) -> list[Drawn]:
-    """The shapes of one mark, whose frame is at `pose` on the body of that path."""
-    at = pose @ RigidTransform(RotationMatrix(np.array(mark.rotation)), mark.position)
+    """The shapes of one mark at `pose` on the body of that path."""
+    at = pose @ RigidTransform(RotationMatrix(np.array(mark.rotation)), np.zeros(3))
     colour = Rgba(*mark.colour)
     if mark.shape == "sphere":
         return [_drawn(path, Sphere(mark.size[0]), at, colour, mark.size[0])]

@@ -65,8 +65,13 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
         for ghost in scene.ghosts:
             if drawn.body in ghost.poses:
                 _draw_shape(meshcat, f"{ghost.name}/{drawn.body}/{i}", drawn, ghost.colour, scene.size)
+    level: dict[str, list[RigidTransform]] = {}  # marks that go with a body, and do not turn with it
     for i, mark in enumerate(scene.marks):
-        _draw_shape(meshcat, f"motion/{mark.body or WORLD}/mark{i}", mark, mark.colour, scene.size)
+        path = f"motion/{mark.body or WORLD}/mark{i}"
+        if mark.origin is not None:
+            path = f"level/{i}/mark"
+            level[str(i)] = [RigidTransform(pose @ mark.origin) for pose in scene.poses[mark.body]]
+        _draw_shape(meshcat, path, mark, mark.colour, scene.size)
     radius = THICKNESS * scene.size
     _draw_tube(meshcat, "trail", scene.trail, radius)
     slots = max((len(step) for step in scene.forces), default=0)  # so many arrows, of which a frame shows some
@@ -80,6 +85,7 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
         meshcat.SetTransform(f"{path}/tip/cone", RigidTransform(turned, [0.0, 0.0, 4 * radius]))
     shaped = {shape.body for shape in (*scene.shapes, *scene.marks)}
     motions = {"motion": _only(scene.poses, shaped)} | {g.name: _only(g.poses, shaped) for g in scene.ghosts}
+    motions["level"] = level
     posed = sum(len(poses) for poses in motions.values()) + 3 * slots
     frames = frames_of(scene.times, max(FEWEST_FRAMES, MOST_POSES // max(1, posed)))
     rate = (len(frames) - 1) / float(scene.times[-1])

@@ -32,7 +32,10 @@ Poses = Mapping[str, Sequence[RigidTransform]]
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A shape on the body of that path, or in the world for ""; `centre` and `radius` [m] are of a ball around it."""
+    """A shape on the body of that path, or in the world for ""; `centre` and `radius` [m] are of a ball around it.
+
+    Where `origin` (3,) [m] is given, a point on the body, `pose` is from there and along the world's axes.
+    """
 
     body: str
     shape: Any
@@ -40,6 +43,7 @@ class Drawn:
     colour: Rgba
     centre: Array
     radius: float
+    origin: Array | None = None
 
 
 @dataclass(frozen=True)
