@@ -1,0 +1,126 @@
+"""The command plan: from a robot file to a verified plan."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.live import Live
+from rich.text import Text
+
+from drake_diff.cli.text import Seed, console, judged, out_option, plain, show, table
+from drake_diff.exceptions import InputError
+
+EXAMPLE = "panda"  # what `drake-diff plan` alone plans for
+
+Goals = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME=NUMBERS", help="hand=0.4,0,0.5 for a frame or body [m], elbow=1.0 for a joint."),
+]
+Obstacles = Annotated[
+    list[str] | None,
+    typer.Option(metavar="SHAPE:NUMBERS", help="sphere:x,y,z,radius or box:x,y,z,width,depth,height [m]."),
+]
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add the command of this module to `app`."""
+    app.command()(plan)
+
+
+def plan(
+    robot: Annotated[
+        Path | None, typer.Argument(metavar="ROBOT", help="A URDF, SDF, MJCF (.xml) or .dmd.yaml file; else a Panda.")
+    ] = None,
+    goal: Goals = None,
+    avoid: Obstacles = None,
+    time: Annotated[str | None, typer.Option(help="least: as fast as can be; else with the least effort.")] = None,
+    out: Annotated[Path | None, out_option("artifacts/plan_<robot>")] = None,
+    seed: Seed = 0,
+) -> None:
+    """Plan a motion of ROBOT: mend its file, solve, write the run directory and verify it.
+
+    Without a goal it goes to a random state that the robot can reach. Exit status 0 only if the plan is verified.
+    """
+    goals = dict(_named_numbers(words) for words in goal or ())
+    if len(goals) < len(goal or ()):
+        raise InputError("--goal", got=" ".join(goal or ()), expected="each name once")
+    shapes = [_shape(words) for words in avoid or ()]
+    if robot is not None and not robot.is_file():
+        raise InputError("ROBOT", got=str(robot), expected="a file that exists")
+    # Only here: what is wrong is refused before Drake is loaded.
+    from drake_diff.model.example import example_files
+    from drake_diff.planning.planner import plan as planned
+
+    file = robot or example_files()[EXAMPLE]
+    with _live(file.name) as report:
+        done = planned(file, goals=goals, avoid=shapes, time=time, out=out, seed=seed, report=report)
+    show(judged("pass" if done.success else "fail"), f" {file.name}: {done.solution.status.value}")
+    for line in done.lines:
+        show(plain(line))
+    raise typer.Exit(0 if done.success else 1)
+
+
+def _named_numbers(words: str) -> tuple[str, list[float]]:
+    name, sign, values = words.rpartition("=")
+    if not sign or not name:
+        raise InputError("--goal", got=repr(words), expected="NAME=x,y,z of a frame, or NAME=number of a joint")
+    return name.strip(), _numbers("--goal", words, values)
+
+
+def _shape(words: str) -> tuple[str, list[float]]:
+    kind, _, values = words.partition(":")
+    counts = {"sphere": 4, "box": 6}
+    expected = "sphere:x,y,z,radius or box:x,y,z,width,depth,height"
+    if kind not in counts:
+        raise InputError("--avoid", got=repr(words), expected=expected)
+    numbers = _numbers("--avoid", words, values)
+    if len(numbers) != counts[kind]:
+        raise InputError("--avoid", got=repr(words), expected=expected)
+    return kind, numbers
+
+
+def _numbers(option: str, words: str, values: str) -> list[float]:
+    try:
+        return [float(value) for value in values.split(",")]
+    except ValueError as error:
+        raise InputError(option, got=repr(words), expected="numbers with commas between") from error
+
+
+@contextmanager
+def _live(name: str) -> Iterator[Callable[[str, str], None]]:
+    """A table of the stages: rewritten on a terminal, a line for each stage elsewhere."""
+    screen, begun, told = console(), dict[str, float](), dict[str, str]()
+    shown = ""
+
+    def now() -> Any:
+        rows = table("stage", "seconds", "", wrap=False)
+        clock = time.monotonic()
+        later = [*list(begun.values())[1:], clock]
+        for stage, start, end in zip(begun, begun.values(), later, strict=True):
+            rows.add_row(plain(stage, "bold"), plain(f"{end - start:.1f}"), plain(told[stage][: screen.width - 24]))
+        return rows
+
+    def note(stage: str, sentence: str) -> None:
+        begun.setdefault(stage, time.monotonic())
+        told[stage] = sentence
+
+    if not screen.is_terminal:
+
+        def line(stage: str, sentence: str) -> None:
+            nonlocal shown
+            if stage != shown:
+                screen.print(Text(f"{stage:9} "), plain(sentence), sep="")
+            shown = stage
+
+        yield line
+        return
+    with Live(now(), console=screen, refresh_per_second=4, transient=True) as live:
+
+        def rewrite(stage: str, sentence: str) -> None:
+            note(stage, sentence)
+            live.update(now())
+
+        yield rewrite

@@ -1,0 +1,2 @@
+from .planner import Plan as Plan
+from .planner import plan as plan

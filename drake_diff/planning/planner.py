@@ -1,0 +1,314 @@
+"""From a robot file to a verified plan, in one call: what `drake-diff plan` does."""
+
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff.artifact.save import save
+from drake_diff.artifact.verify import Verification, verify
+from drake_diff.certificates.audit import Finding, audit
+from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, ModelWarning
+from drake_diff.model.model import Model
+from drake_diff.model.plant import joints, labelled
+from drake_diff.optimize.problem.constraint import Bounds
+from drake_diff.optimize.problem.cost import QuadraticCost
+from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.solution import Solution
+from drake_diff.optimize.solve import solve
+from drake_diff.planning.motion import Guess, along, by_controller, effort_limits
+from drake_diff.planning.robot import Robot, load_robot, ranges
+from drake_diff.planning.task import Task, asked, postures
+from drake_diff.record.solve import EvidenceRecord
+
+TIMES = (None, "least")
+SMALL = 8  # velocities: of a larger robot any smooth motion will do, as its best one takes minutes
+FASTER = (0.2, 2.0)  # of the first guess's duration: the range of a least time
+SPEED_WEIGHT = 0.01  # of a speed against an effort, both as shares of their limits
+BUDGET = 25.0  # [s] of one attempt
+
+Report = Callable[[str, str], None]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Plan(ShowsItsRepr):
+    """What `plan` did with a robot file, from its repairs to the verdict on the artifact.
+
+    Attributes:
+        model: The model that was planned for.
+        repairs: What was mended in the file, a sentence each.
+        findings: What `audit` found in the mended model.
+        solution: The plan.
+        record: The record that was written.
+        verification: What `verify` found in the directory.
+        directory: What was written.
+        tried: What was tried, and how it ended, a sentence each.
+        seconds: Of processor time, by stage.
+    """
+
+    model: Model
+    repairs: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    solution: Solution
+    record: EvidenceRecord
+    verification: Verification
+    directory: Path
+    tried: tuple[str, ...]
+    seconds: Mapping[str, float]
+
+    @property
+    def success(self) -> bool:
+        """Whether the plan is one and its artifact came out again."""
+        return self.record.verdict == "pass" and self.verification.holds
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Ten lines on what was done."""
+        m, s = self.model, self.solution
+        severe = [f for f in self.findings if f.severity in ("error", "warning")]
+        certificates = [c.verdict for c in s.certificates]
+        agreeing = f"{certificates.count('agree')} of {len(certificates)} agree"
+        moved = s.problem.x_goal
+        far = np.nanmax(np.abs(moved - s.problem.x0)[: m.nq]) if moved is not None else np.nan
+        path = self.directory
+        return (
+            f"robot     {m.name}: {m.nq} positions, {m.nv} velocities, {m.nu} motors",
+            f"repaired  {'; '.join(self.repairs) or 'nothing'}",
+            f"audit     {', '.join(sorted({f'{f.severity} {f.code}' for f in severe})) or 'nothing to warn of'}",
+            f"goal      {self._goal(far)}",
+            f"guesses   {'; '.join(self.tried)}",
+            f"solved    {s.method}, {len(s.us)} intervals in {s.horizon:.3g} s, cost {s.cost:.4g}",
+            f"gradients {agreeing}",
+            f"plan      {s.status.value}: {s.message.split(';')[0]}",
+            f"verified  {self.verification.verdict}: {self.verification.sentence[:200]}",
+            f"wrote     {path}: {', '.join(sorted(self.record.files))}",
+        )
+
+    def _goal(self, far: float) -> str:
+        told = [f"a state {far:.2g} away (rad or m), at the end of {self.solution.horizon:.3g} s"]
+        told += [str(goal) for goal in getattr(self.solution.problem, "goals", ())]
+        return ", ".join(told)
+
+    def __repr__(self) -> str:
+        return "\n".join(self.lines)
+
+
+def plan(
+    robot: str | Path,
+    *,
+    goals: Mapping[str, Any] | None = None,
+    avoid: Any = (),
+    time: str | None = None,
+    out: str | Path | None = None,
+    seed: int = 0,
+    report: Report | None = None,
+) -> Plan:
+    """Load a robot file, mend what it leaves out, plan a motion to a goal, write the run and verify it.
+
+    Args:
+        robot: A URDF, SDF, MJCF (.xml) or .dmd.yaml file.
+        goals: What is to be where at the end, at rest: three numbers [m] by the name of a frame or body, one number
+            [rad or m] by the name of a joint. None takes a random state that the robot can reach.
+        avoid: Obstacles: `SphereObstacle`s and `BoxObstacle`s.
+        time: "least" for the shortest time; None for the least effort (of large robots: any smooth motion).
+        out: The directory to write; `artifacts/plan_<robot>` where not given.
+        seed: Of what is drawn; the same seed gives the same plan.
+        report: Gets a stage and a sentence now and then.
+
+    Returns:
+        The `Plan`; its `success` says whether all of it holds.
+
+    Raises:
+        InputError: A goal, an obstacle or an option is wrong.
+        ModelError: The file cannot be read, nothing in it can be driven, or a goal cannot be reached.
+
+    Example:
+        >>> from tempfile import mkdtemp
+        >>> from drake_diff.planning import plan
+        >>> done = plan("models/pendulum.urdf", goals={"hinge": 0.3}, out=mkdtemp())
+        >>> done.success
+        True
+    """
+    path = Path(robot)
+    if time not in TIMES:
+        raise InputError("time", got=repr(time), expected='None or "least"')
+    clock = _Clock(report or _quiet)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        clock.begin("load", path.name)
+        ready = load_robot(path, seed)
+        clock.begin("audit", str(ready.model))
+        findings = tuple(audit(ready.model))
+        clock.begin("guess", f"{len(findings)} findings")
+        task = asked(ready.model, goals or {})
+        tried: list[str] = []
+        found: list[Solution] = []
+        for attempt in _attempts(ready, task, avoid, time, seed):
+            clock.begin("solve", attempt.name)
+            try:
+                solution = attempt.solved(lambda line: clock.report("solve", line))
+            except DrakeDiffError as error:
+                tried.append(f"{attempt.name}: not possible ({error})")
+                continue
+            tried.append(f"{attempt.name}: {solution.status.value}")
+            found.append(solution)
+            if solution.success:
+                break
+        if not found:
+            raise ModelError(f"{path}: no plan could be tried: {'; '.join(tried) or 'no first guess'}")
+        best = found[-1] if found[-1].success else min(found, key=lambda s: s.defect + s.goal_error)
+        directory = Path(out) if out is not None else Path("artifacts") / f"plan_{ready.model.name}"
+        clock.begin("save", best.status.value)
+        record = save(best, directory)
+        clock.begin("verify", record.verdict)
+        verification = verify(directory)
+        seconds = clock.end()
+    return Plan(ready.model, ready.repairs, findings, best, record, verification, directory, tuple(tried), seconds)
+
+
+@dataclass(frozen=True, eq=False)
+class _Attempt:
+    """One problem, the guess that its search starts from, and how it is searched."""
+
+    name: str
+    problem: Problem
+    guess: Guess | None
+    options: Mapping[str, Any]
+
+    def solved(self, progress: Callable[[str], None]) -> Solution:
+        begun = None if self.guess is None else (self.guess.xs, self.guess.us)
+        return solve(self.problem, initial_guess=begun, progress=progress, **self.options)
+
+
+def _attempts(robot: Robot, task: Task, avoid: Any, least: str | None, seed: int) -> Iterator[_Attempt]:
+    """What to try, one after the other, until one is verified."""
+    if robot.is_fully_driven:
+        yield from _of_driven(robot, task, avoid, least, seed)
+    elif task.is_free:
+        yield from _of_reachable(robot, seed)
+    else:
+        yield from _of_passive(robot, task, avoid)
+
+
+def _of_driven(robot: Robot, task: Task, avoid: Any, least: str | None, seed: int) -> Iterator[_Attempt]:
+    """A robot with a motor for each velocity: from each posture that keeps the goals, the best guess first."""
+    for target in postures(robot, task, seed):
+        guess = along(robot, "a straight line in the joints", [robot.q, target])
+        smooth = not guess.model.contract.constraints
+        if smooth and (robot.model.nv <= SMALL or least):
+            yield _collocated(robot, guess, least)
+        if not least:
+            yield _feasible(guess)
+            yield _feasible(along(robot, "the same, in twice the time", [robot.q, target], slower=2.0))
+
+
+def _collocated(robot: Robot, guess: Guess, least: str | None) -> _Attempt:
+    """The least effort, or the least time, by collocation."""
+    model = guess.model
+    x0, x1 = guess.xs[0], guess.xs[-1]
+    asked: dict[str, Any] = {"running_cost": _effort(model)}
+    if least:
+        whole = guess.num_steps * model.time_step
+        asked = {"running_cost": 1.0, "horizon": (FASTER[0] * whole, FASTER[1] * whole)}
+    problem = Problem(model, x0=x0, x_goal=x1, num_steps=guess.num_steps, bounds=_bounds(model), **asked)
+    what = "least time" if least else "least effort"
+    options = {"method": "collocation", "refine": True, "error_tolerance": 1e-5, "time_limit": BUDGET}
+    return _Attempt(f"{what} from {guess.name}", problem, guess, options)
+
+
+def _feasible(guess: Guess) -> _Attempt:
+    """Any motion to where the guess ends that keeps all limits: the guess itself, if it does."""
+    problem = Problem(
+        guess.model, x0=guess.xs[0], x_goal=guess.xs[-1], num_steps=guess.num_steps, bounds=_bounds(guess.model)
+    )
+    return _Attempt(guess.name, problem, guess, {"method": "shooting", "time_limit": BUDGET})
+
+
+def _of_reachable(robot: Robot, seed: int) -> Iterator[_Attempt]:
+    """To the state that a controller reaches, which shows that it can be reached."""
+    random = np.random.default_rng([seed, 2])
+    lower, upper = ranges(robot.model)
+    for reach in (0.5, 0.25, 0.1):
+        target = robot.q + random.uniform(-1, 1, robot.model.nq) * (upper - lower) / 2
+        guess = by_controller(robot, target, steps=50, reach=reach, name=f"what controllers reach ({reach:g})")
+        if guess is not None and _inside(guess):
+            yield _feasible(guess)
+
+
+def _of_passive(robot: Robot, task: Task, avoid: Any) -> Iterator[_Attempt]:
+    """A robot with joints that no motor drives, to a goal: all else ends where it began, at rest."""
+    if task.frames:
+        raise InputError("goal", got=", ".join(task.frames), expected="goals of joints: not every joint has a motor")
+    model = robot.model
+    x0 = np.concatenate([robot.q, np.zeros(model.nv)])
+    goal = x0.copy()
+    named = labelled(joints(model.plant))
+    for name, value in task.joints.items():
+        goal[named[name].position_start()] = value
+    for steps in (100, 150):
+        problem = Problem(
+            model, x0=x0, x_goal=goal, num_steps=steps, bounds=_bounds(model), running_cost=_effort(model)
+        )
+        yield _Attempt(f"least effort in {steps} steps", problem, None, {"method": "auto", "time_limit": BUDGET})
+
+
+def _effort(model: Model) -> QuadraticCost:
+    limits = effort_limits(model)
+    size = np.where(np.isfinite(limits) & (limits > 0), limits, 1.0)
+    speeds = np.concatenate([np.zeros(model.nq), np.full(model.nv, SPEED_WEIGHT)])
+    return QuadraticCost(Q=np.diag(speeds), R=np.diag(1.0 / size**2))
+
+
+def _bounds(model: Model) -> Bounds | None:
+    """The model's own limits, but for velocity limits of 0, which no motion can keep."""
+    highest = np.asarray(model.plant.GetVelocityUpperLimits())
+    if np.all(highest > 0):
+        return None
+    lower, upper = np.full(model.nx, np.nan), np.full(model.nx, np.nan)
+    lower[model.nq :][highest <= 0], upper[model.nq :][highest <= 0] = -np.inf, np.inf
+    return Bounds(x_lower=lower, x_upper=upper)
+
+
+def _inside(guess: Guess) -> bool:
+    """Whether the motion keeps the limits of its model."""
+    plant = guess.model.plant
+    nq = guess.model.nq
+    low = np.concatenate([plant.GetPositionLowerLimits(), plant.GetVelocityLowerLimits()])
+    high = np.concatenate([plant.GetPositionUpperLimits(), plant.GetVelocityUpperLimits()])
+    free = np.concatenate([np.zeros(nq, dtype=bool), high[nq:] <= 0])
+    xs: Array = guess.xs
+    return bool(np.all(free | ((xs >= low) & (xs <= high))))
+
+
+class _Clock:
+    """Processor time by stage."""
+
+    def __init__(self, report: Report):
+        self.report, self.seconds, self.stage = report, dict[str, float](), ""
+        self.start = time.process_time()
+
+    def begin(self, stage: str, told: str) -> None:
+        self._close()
+        self.stage = stage
+        self.report(stage, told)
+
+    def end(self) -> dict[str, float]:
+        self._close()
+        self.stage = ""
+        return self.seconds
+
+    def _close(self) -> None:
+        now = time.process_time()
+        if self.stage:
+            self.seconds[self.stage] = self.seconds.get(self.stage, 0.0) + now - self.start
+        self.start = now
+
+
+def _quiet(stage: str, told: str) -> None:
+    """Nothing."""

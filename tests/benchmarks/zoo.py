@@ -1,0 +1,193 @@
+"""How many robot files end in a verified plan, first try: `drake-diff plan FILE` with default arguments.
+
+    pip install -e '.[test]'
+    pip download --no-deps -d wheels dm_control underactuated     # optional: their models are counted where they are
+    python tests/benchmarks/zoo.py [--only PATTERN] [--count N] [--seed 0] [--wheels wheels] [--out zoo.json]
+
+The files: all URDFs of example-robot-data, the models that come with Drake, MuJoCo and drake_diff, and those in the
+wheels. Each runs in a process of its own with 60 s of one core (the verification included) and 8 GiB of memory. What
+is in --out already is not run again, so that a run that was ended goes on; --markdown writes docs/zoo.md from it.
+"""
+
+import argparse
+import fnmatch
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+CPU_LIMIT, MEMORY = 60, 8 * 2**30  # [s], [bytes]
+AIM = 0.95
+FORMATS = (".urdf", ".sdf", ".xml", ".dmd.yaml")
+LEFT_OUT = ("package.xml", "CMakeLists", "/meshes/", "/textures/", "/common/", "/conf/", "/launch/")
+MODEL = re.compile(r"<(?:robot|sdf|mujoco)[\s>]|directives:")
+SOURCES = {
+    "example-robot-data": ("example-robot-data", ".urdf"),
+    "drake": ("drake", FORMATS),
+    "mujoco": ("mujoco", (".xml", ".urdf")),
+    "dm_control": ("dm_control", (".xml",)),
+    "underactuated": ("underactuated", FORMATS),
+}
+
+
+def installed(package: str) -> list[Path]:
+    try:
+        return [Path(str(f.locate())).resolve() for f in importlib.metadata.files(package) or ()]
+    except importlib.metadata.PackageNotFoundError:
+        return []
+
+
+def files(wheels: Path | None, unpacked: Path) -> Iterator[tuple[str, Path]]:
+    """(source, file) of every model."""
+    for source, (package, endings) in SOURCES.items():
+        found = installed(package)
+        if not found and wheels:
+            for wheel in sorted(wheels.glob(f"{package}-*.whl")):
+                with zipfile.ZipFile(wheel) as archive:
+                    archive.extractall(unpacked / source)
+                found = [path for path in (unpacked / source).rglob("*") if path.is_file()]
+        for path in sorted(set(found)):
+            if not path.name.endswith(endings) or any(part in str(path) for part in LEFT_OUT):
+                continue
+            if source == "dm_control" and "/suite/" not in str(path):
+                continue
+            if MODEL.search(path.read_text(errors="replace")):
+                yield source, path
+    for path in sorted((ROOT / "models").iterdir()):
+        yield "drake_diff", path
+
+
+def limited() -> None:
+    resource.setrlimit(resource.RLIMIT_CPU, (CPU_LIMIT, CPU_LIMIT + 2))
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+
+
+def attempt(path: Path, seed: int) -> dict[str, object]:
+    """One command on one file: how it ended, what was mended, and the processor time it took."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "drake_diff.cli.main", "plan", str(path), "--out", f"{folder}/run"]
+        one = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(
+            [*command, "--seed", str(seed)],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            preexec_fn=limited,
+            env=os.environ | one,
+            cwd=folder,
+        )
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    lines = done.stdout.splitlines()
+    told = {word: next((line[10:] for line in lines if line.startswith(word)), "") for word in ("repaired", "guesses")}
+    said = next((line for line in reversed(lines) if line.startswith("plan ")), "")
+    wrong = [line for line in done.stderr.splitlines() if line.startswith("drake-diff: ")]
+    why = said[10:] if said else (wrong[-1] if wrong else f"ended by {done.returncode}: {done.stderr[-200:]}")
+    if done.returncode in (-9, -24, 137, 152):
+        why = f"took more than {CPU_LIMIT} s"
+    return {
+        "status": done.returncode,
+        "verified": done.returncode == 0,
+        "loaded": any(line.startswith(("robot", "audit")) for line in lines),
+        "traceback": "Traceback" in done.stderr,
+        "held": "(base='weld')" in told["repaired"],
+        "repairs": told["repaired"],
+        "guesses": told["guesses"],
+        "why": "" if done.returncode == 0 else why,
+        "seconds": round(seconds, 1),
+    }
+
+
+def is_for_drake(row: dict[str, object]) -> bool:
+    """Whether Drake's parser takes the file, and something in it can move."""
+    why = str(row["why"])
+    return not ("Drake can read" in why or "Drake says" in why or "cannot move" in why or "UTF-8" in why)
+
+
+def told(rows: dict[str, dict[str, object]]) -> list[str]:
+    """The figures, a line each."""
+    taken = {name: row for name, row in rows.items() if is_for_drake(row)}
+    good = [row for row in taken.values() if row["verified"]]
+    share = len(good) / len(taken) if taken else 0.0
+    lines = [
+        f"{len(rows)} files; {len(taken)} that Drake's parser takes and in which something can move",
+        f"verified plans: {len(good)} of {len(taken)}, {100 * share:.1f} %, asked {100 * AIM:g} %"
+        + ("" if share >= AIM else ": MISSED"),
+        f"above {CPU_LIMIT} s of one core: {sum('took more than' in str(r['why']) for r in rows.values())}; "
+        f"tracebacks: {sum(bool(r['traceback']) for r in rows.values())}",
+    ]
+    for source in sorted({str(r["source"]) for r in taken.values()}):
+        of = [row for row in taken.values() if row["source"] == source]
+        lines.append(f"{source}: {sum(bool(r['verified']) for r in of)} of {len(of)}")
+    causes = Counter(str(r["why"])[:110] for r in taken.values() if not r["verified"])
+    lines += [f"{n} x {cause}" for cause, n in causes.most_common()]
+    return lines
+
+
+def markdown(rows: dict[str, dict[str, object]], seed: int) -> str:
+    """docs/zoo.md."""
+    begin = told(rows)
+    text = ["# The zoo: every robot file, first try", ""]
+    text += ["Each file with `drake-diff plan FILE`, default arguments, 60 s of one core, the verification included."]
+    text += ["Written by `python tests/benchmarks/zoo.py --markdown docs/zoo.md`,", f"seed {seed}, "]
+    text[-1] += f"{platform.python_implementation()} {platform.python_version()}. Times depend on the machine."
+    text += ["", *(f"- {line}" for line in begin), ""]
+    text += ["| File | Verified | CPU [s] | Repairs, or why not |", "|---|---|---|---|"]
+    for name, row in rows.items():
+        said = (row["repairs"] if row["verified"] else row["why"]) or "-"
+        said = re.sub(r"[|<>\n`*_]", " ", re.sub(r"/\S*/", "", str(said)))[:160]
+        text.append(f"| {name} | {'yes' if row['verified'] else 'no'} | {row['seconds']} | {said} |")
+    return "\n".join(text) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", default="*", help="a pattern of names, such as '*panda*'")
+    parser.add_argument("--count", type=int, help="at most so many files, evenly spread")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--wheels", type=Path, help="a folder with wheels of dm_control and underactuated")
+    parser.add_argument("--out", type=Path, help="a JSON file; what is in it already is not run again")
+    parser.add_argument("--markdown", type=Path, help="write the table there")
+    given = parser.parse_args()
+    rows: dict[str, dict[str, object]] = {}
+    if given.out and given.out.is_file():
+        rows = json.loads(given.out.read_text())
+    with tempfile.TemporaryDirectory() as unpacked:
+        named = {
+            f"{source}/{'/'.join(path.parts[-2:])}": (source, path)
+            for source, path in files(given.wheels, Path(unpacked))
+        }
+        chosen = [name for name in named if fnmatch.fnmatch(name, given.only)]
+        if given.count and given.count < len(chosen):
+            chosen = [chosen[i * len(chosen) // given.count] for i in range(given.count)]
+        for name in chosen:
+            if name in rows:
+                continue
+            source, path = named[name]
+            rows[name] = {"source": source, **attempt(path, given.seed)}
+            row = rows[name]
+            print(
+                f"{'yes' if row['verified'] else 'NO ':3} {row['seconds']:6} s  {name}  {str(row['why'])[:140]}",
+                flush=True,
+            )
+            if given.out:
+                given.out.write_text(json.dumps(rows, indent=1))
+    shown = {name: row for name, row in rows.items() if fnmatch.fnmatch(name, given.only)}
+    print("\n".join(told(shown)))
+    if given.markdown:
+        given.markdown.write_text(markdown(shown, given.seed))
+
+
+if __name__ == "__main__":
+    main()
