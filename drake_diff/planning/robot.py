@@ -1,6 +1,5 @@
 """A stranger's file as a robot that can be planned for: what it leaves out is mended, each repair a sentence."""
 
-import inspect
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,142 +8,171 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.exceptions import DrakeDiffError, ModelError, ModelWarning
+from drake_diff.exceptions import DrakeDiffError, ModelError, ModelWarning, SimulationError
 from drake_diff.model.contact import penetration
 from drake_diff.model.model import Model, load_model
-from drake_diff.model.plant import bodies, joints
-from drake_diff.model.step import set_state
+from drake_diff.model.plant import joints
+from drake_diff.model.step import advance, set_state
 
 TIME_STEP = 0.02  # [s] of a plan
-ATTEMPTS = 100  # at a posture in which nothing overlaps
+ATTEMPTS = 60  # at a posture in which nothing overlaps
 INSIDE = 0.05  # of a joint's range: a start is at least that far from both its limits
 TURN, SHIFT = 1.0, 0.2  # [rad], [m] the range on each side of 0 of a joint without limits
-TOUCHING = 1e-5  # [m] of overlap: less is none
+WIDEST = 4 * np.pi  # a wider range is as good as none
+TOUCHING = 1e-4  # [m] of overlap: less is none
+FEW = 0.5  # of all joints: where fewer have a motor, the file says nothing of motors, or forgot some
+TEXTBOOK = 6  # joints: a file of more is no cart-pole, and none of them is meant to be without a motor
+SMALLEST_DRIVE = 1e-9  # of the largest singular value: a velocity with less is not driven
+PROBE = 0.1  # of an effort limit, or of 1 N or N m: what the effect of an input is measured with
 
 
 @dataclass(frozen=True, eq=False)
 class Robot:
     """A model that can be planned for, the posture it starts in, and what was mended in its file.
 
-    `lower` and `upper` (nq,) are where its joints may be: their limits, or a range around 0 where they have none.
+    `lower` and `upper` (nq,) are where its coordinates may be: their limits, or a range around 0 where they have none.
+    `shapes` is the model with its collision shapes, in which overlap is looked for; None where there is nothing to
+    look for.
     """
 
     model: Model
+    shapes: Model | None
     q: Array
     lower: Array
     upper: Array
     repairs: tuple[str, ...]
+    is_fully_driven: bool
 
-    @property
-    def is_fully_driven(self) -> bool:
-        """Whether every velocity has a motor of its own, so that every smooth motion of the joints can be driven."""
-        plant = self.model.plant
-        if self.model.nq != self.model.nv or self.model.nu != self.model.nv:
-            return False
-        return int(np.linalg.matrix_rank(plant.MakeActuationMatrix())) == self.model.nv
+    def overlap(self, q: Array) -> float:
+        """[m] how deep the deepest overlap of shapes is in posture q (nq,); 0 where nothing is looked for."""
+        return 0.0 if self.shapes is None else overlap(self.shapes, q)
 
 
 def load_robot(path: Path, seed: int) -> Robot:
     """The robot in a file, mended where it has to be; ModelError where nothing in it can be driven."""
     options: dict[str, Any] = {"time_step": TIME_STEP}
-    if "mimic" in inspect.signature(load_model).parameters:
-        options["mimic"] = "reduce"
-    model = _loaded(path, options)
     told: list[str] = []
-    if not model.nu:
-        options["actuators"] = "all"
-        model = _loaded(path, options)
-        if model.nu:
-            told.append(f"no joint had a motor: all {model.nu} that can be driven have one (actuators='all')")
-    if model.plant.GetFloatingBaseBodies() and len(joints(model.plant)):
-        held = _loaded(path, options | {"base": "weld"})
-        if held.nv and held.nv < model.nv:
-            names = ", ".join(model.plant.get_body(b).name() for b in model.plant.GetFloatingBaseBodies())
+    model = _loaded(path, options)
+    reduced = _loaded(path, options | {"mimic": "reduce"})
+    if reduced.nv < model.nv:
+        options["mimic"], gone = "reduce", model.nv - reduced.nv
+        told.append(f"{gone} joint{'s' * (gone > 1)} that follow others left the state (mimic='reduce')")
+        model = reduced
+    count = sum(joint.num_velocities() == 1 for joint in joints(model.plant))
+    if model.nu < (count if count > TEXTBOOK else FEW * count):
+        had, model = model.nu, _loaded(path, options | {"actuators": "all"})
+        if model.nu > had:
+            options["actuators"] = "all"
+            begin = f"only {had} joints had a motor" if had else "no joint had a motor"
+            told.append(f"{begin}: all {model.nu} that can be driven have one (actuators='all')")
+    if model.plant.GetFloatingBaseBodies() and joints(model.plant):
+        held = _held(path, options)
+        if held is not None and held.nv < model.nv:
+            names = ", ".join(model.plant.get_body(b).name() for b in sorted(model.plant.GetFloatingBaseBodies()))
             options["base"], model = "weld", held
             told.append(f"{names} floated: it is fixed to the world (base='weld')")
-    stuck = _stuck_joints(model)
+    stuck = tuple(j.name() for j in joints(model.plant) if _is_stuck(j))
+    if stuck and len(stuck) == count:
+        raise ModelError(f"{path}: no joint of it can move: each has the same lower and upper limit, which Drake keeps")
     if stuck:
         options["fix_joints"] = stuck
         model = _loaded(path, options)
         told.append(f"{', '.join(stuck)} had the same lower and upper limit: fixed there (fix_joints)")
     if not model.nu:
         raise ModelError(f"{path}: nothing in it can be driven: it has no revolute or prismatic joint")
-    model = _with_inputs_that_do_something(path, options, model, told)
+    return _placed(path, options, model, told, np.random.default_rng(seed))
+
+
+def _placed(path: Path, options: dict[str, Any], model: Model, told: list[str], random: np.random.Generator) -> Robot:
+    """The robot in the posture it starts in, and with the contact that its plan needs."""
     lower, upper = ranges(model)
-    q, clear = _start(model, lower, upper, np.random.default_rng(seed))
-    if not clear:
-        options["contact"] = False
-        model = _loaded(path, options)
-        told.append("its collision shapes overlap in every posture that was tried: they are left out (contact=False)")
-        q, _ = _start(model, lower, upper, np.random.default_rng(seed))
+    first = _inside(model, lower, upper)
+    driven = is_fully_driven(model, first)
+    shapes: Model | None = model if model.contract.contact.collision_pairs else None
+    q = first
+    if shapes is not None:
+        found = _apart(shapes, first, lower, upper, random)
+        if found is None:
+            shapes = None
+            told.append("its shapes overlap in every posture that was tried, so overlap is not looked for")
+        else:
+            q = found
+        if driven:
+            options["contact"] = False
+            model = _loaded(path, options)
+            told.append("contact is left out of its steps (contact=False)" + ("" if shapes is None else SEEN))
     if np.any(np.abs(q - model.default_state[: model.nq]) > 1e-9):
-        told.append("the start was moved to where its joints are inside their limits and nothing overlaps")
-    return Robot(model, q, lower, upper, tuple(told))
+        told.append("its start is moved to where joints are inside their limits and nothing overlaps")
+    return Robot(model, shapes, q, lower, upper, tuple(told), driven)
+
+
+SEEN = ": overlap is looked for along the plan"
 
 
 def _loaded(path: Path, options: dict[str, Any]) -> Model:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ModelWarning)  # what was mended is told at the end, by `Model.notes`
+        warnings.simplefilter("ignore", ModelWarning)  # what was mended is told at the end
         return load_model(path, **options)
 
 
-def _with_inputs_that_do_something(path: Path, options: dict[str, Any], model: Model, told: list[str]) -> Model:
-    """Without motors whose limit is 0, which Drake keeps but which cannot push: they get no limit."""
-    dead = [a.name for a in model.contract.actuators if a.effort_limit == 0]
-    if not dead:
-        return model
-    told.append(f"{', '.join(dead)} had an effort limit of 0: they stay without effect")
-    return model
+def _held(path: Path, options: dict[str, Any]) -> Model | None:
+    """With its base held; None where nothing can move then."""
+    try:
+        return _loaded(path, options | {"base": "weld"})
+    except ModelError:
+        return None
 
 
-def _stuck_joints(model: Model) -> tuple[str, ...]:
-    """The joints with one coordinate whose lower limit is their upper one."""
-    found = []
-    for joint in joints(model.plant):
-        if joint.num_positions() == 1 and joint.position_lower_limits()[0] == joint.position_upper_limits()[0]:
-            found.append(joint.name())
-    return tuple(found)
+def _is_stuck(joint: Any) -> bool:
+    return bool(joint.num_positions() == 1 and joint.position_lower_limits()[0] == joint.position_upper_limits()[0])
 
 
 def ranges(model: Model) -> tuple[Array, Array]:
-    """(lower, upper) (nq,): a joint's limits, or a range around 0 where it has none, or a wider one than a turn."""
-    lower = np.array(model.plant.GetPositionLowerLimits(), dtype=float)
-    upper = np.array(model.plant.GetPositionUpperLimits(), dtype=float)
-    turns = np.array([p.unit != "m" for p in model.contract.positions])
-    reach = np.where(turns, TURN, SHIFT)
-    widest = 4 * np.pi
-    open_ = ~(np.isfinite(lower) & np.isfinite(upper)) | (upper - lower > widest)
-    low = np.where(open_, np.maximum(np.where(np.isfinite(lower), lower, -np.inf), -reach), lower)
-    high = np.where(open_, np.minimum(np.where(np.isfinite(upper), upper, np.inf), reach), upper)
-    crossed = low >= high  # one limit alone, and beyond the range
-    low = np.where(crossed & np.isfinite(upper), upper - 2 * reach, low)
-    high = np.where(crossed & np.isfinite(lower), lower + 2 * reach, high)
+    """(lower, upper) (nq,): the limits of each coordinate, or a range around 0 where it has none, or a wide one."""
+    lower = np.array([p.lower for p in model.contract.positions], dtype=float)
+    upper = np.array([p.upper for p in model.contract.positions], dtype=float)
+    reach = np.array([SHIFT if p.unit == "m" else TURN for p in model.contract.positions])
+    wide = upper - lower > WIDEST  # so is what has no limits
+    low = np.where(wide, np.maximum(lower, -reach), lower)
+    high = np.where(wide, np.minimum(upper, reach), upper)
+    beyond = low >= high  # one limit alone, on the other side of 0
+    low = np.where(beyond & np.isfinite(upper), upper - 2 * reach, low)
+    high = np.where(beyond & np.isfinite(lower), lower + 2 * reach, high)
     return low, high
 
 
-def _start(model: Model, lower: Array, upper: Array, random: np.random.Generator) -> tuple[Array, bool]:
-    """The posture nearest to the file's that is inside the limits, or a random one where that overlaps; and whether
-    nothing overlaps in it."""
-    q = model.default_state[: model.nq].copy()
-    one = np.zeros(model.nq, dtype=bool)
+def _of_joints(model: Model) -> Array:
+    """(nq,) whether a coordinate is that of a joint, and no part of a free body's pose."""
+    if model.nq == model.nv:
+        return np.ones(model.nq, dtype=bool)
+    found = np.zeros(model.nq, dtype=bool)
     for joint in joints(model.plant):
         if joint.num_positions() == 1:
-            one[joint.position_start()] = True
+            found[joint.position_start()] = True
+    return found
+
+
+def _inside(model: Model, lower: Array, upper: Array) -> Array:
+    """The file's posture, moved inside the limits."""
+    q = model.default_state[: model.nq].copy()
     margin = INSIDE * (upper - lower)
-    q[one] = np.clip(q, lower + margin, upper - margin)[one]
-    first = q.copy()
-    for _ in range(ATTEMPTS):
-        if overlap(model, q) <= TOUCHING:
-            return q, True
-        drawn = random.uniform(lower + margin, upper - margin)
+    return np.where(_of_joints(model), np.clip(q, lower + margin, upper - margin), q)
+
+
+def _apart(shapes: Model, first: Array, lower: Array, upper: Array, random: np.random.Generator) -> Array | None:
+    """The posture `first`, or one drawn at random, in which nothing overlaps; None where none is found."""
+    margin, one, q = INSIDE * (upper - lower), _of_joints(shapes), first
+    for i in range(ATTEMPTS):
+        if overlap(shapes, q) <= TOUCHING:
+            return q
+        part = (i + 1) / ATTEMPTS  # ever farther away
+        drawn = first + part * (random.uniform(lower + margin, upper - margin) - first)
         q = np.where(one, drawn, first)
-    return first, False
+    return None
 
 
 def overlap(model: Model, q: Array) -> float:
     """[m] how deep the deepest overlap of collision shapes is in posture q (nq,); 0 where Drake cannot tell."""
-    if not model.contract.contact.collision_pairs:
-        return 0.0
     set_state(model.double, np.concatenate([q, np.zeros(model.nv)]))
     try:
         return penetration(model)
@@ -152,7 +180,30 @@ def overlap(model: Model, q: Array) -> float:
         return 0.0
 
 
-def floating(model: Model) -> tuple[str, ...]:
-    """The names of the bodies that float."""
-    free = {int(b) for b in model.plant.GetFloatingBaseBodies()}
-    return tuple(b.name() for b in bodies(model.plant) if int(b.index()) in free)
+def effort_limits(model: Model) -> Array:
+    """(nu,) the smaller of the two limits of each input, infinite where there is none."""
+    return np.array([min(abs(u.lower), abs(u.upper)) for u in model.contract.inputs])
+
+
+def drive(model: Model, x: Array) -> tuple[Array, Array]:
+    """(v, J): the velocities after a step from x without input (nv,), and what each input adds to them (nv, nu).
+
+    Raises SimulationError where Drake cannot take the step.
+    """
+    limits = effort_limits(model)
+    probe = np.where(np.isfinite(limits) & (limits > 0), PROBE * limits, PROBE)
+    at_rest = np.array(advance(model.double, x, np.zeros(model.nu)))[model.nq :]
+    columns = [np.array(advance(model.double, x, u))[model.nq :] - at_rest for u in np.diag(probe)]
+    return at_rest, np.array(columns).T / probe
+
+
+def is_fully_driven(model: Model, q: Array) -> bool:
+    """Whether the inputs can give any velocity, so that every smooth motion of the joints can be made."""
+    if model.nq != model.nv or model.nu < model.nv:
+        return False
+    try:
+        _, effect = drive(model, np.concatenate([q, np.zeros(model.nv)]))
+    except SimulationError:
+        return False
+    size = np.linalg.svd(effect, compute_uv=False)
+    return bool(size[-1] > SMALLEST_DRIVE * size[0])
