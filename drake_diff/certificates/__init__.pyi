@@ -1,4 +1,4 @@
-from .audit import Finding as Finding
 from .certificate import Certificate as Certificate
 from .certificate import certify_jacobian as certify_jacobian
+from .finding import Finding as Finding
 from .rollout import RolloutCertificate as RolloutCertificate

@@ -16,7 +16,8 @@ from pydrake.multibody.plant import ContactModel, DiscreteContactApproximation
 from pydrake.multibody.tree import FixedOffsetFrame, WeldJoint
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff.certificates.audit_model import FILE_CHECKS
+from drake_diff.certificates.finding import SEVERITIES, Finding, Findings, Severity
 from drake_diff.derivatives.step import StepDerivatives, differentiate_step
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError
 from drake_diff.model.load_file import MEETS_A_SPHERE, autodiff_supports
@@ -36,44 +37,7 @@ ON_AXIS = 1e-9  # [m] from a sphere's centre to a cylinder's axis
 TOUCH = 1e-9  # [m] of signed distance, where Drake computes it exactly
 ROUGH_TOUCH = 1e-6  # [m] where it iterates (measured: 1e-7 off for an ellipsoid)
 
-Severity = Literal["error", "warning", "info"]
-SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
 UNITS = dict(zip(PROXIMITY, ("", " N/m", " s/m", " s", " Pa"), strict=True))
-
-
-@dataclass(frozen=True, repr=False)
-class Finding(ShowsItsRepr):
-    """Something to know before a model is differentiated.
-
-    `severity` is "error" if Drake throws here or the derivative is wrong, "warning" if it may be or a number was not
-    chosen, and "info" if it is taken care of or a limit to know. `code` is a stable name of the kind of finding,
-    `subject` the part of the model, `message` says what is found and `remedy` what to change.
-
-    Example:
-        >>> dd.certificates.Finding("info", "locked_joint", "elbow", "is locked", "unlock it")
-        info locked_joint (elbow): is locked
-          -> unlock it
-    """
-
-    severity: Severity
-    code: str
-    subject: str
-    message: str
-    remedy: str
-
-    def __str__(self) -> str:
-        return f"{self.severity} {self.code} ({self.subject}): {self.message}\n  -> {self.remedy}"
-
-    __repr__ = __str__
-
-
-class Findings(list[Finding], ShowsItsRepr):
-    """What an audit found, the worst first: a list that prints one finding below the other."""
-
-    def __str__(self) -> str:
-        return "\n".join(map(str, self)) or "nothing found"
-
-    __repr__ = __str__
 
 
 def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) -> Findings:
@@ -556,4 +520,5 @@ _CHECKS = (
     *_CHECKS_WITHOUT_POSES,
     *(_pair_refused, _aligned_faces, _cylinder_axis, _default_decides, _touching),
     *(_saturated_effort, _jacobian, _mechanism),
+    *FILE_CHECKS,
 )

@@ -36,13 +36,17 @@ class Mimic:
 
 @dataclass(frozen=True)
 class JointSays:
-    """Of a joint: its type, and its limits as written (None where it has none)."""
+    """Of a joint: its type, and its limits as written (None where it has none).
+
+    `passive` says that it is not to be driven: so SDF means an effort limit of 0, where it makes a motor of each other.
+    """
 
     type: str
     effort: float | None
     velocity: float | None
     lower: float | None
     upper: float | None
+    passive: bool = False
 
 
 @dataclass(frozen=True)
@@ -128,7 +132,7 @@ def _read_sdf(model: Element, name: str, found: FileFacts) -> None:
     for joint in model.findall("joint"):
         limits = {kind: _text(joint, "axis", "limit", kind) for kind in LIMITS}
         key = (name, joint.get("name"))
-        found.joints[key] = JointSays(joint.get("type"), **limits)
+        found.joints[key] = JointSays(joint.get("type"), *limits.values(), passive=limits["effort"] == 0)
         own = next((element for element in joint.children if element.tag.endswith(":mimic")), None)
         mimic = joint.find("axis", "mimic")
         if own is not None:  # Drake's element

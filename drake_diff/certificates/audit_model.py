@@ -1,0 +1,255 @@
+"""What a user would trip over in a robot file, with the argument of `load_model` that mends it: part of `audit`.
+
+A stranger's file loads, and then cannot be driven, falls through the floor, or has masses that nobody wrote.
+"""
+
+import re
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydrake.multibody.plant import DiscreteContactApproximation
+
+from drake_diff.certificates.finding import Finding, Severity
+from drake_diff.model.load_file import collision_geometries
+from drake_diff.model.plant import FLOATING, PROXIMITY, actuators, bodies, joints
+from drake_diff.model.repairs import can_be_driven
+from drake_diff.model.step import set_state
+
+if TYPE_CHECKING:
+    from drake_diff.certificates.audit import Place
+
+Found = Iterator[Finding]
+NAMES_TOLD = 8  # of links or joints; of more the others are counted
+SAME_MASS = 1e-6  # relative: a file's mass and trace of inertia against the plant's
+NO_MASS = 1e-12  # [kg or kg m^2] of a joint's own entry of the mass matrix
+CORNER = re.compile(r"_corner_\d+$")  # what replace_collision_geometry calls its spheres
+IGNORED = re.compile(r"ignored|not currently support|only supports|unsupported|Skipping transmission", re.IGNORECASE)
+HARMLESS = (
+    "safety_controller",
+    "calibration",
+    "found in a 'link'",
+    "fixed joint",
+    "texture",
+    "material",
+    "transmission'",
+)
+
+
+def _listed(names: Any) -> str:
+    found = list(dict.fromkeys(names))
+    more = f" and {len(found) - NAMES_TOLD} more" if len(found) > NAMES_TOLD else ""
+    return ", ".join(found[:NAMES_TOLD]) + more
+
+
+def _no_actuator(place: "Place") -> Found:
+    model, facts = place.model, place.model.file_facts
+    if model.source is None:
+        return
+    driven = {actuator.joint().index() for actuator in actuators(model.plant)}
+    undriven = []
+    for joint in joints(model.plant):
+        key = (model.plant.GetModelInstanceName(joint.model_instance()), joint.name())
+        says = facts.joints.get(key)
+        passive = says is not None and says.passive
+        if can_be_driven(joint) and joint.index() not in driven and not passive and key not in facts.followers:
+            undriven.append((joint.name(), 0.0 if says is None else says.effort or 0.0))
+    remedy = 'load_model(..., actuators="all"), names of joints, or {joint: effort limit}; nothing if it is passive'
+    if undriven and not driven:
+        message = f"none of its {len(undriven)} joints has an actuator in the file, so that there is no input"
+        yield Finding("warning", "no_actuator", _listed(name for name, _ in undriven), message, remedy)
+        return
+    meant = [name for name, effort in undriven if effort > 0]
+    if meant:
+        message = f"{len(meant)} joints have an effort limit in the file and no actuator; {len(driven)} others have one"
+        yield Finding("info", "undriven", _listed(meant), message, remedy)
+
+
+def _massless(place: "Place") -> Found:
+    plant = place.model.plant
+    for base in sorted(plant.GetFloatingBaseBodies()):
+        held = plant.GetBodiesWeldedTo(plant.get_body(base))
+        if sum(body.default_mass() for body in held) == 0:
+            message = "it has no mass and floats, so that nothing holds up what hangs on it and the step is singular"
+            remedy = 'load_model(..., base="weld") if it stands fixed, else give it a mass in the file'
+            yield Finding("error", "massless_root", plant.get_body(base).name(), message, remedy)
+    set_state(place.model.double, place.x)
+    mass = np.diag(plant.CalcMassMatrix(place.model.double.context))
+    for joint in joints(plant):
+        if can_be_driven(joint) and mass[joint.velocity_start()] < NO_MASS:
+            message = f"nothing that it moves has a mass or an inertia ({joint.child_body().name()})"
+            remedy = f"load_model(..., fix_joints=[{joint.name()!r}]), or give the link a mass in the file"
+            yield Finding("error", "massless_joint", joint.name(), message, remedy)
+
+
+def _lost_shapes(place: "Place") -> Found:
+    model, scene_graph = place.model, place.model.double.scene_graph
+    for note in model.notes:
+        if re.search(r"\bmeshes skipped", note):
+            severity: Severity = "warning" if "collision" in note else "info"
+            remedy = (
+                'load_model(..., meshes="convex") or "spheres" takes collision meshes; packages= says where they are'
+            )
+            yield Finding(severity, "meshes_skipped", "meshes", note.split(":")[0].split("; ")[0], remedy)
+    if scene_graph is None or (model.options or {}).get("contact") is False:
+        return
+    found = {body.index() for body, _ in collision_geometries(model.plant, scene_graph)}
+    lost, given = [], 0
+    for body in bodies(model.plant):
+        says = model.file_facts.links.get((model.plant.GetModelInstanceName(body.model_instance()), body.name()))
+        if says is not None and says.collisions:
+            given += 1
+            lost += [] if body.index() in found else [body.name()]
+    if lost:
+        much = "no collision shape of the file is left" if len(lost) == given else "they have lost all collision shapes"
+        remedy = 'load_model(..., meshes="convex") or "spheres"; contact=False says that nothing is to touch'
+        yield Finding("warning", "collision_gone", _listed(lost), f"{much}, so that they pass through things", remedy)
+
+
+def _falls(place: "Place") -> Found:
+    plant = place.model.plant
+    if not np.any(plant.gravity_field().gravity_vector()) or place.model.double.scene_graph is None:
+        return
+    fixed = {body.name() for body in plant.GetBodiesWeldedTo(plant.world_body())}
+    floating = {joint.child_body().index(): joint for joint in joints(plant) if joint.type_name() in FLOATING}
+    for base in sorted(plant.GetFloatingBaseBodies()):
+        tree = {body.name() for body in plant.GetBodiesKinematicallyAffectedBy([floating[base].index()])}
+        shapes = {body.name() for body, _ in collision_geometries(plant, place.model.double.scene_graph)}
+        moving = sum(j.num_velocities() > 0 and j.child_body().name() in tree for j in joints(plant)) > 1
+        standing = any(set(pair.bodies) & tree and set(pair.bodies) & fixed for pair in place.pairs)
+        if standing or not (moving or shapes & tree):
+            continue
+        name = plant.get_body(base).name()
+        remedy = 'load_model(..., ground=True), base="weld" if it stands fixed, or nothing if it flies'
+        why = "there is nothing fixed below it that it could touch"
+        if not shapes & tree:
+            why = "nothing of it can touch, as it has no collision shapes"
+            remedy = 'load_model(..., meshes="convex" or "spheres", ground=True), base="weld", or nothing if it flies'
+        yield Finding("warning", "falls", name, f"it floats and falls for ever: {why}", remedy)
+
+
+def _invented_inertia(place: "Place") -> Found:
+    plant = place.model.plant
+    fixed = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
+    kinds: dict[tuple[Severity, str], list[str]] = {}
+    for body in bodies(plant):
+        says = place.model.file_facts.links.get((plant.GetModelInstanceName(body.model_instance()), body.name()))
+        if says is None or int(body.index()) in fixed:
+            continue
+        inertia = body.default_spatial_inertia()
+        mass, about_center = inertia.get_mass(), inertia.Shift(inertia.get_com()).CalcRotationalInertia()
+        trace = float(np.trace(about_center.CopyToFullMatrix3()))
+        kind: tuple[Severity, str] | None = None
+        if says.mass is None and says.defaults:
+            kind = ("warning", "the file gives no mass, so that it is the format's own, 1 kg")
+        elif says.mass is not None and not np.isclose(mass, says.mass, rtol=SAME_MASS, atol=0):
+            kind = (
+                "error",
+                f"the file's mass {says.mass:g} kg goes with no inertia; Drake takes {mass:g} kg, a ball of water",
+            )
+        elif says.trace is None and says.defaults:
+            kind = ("warning", "the file gives no inertia, so that it is the format's own, 1 kg m^2 about each axis")
+        elif says.trace is not None and not np.isclose(trace, says.trace, rtol=SAME_MASS, atol=1e-12):
+            kind = (
+                "warning",
+                "no body can have the file's inertia; Drake takes that of a ball of water of the same mass",
+            )
+        if kind is not None:
+            kinds.setdefault(kind, []).append(body.name())
+    for (severity, message), names in kinds.items():
+        remedy = (
+            "give a mass above 0, and an inertia whose moments each are at most the sum of the other two, in the file"
+        )
+        yield Finding(severity, "invented_inertia", _listed(names), message, remedy)
+
+
+def _unread_compliance(place: "Place") -> Found:
+    sap = place.model.plant.get_discrete_contact_approximation() == DiscreteContactApproximation.kSap
+    given, read = ("dissipation", "relaxation_time") if sap else ("relaxation_time", "dissipation")
+    names = [
+        collider.label
+        for collider in place.colliders.values()
+        if collider.own.HasProperty(*PROXIMITY[given]) and not collider.own.HasProperty(*PROXIMITY[read])
+    ]
+    if names:
+        by = "sap" if sap else "similar and lagged"
+        message = f"{PROXIMITY[given][1]} is given, and {by} read {PROXIMITY[read][1]}, which is not"
+        other = '"similar"' if sap else '"sap"'
+        remedy = f"give drake:{PROXIMITY[read][1]} too, or load_model(..., contact_approximation={other})"
+        yield Finding("warning", "unread_compliance", _listed(names), message, remedy)
+
+
+def _ignored(place: "Place") -> Found:
+    kinds: dict[str, list[str]] = {}
+    for note in place.model.notes:
+        first = re.sub(r"^.*?warning: ", "", note.splitlines()[0])
+        if IGNORED.search(first) and "meshes skipped" not in first:
+            kinds.setdefault(
+                re.sub(r"(joint|link|geom) '?[\w/.:-]+'?(?= has)|'-?[\d.eE+-]+'", r"\1 ...", first), []
+            ).append(note)
+    for kind, notes in kinds.items():
+        found = re.search(r"'([^']+)'", kind)
+        severity: Severity = "info" if any(word in kind for word in HARMLESS) else "warning"
+        message = f"{len(notes)} times in the file, and Drake does not read it: {kind}"
+        remedy = (
+            "nothing if it does not matter, else say it in a way that Drake reads, or change the plant in a diagram"
+        )
+        yield Finding(severity, "ignored", found[1] if found else "file", message, remedy)
+
+
+def _zero_limits(place: "Place") -> Found:
+    for joint in joints(place.model.plant):
+        if not can_be_driven(joint):
+            continue
+        zero = []
+        if joint.velocity_lower_limits()[0] == 0 == joint.velocity_upper_limits()[0]:
+            zero.append("its velocity limit is 0")
+        if joint.position_lower_limits()[0] == joint.position_upper_limits()[0]:
+            zero.append(f"its position limits are both {joint.position_lower_limits()[0]:g}")
+        if zero:
+            remedy = (
+                f"load_model(..., actuators=[{joint.name()!r}]) takes limits of 0 as none, fix_joints= fixes the joint"
+            )
+            yield Finding("error", "zero_limit", joint.name(), f"{' and '.join(zero)}: no plan can move it", remedy)
+
+
+def _corners_on_both_sides(place: "Place") -> Found:
+    trees = _trees(place.model.plant)
+    met: dict[str, None] = {}
+    for pair in place.pairs:
+        both = [re.sub(r" \(Sphere\)$", "", label) for label in (pair.a.label, pair.b.label)]
+        if all(CORNER.search(label) for label in both) and trees[pair.a.body] != trees[pair.b.body]:
+            met[" - ".join(sorted(pair.bodies))] = None
+    if met:
+        message = "both are spheres in their corners alone, which miss each other: what one holds falls out of it"
+        remedy = (
+            'contact_geometry="hydroelastic" with contact_model="hydroelastic_with_fallback", or "differences"; or give '
+            "one of them spheres over the face that touches, in the file"
+        )
+        yield Finding("warning", "corners_miss", _listed(met), message, remedy)
+
+
+def _trees(plant: Any) -> dict[str, str]:
+    """For each body the first one, from the world on, of those that hang together with it and move."""
+    fixed = {body.name() for body in plant.GetBodiesWeldedTo(plant.world_body())}
+    above = {joint.child_body().name(): joint.parent_body().name() for joint in joints(plant)}
+
+    def first(name: str) -> str:
+        while name in above and above[name] not in fixed:
+            name = above[name]
+        return name
+
+    return {body.name(): first(body.name()) for body in [plant.world_body(), *bodies(plant)]}
+
+
+FILE_CHECKS: tuple[Callable[["Place"], Found], ...] = (
+    _no_actuator,
+    _massless,
+    _lost_shapes,
+    _falls,
+    _invented_inertia,
+    _unread_compliance,
+    _ignored,
+    _zero_limits,
+    _corners_on_both_sides,
+)

@@ -1,0 +1,284 @@
+"""The audit names what a user trips over in a robot file, and the argument that mends it, and is silent where all is well."""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+from helpers.models import MODELS
+from helpers.table import each_row
+
+import drake_diff as dd
+from drake_diff.certificates.audit_model import FILE_CHECKS
+
+CODES = [
+    "no_actuator",
+    "undriven",
+    "massless_root",
+    "massless_joint",
+    "meshes_skipped",
+    "collision_gone",
+    "falls",
+    "invented_inertia",
+    "unread_compliance",
+    "ignored",
+    "zero_limit",
+    "corners_miss",
+]
+INERTIA = '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>'
+INERTIAL = f'<inertial><mass value="1"/>{INERTIA}</inertial>'
+BOX = '<collision><geometry><box size="0.06 0.06 0.06"/></geometry></collision>'
+LIMIT = '<limit effort="7" velocity="1" lower="-2" upper="2"/>'
+DRIVE = (
+    '<transmission><type>SimpleTransmission</type><joint name="hinge"/><actuator name="motor"/></transmission></robot>'
+)
+
+
+def link(name, inertial=INERTIAL, shape=""):
+    return f'<link name="{name}">{inertial}{shape}</link>'
+
+
+def joint(name, parent, child, kind="revolute", limit=LIMIT, more=""):
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><axis xyz="0 1 0"/>'
+        f"{limit}{more}</joint>"
+    )
+
+
+ARM = f'<robot name="arm">{link("upper")}{joint("hinge", "world", "upper")}{DRIVE}'
+FREE = f'<robot name="arm">{link("base", shape=BOX)}{link("upper")}{joint("hinge", "base", "upper")}{DRIVE}'
+
+
+def sdf(inertial, proximity="", limit=""):
+    body = "<inertial><mass>1</mass><inertia><ixx>1</ixx><iyy>1</iyy><izz>1</izz></inertia></inertial>"
+    shape = (
+        f"<collision name='c'><geometry><sphere><radius>0.1</radius></sphere></geometry>"
+        f"<drake:proximity_properties>{proximity}</drake:proximity_properties></collision>"
+    )
+    return (
+        f'<sdf version="1.9" xmlns:drake="http://drake.mit.edu"><model name="m"><link name="a">{inertial or body}{shape}'
+        f'</link><link name="b">{body}{shape}</link><joint name="j" type="revolute"><parent>world</parent>'
+        f"<child>a</child><axis><xyz>0 1 0</xyz>{limit}</axis></joint><joint name='k' type='revolute'>"
+        "<parent>world</parent><child>b</child><axis><xyz>0 1 0</xyz></axis></joint></model></sdf>"
+    )
+
+
+GRASP = (
+    '<robot name="hand">'
+    + "".join(link(name, shape=BOX) for name in ("left", "right", "block"))
+    + joint("l", "world", "left", "prismatic", more='<origin xyz="-0.06 0 0.5"/>')
+    + joint("r", "world", "right", "prismatic", more='<origin xyz="0.06 0 0.5"/>')
+    + "</robot>"
+)
+
+
+def audited(tmp_path, text, **options):
+    """What the audit of that file says, by its codes of this module."""
+    name = {"<r": "m.urdf", "<s": "m.sdf", "<m": "m.xml"}[text[:2]]
+    (tmp_path / name).write_text(text)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = dd.load_model(tmp_path / name, **{"time_step": 0.01, **options})
+    return {finding.code: finding for finding in dd.audit(model) if finding.code in CODES}
+
+
+MESH = '<{}><geometry><mesh filename="hand.{}"/></geometry></{}>'
+# The code, the severity, the file and options in which it is found, words of it, and what mends it.
+TRAPS = [
+    ("no_actuator", "warning", ARM.replace(DRIVE, "</robot>"), {}, "hinge.*none of its 1 joints", {"actuators": "all"}),
+    (
+        "massless_root",
+        "error",
+        FREE.replace(INERTIAL, "", 1),
+        {},
+        r"base\): it has no mass and floats",
+        {"base": "weld"},
+    ),
+    (
+        "massless_joint",
+        "error",
+        ARM.replace("</robot>", link("tip", "") + joint("wrist", "upper", "tip") + "</robot>"),
+        {},
+        r"wrist\): nothing that it moves has a mass",
+        {"fix_joints": ["wrist"]},
+    ),
+    (
+        "meshes_skipped",
+        "info",
+        ARM.replace("</link>", MESH.format("visual", "dae", "visual") + "</link>"),
+        {},
+        "1 .*meshes skipped",
+        None,
+    ),
+    (
+        "collision_gone",
+        "warning",
+        ARM.replace("</link>", MESH.format("collision", "stl", "collision") + "</link>"),
+        {},
+        r"upper\): no collision shape of the file is left",
+        {"contact": False},
+    ),
+    ("falls", "warning", FREE, {}, r"base\): it floats and falls for ever: there is nothing fixed", {"ground": True}),
+    (
+        "falls",
+        "warning",
+        FREE.replace(BOX, ""),
+        {"ground": True},
+        "as it has no collision shapes",
+        {"base": "weld", "ground": None},
+    ),
+    (
+        "invented_inertia",
+        "error",
+        ARM.replace('mass value="1"', 'mass value="-1"'),
+        {},
+        "mass -1 kg goes with no inertia; Drake takes 1 kg",
+        None,
+    ),
+    (
+        "invented_inertia",
+        "warning",
+        ARM.replace('ixx="0.1"', 'ixx="0.9"'),
+        {},
+        "no body can have the file's inertia",
+        None,
+    ),
+    (
+        "invented_inertia",
+        "warning",
+        sdf("<inertial/>"),
+        {},
+        "gives no mass, so that it is the format's own, 1 kg",
+        None,
+    ),
+    (
+        "invented_inertia",
+        "warning",
+        sdf("<inertial><mass>2</mass></inertial>"),
+        {},
+        "gives no inertia, so that it is the format's own",
+        None,
+    ),
+    (
+        "unread_compliance",
+        "warning",
+        sdf("", "<drake:hunt_crossley_dissipation>3</drake:hunt_crossley_dissipation>"),
+        {},
+        "hunt_crossley_dissipation is given, and sap read relaxation_time, which is not",
+        {"contact_approximation": "similar"},
+    ),
+    (
+        "unread_compliance",
+        "warning",
+        sdf("", "<drake:relaxation_time>3</drake:relaxation_time>"),
+        {"contact_approximation": "lagged"},
+        "relaxation_time is given, and similar and lagged read hunt_crossley_dissipation",
+        {"contact_approximation": "sap"},
+    ),
+    (
+        "ignored",
+        "warning",
+        ARM.replace("</joint>", '<dynamics friction="2"/></joint>'),
+        {},
+        r"friction\): 1 times in the file",
+        None,
+    ),
+    ("ignored", "info", ARM.replace("</joint>", "<safety_controller/></joint>", 1), {}, "safety_controller", None),
+    (
+        "zero_limit",
+        "error",
+        ARM.replace(DRIVE, "</robot>").replace('velocity="1"', 'velocity="0"'),
+        {},
+        "its velocity limit is 0: no plan can move it",
+        {"actuators": ["hinge"]},
+    ),
+    (
+        "zero_limit",
+        "error",
+        ARM.replace(DRIVE, "</robot>").replace('lower="-2" upper="2"', 'lower="0" upper="0"'),
+        {},
+        "its position limits are both 0: no plan can move it",
+        {"actuators": "all"},
+    ),
+    (
+        "corners_miss",
+        "warning",
+        GRASP,
+        {"contact_geometry": "corner_spheres"},
+        "block - left, block - right",
+        {"contact_geometry": "differences"},
+    ),
+    (
+        "undriven",
+        "info",
+        ARM.replace("</robot>", link("tip") + joint("wrist", "upper", "tip") + "</robot>"),
+        {},
+        "wrist.*1 joints have an effort limit in the file and no actuator; 1 others",
+        {"actuators": "all"},
+    ),
+]
+
+
+@each_row("code, severity, text, options, words, mended", TRAPS)
+def test_a_trap_is_named_and_its_remedy_mends_it(tmp_path, code, severity, text, options, words, mended):
+    finding = audited(tmp_path, text, **options)[code]
+    assert finding.severity == severity
+    assert re.search(words, str(finding)), str(finding)
+    if mended is not None:
+        assert next(iter(mended)) in finding.remedy or code == "falls"
+        assert code not in audited(tmp_path, text, **{**options, **mended})
+
+
+def test_every_code_has_a_trap():
+    assert {row[0] for row in TRAPS} == set(CODES)
+
+
+@each_row(
+    "text, options",
+    [
+        (ARM, {}),
+        (FREE, {"ground": 0.5}),
+        (FREE, {"base": "weld"}),
+        (FREE, {"gravity": [0, 0, 0]}),
+        (sdf("", "", "<limit><effort>0</effort></limit>"), {}),  # passive, as SDF says it
+        (GRASP, {"actuators": "all", "contact_geometry": "differences"}),
+        (
+            '<mujoco><worldbody><geom type="plane" size="9 9 1"/><body><freejoint/><geom size="0.1" mass="1"/>'
+            '<body pos="0 0 1"><joint name="j"/><geom size="0.1" mass="1"/></body></body></worldbody>'
+            '<actuator><motor joint="j"/></actuator></mujoco>',
+            {},
+        ),
+    ],
+)
+def test_a_right_model_has_no_trap(tmp_path, text, options):
+    found = audited(tmp_path, text, **options)
+    found.pop("falls", None) if "GRASP" in str(options) else None
+    assert {code for code in found if found[code].severity != "info"} <= ({"falls"} if text == GRASP else set())
+
+
+def test_a_block_falls_out_of_corner_spheres_and_stays_between_boxes(tmp_path):
+    """What the finding corners_miss warns of: fingers press 20 N on a block of 1 kg, friction 0.5 on two faces."""
+    (tmp_path / "m.urdf").write_text(GRASP.replace("0.06 0 0.5", "0.059 0 0.5"))
+    heights = {}
+    for route in ("differences", "corner_spheres"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            model = dd.load_model(
+                tmp_path / "m.urdf", time_step=0.005, actuators={"l": 100, "r": 100}, contact_geometry=route, base=None
+            )
+        x = model.default_state
+        x[model.state_names.index("block_z")] = 0.5
+        us = np.tile([40.0, -40.0], (40, 1))
+        heights[route] = dd.rollout(model, x, us).xs[-1][model.state_names.index("block_z")]
+    assert heights["differences"] > 0.45
+    assert heights["corner_spheres"] == pytest.approx(0.5 - 9.81 * 0.2 * 0.205 / 2, abs=1e-9)  # free fall in 40 steps
+
+
+@each_row("name", sorted(p.name for p in MODELS.iterdir()))
+def test_the_models_of_this_repository_have_none(load, name):
+    model = load(name)
+    assert {f.code for f in dd.audit(model)} & set(CODES) == set()
+
+
+def test_every_check_of_files_is_part_of_the_audit():
+    assert len(FILE_CHECKS) == 9
