@@ -113,7 +113,8 @@ def _falls(place: "Place") -> Found:
     fixed = {body.name() for body in plant.GetBodiesWeldedTo(plant.world_body())}
     floating = {joint.child_body().index(): joint for joint in joints(plant) if joint.type_name() in FLOATING}
     for base in sorted(plant.GetFloatingBaseBodies()):
-        tree = {body.name() for body in plant.GetBodiesKinematicallyAffectedBy([floating[base].index()])}
+        affected = plant.GetBodiesKinematicallyAffectedBy([floating[base].index()])
+        tree = {plant.get_body(index).name() for index in affected}
         shapes = {body.name() for body, _ in collision_geometries(plant, place.model.double.scene_graph)}
         moving = sum(j.num_velocities() > 0 and j.child_body().name() in tree for j in joints(plant)) > 1
         standing = any(set(pair.bodies) & tree and set(pair.bodies) & fixed for pair in place.pairs)
@@ -223,8 +224,8 @@ def _corners_on_both_sides(place: "Place") -> Found:
     if met:
         message = "both are spheres in their corners alone, which miss each other: what one holds falls out of it"
         remedy = (
-            'contact_geometry="hydroelastic" with contact_model="hydroelastic_with_fallback", or "differences"; or give '
-            "one of them spheres over the face that touches, in the file"
+            'contact_geometry="hydroelastic" with contact_model="hydroelastic_with_fallback", or "differences"; or '
+            "give one of them spheres over the face that touches, in the file"
         )
         yield Finding("warning", "corners_miss", _listed(met), message, remedy)
 

@@ -11,7 +11,6 @@ from pydrake.multibody.parsing import PackageMap
 from drake_diff.exceptions import ModelError
 from drake_diff.model.xml_text import Element, XmlText
 
-LIMITS = ("effort", "velocity", "lower", "upper")
 Key = tuple[str, str]  # the names of a model instance and of a joint or link in it
 
 
@@ -36,16 +35,12 @@ class Mimic:
 
 @dataclass(frozen=True)
 class JointSays:
-    """Of a joint: its type, and its limits as written (None where it has none).
+    """Of a joint: the effort limit [N or N m] as written, None where there is none.
 
     `passive` says that it is not to be driven: so SDF means an effort limit of 0, where it makes a motor of each other.
     """
 
-    type: str
     effort: float | None
-    velocity: float | None
-    lower: float | None
-    upper: float | None
     passive: bool = False
 
 
@@ -103,8 +98,7 @@ def _read(path: Path, packages: PackageMap, instance: str | None, found: FileFac
 def _read_urdf(robot: Element, name: str, found: FileFacts) -> None:
     for joint in robot.findall("joint"):
         limit, mimic, key = joint.find("limit"), joint.find("mimic"), (name, joint.get("name"))
-        says = {kind: None if limit is None else _number(limit.get(kind)) for kind in LIMITS}
-        found.joints[key] = JointSays(joint.get("type"), **says)
+        found.joints[key] = JointSays(None if limit is None else _number(limit.get("effort")))
         if mimic is not None and joint.get("type") != "fixed":
             found.followers[key] = _drakes_mimic(key, mimic)
     for link in robot.findall("link"):
@@ -130,9 +124,8 @@ def _link_of_urdf(link: Element) -> LinkSays:
 
 def _read_sdf(model: Element, name: str, found: FileFacts) -> None:
     for joint in model.findall("joint"):
-        limits = {kind: _text(joint, "axis", "limit", kind) for kind in LIMITS}
-        key = (name, joint.get("name"))
-        found.joints[key] = JointSays(joint.get("type"), *limits.values(), passive=limits["effort"] == 0)
+        effort, key = _text(joint, "axis", "limit", "effort"), (name, joint.get("name"))
+        found.joints[key] = JointSays(effort, passive=effort == 0)
         own = next((element for element in joint.children if element.tag.endswith(":mimic")), None)
         mimic = joint.find("axis", "mimic")
         if own is not None:  # Drake's element

@@ -16,7 +16,14 @@ from typing import Any
 import numpy as np
 from pydrake import geometry as pg
 from pydrake.math import RigidTransform
-from pydrake.multibody.parsing import PackageMap, Parser
+from pydrake.multibody.parsing import (
+    AddModel,
+    ModelDirective,
+    ModelDirectives,
+    PackageMap,
+    Parser,
+    ProcessModelDirectives,
+)
 from pydrake.multibody.plant import ContactModel, MultibodyPlant
 
 from drake_diff._base.arrays import Array
@@ -85,6 +92,8 @@ def read_into(
             if xml is not None and xml.changed:
                 make_absolute(xml, path)
                 parser.AddModelsFromString(str(xml), path.suffix.lstrip("."))
+            elif xml is not None and xml.root.tag == "mujoco" and not xml.root.get("model"):
+                _add_named(parser, path, notes)
             else:
                 parser.AddModels(str(path))
             notes += put_meshes(plant, parser.scene_graph(), found)
@@ -95,6 +104,13 @@ def read_into(
             raise ModelError(refusal(path, error, xml, notes)) from error
     told = tuple(note.replace("<literal-string>" + path.suffix, str(path)) for note in notes)
     return FileRead(told, PackageMap(parser.package_map()), done)
+
+
+def _add_named(parser: Parser, path: Path, notes: list[str]) -> None:
+    """Add an MJCF file that gives its model no name, which MuJoCo allows and Drake does not."""
+    model = AddModel(file=path.resolve().as_uri(), name=path.stem)
+    ProcessModelDirectives(ModelDirectives(directives=[ModelDirective(add_model=model)]), parser=parser)
+    notes.append(f"The model has no name in the file: it is called {path.stem}.")
 
 
 @contextmanager
