@@ -99,7 +99,7 @@ TRAPS = [
         "error",
         ARM.replace("</robot>", link("tip", "") + joint("wrist", "upper", "tip") + "</robot>"),
         {},
-        r"wrist\): nothing that it moves has a mass",
+        r"wrist\): nothing that they move has a mass",
         {"fix_joints": ["wrist"]},
     ),
     (
@@ -189,7 +189,7 @@ TRAPS = [
         "error",
         ARM.replace(DRIVE, "</robot>").replace('velocity="1"', 'velocity="0"'),
         {},
-        "its velocity limit is 0: no plan can move it",
+        "the velocity limit is 0: no plan can move what has it",
         {"actuators": ["hinge"]},
     ),
     (
@@ -197,7 +197,7 @@ TRAPS = [
         "error",
         ARM.replace(DRIVE, "</robot>").replace('lower="-2" upper="2"', 'lower="0" upper="0"'),
         {},
-        "its position limits are both 0: no plan can move it",
+        "the position limits are both 0: no plan can move",
         {"actuators": "all"},
     ),
     (

@@ -75,11 +75,11 @@ def _massless(place: "Place") -> Found:
             yield Finding("error", "massless_root", plant.get_body(base).name(), message, remedy)
     set_state(place.model.double, place.x)
     mass = np.diag(plant.CalcMassMatrix(place.model.double.context))
-    for joint in joints(plant):
-        if can_be_driven(joint) and mass[joint.velocity_start()] < NO_MASS:
-            message = f"nothing that it moves has a mass or an inertia ({joint.child_body().name()})"
-            remedy = f"load_model(..., fix_joints=[{joint.name()!r}]), or give the link a mass in the file"
-            yield Finding("error", "massless_joint", joint.name(), message, remedy)
+    light = [j.name() for j in joints(plant) if can_be_driven(j) and mass[j.velocity_start()] < NO_MASS]
+    if light:
+        message = "nothing that they move has a mass or an inertia, so that the step is singular"
+        remedy = f"load_model(..., fix_joints={light[:1]}), or give the links a mass in the file"
+        yield Finding("error", "massless_joint", _listed(light), message, remedy)
 
 
 def _lost_shapes(place: "Place") -> Found:
@@ -184,6 +184,7 @@ def _ignored(place: "Place") -> Found:
     kinds: dict[str, list[str]] = {}
     for note in place.model.notes:
         first = re.sub(r"^.*?warning: ", "", note.splitlines()[0])
+        first = re.sub(r"(Skipping transmission since it's attached to a fixed joint).*", r"\1", first)
         if IGNORED.search(first) and "meshes skipped" not in first:
             kinds.setdefault(
                 re.sub(r"(joint|link|geom) '?[\w/.:-]+'?(?= has)|'-?[\d.eE+-]+'", r"\1 ...", first), []
@@ -199,19 +200,20 @@ def _ignored(place: "Place") -> Found:
 
 
 def _zero_limits(place: "Place") -> Found:
+    kinds: dict[str, list[str]] = {}
     for joint in joints(place.model.plant):
         if not can_be_driven(joint):
             continue
-        zero = []
+        low, high = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
         if joint.velocity_lower_limits()[0] == 0 == joint.velocity_upper_limits()[0]:
-            zero.append("its velocity limit is 0")
-        if joint.position_lower_limits()[0] == joint.position_upper_limits()[0]:
-            zero.append(f"its position limits are both {joint.position_lower_limits()[0]:g}")
-        if zero:
-            remedy = (
-                f"load_model(..., actuators=[{joint.name()!r}]) takes limits of 0 as none, fix_joints= fixes the joint"
-            )
-            yield Finding("error", "zero_limit", joint.name(), f"{' and '.join(zero)}: no plan can move it", remedy)
+            kinds.setdefault("the velocity limit is 0", []).append(joint.name())
+        if low == high:
+            kinds.setdefault(f"the position limits are both {low:g}", []).append(joint.name())
+    for kind, names in kinds.items():
+        remedy = (
+            f"load_model(..., actuators={names[:1]}) takes limits of 0 as none, fix_joints={names[:1]} fixes the joint"
+        )
+        yield Finding("error", "zero_limit", _listed(names), f"{kind}: no plan can move what has it", remedy)
 
 
 def _corners_on_both_sides(place: "Place") -> Found:
