@@ -125,6 +125,10 @@ SOURCES = {
         "1e-6": "drake_diff.artifact.differences:RELATIVE",
         "1e-9": "drake_diff.artifact.differences:ABSOLUTE",
     },
+    "docs/models.md": {
+        "0.5": "drake_diff.model.repairs:GROUND_FRICTION",
+        **dict.fromkeys(("0", "1"), "tests/test_audit_model.py::test_a_trap_is_named_and_its_remedy_mends_it"),
+    },
     "docs/panels.md": {
         "95": "tests/test_robustness.py::test_intervals_are_the_published_ones",
         "20": "tests/test_readme.py::test_the_reference_run_steps_by_20_ms",

@@ -5,19 +5,17 @@ A stranger's file loads, and then cannot be driven, falls through the floor, or 
 
 import re
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydrake.multibody.plant import DiscreteContactApproximation
 
 from drake_diff.certificates.finding import Finding, Severity
+from drake_diff.certificates.place import Place
 from drake_diff.model.load_file import collision_geometries
 from drake_diff.model.plant import FLOATING, PROXIMITY, actuators, bodies, joints
 from drake_diff.model.repairs import can_be_driven
 from drake_diff.model.step import set_state
-
-if TYPE_CHECKING:
-    from drake_diff.certificates.audit import Place
 
 Found = Iterator[Finding]
 NAMES_TOLD = 8  # of links or joints; of more the others are counted
@@ -42,7 +40,7 @@ def _listed(names: Any) -> str:
     return ", ".join(found[:NAMES_TOLD]) + more
 
 
-def _no_actuator(place: "Place") -> Found:
+def _no_actuator(place: Place) -> Found:
     model, facts = place.model, place.model.file_facts
     if model.source is None:
         return
@@ -65,7 +63,7 @@ def _no_actuator(place: "Place") -> Found:
         yield Finding("info", "undriven", _listed(meant), message, remedy)
 
 
-def _massless(place: "Place") -> Found:
+def _massless(place: Place) -> Found:
     plant = place.model.plant
     for base in sorted(plant.GetFloatingBaseBodies()):
         held = plant.GetBodiesWeldedTo(plant.get_body(base))
@@ -82,7 +80,7 @@ def _massless(place: "Place") -> Found:
         yield Finding("error", "massless_joint", _listed(light), message, remedy)
 
 
-def _lost_shapes(place: "Place") -> Found:
+def _lost_shapes(place: Place) -> Found:
     model, scene_graph = place.model, place.model.double.scene_graph
     for note in model.notes:
         if re.search(r"\bmeshes skipped", note):
@@ -106,7 +104,7 @@ def _lost_shapes(place: "Place") -> Found:
         yield Finding("warning", "collision_gone", _listed(lost), f"{much}, so that they pass through things", remedy)
 
 
-def _falls(place: "Place") -> Found:
+def _falls(place: Place) -> Found:
     plant = place.model.plant
     if not np.any(plant.gravity_field().gravity_vector()) or place.model.double.scene_graph is None:
         return
@@ -129,7 +127,7 @@ def _falls(place: "Place") -> Found:
         yield Finding("warning", "falls", name, f"it floats and falls for ever: {why}", remedy)
 
 
-def _invented_inertia(place: "Place") -> Found:
+def _invented_inertia(place: Place) -> Found:
     plant = place.model.plant
     fixed = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
     kinds: dict[tuple[Severity, str], list[str]] = {}
@@ -164,7 +162,7 @@ def _invented_inertia(place: "Place") -> Found:
         yield Finding(severity, "invented_inertia", _listed(names), message, remedy)
 
 
-def _unread_compliance(place: "Place") -> Found:
+def _unread_compliance(place: Place) -> Found:
     sap = place.model.plant.get_discrete_contact_approximation() == DiscreteContactApproximation.kSap
     given, read = ("dissipation", "relaxation_time") if sap else ("relaxation_time", "dissipation")
     names = [
@@ -180,7 +178,7 @@ def _unread_compliance(place: "Place") -> Found:
         yield Finding("warning", "unread_compliance", _listed(names), message, remedy)
 
 
-def _ignored(place: "Place") -> Found:
+def _ignored(place: Place) -> Found:
     kinds: dict[str, list[str]] = {}
     for note in place.model.notes:
         first = re.sub(r"^.*?warning: ", "", note.splitlines()[0])
@@ -199,7 +197,7 @@ def _ignored(place: "Place") -> Found:
         yield Finding(severity, "ignored", found[1] if found else "file", message, remedy)
 
 
-def _zero_limits(place: "Place") -> Found:
+def _zero_limits(place: Place) -> Found:
     kinds: dict[str, list[str]] = {}
     for joint in joints(place.model.plant):
         if not can_be_driven(joint):
@@ -216,7 +214,7 @@ def _zero_limits(place: "Place") -> Found:
         yield Finding("error", "zero_limit", _listed(names), f"{kind}: no plan can move what has it", remedy)
 
 
-def _corners_on_both_sides(place: "Place") -> Found:
+def _corners_on_both_sides(place: Place) -> Found:
     trees = _trees(place.model.plant)
     met: dict[str, None] = {}
     for pair in place.pairs:
@@ -245,7 +243,7 @@ def _trees(plant: Any) -> dict[str, str]:
     return {body.name(): first(body.name()) for body in [plant.world_body(), *bodies(plant)]}
 
 
-FILE_CHECKS: tuple[Callable[["Place"], Found], ...] = (
+FILE_CHECKS: tuple[Callable[[Place], Found], ...] = (
     _no_actuator,
     _massless,
     _lost_shapes,

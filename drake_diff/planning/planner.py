@@ -13,7 +13,8 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.artifact.save import save
 from drake_diff.artifact.verify import Verification, verify
-from drake_diff.certificates.audit import Finding, audit
+from drake_diff.certificates.audit import audit
+from drake_diff.certificates.finding import Finding
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, ModelWarning
 from drake_diff.model.model import Model
 from drake_diff.optimize.problem.constraint import Bounds
