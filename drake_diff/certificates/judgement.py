@@ -23,6 +23,7 @@ RESOLVED = 1e-4  # of an entry: a smaller corner is none
 CORNER, JUMP = 0.25, -0.5  # one-sided quotients part as h^CORNER or less at a corner, and grow as h^JUMP at a jump
 TOLD = 30.0  # times the scatter: what can be told from it
 JITTER_CHANGE = 0.1  # of an entry, 1e-9 beside the point
+MIXED = 1e-9  # of the largest entry of all: what as large a mixed derivative makes 1e-9 beside the point
 
 Flags = NDArray[np.bool_]
 Scales = tuple[Array, Array]
@@ -181,5 +182,7 @@ def _jittery(around: Neighbourhood, a: Array, beside: Array) -> Flags:
     change, size = np.abs(a - beside), np.abs(a) + np.abs(beside)
     reach = np.maximum(np.abs(around.forward), np.abs(around.backward)).max(axis=0, initial=0)
     row_size = size.max(axis=1, keepdims=True, initial=0)
-    # A smooth entry changes by 1e-9 of its slope here, and by 1e-2 of it over the widest quotient.
-    return np.asarray((change > RESOLVED * reach) & (change > JITTER_CHANGE * size) & (size > NEGLIGIBLE * row_size))
+    # A smooth entry changes by 1e-9 of its slope here, and by 1e-2 of it over the widest quotient; by 1e-9 of mixed
+    # derivatives, too, which its own quotients do not show: dq/dt of a quaternion by itself, at rest.
+    smooth = np.maximum(RESOLVED * reach, MIXED * size.max(initial=0))
+    return np.asarray((change > smooth) & (change > JITTER_CHANGE * size) & (size > NEGLIGIBLE * row_size))

@@ -13,8 +13,10 @@ import numpy as np
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_float, positive_int
 from drake_diff.certificates.certificate import Certificate, certify_jacobian
 from drake_diff.certificates.certify import certify
+from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.model.equations import EquationsOfMotion
+from drake_diff.model.model import Model
 from drake_diff.model.soft_contact import SoftContact
 from drake_diff.optimize.advice import advice
 from drake_diff.optimize.drake_program import SOLVERS
@@ -34,6 +36,7 @@ from drake_diff.optimize.transcription.task import DEFAULT_SCHEME, SCHEMES, Opti
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": "riccati"}
 CERTIFIED_KNOTS = 5
+ROUNDED = 1e-6  # of the largest input that holds a state: no input
 GUESS_NOISE = 1e-3  # of the largest input: breaks the symmetry of a guess that is a stationary point
 GUESS_ITERATIONS = 100  # of an attempt that is to find a guess for the next one
 ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
@@ -394,12 +397,34 @@ def _guess(problem: Problem, method: str, given: Any, seed: int) -> _Guess:
     end = np.where(np.isnan(problem.goal), problem.x0, problem.goal)
     xs = problem.x0 + np.linspace(0, 1, count + 1)[:, None] * (end - problem.x0)
     us = np.array(problem.us)
+    if problem.optimizes_controls and not us.any():
+        us = us + _holding(problem)
     if method == "shooting" and problem.optimizes_controls and not us.any():
         limit = np.minimum(np.abs(problem.bounds.u_lower), np.abs(problem.bounds.u_upper))
         size = np.where(np.isfinite(limit), np.minimum(limit, 100.0), 1.0)
         us = GUESS_NOISE * size * np.random.default_rng(seed).standard_normal(us.shape)
     inside = np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
     return _Guess(xs, inside if problem.optimizes_controls else us)
+
+
+def _holding(problem: Problem) -> Array:
+    """(nu,) the inputs that hold the first state best for a step, within bounds, where they are not all actuators.
+
+    Rotors and thrusters without thrust do not steer: a quadrotor that falls moves sideways for none of them. Actuators
+    do, and their guess is 0.
+    """
+    model = problem.model if isinstance(problem.system, Model) else None
+    if model is None or model.inputs.plain:
+        return np.zeros(problem.nu)
+    bounds, still = problem.bounds, np.concatenate([problem.x0[: model.nq], np.zeros(model.nv)])
+    none = np.clip(np.zeros(model.nu), bounds.u_lower, bounds.u_upper)
+    try:
+        d = differentiate_step(model, still, none)
+    except DrakeDiffError:
+        return none
+    by_u, missing = d.B[model.nq :], d.B[model.nq :] @ none - d.x_next[model.nq :]
+    found = np.clip(np.linalg.lstsq(by_u, missing, rcond=None)[0], bounds.u_lower, bounds.u_upper)
+    return np.asarray(np.where(np.abs(found) > ROUNDED * np.abs(found).max(), found, none))
 
 
 @dataclass(frozen=True, eq=False)
