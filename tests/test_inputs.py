@@ -5,6 +5,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from helpers.models import MODELS, add_slide
+from helpers.table import each_row
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import (
     AddMultibodyPlant,
@@ -30,8 +32,6 @@ import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.model import BodyForce
 from drake_diff.optimize.problem.dynamics import plant_dynamics
-from tests.helpers.models import MODELS, add_slide
-from tests.helpers.table import each_row
 
 H = 0.01
 MASS, ARM, RATIO, INERTIA = 0.775, 0.15, 0.0245, np.array([0.0015, 0.0025, 0.0035])
