@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from helpers.models import MODELS, add_slide
 from helpers.table import each_row
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import (
     AddMultibodyPlant,
+    ExternallyAppliedSpatialForceMultiplexer,
     MultibodyPlantConfig,
     Propeller,
     PropellerInfo,
@@ -502,3 +503,105 @@ def test_a_wing_glides_as_a_flat_plate():
     assert dd.certify(model, x, np.zeros(0)).verdict == "agree"
     motion = dd.rollout(model, x, num_steps=100)
     assert abs(motion.energy_drift) < 0.05 * motion.energy_exchanged
+
+
+def lander(time_step=0.05):
+    """The quadrotor's body with one engine through its centre of mass."""
+    engine = BodyForce("engine", "body", upper=30.0)
+    return dd.load_model(MODELS / "quadrotor.urdf", time_step=time_step, body_forces=[engine])
+
+
+@pytest.mark.parametrize(("method", "close"), [("collocation", 1e-6), ("shooting", 0.06), ("ilqr", 0.06)])
+def test_a_rocket_lands_with_least_effort(method, close):
+    """From z, v to rest at 0 in T, least integral of (f - m g)^2: m^2 (12 z^2 / T^3 + 12 z v / T^2 + 4 v^2 / T).
+
+    The thrust is linear in time, so that collocation is exact; steps of T / 40 are so to first order.
+    """
+    model, z, v, T = lander(), 5.0, -2.0, 2.0
+    x0, goal = model.default_state, np.full(13, np.nan)
+    x0[6], x0[12], goal[6], goal[12] = z, v, 0.0, 0.0
+    cost = dd.QuadraticCost(R=[[1.0]], u_ref=[MASS * 9.81])
+    solution = dd.solve(dd.Problem(model, x0=x0, x_goal=goal, num_steps=40, running_cost=cost), method=method)
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(MASS**2 * (12 * z**2 / T**3 + 12 * z * v / T**2 + 4 * v**2 / T), rel=close)
+
+
+def glider(time_step=0.02):
+    """A flat plate of 0.2 m^2 and 0.5 kg with an engine along its chord, and a Propeller for it."""
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=time_step, use_sampled_output_ports=False), builder)
+    body = plant.AddRigidBody("plane", SpatialInertia.SolidBoxWithMass(0.5, 0.6, 0.3, 0.1))
+    plant.Finalize()
+    forward = RigidTransform(RotationMatrix.MakeYRotation(np.pi / 2), np.zeros(3))
+    wing, engine = builder.AddSystem(Wing(body.index(), 0.2)), builder.AddSystem(Propeller(body.index(), forward))
+    both = builder.AddSystem(ExternallyAppliedSpatialForceMultiplexer(2))
+    builder.Connect(plant.get_body_poses_output_port(), wing.get_body_poses_input_port())
+    builder.Connect(plant.get_body_spatial_velocities_output_port(), wing.get_body_spatial_velocities_input_port())
+    builder.Connect(plant.get_body_poses_output_port(), engine.get_body_poses_input_port())
+    builder.Connect(wing.get_spatial_force_output_port(), both.get_input_port(0))
+    builder.Connect(engine.get_spatial_forces_output_port(), both.get_input_port(1))
+    builder.Connect(both.get_output_port(), plant.get_applied_spatial_force_input_port())
+    builder.ExportInput(engine.get_command_input_port(), "engine")
+    return dd.model_from_diagram(builder.Build())
+
+
+def level_flight(pitch):
+    """The speed at which the plate carries its weight, pitched up and flying level, and the thrust that keeps it.
+
+    The plate's force rho S sin(pitch) v^2 is along its normal, the engine's along its chord.
+    """
+    normal, thrust = 0.5 * 9.81 * np.array([np.cos(pitch), np.sin(pitch)])
+    return np.sqrt(normal / (1.204 * 0.2 * np.sin(pitch))), thrust
+
+
+def flying(model, pitch, speed):
+    x = model.default_state
+    x[:4], x[10] = [np.cos(pitch / 2), 0, -np.sin(pitch / 2), 0], speed
+    return x
+
+
+def test_a_plane_flies_level_where_lift_and_thrust_carry_it():
+    model, (speed, thrust) = glider(), level_flight(0.15)
+    x = flying(model, 0.15, speed)
+    end = dd.step(model, x, [thrust])
+    assert end[10:] == pytest.approx(x[10:], abs=1e-12)
+    assert dd.certify(model, x, [thrust]).verdict == "agree"
+
+
+@pytest.mark.parametrize("method", ["collocation", "ilqr"])
+def test_a_plane_is_planned_to_climb(method):
+    """From level flight 1 m up in 1 s; the plan is the plant's own motion, and needs more than the level thrust."""
+    model, (speed, thrust) = glider(), level_flight(0.15)
+    x0, goal = flying(model, 0.15, speed), np.full(13, np.nan)
+    goal[6] = 1.0
+    problem = dd.Problem(
+        model,
+        x0=x0,
+        x_goal=goal,
+        num_steps=50,
+        running_cost=dd.QuadraticCost(R=[[1.0]], u_ref=[thrust]),
+        bounds=dd.Bounds(u_lower=[0.0], u_upper=[30.0]),
+    )
+    solution = dd.solve(problem, method=method)
+    assert solution.success, solution.message
+    assert solution.us.mean() > thrust
+    ends = dd.rollout(model, x0, solution.us).xs[-1]
+    assert ends[6] == pytest.approx(1.0, abs=0.05)
+    assert ends[11] == pytest.approx(0.0, abs=1e-9)  # straight on
+
+
+@pytest.mark.slow
+def test_a_plan_with_rotors_is_saved_and_verified(tmp_path):
+    """1 m to the side and higher, by a quadrotor whose file has no rotors: the record has them."""
+    model = quadrotor(0.03)
+    x0, goal = model.default_state, np.full(13, np.nan)
+    goal[7:] = 0.0
+    end = dd.FrameGoal("body", position=[0.5, 0.2, 0.3], rotation=np.eye(3))
+    cost = dd.QuadraticCost(R=0.1 * np.eye(4), u_ref=HOVER)
+    problem = dd.Problem(model, x0=x0, x_goal=goal, num_steps=30, goals=[end], running_cost=cost)
+    solution = dd.solve(problem, method="collocation")
+    assert solution.success, solution.message
+    dd.save(solution, tmp_path / "run")
+    record = dd.load_record(tmp_path / "run")
+    assert [force["name"] for force in record.model.options["body_forces"]] == [force.name for force in ROTORS]
+    assert dd.verify(tmp_path / "run").verdict == "holds"
