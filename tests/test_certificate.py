@@ -418,3 +418,21 @@ def test_motors_in_the_air_are_not_called_discontinuous():
     model, random = example_robot("solo12.urdf"), np.random.default_rng(0)
     for _ in range(6):
         dd.certify(model, state_in_range(model, random), random.standard_normal(model.nu)).require()
+
+
+def test_a_product_that_is_zero_in_both_factors_is_smooth():
+    """As the rate of a quaternion at rest: beside the point its derivative is another number, of mixed derivatives."""
+    jacobian = lambda z: np.array([[z[1], z[0], 0.0], [0.0, 0.0, 3.0]])  # noqa: E731
+    certificate = dd.certificates.certify_jacobian(lambda z: np.array([z[0] * z[1], 3 * z[2]]), np.zeros(3), jacobian)
+    certificate.require()
+    wrong = lambda z: jacobian(z) + np.array([[0.0, 1e-6, 0.0], [0.0, 0.0, 0.0]])  # noqa: E731
+    false = dd.certificates.certify_jacobian(lambda z: np.array([z[0] * z[1], 3 * z[2]]), np.zeros(3), wrong)
+    assert false.verdict != "agree"
+
+
+def test_a_row_of_rounding_alone_is_zero():
+    """A moment that cancels leaves 1e-50 of a force of 10; a row a millionth of a millionth as large still counts."""
+    for size, verdict_of_zero in ((1e-50, "agree"), (1e-12, "disagree")):
+        f = lambda x, size=size: np.array([10 * x[0], size * np.sin(x[1])])  # noqa: E731
+        zero = np.array([[10.0, 0.0], [0.0, 0.0]])
+        assert dd.certificates.certify_jacobian(f, np.zeros(2), zero).verdict == verdict_of_zero

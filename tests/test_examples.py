@@ -134,3 +134,27 @@ def test_the_panda_arrives_although_it_is_pushed(tmp_path):
     assert change[20] > 10 * change[19]  # at 0.4 s it is hit
     assert np.abs(problem.goal_error(run.motion.xs[-1])).max() < 1e-3
     assert np.all(np.abs(run.commands) <= problem.bounds.u_upper)
+
+
+@pytest.mark.slow
+def test_a_quadrotor_flies_through_its_gates_and_its_record_holds(tmp_path):
+    """The plan passes each gate as the replays do, in finer steps too; verify builds the rotors again."""
+    module = example("quadrotor_gates")
+    solution = dd.solve(module.problem(), **module.solve_options)
+    assert solution.success, solution.message
+    for knot, gate in module.GATES.items():
+        assert np.linalg.norm(solution.xs[knot, 4:7] - gate) <= module.OPENING
+    finer = [
+        r for r in solution.replays if r.holds and r.motion is not None and len(r.motion.us) > 2 * module.NUM_STEPS
+    ]
+    assert finer
+    for replay in finer:
+        parts = len(replay.motion.us) // module.NUM_STEPS
+        for knot, gate in module.GATES.items():
+            assert np.linalg.norm(replay.motion.xs[parts * knot, 4:7] - gate) <= module.OPENING
+    assert np.all((solution.us >= 0) & (solution.us <= module.MOST))
+    dd.save(solution, tmp_path / "run")
+    assert [f["name"] for f in dd.load_record(tmp_path / "run").model.options["body_forces"]] == list(
+        solution.problem.input_names
+    )
+    assert dd.verify(tmp_path / "run").verdict == "holds"

@@ -23,6 +23,7 @@ RESOLVED = 1e-4  # of an entry: a smaller corner is none
 CORNER, JUMP = 0.25, -0.5  # one-sided quotients part as h^CORNER or less at a corner, and grow as h^JUMP at a jump
 TOLD = 30.0  # times the scatter: what can be told from it
 JITTER_CHANGE = 0.1  # of an entry, 1e-9 beside the point
+EPS = float(np.finfo(float).eps)
 MIXED = 1e-9  # of the largest entry of all: what as large a mixed derivative makes 1e-9 beside the point
 
 Flags = NDArray[np.bool_]
@@ -104,6 +105,7 @@ def _matters(around: Neighbourhood, a: Array, difference: Array, second: Scales 
       magnitude where that is more. Where `second` says what the units are with time counted in steps, an entry must be
       negligible both so and in seconds: h in x' = x + h v is small in seconds, h k / m in v' in steps, and both matter;
     - 1e-5 of its own quotient over the widest step, a hundredth of that scale, where the slope is zero at the point;
+    - the rounding of the largest entry of all, where a row is nothing but rounding, as of a moment that is zero;
     - what the smallest step of the widest plateau leaves of the rounding of the value, which is measured, up to 1e-6
       of the largest entry of the row.
     """
@@ -116,7 +118,7 @@ def _matters(around: Neighbourhood, a: Array, difference: Array, second: Scales 
     rounding = (TOLD * around.finest / STEPS[3] / POWER)[:, None]
     rounding = np.minimum(rounding, ROUNDED * found.max(axis=1, keepdims=True, initial=0))
     widest = VANISHING * np.maximum(np.abs(around.forward[0]), np.abs(around.backward[0]))
-    least = np.maximum(np.maximum(small, widest), rounding) + TINY
+    least = np.maximum(np.maximum(small, widest), rounding) + EPS * found.max(initial=0) + TINY
     return np.maximum(np.maximum(np.abs(a), found), least), least
 
 
