@@ -46,6 +46,9 @@ from .optimize.problem.goals import FrameGoal as FrameGoal
 from .optimize.problem.goals import FrameVelocityGoal as FrameVelocityGoal
 from .optimize.problem.goals import JointGoal as JointGoal
 from .optimize.problem.goals import KeepLevel as KeepLevel
+from .optimize.problem.obstacles import BoxObstacle as BoxObstacle
+from .optimize.problem.obstacles import SelfCollision as SelfCollision
+from .optimize.problem.obstacles import SphereObstacle as SphereObstacle
 from .optimize.problem.problem import Problem as Problem
 from .optimize.solution import Solution as Solution
 from .optimize.solution import Status as Status

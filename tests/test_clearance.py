@@ -1,28 +1,44 @@
 """Distances of a robot's pieces: against closed forms, against Drake's own queries, and their derivatives."""
 
 import itertools
+import re
 
 import numpy as np
 import pytest
+import trimesh
+from helpers.models import MODELS, robot_file
 from helpers.robots import example_robot, state_in_range
 from helpers.table import each_row
 from pydrake.autodiffutils import InitializeAutoDiff
-from pydrake.geometry import AddContactMaterial, Box, Capsule, Cylinder, Ellipsoid, ProximityProperties, Sphere
+from pydrake.geometry import (
+    AddContactMaterial,
+    Box,
+    Capsule,
+    Cylinder,
+    Ellipsoid,
+    Mesh,
+    ProximityProperties,
+    Role,
+    Sphere,
+)
 from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlantConfig
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial import ConvexHull
 
 import drake_diff as dd
 from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import InputError
 from drake_diff.mechanics import placing
 from drake_diff.mechanics.clearance import FromBall, FromBox, OfPairs, balls_of
-from drake_diff.mechanics.cover import Piece, around_points, cover_of, pieces_around
+from drake_diff.mechanics.cover import Piece, around_mesh, cover_of, pieces_around, sides_of
 from drake_diff.mechanics.description import read_links
 from drake_diff.mechanics.distance import along_segment, along_segments, length, to_box
 from drake_diff.mechanics.placing import placing_of
 from drake_diff.model.parameters import applied, select
+from drake_diff.model.plant import bodies
 
 ROBOTS = ("ur5_robot.urdf", "panda.urdf", "a1.urdf")  # hinges; hinges and slides; a free base
 CLOSED = 1e-9  # [m] of metres: closed forms on both sides
@@ -201,12 +217,12 @@ def test_a_cover_contains_its_shape_and_sticks_out_by_no_more_than_it_says():
                 assert all(out), shape
 
 
-def test_capsules_around_points_contain_their_hull():
+def test_capsules_around_mesh_contain_their_hull():
     random = np.random.default_rng(6)
     for k in range(20):
         points = random.standard_normal((40, 3)) * 10 ** random.uniform(-2, 0, 3)
         weights = random.dirichlet(np.full(len(points), 0.3), 2000)
-        pieces = around_points(points)
+        pieces = around_mesh(points, sides_of(ConvexHull(points).simplices))
         assert inside(pieces, weights @ points).all(), k
         assert inside(pieces, points).all(), k
 
@@ -224,11 +240,43 @@ def test_balls_of_a_capsule_contain_it():
 
 
 def test_a_robot_without_readable_shapes_is_a_skeleton_and_says_so():
-    model = example_robot("xarm7.urdf", 0.02)
+    model = without_shapes()
     cover = cover_of(model, placing_of(model))
     assert {p.source for p in cover.pieces} == {"skeleton"}
     assert "no shape that could be read" in cover.notes[0]
-    assert all(f"link{i}" in cover.notes[0] for i in range(1, 8))
+    assert "upper, lower" in cover.notes[0]
+
+
+def without_shapes():
+    """Two rods whose file has no visuals and no collisions."""
+    text = (MODELS / "double_pendulum.urdf").read_text()
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.01, use_sampled_output_ports=False), builder)
+    Parser(plant).AddModelsFromString(re.sub(r"<visual>.*?</visual>", "", text, flags=re.DOTALL), "urdf")
+    plant.Finalize()
+    return dd.model_from_diagram(builder.Build())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["ur5_robot.urdf", "xarm7.urdf"])
+def test_meshes_that_are_only_drawn_are_contained(robot):
+    """Every corner of every mesh, as trimesh reads it, is in a capsule of its link."""
+    model = dd.load_model(robot_file(robot), time_step=0.02, base="weld")
+    links = placing_of(model)
+    cover = cover_of(model, links)
+    inspector, checked = model.double.inspector, 0
+    for body in bodies(model.plant):
+        frame = model.plant.GetBodyFrameIdIfExists(body.index())
+        pieces = [(p.start, p.end, p.radius, 0) for p in cover.pieces if p.body == body.name()]
+        for geometry in inspector.GetGeometries(frame, Role.kIllustration) if frame else ():
+            shape = inspector.GetShape(geometry)
+            if isinstance(shape, Mesh):
+                corners = trimesh.load(shape.source().path(), force="mesh").vertices * shape.scale3()
+                to_link = links.on[body.name()][1] @ inspector.GetPoseInFrame(geometry)
+                assert inside(pieces, (to_link @ corners.T).T).all(), body.name()
+                checked += 1
+    assert checked >= 6
+    assert all(p.source != "skeleton" for p in cover.pieces)
 
 
 def test_parameters_that_move_links_are_refused():

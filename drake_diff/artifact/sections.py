@@ -18,6 +18,7 @@ from drake_diff.model.quantities import description_of, made_from
 from drake_diff.optimize.problem.constraint import Bounds, Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost
 from drake_diff.optimize.problem.goals import CenterOfMassGoal, FrameGoal, FrameVelocityGoal, Goal, JointGoal, KeepLevel
+from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.parts import ModelInput, Quantity
@@ -86,10 +87,10 @@ COSTS = ("running_cost", "final_cost", "trajectory_cost")
 LIMITS = ("x_lower", "x_upper", "u_lower", "u_upper")
 GAPS = {"lower": -np.inf, "upper": np.inf}  # what null is, of a bound
 GUESS = ("initial_guess", "initial_guess_sha256")
+KINDS_OF_GOALS = (FrameGoal, FrameVelocityGoal, JointGoal, CenterOfMassGoal, KeepLevel)
+KINDS_OF_OBSTACLES = (SphereObstacle, BoxObstacle, SelfCollision)
 # By the names that a record has.
-GOALS: dict[str, Any] = {
-    kind.__name__: kind for kind in (FrameGoal, FrameVelocityGoal, JointGoal, CenterOfMassGoal, KeepLevel)
-}
+GOALS: dict[str, Any] = {kind.__name__: kind for kind in (*KINDS_OF_GOALS, *KINDS_OF_OBSTACLES)}
 
 
 def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:

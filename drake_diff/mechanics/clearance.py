@@ -148,6 +148,37 @@ class OfPairs(Clearance):
         return first - self.placing.pushes(q, frames, self.second.at, b, way)
 
 
+class Swept(Clearance):
+    """Another clearance, where the positions were `before` (p,) [s], at the velocities that they have now.
+
+    That is the way of a semi-implicit step, but for the turning of a free body, which is left as it is.
+    """
+
+    def __init__(self, other: Clearance, before: Array):
+        super().__init__(other.model, other.placing, other.labels * len(before))
+        self.other, self.before = other, before
+        self.moves = np.zeros((other.model.nx, other.model.nx))  # the rates of the positions that are velocities
+        for link in other.placing.links:
+            q, v = link.joint.q_start, other.model.nq + link.joint.v_start
+            for i, j in zip(range(q + 4, q + 7), range(v + 3, v + 6), strict=True) if link.free else ((q, v),):
+                self.moves[i, j] = 1.0
+
+    def __call__(self, x: Any) -> Any:
+        return np.concatenate([self.other(self._earlier(np.asarray(x), time)) for time in self.before])
+
+    def values(self, xs: Array) -> Array:
+        return np.hstack([self.other.values(self._earlier(xs, time)) for time in self.before])
+
+    def linearize(self, xs: Array) -> tuple[Array, Array]:
+        found = [self.other.linearize(self._earlier(xs, time)) for time in self.before]
+        identity = np.eye(self.moves.shape[0])
+        slopes = [rows @ (identity - time * self.moves) for (_, rows), time in zip(found, self.before, strict=True)]
+        return np.hstack([values for values, _ in found]), np.concatenate(slopes, axis=1)
+
+    def _earlier(self, x: Any, time: float) -> Any:
+        return x - time * (x @ self.moves.T)
+
+
 def balls_of(piece: Piece) -> list[Piece]:
     """Balls that contain a capsule and stick out of it by a tenth of its radius; a ball is itself."""
     half_length = float(np.sqrt(piece.squared)) / 2

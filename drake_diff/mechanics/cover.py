@@ -8,25 +8,30 @@ shape gets capsules from its joint to the next ones, a skeleton: that contains n
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydrake.geometry import Box, Capsule, Convex, Cylinder, Ellipsoid, HalfSpace, Mesh, Role, Sphere
 from pydrake.math import RigidTransform
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, Indices
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.placing import Placing
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, joints, labelled
+from drake_diff.model.triangles import read_mesh, scaled
 
 MOST_STRIPS = 4  # side by side, that cover a box
 MOST_SLABS = 4  # one after the other, that cover a hull or a mesh
+DRAKES_OWN = (".vtk", ".gltf")  # meshes that Drake alone reads: their hull is taken
 WORTH_A_SLAB = 0.8  # of the volume: more slabs have to save that much
 CYLINDER_PART = 0.5  # of a cylinder's radius: how far before its ends a segment ends; it sticks out sideways by 12 %
 BONE_PART, BONE_RADII = 0.2, (0.01, 0.06)  # of its length, and the limits [m]: the radius of a skeleton's capsule
 ROUNDING = 1e-9  # [m] added to a radius that is computed from corners
 WAYS = np.random.default_rng(0).standard_normal((400, 3))  # in which a cover and what it covers are compared
+SOME_WAYS = 120  # of these: the farthest points are looked at first
+AROUND = np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0, 2 * np.pi, 64, endpoint=False)]).T  # in a plane
 WAYS = np.vstack([np.eye(3), -np.eye(3), WAYS / np.linalg.norm(WAYS, axis=1)[:, None]])
 
 
@@ -99,7 +104,10 @@ def _of_shapes(model: Model, inspector: Any, body: Any) -> Iterator[Piece]:
         return
     for role in (Role.kProximity, Role.kIllustration):
         geometries = inspector.GetGeometries(frame, role)
-        found = [p for g in geometries for p in _around(inspector.GetShape(g), inspector.GetPoseInFrame(g))]
+        try:
+            found = [p for g in geometries for p in _around(inspector.GetShape(g), inspector.GetPoseInFrame(g))]
+        except (ModelError, RuntimeError):  # a mesh that cannot be read: told as a skeleton
+            continue
         if found:
             yield from found
             return
@@ -136,8 +144,7 @@ def pieces_around(shape: Any) -> list[tuple[Array, Array, float, float]]:
         end = (axes[longest] - radius) * np.eye(3)[longest]
         return [(-end, end, radius, _beyond(-end, end, radius, np.linalg.norm(WAYS * axes, axis=1)))]
     if isinstance(shape, (Mesh, Convex)):
-        hull = shape.GetConvexHull()
-        return around_points(np.array([hull.vertex(i) for i in range(hull.num_vertices())]))
+        return around_mesh(*_surface(shape))
     raise ModelError(f"shape {type(shape).__name__}: expected one that Drake's files can have")
 
 
@@ -153,13 +160,32 @@ def _around_box(size: Array) -> list[tuple[Array, Array, float, float]]:
     return [(place * np.eye(3)[b] - end, place * np.eye(3)[b] + end, radius, excess) for place in places]
 
 
-def around_points(points: Array) -> list[tuple[Array, Array, float, float]]:
-    """Capsules that contain the convex hull of `points` (P, 3), one after the other along their longest direction."""
-    center = np.mean(points, axis=0)
-    axis = np.linalg.svd(points - center, full_matrices=False)[2][0]
+def _surface(shape: Any) -> tuple[Array, Indices]:
+    """Corners (n, 3) [m] of a mesh and its sides (e, 2), or those of the hull where Drake alone has the shape."""
+    source = shape.source() if isinstance(shape, Mesh) else None
+    if source is not None and source.is_path() and source.extension() not in DRAKES_OWN:
+        mesh = scaled(read_mesh(Path(source.path())), shape.scale3())
+        return mesh.vertices, sides_of(np.asarray(mesh.faces, dtype=np.intp))
+    hull = shape.GetConvexHull()
+    faces = [
+        [hull.element(i).vertex(j) for j in range(hull.element(i).num_vertices())] for i in range(hull.num_faces())
+    ]
+    around = [(a, b) for face in faces for a, b in zip(face, [*face[1:], face[0]], strict=True)]
+    return np.array([hull.vertex(i) for i in range(hull.num_vertices())]), np.array(around, dtype=np.intp)
+
+
+def sides_of(triangles: Indices) -> Indices:
+    """(3 m, 2) the two corners of each side of triangles (m, 3)."""
+    return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+
+
+def around_mesh(corners: Array, sides: Indices) -> list[tuple[Array, Array, float, float]]:
+    """Capsules that contain a body whose surface has these corners (n, 3) and sides (e, 2), along its longest way."""
+    used = corners[np.unique(sides)]
+    axis = np.linalg.svd(used - np.mean(used, axis=0), full_matrices=False)[2][0]
     best: list[tuple[Array, Array, float, float]] = []
     for count in range(1, MOST_SLABS + 1):
-        found = [_around_slab(slab) for slab in _slabs(points, axis, count)]
+        found = [_around_slab(slab) for slab in _slabs(used, corners[sides], axis, count)]
         if best and _volume(found) > WORTH_A_SLAB * _volume(best):
             break
         best = found
@@ -170,32 +196,33 @@ def _volume(pieces: Sequence[tuple[Array, Array, float, float]]) -> float:
     return sum(np.pi * r**2 * (float(np.linalg.norm(b - a)) + 4 / 3 * r) for a, b, r, _ in pieces)
 
 
-def _slabs(points: Array, axis: Array, count: int) -> list[Array]:
-    """The hull of `points` cut across `axis` into `count` equal slabs: the corners of each."""
-    if count == 1:
-        return [points]
-    heights = points @ axis
+def _slabs(corners: Array, sides: Array, axis: Array, count: int) -> list[Array]:
+    """A surface cut across `axis` into `count` slabs: the corners (n, 3) of each, and where `sides` (e, 2, 3) are cut.
+
+    What is inside a surface is, slab by slab, within the hulls of these.
+    """
+    heights, ends = corners @ axis, sides @ axis
     found = []
     for low, high in pairwise(np.linspace(np.min(heights), np.max(heights), count + 1)):
-        corners = [points[(heights >= low) & (heights <= high)]]
-        for level in (low, high):  # where the lines between the corners on both sides cross: no fewer than the hull's
-            below, above = np.flatnonzero(heights < level), np.flatnonzero(heights > level)
-            if len(below) and len(above):
-                part = (level - heights[below, None]) / (heights[above] - heights[below, None])
-                crossing = points[below, None] + part[..., None] * (points[above] - points[below, None])
-                corners.append(crossing.reshape(-1, 3))
-        found.append(np.vstack(corners))
-    return found
+        points = [corners[(heights >= low) & (heights <= high)]]
+        for level in (low, high):
+            across = (ends[:, 0] - level) * (ends[:, 1] - level) < 0
+            part = (level - ends[across, 0]) / (ends[across, 1] - ends[across, 0])
+            points.append(sides[across, 0] + part[:, None] * (sides[across, 1] - sides[across, 0]))
+        found.append(np.vstack(points))
+    return [slab for slab in found if len(slab)]
 
 
 def _around_slab(points: Array) -> tuple[Array, Array, float, float]:
     """The slimmest of some capsules that contain `points`, and how far it sticks out of their hull."""
-    center = (np.min(points, axis=0) + np.max(points, axis=0)) / 2
-    turned = np.linalg.svd(points - center, full_matrices=False)[2]
-    axes = [*np.eye(3), *turned]
-    tried = [_capsule_along(points, axis) for axis in axes]
+    outer = points[np.unique(np.argmax(points @ WAYS[:SOME_WAYS].T, axis=0))]
+    turned = np.linalg.svd(outer - np.mean(outer, axis=0), full_matrices=False)[2]
+    tried = [_capsule_along(outer, axis) for axis in (*np.eye(3), *turned)]
     start, end, radius = min(tried, key=lambda c: _volume([(*c, 0.0)]))
-    return start, end, radius, _beyond(start, end, radius, np.max(WAYS @ points.T, axis=1))
+    squared = np.sum((end - start) ** 2)
+    along = np.clip((points - start) @ (end - start) / max(squared, 1e-300), 0, 1)[:, None] * (end - start) + start
+    radius = max(radius, float(np.max(np.linalg.norm(points - along, axis=1))) + ROUNDING)  # now around all of them
+    return start, end, radius, _beyond(start, end, radius, np.max(WAYS @ outer.T, axis=1))
 
 
 def _beyond(start: Array, end: Array, radius: float, reach: Array) -> float:
@@ -226,9 +253,10 @@ def _capsule_along(points: Array, axis: Array) -> tuple[Array, Array, float]:
 
 def _circle(points: Array) -> Array:
     """(2,) nearly the centre of the smallest circle around `points` (P, 2): steps to the farthest, ever shorter."""
-    center = (np.min(points, axis=0) + np.max(points, axis=0)) / 2
-    for k in range(1, 201):  # Badoiu and Clarkson (2003)
-        far = points[int(np.argmax(np.sum((points - center) ** 2, axis=1)))]
+    outer = points[np.unique(np.argmax(points @ AROUND, axis=0))]  # what is inside of these hardly matters
+    center = (np.min(outer, axis=0) + np.max(outer, axis=0)) / 2
+    for k in range(1, 101):  # Badoiu and Clarkson (2003)
+        far = outer[int(np.argmax(np.sum((outer - center) ** 2, axis=1)))]
         center = center + (far - center) / (k + 1)
     return np.asarray(center)
 

@@ -54,7 +54,7 @@ def sample_states(model: Model, count: int, seed: int = 0) -> list[SampledState]
 def _free(model: Model, random: np.random.Generator) -> Array:
     """A state without overlap, where one is found; else the last one tried."""
     for _ in range(ATTEMPTS):
-        x = _any(model, random)
+        x = any_state(model, random)
         if _depth(model, x) == 0:
             break
     return x
@@ -65,7 +65,7 @@ def _touching(model: Model, random: np.random.Generator) -> Array | None:
     space = tangent_space(model)
     free = _free(model, random)
     for _ in range(ATTEMPTS // 10):
-        inside = _any(model, random)
+        inside = any_state(model, random)
         for start in space.quaternions:  # free bodies are pushed downwards, where the ground is
             inside[start + 6] -= REACH * random.uniform(0, 2)
         if _depth(model, inside) <= 0:
@@ -81,7 +81,7 @@ def _touching(model: Model, random: np.random.Generator) -> Array | None:
     return None
 
 
-def _any(model: Model, random: np.random.Generator) -> Array:
+def any_state(model: Model, random: np.random.Generator) -> Array:
     """A state within the limits, 5 % of the range apart from them; around the default where there are none."""
     nq = model.nq
     x = np.array(model.default_state)

@@ -9,6 +9,8 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import GradientError
 from drake_diff.model.contact import penetration
 from drake_diff.model.step import set_state
+from drake_diff.optimize.problem.goals import in_words
+from drake_diff.optimize.problem.obstacles import along_steps, clearances
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, NlpResult, Outcome
 from drake_diff.optimize.replay import broken_variants, told_of_controls, told_of_goals, told_of_tolerance
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
@@ -87,6 +89,10 @@ def complaints_about(solution: Solution) -> Iterator[str]:
         yield "the cost is not finite"
     if solution.transcribed is not None:
         yield from _between_nodes(solution, solution.transcribed)
+    elif np.all(np.isfinite(solution.xs)):
+        for c in clearances(solution.problem.kept):
+            for told in c.too_near(*along_steps(solution.times, solution.xs), c.between):
+                yield f"between the knots {told}, tolerance {in_words(c.between, 'm')}: take a smaller time step"
     if solution.transcribed is not None and solution.problem.has_model:
         yield from _overlaps(solution, solution.transcribed)
     for certificate in solution.certificates:

@@ -23,6 +23,8 @@ from drake_diff.optimize.drake_program import SOLVERS
 from drake_diff.optimize.ilqr.ilqr import check_problem, is_unconstrained, solve_ilqr
 from drake_diff.optimize.ilqr.through_contact import check_schedule, solve_continuation, solve_through_jumps
 from drake_diff.optimize.judge import ended, judged, refused
+from drake_diff.optimize.problem.goals import in_words
+from drake_diff.optimize.problem.obstacles import lacking_between, swept
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report
 from drake_diff.optimize.reach import out_of_reach, why_blind
@@ -38,6 +40,7 @@ DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": 
 CERTIFIED_KNOTS = 5
 ROUNDED = 1e-6  # of the largest input that holds a state: no input
 GUESS_NOISE = 1e-3  # of the largest input: breaks the symmetry of a guess that is a stationary point
+CLEARANCE_PARTS = (4, 8, 16)  # of a step: looked at where a discrete plan comes too near to an obstacle in between
 GUESS_ITERATIONS = 100  # of an attempt that is to find a guess for the next one
 ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
 FOUND = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
@@ -45,7 +48,7 @@ FOUND = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
 PREFERENCE = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED, Status.INTERRUPTED, Status.TIME_LIMIT)
 
 Progress = Callable[[str], None]
-Searcher = Callable[[Array, Array], tuple[NlpResult, Array, Array]]
+Searcher = Callable[[Problem, Array, Array], tuple[NlpResult, Array, Array]]
 
 
 def solve(
@@ -466,9 +469,11 @@ class Run:
             self.options["derivatives"] = motion.derivatives
             found["us_mid"] = None if self.scheme == "drake" else motion.us_mid
             found["free_horizon"] = motion.horizon if problem.horizon else None
+            found["mesh"] = motion.mesh if len(us) > problem.num_steps else None
             if refinement is not None:
                 self.options["refinements"] = [list(each) for each in motion.refinements]
-                found["mesh"] = motion.mesh if len(us) > problem.num_steps else None
+            if motion.cleared:
+                self.options["clearance_rounds"] = [list(each) for each in motion.cleared]
         if np.all(np.isfinite(xs)):
             certificates += self._certify_equations(jacobian, xs, us)
         return self._judge(self._draft(xs, us, u_final=u_final, certificates=certificates, **found), result)
@@ -478,15 +483,15 @@ class Run:
 
         With `stages`, which take the inputs of the guess alone, it need not have a gradient.
         """
-        limits, report = self.limits, self.report
+        limits, report, first = self.limits, self.report, iter([xs] if given else [])
 
-        def search(rolled: Array, us: Array) -> tuple[NlpResult, Array, Array]:
+        def search(problem: Problem, rolled: Array, us: Array) -> tuple[NlpResult, Array, Array]:
             if stages:
-                result, xs_found, us, logs = solve_continuation(self.problem, us, stages, limits=limits, report=report)
+                result, xs_found, us, logs = solve_continuation(problem, us, stages, limits=limits, report=report)
                 self.options["continuation"] = [asdict(log) for log in logs]
                 return result, xs_found, us
-            solve_method = solve_through_jumps if self.problem.model.contract.contact.collision_pairs else solve_ilqr
-            return solve_method(self.problem, xs if given else rolled, us, limits=limits, report=report)
+            solve_method = solve_through_jumps if problem.model.contract.contact.collision_pairs else solve_ilqr
+            return solve_method(problem, next(first, rolled), us, limits=limits, report=report)
 
         return self._through_steps(xs, us, search, may_be_blind=bool(stages))
 
@@ -502,15 +507,13 @@ class Run:
             except SimulationError as error:
                 return refused(self._draft(xs, us), error)
 
-        def search(xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
+        def search(problem: Problem, xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
             if improve:
-                result, xs, us = solve_ilqr(self.problem, xs, us, limits=limits, report=report)
+                result, xs, us = solve_ilqr(problem, xs, us, limits=limits, report=report)
                 self.options["initial_guess"] = f"default, then {result.message}"
                 if result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
                     return result, xs, us
-            return solve_shooting(
-                self.problem, xs, us, solver=self.solver, limits=limits, report=report, segments=segments
-            )
+            return solve_shooting(problem, xs, us, solver=self.solver, limits=limits, report=report, segments=segments)
 
         return self._through_steps(xs, us, search, segmented=segments > 1)
 
@@ -526,7 +529,7 @@ class Run:
         if blindness and not may_be_blind:
             return ended(self._draft(xs, us, certificates=before), Status.NO_GRADIENT, blindness)
         try:
-            result, xs, us = search(xs, us)
+            result, xs, us = self._keeping_clear(search, xs, us)
             variables = ShootingVariables(self.problem, around=xs if segmented else None)
             z = result.z if self.method == "shooting" and len(result.z) == variables.size else variables.pack(xs[0], us)
             xs, us, after, blindness = self._look_at(variables, z)
@@ -538,6 +541,24 @@ class Run:
         found = {"certificates": before + after, "parameters": values}
         solution = self._judge(self._draft(xs, us, **found), result)
         return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
+
+    def _keeping_clear(self, search: Searcher, xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
+        """What `search` finds; where it comes too near to an obstacle between two states, again with these in view."""
+        problem, rounds, guess = self.problem, list[list[float]](), (xs, us)
+        result, xs, us = search(problem, xs, us)
+        for parts in CLEARANCE_PARTS:
+            lacking, enters = lacking_between(problem.kept, xs)
+            if not lacking or result.outcome not in (Outcome.SOLVED, Outcome.INACCURATE, Outcome.ITERATION_LIMIT):
+                break
+            if self.report is not None:
+                self.report.say(f"{in_words(lacking, 'm')} too near to an obstacle within a step: {parts} parts")
+            more = swept(self.problem.kept, problem.time_step, parts)
+            wider = dataclasses.replace(problem, constraints=(*problem.constraints, *more))
+            result, xs, us = search(wider, *(guess if enters else (xs, us)))
+            rounds.append([parts, lacking])
+        if rounds:
+            self.options["clearance_rounds"] = rounds
+        return result, xs, us
 
     def _judge(self, draft: Solution, result: NlpResult) -> Solution:
         """`judged`, and no success where the cost asks for a motion that nothing here could have begun."""

@@ -30,7 +30,7 @@ from drake_diff.loop.run import ClosedLoop, Controller, Loop, OpenLoop, closed_l
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space
-from drake_diff.optimize.replay import FINEST, Plan, left_bounds, missed_goal, too_deep, track
+from drake_diff.optimize.replay import FINEST, Plan, came_too_near, left_bounds, missed_goal, too_deep, track
 from drake_diff.record.parts import Label
 from drake_diff.trials.perturbation import Setup, perturbed
 
@@ -160,9 +160,10 @@ class Task:
         with applied(select(setup.model, setup.parameters)) as model:
             found = closed_loop(model, policy or self.policy, setup.x0, len(self.us), setup.loop, seed=seed)
             depth = () if found.ended else tuple(too_deep(model, found.motion))
+        near = () if found.ended else tuple(came_too_near(self.plan, found.motion))
         last = found.motion.xs[-1]
         goal = self.plan.problem.goal_error(last) if self.judged_by == "the goal" else last - self.xs[-1]
-        kept_not = (*missed_goal(self.plan, goal), *left_bounds(self.plan, found.motion), *depth)
+        kept_not = (*missed_goal(self.plan, goal), *left_bounds(self.plan, found.motion), *near, *depth)
         return Judgement(
             run=found,
             failures=(found.ended,) if found.ended else kept_not,

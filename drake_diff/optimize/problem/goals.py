@@ -185,7 +185,7 @@ class FrameGoal(Goal):
         self._set(
             frame=name_of("FrameGoal.frame", self.frame),
             position=position,
-            rotation=None if self.rotation is None else _rotation("FrameGoal.rotation", self.rotation),
+            rotation=None if self.rotation is None else rotation_of("FrameGoal.rotation", self.rotation),
             point=tuple(finite_array("FrameGoal.point", self.point, (3,)).tolist()),
             tolerance=positive_float("FrameGoal.tolerance [m]", self.tolerance),
             rotation_tolerance=positive_float("FrameGoal.rotation_tolerance [rad]", self.rotation_tolerance),
@@ -570,7 +570,7 @@ def checked_knots(subject: str, given: Any) -> tuple[int, ...] | None:
     return tuple(int(k) for k in array)
 
 
-def _rotation(subject: str, given: Any) -> tuple[tuple[float, ...], ...]:
+def rotation_of(subject: str, given: Any) -> tuple[tuple[float, ...], ...]:
     """The rows of a rotation that is given as a matrix (3, 3) or as a quaternion w, x, y, z."""
     if np.shape(given) != (4,):
         matrix = finite_array(subject, given, (3, 3))

@@ -17,6 +17,7 @@ from drake_diff.optimize.problem.cost import ConstantCost, FinalCost, QuadraticC
 from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
 from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGoals, in_words
 from drake_diff.optimize.problem.names import bounds_of, state_of
+from drake_diff.optimize.problem.obstacles import ClearanceConstraint
 
 OPTIMIZABLE = ("controls", "initial_state", "parameters")
 # A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
@@ -401,6 +402,12 @@ class Problem(ShowsItsRepr):
         for constraint in self.kept:
             self.knots_of(constraint, input_at_end=not self.has_model)
         for constraint in self.kept_goals:
+            if isinstance(constraint, ClearanceConstraint):
+                if self.initial_state_is_given:
+                    constraint.check("x0", self.x0)
+                if not np.any(np.isnan(self.goal[: self.model.nq])):
+                    constraint.check("x_goal", np.nan_to_num(self.goal))
+                continue
             miss = constraint.miss(self.x0) if constraint.knots is None and self.initial_state_is_given else 0.0
             if miss > constraint.tolerance:
                 allowed = in_words(constraint.tolerance, constraint.unit)

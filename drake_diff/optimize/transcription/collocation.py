@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, frozen
+from drake_diff.optimize.problem.goals import in_words
+from drake_diff.optimize.problem.obstacles import ClearanceConstraint, clearances
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Limits, NlpResult, Outcome, Report
 from drake_diff.optimize.transcription.task import OptimalControl
@@ -25,6 +27,7 @@ DENSE = np.linspace(0, 1, 41)[1:-1]  # where the input is looked at between two 
 # polynomials of states and inputs within; what the dynamics do in between differs from these by the integration error.
 EXCESS_TOLERANCE = 1e-3
 EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in TVLQR, over that of the states
+CLEARANCE_ROUNDS, MOST_INTERVALS = 5, 1000  # where a plan comes too near to an obstacle between its knots
 MOST_PIECES = 4  # of one interval in one round of refinement
 FOUND = (Outcome.SOLVED, Outcome.INACCURATE)
 
@@ -251,6 +254,7 @@ class Transcribed(Collocated):
     result: NlpResult
     derivatives: str  # where the solver's came from, and why there is no Hessian where there is none
     refinements: tuple[tuple[int, float], ...] = ()
+    cleared: tuple[tuple[int, float], ...] = ()  # the same, with what was lacking of a margin [m]; empty if nothing was
 
 
 def _finite(values: Array) -> Array:
@@ -289,7 +293,21 @@ def violation_between_nodes(motion: Collocated) -> Excess:
     applied, ranges, (times, xs) = motion._applied(k, tau), task.problem.ranges(motion.xs), motion.between_knots
     found = [_beyond("state", states, xs, b.x_lower, b.x_upper, ranges, times)]
     for c in task.problem.kept:
-        if c.knots is None:
+        if isinstance(c, ClearanceConstraint):
+            lacking, row = c.lacking(xs), int(np.argmax(c.lacking(xs)))
+            found.append(
+                [
+                    _Beyond(
+                        "constraint",
+                        c.label,
+                        max(float(lacking[row]), 0.0),
+                        c.between,
+                        float(times[row]),
+                        c.told_at(xs[row], float(times[row])),
+                    )
+                ]
+            )
+        elif c.knots is None:
             rows = np.flatnonzero((k > 0) | (tau > 0.5) | (not task.problem.initial_state_is_given))
             with np.errstate(all="ignore"):
                 values = np.array([c(xs[i], applied[i]) for i in rows])
@@ -324,8 +342,11 @@ class _Beyond:
     excess: float
     tolerance: float
     time: float
+    told: str = ""  # in other words
 
     def __str__(self) -> str:
+        if self.told:
+            return f"between the nodes {self.told}, tolerance {in_words(self.tolerance, 'm')}"
         return (
             f"between the nodes {self.name} is {self.excess:.3g} beyond its bound at {self.time:.4g} s, "
             f"tolerance {self.tolerance:.3g}"
@@ -404,26 +425,39 @@ class Transcription:
         """From a guess that `nodes_at` takes, and of `horizon` [s]; `limits.max_iterations` hold for each round.
 
         A refinement splits the intervals whose error is above its tolerance and solves again from what was found.
+        Intervals that come nearer to an obstacle than a plan may are split in any case, up to CLEARANCE_ROUNDS times.
         """
         start, mesh = time.monotonic(), self.mesh
         first = float(np.clip(self.problem.start_horizon if horizon is None else horizon, *self.task.horizon))
-        motion = self._solve_on(mesh, self.nodes_at(mesh, guess), first, limits, report)
-        if refinement is None:
-            return motion
-        rounds = [(len(mesh) - 1, float(np.max(_worst(motion))))]
-        while motion.result.outcome in FOUND and rounds[-1][1] > refinement.tolerance:
-            count, error = rounds[-1]
-            mesh = _split(motion, refinement.tolerance)
-            if len(mesh) - 1 > refinement.most:
-                told = f"the error is still {error:.2g} with {count} intervals: raise max_num_steps"
+        begun = self.nodes_at(mesh, guess)
+        motion = self._solve_on(mesh, begun, first, limits, report)
+        tolerance, most = (np.inf, MOST_INTERVALS) if refinement is None else (refinement.tolerance, refinement.most)
+        rounds, near = [(len(mesh) - 1, float(np.max(_worst(motion))))], [_nearer(motion)]
+        while motion.result.outcome in FOUND:
+            (count, error), lacking = rounds[-1], near[-1] if len(near) <= CLEARANCE_ROUNDS else np.zeros(1)
+            if error <= tolerance and not np.any(lacking > 0):
+                break
+            entered = bool(np.max(lacking) > _largest_margin(self.problem))
+            mesh = _split(motion, tolerance, np.ones_like(lacking) if entered else lacking)
+            far = f"{in_words(float(np.max(lacking)), 'm')} too near to an obstacle"
+            told = f"error {error:.2g}" if error > tolerance else far
+            if len(mesh) - 1 > most:
+                told = f"{told} still, with {count} intervals: raise max_num_steps"
                 motion = replace(motion, result=replace(motion.result, note=told))
                 break
             if report is not None:
-                report.say(f"error {error:.2g} with {count} intervals: refined to {len(mesh) - 1}")
+                report.say(f"{told} with {count} intervals: refined to {len(mesh) - 1}")
             left = replace(limits, time_limit=max(0.0, limits.time_limit - (time.monotonic() - start)))
-            motion = self._solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, left, report)
+            if entered:  # what goes through an obstacle is no place to go on from
+                now, then = (self.task.scheme.node_fractions(each) for each in (mesh, self.mesh))
+                nodes = np.array([np.interp(now, then, column) for column in begun.T]).T
+                motion = self._solve_on(mesh, nodes, first, left, report)
+            else:
+                motion = self._solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, left, report)
             rounds.append((len(mesh) - 1, float(np.max(_worst(motion)))))
-        return replace(motion, refinements=tuple(rounds))
+            near.append(_nearer(motion))
+        cleared = tuple((count, float(np.max(each))) for (count, _), each in zip(rounds, near, strict=True))
+        return replace(motion, refinements=tuple(rounds), cleared=cleared if np.any(near[0] > 0) else ())
 
     def _solve_on(
         self, mesh: Array, nodes: Array, horizon: float, limits: Limits, report: Report | None
@@ -447,10 +481,29 @@ def _worst(motion: Transcribed) -> Array:
     return np.maximum(motion.errors, motion.cost_errors)
 
 
-def _split(motion: Transcribed, tolerance: float) -> Array:
-    """The mesh with intervals above the tolerance in as many pieces as the scheme's order asks for, at most 4."""
+def _nearer(motion: Transcribed) -> Array:
+    """(N,) [m] how much more than its tolerance each interval lacks of a margin, 0 where nothing does."""
+    lacking = np.zeros((SUBSTEPS - 1, len(motion.mesh) - 1))
+    for c in clearances(motion.task.problem.kept):
+        each = c.lacking(motion.between_knots[1]).reshape(lacking.shape)
+        lacking = np.maximum(lacking, np.where(each > c.between, each, 0.0))
+    return np.asarray(np.max(np.nan_to_num(lacking, posinf=0.0), axis=0))
+
+
+def _largest_margin(problem: Problem) -> float:
+    return max((c.margin for c in clearances(problem.kept)), default=0.0)
+
+
+def _split(motion: Transcribed, tolerance: float, lacking: Array) -> Array:
+    """The mesh with intervals above the tolerance in as many pieces as the scheme's order asks for, at most 4.
+
+    Those that come too near to an obstacle, by `lacking`, at least in two.
+    """
     errors = _worst(motion)
     wanted = (errors / tolerance) ** (1 / (motion.task.scheme.order + 1))
     pieces = np.where(errors > tolerance, np.clip(np.ceil(wanted), 2, MOST_PIECES), 1).astype(int)
+    near = lacking > 0
+    near[1:], near[:-1] = near[1:] | (lacking[:-1] > 0), near[:-1] | (lacking[1:] > 0)  # where it goes next, elsewhere
+    pieces = np.maximum(pieces, 1 + near)
     ends = zip(motion.mesh[:-1], motion.mesh[1:], pieces, strict=True)
     return np.append(np.concatenate([a + (b - a) * np.arange(n) / n for a, b, n in ends]), 1.0)

@@ -1,0 +1,437 @@
+"""What a robot keeps clear of: balls and boxes in the world, and itself.
+
+An obstacle is a goal as any other: plain values, bound to the model by the `Problem`. Each of the robot's capsules (see
+`mechanics.cover`) is a row of one constraint, its signed distance at least `margin`; no minimum over them is taken, so
+that each has its own slope. A plan keeps the margin at every knot and in between. A replay may use the margin up, since
+steps of another length lead a little elsewhere, but it may not enter the obstacle.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import KW_ONLY, dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, finite_array, positive_float
+from drake_diff._base.refusal import Refusal
+from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.mechanics.clearance import Clearance, FromBall, FromBox, OfPairs, Swept
+from drake_diff.mechanics.cover import Piece, cover_of
+from drake_diff.mechanics.placing import Placing, placing_of
+from drake_diff.model.model import Model
+from drake_diff.model.plant import bodies, labelled
+from drake_diff.model.sampling import any_state
+from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.goals import Goal, GoalConstraint, Mark, checked_weight, in_words, name_of, rotation_of
+
+MARGIN = 0.01  # [m]
+TOLERANCE_PART, SMALLEST_TOLERANCE = 0.1, 1e-4  # of the margin, and [m]: what a plan may be nearer between its knots
+PARTS = 10  # in which a step is looked at
+RED = (0.78, 0.2, 0.16, 0.55)  # red, green, blue, opacity
+LOOKED_AT = 1000  # random states in which two links that always overlap are found
+UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ClearanceConstraint(GoalConstraint):
+    """That every row of a `clearance` is at least the margin, which is `lower`; `thing` is what is kept clear of."""
+
+    thing: str = ""
+
+    @property
+    def clearance(self) -> Clearance:
+        """The distances, row by row."""
+        found: Clearance = self.function  # type: ignore[assignment]
+        return found
+
+    @property
+    def margin(self) -> float:
+        """[m]"""
+        return float(self.lower[0])
+
+    @property
+    def between(self) -> float:
+        """[m] how much nearer than the margin a plan may be between its knots."""
+        return max(TOLERANCE_PART * self.margin, SMALLEST_TOLERANCE)
+
+    def miss(self, x: Array) -> float:
+        """[m] how much of the margin is used at x (nx,)."""
+        return max(0.0, float(self.lacking(x[None])[0]))
+
+    def differentiate(self, x: Array, u: Array) -> tuple[Array, Array]:
+        values, rows = self.clearance.linearize(x[None])
+        return values[0], np.hstack([rows[0], np.zeros((len(values[0]), len(u)))])
+
+    def too_near(self, times: Array, xs: Array, allowed: float) -> Iterator[str]:
+        """A clause where the nearest of xs (K, nx) at `times` (K,) [s] lacks more than `allowed` [m] of the margin."""
+        lacking = self.lacking(xs)
+        worst = int(np.argmax(lacking))
+        if not lacking[worst] <= allowed:
+            yield self.told_at(xs[worst], float(times[worst]))
+
+    def lacking(self, xs: Array) -> Array:
+        """(K,) [m] by how much the nearest row at each of xs (K, nx) is nearer than the margin; inf of no number."""
+        values = self.clearance.values(xs)
+        return np.where(np.all(np.isfinite(values), axis=1), self.margin - np.min(values, axis=1), np.inf)
+
+    def told_at(self, x: Array, time: float | None) -> str:
+        """What is too near at x (nx,), by how much, and when [s]."""
+        values = self.clearance.values(x[None])[0]
+        row = int(np.argmin(values))
+        who, distance = self.clearance.labels[row], float(values[row])
+        when = "" if time is None else f" at {time:.4g} s"
+        far = in_words(abs(distance), "m")
+        if distance < 0:
+            return f"{who} enters {self.thing} by {far}{when}" if self.thing else f"{who} overlap by {far}{when}"
+        near = f"is {far} from {self.thing}" if self.thing else f"are {far} apart"
+        return f"{who} {near}{when}, nearer than the margin of {in_words(self.margin, 'm')}"
+
+    def check(self, subject: str, x: Array) -> None:
+        """Raise InputError where x (nx,) is nearer than the margin by more than that."""
+        if float(self.lacking(x[None])[0]) > self.between:
+            raise InputError(subject, got=self.told_at(x, None), expected="clear of it: a plan has to be there")
+
+
+class Obstacle(Goal):
+    """The base of what is kept clear of."""
+
+    margin: float
+    weight: float | None
+    knots = None  # all of them
+
+    def constraints(
+        self, clearance: Clearance, margin: float, name: str, thing: str
+    ) -> tuple[ClearanceConstraint, ...]:
+        """That `clearance` is at least `margin`; nothing where it has no row."""
+        if not clearance.labels:
+            return ()
+
+        def used(x: Any) -> Any:
+            lacking = margin - clearance(x)
+            return (lacking + np.abs(lacking)) / 2
+
+        found = ClearanceConstraint(
+            clearance,
+            np.full(len(clearance.labels), margin),
+            name=name,
+            tolerance=max(margin, SMALLEST_TOLERANCE),
+            unit="m",
+            words=lambda off: f"{off} of the margin {'of ' + thing if thing else 'between links'} are used",
+            measured=used,
+            thing=thing,
+        )
+        return (found,)
+
+
+@dataclass(frozen=True, repr=False)
+class SphereObstacle(Obstacle):
+    """A ball in the world that a robot keeps clear of, at every knot of a plan and in between.
+
+    The robot is a few spheres and capsules on each link, which contain its collision shapes, or those that are drawn
+    where it has none; a sphere and a capsule are exact. A link without any shape is a capsule from joint to joint:
+    `Problem` warns of it.
+
+    Args:
+        center: (3,) [m] in the world.
+        radius: [m].
+        margin: [m] the least distance that a plan keeps. Replays in other steps may use it up.
+        links: The bodies that keep clear; all that can move where not given.
+        name: What it is called in messages and pages.
+        weight: With one, it is no longer kept: weight times the square of what is used of the margin [m], of every
+            capsule, is added to the cost per second.
+
+    Raises:
+        InputError: Values that are none; by the Problem, a first or last state that is too near.
+        UnknownNameError: By the Problem: its model has no such body.
+
+    Example:
+        >>> model = dd.load_model("models/double_pendulum.urdf", time_step=0.02)
+        >>> ball = dd.SphereObstacle([0.5, 0, -0.9], 0.1, name="ball")
+        >>> problem = dd.Problem(model, x0=[0, 0, 0, 0], x_goal=[-1, 0, 0, 0], num_steps=50, goals=[ball])
+        >>> problem.goals
+        (SphereObstacle(center=[0.5, 0.0, -0.9], radius=0.1, name='ball'),)
+    """
+
+    center: Any
+    radius: float
+    _: KW_ONLY
+    margin: float = MARGIN
+    links: Any = None
+    name: str = ""
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        self._set(
+            center=tuple(finite_array("SphereObstacle.center", self.center, (3,)).tolist()),
+            radius=positive_float("SphereObstacle.radius [m]", self.radius),
+            margin=_margin("SphereObstacle.margin [m]", self.margin),
+            links=_names("SphereObstacle.links", self.links),
+            weight=checked_weight("SphereObstacle", self.weight, None),
+        )
+
+    @property
+    def label(self) -> str:
+        """The name, or where it is."""
+        return _called(self.name, "sphere", self.center)
+
+    def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
+        placing, center = _placing(model), np.array(self.center)
+        pieces = _near(placing, _pieces(model, placing, self.links), center, self.radius + self.margin)
+        clearance = FromBall(model, placing, pieces, center, self.radius)
+        return self.constraints(clearance, self.margin, f"clear of {self.label}", f"obstacle {self.label}")
+
+    def marks(self) -> tuple[Mark, ...]:
+        return (Mark(f"obstacle {self.label}", "sphere", (self.radius,), self.center, colour=RED),)
+
+
+@dataclass(frozen=True, repr=False)
+class BoxObstacle(Obstacle):
+    """A box in the world that a robot keeps clear of, at every knot of a plan and in between.
+
+    The robot is what it is for a `SphereObstacle`. Beside a box its capsules are rows of balls that contain them and
+    stick out by a tenth of the radius at most.
+
+    Args:
+        center: (3,) [m] in the world.
+        size: (3,) [m] the edges along its own x, y and z.
+        rotation: The box's own in the world: a rotation matrix (3, 3), or a quaternion (4,) as w, x, y, z; upright
+            where not given.
+        margin: [m] the least distance that a plan keeps. Replays in other steps may use it up.
+        links: The bodies that keep clear; all that can move where not given.
+        name: What it is called in messages and pages.
+        weight: With one, it is no longer kept: weight times the square of what is used of the margin [m], of every
+            capsule, is added to the cost per second.
+
+    Raises:
+        InputError: Values that are none; by the Problem, a first or last state that is too near.
+        UnknownNameError: By the Problem: its model has no such body.
+
+    Example:
+        >>> dd.BoxObstacle([0.5, 0, 0.4], [0.1, 0.4, 0.8], name="shelf")
+        BoxObstacle(center=[0.5, 0.0, 0.4], size=[0.1, 0.4, 0.8], name='shelf')
+    """
+
+    center: Any
+    size: Any
+    _: KW_ONLY
+    rotation: Any = UPRIGHT
+    margin: float = MARGIN
+    links: Any = None
+    name: str = ""
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        size = finite_array("BoxObstacle.size", self.size, (3,))
+        if np.any(size <= 0):
+            raise InputError("BoxObstacle.size [m]", got=size.tolist(), expected="three numbers above 0")
+        self._set(
+            center=tuple(finite_array("BoxObstacle.center", self.center, (3,)).tolist()),
+            size=tuple(size.tolist()),
+            rotation=rotation_of("BoxObstacle.rotation", self.rotation),
+            margin=_margin("BoxObstacle.margin [m]", self.margin),
+            links=_names("BoxObstacle.links", self.links),
+            weight=checked_weight("BoxObstacle", self.weight, None),
+        )
+
+    @property
+    def label(self) -> str:
+        """The name, or where it is."""
+        return _called(self.name, "box", self.center)
+
+    def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
+        placing, center, half = _placing(model), np.array(self.center), np.array(self.size) / 2
+        reach = float(np.linalg.norm(half)) + self.margin
+        pieces = _near(placing, _pieces(model, placing, self.links), center, reach)
+        clearance = FromBox(model, placing, pieces, center, np.array(self.rotation), half)
+        return self.constraints(clearance, self.margin, f"clear of {self.label}", f"obstacle {self.label}")
+
+    def marks(self) -> tuple[Mark, ...]:
+        return (Mark(f"obstacle {self.label}", "box", self.size, self.center, self.rotation, colour=RED),)
+
+
+@dataclass(frozen=True, repr=False)
+class SelfCollision(Obstacle):
+    """That the links of a robot keep clear of each other, at every knot of a plan and in between.
+
+    Left out are links next to each other, and pairs whose capsules overlap in the posture that the file gives or in
+    every one of 1,000 random states.
+
+    Args:
+        margin: [m] the least distance that a plan keeps. Replays in other steps may use it up.
+        links: The bodies that keep clear of each other; all where not given.
+        ignore: Pairs of bodies that may touch, such as [("hand", "finger")].
+        weight: With one, it is no longer kept, see `SphereObstacle`.
+
+    Raises:
+        InputError: Values that are none; by the Problem, a first or last state in which two are too near.
+        UnknownNameError: By the Problem: its model has no such body.
+
+    Example:
+        >>> dd.SelfCollision(margin=0.02, ignore=[("panda_hand", "panda_link5")])
+        SelfCollision(margin=0.02, ignore=[['panda_hand', 'panda_link5']])
+    """
+
+    _: KW_ONLY
+    margin: float = MARGIN
+    links: Any = None
+    ignore: Any = ()
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        self._set(
+            margin=_margin("SelfCollision.margin [m]", self.margin),
+            links=_names("SelfCollision.links", self.links),
+            weight=checked_weight("SelfCollision", self.weight, None),
+            ignore=tuple(_pair("SelfCollision.ignore", pair) for pair in self.ignore),
+        )
+
+    def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
+        placing = _placing(model)
+        known = labelled(bodies(model.plant))
+        for name in (each for pair in self.ignore for each in pair):
+            if name not in known:
+                raise UnknownNameError("SelfCollision.ignore", got=name, known=known)
+        pieces, left = _pieces(model, placing, self.links, fixed=True), {frozenset(pair) for pair in self.ignore}
+        pairs = [
+            (a, b)
+            for a, b in combinations(pieces, 2)
+            if not _are_neighbours(placing, a, b) and frozenset((a.body, b.body)) not in left
+        ]
+        touching = _touching(model, placing, pairs)
+        pairs = [pair for pair in pairs if frozenset(p.body for p in pair) not in touching]
+        return self.constraints(OfPairs(model, placing, pairs), self.margin, "clear of itself", "")
+
+
+def _touching(model: Model, placing: Placing, pairs: Sequence[tuple[Piece, Piece]]) -> set[frozenset[str]]:
+    """The pairs of bodies of which some pieces overlap in the default posture, or in all of many random ones."""
+    if not pairs:
+        return set()
+    key = ("touching", tuple((a.body, b.body) for a, b in pairs))
+
+    def found() -> set[frozenset[str]]:
+        random = np.random.default_rng(0)
+        xs = np.array([model.default_state, *(any_state(model, random) for _ in range(LOOKED_AT))])
+        overlaps = OfPairs(model, placing, pairs).values(xs) < 0
+        names = np.array([" ".join(sorted((a.body, b.body))) for a, b in pairs])
+        touching = set()
+        for name in dict.fromkeys(names.tolist()):
+            overlap = np.any(overlaps[:, names == name], axis=1)
+            if overlap[0] or np.all(overlap[1:]):
+                touching.add(frozenset(p.body for p in pairs[int(np.argmax(names == name))]))
+        return touching
+
+    return model.cache(key, found)
+
+
+def _are_neighbours(placing: Placing, a: Piece, b: Piece) -> bool:
+    """Whether two pieces are on one link, or one of their links carries the other."""
+    parent = {i: link.parent for i, link in enumerate(placing.links)}
+    return a.link == b.link or parent.get(a.link) == b.link or parent.get(b.link) == a.link
+
+
+def _placing(model: Model) -> Placing:
+    found = placing_of(model)
+    if isinstance(found, Refusal):
+        raise ModelError(f"obstacles: where the links are has no formula here: {found}")
+    return found
+
+
+def _pieces(model: Model, placing: Placing, links: Sequence[str] | None, *, fixed: bool = False) -> list[Piece]:
+    """Those of the named bodies, or of all; without those that are `fixed` to the world, or with them."""
+    known = labelled(bodies(model.plant))
+    for name in links or ():
+        if name not in known:
+            raise UnknownNameError("links", got=name, known=known)
+    cover = cover_of(model, placing)
+    chosen = [p for p in cover.pieces if (links is None or p.body in links) and (fixed or p.link >= 0)]
+    for name in links or ():
+        if all(p.body != name for p in cover.pieces):
+            raise InputError("links", got=name, expected="a body with a shape, with mass, or with a next joint")
+    return chosen
+
+
+def _near(placing: Placing, pieces: Sequence[Piece], center: Array, reach: float) -> list[Piece]:
+    """Without the pieces that no state brings within `reach` [m] of `center`.
+
+    A link is never further from where its root is held than all offsets and slides between them together.
+    """
+    roots: list[Array] = []
+    lengths: list[float] = []
+    for link in placing.links:
+        slide = float(np.max(np.abs([link.joint.lower, link.joint.upper]))) if link.joint.kind == "prismatic" else 0.0
+        offset = np.asarray(link.on_parent.translation())
+        roots.append(offset if link.parent < 0 else roots[link.parent])
+        before = 0.0 if link.parent < 0 else lengths[link.parent] + float(np.linalg.norm(offset))
+        lengths.append(np.inf if link.free else before + slide)
+    extents = [max(float(np.linalg.norm(end)) for end in (p.start, p.end)) + 2 * p.radius for p in pieces]
+    apart = [float(np.linalg.norm(center - roots[p.link])) - lengths[p.link] for p in pieces]
+    return [p for p, away, extent in zip(pieces, apart, extents, strict=True) if away - extent <= reach]
+
+
+def _called(name: str, kind: str, center: Sequence[float]) -> str:
+    return repr(name) if name else f"{kind} at " + ", ".join(f"{c:g}" for c in center)
+
+
+def _margin(subject: str, given: Any) -> float:
+    return 0.0 if isinstance(given, (int, float)) and given == 0 else positive_float(subject, given)
+
+
+def _names(subject: str, given: Any) -> tuple[str, ...] | None:
+    if given is None:
+        return None
+    if isinstance(given, str) or not len(given):
+        raise InputError(subject, got=repr(given)[:80], expected="names of bodies, or None for all")
+    return tuple(name_of(subject, name) for name in given)
+
+
+def _pair(subject: str, given: Any) -> tuple[str, str]:
+    names = _names(subject, given) or ()
+    if len(names) != 2:
+        raise InputError(subject, got=repr(given)[:80], expected="pairs of names of bodies")
+    return names[0], names[1]
+
+
+def clearances(constraints: Sequence[Constraint]) -> Iterator[ClearanceConstraint]:
+    """Those of `constraints` that keep something clear."""
+    return (c for c in constraints if isinstance(c, ClearanceConstraint))
+
+
+def along_steps(times: Array, xs: Array) -> tuple[Array, Array]:
+    """Times and states at the states xs (N+1, nx) and in 9 places between each two of them, on straight lines.
+
+    That is how a step moves positions: at a constant speed.
+    """
+    at = np.arange(PARTS * (len(xs) - 1) + 1) / PARTS
+    every = np.arange(len(xs))
+    return np.interp(at, every, times), np.array([np.interp(at, every, column) for column in xs.T]).T
+
+
+def lacking_between(constraints: Sequence[Constraint], xs: Array) -> tuple[float, bool]:
+    """What the way between the states xs (N+1, nx) lacks of a margin [m], and whether something is entered.
+
+    It is 0 where it is within the tolerance; see `along_steps`.
+    """
+    path = along_steps(np.arange(float(len(xs))), xs)[1]
+    worst, enters = 0.0, False
+    for c in clearances(constraints):
+        lacking = float(np.max(c.lacking(path)))
+        if c.between < lacking < np.inf:
+            worst, enters = max(worst, lacking), enters or lacking > c.margin + c.between
+    return worst, enters
+
+
+def swept(constraints: Sequence[Constraint], time_step: float, parts: int) -> tuple[ClearanceConstraint, ...]:
+    """What keeps clear of the same in the middle of the step before each knot, in `parts` - 1 places on its way."""
+    found = []
+    for c in clearances(constraints):
+        clearance = Swept(c.clearance, time_step * np.arange(1, parts) / parts)
+        lower = np.full(len(clearance.labels), c.margin)
+        found.append(replace(c, function=clearance, lower=lower, upper=None, name=f"{c.label}, on the way"))
+    return tuple(found)
+
+
+def notes_of(goals: Sequence[Goal], model: Model) -> Iterator[str]:
+    """What is to be said of how a model keeps clear, where one of `goals` asks for it."""
+    if any(isinstance(goal, Obstacle) for goal in goals):
+        yield from cover_of(model, _placing(model)).notes

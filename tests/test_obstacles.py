@@ -1,0 +1,218 @@
+"""Obstacles: a plan keeps clear of them at its knots and in between, as Drake measures it; what does not is named."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from helpers.robots import example_robot
+from helpers.table import each_row
+from pydrake.math import RigidTransform
+
+import drake_diff as dd
+import drake_diff.optimize.solve as solve_module
+import drake_diff.optimize.transcription.collocation as collocation_module
+from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.optimize.judge import complaints_about, judged
+from drake_diff.optimize.program import NlpResult, Outcome
+
+BALL = dd.SphereObstacle([0.0, 0.0, -1.2], 0.1, name="ball")
+POST = dd.BoxObstacle([0.0, 0.0, -1.25], [0.1, 0.4, 0.2], name="post")
+SMOOTH = dd.QuadraticCost(Q=np.diag([0, 0, 1.0, 1.0]), R=1e-2 * np.eye(2))
+
+
+def arm(obstacles, *, num_steps=30, time_step=0.05, **options):
+    """Two rods that swing from one side to the other, with an obstacle below where they would hang."""
+    model = dd.load_model("models/double_pendulum.urdf", time_step=time_step)
+    ends = {"x0": [-1.0, 0.1, 0, 0], "x_goal": [1.0, -0.1, 0, 0]}
+    return dd.Problem(model, num_steps=num_steps, running_cost=SMOOTH, goals=obstacles, **(ends | options))
+
+
+def depth_by_drake(model, xs, obstacle, parts=1):
+    """[m] how deep the rods, of radius 0.02, are in the obstacle along the straight way between xs, in so many parts.
+
+    From Drake's own poses and points on the rods' axes, by no formula of the toolkit.
+    """
+    plant, context = model.plant, model.plant.CreateDefaultContext()
+    deepest = -np.inf
+    for before, after in pairwise(xs):
+        for part in np.arange(parts) / parts:
+            plant.SetPositions(context, ((1 - part) * before + part * after)[: model.nq])
+            for name, long in (("upper", 0.8), ("lower", 0.5)):
+                pose = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName(name))
+                points = (pose @ np.column_stack([np.zeros((201, 2)), -np.linspace(0, long, 201)]).T).T
+                if isinstance(obstacle, dd.SphereObstacle):
+                    distance = np.linalg.norm(points - obstacle.center, axis=1) - obstacle.radius
+                else:
+                    local = (
+                        np.abs((points - obstacle.center) @ np.array(obstacle.rotation)) - np.array(obstacle.size) / 2
+                    )
+                    outside = np.linalg.norm(np.maximum(local, 0), axis=1)
+                    distance = outside + np.minimum(np.max(local, axis=1), 0)
+                deepest = max(deepest, 0.02 - float(np.min(distance)))
+    return deepest
+
+
+@each_row("name, method", [("ball", "collocation")])
+def test_a_plan_goes_around_as_drake_measures_it(name, method):
+    check_that_it_goes_around(name, method)
+
+
+@pytest.mark.slow
+@each_row("name, method", [("post", "collocation"), ("ball", "ilqr"), ("post", "ilqr")])
+def test_a_plan_of_steps_or_lines_goes_around_too(name, method):
+    check_that_it_goes_around(name, method)
+
+
+def check_that_it_goes_around(name, method):
+    obstacle = {"ball": BALL, "post": POST}[name]
+    problem = arm([obstacle])
+    solution = dd.solve(problem, method=method, max_iterations=200)
+    assert solution.success, solution.message
+    if method == "ilqr":
+        assert depth_by_drake(problem.model, solution.xs, obstacle, parts=50) < 0
+    else:
+        assert depth_by_drake(problem.model, finely(solution), obstacle) < 0
+
+
+def finely(solution):
+    """The states of a collocated plan at 1 kHz."""
+    return solution.transcribed.at(np.linspace(0, solution.horizon, 1 + round(1000 * solution.horizon)))[0]
+
+
+@each_row("name", ["ball", "post"])
+def test_without_them_the_plan_goes_through(name):
+    without = dd.solve(arm([]), method="collocation")
+    assert depth_by_drake(without.problem.model, finely(without), {"ball": BALL, "post": POST}[name]) > 0.05
+
+
+@pytest.mark.slow
+def test_shooting_keeps_clear_too():
+    problem = arm([dd.SphereObstacle([0.75, 0.0, -0.75], 0.08, name="ball")], x0=[0, 0, 0, 0], x_goal=[0.6, -0.6, 0, 0])
+    guess = dd.solve(problem, method="ilqr", max_iterations=150)
+    solution = dd.solve(problem, method="shooting", initial_guess=guess, max_iterations=60)
+    assert solution.constraint_violation <= 1e-6
+    assert depth_by_drake(problem.model, solution.xs, problem.goals[0], parts=50) < 0
+
+
+def test_where_a_plan_jumps_through_between_knots_the_mesh_is_refined(monkeypatch):
+    problem = arm([BALL], num_steps=8, time_step=0.2)
+    solution = dd.solve(problem, method="collocation", max_iterations=200)
+    rounds = solution.options["clearance_rounds"]
+    assert rounds[0][0] == 8
+    assert rounds[0][1] > 0.05
+    assert rounds[-1] == [len(solution.us), 0.0]
+    assert depth_by_drake(problem.model, finely(solution), BALL) < 0
+    monkeypatch.setattr(collocation_module, "CLEARANCE_ROUNDS", 0)
+    solution = dd.solve(problem, method="collocation", max_iterations=200)
+    assert solution.status is dd.Status.CONVERGED_NOT_VERIFIED
+    assert "between the nodes lower enters obstacle 'ball' by" in solution.message
+
+
+@pytest.mark.slow
+def test_where_steps_jump_through_they_are_looked_at_within(monkeypatch):
+    problem = arm([BALL])
+    monkeypatch.setattr(solve_module, "CLEARANCE_PARTS", ())
+    through = dd.solve(problem, method="ilqr", max_iterations=200)
+    assert not through.success
+    assert through.constraint_violation <= 1e-5  # every knot is clear
+    assert "between the knots lower enters obstacle 'ball' by" in through.message
+    assert depth_by_drake(problem.model, through.xs, BALL, parts=50) > 0
+
+
+def test_a_plan_through_an_obstacle_is_refused_and_says_by_how_much_and_when():
+    without = dd.solve(arm([]), method="collocation")
+    assert without.success
+    problem = arm([dd.SphereObstacle([0.0, 0.0, -1.25], 0.1, name="ball")])
+    through = replace(without, problem=problem)
+    told = "; ".join(complaints_about(through))
+    assert "clear of 'ball'" in told  # at a knot
+    assert "between the nodes lower enters obstacle 'ball' by" in told
+    found = judged(through, NlpResult(np.zeros(1), Outcome.SOLVED, "said to be solved", ()))
+    assert found.status is dd.Status.CONVERGED_NOT_VERIFIED
+    failures = [failure for r in through.replays for failure in r.failures]
+    deep = [f for f in failures if "enters obstacle 'ball' by" in f]
+    assert len(deep) >= 4
+    # the rod passes the middle of the ball, at 0.75 s, whose far side is 0.1 m and the capsule's radius away
+    assert all(" at 0.7" in f or " at 0.8" in f for f in deep), deep
+
+
+@each_row(
+    "make, message",
+    [
+        (lambda: dd.SphereObstacle([0, 0], 0.1), "SphereObstacle.center"),
+        (lambda: dd.SphereObstacle([0, 0, 0], -0.1), "SphereObstacle.radius"),
+        (lambda: dd.SphereObstacle([0, 0, 0], 0.1, margin=-1), "SphereObstacle.margin"),
+        (lambda: dd.SphereObstacle([0, 0, 0], 0.1, links="lower"), "SphereObstacle.links"),
+        (lambda: dd.BoxObstacle([0, 0, 0], [0.1, 0.0, 0.1]), "BoxObstacle.size"),
+        (lambda: dd.BoxObstacle([0, 0, 0], [1, 1, 1], rotation=[2, 0, 0, 0]), "norm"),
+        (lambda: dd.SelfCollision(ignore=["upper"]), "SelfCollision.ignore"),
+        (lambda: arm([dd.SphereObstacle([0.0, 0.0, -0.4], 0.5)]), "x0.*upper enters obstacle sphere at 0, 0, -0.4 by"),
+        (lambda: arm([dd.SphereObstacle([-0.7, 0.0, -0.5], 0.1)]), "x_goal.*lower enters"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_is_refused_early(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def test_unknown_links_list_the_known_ones():
+    for obstacle in (
+        dd.SphereObstacle([9, 0, 0], 0.1, links=["forearm"]),
+        dd.SelfCollision(ignore=[("upper", "hand")]),
+    ):
+        with pytest.raises(UnknownNameError, match="lower, upper"):
+            arm([obstacle])
+
+
+def test_what_nothing_can_reach_asks_for_nothing():
+    assert arm([dd.SphereObstacle([1.5, 0, 0], 0.1)]).kept_goals == ()
+    near = arm([dd.SphereObstacle([1.4, 0, 0], 0.1)]).kept_goals
+    assert near[0].clearance.labels == ("lower",)
+    assert arm([dd.SphereObstacle([0.9, 0, 0], 0.1, links=["upper"])]).kept_goals[0].clearance.labels == ("upper",)
+
+
+def test_neighbours_and_what_always_overlaps_are_left_out_of_self_collision():
+    model = example_robot("ur5_robot.urdf", 0.02)
+    rest = np.array([0, -1.2, 1.2, 0, 0, 0])
+    x0 = np.concatenate([rest, np.zeros(6)])
+    problem = dd.Problem(model, x0=x0, num_steps=5, final_cost=lambda x: x[0] ** 2, goals=[dd.SelfCollision()])
+    labels = set(problem.kept_goals[0].clearance.labels)
+    assert "shoulder_link and wrist_3_link" in labels or "upper_arm_link and wrist_3_link" in labels
+    assert "upper_arm_link and forearm_link" not in labels
+    some = dd.SelfCollision(ignore=[("wrist_3_link", "upper_arm_link")])
+    fewer = dd.Problem(model, x0=x0, num_steps=5, final_cost=lambda x: x[0] ** 2, goals=[some])
+    assert set(fewer.kept_goals[0].clearance.labels) == labels - {"upper_arm_link and wrist_3_link"}
+
+
+def test_a_folded_arm_is_refused_by_self_collision():
+    model = example_robot("ur5_robot.urdf", 0.02)
+    folded = np.concatenate([[0, -1.2, 3.1, 0, 0, 0], np.zeros(6)])
+    with pytest.raises(InputError, match=r"x0: .* (overlap by|apart)"):
+        dd.Problem(model, x0=folded, num_steps=5, final_cost=lambda x: x[0] ** 2, goals=[dd.SelfCollision()])
+
+
+def test_obstacles_are_recorded_drawn_and_made_again(tmp_path):
+    turned = RigidTransform().rotation().matrix().tolist()
+    post = dd.BoxObstacle([0.0, 0.0, -1.25], [0.1, 0.4, 0.2], rotation=turned, name="post", links=["lower"])
+    problem = arm([BALL, post, dd.SelfCollision()])
+    (sphere,), (box,) = BALL.marks(), post.marks()
+    assert (sphere.shape, sphere.size, sphere.position) == ("sphere", (0.1,), (0.0, 0.0, -1.2))
+    assert (box.shape, box.size) == ("box", (0.1, 0.4, 0.2))
+    solution = dd.solve(problem, method="collocation", max_iterations=200)
+    record = dd.save(solution, tmp_path / "run")
+    assert [next(iter(goal)) for goal in record.problem["goals"]] == ["SphereObstacle", "BoxObstacle", "SelfCollision"]
+    found = dd.verify(tmp_path / "run")
+    assert found.verdict == "holds", found
+
+
+def test_a_soft_obstacle_is_a_cost_of_what_is_used_of_its_margin():
+    hard = arm([dd.SphereObstacle([0.0, 0.0, -1.25], 0.1, margin=0.05)])
+    soft = arm([dd.SphereObstacle([0.0, 0.0, -1.25], 0.1, margin=0.05, weight=200.0)])
+    x = np.array([0.1, -0.05, 0, 0])
+    used = np.maximum(0.05 - hard.kept_goals[0].clearance.values(x[None])[0], 0)
+    assert soft.kept_goals == ()
+    own = SMOOTH(x, np.zeros(2))
+    assert soft.total_running_cost(x, np.zeros(2)) - own == pytest.approx(200 * used @ used, rel=1e-9)
+    assert used.max() > 0.05
