@@ -25,16 +25,12 @@ from drake_diff.pages.meshcat import draw
 from drake_diff.pages.scene import (
     BLUE,
     ContactForce,
-    Drawn,
     Ghost,
     Scene,
-    ball,
-    body_path,
     longest_path,
-    meshcat_path,
     moving_bodies,
-    shapes_of,
 )
+from drake_diff.pages.shapes import Drawn, ball, body_path, meshcat_path, shapes_of
 from drake_diff.record.solve import EvidenceRecord
 
 GHOST = "planned/"  # before the frame names of the plan's bodies

@@ -12,7 +12,7 @@ from pydrake.multibody.tree import FrameIndex
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import UnknownNameError
 from drake_diff.optimize.problem.goals import Goal, Mark
-from drake_diff.pages.scene import Drawn, body_path
+from drake_diff.pages.shapes import Drawn, body_path
 
 AXES = (Rgba(0.8, 0.15, 0.1, 0.9), Rgba(0.1, 0.6, 0.15, 0.9), Rgba(0.1, 0.3, 0.85, 0.9))  # x, y, z
 THIN = 0.03  # of an axis or an arrow: its radius

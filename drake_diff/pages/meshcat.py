@@ -24,8 +24,11 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.files import write_whole
+from drake_diff.exceptions import ModelError
+from drake_diff.model.triangles import Triangles, hull_of
 from drake_diff.pages.html import asset, content_policy
-from drake_diff.pages.scene import ARROW_PART, Drawn, Poses, Scene
+from drake_diff.pages.scene import ARROW_PART, Poses, Scene
+from drake_diff.pages.shapes import Drawn
 
 # Drake prints the port that it listens on, but nobody is meant to connect to it.
 logging.getLogger("drake").addFilter(lambda record: "Meshcat listening" not in record.getMessage())
@@ -115,11 +118,26 @@ def _draw_shape(meshcat: Meshcat, path: str, drawn: Drawn, colour: Rgba, size: f
     if isinstance(shape, HalfSpace):
         side = 20 * size
         shape, pose = Box(side, side, 0.01), pose @ RigidTransform([0.0, 0.0, -0.005])
-    if isinstance(shape, Mesh) and colour.a() < 1:
+    if isinstance(shape, Triangles):
+        _draw_triangles(meshcat, path, shape, colour)
+    elif isinstance(shape, Mesh) and colour.a() < 1:
         meshcat.SetTriangleMesh(path, *_hull(shape), colour)  # a mesh has colours of its own, its hull has none
     else:
         meshcat.SetObject(path, shape, colour)
     meshcat.SetTransform(path, pose)
+
+
+def _draw_triangles(meshcat: Meshcat, path: str, mesh: Triangles, colour: Rgba) -> None:
+    """A mesh in its own colours, or in `colour` where it has none; its hull where that is translucent."""
+    if colour.a() < 1:
+        try:
+            hull = hull_of(mesh.vertices, path)
+            mesh = Triangles(hull.corners, hull.triangles)
+        except ModelError:  # a flat mesh is its own hull
+            mesh = Triangles(mesh.vertices, mesh.faces)
+    for i, (part, own) in enumerate(mesh.parts()):
+        shown = colour if own is None else Rgba(*own, 1.0)
+        meshcat.SetTriangleMesh(f"{path}/{i}", part.vertices.T, part.faces.T.astype(np.int32), shown)
 
 
 def _hull(shape: Mesh) -> tuple[Array, Any]:

@@ -1,14 +1,12 @@
 """What is seen of a motion: shapes on bodies, where the bodies are over time, contact forces, and how large it is."""
 
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
-from pydrake.geometry import Box, Capsule, Convex, Cylinder, Ellipsoid, HalfSpace, Mesh, Rgba, Role, Sphere
+from pydrake.geometry import Rgba
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import FrameIndex
 
@@ -18,32 +16,15 @@ from drake_diff.model.contact import ContactPoint
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies
 from drake_diff.model.step import set_state
+from drake_diff.pages.shapes import Drawn, body_path, shapes_of
 
-DRAWN = (Box, Capsule, Convex, Cylinder, Ellipsoid, HalfSpace, Mesh, Sphere)
-GREY, BLUE = Rgba(0.6, 0.6, 0.62, 1), Rgba(0.15, 0.4, 0.95, 0.3)
-BALL = 0.05  # [m] radius of what stands for a body without geometry
+BLUE = Rgba(0.15, 0.4, 0.95, 0.3)
 LOOKED_AT = 60  # at most so many poses of a motion are looked at for its bounding box
 ARROW_PART = 0.2  # of the scene's size: how long the arrow of `Scene.reference_force` is
 LARGEST_MARK = 0.5  # [m] so much of a goal or an obstacle has to be in view
 SMALLEST_SIZE = 0.3  # [m] the camera comes no closer
 
 Poses = Mapping[str, Sequence[RigidTransform]]
-
-
-@dataclass(frozen=True, eq=False)
-class Drawn:
-    """A shape on the body of that path, or in the world for ""; `centre` and `radius` [m] are of a ball around it.
-
-    Where `origin` (3,) [m] is given, a point on the body, `pose` is from there and along the world's axes.
-    """
-
-    body: str
-    shape: Any
-    pose: RigidTransform
-    colour: Rgba
-    centre: Array
-    radius: float
-    origin: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -186,60 +167,3 @@ def _path_of(model: Model, poses: Poses, count: int, name: str) -> Array:
     origin = known[name].CalcPoseInBodyFrame(context).translation()
     fixed = model.plant.EvalBodyPoseInWorld(context, body)
     return np.array([pose @ origin for pose in poses.get(body_path(body), [fixed] * count)])
-
-
-def shapes_of(plant: Any, context: Any, drawn: Sequence[Any]) -> list[Drawn]:
-    """The shapes of the world and of the bodies `drawn`; a small ball at each centre of mass where there are none."""
-    port = plant.get_geometry_query_input_port()
-    found: list[Drawn] = []
-    if port.HasValue(context):
-        inspector = port.Eval(context).inspector()
-        for body in [plant.world_body(), *drawn]:
-            frame = plant.GetBodyFrameIdIfExists(body.index())
-            if frame is not None:
-                shapes = _shapes_on(inspector, frame, body_path(body))
-                if plant.IsAnchored(body):
-                    pose = plant.EvalBodyPoseInWorld(context, body)
-                    shapes = [replace(s, body="", pose=pose @ s.pose, centre=pose @ s.centre) for s in shapes]
-                found += shapes
-    return found or [ball(body_path(body), body.default_com()) for body in drawn if not plant.IsAnchored(body)]
-
-
-def ball(path: str, centre: ArrayLike = (0.0, 0.0, 0.0)) -> Drawn:
-    """What stands for a body without geometry, at `centre` (3,) [m] on it."""
-    at = np.asarray(centre, dtype=float)
-    return Drawn(path, Sphere(BALL), RigidTransform(at), GREY, at, BALL)
-
-
-def _shapes_on(inspector: Any, frame: Any, path: str) -> list[Drawn]:
-    """Of a frame's geometries those meant to be seen, or those that touch where there are none."""
-    for role in (Role.kIllustration, Role.kProximity):
-        drawn = (_drawn(inspector, geometry, role, path) for geometry in inspector.GetGeometries(frame, role))
-        found = [d for d in drawn if d is not None and isinstance(d.shape, DRAWN)]
-        if found:
-            return found
-    return []
-
-
-def _drawn(inspector: Any, geometry: Any, role: Role, path: str) -> Drawn | None:
-    """A geometry as it is drawn; None where its mesh cannot be read, which the model's notes tell."""
-    colour, pose = GREY, inspector.GetPoseInFrame(geometry)
-    if role == Role.kIllustration:
-        colour = inspector.GetIllustrationProperties(geometry).GetPropertyOrDefault("phong", "diffuse", GREY)
-    try:
-        box = inspector.GetObbInGeometryFrame(geometry)
-    except RuntimeError:  # a mesh is read when it is first asked for
-        return None
-    centre = pose.translation() if box is None else pose @ box.pose().translation()
-    radius = 0.0 if box is None else float(np.linalg.norm(box.half_width()))
-    return Drawn(path, inspector.GetShape(geometry), pose, colour, np.asarray(centre), radius)
-
-
-def body_path(body: Any) -> str:
-    """The path of a body in Meshcat."""
-    return meshcat_path(int(body.index()), body.name())
-
-
-def meshcat_path(index: int, name: str) -> str:
-    """A path of Meshcat that no name can break out of; the index keeps it unique."""
-    return f"{index}_" + re.sub(r"[^A-Za-z0-9_.-]", "_", name)
