@@ -148,30 +148,6 @@ def test_a_page_is_the_same_when_it_is_made_again(tmp_path):
     assert pages[0] == pages[1]
 
 
-MATERIALS = {
-    "two colours": ('<material name="m"><color rgba="0 1 0 1"/></material>', ""),
-    "none at all": ('<material name="m"/>', ""),
-    "given later": ('<material name="m"/>', '<material name="m"><color rgba="1 0 0 1"/></material>'),
-}
-
-
-@each_row("name", list(MATERIALS))
-def test_materials_that_drake_refuses_are_mended(tmp_path, name):
-    material, top = MATERIALS[name]
-    box = '<visual><geometry><box size="0.1 0.1 0.1"/></geometry>{}</visual>'
-    mesh = '<visual><geometry><mesh filename="box.stl"/></geometry></visual>'
-    first = box.format(material)
-    second = box.format('<material name="m"><color rgba="1 0 0 1"/></material>') if name == "two colours" else ""
-    trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / "box.stl")
-    found = scene(saved(tmp_path, arm(first + second + mesh, top)))
-    assert len(on(found, "upper")) == (3 if second else 2)
-    green = on(found, "upper")[0].colour
-    if name == "two colours":
-        assert [d.colour.g() for d in on(found, "upper")[:2]] == [1, 0]
-    elif name == "given later":
-        assert (green.r(), green.g()) == (1, 0)
-
-
 @pytest.mark.slow
 def test_a_humanoid_is_seen_in_a_page_of_bounded_size(tmp_path):
     found = scene(robot_file("talos_full_v2.urdf"))

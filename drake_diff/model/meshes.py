@@ -7,11 +7,10 @@ one, so that pose, friction and filters are read as always; then that sphere's s
 import re
 from dataclasses import dataclass, field
 from functools import lru_cache
-from itertools import count
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
-from xml.sax.saxutils import escape, quoteattr
+from xml.sax.saxutils import escape
 
 import numpy as np
 from pydrake import geometry as pg
@@ -28,7 +27,6 @@ TREATMENTS = ("skip", "convex", "spheres")
 USABLE_MESHES = (".obj", ".vtk", ".gltf", ".glb")  # by Drake
 DOWNLOADED = "drake_models"  # the package that Drake's parser would fetch from the network
 PLACEHOLDER = 1.2345678e-9  # [m] the radius of the first; no file has such a sphere
-UNKNOWN_COLOUR = "0.6 0.6 0.62 1"  # of a material that is named and nowhere given
 MOST_TOLD = 12  # in a note; links with the same file and scale count once
 
 Scale = tuple[float, float, float]
@@ -55,7 +53,6 @@ class FileMeshes:
     skipped: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     unusable: list[str] = field(default_factory=list)
-    materials: list[str] = field(default_factory=list)
 
     def notes(self) -> list[str]:
         """What the user should know of meshes that are not used, a sentence each."""
@@ -72,9 +69,6 @@ class FileMeshes:
             )
         if self.unusable:
             told.append(f"{len(self.unusable)} meshes skipped, they cannot be used: {_listed(self.unusable)}.")
-        if self.materials:
-            names = list(dict.fromkeys(self.materials))
-            told.append(f"Materials that Drake refuses have a name or colour of their own now: {_listed(names)}.")
         return told
 
 
@@ -91,8 +85,6 @@ def read_meshes(xml: XmlText | None, path: Path, packages: PackageMap, treatment
     found = FileMeshes(treatment)
     if xml is None or xml.root.tag not in ("robot", "sdf"):
         return found
-    if xml.root.tag == "robot":
-        _separate_materials(found, xml)
     for element in xml.root.iter("visual", "collision"):
         mesh = next(element.iter("mesh"), None)
         if mesh is not None:
@@ -101,32 +93,6 @@ def read_meshes(xml: XmlText | None, path: Path, packages: PackageMap, treatment
             except ModelError as error:
                 raise ModelError(f"{path}:{mesh.line}: {error}") from error
     return found
-
-
-def _separate_materials(found: FileMeshes, xml: XmlText) -> None:
-    """Make the materials of a URDF such that Drake takes them.
-
-    Drake refuses a name that has several colours, or that is used before its colour is given.
-    """
-    top = xml.root.findall("material")  # which Drake reads first
-    named = [m for m in (*top, *(m for m in xml.root.iter("material") if m not in top)) if m.get("name")]
-    colours: dict[str, str] = {}
-    for material in named:
-        name, colour = material.get("name"), _colour(material)
-        if not colour and name not in colours and material.find("texture") is None:
-            colour = next((c for m in named if m.get("name") == name and (c := _colour(m))), UNKNOWN_COLOUR)
-            xml.fill(material, f"<color rgba={quoteattr(colour)}/>")
-            found.materials.append(f"{name} (used before it has a colour)")
-        if colour and colours.setdefault(name, colour) != colour:
-            xml.set(
-                material, "name", next(n for i in count(2) if colours.setdefault(n := f"{name}_{i}", colour) == colour)
-            )
-            found.materials.append(f"{name} (of several colours)")
-
-
-def _colour(material: Element) -> str:
-    colour = material.find("color")
-    return "" if colour is None else " ".join(colour.get("rgba").split())
 
 
 def _change(found: FileMeshes, xml: XmlText, element: Element, mesh: Element, place: Path | None) -> None:
