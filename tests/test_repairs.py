@@ -10,6 +10,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.mechanics.description import describe_tree
 
 INERTIAL = (
     '<inertial><origin xyz="0 0 -0.5"/><mass value="1"/>'
@@ -301,3 +302,40 @@ def test_messages_name_the_lines_of_the_file_though_meshes_were_taken_out(write)
     _model, told = load(path)
     assert f"{path}:{line}: warning: The tag 'safety_controller'" in told
     assert "literal-string" not in told
+
+
+def test_a_chain_that_is_held_at_its_other_end_is_told_to_engines_and_differentiated(write):
+    model, _ = load(write(), base="lower", actuators="all")
+    dd.certify(model, [0.3, -0.2, 0.1, 0.4], [1.0, 2.0]).require()
+    with pytest.raises(ModelError, match=r"nearer to the world than its parent: .*elbow"):
+        describe_tree(model)
+
+
+REPAIRS = [
+    {"actuators": {"shoulder": 50.0}, "base": "weld", "fix_joints": ["elbow"], "contact": False},
+    {"actuators": ["shoulder", "elbow"], "base": "lower", "packages": {"shapes": "shapes"}},
+    {"actuators": "all", "base": "weld", "ground": True},
+]
+
+
+@pytest.mark.slow
+@each_row("options", REPAIRS)
+def test_a_run_of_a_repaired_model_is_made_again_with_its_repairs(tmp_path, monkeypatch, options):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "shapes").mkdir(exist_ok=True)
+    (tmp_path / "shapes" / "tri.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+    )
+    visual = '<visual><geometry><mesh filename="package://shapes/tri.obj"/></geometry></visual></link>'
+    text = robot(SHOULDER, ELBOW).replace("</link>", visual, 1) if "packages" in options else robot(SHOULDER, ELBOW)
+    (tmp_path / "arm.urdf").write_text(text)
+    model, _ = load("arm.urdf", time_step=0.02, **options)
+    cost = dd.QuadraticCost(Q=np.eye(model.nx), R=0.01 * np.eye(model.nu))
+    problem = dd.Problem(model, x0=np.full(model.nx, 0.1), num_steps=4, running_cost=cost)
+    folder = tmp_path / "-".join(options)
+    record = dd.save(dd.solve(problem, method="ilqr"), folder)
+    assert set(options) <= set(record.model.options)
+    assert record.contract["notes"] == list(model.notes)
+    assert record.contract["notes"]
+    found = dd.verify(folder)
+    assert found.verdict == "holds", found

@@ -228,7 +228,10 @@ def read_links(plant: Any, springs: dict[Any, tuple[float, float]]) -> list[Link
     waiting.sort(key=lambda link: link.v_start)
     placed, ordered = {"world"}, []
     while waiting:
-        link = next(x for x in waiting if x.parent in placed)
+        link = next((x for x in waiting if x.parent in placed), None)
+        if link is None:
+            names = ", ".join(x.joint for x in waiting)
+            raise ModelError(f"the child of a joint is nearer to the world than its parent: {names}")
         placed.add(link.body)
         ordered.append(link)
         waiting.remove(link)
