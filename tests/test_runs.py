@@ -131,6 +131,10 @@ def test_the_commands_print_and_exit_as_they_should(runs, tmp_path):
     done = drake_diff("compare-runs", runs / "a", runs / "b", cwd=tmp_path)
     assert done.returncode == 0
     assert "problem.x_goal[0]" in done.stdout
+    done = drake_diff("compare-runs", runs / "a", runs / "b", "--out", "new/both.html", cwd=tmp_path)
+    assert done.returncode == 0
+    assert "problem.x_goal[0]" in (tmp_path / "new/both.html").read_text()
+    assert "wrote new/both.html" in done.stdout
 
 
 def test_an_exception_in_the_solve_leaves_a_labelled_record_and_exits_with_4(tmp_path):

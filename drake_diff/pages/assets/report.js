@@ -167,9 +167,9 @@
     const lines = linesOf(u.plot);
     u.values.replaceChildren(...lines.map((line, k) => {
       const v = u.data[k + 1][i], raw = u.plot.series[k].y[i];
-      const absolute = isPercent(u.plot) && !isDifference(u.plot) && v !== null ? ` (${shorten(raw)} ${u.plot.unit})` : "";
-      const percentSign = isPercent(u.plot) && v !== null ? " %" : "";
-      return make("span", {}, key(line), (u.named ? line.name + " " : "") + shorten(v) + percentSign + absolute);
+      const absolute = isPercent(u.plot) && !isDifference(u.plot) && v !== null && k === 0 ? ` (${shorten(raw)} ${u.plot.unit})` : "";
+      const value = isPercent(u.plot) && v !== null ? Number(v.toPrecision(3)) + " %" : shorten(v);
+      return make("span", {}, key(line), (u.named ? line.name + " " : "") + value + absolute);
     }));
   }
   function summary(plot) {
@@ -188,7 +188,7 @@
       const limits = limitsOf(plot), far = limits.some((v, i) => v !== null && near[i] === null);
       const told = limits[0] === null ? "≤ " + shorten(limits[1]) : limits[1] === null ? "≥ " + shorten(limits[0])
         : shorten(limits[0]) + " … " + shorten(limits[1]);
-      if (far && !plot.log && !plot.note) found.push("limits " + told);
+      if (far && !plot.log && !plot.note && !isPercent(plot)) found.push("limits " + told);
     }
     if (plot.x.length < plot.points)
       found.push(`${plot.x.length} of ${plot.points} points: the lowest and highest of each stretch`);
@@ -248,7 +248,7 @@
   }
 
   // The plots of one place: a group at a time where there are many, each group with one legend
-  const FEW = 12;  // plots of a place, which are shown all at once
+  const FEW = 16;  // plots of a place, which are shown all at once
   function legendOf(plots) {  // the lines that the plots have in common; null where each has its own
     const found = new Map();
     for (const p of plots) for (const line of linesOf(p)) {
