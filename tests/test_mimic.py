@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, UnknownNameError
+from drake_diff.mechanics.description import describe
 from drake_diff.model.plant import actuators
 from drake_diff.model.plant import joints as joints_of
 
@@ -154,13 +156,13 @@ def test_a_long_motion_and_its_energy_are_those_of_the_exact_motion_to_the_order
     def rate(t, x):
         return [x[1], acceleration_of_the_pantograph(*x, 0.0)]
 
-    exact = solve_ivp(rate, (0.0, 1.0), [1.0, 0.0], method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    exact = solve_ivp(rate, (0.0, 0.4), [1.0, 0.0], method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
     errors = []
     for h in (4e-3, 4e-4):
-        motion = dd.rollout(load(pantograph(tmp_path), time_step=h), [1.0, 0.0], np.zeros((round(1 / h), 1)))
+        motion = dd.rollout(load(pantograph(tmp_path), time_step=h), [1.0, 0.0], np.zeros((round(0.4 / h), 1)))
         errors.append([*np.abs(motion.xs[-1] - exact), np.abs(motion.energy_error).max()])
         assert np.max(motion.constraint_violation) == 0
-        assert motion.energy_exchanged > 5  # [J]
+        assert motion.energy_exchanged > 1  # [J]
     np.testing.assert_allclose(np.divide(*errors), 10.0, rtol=0.1)  # the next order is a few h of the first
 
 
@@ -285,6 +287,57 @@ def test_a_policy_on_a_motor_of_a_follower_is_refused(tmp_path):
         dd.PD(load(sliders(tmp_path, motors=("b",))), kp=1.0, kd=1.0)
 
 
+def test_audit_names_the_joints_and_the_argument(tmp_path):
+    found = [f for f in dd.audit(load(sliders(tmp_path), None)) if f.code == "mimic_joint"]
+    assert [(f.severity, f.subject) for f in found] == [("warning", "b")]
+    assert "b = 1.7 a + 0.3" in found[0].message
+    assert 'mimic="reduce"' in found[0].remedy
+    assert not [f for f in dd.audit(load(sliders(tmp_path))) if f.code in ("mimic_joint", "constraints")]
+    path = tmp_path / "m.sdf"
+    path.write_text(SDF.format(inside=OF_SDF, beside=""))
+    (found,) = [f for f in dd.audit(load(path, None)) if f.code == "mimic_joint"]
+    assert "does not read" in found.message
+
+
+@each_row("name", ["pinocchio", "casadi"])
+def test_an_engine_of_its_own_takes_the_same_step(tmp_path, name):
+    """Two followers and a free base: rounding is all that differs, in steps and in Jacobians."""
+    pytest.importorskip({"casadi": "adam"}.get(name, name))
+    path = urdf(
+        tmp_path,
+        link("body", 3.0, 0.2, "0.1 0 0.05"), link("upper", 1.2, 0.1, "0 0 -0.5"),
+        link("lower", 0.8, 0.05, "0.1 0 -0.7"), link("slider", 0.5, 0.01, "0 0.2 0"),
+        joint("shoulder", "continuous", "body", "upper", "0 1 0", at="0.1 0 0", damping=0.3),
+        joint("elbow", "continuous", "upper", "lower", "0 0.6 0.8", follows("shoulder", -2.0, 0.4), damping=0.2),
+        joint("rail", "prismatic", "body", "slider", "1 0 0", follows("elbow", 0.3)),
+        MOTOR.format("shoulder"), MOTOR.format("rail"),
+    )  # fmt: skip
+    model = load(path)
+    assert (model.nq, model.nv, model.nu) == (8, 7, 2)
+    engine, random = dd.engines.load_engine(name, model), np.random.default_rng(3)
+    for _ in range(3):
+        x, u = random.standard_normal(model.nx), random.standard_normal(2)
+        x[:4] /= np.linalg.norm(x[:4])
+        exact = dd.differentiate_step(model, x, u, method="autodiff")
+        found = engine.differentiate_step(x, u)
+        np.testing.assert_allclose(engine.step(x, u), dd.step(model, x, u), atol=ROUNDING)
+        np.testing.assert_allclose(found.A, exact.A, atol=1e-10)
+        np.testing.assert_allclose(found.B, exact.B, atol=1e-10)
+    lines = dd.engines.match_contracts(dd.engines.load_engine("drake", model), engine)
+    assert [line.quantity for line in lines if line.verdict == "different" and not line.reason] == []
+
+
+def test_other_engines_and_exports_say_why_not(tmp_path):
+    model = load(sliders(tmp_path))
+    for name in ("mujoco", "numpy", "pybullet"):
+        with pytest.raises(ModelError, match='drake, pinocchio, casadi do, or mimic="fix"'):
+            dd.engines.load_engine(name, model)
+    with pytest.raises(ModelError, match="mimic joints are reduced"):
+        describe(model)
+    with pytest.raises(ModelError, match="mimic="):
+        describe(load(sliders(tmp_path), None))
+
+
 def mimics_in(path):
     """(follower, leader, ratio, offset) as another reader of the file finds them."""
     found = []
@@ -334,3 +387,67 @@ def test_the_step_of_a_robot_is_that_of_pinocchios_mass_matrix_projected(tmp_pat
         v_next = v + h * np.linalg.solve(E.T @ (M + h * D) @ E, E.T @ force)
         x_next = dd.step(model, np.concatenate([q, v]), u)
         np.testing.assert_allclose(x_next[model.nq :], v_next, rtol=1e-8, atol=1e-8 * np.abs(v_next).max())
+
+
+@each_row("names, mimic, sizes", [
+    (("c",), "reduce", (1, 1)), (("c",), "fix", None), (("a", "b"), "reduce", (1, 0)), (("b",), "reduce", (2, 0)),
+    (("a", "b"), "fix", (1, 0)), (("a",), "reduce", None),
+])  # fmt: skip
+def test_joints_that_are_fixed_by_name_are_left_out(tmp_path, names, mimic, sizes):
+    """`sizes` are nv and the number of constraints that Drake has; None where the file or what is left is refused."""
+    path = urdf(
+        tmp_path, link("a_link", 1.0, 1.0), link("b_link", 1.0, 1.0), link("c_link", 1.0, 1.0),
+        joint("a", "prismatic", "world", "a_link", "1 0 0"),
+        joint("b", "prismatic", "world", "b_link", "1 0 0", follows("a", 2.0)),
+        joint("c", "prismatic", "world", "c_link", "1 0 0"),
+    )  # fmt: skip
+    if sizes is None:
+        with pytest.raises(ModelError, match=r"cannot move|fix b too"):
+            load(path, mimic, fix_joints=names)
+        return
+    model = load(path, mimic, fix_joints=names)
+    assert (model.nv, model.plant.num_constraints()) == sizes
+
+
+def panda(mimic, time_step=0.02, **options):
+    return load(robot_file("panda.urdf"), mimic, time_step, base="weld", actuators="all", **options)
+
+
+@pytest.mark.slow
+@each_row("mimic, finger", [("reduce", [0.01, 0.03]), ("fix", None)])
+def test_the_panda_as_it_ships_goes_to_a_joint_goal(tmp_path, mimic, finger):
+    """Loaded with the documented arguments: certified, planned by collocation, saved, verified, and compared."""
+    model = panda(mimic)
+    start, goal = np.array(model.default_state), np.array(model.default_state)
+    start[[3, 5]] = goal[[3, 5]] = -1.5, 1.6
+    goal[:3] = 0.3, 0.2, -0.2
+    if finger:
+        start[7], goal[7] = finger
+        assert model.velocity_names[7] == "panda_finger_joint1_v"
+    assert dd.certify(model, start, np.zeros(model.nu)).verdict == "agree"
+    cost = dd.QuadraticCost(R=1e-3 * np.eye(model.nu))
+    problem = dd.Problem(model, x0=start, num_steps=30, running_cost=cost, x_goal=goal)
+    solution = dd.solve(problem, method="collocation")
+    assert solution.success, solution.message
+    dd.save(solution, tmp_path / "run")
+    assert dd.verify(tmp_path / "run").holds
+    free = panda(mimic, 1e-3, contact=False)
+    compared = dd.compare(free, engines=("pinocchio",), x0=start, us=np.zeros((20, free.nu)))
+    assert "pinocchio: the same simulation as Drake" in str(compared)
+
+
+@pytest.mark.slow
+@each_row("seed", range(4))
+def test_certificates_of_reduced_coordinates_agree_in_motion_and_refuse_a_planted_error(seed):
+    """At random states of the Panda within its limits, near those of the fingers too."""
+    model, random = panda("reduce", contact=False), np.random.default_rng(seed)
+    lower, upper = model.position_limits
+    x = np.concatenate(
+        [lower + random.uniform(0.01, 0.99, model.nq) * (upper - lower), 0.2 * random.standard_normal(8)]
+    )
+    u = 0.1 * random.standard_normal(model.nu)
+    assert dd.certify(model, x, u).verdict == "agree"
+    true = dd.differentiate_step(model, x, u, method="autodiff")
+    wrong = np.array(true.A)
+    wrong[random.integers(8, 16), random.integers(0, 16)] += 0.01 * np.abs(wrong).max()
+    assert dd.certify(model, x, u, derivatives=replace(true, A=wrong)).verdict == "disagree"

@@ -18,6 +18,7 @@ from drake_diff.certificates.finding import SEVERITIES, Finding, Findings, Sever
 from drake_diff.certificates.place import PARALLEL, Collider, Pair, Place
 from drake_diff.derivatives.step import StepDerivatives, differentiate_step
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError
+from drake_diff.model.file_facts import Mimic
 from drake_diff.model.load_file import MEETS_A_SPHERE
 from drake_diff.model.model import Model
 from drake_diff.model.parameter_kinds import IDENTITY_OFFSET
@@ -178,7 +179,17 @@ def _jacobian(place: Place) -> Found:
 
 def _mechanism(place: Place) -> Found:
     plant, context = place.model.plant, place.model.double.context
-    if plant.num_constraints():
+    mimics = () if place.model.coupling is not None else _mimics(place.model)
+    if mimics:
+        told = "; ".join(map(str, mimics))
+        message = f"joints follow others, and stay in the state, held by constraints: {told}"
+        if not all(m.in_drake for m in mimics):
+            message = (
+                f"joints should follow others, but Drake does not read SDF's <mimic>, and they move freely: {told}"
+            )
+        remedy = 'mimic="reduce" takes them out of the state, "fix" welds them; collocation and other engines need that'
+        yield Finding("warning", "mimic_joint", ", ".join(m.follower for m in mimics), message, remedy)
+    if place.model.num_constraints:
         message = f"constraints in every step ({plant.num_constraints()}), which the implicit method cannot handle"
         remedy = "nothing to do: method auto takes autodiff; `certify` one state, as a few kinds have no AutoDiffXd"
         yield Finding("info", "constraints", "plant", message, remedy)
@@ -190,6 +201,12 @@ def _mechanism(place: Place) -> Found:
         )
         remedy = "weld it in the plant instead (WeldFrames), or joint.Unlock(model.double.context)"
         yield Finding("info", "locked_joint", ", ".join(locked), message, remedy)
+
+
+def _mimics(model: Model) -> tuple[Mimic, ...]:
+    """What the model's file says of joints that follow others and still can move."""
+    moving = {joint.name() for joint in joints(model.plant) if joint.num_velocities()}
+    return tuple(mimic for mimic in model.file_facts.followers.values() if mimic.follower in moving)
 
 
 def _pair_refused(place: Place) -> Found:

@@ -21,6 +21,7 @@ from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.interface import Engine, EngineContract, Precision
 from drake_diff.exceptions import InputError, NotOfferedError
 from drake_diff.mechanics.coordinates import Coordinates, euler_acceleration, exponential_turn
+from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.step import set_state
 
 INTEGRATOR, CONTACT_LAW, LIMIT_LAW, UNEXPLAINED = "integrator", "contact law", "limit law", "unexplained"
@@ -298,7 +299,7 @@ def attribute_recorded(
     reference: DrakeEngine, x: Array, u: Array, count: int, after: Array, tolerance: float
 ) -> Attribution:
     """What makes the recorded state `after` (nx,) differ from that which `count` steps of the reference lead to."""
-    coordinates = reference.description.coordinates
+    coordinates = coordinates_of(reference.model)
     theirs, ours = (of_norm_one(coordinates, state, x) for state in (after, advanced(reference, x, u, count)))
     gap, schemes = float(np.abs(theirs - ours).max()), (SCHEMES[0], SCHEMES[0])
     if gap <= tolerance:

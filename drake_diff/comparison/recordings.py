@@ -14,8 +14,8 @@ from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff.comparison.recordings_ros2 import is_ros2, read_ros2
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.logs.mcap_file import read_mcap
-from drake_diff.mechanics.description import describe
 from drake_diff.model.model import Model
+from drake_diff.model.plant import joints, labelled
 from drake_diff.model.tangent import tangent_space
 
 # What may be told of the engine, numbers as JSON: the time step [s], gravity (3,) [m/s^2], seeds.
@@ -205,10 +205,11 @@ def _number(subject: str, text: str) -> float:
 def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str]) -> list[int]:
     """Where each wanted column stands."""
     by_joint = {}
-    for link in describe(model).moving:
-        if link.kind != "quaternion_floating":
-            by_joint[f"position.{link.joint}"] = model.state_names[link.q_start]
-            by_joint[f"velocity.{link.joint}"] = model.state_names[model.nq + link.v_start]
+    for label, joint in labelled(joints(model.plant)).items():
+        q, v = model.places(joint)
+        if len(q) == len(v) == 1:
+            by_joint[f"position.{label}"] = model.state_names[q.start]
+            by_joint[f"velocity.{label}"] = model.state_names[model.nq + v.start]
     names = [by_joint.get(text.strip(), text.strip()) for text in header]
     for given, column in zip(header, names, strict=True):
         if column not in wanted:

@@ -22,7 +22,7 @@ from drake_diff.engines.interface import Engine
 from drake_diff.engines.load import ELSEWHERE, ENGINES, load_spec
 from drake_diff.engines.motion import EngineMotion, JacobianAt, jacobian_at, measured, move, rollout_jacobian, seconds
 from drake_diff.exceptions import MissingDependencyError, ModelError, SimulationError
-from drake_diff.mechanics.description import describe
+from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.sampling import sample_states
 from drake_diff.model.tangent import tangent_space
@@ -128,7 +128,7 @@ class _Panel:
     def __init__(self, model: Model, reference: DrakeEngine, x0: Array, us: Array, seed: int):
         self.space, self.names, self.model = tangent_space(model), model.input_names, model
         self.reference, self.x0, self.us = reference, x0, us
-        self.coordinates = describe(model).coordinates
+        self.coordinates = coordinates_of(model)
         self.motion = motion = move(reference, x0, us)
         self.probes = [Probe("start", motion.xs[0], motion.us[0])]
         self.probes += [Probe(sample.kind, sample.x, sample.u) for sample in sample_states(model, 2, seed + 1)]

@@ -60,7 +60,11 @@ class EulerEngine(Arguments):
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
         x, u = self._point(x, u)
-        return euler_step(self.coordinates, self.time_step, x, self._acceleration(x, u))
+        with np.errstate(over="ignore", invalid="ignore"):  # what runs away is said below
+            x_next = euler_step(self.coordinates, self.time_step, x, self._acceleration(x, u))
+        if not np.all(np.isfinite(x_next)):
+            raise SimulationError(f"the step leads to {x_next}, which is not finite, from x = {x}, u = {u}")
+        return x_next
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
         x, u = self._point(x, u)
@@ -90,6 +94,7 @@ class PlantEngine(Arguments):
         self.coordinates = self.description.coordinates
         self.time_step, self.status = model.time_step, "ok"
         self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
+        self._holding = np.zeros(model.nv)  # forces that act for a while beside the inputs
         self.damping, self.armature, self.stiffness, self.rest = (
             self.description.by_velocity(name) for name in ("damping", "armature", "stiffness", "rest")
         )
@@ -97,7 +102,16 @@ class PlantEngine(Arguments):
 
     def _effort(self, u: Array) -> Array:
         """(nv,) B u, cut at the effort limits."""
-        return np.asarray(self.actuation @ np.clip(u, -self.limits, self.limits))
+        return np.asarray(self.actuation @ np.clip(u, -self.limits, self.limits)) + self._holding
+
+    @contextmanager
+    def holding(self, force: Array) -> Iterator[None]:
+        """A generalized force (nv,) acts beside the inputs, whatever the state, until it ends."""
+        self._holding = force
+        try:
+            yield
+        finally:
+            self._holding = np.zeros(self.nv)
 
     def _effort_by_input(self, u: Array) -> Array:
         """(nv, nu) the derivative of `_effort`."""

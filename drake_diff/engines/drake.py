@@ -11,6 +11,7 @@ from drake_diff.derivatives.sources import check_method
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.engines.common import geometry_contracts
 from drake_diff.engines.interface import EngineContract, StepJacobian, float_rows, floats
+from drake_diff.engines.reduced import reduced_contract
 from drake_diff.mechanics.description import Description, describe, joint_contracts
 from drake_diff.model.contact import penetration
 from drake_diff.model.model import Model
@@ -31,8 +32,8 @@ class DrakeEngine:
 
     @cached_property
     def description(self) -> Description:
-        """What the contract is read from; ModelError where the plant has what no other engine is given."""
-        return describe(self.model)
+        """What the contract is read from, with all joints; ModelError where the plant has what no engine is given."""
+        return describe(self.model.whole)
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
         return step(self.model, x, u)
@@ -63,7 +64,7 @@ class DrakeEngine:
     @property
     def contract(self) -> EngineContract:
         contact = self.model.contract.contact
-        return EngineContract(
+        found = EngineContract(
             engine=self.name, joints=joint_contracts(self.description),
             native_order=tuple(link.joint for link in self.description.moving), inputs=self.model.input_names,
             actuation=float_rows(self.description.actuation), effort_limits=floats(self.description.effort_limits),
@@ -74,3 +75,4 @@ class DrakeEngine:
             limit_law="implicit springs in the step's solver, from two steps before the limit on",
             derivatives="by every entry of x and u",
         )  # fmt: skip
+        return reduced_contract(found, self.model)

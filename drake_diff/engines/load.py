@@ -4,7 +4,8 @@ from importlib import import_module
 from typing import Any
 
 from drake_diff.engines.interface import Engine
-from drake_diff.exceptions import InputError, MissingDependencyError, UnknownNameError
+from drake_diff.engines.reduced import TAKEN, ReducedEngine
+from drake_diff.exceptions import InputError, MissingDependencyError, ModelError, UnknownNameError
 from drake_diff.model.model import Model
 
 ENGINES = {
@@ -57,6 +58,12 @@ def load_engine(name: str, model: Any, **options: Any) -> Engine:
     if name not in ENGINES:
         raise UnknownNameError("engine", got=name, known=ENGINES)
     module, kind = ENGINES[name]
+    if isinstance(model, Model) and model.coupling is not None and name != "drake":
+        if name not in TAKEN:
+            raise ModelError(
+                f'{name} does not take mimic joints that are reduced: {", ".join(TAKEN)} do, or mimic="fix"'
+            )
+        return ReducedEngine(load_engine(name, model.whole, **options), model)
     engine: Engine = getattr(import_module(f"drake_diff.{module}"), kind)(model, **options)
     return engine
 

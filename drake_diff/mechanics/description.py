@@ -154,6 +154,14 @@ class Description:
         return B
 
 
+def coordinates_of(model: Model) -> Coordinates:
+    """Where the free bodies and the hinges and slides of `model` are in its state."""
+    places = [(joint, model.places(joint)) for joint in joints(model.plant)]
+    starts = sorted((v.start, q.start, joint.num_velocities() == 6) for joint, (q, v) in places if len(v))
+    free, single = (tuple((i, j) for j, i, six in starts if six == kind) for kind in (True, False))
+    return Coordinates(free, single)
+
+
 def describe(model: Model) -> Description:
     """The description of `model`; ModelError, naming the element, where the plant has what no other engine is given."""
     controlled = [f"actuator {a.name()} has PD gains" for a in actuators(model.plant) if a.has_controller()]
@@ -171,8 +179,13 @@ def describe_tree(model: Model) -> Description:
     found += [f"joint {j.name()} is locked" for j in joints(plant) if j.is_locked(model.double.context)]
     damped = [j for j in joints(plant) if np.any(j.default_damping_vector())]
     found += [f"the free body of joint {j.name()} is damped" for j in damped if j.type_name() == "quaternion_floating"]
-    if plant.num_constraints():
-        found.append(f"{plant.num_constraints()} constraints (couplers, balls, welds, distances)")
+    if model.coupling is not None:
+        found.append('its mimic joints are reduced (mimic="fix" holds them)')
+    if model.num_constraints:
+        found.append(
+            f"{model.num_constraints} constraints (mimic joints, for which see mimic= of load_model, couplers, balls, "
+            "welds, distances)"
+        )
     if model.forces:
         found.append("forces are added to Drake's")
     found += [model.systems_act] if model.systems_act else []

@@ -110,10 +110,15 @@ def check_mimic(choice: str | None) -> None:
         raise UnknownNameError("mimic", got=choice, known=CHOICES)
 
 
-def _joint(plant: MultibodyPlant, mimic: Mimic, name: str) -> Any:
+def _called(plant: MultibodyPlant, mimic: Mimic, name: str) -> list[Any]:
+    """The joints of that name, those of the mimic's model instance where others have them too."""
     found = [j for j in joints(plant) if j.name() == name]
-    if len(found) > 1:
-        found = [j for j in found if plant.GetModelInstanceName(j.model_instance()) == mimic.instance]
+    own = [j for j in found if plant.GetModelInstanceName(j.model_instance()) == mimic.instance]
+    return own if len(found) > 1 else found
+
+
+def _joint(plant: MultibodyPlant, mimic: Mimic, name: str) -> Any:
+    found = _called(plant, mimic, name)
     if len(found) != 1:
         raise ModelError(f"mimic: the joint {mimic.follower} follows {mimic.leader}, and there is no joint {name}")
     if not can_be_driven(found[0]):
@@ -165,6 +170,19 @@ def uncoupled(plant: MultibodyPlant, mimics: Iterable[Mimic]) -> tuple[Mimic, ..
     for constraint in plant.GetConstraintIds() if found else ():
         plant.RemoveConstraint(constraint)
     return found
+
+
+def still_moving(plant: MultibodyPlant, mimics: Iterable[Mimic]) -> tuple[Mimic, ...]:
+    """Those whose follower was not fixed by name. ModelError where what it follows was."""
+
+    def fixed(mimic: Mimic, name: str) -> bool:
+        return any(joint.num_velocities() == 0 for joint in _called(plant, mimic, name))
+
+    left = tuple(mimic for mimic in mimics if not fixed(mimic, mimic.follower))
+    for mimic in left:
+        if fixed(mimic, mimic.leader):
+            raise ModelError(f"fix_joints={mimic.leader!r}: {mimic.follower} mimics it: fix {mimic.follower} too")
+    return left
 
 
 def fix_mimics(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> tuple[str, ...]:

@@ -30,7 +30,7 @@ from drake_diff.model.load_file import (
     replace_collision_geometry,
 )
 from drake_diff.model.meshes import TREATMENTS
-from drake_diff.model.mimic import Coupling, check_mimic, couple, coupling_of, fix_mimics, uncoupled
+from drake_diff.model.mimic import Coupling, check_mimic, couple, coupling_of, fix_mimics, still_moving, uncoupled
 from drake_diff.model.plant import (
     actuators,
     follow,
@@ -106,6 +106,7 @@ class Model(ShowsItsRepr):
         self._others: dict[frozenset[tuple[str, Hashable]], Model] = {}  # the same model with something changed
         self._cache: dict[Hashable, Any] = {}
         self._whole: Model | None = None
+        self.held = 0 if coupling is None else len(coupling.mimics)  # constraints that the reduced state keeps to
         # What parameters in its contexts are, for the time being, not the model's own: see `parameters.applied`.
         self.other_quantities: frozenset[str] = frozenset()
         self.path = path_to_the_plant(diagram)
@@ -164,7 +165,10 @@ class Model(ShowsItsRepr):
 
     @property
     def whole(self) -> "Model":
-        """The model with all of the plant's coordinates, on the same contexts; itself where none is left out."""
+        """The model with all of the plant's coordinates, on the same contexts; itself where none is left out.
+
+        The constraints of mimic joints, which the reduced state keeps to by itself, are none of its `num_constraints`.
+        """
         if self.coupling is None:
             return self
         if self._whole is None:
@@ -172,6 +176,7 @@ class Model(ShowsItsRepr):
                 self.diagram, source=self.source, notes=self.notes, forces=self.forces, body_forces=self.body_forces
             )
             self._whole.double = replace(self.double, coupling=None)
+            self._whole.held = self.held
         self._whole.other_quantities = self.other_quantities
         return self._whole
 
@@ -188,8 +193,8 @@ class Model(ShowsItsRepr):
 
     @property
     def num_constraints(self) -> int:
-        """How many act in the plant beside those that the reduced state keeps to by itself."""
-        return int(self.plant.num_constraints()) if self.coupling is None else 0
+        """How many act in the plant beside those of mimic joints that are reduced."""
+        return int(self.plant.num_constraints()) - self.held
 
     def places(self, joint: Any) -> tuple[range, range]:
         """Where the coordinates of a joint are in q and in v; empty of a joint that only follows another."""
@@ -594,9 +599,10 @@ def _repaired(
         raise InputError("ground", got="contact=False too", expected="contact, without which nothing stands on it")
     choice = options["mimic"]
     try:
-        mimics = () if choice is None else uncoupled(plant, facts.followers.values())
-        notes = fix_mimics(plant, mimics) if choice == "fix" else ()
-        notes += fix(plant, options["fix_joints"], fixed)
+        mimics = () if choice is None else uncoupled(plant, still_moving(plant, facts.followers.values()))
+        notes = fix(plant, options["fix_joints"], fixed)
+        mimics = still_moving(plant, mimics)
+        notes += fix_mimics(plant, mimics) if choice == "fix" else ()
         notes += couple(plant, mimics) if choice == "reduce" else ()
         notes += add_actuators(plant, asked, facts)
         if weld_base is not None:
