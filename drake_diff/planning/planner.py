@@ -32,7 +32,7 @@ TIMES = (None, "least")
 SMALL = 7  # velocities: of a larger robot any smooth motion will do, as its best one takes minutes
 FASTER = (0.2, 2.0)  # of the first guess's duration: the range of a least time
 SPEED_WEIGHT = 0.01  # of a speed against an effort, both as shares of their limits
-BUDGET = 60.0  # [s] on the clock, of one attempt
+BUDGET = 120.0  # [s] on the clock, of one attempt
 BENT = 8  # lines around what a straight one touches
 
 Report = Callable[[str, str], None]

@@ -87,7 +87,8 @@ def _placed(path: Path, options: dict[str, Any], model: Model, told: list[str], 
     """The robot in the posture it starts in, and with the contact that its plan needs."""
     lower, upper = ranges(model)
     first = _inside(model, lower, upper)
-    driven = is_fully_driven(model, first)
+    apart = model if not model.contract.contact.collision_pairs else _loaded(path, options | {"contact": False})
+    driven = is_fully_driven(apart, first)
     shapes: Model | None = model if model.contract.contact.collision_pairs else None
     q = first
     if shapes is not None:
@@ -98,8 +99,7 @@ def _placed(path: Path, options: dict[str, Any], model: Model, told: list[str], 
         else:
             q = found
         if driven:
-            options["contact"] = False
-            model = _loaded(path, options)
+            model = apart
             told.append("contact is left out of its steps (contact=False)" + ("" if shapes is None else SEEN))
     if np.any(np.abs(q - model.default_state[: model.nq]) > 1e-9):
         told.append("its start is moved to where joints are inside their limits and nothing overlaps")
@@ -153,10 +153,12 @@ def _of_joints(model: Model) -> Array:
 
 
 def _inside(model: Model, lower: Array, upper: Array) -> Array:
-    """The file's posture, moved inside the limits."""
+    """The file's posture; in the middle of a joint's limits where that is outside, and inside where it is at one."""
     q = model.default_state[: model.nq].copy()
     margin = INSIDE * (upper - lower)
-    return np.where(_of_joints(model), np.clip(q, lower + margin, upper - margin), q)
+    outside = (q < lower) | (q > upper)
+    inside = np.where(outside, (lower + upper) / 2, np.clip(q, lower + margin, upper - margin))
+    return np.where(_of_joints(model), inside, q)
 
 
 def _apart(shapes: Model, first: Array, lower: Array, upper: Array, random: np.random.Generator) -> Array | None:
