@@ -242,7 +242,7 @@ def _guesses(robot: Robot, target: Array, avoid: Any, seed: int) -> list[Guess]:
 
 def _clear(robot: Robot, guess: Guess, avoid: Any) -> float:
     """[m] how far the guess stays from overlap and obstacles; below 0 where it does not."""
-    return -guess.depth
+    return 0.0 if guess.depth <= TOUCHING else -guess.depth
 
 
 def _collocated(robot: Robot, task: Task, guess: Guess, avoid: Any, least: str | None) -> _Attempt:
