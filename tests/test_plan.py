@@ -5,12 +5,13 @@ import sys
 
 import numpy as np
 import pytest
-from helpers.models import MODELS
+from helpers.models import MODELS, robot_file
 from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.cli.main import main
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.model.example import example_files
 from drake_diff.planning import plan
 from drake_diff.planning.motion import along
 from drake_diff.planning.robot import load_robot
@@ -101,8 +102,6 @@ def test_a_hand_out_of_reach_is_refused_with_its_distance(arm, tmp_path):
         ["--goal", "elbow=1,2"],
         ["--goal", "knee=1"],
         ["--goal", "elbow=4"],
-        ["--avoid", "cone:1,2"],
-        ["--avoid", "sphere:1,2,3"],
         ["--time", "soon"],
         ["no_such_file.urdf"],
     ],
@@ -131,3 +130,16 @@ def test_what_nothing_drives_is_refused(tmp_path):
     path.write_text('<sdf version="1.9"><model name="ball"><link name="ball"/></model></sdf>')
     with pytest.raises(ModelError, match="driven"):
         plan(path, out=tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_a_panda_and_a_ur5_bring_their_hands_to_a_place(tmp_path):
+    """The hand's place by Drake's own kinematics of the last state, which no part of the search computed."""
+    for file, hand in ((example_files()["panda"], "panda_hand"), (robot_file("ur5_robot.urdf"), "tool0")):
+        done = plan(file, goals={hand: [0.4, 0.3, 0.5]}, out=tmp_path / hand)
+        assert done.success, done.lines
+        plant = done.solution.problem.model.plant
+        context = plant.CreateDefaultContext()
+        plant.SetPositions(context, done.solution.xs[-1][: plant.num_positions()])
+        place = plant.GetFrameByName(hand).CalcPoseInWorld(context).translation()
+        assert place == pytest.approx([0.4, 0.3, 0.5], abs=1e-3)  # the tolerance of the goal

@@ -19,10 +19,6 @@ Goals = Annotated[
     list[str] | None,
     typer.Option(metavar="NAME=NUMBERS", help="hand=0.4,0,0.5 for a frame or body [m], elbow=1.0 for a joint."),
 ]
-Obstacles = Annotated[
-    list[str] | None,
-    typer.Option(metavar="SHAPE:NUMBERS", help="sphere:x,y,z,radius or box:x,y,z,width,depth,height [m]."),
-]
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -35,7 +31,6 @@ def plan(
         Path | None, typer.Argument(metavar="ROBOT", help="A URDF, SDF, MJCF (.xml) or .dmd.yaml file; else a Panda.")
     ] = None,
     goal: Goals = None,
-    avoid: Obstacles = None,
     time: Annotated[str | None, typer.Option(help="least: as fast as can be; else with the least effort.")] = None,
     out: Annotated[Path | None, out_option("artifacts/plan_<robot>")] = None,
     seed: Seed = 0,
@@ -47,7 +42,6 @@ def plan(
     goals = dict(_named_numbers(words) for words in goal or ())
     if len(goals) < len(goal or ()):
         raise InputError("--goal", got=" ".join(goal or ()), expected="each name once")
-    shapes = [_shape(words) for words in avoid or ()]
     if robot is not None and not robot.is_file():
         raise InputError("ROBOT", got=str(robot), expected="a file that exists")
     # Only here: what is wrong is refused before Drake is loaded.
@@ -56,7 +50,7 @@ def plan(
 
     file = robot or example_files()[EXAMPLE]
     with _live(file.name) as report:
-        done = planned(file, goals=goals, avoid=shapes, time=time, out=out, seed=seed, report=report)
+        done = planned(file, goals=goals, time=time, out=out, seed=seed, report=report)
     show(judged("pass" if done.success else "fail"), f" {file.name}: {done.solution.status.value}")
     for line in done.lines:
         show(plain(line))
@@ -67,26 +61,10 @@ def _named_numbers(words: str) -> tuple[str, list[float]]:
     name, sign, values = words.rpartition("=")
     if not sign or not name:
         raise InputError("--goal", got=repr(words), expected="NAME=x,y,z of a frame, or NAME=number of a joint")
-    return name.strip(), _numbers("--goal", words, values)
-
-
-def _shape(words: str) -> tuple[str, list[float]]:
-    kind, _, values = words.partition(":")
-    counts = {"sphere": 4, "box": 6}
-    expected = "sphere:x,y,z,radius or box:x,y,z,width,depth,height"
-    if kind not in counts:
-        raise InputError("--avoid", got=repr(words), expected=expected)
-    numbers = _numbers("--avoid", words, values)
-    if len(numbers) != counts[kind]:
-        raise InputError("--avoid", got=repr(words), expected=expected)
-    return kind, numbers
-
-
-def _numbers(option: str, words: str, values: str) -> list[float]:
     try:
-        return [float(value) for value in values.split(",")]
+        return name.strip(), [float(value) for value in values.split(",")]
     except ValueError as error:
-        raise InputError(option, got=repr(words), expected="numbers with commas between") from error
+        raise InputError("--goal", got=repr(words), expected="numbers with commas between") from error
 
 
 @contextmanager
