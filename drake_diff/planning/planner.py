@@ -23,7 +23,7 @@ from drake_diff.optimize.problem.goals import FrameGoal
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
-from drake_diff.planning.motion import Guess, along, by_controller
+from drake_diff.planning.motion import OF_EFFORT, Guess, along, by_controller
 from drake_diff.planning.robot import TOUCHING, Robot, effort_limits, load_robot
 from drake_diff.planning.task import Task, asked, postures
 from drake_diff.record.solve import EvidenceRecord
@@ -224,7 +224,7 @@ def _of_driven(robot: Robot, task: Task, avoid: Any, least: str | None, seed: in
 
 
 def _guesses(robot: Robot, target: Array, avoid: Any, seed: int) -> list[Guess]:
-    """First guesses to `target` (nq,), the best first: those that touch nothing, then those that need least effort.
+    """First guesses to `target` (nq,), the best first: those that touch nothing, then those within the effort limits.
 
     A straight line; where that touches something, lines bent through postures in between, at random.
     """
@@ -237,7 +237,7 @@ def _guesses(robot: Robot, target: Array, avoid: Any, seed: int) -> list[Guess]:
             found.append(along(robot, f"a bent line ({i})", [robot.q, middle, target]))
     else:
         found.append(along(robot, "a straight line in twice the time", [robot.q, target], slower=2.0))
-    return sorted(found, key=lambda guess: (-min(_clear(robot, guess, avoid), 0.0), guess.effort))
+    return sorted(found, key=lambda guess: (-_clear(robot, guess, avoid), max(guess.effort, OF_EFFORT)))
 
 
 def _clear(robot: Robot, guess: Guess, avoid: Any) -> float:
