@@ -1,10 +1,11 @@
 """Goals in a robot's own words: what they check, what they come to, and that the motions found keep them."""
 
+import re
 import shutil
 
 import numpy as np
 import pytest
-from helpers.models import MODELS, robot_file
+from helpers.models import MODELS, ROOT, robot_file
 from helpers.robots import example_robot, state_in_range
 from helpers.table import each_row
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -50,6 +51,18 @@ def reach(model, **changes):
     start, stop = {"shoulder": 0.3, "elbow": 0.4}, {"shoulder_w": 0, "elbow_w": 0}
     given = {"x0": start, "x_goal": stop, "num_steps": 20, "goals": tip(), "running_cost": EFFORT}
     return dd.Problem(model, **given | changes)
+
+
+def test_the_default_tolerances_are_those_of_the_documents():
+    text, moving = (ROOT / "docs" / "tasks.md").read_text(), dd.FrameVelocityGoal
+    table = dict(re.findall(r"^\| `(\w+)\(.*\| (.*) \|$", text, re.MULTILINE))
+    assert table == {
+        "FrameGoal": f"{1000 * dd.FrameGoal.tolerance:g} mm, {dd.FrameGoal.rotation_tolerance:g} rad",
+        "FrameVelocityGoal": f"{moving.tolerance:g} m/s, {moving.angular_tolerance:g} rad/s",
+        "JointGoal": f"{dd.JointGoal.tolerance:g} in the coordinate's unit",
+        "CenterOfMassGoal": f"{1000 * dd.CenterOfMassGoal.tolerance:g} mm",
+        "KeepLevel": f"{dd.KeepLevel.tolerance:g} rad",
+    }
 
 
 KINDS = {
@@ -373,6 +386,42 @@ def test_half_a_turn_away_is_no_gap_in_the_derivatives(pendulum):
     at = np.zeros(3)
     assert np.all(np.isfinite(function.jacobian_of(at)))
     np.testing.assert_allclose(np.linalg.norm(f(at[:2])), 2.0, rtol=1e-12)
+
+
+ARMS = [
+    ("ur5_robot.urdf", "tool0", {}),
+    ("panda.urdf", "panda_hand", {"mimic": "reduce"}),
+    ("solo12.urdf", "HR_FOOT", {}),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+@pytest.mark.parametrize(("name", "frame", "options"), ARMS)
+def test_robots_reach_with_a_hand_or_a_foot_by_default_and_verify_holds(name, frame, options, tmp_path):
+    """To where the frame is at other angles, so that it can be reached; at rest in the end."""
+    model = dd.load_model(robot_file(name), time_step=0.02, actuators="all", base="weld", **options)
+    random, (lower, upper) = np.random.default_rng(0), model.position_limits
+    lower, upper = np.maximum(lower, -2.0), np.minimum(upper, 2.0)
+    start, turn = (lower + upper) / 2, 0.3 * random.uniform(-1, 1, model.nq)
+    x0, there = (np.concatenate([np.clip(q, lower, upper), np.zeros(model.nv)]) for q in (start, start + turn))
+    where = dd.quantities.frame_position(model, frame)
+    problem = dd.Problem(
+        model,
+        x0=x0,
+        num_steps=30,
+        goals=dd.FrameGoal(frame, where(there)),
+        x_goal=dict.fromkeys(model.velocity_names, 0.0),
+        running_cost=dd.QuadraticCost(R=1e-3 * np.eye(model.nu)),
+    )
+    solution = dd.solve(problem, progress=False)
+    assert solution.success, solution.message
+    assert f"the plan holds: {frame} ends " in solution.message
+    assert solution.options["derivatives"] == "symbolic, exact Hessian"
+    # The box in which the plan ends: a tenth of 5 mm each way; the distance is measured by Drake.
+    assert np.linalg.norm(where(solution.xs[-1]) - where(there)) <= AIMED * 5e-3 + 1e-5
+    dd.save(solution, tmp_path / "run")
+    assert dd.verify(tmp_path / "run").require().verdict == "holds"
 
 
 @pytest.fixture(scope="module")

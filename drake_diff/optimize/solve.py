@@ -15,9 +15,11 @@ from drake_diff.certificates.certificate import Certificate, certify_jacobian
 from drake_diff.certificates.certify import certify
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, GradientError, InputError, SimulationError, UnknownNameError
+from drake_diff.model.contact import penetration
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.model import Model
 from drake_diff.model.soft_contact import SoftContact
+from drake_diff.model.step import set_state
 from drake_diff.optimize.advice import advice
 from drake_diff.optimize.drake_program import SOLVERS
 from drake_diff.optimize.ilqr.ilqr import check_problem, is_unconstrained, solve_ilqr
@@ -73,8 +75,9 @@ def solve(
 ) -> Solution:
     """Solve `problem`, certify the derivatives that were used, and measure the result again on Drake's plant.
 
-    "auto" chains methods until one is verified: collocation where the model is smooth, else, or where that fails, iLQR
-    (with a continuation where the guess touches nothing that matters), whose result the next one starts from.
+    "auto" chains methods until one is verified: collocation where the model is smooth, or where every coordinate is
+    driven and nothing touches in x0; else, or where that fails, iLQR (with a continuation where the guess touches
+    nothing that matters), whose result the next one starts from.
     `Solution.options["chain"]` says what was tried, why, and how it ended.
 
     Args:
@@ -178,8 +181,12 @@ def _takes(problem: Problem, method: str) -> bool:
     """Whether `method` can be asked for `problem`, and says anything of its contact."""
     if method == "collocation" and problem.has_model and problem.model.contract.contact.collision_pairs:
         return False
+    return _is_possible(problem, Attempt(method, ""))
+
+
+def _is_possible(problem: Problem, attempt: "Attempt") -> bool:
     try:
-        _check_attempt(problem, Attempt(method, ""))
+        _check_attempt(problem, attempt)
     except DrakeDiffError:
         return False
     return True
@@ -298,6 +305,10 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
     """What to try next and from which guess, by what the attempts before, in `found`, came to."""
     method, reason = choose_method(problem)
     first = dataclasses.replace(asked, method=method, reason=reason, solver=None if method == "ilqr" else asked.solver)
+    told = "nothing touches at first, and every coordinate is driven"
+    free = dataclasses.replace(asked, method="collocation", reason=told)
+    if method == "ilqr" and _is_free_at_first(problem) and _is_possible(problem, free):
+        yield free, given
     yield first, given
     if found[-1].status is Status.NO_GRADIENT and method == "ilqr":
         yield Attempt("ilqr", "the guess has no gradient", continuation="auto"), given
@@ -310,6 +321,21 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
         begun = found[-1].xs, found[-1].us
         after = "collocation" if method == "collocation" else "shooting"
         yield dataclasses.replace(asked, method=after, reason="from the motion that iLQR found"), begun
+
+
+def _is_free_at_first(problem: Problem) -> bool:
+    """Whether contact is there to be avoided: nothing needs to be pushed, and in x0 nothing touches.
+
+    A collocated motion in which geometries overlap is not verified, so that one which is has no contact.
+    """
+    model = problem.model
+    contract = model.contract
+    if contract.constraints or any(actuator.kp is not None for actuator in contract.actuators):
+        return False
+    if np.linalg.matrix_rank(model.actuation) < model.nv:
+        return False
+    set_state(model.double, problem.x0)
+    return penetration(model) <= 0
 
 
 def _check_attempt(problem: Problem, attempt: Attempt) -> str:
