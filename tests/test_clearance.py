@@ -2,6 +2,7 @@
 
 import itertools
 import re
+import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
@@ -16,9 +17,7 @@ from pydrake.geometry import (
     Capsule,
     Cylinder,
     Ellipsoid,
-    Mesh,
     ProximityProperties,
-    Role,
     Sphere,
 )
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -38,7 +37,6 @@ from drake_diff.mechanics.description import read_links
 from drake_diff.mechanics.distance import along_segment, along_segments, length, to_box
 from drake_diff.mechanics.placing import placing_of
 from drake_diff.model.parameters import applied, select
-from drake_diff.model.plant import bodies
 
 ROBOTS = ("ur5_robot.urdf", "panda.urdf", "a1.urdf")  # hinges; hinges and slides; a free base
 CLOSED = 1e-9  # [m] of metres: closed forms on both sides
@@ -243,8 +241,8 @@ def test_a_robot_without_readable_shapes_is_a_skeleton_and_says_so():
     model = without_shapes()
     cover = cover_of(model, placing_of(model))
     assert {p.source for p in cover.pieces} == {"skeleton"}
-    assert "no shape that could be read" in cover.notes[0]
-    assert "upper, lower" in cover.notes[0]
+    assert "no shape that could be read" in cover.doubts[0]
+    assert "upper, lower" in cover.doubts[0]
 
 
 def without_shapes():
@@ -259,24 +257,43 @@ def without_shapes():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ["ur5_robot.urdf", "xarm7.urdf"])
-def test_meshes_that_are_only_drawn_are_contained(robot):
-    """Every corner of every mesh, as trimesh reads it, is in a capsule of its link."""
+def test_collision_meshes_are_contained_though_the_step_skips_them(robot):
+    """Every corner of every mesh, as trimesh reads the file's own, is in a capsule of its link."""
     model = dd.load_model(robot_file(robot), time_step=0.02, base="weld")
     links = placing_of(model)
     cover = cover_of(model, links)
-    inspector, checked = model.double.inspector, 0
-    for body in bodies(model.plant):
-        frame = model.plant.GetBodyFrameIdIfExists(body.index())
-        pieces = [(p.start, p.end, p.radius, 0) for p in cover.pieces if p.body == body.name()]
-        for geometry in inspector.GetGeometries(frame, Role.kIllustration) if frame else ():
-            shape = inspector.GetShape(geometry)
-            if isinstance(shape, Mesh):
-                corners = trimesh.load(shape.source().path(), force="mesh").vertices * shape.scale3()
-                to_link = links.on[body.name()][1] @ inspector.GetPoseInFrame(geometry)
-                assert inside(pieces, (to_link @ corners.T).T).all(), body.name()
-                checked += 1
+    root, checked = ET.parse(robot_file(robot)).getroot(), 0
+    folder = robot_file(robot).parents[[p.name for p in robot_file(robot).parents].index("example-robot-data")]
+    for link in root.iter("link"):
+        pieces = [(p.start, p.end, p.radius, 0) for p in cover.pieces if p.body == link.get("name")]
+        for collision in link.findall("collision"):
+            mesh, origin = collision.find("geometry/mesh"), collision.find("origin")
+            if mesh is None:
+                continue
+            name = mesh.get("filename").removeprefix("package://example-robot-data/")
+            scale = np.array((mesh.get("scale") or "1 1 1").split(), dtype=float)
+            rpy, xyz = (
+                np.array(((origin.get(key) if origin is not None else None) or "0 0 0").split(), dtype=float)
+                for key in ("rpy", "xyz")
+            )
+            on_body = RigidTransform(RollPitchYaw(rpy), xyz)
+            corners = trimesh.load(folder / name, force="mesh").vertices * scale
+            to_link = links.on[link.get("name")][1] @ on_body
+            assert inside(pieces, (to_link @ corners.T).T).all(), link.get("name")
+            checked += 1
     assert checked >= 6
-    assert all(p.source != "skeleton" for p in cover.pieces)
+    shaped = {link.get("name") for link in root.iter("link") if link.find("collision") is not None}
+    assert all(p.source != "skeleton" for p in cover.pieces if p.body in shaped)
+
+
+@each_row("options", [{}, {"contact_geometry": "corner_spheres"}, {"contact": False}])
+def test_what_a_step_touches_with_is_not_what_is_kept_clear(options):
+    """Spheres in its corners leave most of a box open: the cover is that of the box that the file gives."""
+    model = dd.load_model(MODELS / "box_push.sdf", time_step=0.01, **options)
+    whole = dd.load_model(MODELS / "box_push.sdf", time_step=0.01)
+    found, wanted = ([p for p in cover_of(m, placing_of(m)).pieces if p.link >= 0] for m in (model, whole))
+    assert [(p.body, p.radius, p.source) for p in found] == [(p.body, p.radius, p.source) for p in wanted]
+    assert any(p.source == "around a box" for p in found)
 
 
 def test_parameters_that_move_links_are_refused():

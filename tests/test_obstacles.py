@@ -1,7 +1,10 @@
 """Obstacles: a plan keeps clear of them at its knots and in between, as Drake measures it; what does not is named."""
 
+import re
+import warnings
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +15,7 @@ from pydrake.math import RigidTransform
 import drake_diff as dd
 import drake_diff.optimize.solve as solve_module
 import drake_diff.optimize.transcription.collocation as collocation_module
-from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.exceptions import InputError, ModelWarning, UnknownNameError
 from drake_diff.optimize.judge import complaints_about, judged
 from drake_diff.optimize.program import NlpResult, Outcome
 
@@ -216,3 +219,16 @@ def test_a_soft_obstacle_is_a_cost_of_what_is_used_of_its_margin():
     own = SMOOTH(x, np.zeros(2))
     assert soft.total_running_cost(x, np.zeros(2)) - own == pytest.approx(200 * used @ used, rel=1e-9)
     assert used.max() > 0.05
+
+
+def test_a_problem_warns_of_links_that_are_kept_clear_as_a_skeleton(tmp_path):
+    text = Path("models/double_pendulum.urdf").read_text()
+    path = tmp_path / "bare.urdf"
+    path.write_text(re.sub("<(visual|collision)>.*?</(visual|collision)>", "", text, flags=re.DOTALL))
+    model = dd.load_model(path, time_step=0.05)
+    fields = {"x0": [-1.0, 0.1, 0, 0], "num_steps": 10, "running_cost": SMOOTH}
+    with pytest.warns(ModelWarning, match=r"upper, lower: no shape that could be read, kept clear as capsules"):
+        dd.Problem(model, goals=[BALL], **fields)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dd.Problem(model, goals=[dd.JointGoal({"elbow": 0.5})], **fields)

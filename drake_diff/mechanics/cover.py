@@ -25,6 +25,7 @@ from drake_diff.model.triangles import read_mesh, scaled
 MOST_STRIPS = 4  # side by side, that cover a box
 MOST_SLABS = 4  # one after the other, that cover a hull or a mesh
 DRAKES_OWN = (".vtk", ".gltf")  # meshes that Drake alone reads: their hull is taken
+WHOLE_SHAPES: dict[str, Any] = {"contact": True, "contact_geometry": None, "meshes": "convex"}  # options of load_model
 WORTH_A_SLAB = 0.8  # of the volume: more slabs have to save that much
 CYLINDER_PART = 0.5  # of a cylinder's radius: how far before its ends a segment ends; it sticks out sideways by 12 %
 BONE_PART, BONE_RADII = 0.2, (0.01, 0.06)  # of its length, and the limits [m]: the radius of a skeleton's capsule
@@ -55,11 +56,11 @@ class Piece:
 
 @dataclass(frozen=True)
 class Cover:
-    """The pieces of all bodies; `bare` are bodies that have none, `notes` say what is not exact, a sentence each."""
+    """The pieces of all bodies; `bare` are bodies that have none, `doubts` say what they may not contain."""
 
     pieces: tuple[Piece, ...]
     bare: tuple[str, ...]
-    notes: tuple[str, ...]
+    doubts: tuple[str, ...]
 
 
 def cover_of(model: Model, placing: Placing) -> Cover:
@@ -68,19 +69,28 @@ def cover_of(model: Model, placing: Placing) -> Cover:
 
 
 def _cover(model: Model, placing: Placing) -> Cover:
-    inspector, pieces, bare = model.double.inspector, list[Piece](), []
-    for label, body in labelled(bodies(model.plant)).items():
+    whole, pieces, bare, unread = _with_whole_shapes(model), list[Piece](), [], []
+    inspector = whole.double.inspector
+    for label, body in labelled(bodies(whole.plant)).items():
         link, pose = placing.on[label]
-        found = [] if inspector is None else list(_of_shapes(model, inspector, body))
-        found = found or list(_skeleton(model, body))
+        found = [] if inspector is None else list(_of_shapes(whole, inspector, body, unread))
+        found = found or list(_skeleton(whole, body))
         pieces += [replace(p, body=label, link=link, start=pose @ p.start, end=pose @ p.end) for p in found]
     for place, rigid in enumerate(placing.links):
         if all(p.link != place for p in pieces):
             bare.append(rigid.joint.body)
-    return Cover(tuple(pieces), tuple(bare), tuple(_notes(pieces, bare)))
+    return Cover(tuple(pieces), tuple(bare), (*unread, *_doubts(pieces, bare)))
 
 
-def _notes(pieces: Sequence[Piece], bare: Sequence[str]) -> Iterator[str]:
+def _with_whole_shapes(model: Model) -> Model:
+    """The model with the shapes that its file gives: what it touches with may be spheres inside them, or nothing.
+
+    A user's diagram has what it has.
+    """
+    return model.changed(**WHOLE_SHAPES) if model.can_rebuild else model
+
+
+def _doubts(pieces: Sequence[Piece], bare: Sequence[str]) -> Iterator[str]:
     names = dict.fromkeys(p.body for p in pieces)
     bones = [b for b in names if any(p.body == b and p.source == "skeleton" for p in pieces)]
     if bones:
@@ -89,16 +99,15 @@ def _notes(pieces: Sequence[Piece], bare: Sequence[str]) -> Iterator[str]:
             f"{', '.join(bones)}: no shape that could be read, kept clear as capsules from joint to joint, of radius "
             f"{min(radii):.3g} to {max(radii):.3g} m"
         )
-    around = [(max(p.excess for p in pieces if p.body == b), b) for b in names]
-    wide = [f"{b} by {excess:.2g} m" for excess, b in around if excess > ROUNDING]
-    if wide:
-        yield f"kept clear as capsules that stick out of their shapes: {', '.join(wide)}"
     if bare:
         yield f"{', '.join(bare)}: no shape, no mass and no next joint, not kept clear of anything"
 
 
-def _of_shapes(model: Model, inspector: Any, body: Any) -> Iterator[Piece]:
-    """Of the body's collision shapes, or of those that are drawn where there are none, in the body's frame."""
+def _of_shapes(model: Model, inspector: Any, body: Any, unread: list[str]) -> Iterator[Piece]:
+    """Of the body's collision shapes, or of those that are drawn where there are none, in the body's frame.
+
+    A sentence is added to `unread` where shapes of a kind cannot be read.
+    """
     frame = model.plant.GetBodyFrameIdIfExists(body.index())
     if frame is None:
         return
@@ -106,7 +115,9 @@ def _of_shapes(model: Model, inspector: Any, body: Any) -> Iterator[Piece]:
         geometries = inspector.GetGeometries(frame, role)
         try:
             found = [p for g in geometries for p in _around(inspector.GetShape(g), inspector.GetPoseInFrame(g))]
-        except (ModelError, RuntimeError):  # a mesh that cannot be read: told as a skeleton
+        except (ModelError, RuntimeError) as error:
+            kind = "collision shapes" if role == Role.kProximity else "drawn shapes"
+            unread.append(f"{body.name()}: its {kind} cannot be read ({error}), so others stand for them")
             continue
         if found:
             yield from found

@@ -431,7 +431,7 @@ def swept(constraints: Sequence[Constraint], time_step: float, parts: int) -> tu
     return tuple(found)
 
 
-def notes_of(goals: Sequence[Goal], model: Model) -> Iterator[str]:
-    """What is to be said of how a model keeps clear, where one of `goals` asks for it."""
+def doubts_of(goals: Sequence[Goal], model: Model) -> Iterator[str]:
+    """What a model may not keep clear, where one of `goals` asks for it."""
     if any(isinstance(goal, Obstacle) for goal in goals):
-        yield from cover_of(model, _placing(model)).notes
+        yield from cover_of(model, _placing(model)).doubts

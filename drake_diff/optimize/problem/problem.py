@@ -1,5 +1,6 @@
 """What is to be optimized, checked when it is made; contains no solver."""
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
@@ -9,7 +10,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, array_with_gaps, finite_array, frozen, positive_float, positive_int
 from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNameError
+from drake_diff.exceptions import InputError, ModelError, ModelWarning, ShapeError, UnknownNameError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, select
 from drake_diff.optimize.problem.constraint import Constraint, check_inside, plant_limits, resolve_bounds, short
@@ -17,7 +18,7 @@ from drake_diff.optimize.problem.cost import ConstantCost, FinalCost, QuadraticC
 from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
 from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGoals, in_words
 from drake_diff.optimize.problem.names import bounds_of, state_of
-from drake_diff.optimize.problem.obstacles import ClearanceConstraint
+from drake_diff.optimize.problem.obstacles import ClearanceConstraint, doubts_of
 
 OPTIMIZABLE = ("controls", "initial_state", "parameters")
 # A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
@@ -395,6 +396,8 @@ class Problem(ShowsItsRepr):
                 raise InputError("goals", got=type(goal).__name__, expected="a goal such as FrameGoal, or several")
         if given and not self.has_model:
             raise InputError("goals", got="given", expected="none for plain dynamics: a goal is a model's")
+        for doubt in doubts_of(given, self.model) if given else ():
+            warnings.warn(doubt, ModelWarning, stacklevel=4)
         return tuple(given)
 
     def _check_kept(self) -> None:
