@@ -92,7 +92,15 @@ SOURCES = {
         "0.9": "drake_diff.certificates.judgement:DOUBTFUL",
         "0.3": "tests/test_certificate.py::",
     },
+    "docs/mimic.md": {},
+    "docs/plan.md": {
+        "0": CODES["0"],
+        "7": "drake_diff.planning.planner:SMALL",
+        "1e-4": "drake_diff.planning.robot:TOUCHING",
+    },
     "docs/contact.md": {
+        "1000": "drake_diff.model.triangles:MOST_CORNERS",
+        "30000": "drake_diff.pages.shapes:MOST_FACES",
         "1": "tests/test_contact_table.py::test_values_by_hand_and_by_drake_alone",
         "1e4": "tests/test_contact_table.py::test_values_by_hand_and_by_drake_alone",
         "1e-6": SAP,
