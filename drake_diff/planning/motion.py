@@ -7,7 +7,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import SimulationError
 from drake_diff.model.model import Model
-from drake_diff.model.step import advance
+from drake_diff.model.step import advance, set_state
 from drake_diff.planning.robot import Robot, drive, effort_limits
 
 FASTEST = 1.0  # [rad/s or m/s] the peak of a joint without a velocity limit
@@ -65,8 +65,13 @@ def _share(model: Model, us: Array) -> float:
 
 def _inputs(model: Model, x: Array, wanted: Array) -> Array:
     """(nu,) the inputs whose step from x (nx,) leads to the velocities `wanted` (nv,)."""
-    at_rest, effect = drive(model, x)
-    u = np.linalg.lstsq(effect, wanted - at_rest, rcond=None)[0]
+    twin, h = model.double, model.time_step
+    set_state(twin, x)
+    change = wanted - x[model.nq :]
+    # The step's own equation, whose damping acts on the velocity after it; probing the step would meet joint limits.
+    needed = twin.inverse_dynamics(change / h) + twin.damping() * change
+    effect = h * np.linalg.solve(twin.mass_matrix() + h * np.diag(twin.damping()), model.actuation)
+    u = np.linalg.lstsq(model.actuation, needed, rcond=None)[0]
     for _ in range(CORRECTIONS):
         off = wanted - np.array(advance(model.double, x, u))[model.nq :]
         if np.max(np.abs(off), initial=0.0) < EXACT:
