@@ -69,7 +69,7 @@ def cover_of(model: Model, placing: Placing) -> Cover:
 
 
 def _cover(model: Model, placing: Placing) -> Cover:
-    whole, pieces, bare, unread = _with_whole_shapes(model), list[Piece](), [], []
+    whole, pieces, bare, unread = _with_whole_shapes(model), list[Piece](), list[str](), list[str]()
     inspector = whole.double.inspector
     for label, body in labelled(bodies(whole.plant)).items():
         link, pose = placing.on[label]
