@@ -201,7 +201,7 @@ def _check_derivatives(model: Model, jacobians: Array) -> None:
     bound[model.nx + model.nu :] = np.finfo(float).max  # its size is a matter of the parameter's unit
     size = np.where(np.isfinite(jacobian), np.abs(jacobian), np.inf) / bound
     if size.size and size.max() > 1:
-        row, column = np.unravel_index(int(np.argmax(size)), size.shape)
+        row, column = divmod(int(np.argmax(size)), size.shape[1])
         raise GradientError(
             f"the derivative of {model.state_names[row % model.nx]} by variable {column} of [x; u; parameters] is "
             f"{jacobian[row, column]:.6g}: expected a finite number of at most {MAGNITUDE_BOUND:g}"
