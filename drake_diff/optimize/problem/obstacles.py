@@ -97,8 +97,18 @@ class Obstacle(Goal):
     """The base of what is kept clear of."""
 
     margin: float
+    links: Any
     weight: float | None
     knots = None  # all of them
+
+    def checked_common(self) -> dict[str, Any]:
+        """The fields that every obstacle has, checked."""
+        kind = type(self).__name__
+        return {
+            "margin": _margin(f"{kind}.margin [m]", self.margin),
+            "links": _names(f"{kind}.links", self.links),
+            "weight": checked_weight(kind, self.weight, None),
+        }
 
     def constraints(
         self, clearance: Clearance, margin: float, name: str, thing: str
@@ -165,9 +175,7 @@ class SphereObstacle(Obstacle):
         self._set(
             center=tuple(finite_array("SphereObstacle.center", self.center, (3,)).tolist()),
             radius=positive_float("SphereObstacle.radius [m]", self.radius),
-            margin=_margin("SphereObstacle.margin [m]", self.margin),
-            links=_names("SphereObstacle.links", self.links),
-            weight=checked_weight("SphereObstacle", self.weight, None),
+            **self.checked_common(),
         )
 
     @property
@@ -229,9 +237,7 @@ class BoxObstacle(Obstacle):
             center=tuple(finite_array("BoxObstacle.center", self.center, (3,)).tolist()),
             size=tuple(size.tolist()),
             rotation=rotation_of("BoxObstacle.rotation", self.rotation),
-            margin=_margin("BoxObstacle.margin [m]", self.margin),
-            links=_names("BoxObstacle.links", self.links),
-            weight=checked_weight("BoxObstacle", self.weight, None),
+            **self.checked_common(),
         )
 
     @property
@@ -280,9 +286,7 @@ class SelfCollision(Obstacle):
 
     def __post_init__(self) -> None:
         self._set(
-            margin=_margin("SelfCollision.margin [m]", self.margin),
-            links=_names("SelfCollision.links", self.links),
-            weight=checked_weight("SelfCollision", self.weight, None),
+            **self.checked_common(),
             ignore=tuple(_pair("SelfCollision.ignore", pair) for pair in self.ignore),
         )
 
