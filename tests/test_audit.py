@@ -377,11 +377,13 @@ def test_a_sphere_beside_the_axis_is_only_told():
 def test_an_effort_at_its_limit_is_an_error():
     model = block(limit=20.0).model()
     assert "saturated_effort" not in codes(audit(model, u=[19.99]))
-    for u in (20.0, -25.0):
+    for u, slope in ((20.0, "that of the inside, and 0 outside"), (-25.0, "exactly 0")):
         found = only(audit(model, u=[u]), "saturated_effort")
         assert (found.severity, found.subject) == ("error", "motor")
-        assert f"limit 20 (u is {u:g}): there the derivative by u is exactly 0" in found.message
+        assert f"limit 20 (u is {u:g}): there the derivative by u is {slope}" in found.message
     assert np.all(dd.differentiate_step(model, model.default_state, [-25.0]).B == 0)
+    inside = dd.differentiate_step(model, model.default_state, [19.0]).B
+    np.testing.assert_array_equal(dd.differentiate_step(model, model.default_state, [20.0]).B, inside)
 
 
 def test_pd_control_that_saturates_is_an_error_even_at_zero_input():

@@ -25,7 +25,9 @@ from pydrake.multibody.tree import (
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 import drake_diff as dd
+from drake_diff.certificates.certify import certify_inside
 from drake_diff.derivatives import sources
+from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.derivatives.sources import METHODS
 from drake_diff.exceptions import ModelError, ModelWarning, SimulationError, UnknownNameError
 
@@ -153,6 +155,44 @@ def test_efforts_at_their_limits(kp, u):
     assert saturated.any()
     assert np.all(np.abs(d.B).max(axis=0)[saturated] == 0)
     assert np.all(np.abs(d.B).max(axis=0)[~saturated] > 0)
+
+
+@pytest.mark.parametrize("method", ["analytic", "implicit", "autodiff"])
+def test_exactly_at_its_limit_an_input_has_the_derivative_of_the_inside(method):
+    """Plans end up there, and their bounds keep them on that side: a derivative of 0 would never lead away."""
+    model = springs_and_motors(limit=3.0)
+    at, inside = (
+        dd.differentiate_step(model, POINT[0], [a, 0.4, b], method=method).B for a, b in ((3, -3), (2.999, -2.999))
+    )
+    np.testing.assert_allclose(at, inside, rtol=1e-12, atol=1e-14)  # the step is affine in u
+
+
+def outside(u, limit):
+    """A fault: exactly at a limit the derivative is taken for that of the outside, which is 0."""
+    return np.abs(u) >= limit
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_a_derivative_of_the_outside_exactly_at_a_limit_is_found(monkeypatch, scale):
+    """The certificate's differences are taken beside the limit; what changes between there and the limit counts."""
+    model = springs_and_motors(limit=3.0 * scale)
+    x, u = np.array(POINT[0]), np.array([3.0, 0.4, -3.0]) * scale
+    found = certify_inside(model, x, u)
+    assert found.verdict == "agree"
+    assert "certified beside the limit of its effort" in found.told
+    assert certify_inside(model, x, u / 2).told == dd.certify(model, x, u / 2).told
+    force = SmoothStep._force
+    monkeypatch.setattr(
+        SmoothStep, "_force", lambda self, q, v, us: (force(self, q, v, us)[0], outside(us, self.limit))
+    )
+    wrong = certify_inside(model, x, u)
+    assert dd.differentiate_step(model, x, u).method == "analytic"
+    assert wrong.verdict == "disagree"
+    assert "at which the derivative is another one" in wrong.told
+    assert {entry.column for entry in wrong.entries if entry.verdict == "disagree"} == {
+        model.input_names[0],
+        model.input_names[2],
+    }
 
 
 @pytest.mark.parametrize("q", [0.0, 0.5, -0.6])

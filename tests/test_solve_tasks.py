@@ -1,4 +1,4 @@
-"""What users ask `solve` for, by collocation: minimum time, waypoints, path constraints, each against a closed form."""
+"""What users ask `solve` for: minimum time, waypoints, path constraints, limits, each against a closed form."""
 
 import math
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
+from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.exceptions import InputError
 from drake_diff.optimize.solution import Status
 
@@ -129,3 +130,37 @@ def test_what_a_constraint_is_exceeded_by_between_the_nodes_is_in_the_record(wri
     assert solution.success is holds
     assert metrics["state excess between nodes"].value == 0
     assert metrics["input excess between nodes"].value == 0
+
+
+@pytest.mark.parametrize("method", ["shooting", "ilqr"])
+@pytest.mark.parametrize("limit", [2.0, 0.03])
+def test_a_plan_at_the_limits_of_its_motor_is_verified(write_urdf, method, limit):
+    """6 d / T^2 is the largest input of least effort, 4 d / T^2 the least limit that will do: 4.5 d / T^2 acts."""
+    count, h = 30, 0.04
+    distance = limit * (count * h) ** 2 / 4.5
+    model = write_urdf(limit=limit, time_step=h)
+    effort = dd.QuadraticCost(R=np.eye(1) / limit**2)
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[distance, 0], num_steps=count, running_cost=effort)
+    solution = dd.solve(problem, method=method)
+    assert solution.success, solution.message
+    np.testing.assert_allclose(np.abs(solution.us[[0, -1], 0]), limit, rtol=1e-9)
+    assert solution.us.max() <= limit
+    told = [certificate.told for certificate in solution.certificates[-5:]]
+    assert "certified beside the limit of its effort" in told[0]
+    assert "certified beside the limit of its effort" in told[-1]
+
+
+def test_a_plan_whose_derivative_is_wrong_exactly_at_the_limit_is_not_verified(write_urdf, monkeypatch):
+    """The fault is there at the limit alone, where no difference is taken."""
+    force = SmoothStep._force
+    monkeypatch.setattr(
+        SmoothStep,
+        "_force",
+        lambda self, q, v, us: (force(self, q, v, us)[0], np.abs(us) >= self.limit),
+    )
+    model = write_urdf(limit=2.0, time_step=0.04)
+    effort = dd.QuadraticCost(R=np.eye(1) / 4)
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[0.64, 0], num_steps=30, running_cost=effort)
+    solution = dd.solve(problem, method="ilqr")
+    assert not solution.success
+    assert "disagree" in {certificate.verdict for certificate in solution.certificates}

@@ -138,7 +138,9 @@ def _saturated_effort(place: Place) -> Found:
     for actuator, u, now, rest in zip(own, u_own, effort, hold, strict=True):
         limit = float(actuator.effort_limit())
         if abs(now) >= limit:
-            message = f"its effort is at the limit {limit:g} (u is {u:.6g}): there the derivative by u is exactly 0"
+            corner = abs(u) == limit and not actuator.has_controller()
+            slope = "that of the inside, and 0 outside" if corner else "exactly 0"
+            message = f"its effort is at the limit {limit:g} (u is {u:.6g}): there the derivative by u is {slope}"
             yield Finding("error", "saturated_effort", actuator.name(), message, remedy)
         elif abs(rest) > limit:
             message = f"to hold x at rest takes {rest:.6g} (without contact), beyond the limit {limit:g}"

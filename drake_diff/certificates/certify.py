@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.differences import one_by_one
-from drake_diff.certificates.certificate import Certificate, ModeChange, certificate_of, jitter
+from drake_diff.certificates.certificate import JITTER, Certificate, ModeChange, certificate_of, jitter
 from drake_diff.certificates.neighbourhood import Neighbourhood, look_around
 from drake_diff.derivatives.polish import polished_steps
 from drake_diff.derivatives.sources import check_method, step_at
@@ -23,6 +23,9 @@ from drake_diff.model.tangent import TangentSpace, tangent_space
 
 SHARED = "the derivative is of differences too, of another step: the two share a method, and what it misses is missed"
 LIMIT_REACH = 0.05  # [m or rad] a joint limit this near may hold the joint in one of the displaced steps
+EFFORT_ROOM = 0.02  # of max(1, |u|): twice the widest step of the differences
+EFFORT_PART = 0.5  # of an effort limit at most, however small that is
+LEAP = 1e-6  # of what an entry is weighed by: of another derivative at a limit than beside it
 NEIGHBOURHOOD = 1e-4  # in scaled coordinates: how far away a change of contact mode is looked for
 # A row is touched by one if its change departs from what the derivative predicts by this part of the larger one.
 TOUCHED = 1e-2
@@ -100,6 +103,46 @@ def certify(
         if not model.contract.contact.collision_pairs:
             return certificate
         return replace(certificate, mode_changes=_find_mode_changes(model, space, step.drake, derivative, scale))
+
+
+def certify_inside(model: Model, x: Array, u: Array, *, parameters: Parameters = ()) -> Certificate:
+    """`certify`, on the inner side of effort limits: a plan's inputs end up exactly at them, and never go beyond.
+
+    Drake cuts inputs off at the limit, which is a corner: differences are taken beside it, where they have room. By
+    what the derivative exactly at the limit differs from the one just inside, what is certified is off.
+    """
+    limits = _clips(model)
+    room = np.minimum(EFFORT_ROOM * np.maximum(1.0, np.abs(u)), EFFORT_PART * limits)
+    inside = np.minimum(np.maximum(u, room - limits), limits - room)
+    found = certify(model, x, inside, parameters=parameters)
+    moved = inside != u
+    if not moved.any():
+        return found
+    names = ", ".join(np.array(model.input_names)[moved])
+    told = "; ".join(text for text in (found.told, f"{names} certified beside the limit of its effort") if text)
+    leap = _leap(model, x, u, np.where(moved, np.sign(inside - u), 0.0), parameters)
+    if np.any(np.abs(leap) > LEAP * found.size):
+        told += f", at which the derivative is another one, by up to {np.max(np.abs(leap)):.3g}"
+        found = replace(found.of(found.derivative + leap), mode_changes=found.mode_changes)
+    return replace(found, told=told)
+
+
+def _clips(model: Model) -> Array:
+    """(nu,) beyond what Drake cuts each input off; infinite where it does not."""
+    inputs = model.inputs
+    limits = [np.inf if a.has_controller() else a.effort_limit() for a in actuators(model.plant)]
+    return np.where(inputs.actuator >= 0, inputs.of_actuators(limits), np.inf)
+
+
+def _leap(model: Model, x: Array, u: Array, inward: Array, parameters: Parameters) -> Array:
+    """The derivative at u (nu,) less that 1e-9 of u away, to the side that the signs `inward` (nu,) say."""
+    vector, both = select(model, parameters), []
+    with applied(vector) as model:
+        space = tangent_space(model)
+        for at in (u, u + JITTER * np.maximum(1.0, np.abs(u)) * inward):
+            d = step_jacobians(model, vector, x, at, "auto")
+            both.append(space.jacobian(x, d.x_next, d.A, d.B, d.C))
+    return np.asarray(both[0] - both[1])
 
 
 class _RefusedError(Exception):

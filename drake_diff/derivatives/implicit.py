@@ -169,13 +169,16 @@ class Form:
     q_dot_is_v: bool
 
     def effort(self, q: Array, v_next: Array, u: Array, h: float) -> tuple[Array, NDArray[np.bool_], Any]:
-        """(..., nu) what the inputs are before they are clipped, whether they are free of their limits, and kp, kd."""
+        """(..., nu) what the inputs are before they are clipped, whether they are not beyond their limits, and kp, kd.
+
+        Exactly at a limit the derivative is that of the inside, as AutoDiffXd's is: there plans end up, and stay.
+        """
         kp, kd = self.gains()
         effort = u
         if self.pd:
             moved = q[..., self.position] + h * v_next[..., self.velocity] - self.reference[0]
             effort = u - kp * moved - kd * (v_next[..., self.velocity] - self.reference[1])
-        return effort, np.abs(effort) < self.limit, (kp, kd)
+        return effort, np.abs(effort) <= self.limit, (kp, kd)
 
     def gains(self) -> tuple[Array, Array]:
         """kp (nu,) and kd (nu,), zero where there is no controller; they may change as parameters do."""

@@ -116,7 +116,7 @@ class SmoothStep:
 
     def _force(self, q: Array, v: Array, us: Array) -> tuple[Array, NDArray[np.bool_] | None]:
         """(N, nv) B u + c - K q - D v, and which inputs (N, nu) are clipped, None where none is."""
-        clipped = np.abs(us) >= self.limit
+        clipped = np.abs(us) > self.limit
         some = bool(clipped.any())
         if some:
             us = np.clip(us, -self.limit, self.limit)

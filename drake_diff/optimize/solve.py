@@ -12,7 +12,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_float, positive_int
 from drake_diff.certificates.certificate import Certificate, certify_jacobian
-from drake_diff.certificates.certify import certify
+from drake_diff.certificates.certify import certify_inside
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.model.contact import penetration
@@ -612,7 +612,8 @@ class Run:
         """xs and us of z, certificates of some of its steps, and why the goal or cost is out of its reach."""
         us = variables.unpack(z)[1]
         xs, parameters = variables.states(z), variables.parameters(z).to_dict()
-        certificates = tuple(certify(self.problem.model, xs[k], us[k], parameters=parameters) for k in _certified(us))
+        model = self.problem.model
+        certificates = tuple(certify_inside(model, xs[k], us[k], parameters=parameters) for k in _certified(us))
         return xs, us, certificates, why_blind(self.problem, variables, z)
 
     def _certify_equations(self, jacobian: Any, xs: Array, us: Array) -> tuple[Certificate, ...]:
