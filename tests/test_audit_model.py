@@ -1,10 +1,13 @@
 """The audit names what a user trips over in a robot file and what mends it, and is silent where all is well."""
 
+import ast
 import re
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from helpers.models import MODELS
 from helpers.table import each_row
 
@@ -73,15 +76,18 @@ GRASP = (
 
 
 def audited(tmp_path, text, **options):
-    """What the audit of that file says, by its codes of this module."""
+    """What the audit of that file says, by its codes."""
     name = {"<r": "m.urdf", "<s": "m.sdf", "<m": "m.xml"}[text[:2]]
     (tmp_path / name).write_text(text)
+    CUBE.export(tmp_path / "hand.STL")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         model = dd.load_model(tmp_path / name, **{"time_step": 0.01, **options})
-    return {finding.code: finding for finding in dd.audit(model) if finding.code in CODES}
+    return {finding.code: finding for finding in dd.audit(model)}
 
 
+CUBE = trimesh.creation.box((0.06, 0.06, 0.06))
+PACKAGE = Path(dd.__file__).parent
 MESH = '<{}><geometry><mesh filename="hand.{}"/></geometry></{}>'
 # The code, the severity, the file and options in which it is found, words of it, and what mends it.
 TRAPS = [
@@ -113,7 +119,7 @@ TRAPS = [
     (
         "collision_gone",
         "warning",
-        ARM.replace("</link>", MESH.format("collision", "stl", "collision") + "</link>"),
+        ARM.replace("</link>", MESH.format("collision", "stl", "collision").replace("hand", "gone") + "</link>"),
         {},
         r"upper\): no collision shape of the file is left",
         {"contact": False},
@@ -125,7 +131,7 @@ TRAPS = [
         FREE.replace(BOX, ""),
         {"ground": True},
         "as it has no collision shapes",
-        {"base": "weld", "ground": None},
+        {"base": "weld"},
     ),
     (
         "invented_inertia",
@@ -198,7 +204,7 @@ TRAPS = [
         ARM.replace(DRIVE, "</robot>").replace('lower="-2" upper="2"', 'lower="0" upper="0"'),
         {},
         "the position limits are both 0: no plan can move",
-        {"actuators": "all"},
+        {"actuators": ["hinge"]},
     ),
     (
         "corners_miss",
@@ -214,7 +220,107 @@ TRAPS = [
         ARM.replace("</robot>", link("tip") + joint("wrist", "upper", "tip") + "</robot>"),
         {},
         "wrist.*1 joints have an effort limit in the file and no actuator; 1 others",
-        {"actuators": "all"},
+        {"actuators": ["wrist"]},
+    ),
+    (
+        "zero_limit",
+        "error",
+        ARM.replace('lower="-2" upper="2"', 'lower="1" upper="1"').replace(
+            "</robot>", link("tip") + joint("wrist", "upper", "tip") + "</robot>"
+        ),
+        {},
+        "the position limits are both 1: no plan can move",
+        {"fix_joints": ["hinge"]},
+    ),
+    (
+        "zero_limit",
+        "error",
+        ARM.replace('lower="-2" upper="2"', 'lower="1" upper="1"'),
+        {},
+        "give it limits in the file",
+        None,
+    ),
+    (
+        "collision_gone",
+        "warning",
+        ARM.replace("</link>", MESH.format("collision", "STL", "collision") + "</link>"),
+        {},
+        r"upper\): no collision shape of the file is left",
+        {"meshes": "convex"},
+    ),
+    (
+        "meshes_skipped",
+        "warning",
+        ARM.replace("</link>", MESH.format("collision", "STL", "collision") + "</link>"),
+        {},
+        "1 collision meshes skipped",
+        {"meshes": "convex"},
+    ),
+    (
+        "falls",
+        "warning",
+        FREE.replace(BOX, MESH.format("collision", "STL", "collision")),
+        {},
+        r"base\): it floats and falls for ever: nothing of it can touch",
+        {"meshes": "convex", "ground": True},
+    ),
+    (
+        "massless_root",
+        "error",
+        FREE.replace("</robot>", link("ghost", "") + "</robot>"),
+        {"base": "weld"},
+        r"ghost\): it has no mass and floats",
+        None,
+    ),
+    (
+        "saturated_effort",
+        "error",
+        ARM.replace('effort="7"', 'effort="0"'),
+        {},
+        r"hinge\): Drake leaves out actuators with an effort limit of 0",
+        {"actuators": ["hinge"]},
+    ),
+    (
+        "mimic_joint",
+        "warning",
+        ARM.replace(
+            "</robot>", link("tip") + joint("wrist", "upper", "tip", more='<mimic joint="hinge"/>') + "</robot>"
+        ),
+        {},
+        r"wrist\): joints follow others",
+        {"mimic": "reduce"},
+    ),
+    (
+        "pair_refused",
+        "error",
+        FREE,
+        {"ground": True},
+        r"ground \(HalfSpace\)",
+        {"contact_geometry": "corner_spheres"},
+    ),
+    (
+        "pair_refused",
+        "error",
+        FREE,
+        {"ground": True, "contact_model": "hydroelastic"},
+        "hydroelastic contact alone needs properties on both",
+        {"contact_geometry": "hydroelastic"},
+    ),
+    (
+        "pair_refused",
+        "error",
+        FREE.replace(BOX, MESH.format("collision", "STL", "collision")),
+        {"ground": True, "meshes": "convex"},
+        "Convex",
+        {"meshes": "spheres", "contact_geometry": "corner_spheres"},
+    ),
+    (
+        "aligned_faces",
+        "error",
+        FREE,
+        {"ground": True, "contact_model": "hydroelastic", "contact_geometry": "hydroelastic"},
+        "faces 0 rad from parallel",
+        {"contact_model": "point", "contact_geometry": "corner_spheres"},
     ),
 ]
 
@@ -224,13 +330,20 @@ def test_a_trap_is_named_and_its_remedy_mends_it(tmp_path, code, severity, text,
     finding = audited(tmp_path, text, **options)[code]
     assert finding.severity == severity
     assert re.search(words, str(finding)), str(finding)
-    if mended is not None:
-        assert next(iter(mended)) in finding.remedy or code == "falls"
-        assert code not in audited(tmp_path, text, **{**options, **mended})
+    assert finding.arguments == (mended or {})
+    assert all(name in finding.remedy for name in finding.arguments)
+    assert not mended or code not in audited(tmp_path, text, **{**options, **mended})
 
 
-def test_every_code_has_a_trap():
-    assert {row[0] for row in TRAPS} == set(CODES)
+def test_every_code_has_a_trap_and_every_argument_that_is_told_is_tried():
+    assert {row[0] for row in TRAPS} >= set(CODES)
+    told = set()
+    for module in ("audit.py", "audit_model.py"):
+        for node in ast.walk(ast.parse((PACKAGE / "certificates" / module).read_text())):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Finding" and len(node.args) == 6:
+                told.add(node.args[1].value)
+    assert len(told) > 10
+    assert told == {row[0] for row in TRAPS if row[5]}, "an argument that no file here tries"
 
 
 @each_row(
@@ -252,7 +365,9 @@ def test_every_code_has_a_trap():
 )
 def test_a_right_model_has_no_trap(tmp_path, text, options):
     found = audited(tmp_path, text, **options)
-    assert {code for code in found if found[code].severity != "info"} <= ({"falls"} if text == GRASP else set())
+    assert {code for code in CODES if code in found and found[code].severity != "info"} <= (
+        {"falls"} if text == GRASP else set()
+    )
 
 
 def test_a_block_falls_out_of_corner_spheres_and_stays_between_boxes(tmp_path):

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.cli import main as cli
+from drake_diff.cli.text import as_options
 from drake_diff.derivatives.methods import METHODS
 
 PENDULUM = f"""
@@ -208,8 +210,14 @@ def test_help_tells_all_defaults_and_no_text_is_taken_for_markup(monkeypatch, ca
             "contact-model",
             "contact-approximation",
             "contact-geometry",
-            "weld-base",
+            "actuators",
+            "base",
+            "fix-joints",
+            "meshes",
+            "packages",
+            "mimic",
             "ground",
+            "no-contact",
         ):
             assert f"--{option}" in shown[command]
 
@@ -222,6 +230,13 @@ def test_help_tells_all_defaults_and_no_text_is_taken_for_markup(monkeypatch, ca
         (("compare", "PENDULUM", "--seed", "-3"), "--seed"),
         (("compare", "PENDULUM", "--num-steps", "0"), "--num-steps"),
         (("audit", "PENDULUM", "--time-step", "nan"), "time_step [s]: expected a finite number above 0, got nan"),
+        (("audit", "PENDULUM", "--ground", "yes"), "--ground: expected true, or a friction coefficient, got 'yes'"),
+        (("audit", "PENDULUM", "--actuators", "hinge=strong"), "--actuators: expected an effort limit [N or N m]"),
+        (("audit", "PENDULUM", "--actuators", "hinge=1,wrist"), "--actuators: expected all, names of joints, or"),
+        (("audit", "PENDULUM", "--packages", "arm"), "--packages: expected NAME=FOLDER, got 'arm'"),
+        (("audit", "PENDULUM", "--meshes", "round"), "meshes: expected one of convex, skip, spheres, got 'round'"),
+        (("certify", "PENDULUM", "--mimic", "lock"), "got 'lock'"),
+        (("certify", "PENDULUM", "--base", "hand"), "base: frame: expected one of"),
         (("audit", "nothing.urdf"), "expected a file that exists, got nothing.urdf"),
         (("certify", "PENDULUM", "--out", "FILE"), "is a file"),
         (("panel", "nothing.toml"), "expected a panel in TOML"),
@@ -238,6 +253,70 @@ def test_bad_words_exit_with_2_and_one_sentence(tmp_path, monkeypatch, capsys, w
     shown = capsys.readouterr().err
     assert told in shown
     assert "Traceback" not in shown
+
+
+STRANGER = """<robot name="arm">
+<link name="base"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+<link name="arm"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="jaw"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="the hinge" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
+<limit effort="7" velocity="1" lower="-2" upper="2"/></joint>
+<joint name="jaw" type="prismatic"><parent link="arm"/><child link="jaw"/><axis xyz="0 1 0"/>
+<limit effort="7" velocity="1" lower="-2" upper="2"/><mimic joint="the hinge" multiplier="0.5"/></joint></robot>"""
+
+
+@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+def test_what_the_audit_tells_can_be_typed_until_nothing_is_left_to_mend(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.urdf").write_text(STRANGER)
+    typed, seen = [], []
+    for _ in range(8):
+        exit_of(monkeypatch, "audit", "arm.urdf", *typed)
+        shown = capsys.readouterr().out.splitlines()
+        options = [line.split("option: ")[1] for line in shown if "    option: " in line]
+        if not options:
+            break
+        seen.append(options[0])
+        typed += shlex.split(options[0])
+    told = ["--actuators all", "--contact-geometry corner_spheres", "--ground true", "--mimic reduce"]
+    assert sorted(seen) == told
+    assert exit_of(monkeypatch, "certify", "arm.urdf", "--states", "2", *typed) == 0
+
+
+@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+@each_row(
+    "words, kept",
+    [
+        (("--actuators", "all"), {"actuators": "all", "meshes": "skip", "contact": True}),
+        (("--actuators", "the hinge"), {"actuators": ("the hinge",)}),
+        (("--actuators", "the hinge=3"), {"actuators": {"the hinge": 3.0}}),
+        (("--base", "weld", "--fix-joints", "the hinge", "--mimic", "reduce"), None),
+        (("--base", "base", "--mimic", "fix"), None),
+        (("--ground", "0.3", "--meshes", "convex"), {"ground": 0.3, "meshes": "convex"}),
+        (("--ground", "true"), {"ground": True}),
+        (
+            ("--no-contact", "--packages", "a=.", "--packages", "b=.."),
+            {"contact": False, "packages": {"a": ".", "b": ".."}},
+        ),
+    ],
+)
+def test_the_options_are_those_of_load_model(tmp_path, monkeypatch, capsys, words, kept):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.urdf").write_text(STRANGER)
+    seen = []
+    monkeypatch.setattr("drake_diff.certificates.audit.audit", lambda model: seen.append(model) or [])
+    status = exit_of(monkeypatch, "audit", "arm.urdf", *words)
+    if kept is None:  # a refusal in the words of load_model
+        assert (status, "ModelError" in capsys.readouterr().err) == (cli.USAGE, True)
+    else:
+        assert status == 0
+        assert seen[0].options | kept == seen[0].options
+
+
+def test_arguments_are_typed_as_options():
+    arguments = {"fix_joints": ["a b", "c"], "ground": True, "contact": False, "mimic": "reduce"}
+    assert as_options(arguments) == "--fix-joints 'a b,c' --ground true --no-contact --mimic reduce"
 
 
 def test_the_version_is_that_of_the_installation(tmp_path):

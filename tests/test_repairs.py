@@ -179,6 +179,8 @@ def test_a_fixed_joint_is_held_where_it_is_by_default(write):
     model, told = load(write(), base="weld", fix_joints=["elbow"])
     assert model.position_names == ("shoulder_q",)
     assert "1 joints fixed: elbow at 0." in told
+    bent = write(robot(SHOULDER, ELBOW.replace('lower="-2"', 'lower="0.5"')), "bent.urdf")
+    assert "1 joints fixed: elbow at 0.5." in load(bent, base="weld", fix_joints=["elbow"])[1]
     assert model.contract.bodies[0].mass == 1.0  # a pendulum of two bodies: m g l about the shoulder, at rest
     weight = model.double.plant.CalcGravityGeneralizedForces
     context = model.plant.CreateDefaultContext()
@@ -252,6 +254,9 @@ def test_a_joint_is_fixed_beside_those_that_mimic(write):
     assert "2 joints fixed: shoulder at 0, elbow at 0." in load(path, fix_joints=["shoulder", "elbow"])[0].notes
     with pytest.raises(ModelError, match="fix_joints='shoulder': elbow mimics it: fix elbow too"):
         load(path, fix_joints=["shoulder"])
+    bent = finger.replace('lower="-2"', 'lower="1"')
+    with pytest.raises(ModelError, match=r"'elbow': 0 is outside of its limits \[1, 2\]: give mimic= too"):
+        load(write(robot(SHOULDER, bent)), base="weld", fix_joints=["elbow"])
 
 
 def test_slips_that_say_nothing_of_the_robot_are_mended_and_told(write):

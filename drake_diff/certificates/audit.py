@@ -4,12 +4,15 @@
 of contact come after the others; every number in them was measured on the Drake that this package is tested with.
 """
 
+import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import Box, Cylinder, Sphere
-from pydrake.multibody.plant import DiscreteContactApproximation
+from pydrake.multibody.plant import ContactModel, DiscreteContactApproximation
 from pydrake.multibody.tree import FixedOffsetFrame, WeldJoint
 
 from drake_diff._base.arrays import Array
@@ -61,7 +64,9 @@ def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) 
     x = model.default_state if x is None else x
     place = Place(model, *check_point(model, x, np.zeros(model.nu) if u is None and model.nu else u))
     checks = _CHECKS if place.has_poses else _CHECKS_WITHOUT_POSES
-    found = (finding for check in checks for finding in check(place))
+    found = [finding for check in checks for finding in check(place)]
+    if not model.can_rebuild:  # a diagram has no arguments
+        found = [replace(finding, arguments={}) for finding in found]
     return Findings(sorted(found, key=lambda f: (SEVERITIES.index(f.severity), f.subject, f.code)))
 
 
@@ -117,10 +122,7 @@ def _joint_limit(place: Place) -> Found:
 def _saturated_effort(place: Place) -> Found:
     model, plant, twin = place.model, place.model.plant, place.model.double
     remedy = "stay inside the limit (the bounds of a Problem do), or raise it in the file"
-    for note in model.notes:
-        if "zero effort limit" in note:
-            message = f"Drake leaves out actuators with an effort limit of 0, so there is no input: {note}"
-            yield Finding("error", "saturated_effort", "actuators", message, "give the joint an effort above 0")
+    yield from _left_out_actuators(model)
     if not model.nu:
         return
     own = [actuators(plant)[i] for i in model.inputs.actuator[model.inputs.actuator >= 0]]
@@ -145,6 +147,18 @@ def _saturated_effort(place: Place) -> Found:
         elif abs(rest) > limit:
             message = f"to hold x at rest takes {rest:.6g} (without contact), beyond the limit {limit:g}"
             yield Finding("warning", "saturated_effort", actuator.name(), message, remedy)
+
+
+def _left_out_actuators(model: Model) -> Found:
+    driven = {actuator.joint().name() for actuator in actuators(model.plant)}
+    for note in model.notes:
+        joint = re.search(r'joint "([^"]+)" which has a zero effort limit', note)
+        if joint and joint[1] not in driven:
+            message = f"Drake leaves out actuators with an effort limit of 0, so there is no input: {note}"
+            remedy = (
+                "load_model(..., actuators=) drives the joint all the same, or give it an effort above 0 in the file"
+            )
+            yield Finding("error", "saturated_effort", joint[1], message, remedy, {"actuators": [joint[1]]})
 
 
 def _jacobian(place: Place) -> Found:
@@ -190,7 +204,8 @@ def _mechanism(place: Place) -> Found:
                 f"joints should follow others, but Drake does not read SDF's <mimic>, and they move freely: {told}"
             )
         remedy = 'mimic="reduce" takes them out of the state, "fix" welds them; collocation and other engines need that'
-        yield Finding("warning", "mimic_joint", ", ".join(m.follower for m in mimics), message, remedy)
+        followers = ", ".join(m.follower for m in mimics)
+        yield Finding("warning", "mimic_joint", followers, message, remedy, {"mimic": "reduce"})
     if place.model.num_constraints:
         message = f"constraints in every step ({plant.num_constraints()}), which the implicit method cannot handle"
         remedy = "nothing to do: method auto takes autodiff; `certify` one state, as a few kinds have no AutoDiffXd"
@@ -225,8 +240,24 @@ def _pair_refused(place: Place) -> Found:
     for pair in place.pairs:
         if pair.refused:
             groups.setdefault(pair.bodies, []).append(pair)
+    by_choice = severity == "info"
     for bodies, pairs in groups.items():
-        yield Finding(severity, "pair_refused", " - ".join(bodies), _refusal(place, pairs), remedy)
+        arguments = {} if by_choice else _route(place.model, pairs)
+        told = f'meshes="spheres" and {remedy}' if "meshes" in arguments else remedy
+        yield Finding(severity, "pair_refused", " - ".join(bodies), _refusal(place, pairs), told, arguments)
+
+
+def _route(model: Model, pairs: list[Pair]) -> dict[str, Any]:
+    """The arguments with which these pairs are differentiated."""
+    if model.plant.get_contact_model() != ContactModel.kPoint:
+        return {"contact_geometry": "hydroelastic"}
+    kinds = {collider.kind for pair in pairs for collider in (pair.a, pair.b)}
+    if kinds <= MEETS_A_SPHERE:
+        return {"contact_geometry": "corner_spheres"}
+    from_meshes = model.source is not None and model.source.suffix in (".urdf", ".sdf")
+    if from_meshes and kinds <= MEETS_A_SPHERE | {"Mesh", "Convex"}:
+        return {"meshes": "spheres", "contact_geometry": "corner_spheres"}
+    return {"contact_geometry": "differences"}
 
 
 def _refusal(place: Place, pairs: list[Pair]) -> str:
@@ -247,7 +278,8 @@ def _refusal(place: Place, pairs: list[Pair]) -> str:
 
 def _aligned_faces(place: Place) -> Found:
     remedy = (
-        "replace one of them by spheres (corner_spheres), or start tilted by 0.03 rad or more and `certify` the "
+        'load_model(..., contact_model="point", contact_geometry="corner_spheres") replaces one of them by spheres; '
+        "or start tilted by 0.03 rad or more and `certify` the "
         "poses in contact: near the aligned pose too (measured: up to 1e-3 rad, cylinder on cylinder up to 0.04) the "
         "meshes' edges make the step jump"
     )
@@ -263,7 +295,8 @@ def _aligned_faces(place: Place) -> Found:
         elif angle <= NEARLY_PARALLEL:
             severity, told = "warning", "if they meet like this the hydroelastic step jumps"
         message = f"faces {angle:.2g} rad from parallel at x, {gap:.3g} m apart: {told}"
-        yield Finding(severity, "aligned_faces", pair.label, message, remedy)
+        arguments = {} if severity == "info" else {"contact_model": "point", "contact_geometry": "corner_spheres"}
+        yield Finding(severity, "aligned_faces", pair.label, message, remedy, arguments)
 
 
 def _alignment(pair: Pair) -> tuple[float | None, float]:

@@ -13,7 +13,8 @@ from pydrake.multibody.plant import DiscreteContactApproximation
 from drake_diff.certificates.finding import Finding, Severity
 from drake_diff.certificates.place import Place
 from drake_diff.model.load_file import collision_geometries
-from drake_diff.model.plant import FLOATING, PROXIMITY, actuators, bodies, joints
+from drake_diff.model.model import Model
+from drake_diff.model.plant import FLOATING, PROXIMITY, actuators, bodies, joints, labelled
 from drake_diff.model.repairs import can_be_driven
 from drake_diff.model.step import set_state
 
@@ -23,6 +24,7 @@ SAME_MASS = 1e-6  # relative: a file's mass and trace of inertia against the pla
 NO_MASS = 1e-12  # [kg or kg m^2] of a joint's own entry of the mass matrix
 CORNER = re.compile(r"_corner_\d+$")  # what replace_collision_geometry calls its spheres
 IGNORED = re.compile(r"ignored|not currently support|only supports|unsupported|Skipping transmission", re.IGNORECASE)
+SKIPPED = re.compile(r"\d+ collision meshes skipped")  # those that exist and that Drake cannot use
 HARMLESS = (
     "safety_controller",
     "calibration",
@@ -46,21 +48,22 @@ def _no_actuator(place: Place) -> Found:
         return
     driven = {actuator.joint().index() for actuator in actuators(model.plant)}
     undriven = []
-    for joint in joints(model.plant):
+    for name, joint in labelled(joints(model.plant)).items():
         key = (model.plant.GetModelInstanceName(joint.model_instance()), joint.name())
         says = facts.joints.get(key)
         passive = says is not None and says.passive
         if can_be_driven(joint) and joint.index() not in driven and not passive and key not in facts.followers:
-            undriven.append((joint.name(), 0.0 if says is None else says.effort or 0.0))
+            undriven.append((name, 0.0 if says is None else says.effort or 0.0))
     remedy = 'load_model(..., actuators="all"), names of joints, or {joint: effort limit}; nothing if it is passive'
     if undriven and not driven:
         message = f"none of its {len(undriven)} joints has an actuator in the file, so that there is no input"
-        yield Finding("warning", "no_actuator", _listed(name for name, _ in undriven), message, remedy)
+        subject = _listed(name for name, _ in undriven)
+        yield Finding("warning", "no_actuator", subject, message, remedy, {"actuators": "all"})
         return
     meant = [name for name, effort in undriven if effort > 0]
     if meant:
         message = f"{len(meant)} joints have an effort limit in the file and no actuator; {len(driven)} others have one"
-        yield Finding("info", "undriven", _listed(meant), message, remedy)
+        yield Finding("info", "undriven", _listed(meant), message, remedy, {"actuators": meant})
 
 
 def _massless(place: Place) -> Found:
@@ -69,15 +72,32 @@ def _massless(place: Place) -> Found:
         held = plant.GetBodiesWeldedTo(plant.get_body(base))
         if sum(body.default_mass() for body in held) == 0:
             message = "it has no mass and floats, so that nothing holds up what hangs on it and the step is singular"
-            remedy = 'load_model(..., base="weld") if it stands fixed, else give it a mass in the file'
-            yield Finding("error", "massless_root", plant.get_body(base).name(), message, remedy)
+            remedy, arguments = "give it a mass in the file", dict[str, Any]()
+            if any(joint.num_velocities() and joint.parent_body() in held for joint in joints(plant)):
+                remedy, arguments = (
+                    'load_model(..., base="weld") if it stands fixed, else give it a mass in the file',
+                    {"base": "weld"},
+                )
+            yield Finding("error", "massless_root", plant.get_body(base).name(), message, remedy, arguments)
     set_state(place.model.double, place.x)
     mass = np.diag(plant.CalcMassMatrix(place.model.double.context))
-    light = [j.name() for j in joints(plant) if can_be_driven(j) and mass[j.velocity_start()] < NO_MASS]
+    light = [
+        name
+        for name, joint in labelled(joints(plant)).items()
+        if can_be_driven(joint) and mass[joint.velocity_start()] < NO_MASS
+    ]
     if light:
         message = "nothing that they move has a mass or an inertia, so that the step is singular"
-        remedy = f"load_model(..., fix_joints={light[:1]}), or give the links a mass in the file"
-        yield Finding("error", "massless_joint", _listed(light), message, remedy)
+        remedy = "give the links a mass in the file"
+        arguments = _fixed(place.model, light)
+        if arguments:
+            remedy = f"load_model(..., fix_joints=) fixes them, or {remedy}"
+        yield Finding("error", "massless_joint", _listed(light), message, remedy, arguments)
+
+
+def _fixed(model: Model, names: list[str]) -> dict[str, Any]:
+    """The argument that fixes these joints, none where nothing could move then."""
+    return {"fix_joints": names} if len(names) < model.plant.num_velocities() else {}
 
 
 def _lost_shapes(place: Place) -> Found:
@@ -88,7 +108,9 @@ def _lost_shapes(place: Place) -> Found:
             remedy = (
                 'load_model(..., meshes="convex") or "spheres" takes collision meshes; packages= says where they are'
             )
-            yield Finding(severity, "meshes_skipped", "meshes", note.split(":")[0].split("; ")[0], remedy)
+            told = note.split(":")[0].split("; ")[0]
+            arguments = {"meshes": "convex"} if SKIPPED.match(note) else {}
+            yield Finding(severity, "meshes_skipped", "meshes", told, remedy, arguments)
     if scene_graph is None or (model.options or {}).get("contact") is False:
         return
     found = {body.index() for body, _ in collision_geometries(model.plant, scene_graph)}
@@ -101,7 +123,14 @@ def _lost_shapes(place: Place) -> Found:
     if lost:
         much = "no collision shape of the file is left" if len(lost) == given else "they have lost all collision shapes"
         remedy = 'load_model(..., meshes="convex") or "spheres"; contact=False says that nothing is to touch'
-        yield Finding("warning", "collision_gone", _listed(lost), f"{much}, so that they pass through things", remedy)
+        message = f"{much}, so that they pass through things"
+        mends: dict[str, Any] = {"meshes": "convex"} if _has_usable_meshes(model) else {"contact": False}
+        yield Finding("warning", "collision_gone", _listed(lost), message, remedy, mends)
+
+
+def _has_usable_meshes(model: Model) -> bool:
+    """Whether collision meshes were left out that `meshes="convex"` would take."""
+    return any(SKIPPED.match(note) for note in model.notes)
 
 
 def _falls(place: Place) -> Found:
@@ -121,10 +150,14 @@ def _falls(place: Place) -> Found:
         name = plant.get_body(base).name()
         remedy = 'load_model(..., ground=True), base="weld" if it stands fixed, or nothing if it flies'
         why = "there is nothing fixed below it that it could touch"
+        arguments: dict[str, Any] = {"ground": True}
         if not shapes & tree:
             why = "nothing of it can touch, as it has no collision shapes"
             remedy = 'load_model(..., meshes="convex" or "spheres", ground=True), base="weld", or nothing if it flies'
-        yield Finding("warning", "falls", name, f"it floats and falls for ever: {why}", remedy)
+            arguments = {"base": "weld"}
+            if _has_usable_meshes(place.model):
+                arguments = {"meshes": "convex", "ground": True}
+        yield Finding("warning", "falls", name, f"it floats and falls for ever: {why}", remedy, arguments)
 
 
 def _invented_inertia(place: Place) -> Found:
@@ -173,9 +206,9 @@ def _unread_compliance(place: Place) -> Found:
     if names:
         by = "sap" if sap else "similar and lagged"
         message = f"{PROXIMITY[given][1]} is given, and {by} read {PROXIMITY[read][1]}, which is not"
-        other = '"similar"' if sap else '"sap"'
-        remedy = f"give drake:{PROXIMITY[read][1]} too, or load_model(..., contact_approximation={other})"
-        yield Finding("warning", "unread_compliance", _listed(names), message, remedy)
+        other = "similar" if sap else "sap"
+        remedy = f'give drake:{PROXIMITY[read][1]} too, or load_model(..., contact_approximation="{other}")'
+        yield Finding("warning", "unread_compliance", _listed(names), message, remedy, {"contact_approximation": other})
 
 
 def _ignored(place: Place) -> Found:
@@ -198,20 +231,27 @@ def _ignored(place: Place) -> Found:
 
 
 def _zero_limits(place: Place) -> Found:
-    kinds: dict[str, list[str]] = {}
-    for joint in joints(place.model.plant):
+    plant, kinds = place.model.plant, dict[tuple[str, bool], list[str]]()
+    driven = {actuator.joint().index() for actuator in actuators(plant)}
+    for name, joint in labelled(joints(plant)).items():
         if not can_be_driven(joint):
             continue
         low, high = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
+        free = joint.index() not in driven
         if joint.velocity_lower_limits()[0] == 0 == joint.velocity_upper_limits()[0]:
-            kinds.setdefault("the velocity limit is 0", []).append(joint.name())
+            kinds.setdefault(("the velocity limit is 0", free), []).append(name)
         if low == high:
-            kinds.setdefault(f"the position limits are both {low:g}", []).append(joint.name())
-    for kind, names in kinds.items():
-        remedy = (
-            f"load_model(..., actuators={names[:1]}) takes limits of 0 as none, fix_joints={names[:1]} fixes the joint"
-        )
-        yield Finding("error", "zero_limit", _listed(names), f"{kind}: no plan can move what has it", remedy)
+            kinds.setdefault((f"the position limits are both {low:g}", free and low == 0), []).append(name)
+    for (kind, can_open), names in kinds.items():
+        arguments = _fixed(place.model, names)
+        remedy = "load_model(..., fix_joints=) fixes such joints there" if arguments else "give it limits in the file"
+        if can_open:
+            remedy = (
+                "load_model(..., actuators=) takes limits of 0 of the joints that it drives as none; or fix_joints="
+            )
+            arguments = {"actuators": names}
+        message = f"{kind}: no plan can move what has it"
+        yield Finding("error", "zero_limit", _listed(names), message, remedy, arguments)
 
 
 def _corners_on_both_sides(place: Place) -> Found:
@@ -227,7 +267,7 @@ def _corners_on_both_sides(place: Place) -> Found:
             'contact_geometry="hydroelastic" with contact_model="hydroelastic_with_fallback", or "differences"; or '
             "give one of them spheres over the face that touches, in the file"
         )
-        yield Finding("warning", "corners_miss", _listed(met), message, remedy)
+        yield Finding("warning", "corners_miss", _listed(met), message, remedy, {"contact_geometry": "differences"})
 
 
 def _trees(plant: Any) -> dict[str, str]:

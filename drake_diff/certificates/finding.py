@@ -1,7 +1,8 @@
 """What an audit tells: a finding, and the list of them."""
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 from drake_diff._base.jupyter import ShowsItsRepr
 
@@ -15,7 +16,8 @@ class Finding(ShowsItsRepr):
 
     `severity` is "error" if Drake throws here or the derivative is wrong, "warning" if it may be or a number was not
     chosen, and "info" if it is taken care of or a limit to know. `code` is a stable name of the kind of finding,
-    `subject` the part of the model, `message` says what is found and `remedy` what to change.
+    `subject` the part of the model, `message` says what is found and `remedy` what to change. `arguments` are those of
+    `load_model` with which the same file has no such finding; empty where the file, x or u has to change.
 
     Example:
         >>> dd.certificates.Finding("info", "locked_joint", "elbow", "is locked", "unlock it")
@@ -28,6 +30,7 @@ class Finding(ShowsItsRepr):
     subject: str
     message: str
     remedy: str
+    arguments: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __str__(self) -> str:
         return f"{self.severity} {self.code} ({self.subject}): {self.message}\n  -> {self.remedy}"

@@ -5,7 +5,18 @@ from typing import Annotated, Any
 
 import typer
 
-from drake_diff.cli.text import Seed, judged, names_in, names_option, out_option, plain, show, table, takes_model
+from drake_diff.cli.text import (
+    Seed,
+    as_options,
+    judged,
+    names_in,
+    names_option,
+    out_option,
+    plain,
+    show,
+    table,
+    takes_model,
+)
 from drake_diff.derivatives.methods import METHODS
 
 GAPS = {"same": "green", "other law": "yellow", "other model": "red", "unexplained": "red"}
@@ -30,6 +41,8 @@ def audit(model: Any, file: Path) -> None:
     for finding in findings:
         show(plain(finding.severity, FINDINGS[finding.severity]), f"{finding.subject}: {finding.message}")
         show(plain("    remedy:", "dim"), finding.remedy)
+        if finding.arguments:
+            show(plain("    option:", "dim"), as_options(finding.arguments))
     errors, warnings, notes = (sum(f.severity == severity for f in findings) for severity in FINDINGS)
     show(f"{model.name}: {errors} errors, {warnings} warnings, {notes} notes")
     raise typer.Exit(1 if errors else 0)

@@ -5,7 +5,8 @@ What a record or a model says may be a stranger's text: it is printed without ma
 
 import functools
 import inspect
-from collections.abc import Callable, Iterator
+import shlex
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +15,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+
+from drake_diff.exceptions import InputError
 
 NOT_FOLDED = 160  # columns
 GREEN, RED, YELLOW = ("pass", "holds", "agree"), ("fail", "broken", "error", "damaged"), ("warning",)
@@ -26,8 +29,21 @@ Approximation = Annotated[str, typer.Option(help="sap, similar or lagged")]
 Geometry = Annotated[
     str | None, typer.Option(help="For pairs of shapes that Drake refuses: corner_spheres, hydroelastic or differences")
 ]
-WeldBase = Annotated[str | None, typer.Option(help="A link to fix to the world.")]
-Ground = Annotated[float | None, typer.Option(help="Add a ground plane with this friction coefficient.")]
+Ground = Annotated[
+    str | None, typer.Option(metavar="FRICTION", help="Add a floor at z = 0 with this friction; true: the usual one.")
+]
+Actuators = Annotated[
+    str | None, typer.Option(metavar="all|NAMES|NAME=EFFORT,...", help="Joints to drive beside those of the file.")
+]
+Base = Annotated[
+    str | None, typer.Option(metavar="weld|free|FRAME", help="weld fixes what floats; a frame is fixed at the origin.")
+]
+Meshes = Annotated[str, typer.Option(help="What becomes of collision meshes: skip, convex or spheres")]
+Packages = Annotated[
+    list[str] | None, typer.Option(metavar="NAME=FOLDER", help="Where a package:// is. Can be given again.")
+]
+Mimic = Annotated[str | None, typer.Option(help="Joints that follow others: reduce or fix")]
+Contact = Annotated[bool, typer.Option(help="Whether anything collides.")]
 Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same draws.")]
 
 
@@ -72,9 +88,21 @@ def _load(
     contact_model: ContactModel = "point",
     contact_approximation: Approximation = "sap",
     contact_geometry: Geometry = None,
-    weld_base: WeldBase = None,
+    actuators: Actuators = None,
+    base: Base = None,
+    fix_joints: Annotated[str | None, names_option("Joints to replace by welds", "none")] = None,
+    meshes: Meshes = "skip",
+    packages: Packages = None,
+    mimic: Mimic = None,
     ground: Ground = None,
+    contact: Contact = True,
 ) -> Any:
+    # What is wrong is refused before Drake is loaded.
+    options: dict[str, Any] = {
+        "ground": _ground(ground),
+        "actuators": _actuators(actuators),
+        "packages": dict(_split("--packages", words, "NAME=FOLDER") for words in packages) if packages else None,
+    }
     from drake_diff.model.model import load_model
 
     return load_model(
@@ -83,9 +111,58 @@ def _load(
         contact_model=contact_model,
         contact_approximation=contact_approximation,
         contact_geometry=contact_geometry,
-        weld_base=weld_base,
-        ground=ground,
+        base=base,
+        fix_joints=names_in(fix_joints) or (),
+        meshes=meshes,
+        mimic=mimic,
+        contact=contact,
+        **options,
     )
+
+
+def _ground(words: str | None) -> float | bool | None:
+    if words is None or words == "true":
+        return None if words is None else True
+    return _number("--ground", words, "true, or a friction coefficient")
+
+
+def _actuators(words: str | None) -> str | list[str] | dict[str, float] | None:
+    names = names_in(words)
+    if names is None or names == ["all"]:
+        return words
+    if not any("=" in name for name in names):
+        return names
+    efforts = [
+        _split("--actuators", name, "all, names of joints, or an effort for each: NAME=EFFORT") for name in names
+    ]
+    return {name: _number("--actuators", effort, "an effort limit [N or N m]") for name, effort in efforts}
+
+
+def _split(option: str, words: str, expected: str) -> tuple[str, str]:
+    name, sign, value = words.partition("=")
+    if not (name and sign and value):
+        raise InputError(option, got=repr(words), expected=expected)
+    return name.strip(), value.strip()
+
+
+def _number(option: str, words: str, expected: str) -> float:
+    try:
+        return float(words)
+    except ValueError as error:
+        raise InputError(option, got=repr(words), expected=expected) from error
+
+
+def as_options(arguments: Mapping[str, Any]) -> str:
+    """Arguments of `load_model` as they are typed after a command."""
+    words = []
+    for name, value in arguments.items():
+        option = "--" + name.replace("_", "-")
+        if value is False:
+            words.append(option.replace("--", "--no-", 1))
+            continue
+        text = "true" if value is True else value if isinstance(value, str) else ",".join(value)
+        words += [option, shlex.quote(text)]
+    return " ".join(words)
 
 
 def console(*, stderr: bool = False) -> Console:

@@ -401,7 +401,7 @@ def load_model(
             where that is 0 or not given there is none. A file without transmissions or actuators has no input.
         base: "weld" fixes what floats and has joints to the world, where the file puts it; the name of a frame fixes
             that frame at the world's origin; "free" refuses a file that holds its base.
-        fix_joints: The joints to replace by welds, at their default positions.
+        fix_joints: The joints to replace by welds, at their default positions or the nearest that their limits allow.
         packages: The folder of each package:// that the file names, by the name of the package. Without it that is the
             nearest folder of that name above the file. Nothing is ever downloaded.
         contact: False takes every collision shape away.

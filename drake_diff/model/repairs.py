@@ -218,7 +218,7 @@ def _what_holds(plant: MultibodyPlant) -> str:
 
 
 def fix(plant: MultibodyPlant, names: tuple[str, ...], done: Collection[str] = ()) -> tuple[str, ...]:
-    """Replace the joints called `names` by welds at their default positions; a sentence that says so.
+    """Replace the joints called `names` by welds, where they start or at the nearest limit; a sentence that says so.
 
     Those that are `done` were made fixed in the file's text.
     """
@@ -237,7 +237,8 @@ def fix(plant: MultibodyPlant, names: tuple[str, ...], done: Collection[str] = (
                 f"{plant.num_constraints()} (mimic joints, MJCF's equalities): "
                 "give mimic=, or fix the joint in the file"
             )
-        q = float(joint.default_positions()[0])
+        low, high = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
+        q = float(np.clip(joint.default_positions()[0], low, high))
         try:
             weld(plant, joint, q)
         except DRAKES_REFUSALS as error:

@@ -100,6 +100,10 @@ def fix_in_text(xml: XmlText, path: Path, names: tuple[str, ...]) -> tuple[str, 
         if leader in found and follower not in found:
             raise ModelError(f"{path}: fix_joints={leader!r}: {follower} mimics it: fix {follower} too")
     for name in found:
+        limit = there[name].find("limit")
+        if limit and (_above(limit.get("lower"), "0") or _above("0", limit.get("upper"))):
+            range_ = f"[{limit.get('lower')}, {limit.get('upper')}]"
+            raise ModelError(f"{path}: fix_joints={name!r}: 0 is outside of its limits {range_}: give mimic= too")
         xml.set(there[name], "type", "fixed")
         for mimic in there[name].findall("mimic"):
             xml.remove(mimic)
