@@ -1,5 +1,7 @@
 """`drake-diff plan`: from a file to a verified plan; what is wrong is one sentence and a status."""
 
+import os
+import pty
 import subprocess
 import sys
 
@@ -55,6 +57,29 @@ def test_a_textbook_arm_is_mended_planned_for_and_verified(arm, tmp_path):
     assert dd.verify(tmp_path / "out").holds
     end = dd.read_trace(tmp_path / "out" / "trace.mcap").xs[-1]
     assert end[:2] == pytest.approx([0.0, 0.5], abs=0.025)  # what a replay in other steps may be off: 5 % of its way
+
+
+def test_on_a_terminal_the_stages_are_a_live_table(arm, tmp_path):
+    """A table that is written again and again, which no pipe ever sees."""
+    ours, theirs = pty.openpty()
+    words = [sys.executable, "-m", "drake_diff.cli.main", "plan", str(arm), "--goal", "elbow=0.5", "--out", "out"]
+    with subprocess.Popen(words, stdout=theirs, stderr=theirs, cwd=tmp_path, env=os.environ | {"TERM": "xterm"}) as run:
+        os.close(theirs)
+        written = b"".join(iter(lambda: _read(ours), b"")).decode()
+    os.close(ours)
+    assert run.returncode == 0, written
+    assert "Traceback" not in written
+    for stage in ("load", "audit", "guess", "solve", "save", "verify"):
+        assert stage in written
+    assert "\x1b[2K" in written  # rewritten in place
+
+
+def _read(terminal):
+    """What is written next; nothing at the end, which Linux tells by an error."""
+    try:
+        return os.read(terminal, 65536)
+    except OSError:
+        return b""
 
 
 def test_the_inputs_of_a_smooth_guess_make_that_motion(arm):

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -75,15 +76,14 @@ def _live(name: str) -> Iterator[Callable[[str, str], None]]:
 
     def now() -> Any:
         rows = table("stage", "seconds", "", wrap=False)
-        clock = time.monotonic()
-        later = [*list(begun.values())[1:], clock]
-        for stage, start, end in zip(begun, begun.values(), later, strict=True):
+        stages = [*begun.items(), ("", time.monotonic())]
+        for (stage, start), (_, end) in pairwise(stages):
             rows.add_row(plain(stage, "bold"), plain(f"{end - start:.1f}"), plain(told[stage][: screen.width - 24]))
         return rows
 
     def note(stage: str, sentence: str) -> None:
-        begun.setdefault(stage, time.monotonic())
         told[stage] = sentence
+        begun.setdefault(stage, time.monotonic())
 
     if not screen.is_terminal:
 
@@ -95,10 +95,5 @@ def _live(name: str) -> Iterator[Callable[[str, str], None]]:
 
         yield line
         return
-    with Live(now(), console=screen, refresh_per_second=4, transient=True) as live:
-
-        def rewrite(stage: str, sentence: str) -> None:
-            note(stage, sentence)
-            live.update(now())
-
-        yield rewrite
+    with Live(get_renderable=now, console=screen, refresh_per_second=4, transient=True):
+        yield note

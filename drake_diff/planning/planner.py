@@ -149,7 +149,7 @@ def plan(
         ready = load_robot(path, seed)
         clock.begin("audit", str(ready.model))
         findings = tuple(audit(ready.model))
-        clock.begin("guess", f"{len(findings)} findings")
+        clock.begin("guess", f"{len(findings)} finding{'s' * (len(findings) != 1)}")
         task = asked(ready.model, goals or {})
         tried: list[str] = []
         found: list[Solution] = []
