@@ -33,6 +33,7 @@ SMALL = 7  # velocities: of a larger robot any smooth motion will do, as its bes
 FASTER = (0.2, 2.0)  # of the first guess's duration: the range of a least time
 SPEED_WEIGHT = 0.01  # of a speed against an effort, both as shares of their limits
 BUDGET = 120.0  # [s] on the clock, of one attempt
+SEGMENT = 5  # steps of multiple shooting
 BENT = 8  # lines around what a straight one touches
 
 Report = Callable[[str, str], None]
@@ -261,7 +262,11 @@ def _collocated(robot: Robot, task: Task, guess: Guess, avoid: Any, least: str |
 def _feasible(robot: Robot, task: Task, guess: Guess, avoid: Any) -> _Attempt:
     """Any motion to where the guess ends that keeps all limits: the guess itself, if it does."""
     problem = _problem(task, guess, guess.xs[-1], avoid)
-    return _Attempt(guess.name, robot, problem, guess, {"method": "shooting", "time_limit": BUDGET})
+    # From states on the way: rolled out from the first alone, what is upright falls in seconds, by rounding.
+    segments = max(1, guess.num_steps // SEGMENT)
+    return _Attempt(
+        guess.name, robot, problem, guess, {"method": "shooting", "segments": segments, "time_limit": BUDGET}
+    )
 
 
 def _problem(task: Task, guess: Guess, x_goal: Array, avoid: Any, **asked: Any) -> Problem:
