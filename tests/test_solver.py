@@ -401,7 +401,8 @@ def test_bad_options_are_named_before_anything_runs(load, options, words):
 
 
 def test_a_guess_of_another_length_is_named(load):
-    guess = dd.solve(swing_up(load, 10), max_iterations=1)
+    found = dd.solve(swing_up(load, 10), max_iterations=1)
+    guess = found.xs, found.us
     with pytest.raises(ShapeError, match=r"initial_guess xs: expected shape \(21, 4\), got shape \(11, 4\)"):
         dd.solve(swing_up(load, 20), method="shooting", initial_guess=guess)
 

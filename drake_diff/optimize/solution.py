@@ -6,9 +6,11 @@ from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
+from pydrake.trajectories import PiecewisePolynomial
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.jupyter import ShowsItsRepr
@@ -224,6 +226,30 @@ class Solution(ShowsItsRepr):
         mesh = np.linspace(0, 1, len(self.xs)) if self.mesh is None else self.mesh
         return collocated(self.problem, self.scheme, self.xs, self.inputs_at_knots, self.us_mid, self.horizon, mesh)
 
+    def trajectory(self) -> "Trajectories":
+        """The state and the input as Drake's piecewise polynomials, for its own controllers and `Simulator`.
+
+        States of collocation are cubics with the dynamics' slopes at the knots, its inputs lines, or parabolas through
+        the midpoints. Those of a discrete method are lines between its states, under inputs that are held.
+
+        Raises:
+            ModelError: The solution is not whole: it has states or inputs that are no numbers.
+
+        Source:
+            Kelly, "An Introduction to Trajectory Optimization", SIAM Review 59(4), 2017, sections 3.4 and 4.4.
+
+        Example:
+            >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+            >>> effort = dd.QuadraticCost(R=[[1.0]])
+            >>> problem = dd.Problem(block, x0=[0, 0], x_goal=[1, 0], num_steps=10, horizon=1.0, running_cost=effort)
+            >>> state, input = dd.solve(problem).trajectory()
+            >>> state.value(0.5).ravel().round(6), input.value(0.25).ravel().round(6)
+            (array([0.5, 1.5]), array([3.]))
+        """
+        if not self._is_whole or not (np.all(np.isfinite(self.xs)) and np.all(np.isfinite(self.us))):
+            raise ModelError(f"{self.problem.name}: no trajectory: the solution has entries that are no numbers")
+        return trajectories(self)
+
     @cached_property
     def defects(self) -> Array:
         """(N,) how far each interval is from the dynamics, as a state change, in the worst coordinate's unit.
@@ -416,6 +442,32 @@ class Solution(ShowsItsRepr):
             return False
         parts = [part for part in (self.xs, self.inputs_at_knots, self.us_mid) if part is not None]
         return self.scheme == "step" or all(bool(np.all(np.isfinite(part))) for part in parts)
+
+
+class Trajectories(NamedTuple):
+    """A motion as two of Drake's trajectories over the same time [s]."""
+
+    state: PiecewisePolynomial
+    input: PiecewisePolynomial
+
+
+def trajectories(solution: Solution) -> Trajectories:
+    """See `Solution.trajectory`."""
+    times, motion = solution.times, solution.transcribed
+    xs, us = np.asarray(solution.xs), np.asarray(solution.inputs_at_knots)
+    if motion is None:
+        held = PiecewisePolynomial.ZeroOrderHold(times, np.vstack([us, us[-1:]]).T)
+        return Trajectories(PiecewisePolynomial.FirstOrderHold(times, xs.T), held)
+    state = PiecewisePolynomial.CubicHermite(times, xs.T, motion.rates.T)
+    if solution.us_mid is None:
+        return Trajectories(state, PiecewisePolynomial.FirstOrderHold(times, us.T))
+    parabolas = PiecewisePolynomial()
+    for k, (t, end) in enumerate(pairwise(times)):
+        through = np.array([us[k], solution.us_mid[k], us[k + 1]]).T
+        parabolas.ConcatenateInTime(
+            PiecewisePolynomial.LagrangeInterpolatingPolynomial([t, (t + end) / 2, end], through)
+        )
+    return Trajectories(state, parabolas)
 
 
 def _largest(values: Array) -> float:

@@ -10,18 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, finite_array, frozen, positive_float, positive_int
+from drake_diff._base.arrays import Array, frozen, positive_float, positive_int
 from drake_diff.certificates.certificate import Certificate, certify_jacobian
 from drake_diff.certificates.certify import certify_inside
-from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.model.contact import penetration
 from drake_diff.model.equations import EquationsOfMotion
-from drake_diff.model.model import Model
 from drake_diff.model.soft_contact import SoftContact
 from drake_diff.model.step import set_state
 from drake_diff.optimize.advice import advice
 from drake_diff.optimize.drake_program import SOLVERS
+from drake_diff.optimize.guess import Guess, first_guess, sampled
 from drake_diff.optimize.ilqr.ilqr import check_problem, is_unconstrained, solve_ilqr
 from drake_diff.optimize.ilqr.through_contact import check_schedule, solve_continuation, solve_through_jumps
 from drake_diff.optimize.judge import ended, judged, refused
@@ -33,15 +32,13 @@ from drake_diff.optimize.reach import out_of_reach, why_blind
 from drake_diff.optimize.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
 from drake_diff.optimize.shooting import ShootingVariables, check_segments, roll_segments, solve_shooting
 from drake_diff.optimize.solution import Search, Solution, Status
-from drake_diff.optimize.transcription.collocation import Collocated, MeshRefinement, Transcription
+from drake_diff.optimize.transcription.collocation import MeshRefinement, Transcription
 from drake_diff.optimize.transcription.drake import solve_collocation
 from drake_diff.optimize.transcription.task import DEFAULT_SCHEME, SCHEMES, OptimalControl
 
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": "riccati"}
 CERTIFIED_KNOTS = 5
-ROUNDED = 1e-6  # of the largest input that holds a state: no input
-GUESS_NOISE = 1e-3  # of the largest input: breaks the symmetry of a guess that is a stationary point
 CLEARANCE_PARTS = (4, 8, 16)  # of a step: looked at where a discrete plan comes too near to an obstacle in between
 GUESS_ITERATIONS = 100  # of an attempt that is to find a guess for the next one
 ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
@@ -84,9 +81,9 @@ def solve(
         problem: what to optimize, of a model or of plain `Dynamics`.
         method: "collocation" (in continuous time, for models without contact and for plain dynamics), "shooting"
             (through Drake's own steps, contact included), "ilqr" (the same by Riccati sweeps) or "auto".
-        initial_guess: None (a straight line to the goal with inputs near zero), a Solution, or (xs, us) with shapes
-            (N+1, nx) and (N, nu). Collocation also takes us (N+1, nu), a third entry, the horizon [s], and a Solution
-            with another number of steps.
+        initial_guess: None (a straight line to the goal with inputs near zero), a Solution of any method, number of
+            steps and horizon, a pair of Drake's trajectories (state, input) as `Solution.trajectory` gives, or (xs, us)
+            with shapes (N+1, nx) and (N, nu). Collocation also takes us (N+1, nu), and a third entry, the horizon [s].
         scheme: of collocation: "hermite_simpson" (order 4, the default), "trapezoid" (order 2), or "drake", which is
             what Drake's DirectCollocation transcribes.
         solver: "ipopt" or "snopt"; the latter with method="shooting", or with scheme="drake", which then is Drake's
@@ -152,6 +149,7 @@ def solve(
     asked = Attempt(method, "asked for", scheme, solver, segments, continuation, refinement if refine else None)
     if method == "auto" and continuation is not None:
         asked = dataclasses.replace(asked, method="ilqr", reason="a continuation is asked for")
+    initial_guess = sampled(problem, asked.method, initial_guess)
     in_chain = asked.method == "auto" and segments == 1
     make = partial(_solve_in_chain, task, asked, initial_guess) if in_chain else task.prepare(asked, initial_guess)
     solution = make()
@@ -210,17 +208,6 @@ class Attempt:
     max_iterations: int | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class _Guess:
-    """Where a search starts: xs (N+1, nx), us (N, nu); for collocation also the last input, a horizon, or a motion."""
-
-    xs: Array
-    us: Array
-    u_final: Array | None = None
-    horizon: float | None = None  # [s]
-    motion: Collocated | None = None
-
-
 @dataclass(eq=False)
 class _Task:
     """What all attempts at a problem share."""
@@ -236,7 +223,7 @@ class _Task:
         """Check that `attempt` can be made from the guess `given`; what is returned makes it."""
         problem, method = self.problem, attempt.method
         scheme = _check_attempt(problem, attempt)
-        guess = _guess(problem, method, given, self.seed)
+        guess = first_guess(problem, method, given, self.seed)
         xs, us = guess.xs, guess.us
         check_segments(problem, method, attempt.segments)
         if attempt.continuation is not None and method != "ilqr":
@@ -402,60 +389,6 @@ def choose_method(problem: Problem) -> tuple[str, str]:
     return "collocation", "the model is smooth"
 
 
-def _guess(problem: Problem, method: str, given: Any, seed: int) -> _Guess:
-    count, nx, nu = problem.num_steps, problem.nx, problem.nu
-    if isinstance(given, Solution):
-        motion = given.transcribed
-        if motion is not None and (motion.task.dynamics.nx, motion.task.dynamics.nu) == (nx, nu):
-            if method == "collocation":
-                xs, us = motion.at(np.linspace(0, motion.horizon, count + 1))
-                return _Guess(xs, us[:-1], us[-1], motion.horizon, motion)
-            given = (given.xs[given.knots], given.inputs_at_knots[given.knots][:-1])
-        else:
-            given = (given.xs, given.us)
-    if given is not None:
-        most = 3 if method == "collocation" else 2
-        if not (isinstance(given, (tuple, list)) and 2 <= len(given) <= most):
-            forms = "None, (xs, us) or a Solution" if most == 2 else "None, (xs, us), (xs, us, horizon) or a Solution"
-            raise InputError("initial_guess", got=type(given).__name__, expected=forms)
-        xs = finite_array("initial_guess xs", given[0], (count + 1, nx))
-        at_knots = method == "collocation" and np.shape(given[1]) == (count + 1, nu)
-        us = finite_array("initial_guess us", given[1], (count + at_knots, nu))
-        horizon = positive_float("initial_guess horizon [s]", given[2]) if len(given) == 3 else None
-        return _Guess(xs, us[:count], us[-1] if at_knots else None, horizon)
-    end = np.where(np.isnan(problem.goal), problem.x0, problem.goal)
-    xs = problem.x0 + np.linspace(0, 1, count + 1)[:, None] * (end - problem.x0)
-    us = np.array(problem.us)
-    if problem.optimizes_controls and not us.any():
-        us = us + _holding(problem)
-    if method == "shooting" and problem.optimizes_controls and not us.any():
-        limit = np.minimum(np.abs(problem.bounds.u_lower), np.abs(problem.bounds.u_upper))
-        size = np.where(np.isfinite(limit), np.minimum(limit, 100.0), 1.0)
-        us = GUESS_NOISE * size * np.random.default_rng(seed).standard_normal(us.shape)
-    inside = np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
-    return _Guess(xs, inside if problem.optimizes_controls else us)
-
-
-def _holding(problem: Problem) -> Array:
-    """(nu,) the inputs that hold the first state best for a step, within bounds, where they are not all actuators.
-
-    Rotors and thrusters without thrust do not steer: a quadrotor that falls moves sideways for none of them. Actuators
-    do, and their guess is 0.
-    """
-    model = problem.model if isinstance(problem.system, Model) else None
-    if model is None or model.inputs.plain:
-        return np.zeros(problem.nu)
-    bounds, still = problem.bounds, np.concatenate([problem.x0[: model.nq], np.zeros(model.nv)])
-    none = np.clip(np.zeros(model.nu), bounds.u_lower, bounds.u_upper)
-    try:
-        d = differentiate_step(model, still, none)
-    except DrakeDiffError:
-        return none
-    by_u, missing = d.B[model.nq :], d.B[model.nq :] @ none - d.x_next[model.nq :]
-    found = np.clip(np.linalg.lstsq(by_u, missing, rcond=None)[0], bounds.u_lower, bounds.u_upper)
-    return np.asarray(np.where(np.abs(found) > ROUNDED * np.abs(found).max(), found, none))
-
-
 @dataclass(frozen=True, eq=False)
 class Run:
     """One solve by one method: certify at the guess, search, certify at the result, measure, judge."""
@@ -469,7 +402,7 @@ class Run:
     report: Report | None
     start: float = field(default_factory=time.monotonic)
 
-    def collocate(self, guess: _Guess, refinement: MeshRefinement | None) -> Solution:
+    def collocate(self, guess: Guess, refinement: MeshRefinement | None) -> Solution:
         """In CasADi; SNOPT, which that does not carry, in Drake's own DirectCollocation."""
         problem, limits, report, found = self.problem, self.limits, self.report, dict[str, Any]()
         if self.solver == "snopt":

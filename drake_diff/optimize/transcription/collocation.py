@@ -87,15 +87,20 @@ class Collocated:
             k, tau = np.repeat(np.arange(count), parts), np.tile(np.arange(parts) / parts, count)
             weights = scheme.integrated(tau + 1 / parts) - scheme.integrated(tau)
             us = parts * np.einsum("sj,sju->su", weights, inputs[k])
-        else:  # parts may end within the intervals of a refined mesh
-            ends, lengths = np.arange(parts * count + 1) / (parts * count), np.diff(self.mesh)[:, None]
-            k, tau = self._place(ends)
-            whole = lengths * np.einsum("j,nju->nu", scheme.integrated(np.ones(1))[0], inputs)
-            before = np.vstack([np.zeros(whole.shape[1]), np.cumsum(whole, axis=0)])[k]
-            within = lengths[k] * np.einsum("sj,sju->su", scheme.integrated(tau), inputs[k])
-            us = np.diff(before + within, axis=0) * (parts * count)
-            k, tau = k[:-1], tau[:-1]
+        else:
+            ends = np.arange(parts * count + 1) / (parts * count)
+            us, (k, tau) = self.means(ends), self._place(ends[:-1])
         return np.vstack([self._between(k, tau)[0], self.xs[-1]]), us
+
+    def means(self, ends: Array) -> Array:
+        """(M, nu) the mean inputs between `ends` (M+1,), fractions of the horizon, which may lie within intervals."""
+        scheme, lengths = self.task.scheme, np.diff(self.mesh)[:, None]
+        inputs = scheme.per_interval(self.nodes[:, self.task.dynamics.nx :])
+        k, tau = self._place(ends)
+        whole = lengths * np.einsum("j,nju->nu", scheme.integrated(np.ones(1))[0], inputs)
+        before = np.vstack([np.zeros(whole.shape[1]), np.cumsum(whole, axis=0)])[k]
+        within = lengths[k] * np.einsum("sj,sju->su", scheme.integrated(tau), inputs[k])
+        return np.asarray(np.diff(before + within, axis=0) / np.diff(ends)[:, None])
 
     @cached_property
     def cost(self) -> float:
@@ -142,6 +147,11 @@ class Collocated:
     def at(self, times: Any) -> tuple[Array, Array]:
         """xs (S, nx) and us (S, nu) at `times` (S,) [s] by the scheme's own polynomials."""
         return self._between(*self._place(np.asarray(times, dtype=float) / self.horizon))
+
+    @property
+    def rates(self) -> Array:
+        """(N+1, nx) x' at the knots."""
+        return self._rates[:: self.task.scheme.nodes]
 
     @cached_property
     def _rates(self) -> Array:

@@ -1,0 +1,142 @@
+"""Where a search starts: a line to the goal, arrays, Drake's trajectories, or a solution on whatever knots it has.
+
+What has another length or other knots is stretched to the problem's: its first state is the first, its last the last.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydrake.trajectories import Trajectory
+
+from drake_diff._base.arrays import Array, finite_array, positive_float
+from drake_diff.derivatives.step import differentiate_step
+from drake_diff.exceptions import DrakeDiffError, InputError, ShapeError
+from drake_diff.model.model import Model
+from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.solution import Solution
+from drake_diff.optimize.transcription.collocation import Collocated
+
+ROUNDED = 1e-6  # of the largest input that holds a state: no input
+NOISE = 1e-3  # of the largest input: breaks the symmetry of a guess that is a stationary point
+FORMS = "None, (xs, us), two of Drake's trajectories (state, input) or a Solution"
+
+
+@dataclass(frozen=True, eq=False)
+class Guess:
+    """Where a search starts: xs (N+1, nx), us (N, nu); for collocation also the last input, a horizon, or a motion."""
+
+    xs: Array
+    us: Array
+    u_final: Array | None = None
+    horizon: float | None = None  # [s]
+    motion: Collocated | None = None
+
+
+def first_guess(problem: Problem, method: str, given: Any, seed: int) -> Guess:
+    """The guess of a search by `method`: `given`, or a straight line where that is None."""
+    continuous = method == "collocation"
+    if given is None:
+        return _line(problem, method, seed)
+    if isinstance(given, Solution):
+        return _of_solution(problem, given, continuous)
+    if not (isinstance(given, (tuple, list)) and 2 <= len(given) <= 2 + continuous):
+        forms = FORMS.replace("(xs, us)", "(xs, us), (xs, us, horizon)") if continuous else FORMS
+        raise InputError("initial_guess", got=type(given).__name__, expected=forms)
+    count = problem.num_steps
+    xs = finite_array("initial_guess xs", given[0], (count + 1, problem.nx))
+    at_knots = continuous and np.shape(given[1]) == (count + 1, problem.nu)
+    us = finite_array("initial_guess us", given[1], (count + at_knots, problem.nu))
+    horizon = positive_float("initial_guess horizon [s]", given[2]) if len(given) == 3 else None
+    return Guess(xs, us[:count], us[-1] if at_knots else None, horizon)
+
+
+def _of_solution(problem: Problem, given: Solution, continuous: bool) -> Guess:
+    """The motion of a solution with as many states and inputs, on the problem's own knots."""
+    count, motion = problem.num_steps, given.transcribed
+    sizes = given.xs.shape[1], given.us.shape[1]
+    if sizes != (problem.nx, problem.nu):
+        raise ShapeError("initial_guess: states and inputs", got=sizes, expected=(problem.nx, problem.nu))
+    if motion is None:
+        knots = np.linspace(0.0, len(given.us), count + 1)
+        if len(given.us) == count:
+            return Guess(np.asarray(given.xs), np.asarray(given.us))
+        xs = np.array([np.interp(knots, np.arange(len(given.xs)), column) for column in given.xs.T]).T
+        return Guess(xs, _means(given.us, knots))
+    if continuous:
+        xs, us = motion.at(np.linspace(0, motion.horizon, count + 1))
+        return Guess(xs, us[:-1], us[-1], motion.horizon, motion)
+    if len(given.knots) == count + 1:
+        return Guess(given.xs[given.knots], given.inputs_at_knots[given.knots][:-1])
+    return Guess(motion.at(np.linspace(0, motion.horizon, count + 1))[0], motion.means(np.arange(count + 1) / count))
+
+
+def _means(us: Array, ends: Array) -> Array:
+    """(M, nu) the means of held inputs us (N, nu) between `ends` (M+1,), counted in steps from 0 to N."""
+    summed = np.vstack([np.zeros((1, us.shape[1])), np.cumsum(us, axis=0)])
+    at = np.array([np.interp(ends, np.arange(len(summed)), column) for column in summed.T]).T
+    return np.asarray(np.diff(at, axis=0) / np.diff(ends)[:, None])
+
+
+def sampled(problem: Problem, method: str, given: Any) -> Any:
+    """`given`; of two of Drake's trajectories the arrays that they are at the problem's knots.
+
+    Inputs that are held are taken in the middle of a step.
+    """
+    if not (isinstance(given, (tuple, list)) and any(isinstance(part, Trajectory) for part in given)):
+        return given
+    if len(given) != 2:
+        raise InputError("initial_guess", got=f"{len(given)} entries", expected="two trajectories: (state, input)")
+    for name, part, rows in zip(("state", "input"), given, (problem.nx, problem.nu), strict=True):
+        if not isinstance(part, Trajectory):
+            raise InputError(f"initial_guess {name}", got=type(part).__name__, expected="a trajectory, as the other is")
+        if (part.rows(), part.cols()) != (rows, 1):
+            raise ShapeError(f"initial_guess {name}", got=(part.rows(), part.cols()), expected=(rows, 1))
+    state, held = given
+    start, end = state.start_time(), state.end_time()
+    if not (np.isfinite(end - start) and end > start):
+        raise InputError("initial_guess state", got=f"from {start:g} to {end:g} s", expected="a beginning and an end")
+    knots = np.linspace(start, end, problem.num_steps + 1)
+    if method == "collocation" or problem.horizon:  # a free one is collocation's
+        return _values("state", state, knots), _values("input", held, knots), end - start
+    return _values("state", state, knots), _values("input", held, (knots[:-1] + knots[1:]) / 2)
+
+
+def _values(name: str, trajectory: Any, times: Array) -> Array:
+    inside = np.clip(times, trajectory.start_time(), trajectory.end_time())
+    return finite_array(f"initial_guess {name}", trajectory.vector_values(inside).T, (len(times), trajectory.rows()))
+
+
+def _line(problem: Problem, method: str, seed: int) -> Guess:
+    """A straight line to the goal, with the problem's inputs, or inputs near zero."""
+    end = np.where(np.isnan(problem.goal), problem.x0, problem.goal)
+    xs = problem.x0 + np.linspace(0, 1, problem.num_steps + 1)[:, None] * (end - problem.x0)
+    us = np.array(problem.us)
+    if problem.optimizes_controls and not us.any():
+        us = us + _holding(problem)
+    if method == "shooting" and problem.optimizes_controls and not us.any():
+        limit = np.minimum(np.abs(problem.bounds.u_lower), np.abs(problem.bounds.u_upper))
+        size = np.where(np.isfinite(limit), np.minimum(limit, 100.0), 1.0)
+        us = NOISE * size * np.random.default_rng(seed).standard_normal(us.shape)
+    inside = np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
+    return Guess(xs, inside if problem.optimizes_controls else us)
+
+
+def _holding(problem: Problem) -> Array:
+    """(nu,) the inputs that hold the first state best for a step, within bounds, where they are not all actuators.
+
+    Rotors and thrusters without thrust do not steer: a quadrotor that falls moves sideways for none of them. Actuators
+    do, and their guess is 0.
+    """
+    model = problem.model if isinstance(problem.system, Model) else None
+    if model is None or model.inputs.plain:
+        return np.zeros(problem.nu)
+    bounds, still = problem.bounds, np.concatenate([problem.x0[: model.nq], np.zeros(model.nv)])
+    none = np.clip(np.zeros(model.nu), bounds.u_lower, bounds.u_upper)
+    try:
+        d = differentiate_step(model, still, none)
+    except DrakeDiffError:
+        return none
+    by_u, missing = d.B[model.nq :], d.B[model.nq :] @ none - d.x_next[model.nq :]
+    found = np.clip(np.linalg.lstsq(by_u, missing, rcond=None)[0], bounds.u_lower, bounds.u_upper)
+    return np.asarray(np.where(np.abs(found) > ROUNDED * np.abs(found).max(), found, none))

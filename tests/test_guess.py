@@ -1,0 +1,145 @@
+"""A guess may be any motion: a solution on other knots, of another time or method, or trajectories of Drake."""
+
+import re
+
+import numpy as np
+import pytest
+from helpers.table import each_row
+from pydrake.trajectories import PiecewisePolynomial
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError, ModelError, ShapeError
+from drake_diff.optimize.guess import first_guess
+
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+
+
+def block(count=10, horizon=1.0, **asked):
+    """A block of 1 kg from 0 to 1 m, at rest at both ends: u = 6 - 12 t at least effort, of cost 12."""
+    push = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+    ends = {"x0": [0, 0], "x_goal": [1, 0]} | asked
+    return dd.Problem(push, num_steps=count, horizon=horizon, running_cost=EFFORT, **ends)
+
+
+def plant(write_urdf, count=10, h=0.1):
+    model = write_urdf(time_step=h)
+    return dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=count, running_cost=EFFORT)
+
+
+@each_row("scheme", ["hermite_simpson", "trapezoid", "drake"])
+def test_a_collocated_solution_as_drakes_trajectories_is_its_motion(scheme):
+    solution = dd.solve(block(), scheme=scheme)
+    state, held = solution.trajectory()
+    assert (state.start_time(), state.end_time(), held.end_time()) == (0.0, 1.0, 1.0)
+    at = np.linspace(0, 1, 57)
+    xs, us = solution.transcribed.at(at)
+    np.testing.assert_allclose(state.vector_values(at).T, xs, atol=1e-9)  # where the defects are 1e-10
+    np.testing.assert_allclose(held.vector_values(at).T, us, atol=1e-9)
+
+
+def test_an_input_between_the_knots_is_the_closed_forms():
+    """Least effort: x = 3 t^2 - 2 t^3 and u = 6 - 12 t, which a cubic and a parabola hold exactly."""
+    state, held = dd.solve(block(count=3)).trajectory()
+    for t in (0.1, 0.4, 0.77):
+        np.testing.assert_allclose(state.value(t).ravel(), [3 * t**2 - 2 * t**3, 6 * t - 6 * t**2], atol=1e-8)
+        np.testing.assert_allclose(held.value(t).ravel(), [6 - 12 * t], atol=1e-7)
+
+
+def test_a_discrete_solution_as_drakes_trajectories_holds_its_inputs(write_urdf):
+    solution = dd.solve(plant(write_urdf), method="ilqr")
+    state, held = solution.trajectory()
+    np.testing.assert_allclose(state.vector_values(solution.times).T, solution.xs, atol=1e-15)
+    np.testing.assert_array_equal(held.value(0.05).ravel(), solution.us[0])
+    np.testing.assert_array_equal(held.value(0.95).ravel(), solution.us[9])
+    np.testing.assert_allclose(state.value(0.05).ravel(), (solution.xs[0] + solution.xs[1]) / 2, atol=1e-15)
+
+
+def test_a_refined_mesh_keeps_its_times():
+    solution = dd.solve(block(count=2, x_goal=[1, None]), refine=True, error_tolerance=1e-12)
+    state, held = solution.trajectory()
+    np.testing.assert_allclose(state.get_segment_times(), solution.times, atol=1e-15)
+    np.testing.assert_allclose(held.get_segment_times(), solution.times, atol=1e-15)
+
+
+def test_a_solution_that_is_not_finite_has_no_trajectory(write_urdf):
+    problem = plant(write_urdf)
+    broken = dd.solve(problem, method="ilqr").told()
+    vars(broken)["xs"] = np.full((11, 2), np.nan)
+    with pytest.raises(ModelError, match="no trajectory"):
+        broken.trajectory()
+
+
+@each_row("method", ["collocation", "ilqr", "shooting"])
+@each_row("count", [7, 10, 25])
+def test_a_solution_of_any_method_and_length_is_a_guess(write_urdf, method, count):
+    """The guess on the new knots is the line of the old one; the search ends where it does without."""
+    first = plant(write_urdf)
+    found = dd.solve(first, method=method)
+    problem = plant(write_urdf, count, h=1.0 / count)
+    for other in ("collocation", "ilqr", "shooting"):
+        guess = first_guess(problem, other, found, 0)
+        assert guess.xs.shape == (count + 1, 2)
+        assert guess.us.shape == (count, 1)
+        t = np.linspace(0, 1, count + 1)
+        np.testing.assert_allclose(guess.xs[[0, -1]], [[0, 0], [1, 0]], atol=1e-6)
+        np.testing.assert_allclose(guess.xs[:, 0], 3 * t**2 - 2 * t**3, atol=0.08)  # half a step at 1.5 m/s is 0.075 m
+        mean = 6 - 12 * (t[1:] + t[:-1]) / 2
+        np.testing.assert_allclose(guess.us[:, 0], mean, atol=1.0 if other != "collocation" else 1.5)
+        if other == "collocation":
+            continue
+        np.testing.assert_allclose(np.sum(guess.us) / count, np.mean(found.us), atol=0.6)
+    warm = dd.solve(problem, method="ilqr", initial_guess=found)
+    assert warm.success
+    np.testing.assert_allclose(warm.us, dd.solve(problem, method="ilqr").us, atol=1e-6)
+
+
+def test_held_inputs_on_other_knots_have_the_same_integral(write_urdf):
+    found = dd.solve(plant(write_urdf), method="ilqr")
+    for count in (3, 4, 9, 20, 33):
+        us = first_guess(plant(write_urdf, count, 1 / count), "ilqr", found, 0).us
+        assert us.mean() == pytest.approx(found.us.mean(), abs=1e-13)
+
+
+def test_drakes_trajectories_are_a_guess(write_urdf):
+    """The closed form as Drake's polynomials: iLQR needs a single step from there, as from anywhere."""
+    t = np.linspace(0, 1, 5)
+    state = PiecewisePolynomial.CubicHermite(t, [3 * t**2 - 2 * t**3, 6 * t - 6 * t**2], [6 * t - 6 * t**2, 6 - 12 * t])
+    held = PiecewisePolynomial.FirstOrderHold([0, 1], [[6.0, -6.0]])
+    problem = plant(write_urdf, 20, 0.05)
+    solution = dd.solve(problem, method="ilqr", initial_guess=(state, held))
+    assert solution.success
+    assert solution.options["initial_guess"] == "given"
+    np.testing.assert_allclose(solution.search.guess[1].ravel(), 6 - 12 * (np.arange(20) + 0.5) / 20, atol=1e-12)
+    collocated = dd.solve(block(horizon=(0.5, 2.0)), initial_guess=(state, held), max_iterations=100)
+    assert collocated.search.guess[2] == 1.0
+
+
+def test_a_run_that_began_from_drakes_trajectories_verifies(write_urdf, tmp_path):
+    """What is recorded are the arrays that they came to, so that the search is the same one again."""
+    first = dd.solve(plant(write_urdf), method="ilqr")
+    problem = plant(write_urdf, 20, 0.05)
+    for name, guess in (("trajectories", first.trajectory()), ("solution", first)):
+        dd.save(dd.solve(problem, method="shooting", initial_guess=guess), tmp_path / name)
+        assert dd.verify(tmp_path / name).holds
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ((PiecewisePolynomial.FirstOrderHold([0, 1], np.zeros((3, 2))),) * 2, "initial_guess state: expected shape"),
+        ((PiecewisePolynomial.FirstOrderHold([0, 1], np.zeros((2, 2))),) * 2, "initial_guess input: expected shape"),
+        ((PiecewisePolynomial.FirstOrderHold([0, 1], np.zeros((2, 2))), np.zeros((10, 1))), "initial_guess input: exp"),
+        ((PiecewisePolynomial.FirstOrderHold([0, 1], np.zeros((2, 2))),), "two trajectories"),
+        ((PiecewisePolynomial([[0.0], [0.0]]), PiecewisePolynomial([[0.0]])), "a beginning and an end"),
+    ],
+)
+def test_trajectories_that_do_not_fit_are_refused(write_urdf, given, message):
+    with pytest.raises((InputError, ShapeError), match=re.escape(message)):
+        dd.solve(plant(write_urdf), method="ilqr", initial_guess=given)
+
+
+def test_a_solution_of_another_system_is_refused(write_urdf):
+    found = dd.solve(plant(write_urdf), method="ilqr")
+    cart = dd.example_model("cart_pole", time_step=0.1)
+    with pytest.raises(ShapeError, match="states and inputs"):
+        dd.solve(dd.Problem(cart, x0=[0, 0, 0, 0], x_goal=[0, 0.1, 0, 0], num_steps=10), initial_guess=found)
