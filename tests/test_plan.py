@@ -15,6 +15,7 @@ from drake_diff.cli.main import main
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.model.example import example_files
 from drake_diff.planning import plan
+from drake_diff.planning.around import Line
 from drake_diff.planning.motion import along
 from drake_diff.planning.robot import load_robot
 
@@ -85,7 +86,7 @@ def _read(terminal):
 def test_the_inputs_of_a_smooth_guess_make_that_motion(arm):
     """The recursion of Newton and Euler, stepped by Drake: to rounding of the state after 30 to 100 steps."""
     robot = load_robot(arm, 0)
-    guess = along(robot, "line", [robot.q, np.array([0.7, -0.4])])
+    guess = along(robot, Line("line", np.array([robot.q, [0.7, -0.4]])))
     motion = dd.rollout(guess.model, guess.xs[0], guess.us)
     assert motion.xs == pytest.approx(guess.xs, abs=1e-9)
     assert guess.xs[-1] == pytest.approx([0.7, -0.4, 0.0, 0.0], abs=1e-12)

@@ -21,6 +21,12 @@ Goals = Annotated[
     typer.Option(metavar="NAME=NUMBERS", help="hand=0.4,0,0.5 for a frame or body [m], elbow=1.0 for a joint."),
 ]
 
+Obstacles = Annotated[
+    list[str] | None,
+    typer.Option(metavar="SHAPE:NUMBERS", help="sphere:x,y,z,radius or box:x,y,z,length,width,height [m]; repeatable."),
+]
+NUMBERS = {"sphere": 4, "box": 6}
+
 
 def add_commands(app: typer.Typer) -> None:
     """Add the command of this module to `app`."""
@@ -32,6 +38,7 @@ def plan(
         Path | None, typer.Argument(metavar="ROBOT", help="A URDF, SDF, MJCF (.xml) or .dmd.yaml file; else a Panda.")
     ] = None,
     goal: Goals = None,
+    avoid: Obstacles = None,
     time: Annotated[str | None, typer.Option(help="least: as fast as can be; else with the least effort.")] = None,
     out: Annotated[Path | None, out_option("artifacts/plan_<robot>")] = None,
     seed: Seed = 0,
@@ -43,19 +50,37 @@ def plan(
     goals = dict(_named_numbers(words) for words in goal or ())
     if len(goals) < len(goal or ()):
         raise InputError("--goal", got=" ".join(goal or ()), expected="each name once")
+    shapes = [_shape(words) for words in avoid or ()]
     if robot is not None and not robot.is_file():
         raise InputError("ROBOT", got=str(robot), expected="a file that exists")
     # Only here: what is wrong is refused before Drake is loaded.
     from drake_diff.model.example import example_files
+    from drake_diff.optimize.problem.obstacles import BoxObstacle, SphereObstacle
     from drake_diff.planning.planner import plan as planned
+
+    obstacles = [SphereObstacle(n[:3], n[3]) if kind == "sphere" else BoxObstacle(n[:3], n[3:]) for kind, n in shapes]
 
     file = robot or example_files()[EXAMPLE]
     with _live(file.name) as report:
-        done = planned(file, goals=goals, time=time, out=out, seed=seed, report=report)
+        done = planned(file, goals=goals, avoid=obstacles, time=time, out=out, seed=seed, report=report)
     show(judged("pass" if done.success else "fail"), f" {file.name}: {done.solution.status.value}")
     for line in done.lines:
         show(plain(line))
     raise typer.Exit(0 if done.success else 1)
+
+
+def _shape(words: str) -> tuple[str, list[float]]:
+    kind, colon, values = words.partition(":")
+    expected = "sphere:x,y,z,radius or box:x,y,z,length,width,height"
+    if not colon or kind not in NUMBERS:
+        raise InputError("--avoid", got=repr(words), expected=expected)
+    try:
+        numbers = [float(value) for value in values.split(",")]
+    except ValueError as error:
+        raise InputError("--avoid", got=repr(words), expected=f"numbers with commas between: {expected}") from error
+    if len(numbers) != NUMBERS[kind]:
+        raise InputError("--avoid", got=repr(words), expected=f"{NUMBERS[kind]} numbers: {expected}")
+    return kind, numbers
 
 
 def _named_numbers(words: str) -> tuple[str, list[float]]:

@@ -8,6 +8,7 @@ from drake_diff._base.arrays import Array
 from drake_diff.exceptions import SimulationError
 from drake_diff.model.model import Model
 from drake_diff.model.step import advance, set_state
+from drake_diff.planning.around import Line
 from drake_diff.planning.robot import Robot, drive, effort_limits
 
 FASTEST = 1.0  # [rad/s or m/s] the peak of a joint without a velocity limit
@@ -15,7 +16,6 @@ OF_SPEED = 0.6  # of a velocity limit: the peak of a first guess
 SHORTEST, LONGEST = 0.6, 6.0  # [s] a motion
 STEPS = (30, 100)  # fewest and most of a plan
 OF_EFFORT = 0.9  # of an effort limit: what a first guess may use
-PEAK = 1.875  # the greatest slope of 10 s^3 - 15 s^4 + 6 s^5
 CORRECTIONS = 3
 EXACT = 1e-11  # [rad/s or m/s]
 PULL, DAMP = 30.0, 9.0  # [1/s^2], [1/s] of a controller
@@ -80,23 +80,25 @@ def _inputs(model: Model, x: Array, wanted: Array) -> Array:
     return np.asarray(u)
 
 
-def along(robot: Robot, name: str, via: list[Array], *, slower: float = 1.0) -> Guess:
-    """The smooth motion through postures `via`, [q0, ..., q1], at rest at both ends, and the inputs that make it.
+def along(robot: Robot, line: Line, *, slower: float = 1.0) -> Guess:
+    """The smooth motion along a line, at rest at both ends, and the inputs that make it.
 
     It is as fast as the joints' speeds and efforts allow, within the limits of this module. SimulationError where
     Drake cannot take a step of it.
     """
-    legs = np.diff(np.array(via), axis=0)
-    slowest = max(float(np.max(np.abs(leg) / speed_limits(robot.model), initial=0.0)) for leg in legs)
-    duration = float(np.clip(slower * PEAK * len(legs) * slowest, SHORTEST, LONGEST))
-    found = _timed(robot, name, via, duration)
+    t = np.linspace(0, 1, 101)
+    speeds = np.abs(line.slopes(_smooth(t))) * (30 * t**2 * (1 - t) ** 2)[:, None]
+    duration = slower * float(np.max(speeds / speed_limits(robot.model), initial=0.0))
+    duration = float(np.clip(duration, SHORTEST, LONGEST))
+    name = line.name if slower == 1 else f"{line.name} in {slower:g} times the time"
+    found = _timed(robot, name, line, duration)
     while found.effort > OF_EFFORT and duration < LONGEST:
         duration = min(1.5 * duration, LONGEST)
-        found = _timed(robot, name, via, duration)
+        found = _timed(robot, name, line, duration)
     return found
 
 
-def _timed(robot: Robot, name: str, via: list[Array], duration: float) -> Guess:
+def _timed(robot: Robot, name: str, line: Line, duration: float) -> Guess:
     model = robot.model
     steps = int(np.clip(round(duration / model.time_step), *STEPS))
     if duration / steps > 1.25 * model.time_step:
@@ -104,21 +106,16 @@ def _timed(robot: Robot, name: str, via: list[Array], duration: float) -> Guess:
     h = model.time_step
     # One step before the end it is at the goal, and rests there: Drake's step moves by the velocity after it.
     s = np.clip(np.arange(steps + 1) / (steps - 1), 0.0, 1.0)
-    q = _through(np.array(via), 10 * s**3 - 15 * s**4 + 6 * s**5)
+    q = line.at(_smooth(s))
     v = np.vstack([np.zeros((1, model.nv)), np.diff(q, axis=0) / h])
     us = np.array([_inputs(model, np.concatenate([q[k], v[k]]), v[k + 1]) for k in range(steps)])
     depth = max(robot.overlap(posture) for posture in q[:: max(1, steps // 25)])
     return Guess(name, model, np.hstack([q, v]), us, _share(model, us), depth)
 
 
-def _through(via: Array, s: Array) -> Array:
-    """(M, nq) from the first of `via` (K, nq) to the last at s (M,) in [0, 1]: a line, or a parabola by the middle."""
-    t = s[:, None]
-    if len(via) == 2:
-        return np.asarray(via[0] + t * (via[1] - via[0]))
-    start, middle, end = via
-    control = 2 * middle - (start + end) / 2
-    return np.asarray((1 - t) ** 2 * start + 2 * t * (1 - t) * control + t**2 * end)
+def _smooth(t: Array) -> Array:
+    """From 0 to 1 as t does, with a speed and an acceleration of 0 at both ends."""
+    return np.asarray(10 * t**3 - 15 * t**4 + 6 * t**5)
 
 
 def by_controller(robot: Robot, target: Array, *, steps: int, reach: float, name: str) -> Guess | None:
@@ -137,8 +134,8 @@ def by_controller(robot: Robot, target: Array, *, steps: int, reach: float, name
         gain = model.time_step / effect[own, np.arange(model.nu)]
         at = own + free
         for k in range(steps):
-            s = min(1.0, 1.25 * (k + 1) / steps)
-            aim = robot.q[at] + reach * (10 * s**3 - 15 * s**4 + 6 * s**5) * (target[at] - robot.q[at])
+            s = np.array(min(1.0, 1.25 * (k + 1) / steps))
+            aim = robot.q[at] + reach * _smooth(s) * (target[at] - robot.q[at])
             u = gain * (PULL * (aim - x[at]) - DAMP * x[model.nq + own])
             u = np.clip(u, -OF_PULL * limits, OF_PULL * limits)
             x = np.array(advance(model.double, x, u))

@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,11 @@ from drake_diff.model.model import Model
 from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.cost import QuadraticCost
 from drake_diff.optimize.problem.goals import FrameGoal
+from drake_diff.optimize.problem.obstacles import Obstacle, doubts_of
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
+from drake_diff.planning.around import Space, lines
 from drake_diff.planning.motion import OF_EFFORT, Guess, along, by_controller
 from drake_diff.planning.robot import TOUCHING, Robot, effort_limits, load_robot
 from drake_diff.planning.task import Task, asked, postures
@@ -34,7 +36,6 @@ FASTER = (0.2, 2.0)  # of the first guess's duration: the range of a least time
 SPEED_WEIGHT = 0.01  # of a speed against an effort, both as shares of their limits
 BUDGET = 120.0  # [s] on the clock, of one attempt
 SEGMENT = 5  # steps of multiple shooting
-BENT = 8  # lines around what a straight one touches
 
 Report = Callable[[str, str], None]
 
@@ -97,7 +98,9 @@ class Plan(ShowsItsRepr):
 
     def _goal(self, far: float) -> str:
         told = [f"a state {far:.2g} away (rad or m), at the end of {self.solution.horizon:.3g} s"]
-        told += [str(goal) for goal in getattr(self.solution.problem, "goals", ())]
+        goals = getattr(self.solution.problem, "goals", ())
+        told += [str(goal) for goal in goals]
+        told += doubts_of(goals, self.model)
         return ", ".join(told)
 
     def __repr__(self) -> str:
@@ -108,7 +111,7 @@ def plan(
     robot: str | Path,
     *,
     goals: Mapping[str, Any] | None = None,
-    avoid: Any = (),
+    avoid: Sequence[Obstacle] = (),
     time: str | None = None,
     out: str | Path | None = None,
     seed: int = 0,
@@ -151,11 +154,11 @@ def plan(
         clock.begin("audit", str(ready.model))
         findings = tuple(audit(ready.model))
         clock.begin("guess", f"{len(findings)} finding{'s' * (len(findings) != 1)}")
-        task = asked(ready.model, goals or {})
+        task = asked(ready.model, goals or {}, avoid)
         tried: list[str] = []
         found: list[Solution] = []
         apart = False
-        for attempt in _attempts(ready, task, avoid, time, seed):
+        for attempt in _attempts(ready, task, time, seed):
             clock.begin("solve", attempt.name)
             try:
                 solution = attempt.solved(lambda line: clock.report("solve", line))
@@ -203,65 +206,60 @@ class _Attempt:
         return max((self.robot.overlap(x[: self.problem.model.nq]) for x in solution.xs), default=0.0)
 
 
-def _attempts(robot: Robot, task: Task, avoid: Any, least: str | None, seed: int) -> Iterator[_Attempt]:
+def _attempts(robot: Robot, task: Task, least: str | None, seed: int) -> Iterator[_Attempt]:
     """What to try, one after the other, until one is verified."""
+    Space.of(robot, task.avoid).check("start", robot.q)
     if robot.is_fully_driven:
-        yield from _of_driven(robot, task, avoid, least, seed)
+        yield from _of_driven(robot, task, least, seed)
     elif task.is_free:
-        yield from _of_reachable(robot, seed)
+        yield from _of_reachable(robot, task, seed)
     else:
         yield from _of_passive(robot, task)
 
 
-def _of_driven(robot: Robot, task: Task, avoid: Any, least: str | None, seed: int) -> Iterator[_Attempt]:
+def _of_driven(robot: Robot, task: Task, least: str | None, seed: int) -> Iterator[_Attempt]:
     """A robot whose every smooth motion can be driven: from each posture that keeps the goals, the best guess first."""
+    space = Space.of(robot, task.avoid)
     for target in postures(robot, task, seed):
-        guesses = _guesses(robot, target, avoid, seed)
+        guesses = _guesses(space, target, seed)
         for guess in guesses[:2]:
             if robot.model.nv <= SMALL or least:
-                yield _collocated(robot, task, guess, avoid, least)
+                yield _collocated(robot, task, guess, least)
         for guess in () if least else guesses[:2]:
-            yield _feasible(robot, task, guess, avoid)
+            yield _feasible(robot, task, guess)
 
 
-def _guesses(robot: Robot, target: Array, avoid: Any, seed: int) -> list[Guess]:
-    """First guesses to `target` (nq,), the best first: those that touch nothing, then those within the effort limits.
-
-    A straight line; where that touches something, lines bent through postures in between, at random.
-    """
-    random = np.random.default_rng([seed, 3])
-    found = [along(robot, "a straight line in the joints", [robot.q, target])]
-    if _clear(robot, found[0], avoid) < 0 and len(found) < BENT:
-        for i in range(BENT):
-            width = 0.3 * random.uniform(-1, 1, robot.model.nq) * (robot.upper - robot.lower)
-            middle = np.clip((robot.q + target) / 2 + width, robot.lower, robot.upper)
-            found.append(along(robot, f"a bent line ({i})", [robot.q, middle, target]))
-    else:
-        found.append(along(robot, "a straight line in twice the time", [robot.q, target], slower=2.0))
-    return sorted(found, key=lambda guess: (-_clear(robot, guess, avoid), max(guess.effort, OF_EFFORT)))
+def _guesses(space: Space, target: Array, seed: int) -> list[Guess]:
+    """First guesses to `target` (nq,): those that touch nothing before others, then those within the effort limits."""
+    robot, found = space.robot, lines(space, target, seed)
+    guesses = [along(robot, line) for line in found]
+    if len(found) == 1:
+        guesses.append(along(robot, found[0], slower=2.0))
+    return sorted(guesses, key=lambda guess: (_touched(space, guess), max(guess.effort, OF_EFFORT)))
 
 
-def _clear(robot: Robot, guess: Guess, avoid: Any) -> float:
-    """[m] how far the guess stays from overlap and obstacles; below 0 where it does not."""
-    return 0.0 if guess.depth <= TOUCHING else -guess.depth
+def _touched(space: Space, guess: Guess) -> float:
+    """[m] how deep shapes overlap or what is used of an obstacle's margin along a guess; 0 where nothing is."""
+    depth = guess.depth if guess.depth > TOUCHING else 0.0
+    return max(0.0, depth, float(np.max(space.lacking(guess.xs[:, : space.robot.model.nq]))))
 
 
-def _collocated(robot: Robot, task: Task, guess: Guess, avoid: Any, least: str | None) -> _Attempt:
+def _collocated(robot: Robot, task: Task, guess: Guess, least: str | None) -> _Attempt:
     """The least effort, or the least time, by collocation."""
     model, x1 = guess.model, guess.xs[-1].copy()
     asked: dict[str, Any] = {"running_cost": _effort(model)}
     if least:
         whole = guess.num_steps * model.time_step
         asked = {"running_cost": 1.0, "horizon": (FASTER[0] * whole, FASTER[1] * whole)}
-    problem = _problem(task, guess, x1, avoid, **asked)
+    problem = _problem(task, guess, x1, **asked)
     what = "least time" if least else "least effort"
     options = {"method": "collocation", "refine": True, "error_tolerance": 1e-5, "time_limit": BUDGET}
     return _Attempt(f"{what} from {guess.name}", robot, problem, guess, options)
 
 
-def _feasible(robot: Robot, task: Task, guess: Guess, avoid: Any) -> _Attempt:
+def _feasible(robot: Robot, task: Task, guess: Guess) -> _Attempt:
     """Any motion to where the guess ends that keeps all limits: the guess itself, if it does."""
-    problem = _problem(task, guess, guess.xs[-1], avoid)
+    problem = _problem(task, guess, guess.xs[-1])
     # From states on the way: rolled out from the first alone, what is upright falls in seconds, by rounding.
     segments = max(1, guess.num_steps // SEGMENT)
     return _Attempt(
@@ -269,20 +267,20 @@ def _feasible(robot: Robot, task: Task, guess: Guess, avoid: Any) -> _Attempt:
     )
 
 
-def _problem(task: Task, guess: Guess, x_goal: Array, avoid: Any, **asked: Any) -> Problem:
+def _problem(task: Task, guess: Guess, x_goal: Array, **asked: Any) -> Problem:
     goals = [FrameGoal(name, position=place) for name, place in task.frames.items()]
     return Problem(
         guess.model,
         x0=guess.xs[0],
         x_goal=x_goal,
         num_steps=guess.num_steps,
-        goals=[*goals, *avoid],
+        goals=[*goals, *task.avoid],
         bounds=_bounds(guess.model),
         **asked,
     )
 
 
-def _of_reachable(robot: Robot, seed: int) -> Iterator[_Attempt]:
+def _of_reachable(robot: Robot, task: Task, seed: int) -> Iterator[_Attempt]:
     """To the state that a controller reaches, which shows that it can be reached."""
     random = np.random.default_rng([seed, 2])
     part = random.uniform(-1, 1, robot.model.nq)
@@ -290,7 +288,7 @@ def _of_reachable(robot: Robot, seed: int) -> Iterator[_Attempt]:
     for reach in (0.5, 0.25, 0.1):
         guess = by_controller(robot, target, steps=50, reach=reach, name=f"what controllers reach ({reach:g})")
         if guess is not None and _inside(guess):
-            yield _feasible(robot, Task({}, {}), guess, ())
+            yield _feasible(robot, task, guess)
 
 
 def _of_passive(robot: Robot, task: Task) -> Iterator[_Attempt]:
@@ -303,7 +301,13 @@ def _of_passive(robot: Robot, task: Task) -> Iterator[_Attempt]:
     goal[list(task.joints)] = list(task.joints.values())
     for steps in (100, 150):
         problem = Problem(
-            model, x0=x0, x_goal=goal, num_steps=steps, bounds=_bounds(model), running_cost=_effort(model)
+            model,
+            x0=x0,
+            x_goal=goal,
+            num_steps=steps,
+            bounds=_bounds(model),
+            goals=task.avoid,
+            running_cost=_effort(model),
         )
         yield _Attempt(f"least effort in {steps} steps", robot, problem, None, {"method": "auto", "time_limit": BUDGET})
 

@@ -1,6 +1,6 @@
 """What a robot is asked to do: goals by the names of frames and joints, and postures that keep them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,8 @@ from drake_diff._base.arrays import Array, finite_array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.model.model import Model
 from drake_diff.model.quantities import frame_position
+from drake_diff.optimize.problem.obstacles import Obstacle
+from drake_diff.planning.around import Space
 from drake_diff.planning.motion import OF_EFFORT, share_to_hold
 from drake_diff.planning.robot import TOUCHING, Robot
 
@@ -19,6 +21,7 @@ ITERATIONS = 150
 FARTHEST = 0.3  # [rad or m] of one iteration
 REACHED = 1e-6  # [m]
 SEEDS = 12  # first postures of inverse kinematics
+MORE_SEEDS = 40  # where obstacles are in the way
 CANDIDATES = 3  # postures that are tried
 MOVE = 0.25  # part of a joint's range that a random goal is away, at most
 DRAWS = 50
@@ -26,10 +29,14 @@ DRAWS = 50
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Goals of one robot: positions (3,) of frames, positions of joints by their place in q; none is a random goal."""
+    """Goals of one robot: positions (3,) of frames, positions of joints by their place in q; none is a random goal.
+
+    `avoid` is what it keeps clear of on its way.
+    """
 
     frames: Mapping[str, Array]
     joints: Mapping[int, float]
+    avoid: tuple[Obstacle, ...] = ()
 
     @property
     def is_free(self) -> bool:
@@ -37,7 +44,7 @@ class Task:
         return not self.frames and not self.joints
 
 
-def asked(model: Model, goals: Mapping[str, Any]) -> Task:
+def asked(model: Model, goals: Mapping[str, Any], avoid: Sequence[Obstacle] = ()) -> Task:
     """The task that `goals` are for `model`: a name with three numbers is a frame's, with one a joint's.
 
     Raises UnknownNameError where there is no such frame or joint, InputError where the numbers do not fit.
@@ -62,7 +69,10 @@ def asked(model: Model, goals: Mapping[str, Any]) -> Task:
         else:
             expected = "three numbers (the position of a frame) or one (that of a joint)"
             raise InputError(f"goal {name}", got=f"{len(numbers)} numbers", expected=expected)
-    return Task(places, angles)
+    for obstacle in avoid:
+        if not isinstance(obstacle, Obstacle):
+            raise InputError("avoid", got=repr(obstacle)[:80], expected="SphereObstacles and BoxObstacles")
+    return Task(places, angles, tuple(avoid))
 
 
 def postures(robot: Robot, task: Task, seed: int) -> list[Array]:
@@ -70,22 +80,29 @@ def postures(robot: Robot, task: Task, seed: int) -> list[Array]:
 
     Where nothing is asked for it is a random one: inside the limits, without overlap, and held by its motors.
     """
-    random = np.random.default_rng([seed, 1])
+    random, space = np.random.default_rng([seed, 1]), Space.of(robot, task.avoid)
     if task.is_free:
-        return [_random_posture(robot, random)]
+        return [_random_posture(space, random)]
     start, fixed = robot.q.copy(), np.zeros(robot.model.nq, dtype=bool)
     for at, value in task.joints.items():
         start[at], fixed[at] = value, True
     if not task.frames:
+        space.check("goal", start)
         return [start]
     found: list[Array] = []
-    nearest = np.inf
-    for i in range(SEEDS):
+    nearest, blocked = np.inf, ""
+    for i in range(MORE_SEEDS if task.avoid else SEEDS):
+        if len(found) >= CANDIDATES and i >= SEEDS:
+            break
         first = start if i == 0 else np.where(fixed, start, random.uniform(robot.lower, robot.upper))
         q, off = _reached(robot, task, first, fixed)
         nearest = min(nearest, off)
         if off <= REACHED and robot.overlap(q) <= TOUCHING and share_to_hold(robot.model, q) <= 1.0:
-            found.append(q)
+            blocked = space.told(q)
+            found += [] if blocked else [q]
+    if not found and blocked:
+        expected = f"a goal that some posture reaches clear of all obstacles; {MORE_SEEDS} were tried"
+        raise InputError(f"goal {', '.join(task.frames)}", got=f"at the goal {blocked}", expected=expected)
     if not found:
         told = "inside all limits, without overlap and held by the motors"
         if nearest > REACHED:
@@ -128,8 +145,9 @@ def _reached(robot: Robot, task: Task, q: Array, fixed: Array) -> tuple[Array, f
     return q, off
 
 
-def _random_posture(robot: Robot, random: np.random.Generator) -> Array:
-    """Some way off the start, inside the limits, where nothing overlaps and the motors hold the weight."""
+def _random_posture(space: Space, random: np.random.Generator) -> Array:
+    """Some way off the start, inside the limits, where nothing is touched and the motors hold the weight."""
+    robot = space.robot
     reach = MOVE * (robot.upper - robot.lower)
     margin = 0.2 * reach
     best, least = robot.q, np.inf
@@ -138,6 +156,8 @@ def _random_posture(robot: Robot, random: np.random.Generator) -> Array:
         q = robot.q + part * random.uniform(-1, 1, len(reach)) * reach
         q = np.clip(q, robot.lower + margin, robot.upper - margin)
         if any(robot.overlap(robot.q + s * (q - robot.q)) > TOUCHING for s in (0.25, 0.5, 0.75, 1.0)):
+            continue
+        if space.told(q):
             continue
         load = share_to_hold(robot.model, q)
         if load <= 0.7 * OF_EFFORT:

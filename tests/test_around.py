@@ -1,0 +1,154 @@
+"""Ways around obstacles: what is in the way is named, and what is found is clear by closed forms of two links."""
+
+import subprocess
+import sys
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from helpers.table import each_row
+
+import drake_diff as dd
+from drake_diff.cli.main import main
+from drake_diff.exceptions import InputError
+from drake_diff.planning import plan
+from drake_diff.planning.around import Line, Space, lines
+from drake_diff.planning.robot import load_robot
+
+LONG, THICK = 0.5, 0.03  # [m] of each link, and its radius
+ROD = """<link name="{name}"><inertial><origin xyz="0 0 -0.25"/><mass value="1"/>
+<inertia ixx="0.02" iyy="0.02" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><origin xyz="0 0 -0.25"/><geometry><capsule radius="0.03" length="0.5"/></geometry></collision></link>"""
+ARM = f"""<robot name="arm"><link name="base"/>{ROD.format(name="upper")}{ROD.format(name="lower")}
+<link name="tip"/><joint name="at_tip" type="fixed"><parent link="lower"/><child link="tip"/>
+<origin xyz="0 0 -0.5"/></joint>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
+<limit lower="-3" upper="3" effort="40" velocity="4"/></joint>
+<joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0 0 -0.5"/>
+<axis xyz="0 1 0"/><limit lower="-2.5" upper="2.5" effort="20" velocity="4"/></joint></robot>"""
+
+
+@pytest.fixture
+def arm(tmp_path):
+    """Two links of 0.5 m in the plane of x and z, hanging at 0, both of capsules."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(ARM)
+    return path
+
+
+def distance(qs, center):
+    """(K,) [m] of the two links' surfaces from a point, by their angles qs (K, 2): Pythagoras on two segments."""
+    found = []
+    for shoulder, elbow in qs:
+        ends = [np.zeros(2)]
+        for angle in (shoulder, shoulder + elbow):  # about y, downwards at 0
+            ends.append(ends[-1] - LONG * np.array([np.sin(angle), np.cos(angle)]))
+        point, best = np.array([center[0], center[2]]), np.inf
+        for a, b in pairwise(ends):
+            t = np.clip((point - a) @ (b - a) / LONG**2, 0, 1)
+            best = min(best, np.hypot(np.linalg.norm(point - a - t * (b - a)), center[1]))
+        found.append(best - THICK)
+    return np.array(found)
+
+
+def test_a_line_is_bent_around_a_disk_that_the_straight_one_meets(arm):
+    """From hanging to the right with the elbow straight, past a ball 0.95 m below at 0.4 rad: the elbow has to fold."""
+    robot, angle = load_robot(arm, 0), 0.5
+    center = -0.95 * np.array([np.sin(angle), 0, np.cos(angle)])
+    ball = dd.SphereObstacle(center, 0.08)
+    target = np.array([1.0, 0.0])
+    space = Space.of(robot, [ball])
+    straight = Line("", np.array([robot.q, target]))
+    assert np.min(distance(straight.postures, center)) < 0.0
+    assert not space.is_free(straight.postures)
+    found = lines(space, target, 0)
+    assert found
+    for line in found:
+        fine = line.at(np.linspace(0, 1, 2000))
+        assert fine[0] == pytest.approx(robot.q, abs=1e-12)
+        assert fine[-1] == pytest.approx(target, abs=1e-12)
+        # the margin, less what a line may lose between the postures that are looked at: 0.04 rad of a metre, halved
+        assert np.min(distance(fine, center)) >= 0.08 + 0.01 - 0.02
+        assert np.max(np.abs(fine[:, 1])) > 0.3
+
+
+def test_what_a_space_lacks_is_the_closed_form(arm):
+    robot, random = load_robot(arm, 0), np.random.default_rng(0)
+    center = np.array([0.3, 0.1, -0.5])
+    space = Space.of(robot, [dd.SphereObstacle(center, 0.08, margin=0.02)])
+    qs = random.uniform(-2, 2, (200, 2))
+    assert space.lacking(qs) == pytest.approx(0.02 + 0.08 - distance(qs, center), abs=1e-9)
+
+
+def test_the_same_seed_finds_the_same_lines(arm):
+    robot = load_robot(arm, 0)
+    space = Space.of(robot, [dd.SphereObstacle([-0.45, 0, -0.8], 0.08)])
+    one, other = ([line.controls for line in lines(space, np.array([1.0, 0.0]), 3)] for _ in range(2))
+    assert [a.tolist() for a in one] == [b.tolist() for b in other]
+
+
+def test_a_hand_goes_around_a_ball_and_the_plan_is_clear_by_the_closed_form(arm, tmp_path):
+    angle = 0.5
+    center = -0.95 * np.array([np.sin(angle), 0, np.cos(angle)])
+    done = plan(arm, goals={"shoulder": 1.0, "elbow": 0.0}, avoid=[dd.SphereObstacle(center, 0.08)], out=tmp_path)
+    assert done.success, done.lines
+    times = np.linspace(0, done.solution.horizon, 1 + round(1000 * done.solution.horizon))
+    qs = done.solution.transcribed.at(times)[0][:, :2]
+    assert np.min(distance(qs, center)) >= 0.08 + 0.01 - 0.001  # the margin, and what may be used of it between knots
+    assert "SphereObstacle" in done.lines[3]
+
+
+@each_row(
+    "avoid, message",
+    [
+        ([dd.SphereObstacle([0, 0, -0.8], 0.1)], r"start: .*got lower enters obstacle sphere at 0, 0, -0.8"),
+        ([dd.SphereObstacle([-1, 0, 0], 0.2)], r"goal tip: .*got at the goal lower enters obstacle"),
+        ([dd.BoxObstacle([-0.9, 0, 0.1], [0.3, 0.3, 0.3])], r"goal tip: .*got at the goal lower enters obstacle"),
+        ([1.0], r"avoid: .*SphereObstacles"),
+    ],
+    ids=str,
+)
+def test_what_no_way_leads_around_is_named_before_it_is_solved(avoid, message, arm, tmp_path):
+    with pytest.raises(InputError, match=message):
+        plan(arm, goals={"tip": [-0.9, 0, 0.1]}, avoid=avoid, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@each_row(
+    "words, message",
+    [
+        ("ball:0,0,0,1", "sphere:x,y,z,radius or box:"),
+        ("0,0,0,1", "sphere:x,y,z,radius or box:"),
+        ("sphere:0,0,0", "4 numbers"),
+        ("box:0,0,0,1", "6 numbers"),
+        ("sphere:a,0,0,1", "numbers with commas"),
+        ("sphere:0,0,0,-1", "SphereObstacle.radius"),
+        ("box:0,0,0,1,0,1", "BoxObstacle.size"),
+    ],
+)
+def test_bad_words_of_an_obstacle_are_one_sentence(words, message, arm, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["drake-diff", "plan", str(arm), "--goal", "elbow=1", "--avoid", words])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    told = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert told.startswith("drake-diff: ")
+    assert message in told
+
+
+@pytest.mark.slow
+def test_the_command_leads_around(arm, tmp_path):
+    words = ["--goal", "shoulder=1.0", "--goal", "elbow=0", "--avoid", "sphere:-0.45,0,-0.83,0.08"]
+    words += ["--avoid", "box:0.5,0,-0.8,0.1,0.1,0.1", "--time", "least", "--out", "out"]
+    done = subprocess.run(
+        [sys.executable, "-m", "drake_diff.cli.main", "plan", str(arm), *words],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert dd.verify(tmp_path / "out").verdict == "holds"
+    qs = dd.read_trace(tmp_path / "out" / "trace.mcap").xs[:, :2]
+    assert np.min(distance(qs, np.array([-0.45, 0, -0.83]))) >= 0.08  # at the knots
