@@ -27,6 +27,9 @@ CODES = [
     "ignored",
     "zero_limit",
     "corners_miss",
+    "left_out",
+    "lost_armature",
+    "switched_off",
 ]
 INERTIA = '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>'
 INERTIAL = f'<inertial><mass value="1"/>{INERTIA}</inertial>'
@@ -325,6 +328,52 @@ TRAPS = [
 ]
 
 
+SWING = '<body name="a"><joint name="j" axis="0 1 0" {}/><geom size="0.1" mass="1"/></body>'
+MJCF = f'<mujoco model="m">{{}}<worldbody><geom type="plane" size="9 9 1"/>{SWING}</worldbody>{{}}</mujoco>'
+TRAPS += [
+    (
+        "left_out",
+        "warning",
+        MJCF.format("", "", '<actuator><general name="servo" joint="j" gainprm="5"/></actuator>'),
+        {},
+        r"1 actuators left out, .*: servo \(general of j\)",
+        {"actuators": ["j"]},
+    ),
+    (
+        "left_out",
+        "warning",
+        MJCF.format("", "", '<actuator><motor name="pull" tendon="t"/></actuator>'),
+        {},
+        r"pull \(motor of no joint\)",
+        None,
+    ),
+    (
+        "lost_armature",
+        "warning",
+        MJCF.format("", 'armature="2"', ""),
+        {},
+        r"j\): Drake has the armature of a joint only with an actuator",
+        {"actuators": ["j"]},
+    ),
+    (
+        "switched_off",
+        "warning",
+        MJCF.format('<option><flag contact="disable"/></option>', "", ""),
+        {},
+        r"contact\): the file switches it off",
+        {"contact": False},
+    ),
+    (
+        "switched_off",
+        "warning",
+        MJCF.format('<option><flag gravity="disable"/></option>', "", ""),
+        {},
+        r"gravity\): the file switches it off",
+        {"gravity": [0.0, 0.0, 0.0]},
+    ),
+]
+
+
 @each_row("code, severity, text, options, words, mended", TRAPS)
 def test_a_trap_is_named_and_its_remedy_mends_it(tmp_path, code, severity, text, options, words, mended):
     finding = audited(tmp_path, text, **options)[code]
@@ -395,4 +444,4 @@ def test_the_models_of_this_repository_have_none(load, name):
 
 
 def test_every_check_of_files_is_part_of_the_audit():
-    assert len(FILE_CHECKS) == 9
+    assert len(FILE_CHECKS) == 12

@@ -30,7 +30,7 @@ from pydrake.multibody.tree import SpatialInertia
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, SimulationError, UnknownNameError
 from drake_diff.model.contact import contacts_of_the_step
-from drake_diff.model.load_file import ROUTES, autodiff_supports, replace_collision_geometry
+from drake_diff.model.contact_geometry import ROUTES, autodiff_supports, replace_collision_geometry
 
 MASS, SIZE = 2.0, (0.3, 0.2, 0.1)  # [kg], [m]
 BOX_STIFFNESS, GROUND_STIFFNESS = 2e4, 1e4  # [N/m]

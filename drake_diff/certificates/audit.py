@@ -21,8 +21,8 @@ from drake_diff.certificates.finding import SEVERITIES, Finding, Findings, Sever
 from drake_diff.certificates.place import PARALLEL, Collider, Pair, Place
 from drake_diff.derivatives.step import StepDerivatives, differentiate_step
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError
+from drake_diff.model.contact_geometry import MEETS_A_SPHERE
 from drake_diff.model.file_facts import Mimic
-from drake_diff.model.load_file import MEETS_A_SPHERE
 from drake_diff.model.model import Model
 from drake_diff.model.parameter_kinds import IDENTITY_OFFSET
 from drake_diff.model.plant import PROXIMITY, actuators, instances, joints
@@ -200,9 +200,7 @@ def _mechanism(place: Place) -> Found:
         told = "; ".join(map(str, mimics))
         message = f"joints follow others, and stay in the state, held by constraints: {told}"
         if not all(m.in_drake for m in mimics):
-            message = (
-                f"joints should follow others, but Drake does not read SDF's <mimic>, and they move freely: {told}"
-            )
+            message = f"joints should follow others, but Drake does not read that, and they move freely: {told}"
         remedy = 'mimic="reduce" takes them out of the state, "fix" welds them; collocation and other engines need that'
         followers = ", ".join(m.follower for m in mimics)
         yield Finding("warning", "mimic_joint", followers, message, remedy, {"mimic": "reduce"})

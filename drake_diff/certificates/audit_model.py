@@ -12,7 +12,7 @@ from pydrake.multibody.plant import DiscreteContactApproximation
 
 from drake_diff.certificates.finding import Finding, Severity
 from drake_diff.certificates.place import Place
-from drake_diff.model.load_file import collision_geometries
+from drake_diff.model.contact_geometry import collision_geometries
 from drake_diff.model.model import Model
 from drake_diff.model.plant import FLOATING, PROXIMITY, actuators, bodies, joints, labelled
 from drake_diff.model.repairs import can_be_driven
@@ -33,6 +33,8 @@ HARMLESS = (
     "texture",
     "material",
     "transmission'",
+    *("camera", "light", "visual", "'site'", "sensor", "statistic", "timestep", "integrator", "keyframe", "'user'"),
+    *("'cone'", "iterations", "custom", "'size'"),
 )
 
 
@@ -64,6 +66,52 @@ def _no_actuator(place: Place) -> Found:
     if meant:
         message = f"{len(meant)} joints have an effort limit in the file and no actuator; {len(driven)} others have one"
         yield Finding("info", "undriven", _listed(meant), message, remedy, {"actuators": meant})
+
+
+def _lost_armature(place: Place) -> Found:
+    plant, facts = place.model.plant, place.model.file_facts
+    driven = {actuator.joint().index() for actuator in actuators(plant)}
+    lost = [
+        name
+        for name, joint in labelled(joints(plant)).items()
+        if (says := facts.joints.get((plant.GetModelInstanceName(joint.model_instance()), joint.name()))) is not None
+        and (says.armature and joint.index() not in driven and can_be_driven(joint))
+    ]
+    if lost:
+        message = "Drake has the armature of a joint only with an actuator on it: here their inertia is too small"
+        remedy = "load_model(..., actuators=) with these joints"
+        yield Finding("warning", "lost_armature", _listed(lost), message, remedy, {"actuators": lost})
+
+
+def _left_out_actuators(place: Place) -> Found:
+    plant, facts = place.model.plant, place.model.file_facts
+    for note in place.model.notes:
+        found = re.match(r"(\d+ actuators left out)[^:]*: (.*)\.$", note)
+        if not found:
+            continue
+        message = f"{found[1]}, of kinds or transmissions that Drake does not read: {found[2]}"
+        remedy = "drive joints with a torque of their own, load_model(..., actuators=), or write the file with motors"
+        driven = {actuator.joint().index() for actuator in actuators(plant)}
+        missing = [
+            name
+            for name, joint in labelled(joints(plant)).items()
+            if can_be_driven(joint)
+            and joint.index() not in driven
+            and (plant.GetModelInstanceName(joint.model_instance()), joint.name()) in facts.left_out
+        ]
+        if missing or any(not joint for _, joint in facts.left_out):
+            arguments = {"actuators": missing} if missing else {}
+            yield Finding("warning", "left_out", "actuators", message, remedy, arguments)
+
+
+def _switched_off(place: Place) -> Found:
+    facts, gravity = place.model.file_facts, place.model.plant.gravity_field().gravity_vector()
+    begin = "the file switches it off, and Drake has it all the same"
+    if facts.disabled & {"contact", "constraint"} and place.pairs:
+        yield Finding("warning", "switched_off", "contact", begin, "load_model(..., contact=False)", {"contact": False})
+    if "gravity" in facts.disabled and np.any(gravity):
+        remedy = "load_model(..., gravity=[0, 0, 0])"
+        yield Finding("warning", "switched_off", "gravity", begin, remedy, {"gravity": [0.0, 0.0, 0.0]})
 
 
 def _massless(place: Place) -> Found:
@@ -285,6 +333,9 @@ def _trees(plant: Any) -> dict[str, str]:
 
 FILE_CHECKS: tuple[Callable[[Place], Found], ...] = (
     _no_actuator,
+    _left_out_actuators,
+    _lost_armature,
+    _switched_off,
     _massless,
     _lost_shapes,
     _falls,

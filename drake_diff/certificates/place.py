@@ -11,7 +11,7 @@ from pydrake.multibody.plant import ContactModel
 from drake_diff._base.arrays import Array
 from drake_diff.derivatives.step import StepDerivatives, differentiate_step
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError
-from drake_diff.model.load_file import autodiff_supports
+from drake_diff.model.contact_geometry import autodiff_supports
 from drake_diff.model.model import Model
 from drake_diff.model.step import advance, set_state
 

@@ -43,6 +43,7 @@ Packages = Annotated[
     list[str] | None, typer.Option(metavar="NAME=FOLDER", help="Where a package:// is. Can be given again.")
 ]
 Mimic = Annotated[str | None, typer.Option(help="Joints that follow others: reduce or fix")]
+Gravity = Annotated[str | None, typer.Option(metavar="X,Y,Z", show_default="0,0,-9.81", help="Gravity in m/s^2.")]
 Contact = Annotated[bool, typer.Option(help="Whether anything collides.")]
 Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same draws.")]
 
@@ -95,11 +96,13 @@ def _load(
     packages: Packages = None,
     mimic: Mimic = None,
     ground: Ground = None,
+    gravity: Gravity = None,
     contact: Contact = True,
 ) -> Any:
     # What is wrong is refused before Drake is loaded.
     options: dict[str, Any] = {
         "ground": _ground(ground),
+        "gravity": gravity and [_number("--gravity", word, "three numbers") for word in gravity.split(",")],
         "actuators": _actuators(actuators),
         "packages": dict(_split("--packages", words, "NAME=FOLDER") for words in packages) if packages else None,
     }
@@ -160,7 +163,7 @@ def as_options(arguments: Mapping[str, Any]) -> str:
         if value is False:
             words.append(option.replace("--", "--no-", 1))
             continue
-        text = "true" if value is True else value if isinstance(value, str) else ",".join(value)
+        text = "true" if value is True else value if isinstance(value, str) else ",".join(map(str, value))
         words += [option, shlex.quote(text)]
     return " ".join(words)
 

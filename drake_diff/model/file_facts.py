@@ -9,6 +9,7 @@ from pydrake.common.yaml import yaml_load
 from pydrake.multibody.parsing import PackageMap
 
 from drake_diff.exceptions import ModelError
+from drake_diff.model.mjcf import Mjcf, with_includes
 from drake_diff.model.xml_text import Element, XmlText
 
 Key = tuple[str, str]  # the names of a model instance and of a joint or link in it
@@ -18,7 +19,7 @@ Key = tuple[str, str]  # the names of a model instance and of a joint or link in
 class Mimic:
     """q of `follower` = ratio * q of `leader` + offset, joints of one model instance, by their names.
 
-    `in_drake` says whether Drake's parser makes a constraint of it.
+    `in_drake` says whether Drake's parser makes a constraint of it. MJCF's equalities of joints are such, too.
     """
 
     instance: str
@@ -38,10 +39,14 @@ class JointSays:
     """Of a joint: the effort limit [N or N m] as written, None where there is none.
 
     `passive` says that it is not to be driven: so SDF means an effort limit of 0, where it makes a motor of each other.
+    `spring` is the stiffness [N m/rad or N/m] and the position at rest of one that Drake's parser does not read,
+    `armature` [kg m^2 or kg] MJCF's inertia of a rotor, which Drake has only where an actuator is.
     """
 
     effort: float | None
     passive: bool = False
+    spring: tuple[float, float] | None = None
+    armature: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -61,18 +66,21 @@ class LinkSays:
 class FileFacts:
     """What the files say, joints and links by the names of their model instance and their own.
 
-    `followers` are the joints that mimic another one.
+    `followers` are the joints that mimic another one. `disabled` is what MJCF switches off and Drake has all the same:
+    contact, constraint, gravity. `left_out` are the joints of actuators of MJCF that Drake does not read.
     """
 
     joints: dict[Key, JointSays] = field(default_factory=dict)
     links: dict[Key, LinkSays] = field(default_factory=dict)
     followers: dict[Key, Mimic] = field(default_factory=dict)
+    disabled: set[str] = field(default_factory=set)
+    left_out: set[Key] = field(default_factory=set)
 
 
 def file_facts(path: Path, packages: PackageMap) -> FileFacts:
-    """What the file at `path`, and the models that a .dmd.yaml adds, say of links and joints. Of MJCF that is nothing.
+    """What the file at `path`, and the models that a .dmd.yaml adds, say of joints and links; of MJCF no links.
 
-    Of what is no XML that is nothing too. Raises ModelError where a file that Drake could read is no YAML for Python.
+    Of what is no XML that is nothing. Raises ModelError where a file that Drake could read is no YAML for Python.
     """
     found = FileFacts()
     _read(path, packages, None, found)
@@ -84,13 +92,16 @@ def _read(path: Path, packages: PackageMap, instance: str | None, found: FileFac
         if path.name.endswith(".dmd.yaml"):
             _read_directives(yaml_load(filename=str(path)), packages, instance, found)
             return
-        root = XmlText(path.read_bytes()).root
+        xml = XmlText(path.read_bytes())
+        root = xml.root
     except ModelError:
         return  # a note says that the file is no XML
     except (OSError, RuntimeError) as error:
         raise ModelError(f"{path}: what it says of joints and links cannot be read: {error}") from error
     if root.tag == "robot":
         _read_urdf(root, instance or root.get("name") or path.stem, found)
+    if root.tag == "mujoco":
+        _read_mjcf(Mjcf(with_includes(xml, path)), instance or root.get("model") or path.stem, found)
     for model in root.findall("model"):  # of SDF
         _read_sdf(model, instance or model.get("name"), found)
 
@@ -103,6 +114,19 @@ def _read_urdf(robot: Element, name: str, found: FileFacts) -> None:
             found.followers[key] = _drakes_mimic(key, mimic)
     for link in robot.findall("link"):
         found.links[name, link.get("name")] = _link_of_urdf(link)
+
+
+def _read_mjcf(mjcf: Mjcf, name: str, found: FileFacts) -> None:
+    limits = {actuator.joint: actuator.limit for actuator in mjcf.actuators if math.isfinite(actuator.limit)}
+    for joint in mjcf.joints.values():
+        spring = (joint.stiffness, joint.rest) if joint.stiffness else None
+        effort = limits.get(joint.name, joint.effort)
+        found.joints[name, joint.name] = JointSays(effort, spring=spring, armature=joint.armature)
+    for pair in mjcf.coupled:
+        mimic = Mimic(name, pair.follower, pair.leader, pair.ratio, pair.offset, in_drake=False)
+        found.followers[name, pair.follower] = mimic
+    found.disabled.update(mjcf.disabled)
+    found.left_out.update((name, actuator.joint) for actuator in mjcf.actuators if not actuator.read)
 
 
 def _drakes_mimic(key: Key, mimic: Element) -> Mimic:

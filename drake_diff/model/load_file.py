@@ -1,39 +1,32 @@
-"""From a robot file to a plant: read the file, and replace collision geometry that AutoDiffXd cannot step.
-
-In point contact the AutoDiffXd step takes a sphere against a sphere, box, cylinder, capsule or half space and nothing
-else. One other pair whose bounding boxes meet is enough for the whole step to throw, so there are routes around such
-pairs, chosen before the plant is finalized.
-"""
+"""From a robot file to a plant: what Drake's parser is given, and what it says."""
 
 import logging
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
-from itertools import combinations, product
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
 
-import numpy as np
-from pydrake import geometry as pg
-from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import (
-    AddModel,
-    ModelDirective,
-    ModelDirectives,
+    FlattenModelDirectives,
+    LoadModelDirectives,
     PackageMap,
     Parser,
     ProcessModelDirectives,
 )
-from pydrake.multibody.plant import ContactModel, MultibodyPlant
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
 
-from drake_diff._base.arrays import Array
-from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.model.meshes import make_absolute, put_meshes, read_meshes
-from drake_diff.model.plant import bodies
+from drake_diff.exceptions import InputError, ModelError
+from drake_diff.model.meshes import FileMeshes, make_absolute, put_meshes, read_meshes
+from drake_diff.model.mjcf import Mjcf, correct
 from drake_diff.model.robot_text import add_packages, fix_in_text, refusal, text_of
+from drake_diff.model.xml_text import XmlText
 
 FORMATS = (".urdf", ".sdf", ".xml", ".mjcf", ".dmd.yaml")
 DRAKES_REFUSALS = (RuntimeError, ValueError, SystemExit)  # SystemExit is a failed condition in Drake's C++
+OF_A_SPRING = re.compile(r"attribute '(?:stiffness|springref)' found in a 'joint' tag .* ignored")
 
 # Drake says of every half space that deformable bodies will not touch it, which no model here has.
 logging.getLogger("drake").addFilter(lambda r: "not currently supported for deformable contact" not in r.getMessage())
@@ -80,42 +73,101 @@ def read_into(
     if not path.name.endswith(FORMATS):
         raise InputError("model file", got=str(path), expected="a name that ends in " + ", ".join(FORMATS))
     parser = Parser(plant)
-    notes: list[str] = []
-    xml = None
-    with _drake_warnings(notes):
+    with TemporaryDirectory(prefix="drake_diff_") as folder, _drake_warnings() as notes:
+        reading = _Reading(parser, FileMeshes(meshes, Path(folder)), notes, packages, fixed)
         try:
-            xml = text_of(path, notes)
-            done = () if xml is None else fix_in_text(xml, path, fixed)
             add_packages(parser.package_map(), path, packages)
-            found = read_meshes(xml, path, parser.package_map(), meshes)
-            notes += found.notes()
-            if xml is not None and xml.changed:
-                make_absolute(xml, path)
-                parser.AddModelsFromString(str(xml), path.suffix.lstrip("."))
-            elif xml is not None and xml.root.tag == "mujoco" and not xml.root.get("model"):
-                _add_named(parser, path, notes)
+            if path.name.endswith(".dmd.yaml"):
+                reading.directives(path)
             else:
-                parser.AddModels(str(path))
-            notes += put_meshes(plant, parser.scene_graph(), found)
+                reading.robot(path)
+            became = put_meshes(plant, parser.scene_graph(), reading.meshes)
+            notes += reading.meshes.notes() + became
         except UnicodeDecodeError as error:
             got = f"byte {error.object[error.start]:#04x} at position {error.start}"
             raise ModelError(f"{path}: expected text in UTF-8, got {got}") from error
         except DRAKES_REFUSALS as error:
-            raise ModelError(refusal(path, error, xml, notes)) from error
-    told = tuple(note.replace("<literal-string>" + path.suffix, str(path)) for note in notes)
-    return FileRead(told, PackageMap(parser.package_map()), done)
+            raise ModelError(refusal(path, reading.in_own_words(str(error)), reading.xml, notes)) from error
+    told = tuple(reading.in_own_words(note) for note in notes)
+    return FileRead(told, PackageMap(parser.package_map()), reading.done)
 
 
-def _add_named(parser: Parser, path: Path, notes: list[str]) -> None:
-    """Add an MJCF file that gives its model no name, which MuJoCo allows and Drake does not."""
-    model = AddModel(file=path.resolve().as_uri(), name=path.stem)
-    ProcessModelDirectives(ModelDirectives(directives=[ModelDirective(add_model=model)]), parser=parser)
-    notes.append(f"The model has no name in the file: it is called {path.stem}.")
+@dataclass
+class _Reading:
+    """One call of `read_into`: what it gives to the parser, and what it was told."""
+
+    parser: Parser
+    meshes: FileMeshes
+    notes: list[str]
+    packages: Mapping[str, str] | None
+    fixed: tuple[str, ...]
+    done: tuple[str, ...] = ()
+    xml: XmlText | None = None  # of the robot file that is read at the moment
+    given: dict[str, str] = field(default_factory=dict)  # the robot files by what the parser calls them
+
+    def robot(self, path: Path) -> None:
+        """Read a URDF, SDF or MJCF file."""
+        xml = self._prepared(path)
+        self.given["<literal-string>" + path.suffix] = self.given["<literal-string>.urdf"] = str(path)
+        if xml is not None and xml.changed:
+            found = self.parser.AddModelsFromString(str(xml), path.suffix.lstrip("."))
+        else:
+            found = self.parser.AddModels(str(path))
+        self._corrected(xml, found[0] if found else None)
+
+    def directives(self, path: Path) -> None:
+        """Read a .dmd.yaml file: each robot file that it adds as `robot` reads one."""
+        text_of(path, self.notes)
+        flat = FlattenModelDirectives(LoadModelDirectives(str(path)), self.parser.package_map())
+        robots: dict[str, XmlText | None] = {}
+        for i, model in enumerate(directive.add_model for directive in flat.directives):
+            if model is None:
+                continue
+            self.xml = None
+            file = Path(self.parser.package_map().ResolveUrl(model.file))
+            robots[model.name] = xml = self._prepared(file)
+            if xml is not None and xml.changed:
+                changed = self.meshes.folder / f"model_{i}" / file.name
+                changed.parent.mkdir()
+                changed.write_text(str(xml))
+                self.given[str(changed)] = str(file)
+                model.file = changed.as_uri()
+        self.xml = None
+        ProcessModelDirectives(flat, parser=self.parser)
+        plant = self.parser.plant()
+        for name, xml in robots.items():
+            self._corrected(xml, plant.GetModelInstanceByName(name) if plant.HasModelInstanceNamed(name) else None)
+
+    def _prepared(self, path: Path) -> XmlText | None:
+        """The text of a robot file with its slips mended and its meshes looked for; None where it is no XML."""
+        self.xml = xml = text_of(path, self.notes)
+        if xml is None:
+            return None
+        self.done += fix_in_text(xml, path, self.fixed)
+        read_meshes(self.meshes, xml, path, self.parser.package_map())
+        if xml.changed:
+            make_absolute(xml, path)
+        return xml
+
+    def _corrected(self, xml: XmlText | None, instance: ModelInstanceIndex | None) -> None:
+        """Give what was read of an MJCF file the numbers that the file means."""
+        if xml is not None and xml.root.tag == "mujoco" and instance is not None:
+            mjcf = Mjcf(xml)
+            self.notes += correct(self.parser.plant(), instance, mjcf)
+            if not mjcf.has_other_springs:
+                self.notes[:] = [note for note in self.notes if not OF_A_SPRING.search(note)]
+
+    def in_own_words(self, said: str) -> str:
+        """What the parser said, with the files of the user in the place of what it was given."""
+        for name, path in self.given.items():
+            said = said.replace(name, path)
+        return said
 
 
 @contextmanager
-def _drake_warnings(notes: list[str]) -> Iterator[None]:
-    """Collect in `notes` what Drake's parser warns of, and keep it off the terminal."""
+def _drake_warnings() -> Iterator[list[str]]:
+    """A list that collects what Drake's parser warns of, and keeps it off the terminal."""
+    notes: list[str] = []
 
     class Collect(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
@@ -126,175 +178,7 @@ def _drake_warnings(notes: list[str]) -> Iterator[None]:
     logger.addHandler(handler)
     logger.propagate = False
     try:
-        yield
+        yield notes
     finally:
         logger.removeHandler(handler)
         logger.propagate = propagate
-
-
-ROUTES = ("corner_spheres", "hydroelastic", "differences")
-CORNER_RADIUS = 0.05  # of a corner sphere [1], relative to the smallest edge: small enough to leave the shape its size
-SPHERES_PER_RIM = 8  # of a cylinder
-HYDROELASTIC_MODULUS = 1e7  # [Pa], that of stiff rubber
-
-MEETS_A_SPHERE = {"Sphere", "Box", "Cylinder", "Capsule", "HalfSpace"}  # in point contact under AutoDiffXd
-HYDROELASTIC_SHAPES = MEETS_A_SPHERE | {"Ellipsoid", "Convex", "Mesh"}
-CONTACT_MODELS = ("point", "hydroelastic", "hydroelastic_with_fallback")
-
-
-def autodiff_supports(shape_a: pg.Shape, shape_b: pg.Shape, contact_model: str) -> bool:
-    """Whether the AutoDiffXd step takes this pair of touching shapes, as measured with Drake 1.51 and 1.58.
-
-    For the two hydroelastic models the shapes have the properties that the route "hydroelastic" gives them.
-    Raises UnknownNameError where there is no such contact model.
-    """
-    if contact_model not in CONTACT_MODELS:
-        raise UnknownNameError("contact_model", got=contact_model, known=CONTACT_MODELS)
-    shapes = {type(shape_a).__name__, type(shape_b).__name__}
-    if contact_model == "point":
-        return "Sphere" in shapes and shapes <= MEETS_A_SPHERE
-    return shapes <= HYDROELASTIC_SHAPES and shapes != {"HalfSpace"}
-
-
-def replace_collision_geometry(plant: MultibodyPlant, scene_graph: pg.SceneGraph, route: str) -> tuple[str, ...]:
-    """Change what `plant` collides with, so that AutoDiffXd can step it; a sentence for each change.
-
-    To be called when every geometry is there. Masses, inertias and what is drawn stay as they are. `route` is one of
-
-    - "corner_spheres": each box, cylinder and capsule on a body that can move becomes spheres inside it;
-    - "hydroelastic": each geometry without hydroelastic properties gets compliant ones, a half space rigid ones;
-    - "differences": nothing changes, and what AutoDiffXd refuses is differenced.
-    """
-    if route not in ROUTES:
-        raise UnknownNameError("contact_geometry", got=route, known=ROUTES)
-    if plant.is_finalized():
-        raise ModelError("the plant is finalized: its collision geometry can only be replaced before that")
-    try:
-        if route == "corner_spheres":
-            return _to_corner_spheres(plant, scene_graph)
-        if route == "hydroelastic":
-            return _to_hydroelastic(plant, scene_graph)
-    except RuntimeError as error:
-        raise ModelError(f"Drake refuses the route {route!r}: {error}") from error
-    return (
-        "Where geometries touch that AutoDiffXd refuses, steps are differentiated by finite differences, as chosen.",
-    )
-
-
-def _to_corner_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
-    inspector = scene_graph.model_inspector()
-    found = collision_geometries(plant, scene_graph)
-    welded = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
-    fixed = [int(body.index()) in welded for body, _ in found]
-    # Pairs that a file or a user lets pass through each other: Drake keeps its filters by geometry, so the spheres
-    # would not inherit them.
-    pairs = [(a, b) for (body_a, a), (body_b, b) in combinations(found, 2) if body_a.index() != body_b.index()]
-    filtered = [(a, b) for a, b in pairs if inspector.CollisionFiltered(a, b)]
-    became = {geometry: [geometry] for _, geometry in found}
-    notes = []
-    for (body, geometry), stays in zip(found, fixed, strict=True):
-        name, shape = f"{inspector.GetName(geometry)} on {body.name()}", inspector.GetShape(geometry)
-        if isinstance(shape, pg.Convex | pg.Ellipsoid | pg.Mesh):
-            notes.append(
-                f"{name}: a {type(shape).__name__} stays as it is, and AutoDiffXd refuses every point contact with it; "
-                "take the route hydroelastic or differences where something can touch it."
-            )
-        elif not stays and isinstance(shape, pg.Box | pg.Capsule | pg.Cylinder):
-            became[geometry], note = _replace(plant, scene_graph, body, geometry, shape)
-            notes.append(f"{name}: {note}")
-    for a, b in filtered:
-        declaration = pg.CollisionFilterDeclaration().ExcludeBetween(
-            pg.GeometrySet(became[a]), pg.GeometrySet(became[b])
-        )
-        scene_graph.collision_filter_manager().Apply(declaration)
-    return tuple(notes)
-
-
-def collision_geometries(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> list[tuple[Any, Any]]:
-    """The body and the id of every rigid geometry of the plant that has the proximity role.
-
-    Not by plant.GetCollisionGeometriesForBody: its ids live in the plant's own list, which moves when it grows.
-    """
-    inspector, source = scene_graph.model_inspector(), plant.get_source_id()
-    frames = [(body, plant.GetBodyFrameIdIfExists(body.index())) for body in [plant.world_body(), *bodies(plant)]]
-    return [
-        (body, geometry)
-        for body, frame in frames
-        if frame is not None
-        for geometry in inspector.GetGeometries(frame, pg.Role.kProximity)
-        if inspector.BelongsToSource(geometry, source) and not inspector.IsDeformableGeometry(geometry)
-    ]
-
-
-def _replace(
-    plant: MultibodyPlant, scene_graph: pg.SceneGraph, body: Any, geometry: Any, shape: Any
-) -> tuple[list[Any], str]:
-    """Spheres in place of a geometry, which loses its proximity role; their ids, and what became of it."""
-    inspector = scene_graph.model_inspector()
-    X_BG = RigidTransform(inspector.GetPoseInFrame(geometry))
-    properties = pg.ProximityProperties(inspector.GetProximityProperties(geometry))
-    name = inspector.GetName(geometry).removeprefix(f"{plant.GetModelInstanceName(body.model_instance())}::")
-    scene_graph.RemoveRole(plant.get_source_id(), geometry, pg.Role.kProximity)
-    radius, centres = _spheres(shape)
-    spheres = []
-    for i, p_GS in enumerate(centres):
-        pose, corner = X_BG @ RigidTransform(p_GS), f"{name}_corner_{i}"
-        spheres.append(plant.RegisterCollisionGeometry(body, pose, pg.Sphere(radius), corner, properties))
-    became = f"a {type(shape).__name__.lower()} became {len(centres)} spheres of radius {radius:.4g} m"
-    stiffness = "each with the stiffness of the whole, as every contact point has its own spring"
-    if isinstance(shape, pg.Capsule):
-        return spheres, f"{became}, its ends ({stiffness}); nothing touches between them."
-    if isinstance(shape, pg.Box):
-        where = f"in its corners ({stiffness}: a face rests on 4 springs)"
-        return spheres, f"{became} {where}; edges and faces between them are open."
-    return spheres, f"{became} along its rims, which is approximate ({stiffness}); it rolls like a polygon."
-
-
-def _spheres(shape: Any) -> tuple[float, list[Array]]:
-    """The radius [m] of the spheres inside a shape, and their centres [m] in its frame.
-
-    Each touches the surface from inside: three faces of a box, a cap and the side of a cylinder. Those of a
-    capsule are its two ends.
-    """
-    if isinstance(shape, pg.Capsule):
-        return shape.radius(), [np.array([0, 0, z * shape.length() / 2]) for z in (-1, 1)]
-    if isinstance(shape, pg.Box):
-        half = np.asarray(shape.size()) / 2
-        radius = CORNER_RADIUS * 2 * float(np.min(half))
-        return radius, [np.array(signs) * (half - radius) for signs in product((-1, 1), repeat=3)]
-    radius = CORNER_RADIUS * min(2 * shape.radius(), shape.length())
-    ring, height = shape.radius() - radius, shape.length() / 2 - radius
-    angles = np.arange(SPHERES_PER_RIM) * 2 * np.pi / SPHERES_PER_RIM
-    return radius, [np.array([ring * np.cos(a), ring * np.sin(a), z * height]) for z in (-1, 1) for a in angles]
-
-
-def _to_hydroelastic(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
-    if plant.get_contact_model() == ContactModel.kPoint:
-        expected = 'hydroelastic or hydroelastic_with_fallback, since contact_geometry is "hydroelastic"'
-        raise InputError("contact_model", got="point", expected=expected)
-    inspector, notes = scene_graph.model_inspector(), []
-    for body, geometry in collision_geometries(plant, scene_graph):
-        name = f"{inspector.GetName(geometry)} on {body.name()}"
-        properties = pg.ProximityProperties(inspector.GetProximityProperties(geometry))
-        if properties.HasProperty("hydroelastic", "compliance_type"):
-            notes.append(f"{name}: keeps its own hydroelastic properties.")
-            continue
-        box = inspector.GetObbInGeometryFrame(geometry)
-        if isinstance(inspector.GetShape(geometry), pg.HalfSpace) or box is None:
-            pg.AddRigidHydroelasticProperties(properties)
-            became = "rigid hydroelastic, as a compliant half space has no contact with a compliant body"
-        else:  # a modulus or hint of its own stays
-            hint = _taken(properties, "resolution_hint", float(np.min(box.half_width())))
-            modulus = _taken(properties, "hydroelastic_modulus", HYDROELASTIC_MODULUS)
-            pg.AddCompliantHydroelasticProperties(hint, modulus, properties)
-            became = f"compliant hydroelastic, modulus {modulus:.4g} Pa, resolution {hint:.4g} m"
-        scene_graph.AssignRole(plant.get_source_id(), geometry, properties, pg.RoleAssign.kReplace)
-        notes.append(f"{name}: became {became}.")
-    return tuple(notes)
-
-
-def _taken(properties: pg.ProximityProperties, name: str, default: float) -> float:
-    """A hydroelastic property that a geometry has already, taken out of its properties, or the default."""
-    value = float(properties.GetPropertyOrDefault("hydroelastic", name, default))
-    properties.RemoveProperty("hydroelastic", name)
-    return value

@@ -20,7 +20,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_diff.exceptions import ModelError
 from drake_diff.model.sphere_fit import Spheres, fit_spheres
-from drake_diff.model.triangles import READ_BY_TRIMESH, Hull, hull_of_file
+from drake_diff.model.triangles import READ_BY_TRIMESH, Hull, as_obj, hull_of_file, read_mesh
 from drake_diff.model.xml_text import Element, XmlText
 
 TREATMENTS = ("skip", "convex", "spheres")
@@ -43,13 +43,17 @@ class CollisionMesh:
 
 @dataclass
 class FileMeshes:
-    """The meshes of one robot file: what is to be put in the place of placeholders, and what is left out.
+    """The meshes of robot files: what is to be put in the place of placeholders, and what is left out.
 
-    `wanted` has the collision meshes by their placeholder's radius [m].
+    `wanted` has the collision meshes of URDF and SDF by their placeholder's radius [m], `converted` those of MJCF by
+    the OBJ file in `folder` that Drake reads instead, and `whole` has the other files that MJCF names.
     """
 
     treatment: str
+    folder: Path
     wanted: dict[float, CollisionMesh] = field(default_factory=dict)
+    converted: dict[str, Path] = field(default_factory=dict)
+    whole: dict[str, Path] = field(default_factory=dict)
     skipped: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     unusable: list[str] = field(default_factory=list)
@@ -77,14 +81,14 @@ def _listed(names: list[str]) -> str:
     return "; ".join(names[:MOST_TOLD]) + more
 
 
-def read_meshes(xml: XmlText | None, path: Path, packages: PackageMap, treatment: str) -> FileMeshes:
-    """Change what `xml`, the text of the robot file at `path`, says of meshes. Of formats but URDF and SDF nothing.
+def read_meshes(found: FileMeshes, xml: XmlText, path: Path, packages: PackageMap) -> None:
+    """Change what `xml`, the text of the robot file at `path`, says of meshes.
 
     Raises ModelError where a scale is no number.
     """
-    found = FileMeshes(treatment)
-    if xml is None or xml.root.tag not in ("robot", "sdf"):
-        return found
+    if xml.root.tag == "mujoco":
+        _convert_assets(found, xml, path)
+        return
     for element in xml.root.iter("visual", "collision"):
         mesh = next(element.iter("mesh"), None)
         if mesh is not None:
@@ -92,7 +96,43 @@ def read_meshes(xml: XmlText | None, path: Path, packages: PackageMap, treatment
                 _change(found, xml, element, mesh, _place(_uri(mesh), path, packages))
             except ModelError as error:
                 raise ModelError(f"{path}:{mesh.line}: {error}") from error
-    return found
+
+
+def _convert_assets(found: FileMeshes, xml: XmlText, path: Path) -> None:
+    """Give Drake an OBJ in the place of each mesh of an MJCF file that it does not read.
+
+    It computes masses by them, as MuJoCo does; `put_meshes` then puts back what was there.
+    """
+    for mesh in (m for section in xml.root.findall("asset") for m in section.findall("mesh")):
+        file = _asset(xml, mesh, path)
+        if file is None:
+            continue  # which Drake says
+        if file.suffix.lower() in USABLE_MESHES or file.suffix.lower() not in READ_BY_TRIMESH:
+            found.whole[str(file)] = file
+            continue
+        try:
+            triangles = read_mesh(file)
+        except ModelError as error:
+            raise ModelError(f"{path}:{mesh.line}: {error}") from error
+        obj = found.folder / f"mesh_{len(found.converted)}" / f"{file.stem}.obj"
+        obj.parent.mkdir()
+        obj.write_text(as_obj(triangles))
+        found.converted[str(obj)] = file
+        xml.set(mesh, "file", str(obj))
+
+
+def _asset(xml: XmlText, mesh: Element, path: Path) -> Path | None:
+    """The file of a mesh of MJCF, by the folders that <compiler> says."""
+    name, folders = mesh.get("file"), dict[str, str]()
+    for compiler in xml.root.findall("compiler"):
+        folders |= compiler.attributes
+    if folders.get("strippath") == "true":
+        name = Path(name).name
+    return (
+        in_any_case((path.parent / folders.get("meshdir", folders.get("assetdir", "")) / name).absolute())
+        if name
+        else None
+    )
 
 
 def _change(found: FileMeshes, xml: XmlText, element: Element, mesh: Element, place: Path | None) -> None:
@@ -169,6 +209,12 @@ def make_absolute(xml: XmlText, path: Path) -> None:
 
     A model that is given to Drake as text has no folder to start from.
     """
+    if xml.root.tag == "mujoco":
+        for mesh in (m for section in xml.root.findall("asset") for m in section.findall("mesh")):
+            file = _asset(xml, mesh, path)
+            if file is not None and not Path(mesh.get("file")).is_absolute():
+                xml.set(mesh, "file", str(file))
+        return
     for element in xml.root.iter("mesh", "include"):
         uri = _uri(element)
         if uri and "://" not in uri and (path.parent / uri).exists():
@@ -234,16 +280,21 @@ def put_meshes(plant: MultibodyPlant, scene_graph: pg.SceneGraph, meshes: FileMe
 
     To be called before anything else is added and the plant is finalized. Masses and inertias stay as they are.
     """
-    if not meshes.wanted:
-        return []
+    became_other: list[CollisionMesh] = []
+    _put_back(plant, scene_graph, meshes)
     inspector = scene_graph.model_inspector()
     known = list(inspector.GetAllGeometryIds(pg.Role.kProximity))
     for geometry in tuple(known):
-        shape = inspector.GetShape(geometry)
-        mesh = meshes.wanted.get(shape.radius()) if isinstance(shape, pg.Sphere) else None
+        mesh = _meant(plant, inspector, geometry, meshes)
         if mesh is None:
             continue
-        hull, spheres = _became(mesh, meshes.treatment)
+        try:
+            hull, spheres = _became(mesh, meshes.treatment)
+        except ModelError as error:  # of URDF and SDF these are left out before
+            meshes.unusable.append(f"{mesh.link} collision {mesh.path} ({error})")
+            scene_graph.RemoveRole(plant.get_source_id(), geometry, pg.Role.kProximity)
+            continue
+        became_other.append(mesh)
         filtered = [g for g in known if inspector.CollisionFiltered(g, geometry)]
         if spheres is None:
             scene_graph.ChangeShape(plant.get_source_id(), geometry, hull.shape(mesh.path.name))
@@ -254,7 +305,39 @@ def put_meshes(plant: MultibodyPlant, scene_graph: pg.SceneGraph, meshes: FileMe
             between = pg.CollisionFilterDeclaration().ExcludeBetween(pg.GeometrySet(became), pg.GeometrySet(filtered))
             scene_graph.collision_filter_manager().Apply(between)
         known += became[1:]
-    return [_told(meshes)]
+    return [_told(became_other, meshes.treatment)] if became_other else []
+
+
+def _put_back(plant: MultibodyPlant, scene_graph: pg.SceneGraph, meshes: FileMeshes) -> None:
+    """Give what MJCF draws its own files again, and leave out collision meshes that Drake cannot use."""
+    inspector = scene_graph.model_inspector()
+    for geometry in inspector.GetAllGeometryIds():
+        shape = inspector.GetShape(geometry)
+        own = meshes.converted.get(_path_of(shape))
+        if own is None:
+            continue
+        if inspector.GetProximityProperties(geometry) is None:
+            scene_graph.ChangeShape(plant.get_source_id(), geometry, pg.Mesh(str(own), shape.scale3()))
+        elif meshes.treatment == "skip":
+            link = plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).name()
+            meshes.skipped.append(f"{link} collision {own.name}")
+            scene_graph.RemoveRole(plant.get_source_id(), geometry, pg.Role.kProximity)
+
+
+def _path_of(shape: Any) -> str:
+    return str(shape.source().path()) if isinstance(shape, pg.Mesh) and shape.source().is_path() else ""
+
+
+def _meant(plant: MultibodyPlant, inspector: Any, geometry: Any, meshes: FileMeshes) -> CollisionMesh | None:
+    """The collision mesh that a geometry is to become something else for."""
+    shape = inspector.GetShape(geometry)
+    if isinstance(shape, pg.Sphere):
+        return meshes.wanted.get(shape.radius())
+    path = (meshes.converted | meshes.whole).get(_path_of(shape))
+    if path is None or meshes.treatment == "skip":
+        return None
+    x, y, z = (float(factor) for factor in shape.scale3())
+    return CollisionMesh(plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).name(), path, (x, y, z))
 
 
 def _put_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph, geometry: Any, spheres: Spheres) -> list[Any]:
@@ -272,20 +355,20 @@ def _put_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph, geometry: An
     ]
 
 
-def _told(meshes: FileMeshes) -> str:
+def _told(meshes: list[CollisionMesh], treatment: str) -> str:
     """One sentence for all meshes, and one for each kind of link, those that are met worst first."""
     kinds: dict[tuple[Path, Scale], list[str]] = {}
-    for mesh in meshes.wanted.values():
+    for mesh in meshes:
         kinds.setdefault((mesh.path, mesh.scale), []).append(mesh.link)
-    became = {kind: _became(CollisionMesh("", *kind), meshes.treatment) for kind in kinds}
+    became = {kind: _became(CollisionMesh("", *kind), treatment) for kind in kinds}
     lost = max(hull.lost for hull, _ in became.values())
     less = (
         f" Of fine meshes only part of the corners is used: they reach up to {lost:.2g} m farther." if lost > 0 else ""
     )
-    if meshes.treatment == "convex":
+    if treatment == "convex":
         corners = [len(hull.corners) for hull, _ in became.values()]
         return (
-            f"{len(meshes.wanted)} collision meshes became their convex hulls, of {min(corners)} to {max(corners)} "
+            f"{len(meshes)} collision meshes became their convex hulls, of {min(corners)} to {max(corners)} "
             f"corners; what is hollow is filled. AutoDiffXd refuses point contact with them.{less}"
         )
     fits = sorted(((s, k) for k, (_, s) in became.items() if s is not None), key=lambda f: -f[0].ground_gap)
@@ -297,7 +380,7 @@ def _told(meshes: FileMeshes) -> str:
     ]
     rest = f"; and {len(fits) - MOST_TOLD} kinds of link with smaller gaps" if len(fits) > MOST_TOLD else ""
     return (
-        f"{len(meshes.wanted)} collision meshes became {count} spheres inside their convex hulls. The first gap is how "
+        f"{len(meshes)} collision meshes became {count} spheres inside their convex hulls. The first gap is how "
         "much later a flat ground is met at most, the second how far the hull's surface is from the spheres: "
         f"{'; '.join(lines)}{rest}.{less}"
     )

@@ -18,17 +18,11 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from drake_diff._base.arrays import finite_array, positive_float
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
+from drake_diff.model.contact_geometry import CONTACT_MODELS, ROUTES, replace_collision_geometry
 from drake_diff.model.contract import Contract, read_contract
 from drake_diff.model.file_facts import FileFacts, Mimic, file_facts
 from drake_diff.model.inputs import TIMES, BodyForce, add_body_forces, check_body_forces, read_inputs
-from drake_diff.model.load_file import (
-    CONTACT_MODELS,
-    DRAKES_REFUSALS,
-    ROUTES,
-    as_packages,
-    read_into,
-    replace_collision_geometry,
-)
+from drake_diff.model.load_file import DRAKES_REFUSALS, as_packages, read_into
 from drake_diff.model.meshes import TREATMENTS
 from drake_diff.model.mimic import Coupling, check_mimic, couple, coupling_of, fix_mimics, still_moving, uncoupled
 from drake_diff.model.plant import (
@@ -42,6 +36,7 @@ from drake_diff.model.plant import (
 from drake_diff.model.repairs import (
     add_actuators,
     add_ground,
+    add_springs,
     as_actuated,
     as_ground,
     as_names,
@@ -608,6 +603,7 @@ def _repaired(
         if weld_base is not None:
             weld_link(plant, weld_base)
         notes += hold_base(plant, base)
+        notes += add_springs(plant, facts)
         notes += () if options["contact"] else take_away_contact(plant, scene_graph)
         return notes + add_ground(plant, options["ground"]), mimics if choice == "reduce" else ()
     except ModelError as error:

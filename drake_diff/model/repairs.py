@@ -12,11 +12,19 @@ from pydrake import geometry as pg
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
-from pydrake.multibody.tree import FrameIndex, PrismaticJoint, RevoluteJoint, WeldJoint
+from pydrake.multibody.tree import (
+    FrameIndex,
+    PrismaticJoint,
+    PrismaticSpring,
+    RevoluteJoint,
+    RevoluteSpring,
+    WeldJoint,
+)
 
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.model.contact_geometry import collision_geometries
 from drake_diff.model.file_facts import FileFacts
-from drake_diff.model.load_file import DRAKES_REFUSALS, collision_geometries
+from drake_diff.model.load_file import DRAKES_REFUSALS
 from drake_diff.model.plant import actuators, bodies, joints, labelled, named
 
 GROUND_FRICTION = 0.5  # of ground=True: what Drake's SceneGraph gives to geometry without a friction of its own
@@ -77,7 +85,9 @@ def add_actuators(plant: MultibodyPlant, asked: Actuated, facts: FileFacts) -> t
         if joint.index() in driven:
             notes += _limit_again(driven[joint.index()], limit) if isinstance(asked, dict) else []
             continue
-        plant.AddJointActuator(joint.name(), joint, limit)
+        actuator = plant.AddJointActuator(joint.name(), joint, limit)
+        if says is not None and says.armature:
+            actuator.set_default_rotor_inertia(says.armature)
         opened += [f"{name} ({what})" for what in _open(joint)]
         if np.isfinite(limit):
             added.append((name, limit))
@@ -257,6 +267,20 @@ def weld(plant: MultibodyPlant, joint: Any, q: float) -> None:
     moved = RigidTransform(turned, np.zeros(3)) if turned is not None else RigidTransform(q * axis)
     plant.RemoveJoint(joint)
     plant.AddJoint(WeldJoint(name, parent, child, moved))
+
+
+def add_springs(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
+    """Put the springs of a file on its joints that Drake's parser does not read: those of MJCF."""
+    told = []
+    for name, joint in labelled(joints(plant)).items():
+        says = facts.joints.get(_key(plant, joint))
+        if says is None or says.spring is None or not can_be_driven(joint):
+            continue
+        stiffness, rest = says.spring
+        spring = RevoluteSpring if isinstance(joint, RevoluteJoint) else PrismaticSpring
+        plant.AddForceElement(spring(joint, rest, stiffness))
+        told.append(f"{name} ({stiffness:g} about {rest:g})")
+    return (f"{len(told)} springs of joints, which Drake's parser does not read: {', '.join(told)}.",) if told else ()
 
 
 def take_away_contact(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:

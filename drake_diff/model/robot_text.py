@@ -12,13 +12,13 @@ from pathlib import Path
 from pydrake.multibody.parsing import PackageMap
 
 from drake_diff.exceptions import ModelError
+from drake_diff.model.mjcf import as_mujoco_means
 from drake_diff.model.xml_text import Element, XmlText
 
 MOVING = ("revolute", "continuous", "prismatic")  # the types of joints that can be fixed
 INCLUDED = re.compile(r"^\s*-?\s*file:\s*[\"']?([^\s\"']+)", re.MULTILINE)  # in a .dmd.yaml
 DOWNLOADED = "drake_models"  # the package that Drake would fetch over the network
 IN_CPP = re.compile(r"Failure at \S+ in \w+\(\): ")
-LITERAL = re.compile(r"<literal-string>\.\w+")
 
 
 def text_of(path: Path, notes: list[str]) -> XmlText | None:
@@ -35,6 +35,8 @@ def text_of(path: Path, notes: list[str]) -> XmlText | None:
     except ModelError as error:  # Drake forgives more; where it does not, this line is what is wrong
         notes.append(f"{path}, {error}: only what Drake reads of it is known.")
         return None
+    if xml.root.tag == "mujoco":
+        return as_mujoco_means(xml, path, notes)
     if xml.root.tag != "robot":
         return xml
     for transmission in xml.root.findall("transmission"):
@@ -183,9 +185,9 @@ def package_above(file: Path, name: str) -> Path | None:
     return None
 
 
-def refusal(path: Path, error: BaseException, xml: XmlText | None, notes: list[str]) -> str:
+def refusal(path: Path, said: str, xml: XmlText | None, notes: list[str]) -> str:
     """What Drake says of the file, with its name, the line if that can be known, and what to do if that is known."""
-    said = IN_CPP.sub("", LITERAL.sub(str(path), str(error))).strip()
+    said = IN_CPP.sub("", said).strip()
     said = said.replace(f"{path}:{path}", str(path))
     known = re.search(re.escape(str(path)) + r":\d+", said)
     line = "" if known or xml is None else "".join(f"; see {path}:{at}: {what}" for at, what in _suspects(xml, said))

@@ -81,6 +81,12 @@ def read_mesh(path: Path) -> Triangles:
     return _read(path, *_state(path))
 
 
+def as_obj(mesh: Triangles) -> str:
+    """The mesh as the text of an OBJ file."""
+    vertices = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in mesh.vertices.tolist())
+    return vertices + "".join(f"f {a} {b} {c}\n" for a, b, c in (mesh.faces + 1).tolist())
+
+
 def _state(path: Path) -> tuple[int, int]:
     """When the file was changed, and how large it is; ModelError where it is missing or too large."""
     try:

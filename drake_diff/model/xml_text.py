@@ -97,6 +97,12 @@ class XmlText:
         found = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>").match(self._tags, start)
         return found.end() if found else len(self._tags)
 
+    def content(self, element: Element) -> str:
+        """The XML text inside an element."""
+        if self.data[element.inside - 2 : element.inside] == b"/>":
+            return ""
+        return self.data[element.inside : self._tags.rindex(b"</", element.inside, element.end)].decode()
+
     def remove(self, element: Element) -> None:
         """Take an element out; its lines stay, empty."""
         self._replace(element.start, element.end, b"")

@@ -1,0 +1,185 @@
+"""Collision geometry that AutoDiffXd cannot step, and what is put in its place.
+
+In point contact the AutoDiffXd step takes a sphere against a sphere, box, cylinder, capsule or half space and nothing
+else. One other pair whose bounding boxes meet is enough for the whole step to throw, so there are routes around such
+pairs, chosen before the plant is finalized.
+"""
+
+from itertools import combinations, product
+from typing import Any
+
+import numpy as np
+from pydrake import geometry as pg
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import ContactModel, MultibodyPlant
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.model.plant import bodies
+
+ROUTES = ("corner_spheres", "hydroelastic", "differences")
+CORNER_RADIUS = 0.05  # of a corner sphere [1], relative to the smallest edge: small enough to leave the shape its size
+SPHERES_PER_RIM = 8  # of a cylinder
+HYDROELASTIC_MODULUS = 1e7  # [Pa], that of stiff rubber
+
+MEETS_A_SPHERE = {"Sphere", "Box", "Cylinder", "Capsule", "HalfSpace"}  # in point contact under AutoDiffXd
+HYDROELASTIC_SHAPES = MEETS_A_SPHERE | {"Ellipsoid", "Convex", "Mesh"}
+CONTACT_MODELS = ("point", "hydroelastic", "hydroelastic_with_fallback")
+
+
+def autodiff_supports(shape_a: pg.Shape, shape_b: pg.Shape, contact_model: str) -> bool:
+    """Whether the AutoDiffXd step takes this pair of touching shapes, as measured with Drake 1.51 and 1.58.
+
+    For the two hydroelastic models the shapes have the properties that the route "hydroelastic" gives them.
+    Raises UnknownNameError where there is no such contact model.
+    """
+    if contact_model not in CONTACT_MODELS:
+        raise UnknownNameError("contact_model", got=contact_model, known=CONTACT_MODELS)
+    shapes = {type(shape_a).__name__, type(shape_b).__name__}
+    if contact_model == "point":
+        return "Sphere" in shapes and shapes <= MEETS_A_SPHERE
+    return shapes <= HYDROELASTIC_SHAPES and shapes != {"HalfSpace"}
+
+
+def replace_collision_geometry(plant: MultibodyPlant, scene_graph: pg.SceneGraph, route: str) -> tuple[str, ...]:
+    """Change what `plant` collides with, so that AutoDiffXd can step it; a sentence for each change.
+
+    To be called when every geometry is there. Masses, inertias and what is drawn stay as they are. `route` is one of
+
+    - "corner_spheres": each box, cylinder and capsule on a body that can move becomes spheres inside it;
+    - "hydroelastic": each geometry without hydroelastic properties gets compliant ones, a half space rigid ones;
+    - "differences": nothing changes, and what AutoDiffXd refuses is differenced.
+    """
+    if route not in ROUTES:
+        raise UnknownNameError("contact_geometry", got=route, known=ROUTES)
+    if plant.is_finalized():
+        raise ModelError("the plant is finalized: its collision geometry can only be replaced before that")
+    try:
+        if route == "corner_spheres":
+            return _to_corner_spheres(plant, scene_graph)
+        if route == "hydroelastic":
+            return _to_hydroelastic(plant, scene_graph)
+    except RuntimeError as error:
+        raise ModelError(f"Drake refuses the route {route!r}: {error}") from error
+    return (
+        "Where geometries touch that AutoDiffXd refuses, steps are differentiated by finite differences, as chosen.",
+    )
+
+
+def _to_corner_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
+    inspector = scene_graph.model_inspector()
+    found = collision_geometries(plant, scene_graph)
+    welded = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
+    fixed = [int(body.index()) in welded for body, _ in found]
+    # Pairs that a file or a user lets pass through each other: Drake keeps its filters by geometry, so the spheres
+    # would not inherit them.
+    pairs = [(a, b) for (body_a, a), (body_b, b) in combinations(found, 2) if body_a.index() != body_b.index()]
+    filtered = [(a, b) for a, b in pairs if inspector.CollisionFiltered(a, b)]
+    became = {geometry: [geometry] for _, geometry in found}
+    notes = []
+    for (body, geometry), stays in zip(found, fixed, strict=True):
+        name, shape = f"{inspector.GetName(geometry)} on {body.name()}", inspector.GetShape(geometry)
+        if isinstance(shape, pg.Convex | pg.Ellipsoid | pg.Mesh):
+            notes.append(
+                f"{name}: a {type(shape).__name__} stays as it is, and AutoDiffXd refuses every point contact with it; "
+                "take the route hydroelastic or differences where something can touch it."
+            )
+        elif not stays and isinstance(shape, pg.Box | pg.Capsule | pg.Cylinder):
+            became[geometry], note = _replace(plant, scene_graph, body, geometry, shape)
+            notes.append(f"{name}: {note}")
+    for a, b in filtered:
+        declaration = pg.CollisionFilterDeclaration().ExcludeBetween(
+            pg.GeometrySet(became[a]), pg.GeometrySet(became[b])
+        )
+        scene_graph.collision_filter_manager().Apply(declaration)
+    return tuple(notes)
+
+
+def collision_geometries(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> list[tuple[Any, Any]]:
+    """The body and the id of every rigid geometry of the plant that has the proximity role.
+
+    Not by plant.GetCollisionGeometriesForBody: its ids live in the plant's own list, which moves when it grows.
+    """
+    inspector, source = scene_graph.model_inspector(), plant.get_source_id()
+    frames = [(body, plant.GetBodyFrameIdIfExists(body.index())) for body in [plant.world_body(), *bodies(plant)]]
+    return [
+        (body, geometry)
+        for body, frame in frames
+        if frame is not None
+        for geometry in inspector.GetGeometries(frame, pg.Role.kProximity)
+        if inspector.BelongsToSource(geometry, source) and not inspector.IsDeformableGeometry(geometry)
+    ]
+
+
+def _replace(
+    plant: MultibodyPlant, scene_graph: pg.SceneGraph, body: Any, geometry: Any, shape: Any
+) -> tuple[list[Any], str]:
+    """Spheres in place of a geometry, which loses its proximity role; their ids, and what became of it."""
+    inspector = scene_graph.model_inspector()
+    X_BG = RigidTransform(inspector.GetPoseInFrame(geometry))
+    properties = pg.ProximityProperties(inspector.GetProximityProperties(geometry))
+    name = inspector.GetName(geometry).removeprefix(f"{plant.GetModelInstanceName(body.model_instance())}::")
+    scene_graph.RemoveRole(plant.get_source_id(), geometry, pg.Role.kProximity)
+    radius, centres = _spheres(shape)
+    spheres = []
+    for i, p_GS in enumerate(centres):
+        pose, corner = X_BG @ RigidTransform(p_GS), f"{name}_corner_{i}"
+        spheres.append(plant.RegisterCollisionGeometry(body, pose, pg.Sphere(radius), corner, properties))
+    became = f"a {type(shape).__name__.lower()} became {len(centres)} spheres of radius {radius:.4g} m"
+    stiffness = "each with the stiffness of the whole, as every contact point has its own spring"
+    if isinstance(shape, pg.Capsule):
+        return spheres, f"{became}, its ends ({stiffness}); nothing touches between them."
+    if isinstance(shape, pg.Box):
+        where = f"in its corners ({stiffness}: a face rests on 4 springs)"
+        return spheres, f"{became} {where}; edges and faces between them are open."
+    return spheres, f"{became} along its rims, which is approximate ({stiffness}); it rolls like a polygon."
+
+
+def _spheres(shape: Any) -> tuple[float, list[Array]]:
+    """The radius [m] of the spheres inside a shape, and their centres [m] in its frame.
+
+    Each touches the surface from inside: three faces of a box, a cap and the side of a cylinder. Those of a
+    capsule are its two ends.
+    """
+    if isinstance(shape, pg.Capsule):
+        return shape.radius(), [np.array([0, 0, z * shape.length() / 2]) for z in (-1, 1)]
+    if isinstance(shape, pg.Box):
+        half = np.asarray(shape.size()) / 2
+        radius = CORNER_RADIUS * 2 * float(np.min(half))
+        return radius, [np.array(signs) * (half - radius) for signs in product((-1, 1), repeat=3)]
+    radius = CORNER_RADIUS * min(2 * shape.radius(), shape.length())
+    ring, height = shape.radius() - radius, shape.length() / 2 - radius
+    angles = np.arange(SPHERES_PER_RIM) * 2 * np.pi / SPHERES_PER_RIM
+    return radius, [np.array([ring * np.cos(a), ring * np.sin(a), z * height]) for z in (-1, 1) for a in angles]
+
+
+def _to_hydroelastic(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
+    if plant.get_contact_model() == ContactModel.kPoint:
+        expected = 'hydroelastic or hydroelastic_with_fallback, since contact_geometry is "hydroelastic"'
+        raise InputError("contact_model", got="point", expected=expected)
+    inspector, notes = scene_graph.model_inspector(), []
+    for body, geometry in collision_geometries(plant, scene_graph):
+        name = f"{inspector.GetName(geometry)} on {body.name()}"
+        properties = pg.ProximityProperties(inspector.GetProximityProperties(geometry))
+        if properties.HasProperty("hydroelastic", "compliance_type"):
+            notes.append(f"{name}: keeps its own hydroelastic properties.")
+            continue
+        box = inspector.GetObbInGeometryFrame(geometry)
+        if isinstance(inspector.GetShape(geometry), pg.HalfSpace) or box is None:
+            pg.AddRigidHydroelasticProperties(properties)
+            became = "rigid hydroelastic, as a compliant half space has no contact with a compliant body"
+        else:  # a modulus or hint of its own stays
+            hint = _taken(properties, "resolution_hint", float(np.min(box.half_width())))
+            modulus = _taken(properties, "hydroelastic_modulus", HYDROELASTIC_MODULUS)
+            pg.AddCompliantHydroelasticProperties(hint, modulus, properties)
+            became = f"compliant hydroelastic, modulus {modulus:.4g} Pa, resolution {hint:.4g} m"
+        scene_graph.AssignRole(plant.get_source_id(), geometry, properties, pg.RoleAssign.kReplace)
+        notes.append(f"{name}: became {became}.")
+    return tuple(notes)
+
+
+def _taken(properties: pg.ProximityProperties, name: str, default: float) -> float:
+    """A hydroelastic property that a geometry has already, taken out of its properties, or the default."""
+    value = float(properties.GetPropertyOrDefault("hydroelastic", name, default))
+    properties.RemoveProperty("hydroelastic", name)
+    return value

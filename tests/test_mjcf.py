@@ -1,0 +1,270 @@
+"""MJCF as MuJoCo means it: MuJoCo's own inverse dynamics is the referee of what is read of random files."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.table import each_row
+from pydrake.geometry import Role
+from pydrake.multibody.tree import MultibodyForces
+
+import drake_diff as dd
+from drake_diff.exceptions import ModelError
+from drake_diff.model.plant import actuators, joints
+
+GEOM = '<geom size="0.1" mass="1"/>'
+AGREE = 1e-9  # relative: both sum up a chain of a few bodies in double precision
+
+
+def load(path, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return dd.load_model(path, **{"time_step": 0.01, **options})
+
+
+def write(folder, body, *, defaults="", more="", head='<mujoco model="m">'):
+    path = folder / "m.xml"
+    path.write_text(f"{head}{defaults}<worldbody>{body}</worldbody>{more}</mujoco>")
+    return path
+
+
+def random_attributes(random):
+    """Of a joint, each there or not."""
+    found = {
+        "damping": random.uniform(0.1, 3),
+        "stiffness": random.uniform(1, 30),
+        "springref": random.uniform(-20, 20),
+        "armature": random.uniform(0.1, 2),
+    }
+    return " ".join(f'{name}="{value}"' for name, value in found.items() if random.random() < 0.5)
+
+
+def random_file(random):
+    """A chain of three to five bodies with nested default classes, some of which say nothing of joints or actuators."""
+    angle, count = random.choice(["degree", "radian"]), int(random.integers(3, 6))
+    inner = "".join(
+        f'<default class="c{i}">'
+        + (f"<joint {random_attributes(random)}/>" if random.random() < 0.5 else "")
+        + (f'<motor gear="{random.uniform(1, 9)}"/>' if random.random() < 0.5 else "")
+        + f'<default class="d{i}"><geom density="{random.uniform(500, 900)}"/></default></default>'
+        for i in range(2)
+    )
+    first = f'<default><joint {random_attributes(random)}/><motor ctrlrange="-2 2"/>{inner}</default>'
+    second = f'<default><joint ref="0.2"/><general gear="{random.uniform(1, 9)}"/></default>'
+    classes = ("", 'class="c0"', 'class="d0"', 'class="c1"', 'class="d1"')
+    body, motors = "", ""
+    for i in range(count):
+        kind, childclass = random.choice(["hinge", "slide"]), random.choice(["", 'childclass="c0"', 'childclass="d1"'])
+        axis, where = " ".join(map(str, random.normal(size=3))), " ".join(map(str, random.uniform(-1, 1, 3)))
+        kp = random.uniform(1, 9)
+        body += (
+            f'<body pos="{where}" {childclass}>'
+            f'<joint name="j{i}" type="{kind}" axis="{axis}" {random.choice(classes)}/>'
+            f'<geom type="capsule" size="0.1 0.2" pos="0.3 0 0" {random.choice(classes)}/>'
+        )
+        if random.random() < 0.8:
+            force = random.choice(["", 'forcerange="-3 3"'])
+            motors += random.choice(
+                [
+                    f'<motor name="m{i}" joint="j{i}" {random.choice(classes)} {force}/>',
+                    f'<position name="m{i}" joint="j{i}" kp="{kp}" kv="0.5" ctrlrange="-1 1" {force}/>',
+                ]
+            )
+    return (
+        f'<mujoco model="m"><compiler angle="{angle}"/>{first}{second}<worldbody>{body}{"</body>" * count}</worldbody>'
+        f"<actuator>{motors}</actuator></mujoco>"
+    )
+
+
+def gap_to_mujoco(text, model, random):
+    """The largest relative gap of efforts at a random state, and of limits and gains of actuators."""
+    mujoco = pytest.importorskip("mujoco")
+    other = mujoco.MjModel.from_xml_string(text)
+    data, plant = mujoco.MjData(other), model.plant
+    data.qpos, data.qvel, data.qacc = random.uniform(-1, 1, (3, other.nv))
+    mujoco.mj_inverse(other, data)
+    index = {j.name(): mujoco.mj_name2id(other, mujoco.mjtObj.mjOBJ_JOINT, j.name()) for j in joints(plant)}
+    order = [index[j.name()] for j in sorted(joints(plant), key=lambda j: j.velocity_start())]
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, data.qpos[order])
+    plant.SetVelocities(context, data.qvel[order])
+    forces = MultibodyForces(plant)
+    plant.CalcForceElementsContribution(context, forces)  # gravity, springs and damping
+    found = plant.CalcInverseDynamics(context, data.qacc[order], forces)
+    wanted = data.qfrc_inverse[order]
+    gaps = [np.max(np.abs(found - wanted)) / np.max(np.abs(wanted))]
+    for actuator in actuators(plant):
+        i = mujoco.mj_name2id(other, mujoco.mjtObj.mjOBJ_ACTUATOR, actuator.name())
+        if i < 0:
+            continue  # added
+        gear, gain = abs(other.actuator_gear[i, 0]), other.actuator_gainprm[i, 0]
+        is_servo = other.actuator_biastype[i] != 0
+        limits = [np.inf]
+        if other.actuator_forcelimited[i]:
+            limits.append(gear * other.actuator_forcerange[i, 1])
+        if other.actuator_ctrllimited[i] and not is_servo:
+            limits.append(gear * gain * other.actuator_ctrlrange[i, 1])
+        gaps.append(0.0 if actuator.effort_limit() == min(limits) else abs(actuator.effort_limit() / min(limits) - 1))
+        if is_servo:
+            gains = actuator.get_controller_gains()
+            wanted = gear**2 * np.array([gain, -other.actuator_biasprm[i, 2]])
+            gaps.append(np.max(np.abs(np.array([gains.p, gains.d]) - wanted)) / np.max(wanted))
+    return max(gaps)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_random_file_is_read_as_mujoco_reads_it(tmp_path, seed):
+    random = np.random.default_rng(seed)
+    text = random_file(random)
+    (tmp_path / "m.xml").write_text(text)
+    model = load(tmp_path / "m.xml", actuators="all")  # without an actuator Drake has no armature
+    assert gap_to_mujoco(text, model, random) < AGREE
+
+
+HINGE = f'<body name="a" pos="0 0 1"><joint name="j" axis="0 1 0" {{}}/>{GEOM}{{}}</body>'
+
+
+@each_row(
+    "attributes, actuator, limit, gains",
+    [
+        ("", '<motor joint="j" gear="3" ctrlrange="-2 2"/>', 6.0, None),
+        ("", '<motor joint="j" gear="-3" ctrlrange="-2 2"/>', 6.0, None),
+        ("", '<motor joint="j" gear="3" ctrlrange="-2 2" forcerange="-1 1"/>', 3.0, None),
+        ("", '<motor joint="j" ctrlrange="-2 2" ctrllimited="false"/>', math.inf, None),
+        ('actuatorfrcrange="-5 5"', '<motor joint="j" gear="3" ctrlrange="-2 2"/>', 5.0, None),
+        ("", '<position joint="j" kp="7" kv="2" ctrlrange="-2 2"/>', math.inf, (7.0, 2.0)),
+        ("", '<position joint="j" kp="7" kv="2" gear="3" forcerange="-2 2"/>', 6.0, (63.0, 18.0)),
+    ],
+)
+def test_an_effort_is_limited_at_the_joint(tmp_path, attributes, actuator, limit, gains):
+    """The torque is gear times force, and a position servo of gear g has the stiffness g^2 kp at the joint."""
+    model = load(write(tmp_path, HINGE.format(attributes, ""), more=f"<actuator>{actuator}</actuator>"))
+    (found,) = actuators(model.plant)
+    assert found.effort_limit() == limit
+    if gains:
+        assert (found.get_controller_gains().p, found.get_controller_gains().d) == gains
+
+
+def test_a_spring_pulls_to_its_rest_in_the_step(tmp_path):
+    """A slide of 2 kg on a spring, whose force Drake takes at the start of the step: m v' = m v - h k (q - rest)."""
+    spring = 'type="slide" axis="1 0 0" stiffness="8" springref="0.5"'
+    model = load(write(tmp_path, f'<body><joint name="j" {spring}/><geom size="0.1" mass="2"/></body>'))
+    h, q, v = model.time_step, 0.2, 0.3
+    found = dd.step(model, [q, v], [])
+    assert found[1] == pytest.approx(v - h * 8 * (q - 0.5) / 2, abs=1e-12)
+    assert found[0] == pytest.approx(q + h * found[1], abs=1e-12)
+    assert "1 springs of joints" in str(model.notes)
+    assert "stiffness" not in str(model.notes)
+    ball = f'<body><joint name="b" type="ball" stiffness="8"/>{GEOM}</body>'
+    assert "attribute 'stiffness' found in a 'joint' tag is" in str(load(write(tmp_path, ball)).notes)
+
+
+def test_what_is_included_is_read_and_other_lines_keep_their_numbers(tmp_path):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "arm.xml").write_text(
+        '<mujoco>\n<default>\n<joint damping="3"/></default>\n<!-- an arm -->\n<worldbody>\n'
+        f'{HINGE.format("", "")}</worldbody>\n<actuator>\n<motor joint="j" gear="3" ctrlrange="-2 2"/></actuator>'
+        "</mujoco>"
+    )
+    path = tmp_path / "scene.xml"
+    path.write_text('<mujoco model="scene">\n<include file="parts/arm.xml"/>\n<option wind="1 0 0"/>\n</mujoco>')
+    model = load(path)
+    assert model.plant.GetJointByName("j").default_damping() == 3.0
+    assert actuators(model.plant)[0].effort_limit() == 6.0
+    path.write_text(
+        '<mujoco model="scene">\n<include file="parts/arm.xml"/>\n<worldbody>\n<geom type="box"/></worldbody></mujoco>'
+    )
+    with pytest.raises(ModelError, match=rf"{path}:4: error: The size attribute"):
+        load(path)
+
+
+def test_a_file_that_includes_itself_is_refused(tmp_path):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "a.xml").write_text('<mujoco><include file="m.xml"/></mujoco>')
+    with pytest.raises(ModelError, match="it includes itself"):
+        load(write(tmp_path, HINGE.format("", ""), more='<include file="sub/a.xml"/>'))
+
+
+PYRAMID = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+
+
+@each_row("ending", ["stl", "obj", "STL"])
+def test_a_mesh_gives_its_mass_whatever_its_format(tmp_path, ending):
+    """A pyramid of volume 1/6, scaled by 0.1, 0.2 and 0.3, of 1000 kg/m^3, has 1 kg; drawn as it is in the file."""
+    mesh = trimesh.Trimesh(PYRAMID, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    (tmp_path / "shapes").mkdir()
+    file = tmp_path / "shapes" / f"part.{ending}"
+    mesh.export(file, file_type=ending.lower())
+    asset = (
+        f'<compiler meshdir="shapes"/><asset><mesh file="part.{ending}" scale="0.1 0.2 0.3"/></asset><worldbody>'
+        '<geom type="plane" size="1 1 1"/></worldbody>'
+    )
+    geoms = (
+        '<geom type="mesh" mesh="part" density="1000"/>'
+        '<geom type="mesh" mesh="part" contype="0" conaffinity="0" mass="0"/>'
+    )
+    path = write(tmp_path, f'<body name="a"><joint name="j"/>{geoms}</body>', more=asset)
+    model = load(path)
+    assert model.contract.bodies[0].mass == pytest.approx(1.0, rel=1e-6)
+    inspector = model.double.scene_graph.model_inspector()
+    drawn = [inspector.GetShape(g) for g in inspector.GetAllGeometryIds(Role.kIllustration)]
+    files = [shape.source().path() for shape in drawn if type(shape).__name__ == "Mesh"]
+    assert files
+    assert set(files) == {file}
+    kinds = [g.shape for g in model.contract.geometries if g.body == "a"]
+    assert kinds == (["Mesh"] if ending == "obj" else [])
+    assert ending == "obj" or "1 collision meshes skipped" in str(model.notes)
+    hull = load(path, meshes="convex")
+    assert [g.shape for g in hull.contract.geometries if g.body == "a"] == ["Convex"]
+    assert {g.shape for g in load(path, meshes="spheres").contract.geometries if g.body == "a"} == {"Sphere"}
+    assert hull.contract.bodies[0].mass == pytest.approx(1.0, rel=1e-6)
+
+
+FINGERS = (
+    '<body name="l"><joint name="left" type="slide" axis="1 0 0" ref="0.1"/>' + GEOM + "</body>"
+    '<body name="r"><joint name="right" type="slide" axis="-1 0 0" ref="0.3"/>' + GEOM + "</body>"
+)
+
+
+@each_row(
+    "polynomial, start, ratio, offset",
+    [
+        ("0.5 2", "", 2.0, 0.3 + 0.5 - 2 * 0.1),
+        ("0 1 0 0 0", "", 1.0, 0.2),
+        ("0 1", 'active="false"', None, None),
+        ("0 1 3", "", None, None),
+    ],
+)
+def test_coupled_joints_can_be_reduced(tmp_path, polynomial, start, ratio, offset):
+    """MuJoCo holds y - y0 = a0 + a1 (x - x0), with y0 and x0 the positions in the file's pose."""
+    equality = f'<equality><joint joint1="right" joint2="left" polycoef="{polynomial}" {start}/></equality>'
+    path = write(tmp_path, FINGERS, more=equality)
+    whole, reduced = load(path), load(path, mimic="reduce")
+    assert whole.nq == 2
+    assert reduced.nq == (2 if ratio is None else 1)
+    assert any(f.code == "mimic_joint" for f in dd.audit(whole)) == (ratio is not None)
+    if ratio is not None:
+        (mimic,) = whole.file_facts.followers.values()
+        assert (mimic.ratio, mimic.offset) == pytest.approx((ratio, offset))
+        np.testing.assert_allclose(reduced.coupling.positions(np.array([0.7])), [0.7, ratio * 0.7 + offset])
+
+
+def test_directives_add_robots_with_their_slips_mended(tmp_path):
+    """A file that is added is read as one that is loaded: here an MJCF with a gear and an STL."""
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "part.stl")
+    more = '<asset><mesh file="part.stl"/></asset><actuator><motor joint="j" gear="3" ctrlrange="-2 2"/></actuator>'
+    write(tmp_path, HINGE.format("", '<geom type="mesh" mesh="part"/>'), more=more)
+    path = tmp_path / "two.dmd.yaml"
+    path.write_text(
+        "directives:\n- add_model: {name: one, file: package://here/m.xml}\n"
+        "- add_frame: {name: shelf, X_PF: {base_frame: world, translation: [0, 0, 2]}}\n"
+        "- add_model: {name: two, file: package://here/m.xml}\n"
+    )
+    model = load(path, packages={"here": tmp_path})
+    assert [a.effort_limit() for a in actuators(model.plant)] == [6.0, 6.0]
+    assert "2 collision meshes skipped" in str(model.notes)
+    assert "drake_diff_" not in str(model.notes)  # the folder that is gone
+    hulls = load(path, packages={"here": tmp_path}, meshes="convex")
+    assert [g.shape for g in hulls.contract.geometries].count("Convex") == 2
