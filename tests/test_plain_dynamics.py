@@ -13,6 +13,8 @@ import drake_diff as dd
 from drake_diff.artifact.live import scene_of_run
 from drake_diff.exceptions import ArtifactError, InputError, ModelError
 from drake_diff.optimize.judge import complaints_about
+from drake_diff.optimize.program import Outcome
+from drake_diff.optimize.transcription.collocation import Transcription
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
@@ -98,7 +100,11 @@ def test_a_problem_of_plain_dynamics_says_that_it_has_no_model():
             {"solver": "snopt", "scheme": "drake"},
             "constraints: expected none for",
         ),
-        ({"system": "model", "horizon": None}, {"method": "shooting", "refine": True}, "refine: expected False for"),
+        (
+            {"system": "model", "horizon": None},
+            {"method": "shooting", "refine": True},
+            "refine: expected None or False for",
+        ),
     ],
 )
 def test_what_a_solver_would_leave_out_is_refused(load, changes, options, match):
@@ -113,7 +119,7 @@ def test_what_does_not_hold_is_told_in_the_words_of_plain_dynamics():
     """No time step that could be smaller, and no model: a finer mesh, and the dynamics."""
     swing = dd.Dynamics(lambda x, u: [x[1], u[0] - 10 * np.sin(x[0])], nx=2, nu=1)
     asked = {"x0": [0, 0], "x_goal": [np.pi, 0], "num_steps": 4, "horizon": 2.0, "running_cost": EFFORT}
-    coarse = dd.solve(dd.Problem(swing, **asked))
+    coarse = dd.solve(dd.Problem(swing, **asked), refine=False)
     assert coarse.status is dd.Status.CONVERGED_NOT_VERIFIED
     assert "pass refine=True, or take more steps (num_steps)" in coarse.message
     assert "time step" not in coarse.message
@@ -128,6 +134,52 @@ def test_a_run_of_plain_dynamics_has_no_body_to_draw(tmp_path):
 
 
 # ------------------------------------------------------------------------------ refined meshes
+
+
+def test_a_mesh_on_which_the_plan_does_not_hold_is_refined_by_itself():
+    """Too coarse by its errors, by an input between the nodes (9/8 of its bound), and by a constraint there."""
+    swing = dd.Dynamics(lambda x, u: [x[1], u[0] - 10 * np.sin(x[0])], nx=2, nu=1)
+    up = dd.Problem(swing, x0=[0, 0], x_goal=[np.pi, 0], num_steps=4, horizon=2.0, running_cost=EFFORT)
+    slow = block_move(num_steps=4, constraints=dd.Constraint(lambda x: x[1], upper=1.25, name="slow"))
+    for problem in (up, slow):
+        coarse, found, fine = (dd.solve(problem, refine=refine) for refine in (False, None, True))
+        assert coarse.status is dd.Status.CONVERGED_NOT_VERIFIED
+        assert found.success, found.message
+        rounds = found.options["refinements"]
+        assert rounds[0][0] == 4 < len(found.us) == rounds[-1][0]
+        assert f"the mesh was refined from 4 to {len(found.us)} intervals" in found.message
+        if problem is up:
+            assert found.cost == pytest.approx(fine.cost, rel=0.07)  # which is refined until 1e-6
+
+
+def test_a_plan_that_holds_is_not_refined():
+    solution = dd.solve(block_move())
+    assert solution.success
+    assert solution.mesh is None
+    assert "refinements" not in solution.options
+
+
+@each_row("refine", [None, True])
+def test_where_a_finer_mesh_fails_the_last_motion_is_kept(monkeypatch, refine):
+    """The first mesh is solved, and every finer one is said to have none."""
+    swing = dd.Dynamics(lambda x, u: [x[1], u[0] - 10 * np.sin(x[0])], nx=2, nu=1)
+    problem = dd.Problem(swing, x0=[0, 0], x_goal=[np.pi, 0], num_steps=4, horizon=2.0, running_cost=EFFORT)
+    coarse = dd.solve(problem, refine=False)
+    honest = Transcription._solve_on
+
+    def fails_later(self, mesh, *arguments):
+        found = honest(self, mesh, *arguments)
+        if len(mesh) == 5:
+            return found
+        return dataclasses.replace(found, result=dataclasses.replace(found.result, outcome=Outcome.INFEASIBLE))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Transcription, "_solve_on", fails_later)
+        solution = dd.solve(problem, refine=refine, method="collocation")
+    np.testing.assert_array_equal(solution.xs, coarse.xs)
+    assert solution.status is dd.Status.CONVERGED_NOT_VERIFIED
+    assert "intervals no motion was found" in solution.message
+    assert "that on 4 is kept" in solution.message
 
 
 def test_a_models_mesh_is_refined_and_its_plan_replayed(load, tmp_path):

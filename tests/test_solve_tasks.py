@@ -121,7 +121,7 @@ def test_what_a_constraint_is_exceeded_by_between_the_nodes_is_in_the_record(wri
         running_cost=EFFORT,
         constraints=dd.Constraint(lambda x: x[1], upper=1.25, name="slow"),
     )
-    solution = dd.solve(problem, method="collocation", scheme="hermite_simpson")
+    solution = dd.solve(problem, method="collocation", scheme="hermite_simpson", refine=False)
     record = dd.save(solution, tmp_path / f"run{count}")
     metrics = {m.name: m for m in record.metrics}
     beyond = solution.transcribed.at(np.linspace(0, 1, 5001))[0][:, 1].max() - 1.25

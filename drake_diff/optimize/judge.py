@@ -70,6 +70,17 @@ def _stationarity(draft: Solution, result: NlpResult) -> float:
     return ratio if np.isfinite(ratio) else float("inf")
 
 
+def may_be_too_coarse(solution: Solution) -> bool:
+    """Whether a collocated plan keeps all that was asked at its nodes, and yet is none: a finer mesh may mend that."""
+    motion = solution.transcribed
+    if solution.status is not Status.CONVERGED_NOT_VERIFIED or motion is None:
+        return False
+    agree = all(certificate.verdict == "agree" for certificate in solution.certificates)
+    if not agree or not np.isfinite(solution.cost) or next(_infeasibilities(solution), ""):
+        return False
+    return not solution.problem.has_model or next(_overlaps(solution, motion), "") == ""
+
+
 def refused(draft: Solution, error: Exception) -> Solution:
     """The draft of a solve that ended because a step or its derivative was refused."""
     status = Status.NO_GRADIENT if isinstance(error, GradientError) else Status.DIVERGED

@@ -23,7 +23,7 @@ from drake_diff.optimize.drake_program import SOLVERS
 from drake_diff.optimize.guess import Guess, first_guess, sampled
 from drake_diff.optimize.ilqr.ilqr import check_problem, is_unconstrained, solve_ilqr
 from drake_diff.optimize.ilqr.through_contact import check_schedule, solve_continuation, solve_through_jumps
-from drake_diff.optimize.judge import ended, judged, refused
+from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, refused
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import lacking_between, swept
 from drake_diff.optimize.problem.problem import Problem
@@ -32,7 +32,14 @@ from drake_diff.optimize.reach import out_of_reach, why_blind
 from drake_diff.optimize.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
 from drake_diff.optimize.shooting import ShootingVariables, check_segments, roll_segments, solve_shooting
 from drake_diff.optimize.solution import Search, Solution, Status
-from drake_diff.optimize.transcription.collocation import MeshRefinement, Transcription
+from drake_diff.optimize.transcription.collocation import (
+    FOUND,
+    MeshRefinement,
+    Transcribed,
+    Transcription,
+    kept,
+    violation_between_nodes,
+)
 from drake_diff.optimize.transcription.drake import solve_collocation
 from drake_diff.optimize.transcription.task import DEFAULT_SCHEME, SCHEMES, OptimalControl
 
@@ -40,9 +47,10 @@ METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": "riccati"}
 CERTIFIED_KNOTS = 5
 CLEARANCE_PARTS = (4, 8, 16)  # of a step: looked at where a discrete plan comes too near to an obstacle in between
+FINER_ROUNDS = 6  # of a mesh whose plan does not hold
 GUESS_ITERATIONS = 100  # of an attempt that is to find a guess for the next one
 ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
-FOUND = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
+PLANS = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
 # The order in which a chain that ends without a verified motion prefers what it has.
 PREFERENCE = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED, Status.INTERRUPTED, Status.TIME_LIMIT)
 
@@ -63,7 +71,7 @@ def solve(
     seed: int = 0,
     segments: int = 1,
     continuation: Any = None,
-    refine: bool = False,
+    refine: bool | None = None,
     error_tolerance: float = 1e-6,
     max_num_steps: int = 1000,
     progress: bool | Progress = False,
@@ -95,7 +103,9 @@ def solve(
         segments: of multiple shooting, whose first states are variables too; 1 is single shooting.
         continuation: finds contact that the guess does not make, by stages of a force at a distance before the true
             plant: "auto" or a sequence of SoftContacts, with method="ilqr". `Solution.options` has the stages' log.
-        refine: with collocation, split the intervals whose error is above `error_tolerance` and solve again.
+        refine: with collocation, whether coarse intervals are split and the problem is solved again. None: where the
+            plan does not hold between its knots or in a replay, until it does or every error is at most
+            `error_tolerance`. True: until every error is. False: never.
         error_tolerance: of an interval, against an accurate integration, in the states' units; and of its part of
             the cost, relative to the whole.
         max_num_steps: the most intervals of a refined mesh.
@@ -144,9 +154,11 @@ def solve(
     refinement = MeshRefinement(
         positive_float("error_tolerance", error_tolerance), positive_int("max_num_steps", max_num_steps)
     )
+    if refine not in (None, True, False):
+        raise InputError("refine", got=repr(refine), expected="None, True or False")
     report = Report(print if progress is True else (progress or None), callback)
     task = _Task(problem, limits, seed, report, on_start)
-    asked = Attempt(method, "asked for", scheme, solver, segments, continuation, refinement if refine else None)
+    asked = Attempt(method, "asked for", scheme, solver, segments, continuation, refine, refinement)
     if method == "auto" and continuation is not None:
         asked = dataclasses.replace(asked, method="ilqr", reason="a continuation is asked for")
     initial_guess = sampled(problem, asked.method, initial_guess)
@@ -163,7 +175,7 @@ def solve(
         "seed": int(seed),
         "segments": int(segments),
         "continuation": continuation if continuation is None or continuation == "auto" else _plain_stages(continuation),
-        "refine": bool(refine),
+        "refine": refine,
         "error_tolerance": refinement.tolerance,
         "max_num_steps": refinement.most,
     }
@@ -204,6 +216,7 @@ class Attempt:
     solver: str | None = None
     segments: int = 1
     continuation: Any = None
+    refine: bool | None = None
     refinement: MeshRefinement | None = None
     max_iterations: int | None = None
 
@@ -250,7 +263,7 @@ class _Task:
                 self.on_start()
                 self.on_start = None
             if method == "collocation":
-                return run.collocate(guess, attempt.refinement)
+                return run.collocate(guess, attempt.refinement, refine=attempt.refine)
             if method == "ilqr":
                 return run.sweep(xs, us, given=given is not None, stages=stages)
             improve = given is None and attempt.segments == 1 and is_unconstrained(problem)
@@ -338,8 +351,8 @@ def _check_attempt(problem: Problem, attempt: Attempt) -> str:
         raise InputError("problem", got="plain dynamics", expected=expected)
     if problem.horizon is not None:
         raise InputError("horizon", got="given", expected=f"none for discrete steps: {takes}")
-    if attempt.refinement is not None:
-        raise InputError("refine", got=True, expected=f'False for method="{method}": {takes}')
+    if attempt.refine:
+        raise InputError("refine", got=True, expected=f'None or False for method="{method}": {takes}')
     if method == "ilqr":
         check_problem(problem)
     return "step"
@@ -363,7 +376,7 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
             "constraints": problem.constraints,
             "goals": problem.goals,
             "horizon": problem.horizon,
-            "refine": attempt.refinement,
+            "refine": attempt.refine,
         }
         for name, value in left_out.items():
             if value:
@@ -402,40 +415,102 @@ class Run:
     report: Report | None
     start: float = field(default_factory=time.monotonic)
 
-    def collocate(self, guess: Guess, refinement: MeshRefinement | None) -> Solution:
-        """In CasADi; SNOPT, which that does not carry, in Drake's own DirectCollocation."""
-        problem, limits, report, found = self.problem, self.limits, self.report, dict[str, Any]()
+    def collocate(self, guess: Guess, refinement: MeshRefinement | None, *, refine: bool | None) -> Solution:
+        """In CasADi; SNOPT, which that does not carry, in Drake's own DirectCollocation.
+
+        The mesh is refined where `refine` is True; where it is None, for as long as the plan does not hold.
+        """
         if self.solver == "snopt":
-            jacobian: Any = EquationsOfMotion(problem.model).jacobian
-        else:
-            transcription = Transcription(problem, self.scheme)
-            jacobian = transcription.jacobian
+            return self._collocate_in_drake(guess)
+        problem, limits, report = self.problem, self.limits, self.report
+        transcription = Transcription(problem, self.scheme)
+        try:
+            before = self._certify_equations(transcription.jacobian, guess.xs, guess.us)
+        except (GradientError, SimulationError) as error:
+            return refused(self._draft(guess.xs, guess.us), error)
+        us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
+        begun = guess.motion or (guess.xs, np.vstack([guess.us, us_end]))
+        asked = refinement if refine else None
+        motion = transcription.solve(begun, horizon=guess.horizon, limits=limits, report=report, refinement=asked)
+        if refine:
+            self.options["refinements"] = [list(each) for each in motion.refinements]
+        if motion.cleared:
+            self.options["clearance_rounds"] = [list(each) for each in motion.cleared]
+
+        def judged(motion: Transcribed) -> Solution:
+            return self._judge_collocated(transcription, motion, before)
+
+        solution = judged(motion)
+        if refine is not None or refinement is None:
+            return solution
+        return self._refined(transcription, motion, solution, refinement, judged)
+
+    def _refined(
+        self,
+        transcription: Transcription,
+        motion: Transcribed,
+        solution: Solution,
+        until: MeshRefinement,
+        judged: Callable[[Transcribed], Solution],
+    ) -> Solution:
+        """`solution`, or that on a mesh which is made finer for as long as the plan does not hold."""
+        rounds = list(motion.refinements)
+        for _ in range(FINER_ROUNDS):
+            left = self.limits.time_limit - (time.monotonic() - self.start)
+            if left <= 0 or not may_be_too_coarse(solution):
+                break
+            exceeded = violation_between_nodes(motion).intervals
+            if motion.largest_error <= until.tolerance and not exceeded:
+                break  # what does not hold is not the mesh's
+            limits = dataclasses.replace(self.limits, time_limit=left)
+            finer = transcription.finer(motion, exceeded, until.most, limits, self.report)
+            if finer is None:
+                break
+            if finer.result.outcome not in FOUND:
+                last = kept(motion, finer).result
+                if last.outcome is Outcome.INTERRUPTED:
+                    return self._judge(solution, last)
+                return solution.told(message=f"{solution.message}; {last.note}")
+            motion = finer
+            rounds.append((len(finer.mesh) - 1, finer.largest_error))
+            self.options["refinements"] = [list(each) for each in rounds]
+            solution = judged(motion)
+        if len(rounds) > 1:
+            told = f"the mesh was refined from {rounds[0][0]} to {rounds[-1][0]} intervals"
+            solution = solution.told(message=f"{solution.message}; {told}")
+        return solution
+
+    def _collocate_in_drake(self, guess: Guess) -> Solution:
+        """By Drake's own DirectCollocation."""
+        jacobian = EquationsOfMotion(self.problem.model).jacobian
         try:
             certificates = self._certify_equations(jacobian, guess.xs, guess.us)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(guess.xs, guess.us), error)
-        if self.solver == "snopt":
-            result, xs, us, u_final = solve_collocation(
-                problem, guess.xs, guess.us, solver=self.solver, limits=limits, report=report
-            )
-        else:
-            us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
-            begun = guess.motion or (guess.xs, np.vstack([guess.us, us_end]))
-            motion = transcription.solve(
-                begun, horizon=guess.horizon, limits=limits, report=report, refinement=refinement
-            )
-            result, xs, us, u_final = motion.result, motion.xs, motion.us[:-1], motion.us[-1]
-            self.options["derivatives"] = motion.derivatives
-            found["us_mid"] = None if self.scheme == "drake" else motion.us_mid
-            found["free_horizon"] = motion.horizon if problem.horizon else None
-            found["mesh"] = motion.mesh if len(us) > problem.num_steps else None
-            if refinement is not None:
-                self.options["refinements"] = [list(each) for each in motion.refinements]
-            if motion.cleared:
-                self.options["clearance_rounds"] = [list(each) for each in motion.cleared]
+        result, xs, us, u_final = solve_collocation(
+            self.problem, guess.xs, guess.us, solver=self.solver, limits=self.limits, report=self.report
+        )
         if np.all(np.isfinite(xs)):
             certificates += self._certify_equations(jacobian, xs, us)
-        return self._judge(self._draft(xs, us, u_final=u_final, certificates=certificates, **found), result)
+        return self._judge(self._draft(xs, us, u_final=u_final, certificates=certificates), result)
+
+    def _judge_collocated(
+        self, transcription: Transcription, motion: Transcribed, certificates: tuple[Certificate, ...]
+    ) -> Solution:
+        xs, us = motion.xs, motion.us[:-1]
+        self.options["derivatives"] = motion.derivatives
+        if np.all(np.isfinite(xs)):
+            certificates += self._certify_equations(transcription.jacobian, xs, us)
+        draft = self._draft(
+            xs,
+            us,
+            u_final=motion.us[-1],
+            us_mid=None if self.scheme == "drake" else motion.us_mid,
+            free_horizon=motion.horizon if self.problem.horizon else None,
+            mesh=motion.mesh if len(us) > self.problem.num_steps else None,
+            certificates=certificates,
+        )
+        return self._judge(draft, motion.result)
 
     def sweep(self, xs: Array, us: Array, *, given: bool, stages: tuple[SoftContact, ...]) -> Solution:
         """iLQR; from the states of a `given` guess, which need not be a rollout, else from the rollout of `us`.
@@ -522,7 +597,7 @@ class Run:
     def _judge(self, draft: Solution, result: NlpResult) -> Solution:
         """`judged`, and no success where the cost asks for a motion that nothing here could have begun."""
         solution, problem = judged(draft, result), self.problem
-        if solution.status not in FOUND or not problem.has_model:
+        if solution.status not in PLANS or not problem.has_model:
             return solution
         xs, us = solution.plan.sample(1)
         variables = ShootingVariables(problem, around=xs)

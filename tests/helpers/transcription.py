@@ -40,7 +40,9 @@ OPTIONS = (
 
 def collocate(dynamics, **asked):
     """The problem of `dynamics` with the fields and options `asked`, solved to a tolerance of 1e-9."""
-    options = {"tolerance": 1e-9, "max_iterations": 3000} | {k: asked.pop(k) for k in OPTIONS if k in asked}
+    options = {"tolerance": 1e-9, "max_iterations": 3000, "refine": False} | {
+        k: asked.pop(k) for k in OPTIONS if k in asked
+    }
     return dd.solve(dd.Problem(dynamics, **asked), method="collocation", **options)
 
 

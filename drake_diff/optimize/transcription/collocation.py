@@ -28,6 +28,7 @@ DENSE = np.linspace(0, 1, 41)[1:-1]  # where the input is looked at between two 
 EXCESS_TOLERANCE = 1e-3
 EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in TVLQR, over that of the states
 CLEARANCE_ROUNDS, MOST_INTERVALS = 5, 1000  # where a plan comes too near to an obstacle between its knots
+SMALLEST_ERROR = 1e-12  # of an interval: rounding, which no finer mesh makes less
 MOST_PIECES = 4  # of one interval in one round of refinement
 FOUND = (Outcome.SOLVED, Outcome.INACCURATE)
 
@@ -37,7 +38,8 @@ class Excess:
     """The largest excess over a bound of a state, an input and a constraint between the nodes.
 
     The tolerance of each is 1e-3 of its range along the motion, or 1e-5 where that is more. `worst` is the largest
-    excess as a part of its tolerance, `where` that is, and `broken` has a clause for each that is above.
+    excess as a part of its tolerance, `where` that is, and `broken` has a clause for each that is above, in one of the
+    `intervals`.
     """
 
     state: float
@@ -46,6 +48,7 @@ class Excess:
     worst: float
     where: str
     broken: tuple[str, ...]
+    intervals: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,6 +269,11 @@ class Transcribed(Collocated):
     refinements: tuple[tuple[int, float], ...] = ()
     cleared: tuple[tuple[int, float], ...] = ()  # the same, with what was lacking of a margin [m]; empty if nothing was
 
+    @property
+    def largest_error(self) -> float:
+        """Of an interval and of its part of the cost."""
+        return float(np.max(_worst(self)))
+
 
 def _finite(values: Array) -> Array:
     """With inf for what is no number."""
@@ -292,7 +300,7 @@ def violation_between_nodes(motion: Collocated) -> Excess:
         >>> problem = dd.Problem(
         ...     block, x0=[0, 0], x_goal=[1, 0], num_steps=4, horizon=1.0, running_cost=effort, constraints=slow
         ... )
-        >>> solution = dd.solve(problem)
+        >>> solution = dd.solve(problem, refine=False)
         >>> excess = dd.optimize.violation_between_nodes(solution.transcribed)
         >>> excess.state, excess.input, round(excess.constraint, 3), solution.status.value
         (0.0, 0.0, 0.004, 'converged_not_verified')
@@ -313,6 +321,7 @@ def violation_between_nodes(motion: Collocated) -> Excess:
                         max(float(lacking[row]), 0.0),
                         c.between,
                         float(times[row]),
+                        times[~(lacking <= c.between)],
                         c.told_at(xs[row], float(times[row])),
                     )
                 ]
@@ -337,6 +346,7 @@ def violation_between_nodes(motion: Collocated) -> Excess:
         worst=worst.excess / worst.tolerance,
         where=where,
         broken=tuple(str(e) for e in every if not e.excess <= e.tolerance),
+        intervals=tuple(np.unique(motion._place(np.concatenate([e.when for e in every]) / motion.horizon)[0]).tolist()),
     )
 
 
@@ -352,6 +362,7 @@ class _Beyond:
     excess: float
     tolerance: float
     time: float
+    when: Array  # [s] the times at which it is above its tolerance
     told: str = ""  # in other words
 
     def __str__(self) -> str:
@@ -371,7 +382,14 @@ def _beyond(
     excess = np.where(np.isfinite(values), excess, np.inf)
     tolerance, at = np.maximum(EXCESS_TOLERANCE * ranges, FEASIBILITY_TOLERANCE), np.argmax(excess, axis=0)
     return [
-        _Beyond(kind, name, float(excess[k, i]), float(tolerance[i]), float(times[k]))
+        _Beyond(
+            kind,
+            name,
+            float(excess[k, i]),
+            float(tolerance[i]),
+            float(times[k]),
+            times[~(excess[:, i] <= tolerance[i])],
+        )
         for i, (name, k) in enumerate(zip(names, at, strict=True))
     ]
 
@@ -442,7 +460,7 @@ class Transcription:
         begun = self.nodes_at(mesh, guess)
         motion = self._solve_on(mesh, begun, first, limits, report)
         tolerance, most = (np.inf, MOST_INTERVALS) if refinement is None else (refinement.tolerance, refinement.most)
-        rounds, near = [(len(mesh) - 1, float(np.max(_worst(motion))))], [_nearer(motion)]
+        rounds, near = [(len(mesh) - 1, motion.largest_error)], [_nearer(motion)]
         while motion.result.outcome in FOUND:
             (count, error), lacking = rounds[-1], near[-1] if len(near) <= CLEARANCE_ROUNDS else np.zeros(1)
             if error <= tolerance and not np.any(lacking > 0):
@@ -457,17 +475,37 @@ class Transcription:
                 break
             if report is not None:
                 report.say(f"{told} with {count} intervals: refined to {len(mesh) - 1}")
-            left = replace(limits, time_limit=max(0.0, limits.time_limit - (time.monotonic() - start)))
+            left, last = _left(limits, start), motion
             if entered:  # what goes through an obstacle is no place to go on from
                 now, then = (self.task.scheme.node_fractions(each) for each in (mesh, self.mesh))
                 nodes = np.array([np.interp(now, then, column) for column in begun.T]).T
                 motion = self._solve_on(mesh, nodes, first, left, report)
             else:
                 motion = self._solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, left, report)
-            rounds.append((len(mesh) - 1, float(np.max(_worst(motion)))))
+            if motion.result.outcome not in FOUND and not entered:
+                motion = kept(last, motion)
+                break
+            rounds.append((len(mesh) - 1, motion.largest_error))
             near.append(_nearer(motion))
         cleared = tuple((count, float(np.max(each))) for (count, _), each in zip(rounds, near, strict=True))
         return replace(motion, refinements=tuple(rounds), cleared=cleared if np.any(near[0] > 0) else ())
+
+    def finer(
+        self, motion: Transcribed, exceeded: Sequence[int], most: int, limits: Limits, report: Report | None
+    ) -> Transcribed | None:
+        """The problem on a mesh with the coarsest intervals of `motion` split, those `exceeded` among them.
+
+        None where that has more than `most` intervals.
+        """
+        lacking = np.zeros(len(motion.mesh) - 1)
+        lacking[list(exceeded)] = 1.0
+        tolerance = motion.largest_error / 2 ** (motion.task.scheme.order + 1)  # what halving all would bring
+        mesh = _split(motion, max(tolerance, SMALLEST_ERROR), lacking)
+        if len(mesh) - 1 > most or len(mesh) == len(motion.mesh):
+            return None
+        if report is not None:
+            report.say(f"what is found does not hold with {len(motion.mesh) - 1} intervals: refined to {len(mesh) - 1}")
+        return self._solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, limits, report)
 
     def _solve_on(
         self, mesh: Array, nodes: Array, horizon: float, limits: Limits, report: Report | None
@@ -485,6 +523,20 @@ class Transcription:
                 told, result = "symbolic, limited-memory Hessian: the exact one is not finite at an iterate", again
         found, horizon = program.unpack(result.z)
         return Transcribed(self.task, frozen(mesh), frozen(found), horizon, result, told)
+
+
+def _left(limits: Limits, start: float) -> Limits:
+    """What is left of `limits` of a solve that began at `start`, of the monotonic clock."""
+    return replace(limits, time_limit=max(0.0, limits.time_limit - (time.monotonic() - start)))
+
+
+def kept(last: Transcribed, failed: Transcribed) -> Transcribed:
+    """The last motion that was found, with a note on the finer mesh on which none was, or interrupted as that was."""
+    if failed.result.outcome is Outcome.INTERRUPTED:
+        return replace(last, result=replace(failed.result, z=last.result.z))
+    counts = len(failed.mesh) - 1, len(last.mesh) - 1
+    note = f"on {counts[0]} intervals no motion was found ({failed.result.message}): that on {counts[1]} is kept"
+    return replace(last, result=replace(last.result, note="; ".join(filter(None, (last.result.note, note)))))
 
 
 def _worst(motion: Transcribed) -> Array:
