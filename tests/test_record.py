@@ -254,6 +254,19 @@ def with_replay(solution, **changes):
     return other
 
 
+def test_energy_from_nowhere_fails_where_the_verdict_rests_on_that_motion():
+    """A replay that diverges open loop has its energy error told, and not asked for: another replay holds, and is."""
+    solution = dd.solve(pendulum(), method="collocation")
+    potential = solution.replay.potential_energy + np.linspace(0, 100, len(solution.replay.times))
+    off = with_replay(solution, potential_energy=potential)
+    for rests_on, verdict in ((off.replay, "fail"), (solution.replay, "info")):
+        holding = [dataclasses.replace(r, failures=(), motion=rests_on) for r in solution.replays]
+        vars(off)["replays"] = tuple(holding)
+        found = {m.name: m for m in measure(off).metrics}["energy drift"]
+        assert found.value > 40
+        assert found.verdict == verdict
+
+
 def test_a_force_outside_the_friction_cone_and_momentum_from_nowhere_are_seen(thrown):
     """mu = 0.5 on both: of 2 N along the ground under 1 N of push, 1.5 N are more than friction can give."""
     contacts = list(thrown.replay.contacts)

@@ -242,7 +242,9 @@ def _metrics_of_the_replay(
             float(np.max(motion.constraint_violation)),
         ]
     bounds = {}
-    if motion is not None and np.all(np.isfinite(motion.constraint_violation)):  # else constraints may have taken it
+    judged = solution.judged_replay  # each that holds has kept its own energy
+    rests_on_it = judged is None or judged.motion is None or judged.motion is motion
+    if motion is not None and rests_on_it and np.all(np.isfinite(motion.constraint_violation)):  # which may take some
         bounds["energy drift"] = energy_tolerance(motion)
     for (name, definition, unit), value in zip(measures, values, strict=True):
         yield measured(name, definition, value, unit, bounds.get(name), reason=reason)
