@@ -143,7 +143,7 @@ def test_an_arrow_is_as_long_as_its_force(runs, browser, thrown):
     find = "viewer.scene_tree.find(['drake', 'contacts', '0', 'shaft']).object.scale.z"
     scene = scene_of(thrown.problem.model, thrown.times, thrown.replay.xs, contacts=thrown.replay.contacts)
     force = np.linalg.norm(thrown.replay.contacts[-1][0].force)
-    expected = force / scene.reference_force * ARROW_PART * scene.size
+    expected = force / scene.reference_of(scene.contacts) * ARROW_PART * scene.size
     assert browser.execute_script(f"return {find}") == pytest.approx(expected, rel=1e-2)  # between two frames
 
 

@@ -24,7 +24,7 @@ from drake_diff.model.plant import bodies
 from drake_diff.pages.meshcat import draw
 from drake_diff.pages.scene import (
     BLUE,
-    ContactForce,
+    Force,
     Ghost,
     Scene,
     longest_path,
@@ -80,7 +80,7 @@ def scene_of_run(directory: str | Path) -> tuple[Scene, tuple[str, ...]]:
         times=times,
         poses=motion,
         ghosts=(Ghost("plan", plan, BLUE),) if plan else (),
-        forces=tuple(contacts.get(time, ()) for time, _ in rows[:-1]),
+        contacts=tuple(contacts.get(time, ()) for time, _ in rows[:-1]),
         trail=longest_path(motion, tuple(moving.values())),
         marks=told,
     ), notes
@@ -106,10 +106,10 @@ def _poses(messages: Iterator[Any]) -> dict[str, list[RigidTransform]]:
     return found
 
 
-def _forces(message: Any) -> tuple[ContactForce, ...]:
+def _forces(message: Any) -> tuple[Force, ...]:
     points = np.array([message.px, message.py, message.pz]).T
     forces = np.array([message.fx, message.fy, message.fz]).T
-    return tuple(ContactForce(point, force) for point, force in zip(points, forces, strict=True))
+    return tuple(Force(point, force) for point, force in zip(points, forces, strict=True))
 
 
 def _load(attachments: dict[str, bytes], source: Any) -> tuple[Any, Any, tuple[str, ...]]:

@@ -36,10 +36,10 @@ def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str,
             planned = m.solution.plan.sample(_parts(m))[0]
             drawn = bool(np.all(np.isfinite(planned))) and not np.array_equal(planned, xs)
             ghosts = {"plan": (planned, BLUE)} if drawn else None
-        contacts = () if motion is None else motion.contacts
+        contacts, us = ((), None) if motion is None else (motion.contacts, motion.us)
         model = m.solution.problem.model
         marks = drawn_goals(model.plant, model.double.context, m.solution.problem.goals)
-        scene = scene_of(model, times, xs, contacts=contacts, ghosts=ghosts, marks=marks)
+        scene = scene_of(model, times, xs, us=us, contacts=contacts, ghosts=ghosts, marks=marks)
         write_replay(replay, scene, title=f"{record['name']}: {m.solution.status.value}")
         view = replay.read_text(encoding="utf-8")
     data = page_data(float(m.times[-1]), plots, m.solution.certificates)

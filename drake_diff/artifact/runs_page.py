@@ -146,7 +146,7 @@ def _together(first: Scene, second: Scene) -> Scene:
     trail = longest_path(_resampled(first, times))
     marks = tuple(mark for mark in (*first.marks, *second.marks) if not mark.body)
     shapes = (*first.shapes, *others)
-    return Scene(shapes=shapes, times=times, poses=poses, ghosts=(), forces=(), trail=trail, marks=marks)
+    return Scene(shapes=shapes, times=times, poses=poses, ghosts=(), contacts=(), trail=trail, marks=marks)
 
 
 def _resampled(scene: Scene, times: Array) -> Poses:

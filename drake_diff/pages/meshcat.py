@@ -3,7 +3,8 @@
 import html
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from drake_diff._base.files import write_whole
 from drake_diff.exceptions import ModelError
 from drake_diff.model.triangles import Triangles, hull_of
 from drake_diff.pages.html import asset, content_policy
-from drake_diff.pages.scene import ARROW_PART, Poses, Scene
+from drake_diff.pages.scene import ARROW_PART, SMALLEST_SIZE, Force, Poses, Scene
 from drake_diff.pages.shapes import Drawn
 
 # Drake prints the port that it listens on, but nobody is meant to connect to it.
@@ -38,19 +39,31 @@ FRAMES_PER_SECOND = 64.0
 MOST_POSES = 9000  # of all bodies in all frames, at 140 bytes each: between two frames the viewer interpolates
 FEWEST_FRAMES = 60
 REPETITIONS = 5
-RED, TRAIL = Rgba(0.85, 0.2, 0.1, 1), Rgba(0.93, 0.55, 0.1, 1)
+RED, TRAIL, VIOLET = Rgba(0.85, 0.2, 0.1, 1), Rgba(0.93, 0.55, 0.1, 1), Rgba(0.62, 0.24, 0.85, 1)
 LINES = Rgba(0.72, 0.75, 0.79, 1)
 WORLD = "world"
-TOP, BOTTOM = [0.86, 0.89, 0.93], [0.97, 0.97, 0.98]  # of the background
+TOP, BOTTOM = [0.86, 0.89, 0.93], [0.97, 0.97, 0.98]  # of the background; replay.js has them, and those of the dark
 LONGEST = 3.0  # times the arrow of the reference force: longer ones are cut, as an impact is a hundred times a weight
 THICKNESS = 0.003  # of the scene's size: the radius of the trail and of an arrow's shaft
 FIELD_OF_VIEW = np.deg2rad(75.0)  # Meshcat's camera, from top to bottom
+ASPECT = 1.1  # width over height of the picture in a report: on a phone it is wider
+FILLED = 0.9  # of the picture, by what is drawn
+# Meshcat's own lamps are 2.5 m from the origin: far from it all is dark, and beside them white. These shine alike
+# everywhere; the light of a point is divided by the square of its distance.
+FAR = 1e3  # [m]
+LIGHTS: dict[str, dict[str, Any]] = {
+    "AmbientLight": {"intensity": 1.0},
+    "FillLight": {"intensity": 2.0, "position": [-4.0, -6.0, 8.0]},
+    "PointLightPositiveX": {"intensity": FAR**2, "position": [0.8 * FAR, -0.4 * FAR, 0.4 * FAR], "distance": 0.0},
+    "PointLightNegativeX": {"intensity": 0.0},
+    "SpotLight": {"intensity": 0.0},
+}
 
 
 def write_replay(path: Path, scene: Scene, *, title: str = "") -> None:
     """Write `scene` as one page that opens without a network, plays the motion, and can be paused and moved.
 
-    Contact forces are arrows (see `Scene.reference_force`), ghosts are translucent, and the trail is a line.
+    Forces are arrows (see `Scene.reference_of`), ghosts are translucent, and the trail is a line.
     """
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
     draw(meshcat, scene)
@@ -59,6 +72,51 @@ def write_replay(path: Path, scene: Scene, *, title: str = "") -> None:
     page = page.replace("</html>", f"<script>{asset('replay.js')}</script>\n</html>", 1)
     page = page.replace("<head>", f"<head>\n  {VIEWPORT}\n  {content_policy(page)}", 1)
     write_whole(path, page.encode())
+
+
+@dataclass(frozen=True, eq=False)
+class _Arrows:
+    """Arrows of forces below the path `root`: `slots` of them, of which a step shows as many as it has forces."""
+
+    root: str
+    steps: Sequence[Sequence[Force]]
+    colour: Rgba
+    longest: float  # [m] the arrow of `reference`
+    reference: float  # [N]
+
+    @property
+    def slots(self) -> int:
+        return max((len(step) for step in self.steps), default=0)
+
+    def make(self, meshcat: Meshcat, radius: float) -> None:
+        """Each along +z from its point, one metre long until it is scaled."""
+        for slot in range(self.slots):
+            path = f"{self.root}/{slot}"
+            meshcat.SetObject(f"{path}/point", Sphere(2 * radius), self.colour)
+            meshcat.SetObject(f"{path}/shaft/unit", Cylinder(radius, 1.0), self.colour)
+            meshcat.SetTransform(f"{path}/shaft/unit", RigidTransform([0.0, 0.0, 0.5]))
+            meshcat.SetObject(f"{path}/tip/cone", MeshcatCone(8 * radius, 3 * radius, 3 * radius), self.colour)
+            turned = RollPitchYaw(np.pi, 0.0, 0.0)
+            meshcat.SetTransform(f"{path}/tip/cone", RigidTransform(turned, [0.0, 0.0, 4 * radius]))
+
+    def place(self, meshcat: Meshcat, k: int, time: float | None) -> None:
+        """The forces in the step from state k, or in the last step."""
+        step = self.steps[min(k, len(self.steps) - 1)] if self.steps else ()
+        pushing = [one for one in step if np.linalg.norm(one.force) > 0]
+        for slot in range(self.slots):
+            path, used = f"{self.root}/{slot}", slot < len(pushing)
+            if used:
+                force = pushing[slot].force
+                length = min(float(np.linalg.norm(force)) / self.reference, LONGEST) * self.longest
+                pose = RigidTransform(RotationMatrix.MakeFromOneVector(force, 2), pushing[slot].point)
+                meshcat.SetTransform(path, pose, time_in_recording=time)
+                meshcat.SetTransform(f"{path}/tip", RigidTransform([0.0, 0.0, length]), time_in_recording=time)
+                meshcat.SetProperty(f"{path}/shaft", "scale", [1.0, 1.0, length], time_in_recording=time)
+            meshcat.SetProperty(path, "visible", used, time_in_recording=time)
+
+
+def _arrows_of(root: str, steps: Sequence[Sequence[Force]], colour: Rgba, scene: Scene) -> _Arrows:
+    return _Arrows(root, steps, colour, ARROW_PART * scene.size, scene.reference_of(steps))
 
 
 def draw(meshcat: Meshcat, scene: Scene) -> None:
@@ -77,26 +135,20 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
         _draw_shape(meshcat, path, mark, mark.colour, scene.size)
     radius = THICKNESS * scene.size
     _draw_tube(meshcat, "trail", scene.trail, radius)
-    slots = max((len(step) for step in scene.forces), default=0)  # so many arrows, of which a frame shows some
-    for slot in range(slots):  # each along +z from its contact point, one metre long until it is scaled
-        path = f"contacts/{slot}"
-        meshcat.SetObject(f"{path}/point", Sphere(2 * radius), RED)
-        meshcat.SetObject(f"{path}/shaft/unit", Cylinder(radius, 1.0), RED)
-        meshcat.SetTransform(f"{path}/shaft/unit", RigidTransform([0.0, 0.0, 0.5]))
-        meshcat.SetObject(f"{path}/tip/cone", MeshcatCone(8 * radius, 3 * radius, 3 * radius), RED)
-        turned = RollPitchYaw(np.pi, 0.0, 0.0)
-        meshcat.SetTransform(f"{path}/tip/cone", RigidTransform(turned, [0.0, 0.0, 4 * radius]))
+    arrows = [_arrows_of("contacts", scene.contacts, RED, scene), _arrows_of("thrusts", scene.thrusts, VIOLET, scene)]
+    for some in arrows:
+        some.make(meshcat, radius)
     shaped = {shape.body for shape in (*scene.shapes, *scene.marks)}
     motions = {"motion": _only(scene.poses, shaped)} | {g.name: _only(g.poses, shaped) for g in scene.ghosts}
     motions["level"] = level
-    posed = sum(len(poses) for poses in motions.values()) + 3 * slots
+    posed = sum(len(poses) for poses in motions.values()) + 3 * sum(some.slots for some in arrows)
     frames = frames_of(scene.times, max(FEWEST_FRAMES, MOST_POSES // max(1, posed)))
     rate = (len(frames) - 1) / float(scene.times[-1])
     meshcat.StartRecording(frames_per_second=rate, set_visualizations_while_recording=False)
     for time, k in frames:
-        _place(meshcat, scene, motions, k, slots, time)
+        _place(meshcat, motions, arrows, k, time)
     meshcat.StopRecording()
-    _place(meshcat, scene, motions, 0, slots, None)  # what is seen before play
+    _place(meshcat, motions, arrows, 0, None)  # what is seen before play
     animation = meshcat.get_mutable_recording()
     animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
     animation.set_repetitions(REPETITIONS)
@@ -179,35 +231,49 @@ def _only(poses: Poses, shaped: set[str]) -> Poses:
 
 
 def _place(
-    meshcat: Meshcat, scene: Scene, motions: Mapping[str, Poses], k: int, slots: int, time: float | None
+    meshcat: Meshcat, motions: Mapping[str, Poses], arrows: Sequence[_Arrows], k: int, time: float | None
 ) -> None:
-    """Bodies and ghosts as in state k, and arrows of the forces in the step from there, or in the last step."""
+    """Bodies and ghosts as in state k, and the forces of the step from there."""
     for root, poses in motions.items():
         for path, found in poses.items():
             meshcat.SetTransform(f"{root}/{path}", found[k], time_in_recording=time)
-    contacts = scene.forces[min(k, len(scene.forces) - 1)] if scene.forces else ()
-    pushing = [contact for contact in contacts if np.linalg.norm(contact.force) > 0]
-    for slot in range(slots):
-        path, used = f"contacts/{slot}", slot < len(pushing)
-        if used:
-            force = pushing[slot].force
-            length = min(float(np.linalg.norm(force)) / scene.reference_force, LONGEST) * ARROW_PART * scene.size
-            pose = RigidTransform(RotationMatrix.MakeFromOneVector(force, 2), pushing[slot].point)
-            meshcat.SetTransform(path, pose, time_in_recording=time)
-            meshcat.SetTransform(f"{path}/tip", RigidTransform([0.0, 0.0, length]), time_in_recording=time)
-            meshcat.SetProperty(f"{path}/shaft", "scale", [1.0, 1.0, length], time_in_recording=time)
-        meshcat.SetProperty(path, "visible", used, time_in_recording=time)
+    for some in arrows:
+        some.place(meshcat, k, time)
+
+
+def camera_of(scene: Scene) -> tuple[Array, Array]:
+    """Where the camera is, and what it looks at, (3,) each [m]: so near that what is drawn fills the picture."""
+    low, high = scene.box
+    flat = high - low < 0.35 * np.max(high - low)
+    view = np.array([0.6, -0.9, 0.45])  # at an angle, or onto the motion's plane where it has one
+    if flat[0] or flat[1]:
+        view = np.array([0.15, -1.0, 0.25] if flat[1] else [1.0, -0.15, 0.25])
+    view /= np.linalg.norm(view)
+    right = np.cross(-view, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    axes = np.array([right, np.cross(right, -view), view])  # of the picture, and towards the camera
+    centres, radii = scene.balls
+    target = (low + high) / 2
+    half = FILLED * np.tan(FIELD_OF_VIEW / 2) * np.array([ASPECT, 1.0])
+    back = 0.0
+    for _ in range(3):  # a target in the middle of the picture depends on how far away the camera is
+        at = (centres - target) @ axes.T
+        reach = (np.abs(at[:, :2]) + radii[:, None]) / half
+        back = max(float(np.max(at[:, 2] + np.max(reach, axis=1))), SMALLEST_SIZE / 2 / np.tan(FIELD_OF_VIEW / 2))
+        depth = np.maximum(back - at[:, 2], 1e-6)[:, None]
+        ends = np.min((at[:, :2] - radii[:, None]) / depth, axis=0), np.max((at[:, :2] + radii[:, None]) / depth, axis=0)
+        target = target + (ends[0] + ends[1]) / 2 * back @ axes[:2]
+    return target + back * view, target
 
 
 def _look_at(meshcat: Meshcat, scene: Scene) -> None:
     """A camera far enough back to have all of the motion in view, and a grid to see it by."""
     low, high = scene.box
-    centre, flat = (low + high) / 2, high - low < 0.35 * np.max(high - low)
-    view = [0.6, -0.9, 0.45]  # at an angle, or onto the motion's plane where it has one
-    if flat[0] or flat[1]:
-        view = [0.15, -1.0, 0.25] if flat[1] else [1.0, -0.15, 0.25]
-    back = 0.52 * scene.size / np.tan(FIELD_OF_VIEW / 2)
-    meshcat.SetCameraPose(centre + back * (np.array(view) / np.linalg.norm(view)), centre)
+    centre = (low + high) / 2
+    meshcat.SetCameraPose(*camera_of(scene))
+    for name, properties in LIGHTS.items():
+        for key, value in properties.items():
+            meshcat.SetProperty(f"/Lights/{name}/<object>", key, value)
     for decoration in ("/Axes", "/Grid"):
         meshcat.SetProperty(decoration, "visible", False)
     meshcat.SetProperty("/Background/<object>", "top_color", TOP)

@@ -28,8 +28,8 @@ Poses = Mapping[str, Sequence[RigidTransform]]
 
 
 @dataclass(frozen=True)
-class ContactForce:
-    """A contact force (3,) [N] at a point (3,) [m], in the world frame."""
+class Force:
+    """A force (3,) [N] at a point (3,) [m], in the world frame."""
 
     point: Array
     force: Array
@@ -50,8 +50,9 @@ class Ghost:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A motion to be drawn: `poses` of every moving body at `times` (N+1,) [s], `forces` in each of the N steps.
+    """A motion to be drawn: `poses` of every moving body at `times` (N+1,) [s].
 
+    In each of the N steps there are contact forces, `contacts`, and those that inputs put on bodies, `thrusts`.
     `trail` (N+1, 3) [m] is the path of the point that is followed, `marks` are goals and obstacles.
     """
 
@@ -59,27 +60,29 @@ class Scene:
     times: Array
     poses: Poses
     ghosts: tuple[Ghost, ...]
-    forces: tuple[tuple[ContactForce, ...], ...]
+    contacts: tuple[tuple[Force, ...], ...]
     trail: Array
     marks: tuple[Drawn, ...] = ()
+    thrusts: tuple[tuple[Force, ...], ...] = ()
 
     @cached_property
-    def box(self) -> tuple[Array, Array]:
-        """The lowest and highest corner (3,) of the box that holds the motion and the framed ghosts."""
-        lows, highs = [np.min(self.trail, axis=0)], [np.max(self.trail, axis=0)]
+    def balls(self) -> tuple[Array, Array]:
+        """Centres (n, 3) and radii (n,) [m] of balls that hold the motion, the framed ghosts and what marks the world."""
+        trail = self.trail[:: max(1, len(self.trail) // LOOKED_AT)]
+        found = [(point, 0.0) for point in (*trail, self.trail[-1])]
         motions = [self.poses, *(ghost.poses for ghost in self.ghosts if ghost.framed)]
         for drawn in self.shapes:
             for motion in motions:
                 poses = motion.get(drawn.body, ())
-                for pose in poses[:: max(1, len(poses) // LOOKED_AT)]:
-                    centre = pose @ drawn.centre
-                    lows.append(centre - drawn.radius)
-                    highs.append(centre + drawn.radius)
-        for mark in self.marks:
-            if not mark.body:
-                lows.append(mark.centre - min(mark.radius, LARGEST_MARK))
-                highs.append(mark.centre + min(mark.radius, LARGEST_MARK))
-        return np.min(lows, axis=0), np.max(highs, axis=0)
+                found += [(p @ drawn.centre, drawn.radius) for p in poses[:: max(1, len(poses) // LOOKED_AT)]]
+        found += [(mark.centre, min(mark.radius, LARGEST_MARK)) for mark in self.marks if not mark.body]
+        return np.array([centre for centre, _ in found]), np.array([radius for _, radius in found])
+
+    @cached_property
+    def box(self) -> tuple[Array, Array]:
+        """The lowest and highest corner (3,) of the box that holds the balls."""
+        centres, radii = self.balls
+        return np.min(centres - radii[:, None], axis=0), np.max(centres + radii[:, None], axis=0)
 
     @cached_property
     def size(self) -> float:
@@ -87,10 +90,9 @@ class Scene:
         low, high = self.box
         return max(SMALLEST_SIZE, float(np.linalg.norm(high - low)))
 
-    @cached_property
-    def reference_force(self) -> float:
-        """[N] the force whose arrow is ARROW_PART of the size: nine tenths of all contact forces are no larger."""
-        sizes = [float(np.linalg.norm(contact.force)) for step in self.forces for contact in step]
+    def reference_of(self, forces: Sequence[Sequence[Force]]) -> float:
+        """[N] the force whose arrow is ARROW_PART of the size: nine tenths of all `forces` are no larger."""
+        sizes = [float(np.linalg.norm(one.force)) for step in forces for one in step]
         pushing = [size for size in sizes if size > 0]
         return float(np.quantile(pushing, 0.9)) if pushing else 1.0
 
@@ -100,6 +102,7 @@ def scene_of(
     times: Array,
     xs: Array,
     *,
+    us: Array | None = None,
     contacts: Sequence[Sequence[ContactPoint]] = (),
     ghosts: Mapping[str, tuple[Array, Rgba]] | None = None,
     frame: str | None = None,
@@ -111,6 +114,7 @@ def scene_of(
         model: Whose bodies move.
         times: (N+1,) [s].
         xs: (N+1, nx) the states at those times.
+        us: (N, nu) the inputs in each of the N steps: the forces that they put on bodies are drawn as arrows.
         contacts: The contacts in each of the N steps, drawn as arrows.
         ghosts: States (N+1, nx) and colour by name; a ghost that would hide behind the motion is left out.
         frame: The name of the frame or body whose origin leaves a trail; by default the centre of mass that moves most.
@@ -130,10 +134,29 @@ def scene_of(
         times=times,
         poses=poses,
         ghosts=tuple(Ghost(name, found, (ghosts or {})[name][1]) for name, found in of_ghosts.items()),
-        forces=tuple(tuple(ContactForce(c.point, c.force) for c in step) for step in contacts),
+        contacts=tuple(tuple(Force(c.point, c.force) for c in step) for step in contacts),
         trail=trail,
         marks=tuple(marks),
+        thrusts=() if us is None else _thrusts_of(model, xs, us),
     )
+
+
+def _thrusts_of(model: Model, xs: Array, us: Array) -> tuple[tuple[Force, ...], ...]:
+    """The forces that propellers, thrusters and the like put on bodies from each state on; () without any such."""
+    twin = model.double
+    port = twin.plant.get_applied_spatial_force_input_port()
+    if int(port.get_index()) not in twin.inputs.fed:
+        return ()
+    found = []
+    for x, u in zip(xs, us, strict=False):  # the last state has no input
+        set_state(twin, x)
+        twin.set_input(u)
+        step = []
+        for one in port.Eval(twin.context):
+            pose = twin.plant.EvalBodyPoseInWorld(twin.context, twin.plant.get_body(one.body_index))
+            step.append(Force(pose @ one.p_BoBq_B, np.asarray(one.F_Bq_W.translational())))
+        found.append(tuple(step))
+    return tuple(found)
 
 
 def _poses_of(model: Model, moving: Sequence[Any], xs: Array) -> dict[str, list[RigidTransform]]:

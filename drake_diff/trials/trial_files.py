@@ -45,7 +45,7 @@ def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None
         xs = xs if len(xs) > 1 else np.repeat(xs, 2, axis=0)  # it broke off at once
         times = np.asarray(model.time_step * np.arange(len(xs)), dtype=float)
         contacts = motion.contacts if len(motion.contacts) == len(xs) - 1 else ()
-        scene = scene_of(model, times, xs, contacts=contacts, ghosts={"plan": (ghost[: len(xs)], BLUE)})
+        scene = scene_of(model, times, xs, us=motion.us, contacts=contacts, ghosts={"plan": (ghost[: len(xs)], BLUE)})
         far = f", drawn up to {FURTHEST:g} only" if np.any(np.abs(motion.xs) > FURTHEST) else ""
         title = f"{evidence.perturbation} {evidence.level:g}: {trial.label or 'success'}{far}"
         write_replay(folder / REPLAY, scene, title=title)

@@ -1,0 +1,65 @@
+"""What a picture of a motion shows: forces of inputs where they push, and a camera that has all of it in view."""
+
+import numpy as np
+import pytest
+from helpers.models import MODELS
+from pydrake.geometry import Rgba, Sphere
+from pydrake.math import RigidTransform, RollPitchYaw
+
+import drake_diff as dd
+from drake_diff.pages.meshcat import ASPECT, FIELD_OF_VIEW, FILLED, camera_of
+from drake_diff.pages.scene import Scene, scene_of
+from drake_diff.pages.shapes import Drawn
+
+ROTORS = [
+    dd.model.BodyForce("left", "ball", point=(0, 0.2, 0.1), direction=(0, 0, 2), upper=9.0),
+    dd.model.BodyForce("right", "ball", point=(0, -0.2, 0.1), direction=(0, 3, 4), moment_ratio=0.1),
+]
+
+
+def test_the_force_of_an_input_is_drawn_where_it_pushes():
+    """At p + R r along R d, of u newtons: from the formula of a body's pose."""
+    model = dd.load_model(MODELS / "projectile.sdf", time_step=0.01, body_forces=ROTORS)
+    rng = np.random.default_rng(5)
+    xs, us = np.tile(model.default_state, (3, 1)), rng.uniform(1, 5, (2, 2))
+    turns = [RollPitchYaw(rng.uniform(-1, 1, 3)) for _ in xs]
+    for x, turn in zip(xs, turns, strict=True):
+        x[:4], x[4:7] = turn.ToQuaternion().wxyz(), rng.uniform(-1, 1, 3)
+    found = scene_of(model, np.array([0, 0.01, 0.02]), xs, us=us).thrusts
+    assert [len(step) for step in found] == [2, 2]
+    for x, turn, u, step in zip(xs, turns, us, found, strict=False):
+        R = turn.ToRotationMatrix().matrix()
+        for rotor, force, one in zip(ROTORS, u, step, strict=True):
+            along = np.array(rotor.direction) / np.linalg.norm(rotor.direction)
+            np.testing.assert_allclose(one.point, x[4:7] + R @ rotor.point, atol=1e-12)
+            np.testing.assert_allclose(one.force, force * R @ along, atol=1e-12)
+
+
+def test_motors_are_not_forces_on_bodies():
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.01)
+    assert scene_of(model, np.array([0, 0.01]), np.zeros((2, 2)), us=np.ones((1, 1))).thrusts == ()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_all_of_a_motion_is_in_view_and_fills_the_picture(seed):
+    """By a pinhole camera, which knows of the balls alone: none beyond FILLED, and one at least at its edge."""
+    rng = np.random.default_rng(seed)
+    size = 10.0 ** rng.uniform(-1, 2)
+    steps = 20
+    path = size * rng.normal(size=(steps, 3)) * rng.choice([0.02, 1.0], size=3) + rng.normal(size=3) * 5
+    radius = 0.1 * size * rng.uniform()
+    shape = Drawn("b", Sphere(radius), RigidTransform(), Rgba(1, 0, 0), np.zeros(3), radius)
+    poses = {"b": [RigidTransform(p) for p in path]}
+    scene = Scene(shapes=(shape,), times=np.arange(steps) / 10, poses=poses, ghosts=(), contacts=(), trail=path)
+    camera, target = camera_of(scene)
+    ahead = (target - camera) / np.linalg.norm(target - camera)
+    right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(np.cross(ahead, [0, 0, 1]))
+    up = np.cross(right, ahead)
+    assert up[2] > 0.5  # seen from the side, a little above
+    depth = (path - camera) @ ahead
+    assert depth.min() > 0
+    edge = np.tan(FIELD_OF_VIEW / 2)
+    across = (np.abs((path - camera) @ right) + radius) / depth / (edge * ASPECT)
+    high = (np.abs((path - camera) @ up) + radius) / depth / edge
+    most = max(across.max(), high.max())
+    assert 0.75 * FILLED < most < 1.0
