@@ -7,7 +7,7 @@ from pydrake.geometry import Box, Sphere
 
 import drake_diff as dd
 from drake_diff.artifact.live import scene_of_run
-from drake_diff.artifact.marks import drawn_goals, labels_of
+from drake_diff.artifact.marks import drawn_goals, meaning_of
 from drake_diff.exceptions import UnknownNameError
 from drake_diff.pages.scene import scene_of
 
@@ -76,4 +76,12 @@ def test_a_run_has_its_goals_in_its_live_view_too(model, tmp_path):
     scene, notes = scene_of_run(tmp_path)
     assert notes == ()
     np.testing.assert_allclose(scene.marks[0].pose.translation(), [0.2, 0, 0])
-    assert labels_of([goal])[0] in (tmp_path / "report.html").read_text()
+    assert meaning_of([goal])[0][2] in (tmp_path / "report.html").read_text()
+
+
+def test_a_robot_is_seen_through_a_large_goal(model):
+    """A plane in the way of the camera; a small target and an obstacle are as they are."""
+    (plane,) = drawn(model, dd.FrameGoal("pole", position=[0.1, None, None]))
+    (small,) = drawn(model, dd.FrameGoal("pole", position=[0.1, 0.0, 0.3]))
+    (wall,) = drawn(model, dd.BoxObstacle([0, 0, 5], [4, 4, 0.1]))
+    assert plane.colour.a() <= 0.2 < 0.5 < min(small.colour.a(), wall.colour.a())

@@ -172,7 +172,7 @@ def test_the_picture_is_dark_where_the_screen_is(two, browser):
     corner = {}
     for page in ("report.html", "replay.html"):
         for scheme in ("light", "dark"):
-            open_page(browser, two / "long" / page, scheme=scheme)
+            open_page(browser, two / "short" / page, scheme=scheme)
             corner[scheme, page] = view_of(browser)[5, 5].mean()
     assert min(corner["light", page] for page in ("report.html", "replay.html")) > 0.8
     assert max(corner["dark", page] for page in ("report.html", "replay.html")) < 0.3
@@ -193,7 +193,7 @@ def test_two_runs_share_a_replay_and_plots(two, browser, tmp_path):
     assert rows[0][:3] == ["t [s]", "slide_x: short [m]", "slide_x: long [m]"]
     assert [float(v) for v in rows[1][1:5]] == [0.0, 0.1, 0.3, 0.5]
     assert rows[-1][1] == ""  # the first run has ended
-    press(browser, ".chooser button", "short less long")
+    press(browser, ".chooser button", "show short minus long")
     told = texts(browser, ".values")[1]
     move_slider(browser, 0.0)
     assert texts(browser, ".values")[1].strip().endswith("-0.2")  # 0.3 less 0.5 rad

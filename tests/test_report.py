@@ -210,7 +210,7 @@ def test_a_failed_run_says_so_on_top(runs):
 
 def test_a_run_without_a_replay_does_not_claim_one(runs):
     page = (runs / "no_replay" / "report.html").read_text()
-    assert "The solver's states, not a replay" in page
+    assert "The states of the solver, not a replay" in page
 
 
 def test_plots_hold_what_was_measured(swing_up):

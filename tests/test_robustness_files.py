@@ -205,11 +205,16 @@ def test_the_page_opens_without_a_network_and_without_an_error(saved, browser, t
     shutil.copy(saved[0] / "robustness.html", page)
     open_page(browser, page, size=size, scheme=scheme)
     assert browser.execute_script("return document.documentElement.scrollWidth") <= size[0]
-    count = browser.execute_script("return document.querySelectorAll('.plot canvas').length")
+    drawn = "return document.querySelectorAll('.plot canvas').length"
+    assert browser.execute_script(drawn) == 4  # angle, speed, torque, status: a folded part is drawn when it is opened
+    browser.execute_script("document.querySelectorAll('details.part').forEach(d => { d.open = true; })")
+    browser.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= size[0]
+    count = browser.execute_script(drawn)
     assert count == browser.execute_script(
         "return JSON.parse(document.getElementById('data').textContent).plots.length"
     )
-    assert count == 4 + 3 * len(LEVELS)  # angle, speed, torque, status
+    assert count == 4 + 3 * len(LEVELS)
     move_slider(browser, 0.7)
     assert len(np.unique(view_of(browser).reshape(-1, 3), axis=0)) > 50  # not blank
     assert errors(browser) == []

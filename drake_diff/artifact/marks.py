@@ -16,6 +16,7 @@ from drake_diff.pages.shapes import Drawn, body_path
 
 AXES = (Rgba(0.8, 0.15, 0.1, 0.9), Rgba(0.1, 0.6, 0.15, 0.9), Rgba(0.1, 0.3, 0.85, 0.9))  # x, y, z
 THIN = 0.03  # of an axis or an arrow: its radius
+LARGE = 0.25  # [m] the radius from which on a goal is so translucent that the robot is seen through it
 
 
 def drawn_goals(plant: Any, context: Any, goals: Iterable[Goal]) -> tuple[Drawn, ...]:
@@ -48,6 +49,8 @@ def _shapes(mark: Mark, path: str, pose: RigidTransform) -> list[Drawn]:
     """The shapes of one mark at `pose` on the body of that path."""
     at = pose @ RigidTransform(RotationMatrix(np.array(mark.rotation)), np.zeros(3))
     colour = Rgba(*mark.colour)
+    if mark.shape in ("sphere", "box") and not mark.label.startswith("obstacle") and max(mark.size) / 2 > LARGE:
+        colour = Rgba(*mark.colour[:3], 0.2)
     if mark.shape == "sphere":
         return [_drawn(path, Sphere(mark.size[0]), at, colour, mark.size[0])]
     if mark.shape == "box":
@@ -75,6 +78,15 @@ def _drawn(path: str, shape: Any, pose: RigidTransform, colour: Rgba, radius: fl
     return Drawn(path, shape, pose, colour, np.asarray(pose.translation()), radius)
 
 
-def labels_of(goals: Sequence[Goal]) -> list[str]:
-    """What the marks of the `goals` are called, each once."""
-    return list(dict.fromkeys(mark.label for goal in goals for mark in goal.marks()))
+def meaning_of(goals: Sequence[Goal]) -> list[tuple[str, str, str]]:
+    """What the marks of the `goals` mean, each once: a colour of CSS, "dot" or "arrow", and words."""
+    marks = [mark for goal in goals for mark in goal.marks() if mark.shape != "axes"]
+    rows = [(css(Rgba(*mark.colour)), "arrow" if mark.shape == "arrow" else "dot", mark.label) for mark in marks]
+    if any(mark.shape == "axes" for goal in goals for mark in goal.marks()):
+        rows.append((css(AXES[2]), "line", "axes of a target: x red, y green, z blue"))
+    return list(dict.fromkeys(rows))
+
+
+def css(colour: Any) -> str:
+    """A colour of Drake's for a style sheet, without its opacity."""
+    return f"rgb({', '.join(str(round(255 * part)) for part in (colour.r(), colour.g(), colour.b()))})"

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.artifact.marks import drawn_goals, labels_of
+from drake_diff.artifact.first_screen import asked_for, checks_of
+from drake_diff.artifact.marks import css, drawn_goals, meaning_of
 from drake_diff.artifact.measurement import Column, Measurement, gradient_norms
 from drake_diff.pages.html import Line, Plot, page_data, write_page
-from drake_diff.pages.meshcat import write_replay
-from drake_diff.pages.scene import BLUE, scene_of
+from drake_diff.pages.meshcat import RED, TRAIL, VIOLET, write_replay
+from drake_diff.pages.scene import BLUE, Scene, scene_of
 
 SERIES_PER_PLOT = 6  # more lines cannot be told apart
 PHYSICS, SEARCH = "Energy and contact", "Search"
@@ -25,37 +26,71 @@ def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str,
     Plain dynamics have nothing to draw in 3D, and so no page `replay`. The bytes are the same for the same solution,
     but for the paragraph of wall-clock times.
     """
-    plots, view, ghosts = list(plots_of(m)), "", None
-    motion, control = m.shown
+    plots, view, colours = list(plots_of(m)), "", list[Colour]()
     if m.solution.problem.has_model:
-        times, xs = m.times, m.xs
-        if motion is None:  # the plan alone; states of it that are not finite are drawn at x0
-            xs = np.where(np.all(np.isfinite(xs), axis=1)[:, None], xs, m.solution.problem.x0)
-        else:  # beside a plan that is not the motion itself
-            times, xs = motion.times, motion.xs
-            planned = m.solution.plan.sample(_parts(m))[0]
-            drawn = bool(np.all(np.isfinite(planned))) and not np.array_equal(planned, xs)
-            ghosts = {"plan": (planned, BLUE)} if drawn else None
-        contacts, us = ((), None) if motion is None else (motion.contacts, motion.us)
-        model = m.solution.problem.model
-        marks = drawn_goals(model.plant, model.double.context, m.solution.problem.goals)
-        scene = scene_of(model, times, xs, us=us, contacts=contacts, ghosts=ghosts, marks=marks)
-        write_replay(replay, scene, title=f"{record['name']}: {m.solution.status.value}")
-        view = replay.read_text(encoding="utf-8")
+        scene = _scene(m)
+        write_replay(replay, scene, title=f"{record['name']}: {m.solution.status.value.replace('_', ' ')}")
+        view, colours = replay.read_text(encoding="utf-8"), [*colours_of(scene), *meaning_of(m.solution.problem.goals)]
     data = page_data(float(m.times[-1]), plots, m.solution.certificates)
+    judged = m.solution.judged_replay
     write_page(
         report,
         "report.html.j2",
         record=record,
         data=data,
         view=view,
+        asked=asked_for(m.solution.problem, m.times),
+        checks=checks_of(m, record),
         cost=m.solution.cost,
-        replayed=motion is not None,
-        control=control,
-        has_plan=ghosts is not None,
-        goals=labels_of(m.solution.problem.goals),
-        has_contacts=motion is not None and any(motion.contacts),
+        certificates=alike(record["gradient"]["certificates"]),
+        replayed=m.shown[0] is not None,
+        control="open loop" if judged is None else judged.control,
+        variant=f"in steps of {m.solution.time_step:g} s" if judged is None else judged.variant,
+        open_loop_holds=all(r["holds"] for r in record["replays"] if r["control"] == "open loop"),
+        colours=colours,
     )
+
+
+def _scene(m: Measurement) -> Scene:
+    """The motion that the verdict rests on beside the plan, or the plan alone where there is no motion."""
+    problem, motion = m.solution.problem, m.shown[0]
+    model = problem.model
+    marks = drawn_goals(model.plant, model.double.context, problem.goals)
+    if motion is None:  # states of the plan that are not finite are drawn at x0
+        xs = np.where(np.all(np.isfinite(m.xs), axis=1)[:, None], m.xs, problem.x0)
+        return scene_of(model, m.times, xs, marks=marks)
+    planned = m.solution.plan.sample(_parts(m))[0]
+    apart = bool(np.all(np.isfinite(planned))) and not np.array_equal(planned, motion.xs)
+    ghosts = {"plan": (planned, BLUE)} if apart else None
+    return scene_of(model, motion.times, motion.xs, us=motion.us, contacts=motion.contacts, ghosts=ghosts, marks=marks)
+
+
+Colour = tuple[str, str, str]  # of the page's legend: a colour of CSS, "line", "dot" or "arrow", and what it means
+
+
+def colours_of(scene: Scene) -> list[Colour]:
+    """What is drawn in a replay beside the robot."""
+    found = [(css(BLUE), "dot", "the plan, where the motion is elsewhere")] if scene.ghosts else []
+    found.append((css(TRAIL), "line", "path of the centre of mass of the body that moves most"))
+    if any(scene.contacts):
+        found.append((css(RED), "arrow", "contact forces: longer is more, and the largest tenth may be cut"))
+    if any(scene.thrusts):
+        found.append((css(VIOLET), "arrow", "forces of the inputs on bodies"))
+    return found
+
+
+def alike(certificates: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each run of certificates that say the same; `power` is that of the one which would notice least."""
+    rows: list[dict[str, Any]] = []
+    for number, c in enumerate(certificates):
+        told = {name: c[name] for name in ("subject", "method", "verdict", "entries")} | {"agree": c["counts"]["agree"]}
+        if not rows or any(rows[-1][name] != value for name, value in told.items()):
+            rows.append({**told, "first": number, "count": 0, "power": 0.0})
+        row = rows[-1]
+        row["count"] += 1
+        row["power"] = max(row["power"], c["power"])
+        row["numbers"] = f"{row['first']} to {number}" if row["count"] > 1 else str(number)
+    return rows
 
 
 def plots_of(m: Measurement) -> Iterator[Plot]:

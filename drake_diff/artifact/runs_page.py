@@ -131,7 +131,8 @@ def _replay(folders: Sequence[Path], names: Sequence[str]) -> tuple[str, str]:
         page = Path(folder) / "replay.html"
         write_replay(page, _together(*(scene for scene, _ in scenes)), title=f"{names[0]} and {names[1]}")
         view = page.read_text(encoding="utf-8")
-    seen = f"The plans of both runs: {names[0]} in its own colours, {names[1]} translucent orange"
+    first, second = names
+    seen = f"The plans of both runs, {first} in its own colours and {second} in orange. The one that ends first waits"
     return view, "; ".join([seen, *dict.fromkeys(notes)])
 
 

@@ -21,7 +21,8 @@ TRACE, REPLAY, PAGE = "trace.mcap", "replay.html", "comparison.html"
 FILES = (TRACE, REPLAY, PAGE)
 # Of ghosts: the second and further colours of the page's plots, the first being the reference's.
 COLOURS = (
-    (0.85, 0.4, 0.04), (0.06, 0.54, 0.42), (0.64, 0.22, 0.61), (0.43, 0.42, 0), (0.32, 0.38, 0.43), (0.04, 0.38, 0.72),
+    (0.85, 0.4, 0.04), (0.06, 0.54, 0.42), (0.64, 0.22, 0.61), (0.43, 0.42, 0), (0.32, 0.38, 0.43), (0.76, 0.09, 0.36),
+    (0.48, 0.29, 0.07), (0.04, 0.38, 0.72),
 )  # fmt: skip
 OPACITY = 0.35
 

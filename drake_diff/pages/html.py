@@ -211,7 +211,7 @@ def _environment() -> "Environment":
     )
     # tojson writes <, >, & and ' as \u003c and so on: no text can end the script element that it is in.
     environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "allow_nan": False, "separators": (",", ":")}
-    environment.filters.update(short=short_number, words=in_words, phrase=phrase, shell=shlex.join)
+    environment.filters.update(short=short_number, words=in_words, phrase=phrase, unit=unit_of, shell=shlex.join)
     environment.globals["asset"] = asset
     return environment
 
@@ -226,12 +226,17 @@ def short_number(value: float | None, digits: int = 6) -> str:
     return "–" if value is None else f"{value:.{digits}g}"
 
 
-def in_words(value: Any) -> str:
+def unit_of(unit: str) -> str:
+    """A unit for a reader: nothing for pure numbers."""
+    return " or ".join(part for part in unit.split(" or ") if part != "1")
+
+
+def in_words(value: Any, digits: int = 6) -> str:
     """Anything of a record in one line."""
     if isinstance(value, dict):
-        return ", ".join(f"{phrase(k)} {in_words(v)}" for k, v in value.items())
+        return ", ".join(f"{phrase(k)} {in_words(v, digits)}" for k, v in value.items())
     if isinstance(value, list):
-        return ", ".join(in_words(v) for v in value)
+        return ", ".join(in_words(v, digits) for v in value)
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return short_number(value) if value is None or isinstance(value, float) else str(value)
+    return short_number(value, digits) if value is None or isinstance(value, float) else str(value)

@@ -67,7 +67,7 @@ class Scene:
 
     @cached_property
     def balls(self) -> tuple[Array, Array]:
-        """Centres (n, 3) and radii (n,) [m] of balls that hold the motion, the framed ghosts and what marks the world."""
+        """Centres (n, 3) and radii (n,) [m] of balls that hold the motion, framed ghosts and marks in the world."""
         trail = self.trail[:: max(1, len(self.trail) // LOOKED_AT)]
         found = [(point, 0.0) for point in (*trail, self.trail[-1])]
         motions = [self.poses, *(ghost.poses for ghost in self.ghosts if ghost.framed)]

@@ -117,7 +117,9 @@ def _level_plots(result: Robustness, name: str) -> Iterator[Plot]:
     order = np.argsort(across, kind="stable")
     which = np.repeat(np.arange(len(ends)), [len(end) for end in ends])[order]
     up = np.concatenate([end[:, j] for end in ends])[order]
-    labels, names = [*(f"{level:g}" for level in levels), "the plan's"], task.model.state_names
+    labels, names = [*(f"level {level:g}" for level in levels), "the plan's"], task.model.state_names
+    contract = task.model.contract
+    units = [c.unit for c in (*contract.positions, *contract.velocities)]
     series = [Line(label, np.where(which == k, up, np.nan)) for k, label in enumerate(labels)]
     title = f"last {names[j]} over {names[i]}"
-    yield Plot(title, "by level", across[order], series, axis=names[i], marks="points", place=name)
+    yield Plot(title, units[j], across[order], series, axis=f"{names[i]} [{units[i]}]", marks="points", place=name)

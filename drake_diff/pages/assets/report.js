@@ -71,8 +71,20 @@
   }
 
   // Numbers and axes
+  const HUES = 8;  // colours of lines
+  const power = (text) => text.replace(/\.0+(?=e)/, "").replace("e+", "e");
   const shorten = (v) => v === null || v === undefined ? "–" : Math.abs(v) >= 1e5 || (v && Math.abs(v) < 1e-3)
-    ? v.toExponential(1) : String(Number(v.toPrecision(4)));
+    ? power(v.toExponential(1)) : String(Number(v.toPrecision(4)));
+  function marked(ticks) {  // the numbers of an axis: no two of them the same
+    const known = ticks.filter((v) => v !== null), apart = known.length > 1 ? Math.abs(known[1] - known[0]) : 0;
+    const digits = apart > 0 ? Math.ceil(-Math.log10(apart) + 1e-9) : 0, most = Math.max(...known.map(Math.abs));
+    const plain = digits > 3 && digits < 8 && most < 1e3 && most >= 10 * apart;
+    return ticks.map((v) => v === null ? "" : plain ? v.toFixed(digits) : shorten(v));
+  }
+  function room(u, values) {  // for the widest number of an axis and its label
+    const widest = (values || []).reduce((most, text) => Math.max(most, String(text).length), 0);
+    return Math.max(48, 19 + 5.8 * widest);
+  }
   function decades(low, high) {  // whole powers of ten, sixteen of them at most
     if (!(high > 0)) return [1e-3, 1];
     const top = Math.ceil(Math.log10(high) + 1e-9), bottom = Math.floor(Math.log10(Math.max(low, high * 1e-16)));
@@ -93,6 +105,7 @@
       if (plot.range) return plot.range;
       if (plot.log) return decades(low, high);
       if (low === null || (low === 0 && high === 0)) return [0, 1];
+      if (high - low <= 1e-9 * Math.abs(high)) { const v = high, half = Math.abs(v) / 2; low = v - half; high = v + half; }
       const near = nearLimits(plot, low, high).filter((v) => v !== null);
       const span = Math.max(high - low, Math.abs(high) * 1e-3, 1e-12);
       low = Math.min(low, ...near); high = Math.max(high, ...near);
@@ -124,16 +137,16 @@
   const isDifference = (p) => subtracting && canSubtract(p);
   const limitsOf = (p) => isDifference(p) ? [null, null] : isPercent(p)
     ? p.limits.map((v) => v && Math.sign(v) * 100) : p.limits;
-  const unitOf = (p) => isPercent(p) ? "% of limit" : p.unit;
+  const unitOf = (p) => isPercent(p) ? "% of limit" : p.unit === "1" ? "" : p.unit;
   function valuesOf(p) {
     const seen = (v) => v === null ? null : p.log && !(v > 0) ? null : isPercent(p) ? percent(p, v) : v;
     const ys = p.series.map((s) => s.y.map(seen));
     return isDifference(p) ? [ys[0].map((v, i) => v === null || ys[1][i] === null ? null : v - ys[1][i])] : ys;
   }
   function linesOf(p) {  // name, colour, dashed
-    if (isDifference(p)) return [{ ...p.series[0], name: p.series[0].name + " less " + p.series[1].name, hue: 0, dashed: false }];
+    if (isDifference(p)) return [{ ...p.series[0], name: p.series[0].name + " minus " + p.series[1].name, hue: 0, dashed: false }];
     const solid = p.series.filter((s) => !s.dashed).length;
-    return p.series.map((s, i) => ({ ...s, hue: (p.band ? 0 : s.dashed ? i - solid : i) % 6 }));
+    return p.series.map((s, i) => ({ ...s, hue: (p.band ? 0 : s.dashed ? i - solid : i) % HUES }));
   }
 
   // A comma-separated table: a name that a spreadsheet would take for a formula begins with a quote
@@ -160,7 +173,7 @@
   // One plot
   function key(line) {
     const swatch = make("i", { class: line.dashed ? "dashed" : "solid" });
-    swatch.style.borderColor = `var(--s${line.hue})`;
+    swatch.style.color = swatch.style.borderColor = `var(--s${line.hue})`;
     return swatch;
   }
   function tell(u, i) {  // the values at point i
@@ -179,7 +192,7 @@
       const least = ys.reduce((a, b) => Math.min(a, b)), most = ys.reduce((a, b) => Math.max(a, b));
       return `${line.name} from ${shorten(ys[0])} to ${shorten(ys[ys.length - 1])}, lowest ${shorten(least)}, highest ${shorten(most)}`;
     });
-    return `${plot.title} in ${unitOf(plot)}: ${parts.join("; ")}`;
+    return `${plot.title}${unitOf(plot) && " in " + unitOf(plot)}: ${parts.join("; ")}`;
   }
   function remarks(plot) {
     const found = plot.note ? [plot.note] : [], all = valuesOf(plot).flat().filter((v) => v !== null);
@@ -187,8 +200,8 @@
       const near = nearLimits(plot, all.reduce((a, b) => Math.min(a, b)), all.reduce((a, b) => Math.max(a, b)));
       const limits = limitsOf(plot), far = limits.some((v, i) => v !== null && near[i] === null);
       const told = limits[0] === null ? "≤ " + shorten(limits[1]) : limits[1] === null ? "≥ " + shorten(limits[0])
-        : shorten(limits[0]) + " … " + shorten(limits[1]);
-      if (far && !plot.log && !plot.note && !isPercent(plot)) found.push("limits " + told);
+        : shorten(limits[0]) + " to " + shorten(limits[1]);
+      if (far && !plot.log && !plot.note && !isPercent(plot)) found.push(`limits ${told} ${unitOf(plot)}`.trim());
     }
     if (plot.x.length < plot.points)
       found.push(`${plot.x.length} of ${plot.points} points: the lowest and highest of each stretch`);
@@ -209,19 +222,20 @@
     place.append(box);
     const axis = { stroke: () => colour("soft"), grid: { stroke: () => colour("line"), width: 1 },
       ticks: { stroke: () => colour("line"), width: 1, size: 4 }, font: "11px system-ui, sans-serif", gap: 3 };
-    const units = (u, ticks) => ticks.map((v, i) => shorten(v) + (i === ticks.length - 1 && plot.axis === "time" ? " s" : ""));
-    const lines = linesOf(plot);
+    const units = (u, ticks) => marked(ticks).map((v, i) => v + (i === ticks.length - 1 && plot.axis === "time" ? " s" : ""));
+    const lines = linesOf(plot), unit = unitOf(plot);
+    const aside = (u, low, high) => [low - 0.04 * (high - low || 1), high + 0.04 * (high - low || 1)];
     const options = {
       width: Math.max(box.clientWidth, 120), height,
       cursor: { y: false, drag: { x: false, y: false }, points: { size: 6 } },
-      scales: { x: { time: false, distr: plot.levels ? 3 : 1, range: plot.levels ? levels(plot.x) : undefined }, y: { range: range(plot), distr: plot.log ? 3 : 1 } },
+      scales: { x: { time: false, distr: plot.levels ? 3 : 1, range: plot.levels ? levels(plot.x) : plot.marks === "lines" ? undefined : aside }, y: { range: range(plot), distr: plot.log ? 3 : 1 } },
       legend: { show: false },
       bands: plot.band ? [{ series: [lines.length, lines.length - 1], fill: () => colour("s0") + "33" }] : [],
-      axes: [{ ...axis, size: plot.axis === "time" ? 22 : 36, space: 44, values: units,
-        ...(plot.axis === "time" ? {} : { label: plot.axis, labelSize: 14, labelFont: "11px system-ui, sans-serif" }),
+      axes: [{ ...axis, size: plot.axis === "time" ? 22 : 36, space: height < 150 ? 36 : 44, values: units,
+        ...(plot.axis === "time" ? {} : { label: plot.axis, labelSize: 14, labelGap: 0, labelFont: "11px system-ui, sans-serif" }),
         ...(plot.levels ? { splits: () => plot.x, filter: (u, all) => all, values: (u, all) => all.map(shorten) } : {}) },
-      { ...axis, size: 44, space: 24, label: unitOf(plot), labelSize: 14, labelGap: 0, labelFont: "11px system-ui, sans-serif",
-        values: (u, ticks) => ticks.map((v) => v === null ? "" : shorten(v)),
+      { ...axis, size: room, space: 24, ...(unit ? { label: unit, labelSize: 14, labelGap: 0, labelFont: "11px system-ui, sans-serif" } : {}),
+        values: (u, ticks) => plot.log ? ticks.map((v) => v === null ? "" : shorten(v)) : marked(ticks),
         ...(plot.log ? { splits: (u, i, low, high) => powers(low, high), filter: (u, ticks) => ticks } : {}) }],
       series: [{}].concat(lines.map((s) => ({ stroke: () => colour("s" + s.hue), width: 1.8,
         dash: s.dashed ? [6, 4] : [], paths: plot.marks === "points" ? () => null
@@ -305,8 +319,8 @@
     words.addEventListener("input", () => { sift(); setTime(time); });
     if (names.some((name) => of(name).length > FEW)) bar.append(words);
     if (plots.some(canSubtract)) {
-      const pairs = [...new Set(plots.filter(canSubtract).map((p) => `${p.series[0].name} less ${p.series[1].name}`))];
-      const less = make("button", { type: "button", "aria-pressed": "false" }, pairs.length === 1 ? pairs[0] : "difference");
+      const pairs = [...new Set(plots.filter(canSubtract).map((p) => `${p.series[0].name} minus ${p.series[1].name}`))];
+      const less = make("button", { type: "button", "aria-pressed": "false" }, "show " + (pairs.length === 1 ? pairs[0] : "the difference"));
       less.addEventListener("click", () => {
         subtracting = !subtracting;
         less.setAttribute("aria-pressed", String(subtracting));
@@ -389,9 +403,11 @@
   // The page around them
   function listSections() {
     const contents = byId("contents");
-    [...document.querySelectorAll("section > h2")].forEach((title, i) => {
+    [...document.querySelectorAll("section h2")].forEach((title, i) => {
       title.id = title.id || "part" + i;
-      contents.append(make("a", { href: "#" + title.id }, title.textContent));
+      const link = make("a", { href: "#" + title.id }, title.textContent), folded = title.closest("details");
+      if (folded) link.addEventListener("click", () => { folded.open = true; });
+      contents.append(link);
     });
   }
   function reachTables() {  // by the keyboard, where they scroll
@@ -400,8 +416,9 @@
   }
 
   for (const place of document.querySelectorAll(".plots")) {
-    const plots = data.plots.filter((p) => p.place === place.id);
-    if (plots.length) lay(place, plots);
+    const plots = data.plots.filter((p) => p.place === place.id), folded = place.closest("details:not([open])");
+    const fillPlace = () => { if (plots.length) lay(place, plots); };
+    if (folded) folded.addEventListener("toggle", fillPlace, { once: true }); else fillPlace();  // drawn when they are seen
   }
   drawMaps();
   listSections();
@@ -411,6 +428,19 @@
   if (slider) {
     slider.addEventListener("input", () => { setPlaying(false); setTime(Number(slider.value)); });
     play.addEventListener("click", () => setPlaying(!playing));
+    const byFrame = (event) => {  // a hundredth of the motion
+      const step = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1 }[event.key];
+      if (!step) return;
+      event.preventDefault();
+      setPlaying(false);
+      setTime(time + step * data.duration / 100);
+    };
+    slider.addEventListener("keydown", byFrame);
+    document.addEventListener("keydown", (event) => {  // where no other control takes the space bar
+      if (event.key !== " " || event.target.closest("button, select, input, summary, a, [tabindex]")) return;
+      event.preventDefault();
+      setPlaying(!playing);
+    });
     byId("fold").addEventListener("click", () => {
       const folded = byId("motion").classList.toggle("folded");
       byId("fold").textContent = folded ? "show" : "hide";
@@ -431,6 +461,7 @@
   const redraw = () => drawn.forEach((u) => u.redraw(false, true));
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   addEventListener("beforeprint", () => {
+    for (const part of document.querySelectorAll("details.part")) part.open = true;
     document.documentElement.classList.add("printed");
     redraw();
     if (!isReady()) return;

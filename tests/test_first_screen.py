@@ -1,0 +1,137 @@
+"""What the first screen of a report says: the task in words, and what was checked, each in the colour it deserves."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.models import MODELS
+
+import drake_diff as dd
+from drake_diff.artifact import measure
+from drake_diff.artifact.first_screen import asked_for, checks_of
+from drake_diff.artifact.page import alike
+from drake_diff.artifact.save import record_of
+
+
+@pytest.fixture(scope="module")
+def cart_pole():
+    return dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
+
+
+def asked(model, num_steps=50, **options):
+    problem = dd.Problem(model, x0=np.zeros(model.nx), num_steps=num_steps, **options)
+    return asked_for(problem, np.linspace(0, num_steps * 0.02, num_steps + 1))
+
+
+def test_the_end_is_named_with_its_units(cart_pole):
+    told = asked(cart_pole, x_goal={"slide_x": 1.0, "hinge_q": 3.0, "slide_v": 0.0, "hinge_w": 0.0})
+    assert told == (
+        "Task for cart_pole (2 degrees of freedom, 1 input): end with slide_x = 1 m and hinge_q = 3 rad and be at rest "
+        "at the end, in 1 s."
+    )
+    assert "rest" not in asked(cart_pole, x_goal={"slide_x": 1.0, "hinge_w": 0.5})
+    assert "end with slide_x = 1 m and hinge_w = 0.5 rad/s" in asked(cart_pole, x_goal={"slide_x": 1.0, "hinge_w": 0.5})
+
+
+def test_goals_and_obstacles_are_what_the_robot_was_to_do(cart_pole):
+    told = asked(
+        cart_pole,
+        goals=[
+            dd.FrameGoal("pole", position=[0.3, None, None], knots=[25]),
+            dd.FrameVelocityGoal("cart"),
+            dd.JointGoal({"hinge": 1.0}),
+            dd.SphereObstacle([0, 0, 2], 0.1, name="lamp"),
+            dd.FrameGoal("pole", position=[9, 9, 9], weight=1.0),  # part of the cost: not asked for
+        ],
+        constraints=[dd.Constraint(lambda x: x[:1], [-1.0], [1.0], name="on the rail")],
+    )
+    for words in (
+        "bring pole to x = 0.3 m at 0.5 s",
+        "hold cart still",
+        "have hinge = 1",
+        "keep clear of obstacle 'lamp'",
+        "keep “on the rail”",
+    ):
+        assert words in told
+    assert "9" not in told.split(":")[1]
+
+
+def test_a_free_time_and_what_else_was_found_are_said(cart_pole):
+    fast = asked(cart_pole, x_goal={"slide_x": 1.0}, horizon=(0.5, 2.0), running_cost=1.0)
+    assert fast.endswith("as fast as it can: 1 s.")
+    fit = asked(
+        cart_pole,
+        optimize="parameters",
+        parameters=["cart.mass"],
+        trajectory_cost=lambda xs, us: xs[-1, 0] ** 2,
+        us=np.ones((50, 1)),
+    )
+    assert fit.endswith("Found: parameters; the inputs were given.")
+
+
+@pytest.fixture(scope="module")
+def swung():
+    """A pendulum that swings up, and the same plan stopped early, and with an input that does not lead to its goal."""
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=40, running_cost=dd.QuadraticCost(R=[[1.0]]))
+    return dd.solve(problem, method="shooting"), dd.solve(problem, method="shooting", max_iterations=2)
+
+
+def checked(solution):
+    m = measure(solution)
+    record = record_of(m, Path("run")).model_dump(mode="json")
+    return {check.title: check for check in checks_of(m, record)}, record
+
+
+def test_what_holds_is_green(swung):
+    found, record = checked(swung[0])
+    assert record["verdict"] == "pass"
+    assert {name: check.kind for name, check in found.items()} == {
+        "Solver": "pass",
+        "Plan": "pass",
+        "Inputs alone, without feedback": "pass",
+        "With feedback (TVLQR)": "pass",
+        "Gradients": "pass",
+    }
+    assert found["Solver"].text.startswith("converged after ")
+
+
+def test_what_fails_is_red_and_named(swung):
+    found, record = checked(swung[1])
+    assert record["verdict"] == "fail"
+    assert found["Solver"].kind == found["Plan"].kind == "fail"
+    assert found["Solver"].text.startswith("iteration limit after")
+    assert "goal error" in found["Plan"].text
+    for name in ("Inputs alone, without feedback", "With feedback (TVLQR)"):
+        assert found[name].kind == "fail"
+        assert "hinge" in found[name].text
+
+
+def test_a_plan_that_misses_its_goal_is_not_green_whatever_the_solver_says(swung):
+    """The inputs of another motion, under the solver's word that it converged."""
+    wrong = dataclasses.replace(swung[0], us=np.zeros((40, 1)), xs=np.zeros((41, 2)))
+    found, _ = checked(wrong)
+    assert found["Solver"].kind == "pass"
+    assert found["Plan"].kind == "fail"
+    assert "pass" not in {found[name].kind for name in found if "feedback" in name}
+
+
+def test_certificates_that_say_the_same_are_one_row():
+    def one(verdict="agree", power=1e-4, agree=6):
+        return {
+            "subject": "a",
+            "method": "m",
+            "verdict": verdict,
+            "entries": 6,
+            "power": power,
+            "counts": {"agree": agree},
+        }
+
+    rows = alike([one(), one(power=3e-4), one("disagree", agree=5), one()])
+    assert [(row["numbers"], row["count"], row["verdict"]) for row in rows] == [
+        ("0 to 1", 2, "agree"),
+        ("2", 1, "disagree"),
+        ("3", 1, "agree"),
+    ]
+    assert rows[0]["power"] == 3e-4  # what the weaker one would have noticed
