@@ -268,3 +268,40 @@ def test_directives_add_robots_with_their_slips_mended(tmp_path):
     assert "drake_diff_" not in str(model.notes)  # the folder that is gone
     hulls = load(path, packages={"here": tmp_path}, meshes="convex")
     assert [g.shape for g in hulls.contract.geometries].count("Convex") == 2
+
+
+def test_a_mesh_in_mujocos_own_format_is_read(tmp_path):
+    """The pyramid of 1/6 of volume again: 4 vertices, no normals, no texture, 4 faces."""
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], dtype="<i4")
+    data = np.array([4, 0, 0, 4], dtype="<i4").tobytes() + np.array(PYRAMID, dtype="<f4").tobytes() + faces.tobytes()
+    (tmp_path / "part.msh").write_bytes(data)
+    body = '<body><joint name="j"/><geom type="mesh" mesh="part" density="6"/></body>'
+    path = write(tmp_path, body, more='<asset><mesh file="part.msh"/></asset>')
+    assert load(path).contract.bodies[0].mass == pytest.approx(1.0, rel=1e-6)
+    (tmp_path / "part.msh").write_bytes(data[:-4])
+    with pytest.raises(ModelError, match=r"part.msh: expected 112 bytes of a mesh of MuJoCo, got 108"):
+        load(path)
+
+
+def test_what_would_end_the_process_in_drake_is_refused_with_its_line(tmp_path):
+    for other in ("", 'body2="world"'):
+        more = f'\n<equality>\n<connect body1="a" {other} anchor="0 0 0"/></equality>'
+        with pytest.raises(ModelError, match=r"m.xml:3: <connect> holds a to the world.*ends the process"):
+            load(write(tmp_path, HINGE.format("", ""), more=more))
+    off = '<equality><connect body1="a" anchor="0 0 0" active="false"/></equality>'
+    model = load(write(tmp_path, HINGE.format("", ""), more=off))
+    assert model.num_constraints == 0
+    dd.step(model, [0.1, 0.2], [])
+
+
+def test_a_missing_mesh_is_named_where_it_should_be(tmp_path, monkeypatch):
+    """And no file of that name in the folder that Python happens to run in is taken."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    (tmp_path / "here" / "part.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+    )
+    asset = '<asset><mesh file="part.obj"/></asset>'
+    path = write(tmp_path, HINGE.format("", '<geom type="mesh" mesh="part"/>'), more=asset, head="<mujoco>")
+    with pytest.raises(ModelError, match=f'"{tmp_path}/part.obj" could not be found'):
+        load(path)

@@ -344,3 +344,18 @@ def test_a_run_of_a_repaired_model_is_made_again_with_its_repairs(tmp_path, monk
     assert record.contract["notes"]
     found = dd.verify(folder)
     assert found.verdict == "holds", found
+
+
+def test_what_speaks_of_joints_that_are_not_there_is_left_out_and_told(write):
+    lost = (
+        '<transmission name="t"><type>SimpleTransmission</type><joint name="gone"/><actuator name="m"/></transmission>'
+        '<material name="red"><color rgba="1, 0.5,0 1"/></material>'
+    )
+    follower = joint("elbow", "upper", "lower", more='<mimic joint="gone"/>')
+    model, _ = load(write(robot(SHOULDER, follower).replace("</robot>", lost + "</robot>")), base="weld")
+    assert model.nq == 2
+    assert model.notes[:3] == (
+        "Materials: red has its colour written with commas.",
+        "The joint elbow mimics gone, which does not exist: it moves by itself.",
+        "A transmission is left out, as its joint does not exist: gone.",
+    )

@@ -28,6 +28,7 @@ from drake_diff.model.parameter_kinds import IDENTITY_OFFSET
 from drake_diff.model.plant import PROXIMITY, actuators, instances, joints
 from drake_diff.model.step import advance, check_point, set_state
 
+PAIRS_TOLD = 6  # of links, each with a finding of its own; a humanoid has hundreds
 AT_LIMIT = 1e-6  # [m or rad] from a joint's limit
 HUGE = 1e3  # of an entry of A or B: sap's reach 14, lagged contact's 4e4
 NEARLY_PARALLEL = 1e-2  # [rad]: jumps were measured up to 1e-3 and beyond
@@ -239,10 +240,19 @@ def _pair_refused(place: Place) -> Found:
         if pair.refused:
             groups.setdefault(pair.bodies, []).append(pair)
     by_choice = severity == "info"
-    for bodies, pairs in groups.items():
+    named, rest = list(groups)[:PAIRS_TOLD], list(groups)[PAIRS_TOLD:]
+    for bodies in named:
+        arguments = {} if by_choice else _route(place.model, groups[bodies])
+        told = f'meshes="spheres" and {remedy}' if "meshes" in arguments else remedy
+        message = _refusal(place, groups[bodies])
+        yield Finding(severity, "pair_refused", " - ".join(bodies), message, told, arguments)
+    if rest:
+        pairs = [pair for bodies in rest for pair in groups[bodies]]
         arguments = {} if by_choice else _route(place.model, pairs)
         told = f'meshes="spheres" and {remedy}' if "meshes" in arguments else remedy
-        yield Finding(severity, "pair_refused", " - ".join(bodies), _refusal(place, pairs), told, arguments)
+        listed = ", ".join(" - ".join(bodies) for bodies in rest[:PAIRS_TOLD])
+        message = f"of such shapes, too: {listed}" + (" ..." if len(rest) > PAIRS_TOLD else "")
+        yield Finding(severity, "pair_refused", f"{len(rest)} more pairs of links", message, told, arguments)
 
 
 def _route(model: Model, pairs: list[Pair]) -> dict[str, Any]:
@@ -328,20 +338,25 @@ def _normals(collider: Collider, other: Collider) -> list[Array]:
 
 
 def _cylinder_axis(place: Place) -> Found:
+    beside: dict[str, float] = {}  # [m]
+    remedy = "move the sphere off the axis by 1e-6 m or more, or replace the cylinder by a box"
     for pair in place.pairs:
         both = pair.of_kinds(Sphere, Cylinder)
         if both is None or pair.contact != "point":
             continue
         offset = both[0].pose.translation() - both[1].pose.translation()
         distance = float(np.linalg.norm(np.cross(both[1].axis(2), offset)))
-        severity: Severity = "info"
-        told = "exactly on it AutoDiffXd would be singular"
-        if distance < ON_AXIS:
-            severity = "error"
-            told = "if they touch AutoDiffXd is singular on it (NaN, or a plausible wrong number)"
+        if distance >= ON_AXIS:
+            beside[pair.label] = distance
+            continue
+        told = "if they touch AutoDiffXd is singular on it (NaN, or a plausible wrong number)"
         message = f"the sphere's centre is {distance:.3g} m from the cylinder's axis: {told}"
-        remedy = "move the sphere off the axis by 1e-6 m or more, or replace the cylinder by a box"
-        yield Finding(severity, "cylinder_axis", pair.label, message, remedy)
+        yield Finding("error", "cylinder_axis", pair.label, message, remedy)
+    if beside:
+        subject = next(iter(beside)) if len(beside) == 1 else f"{len(beside)} pairs"
+        told = "exactly on it AutoDiffXd would be singular"
+        message = f"the sphere's centre is {min(beside.values()):.3g} m from the cylinder's axis: {told}"
+        yield Finding("info", "cylinder_axis", subject, message, remedy)
 
 
 def _default_decides(place: Place) -> Found:

@@ -100,9 +100,23 @@ def certify(
             stopped=left,
             second=in_steps(model, space, len(scale)),
         )
+        limits = _at_limits(model, x) if certificate.verdict != "agree" else ""
+        if limits:
+            certificate = replace(certificate, told="; ".join(text for text in (certificate.told, limits) if text))
         if not model.contract.contact.collision_pairs:
             return certificate
         return replace(certificate, mode_changes=_find_mode_changes(model, space, step.drake, derivative, scale))
+
+
+def _at_limits(model: Model, x: Array) -> str:
+    """Which positions are at or beyond a joint limit, where a step has a corner and its forces are stiff."""
+    found = []
+    for name, q, low, high in zip(model.position_names, x, *model.position_limits, strict=False):
+        reach = NEIGHBOURHOOD * max(1.0, abs(q))
+        if q <= low + reach or q >= high - reach:
+            where = "beyond" if q < low or q > high else "at"
+            found.append(f"{name} is {q:.6g}, {where} its limits [{low:g}, {high:g}]")
+    return f"joint limits act: {', '.join(found)}" if found else ""
 
 
 def certify_inside(model: Model, x: Array, u: Array, *, parameters: Parameters = ()) -> Certificate:

@@ -25,7 +25,7 @@ from drake_diff.model.robot_text import add_packages, fix_in_text, refusal, text
 from drake_diff.model.xml_text import XmlText
 
 FORMATS = (".urdf", ".sdf", ".xml", ".mjcf", ".dmd.yaml")
-DRAKES_REFUSALS = (RuntimeError, ValueError, SystemExit)  # SystemExit is a failed condition in Drake's C++
+DRAKES_REFUSALS = (RuntimeError, ValueError, IndexError, OverflowError, SystemExit)  # the last is a failed condition
 OF_A_SPRING = re.compile(r"attribute '(?:stiffness|springref)' found in a 'joint' tag .* ignored")
 
 # Drake says of every half space that deformable bodies will not touch it, which no model here has.

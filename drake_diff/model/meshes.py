@@ -20,10 +20,11 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_diff.exceptions import ModelError
 from drake_diff.model.sphere_fit import Spheres, fit_spheres
-from drake_diff.model.triangles import READ_BY_TRIMESH, Hull, as_obj, hull_of_file, read_mesh
+from drake_diff.model.triangles import OF_MUJOCO, READ_BY_TRIMESH, Hull, as_obj, hull_of_file, read_mesh
 from drake_diff.model.xml_text import Element, XmlText
 
 TREATMENTS = ("skip", "convex", "spheres")
+NOT_OBJ = tuple(ending for ending in READ_BY_TRIMESH if ending != ".obj")  # Drake reads no other in MJCF
 USABLE_MESHES = (".obj", ".vtk", ".gltf", ".glb")  # by Drake
 DOWNLOADED = "drake_models"  # the package that Drake's parser would fetch from the network
 PLACEHOLDER = 1.2345678e-9  # [m] the radius of the first; no file has such a sphere
@@ -104,10 +105,10 @@ def _convert_assets(found: FileMeshes, xml: XmlText, path: Path) -> None:
     It computes masses by them, as MuJoCo does; `put_meshes` then puts back what was there.
     """
     for mesh in (m for section in xml.root.findall("asset") for m in section.findall("mesh")):
-        file = _asset(xml, mesh, path)
+        file = in_any_case(_asset(xml, mesh, path)) if mesh.get("file") else None
         if file is None:
             continue  # which Drake says
-        if file.suffix.lower() in USABLE_MESHES or file.suffix.lower() not in READ_BY_TRIMESH:
+        if file.suffix.lower() not in (*NOT_OBJ, OF_MUJOCO):
             found.whole[str(file)] = file
             continue
         try:
@@ -121,18 +122,14 @@ def _convert_assets(found: FileMeshes, xml: XmlText, path: Path) -> None:
         xml.set(mesh, "file", str(obj))
 
 
-def _asset(xml: XmlText, mesh: Element, path: Path) -> Path | None:
-    """The file of a mesh of MJCF, by the folders that <compiler> says."""
+def _asset(xml: XmlText, mesh: Element, path: Path) -> Path:
+    """Where the file of a mesh of MJCF should be, by the folders that <compiler> says."""
     name, folders = mesh.get("file"), dict[str, str]()
     for compiler in xml.root.findall("compiler"):
         folders |= compiler.attributes
     if folders.get("strippath") == "true":
         name = Path(name).name
-    return (
-        in_any_case((path.parent / folders.get("meshdir", folders.get("assetdir", "")) / name).absolute())
-        if name
-        else None
-    )
+    return (path.parent / folders.get("meshdir", folders.get("assetdir", "")) / name).absolute()
 
 
 def _change(found: FileMeshes, xml: XmlText, element: Element, mesh: Element, place: Path | None) -> None:
@@ -211,9 +208,10 @@ def make_absolute(xml: XmlText, path: Path) -> None:
     """
     if xml.root.tag == "mujoco":
         for mesh in (m for section in xml.root.findall("asset") for m in section.findall("mesh")):
-            file = _asset(xml, mesh, path)
-            if file is not None and not Path(mesh.get("file")).is_absolute():
-                xml.set(mesh, "file", str(file))
+            if mesh.get("file") and not Path(mesh.get("file")).is_absolute():
+                xml.set(mesh, "file", str(_asset(xml, mesh, path)))
+        for include in xml.root.iter("include"):  # what is left is missing
+            xml.set(include, "file", str((path.parent / include.get("file")).absolute()))
         return
     for element in xml.root.iter("mesh", "include"):
         uri = _uri(element)

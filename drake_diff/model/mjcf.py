@@ -42,6 +42,16 @@ def as_mujoco_means(xml: XmlText, path: Path, notes: list[str]) -> XmlText:
         xml.set(xml.root, "model", path.stem)
         notes.append(f"The model has no name in the file: it is called {path.stem}.")
     mjcf = Mjcf(xml)
+    for connect in (c for section in xml.root.findall("equality") for c in section.findall("connect")):
+        says = mjcf.attributes(connect)
+        if says.get("active") == "false":
+            xml.remove(connect)
+            notes.append(f"{path}:{connect.line}: a <connect> that is not active was left out.")
+        elif says.get("body1") and says.get("body2", "world") == "world":
+            raise ModelError(
+                f"{path}:{connect.line}: <connect> holds {says['body1']} to the world, and a step with such a "
+                "constraint ends the process in Drake: let its body2 be a body without a joint, in <worldbody>"
+            )
     if mjcf.needs_flat_defaults:
         mjcf.flatten_defaults()
         notes.append("Default classes were written out with what they inherit, which Drake would lose.")

@@ -8,13 +8,16 @@ written. Every line keeps its number, so that messages name lines of the file it
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
+import yaml
 from pydrake.multibody.parsing import PackageMap
 
 from drake_diff.exceptions import ModelError
 from drake_diff.model.mjcf import as_mujoco_means
 from drake_diff.model.xml_text import Element, XmlText
 
+MOST_NODES = 100_000  # of a YAML file, its aliases written out
 MOVING = ("revolute", "continuous", "prismatic")  # the types of joints that can be fixed
 INCLUDED = re.compile(r"^\s*-?\s*file:\s*[\"']?([^\s\"']+)", re.MULTILINE)  # in a .dmd.yaml
 DOWNLOADED = "drake_models"  # the package that Drake would fetch over the network
@@ -29,6 +32,7 @@ def text_of(path: Path, notes: list[str]) -> XmlText | None:
     path.read_text()  # which says what byte is no text
     refuse_circles(path, ())
     if path.name.endswith(".dmd.yaml"):
+        _check_yaml(path)
         return None
     try:
         xml = XmlText(path.read_bytes())
@@ -48,11 +52,54 @@ def text_of(path: Path, notes: list[str]) -> XmlText | None:
         notes.append(f"The robot has no name in the file: it is called {path.stem}.")
     notes += _one_colour_for_each_material(xml)
     notes += _continuous_without_limits(xml)
-    for mimic in [mimic for joint in xml.root.findall("joint") for mimic in joint.findall("mimic")]:
-        if mimic.parent is not None and mimic.parent.get("type") == "fixed":
-            xml.remove(mimic)
-            notes.append(f"The joint {mimic.parent.get('name')} is fixed, so that it mimics nothing.")
+    notes += _without_lost_joints(xml)
     return xml
+
+
+def _without_lost_joints(xml: XmlText) -> list[str]:
+    """Leave out what speaks of a joint that is not there, and what a fixed joint mimics: Drake refuses both."""
+    told, joints = [], {joint.get("name"): joint for joint in xml.root.findall("joint")}
+    for name, joint in joints.items():
+        for mimic in joint.findall("mimic"):
+            leader = mimic.get("joint")
+            if joint.get("type") == "fixed":
+                told.append(f"The joint {name} is fixed, so that it mimics nothing.")
+            elif leader and leader not in joints:
+                told.append(f"The joint {name} mimics {leader}, which does not exist: it moves by itself.")
+            else:
+                continue
+            xml.remove(mimic)
+    there = set(joints) | {other.get("name") for other in xml.root.iter("drake:joint")}
+    for transmission in xml.root.findall("transmission"):
+        driven = [joint.get("name") for joint in transmission.findall("joint")]
+        if driven and not there & set(driven):
+            xml.remove(transmission)
+            told.append(f"A transmission is left out, as its joint does not exist: {', '.join(driven)}.")
+    return told
+
+
+def _check_yaml(path: Path) -> None:
+    """Raise ModelError where a file is no YAML, or its aliases stand for more than memory holds."""
+    sizes: dict[int, int] = {}
+
+    def size(node: Any) -> int:
+        if id(node) not in sizes:
+            inner = [] if node is None or isinstance(node.value, str) else node.value
+            pairs = [part for entry in inner for part in (entry if isinstance(entry, tuple) else (entry,))]
+            sizes[id(node)] = 1 + sum(map(size, pairs))
+        return sizes[id(node)]
+
+    try:
+        root = yaml.compose(path.read_text())
+        large = size(root) > MOST_NODES
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        at = f":{mark.line + 1}" if mark else ""
+        raise ModelError(f"{path}{at}: no YAML: {getattr(error, 'problem', None) or error}") from error
+    except RecursionError as error:
+        raise ModelError(f"{path}: its lists are too deep") from error
+    if large:
+        raise ModelError(f"{path}: its aliases stand for more than {MOST_NODES} entries")
 
 
 def _one_colour_for_each_material(xml: XmlText) -> list[str]:
@@ -62,6 +109,9 @@ def _one_colour_for_each_material(xml: XmlText) -> list[str]:
     top = xml.root.findall("material")
     for material in [*top, *(m for m in xml.root.iter("material") if m.parent is not xml.root)]:
         name, colour, texture = material.get("name"), material.find("color"), material.find("texture")
+        if colour and "," in colour.get("rgba"):
+            told[f"{name or 'one'} has its colour written with commas"] = None
+            xml.set(colour, "rgba", " ".join(colour.get("rgba").replace(",", " ").split()))
         given = " ".join(colour.get("rgba").split()) if colour else texture.get("filename") if texture else ""
         if not name or (name in known and given in ("", known[name])):
             continue

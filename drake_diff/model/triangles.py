@@ -20,6 +20,7 @@ from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError
 
 READ_BY_TRIMESH = (".stl", ".dae", ".obj", ".ply", ".off")
+OF_MUJOCO = ".msh"  # its own binary format, which is read here
 LARGEST_FILE = 2**29  # [bytes] of a mesh file that is read
 MOST_COLOURS = 12  # of one mesh; all others become one, their average
 MOST_CORNERS = 1000  # of a convex hull
@@ -103,6 +104,8 @@ def _read(path: Path, _changed: int, _size: int) -> Triangles:
     import trimesh
 
     kind = path.suffix.lower()
+    if kind == OF_MUJOCO:
+        return _read_msh(path)
     try:
         data, beside = BytesIO(path.read_bytes()), _Materials(path.parent)
         scene: Any = trimesh.load_scene(data, file_type=kind[1:], resolver=beside, process=False)
@@ -121,6 +124,23 @@ def _read(path: Path, _changed: int, _size: int) -> Triangles:
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
     return _joined(vertices, faces, colours)
+
+
+def _read_msh(path: Path) -> Triangles:
+    """MuJoCo's own format: the numbers of vertices, normals, texture coordinates and faces, then these as arrays."""
+    data = path.read_bytes()
+    counts = np.frombuffer(data[:16], dtype="<i4").astype(int)
+    if len(counts) < 4 or np.any(counts < 0) or counts[0] < 4 or counts[3] < 1:
+        raise ModelError(f"{path}: expected a mesh of MuJoCo, with vertices and faces")
+    vertices, normals, texture, faces = counts.tolist()
+    begin = 16 + 4 * (3 * vertices + 3 * normals + 2 * texture)
+    if len(data) != begin + 12 * faces:
+        raise ModelError(f"{path}: expected {begin + 12 * faces} bytes of a mesh of MuJoCo, got {len(data)}")
+    corners = np.frombuffer(data, dtype="<f4", count=3 * vertices, offset=16).reshape(-1, 3).astype(float)
+    indices = np.frombuffer(data, dtype="<i4", count=3 * faces, offset=begin).reshape(-1, 3).astype(np.int64)
+    if np.any(indices < 0) or np.any(indices >= vertices) or not np.all(np.isfinite(corners)):
+        raise ModelError(f"{path}: expected faces of the mesh's own vertices")
+    return _joined(corners, indices, None)
 
 
 class _Materials:

@@ -13,6 +13,8 @@ from xml.sax.saxutils import quoteattr
 
 from drake_diff.exceptions import ModelError
 
+DEEPEST = 300  # elements in one another: Python and Drake's parser end at some depth
+
 
 @dataclass(eq=False)
 class Element:
@@ -74,9 +76,13 @@ class XmlText:
             parser.Parse(self._tags, True)
         except expat.ExpatError as error:
             raise ModelError(f"line {error.lineno}: no XML: {expat.ErrorString(error.code)}") from error
+        except LookupError as error:
+            raise ModelError(f"line 1: {error}") from error
         self.root: Element = self._roots[0]
 
     def _begin(self, parser: Any, tag: str, attributes: dict[str, str]) -> None:
+        if len(self._open) >= DEEPEST:
+            raise ModelError(f"line {parser.CurrentLineNumber}: expected at most {DEEPEST} elements inside one another")
         parent = self._open[-1] if self._open else None
         start = parser.CurrentByteIndex
         element = Element(tag, attributes, parent, parser.CurrentLineNumber, start, self._behind_tag(start))
