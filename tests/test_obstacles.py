@@ -17,6 +17,7 @@ import drake_diff.optimize.solve as solve_module
 import drake_diff.optimize.transcription.collocation as collocation_module
 from drake_diff.exceptions import InputError, ModelWarning, UnknownNameError
 from drake_diff.optimize.judge import complaints_about, judged
+from drake_diff.optimize.problem.obstacles import along_steps
 from drake_diff.optimize.program import NlpResult, Outcome
 
 BALL = dd.SphereObstacle([0.0, 0.0, -1.2], 0.1, name="ball")
@@ -110,6 +111,39 @@ def test_where_a_plan_jumps_through_between_knots_the_mesh_is_refined(monkeypatc
     solution = dd.solve(problem, method="collocation", max_iterations=200, refine=False)
     assert solution.status is dd.Status.CONVERGED_NOT_VERIFIED
     assert "between the nodes lower enters obstacle 'ball' by" in solution.message
+
+
+def test_no_obstacle_is_so_thin_that_a_motion_jumps_over_it_unseen():
+    """Balls of 1 mm on the way of the lower rod's end, which moves by half of the rods' width and more between looks.
+
+    How deep the rods are in each is Pythagoras at 10,000 times.
+    """
+    ends = {"num_steps": 4, "time_step": 0.4, "x0": [-1.5, 0.1, 0, 0], "x_goal": [1.5, -0.1, 0, 0]}
+    plan = dd.solve(arm([], **ends), method="collocation", refine=False)
+    angles = np.cumsum(plan.transcribed.at(np.linspace(0, plan.horizon, 10_000))[0][:, :2], axis=1)
+    hinges = -0.8 * np.column_stack([np.sin(angles[:, 0]), np.cos(angles[:, 0])])
+    tips = hinges - 0.49 * np.column_stack([np.sin(angles[:, 1]), np.cos(angles[:, 1])])
+    assert np.linalg.norm(np.diff(tips[2500:7500:250], axis=0), axis=1).max() > 0.08  # within a tenth of an interval
+    for k in (2650, 3100, 3660, 4210, 4440, 5330, 5870, 6420, 6905):
+        ball = dd.SphereObstacle([tips[k, 0], 0, tips[k, 1]], 1e-3, margin=1e-3, name="pin")
+        along = np.clip(np.sum((tips[k] - hinges) * (tips - hinges), axis=1) / 0.49**2, 0, 1)[:, None]
+        nearest = np.linalg.norm(hinges + along * (tips - hinges) - tips[k], axis=1).min()
+        assert nearest < 1e-3
+        told = "; ".join(complaints_about(replace(plan, problem=arm([ball], **ends))))
+        assert re.search(r"between the nodes lower enters obstacle 'pin' by \d+(\.\d+)? mm", told), (k, told)
+
+
+def test_steps_are_looked_at_as_closely_and_a_motion_too_wild_to_be_seen_is_none():
+    constraint = arm([dd.SphereObstacle([0, 0, -1.25], 1e-3, margin=1e-3, name="pin")]).kept_goals[0]
+    for turn in (0.5, 3.0, 40.0):  # in one step, past the pin in its middle
+        steps = along_steps(np.array([0.0, 1.0]), np.array([[-turn / 2, 0, 0, 0], [turn / 2 + 0.3, 0, 0, 0]]))
+        (told,) = constraint.too_near(*steps, constraint.tolerance)
+        assert "lower enters obstacle 'pin' by" in told
+    beside = along_steps(np.array([0.0, 1.0]), np.array([[0.03, 0, 0, 0], [1.0, 0, 0, 0]]))
+    assert not list(constraint.too_near(*beside, constraint.tolerance))  # 0.03 of 1.25 m: clear of 21 mm
+    wild = along_steps(np.array([0.0, 1.0]), np.array([[0.03, 0, 0, 0], [1e9, 0, 0, 0]]))
+    (told,) = constraint.too_near(*wild, constraint.tolerance)
+    assert "cannot be seen" in told or "enters" in told
 
 
 @pytest.mark.slow

@@ -37,6 +37,11 @@ class Pieces:
         R, p = frames[0][..., self.at, :, :], frames[1][..., self.at, :]
         return (R @ self.start[..., None])[..., 0] + p, (R @ self.end[..., None])[..., 0] + p
 
+    def ways(self, frames: tuple[Array, Array]) -> Array:
+        """(K-1, m) [m] the longest of the straight ways of each piece's points, from frame to frame (K, ...)."""
+        far = [np.linalg.norm(np.diff(end, axis=0), axis=-1) for end in self.ends(frames)]
+        return np.asarray(np.maximum(*far))
+
 
 def in_rows(pieces: Sequence[Piece]) -> Pieces:
     """The same, in rows."""
@@ -71,7 +76,17 @@ class Clearance:
         frames = self.placing(q)
         return np.asarray(self._distances(frames)), self._slopes(q, frames)
 
+    def moved(self, xs: Array) -> Array:
+        """(K-1, m) [m] how far what each row is of moves from one of xs (K, nx) to the next: no distance changes more.
+
+        That is the longest of the straight ways of its points.
+        """
+        return np.asarray(self._ways(self.placing(xs[:, : self.model.nq])))
+
     def _distances(self, frames: tuple[Any, Any]) -> Any:
+        raise NotImplementedError
+
+    def _ways(self, frames: tuple[Array, Array]) -> Array:
         raise NotImplementedError
 
     def _slopes(self, q: Array, frames: tuple[Array, Array]) -> Array:
@@ -92,6 +107,9 @@ class FromBall(Clearance):
 
     def _distances(self, frames: tuple[Any, Any]) -> Any:
         return length(self._nearest(frames) - self.center) - (self.pieces.radius + self.radius)
+
+    def _ways(self, frames: tuple[Array, Array]) -> Array:
+        return self.pieces.ways(frames)
 
     def _slopes(self, q: Array, frames: tuple[Array, Array]) -> Array:
         points = self._nearest(frames)
@@ -120,6 +138,9 @@ class FromBox(Clearance):
     def _distances(self, frames: tuple[Any, Any]) -> Any:
         return to_box(self._within(frames)[1], self.half) - self.pieces.radius
 
+    def _ways(self, frames: tuple[Array, Array]) -> Array:
+        return self.pieces.ways(frames)
+
     def _slopes(self, q: Array, frames: tuple[Array, Array]) -> Array:
         points, local = self._within(frames)
         return self.placing.pushes(q, frames, self.pieces.at, points, away_from_box(local, self.half) @ self.rotation.T)
@@ -140,6 +161,9 @@ class OfPairs(Clearance):
     def _distances(self, frames: tuple[Any, Any]) -> Any:
         a, b = self._nearest(frames)
         return length(a - b) - (self.first.radius + self.second.radius)
+
+    def _ways(self, frames: tuple[Array, Array]) -> Array:
+        return self.first.ways(frames) + self.second.ways(frames)
 
     def _slopes(self, q: Array, frames: tuple[Array, Array]) -> Array:
         a, b = self._nearest(frames)
@@ -168,6 +192,9 @@ class Swept(Clearance):
 
     def values(self, xs: Array) -> Array:
         return np.hstack([self.other.values(self._earlier(xs, time)) for time in self.before])
+
+    def moved(self, xs: Array) -> Array:
+        return np.hstack([self.other.moved(self._earlier(xs, time)) for time in self.before])
 
     def linearize(self, xs: Array) -> tuple[Array, Array]:
         found = [self.other.linearize(self._earlier(xs, time)) for time in self.before]

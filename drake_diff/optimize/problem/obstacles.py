@@ -6,7 +6,7 @@ that each has its own slope. A plan keeps the margin at every knot and in betwee
 steps of another length lead a little elsewhere, but it may not enter the obstacle.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -27,10 +27,15 @@ from drake_diff.optimize.problem.goals import Goal, GoalConstraint, Mark, checke
 
 MARGIN = 0.01  # [m]
 TOLERANCE_PART, SMALLEST_TOLERANCE = 0.1, 1e-4  # of the margin, and [m]: what a plan may be nearer between its knots
-PARTS = 10  # in which a step is looked at
+PARTS = 10  # in which a step is looked at, at least
+MOST_SEEN = 20_000  # states
+ARC = 1.05  # over its chord: the way of a point while all joints together turn by TURN
+TURN = 1.0  # [rad]
 RED = (0.78, 0.2, 0.16, 0.55)  # red, green, blue, opacity
 LOOKED_AT = 1000  # random states in which two links that always overlap are found
 UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+Motion = Callable[[Array], Array]  # the states (S, nx) at times (S,) [s]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,8 +68,33 @@ class ClearanceConstraint(GoalConstraint):
         values, rows = self.clearance.linearize(x[None])
         return values[0], np.hstack([rows[0], np.zeros((len(values[0]), len(u)))])
 
-    def too_near(self, times: Array, xs: Array, allowed: float) -> Iterator[str]:
-        """A clause where the nearest of xs (K, nx) at `times` (K,) [s] lacks more than `allowed` [m] of the margin."""
+    def seen(self, times: Array, at: Motion, allowed: float) -> tuple[Array, Array]:
+        """`times` (K,) [s], and as many between them that nothing of a motion that lacks more than `allowed` is missed.
+
+        Between two states that are clear by a and b while a piece moves by s, it is clear by (a + b - s) / 2 at least.
+        Where that is too little, the middle is looked at, until it is not, or the piece moves by less than `allowed`.
+
+        Returns:
+            Times (S,), and the states (S, nx) that `at` gives there.
+        """
+        xs, least = at(times), self.margin - allowed
+        while True:
+            values, ways = self.clearance.values(xs), ARC * self.clearance.moved(xs)
+            clear = np.min((values[:-1] + values[1:] - ways) / 2, axis=1) >= least
+            known = np.min(values, axis=1) < least  # and told anyway
+            short = (np.max(ways, axis=1) <= allowed) | known[:-1] | known[1:]
+            turns = np.sum(np.abs(np.diff(xs[:, : self.clearance.model.nq], axis=0)), axis=1) > TURN
+            unseen = np.flatnonzero(~(clear | short) | turns)
+            if not len(unseen) or len(times) + len(unseen) > MOST_SEEN:
+                break
+            middle = (times[unseen] + times[unseen + 1]) / 2
+            times, xs = np.insert(times, unseen + 1, middle), np.insert(xs, unseen + 1, at(middle), axis=0)
+        xs[unseen] = np.nan  # a motion too wild to be looked at: nobody knows what it enters
+        return times, xs
+
+    def too_near(self, times: Array, at: Motion, allowed: float) -> Iterator[str]:
+        """A clause where a motion lacks more than `allowed` [m] of the margin, at `times` (K,) [s] or in between."""
+        times, xs = self.seen(times, at, allowed)
         lacking = self.lacking(xs)
         worst = int(np.argmax(lacking))
         if not lacking[worst] <= allowed:
@@ -81,6 +111,8 @@ class ClearanceConstraint(GoalConstraint):
         row = int(np.argmin(values))
         who, distance = self.clearance.labels[row], float(values[row])
         when = "" if time is None else f" at {time:.4g} s"
+        if not np.isfinite(distance):
+            return f"whether {who} keeps clear{' of ' * bool(self.thing)}{self.thing} cannot be seen{when}"
         far = in_words(abs(distance), "m")
         if distance < 0:
             return f"{who} enters {self.thing} by {far}{when}" if self.thing else f"{who} overlap by {far}{when}"
@@ -401,14 +433,13 @@ def clearances(constraints: Sequence[Constraint]) -> Iterator[ClearanceConstrain
     return (c for c in constraints if isinstance(c, ClearanceConstraint))
 
 
-def along_steps(times: Array, xs: Array) -> tuple[Array, Array]:
-    """Times and states at the states xs (N+1, nx) and in 9 places between each two of them, on straight lines.
+def along_steps(times: Array, xs: Array) -> tuple[Array, Motion]:
+    """The `times` (N+1,) [s] of xs (N+1, nx) with 9 between each two of them, and the motion on straight lines.
 
     That is how a step moves positions: at a constant speed.
     """
-    at = np.arange(PARTS * (len(xs) - 1) + 1) / PARTS
-    every = np.arange(len(xs))
-    return np.interp(at, every, times), np.array([np.interp(at, every, column) for column in xs.T]).T
+    at = np.interp(np.arange(PARTS * (len(xs) - 1) + 1) / PARTS, np.arange(len(xs)), times)
+    return at, lambda every: np.array([np.interp(every, times, column) for column in xs.T]).T
 
 
 def lacking_between(constraints: Sequence[Constraint], xs: Array) -> tuple[float, bool]:
@@ -416,10 +447,10 @@ def lacking_between(constraints: Sequence[Constraint], xs: Array) -> tuple[float
 
     It is 0 where it is within the tolerance; see `along_steps`.
     """
-    path = along_steps(np.arange(float(len(xs))), xs)[1]
+    path = along_steps(np.arange(float(len(xs))), xs)
     worst, enters = 0.0, False
     for c in clearances(constraints):
-        lacking = float(np.max(c.lacking(path)))
+        lacking = float(np.max(c.lacking(c.seen(*path, c.between)[1])))
         if c.between < lacking < np.inf:
             worst, enters = max(worst, lacking), enters or lacking > c.margin + c.between
     return worst, enters

@@ -164,6 +164,10 @@ class Collocated:
     def _lengths(self) -> Array:
         return self.horizon * np.diff(self.mesh)
 
+    def interval_at(self, times: Array) -> Indices:
+        """(S,) the number of the interval that each of `times` (S,) [s] lies in."""
+        return self._place(times / self.horizon)[0]
+
     def _place(self, fractions: Array) -> tuple[Indices, Array]:
         """The interval that each of `fractions` (S,) of the horizon lies in, and where in it, from 0 to 1."""
         k = np.clip(np.searchsorted(self.mesh, fractions, side="right") - 1, 0, len(self.mesh) - 2)
@@ -312,20 +316,12 @@ def violation_between_nodes(motion: Collocated) -> Excess:
     found = [_beyond("state", states, xs, b.x_lower, b.x_upper, ranges, times)]
     for c in task.problem.kept:
         if isinstance(c, ClearanceConstraint):
-            lacking, row = c.lacking(xs), int(np.argmax(c.lacking(xs)))
-            found.append(
-                [
-                    _Beyond(
-                        "constraint",
-                        c.label,
-                        max(float(lacking[row]), 0.0),
-                        c.between,
-                        float(times[row]),
-                        times[~(lacking <= c.between)],
-                        c.told_at(xs[row], float(times[row])),
-                    )
-                ]
-            )
+            moments, places = _seen(motion, c)
+            lacking = c.lacking(places)
+            row = int(np.argmax(lacking))
+            far, when, told = max(float(lacking[row]), 0.0), float(moments[row]), c.told_at(places[row], moments[row])
+            beyond = moments[~(lacking <= c.between)]
+            found.append([_Beyond("constraint", c.label, far, c.between, when, beyond, told)])
         elif c.knots is None:
             rows = np.flatnonzero((k > 0) | (tau > 0.5) | (not task.problem.initial_state_is_given))
             with np.errstate(all="ignore"):
@@ -346,8 +342,20 @@ def violation_between_nodes(motion: Collocated) -> Excess:
         worst=worst.excess / worst.tolerance,
         where=where,
         broken=tuple(str(e) for e in every if not e.excess <= e.tolerance),
-        intervals=tuple(np.unique(motion._place(np.concatenate([e.when for e in every]) / motion.horizon)[0]).tolist()),
+        intervals=tuple(np.unique(motion.interval_at(np.concatenate([e.when for e in every]))).tolist()),
     )
+
+
+def _seen(motion: Collocated, c: ClearanceConstraint) -> tuple[Array, Array]:
+    """Times (S,) [s] between the knots and states (S, nx): where the dynamics lead, and what `c` looks at besides.
+
+    The latter are by the scheme's polynomials.
+    """
+    times, xs = motion.between_knots
+    every = np.unique(np.concatenate([motion.horizon * motion.mesh, times]))
+    when, where = c.seen(every, lambda at: motion.at(at)[0], c.between)
+    between = ~np.isin(when, motion.horizon * motion.mesh)
+    return np.concatenate([times, when[between]]), np.vstack([xs, where[between]])
 
 
 KINDS = ("state", "input", "constraint")
@@ -545,11 +553,12 @@ def _worst(motion: Transcribed) -> Array:
 
 def _nearer(motion: Transcribed) -> Array:
     """(N,) [m] how much more than its tolerance each interval lacks of a margin, 0 where nothing does."""
-    lacking = np.zeros((SUBSTEPS - 1, len(motion.mesh) - 1))
+    lacking = np.zeros(len(motion.mesh) - 1)
     for c in clearances(motion.task.problem.kept):
-        each = c.lacking(motion.between_knots[1]).reshape(lacking.shape)
-        lacking = np.maximum(lacking, np.where(each > c.between, each, 0.0))
-    return np.asarray(np.max(np.nan_to_num(lacking, posinf=0.0), axis=0))
+        times, xs = _seen(motion, c)
+        each = np.nan_to_num(c.lacking(xs), posinf=0.0)
+        np.maximum.at(lacking, motion.interval_at(times), np.where(each > c.between, each, 0.0))
+    return lacking
 
 
 def _largest_margin(problem: Problem) -> float:
