@@ -136,14 +136,23 @@ def _pair(model: Model, a: Any, b: Any) -> Pair:
 
 def penetration(model: Model) -> float:
     """The largest overlap [m] of two geometries that may collide, in the double context's state; 0 if none."""
+    return float(max((pair.depth for pair in _penetrations(model)), default=0.0))
+
+
+def overlaps(model: Model) -> dict[Pair, float]:
+    """[m] how deep each two geometries that may collide and do overlap, in the double context's state."""
+    return {_pair(model, pair.id_A, pair.id_B): float(pair.depth) for pair in _penetrations(model)}
+
+
+def _penetrations(model: Model) -> list[Any]:
+    """Raises SimulationError where Drake cannot measure the shapes."""
     port = model.plant.get_geometry_query_input_port()
     if not port.HasValue(model.double.context):
-        return 0.0
+        return []
     try:
-        pairs = port.Eval(model.double.context).ComputePointPairPenetration()
+        return list(port.Eval(model.double.context).ComputePointPairPenetration())
     except RuntimeError as error:
         raise SimulationError(f"Drake cannot measure how deep the geometries overlap: {error}") from error
-    return float(max((pair.depth for pair in pairs), default=0.0))
 
 
 def thinnest_geometry(model: Model) -> tuple[float, str]:

@@ -14,7 +14,8 @@ from pydrake.trajectories import BsplineTrajectory
 
 from drake_diff._base.arrays import Array
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, Obstacle, clearances
-from drake_diff.planning.robot import TOUCHING, Robot
+from drake_diff.planning.posture import TOUCHING
+from drake_diff.planning.robot import Robot
 
 BENDS = 100  # lines bent at random that are looked at
 WIDTH = 0.4  # of a joint's range: how far such a line is pulled off the middle, at most

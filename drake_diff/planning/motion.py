@@ -4,12 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, Indices
 from drake_diff.exceptions import SimulationError
 from drake_diff.model.model import Model
+from drake_diff.model.plant import joints
 from drake_diff.model.step import advance, set_state
 from drake_diff.planning.around import Line
-from drake_diff.planning.robot import Robot, drive, effort_limits
+from drake_diff.planning.posture import effort_limits, share
+from drake_diff.planning.robot import Robot, drive
 
 FASTEST = 1.0  # [rad/s or m/s] the peak of a joint without a velocity limit
 OF_SPEED = 0.6  # of a velocity limit: the peak of a first guess
@@ -46,21 +48,6 @@ def speed_limits(model: Model) -> Array:
     """(nv,) what a first guess may use of the velocity limits; FASTEST where there is none, or one of 0."""
     found = np.array([min(abs(v.lower), abs(v.upper)) for v in model.contract.velocities])
     return np.where((found > 0) & np.isfinite(found), np.minimum(OF_SPEED * found, 5 * FASTEST), FASTEST)
-
-
-def share_to_hold(model: Model, q: Array) -> float:
-    """The share of its effort limits that a fully driven robot needs to hold posture q (nq,); inf if it cannot."""
-    try:
-        us = _inputs(model, np.concatenate([q, np.zeros(model.nv)]), np.zeros(model.nv))
-    except SimulationError:
-        return float("inf")
-    return _share(model, us[None])
-
-
-def _share(model: Model, us: Array) -> float:
-    limits = effort_limits(model)
-    used = np.abs(us) / np.where(limits > 0, limits, np.inf)
-    return float(np.max(np.where(np.isfinite(limits), used, 0.0), initial=0.0))
 
 
 def _inputs(model: Model, x: Array, wanted: Array) -> Array:
@@ -110,12 +97,22 @@ def _timed(robot: Robot, name: str, line: Line, duration: float) -> Guess:
     v = np.vstack([np.zeros((1, model.nv)), np.diff(q, axis=0) / h])
     us = np.array([_inputs(model, np.concatenate([q[k], v[k]]), v[k + 1]) for k in range(steps)])
     depth = max(robot.overlap(posture) for posture in q[:: max(1, steps // 25)])
-    return Guess(name, model, np.hstack([q, v]), us, _share(model, us), depth)
+    return Guess(name, model, np.hstack([q, v]), us, share(model, us), depth)
 
 
 def _smooth(t: Array) -> Array:
     """From 0 to 1 as t does, with a speed and an acceleration of 0 at both ends."""
     return np.asarray(10 * t**3 - 15 * t**4 + 6 * t**5)
+
+
+def _positions(model: Model) -> Indices:
+    """(nv,) where in q the coordinate of each velocity of a joint is."""
+    found = np.arange(model.nv)
+    for joint in joints(model.plant):
+        q, v = model.places(joint)
+        if len(q) == len(v) == 1:
+            found[v[0]] = q[0]
+    return found
 
 
 def by_controller(robot: Robot, target: Array, *, steps: int, reach: float, name: str) -> Guess | None:
@@ -126,13 +123,12 @@ def by_controller(robot: Robot, target: Array, *, steps: int, reach: float, name
     model = robot.model
     x = np.concatenate([robot.q, np.zeros(model.nv)])
     limits = np.minimum(effort_limits(model), 1e4)
-    free = model.nq - model.nv  # a free body has one coordinate more than it has velocities
     xs, us = [x], []
     try:
-        _, effect = drive(model, x)
+        effect = drive(model, robot.q)
         own = np.argmax(np.abs(effect), axis=0)  # the velocity that an input acts on most
         gain = model.time_step / effect[own, np.arange(model.nu)]
-        at = own + free
+        at = _positions(model)[own]
         for k in range(steps):
             s = np.array(min(1.0, 1.25 * (k + 1) / steps))
             aim = robot.q[at] + reach * _smooth(s) * (target[at] - robot.q[at])
@@ -143,4 +139,4 @@ def by_controller(robot: Robot, target: Array, *, steps: int, reach: float, name
             us.append(u)
     except SimulationError:
         return None
-    return Guess(name, model, np.array(xs), np.array(us), _share(model, np.array(us)))
+    return Guess(name, model, np.array(xs), np.array(us), share(model, np.array(us)))

@@ -26,7 +26,8 @@ from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
 from drake_diff.planning.around import Space, lines
 from drake_diff.planning.motion import OF_EFFORT, Guess, along, by_controller
-from drake_diff.planning.robot import TOUCHING, Robot, effort_limits, load_robot
+from drake_diff.planning.posture import TOUCHING, effort_limits
+from drake_diff.planning.robot import Robot, load_robot
 from drake_diff.planning.task import Task, asked, postures
 from drake_diff.record.solve import EvidenceRecord
 

@@ -12,8 +12,9 @@ from drake_diff.model.model import Model
 from drake_diff.model.quantities import frame_position
 from drake_diff.optimize.problem.obstacles import Obstacle
 from drake_diff.planning.around import Space
-from drake_diff.planning.motion import OF_EFFORT, share_to_hold
-from drake_diff.planning.robot import TOUCHING, Robot
+from drake_diff.planning.motion import PEAK, speed_limits
+from drake_diff.planning.posture import HELD, TOUCHING, share_to_hold
+from drake_diff.planning.robot import Robot
 
 DAMPING = 1e-3  # of the least squares, in the unit of the Jacobian
 DIFFERENCE = 1e-6  # [rad or m] of a Jacobian: errors of 1e-10 do not matter to a search
@@ -24,7 +25,9 @@ SEEDS = 12  # first postures of inverse kinematics
 MORE_SEEDS = 40  # where obstacles are in the way
 CANDIDATES = 3  # postures that are tried
 MOVE = 0.25  # part of a joint's range that a random goal is away, at most
+SOON = 2.0  # [s] a random goal is no further than what its joints do in that time
 DRAWS = 50
+NEARER = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,19 +151,20 @@ def _reached(robot: Robot, task: Task, q: Array, fixed: Array) -> tuple[Array, f
 def _random_posture(space: Space, random: np.random.Generator) -> Array:
     """Some way off the start, inside the limits, where nothing is touched and the motors hold the weight."""
     robot = space.robot
-    reach = MOVE * (robot.upper - robot.lower)
-    margin = 0.2 * reach
+    far = speed_limits(robot.model) * SOON / PEAK
+    reach = np.minimum(MOVE * (robot.upper - robot.lower), far)
+    margin = 0.2 * MOVE * (robot.upper - robot.lower)
     best, least = robot.q, np.inf
     for i in range(DRAWS):
-        part = 1.0 if i < DRAWS // 2 else 0.3  # some robots can only hold what is near
+        part = NEARER ** (i // (DRAWS // 5))  # some robots can only hold what is near
         q = robot.q + part * random.uniform(-1, 1, len(reach)) * reach
         q = np.clip(q, robot.lower + margin, robot.upper - margin)
         if any(robot.overlap(robot.q + s * (q - robot.q)) > TOUCHING for s in (0.25, 0.5, 0.75, 1.0)):
             continue
         if space.told(q):
             continue
-        load = share_to_hold(robot.model, q)
-        if load <= 0.7 * OF_EFFORT:
+        load = max(share_to_hold(robot.model, robot.q + s * (q - robot.q)) for s in (0.5, 1.0))
+        if load <= HELD:
             return q
         if load < least:
             best, least = q, load
