@@ -50,6 +50,32 @@ def _law_part(law: Cone | HuntCrossley, which: Indices) -> Cone | HuntCrossley:
     return replace(law, **arrays)
 
 
+def _add(total: Array, where: Indices, parts: Array) -> None:
+    """Add each of parts (M, ...) to the entry of `total` that `where` (M,) says: np.add.at, many times as fast."""
+    if len(where):
+        order, begins, rows = _grouped(where)
+        total[rows] += np.add.reduceat(parts[order], begins, axis=0)
+
+
+def _add_squares(total: Array, where: Indices, size: Array, vectors: Array) -> None:
+    """Add size w w' of each of vectors (M, n) to the entry of `total` (N, n, n) that `where` (M,) says."""
+    if not len(where):
+        return
+    order, begins, rows = _grouped(where)
+    counts = np.diff(begins, append=len(where))
+    at = np.repeat(np.arange(len(rows)), counts), np.arange(len(where)) - np.repeat(begins, counts)
+    stacked = np.zeros((2, len(rows), int(np.max(counts)), vectors.shape[1]))
+    stacked[0][at], stacked[1][at] = vectors[order], (size[:, None] * vectors)[order]
+    total[rows] += stacked[0].swapaxes(1, 2) @ stacked[1]
+
+
+def _grouped(where: Indices) -> tuple[Indices, Indices, Indices]:
+    """The order by group, where each group begins in it, and the groups."""
+    order = np.argsort(where, kind="stable")
+    begins = np.flatnonzero(np.diff(where[order], prepend=-1))
+    return order, begins, where[order][begins]
+
+
 @dataclass(frozen=True, eq=False)
 class Balance:
     """What is left of the momentum balance of N problems at some velocities."""
@@ -94,11 +120,11 @@ class ConvexSteps:
         given, curvature = np.zeros_like(v), np.array(self.A)
         if self.contacts is not None:
             J, (impulse, slope) = self.contacts.jacobian, self.contacts.at(v)
-            np.add.at(given, self.contacts.problem, (J @ impulse[..., None])[..., 0])
-            np.add.at(curvature, self.contacts.problem, J @ slope @ J.swapaxes(-1, -2))
+            _add(given, self.contacts.problem, (J @ impulse[..., None])[..., 0])
+            _add(curvature, self.contacts.problem, J @ slope @ J.swapaxes(-1, -2))
         j, (pull, stiffness) = self.joints.direction, self.joints.at(v)
-        np.add.at(given, self.joints.problem, j * pull[:, None])
-        np.add.at(curvature, self.joints.problem, (j * stiffness[:, None])[:, :, None] * j[:, None, :])
+        _add(given, self.joints.problem, j * pull[:, None])
+        _add_squares(curvature, self.joints.problem, stiffness, j)
         had = (self.A @ v[..., None])[..., 0]
         return Balance(had - self.momentum - given, given, curvature)
 
