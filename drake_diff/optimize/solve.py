@@ -414,6 +414,7 @@ class Run:
     options: dict[str, Any]
     report: Report | None
     start: float = field(default_factory=time.monotonic)
+    certified: dict[bytes, Certificate] = field(default_factory=dict)  # by state, input and parameters
 
     def collocate(self, guess: Guess, refinement: MeshRefinement | None, *, refine: bool | None) -> Solution:
         """In CasADi; SNOPT, which that does not carry, in Drake's own DirectCollocation.
@@ -621,7 +622,15 @@ class Run:
         us = variables.unpack(z)[1]
         xs, parameters = variables.states(z), variables.parameters(z).to_dict()
         model = self.problem.model
-        certificates = tuple(certify_inside(model, xs[k], us[k], parameters=parameters) for k in _certified(us))
+
+        def certificate(x: Array, u: Array) -> Certificate:
+            """That of a search which ends where it began is known: it costs as much as the search."""
+            at = x.tobytes() + u.tobytes() + repr(parameters).encode()
+            if at not in self.certified:
+                self.certified[at] = certify_inside(model, x, u, parameters=parameters)
+            return self.certified[at]
+
+        certificates = tuple(certificate(xs[k], us[k]) for k in _certified(us))
         return xs, us, certificates, why_blind(self.problem, variables, z)
 
     def _certify_equations(self, jacobian: Any, xs: Array, us: Array) -> tuple[Certificate, ...]:

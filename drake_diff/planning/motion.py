@@ -10,7 +10,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
 from drake_diff.model.step import advance, set_state
 from drake_diff.planning.around import Line
-from drake_diff.planning.posture import effort_limits, share
+from drake_diff.planning.posture import effort_limits, shares
 from drake_diff.planning.robot import Robot, drive
 
 FASTEST = 1.0  # [rad/s or m/s] the peak of a joint without a velocity limit
@@ -97,7 +97,7 @@ def _timed(robot: Robot, name: str, line: Line, duration: float) -> Guess:
     v = np.vstack([np.zeros((1, model.nv)), np.diff(q, axis=0) / h])
     us = np.array([_inputs(model, np.concatenate([q[k], v[k]]), v[k + 1]) for k in range(steps)])
     depth = max(robot.overlap(posture) for posture in q[:: max(1, steps // 25)])
-    return Guess(name, model, np.hstack([q, v]), us, share(model, us), depth)
+    return Guess(name, model, np.hstack([q, v]), us, float(np.max(shares(model, us))), depth)
 
 
 def _smooth(t: Array) -> Array:
@@ -139,4 +139,4 @@ def by_controller(robot: Robot, target: Array, *, steps: int, reach: float, name
             us.append(u)
     except SimulationError:
         return None
-    return Guess(name, model, np.array(xs), np.array(us), share(model, np.array(us)))
+    return Guess(name, model, np.array(xs), np.array(us), float(np.max(shares(model, np.array(us)))))

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array
-from drake_diff.exceptions import DrakeDiffError
 from drake_diff.model.contact import overlaps
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
@@ -98,20 +97,21 @@ def _overlaps(shapes: Model, q: Array) -> dict[Pair, float]:
 
 
 def share_to_hold(model: Model, q: Array) -> float:
-    """The share of its effort limits that a fully driven robot needs to hold posture q (nq,); inf if it cannot."""
+    """The share of its effort limits that a fully driven robot needs to hold posture q (nq,)."""
+    return float(np.max(shares_to_hold(model, q), initial=0.0))
+
+
+def shares_to_hold(model: Model, q: Array) -> Array:
+    """(nu,) the same of each input."""
     set_state(model.double, np.concatenate([q, np.zeros(model.nv)]))
-    try:
-        needed = model.double.inverse_dynamics(np.zeros(model.nv))
-    except DrakeDiffError:
-        return float("inf")
-    return share(model, np.linalg.lstsq(model.actuation, needed, rcond=None)[0])
+    needed = model.double.inverse_dynamics(np.zeros(model.nv))
+    return shares(model, np.linalg.lstsq(model.actuation, needed, rcond=None)[0])
 
 
-def share(model: Model, us: Array) -> float:
-    """The largest share of an effort limit in inputs us (..., nu)."""
+def shares(model: Model, us: Array) -> Array:
+    """(..., nu) of the effort limits, in inputs us (..., nu); 0 where there is none."""
     limits = effort_limits(model)
-    used = np.abs(us) / np.where(limits > 0, limits, np.inf)
-    return float(np.max(np.where(np.isfinite(limits), used, 0.0), initial=0.0))
+    return np.asarray(np.abs(us) / np.where((limits > 0) & np.isfinite(limits), limits, np.inf))
 
 
 def effort_limits(model: Model) -> Array:

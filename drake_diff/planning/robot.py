@@ -11,9 +11,9 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError, ModelWarning, SimulationError
 from drake_diff.model.model import Model, load_model
-from drake_diff.model.plant import joints
+from drake_diff.model.plant import actuators, joints
 from drake_diff.model.step import advance, set_state
-from drake_diff.planning.posture import Pair, deepest, inside, ranges, start
+from drake_diff.planning.posture import Pair, Start, deepest, inside, ranges, shares_to_hold, start
 
 TIME_STEP = 0.02  # [s] of a plan
 FEW = 0.5  # of all joints: where fewer have a motor, the file says nothing of motors, or forgot some
@@ -94,6 +94,11 @@ def _placed(path: Path, options: dict[str, Any], model: Model, told: list[str], 
     except SimulationError as error:
         told.append(f"its overlap is not looked for: {error}")
         shapes, found = None, start(None, apart if driven else None, first, lower, upper, random)
+    weak = _too_weak(apart, found) if driven and found.load > 1 else ()
+    if weak and len(weak) < model.nv:
+        told.append(f"the motors of {_few(weak)} cannot hold the weight in any posture tried: fixed (fix_joints)")
+        fixed = options | {"fix_joints": (*options.get("fix_joints", ()), *weak)}
+        return _placed(path, fixed, _loaded(path, fixed), told, random)
     if found.always:
         told.append(f"{_few(map(' and '.join, sorted(found.always)))} overlap in every posture, which is not looked at")
     if driven and touches:
@@ -105,6 +110,13 @@ def _placed(path: Path, options: dict[str, Any], model: Model, told: list[str], 
             "its start is moved to where joints are inside their limits, nothing overlaps and its motors hold it"
         )
     return Robot(model, shapes, found.q, lower, upper, tuple(told), driven, found.always)
+
+
+def _too_weak(model: Model, found: Start) -> tuple[str, ...]:
+    """The joints whose motors are too weak for the posture, and those that follow them."""
+    over = np.flatnonzero(shares_to_hold(model, found.q) > 1)
+    moved = [actuator.joint().name() for actuator in actuators(model.plant)]
+    return _with_followers(model, [moved[i] for i in model.inputs.actuator[over]])
 
 
 def _loaded(path: Path, options: dict[str, Any]) -> Model:
@@ -129,7 +141,12 @@ def _stuck(model: Model) -> tuple[str, ...]:
         (at, _) = model.places(joint)
         if joint.num_positions() == 1 and len(at) and lower[at[0]] >= upper[at[0]]:
             found.append(joint.name())
-    mimics = () if model.coupling is None else model.coupling.mimics
+    return _with_followers(model, found)
+
+
+def _with_followers(model: Model, names: list[str]) -> tuple[str, ...]:
+    """The joints, and those that follow them."""
+    found, mimics = list(names), () if model.coupling is None else model.coupling.mimics
     while more := [m.follower for m in mimics if m.leader in found and m.follower not in found]:
         found += more
     return tuple(found)
