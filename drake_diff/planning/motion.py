@@ -18,6 +18,7 @@ OF_SPEED = 0.6  # of a velocity limit: the peak of a first guess
 SHORTEST, LONGEST = 0.6, 6.0  # [s] a motion
 STEPS = (30, 100)  # fewest and most of a plan
 OF_EFFORT = 0.9  # of an effort limit: what a first guess may use
+PEAK = 1.875  # the greatest slope of the smooth way from 0 to 1
 CORRECTIONS = 3
 EXACT = 1e-11  # [rad/s or m/s]
 PULL, DAMP = 30.0, 9.0  # [1/s^2], [1/s] of a controller

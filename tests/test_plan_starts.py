@@ -1,0 +1,150 @@
+"""What a stranger's file may hold that a plan has to mend: weak motors, shapes that always overlap, slow joints."""
+
+import numpy as np
+import pytest
+
+import drake_diff as dd
+from drake_diff.exceptions import ModelError
+from drake_diff.planning import plan
+from drake_diff.planning.posture import TOUCHING, share_to_hold
+from drake_diff.planning.robot import load_robot
+from drake_diff.planning.task import Task, postures
+
+G = 9.81
+INERTIA = '<inertia ixx="0.02" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/>'
+
+
+def link(name, mass=1.0, at="0 0 -0.25", shape=""):
+    collision = f'<collision name="skin"><origin xyz="{at}"/><geometry>{shape}</geometry></collision>' if shape else ""
+    inertial = f'<inertial><origin xyz="{at}"/><mass value="{mass}"/>{INERTIA}</inertial>' if mass else ""
+    return f'<link name="{name}">{inertial}{collision}</link>'
+
+
+def joint(name, parent, child, *, at="0 0 0", axis="0 1 0", kind="revolute", limit="", more=""):
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><origin xyz="{at}"/>'
+        f'<axis xyz="{axis}"/><limit {limit}/>{more}</joint>'
+    )
+
+
+def robot(tmp_path, *parts):
+    path = tmp_path / "robot.urdf"
+    path.write_text(f'<robot name="robot"><link name="world"/>{"".join(parts)}</robot>')
+    return path
+
+
+def outstretched(tmp_path, effort):
+    """An arm of 1 kg that points along x at 0, 0.25 m out: it needs 2.45 N m there, and sin(q) of that elsewhere."""
+    limit = f'lower="-1.6" upper="1.6" effort="{effort}" velocity="3"'
+    return robot(tmp_path, link("arm", at="0.25 0 0"), joint("shoulder", "world", "arm", limit=limit))
+
+
+def test_a_plan_starts_where_the_motors_hold_the_robot(tmp_path):
+    found = load_robot(outstretched(tmp_path, 1.0), 0)
+    assert abs(np.cos(found.q[0])) * G * 0.25 <= 0.63  # the gravity torque, by hand, of the limit of 1 N m
+    assert "motors hold" in " ".join(found.repairs)
+    assert plan(outstretched(tmp_path, 1.0), out=tmp_path / "out").success
+
+
+def test_a_start_that_is_held_is_left_where_the_file_puts_it(tmp_path):
+    assert load_robot(outstretched(tmp_path, 10.0), 0).q == pytest.approx([0.0])
+
+
+def test_a_joint_that_no_posture_relieves_is_fixed_and_told(tmp_path):
+    """A vertical slide carries 9.81 N wherever it is, and its motor has 5 N."""
+    slide = joint(
+        "slide",
+        "world",
+        "carriage",
+        axis="0 0 1",
+        kind="prismatic",
+        limit='lower="0" upper="1" effort="5" velocity="1"',
+    )
+    arm = joint("shoulder", "carriage", "arm", limit='lower="-1" upper="1" effort="30" velocity="3"')
+    found = load_robot(robot(tmp_path, link("carriage"), link("arm"), slide, arm), 0)
+    assert found.model.position_names == ("shoulder_q",)
+    assert "motors of slide cannot hold the weight" in " ".join(found.repairs)
+
+
+def test_only_shapes_that_overlap_in_every_posture_are_not_looked_at(tmp_path):
+    """The hand is inside the collar for good, two links before it; the forearm meets the post only where it is bent."""
+    ball = '<sphere radius="0.05"/>'
+    limit = 'lower="-3" upper="3" effort="50" velocity="3"'
+    path = robot(
+        tmp_path,
+        link("post", at="0.3 0 -0.5", shape=ball),
+        joint("still", "world", "post", kind="fixed"),
+        link("upper"),
+        joint("shoulder", "world", "upper", limit=limit),
+        link("collar", at="0 0 -0.2", shape=ball),
+        joint("twist", "upper", "collar", axis="0 0 1", limit=limit),
+        link("fore", at="0 0 -0.5", shape=ball),
+        joint("elbow", "collar", "fore", at="0 0 -0.1", limit='lower="-0.1" upper="0.1" effort="50" velocity="3"'),
+        link("hand", at="0 0 -0.1", shape=ball),
+        joint("wrist", "fore", "hand", axis="0 0 1", limit=limit),
+    )
+    found = load_robot(path, 0)
+    assert found.always == {("collar/skin", "hand/skin")}
+    assert found.shapes is not None
+    assert found.overlap(np.zeros(found.model.nq)) == 0  # though the hand is in the collar
+    angle = np.arctan2(-0.3, 0.5)  # the forearm's ball is 0.6 m from the shoulder, the post's 0.583 m
+    bent = np.zeros(found.model.nq)
+    bent[found.model.position_names.index("shoulder_q")] = angle
+    assert found.overlap(bent) == pytest.approx(0.1 - (0.6 - np.hypot(0.3, 0.5)), abs=1e-9)
+
+
+def test_a_random_goal_is_no_further_than_slow_joints_go(tmp_path):
+    """At 0.6 of 0.1 rad/s, a smooth motion of 2 s goes 0.064 rad."""
+    limit = 'lower="-3" upper="3" effort="50" velocity="0.1"'
+    found = load_robot(robot(tmp_path, link("arm"), joint("shoulder", "world", "arm", limit=limit)), 0)
+    for seed in range(10):
+        (goal,) = postures(found, Task({}, {}), seed)
+        assert abs(goal[0] - found.q[0]) <= 0.06 * 2.0 / 1.875 + 1e-12
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_random_goal_and_the_way_to_it_are_held(tmp_path, seed):
+    found = load_robot(outstretched(tmp_path, 1.0), seed)
+    (goal,) = postures(found, Task({}, {}), seed)
+    for s in (0.5, 1.0):
+        assert share_to_hold(found.model, found.q + s * (goal - found.q)) <= 0.63
+    assert found.overlap(goal) <= TOUCHING
+
+
+FOLLOWER = '<mimic joint="lead" multiplier="{ratio}" offset="0"/>'
+
+
+def test_a_joint_that_its_followers_hold_is_fixed(tmp_path):
+    """It may go from 0 to 1, its follower too and the other way: nothing but 0 is left."""
+    limit = 'lower="0" upper="1" effort="50" velocity="3"'
+    path = robot(
+        tmp_path,
+        link("arm"),
+        joint("shoulder", "world", "arm", limit='lower="-1" upper="1" effort="50" velocity="3"'),
+        link("a"),
+        joint("lead", "arm", "a", limit=limit),
+        link("b"),
+        joint("follow", "arm", "b", limit=limit, more=FOLLOWER.format(ratio=-1)),
+    )
+    found = load_robot(path, 0)
+    assert found.model.position_names == ("shoulder_q",)
+    assert any("lead, follow" in told for told in found.repairs)
+
+
+@pytest.mark.parametrize("follows", [True, False], ids=["a follower", "a joint of its own"])
+def test_a_finger_without_mass_is_fixed(tmp_path, follows):
+    limit = 'lower="-1" upper="1" effort="50" velocity="3"'
+    parts = [link("arm"), joint("shoulder", "world", "arm", limit=limit), link("lead_link")]
+    parts += [joint("lead", "arm", "lead_link", limit=limit), link("tip", mass=0)]
+    parts += [joint("tip_joint", "lead_link", "tip", limit=limit, more=FOLLOWER.format(ratio=1) if follows else "")]
+    path = robot(tmp_path, *parts)
+    found = load_robot(path, 0)
+    assert "tip_joint_q" not in found.model.position_names
+    assert "shoulder_q" in found.model.position_names
+    dd.step(found.model, found.model.default_state, np.zeros(found.model.nu))
+
+
+def test_a_robot_of_joints_without_a_way_to_go_is_refused(tmp_path):
+    limit = 'lower="0.5" upper="0.5" effort="50" velocity="3"'
+    with pytest.raises(ModelError, match="same lower and upper limit"):
+        load_robot(robot(tmp_path, link("arm"), joint("shoulder", "world", "arm", limit=limit)), 0)
