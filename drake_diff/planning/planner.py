@@ -3,7 +3,7 @@
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from drake_diff.model.model import Model
 from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.cost import QuadraticCost
 from drake_diff.optimize.problem.goals import FrameGoal
-from drake_diff.optimize.problem.obstacles import Obstacle, doubts_of
+from drake_diff.optimize.problem.obstacles import Obstacle, along_steps, doubts_of
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
@@ -35,6 +35,8 @@ TIMES = (None, "least")
 SMALL = 7  # velocities: of a larger robot any smooth motion will do, as its best one takes minutes
 FASTER = (0.2, 2.0)  # of the first guess's duration: the range of a least time
 SPEED_WEIGHT = 0.01  # of a speed against an effort, both as shares of their limits
+BESIDE = 0.05  # [rad or m] the range of each joint around a guess that a motion is kept near
+LOOKS = 3  # of the ten places in each step, those at which overlap is looked for are so many apart
 BUDGET = 120.0  # [s] on the clock, of one attempt
 SEGMENT = 5  # steps of multiple shooting
 
@@ -156,24 +158,7 @@ def plan(
         findings = tuple(audit(ready.model))
         clock.begin("guess", f"{len(findings)} finding{'s' * (len(findings) != 1)}")
         task = asked(ready.model, goals or {}, avoid)
-        tried: list[str] = []
-        found: list[Solution] = []
-        apart = False
-        for attempt in _attempts(ready, task, time, seed):
-            clock.begin("solve", attempt.name)
-            try:
-                solution = attempt.solved(lambda line: clock.report("solve", line))
-            except DrakeDiffError as error:
-                tried.append(f"{attempt.name}: not possible ({error})")
-                continue
-            depth = attempt.depth(solution) if solution.success else 0.0
-            found.append(solution)
-            tried.append(f"{attempt.name}: {solution.status.value}")
-            if solution.success and depth <= TOUCHING:
-                apart = True
-                break
-            if depth > TOUCHING:
-                tried[-1] += f", but shapes overlap by {1000 * depth:.2g} mm"
+        tried, found, apart = _first_that_holds(_attempts(ready, task, time, seed), clock)
         if not found:
             raise ModelError(f"{path}: no plan could be tried: {'; '.join(tried) or 'no first guess'}")
         best = found[-1] if apart else min(found, key=lambda s: s.defect + s.goal_error)
@@ -190,13 +175,17 @@ def plan(
 
 @dataclass(frozen=True, eq=False)
 class _Attempt:
-    """One problem, the guess that its search starts from, and how it is searched."""
+    """One problem, the guess that its search starts from, and how it is searched.
+
+    `instead` is what to try where the robot's shapes overlap along what is found.
+    """
 
     name: str
     robot: Robot
     problem: Problem
     guess: Guess | None
     options: Mapping[str, Any]
+    instead: "_Attempt | None" = None
 
     def solved(self, progress: Callable[[str], None]) -> Solution:
         begun = None if self.guess is None else (self.guess.xs, self.guess.us)
@@ -204,7 +193,33 @@ class _Attempt:
 
     def depth(self, solution: Solution) -> float:
         """[m] the deepest overlap of shapes along a solution; 0 where none is looked for."""
-        return max((self.robot.overlap(x[: self.problem.model.nq]) for x in solution.xs), default=0.0)
+        every, motion = along_steps(solution.times, solution.xs)
+        xs = motion(every) if solution.transcribed is None else solution.transcribed.at(every)[0]
+        return max(self.robot.overlap(x[: self.problem.model.nq]) for x in xs[::LOOKS])
+
+
+def _first_that_holds(attempts: Iterator[_Attempt], clock: "_Clock") -> tuple[list[str], list[Solution], bool]:
+    """How each attempt ended, the solutions, and whether the last one is verified and keeps shapes apart."""
+    tried: list[str] = []
+    found: list[Solution] = []
+    for first in attempts:
+        attempt: _Attempt | None = first
+        while attempt is not None:
+            clock.begin("solve", attempt.name)
+            try:
+                solution = attempt.solved(lambda line: clock.report("solve", line))
+            except DrakeDiffError as error:
+                tried.append(f"{attempt.name}: not possible ({error})")
+                break
+            depth = attempt.depth(solution) if solution.success else 0.0
+            found.append(solution)
+            tried.append(f"{attempt.name}: {solution.status.value}")
+            if solution.success and depth <= TOUCHING:
+                return tried, found, True
+            if depth > TOUCHING:
+                tried[-1] += f", but shapes overlap by {1000 * depth:.2g} mm"
+            attempt = attempt.instead if depth > TOUCHING else None
+    return tried, found, False
 
 
 def _attempts(robot: Robot, task: Task, least: str | None, seed: int) -> Iterator[_Attempt]:
@@ -255,7 +270,10 @@ def _collocated(robot: Robot, task: Task, guess: Guess, least: str | None) -> _A
     problem = _problem(task, guess, x1, **asked)
     what = "least time" if least else "least effort"
     options = {"method": "collocation", "refine": True, "error_tolerance": 1e-5, "time_limit": BUDGET}
-    return _Attempt(f"{what} from {guess.name}", robot, problem, guess, options)
+    name = f"{what} from {guess.name}"
+    near = replace(problem, bounds=_bounds(model, guess.xs[:, : model.nq]))
+    instead = _Attempt(f"{name}, near it", robot, near, guess, options)
+    return _Attempt(name, robot, problem, guess, options, instead if guess.depth <= TOUCHING else None)
 
 
 def _feasible(robot: Robot, task: Task, guess: Guess) -> _Attempt:
@@ -320,13 +338,20 @@ def _effort(model: Model) -> QuadraticCost:
     return QuadraticCost(Q=np.diag(speeds), R=np.diag(1.0 / size**2))
 
 
-def _bounds(model: Model) -> Bounds | None:
-    """The model's own limits, but for velocity limits of 0, which no motion can keep."""
+def _bounds(model: Model, near: Array | None = None) -> Bounds | None:
+    """The model's own limits, but for velocity limits of 0, which no motion can keep.
+
+    With postures (K, nq) that a motion is to stay `near`, each joint stays within their range, and a little more.
+    """
     dead = np.array([v.lower >= v.upper for v in model.contract.velocities])
-    if not np.any(dead):
+    if near is None and not np.any(dead):
         return None
     lower, upper = np.full(model.nx, np.nan), np.full(model.nx, np.nan)
     lower[model.nq :][dead], upper[model.nq :][dead] = -np.inf, np.inf
+    if near is not None:
+        limits = model.contract.positions
+        lower[: model.nq] = np.maximum([p.lower for p in limits], np.min(near, axis=0) - BESIDE)
+        upper[: model.nq] = np.minimum([p.upper for p in limits], np.max(near, axis=0) + BESIDE)
     return Bounds(x_lower=lower, x_upper=upper)
 
 

@@ -1,6 +1,6 @@
 """Postures of a robot: where its coordinates may be, which shapes overlap, what its motors hold, where it starts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ WIDEST = 4 * np.pi  # a wider range is as good as none
 TOUCHING = 1e-4  # [m] of overlap: less is none
 HELD = 0.63  # of the effort limits: what a start may need to be held
 SEEN = 16  # postures in which a pair of shapes overlaps before it is said to do so always
+ROOM, BESIDE = 0.1, 6  # [rad or m] that all joints can move at once from a start, in so many ways at random
 ATTEMPTS, FINER = 60, 400  # at a start: drawn ever farther from the file's, and near the best so far
 DEPTH = 0.01  # [m] of overlap that weighs as much as all that the motors have
 Pair = tuple[str, str]
@@ -40,6 +41,7 @@ def start(
 ) -> Start:
     """The posture `first` (nq,), or one that is better: where nothing overlaps, and which the motors of `driven` hold.
 
+    It has room beside it where one of ATTEMPTS has, since searches go on from it in all directions.
     `lower` and `upper` (nq,) are the ranges of all coordinates; those of a free body's pose are left alone.
     """
     model = shapes or driven
@@ -58,10 +60,18 @@ def start(
         load = 0.0 if driven is None else share_to_hold(driven, q)
         return Start(q, 0.0 if shapes is None else deepest(shapes, q, always), load, always)
 
-    best = measured(first)
+    def has_room(q: Array) -> bool:
+        beside = [q + np.where(one, random.choice([-ROOM, ROOM], len(q)), 0.0) for _ in range(BESIDE)]
+        return shapes is None or all(deepest(shapes, other, always) <= TOUCHING for other in beside)
+
+    best, tight = measured(first), None
     for i in range(ATTEMPTS + FINER):
+        if i == ATTEMPTS and tight is not None:
+            return tight
         if _badness(best) == 0:
-            break
+            if has_room(best.q):
+                break
+            tight, best = tight or best, replace(best, depth=np.inf)  # unless all others are worse
         if i < ATTEMPTS:
             part = (i + 1) / ATTEMPTS
             q = np.where(one, first + part * (random.uniform(lower + margin, upper - margin) - first), first)
