@@ -4,12 +4,13 @@ import re
 
 import numpy as np
 import pytest
+from helpers.models import MODELS
 from helpers.table import each_row
 from pydrake.trajectories import PiecewisePolynomial
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, ShapeError
-from drake_diff.optimize.guess import first_guess
+from drake_diff.optimize.guess import another_guess, first_guess
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
@@ -143,3 +144,70 @@ def test_a_solution_of_another_system_is_refused(write_urdf):
     cart = dd.example_model("cart_pole", time_step=0.1)
     with pytest.raises(ShapeError, match="states and inputs"):
         dd.solve(dd.Problem(cart, x0=[0, 0, 0, 0], x_goal=[0, 0.1, 0, 0], num_steps=10), initial_guess=found)
+
+
+# ------------------------------------------------------------------------------ other first guesses
+
+
+def limited_pendulum(limit, **asked):
+    """m = l = 1: it hangs by its motor at 9.81 N m, so that less has to swing up."""
+    swing = dd.Dynamics(
+        lambda x, u: [x[1], u[0] - 9.81 * np.sin(x[0]) - 0.1 * x[1]], nx=2, nu=1, u_lower=[-limit], u_upper=[limit]
+    )
+    ends = {"x0": [0, 0], "x_goal": [np.pi, 0], "num_steps": 40}
+    return dd.Problem(swing, **ends | asked)
+
+
+@each_row("limit", [3.9, 4.5, 3.0, 2.5])
+@each_row("method", ["auto", "collocation"])
+def test_a_swing_up_in_least_time_is_found_from_another_first_guess(limit, method):
+    """IPOPT calls it infeasible from a straight line. The motion is integrated here, under the plan's own input."""
+    solution = dd.solve(limited_pendulum(limit, horizon=(0.5, 10.0), running_cost=1.0), method=method)
+    assert solution.success, solution.message
+    chain = solution.options["chain"]
+    assert len(chain) > 1
+    assert {link["ended"] for link in chain[:-1]} <= {"infeasible", "iteration_limit"}
+    assert f"another first guess ({len(chain) - 1} of 8)" in chain[-1]["reason"]
+    assert np.abs(solution.us).max() <= limit + 1e-6
+    x, parts = np.zeros(2), 4000
+    us = solution.transcribed.at(solution.horizon * (np.arange(parts) + 0.5) / parts)[1][:, 0]
+    for u in us:  # the midpoint rule, whose error is 1e-6 in such steps
+        h = solution.horizon / parts
+        middle = x + h / 2 * np.array([x[1], u - 9.81 * np.sin(x[0]) - 0.1 * x[1]])
+        x = x + h * np.array([middle[1], u - 9.81 * np.sin(middle[0]) - 0.1 * middle[1]])
+    np.testing.assert_allclose(x, [np.pi, 0], atol=0.06)  # an upright pendulum makes 1e-6 grow e^(3 t)
+
+
+def test_the_same_seed_tries_the_same_guesses():
+    problem = limited_pendulum(3.0, horizon=(0.5, 10.0), running_cost=1.0)
+    a, b, c = (dd.solve(problem, seed=seed) for seed in (0, 0, 3))
+    np.testing.assert_array_equal(a.xs, b.xs)
+    assert a.success
+    assert c.success
+    assert a.options["initial_guess_sha256"] != c.options["initial_guess_sha256"]
+
+
+def test_what_no_guess_solves_says_how_many_were_tried():
+    """1 m in 1 s from rest to rest needs 4 N at least."""
+    problem = block(bounds=dd.Bounds(u_lower=[-3.9], u_upper=[3.9]))
+    solution = dd.solve(problem)
+    assert solution.status is dd.Status.INFEASIBLE
+    assert "from none of 9 first guesses was a plan found" in solution.message
+    assert len(solution.options["chain"]) == 9
+    given = dd.solve(problem, initial_guess=(solution.xs, solution.us))  # what is given is what is tried
+    assert len(given.options["chain"]) == 1
+
+
+def test_another_guess_is_inside_all_bounds_and_begins_where_the_motion_does():
+    problem = limited_pendulum(3.0, horizon=(0.5, 10.0), running_cost=1.0, bounds={"x1": (-1, 2)})
+    for number in range(1, 9):
+        xs, us, horizon = another_guess(problem, 0, number)
+        np.testing.assert_array_equal(xs[0], [0, 0])
+        assert np.all((xs[:, 1] >= -1) & (xs[:, 1] <= 2))
+        assert np.abs(us).max() <= 3.0
+        assert 0.5 <= horizon <= 10.0
+    lift = dd.model.BodyForce("lift", "body", upper=20.0)
+    quadrotor = dd.load_model(MODELS / "quadrotor.urdf", time_step=0.05, body_forces=[lift])
+    x0 = quadrotor.default_state
+    free = dd.Problem(quadrotor, x0=x0, x_goal=x0, num_steps=5)
+    np.testing.assert_allclose(np.linalg.norm(another_guess(free, 0, 1)[0][:, :4], axis=1), 1.0, rtol=1e-12)

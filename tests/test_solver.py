@@ -429,6 +429,7 @@ def test_auto_goes_on_from_what_a_failed_attempt_left(load, monkeypatch):
         return dataclasses.replace(solution, status=Status.INFEASIBLE) if len(calls) == 1 else solution
 
     monkeypatch.setattr(Run, "collocate", fail_once)
+    monkeypatch.setattr("drake_diff.optimize.solve.OTHER_GUESSES", 0)
     solution = dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]))
     assert solution.success, solution.message
     assert [link["method"] for link in solution.options["chain"]] == ["collocation", "ilqr"]

@@ -13,12 +13,16 @@ from drake_diff._base.arrays import Array, finite_array, positive_float
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, InputError, ShapeError
 from drake_diff.model.model import Model
+from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.transcription.collocation import Collocated
 
 ROUNDED = 1e-6  # of the largest input that holds a state: no input
 NOISE = 1e-3  # of the largest input: breaks the symmetry of a guess that is a stationary point
+WANDER = (1.0, 0.3)  # of the way to the goal, or of 1: how far another guess goes from the straight line
+WAVES = 4
+LONGER = 3.0  # times the first horizon at most, or that part of it at least
 FORMS = "None, (xs, us), two of Drake's trajectories (state, input) or a Solution"
 
 
@@ -120,6 +124,29 @@ def _line(problem: Problem, method: str, seed: int) -> Guess:
         us = NOISE * size * np.random.default_rng(seed).standard_normal(us.shape)
     inside = np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
     return Guess(xs, inside if problem.optimizes_controls else us)
+
+
+def another_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
+    """A random smooth motion about the straight line, for collocation: xs (N+1, nx), us (N+1, nu) and a horizon.
+
+    One sine or cosine for each of a few frequencies, with amplitudes from a normal distribution; of two in turn, one
+    stays near the line and one goes far. A free horizon is a random part or multiple of the first one's.
+    """
+    random = np.random.default_rng([seed, number])
+    far, s = WANDER[number % len(WANDER)], np.linspace(0, 1, problem.num_steps + 1)[:, None]
+    b, end = problem.bounds, np.where(np.isnan(problem.goal), problem.x0, problem.goal)
+    limit = np.minimum(np.abs(b.u_lower), np.abs(b.u_upper))
+    size = np.where(np.isfinite(limit), np.minimum(limit, 100.0) / 2, 1.0)
+    waves = [random.standard_normal(problem.nx) * np.sin(j * np.pi * s) / j for j in range(1, WAVES)]
+    swings = [random.standard_normal(problem.nu) * np.cos(j * np.pi * s) / (j + 1) for j in range(WAVES)]
+    xs = problem.x0 + s * (end - problem.x0) + far * np.maximum(1.0, np.abs(end - problem.x0)) * sum(waves)
+    us = np.clip(size * sum(swings), b.u_lower, b.u_upper)
+    xs[1:] = np.clip(xs[1:], b.x_lower, b.x_upper)
+    for start in tangent_space(problem.model).quaternions if problem.has_model else ():
+        xs[:, start : start + 4] /= np.linalg.norm(xs[:, start : start + 4], axis=1, keepdims=True)
+    if not problem.horizon or problem.horizon[0] == problem.horizon[1]:
+        return xs, us
+    return xs, us, float(np.clip(problem.start_horizon * LONGER ** random.uniform(-1, 1), *problem.horizon))
 
 
 def _holding(problem: Problem) -> Array:

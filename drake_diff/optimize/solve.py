@@ -20,7 +20,7 @@ from drake_diff.model.soft_contact import SoftContact
 from drake_diff.model.step import set_state
 from drake_diff.optimize.advice import advice
 from drake_diff.optimize.drake_program import SOLVERS
-from drake_diff.optimize.guess import Guess, first_guess, sampled
+from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
 from drake_diff.optimize.ilqr.ilqr import check_problem, is_unconstrained, solve_ilqr
 from drake_diff.optimize.ilqr.through_contact import check_schedule, solve_continuation, solve_through_jumps
 from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, refused
@@ -47,6 +47,9 @@ METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": "riccati"}
 CERTIFIED_KNOTS = 5
 CLEARANCE_PARTS = (4, 8, 16)  # of a step: looked at where a discrete plan comes too near to an obstacle in between
+OTHER_GUESSES = 8  # of a collocation that finds no motion from a straight line
+OTHER_ITERATIONS = 200  # of each
+NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
 FINER_ROUNDS = 6  # of a mesh whose plan does not hold
 GUESS_ITERATIONS = 100  # of an attempt that is to find a guess for the next one
 ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
@@ -83,6 +86,7 @@ def solve(
     "auto" chains methods until one is verified: collocation where the model is smooth, or where every coordinate is
     driven and nothing touches in x0; else, or where that fails, iLQR (with a continuation where the guess touches
     nothing that matters), whose result the next one starts from.
+    A collocation that finds no motion from a straight line is tried from other first guesses, random ones by `seed`.
     `Solution.options["chain"]` says what was tried, why, and how it ended.
 
     Args:
@@ -99,7 +103,7 @@ def solve(
         max_iterations: of the solver, and of each round of a refinement.
         time_limit: [s] of the whole solve.
         tolerance: the solver's, on feasibility and optimality.
-        seed: of the noise in a default guess.
+        seed: of the noise in a default guess, and of the other first guesses.
         segments: of multiple shooting, whose first states are variables too; 1 is single shooting.
         continuation: finds contact that the guess does not make, by stages of a force at a distance before the true
             plant: "auto" or a sequence of SoftContacts, with method="ilqr". `Solution.options` has the stages' log.
@@ -158,11 +162,11 @@ def solve(
         raise InputError("refine", got=repr(refine), expected="None, True or False")
     report = Report(print if progress is True else (progress or None), callback)
     task = _Task(problem, limits, seed, report, on_start)
-    asked = Attempt(method, "asked for", scheme, solver, segments, continuation, refine, refinement)
+    asked = Attempt(method, "asked for", scheme, solver, segments, continuation, int(seed), refine, refinement)
     if method == "auto" and continuation is not None:
         asked = dataclasses.replace(asked, method="ilqr", reason="a continuation is asked for")
     initial_guess = sampled(problem, asked.method, initial_guess)
-    in_chain = asked.method == "auto" and segments == 1
+    in_chain = asked.method in ("auto", "collocation") and segments == 1
     make = partial(_solve_in_chain, task, asked, initial_guess) if in_chain else task.prepare(asked, initial_guess)
     solution = make()
     arguments: dict[str, Any] = {
@@ -216,6 +220,7 @@ class Attempt:
     solver: str | None = None
     segments: int = 1
     continuation: Any = None
+    seed: int = 0
     refine: bool | None = None
     refinement: MeshRefinement | None = None
     max_iterations: int | None = None
@@ -273,7 +278,10 @@ class _Task:
 
 
 def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
-    """Attempt after attempt until one is verified; the best of them, with what was tried in its options."""
+    """Attempt after attempt until one is verified; the best of them, with what was tried in its options.
+
+    A collocation that was asked for is tried from other first guesses alone.
+    """
     found: list[Solution] = []
     chain: list[dict[str, str]] = []
     for attempt, guess in _attempts(task.problem, asked, given, found):
@@ -298,11 +306,19 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
         return rank, solution.defect + solution.goal_error, solution.cost
 
     best = min(found, key=preference)
+    if asked.method != "auto" and len(chain) == 1:
+        return best
+    if len(found) > 1 and best.status not in PLANS and all(s.method == "collocation" for s in found):
+        best = best.told(message=f"{best.message}; from none of {len(found)} first guesses was a plan found")
     return best.told(options=best.options | {"chain": chain})
 
 
 def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution]) -> Iterator[tuple[Attempt, Any]]:
     """What to try next and from which guess, by what the attempts before, in `found`, came to."""
+    if asked.method == "collocation":
+        yield asked, given
+        yield from _other_guesses(problem, asked, given, found)
+        return
     method, reason = choose_method(problem)
     first = dataclasses.replace(asked, method=method, reason=reason, solver=None if method == "ilqr" else asked.solver)
     told = "nothing touches at first, and every coordinate is driven"
@@ -310,6 +326,8 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
     if method == "ilqr" and _is_free_at_first(problem) and _is_possible(problem, free):
         yield free, given
     yield first, given
+    if method == "collocation":
+        yield from _other_guesses(problem, first, given, found)
     if found[-1].status is Status.NO_GRADIENT and method == "ilqr":
         yield Attempt("ilqr", "the guess has no gradient", continuation="auto"), given
     if method == "shooting" or not problem.has_model:
@@ -321,6 +339,20 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
         begun = found[-1].xs, found[-1].us
         after = "collocation" if method == "collocation" else "shooting"
         yield dataclasses.replace(asked, method=after, reason="from the motion that iLQR found"), begun
+
+
+def _other_guesses(
+    problem: Problem, attempt: Attempt, given: Any, found: list[Solution]
+) -> Iterator[tuple[Attempt, Any]]:
+    """A collocation from other first guesses than a straight line, from which no motion was found."""
+    if given is not None or attempt.solver == "snopt":
+        return
+    for number in range(1, OTHER_GUESSES + 1):
+        if found[-1].status not in NOT_FOUND:
+            return
+        reason = f"no motion was found: another first guess ({number} of {OTHER_GUESSES})"
+        begun = another_guess(problem, attempt.seed, number)
+        yield dataclasses.replace(attempt, reason=reason, max_iterations=OTHER_ITERATIONS), begun
 
 
 def _is_free_at_first(problem: Problem) -> bool:
