@@ -96,7 +96,7 @@ SOURCES = {
     "docs/plan.md": {
         "0": CODES["0"],
         "7": "drake_diff.planning.planner:SMALL",
-        "1e-4": "drake_diff.planning.robot:TOUCHING",
+        "1e-4": "drake_diff.planning.posture:TOUCHING",
     },
     "docs/contact.md": {
         "1000": "drake_diff.model.triangles:MOST_CORNERS",
