@@ -13,6 +13,7 @@ from pydrake.multibody.tree import MultibodyForces
 import drake_diff as dd
 from drake_diff.exceptions import ModelError
 from drake_diff.model.plant import actuators, joints
+from drake_diff.record.provenance import named_files
 
 GEOM = '<geom size="0.1" mass="1"/>'
 AGREE = 1e-9  # relative: both sum up a chain of a few bodies in double precision
@@ -305,3 +306,24 @@ def test_a_missing_mesh_is_named_where_it_should_be(tmp_path, monkeypatch):
     path = write(tmp_path, HINGE.format("", '<geom type="mesh" mesh="part"/>'), more=asset, head="<mujoco>")
     with pytest.raises(ModelError, match=f'"{tmp_path}/part.obj" could not be found'):
         load(path)
+
+
+def test_a_record_knows_every_file_that_the_robot_is_made_of(tmp_path):
+    """Of directives and of what a file includes too: a mesh that is changed later is another robot."""
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "part.stl")
+    (tmp_path / "assets.xml").write_text('<mujoco><asset><mesh file="part.stl"/></asset></mujoco>')
+    write(tmp_path, HINGE.format("", '<geom type="mesh" mesh="part"/>'), more='<include file="assets.xml"/>')
+    (tmp_path / "two.dmd.yaml").write_text("directives:\n- add_model: {name: one, file: package://here/m.xml}\n")
+    names = {e.path: e.reason for e in named_files(tmp_path / "two.dmd.yaml", {"here": str(tmp_path)})}
+    inner = "package://here/m.xml"
+    assert names == {inner: None, f"{inner}: assets.xml": None, f"{inner}: part.stl": None}
+
+
+def test_joints_of_one_name_in_two_robots_have_inputs_of_their_own_names(tmp_path):
+    write(tmp_path, HINGE.format("", ""))
+    path = tmp_path / "two.dmd.yaml"
+    add = "- add_model: {{name: {0}, file: package://here/m.xml}}\n"
+    path.write_text("directives:\n" + add.format("left") + add.format("right"))
+    model = load(path, packages={"here": tmp_path}, actuators="all")
+    assert model.input_names == ("left::j", "right::j")
+    assert load(path, packages={"here": tmp_path}, actuators=["right::j"]).input_names == ("j",)

@@ -218,6 +218,11 @@ def test_neighbours_and_what_always_overlaps_are_left_out_of_self_collision():
     labels = set(problem.kept_goals[0].clearance.labels)
     assert "shoulder_link and wrist_3_link" in labels or "upper_arm_link and wrist_3_link" in labels
     assert "upper_arm_link and forearm_link" not in labels
+    left = dd.SelfCollision().left_out(model)
+    assert left
+    assert not labels & set(left)
+    with pytest.warns(ModelWarning, match=f"does not keep {len(left)} pairs of links apart, .*{left[0]}"):
+        dd.Problem(model, x0=x0, num_steps=5, final_cost=lambda x: x[0] ** 2, goals=[dd.SelfCollision()])
     some = dd.SelfCollision(ignore=[("wrist_3_link", "upper_arm_link")])
     fewer = dd.Problem(model, x0=x0, num_steps=5, final_cost=lambda x: x[0] ** 2, goals=[some])
     assert set(fewer.kept_goals[0].clearance.labels) == labels - {"upper_arm_link and wrist_3_link"}

@@ -354,6 +354,7 @@ def test_what_speaks_of_joints_that_are_not_there_is_left_out_and_told(write):
     follower = joint("elbow", "upper", "lower", more='<mimic joint="gone"/>')
     model, _ = load(write(robot(SHOULDER, follower).replace("</robot>", lost + "</robot>")), base="weld")
     assert model.nq == 2
+    assert load(model.source, base="weld", mimic="reduce")[0].nq == 2
     assert model.notes[:3] == (
         "Materials: red has its colour written with commas.",
         "The joint elbow mimics gone, which does not exist: it moves by itself.",

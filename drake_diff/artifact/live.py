@@ -61,7 +61,9 @@ def scene_of_run(directory: str | Path) -> tuple[Scene, tuple[str, ...]]:
     poses = _poses(message for _, message in rows)
     contacts = {time: _forces(message) for time, message in log.messages.get("/contacts", [])}
     try:
-        plant, context, notes = _load(log.attachments, record.contract.get("source"))
+        options: dict[str, Any] = dict(record.model.options or {})
+        packages = options.get("packages") or {}
+        plant, context, notes = _load(log.attachments, record.contract.get("source"), packages)
         moving = {f"{plant.GetModelInstanceName(b.model_instance())}::{b.name()}": b for b in moving_bodies(plant)}
         paths = {name: body_path(body) for name, body in moving.items()}
         shapes = tuple(shapes_of(plant, context, bodies(plant)))
@@ -112,27 +114,28 @@ def _forces(message: Any) -> tuple[Force, ...]:
     return tuple(Force(point, force) for point, force in zip(points, forces, strict=True))
 
 
-def _load(attachments: dict[str, bytes], source: Any) -> tuple[Any, Any, tuple[str, ...]]:
+def _load(attachments: dict[str, bytes], source: Any, packages: dict[str, str]) -> tuple[Any, Any, tuple[str, ...]]:
     """Plant, context and notes: of the source file where it is still the one attached, else of the attachment."""
+    packages = {name: folder for name, folder in packages.items() if Path(folder).is_dir()}
     name = next((name for name in attachments if name.endswith(FORMATS)), None)
     if name is None:
         raise ModelError("the run has no model file attached: it was made from a diagram")
     if isinstance(source, str) and Path(source).is_file() and Path(source).read_bytes() == attachments[name]:
-        return _plant(Path(source))
+        return _plant(Path(source), packages)
     suffix = next(end for end in FORMATS if name.endswith(end))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"model{suffix}"
         text, skipped = _without_meshes(attachments[name], suffix)
         path.write_bytes(text)
-        plant, context, notes = _plant(path)
+        plant, context, notes = _plant(path, packages)
     gone = (f"the model's source is gone or changed: {skipped} meshes are not drawn",) if skipped else ()
     return plant, context, gone + notes
 
 
-def _plant(path: Path) -> tuple[Any, Any, tuple[str, ...]]:
+def _plant(path: Path, packages: dict[str, str]) -> tuple[Any, Any, tuple[str, ...]]:
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=0.01)
-    notes = read_into(plant, path).notes
+    notes = read_into(plant, path, packages).notes
     plant.Finalize()
     diagram = builder.Build()
     root = diagram.CreateDefaultContext()

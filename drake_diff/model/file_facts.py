@@ -3,10 +3,8 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from pydrake.common.yaml import yaml_load
-from pydrake.multibody.parsing import PackageMap
+from pydrake.multibody.parsing import FlattenModelDirectives, LoadModelDirectives, PackageMap
 
 from drake_diff.exceptions import ModelError
 from drake_diff.model.mjcf import Mjcf, with_includes
@@ -80,7 +78,7 @@ class FileFacts:
 def file_facts(path: Path, packages: PackageMap) -> FileFacts:
     """What the file at `path`, and the models that a .dmd.yaml adds, say of joints and links; of MJCF no links.
 
-    Of what is no XML that is nothing. Raises ModelError where a file that Drake could read is no YAML for Python.
+    Of what is no XML that is nothing. Raises ModelError where a file cannot be read.
     """
     found = FileFacts()
     _read(path, packages, None, found)
@@ -90,7 +88,10 @@ def file_facts(path: Path, packages: PackageMap) -> FileFacts:
 def _read(path: Path, packages: PackageMap, instance: str | None, found: FileFacts) -> None:
     try:
         if path.name.endswith(".dmd.yaml"):
-            _read_directives(yaml_load(filename=str(path)), packages, instance, found)
+            for directive in FlattenModelDirectives(LoadModelDirectives(str(path)), packages).directives:
+                if directive.add_model is not None:
+                    file = Path(packages.ResolveUrl(directive.add_model.file))
+                    _read(file, packages, directive.add_model.name, found)
             return
         xml = XmlText(path.read_bytes())
         root = xml.root
@@ -107,10 +108,11 @@ def _read(path: Path, packages: PackageMap, instance: str | None, found: FileFac
 
 
 def _read_urdf(robot: Element, name: str, found: FileFacts) -> None:
+    names = {joint.get("name") for joint in robot.findall("joint")}
     for joint in robot.findall("joint"):
         limit, mimic, key = joint.find("limit"), joint.find("mimic"), (name, joint.get("name"))
         found.joints[key] = JointSays(None if limit is None else _number(limit.get("effort")))
-        if mimic is not None and joint.get("type") != "fixed":
+        if mimic is not None and joint.get("type") != "fixed" and mimic.get("joint") in names:
             found.followers[key] = _drakes_mimic(key, mimic)
     for link in robot.findall("link"):
         found.links[name, link.get("name")] = _link_of_urdf(link)
@@ -186,15 +188,3 @@ def _number(text: str) -> float | None:
 def _sum(numbers: list[float | None]) -> float | None:
     given = [number for number in numbers if number is not None]
     return sum(given) if numbers and len(given) == len(numbers) else None
-
-
-def _read_directives(content: Any, packages: PackageMap, namespace: str | None, found: FileFacts) -> None:
-    for directive in content.get("directives", []):
-        model, more = directive.get("add_model"), directive.get("add_directives")
-        if model:
-            name = model["name"] if namespace is None else f"{namespace}::{model['name']}"
-            _read(Path(packages.ResolveUrl(model["file"])), packages, name, found)
-        elif more:
-            inner = more.get("model_namespace")
-            scope = "::".join(part for part in (namespace, inner) if part) or None
-            _read(Path(packages.ResolveUrl(more["file"])), packages, scope, found)

@@ -318,10 +318,10 @@ def _check_states(systems: Sequence[Any]) -> None:
 
 
 def _rows_of_actuators(plant: Any, which: list[int]) -> list[Row]:
-    found = actuators(plant)
+    found, names = actuators(plant), list(labelled(actuators(plant)))
     lower, upper = plant.GetEffortLowerLimits(), plant.GetEffortUpperLimits()
     units = ["N" if a.joint().type_name() == "prismatic" else "N m" for a in found]
-    return [(found[i].name(), units[i], float(lower[i]), float(upper[i]), i) for i in which]
+    return [(names[i], units[i], float(lower[i]), float(upper[i]), i) for i in which]
 
 
 def _rows_of_port(plant: Any, port: Any, into: set[int], generalized: int, forces: Sequence[BodyForce]) -> list[Row]:

@@ -74,7 +74,7 @@ def with_includes(xml: XmlText, path: Path) -> XmlText:
 
 def _included(element: Element, path: Path) -> Path | None:
     file = path.parent / element.get("file")
-    return file if element.get("file") and file.is_file() else None
+    return file if file.name.endswith((".xml", ".mjcf")) and file.is_file() else None
 
 
 @dataclass(frozen=True)

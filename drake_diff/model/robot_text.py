@@ -19,7 +19,6 @@ from drake_diff.model.xml_text import Element, XmlText
 
 MOST_NODES = 100_000  # of a YAML file, its aliases written out
 MOVING = ("revolute", "continuous", "prismatic")  # the types of joints that can be fixed
-INCLUDED = re.compile(r"^\s*-?\s*file:\s*[\"']?([^\s\"']+)", re.MULTILINE)  # in a .dmd.yaml
 DOWNLOADED = "drake_models"  # the package that Drake would fetch over the network
 IN_CPP = re.compile(r"Failure at \S+ in \w+\(\): ")
 
@@ -32,7 +31,6 @@ def text_of(path: Path, notes: list[str]) -> XmlText | None:
     path.read_text()  # which says what byte is no text
     refuse_circles(path, ())
     if path.name.endswith(".dmd.yaml"):
-        _check_yaml(path)
         return None
     try:
         xml = XmlText(path.read_bytes())
@@ -165,7 +163,7 @@ def fix_in_text(xml: XmlText, path: Path, names: tuple[str, ...]) -> tuple[str, 
 def included(path: Path) -> Iterator[str]:
     """The robot files that the one at `path` includes, as it names them."""
     if path.name.endswith(".dmd.yaml"):
-        yield from INCLUDED.findall(path.read_text(errors="replace"))
+        yield from files_of_directives(path)
         return
     try:
         root = XmlText(path.read_bytes()).root
@@ -176,6 +174,22 @@ def included(path: Path) -> Iterator[str]:
         name = include.get("file") or (uri.text.strip() if uri else "")
         if name:
             yield name
+
+
+def files_of_directives(path: Path) -> list[str]:
+    """What a .dmd.yaml file calls `file`. ModelError where it is no YAML, or far too large."""
+    _check_yaml(path)
+    found, waiting = [], [yaml.compose(path.read_text())]
+    while waiting:
+        node = waiting.pop()
+        for entry in getattr(node, "value", None) or [] if not isinstance(node, yaml.ScalarNode) else []:
+            if not isinstance(entry, tuple):
+                waiting.append(entry)
+            elif entry[0].value == "file" and isinstance(entry[1], yaml.ScalarNode):
+                found.append(str(entry[1].value))
+            else:
+                waiting.append(entry[1])
+    return found
 
 
 def refuse_circles(path: Path, above: tuple[Path, ...]) -> None:

@@ -21,13 +21,18 @@ import numpy as np
 
 from drake_diff.certificates.certificate import Certificate
 from drake_diff.certificates.judgement import VERDICTS
+from drake_diff.exceptions import ModelError
 from drake_diff.model.inputs import BodyForce
 from drake_diff.model.load_file import FORMATS
 from drake_diff.model.meshes import in_any_case
+from drake_diff.model.mjcf import with_includes
 from drake_diff.model.model import Model
+from drake_diff.model.robot_text import files_of_directives, package_above
+from drake_diff.model.xml_text import XmlText
 from drake_diff.record.parts import Certified, FileEvidence, ModelInput, Provenance
 
 MESHES = (".obj", ".mtl", ".vtk", ".gltf", ".glb", ".bin", ".stl", ".dae", ".ply", ".off", ".msh", ".png", ".jpg")
+OF_MJCF = (".xml", ".mjcf")  # all that such a file includes is read with it
 LIBRARIES = (".so", ".dll", ".dylib")  # plugins of Gazebo, which Drake does not read
 UNSAID = (None, (), "skip")  # options of `load_model` that change nothing are not recorded
 READABLE = (*MESHES, *FORMATS)
@@ -108,15 +113,18 @@ def file_evidence(path: Path, name: str) -> FileEvidence:
     return FileEvidence(path=name, bytes=len(data), sha256=sha256(data).hexdigest())
 
 
-def named_files(path: Path, packages: Mapping[str, Any] | None = None) -> list[FileEvidence]:
+def named_files(
+    path: Path, packages: Mapping[str, Any] | None = None, above: tuple[Path, ...] = ()
+) -> list[FileEvidence]:
     """What the model file at `path` names, by the name it has there, sorted; `packages` as `load_model` takes them.
 
+    What is named by a robot file that it names, in turn, is called by both names. `above` are the files that lead here.
     Where they cannot be read out of it (Drake's parser forgives more than Python's) its own name has the reason.
     """
     found = []
     try:
         names = sorted(_names(path))
-    except (OSError, UnicodeDecodeError, ET.ParseError) as error:
+    except (OSError, UnicodeDecodeError, ET.ParseError, ModelError) as error:
         return [_unread(path.name, f"the files that it names cannot be listed: {error}")]
     for name, folder in names:
         if not name.lower().endswith(READABLE):
@@ -128,6 +136,11 @@ def named_files(path: Path, packages: Mapping[str, Any] | None = None) -> list[F
             found.append(file_evidence(target, name) if target and target.is_file() else _unread(name, "no such file"))
         except OSError as error:
             found.append(_unread(name, f"it cannot be read: {error.strerror}"))
+            continue
+        here = (*above, path.resolve())
+        if target and target.is_file() and target.name.endswith(FORMATS) and target.resolve() not in here:
+            inner = [] if path.name.endswith(OF_MJCF) else named_files(target, packages, here)
+            found += [evidence.model_copy(update={"path": f"{name}: {evidence.path}"}) for evidence in inner]
     return found
 
 
@@ -137,10 +150,16 @@ def _unread(name: str, reason: str) -> FileEvidence:
 
 def _names(path: Path) -> set[tuple[str, str]]:
     """(name, folder that it starts from) of every file that is named."""
-    text = path.read_text()
     if path.name.endswith(".dmd.yaml"):
-        return {(name.strip("\"'"), "") for name in re.findall(r"^\s*-?\s*file:\s*(\S+)", text, re.MULTILINE)}
-    root = ET.fromstring(text)
+        return {(name, "") for name in files_of_directives(path)}
+    root = ET.fromstring(path.read_text())
+    if root.tag == "mujoco":  # whose files start from the first one's folder, wherever they are named
+        names = {(element.get("file", ""), "") for element in root.iter("include")}
+        return names | _named_in(ET.fromstring(str(with_includes(XmlText(path.read_bytes()), path))))
+    return _named_in(root)
+
+
+def _named_in(root: ET.Element) -> set[tuple[str, str]]:
     folders = {key: element.get(key, "") for element in root.iter("compiler") for key in ("assetdir", "meshdir")}
     folder = folders.get("meshdir") or folders.get("assetdir") or ""
     found = {(element.get(key, ""), folder) for element in root.iter() for key in ("filename", "file")}
@@ -154,7 +173,7 @@ def _resolve(path: Path, name: str, folder: str, packages: Mapping[str, Any]) ->
     if package:
         if package[1] in packages:
             return Path(str(packages[package[1]])) / package[2]
-        above = next((p for p in path.resolve().parents if p.name == package[1]), None)
+        above = package_above(path, package[1])
         return None if above is None else above / package[2]
     if "\0" in name or "\0" in folder:
         return None

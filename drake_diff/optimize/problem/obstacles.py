@@ -323,6 +323,16 @@ class SelfCollision(Obstacle):
         )
 
     def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
+        pairs, touching = self._pairs(model)
+        kept = [pair for pair in pairs if frozenset(p.body for p in pair) not in touching]
+        return self.constraints(OfPairs(model, _placing(model), kept), self.margin, "clear of itself", "")
+
+    def left_out(self, model: Model) -> tuple[str, ...]:
+        """The pairs of bodies of `model` that overlap by their shapes and are not kept apart: "a and b"."""
+        return tuple(sorted(" and ".join(sorted(pair)) for pair in self._pairs(model)[1]))
+
+    def _pairs(self, model: Model) -> tuple[list[tuple[Piece, Piece]], set[frozenset[str]]]:
+        """The pairs of pieces that may touch, and the pairs of bodies among them that always do."""
         placing = _placing(model)
         known = labelled(bodies(model.plant))
         for name in (each for pair in self.ignore for each in pair):
@@ -334,9 +344,7 @@ class SelfCollision(Obstacle):
             for a, b in combinations(pieces, 2)
             if not _are_neighbours(placing, a, b) and frozenset((a.body, b.body)) not in left
         ]
-        touching = _touching(model, placing, pairs)
-        pairs = [pair for pair in pairs if frozenset(p.body for p in pair) not in touching]
-        return self.constraints(OfPairs(model, placing, pairs), self.margin, "clear of itself", "")
+        return pairs, _touching(model, placing, pairs)
 
 
 def _touching(model: Model, placing: Placing, pairs: Sequence[tuple[Piece, Piece]]) -> set[frozenset[str]]:
@@ -470,3 +478,9 @@ def doubts_of(goals: Sequence[Goal], model: Model) -> Iterator[str]:
     """What a model may not keep clear, where one of `goals` asks for it."""
     if any(isinstance(goal, Obstacle) for goal in goals):
         yield from cover_of(model, _placing(model)).doubts
+    for goal in goals:
+        if isinstance(goal, SelfCollision) and (left := goal.left_out(model)):
+            yield (
+                f"SelfCollision does not keep {len(left)} pairs of links apart, as their shapes overlap in the posture "
+                f"of the file or in every one: {', '.join(left)}"
+            )
