@@ -155,11 +155,32 @@ def _penetrations(model: Model) -> list[Any]:
         raise SimulationError(f"Drake cannot measure how deep the geometries overlap: {error}") from error
 
 
+def deepest_overlap(model: Model) -> tuple[float, float, str]:
+    """(depth [m], thickness [m], name) of the overlap in the double context's state that is deepest for what overlaps.
+
+    The thickness and the name are those of the thinner of the two geometries; (0, inf, "nothing") where none overlap.
+    """
+    found = 0.0, float("inf"), "nothing"
+    port = model.plant.get_geometry_query_input_port()
+    if not port.HasValue(model.double.context):
+        return found
+    for pair in port.Eval(model.double.context).ComputePointPairPenetration():
+        thickness, name = min(_thickness(model, geometry) for geometry in (pair.id_A, pair.id_B))
+        if pair.depth / thickness > found[0] / found[1]:
+            found = float(pair.depth), thickness, name
+    return found
+
+
 def thinnest_geometry(model: Model) -> tuple[float, str]:
     """(thickness [m], name) of the thinnest geometry that may collide; (inf, "nothing") where none has a size."""
-    found, inspector = (float("inf"), "nothing"), model.double.inspector
-    for geometry in {g for pair in inspector.GetCollisionCandidates() for g in pair} if inspector else ():
-        box = inspector.GetObbInGeometryFrame(geometry)
-        if box is not None:  # a half space has none
-            found = min(found, (2 * float(np.min(box.half_width())), str(inspector.GetName(geometry))))
-    return found
+    inspector = model.double.inspector
+    pairs = inspector.GetCollisionCandidates() if inspector else ()
+    return min((_thickness(model, g) for pair in pairs for g in pair), default=(float("inf"), "nothing"))
+
+
+def _thickness(model: Model, geometry: Any) -> tuple[float, str]:
+    """(thickness [m], name) of a geometry; a half space has none."""
+    box = model.double.inspector.GetObbInGeometryFrame(geometry)
+    if box is None:
+        return float("inf"), "nothing"
+    return 2 * float(np.min(box.half_width())), str(model.double.inspector.GetName(geometry))

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.autodiffutils import AutoDiffXd
-from pydrake.geometry import SceneGraph
+from pydrake.geometry import SceneGraph, SceneGraphConfig
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Diagram, DiagramBuilder
@@ -40,9 +40,11 @@ from drake_diff.model.repairs import (
     as_actuated,
     as_ground,
     as_names,
+    check_contact,
     fix,
     hold_base,
     take_away_contact,
+    touch_the_world_alone,
     weld_link,
 )
 from drake_diff.model.twin import AddedForce, Twin
@@ -372,10 +374,12 @@ def load_model(
     base: str | None = None,
     fix_joints: Sequence[str] = (),
     packages: Mapping[str, str | Path] | None = None,
-    contact: bool = True,
+    contact: bool | str = True,
     mimic: str | None = None,
     body_forces: Sequence[BodyForce | Mapping[str, Any]] = (),
     meshes: str = "skip",
+    relaxation_time: float | None = None,
+    near_rigid: float | None = None,
 ) -> Model:
     """The robot in a URDF, SDF, MJCF (.xml) or .dmd.yaml file as a discrete model.
 
@@ -399,7 +403,8 @@ def load_model(
         fix_joints: The joints to replace by welds, at their default positions or the nearest that their limits allow.
         packages: The folder of each package:// that the file names, by the name of the package. Without it that is the
             nearest folder of that name above the file. Nothing is ever downloaded.
-        contact: False takes every collision shape away.
+        contact: False takes every collision shape away. "ground" lets what moves touch only what is fixed to the world,
+            such as a ground: a robot's own shapes pass through each other.
         mimic: What becomes of joints that follow others, as a gripper's second finger does, and which Drake holds
             together by constraints: "reduce" takes the followers out of the state, whose equations are then those of
             the independent coordinates; "fix" welds followers and leaders where they are. None keeps all in the state,
@@ -408,6 +413,9 @@ def load_model(
         meshes: What becomes of collision meshes of a URDF or SDF. "skip" leaves out those in formats that Drake cannot
             use; "convex" takes the convex hull of each, from STL, DAE, OBJ, PLY and OFF files too; "spheres" takes a
             few spheres inside each hull, whose contact AutoDiffXd can differentiate. What is drawn stays as it is.
+        relaxation_time: [s] in sap contact, of shapes for which the file gives none; Drake's own default is 0.1 s.
+        near_rigid: Drake's near-rigid threshold of sap contact, its own default 1. It softens light bodies' contact
+            where steps are long, so that they sink deeper; a smaller one keeps to the stiffness of the shapes.
 
     Returns:
         The Model. What was left out of the file (such as meshes in formats that Drake cannot use) and what was added
@@ -428,8 +436,7 @@ def load_model(
     if contact_geometry is not None:
         _check_choice("contact_geometry", contact_geometry, ROUTES)
     _check_choice("meshes", meshes, TREATMENTS)
-    if not isinstance(contact, bool):
-        raise InputError("contact", got=repr(contact), expected="True or False")
+    check_contact(contact)
     check_mimic(mimic)
     body_forces = check_body_forces(body_forces)
     try:
@@ -444,6 +451,7 @@ def load_model(
     )
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(config, builder)
+    _set_contact_law(plant, scene_graph, near_rigid, relaxation_time)
     options: dict[str, Any] = {
         "time_step": time_step,
         "contact_model": contact_model,
@@ -460,6 +468,8 @@ def load_model(
         "mimic": mimic,
         "body_forces": body_forces,
         "meshes": meshes,
+        "relaxation_time": relaxation_time,
+        "near_rigid": near_rigid,
     }
     fixed = options["fix_joints"] if mimic is None else ()  # else the followers are free of each other later
     read = read_into(plant, source, options["packages"], meshes, fixed)
@@ -468,8 +478,7 @@ def load_model(
     notes = read.notes + repairs
     if notes:
         warnings.warn("\n  ".join([f"{source.name}:", *notes]), ModelWarning, stacklevel=2)
-    if contact_geometry is not None:
-        notes += replace_collision_geometry(plant, scene_graph, contact_geometry)
+    notes += _changed_shapes(plant, scene_graph, contact_geometry, contact)
     if gravity is not None:
         plant.mutable_gravity_field().set_gravity_vector(options["gravity"])
     try:
@@ -497,6 +506,25 @@ def load_model(
     model.options = options
     model.file_facts = facts
     return model
+
+
+def _set_contact_law(
+    plant: MultibodyPlant, scene_graph: SceneGraph, near_rigid: float | None, relaxation_time: float | None
+) -> None:
+    if near_rigid is not None:
+        plant.set_sap_near_rigid_threshold(positive_float("near_rigid", near_rigid))
+    if relaxation_time is not None:
+        defaults = SceneGraphConfig()
+        defaults.default_proximity_properties.relaxation_time = positive_float("relaxation_time [s]", relaxation_time)
+        scene_graph.set_config(defaults)
+
+
+def _changed_shapes(
+    plant: MultibodyPlant, scene_graph: SceneGraph, route: str | None, contact: bool | str
+) -> tuple[str, ...]:
+    """Replace shapes by the `route`, then say what may touch; a sentence for each change."""
+    notes = () if route is None else replace_collision_geometry(plant, scene_graph, route)
+    return notes + (touch_the_world_alone(plant, scene_graph) if contact == "ground" else ())
 
 
 def model_from_diagram(diagram: Diagram) -> Model:

@@ -283,12 +283,28 @@ def add_springs(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
     return (f"{len(told)} springs of joints, which Drake's parser does not read: {', '.join(told)}.",) if told else ()
 
 
+def check_contact(value: Any) -> None:
+    """InputError where the argument `contact` is none."""
+    if not (isinstance(value, bool) or value == "ground"):
+        raise InputError("contact", got=repr(value), expected='True, False or "ground"')
+
+
 def take_away_contact(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
     """Let nothing collide: every collision shape loses that role and is drawn no more."""
     found = collision_geometries(plant, scene_graph)
     for _, geometry in found:
         scene_graph.RemoveRole(plant.get_source_id(), geometry, pg.Role.kProximity)
     return (f"{len(found)} collision shapes taken away: nothing touches.",) if found else ()
+
+
+def touch_the_world_alone(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
+    """Let what moves collide with what is fixed to the world only; to be called when every shape is there."""
+    fixed = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
+    found = [geometry for body, geometry in collision_geometries(plant, scene_graph) if int(body.index()) not in fixed]
+    if found:
+        apart = pg.CollisionFilterDeclaration().ExcludeWithin(pg.GeometrySet(found))
+        scene_graph.collision_filter_manager().Apply(apart)
+    return (f"{len(found)} collision shapes touch only what is fixed to the world, not each other.",) if found else ()
 
 
 def as_ground(value: Any) -> float | bool | None:

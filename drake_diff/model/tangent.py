@@ -49,6 +49,17 @@ class TangentSpace:
             found[r] = 2 * between[1:] / between[0]
         return found
 
+    def scale(self, ranges: Array) -> Array:
+        """(size,): the ranges (nx,) of a state's entries as those of a tangent vector; a turn's is the same all round.
+
+        A quaternion changes by half of the angle that its body turns by.
+        """
+        found, (of_x, of_d) = np.empty(self.size), self._plain
+        found[of_d] = ranges[of_x]
+        for q, r in self._turns:
+            found[r] = 2 * np.max(ranges[q])
+        return found
+
     def derivative_of_plus(self, x: Array) -> Array:
         """(nx, size): d plus(x, d) / d d at d = 0."""
         derivative = np.zeros((self.nx, self.size))

@@ -16,9 +16,10 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import GradientError, InputError, ModelError, SimulationError
-from drake_diff.model.contact import thinnest_geometry
+from drake_diff.model.contact import deepest_overlap, thinnest_geometry
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
+from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import TVLQR
 from drake_diff.motion.rollout import Policy, Rollout, rollout
@@ -268,7 +269,7 @@ def regulator_weights(plan: Plan, us: Array) -> tuple[Array, Array, Array]:
     """Q (nt, nt), R (nu, nu) and Qf by Bryson's rule, one over the square of each range; a rotation's is a radian."""
     model = plan.problem.model
     space = tangent_space(model)
-    scale = plan.scale if space.size == model.nx else np.ones(space.size)
+    scale = space.scale(plan.scale)
     effort = np.maximum(np.max(np.abs(us), axis=0), SMALLEST_RANGE)
     Q = np.diag(1 / scale**2)
     return Q, EFFORT_WEIGHT * np.diag(1 / effort**2), FINAL_WEIGHT * Q
@@ -351,13 +352,18 @@ def came_too_near(plan: Plan, motion: Rollout) -> Iterator[str]:
 
 
 def too_deep(model: Model, motion: Rollout) -> Iterator[str]:
-    """Where geometries overlap by more than a quarter of the thinnest."""
-    limit, geometry = thinnest_geometry(model)
-    limit *= PENETRATION_PART
-    depth = float(np.max(motion.penetration))
-    if depth > limit:
-        when = motion.times[int(np.argmax(motion.penetration))]
-        yield f"geometries overlap by {depth:.3g} m at {when:.3g} s, limit {limit:.3g} m (a quarter of {geometry})"
+    """Where geometries overlap by more than a quarter of the thinner of them."""
+    least, _ = thinnest_geometry(model)
+    worst = 0.0, ""
+    for k in np.flatnonzero(motion.penetration > PENETRATION_PART * least):
+        set_state(model.double, motion.xs[k])
+        depth, thickness, geometry = deepest_overlap(model)
+        limit = PENETRATION_PART * thickness
+        if depth / limit > max(worst[0], 1.0):
+            told = f"geometries overlap by {depth:.3g} m at {motion.times[k]:.3g} s, limit {limit:.3g} m"
+            worst = depth / limit, f"{told} (a quarter of {geometry})"
+    if worst[1]:
+        yield worst[1]
 
 
 def _broken_constraints(plan: Plan, xs: Array, us: Array) -> Iterator[str]:

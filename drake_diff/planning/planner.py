@@ -11,6 +11,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff._base.refusal import Refusal
 from drake_diff.artifact.save import save
 from drake_diff.artifact.verify import Verification, verify
 from drake_diff.certificates.audit import audit
@@ -28,6 +29,8 @@ from drake_diff.planning.around import Space, lines
 from drake_diff.planning.motion import OF_EFFORT, Guess, along, by_controller
 from drake_diff.planning.posture import TOUCHING, effort_limits
 from drake_diff.planning.robot import Robot, load_robot
+from drake_diff.planning.shifting import random_shift, shift_to
+from drake_diff.planning.standing import Legged, Rest
 from drake_diff.planning.task import Task, asked, postures
 from drake_diff.record.solve import EvidenceRecord
 
@@ -152,13 +155,18 @@ def plan(
     clock = _Clock(report or _quiet)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
-        clock.begin("load", path.name)
-        ready = load_robot(path, seed)
-        clock.begin("audit", str(ready.model))
-        findings = tuple(audit(ready.model))
-        clock.begin("guess", f"{len(findings)} finding{'s' * (len(findings) != 1)}")
-        task = asked(ready.model, goals or {}, avoid)
-        tried, found, apart = _first_that_holds(_attempts(ready, task, time, seed), clock)
+        held = "the least time is sought without contact" if time else ""
+        for _ in range(2):
+            clock.begin("load", path.name)
+            ready = load_robot(path, seed, held)
+            clock.begin("audit", str(ready.model))
+            findings = tuple(audit(ready.model))
+            clock.begin("guess", f"{len(findings)} finding{'s' * (len(findings) != 1)}")
+            task = asked(ready.model, goals or {}, avoid)
+            tried, found, apart = _first_that_holds(_attempts(ready, task, time, seed), clock)
+            if apart or ready.standing is None:
+                break
+            held = f"no plan with its feet on the ground was verified: {'; '.join(tried)}"
         if not found:
             raise ModelError(f"{path}: no plan could be tried: {'; '.join(tried) or 'no first guess'}")
         best = found[-1] if apart else min(found, key=lambda s: s.defect + s.goal_error)
@@ -224,6 +232,9 @@ def _first_that_holds(attempts: Iterator[_Attempt], clock: "_Clock") -> tuple[li
 
 def _attempts(robot: Robot, task: Task, least: str | None, seed: int) -> Iterator[_Attempt]:
     """What to try, one after the other, until one is verified."""
+    if robot.standing is not None:
+        yield from _of_standing(robot, robot.standing, task, seed)
+        return
     Space.of(robot, task.avoid).check("start", robot.q)
     if robot.is_fully_driven:
         yield from _of_driven(robot, task, least, seed)
@@ -231,6 +242,20 @@ def _attempts(robot: Robot, task: Task, least: str | None, seed: int) -> Iterato
         yield from _of_reachable(robot, task, seed)
     else:
         yield from _of_passive(robot, task)
+
+
+def _of_standing(robot: Robot, standing: tuple[Legged, Rest], task: Task, seed: int) -> Iterator[_Attempt]:
+    """A robot on its feet, which stay where they are."""
+    legged, rest = standing
+    if task.is_free:
+        found = random_shift(legged, rest, seed, robot.overlap)
+    else:
+        found = shift_to(legged, rest, task.frames, task.joints)
+    if isinstance(found, Refusal):
+        raise ModelError(f"from where it stands no other posture was found: {found}")
+    moved = np.max(np.abs(legged.apart(found.xs[-1][: robot.model.nq], robot.q)))
+    name = f"its feet where they are, up to {moved:.2g} rad or m to a posture that it holds"
+    yield _feasible(robot, task, Guess(name, robot.model, found.xs, found.us, 0.0))
 
 
 def _of_driven(robot: Robot, task: Task, least: str | None, seed: int) -> Iterator[_Attempt]:

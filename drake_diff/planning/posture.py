@@ -54,7 +54,7 @@ def start(
         return np.where(one & moved, q, middle)
 
     every, whole = np.ones(len(first), dtype=bool), upper - lower
-    always = _always(shapes, [first, *(drawn(first, whole, every) for _ in range(SEEN - 1))])
+    always = pairs_always([first, *(drawn(first, whole, every) for _ in range(SEEN - 1))], shapes)
 
     def measured(q: Array) -> Start:
         load = 0.0 if driven is None else share_to_hold(driven, q)
@@ -88,8 +88,8 @@ def _badness(found: Start) -> float:
     return overlap / DEPTH + max(0.0, found.load - HELD)
 
 
-def _always(shapes: Model | None, tried: list[Array]) -> frozenset[Pair]:
-    """The pairs that overlap in each of the postures."""
+def pairs_always(tried: list[Array], shapes: Model | None) -> frozenset[Pair]:
+    """The pairs of shapes that overlap in each of the postures (nq,)."""
     if shapes is None:
         return frozenset()
     found = [{pair for pair, depth in _overlaps(shapes, q).items() if depth > TOUCHING} for q in tried]

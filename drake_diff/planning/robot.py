@@ -9,11 +9,23 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.exceptions import ModelError, ModelWarning, SimulationError
+from drake_diff._base.refusal import Refusal
+from drake_diff.exceptions import DrakeDiffError, ModelError, ModelWarning, SimulationError
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.plant import actuators, joints
 from drake_diff.model.step import advance, set_state
-from drake_diff.planning.posture import Pair, Start, deepest, inside, ranges, shares_to_hold, start
+from drake_diff.planning.posture import (
+    Pair,
+    Start,
+    deepest,
+    inside,
+    of_joints,
+    pairs_always,
+    ranges,
+    shares_to_hold,
+    start,
+)
+from drake_diff.planning.standing import Legged, Rest, stand
 
 TIME_STEP = 0.02  # [s] of a plan
 FEW = 0.5  # of all joints: where fewer have a motor, the file says nothing of motors, or forgot some
@@ -29,6 +41,7 @@ class Robot:
     `lower` and `upper` (nq,) are where its coordinates may be: their limits, or a range around 0 where they have none.
     `shapes` is the model with its collision shapes, in which overlap is looked for; None where there is nothing to
     look for. `always` are the pairs of shapes that overlap in every posture, which is not looked at.
+    `standing` tells how it stands on its feet, where it does; else what floats is held.
     """
 
     model: Model
@@ -39,14 +52,18 @@ class Robot:
     repairs: tuple[str, ...]
     is_fully_driven: bool
     always: frozenset[Pair] = frozenset()
+    standing: tuple[Legged, Rest] | None = None
 
     def overlap(self, q: Array) -> float:
         """[m] how deep the deepest overlap of shapes is in posture q (nq,); 0 where nothing is looked for."""
         return 0.0 if self.shapes is None else deepest(self.shapes, q, self.always)
 
 
-def load_robot(path: Path, seed: int) -> Robot:
-    """The robot in a file, mended where it has to be; ModelError where nothing in it can be driven."""
+def load_robot(path: Path, seed: int, held: str = "") -> Robot:
+    """The robot in a file, mended where it has to be; ModelError where nothing in it can be driven.
+
+    What floats and can stand on feet does so, unless `held` says why it is to be held.
+    """
     options: dict[str, Any] = {"time_step": TIME_STEP}
     told: list[str] = []
     model = _loaded(path, options)
@@ -63,11 +80,14 @@ def load_robot(path: Path, seed: int) -> Robot:
             begin = f"only {had} joints had a motor" if had else "no joint had a motor"
             told.append(f"{begin}: all {model.nu} that can be driven have one (actuators='all')")
     if model.plant.GetFloatingBaseBodies() and joints(model.plant):
-        held = _held(path, options)
-        if held is not None and held.nv < model.nv:
+        standing = Refusal(held) if held else _standing(path, options, told, np.random.default_rng(seed))
+        if isinstance(standing, Robot):
+            return standing
+        welded = _held(path, options)
+        if welded is not None and welded.nv < model.nv:
             names = _few(model.plant.get_body(b).name() for b in sorted(model.plant.GetFloatingBaseBodies()))
-            options["base"], model = "weld", held
-            told.append(f"{names} floated: it is fixed to the world (base='weld')")
+            options["base"], model = "weld", welded
+            told.append(f"{names} floated: it is fixed to the world (base='weld'), as {standing}")
     stuck = _stuck(model)
     if stuck and len(stuck) == count:
         raise ModelError(f"{path}: no joint of it can move: each has the same lower and upper limit, which Drake keeps")
@@ -79,6 +99,43 @@ def load_robot(path: Path, seed: int) -> Robot:
     if not model.nu:
         raise ModelError(f"{path}: nothing in it can be driven: it has no revolute or prismatic joint")
     return _placed(path, options, model, told, np.random.default_rng(seed))
+
+
+# Of a robot that stands: every shape is spheres, which a ground meets with derivatives, and only the ground is met.
+ON_FEET: dict[str, Any] = {"base": "free", "meshes": "spheres", "contact_geometry": "corner_spheres"}
+# Drake's own values let light legs sink by millimetres, by how much depends on the step, and rise only in 0.2 s.
+GROUND: dict[str, Any] = {"ground": True, "contact": "ground", "near_rigid": 0.1, "relaxation_time": 0.02}
+STEP_ON_FEET = 0.005  # [s]
+DRAWN = 16  # postures, to see which shapes always overlap
+
+
+def _standing(path: Path, options: dict[str, Any], told: list[str], random: np.random.Generator) -> Robot | Refusal:
+    """The robot on its feet on a ground; or why it does not stand."""
+    on_feet = options | ON_FEET | GROUND | {"time_step": STEP_ON_FEET}
+    told = list(told)
+    try:
+        model = _loaded(path, on_feet)
+        stuck = _stuck(model)
+        if stuck:
+            on_feet["fix_joints"] = stuck
+            model = _loaded(path, on_feet)
+            told.append(f"{_few(stuck)} had the same lower and upper limit: fixed there (fix_joints)")
+        model = _with_mass(path, on_feet, model, told)
+        lower, upper = ranges(model)
+        found = stand(model, lower, upper)
+        if isinstance(found, Refusal):
+            return Refusal(f"it cannot stand: {found}")
+        shapes = _loaded(path, on_feet | {"ground": None, "contact": True})
+        q, one = found[1].x[: model.nq], of_joints(model)
+        overlapping = pairs_always([np.where(one, random.uniform(lower, upper), q) for _ in range(DRAWN)], shapes)
+        besides = overlapping | pairs_always([q], shapes)
+    except DrakeDiffError as error:
+        return Refusal(f"a model that could stand cannot be made: {error}")
+    feet = _few(foot.bodies[0] for foot in found[0].feet)
+    told.append(f"it stands on {feet}, on a ground that was added (base='free', ground=True), by spheres in its shapes")
+    if besides:
+        told.append(f"{_few(map(' and '.join, sorted(besides)))} overlap where it stands, which is not looked at")
+    return Robot(model, shapes, q, lower, upper, tuple(told), False, besides, found)
 
 
 def _placed(path: Path, options: dict[str, Any], model: Model, told: list[str], random: np.random.Generator) -> Robot:

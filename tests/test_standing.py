@@ -1,0 +1,194 @@
+"""Legged robots on their feet: weights that are shared, postures that are refused, and a plan that holds."""
+
+import numpy as np
+import pytest
+from helpers.models import robot_file
+from helpers.table import each_row
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+
+import drake_diff as dd
+from drake_diff._base.refusal import Refusal
+from drake_diff.exceptions import InputError
+from drake_diff.model.contact import contacts_of_the_step
+from drake_diff.model.step import advance
+from drake_diff.model.tangent import tangent_space
+from drake_diff.planning import plan
+from drake_diff.planning.feet import find_feet
+from drake_diff.planning.robot import GROUND, ON_FEET, load_robot, ranges
+from drake_diff.planning.standing import Legged, hold, stand, standing_posture
+
+G = 9.81
+HIPS = {"fl": (0.2, 0.1), "fr": (0.2, -0.1), "hl": (-0.2, 0.1), "hr": (-0.2, -0.1)}
+
+
+def body(name, mass, centre, shape=""):
+    box = f'<inertia ixx="{mass / 50}" iyy="{mass / 50}" izz="{mass / 50}" ixy="0" ixz="0" iyz="0"/>'
+    inertial = f'<inertial><origin xyz="{centre}"/><mass value="{mass}"/>{box}</inertial>'
+    return f'<link name="{name}">{inertial}{shape}</link>'
+
+
+def sphere(place, radius):
+    return f'<collision><origin xyz="{place}"/><geometry><sphere radius="{radius}"/></geometry></collision>'
+
+
+def quadruped(*, load="0 0 0", effort=60.0, foot=True, trunk=10.0, bottom=0.05):
+    """A trunk of 10 kg on four legs of 0.2 + 0.2 m, 1 kg each, with balls as feet; `load` is the trunk's centre."""
+    text = '<robot name="table">' + body("trunk", trunk, load, sphere("0 0 0", bottom))
+    for leg, (x, y) in HIPS.items():
+        text += body(f"{leg}_thigh", 0.5, "0 0 -0.1")
+        text += body(f"{leg}_shank", 0.5, "0 0 -0.1", sphere("0 0 -0.2", 0.02) if foot else "")
+        for name, parent, child, place in (
+            ("hip", "trunk", "thigh", f"{x} {y} 0"),
+            ("knee", f"{leg}_thigh", "shank", "0 0 -0.2"),
+        ):
+            text += f'<joint name="{leg}_{name}" type="revolute"><parent link="{parent}"/><child link="{leg}_{child}"/>'
+            text += f'<origin xyz="{place}"/><axis xyz="0 1 0"/>'
+            text += f'<limit lower="-2.5" upper="2.5" effort="{effort}" velocity="10"/></joint>'
+    return text + "</robot>"
+
+
+@pytest.fixture
+def on_feet(tmp_path):
+    def make(**changes):
+        path = tmp_path / "table.urdf"
+        path.write_text(quadruped(**changes))
+        return dd.load_model(path, time_step=0.005, actuators="all", **ON_FEET, **GROUND)
+
+    return make
+
+
+def legged(model):
+    feet = find_feet(model, model.default_state[: model.nq])
+    assert not isinstance(feet, Refusal), feet
+    return Legged(model, feet, *ranges(model))
+
+
+def test_four_feet_share_the_weight(on_feet):
+    """m g in all, no force sideways in all, no moment about the centre of mass; by symmetry a fourth on each foot."""
+    robot = legged(on_feet())
+    stance = standing_posture(robot, robot.model.default_state[: robot.model.nq])
+    total = np.sum(stance.forces, axis=0)
+    assert total == pytest.approx([0.0, 0.0, 14 * G], abs=1e-5)  # what Clarabel may be off, 1e-8 of the weight
+    assert stance.forces[:, 2] == pytest.approx(np.full(4, 14 * G / 4), rel=0.05)  # the trunk is centred to mm
+    center = robot.model.plant.CalcCenterOfMassPositionInWorld(robot.model.double.context)
+    moment = np.sum(np.cross(stance.points - center, stance.forces), axis=0)
+    assert moment == pytest.approx([0.0, 0.0, 0.0], abs=1e-5)
+
+
+def test_forces_of_a_load_off_the_middle_obey_the_lever(on_feet):
+    """The trunk's centre 0.1 m to the front: moments about the hind feet's line give what the front feet carry."""
+    robot = legged(on_feet(load="0.1 0 0"))
+    model = robot.model
+    stance = hold(robot, model.default_state[: model.nq] + np.eye(model.nq)[robot.base_q + 6] * 0.4)
+    front = stance.forces[stance.points[:, 0] > 0, 2].sum()
+    assert front == pytest.approx((10 * G * 0.3 + 4 * G * 0.2) / 0.4, rel=1e-6)
+
+
+@each_row(
+    "change, why",
+    [
+        ({"load": "0.9 0 0", "trunk": 60.0}, "no forces"),  # beyond the feet, wherever they are put on 0.4 m of leg
+        ({"effort": 0.5}, "no forces"),  # a fourth of 14 kg on a bent knee takes some N m
+        ({"foot": False}, "has no shape|end in a shape"),
+        ({"bottom": 0.6}, "not the end of a limb"),  # it lies on its belly
+    ],
+)
+def test_what_cannot_stand_is_refused_with_the_reason(change, why, on_feet):
+    model = on_feet(**change)
+    found = stand(model, *ranges(model))
+    assert isinstance(found, Refusal)
+    assert any(part in found.reason for part in why.split("|")), found.reason
+
+
+def test_at_rest_the_step_changes_nothing_and_drake_carries_the_weight(on_feet):
+    """In Drake's own contact forces, and over 100 steps under constant inputs too short for a fall."""
+    model = on_feet()
+    robot, rest = stand(model, *ranges(model))
+    x = np.array(advance(model.double, rest.x, rest.u))
+    forces = sum(contact.force for contact in contacts_of_the_step(model))
+    assert forces == pytest.approx([0.0, 0.0, 14 * G], abs=0.05)  # at 1e-4 m/s per step of 5 ms: 14 kg * 0.02 m/s^2
+    assert np.max(np.abs(x[model.nq :])) < 5e-3  # what counts as rest
+    assert {contact.body_a for contact in contacts_of_the_step(model)} == {f"{leg}_shank" for leg in HIPS}
+    assert np.max(np.abs(robot.soles(rest.x[: model.nq])[0][:, 2])) < 1e-3
+
+
+@each_row("name", ["panda.urdf", "iris.urdf", "allegro_left_hand.urdf", "kinova.urdf"])
+def test_an_arm_a_hand_and_a_drone_have_no_feet(name):
+    model = dd.load_model(robot_file(name), time_step=0.005, actuators="all", mimic="reduce", **ON_FEET, **GROUND)
+    assert isinstance(find_feet(model, model.default_state[: model.nq]), Refusal)
+
+
+def test_what_cannot_stand_is_held_and_the_reason_is_told(tmp_path):
+    path = tmp_path / "weak.urdf"
+    path.write_text(quadruped(effort=0.5))
+    robot = load_robot(path, 0)
+    assert robot.standing is None
+    assert any("base='weld'" in told and "it cannot stand: no forces" in told for told in robot.repairs)
+    path.write_text(quadruped())
+    assert any("base='free'" in told for told in load_robot(path, 0).repairs)
+
+
+def test_a_robot_may_touch_the_ground_and_not_itself(tmp_path):
+    path = tmp_path / "table.urdf"
+    path.write_text(quadruped())
+    options = {"time_step": 0.01, "ground": True}
+    every, ground = (dd.load_model(path, contact=contact, **options).contract.contact for contact in (True, "ground"))
+    assert ground.collision_pairs == 5  # a trunk and four feet
+    assert every.collision_pairs > ground.collision_pairs
+    with pytest.raises(InputError, match="ground"):
+        dd.load_model(path, contact="floor", **options)
+
+
+def test_the_law_of_contact_can_be_told_where_the_file_does_not(tmp_path):
+    """A ball of 1 kg sinks by m g / k, which the near-rigid threshold would hide at long steps for light bodies."""
+    path = tmp_path / "table.urdf"
+    path.write_text(quadruped())
+    model = dd.load_model(path, time_step=0.01, near_rigid=0.1, relaxation_time=0.02)
+    assert model.contract.contact.sap_near_rigid_threshold == 0.1
+    assert model.changed(time_step=0.005).contract.contact.sap_near_rigid_threshold == 0.1
+    for wrong in ({"near_rigid": 0}, {"relaxation_time": -1.0}):
+        with pytest.raises(InputError, match="above 0"):
+            dd.load_model(path, time_step=0.01, **wrong)
+
+
+def test_a_range_of_a_quaternion_is_that_of_the_turn(on_feet):
+    """Turned by a small angle the unit quaternion changes by half of it."""
+    model = on_feet()
+    space, x = tangent_space(model), model.default_state
+    turn = np.zeros(space.size)
+    turn[[0, 3]] = 1e-3, 0.2
+    ranges_of_x = np.ptp([x, space.plus(x, turn)], axis=0)
+    assert space.scale(ranges_of_x)[[0, 1, 2, 3, 4]] == pytest.approx([1e-3, 1e-3, 1e-3, 0.2, 0.0], rel=1e-6)
+
+
+@pytest.mark.slow
+def test_solo12_lowers_its_trunk_with_its_feet_on_the_ground(tmp_path):
+    """Its own file in a plant of ours tells where feet and trunk are, in a replay in half the steps."""
+    file = robot_file("solo12.urdf")
+    done = plan(file, out=tmp_path / "out")
+    assert done.success, done.lines
+    assert any("base='free'" in told for told in done.repairs)
+    solution, model = done.solution, done.model
+    half = model.at_time_step(model.time_step / 2)
+    xs, us = solution.plan.sample(2)
+    weights = np.eye(half.nu), np.eye(tangent_space(half).size)
+    policy = dd.TVLQR(half, xs, us, 100 * weights[1], weights[0])
+    motion = dd.rollout(half, xs[0], policy=policy, num_steps=len(us))
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModels(str(file))
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+    feet = [plant.GetFrameByName(f"{leg}_FOOT") for leg in ("FL", "FR", "HL", "HR")]
+
+    def places(x):
+        plant.SetPositions(context, x[: plant.num_positions()])
+        return np.array([frame.CalcPoseInWorld(context).translation() for frame in feet])
+
+    first = places(motion.xs[0])
+    way = np.max([np.abs(places(x) - first) for x in motion.xs])
+    assert way < 4e-3  # [m] a foot: a ball of 5 mm that rolls as the leg turns by a third of a radian
+    trunk = [motion.xs[0][6], solution.xs[-1][6], motion.xs[-1][6]]
+    assert trunk[0] - trunk[1] > 0.003  # it is lowered
+    assert trunk[2] == pytest.approx(trunk[1], abs=1e-3)
+    assert np.max(np.abs(motion.xs[-1][model.nq :])) < 0.05  # [rad/s, m/s] at rest
