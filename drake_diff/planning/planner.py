@@ -163,7 +163,12 @@ def plan(
             findings = tuple(audit(ready.model))
             clock.begin("guess", f"{len(findings)} finding{'s' * (len(findings) != 1)}")
             task = asked(ready.model, goals or {}, avoid)
-            tried, found, apart = _first_that_holds(_attempts(ready, task, time, seed), clock)
+            try:
+                tried, found, apart = _first_that_holds(_attempts(ready, task, time, seed), clock)
+            except ModelError as error:
+                if ready.standing is None:
+                    raise
+                tried, found, apart = [str(error)], [], False
             if apart or ready.standing is None:
                 break
             held = f"no plan with its feet on the ground was verified: {'; '.join(tried)}"

@@ -208,7 +208,7 @@ def find_posture(robot: Legged, first: Array, wish: Wish) -> Array:
         stuck[at] = ((values <= lower) & (down[at] > 0)) | ((values >= upper) & (down[at] < 0))
         jacobian = np.where(stuck, 0.0, jacobian)
         normal = jacobian.T @ jacobian + DAMPING * np.eye(jacobian.shape[1])
-        change = -np.linalg.solve(normal, np.where(stuck, 0.0, down))
+        change = np.asarray(-np.linalg.solve(normal, np.where(stuck, 0.0, down)), dtype=float)
         change *= min(1.0, FARTHEST / max(float(np.max(np.abs(change))), 1e-12))
         q = robot.moved(q, change, wish.inside)
         if np.max(np.abs(change)) < STILL:
