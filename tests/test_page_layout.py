@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from helpers.browser import browsing, errors, move_slider, open_page, view_of
+from helpers.browser import badly_laid, browsing, errors, faint_texts, move_slider, nameless, open_page, view_of
 from helpers.models import MODELS
 from helpers.robots import example_robot, state_in_range
 from helpers.table import each_row
@@ -151,6 +151,66 @@ def test_tables_scroll_in_their_own_box(humanoid, browser):
     assert max(box[0] for box in boxes) <= 0.61 * PHONE[1]
     assert any(box[1] > 2 * box[0] for box in boxes)
     assert browser.execute_script("return document.documentElement.scrollWidth") <= PHONE[0]
+
+
+def open_all(browser):
+    """Every part and table of the page, and every group of plots."""
+    browser.execute_script("document.querySelectorAll('details').forEach(d => { d.open = true; })")
+    browser.execute_script("const all = [...document.querySelectorAll('.choices button')].pop(); if (all) all.click()")
+    browser.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
+
+
+@browsing
+@each_row("size, scheme", [(DESK, "light"), (PHONE, "dark")], ids=["desktop", "phone"])
+def test_every_text_can_be_read_and_every_control_has_a_name(humanoid, browser, size, scheme):
+    open_page(browser, humanoid / "report.html", size=size, scheme=scheme)
+    open_all(browser)
+    assert faint_texts(browser) == []
+    assert nameless(browser) == []
+    assert badly_laid(browser) == []
+    assert browser.execute_script("return document.documentElement.lang") == "en"
+    assert browser.title == "run: pass"
+    plots = browser.execute_script(
+        "return [...document.querySelectorAll('.plot')].map(p => p.getAttribute('aria-label'))"
+    )
+    assert all("lowest" in label or "no value" in label for label in plots)
+
+
+@browsing
+def test_what_cannot_be_read_is_found(two, browser):
+    """What the test above looks for, planted."""
+    open_page(browser, two / "short" / "report.html", size=PHONE)
+    assert faint_texts(browser) == nameless(browser) == badly_laid(browser) == []
+    browser.execute_script(
+        "document.querySelector('.facts').style.cssText = 'color: #bbb; margin-top: -40px';"
+        "document.querySelector('.sentence').style.width = '900px';"
+        "document.querySelector('.checks li').style.cssText = 'overflow: hidden; white-space: nowrap; width: 60px';"
+        "document.getElementById('play').removeAttribute('aria-label');"
+        "document.getElementById('play').removeAttribute('title'); document.getElementById('play').textContent = ''"
+    )
+    assert [tag for _, tag, _ in faint_texts(browser)] == ["P"]
+    assert len(nameless(browser)) == 1
+    assert {kind for kind, *_ in badly_laid(browser)} == {"beyond the page", "cut", "overlap"}
+
+
+@browsing
+def test_the_replay_is_moved_by_the_keyboard(two, browser):
+    """The arrow keys move it by a hundredth, the space bar plays and pauses, and types a space in a field."""
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.keys import Keys
+
+    open_page(browser, two / "short" / "report.html")
+    at = "return Number(document.getElementById('time').value)"
+    is_playing = "return document.getElementById('play').getAttribute('aria-label') === 'pause'"
+    browser.execute_script("document.getElementById('time').focus()")
+    ActionChains(browser).send_keys(Keys.ARROW_RIGHT * 3 + Keys.ARROW_LEFT).perform()
+    assert browser.execute_script(at) == pytest.approx(2 * 0.4 / 100)
+    browser.execute_script("document.activeElement.blur()")
+    ActionChains(browser).send_keys(" ").perform()
+    assert browser.execute_script(is_playing)
+    assert browser.execute_script("return scrollY") == 0
+    ActionChains(browser).send_keys(" ").perform()
+    assert not browser.execute_script(is_playing)
 
 
 @browsing

@@ -3,6 +3,7 @@
 import base64
 import shutil
 from io import BytesIO
+from pathlib import Path
 
 import pytest
 
@@ -54,3 +55,21 @@ def view_of(browser):
         "v.render(); return v.renderer.domElement.toDataURL('image/png')"
     )
     return matplotlib.image.imread(BytesIO(base64.b64decode(url.split(",")[1])))[..., :3]
+
+
+READABLE = (Path(__file__).parent / "readable.js").read_text(encoding="utf-8")
+
+
+def faint_texts(browser):
+    """Texts in view whose contrast is below WCAG's AA, with the element and the ratio; those of drawings apart."""
+    return browser.execute_script(READABLE + "return faint();")
+
+
+def nameless(browser):
+    """Controls and pictures that a screen reader has no words for."""
+    return browser.execute_script(READABLE + "return nameless();")
+
+
+def badly_laid(browser):
+    """What leaves the page, is cut without a way to read it, or lies on another text."""
+    return browser.execute_script(READABLE + "return badlyLaid();")
