@@ -84,7 +84,9 @@ def embedded(page):
 
 
 def test_a_report_of_thirty_joints_is_below_5_mb(humanoid):
-    assert (humanoid / "report.html").stat().st_size < 5e6
+    """With ten certificates of its steps, and a megabyte for meshes, which test_shapes.py bounds."""
+    certificates = json.dumps(page_data(0.0, (), [certificate(58, 87)] * 10))
+    assert (humanoid / "report.html").stat().st_size + len(certificates) < 4e6
     data = embedded(humanoid / "report.html")
     assert len([p for p in data["plots"] if p["group"] == "Inputs"]) == 29
     assert len(data["xs"]) < 5  # the times stand once, not with each of 100 plots
@@ -286,6 +288,38 @@ def test_goals_are_in_the_replay(two, browser):
     assert "target of pole" in (two / "long" / "report.html").read_text()
 
 
+@browsing
+def test_a_goal_is_seen_through_the_robot_and_the_plan_behind_it(browser, tmp_path):
+    """The target is inside the cart where the motion ends, the plan 0.3 rad and 5 cm from the motion."""
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
+    us = np.full((20, 1), 1.0)
+    xs = np.array(dd.rollout(model, [0, 0.3, 0, 0], us).xs)
+    goal = dd.FrameGoal("cart", position=[float(xs[-1, 0]), 0, 0], tolerance=0.02)
+    xs[1:] += [0.05, 0.3, 0, 0]
+    dd.save(by_hand(model, xs, us, goals=(goal,)), tmp_path / "run")
+    open_page(browser, tmp_path / "run" / "report.html")
+    move_slider(browser, 1.0)
+
+    def seen(**shown):
+        for name, visible in shown.items():
+            browser.execute_script(
+                "document.getElementById('view').contentWindow.viewer.set_property(['drake', arguments[0]],"
+                "'visible', arguments[1])",
+                name,
+                visible,
+            )
+        return view_of(browser)
+
+    alone, nothing = seen(motion=True, plan=False), seen(motion=False, plan=False)
+    robot = np.abs(alone - nothing).max(axis=2) > 0.05
+    both = seen(motion=True, plan=True)
+    changed = np.abs(both - alone).max(axis=2)
+    assert robot.sum() > 1000
+    assert (changed[robot] > 0.02).mean() < 0.02  # the plan hides none of it: its edges alone are mixed with it
+    assert (changed[~robot] > 0.05).sum() > 200
+    assert (alone[..., 1] > alone[..., [0, 2]].max(axis=2) + 0.05).sum() > 50  # the target, inside the cart
+
+
 def certificate(rows, columns, wrong=()):
     matrix = np.arange(1.0, rows * columns + 1).reshape(rows, columns)
     given = matrix.copy()
@@ -327,7 +361,7 @@ def test_of_a_long_series_the_extremes_are_kept():
 def test_a_replay_of_many_bodies_has_fewer_frames():
     times = np.linspace(0, 10, 1001)
     assert len(frames_of(times)) == 641  # 64 in each second
-    assert len(frames_of(times, MOST_POSES // 60)) == 151
+    assert len(frames_of(times, MOST_POSES // 60)) == 101
     assert frames_of(times, 100)[-1] == (10.0, 1000)
 
 

@@ -17,12 +17,15 @@ from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Status
 
 FEW = 4  # so many goals, or coordinates of one, are named
-CONTROLS = {"open loop": "Inputs alone, without feedback", "TVLQR": "With feedback (TVLQR)"}
+CONTROLS = {"open loop": "Inputs alone (open loop)", "TVLQR": "With feedback (TVLQR)"}
 
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was checked: its `title`, "pass", "fail", "undecided" or "info", and what was found in words."""
+    """One thing that was checked: its `title`, its `kind`, and what was found in words.
+
+    The kind is "pass", "fail", "undecided", "info", or "warn" where something fails that the verdict does not rest on.
+    """
 
     title: str
     kind: str
@@ -151,5 +154,5 @@ def _of_replays(m: Measurement, replays: Sequence[Mapping[str, Any]]) -> Iterato
         if lost:
             text = f"holds in {len(tried) - len(lost)} of {len(tried)} replays; {lost[0]['variant']}: "
             text += lost[0]["failures"][0] if lost[0]["failures"] else "it fails"
-        kind = "pass" if enough or not lost else "fail" if judged is None else "undecided"
+        kind = "pass" if enough or not lost else "fail" if judged is None else "warn"
         yield Check(CONTROLS.get(control, control), kind, text)

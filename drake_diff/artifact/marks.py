@@ -12,6 +12,7 @@ from pydrake.multibody.tree import FrameIndex
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import UnknownNameError
 from drake_diff.optimize.problem.goals import Goal, Mark
+from drake_diff.optimize.problem.obstacles import Obstacle
 from drake_diff.pages.shapes import Drawn, body_path
 
 AXES = (Rgba(0.8, 0.15, 0.1, 0.9), Rgba(0.1, 0.6, 0.15, 0.9), Rgba(0.1, 0.3, 0.85, 0.9))  # x, y, z
@@ -21,12 +22,12 @@ LARGE = 0.25  # [m] the radius from which on a goal is so translucent that the r
 
 def drawn_goals(plant: Any, context: Any, goals: Iterable[Goal]) -> tuple[Drawn, ...]:
     """What the `goals` mark, on the bodies of `plant` or in its world; UnknownNameError where it has no such frame."""
-    marks = [mark for goal in goals for mark in goal.marks()]
+    marks = [(mark, not isinstance(goal, Obstacle)) for goal in goals for mark in goal.marks()]
     frames: dict[str, Any] = {}
     for frame in (plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())):
         frames.setdefault(frame.name(), frame)
     found: list[Drawn] = []
-    for mark in marks:
+    for mark, above in marks:
         if mark.frame not in frames:
             raise UnknownNameError("frame", got=mark.frame, known=tuple(frames))
         frame = frames[mark.frame]
@@ -35,21 +36,25 @@ def drawn_goals(plant: Any, context: Any, goals: Iterable[Goal]) -> tuple[Drawn,
         if not path:
             pose = plant.EvalBodyPoseInWorld(context, body) @ pose
         if not mark.in_world:
-            found += _shapes(mark, path, pose @ RigidTransform(mark.position))
+            found += _shapes(mark, path, pose @ RigidTransform(mark.position), above)
             continue
         place = pose @ np.array(mark.position)  # on the body, which may turn as it likes
         if path:
-            found += [replace(shape, origin=place) for shape in _shapes(mark, path, RigidTransform())]
+            found += [replace(shape, origin=place) for shape in _shapes(mark, path, RigidTransform(), above)]
         else:
-            found += _shapes(mark, path, RigidTransform(place))
+            found += _shapes(mark, path, RigidTransform(place), above)
     return tuple(found)
 
 
-def _shapes(mark: Mark, path: str, pose: RigidTransform) -> list[Drawn]:
-    """The shapes of one mark at `pose` on the body of that path."""
+def _shapes(mark: Mark, path: str, pose: RigidTransform, above: bool) -> list[Drawn]:
+    """The shapes of one mark at `pose` on the body of that path; those of a goal are `above` what hides them."""
+    return [replace(shape, above=above) for shape in _shapes_of(mark, path, pose, above)]
+
+
+def _shapes_of(mark: Mark, path: str, pose: RigidTransform, above: bool) -> list[Drawn]:
     at = pose @ RigidTransform(RotationMatrix(np.array(mark.rotation)), np.zeros(3))
     colour = Rgba(*mark.colour)
-    if mark.shape in ("sphere", "box") and not mark.label.startswith("obstacle") and max(mark.size) / 2 > LARGE:
+    if above and mark.shape in ("sphere", "box") and max(mark.size) / 2 > LARGE:
         colour = Rgba(*mark.colour[:3], 0.2)
     if mark.shape == "sphere":
         return [_drawn(path, Sphere(mark.size[0]), at, colour, mark.size[0])]

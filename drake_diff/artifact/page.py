@@ -17,6 +17,7 @@ from drake_diff.pages.meshcat import RED, TRAIL, VIOLET, write_replay
 from drake_diff.pages.scene import BLUE, Scene, scene_of
 
 SERIES_PER_PLOT = 6  # more lines cannot be told apart
+SEEN = 1e-3  # of the height of a plot: less than a pixel
 PHYSICS, SEARCH = "Energy and contact", "Search"
 
 
@@ -60,8 +61,7 @@ def _scene(m: Measurement) -> Scene:
         xs = np.where(np.all(np.isfinite(m.xs), axis=1)[:, None], m.xs, problem.x0)
         return scene_of(model, m.times, xs, marks=marks)
     planned = m.solution.plan.sample(_parts(m))[0]
-    apart = bool(np.all(np.isfinite(planned))) and not np.array_equal(planned, motion.xs)
-    ghosts = {"plan": (planned, BLUE)} if apart else None
+    ghosts = {"plan": (planned, BLUE)} if np.all(np.isfinite(planned)) and _differ(motion.xs, planned) else None
     return scene_of(model, motion.times, motion.xs, us=motion.us, contacts=motion.contacts, ghosts=ghosts, marks=marks)
 
 
@@ -118,12 +118,19 @@ def _state_plots(m: Measurement, group: str, start: int, columns: Sequence[Colum
     """A plot for each column: the motion, and the plan where it is another. Plain dynamics have "states" alone."""
     shown = m.shown[0]
     motion = m.integrated if shown is None else shown.xs[:: _parts(m)]
-    differs = motion is not None and not np.array_equal(motion, m.xs)
+    differs = motion is not None and _differ(motion, m.xs)
     for i, c in enumerate(columns, start):
         lines = [] if motion is None else [Line("motion", motion[:, i])]
         if motion is None or differs:
             lines.append(Line("plan", m.xs[:, i], dashed=differs))
         yield Plot(c.name, c.unit, m.times, lines, limits=(c.lower, c.upper), group=group if m.velocities else "States")
+
+
+def _differ(motion: Array, plan: Array) -> bool:
+    """Whether a reader could tell a motion (n, m) from its plan: by SEEN of what a column moves, 1e-3 at least."""
+    moved = np.ptp(motion, axis=0)
+    apart = np.max(np.abs(motion - plan), axis=0)
+    return not bool(np.all(apart <= SEEN * np.maximum(moved, 1e-3)))  # what is not finite differs
 
 
 def _parts(m: Measurement) -> int:
@@ -140,7 +147,7 @@ def _input_plots(m: Measurement) -> Iterator[Plot]:
         lines = [planned]
         if motion is not None:
             applied = motion.us[:: _parts(m), i]
-            same = held and np.array_equal(applied, m.us[:, i])
+            same = held and not _differ(applied[:, None], m.us[:, i : i + 1])
             ours = Line("motion", _as_long(applied, m.times), held=True)
             lines = [ours] if same else [ours, replace(planned, dashed=True)]
         yield Plot(f"input {c.name}", c.unit, m.times, lines, limits=(c.lower, c.upper), percent=True, group="Inputs")

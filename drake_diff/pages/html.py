@@ -85,9 +85,9 @@ class Plot:
     note: str = ""
 
 
-ENTRY = ("derivative", "difference", "tolerance", "noticeable")
+ENTRY = {"derivative": 9, "difference": 9, "tolerance": 2, "noticeable": 2}  # what is told of one, in so many digits
 MOST_POINTS = 1200  # of a plot: of a longer one the lowest and highest of each stretch are kept
-MOST_ENTRIES = 1000  # of a certificate, whose numbers are in the page; of a larger one those nearest to failing
+MOST_ENTRIES = 500  # of a certificate, whose numbers are in the page; of a larger one those nearest to failing
 
 
 def page_data(duration: float, plots: Iterable[Plot], certificates: Iterable[Certificate] = ()) -> dict[str, Any]:
@@ -126,7 +126,7 @@ def _map_of(c: Certificate) -> dict[str, Any]:
     gap = np.nan_to_num(gap, nan=np.inf, posinf=np.inf)
     told = np.lexsort((np.arange(len(codes)), -gap, -codes))[:MOST_ENTRIES]
     told = np.arange(len(codes)) if len(codes) <= MOST_ENTRIES else told
-    entries = {name: numbers(getattr(c, name).ravel()[told]) for name in ENTRY}
+    entries = {name: numbers(getattr(c, name).ravel()[told], digits) for name, digits in ENTRY.items()}
     subject = {
         "subject": c.subject,
         "method": c.method,
@@ -144,9 +144,9 @@ def _pooled(data: Mapping[str, Any]) -> dict[str, Any]:
     return {**data, "plots": plots, "xs": [list(x) for x in xs]}
 
 
-def numbers(values: Iterable[Any]) -> list[float | None]:
-    """`values` with eight digits, more than a screen shows; None where there is none, or none that is finite."""
-    return [float(f"{v:.8g}") if v is not None and math.isfinite(v) else None for v in values]
+def numbers(values: Iterable[Any], digits: int = 8) -> list[float | None]:
+    """`values` with so many digits (a screen shows fewer than eight); None where there is no finite one."""
+    return [float(f"{v:.{digits}g}") if v is not None and math.isfinite(v) else None for v in values]
 
 
 def write_page(

@@ -36,7 +36,7 @@ logging.getLogger("drake").addFilter(lambda record: "Meshcat listening" not in r
 
 VIEWPORT = '<meta name="viewport" content="width=device-width, initial-scale=1">'
 FRAMES_PER_SECOND = 64.0
-MOST_POSES = 9000  # of all bodies in all frames, at 140 bytes each: between two frames the viewer interpolates
+MOST_POSES = 6000  # of all bodies in all frames, at 140 bytes each: between two frames the viewer interpolates
 FEWEST_FRAMES = 60
 REPETITIONS = 5
 RED, TRAIL, VIOLET = Rgba(0.85, 0.2, 0.1, 1), Rgba(0.93, 0.55, 0.1, 1), Rgba(0.62, 0.24, 0.85, 1)
@@ -128,9 +128,10 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
                 _draw_shape(meshcat, f"{ghost.name}/{drawn.body}/{i}", drawn, ghost.colour, scene.size)
     level: dict[str, list[RigidTransform]] = {}  # marks that go with a body, and do not turn with it
     for i, mark in enumerate(scene.marks):
-        path = f"motion/{mark.body or WORLD}/mark{i}"
+        kind = "above" if mark.above else "mark"  # replay.js draws the former through all else
+        path = f"motion/{mark.body or WORLD}/{kind}{i}"
         if mark.origin is not None:
-            path = f"level/{i}/mark"
+            path = f"level/{i}/{kind}"
             level[str(i)] = [RigidTransform(pose @ mark.origin) for pose in scene.poses[mark.body]]
         _draw_shape(meshcat, path, mark, mark.colour, scene.size)
     radius = THICKNESS * scene.size

@@ -33,7 +33,8 @@ MeshFile = tuple[Path, tuple[float, float, float], int, int]  # with its scale, 
 class Drawn:
     """A shape on the body of that path, or in the world for ""; `centre` and `radius` [m] are of a ball around it.
 
-    Where `origin` (3,) [m] is given, a point on the body, `pose` is from there and along the world's axes.
+    Where `origin` (3,) [m] is given, a point on the body, `pose` is from there and along the world's axes. What is
+    `above` is seen through all that is before it.
     """
 
     body: str
@@ -43,6 +44,7 @@ class Drawn:
     centre: Array
     radius: float
     origin: Array | None = None
+    above: bool = False
 
 
 def shapes_of(plant: Any, context: Any, drawn: Sequence[Any]) -> list[Drawn]:
