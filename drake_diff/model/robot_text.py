@@ -34,7 +34,10 @@ def text_of(path: Path, notes: list[str]) -> XmlText | None:
         return None
     try:
         xml = XmlText(path.read_bytes())
-    except ModelError as error:  # Drake forgives more; where it does not, this line is what is wrong
+    except ModelError as error:
+        if error.__cause__ is None:
+            raise ModelError(f"{path}, {error}") from error
+        # Drake forgives more; where it does not, this line is what is wrong.
         notes.append(f"{path}, {error}: only what Drake reads of it is known.")
         return None
     if xml.root.tag == "mujoco":

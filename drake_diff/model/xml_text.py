@@ -57,7 +57,8 @@ class Element:
 class XmlText:
     """An XML file's text that can be changed in place.
 
-    Raises ModelError, with the line, where the text is no XML.
+    Raises ModelError, with the line, where the text is no XML; it has no cause where the text is XML that is not read:
+    too deep, or with entities.
     """
 
     def __init__(self, data: bytes):
@@ -72,6 +73,7 @@ class XmlText:
         parser.StartElementHandler = lambda tag, attributes: self._begin(parser, tag, attributes)
         parser.EndElementHandler = lambda _: self._close(parser)
         parser.CharacterDataHandler = self._add_text
+        parser.EntityDeclHandler = lambda *_: self._refuse_entity(parser)
         try:
             parser.Parse(self._tags, True)
         except expat.ExpatError as error:
@@ -79,6 +81,9 @@ class XmlText:
         except LookupError as error:
             raise ModelError(f"line 1: {error}") from error
         self.root: Element = self._roots[0]
+
+    def _refuse_entity(self, parser: Any) -> None:
+        raise ModelError(f"line {parser.CurrentLineNumber}: entities are not read, by Drake neither")
 
     def _begin(self, parser: Any, tag: str, attributes: dict[str, str]) -> None:
         if len(self._open) >= DEEPEST:
