@@ -86,8 +86,8 @@ def gap_to_mujoco(text, model, random):
     data, plant = mujoco.MjData(other), model.plant
     data.qpos, data.qvel, data.qacc = random.uniform(-1, 1, (3, other.nv))
     mujoco.mj_inverse(other, data)
-    index = {j.name(): mujoco.mj_name2id(other, mujoco.mjtObj.mjOBJ_JOINT, j.name()) for j in joints(plant)}
-    order = [index[j.name()] for j in sorted(joints(plant), key=lambda j: j.velocity_start())]
+    moving = sorted((j for j in joints(plant) if j.num_velocities()), key=lambda j: j.velocity_start())
+    order = [mujoco.mj_name2id(other, mujoco.mjtObj.mjOBJ_JOINT, j.name()) for j in moving]
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, data.qpos[order])
     plant.SetVelocities(context, data.qvel[order])
@@ -327,3 +327,37 @@ def test_joints_of_one_name_in_two_robots_have_inputs_of_their_own_names(tmp_pat
     model = load(path, packages={"here": tmp_path}, actuators="all")
     assert model.input_names == ("left::j", "right::j")
     assert load(path, packages={"here": tmp_path}, actuators=["right::j"]).input_names == ("j",)
+
+
+def test_frames_are_bodies_without_a_joint(tmp_path):
+    """The same inertia as MuJoCo has of what is in frames, one in the other, and with a class of their own."""
+    inner = (
+        '<frame pos="0 0 1" euler="30 0 0" childclass="c"><geom name="x" size="0.1" pos="1 0 0"/>'
+        '<frame pos="1 0 0"><body name="end"><joint name="k" axis="1 0 1"/><geom size="0.2"/></body></frame></frame>'
+    )
+    defaults = '<default><default class="c"><geom density="700"/></default></default>'
+    path = write(tmp_path, HINGE.format("", inner), defaults=defaults)
+    model = load(path)
+    assert model.nv == 2
+    assert gap_to_mujoco(path.read_text(), model, np.random.default_rng(0)) < AGREE
+    assert "2 <frame>s became bodies" in str(model.notes)
+
+
+@each_row(
+    "body, head, told",
+    [
+        ('<replicate count="3"><geom size="0.1"/></replicate>', "", "<replicate> and what is in it is ignored"),
+        (
+            '<body><joint name="b" type="ball" armature="2"/><geom size="0.1"/></body>',
+            "",
+            "armature of the ball joint b is ignored",
+        ),
+        ("", '<asset><mesh name="x" file="part.obj" inertia="shell"/></asset>', "its inertia is ignored"),
+        ('<frame pos="0 0 1"><joint name="l"/></frame>', "", "tag 'frame' found as a child of 'body'"),
+    ],
+)
+def test_what_drake_leaves_out_without_a_word_is_told(tmp_path, body, head, told):
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "part.obj")
+    model = load(write(tmp_path, HINGE.format("", body), more=head))
+    assert told in str(model.notes)
+    assert any(finding.code == "ignored" and told in finding.message for finding in dd.audit(model))

@@ -41,7 +41,9 @@ def as_mujoco_means(xml: XmlText, path: Path, notes: list[str]) -> XmlText:
     if not xml.root.get("model"):
         xml.set(xml.root, "model", path.stem)
         notes.append(f"The model has no name in the file: it is called {path.stem}.")
+    notes += _frames_to_bodies(xml)
     mjcf = Mjcf(xml)
+    notes += _unread(mjcf, path)
     for connect in (c for section in xml.root.findall("equality") for c in section.findall("connect")):
         says = mjcf.attributes(connect)
         if says.get("active") == "false":
@@ -56,6 +58,35 @@ def as_mujoco_means(xml: XmlText, path: Path, notes: list[str]) -> XmlText:
         mjcf.flatten_defaults()
         notes.append("Default classes were written out with what they inherit, which Drake would lose.")
     return xml
+
+
+def _frames_to_bodies(xml: XmlText) -> list[str]:
+    """Make bodies without a joint of <frame>s, whose content Drake would leave out; those with a joint stay."""
+    frames = [
+        frame
+        for world in xml.root.findall("worldbody")
+        for frame in world.iter("frame")
+        if not any(child.tag in ("joint", "freejoint", "inertial") for child in frame.children)
+    ]
+    for frame in frames:
+        xml.rename(frame, "body")
+    return [f"{len(frames)} <frame>s became bodies without a joint, which is the same."] if frames else []
+
+
+def _unread(mjcf: "Mjcf", path: Path) -> Iterator[str]:
+    """A sentence for each thing that Drake's parser leaves out without a word."""
+    elements = [element for section in mjcf.root.findall("worldbody") for element in section.iter()]
+    for element in elements:
+        if element.tag == "replicate":
+            yield f"{path}:{element.line}: <replicate> and what is in it is ignored."
+    for element in elements:
+        says = mjcf.attributes(element) if element.tag == "joint" else {}
+        if says.get("type") in ("ball", "free") and any(_numbers(says.get("armature", "0"))):
+            name = says.get("name", "without a name")
+            yield f"{path}:{element.line}: the armature of the {says['type']} joint {name} is ignored."
+    for mesh in (m for section in mjcf.root.findall("asset") for m in section.findall("mesh")):
+        if mjcf.attributes(mesh).get("inertia") == "shell":
+            yield f"{path}:{mesh.line}: a mesh whose mass is in its shell is taken as solid, its inertia is ignored."
 
 
 def with_includes(xml: XmlText, path: Path) -> XmlText:

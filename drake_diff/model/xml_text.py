@@ -122,6 +122,15 @@ class XmlText:
         """Put XML text in the place of an element."""
         self._replace(element.start, element.end, text.encode())
 
+    def rename(self, element: Element, tag: str) -> None:
+        """Give an element another tag."""
+        old = element.tag.encode()
+        self._replace(element.start + 1, element.start + 1 + len(old), tag.encode())
+        if self.data[element.inside - 2 : element.inside] != b"/>":
+            close = self._tags.rindex(b"</", element.inside, element.end)
+            self._replace(close + 2, close + 2 + len(old), tag.encode())
+        element.tag = tag
+
     def set(self, element: Element, name: str, value: str) -> None:
         """Give an attribute another value, or add it."""
         element.attributes[name] = value
