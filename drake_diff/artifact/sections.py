@@ -20,6 +20,7 @@ from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCo
 from drake_diff.optimize.problem.goals import CenterOfMassGoal, FrameGoal, FrameVelocityGoal, Goal, JointGoal, KeepLevel
 from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.timed import SumOfCosts, TrackingCost
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.parts import ModelInput, Quantity
 from drake_diff.record.provenance import gradient_evidence, model_input
@@ -298,6 +299,14 @@ def _cost(cost: Any) -> Any:
         return {
             "CostToGo": {name: np.asarray(getattr(cost, name)).tolist() for name in ("x_ref", "gradient", "hessian")}
         }
+    if isinstance(cost, TrackingCost):
+        named = zip(("times", "xs", "us"), cost.reference, strict=True)
+        parts = {**dict(named), "Q": cost.Q, "R": cost.R}
+        return {"TrackingCost": {name: np.asarray(v).tolist() for name, v in parts.items() if v is not None}}
+    if isinstance(cost, SumOfCosts):
+        found = [_cost(each) for each in cost.costs]
+        unknown = [each for each in found if isinstance(each, str)]
+        return f"a sum with {', '.join(unknown)}" if unknown else {"SumOfCosts": found}
     return None if cost is None else getattr(cost, "__qualname__", type(cost).__name__)
 
 
@@ -378,4 +387,10 @@ def _rebuild_cost(cost: Any) -> Any:
         return ConstantCost(cost["ConstantCost"]["rate"])
     if "CostToGo" in cost:
         return CostToGo(**{name: np.array(value, dtype=float) for name, value in cost["CostToGo"].items()})
+    if "TrackingCost" in cost:
+        parts = {name: np.array(value, dtype=float) for name, value in cost["TrackingCost"].items()}
+        reference = parts["times"], parts["xs"], parts.get("us")
+        return TrackingCost(reference, Q=parts.get("Q"), R=parts.get("R"))
+    if "SumOfCosts" in cost:
+        return [_rebuild_cost(each) for each in cost["SumOfCosts"]]
     return QuadraticCost(**cost["QuadraticCost"])

@@ -21,6 +21,7 @@ from drake_diff.optimize.ilqr.ilqr import check_problem, costs_to_go, solve_ilqr
 from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.cost import QuadraticCost
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.timed import Later, TimedCost
 from drake_diff.optimize.program import Limits, Outcome
 from drake_diff.optimize.replay import Plan, held, regulator_weights
 from drake_diff.optimize.solution import Solution
@@ -128,6 +129,8 @@ class MPC:
         """What is minimized from `x` at step `k`."""
         problem, count = self._problem, self._count(k)
         running, final = problem.running_cost, problem.final_cost
+        if isinstance(running, TimedCost):
+            running = Later(running, k * problem.model.time_step)
         if k + count < problem.num_steps:
             final = self._tails[k + count]
         elif k >= problem.num_steps and self._stay is not None:

@@ -28,6 +28,7 @@ from drake_diff.model.soft_contact import distances
 from drake_diff.model.step import advance, set_state
 from drake_diff.optimize.problem.cost import final_cost_hessian, running_cost_hessian
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.timed import cost_at
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.shooting import RolloutCost, ShootingVariables, final_sensitivity
 
@@ -175,7 +176,8 @@ class _Plan:
             running = problem.total_running_cost
             if running is None:
                 return np.zeros((nx + nu, nx + nu))
-            return problem.model.time_step * running_cost_hessian(running, self.xs[k], self.us[k])
+            h = problem.model.time_step
+            return h * running_cost_hessian(cost_at(running, k * h), self.xs[k], self.us[k])
         hessian = np.zeros((nx + nu, nx + nu))
         if problem.total_final_cost is not None:
             hessian[:nx, :nx] = final_cost_hessian(problem.total_final_cost, self.xs[k])

@@ -27,6 +27,7 @@ from drake_diff.motion.rollout import roll_states
 from drake_diff.optimize.drake_program import solve_program
 from drake_diff.optimize.problem.cost import differentiate_cost, differentiate_final_cost
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.timed import cost_at
 from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report
 
 DEFAULT_SOLVER = "snopt"
@@ -323,8 +324,14 @@ class RolloutCost:
         xs, us = self.variables.states(z), self.variables.unpack(z)[1]
         total = 0.0 if self.final is None else float(self.final(xs[-1]))
         if self.running is not None:
-            total += self.time_step * sum(float(self.running(x, u)) for x, u in zip(xs, us, strict=False))
+            total += self.time_step * sum(
+                float(self._rate(k)(x, u)) for k, (x, u) in enumerate(zip(xs, us, strict=False))
+            )
         return total + (0.0 if self.trajectory is None else float(self.trajectory(xs, us)))
+
+    def _rate(self, k: int) -> Any:
+        """The running cost at step `k` of these."""
+        return cost_at(self.running, (self.variables.steps.start + k) * self.time_step)
 
     def differentiate(self, z: Array) -> tuple[float, Array]:
         """(value, gradient by z) at z."""
@@ -337,7 +344,7 @@ class RolloutCost:
         by_xs, by_us, total = np.zeros_like(xs), np.zeros_like(us), 0.0
         if self.running is not None:
             for k, u in enumerate(us):
-                value, by_x, by_u = differentiate_cost(self.running, xs[k], u)
+                value, by_x, by_u = differentiate_cost(self._rate(k), xs[k], u)
                 total += h * value
                 by_xs[k], by_us[k] = h * by_x, h * by_u
         if self.final is not None:

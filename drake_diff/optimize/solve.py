@@ -27,6 +27,7 @@ from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, refused
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import lacking_between, swept
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.timed import TimedCost
 from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report
 from drake_diff.optimize.reach import out_of_reach, why_blind
 from drake_diff.optimize.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
@@ -400,6 +401,10 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
         raise InputError("parameters, trajectory_cost", got="given", expected='method="shooting"')
     if not problem.optimizes_controls:
         raise InputError("optimize", got=list(problem.optimize), expected='"controls" for method="collocation"')
+    if isinstance(problem.running_cost, TimedCost) and problem.horizon and problem.horizon[0] < problem.horizon[1]:
+        raise InputError(
+            "running_cost", got="one that changes in time", expected="one that does not: the horizon is free"
+        )
     OptimalControl(problem, scheme)  # raises where a cost is no function that can be differentiated
     if attempt.solver == "snopt":  # Drake's DirectCollocation gets bounds, ends and costs alone
         left_out = {
@@ -408,6 +413,7 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
             "constraints": problem.constraints,
             "goals": problem.goals,
             "horizon": problem.horizon,
+            "a running_cost that changes in time": isinstance(problem.running_cost, TimedCost),
             "refine": attempt.refine,
         }
         for name, value in left_out.items():

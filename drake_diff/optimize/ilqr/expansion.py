@@ -22,6 +22,7 @@ from drake_diff.optimize.problem.cost import (
     running_cost_hessian,
 )
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.timed import cost_at
 
 # Of a state, or of 1: Jacobians are known to 1e-12, so that this leaves 1e-6 of their derivative.
 DIFFERENCE_STEP = 1e-6
@@ -97,8 +98,9 @@ def _expand_running_cost(problem: Problem, xs: Array, us: Array) -> tuple[Array,
         gradients = (np.hstack([xs[:-1], us]) - np.concatenate([x_ref, u_ref])) @ hessians[0]
     elif cost is not None:
         for k, u in enumerate(us):
-            gradients[k] = h * np.concatenate(differentiate_cost(cost, xs[k], u)[1:])
-            hessians[k] = h * running_cost_hessian(cost, xs[k], u)
+            rate = cost_at(cost, k * h)
+            gradients[k] = h * np.concatenate(differentiate_cost(rate, xs[k], u)[1:])
+            hessians[k] = h * running_cost_hessian(rate, xs[k], u)
     return gradients, hessians
 
 

@@ -19,6 +19,7 @@ from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
 from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGoals, in_words
 from drake_diff.optimize.problem.names import bounds_of, state_of
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, doubts_of
+from drake_diff.optimize.problem.timed import SumOfCosts, TimedCost, TrackingCost, cost_at, running_cost_of
 
 OPTIMIZABLE = ("controls", "initial_state", "parameters")
 # A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
@@ -40,8 +41,9 @@ class Problem(ShowsItsRepr):
         x0: (nx,) the initial state; or a mapping from names of coordinates to values, the model's default elsewhere. A
             name is one of `state_names`, or that of a joint with one position, which it then is.
         num_steps: number N of intervals, of model.time_step each where no `horizon` is given.
-        running_cost: a function (x, u) -> scalar, a QuadraticCost, or, with `horizon`, a number [per s]: with 1.0 the
-            cost is the time itself.
+        running_cost: a function (x, u) or (x, u, t) -> scalar, t [s] from the first state on; a QuadraticCost, an
+            `optimize.TrackingCost`, or a list of such costs, whose sum it is; or, with `horizon`, a number [per s]:
+            with 1.0 the cost is the time itself.
         final_cost: a function x -> scalar, or a QuadraticCost.
         x_goal: (nx,) final state, a hard equality; NaN entries are free. Or a mapping as `x0`, the rest free.
         waypoints: mapping from knots (1 ... N-1) to states (nx,), with NaN where free, or mappings as `x_goal`.
@@ -148,7 +150,7 @@ class Problem(ShowsItsRepr):
         for name in ("running_cost", "final_cost", "trajectory_cost"):
             cost = getattr(self, name)
             if cost is not None:
-                own = isinstance(cost, (QuadraticCost, ConstantCost))
+                own = isinstance(cost, (QuadraticCost, ConstantCost, TrackingCost, SumOfCosts))
                 told = repr(cost) if own else getattr(cost, "__qualname__", type(cost).__name__)
                 lines.append(f"{name.replace('_', ' ')}: {told}")
         if self.waypoints:
@@ -237,6 +239,8 @@ class Problem(ShowsItsRepr):
     def _with_goals(self, own: Any, knots: Any) -> Any:
         soft = [goal for goal in self.goals if goal.weight is not None and goal.knots == knots]
         terms = tuple((cast(float, goal.weight), constraint) for goal in soft for constraint in self._bound(goal))
+        if terms and isinstance(own, TimedCost):
+            return SumOfCosts((own, WithGoals(None, terms)))
         return WithGoals(own, terms) if terms else own
 
     @property
@@ -328,7 +332,8 @@ class Problem(ShowsItsRepr):
             if isinstance(running, QuadraticCost):
                 rates = running.along(before, inputs)
             else:
-                rates = np.array([float(running(x, u)) for x, u in zip(before, inputs, strict=True)])
+                along = enumerate(zip(before, inputs, strict=True))
+                rates = np.array([float(cost_at(running, k * self.time_step)(x, u)) for k, (x, u) in along])
             if len(inputs) == len(xs):
                 rates[0], rates[-1] = rates[0] / 2, rates[-1] / 2
             total += self.time_step * float(np.sum(rates))
@@ -435,14 +440,15 @@ class Problem(ShowsItsRepr):
     def _check_costs(self) -> None:
         if isinstance(self.running_cost, (int, float)) and self.horizon is not None:
             self._set("running_cost", ConstantCost(positive_float("running_cost", self.running_cost)))
+        self._set("running_cost", running_cost_of(self.running_cost))
         costs = (self.running_cost, self.final_cost, self.trajectory_cost)
         if all(cost is None for cost in costs) and np.all(np.isnan(self.goal)) and not self.goals:
             raise InputError("problem", got="no cost and no goal", expected="a cost, an x_goal or goals")
         for name in ("running_cost", "final_cost", "trajectory_cost"):
             cost = getattr(self, name)
-            if cost is not None and not callable(cost):
+            if cost is not None and not callable(cost) and not (name == "running_cost" and isinstance(cost, TimedCost)):
                 raise InputError(name, got=type(cost).__name__, expected="a function or a QuadraticCost")
-            if isinstance(cost, QuadraticCost):
+            if isinstance(cost, (QuadraticCost, TimedCost)):
                 cost.check_sizes(name, self.nx, self.nu)
 
     def _check_quantities(self) -> None:
@@ -454,7 +460,7 @@ class Problem(ShowsItsRepr):
             for constraint in self.kept:
                 constraint(x, u)
             if self.total_running_cost is not None:
-                self.total_running_cost(x, u)
+                cost_at(self.total_running_cost, 0.0)(x, u)
             if self.total_final_cost is not None:
                 self.total_final_cost(x)
             if self.trajectory_cost is not None:

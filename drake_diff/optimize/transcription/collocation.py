@@ -110,7 +110,7 @@ class Collocated:
         """The scheme's own quadrature of the running cost, and the final cost."""
         weights = self.horizon * self.task.scheme.node_weights(self.mesh)
         final = 0.0 if self.task.final is None else float(self.task.final.values(self.nodes[-1:])[0, 0])
-        return float(weights @ self.task.rate.values(self.nodes)[:, 0]) + final
+        return float(weights @ self._cost_rates) + final
 
     @cached_property
     def defects(self) -> Array:
@@ -143,8 +143,8 @@ class Collocated:
     @property
     def cost_errors(self) -> Array:
         """(N,) the same of the running cost's quadrature, as a part of the whole cost (of 1 where that is less)."""
-        scheme, rates = self.task.scheme, self.task.rate.values(self.nodes)[:, 0]
-        quadrature = self._lengths * (scheme.per_interval(rates) @ scheme.weights)
+        scheme = self.task.scheme
+        quadrature = self._lengths * (scheme.per_interval(self._cost_rates) @ scheme.weights)
         return _finite(np.abs(self._integrated[-1, :, -1] - quadrature) / max(1.0, abs(self.cost)))
 
     def at(self, times: Any) -> tuple[Array, Array]:
@@ -159,6 +159,11 @@ class Collocated:
     @cached_property
     def _rates(self) -> Array:
         return self.task.dynamics.values(self.nodes)
+
+    @property
+    def _cost_rates(self) -> Array:
+        """(K,) the running cost at the nodes."""
+        return self.task.rates(self.nodes, self.horizon * self.task.scheme.node_fractions(self.mesh))
 
     @property
     def _lengths(self) -> Array:
@@ -233,7 +238,7 @@ class Collocated:
 
         With `gains` (nu, nx), under feedback about the motion too.
         """
-        dynamics, rates, nx = self.task.dynamics, self.task.rate, self.task.dynamics.nx
+        dynamics, nx = self.task.dynamics, self.task.dynamics.nx
         dt, found = self._lengths[k, None] / SUBSTEPS, [z]
 
         def rate(z: Array, step: float) -> Array:
@@ -243,7 +248,7 @@ class Collocated:
                 us = us + (self._between(k, tau)[0] - z[:, :nx]) @ gains.T
                 us = self._cut_off(np.clip(us, b.u_lower, b.u_upper))
             knots = np.hstack([z[:, :nx], us])
-            return np.column_stack([dynamics.values(knots), rates.values(knots)])
+            return np.column_stack([dynamics.values(knots), self.task.rates(knots, self._times(k, tau))])
 
         with np.errstate(all="ignore"):
             for i in range(SUBSTEPS):

@@ -23,7 +23,7 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.mechanics.casadi_tree import PlantFunctions, agrees, symbolic_plant
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.dynamics import Dynamics, PlantKnots, Pointwise
-from drake_diff.optimize.transcription.task import OptimalControl
+from drake_diff.optimize.transcription.task import OptimalControl, TimedRate
 
 SAME_VALUES = 1e-10  # of the largest value at a knot: the same operations, rounded in another order
 
@@ -113,22 +113,22 @@ class Symbolic:
 
     why_not = ""
 
-    def __init__(self, function: Any):
-        self.function, self.rows, self.width = function, function.size1_out(0), function.size1_in(0)
+    def __init__(self, function: Any, *known: Any):
+        self.function, self.rows, self.width, self.known = function, function.size1_out(0), function.size1_in(0), known
         self.jacobian_at = _places(self._jacobian.sparsity_out(0))
 
     def values(self, knots: Any) -> Any:
-        return _at_all(self.function, knots)
+        return _at_all(self.function, knots, *self.known)
 
     def jacobian(self, knots: Any) -> Any:
-        return ca.vec(_at_all(self._jacobian, knots).nz[:])
+        return ca.vec(_at_all(self._jacobian, knots, *self.known).nz[:])
 
     def jacobian_of(self, knot: Array) -> Array:
         """(m, nx + nu) at one `knot` (nx + nu,)."""
         return np.asarray(self._jacobian(knot).full())
 
     def hessian(self, knots: Any, weights: Any) -> Any:
-        return ca.vec(_at_all(self._hessian, knots, weights).nz[:])
+        return ca.vec(_at_all(self._hessian, knots, weights, *self.known).nz[:])
 
     @property
     def hessian_at(self) -> tuple[Indices, Indices]:
@@ -136,15 +136,19 @@ class Symbolic:
 
     @cached_property
     def _jacobian(self) -> Any:
-        knot = ca.SX.sym("knot", self.width)
-        return ca.Function("jacobian", [knot], [ca.jacobian(self.function(knot), knot)])
+        knot, *known = self._symbols()
+        return ca.Function("jacobian", [knot, *known], [ca.jacobian(self.function(knot, *known), knot)])
 
     @cached_property
     def _hessian(self) -> Any:
         """The upper triangle."""
-        knot, weights = ca.SX.sym("knot", self.width), ca.SX.sym("weights", self.rows)
-        hessian, _ = ca.hessian(ca.dot(weights, self.function(knot)), knot)
-        return ca.Function("hessian", [knot, weights], [ca.triu(hessian)])
+        (knot, *known), weights = self._symbols(), ca.SX.sym("weights", self.rows)
+        hessian, _ = ca.hessian(ca.dot(weights, self.function(knot, *known)), knot)
+        return ca.Function("hessian", [knot, weights, *known], [ca.triu(hessian)])
+
+    def _symbols(self) -> list[Any]:
+        """The knot, and what is known beside it."""
+        return [ca.SX.sym(f"z{i}", self.function.size1_in(i)) for i in range(self.function.n_in())]
 
 
 def _at_all(function: Any, knots: Any, *others: Any) -> Any:
@@ -281,6 +285,37 @@ class _KnotCallback(ca.Callback):  # type: ignore[misc]
         return 0
 
 
+class Timed:
+    """A running cost that changes in time: of the nodes of a mesh it is one of the two kinds, see `at`."""
+
+    error: Exception | None = None
+
+    def __init__(self, rate: TimedRate, nx: int):
+        self.rate, self.width = rate, rate.width
+        with np.errstate(all="ignore"):
+            self.found = trace(rate.f, nx, rate.probe, rate.values(rate.probe))
+        self.why_not = self.found.reason if isinstance(self.found, Refusal) else ""
+
+    def at(self, times: Array) -> Symbolic | Called:
+        """The function of the knots at `times` (K,) [s]."""
+        known = self.rate.cost.known_at(times)
+        if not isinstance(self.found, Refusal):
+            knot, p = ca.SX.sym("knot", self.width), ca.SX.sym("known", known.shape[1])
+            return Symbolic(ca.Function("timed", [knot, p], [self.found(ca.vertcat(knot, p))]), ca.DM(known.T))
+
+        def kept(function: Any) -> Any:
+            def call(knots: Array) -> Any:
+                try:
+                    return function(np.hstack([knots, known]))
+                except Exception as error:
+                    self.error = self.error or error
+                    raise
+
+            return call
+
+        return Called(self.why_not, kept(self.rate.values), kept(self.rate.linearize), 1, self.width)
+
+
 KnotFunction = Symbolic | Called
 
 
@@ -293,7 +328,7 @@ class KnotFunctions:
     """Those of a task; the final cost is one of the last knot, `paths` are its constraints."""
 
     dynamics: KnotFunction
-    rate: KnotFunction
+    rate: KnotFunction | Timed
     final: KnotFunction | None
     paths: tuple[KnotFunction, ...]
 
@@ -308,7 +343,7 @@ class KnotFunctions:
     def error(self) -> Exception | None:
         """The first error that one of them raised."""
         every = (self.dynamics, self.rate, self.final, *self.paths)
-        called = [f for f in every if isinstance(f, (Called, SymbolicPlant))]
+        called = [f for f in every if isinstance(f, (Called, SymbolicPlant, Timed))]
         return next((f.error for f in called if f.error is not None), None)
 
 
@@ -336,7 +371,7 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
 
     return KnotFunctions(
         _dynamics(task.dynamics),
-        choose(rate.f, rate.values, rate.linearize, 1),
+        Timed(rate, nx) if isinstance(rate, TimedRate) else choose(rate.f, rate.values, rate.linearize, 1),
         final if final is None else choose(final.f, final.values, final.linearize, 1),
         tuple(path(constraint) for constraint in task.problem.kept),
     )

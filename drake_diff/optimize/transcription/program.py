@@ -28,7 +28,7 @@ from drake_diff.optimize.program import (
     Watch,
     ctrl_c,
 )
-from drake_diff.optimize.transcription.expressions import KnotFunctions
+from drake_diff.optimize.transcription.expressions import KnotFunctions, Timed
 from drake_diff.optimize.transcription.task import OptimalControl
 
 OUTCOMES = {
@@ -66,8 +66,10 @@ class TranscribedProgram:
         self.time = self.z[-1] if self.free else ca.MX(task.horizon[0])
         paths = zip(functions.paths, task.problem.kept, strict=True)
         self.paths = [(f, task.nodes_of(constraint, mesh), constraint) for f, constraint in paths]
-        self.rates, self.costs = functions.dynamics.values(self.knots), functions.rate.values(self.knots)
-        self.rate_rows, self.cost_rows = functions.dynamics.jacobian(self.knots), functions.rate.jacobian(self.knots)
+        times = task.horizon[0] * task.scheme.node_fractions(mesh)  # of a cost that changes in time, which fixes it
+        self.rate = functions.rate.at(times) if isinstance(functions.rate, Timed) else functions.rate
+        self.rates, self.costs = functions.dynamics.values(self.knots), self.rate.values(self.knots)
+        self.rate_rows, self.cost_rows = functions.dynamics.jacobian(self.knots), self.rate.jacobian(self.knots)
         self._set_links()
 
     def pack(self, nodes: Array, horizon: float) -> Array:
@@ -167,7 +169,7 @@ class TranscribedProgram:
 
     def _gradient(self) -> Any:
         total, last = _Sum((self.z.numel(), 1)), self.every[-1:]
-        b = _Blocks(self.functions.rate.jacobian_at, self.every, self.width)
+        b = _Blocks(self.rate.jacobian_at, self.every, self.width)
         total.add(b.column, 0, self.weights[b.node], self.time * self.cost_rows, b.index)
         if self.free:
             total.add(self.z.numel() - 1, 0, self.weights, ca.vec(self.costs), self.every)
@@ -202,7 +204,7 @@ class TranscribedProgram:
 
     def _hessian(self, sigma: Any, multipliers: Any) -> Any:
         """The upper triangle of d^2 (sigma f + multipliers' g) / dz^2."""
-        f, rate, total = self.functions.dynamics, self.functions.rate, _Sum((self.z.numel(), self.z.numel()))
+        f, rate, total = self.functions.dynamics, self.rate, _Sum((self.z.numel(), self.z.numel()))
         nu = ca.mtimes(self._D.T, multipliers[: self.num_links])
         weights = ca.DM(self.weights).T
         terms: list[tuple[Any, Indices, Any]] = [

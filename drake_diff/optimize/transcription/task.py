@@ -26,6 +26,7 @@ from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost, differentiate_cost
 from drake_diff.optimize.problem.dynamics import Pointwise
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.timed import TimedCost
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +123,29 @@ class KnownRate:
         return np.array([[v] for v, _, _ in found]), np.array([[np.concatenate(g)] for _, *g in found])
 
 
+class TimedRate:
+    """A TimedCost at many knots, of which the times are known."""
+
+    def __init__(self, cost: TimedCost, nx: int, nu: int, probe: Array):
+        self.cost, self.width = cost, nx + nu
+        self.probe = self.with_known(probe, np.linspace(0.0, 1.0, len(probe)))
+        self.f = lambda x, z: cost.of(x, z[:nu], z[nu:])
+        self.inner = Pointwise("running_cost", self.f, nx, (), self.probe)
+
+    def with_known(self, knots: Array, times: Array) -> Array:
+        """(K, nx + nu + p) `knots` (K, nx + nu) with what the cost needs to know at `times` (K,) [s]."""
+        return np.hstack([knots, self.cost.known_at(times)])
+
+    def values(self, knots: Array) -> Array:
+        """(K, 1) at knots (K, nx + nu + p)."""
+        return self.inner.values(knots)
+
+    def linearize(self, knots: Array) -> tuple[Array, Array]:
+        """(K, 1) and the gradients (K, 1, nx + nu), by state and input alone."""
+        values, rows = self.inner.linearize(knots)
+        return values, rows[:, :, : self.width]
+
+
 class OptimalControl:
     """What `problem` asks of a collocation scheme; ModelError where its model has no continuous form.
 
@@ -134,14 +158,21 @@ class OptimalControl:
         self.horizon: tuple[float, float] = problem.horizon or (problem.start_horizon,) * 2  # (lower, upper) [s]
         running, cost, nx = problem.total_running_cost, problem.total_final_cost, self.dynamics.nx
         running = ConstantCost(0.0) if running is None else running
-        self.rate: KnownRate | Pointwise
-        if isinstance(running, (ConstantCost, QuadraticCost)):
+        self.rate: KnownRate | Pointwise | TimedRate
+        if isinstance(running, TimedCost):
+            self.rate = TimedRate(running, nx, self.dynamics.nu, self.dynamics.probe())
+        elif isinstance(running, (ConstantCost, QuadraticCost)):
             self.rate = KnownRate(running, nx)
         else:
             self.rate = Pointwise("running_cost", running, nx, (), self.dynamics.probe())
         self.final: Pointwise | None = None  # of knots [x, u], whose inputs have no part in it
         if cost is not None:
             self.final = Pointwise("final_cost", lambda x, u: cost(x), nx, (), self.dynamics.probe())
+
+    def rates(self, knots: Array, times: Array) -> Array:
+        """(K,) the running cost at `knots` (K, nx + nu) and `times` (K,) [s]."""
+        with_known = self.rate.with_known(knots, times) if isinstance(self.rate, TimedRate) else knots
+        return self.rate.values(with_known)[:, 0]
 
     def nodes_of(self, constraint: Constraint, mesh: Array) -> Indices:
         """The nodes of `mesh` (N+1,) where `constraint` holds: its knots, or all nodes but a given first one."""
