@@ -13,7 +13,7 @@ from drake_diff.exceptions import InputError
 from drake_diff.model.contact import contacts_of_the_step
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
-from drake_diff.planning import plan
+from drake_diff.planning import plan, shifting
 from drake_diff.planning.feet import find_feet
 from drake_diff.planning.robot import GROUND, ON_FEET, load_robot, ranges
 from drake_diff.planning.standing import Legged, hold, stand, standing_posture
@@ -112,6 +112,35 @@ def test_at_rest_the_step_changes_nothing_and_drake_carries_the_weight(on_feet):
     assert np.max(np.abs(x[model.nq :])) < 5e-3  # what counts as rest
     assert {contact.body_a for contact in contacts_of_the_step(model)} == {f"{leg}_shank" for leg in HIPS}
     assert np.max(np.abs(robot.soles(rest.x[: model.nq])[0][:, 2])) < 1e-3
+
+
+def test_a_motion_that_does_not_end_at_rest_is_no_shift(on_feet, monkeypatch):
+    """2 cm down in 30 ms and held for 10 ms: it is still falling or bouncing, or takes more than friction allows."""
+    model = on_feet()
+    robot, rest = stand(model, *ranges(model))
+    assert isinstance(shifting.random_shift(robot, rest, 0, lambda q: 0.0), shifting.Shift)
+    monkeypatch.setattr(shifting, "DURATIONS", (0.03,))
+    monkeypatch.setattr(shifting, "HELD", 0.01)
+    found = shifting.random_shift(robot, rest, 0, lambda q: 0.0)
+    assert isinstance(found, Refusal) or np.max(np.abs(found.xs[-1][model.nq :])) <= shifting.AT_REST
+
+
+def test_a_frame_and_a_joint_go_where_they_are_asked_to(on_feet):
+    """By Drake's kinematics of the last state; what no motion of legs with feet in place reaches is refused."""
+    model = on_feet()
+    robot, rest = stand(model, *ranges(model))
+    frame, context = model.plant.GetFrameByName("trunk"), model.plant.CreateDefaultContext()
+    lower = rest.x[robot.base_q + 4 : robot.base_q + 7] - np.array([0.01, 0.0, 0.01])
+    found = shifting.shift_to(robot, rest, {"trunk": lower}, {})
+    assert isinstance(found, shifting.Shift), found
+    model.plant.SetPositions(context, found.xs[-1][: model.nq])
+    assert frame.CalcPoseInWorld(context).translation() == pytest.approx(lower, abs=5e-4)
+    knee = model.position_names.index("fl_knee_q")
+    found = shifting.shift_to(robot, rest, {}, {knee: rest.x[knee] + 0.05})
+    assert isinstance(found, shifting.Shift), found
+    assert found.xs[-1][knee] == pytest.approx(rest.x[knee] + 0.05, abs=2e-3)
+    sideways = shifting.shift_to(robot, rest, {"trunk": lower + np.array([0.0, 0.1, 0.0])}, {})
+    assert isinstance(sideways, Refusal)  # legs of two joints about y keep the trunk in its plane
 
 
 @each_row("name", ["panda.urdf", "iris.urdf", "allegro_left_hand.urdf", "kinova.urdf"])

@@ -80,7 +80,7 @@ def load_robot(path: Path, seed: int, held: str = "") -> Robot:
             begin = f"only {had} joints had a motor" if had else "no joint had a motor"
             told.append(f"{begin}: all {model.nu} that can be driven have one (actuators='all')")
     if model.plant.GetFloatingBaseBodies() and joints(model.plant):
-        standing = Refusal(held) if held else _standing(path, options, told, np.random.default_rng(seed))
+        standing = Refusal(held) if held else _standing(path, model, options, told, seed)
         if isinstance(standing, Robot):
             return standing
         welded = _held(path, options)
@@ -105,13 +105,14 @@ def load_robot(path: Path, seed: int, held: str = "") -> Robot:
 ON_FEET: dict[str, Any] = {"base": "free", "meshes": "spheres", "contact_geometry": "corner_spheres"}
 # Drake's own values let light legs sink by millimetres, by how much depends on the step, and rise only in 0.2 s.
 GROUND: dict[str, Any] = {"ground": True, "contact": "ground", "near_rigid": 0.1, "relaxation_time": 0.02}
-STEP_ON_FEET = 0.005  # [s]
+STEPS_ON_FEET, MANY = (0.005, 0.01), 24  # [s], the second of robots of more velocities, each of whose steps costs more
 DRAWN = 16  # postures, to see which shapes always overlap
 
 
-def _standing(path: Path, options: dict[str, Any], told: list[str], random: np.random.Generator) -> Robot | Refusal:
-    """The robot on its feet on a ground; or why it does not stand."""
-    on_feet = options | ON_FEET | GROUND | {"time_step": STEP_ON_FEET}
+def _standing(path: Path, read: Model, options: dict[str, Any], told: list[str], seed: int) -> Robot | Refusal:
+    """The robot that was `read` on its feet on a ground; or why it does not stand."""
+    on_feet = options | ON_FEET | GROUND | {"time_step": STEPS_ON_FEET[read.nv > MANY]}
+    random = np.random.default_rng(seed)
     told = list(told)
     try:
         model = _loaded(path, on_feet)

@@ -26,7 +26,7 @@ from drake_diff.planning.standing import (
 )
 
 DURATIONS, HELD = (0.6, 1.0), 0.2  # [s] of a motion, and of holding its end
-SIZES = (1.0, 0.5, 0.25, 0.12)  # of what is drawn at random
+SIZES = ((1.0, 1.0), (1.0, 0.2), (0.5, 0.2), (0.25, 0.1), (0.12, 0.0))  # of a random shift of the base and of the arms
 TURNED, SHIFTED, LOWERED = 0.1, 0.06, 0.12  # [rad], and shares of the height of the centre of mass: of the base
 MOVED = 0.1  # of the range of a joint that is no leg's
 ARRIVED, AT_REST = 0.01, 0.02  # [rad or m] off the rest that was to be reached, [rad/s or m/s] there
@@ -62,12 +62,12 @@ def random_shift(robot: Legged, start: Rest, seed: int, depth: Callable[[Array],
     arms = np.array([i for i, v in enumerate(robot.joint_v) if v not in legs], dtype=int)
     low, high = robot.limits(0.0)
     why = Refusal("")
-    for size in SIZES:
+    for size, of_arms in SIZES:
         way = np.zeros(model.nv)
         way[base : base + 3] = size * TURNED * random.uniform(-1, 1, 3)
         way[base + 3 : base + 5] = size * SHIFTED * tall * random.uniform(-1, 1, 2)
         way[base + 5] = -size * LOWERED * tall * random.uniform(0.5, 1)
-        way[robot.joint_v[arms]] = size * MOVED * random.uniform(-1, 1, len(arms)) * (high - low)[arms]
+        way[robot.joint_v[arms]] = of_arms * MOVED * random.uniform(-1, 1, len(arms)) * (high - low)[arms]
         wish = Wish(robot.moved(q0, way), near, feet, inside=INSIDE / 2)
         found = reached(robot, start, find_posture(robot, q0, wish), feet)
         if isinstance(found, Refusal):

@@ -105,6 +105,7 @@ def attempt(path: Path, seed: int) -> dict[str, object]:
         "loaded": any(line.startswith(("robot", "audit")) for line in lines),
         "traceback": "Traceback" in done.stderr,
         "held": "(base='weld')" in told["repaired"],
+        "stands": "(base='free', ground=True)" in told["repaired"],
         "repairs": told["repaired"],
         "guesses": told["guesses"],
         "why": "" if done.returncode == 0 else why,
@@ -130,6 +131,10 @@ def told(rows: dict[str, dict[str, object]]) -> list[str]:
         f"above {CPU_LIMIT} s of one core: {sum('took more than' in str(r['why']) for r in rows.values())}; "
         f"tracebacks: {sum(bool(r['traceback']) for r in rows.values())}",
     ]
+    lines.append(
+        f"of them with feet on the ground: {sum(bool(r.get('stands')) for r in good)}; "
+        f"with a base that floats in the file fixed to the world: {sum(bool(r.get('held')) for r in good)}"
+    )
     for source in sorted({str(r["source"]) for r in taken.values()}):
         of = [row for row in taken.values() if row["source"] == source]
         lines.append(f"{source}: {sum(bool(r['verified']) for r in of)} of {len(of)}")
@@ -146,11 +151,12 @@ def markdown(rows: dict[str, dict[str, object]], seed: int) -> str:
     text += ["Written by `python tests/benchmarks/zoo.py --markdown docs/zoo.md`,", f"seed {seed}, "]
     text[-1] += f"{platform.python_implementation()} {platform.python_version()}. Times depend on the machine."
     text += ["", *(f"- {line}" for line in begin), ""]
-    text += ["| File | Verified | CPU [s] | Repairs, or why not |", "|---|---|---|---|"]
+    text += ["| File | Verified | Base | CPU [s] | Repairs, or why not |", "|---|---|---|---|---|"]
     for name, row in rows.items():
         said = (row["repairs"] if row["verified"] else row["why"]) or "-"
         said = re.sub(r"[|<>\n`*_]", " ", re.sub(r"/\S*/", "", str(said)))[:160]
-        text.append(f"| {name} | {'yes' if row['verified'] else 'no'} | {row['seconds']} | {said} |")
+        base = "on its feet" if row.get("stands") else "held" if row.get("held") else "as in the file"
+        text.append(f"| {name} | {'yes' if row['verified'] else 'no'} | {base} | {row['seconds']} | {said} |")
     return "\n".join(text) + "\n"
 
 
