@@ -152,8 +152,12 @@ def test_unknown_names_list_the_known_ones(arm, tmp_path):
 
 
 def test_what_nothing_drives_is_refused(tmp_path):
+    """A ball joint takes no motor, and what hangs on it does not float."""
     path = tmp_path / "ball.sdf"
-    path.write_text('<sdf version="1.9"><model name="ball"><link name="ball"/></model></sdf>')
+    path.write_text(
+        '<sdf version="1.9"><model name="ball"><link name="ball"/><joint name="hangs" type="ball">'
+        "<parent>world</parent><child>ball</child></joint></model></sdf>"
+    )
     with pytest.raises(ModelError, match="driven"):
         plan(path, out=tmp_path / "out")
 

@@ -75,7 +75,7 @@ def along(robot: Robot, line: Line, *, slower: float = 1.0) -> Guess:
     Drake cannot take a step of it.
     """
     t = np.linspace(0, 1, 101)
-    speeds = np.abs(line.slopes(_smooth(t))) * (30 * t**2 * (1 - t) ** 2)[:, None]
+    speeds = np.abs(line.slopes(smooth(t))) * (30 * t**2 * (1 - t) ** 2)[:, None]
     duration = slower * float(np.max(speeds / speed_limits(robot.model), initial=0.0))
     duration = float(np.clip(duration, SHORTEST, LONGEST))
     name = line.name if slower == 1 else f"{line.name} in {slower:g} times the time"
@@ -94,14 +94,14 @@ def _timed(robot: Robot, name: str, line: Line, duration: float) -> Guess:
     h = model.time_step
     # One step before the end it is at the goal, and rests there: Drake's step moves by the velocity after it.
     s = np.clip(np.arange(steps + 1) / (steps - 1), 0.0, 1.0)
-    q = line.at(_smooth(s))
+    q = line.at(smooth(s))
     v = np.vstack([np.zeros((1, model.nv)), np.diff(q, axis=0) / h])
     us = np.array([_inputs(model, np.concatenate([q[k], v[k]]), v[k + 1]) for k in range(steps)])
     depth = max(robot.overlap(posture) for posture in q[:: max(1, steps // 25)])
     return Guess(name, model, np.hstack([q, v]), us, float(np.max(shares(model, us))), depth)
 
 
-def _smooth(t: Array) -> Array:
+def smooth(t: Array) -> Array:
     """From 0 to 1 as t does, with a speed and an acceleration of 0 at both ends."""
     return np.asarray(10 * t**3 - 15 * t**4 + 6 * t**5)
 
@@ -132,7 +132,7 @@ def by_controller(robot: Robot, target: Array, *, steps: int, reach: float, name
         at = _positions(model)[own]
         for k in range(steps):
             s = np.array(min(1.0, 1.25 * (k + 1) / steps))
-            aim = robot.q[at] + reach * _smooth(s) * (target[at] - robot.q[at])
+            aim = robot.q[at] + reach * smooth(s) * (target[at] - robot.q[at])
             u = gain * (PULL * (aim - x[at]) - DAMP * x[model.nq + own])
             u = np.clip(u, -OF_PULL * limits, OF_PULL * limits)
             x = np.array(advance(model.double, x, u))

@@ -26,6 +26,7 @@ from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
 from drake_diff.planning.around import Space, lines
+from drake_diff.planning.flying import flight
 from drake_diff.planning.motion import OF_EFFORT, Guess, along, by_controller
 from drake_diff.planning.posture import TOUCHING, effort_limits
 from drake_diff.planning.robot import Robot, load_robot
@@ -241,7 +242,9 @@ def _attempts(robot: Robot, task: Task, least: str | None, seed: int) -> Iterato
         yield from _of_standing(robot, robot.standing, task, seed)
         return
     Space.of(robot, task.avoid).check("start", robot.q)
-    if robot.is_fully_driven:
+    if robot.model.body_forces:
+        yield _feasible(robot, task, flight(robot, task.frames, seed))
+    elif robot.is_fully_driven:
         yield from _of_driven(robot, task, least, seed)
     elif task.is_free:
         yield from _of_reachable(robot, task, seed)

@@ -26,6 +26,7 @@ from drake_diff.planning.posture import (
     start,
 )
 from drake_diff.planning.standing import Legged, Rest, stand
+from drake_diff.planning.thrusters import lifted, thrusters
 
 TIME_STEP = 0.02  # [s] of a plan
 FEW = 0.5  # of all joints: where fewer have a motor, the file says nothing of motors, or forgot some
@@ -67,7 +68,7 @@ def load_robot(path: Path, seed: int, held: str = "") -> Robot:
     options: dict[str, Any] = {"time_step": TIME_STEP}
     told: list[str] = []
     model = _loaded(path, options)
-    reduced = _loaded(path, options | {"mimic": "reduce"})
+    reduced = _reduced(path, options, model, told)
     if reduced.nv < model.nv:
         options["mimic"], gone = "reduce", model.nv - reduced.nv
         told.append(f"{gone} joint{'s' * (gone > 1)} that follow others left the state (mimic='reduce')")
@@ -96,8 +97,13 @@ def load_robot(path: Path, seed: int, held: str = "") -> Robot:
         model = _loaded(path, options)
         told.append(f"{_few(stuck)} had the same lower and upper limit: fixed there (fix_joints)")
     model = _with_mass(path, options, model, told)
+    if not model.nu and model.plant.GetFloatingBaseBodies():
+        options["body_forces"] = thrusters(model)
+        model = _loaded(path, options)
+        names = _few(dict.fromkeys(force.body for force in options["body_forces"]))
+        told.append(f"nothing drives {names}: six thrusters push and turn it, two along each axis (body_forces)")
     if not model.nu:
-        raise ModelError(f"{path}: nothing in it can be driven: it has no revolute or prismatic joint")
+        raise ModelError(f"{path}: nothing in it can be driven: it has no revolute or prismatic joint, and none floats")
     return _placed(path, options, model, told, np.random.default_rng(seed))
 
 
@@ -139,6 +145,15 @@ def _standing(path: Path, read: Model, options: dict[str, Any], told: list[str],
     return Robot(model, shapes, q, lower, upper, tuple(told), False, besides, found)
 
 
+def _reduced(path: Path, options: dict[str, Any], model: Model, told: list[str]) -> Model:
+    """The model without the joints that follow others; as it is where that cannot be done, which is told."""
+    try:
+        return _loaded(path, options | {"mimic": "reduce"})
+    except ModelError as error:
+        told.append(f"joints that follow others stay in the state, as {error}")
+        return model
+
+
 def _placed(path: Path, options: dict[str, Any], model: Model, told: list[str], random: np.random.Generator) -> Robot:
     """The robot in the posture it starts in, and with the contact that its plan needs."""
     lower, upper = ranges(model)
@@ -146,7 +161,10 @@ def _placed(path: Path, options: dict[str, Any], model: Model, told: list[str], 
     touches = bool(model.contract.contact.collision_pairs)
     apart = _loaded(path, options | {"contact": False}) if touches else model
     driven = is_fully_driven(apart)
+    flies = bool(options.get("body_forces"))
     shapes = model if touches else None
+    if flies and shapes is not None:
+        first = lifted(shapes, first)
     try:
         found = start(shapes, apart if driven else None, first, lower, upper, random)
     except SimulationError as error:
@@ -159,7 +177,7 @@ def _placed(path: Path, options: dict[str, Any], model: Model, told: list[str], 
         return _placed(path, fixed, _loaded(path, fixed), told, random)
     if found.always:
         told.append(f"{_few(map(' and '.join, sorted(found.always)))} overlap in every posture, which is not looked at")
-    if driven and touches:
+    if (driven or flies) and touches:
         model = apart
         seen = "" if shapes is None else ": overlap is looked for along the plan"
         told.append(f"contact is left out of its steps (contact=False){seen}")

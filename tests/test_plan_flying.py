@@ -1,0 +1,65 @@
+"""Bodies that float and that nothing drives, such as a drone's base in a URDF, fly by thrusters that `plan` adds."""
+
+import numpy as np
+import pytest
+from helpers.models import MODELS, robot_file
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError
+from drake_diff.planning import plan
+from drake_diff.planning.robot import load_robot
+
+BOX = """<sdf version="1.9"><model name="scene">
+<link name="ground"><collision name="skin"><pose>0 0 -0.5 0 0 0</pose><geometry><box><size>9 9 1</size></box></geometry>
+</collision></link><joint name="held" type="fixed"><parent>world</parent><child>ground</child></joint>
+<link name="box"><pose>0.3 0 0.05 0 0 0.4</pose><inertial><pose>0.1 0.02 0 0 0 0</pose><mass>3</mass><inertia>
+<ixx>0.03</ixx><iyy>0.05</iyy><izz>0.07</izz></inertia></inertial><collision name="skin"><geometry><box><size>
+0.2 0.2 0.2</size></box></geometry></collision></link></model></sdf>"""
+
+
+@pytest.fixture
+def box(tmp_path):
+    """A box of 3 kg whose centre of mass is not its origin, and that begins half in the ground."""
+    path = tmp_path / "box.sdf"
+    path.write_text(BOX)
+    return path
+
+
+def test_thrusters_push_and_turn_a_body_in_every_direction(box):
+    """The wrench of each about the centre of mass by hand: r x f, in the body's frame."""
+    model = load_robot(box, 0).model
+    wrenches = []
+    for thruster in model.body_forces:
+        force = np.array(thruster.direction)
+        wrenches.append(np.append(np.cross(np.array(thruster.point) - [0.1, 0.02, 0.0], force), force))
+        assert thruster.upper == -thruster.lower == pytest.approx(1.5 * 3 * 9.81, rel=2e-3)  # three digits
+    assert np.linalg.svd(np.array(wrenches), compute_uv=False)[-1] > 0.1  # the arm is 0.15 m
+    assert np.sum(wrenches, axis=0) == pytest.approx([0, 0, 0, 2, 2, 2], abs=1e-12)
+
+
+def test_a_box_is_lifted_out_of_the_ground_and_flown(box, tmp_path):
+    found = load_robot(box, 0)
+    assert "thrusters" in " ".join(found.repairs)
+    assert found.q[6] >= 0.1 - 1e-4
+    done = plan(box, out=tmp_path / "out", seed=1)
+    assert done.success, done.lines
+    assert min(x[6] for x in done.solution.xs) >= 0.1 - 1e-4
+    assert dd.verify(tmp_path / "out").holds
+
+
+def test_a_drone_goes_where_it_is_asked_to(tmp_path):
+    done = plan(MODELS / "quadrotor.urdf", goals={"body": [1.0, -0.5, 2.0]}, out=tmp_path / "out")
+    assert done.success, done.lines
+    assert done.solution.xs[-1][4:7] == pytest.approx([1.0, -0.5, 2.0], abs=1e-6)
+    assert done.solution.xs[-1][7:] == pytest.approx(np.zeros(6), abs=1e-6)
+
+
+def test_a_goal_of_what_does_not_fly_is_refused(box, tmp_path):
+    with pytest.raises(InputError, match="box"):
+        plan(box, goals={"ground": [0.0, 0.0, 1.0]}, out=tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", ["quadrotor_base.urdf", "iris_simple.urdf"])
+def test_drones_of_strangers_hover(name, tmp_path):
+    done = plan(robot_file(name), out=tmp_path / "out", seed=2)
+    assert done.success, done.lines
