@@ -60,12 +60,20 @@ def _inputs(model: Model, x: Array, wanted: Array) -> Array:
     needed = twin.inverse_dynamics(change / h) + twin.damping() * change
     effect = h * np.linalg.solve(twin.mass_matrix() + h * np.diag(twin.damping()), model.actuation)
     u = np.linalg.lstsq(model.actuation, needed, rcond=None)[0]
-    for _ in range(CORRECTIONS):
+    for i in range(CORRECTIONS):
         off = wanted - np.array(advance(model.double, x, u))[model.nq :]
         if np.max(np.abs(off), initial=0.0) < EXACT:
             break
+        if i == 1:  # controllers in the plant, which the equation does not have
+            effect = _probed(model, x, u)
         u = u + np.linalg.lstsq(effect, off, rcond=None)[0]
     return np.asarray(u)
+
+
+def _probed(model: Model, x: Array, u: Array) -> Array:
+    """(nv, nu) what a change of each input by 1 adds to the velocities after the step from x (nx,) with u (nu,)."""
+    nq, still = model.nq, np.array(advance(model.double, x, u))[model.nq :]
+    return np.array([np.array(advance(model.double, x, u + d))[nq:] - still for d in np.eye(model.nu)]).T
 
 
 def along(robot: Robot, line: Line, *, slower: float = 1.0) -> Guess:
@@ -116,12 +124,11 @@ def _positions(model: Model) -> Indices:
     return found
 
 
-def by_controller(robot: Robot, target: Array, *, steps: int, reach: float, name: str) -> Guess | None:
-    """What the robot does when each input pulls its own joint toward `target` (nq,), `reach` of the way.
+def by_controller(robot: Robot, model: Model, target: Array, *, steps: int, reach: float, name: str) -> Guess | None:
+    """What `model` of the robot does when each input pulls its own joint toward `target` (nq,), `reach` of the way.
 
     None where Drake cannot take a step of it.
     """
-    model = robot.model
     x = np.concatenate([robot.q, np.zeros(model.nv)])
     limits = np.minimum(effort_limits(model), 1e4)
     xs, us = [x], []
@@ -140,4 +147,5 @@ def by_controller(robot: Robot, target: Array, *, steps: int, reach: float, name
             us.append(u)
     except SimulationError:
         return None
-    return Guess(name, model, np.array(xs), np.array(us), float(np.max(shares(model, np.array(us)))))
+    depth = max(robot.overlap(x[: model.nq]) for x in xs) if model is robot.apart else 0.0
+    return Guess(name, model, np.array(xs), np.array(us), float(np.max(shares(model, np.array(us)))), depth)

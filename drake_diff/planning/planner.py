@@ -4,6 +4,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from drake_diff.optimize.solve import solve
 from drake_diff.planning.around import Space, lines
 from drake_diff.planning.flying import flight
 from drake_diff.planning.motion import OF_EFFORT, Guess, along, by_controller
-from drake_diff.planning.posture import TOUCHING, effort_limits
+from drake_diff.planning.posture import TOUCHING, effort_limits, of_joints
 from drake_diff.planning.robot import Robot, load_robot
 from drake_diff.planning.shifting import random_shift, shift_to
 from drake_diff.planning.standing import Legged, Rest
@@ -41,7 +42,9 @@ FASTER = (0.2, 2.0)  # of the first guess's duration: the range of a least time
 SPEED_WEIGHT = 0.01  # of a speed against an effort, both as shares of their limits
 BESIDE = 0.05  # [rad or m] the range of each joint around a guess that a motion is kept near
 LOOKS = 3  # of the ten places in each step, those at which overlap is looked for are so many apart
-BUDGET = 120.0  # [s] on the clock, of one attempt
+BUDGET, BUDGET_OF_LEAST = 40.0, 120.0  # [s] on the clock, of one attempt: another one needs no search
+REACHES = ((0.5, 50), (0.25, 50), (0.1, 50), (0.1, 25), (0.1, 12))  # part of the way, and steps to go it
+WIDTH, DRAWS = 0.3, 30  # of a coordinate's range, and postures: another one to begin in
 SEGMENT = 5  # steps of multiple shooting
 
 Report = Callable[[str, str], None]
@@ -206,7 +209,10 @@ class _Attempt:
         return solve(self.problem, initial_guess=begun, progress=progress, **self.options)
 
     def depth(self, solution: Solution) -> float:
-        """[m] the deepest overlap of shapes along a solution; 0 where none is looked for."""
+        """[m] the deepest overlap of shapes along a solution; 0 where none is looked for, or all are in its steps."""
+        model = self.problem.model
+        if model.contract.contact.collision_pairs and (model.options or {}).get("contact") is True:
+            return 0.0  # how deep they may is judged by its replays
         every, motion = along_steps(solution.times, solution.xs)
         xs = motion(every) if solution.transcribed is None else solution.transcribed.at(every)[0]
         return max(self.robot.overlap(x[: self.problem.model.nq]) for x in xs[::LOOKS])
@@ -274,8 +280,8 @@ def _of_driven(robot: Robot, task: Task, least: str | None, seed: int) -> Iterat
         for guess in guesses[:2]:
             if robot.model.nv <= SMALL or least:
                 yield _collocated(robot, task, guess, least)
-        for guess in () if least else guesses[:2]:
-            yield _feasible(robot, task, guess)
+            if not least:
+                yield _feasible(robot, task, guess)
 
 
 def _guesses(space: Space, target: Array, seed: int) -> list[Guess]:
@@ -302,7 +308,8 @@ def _collocated(robot: Robot, task: Task, guess: Guess, least: str | None) -> _A
         asked = {"running_cost": 1.0, "horizon": (FASTER[0] * whole, FASTER[1] * whole)}
     problem = _problem(task, guess, x1, **asked)
     what = "least time" if least else "least effort"
-    options = {"method": "collocation", "refine": True, "error_tolerance": 1e-5, "time_limit": BUDGET}
+    limit = BUDGET_OF_LEAST if least else BUDGET
+    options = {"method": "collocation", "refine": True, "error_tolerance": 1e-5, "time_limit": limit}
     name = f"{what} from {guess.name}"
     near = replace(problem, bounds=_bounds(model, guess.xs[:, : model.nq]))
     instead = _Attempt(f"{name}, near it", robot, near, guess, options)
@@ -337,10 +344,29 @@ def _of_reachable(robot: Robot, task: Task, seed: int) -> Iterator[_Attempt]:
     random = np.random.default_rng([seed, 2])
     part = random.uniform(-1, 1, robot.model.nq)
     target = robot.q + part * (robot.upper - robot.lower) / 2
-    for reach in (0.5, 0.25, 0.1):
-        guess = by_controller(robot, target, steps=50, reach=reach, name=f"what controllers reach ({reach:g})")
-        if guess is not None and _inside(guess):
-            yield _feasible(robot, task, guess)
+    for (reach, steps), begun in product(REACHES, (robot, _elsewhere(robot, random))):
+        where = "" if begun is robot else " from elsewhere"
+        what = f"what controllers reach ({reach:g} of the way in {steps} steps{where})"
+        for model in (robot.apart, robot.model):
+            guess = None if model is None else by_controller(begun, model, target, steps=steps, reach=reach, name=what)
+            if guess is None or not _inside(guess):
+                continue
+            if model is robot.model:
+                yield _feasible(robot, task, guess)
+            elif _touched(Space.of(robot, task.avoid), guess) <= 0:
+                yield _feasible(robot, task, replace(guess, name=f"{what}, touching nothing (contact=False)"))
+
+
+def _elsewhere(robot: Robot, random: np.random.Generator) -> Robot:
+    """The robot in another posture to begin in: that of its file may be one in which it just touches something."""
+    one = of_joints(robot.model)
+    for i in range(DRAWS):
+        width = WIDTH * (i + 1) / DRAWS * (robot.upper - robot.lower)
+        drawn = np.clip(robot.q + width * random.uniform(-1, 1, len(robot.q)), robot.lower, robot.upper)
+        q = np.where(one, drawn, robot.q)
+        if robot.overlap(q) == 0:
+            return replace(robot, q=q)
+    return robot
 
 
 def _of_passive(robot: Robot, task: Task) -> Iterator[_Attempt]:

@@ -41,8 +41,9 @@ class Robot:
 
     `lower` and `upper` (nq,) are where its coordinates may be: their limits, or a range around 0 where they have none.
     `shapes` is the model with its collision shapes, in which overlap is looked for; None where there is nothing to
-    look for. `always` are the pairs of shapes that overlap in every posture, which is not looked at.
-    `standing` tells how it stands on its feet, where it does; else what floats is held.
+    look for. `always` are the pairs of shapes that overlap in every posture, which is not looked at. `apart` is the
+    model without contact in its steps, for a way on which nothing touches, where `model` has contact. `standing`
+    tells how it stands on its feet, where it does; else what floats is held.
     """
 
     model: Model
@@ -54,6 +55,7 @@ class Robot:
     is_fully_driven: bool
     always: frozenset[Pair] = frozenset()
     standing: tuple[Legged, Rest] | None = None
+    apart: Model | None = None
 
     def overlap(self, q: Array) -> float:
         """[m] how deep the deepest overlap of shapes is in posture q (nq,); 0 where nothing is looked for."""
@@ -97,13 +99,7 @@ def load_robot(path: Path, seed: int, held: str = "") -> Robot:
         model = _loaded(path, options)
         told.append(f"{_few(stuck)} had the same lower and upper limit: fixed there (fix_joints)")
     model = _with_mass(path, options, model, told)
-    if not model.nu and model.plant.GetFloatingBaseBodies():
-        options["body_forces"] = thrusters(model)
-        model = _loaded(path, options)
-        names = _few(dict.fromkeys(force.body for force in options["body_forces"]))
-        told.append(f"nothing drives {names}: six thrusters push and turn it, two along each axis (body_forces)")
-    if not model.nu:
-        raise ModelError(f"{path}: nothing in it can be driven: it has no revolute or prismatic joint, and none floats")
+    model = _with_thrusters(path, options, model, told)
     return _placed(path, options, model, told, np.random.default_rng(seed))
 
 
@@ -143,6 +139,18 @@ def _standing(path: Path, read: Model, options: dict[str, Any], told: list[str],
     if besides:
         told.append(f"{_few(map(' and '.join, sorted(besides)))} overlap where it stands, which is not looked at")
     return Robot(model, shapes, q, lower, upper, tuple(told), False, besides, found)
+
+
+def _with_thrusters(path: Path, options: dict[str, Any], model: Model, told: list[str]) -> Model:
+    """The model, with thrusters where it floats and nothing drives it; ModelError where nothing can."""
+    if not model.nu and model.plant.GetFloatingBaseBodies():
+        options["body_forces"] = thrusters(model)
+        model = _loaded(path, options)
+        names = _few(dict.fromkeys(force.body for force in options["body_forces"]))
+        told.append(f"nothing drives {names}: six thrusters push and turn it, two along each axis (body_forces)")
+    if not model.nu:
+        raise ModelError(f"{path}: nothing in it can be driven: it has no revolute or prismatic joint, and none floats")
+    return model
 
 
 def _reduced(path: Path, options: dict[str, Any], model: Model, told: list[str]) -> Model:
@@ -185,7 +193,8 @@ def _placed(path: Path, options: dict[str, Any], model: Model, told: list[str], 
         told.append(
             "its start is moved to where joints are inside their limits, nothing overlaps and its motors hold it"
         )
-    return Robot(model, shapes, found.q, lower, upper, tuple(told), driven, found.always)
+    other = apart if model is not apart else None
+    return Robot(model, shapes, found.q, lower, upper, tuple(told), driven, found.always, apart=other)
 
 
 def _too_weak(model: Model, found: Start) -> tuple[str, ...]:
