@@ -328,6 +328,32 @@ TRAPS = [
 ]
 
 
+TRAPS += [
+    (
+        "ignored",
+        "warning",
+        sdf("").replace("</xyz></axis>", "</xyz><dynamics><friction>0.3</friction></dynamics></axis>"),
+        {},
+        r"the friction of a joint, 0\.3, is ignored",
+        None,
+    ),
+    (
+        "ignored",
+        "warning",
+        ARM.replace("</link>", '<contact><lateral_friction value="2"/></contact></link>'),
+        {},
+        "1 <contact> are ignored",
+        None,
+    ),
+    (
+        "ignored",
+        "info",
+        ARM.replace("</robot>", '<gazebo reference="upper"><mu1>0.1</mu1></gazebo></robot>'),
+        {},
+        "1 <gazebo> are ignored",
+        None,
+    ),
+]
 SWING = '<body name="a"><joint name="j" axis="0 1 0" {}/><geom size="0.1" mass="1"/></body>'
 MJCF = f'<mujoco model="m">{{}}<worldbody><geom type="plane" size="9 9 1"/>{SWING}</worldbody>{{}}</mujoco>'
 TRAPS += [

@@ -33,6 +33,7 @@ HARMLESS = (
     "texture",
     "material",
     "transmission'",
+    "only Gazebo reads",
     *("camera", "light", "visual", "'site'", "sensor", "statistic", "timestep", "integrator", "keyframe", "'user'"),
     *("'cone'", "iterations", "custom", "'size'"),
 )

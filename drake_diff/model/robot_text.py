@@ -17,6 +17,7 @@ from drake_diff.exceptions import ModelError
 from drake_diff.model.mjcf import as_mujoco_means
 from drake_diff.model.xml_text import Element, XmlText
 
+OF_SIMULATORS = {"gazebo": "what only Gazebo reads", "contact": "friction and the like that only PyBullet reads"}
 MOST_NODES = 100_000  # of a YAML file, its aliases written out
 MOVING = ("revolute", "continuous", "prismatic")  # the types of joints that can be fixed
 DOWNLOADED = "drake_models"  # the package that Drake would fetch over the network
@@ -42,6 +43,7 @@ def text_of(path: Path, notes: list[str]) -> XmlText | None:
         return None
     if xml.root.tag == "mujoco":
         return as_mujoco_means(xml, path, notes)
+    notes += _unread(xml, path)
     if xml.root.tag != "robot":
         return xml
     for transmission in xml.root.findall("transmission"):
@@ -55,6 +57,19 @@ def text_of(path: Path, notes: list[str]) -> XmlText | None:
     notes += _continuous_without_limits(xml)
     notes += _without_lost_joints(xml)
     return xml
+
+
+def _unread(xml: XmlText, path: Path) -> Iterator[str]:
+    """A sentence for each thing in a URDF or SDF that Drake's parser leaves out without a word."""
+    for friction in (f for dynamics in xml.root.iter("dynamics") for f in dynamics.findall("friction")):
+        if friction.text.strip().strip("0."):
+            yield f"{path}:{friction.line}: the friction of a joint, {friction.text.strip()}, is ignored."
+    for added in xml.root.iter("fluid_added_mass"):
+        yield f"{path}:{added.line}: <fluid_added_mass> is ignored."
+    for tag, meaning in OF_SIMULATORS.items() if xml.root.tag == "robot" else ():
+        found = [element for element in xml.root.iter(tag) if element.children]
+        if found:
+            yield f"{path}:{found[0].line}: {len(found)} <{tag}> are ignored: {meaning}."
 
 
 def _without_lost_joints(xml: XmlText) -> list[str]:
