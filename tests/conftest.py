@@ -110,8 +110,9 @@ def pushed(tmp_path_factory):
     return model, motion, folder
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def browser(tmp_path_factory):
+    """One browser for all tests: each loads its page anew."""
     webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed (the test extra has it)")
     from selenium.webdriver.chrome.service import Service
 

@@ -6,7 +6,18 @@ import json
 
 import numpy as np
 import pytest
-from helpers.browser import badly_laid, browsing, errors, faint_texts, move_slider, nameless, open_page, view_of
+from helpers.browser import (
+    badly_laid,
+    browsing,
+    errors,
+    faint_texts,
+    move_slider,
+    nameless,
+    open_page,
+    set_screen,
+    view_of,
+    wait_for_frame,
+)
 from helpers.models import MODELS
 from helpers.robots import example_robot, state_in_range
 from helpers.table import each_row
@@ -159,7 +170,7 @@ def open_all(browser):
     """Every part and table of the page, and every group of plots."""
     browser.execute_script("document.querySelectorAll('details').forEach(d => { d.open = true; })")
     browser.execute_script("const all = [...document.querySelectorAll('.choices button')].pop(); if (all) all.click()")
-    browser.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
+    wait_for_frame(browser)
 
 
 @browsing
@@ -229,12 +240,13 @@ def test_the_speed_of_the_replay_is_chosen(two, browser):
 
 
 @browsing
-@pytest.mark.slow
 def test_the_picture_is_dark_where_the_screen_is(two, browser):
     corner = {}
     for page in ("report.html", "replay.html"):
+        open_page(browser, two / "short" / page)
         for scheme in ("light", "dark"):
-            open_page(browser, two / "short" / page, scheme=scheme)
+            set_screen(browser, DESK, scheme)
+            wait_for_frame(browser)
             corner[scheme, page] = view_of(browser)[5, 5].mean()
     assert min(corner["light", page] for page in ("report.html", "replay.html")) > 0.8
     assert max(corner["dark", page] for page in ("report.html", "replay.html")) < 0.3

@@ -14,6 +14,7 @@ from helpers.models import MODELS
 from helpers.table import each_row
 
 import drake_diff as dd
+from drake_diff.artifact.first_screen import Check
 from drake_diff.artifact.live import scene_of_run
 from drake_diff.artifact.verify import recalled
 from drake_diff.pages import html
@@ -23,7 +24,7 @@ from drake_diff.studies.gradient_cases import wall
 PACKAGE = Path(dd.__file__).parent
 EVIL = "</script><script>document.title = 'evil'</script><img src=x onerror=\"document.title = 'evil'\">'"
 # What decides what is drawn where is not from a model or a file.
-OURS = ("verdict", "own", "direction", "axis", "marks", "codes", "verdicts")
+OURS = ("control", "verdict", "own", "direction", "axis", "marks", "codes", "verdicts")
 NAMED = ("seconds_per_step", "seconds_per_jacobian", "effects")  # their keys are names
 
 
@@ -31,6 +32,10 @@ def poisoned(value, key=""):
     """`value` with EVIL at the end of every text in it."""
     if isinstance(value, dict):
         return {k + EVIL if key in NAMED else k: v if k in OURS else poisoned(v, k) for k, v in value.items()}
+    if isinstance(value, Check):
+        return Check(value.title + EVIL, value.kind, value.text + EVIL)
+    if isinstance(value, tuple) and key == "colours":
+        return (*value[:2], value[2] + EVIL)
     if isinstance(value, list):
         return [poisoned(v, key) for v in value]
     return value + EVIL if isinstance(value, str) and (key, value) != ("place", "plots") else value
@@ -39,7 +44,7 @@ def poisoned(value, key=""):
 def write_poisoned(path, template, *, record, data, view="", **facts):
     kept = record.get("verdict")
     record = poisoned(record) | ({} if kept is None else {"verdict": kept})
-    facts = {name: fact + EVIL if isinstance(fact, str) else fact for name, fact in facts.items()}
+    facts = {name: poisoned(fact, name) for name, fact in facts.items()}
     write_page(path, template, record=record, data=poisoned(data), view=view, **facts)
 
 

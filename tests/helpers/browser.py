@@ -5,6 +5,7 @@ import shutil
 from io import BytesIO
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
@@ -21,16 +22,32 @@ def open_page(browser, page, *, size=(1440, 900), scheme="light"):
     """Load `page` from the disk and wait until its animation is there; nothing may have gone wrong."""
     from selenium.webdriver.support.ui import WebDriverWait
 
-    screen = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": size[0] < 600}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
-    media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+    set_screen(browser, size, scheme)
     browser.get_log("browser")
     browser.get(page.as_uri())
     ready = (
         "document.documentElement.dataset.ready === 'yes'" if page.name == "report.html" else "viewer.animator.duration"
     )
     WebDriverWait(browser, 30).until(lambda b: b.execute_script(f"return Boolean({ready})"))
+
+
+def set_screen(browser, size, scheme):
+    """The size of the screen [pixels], a phone's below 600, and whether it is "light" or "dark"."""
+    screen = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": size[0] < 600}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+
+
+def wait_for_frame(browser):
+    """Until the page has been drawn again."""
+    browser.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
+
+
+def colours(picture):
+    """How many colours a picture (n, m, 3) of 0 to 1 has: a blank one has few."""
+    bytes_ = np.round(255 * picture).astype(int)
+    return len(np.unique(bytes_ @ [65536, 256, 1]))
 
 
 def errors(browser):
@@ -43,7 +60,7 @@ def move_slider(browser, part):
         "const s = document.getElementById('time');s.value = arguments[0] * s.max; s.dispatchEvent(new Event('input'))",
         part,
     )
-    browser.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
+    wait_for_frame(browser)
 
 
 def view_of(browser):
