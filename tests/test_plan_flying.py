@@ -5,7 +5,7 @@ import pytest
 from helpers.models import MODELS, robot_file
 
 import drake_diff as dd
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import InputError, ModelError
 from drake_diff.planning import plan
 from drake_diff.planning.robot import load_robot
 
@@ -63,3 +63,10 @@ def test_a_goal_of_what_does_not_fly_is_refused(box, tmp_path):
 def test_drones_of_strangers_hover(name, tmp_path):
     done = plan(robot_file(name), out=tmp_path / "out", seed=2)
     assert done.success, done.lines
+
+
+def test_what_floats_without_a_mass_is_refused(tmp_path):
+    path = tmp_path / "tool.urdf"
+    path.write_text('<robot name="tool"><link name="tool"/></robot>')
+    with pytest.raises(ModelError, match=r"tool floats.*no mass"):
+        plan(path, out=tmp_path / "out")

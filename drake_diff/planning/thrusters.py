@@ -3,6 +3,7 @@
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff.exceptions import ModelError
 from drake_diff.model.inputs import BodyForce
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
@@ -29,6 +30,8 @@ def thrusters(model: Model) -> tuple[BodyForce, ...]:
         whole = [each.index() for each in plant.GetBodiesWeldedTo(body)]
         inertia = plant.CalcSpatialInertia(model.double.context, body.body_frame(), whole)
         mass, centre = float(inertia.get_mass()), np.asarray(inertia.get_com())
+        if not mass > 0:
+            raise ModelError(f"{label} floats, nothing drives it, and it has no mass: give it an inertial element")
         about = inertia.Shift(centre).CalcRotationalInertia().CopyToFullMatrix3()
         arm = max(SMALLEST_ARM, float(np.sqrt(np.max(np.linalg.eigvalsh(about)) / mass)))
         limit = float(f"{STRENGTH * mass * GRAVITY:.3g}")

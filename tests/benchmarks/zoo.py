@@ -5,8 +5,10 @@
     python tests/benchmarks/zoo.py [--only PATTERN] [--count N] [--seed 0] [--wheels wheels] [--out zoo.json]
 
 The files: all URDFs of example-robot-data, the models that come with Drake, MuJoCo and drake_diff, and those in the
-wheels. Each runs in a process of its own with 60 s of one core (the verification included) and 8 GiB of memory. What
-is in --out already is not run again, so that a run that was ended goes on; --markdown writes docs/zoo.md from it.
+wheels (of dm_control its suite). Each runs in a process of its own with 60 s of one core (the verification included)
+and 8 GiB of memory. What counts is what Drake's own parser takes and can move, by Drake's word, not by ours, and what
+drake_diff reads where Drake does not. Single bodies without a joint (boxes, walls) count apart, drones do not. What is
+in --out already is not run again, so that a run that was ended goes on; --markdown writes docs/zoo.md from it.
 """
 
 import argparse
@@ -32,15 +34,31 @@ FORMATS = (".urdf", ".sdf", ".xml", ".dmd.yaml")
 LEFT_OUT = ("package.xml", "CMakeLists", "/meshes/", "/textures/", "/common/", "/conf/", "/launch/")
 MODEL = re.compile(r"<(?:robot|sdf|mujoco)[\s>]|directives:")
 SOURCES = {
-    "example-robot-data": ("example-robot-data", ".urdf"),
-    "drake": ("drake", FORMATS),
-    "mujoco": ("mujoco", (".xml", ".urdf")),
-    "dm_control": ("dm_control", (".xml",)),
-    "underactuated": ("underactuated", FORMATS),
+    "example-robot-data": (("example-robot-data",), ".urdf"),
+    "drake": (("drake",), FORMATS),
+    "mujoco": (("mujoco", "mujoco_core"), (".xml", ".urdf")),
+    "dm_control": (("dm_control",), (".xml",)),
+    "underactuated": (("underactuated",), FORMATS),
 }
-
-
-NO_ROBOT = ("nothing in it can be driven", "can move: each has the same")  # a table, a box: nothing has a joint
+DRONES = ("quadrotor", "iris")  # in the names of files: single bodies that a reasonable user wants to fly
+# What Drake alone says of a file: whether its parser takes it, and how many velocities its joints and free bodies have.
+ALONE = """
+import re
+import sys
+from pathlib import Path
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+plant = MultibodyPlant(0.01)
+parser = Parser(plant)
+path = Path(sys.argv[1]).resolve()
+for name in set(re.findall("package://([^/]+)/", path.read_text(errors="replace"))):
+    for folder in (folder for folder in path.parents if folder.name == name):
+        parser.package_map().Add(name, str(folder))
+parser.AddModels(sys.argv[1])
+plant.Finalize()
+free = 6 * len(plant.GetFloatingBaseBodies())
+print("TAKES", plant.num_velocities() - free, free)
+"""
 
 
 def installed(package: str) -> list[Path]:
@@ -52,10 +70,10 @@ def installed(package: str) -> list[Path]:
 
 def files(wheels: Path | None, unpacked: Path) -> Iterator[tuple[str, Path]]:
     """(source, file) of every model."""
-    for source, (package, endings) in SOURCES.items():
-        found = installed(package)
+    for source, (packages, endings) in SOURCES.items():
+        found = [path for package in packages for path in installed(package)]
         if not found and wheels:
-            for wheel in sorted(wheels.glob(f"{package}-*.whl")):
+            for wheel in sorted(wheels.glob(f"{packages[0]}-*.whl")):
                 with zipfile.ZipFile(wheel) as archive:
                     archive.extractall(unpacked / source)
                 found = [path for path in (unpacked / source).rglob("*") if path.is_file()]
@@ -75,8 +93,16 @@ def limited() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
 
 
+def alone(path: Path) -> tuple[bool, int, int]:
+    """Whether Drake's parser takes the file, and the numbers of velocities of its joints and of its free bodies."""
+    done = subprocess.run([sys.executable, "-c", ALONE, str(path)], capture_output=True, text=True, errors="replace")
+    words = next((line.split() for line in done.stdout.splitlines() if line.startswith("TAKES")), None)
+    return (True, int(words[1]), int(words[2])) if words and done.returncode == 0 else (False, 0, 0)
+
+
 def attempt(path: Path, seed: int) -> dict[str, object]:
     """One command on one file: how it ended, what was mended, and the processor time it took."""
+    takes, of_joints, free = alone(path)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "drake_diff.cli.main", "plan", str(path), "--out", f"{folder}/run"]
@@ -100,11 +126,15 @@ def attempt(path: Path, seed: int) -> dict[str, object]:
     if done.returncode in (-9, -24, 137, 152):
         why = f"took more than {CPU_LIMIT} s"
     return {
+        "drake": takes,
+        "joints": of_joints,
+        "free": free,
         "status": done.returncode,
         "verified": done.returncode == 0,
         "loaded": any(line.startswith(("robot", "audit")) for line in lines),
         "traceback": "Traceback" in done.stderr,
-        "held": "(base='weld')" in told["repaired"],
+        "held": "(base='weld'" in told["repaired"],
+        "flies": "thrusters" in told["repaired"],
         "stands": "(base='free', ground=True)" in told["repaired"],
         "repairs": told["repaired"],
         "guesses": told["guesses"],
@@ -113,28 +143,36 @@ def attempt(path: Path, seed: int) -> dict[str, object]:
     }
 
 
-def is_for_drake(row: dict[str, object]) -> bool:
-    """Whether Drake's parser takes the file, and it has a joint that can move and be driven."""
-    why = str(row["why"])
-    return not any(words in why for words in ("Drake can read", "Drake says", "cannot move", "UTF-8", *NO_ROBOT))
+def counts(name: str, row: dict[str, object]) -> str:
+    """A "robot", a "thing" (a single body without a joint), or why it does not count: "refused", "still"."""
+    if not row["drake"] and not row["loaded"]:
+        return "refused"
+    if row["drake"] and not row["joints"]:
+        drone = any(word in name for word in DRONES)
+        return "still" if not row["free"] else "robot" if drone else "thing"
+    return "robot"
 
 
 def told(rows: dict[str, dict[str, object]]) -> list[str]:
     """The figures, a line each."""
-    taken = {name: row for name, row in rows.items() if is_for_drake(row)}
+    kinds = {name: counts(name, row) for name, row in rows.items()}
+    taken = {name: row for name, row in rows.items() if kinds[name] == "robot"}
+    things = [row for name, row in rows.items() if kinds[name] == "thing"]
     good = [row for row in taken.values() if row["verified"]]
     share = len(good) / len(taken) if taken else 0.0
+    number = Counter(kinds.values())
     lines = [
-        f"{len(rows)} files; {len(taken)} that Drake's parser takes and that have a joint that can be driven",
-        f"verified plans: {len(good)} of {len(taken)}, {100 * share:.1f} %, asked {100 * AIM:g} %"
+        f"{len(rows)} files: {number['robot']} robots; {number['thing']} single bodies without a joint; "
+        f"{number['still']} in which nothing can move; {number['refused']} that neither Drake nor drake_diff reads",
+        f"robots with a verified plan: {len(good)} of {len(taken)}, {100 * share:.1f} %, asked {100 * AIM:g} %"
         + ("" if share >= AIM else ": MISSED"),
+        f"of these plans {sum(bool(r['stands']) for r in good)} are of robots on their feet, "
+        f"{sum(bool(r['flies']) for r in good)} of ones that fly, {sum(bool(r['held']) for r in good)} of ones whose "
+        "floating base was fixed to the world",
+        f"single bodies with a verified plan: {sum(bool(r['verified']) for r in things)} of {len(things)}",
         f"above {CPU_LIMIT} s of one core: {sum('took more than' in str(r['why']) for r in rows.values())}; "
         f"tracebacks: {sum(bool(r['traceback']) for r in rows.values())}",
     ]
-    lines.append(
-        f"of them with feet on the ground: {sum(bool(r.get('stands')) for r in good)}; "
-        f"with a base that floats in the file fixed to the world: {sum(bool(r.get('held')) for r in good)}"
-    )
     for source in sorted({str(r["source"]) for r in taken.values()}):
         of = [row for row in taken.values() if row["source"] == source]
         lines.append(f"{source}: {sum(bool(r['verified']) for r in of)} of {len(of)}")
