@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 import trimesh
-from helpers.models import MODELS, robot_file
+from helpers.models import MODELS, Plant, contact_properties, robot_file
 from helpers.robots import example_robot, state_in_range
 from helpers.table import each_row
 from pydrake.autodiffutils import InitializeAutoDiff
@@ -23,20 +23,30 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlantConfig
-from pydrake.multibody.tree import SpatialInertia
+from pydrake.multibody.tree import (
+    BallRpyJoint,
+    FixedOffsetFrame,
+    PlanarJoint,
+    RevoluteJoint,
+    RpyFloatingJoint,
+    ScrewJoint,
+    SpatialInertia,
+    UniversalJoint,
+)
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial import ConvexHull
 
 import drake_diff as dd
 from drake_diff._base.refusal import Refusal
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import InputError, ModelError
 from drake_diff.mechanics import placing
-from drake_diff.mechanics.clearance import FromBall, FromBox, OfPairs, balls_of
+from drake_diff.mechanics.clearance import FromBall, FromBox, OfPairs, Swept, balls_of
 from drake_diff.mechanics.cover import Piece, around_mesh, cover_of, pieces_around, sides_of
 from drake_diff.mechanics.description import read_links
 from drake_diff.mechanics.distance import along_segment, along_segments, length, to_box
 from drake_diff.mechanics.placing import placing_of
 from drake_diff.model.parameters import applied, select
+from drake_diff.model.sampling import any_state
 
 ROBOTS = ("ur5_robot.urdf", "panda.urdf", "a1.urdf")  # hinges; hinges and slides; a free base
 CLOSED = 1e-9  # [m] of metres: closed forms on both sides
@@ -303,3 +313,91 @@ def test_parameters_that_move_links_are_refused():
     names = [p.name for p in dd.list_parameters(model) if p.name.endswith(".offset")]
     with applied(select(model, names)) as other, pytest.raises(InputError, match="offset"):
         clearance(np.zeros(other.nx))
+
+
+def chain(*kinds):
+    """Balls of 0.1 m on joints of these types, each turned and 0.4 m from the last."""
+    plant, turn = Plant(0.01), RigidTransform(RollPitchYaw(0.3, -0.4, 0.5), [0.1, 0.2, 0.4])
+    before = plant.plant.world_body()
+    for i, kind in enumerate(kinds):
+        body = plant.plant.AddRigidBody(f"body {i}", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+        plant.plant.RegisterCollisionGeometry(
+            body, RigidTransform([0, 0, 0.1]), Sphere(0.1), "ball", contact_properties(1e4, 1.0, 0.5, 0.01)
+        )
+        frames = [
+            plant.plant.AddFrame(FixedOffsetFrame(f"{side} {i}", b.body_frame(), pose))
+            for side, b, pose in (("parent", before, turn), ("child", body, turn.inverse()))
+        ]
+        options = {"axis": [0.6, 0, 0.8]} if kind is RevoluteJoint else {}
+        plant.plant.AddJoint(kind(f"joint {i}", *frames, **options))
+        before = body
+    return plant.model()
+
+
+@each_row(
+    "kinds",
+    [
+        (PlanarJoint, RevoluteJoint),
+        (BallRpyJoint, UniversalJoint),
+        (RevoluteJoint, PlanarJoint, BallRpyJoint),
+        (RpyFloatingJoint, RevoluteJoint, BallRpyJoint),
+    ],
+)
+def test_joints_of_several_coordinates_are_chains_of_hinges_and_slides(kinds):
+    model, random = chain(*kinds), np.random.default_rng(2)
+    links = placing_of(model)
+    assert not isinstance(links, Refusal), links
+    cover = cover_of(model, links)
+    assert (len(cover.pieces), cover.bare) == (len(kinds), ())
+    xs = random.uniform(-1, 1, (4, model.nx))
+    clearance = FromBall(model, links, cover.pieces, np.array([0.4, 0.1, 0.5]), 0.1)
+    values, slopes = clearance.linearize(xs)
+    for x, row, slope in zip(xs, values, slopes, strict=True):
+        context = model.plant.CreateDefaultContext()
+        model.plant.SetPositions(context, x[: model.nq])
+        for i, found in enumerate(row):
+            pose = model.plant.EvalBodyPoseInWorld(context, model.plant.GetBodyByName(f"body {i}"))
+            assert found == pytest.approx(np.linalg.norm(pose @ [0, 0, 0.1] - [0.4, 0.1, 0.5]) - 0.2, abs=CLOSED)
+        exact = np.array([e.derivatives() for e in clearance(InitializeAutoDiff(x).ravel())])
+        assert np.abs(exact - slope).max() <= SLOPES
+    neighbours = [(i, j) for i, j in itertools.combinations(range(len(kinds)), 2) if j - i == 1]
+    apart = dd.SelfCollision().bind(model)
+    labels = apart[0].clearance.labels if apart else ()
+    assert len(labels) <= len(kinds) * (len(kinds) - 1) // 2 - len(neighbours)
+
+
+@each_row("kinds", [(PlanarJoint, RevoluteJoint), (BallRpyJoint, UniversalJoint), (RpyFloatingJoint, RevoluteJoint)])
+def test_the_way_of_a_step_is_along_the_rates_of_positions(kinds):
+    """A little earlier the positions were those at now's rates, but for what turns freely."""
+    model, random = chain(*kinds), np.random.default_rng(3)
+    links = placing_of(model)
+    clearance = FromBall(model, links, cover_of(model, links).pieces, np.array([0.4, 0.1, 0.5]), 0.1)
+    x, dt = random.uniform(-0.5, 0.5, model.nx), 0.02
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositionsAndVelocities(context, x)
+    rates = np.array(model.plant.MapVelocityToQDot(context, x[model.nq :]))
+    turning = {BallRpyJoint: range(3), RpyFloatingJoint: range(3)}.get(kinds[0], ())
+    rates[list(turning)] = 0.0
+    earlier = np.concatenate([x[: model.nq] - dt * rates, x[model.nq :]])
+    found = Swept(clearance, np.array([dt])).values(x[None])
+    np.testing.assert_allclose(found, clearance.values(earlier[None]), rtol=0, atol=CLOSED)
+
+
+@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+def test_the_way_of_a_step_with_joints_that_follow_others_is_theirs_too():
+    model = dd.load_model(robot_file("panda.urdf"), time_step=0.02, base="weld", actuators="all", mimic="reduce")
+    links, random = placing_of(model), np.random.default_rng(3)
+    clearance = FromBall(model, links, cover_of(model, links).pieces, np.array([0.6, 0.3, 0.6]), 0.05)
+    x, dt = any_state(model, random), 0.02
+    earlier = np.concatenate([x[: model.nq] - dt * x[model.nq :], x[model.nq :]])
+    found = Swept(clearance, np.array([dt])).values(x[None])
+    np.testing.assert_allclose(found, clearance.values(earlier[None]), rtol=0, atol=CLOSED)
+
+
+def test_a_joint_without_a_formula_is_refused_by_its_name():
+    screw = lambda name, a, b: ScrewJoint(name, a, b, axis=[0, 0, 1.0], screw_pitch=0.1, damping=0.0)  # noqa: E731
+    model = chain(RevoluteJoint, screw)
+    with pytest.raises(
+        ModelError, match="obstacles: joint joint 1 is a screw joint, and where that leads is not written out"
+    ):
+        dd.SphereObstacle([0, 0, 0], 0.1).bind(model)

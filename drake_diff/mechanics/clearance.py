@@ -17,6 +17,7 @@ from drake_diff.mechanics.cover import Piece
 from drake_diff.mechanics.distance import along_segment, along_segments, away_from_box, length, to_box
 from drake_diff.mechanics.placing import Placing
 from drake_diff.model.model import Model
+from drake_diff.model.plant import joints
 from drake_diff.model.quantities import PLACE
 
 BALL_PART = 0.1  # of a capsule's radius: how far the balls that it becomes beside a box stick out of it
@@ -175,17 +176,22 @@ class OfPairs(Clearance):
 class Swept(Clearance):
     """Another clearance, where the positions were `before` (p,) [s], at the velocities that they have now.
 
-    That is the way of a semi-implicit step, but for the turning of a free body, which is left as it is.
+    That is the way of a semi-implicit step, but for the turning of a free body or a ball, which is left as it is.
     """
 
     def __init__(self, other: Clearance, before: Array):
         super().__init__(other.model, other.placing, other.labels * len(before))
         self.other, self.before = other, before
         self.moves = np.zeros((other.model.nx, other.model.nx))  # the rates of the positions that are velocities
-        for link in other.placing.links:
-            q, v = link.joint.q_start, other.model.nq + link.joint.v_start
-            for i, j in zip(range(q + 4, q + 7), range(v + 3, v + 6), strict=True) if link.free else ((q, v),):
-                self.moves[i, j] = 1.0
+        for joint in joints(other.model.plant):
+            q, v = other.model.places(joint)
+            kind = joint.type_name()
+            if kind == "quaternion_floating":
+                q, v = q[4:], v[3:]
+            elif kind == "rpy_floating":
+                q, v = q[3:], v[3:]
+            for i, j in () if kind == "ball_rpy" else zip(q, v, strict=True):
+                self.moves[i, other.model.nq + j] = 1.0
 
     def __call__(self, x: Any) -> Any:
         return np.concatenate([self.other(self._earlier(np.asarray(x), time)) for time in self.before])

@@ -77,7 +77,7 @@ def _cover(model: Model, placing: Placing) -> Cover:
         found = found or list(_skeleton(whole, body))
         pieces += [replace(p, body=label, link=link, start=pose @ p.start, end=pose @ p.end) for p in found]
     for place, rigid in enumerate(placing.links):
-        if all(p.link != place for p in pieces):
+        if place not in placing.between and all(p.link != place for p in pieces):
             bare.append(rigid.joint.body)
     return Cover(tuple(pieces), tuple(bare), (*unread, *_doubts(pieces, bare)))
 

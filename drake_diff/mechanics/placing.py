@@ -3,24 +3,35 @@
     R = R_parent R_F exp(axis q),  p = p_parent + R_parent p_F        of a hinge
     R = R_parent R_F,              p = p_parent + R_parent (p_F + R_F axis q)   of a slide
 
-and a free body's from its quaternion, which need not be of length 1, and its position: what Drake does.
+and a free body's from its quaternion, which need not be of length 1, and its position: what Drake does. A joint of
+several other coordinates is a chain of hinges and slides, with links between them that are no bodies.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.math import RigidTransform
 
 from drake_diff._base.arrays import Array, Indices, cross, skew
 from drake_diff._base.refusal import Refusal
-from drake_diff.mechanics.description import RigidLink, read_links, without_welds
+from drake_diff.mechanics.description import Link, RigidLink, read_links, without_welds
 from drake_diff.model.mimic import Coupling
 from drake_diff.model.model import Model
-from drake_diff.model.plant import joints
+from drake_diff.model.plant import bodies, joints, labelled
 from drake_diff.model.step import set_state
 
-PLACED = ("weld", "revolute", "prismatic", "quaternion_floating")
+X, Y, Z = np.eye(3)
+TURNS = (("revolute", Z, 2), ("revolute", Y, 1), ("revolute", X, 0))  # roll, pitch and yaw
+CHAINS: dict[str, tuple[tuple[str, Array, int], ...]] = {  # the kind, axis and coordinate of each link
+    "planar": (("prismatic", X, 0), ("prismatic", Y, 1), ("revolute", Z, 2)),
+    "universal": (("revolute", X, 0), ("revolute", Y, 1)),
+    "ball_rpy": TURNS,
+    "rpy_floating": (("prismatic", X, 3), ("prismatic", Y, 4), ("prismatic", Z, 5), *TURNS),
+}
+PLACED = ("weld", "revolute", "prismatic", "quaternion_floating", *CHAINS)
 SAME_PLACE = 1e-11  # [m, and of a rotation's entries] rounding, relative to the largest
 
 
@@ -30,9 +41,15 @@ class Placing:
 
     links: tuple[RigidLink, ...]
     on: dict[str, tuple[int, Any]]  # body -> (place among the links, pose on it)
+    between: frozenset[int]  # the links that are no bodies
     carried: NDArray[np.bool_]  # (L, L): whether link j carries link i, or is i
     nx: int
     coupling: Coupling | None  # where q has the independent coordinates alone
+
+    def carrier(self, link: int) -> int:
+        """The next link below that is a body, -1 for the world."""
+        parent = self.links[link].parent
+        return self.carrier(parent) if parent in self.between else parent
 
     def __call__(self, q: Any) -> tuple[Any, Any]:
         """Rotations (..., L + 1, 3, 3) and origins (..., L + 1, 3) of the links, the world last, at q (..., nq)."""
@@ -126,19 +143,43 @@ def placing_of(model: Model) -> Placing | Refusal:
             return Refusal("nothing in it can move")
         for joint in joints(model.plant):
             if joint.type_name() not in PLACED:
-                return Refusal(f"joint {joint.name()} is of type {joint.type_name()}")
-        links, on, _ = without_welds(read_links(model.plant, {}))
+                return Refusal(
+                    f"joint {joint.name()} is a {joint.type_name()} joint, and where that leads is not written out: "
+                    "replace it by hinges and slides"
+                )
+        single = [part for link in read_links(model.plant, {}) for part in _chain(link)]
+        links, on, _ = without_welds(single)
+        known = {"world", *labelled(bodies(model.plant))}
+        between = frozenset(i for i, link in enumerate(links) if link.joint.body not in known)
+        on = {body: place for body, place in on.items() if body in known}
         carried = np.eye(len(links), dtype=bool)
         for i, link in enumerate(links):
             if link.parent >= 0:
                 carried[i] |= carried[link.parent]
-        placing = Placing(tuple(links), on, carried, model.nx, model.coupling)
+        placing = Placing(tuple(links), on, between, carried, model.nx, model.coupling)
         here, random = model.double.state(), np.random.default_rng(0)
         same = all(_is_same(model, placing, random.standard_normal(model.nq)) for _ in range(2))
         set_state(model.double, here)
         return placing if same else Refusal("its links are not where Drake has them")
 
     return model.cache("placing", compared)
+
+
+def _chain(link: Link) -> Iterator[Link]:
+    """A link as it is, or one for each coordinate of its joint; the body is the last."""
+    chain = CHAINS.get(link.kind)
+    if chain is None:
+        yield link
+        return
+    parent, pose = link.parent, link.on_parent
+    for i, (kind, axis, k) in enumerate(chain):
+        last = i == len(chain) - 1
+        own: dict[str, Any] = {} if last else {"mass": 0.0, "inertia": np.zeros((3, 3)), "on_child": RigidTransform()}
+        body = link.body if last else f"{link.body} behind {i + 1} of {len(chain)} coordinates"
+        yield replace(
+            link, body=body, parent=parent, kind=kind, axis=axis, q_start=link.q_start + k, on_parent=pose, **own
+        )
+        parent, pose = body, RigidTransform()
 
 
 def _is_same(model: Model, placing: Placing, q: Array) -> bool:

@@ -370,14 +370,14 @@ def _touching(model: Model, placing: Placing, pairs: Sequence[tuple[Piece, Piece
 
 def _are_neighbours(placing: Placing, a: Piece, b: Piece) -> bool:
     """Whether two pieces are on one link, or one of their links carries the other."""
-    parent = {i: link.parent for i, link in enumerate(placing.links)}
-    return a.link == b.link or parent.get(a.link) == b.link or parent.get(b.link) == a.link
+    carriers = [-2 if piece.link < 0 else placing.carrier(piece.link) for piece in (a, b)]
+    return a.link == b.link or carriers[0] == b.link or carriers[1] == a.link
 
 
 def _placing(model: Model) -> Placing:
     found = placing_of(model)
     if isinstance(found, Refusal):
-        raise ModelError(f"obstacles: where the links are has no formula here: {found}")
+        raise ModelError(f"obstacles: {found}")
     return found
 
 
