@@ -272,6 +272,23 @@ def test_a_run_of_a_users_own_diagram_is_shown_as_balls(tmp_path):
     assert np.ptp(scene.trail, axis=0).max() < 1e-12
 
 
+def test_the_live_view_shows_the_plan_where_only_feedback_keeps_it(tmp_path):
+    """A pendulum held upright: without feedback it falls, which the verdict does not rest on."""
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    cost = dd.QuadraticCost(R=[[1.0]])
+    problem = dd.Problem(model, x0=[np.pi - 0.2, 0], x_goal=[np.pi, 0], num_steps=150, running_cost=cost)
+    solution = dd.solve(problem, method="collocation")
+    assert solution.judged_replay.control == "TVLQR"
+    dd.save(solution, tmp_path / "run")
+    scene, _ = scene_of_run(tmp_path / "run")
+    (poses,) = (found for path, found in scene.poses.items() if "pole" in path)
+    hinge = [np.arctan2(pose.rotation().matrix()[0, 2], pose.rotation().matrix()[0, 0]) for pose in poses]
+    assert np.cos(np.array(hinge) - solution.xs[:, 0]) == pytest.approx(1.0, abs=1e-9)
+    (ghost,) = scene.ghosts
+    assert (ghost.name, ghost.framed) == ("without_feedback", False)
+    assert any("without feedback" in note for note in serve(tmp_path / "run")[1])
+
+
 def test_the_live_view_is_at_loopback_only(runs):
     meshcat, notes = serve(runs / "thrown")
     assert notes == ()

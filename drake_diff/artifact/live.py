@@ -34,6 +34,8 @@ from drake_diff.pages.shapes import Drawn, ball, body_path, meshcat_path, shapes
 from drake_diff.record.solve import EvidenceRecord
 
 GHOST = "planned/"  # before the frame names of the plan's bodies
+PLAN, WITHOUT = "plan", "without_feedback"  # the names of ghosts
+OPEN_LOOP = "open loop"
 LOOPBACK = "127.0.0.1"
 
 
@@ -45,6 +47,11 @@ def serve(directory: str | Path) -> tuple[Meshcat, tuple[str, ...]]:
     scene, notes = scene_of_run(directory)
     meshcat = Meshcat(MeshcatParams(host=LOOPBACK, show_stats_plot=False))
     draw(meshcat, scene)
+    if any(ghost.name == WITHOUT for ghost in scene.ghosts):
+        notes = (
+            *notes,
+            "what moves is the plan, near which feedback keeps the robot; blue: the robot without feedback",
+        )
     return meshcat, notes
 
 
@@ -77,12 +84,16 @@ def scene_of_run(directory: str | Path) -> tuple[Scene, tuple[str, ...]]:
         shapes, told = tuple(ball(path) for path in paths.values()), ()
     motion = {path: poses[name] for name, path in paths.items() if name in poses}
     plan = {path: poses[GHOST + name] for name, path in paths.items() if GHOST + name in poses}
+    pushes, ghosts = tuple(contacts.get(time, ()) for time, _ in rows[:-1]), (Ghost(PLAN, plan, BLUE),) if plan else ()
+    rests_on = log.metadata.get("run", {}).get("verdict_rests_on", OPEN_LOOP)
+    if plan and not rests_on.startswith(OPEN_LOOP):  # a motion that the trace does not have, near the plan
+        ghosts, motion, pushes = (Ghost(WITHOUT, motion, BLUE, framed=False),), plan, ()
     return Scene(
         shapes=shapes,
         times=times,
         poses=motion,
-        ghosts=(Ghost("plan", plan, BLUE),) if plan else (),
-        contacts=tuple(contacts.get(time, ()) for time, _ in rows[:-1]),
+        ghosts=ghosts,
+        contacts=pushes,
         trail=longest_path(motion, tuple(moving.values())),
         marks=told,
     ), notes

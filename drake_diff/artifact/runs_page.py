@@ -11,7 +11,7 @@ from pydrake.geometry import Rgba
 
 from drake_diff._base.arrays import Array
 from drake_diff.artifact.listing import compare_runs
-from drake_diff.artifact.live import scene_of_run
+from drake_diff.artifact.live import PLAN, scene_of_run
 from drake_diff.artifact.rerun import TRACE
 from drake_diff.artifact.trace import read_trace
 from drake_diff.exceptions import ArtifactError
@@ -152,7 +152,7 @@ def _together(first: Scene, second: Scene) -> Scene:
 
 def _resampled(scene: Scene, times: Array) -> Poses:
     """The poses of a run's plan, which is a ghost where the motion is another, at the nearest of its times."""
-    poses = scene.ghosts[0].poses if scene.ghosts else scene.poses
+    poses = next((ghost.poses for ghost in scene.ghosts if ghost.name == PLAN), scene.poses)
     middles = (scene.times[:-1] + scene.times[1:]) / 2
     nearest = np.searchsorted(middles, times)
     return {path: [found[k] for k in nearest] for path, found in poses.items()}
