@@ -10,6 +10,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.refusal import Refusal
+from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.exceptions import DrakeDiffError, ModelError, ModelWarning, SimulationError
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.plant import actuators, joints
@@ -124,6 +125,13 @@ def _standing(path: Path, read: Model, options: dict[str, Any], told: list[str],
             model = _loaded(path, on_feet)
             told.append(f"{_few(stuck)} had the same lower and upper limit: fixed there (fix_joints)")
         model = _with_mass(path, on_feet, model, told)
+        if model.nv > MANY and isinstance(analytic_of(model), Refusal) and options.get("mimic") == "reduce":
+            on_feet["mimic"] = "fix"
+            model = _loaded(path, on_feet)
+            told.append("what follows and what leads is fixed where it stands (mimic='fix'), for analytic derivatives")
+        derivatives = analytic_of(model)
+        if model.nv > MANY and isinstance(derivatives, Refusal):
+            return Refusal(f"the derivatives of {model.nv} velocities in contact would take minutes: {derivatives}")
         lower, upper = ranges(model)
         found = stand(model, lower, upper)
         if isinstance(found, Refusal):
