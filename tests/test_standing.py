@@ -118,10 +118,10 @@ def test_a_motion_that_does_not_end_at_rest_is_no_shift(on_feet, monkeypatch):
     """2 cm down in 30 ms and held for 10 ms: it is still falling or bouncing, or takes more than friction allows."""
     model = on_feet()
     robot, rest = stand(model, *ranges(model))
-    assert isinstance(shifting.random_shift(robot, rest, 0, lambda q: 0.0), shifting.Shift)
+    assert isinstance(shifting.random_shift(robot, rest, [0], lambda q: 0.0), shifting.Shift)
     monkeypatch.setattr(shifting, "DURATIONS", (0.03,))
     monkeypatch.setattr(shifting, "HELD", 0.01)
-    found = shifting.random_shift(robot, rest, 0, lambda q: 0.0)
+    found = shifting.random_shift(robot, rest, [0], lambda q: 0.0)
     assert isinstance(found, Refusal) or np.max(np.abs(found.xs[-1][model.nq :])) <= shifting.AT_REST
 
 

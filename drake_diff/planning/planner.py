@@ -37,6 +37,7 @@ from drake_diff.planning.task import Task, asked, postures
 from drake_diff.record.solve import EvidenceRecord
 
 TIMES = (None, "least")
+TRIED_TWICE = 36  # velocities: of a larger robot on its feet a second goal would take half a minute more
 SMALL = 7  # velocities: of a larger robot any smooth motion will do, as its best one takes minutes
 FASTER = (0.2, 2.0)  # of the first guess's duration: the range of a least time
 SPEED_WEIGHT = 0.01  # of a speed against an effort, both as shares of their limits
@@ -259,17 +260,18 @@ def _attempts(robot: Robot, task: Task, least: str | None, seed: int) -> Iterato
 
 
 def _of_standing(robot: Robot, standing: tuple[Legged, Rest], task: Task, seed: int) -> Iterator[_Attempt]:
-    """A robot on its feet, which stay where they are."""
+    """A robot on its feet, which stay where they are; where the goal is free, to another one if need be."""
     legged, rest = standing
-    if task.is_free:
-        found = random_shift(legged, rest, seed, robot.overlap)
-    else:
-        found = shift_to(legged, rest, task.frames, task.joints)
-    if isinstance(found, Refusal):
-        raise ModelError(f"from where it stands no other posture was found: {found}")
-    moved = np.max(np.abs(legged.apart(found.xs[-1][: robot.model.nq], robot.q)))
-    name = f"its feet where they are, up to {moved:.2g} rad or m to a posture that it holds"
-    yield _feasible(robot, task, Guess(name, robot.model, found.xs, found.us, 0.0))
+    for again in range(1 + (task.is_free and robot.model.nv <= TRIED_TWICE)):
+        if task.is_free:
+            found = random_shift(legged, rest, [seed, again], robot.overlap)
+        else:
+            found = shift_to(legged, rest, task.frames, task.joints)
+        if isinstance(found, Refusal):
+            raise ModelError(f"from where it stands no other posture was found: {found}")
+        moved = np.max(np.abs(legged.apart(found.xs[-1][: robot.model.nq], robot.q)))
+        name = f"its feet where they are, up to {moved:.2g} rad or m to a posture that it holds"
+        yield _feasible(robot, task, Guess(name, robot.model, found.xs, found.us, 0.0))
 
 
 def _of_driven(robot: Robot, task: Task, least: str | None, seed: int) -> Iterator[_Attempt]:

@@ -1,6 +1,6 @@
 """From one posture in which a robot stands to another, its feet where they are."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -47,12 +47,12 @@ class Shift:
     end: Rest
 
 
-def random_shift(robot: Legged, start: Rest, seed: int, depth: Callable[[Array], float]) -> Shift | Refusal:
+def random_shift(robot: Legged, start: Rest, seed: Sequence[int], depth: Callable[[Array], float]) -> Shift | Refusal:
     """To a posture drawn at random, the base lower and shifted and the arms moved; or why none was found.
 
     `depth` tells how deep [m] shapes overlap in a posture: more than at the start is not wanted.
     """
-    random = np.random.default_rng([seed, 4])
+    random = np.random.default_rng([*seed, 4])
     model, q0 = robot.model, start.x[: robot.model.nq]
     deepest, feet = max(depth(q0), 1e-4), robot.soles(q0)[0]
     tall = float(center_of_mass(model)[0][2])
