@@ -1,5 +1,7 @@
 """What a stranger's file may hold that a plan has to mend: weak motors, shapes that always overlap, slow joints."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from drake_diff.planning import plan
 from drake_diff.planning.posture import TOUCHING, share_to_hold
 from drake_diff.planning.robot import load_robot
 from drake_diff.planning.task import Task, postures
+from drake_diff.record.parts import Failure
 
 G = 9.81
 INERTIA = '<inertia ixx="0.02" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/>'
@@ -98,17 +101,17 @@ def test_a_random_goal_is_no_further_than_slow_joints_go(tmp_path):
     limit = 'lower="-3" upper="3" effort="50" velocity="0.1"'
     found = load_robot(robot(tmp_path, link("arm"), joint("shoulder", "world", "arm", limit=limit)), 0)
     for seed in range(10):
-        (goal,) = postures(found, Task({}, {}), seed)
-        assert abs(goal[0] - found.q[0]) <= 0.06 * 2.0 / 1.875 + 1e-12
+        for goal in postures(found, Task({}, {}), seed):
+            assert abs(goal[0] - found.q[0]) <= 0.06 * 2.0 / 1.875 + 1e-12
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_random_goal_and_the_way_to_it_are_held(tmp_path, seed):
     found = load_robot(outstretched(tmp_path, 1.0), seed)
-    (goal,) = postures(found, Task({}, {}), seed)
-    for s in (0.5, 1.0):
-        assert share_to_hold(found.model, found.q + s * (goal - found.q)) <= 0.63
-    assert found.overlap(goal) <= TOUCHING
+    for goal in postures(found, Task({}, {}), seed):
+        for s in (0.5, 1.0):
+            assert share_to_hold(found.model, found.q + s * (goal - found.q)) <= 0.63
+        assert found.overlap(goal) <= TOUCHING
 
 
 FOLLOWER = '<mimic joint="lead" multiplier="{ratio}" offset="0"/>'
@@ -148,3 +151,53 @@ def test_a_robot_of_joints_without_a_way_to_go_is_refused(tmp_path):
     limit = 'lower="0.5" upper="0.5" effort="50" velocity="3"'
     with pytest.raises(ModelError, match="same lower and upper limit"):
         load_robot(robot(tmp_path, link("arm"), joint("shoulder", "world", "arm", limit=limit)), 0)
+
+
+def test_a_plan_whose_record_would_not_hold_is_none(tmp_path, monkeypatch):
+    """The first attempt is said to miss a metric: the next one is tried, and both are told."""
+    from drake_diff.artifact.measurement import measure
+    from drake_diff.planning import planner
+
+    seen = []
+
+    def measured(solution):
+        found = measure(solution)
+        seen.append(solution)
+        failure = Failure(
+            label="evaluation_error", code="metric_does_not_hold", message="it drifts", detected_by="a test"
+        )
+        return dataclasses.replace(found, failures=(failure,)) if len(seen) == 1 else found
+
+    monkeypatch.setattr(planner, "measure", measured)
+    done = plan(outstretched(tmp_path, 10.0), out=tmp_path / "out")
+    assert done.success
+    assert len(seen) == 2
+    assert "but it drifts" in done.tried[0]
+
+
+def test_a_cart_in_its_rails_goes_without_contact(tmp_path):
+    """The cart is inside the rail for good, which would brake it, and touches nothing else on its way."""
+    pole = joint("hinge", "cart", "pole", limit='lower="-9" upper="9" effort="0" velocity="20"')
+    motor = (
+        '<transmission><type>transmission_interface/SimpleTransmission</type><joint name="slide"><hardwareInterface>'
+        "EffortJointInterface</hardwareInterface></joint><actuator name='motor'/></transmission>"
+    )
+    path = robot(
+        tmp_path,
+        link("rail", shape='<box size="2 0.1 0.1"/>', at="0 0 0"),
+        joint("still", "world", "rail", kind="fixed"),
+        link("carriage"),
+        joint("slide", "rail", "carriage", kind="prismatic", axis="1 0 0", limit=LIMIT_OF_THE_SLIDE),
+        link("cart", shape='<box size="0.2 0.1 0.1"/>', at="0 0 0"),
+        joint("bolt", "carriage", "cart", kind="fixed"),
+        link("pole"),
+        pole,
+        motor,
+    )
+    done = plan(path, out=tmp_path / "out")
+    assert done.success, done.lines
+    assert "touching nothing" in done.tried[-1]
+    assert done.solution.problem.model.contract.contact.collision_pairs == 0
+
+
+LIMIT_OF_THE_SLIDE = 'lower="-1" upper="1" effort="20" velocity="5"'

@@ -323,7 +323,10 @@ def add_ground(plant: MultibodyPlant, ground: float | bool | None) -> tuple[str,
     friction = GROUND_FRICTION if ground is True else float(ground)
     properties = pg.ProximityProperties()
     pg.AddContactMaterial(friction=CoulombFriction(friction, friction), properties=properties)
-    plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), pg.HalfSpace(), "ground", properties)
+    try:
+        plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), pg.HalfSpace(), "ground", properties)
+    except DRAKES_REFUSALS as error:
+        raise ModelError(f"ground: the file has a ground of its own: leave ground= out ({_plain(error)})") from error
     return (f"A ground was added at z = 0, with friction {friction:g}.",) if ground is True else ()
 
 

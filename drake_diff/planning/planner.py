@@ -13,6 +13,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
+from drake_diff.artifact.measurement import measure
 from drake_diff.artifact.save import save
 from drake_diff.artifact.verify import Verification, verify
 from drake_diff.certificates.audit import audit
@@ -45,6 +46,13 @@ BESIDE = 0.05  # [rad or m] the range of each joint around a guess that a motion
 LOOKS = 3  # of the ten places in each step, those at which overlap is looked for are so many apart
 BUDGET, BUDGET_OF_LEAST = 40.0, 120.0  # [s] on the clock, of one attempt: another one needs no search
 REACHES = ((0.5, 50), (0.25, 50), (0.1, 50), (0.1, 25), (0.1, 12))  # part of the way, and steps to go it
+# Where shapes must touch: spheres have derivatives, and their contact is the same in steps of other lengths.
+GENTLE: dict[str, Any] = {"time_step": 0.005, "meshes": "spheres", "contact_geometry": "corner_spheres"}
+GENTLE |= {"near_rigid": 0.1, "relaxation_time": 0.02}
+SMALLEST_WAY = 0.01  # [rad or m] of the coordinate that goes furthest: less is no plan
+NOTHING = "no motion was found to begin with that its motors make and that keeps to its limits: give a goal of joints"
+GENTLY = ((0.25, 100), (0.1, 100))
+COMES_TO_REST = 400  # steps of GENTLE
 WIDTH, DRAWS = 0.3, 30  # of a coordinate's range, and postures: another one to begin in
 SEGMENT = 5  # steps of multiple shooting
 
@@ -178,7 +186,7 @@ def plan(
                 break
             held = f"no plan with its feet on the ground was verified: {'; '.join(tried)}"
         if not found:
-            raise ModelError(f"{path}: no plan could be tried: {'; '.join(tried) or 'no first guess'}")
+            raise ModelError(f"{path}: no plan could be tried: {'; '.join(tried) or NOTHING}")
         best = found[-1] if apart else min(found, key=lambda s: s.defect + s.goal_error)
         directory = Path(out) if out is not None else Path("artifacts") / f"plan_{ready.model.name}"
         clock.begin("save", best.status.value)
@@ -235,8 +243,10 @@ def _first_that_holds(attempts: Iterator[_Attempt], clock: "_Clock") -> tuple[li
             depth = attempt.depth(solution) if solution.success else 0.0
             found.append(solution)
             tried.append(f"{attempt.name}: {solution.status.value}")
-            if solution.success and depth <= TOUCHING:
+            failures = measure(solution).failures if solution.success else ()
+            if solution.success and depth <= TOUCHING and not failures:
                 return tried, found, True
+            tried[-1] += "".join(f", but {failure.message}" for failure in failures)
             if depth > TOUCHING:
                 tried[-1] += f", but shapes overlap by {1000 * depth:.2g} mm"
             attempt = attempt.instead if depth > TOUCHING else None
@@ -342,21 +352,35 @@ def _problem(task: Task, guess: Guess, x_goal: Array, **asked: Any) -> Problem:
 
 
 def _of_reachable(robot: Robot, task: Task, seed: int) -> Iterator[_Attempt]:
-    """To the state that a controller reaches, which shows that it can be reached."""
+    """To the state that a controller reaches, which shows that it can be reached.
+
+    As the file says; then on ways on which nothing touches; then from where it comes to rest.
+    """
     random = np.random.default_rng([seed, 2])
     part = random.uniform(-1, 1, robot.model.nq)
     target = robot.q + part * (robot.upper - robot.lower) / 2
-    for (reach, steps), begun in product(REACHES, (robot, _elsewhere(robot, random))):
-        where = "" if begun is robot else " from elsewhere"
-        what = f"what controllers reach ({reach:g} of the way in {steps} steps{where})"
-        for model in (robot.apart, robot.model):
-            guess = None if model is None else by_controller(begun, model, target, steps=steps, reach=reach, name=what)
-            if guess is None or not _inside(guess):
-                continue
-            if model is robot.model:
-                yield _feasible(robot, task, guess)
-            elif _touched(Space.of(robot, task.avoid), guess) <= 0:
-                yield _feasible(robot, task, replace(guess, name=f"{what}, touching nothing (contact=False)"))
+    guesses = [_reachable(robot, robot.model, target, *REACHES[0])]
+    if robot.apart is not None:
+        space, elsewhere = Space.of(robot, task.avoid), _elsewhere(robot, random)
+        for reach, begun in product(REACHES, (robot, elsewhere)):
+            guess = _reachable(begun, robot.apart, target, *reach, "touching nothing (contact=False)")
+            guesses += [guess] if guess is not None and _touched(space, guess) <= 0 else []
+    yield from (_feasible(robot, task, guess) for guess in guesses if guess is not None and _goes(guess))
+    if robot.apart is not None:
+        gentle = robot.model.changed(**GENTLE)
+        rest = by_controller(robot, gentle, robot.q, steps=COMES_TO_REST, reach=0.0, name="")
+        settled = robot if rest is None else replace(robot, q=rest.xs[-1][: gentle.nq])
+        told = f"from where it comes to rest, by spheres in its shapes and steps of {GENTLE['time_step']:g} s"
+        guesses = [_reachable(settled, gentle, target, reach, steps, told) for reach, steps in GENTLY]
+    else:
+        guesses = []
+    guesses += [_reachable(robot, robot.model, target, *reach) for reach in REACHES[1:]]
+    yield from (_feasible(robot, task, guess) for guess in guesses if guess is not None and _goes(guess))
+
+
+def _reachable(robot: Robot, model: Model, target: Array, reach: float, steps: int, how: str = "") -> Guess | None:
+    name = f"what controllers reach ({reach:g} of the way in {steps} steps){how and f', {how}'}"
+    return by_controller(robot, model, target, steps=steps, reach=reach, name=name)
 
 
 def _elsewhere(robot: Robot, random: np.random.Generator) -> Robot:
@@ -416,11 +440,12 @@ def _bounds(model: Model, near: Array | None = None) -> Bounds | None:
     return Bounds(x_lower=lower, x_upper=upper)
 
 
-def _inside(guess: Guess) -> bool:
-    """Whether the motion keeps the limits of its model, but for velocity limits of 0."""
+def _goes(guess: Guess) -> bool:
+    """Whether the motion goes somewhere, and keeps the limits of its model, but for velocity limits of 0."""
     terms = [*guess.model.contract.positions, *guess.model.contract.velocities]
     low, high = np.array([t.lower for t in terms]), np.array([t.upper for t in terms])
-    return bool(np.all((low >= high) | ((guess.xs >= low) & (guess.xs <= high))))
+    goes = np.max(np.ptp(guess.xs[:, : guess.model.nq], axis=0)) >= SMALLEST_WAY
+    return bool(goes and np.all((low >= high) | ((guess.xs >= low) & (guess.xs <= high))))
 
 
 class _Clock:

@@ -25,6 +25,7 @@ SEEDS = 12  # first postures of inverse kinematics
 MORE_SEEDS = 40  # where obstacles are in the way
 CANDIDATES = 3  # postures that are tried
 MOVE = 0.25  # part of a joint's range that a random goal is away, at most
+RANDOM = 2  # goals that are drawn where none is asked for
 SOON = 2.0  # [s] a random goal is no further than what its joints do in that time
 DRAWS = 50
 NEARER = 0.5
@@ -85,7 +86,7 @@ def postures(robot: Robot, task: Task, seed: int) -> list[Array]:
     """
     random, space = np.random.default_rng([seed, 1]), Space.of(robot, task.avoid)
     if task.is_free:
-        return [_random_posture(space, random)]
+        return [_random_posture(space, random) for _ in range(RANDOM)]
     start, fixed = robot.q.copy(), np.zeros(robot.model.nq, dtype=bool)
     for at, value in task.joints.items():
         start[at], fixed[at] = value, True
