@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from helpers.browser import browsing, open_page, set_screen, view_of, wait_for_frame
 from helpers.models import MODELS
-from pydrake.geometry import Rgba, Sphere
+from pydrake.geometry import HalfSpace, Rgba, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw
 
 import drake_diff as dd
-from drake_diff.pages.meshcat import ASPECT, FIELD_OF_VIEW, FILLED, camera_of
+from drake_diff.pages.meshcat import ASPECT, FIELD_OF_VIEW, FILLED, camera_of, write_replay
 from drake_diff.pages.scene import Scene, scene_of
 from drake_diff.pages.shapes import Drawn
 
@@ -63,3 +64,22 @@ def test_all_of_a_motion_is_in_view_and_fills_the_picture(seed):
     high = (np.abs((path - camera) @ up) + radius) / depth / edge
     most = max(across.max(), high.max())
     assert 0.75 * FILLED < most < FILLED + 1e-9
+
+
+@browsing
+def test_the_ground_is_as_dark_as_the_screen(browser, tmp_path):
+    """A half space, which has no look of its own: below the middle of the picture there is nothing else."""
+    ball = Drawn("b", Sphere(0.1), RigidTransform(), Rgba(1, 0, 0), np.zeros(3), 0.1)
+    ground = Drawn("", HalfSpace(), RigidTransform(), Rgba(0.6, 0.6, 0.6), np.zeros(3), 0.0)
+    path = np.array([[0, 0, 0.1], [0.5, 0, 0.1]])
+    poses = {"b": [RigidTransform(p) for p in path]}
+    scene = Scene((ball, ground), np.array([0.0, 1.0]), poses, ghosts=(), contacts=(), trail=path)
+    write_replay(tmp_path / "replay.html", scene)
+    open_page(browser, tmp_path / "replay.html", size=(800, 600))
+    seen = {}
+    for scheme in ("light", "dark"):
+        set_screen(browser, (800, 600), scheme)
+        wait_for_frame(browser)
+        seen[scheme] = np.median(view_of(browser)[540:590, 300:500])
+    assert seen["light"] > 0.7
+    assert seen["dark"] < 0.35

@@ -16,6 +16,7 @@ from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, Sp
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Status
 
+STILL = 1e-3  # [rad/s or m/s] what is no faster is at rest
 FEW = 4  # so many goals, or coordinates of one, are named
 CONTROLS = {"open loop": "Inputs alone (open loop)", "TVLQR": "With feedback (TVLQR)"}
 
@@ -64,7 +65,7 @@ def _end(problem: Problem) -> Iterator[str]:
     if not given.any():
         return
     nq = problem.model.nq if problem.has_model else problem.nx
-    still = nq < problem.nx and given[nq:].all() and not goal[nq:].any()
+    still = nq < problem.nx and given[nq:].all() and float(np.max(np.abs(goal[nq:]))) < STILL
     where = [i for i in np.flatnonzero(given) if not (still and i >= nq)]
     if where and len(where) <= FEW:
         units = [f" {unit}" if unit not in ("1", UNKNOWN) else "" for unit in units_of(problem)]
@@ -150,7 +151,9 @@ def _of_replays(m: Measurement, replays: Sequence[Mapping[str, Any]]) -> Iterato
         tried = [r for r in replays if r["control"] == control]
         lost = [r for r in tried if not r["holds"]]
         enough = judged is not None and judged.control == control
-        text = f"holds in all {len(tried)} replays"
+        text = {1: "holds in its replay", 2: "holds in both replays"}.get(
+            len(tried), f"holds in all {len(tried)} replays"
+        )
         if lost:
             text = f"holds in {len(tried) - len(lost)} of {len(tried)} replays; {lost[0]['variant']}: "
             text += lost[0]["failures"][0] if lost[0]["failures"] else "it fails"

@@ -122,7 +122,8 @@ def _arrows_of(root: str, steps: Sequence[Sequence[Force]], colour: Rgba, scene:
 def draw(meshcat: Meshcat, scene: Scene) -> None:
     """Draw `scene` and publish its animation."""
     for i, drawn in enumerate(scene.shapes):
-        _draw_shape(meshcat, f"motion/{drawn.body or WORLD}/{i}", drawn, drawn.colour, scene.size)
+        name = f"ground{i}" if isinstance(drawn.shape, HalfSpace) else str(i)  # replay.js paints the former
+        _draw_shape(meshcat, f"motion/{drawn.body or WORLD}/{name}", drawn, drawn.colour, scene.size)
         for ghost in scene.ghosts:
             if drawn.body in ghost.poses:
                 _draw_shape(meshcat, f"{ghost.name}/{drawn.body}/{i}", drawn, ghost.colour, scene.size)

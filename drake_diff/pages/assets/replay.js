@@ -3,12 +3,14 @@
   const dark = matchMedia("(prefers-color-scheme: dark)"), calm = matchMedia("(prefers-reduced-motion: reduce)");
   const under = (...path) => viewer.scene_tree.find(["drake", ...path]).object;
   const meshes = (object, act) => object && object.traverse((part) => { if (part.material) { act(part, part.material); part.material.needsUpdate = true; } });
+  const named = (pattern, act) => meshes(under(), (part, m) => { if (pattern.test(part.name) || pattern.test(part.parent.name)) act(part, m); });
   const ARROWS = ["trail", "contacts", "thrusts"], OWN = ["motion", "level", "grid", ...ARROWS];  // all others are ghosts
   const paint = () => {
     const ground = ["Background", "<object>"];
     viewer.set_property(ground, "top_color", dark.matches ? [0.2, 0.24, 0.3] : [0.86, 0.89, 0.93]);
     viewer.set_property(ground, "bottom_color", dark.matches ? [0.11, 0.13, 0.16] : [0.97, 0.97, 0.98]);
     meshes(under("grid"), (part, m) => { m.vertexColors = false; m.color.setHex(dark.matches ? 0x4a5663 : 0xb8bfc9); });
+    named(/^ground/, (part, m) => m.color.setHex(dark.matches ? 0x2c343d : 0xdde1e6));
     viewer.set_dirty();
   };
   function putBehind(ghosts) {  // a ghost shows where the motion is not: it is drawn first, whatever is nearer
@@ -33,8 +35,7 @@
     meshes(under("motion"), (part, m) => {  // of two bodies at one place the translucent one is behind
       if (m.transparent) { m.polygonOffset = true; m.polygonOffsetFactor = 1; m.polygonOffsetUnits = 4; }
     });
-    meshes(under(), (part, m) => {  // a goal is seen through what stands before it
-      if (!/^above/.test(part.name) && !/^above/.test(part.parent.name)) return;
+    named(/^above/, (part, m) => {  // a goal is seen through what stands before it
       Object.assign(m, { depthTest: false, depthWrite: false, transparent: true, opacity: Math.min(m.opacity, 0.55) });
       part.renderOrder = 4;
     });
