@@ -249,7 +249,7 @@ TRAPS = [
         ARM.replace("</link>", MESH.format("collision", "STL", "collision") + "</link>"),
         {},
         r"upper\): no collision shape of the file is left",
-        {"meshes": "convex"},
+        {"meshes": "spheres"},
     ),
     (
         "meshes_skipped",
@@ -257,7 +257,7 @@ TRAPS = [
         ARM.replace("</link>", MESH.format("collision", "STL", "collision") + "</link>"),
         {},
         "1 collision meshes skipped",
-        {"meshes": "convex"},
+        {"meshes": "spheres"},
     ),
     (
         "falls",
@@ -265,7 +265,7 @@ TRAPS = [
         FREE.replace(BOX, MESH.format("collision", "STL", "collision")),
         {},
         r"base\): it floats and falls for ever: nothing of it can touch",
-        {"meshes": "convex", "ground": True},
+        {"meshes": "spheres", "ground": True},
     ),
     (
         "massless_root",
@@ -352,6 +352,25 @@ TRAPS += [
         {},
         "1 <gazebo> are ignored",
         None,
+    ),
+]
+TRAPS += [
+    (
+        "zero_limit",
+        "error",
+        ARM.replace(
+            "</robot>",
+            link("tip")
+            + joint("wrist", "upper", "tip", limit='<limit effort="1" velocity="0" lower="-1" upper="1"/>').replace(
+                "</joint>", '<mimic joint="hinge"/></joint>'
+            )
+            + link("end")
+            + joint("last", "tip", "end")
+            + "</robot>",
+        ),
+        {},
+        r"wrist\): the velocity limit is 0",
+        {"mimic": "fix"},
     ),
 ]
 SWING = '<body name="a"><joint name="j" axis="0 1 0" {}/><geom size="0.1" mass="1"/></body>'

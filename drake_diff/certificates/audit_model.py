@@ -158,7 +158,7 @@ def _lost_shapes(place: Place) -> Found:
                 'load_model(..., meshes="convex") or "spheres" takes collision meshes; packages= says where they are'
             )
             told = note.split(":")[0].split("; ")[0]
-            arguments = {"meshes": "convex"} if SKIPPED.match(note) else {}
+            arguments = {"meshes": "spheres"} if SKIPPED.match(note) else {}
             yield Finding(severity, "meshes_skipped", "meshes", told, remedy, arguments)
     if scene_graph is None or (model.options or {}).get("contact") is False:
         return
@@ -173,7 +173,7 @@ def _lost_shapes(place: Place) -> Found:
         much = "no collision shape of the file is left" if len(lost) == given else "they have lost all collision shapes"
         remedy = 'load_model(..., meshes="convex") or "spheres"; contact=False says that nothing is to touch'
         message = f"{much}, so that they pass through things"
-        mends: dict[str, Any] = {"meshes": "convex"} if _has_usable_meshes(model) else {"contact": False}
+        mends: dict[str, Any] = {"meshes": "spheres"} if _has_usable_meshes(model) else {"contact": False}
         yield Finding("warning", "collision_gone", _listed(lost), message, remedy, mends)
 
 
@@ -205,7 +205,7 @@ def _falls(place: Place) -> Found:
             remedy = 'load_model(..., meshes="convex" or "spheres", ground=True), base="weld", or nothing if it flies'
             arguments = {"base": "weld"}
             if _has_usable_meshes(place.model):
-                arguments = {"meshes": "convex", "ground": True}
+                arguments = {"meshes": "spheres", "ground": True}
         yield Finding("warning", "falls", name, f"it floats and falls for ever: {why}", remedy, arguments)
 
 
@@ -280,25 +280,31 @@ def _ignored(place: Place) -> Found:
 
 
 def _zero_limits(place: Place) -> Found:
-    plant, kinds = place.model.plant, dict[tuple[str, bool], list[str]]()
+    plant, kinds = place.model.plant, dict[tuple[str, str], list[str]]()
+    followers = place.model.file_facts.followers
     driven = {actuator.joint().index() for actuator in actuators(plant)}
     for name, joint in labelled(joints(plant)).items():
         if not can_be_driven(joint):
             continue
         low, high = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
-        free = joint.index() not in driven
+        mended = "" if joint.index() in driven else "actuators"
+        if (plant.GetModelInstanceName(joint.model_instance()), joint.name()) in followers:
+            mended = "mimic"
         if joint.velocity_lower_limits()[0] == 0 == joint.velocity_upper_limits()[0]:
-            kinds.setdefault(("the velocity limit is 0", free), []).append(name)
+            kinds.setdefault(("the velocity limit is 0", mended), []).append(name)
         if low == high:
-            kinds.setdefault((f"the position limits are both {low:g}", free and low == 0), []).append(name)
-    for (kind, can_open), names in kinds.items():
+            how = "" if mended == "actuators" and low else mended
+            kinds.setdefault((f"the position limits are both {low:g}", how), []).append(name)
+    for (kind, mended), names in kinds.items():
         arguments = _fixed(place.model, names)
         remedy = "load_model(..., fix_joints=) fixes such joints there" if arguments else "give it limits in the file"
-        if can_open:
+        if mended == "actuators":
             remedy = (
                 "load_model(..., actuators=) takes limits of 0 of the joints that it drives as none; or fix_joints="
             )
             arguments = {"actuators": names}
+        elif mended == "mimic":
+            remedy, arguments = 'load_model(..., mimic="fix") welds joints that follow others', {"mimic": "fix"}
         message = f"{kind}: no plan can move what has it"
         yield Finding("error", "zero_limit", _listed(names), message, remedy, arguments)
 
