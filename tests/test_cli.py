@@ -233,6 +233,7 @@ def test_help_tells_all_defaults_and_no_text_is_taken_for_markup(monkeypatch, ca
         (("audit", "PENDULUM", "--ground", "yes"), "--ground: expected true, or a friction coefficient, got 'yes'"),
         (("audit", "PENDULUM", "--actuators", "hinge=strong"), "--actuators: expected an effort limit [N or N m]"),
         (("audit", "PENDULUM", "--actuators", "hinge=1,wrist"), "--actuators: expected all, names of joints, or"),
+        (("audit", "PENDULUM", "--gravity", "down"), "--gravity: expected three numbers, got 'down'"),
         (("audit", "PENDULUM", "--packages", "arm"), "--packages: expected NAME=FOLDER, got 'arm'"),
         (("audit", "PENDULUM", "--meshes", "round"), "meshes: expected one of convex, skip, spheres, got 'round'"),
         (("certify", "PENDULUM", "--mimic", "lock"), "got 'lock'"),
@@ -295,6 +296,7 @@ def test_what_the_audit_tells_can_be_typed_until_nothing_is_left_to_mend(tmp_pat
         (("--base", "base", "--mimic", "fix"), None),
         (("--ground", "0.3", "--meshes", "convex"), {"ground": 0.3, "meshes": "convex"}),
         (("--ground", "true"), {"ground": True}),
+        (("--gravity", "0,0,-1.62"), {"gravity": (0.0, 0.0, -1.62)}),
         (
             ("--no-contact", "--packages", "a=.", "--packages", "b=.."),
             {"contact": False, "packages": {"a": ".", "b": ".."}},

@@ -100,8 +100,9 @@ def _left_out_actuators(place: Place) -> Found:
             and joint.index() not in driven
             and (plant.GetModelInstanceName(joint.model_instance()), joint.name()) in facts.left_out
         ]
-        if missing or any(not joint for _, joint in facts.left_out):
-            arguments = {"actuators": missing} if missing else {}
+        others = any(not joint for _, joint in facts.left_out)  # of tendons and sites, which no joint stands for
+        if missing or others:
+            arguments = {"actuators": missing} if missing and not others else {}
             yield Finding("warning", "left_out", "actuators", message, remedy, arguments)
 
 
