@@ -10,7 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 import drake_diff as dd
 from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import InputError
-from drake_diff.model.contact import contacts_of_the_step
+from drake_diff.model.contact import contacts_of_the_step, deepest_overlap, thinnest_geometry
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.planning import plan, shifting
@@ -84,6 +84,23 @@ def test_forces_of_a_load_off_the_middle_obey_the_lever(on_feet):
     stance = hold(robot, model.default_state[: model.nq] + np.eye(model.nq)[robot.base_q + 6] * 0.4)
     front = stance.forces[stance.points[:, 0] > 0, 2].sum()
     assert front == pytest.approx((10 * G * 0.3 + 4 * G * 0.2) / 0.4, rel=1e-6)
+
+
+def test_the_centre_of_mass_has_to_be_over_the_feet(on_feet):
+    """Legs straight, so that motors carry little: what is outside of the feet's rectangle falls, what is inside stands.
+
+    Each foot carries a tenth of an even share at least, which takes a twentieth of the half widths off.
+    """
+    random, seen = np.random.default_rng(0), {True: 0, False: 0}
+    for load in random.uniform([-0.4, -0.2], [0.4, 0.2], (24, 2)):
+        robot = legged(on_feet(load=f"{load[0]} {load[1]} 0", effort=500))
+        q = robot.model.default_state[: robot.model.nq] + np.eye(robot.model.nq)[robot.base_q + 6] * 0.42
+        part = float(np.max(np.abs(load * 10 / 14) / [0.2, 0.1]))  # of the half widths
+        held = not isinstance(hold(robot, q), Refusal)
+        if part > 1 or part < 0.9:
+            assert held == (part < 1), (load, part)
+            seen[held] += 1
+    assert min(seen.values()) > 5
 
 
 @each_row(
@@ -180,6 +197,20 @@ def test_the_law_of_contact_can_be_told_where_the_file_does_not(tmp_path):
     for wrong in ({"near_rigid": 0}, {"relaxation_time": -1.0}):
         with pytest.raises(InputError, match="above 0"):
             dd.load_model(path, time_step=0.01, **wrong)
+
+
+def test_an_overlap_is_judged_by_what_overlaps(on_feet):
+    """Feet of 4 cm, 1 mm in the ground, and a trunk whose shape, 0.2 mm thick, is in the air."""
+    model = on_feet(bottom=1e-4)
+    x = model.default_state
+    x[6] = 0.42 - 1e-3
+    advance(model.double, x, np.zeros(model.nu))
+    depth, thickness, _ = deepest_overlap(model)
+    assert (depth, thickness) == pytest.approx((1e-3, 0.04), rel=1e-9)
+    assert thinnest_geometry(model)[0] == pytest.approx(2e-4)
+    x[6] = 5.0
+    advance(model.double, x, np.zeros(model.nu))
+    assert deepest_overlap(model)[2] == "nothing"
 
 
 def test_a_range_of_a_quaternion_is_that_of_the_turn(on_feet):
