@@ -47,6 +47,11 @@ class Foot:
     sole: Indices
 
     @property
+    def name(self) -> str:
+        """That of the body which has the first of the spheres."""
+        return str(self.frame.body().name())
+
+    @property
     def is_flat(self) -> bool:
         """Whether the sole is a face, which turns the foot as it lies on the ground."""
         middle = self.centres[self.sole] - np.mean(self.centres[self.sole], axis=0)

@@ -142,7 +142,7 @@ def _standing(path: Path, read: Model, options: dict[str, Any], told: list[str],
         besides = overlapping | pairs_always([q], shapes)
     except DrakeDiffError as error:
         return Refusal(f"a model that could stand cannot be made: {error}")
-    feet = _few(foot.bodies[0] for foot in found[0].feet)
+    feet = _few(foot.name for foot in found[0].feet)
     told.append(f"it stands on {feet}, on a ground that was added (base='free', ground=True), by spheres in its shapes")
     if besides:
         told.append(f"{_few(map(' and '.join, sorted(besides)))} overlap where it stands, which is not looked at")

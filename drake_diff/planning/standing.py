@@ -313,7 +313,7 @@ def settled(robot: Legged, stance: Stance) -> Rest | Refusal:
     except (SimulationError, GradientError) as error:
         return Refusal(f"its standing cannot be stepped: {error}")
     touching = {contact.body_a for contact in contacts_of_the_step(model)}
-    lifted = [foot.bodies[0] for foot in robot.feet if not touching & set(foot.bodies)]
+    lifted = [foot.name for foot in robot.feet if not touching & set(foot.bodies)]
     others = touching.difference(*[foot.bodies for foot in robot.feet])
     if lifted or others:
         told = f"{lifted[0]} is off the ground" if lifted else f"{min(others)} is on the ground"
