@@ -118,6 +118,10 @@ def test_a_group_of_plots_is_shown_at_a_time_under_one_legend(humanoid, browser)
     )
     assert 0 < len(texts(browser, ".plot")) < 6
     assert all("elbow" in name.lower() for name in texts(browser, ".plot h4"))
+    whole = browser.execute_script("return [...document.querySelectorAll('.plot h4')].map(h => h.title)")
+    short = browser.execute_script("return [...document.querySelectorAll('.plot h4')].map(h => h.textContent)")
+    assert all(name.startswith(part) and part for name, part in zip(whole, short, strict=True))
+    assert len(set(short[:36])) == 36  # what is left of the names tells them apart
     assert errors(browser) == []
 
 

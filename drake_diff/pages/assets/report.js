@@ -207,16 +207,16 @@
       found.push(`${plot.x.length} of ${plot.points} points: the lowest and highest of each stretch`);
     return found;
   }
-  function commonEnd(plots) {  // "_joint_q", where all of many titles end so
+  function commonEnd(plots) {  // "_joint_q", where most of many titles end as the last one does
     const ends = plots.map((p) => (/(_[A-Za-z]{1,12}){1,3}$/.exec(p.title) || [""])[0].split("_").slice(1));
-    let count = 0;
-    const part = (words) => words[words.length - 1 - count];
-    while (plots.length > 4 && ends.every((words) => words.length > count && part(words) === part(ends[0]))) count++;
-    const end = count ? "_" + ends[0].slice(-count).join("_") : "";
-    return plots.every((p) => p.title.length > end.length) ? end : "";
+    const final = ends[ends.length - 1];
+    const share = (n) => ends.filter((words) => words.slice(-n).join("_") === final.slice(-n).join("_")).length / plots.length;
+    let count = plots.length > 4 ? final.length : 0;
+    while (count && share(count) < 0.6) count--;
+    return count ? "_" + final.slice(-count).join("_") : "";
   }
   function draw(plot, place, { named, height, end }) {
-    const title = make("h4", { title: plot.title }, plot.title.slice(0, plot.title.length - end.length)), values = make("p", { class: "values" });
+    const title = make("h4", { title: plot.title }, end && plot.title.endsWith(end) && plot.title !== end ? plot.title.slice(0, -end.length) : plot.title), values = make("p", { class: "values" });
     const box = make("div", { class: "plot", role: "group", "aria-label": summary(plot) },
       make("div", { class: "head" }, title, csvButton(plot.title, [plot])), values);
     place.append(box);
