@@ -27,6 +27,11 @@ ARM = f"""<robot name="arm"><link name="base"/>{ROD.format(name="upper")}{ROD.fo
 <joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0 0 -0.5"/>
 <axis xyz="0 1 0"/><limit lower="-2.5" upper="2.5" effort="20" velocity="4"/></joint></robot>"""
 
+SLIDE = """<robot name="slide"><link name="base"/><link name="block"><inertial><mass value="2"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="slide" type="prismatic"><parent link="base"/><child link="block"/><axis xyz="1 0 0"/>
+<limit lower="-1" upper="1" {limits}/></joint></robot>"""
+
 
 @pytest.fixture
 def arm(tmp_path):
@@ -152,3 +157,20 @@ def test_the_command_leads_around(arm, tmp_path):
     assert dd.verify(tmp_path / "out").verdict == "holds"
     qs = dd.read_trace(tmp_path / "out" / "trace.mcap").xs[:, :2]
     assert np.min(distance(qs, np.array([-0.45, 0, -0.83]))) >= 0.08  # at the knots
+
+
+@pytest.mark.slow
+def test_a_least_time_is_that_of_full_force_one_way_and_then_the_other(tmp_path):
+    """A slide of 2 kg, 4 N, from 0 to 0.5 m: T = 2 sqrt(d m / F), to what intervals and a tolerance cost."""
+    path = tmp_path / "slide.urdf"
+    path.write_text(SLIDE.format(limits='effort="4" velocity="100"'))
+    done = plan(path, goals={"slide": 0.5}, time="least", out=tmp_path / "out")
+    assert done.success, done.lines
+    assert 1.0 <= done.solution.horizon / (2 * np.sqrt(0.5 * 2 / 4)) <= 1.02
+
+
+def test_without_limits_there_is_no_least_time(tmp_path):
+    path = tmp_path / "slide.urdf"
+    path.write_text(SLIDE.format(limits=""))
+    with pytest.raises(InputError, match=r"least.*no limit of slide"):
+        plan(path, goals={"slide": 0.5}, time="least", out=tmp_path / "out")

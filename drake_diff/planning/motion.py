@@ -1,6 +1,6 @@
 """Motions to begin a search with: smooth ones of driven joints with their inputs, and those that a controller makes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,6 +43,13 @@ class Guess:
     def num_steps(self) -> int:
         """The number of steps."""
         return len(self.us)
+
+    def in_steps(self, count: int) -> "Guess":
+        """The same motion at `count` + 1 even times, for a search whose horizon is free."""
+        now, then = np.linspace(0, 1, count + 1), np.linspace(0, 1, len(self.xs))
+        xs = np.array([np.interp(now, then, column) for column in self.xs.T]).T
+        us = np.array([np.interp((now[1:] + now[:-1]) / 2, (then[1:] + then[:-1]) / 2, c) for c in self.us.T]).T
+        return replace(self, xs=xs, us=us)
 
 
 def speed_limits(model: Model) -> Array:

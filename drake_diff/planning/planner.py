@@ -40,8 +40,10 @@ from drake_diff.record.solve import EvidenceRecord
 TIMES = (None, "least")
 TRIED_TWICE = 36  # velocities: of a larger robot on its feet a second goal would take half a minute more
 SMALL = 7  # velocities: of a larger robot any smooth motion will do, as its best one takes minutes
-FASTER = (0.2, 2.0)  # of the first guess's duration: the range of a least time
+FASTER = (0.02, 2.0)  # of the first guess's duration: the range of a least time
 SPEED_WEIGHT = 0.01  # of a speed against an effort, both as shares of their limits
+FEW = 40  # steps of a least time, which is refined: a slow guess has more than a fast motion needs
+FINE, COARSE = 1e-5, 1e-4  # errors of an interval; inputs that jump need ever more intervals for less
 BESIDE = 0.05  # [rad or m] the range of each joint around a guess that a motion is kept near
 LOOKS = 3  # of the ten places in each step, those at which overlap is looked for are so many apart
 BUDGET, BUDGET_OF_LEAST = 40.0, 120.0  # [s] on the clock, of one attempt: another one needs no search
@@ -286,6 +288,8 @@ def _of_standing(robot: Robot, standing: tuple[Legged, Rest], task: Task, seed: 
 
 def _of_driven(robot: Robot, task: Task, least: str | None, seed: int) -> Iterator[_Attempt]:
     """A robot whose every smooth motion can be driven: from each posture that keeps the goals, the best guess first."""
+    if least:
+        _check_that_limits_bound_time(robot.model)
     space = Space.of(robot, task.avoid)
     for target in postures(robot, task, seed):
         guesses = _guesses(space, target, seed)
@@ -294,6 +298,15 @@ def _of_driven(robot: Robot, task: Task, least: str | None, seed: int) -> Iterat
                 yield _collocated(robot, task, guess, least)
             if not least:
                 yield _feasible(robot, task, guess)
+
+
+def _check_that_limits_bound_time(model: Model) -> None:
+    """InputError where joints are as fast as one likes: without limits of effort or of speed there is no least time."""
+    fast = [v.name for v in model.contract.velocities if not v.lower < v.upper or np.isinf([v.lower, v.upper]).any()]
+    strong = [u.name for u in model.contract.inputs if np.isinf([u.lower, u.upper]).any()]
+    if fast and strong:
+        got = f"no limit of {', '.join(fast[:4])} nor of {', '.join(strong[:4])}"
+        raise InputError('time="least"', got=got, expected="limits of every speed or of every motor in the file")
 
 
 def _guesses(space: Space, target: Array, seed: int) -> list[Guess]:
@@ -317,11 +330,12 @@ def _collocated(robot: Robot, task: Task, guess: Guess, least: str | None) -> _A
     asked: dict[str, Any] = {"running_cost": _effort(model)}
     if least:
         whole = guess.num_steps * model.time_step
+        guess = guess.in_steps(min(guess.num_steps, FEW))
         asked = {"running_cost": 1.0, "horizon": (FASTER[0] * whole, FASTER[1] * whole)}
     problem = _problem(task, guess, x1, **asked)
     what = "least time" if least else "least effort"
-    limit = BUDGET_OF_LEAST if least else BUDGET
-    options = {"method": "collocation", "refine": True, "error_tolerance": 1e-5, "time_limit": limit}
+    error, limit = (COARSE, BUDGET_OF_LEAST) if least else (FINE, BUDGET)
+    options = {"method": "collocation", "refine": True, "error_tolerance": error, "time_limit": limit}
     name = f"{what} from {guess.name}"
     near = replace(problem, bounds=_bounds(model, guess.xs[:, : model.nq]))
     instead = _Attempt(f"{name}, near it", robot, near, guess, options)
