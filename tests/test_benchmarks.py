@@ -261,3 +261,31 @@ def test_trust_counts_a_part_and_refuses_one_that_it_does_not_have(tmp_path):
     done = subprocess.run([*trust, "hope"], capture_output=True, text=True)
     assert done.returncode == 2
     assert "unknown part 'hope'" in done.stderr
+
+
+TAKEN = {"drake": True, "joints": 6, "free": 0, "loaded": True}
+
+
+@each_row(
+    "name, row, kind",
+    [
+        ("arm.urdf", {}, "robot"),
+        ("arm.urdf", {"loaded": False}, "robot"),  # whatever we say of it
+        ("mended.urdf", {"drake": False, "joints": 0}, "robot"),
+        ("broken.urdf", {"drake": False, "loaded": False}, "refused"),
+        ("box.sdf", {"joints": 0, "free": 6}, "thing"),
+        ("quadrotor_base.urdf", {"joints": 0, "free": 6}, "robot"),
+        ("ground.urdf", {"joints": 0}, "still"),
+    ],
+)
+def test_the_zoo_counts_what_drake_takes_by_drakes_word(part, name, row, kind):
+    assert part("zoo").counts(name, TAKEN | row) == kind
+
+
+def test_the_zoo_asks_drake_alone(part, tmp_path):
+    zoo, broken = part("zoo"), tmp_path / "broken.urdf"
+    broken.write_text("<robot name='broken'><joint/></robot>")
+    models = Path(__file__).parents[1] / "models"
+    assert zoo.alone(models / "cart_pole.urdf") == (True, 2, 0)
+    assert zoo.alone(models / "quadrotor.urdf") == (True, 0, 6)
+    assert zoo.alone(broken) == (False, 0, 0)
