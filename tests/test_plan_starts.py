@@ -201,3 +201,22 @@ def test_a_cart_in_its_rails_goes_without_contact(tmp_path):
 
 
 LIMIT_OF_THE_SLIDE = 'lower="-1" upper="1" effort="20" velocity="5"'
+
+
+def test_a_robot_that_can_go_nowhere_is_refused_and_not_planned_for(tmp_path):
+    """Two balls that overlap but for 0.01 rad about the start: a plan that stays there would be none."""
+    ball = '<sphere radius="0.25"/>'
+    posts = [
+        part
+        for name, side in (("left", 1.0), ("right", -1.0))
+        for part in (
+            link(name, at=f"0.502 0 {side * 0.5}", shape=ball),
+            joint(f"{name}_still", "world", name, kind="fixed"),
+        )
+    ]
+    limit = 'lower="-1.2" upper="1.2" effort="50" velocity="3"'
+    path = robot(
+        tmp_path, *posts, link("arm", at="0.502 0 0", shape=ball), joint("shoulder", "world", "arm", limit=limit)
+    )
+    with pytest.raises(ModelError, match="no posture to go to"):
+        plan(path, out=tmp_path / "out")

@@ -18,20 +18,20 @@ TOUCHING = 1e-4  # [m] of overlap: less is none
 HELD = 0.63  # of the effort limits: what a start may need to be held
 SEEN = 16  # postures in which a pair of shapes overlaps before it is said to do so always
 ROOM, BESIDE = 0.1, 6  # [rad or m] that all joints can move at once from a start, in so many ways at random
-ATTEMPTS, FINER = 60, 400  # at a start: drawn ever farther from the file's, and near the best so far
+ATTEMPTS, FINER = 60, 1000  # at a start: drawn ever farther from the file's, and near the best so far
 DEPTH = 0.01  # [m] of overlap that weighs as much as all that the motors have
 Pair = tuple[str, str]
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A posture q (nq,), its deepest overlap [m] and what it takes of the effort limits.
+    """A posture q (nq,), the sum of its overlaps [m] and what it takes of the effort limits.
 
     `always` are the pairs of shapes that overlap in every posture that was seen, which are not looked at.
     """
 
     q: Array
-    depth: float
+    overlap: float
     load: float
     always: frozenset[Pair]
 
@@ -58,7 +58,9 @@ def start(
 
     def measured(q: Array) -> Start:
         load = 0.0 if driven is None else share_to_hold(driven, q)
-        return Start(q, 0.0 if shapes is None else deepest(shapes, q, always), load, always)
+        found = {} if shapes is None else _overlaps(shapes, q)
+        overlap = sum(depth for pair, depth in found.items() if pair not in always and depth > TOUCHING)
+        return Start(q, overlap, load, always)
 
     def has_room(q: Array) -> bool:
         beside = [q + np.where(one, random.choice([-ROOM, ROOM], len(q)), 0.0) for _ in range(BESIDE)]
@@ -71,7 +73,7 @@ def start(
         if _badness(best) == 0:
             if has_room(best.q):
                 break
-            tight, best = tight or best, replace(best, depth=np.inf)  # unless all others are worse
+            tight, best = tight or best, replace(best, overlap=np.inf)  # unless all others are worse
         if i < ATTEMPTS:
             part = (i + 1) / ATTEMPTS
             q = np.where(one, first + part * (random.uniform(lower + margin, upper - margin) - first), first)
@@ -84,8 +86,7 @@ def start(
 
 
 def _badness(found: Start) -> float:
-    overlap = found.depth if found.depth > TOUCHING else 0.0
-    return overlap / DEPTH + max(0.0, found.load - HELD)
+    return found.overlap / DEPTH + max(0.0, found.load - HELD)
 
 
 def pairs_always(tried: list[Array], shapes: Model | None) -> frozenset[Pair]:

@@ -86,7 +86,7 @@ def postures(robot: Robot, task: Task, seed: int) -> list[Array]:
     """
     random, space = np.random.default_rng([seed, 1]), Space.of(robot, task.avoid)
     if task.is_free:
-        return [_random_posture(space, random) for _ in range(RANDOM)]
+        return _random_goals(space, random)
     start, fixed = robot.q.copy(), np.zeros(robot.model.nq, dtype=bool)
     for at, value in task.joints.items():
         start[at], fixed[at] = value, True
@@ -149,13 +149,24 @@ def _reached(robot: Robot, task: Task, q: Array, fixed: Array) -> tuple[Array, f
     return q, off
 
 
-def _random_posture(space: Space, random: np.random.Generator) -> Array:
-    """Some way off the start, inside the limits, where nothing is touched and the motors hold the weight."""
+def _random_goals(space: Space, random: np.random.Generator) -> list[Array]:
+    """Some of those; ModelError where none is found."""
+    drawn = [_random_posture(space, random) for _ in range(RANDOM)]
+    found = [q for q in drawn if q is not None]
+    if not found:
+        told = "no posture to go to was found: none that was drawn is clear of all shapes and held by the motors"
+        raise ModelError(f"{told}: give a goal")
+    return found
+
+
+def _random_posture(space: Space, random: np.random.Generator) -> Array | None:
+    """Some way off the start, inside the limits, where nothing is touched and the motors hold the weight, best within
+    HELD; None where none of those drawn is."""
     robot = space.robot
     far = speed_limits(robot.model) * SOON / PEAK
     reach = np.minimum(MOVE * (robot.upper - robot.lower), far)
     margin = 0.2 * MOVE * (robot.upper - robot.lower)
-    best, least = robot.q, np.inf
+    best, least = None, 1.0
     for i in range(DRAWS):
         part = NEARER ** (i // (DRAWS // 5))  # some robots can only hold what is near
         q = robot.q + part * random.uniform(-1, 1, len(reach)) * reach
