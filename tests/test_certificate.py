@@ -436,3 +436,19 @@ def test_a_row_of_rounding_alone_is_zero():
         f = lambda x, size=size: np.array([10 * x[0], size * np.sin(x[1])])  # noqa: E731
         zero = np.array([[10.0, 0.0], [0.0, 0.0]])
         assert dd.certificates.certify_jacobian(f, np.zeros(2), zero).verdict == verdict_of_zero
+
+
+def test_what_does_not_agree_at_a_joint_limit_says_so(tmp_path):
+    """A pendulum that rests exactly at its lower limit: pushed one way it moves, the other way it does not."""
+    (tmp_path / "arm.urdf").write_text(
+        '<robot name="arm"><link name="rod"><inertial><origin xyz="0 0 -1"/><mass value="1"/>'
+        '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="hinge" '
+        'type="revolute"><parent link="world"/><child link="rod"/><axis xyz="0 1 0"/>'
+        '<limit effort="7" velocity="1" lower="0" upper="2"/></joint></robot>'
+    )
+    model = dd.load_model(tmp_path / "arm.urdf", time_step=0.01)
+    found = dd.certify(model, [0.0, 0.0], [])
+    assert found.verdict == "discontinuous"
+    assert "joint limits act: hinge_q is 0, at its limits [0, 2]" in found.told
+    inside = dd.certify(model, [1.0, 0.0], []).require()
+    assert "limits" not in inside.told

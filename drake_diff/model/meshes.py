@@ -19,6 +19,7 @@ from pydrake.multibody.parsing import PackageMap
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_diff.exceptions import ModelError
+from drake_diff.model.robot_text import DOWNLOADED
 from drake_diff.model.sphere_fit import Spheres, fit_spheres
 from drake_diff.model.triangles import OF_MUJOCO, READ_BY_TRIMESH, Hull, as_obj, hull_of_file, read_mesh
 from drake_diff.model.xml_text import Element, XmlText
@@ -26,7 +27,6 @@ from drake_diff.model.xml_text import Element, XmlText
 TREATMENTS = ("skip", "convex", "spheres")
 NOT_OBJ = tuple(ending for ending in READ_BY_TRIMESH if ending != ".obj")  # Drake reads no other in MJCF
 USABLE_MESHES = (".obj", ".vtk", ".gltf", ".glb")  # by Drake
-DOWNLOADED = "drake_models"  # the package that Drake's parser would fetch from the network
 PLACEHOLDER = 1.2345678e-9  # [m] the radius of the first; no file has such a sphere
 MOST_TOLD = 12  # in a note; links with the same file and scale count once
 
