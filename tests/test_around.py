@@ -10,8 +10,8 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.cli.main import main
-from drake_diff.exceptions import InputError
-from drake_diff.planning import plan
+from drake_diff.exceptions import InputError, MissingDependencyError
+from drake_diff.planning import around, plan
 from drake_diff.planning.around import Line, Space, lines
 from drake_diff.planning.robot import load_robot
 
@@ -83,6 +83,15 @@ def test_what_a_space_lacks_is_the_closed_form(arm):
     space = Space.of(robot, [dd.SphereObstacle(center, 0.08, margin=0.02)])
     qs = random.uniform(-2, 2, (200, 2))
     assert space.lacking(qs) == pytest.approx(0.02 + 0.08 - distance(qs, center), abs=1e-9)
+
+
+def test_where_no_bent_line_is_clear_and_ompl_is_missing_it_is_asked_for(arm, monkeypatch):
+    robot = load_robot(arm, 0)
+    space, target = Space.of(robot, [dd.SphereObstacle([-0.45, 0, -0.8], 0.08)]), np.array([1.0, 0.0])
+    monkeypatch.setattr(around, "find_spec", lambda name: None)
+    monkeypatch.setattr(around, "BENDS", 0)
+    with pytest.raises(MissingDependencyError, match="pip install ompl"):
+        lines(space, target, 0)
 
 
 def test_the_same_seed_finds_the_same_lines(arm):

@@ -6,6 +6,7 @@ they lead to is checked as any other plan.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from pydrake.math import BsplineBasis
 from pydrake.trajectories import BsplineTrajectory
 
 from drake_diff._base.arrays import Array
+from drake_diff.exceptions import MissingDependencyError
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, Obstacle, clearances
 from drake_diff.planning.posture import TOUCHING
 from drake_diff.planning.robot import Robot
@@ -94,22 +96,26 @@ class Line:
 def lines(space: Space, target: Array, seed: int) -> list[Line]:
     """Lines from where the robot starts to `target` (nq,), the best first.
 
-    The straight one if it is clear; else bent ones that are; else what searches find, which may be nothing; else the
-    straight one, for a solver to push out of the way.
+    The straight one if it is clear; else the shortest bent ones that are, and of those that searches find; else the
+    straight one, for a solver to push out of the way. MissingDependencyError where only a search could help, without
+    OMPL.
     """
     robot = space.robot
     straight = Line("a straight line in the joints", np.array([robot.q, target]))
     if space.is_free(straight.postures):
         return [straight]
     random = np.random.default_rng([seed, 3])
-    found = []
+    can_search, found = find_spec("ompl") is not None, []
+    bent = "a bent line" if can_search else "a bent line (no search: ompl is not installed)"
     for i in range(BENDS):
         pull = WIDTH * (i + 1) / BENDS * random.uniform(-1, 1, len(target)) * (robot.upper - robot.lower)
         middle = np.clip((robot.q + target) / 2 + pull, robot.lower, robot.upper)
-        line = Line("a bent line", np.array([robot.q, middle, target]))
+        line = Line(bent, np.array([robot.q, middle, target]))
         if space.is_free(line.postures):
             found.append(line)
-    searched = [_searched(space, target, seed + i) for i in range(SEARCHES)]
+    if not (can_search or found):
+        raise MissingDependencyError("a way around what is in the way needs a search: pip install ompl")
+    searched = [_searched(space, target, seed + i) for i in range(SEARCHES if can_search else 0)]
     found += [line for line in searched if line is not None]
     return sorted(found, key=lambda line: line.length)[:KEPT] or [straight]
 
