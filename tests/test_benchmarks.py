@@ -263,7 +263,7 @@ def test_trust_counts_a_part_and_refuses_one_that_it_does_not_have(tmp_path):
     assert "unknown part 'hope'" in done.stderr
 
 
-TAKEN = {"drake": True, "joints": 6, "free": 0, "loaded": True}
+TAKEN = {"drake": True, "joints": 6, "free": 0, "loaded": True, "flies": False}
 
 
 @each_row(
@@ -274,6 +274,7 @@ TAKEN = {"drake": True, "joints": 6, "free": 0, "loaded": True}
         ("mended.urdf", {"drake": False, "joints": 0}, "robot"),
         ("broken.urdf", {"drake": False, "loaded": False}, "refused"),
         ("box.sdf", {"joints": 0, "free": 6}, "thing"),
+        ("wall.sdf", {"drake": False, "joints": 0, "flies": True}, "thing"),
         ("quadrotor_base.urdf", {"joints": 0, "free": 6}, "robot"),
         ("ground.urdf", {"joints": 0}, "still"),
     ],

@@ -147,10 +147,10 @@ def counts(name: str, row: dict[str, object]) -> str:
     """A "robot", a "thing" (a single body without a joint), or why it does not count: "refused", "still"."""
     if not row["drake"] and not row["loaded"]:
         return "refused"
-    if row["drake"] and not row["joints"]:
-        drone = any(word in name for word in DRONES)
-        return "still" if not row["free"] else "robot" if drone else "thing"
-    return "robot"
+    if row["drake"] and not row["joints"] and not row["free"]:
+        return "still"
+    single = not row["joints"] if row["drake"] else row["flies"]  # where Drake does not read it, by what was told
+    return "thing" if single and not any(word in name for word in DRONES) else "robot"
 
 
 def told(rows: dict[str, dict[str, object]]) -> list[str]:
