@@ -52,7 +52,7 @@ plant = MultibodyPlant(0.01)
 parser = Parser(plant)
 path = Path(sys.argv[1]).resolve()
 for name in set(re.findall("package://([^/]+)/", path.read_text(errors="replace"))):
-    for folder in (folder for folder in path.parents if folder.name == name):
+    for folder in [folder for folder in path.parents if folder.name == name][:1]:
         parser.package_map().Add(name, str(folder))
 parser.AddModels(sys.argv[1])
 plant.Finalize()
