@@ -4,7 +4,7 @@ A motion that exists at one step size or in one approximation of contact only is
 of the plant holds if the inputs, open loop or with TVLQR feedback about the plan, reach the goal and keep all limits:
 an unstable motion diverges open loop however right it is, and feedback through contact can do harm. A discrete plan has
 to hold at h, h/2 and h/8; a collocated one, whose interval need not be a step that the simulator can take, at two
-successive ones of h, h/2, ... h/16. Under feedback less is allowed, since the end then depends on its weights too.
+successive ones of h, h/2, ... h/64. Under feedback less is allowed, since the end then depends on its weights too.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -39,7 +39,9 @@ ENERGY_TOLERANCE = 0.1  # of the energy that the motion exchanges: what no force
 PENETRATION_PART = 0.25  # of the thinnest geometry's thickness: beyond half of it contact may push out the other way
 OTHER_APPROXIMATION = {"sap": "lagged", "similar": "sap", "lagged": "sap", "tamsi": "sap"}
 FINE = 8  # parts of a step: what is left of an error of O(h) from there on is a seventh of what is seen up to there
-FINEST = 16  # intervals are cut into at most that many steps
+# Intervals are cut into at most that many steps: a hand that is to be within 5 mm at 1 m/s needs those of 5 ms and less.
+FINER, FINEST = 16, 64
+MOST_STEPS = 4000  # of a replay in more than FINER parts of an interval
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -121,7 +123,8 @@ def replays(plan: Plan) -> tuple[Replay, ...]:
         found += _replay_step(plan, parts)
         if not plan.continuous:
             found += _replay_step(plan, FINE)
-        while plan.continuous and parts < FINEST and not (_holds(found[-2:]) and _holds(found[-4:-2])):
+        most = finest_parts(plan)
+        while plan.continuous and parts < most and not (_holds(found[-2:]) and _holds(found[-4:-2])):
             parts *= 2
             found += _replay_step(plan, parts)
         contact = model.contract.contact
@@ -129,6 +132,11 @@ def replays(plan: Plan) -> tuple[Replay, ...]:
             other = OTHER_APPROXIMATION[contact.approximation]
             found += _replay_in(plan, f"with {other} contact", lambda: model.with_contact(other), 1)
     return tuple(found)
+
+
+def finest_parts(plan: Plan) -> int:
+    """In how many steps an interval of a collocated plan is cut at most."""
+    return min(FINEST, max(FINER, MOST_STEPS // plan.problem.num_steps))
 
 
 def _replay_step(plan: Plan, parts: int) -> list[Replay]:

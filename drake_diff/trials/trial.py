@@ -30,7 +30,7 @@ from drake_diff.loop.run import ClosedLoop, Controller, Loop, OpenLoop, closed_l
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space
-from drake_diff.optimize.replay import FINEST, Plan, came_too_near, left_bounds, missed_goal, too_deep, track
+from drake_diff.optimize.replay import Plan, came_too_near, finest_parts, left_bounds, missed_goal, too_deep, track
 from drake_diff.record.parts import Label
 from drake_diff.trials.perturbation import Setup, perturbed
 
@@ -80,7 +80,7 @@ class Task:
     """A plan to be followed: its controller, made on the plant as planned, and how a run of it is judged.
 
     `controller` is as `robustness` takes it. Its period is the longest of the plan's interval and its halves, quarters
-    ... 16ths in which the unperturbed run succeeds. It is the interval itself where none does, and for MPC.
+    ... 64ths in which the unperturbed run succeeds. It is the interval itself where none does, and for MPC.
     """
 
     def __init__(self, plan: Plan, controller: str | MPC | MakeController = "tvlqr", loop: Loop | None = None):
@@ -90,7 +90,7 @@ class Task:
         self.judged_by = "the plan's end" if np.all(np.isnan(plan.problem.goal)) else "the goal"
         self._use(1)
         parts, can_be_finer = 1, plan.continuous and controller != "mpc" and not isinstance(controller, MPC)
-        while not self.nominal.success and can_be_finer and parts < FINEST:
+        while not self.nominal.success and can_be_finer and parts < finest_parts(plan):
             parts *= 2
             self._use(parts)
         if not self.nominal.success and parts > 1:

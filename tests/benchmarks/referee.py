@@ -1,7 +1,8 @@
 """What a plan really does, by pydrake alone: its own Simulator, error-controlled or in finer steps, and its own TVLQR.
 
 A plan is true if the plant, under its inputs or with feedback about them, cut off at their limits, ends at the goal
-and stays within the bounds, to `tolerance` of each state's range (at least a fifth of the largest of its kind).
+and stays within the bounds, to `tolerance` of each state's range (at least a fifth of the largest of its kind). What
+else is asked of it are its `asks`: (name, function of the times and states, most allowed).
 """
 
 import numpy as np
@@ -30,7 +31,9 @@ def state_of(context):
     return getattr(context, names[context.has_only_continuous_state()])()
 
 
-def simulate(plan, step, times, gains):  # (S, nx) the states that the plant with `step` [s] (0: continuous) takes
+def simulate(
+    plan, step, times, gains
+):  # (S,) [s], (S, nx): what the plant with `step` [s] (0: continuous) goes through
     builder, seen, (system, port_in, port_out) = DiagramBuilder(), [], plan["build"](step)
     system, control = builder.AddSystem(system), builder.AddSystem(Control(plan, times, gains))
     builder.Connect(control.get_output_port(), system.get_input_port(port_in))
@@ -39,9 +42,9 @@ def simulate(plan, step, times, gains):  # (S, nx) the states that the plant wit
     own = system.GetMyContextFromRoot(simulator.get_mutable_context())
     state_of(own).SetFromVector(plan["x"](0.0))
     ResetIntegratorFromFlags(simulator, "runge_kutta3", times[1]).set_target_accuracy(1e-7)
-    simulator.set_monitor(lambda _: seen.append(state_of(own).CopyToVector()) and None)
+    simulator.set_monitor(lambda root: seen.append([root.get_time(), *state_of(own).CopyToVector()]) and None)
     simulator.AdvanceTo(times[-1] - step / 2)  # a step begins at each multiple of it
-    return np.array(seen)
+    return np.array(seen)[:, 0], np.array(seen)[:, 1:]
 
 
 def regulator(plan, step, times, scale):  # gains at `times` by Riccati's recursion, from the plant's linearizations
@@ -70,11 +73,14 @@ def judge(plan, step, tolerance):
         return f"input beyond its bound by {beyond:.2g} of its range", np.inf
     best = np.inf, "no motion"
     for control in ("open loop", "TVLQR"):
-        xs = simulate(plan, step, times, None if control == "open loop" else regulator(plan, step, times, scale))
+        at, xs = simulate(plan, step, times, None if control == "open loop" else regulator(plan, step, times, scale))
         excess = np.maximum(plan["x_lower"] - xs, xs - plan["x_upper"])[1:].max(axis=0)
         missed = np.where(np.isnan(plan["goal"]), 0, np.abs(xs[-1] - plan["goal"]))
         worst = float(np.nan_to_num(np.maximum(missed, excess) / scale, nan=np.inf).max())
-        if worst <= tolerance:
+        found = [(name, miss(at, xs), allowed) for name, miss, allowed in plan.get("asks", ())]
+        lacking = [f"{name}: {miss:.4g}, {allowed:g} allowed" for name, miss, allowed in found if not miss <= allowed]
+        if worst <= tolerance and not lacking:
             return "", worst
-        best = min(best, (worst, f"{control}, {step:g} s: {missed.round(4)} off, {excess.round(4)} beyond bounds"))
+        told = [f"{missed.round(4)} off, {excess.round(4)} beyond bounds"] * (worst > tolerance) + lacking
+        best = min(best, (max(worst, bool(lacking) * 1.0), f"{control}, {step:g} s: {'; '.join(told)}"))
     return best[1], best[0]

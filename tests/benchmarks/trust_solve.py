@@ -63,7 +63,8 @@ def touching(path):
     def build(step):
         builder = DiagramBuilder()
         plant, _ = AddMultibodyPlantSceneGraph(builder, step)
-        plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
+        if step:
+            plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
         plant.SetUseSampledOutputPorts(False)
         Parser(plant).AddModels(str(path))
         plant.Finalize()
