@@ -130,6 +130,23 @@ def test_pure_noise_is_not_passed():
     assert verdict(lambda x: random.standard_normal(1), 0.0) != "agree"
 
 
+def test_what_a_value_at_rest_does_not_depend_on_is_known_and_one_wrong_entry_is_seen():
+    """cos(x0) at 0 has no slope at all: beside it x1 counts, which changes nothing to the last bit."""
+
+    def f(x):
+        return np.array([np.cos(x[0]), x[1]])
+
+    right = np.array([[0.0, 0.0], [0.0, 1.0]])
+    certificate = dd.certificates.certify_jacobian(f, np.zeros(2), right)
+    assert certificate.verdict == "agree"
+    for entry in ((0, 0), (0, 1), (1, 0)):
+        wrong = right.copy()
+        wrong[entry] = 1e-3
+        assert dd.certificates.certify_jacobian(f, np.zeros(2), wrong).verdict != "agree"
+    hidden = dd.certificates.certify_jacobian(lambda x: np.array([1e20 + x[0], x[1]]), np.zeros(2), right)
+    assert hidden.verdict == "undecided"  # the slope is 1
+
+
 def test_a_large_offset_that_hides_the_derivative_is_undecided():
     """Next to 1e15 the rounding of the value is 0.1: no step resolves a slope of 1."""
     certificate = dd.certificates.certify_jacobian(lambda x: 1e15 + x, [0.0], [[1.0]])

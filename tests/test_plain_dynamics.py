@@ -278,3 +278,12 @@ def test_what_is_printed_fits_on_a_screen_and_is_escaped():
     assert "<i>" not in problem._repr_html_()
     assert "<b>" not in solution._repr_html_()
     assert MODELS.name not in repr(problem)
+
+
+def test_the_shortest_way_of_a_car_that_begins_along_an_axis_is_found():
+    """Dubins: two quarter turns of unit radius and 0.2 m between them; at heading 0 cos has no slope."""
+    car = dd.Dynamics(lambda x, u: [np.cos(x[2]), np.sin(x[2]), u[0]], 3, 1, u_lower=[-1], u_upper=[1])
+    problem = dd.Problem(car, x0=np.zeros(3), x_goal=[0, 2.2, np.pi], num_steps=30, horizon=(0.3, 20), running_cost=1.0)
+    solution = dd.solve(problem)
+    assert solution.success, solution.message
+    assert solution.horizon == pytest.approx(np.pi + 0.2, rel=1e-4)

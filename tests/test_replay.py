@@ -214,6 +214,25 @@ def test_a_collocated_plan_is_replayed_in_finer_steps_until_two_hold(write_urdf)
     assert all(any(r.holds for r in solution.replays if r.variant == v) for v in variants[-2:])
 
 
+def test_a_frame_that_has_to_be_exact_is_replayed_in_steps_that_are_fine_enough_for_it(write_urdf):
+    """x = t^2 under 2 N on 1 kg: in steps of h the simulator ends h further. 5 mm allow h/32, not h/16, of 0.1 s."""
+    fixed = dd.Bounds(u_lower=[2.0], u_upper=[2.0])  # feedback cannot help
+    goals = [dd.FrameGoal("block", [1, 0, 0])]
+    problem = block(write_urdf, time_step=0.1, count=10, bounds=fixed, goals=goals)
+
+    def sample(parts):
+        times = np.linspace(0, 1, 10 * parts + 1)
+        return np.column_stack([times**2, 2 * times]), np.full((10 * parts, 1), 2.0)
+
+    plan = Plan(problem, select(problem.model, ()), 0.1, sample, continuous=True)
+    found = replays(plan)
+    for parts in (1, 2, 4, 8, 16, 32, 64):
+        replay = by_name(found, f"in steps of {0.1 / parts:.4g} s", "open loop")
+        assert replay.motion.xs[-1, 0] == pytest.approx(1 + 0.1 / parts, rel=1e-9)
+        assert replay.holds == (parts >= 32)
+    assert not list(broken_variants(plan, found))
+
+
 def test_a_verdict_names_how_far_the_plan_ends_from_its_goal_and_what_is_allowed(write_urdf):
     """A block moved in steps of 0.05 s: held inputs in half the steps lead elsewhere by the closed form of the sums."""
     problem = block(write_urdf, x_goal=[1, 0])

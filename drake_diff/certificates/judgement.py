@@ -66,6 +66,9 @@ def judge(
     tells = TRUSTED * doubt <= POWER * size
     codes = np.full(a.shape, VERDICTS.index("undecided"))
     codes[(gap <= tolerance) & (noticeable <= POWER * size)] = VERDICTS.index("agree")
+    left_out = (a == 0) & _is_left_out(around) & (noticeable <= EXACT * np.abs(difference).max(initial=0))
+    codes[left_out] = VERDICTS.index("agree")
+    size = np.where(left_out, np.maximum(size, noticeable / POWER), size)  # nothing else tells what matters there
     codes[(gap > doubtful) & (tells | (gap > DOUBTLESS * tolerance))] = VERDICTS.index("disagree")
     reasons = _broken(around, a, difference, size)
     for j, why in _stairs(around, size).items():
@@ -76,6 +79,11 @@ def judge(
     for entry in reasons:
         codes[entry] = VERDICTS.index("discontinuous")
     return Judgement(difference, tolerance, noticeable, size, codes, reasons)
+
+
+def _is_left_out(around: Neighbourhood) -> Flags:
+    """(m, n) where the function does not depend on the variable: to the last bit it is the same at every step."""
+    return np.asarray(np.all((around.forward == 0) & (around.backward == 0), axis=0))
 
 
 def _nearest(around: Neighbourhood, a: Array, second: Scales | None) -> tuple[Array, Array]:

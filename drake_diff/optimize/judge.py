@@ -78,7 +78,13 @@ def may_be_too_coarse(solution: Solution) -> bool:
     agree = all(certificate.verdict == "agree" for certificate in solution.certificates)
     if not agree or not np.isfinite(solution.cost) or next(_infeasibilities(solution), ""):
         return False
-    return not solution.problem.has_model or next(_overlaps(solution, motion), "") == ""
+    return not overlaps(solution)
+
+
+def overlaps(solution: Solution) -> bool:
+    """Whether geometries overlap in a collocated motion, which leaves contact out."""
+    motion = solution.transcribed
+    return motion is not None and solution.problem.has_model and next(_overlaps(solution, motion), "") != ""
 
 
 def refused(draft: Solution, error: Exception) -> Solution:

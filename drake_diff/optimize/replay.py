@@ -39,7 +39,7 @@ ENERGY_TOLERANCE = 0.1  # of the energy that the motion exchanges: what no force
 PENETRATION_PART = 0.25  # of the thinnest geometry's thickness: beyond half of it contact may push out the other way
 OTHER_APPROXIMATION = {"sap": "lagged", "similar": "sap", "lagged": "sap", "tamsi": "sap"}
 FINE = 8  # parts of a step: what is left of an error of O(h) from there on is a seventh of what is seen up to there
-# Intervals are cut into at most that many steps: a hand that is to be within 5 mm at 1 m/s needs those of 5 ms and less.
+# Intervals are cut into at most that many steps: a hand that is to be within 5 mm at 1 m/s needs those of 5 ms.
 FINER, FINEST = 16, 64
 MOST_STEPS = 4000  # of a replay in more than FINER parts of an interval
 

@@ -19,11 +19,12 @@ from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.soft_contact import SoftContact
 from drake_diff.model.step import set_state
 from drake_diff.optimize.advice import advice
+from drake_diff.optimize.apart import is_kept_apart, kept_apart
 from drake_diff.optimize.drake_program import SOLVERS
 from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
 from drake_diff.optimize.ilqr.ilqr import check_problem, is_unconstrained, solve_ilqr
 from drake_diff.optimize.ilqr.through_contact import check_schedule, solve_continuation, solve_through_jumps
-from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, refused
+from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, overlaps, refused
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import lacking_between, swept
 from drake_diff.optimize.problem.problem import Problem
@@ -225,6 +226,7 @@ class Attempt:
     refine: bool | None = None
     refinement: MeshRefinement | None = None
     max_iterations: int | None = None
+    apart: bool = False  # whether links are kept from each other that nothing else keeps apart
 
 
 @dataclass(eq=False)
@@ -262,7 +264,9 @@ class _Task:
             "initial_guess": "default" if given is None else "given",
             "initial_guess_sha256": sha256(xs.tobytes() + us.tobytes()).hexdigest(),
         }
-        run = Run(problem, method, scheme, attempt.solver or DEFAULT_SOLVERS[method], limits, options, self.report)
+        searched = kept_apart(problem) if attempt.apart else None
+        solver = attempt.solver or DEFAULT_SOLVERS[method]
+        run = Run(problem, method, scheme, solver, limits, options, self.report, searched)
 
         def make() -> Solution:
             if self.on_start is not None:
@@ -319,6 +323,7 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
     if asked.method == "collocation":
         yield asked, given
         yield from _other_guesses(problem, asked, given, found)
+        yield from _kept_apart(problem, asked, found)
         return
     method, reason = choose_method(problem)
     first = dataclasses.replace(asked, method=method, reason=reason, solver=None if method == "ilqr" else asked.solver)
@@ -326,9 +331,11 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
     free = dataclasses.replace(asked, method="collocation", reason=told)
     if method == "ilqr" and _is_free_at_first(problem) and _is_possible(problem, free):
         yield free, given
+        yield from _kept_apart(problem, free, found)
     yield first, given
     if method == "collocation":
         yield from _other_guesses(problem, first, given, found)
+        yield from _kept_apart(problem, first, found)
     if found[-1].status is Status.NO_GRADIENT and method == "ilqr":
         yield Attempt("ilqr", "the guess has no gradient", continuation="auto"), given
     if method == "shooting" or not problem.has_model:
@@ -354,6 +361,15 @@ def _other_guesses(
         reason = f"no motion was found: another first guess ({number} of {OTHER_GUESSES})"
         begun = another_guess(problem, attempt.seed, number)
         yield dataclasses.replace(attempt, reason=reason, max_iterations=OTHER_ITERATIONS), begun
+
+
+def _kept_apart(problem: Problem, attempt: Attempt, found: list[Solution]) -> Iterator[tuple[Attempt, Any]]:
+    """A collocation whose links went through each other, from where it ended, with these kept apart."""
+    last = found[-1]
+    if attempt.solver == "snopt" or last.status is not Status.CONVERGED_NOT_VERIFIED or is_kept_apart(problem):
+        return
+    if overlaps(last):
+        yield dataclasses.replace(attempt, reason="links overlapped: they are kept apart", apart=True), last
 
 
 def _is_free_at_first(problem: Problem) -> bool:
@@ -451,6 +467,7 @@ class Run:
     limits: Limits
     options: dict[str, Any]
     report: Report | None
+    searched: Problem | None = None  # what is solved where that is more than what is asked
     start: float = field(default_factory=time.monotonic)
     certified: dict[bytes, Certificate] = field(default_factory=dict)  # by state, input and parameters
 
@@ -462,7 +479,7 @@ class Run:
         if self.solver == "snopt":
             return self._collocate_in_drake(guess)
         problem, limits, report = self.problem, self.limits, self.report
-        transcription = Transcription(problem, self.scheme)
+        transcription = Transcription(self.searched or problem, self.scheme)
         try:
             before = self._certify_equations(transcription.jacobian, guess.xs, guess.us)
         except (GradientError, SimulationError) as error:

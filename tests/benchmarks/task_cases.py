@@ -683,7 +683,7 @@ def car_follows_an_eight(random):
     rate = size * 2 * np.pi / time * np.column_stack([np.cos(angle), np.cos(2 * angle)])
     heading, speed = np.unwrap(np.arctan2(rate[:, 1], rate[:, 0])), np.hypot(*rate.T)
     wanted = np.column_stack([at, heading, speed])
-    cost = dd.optimize.TrackingCost((times, wanted), Q=np.diag([10.0, 10.0, 1.0, 1.0]), R=1e-3 * np.eye(2))
+    cost = dd.optimize.TrackingCost((times, wanted), Q=np.diag([10.0, 10.0, 1.0, 1.0]), R=0.05 * np.eye(2))
     limits = ([-ANY] * 4, [ANY] * 4), ([-2, -1.2], [2, 1.2])
     start = wanted[0] + random.uniform(-0.1, 0.1, 4)
     case = plain(bicycle, 4, 2, limits=limits, x0=start, goal=None, count=80, horizon=time, cost=cost, peer=False)

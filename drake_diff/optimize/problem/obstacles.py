@@ -327,6 +327,19 @@ class SelfCollision(Obstacle):
         kept = [pair for pair in pairs if frozenset(p.body for p in pair) not in touching]
         return self.constraints(OfPairs(model, _placing(model), kept), self.margin, "clear of itself", "")
 
+    def apart_but_at(self, model: Model, xs: Array) -> tuple[ClearanceConstraint, ...]:
+        """What keeps all pairs of `model` apart but those that are nearer than the margin at one of xs (K, nx).
+
+        What stands for a link contains its shapes and sticks out of some: what is near there need not touch.
+        """
+        placing, (pairs, _) = _placing(model), self._pairs(model)
+        if not pairs:
+            return ()
+        near = np.any(OfPairs(model, placing, pairs).values(xs) < self.margin, axis=0)
+        touching = {frozenset((a.body, b.body)) for (a, b), close in zip(pairs, near, strict=True) if close}
+        kept = [pair for pair in pairs if frozenset(p.body for p in pair) not in touching]
+        return self.constraints(OfPairs(model, placing, kept), self.margin, "clear of itself", "")
+
     def left_out(self, model: Model) -> tuple[str, ...]:
         """The pairs of bodies of `model` that overlap by their shapes and are not kept apart: "a and b"."""
         return tuple(sorted(" and ".join(sorted(pair)) for pair in self._pairs(model)[1]))
