@@ -18,12 +18,14 @@ EXAMPLE = "panda"  # what `drake-diff plan` alone plans for
 
 Goals = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME=NUMBERS", help="hand=0.4,0,0.5 for a frame or body [m], elbow=1.0 for a joint."),
+    typer.Option(metavar="NAME=NUMBERS", help="hand=0.4,0,0.5 for a frame or body, in metres, elbow=1.0 for a joint."),
 ]
 
 Obstacles = Annotated[
     list[str] | None,
-    typer.Option(metavar="SHAPE:NUMBERS", help="sphere:x,y,z,radius or box:x,y,z,length,width,height [m]; repeatable."),
+    typer.Option(
+        metavar="SHAPE:NUMBERS", help="sphere:x,y,z,radius or box:x,y,z,length,width,height in metres; repeatable."
+    ),
 ]
 NUMBERS = {"sphere": 4, "box": 6}
 
