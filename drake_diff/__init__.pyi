@@ -50,6 +50,7 @@ from .optimize.problem.obstacles import BoxObstacle as BoxObstacle
 from .optimize.problem.obstacles import SelfCollision as SelfCollision
 from .optimize.problem.obstacles import SphereObstacle as SphereObstacle
 from .optimize.problem.problem import Problem as Problem
+from .optimize.sensitivity import sensitivity as sensitivity
 from .optimize.solution import Solution as Solution
 from .optimize.solution import Status as Status
 from .optimize.solve import solve as solve

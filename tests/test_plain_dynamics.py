@@ -165,7 +165,7 @@ def test_where_a_finer_mesh_fails_the_last_motion_is_kept(monkeypatch, refine):
     swing = dd.Dynamics(lambda x, u: [x[1], u[0] - 10 * np.sin(x[0])], nx=2, nu=1)
     problem = dd.Problem(swing, x0=[0, 0], x_goal=[np.pi, 0], num_steps=4, horizon=2.0, running_cost=EFFORT)
     coarse = dd.solve(problem, refine=False)
-    honest = Transcription._solve_on
+    honest = Transcription.solve_on
 
     def fails_later(self, mesh, *arguments):
         found = honest(self, mesh, *arguments)
@@ -174,7 +174,7 @@ def test_where_a_finer_mesh_fails_the_last_motion_is_kept(monkeypatch, refine):
         return dataclasses.replace(found, result=dataclasses.replace(found.result, outcome=Outcome.INFEASIBLE))
 
     with monkeypatch.context() as patched:
-        patched.setattr(Transcription, "_solve_on", fails_later)
+        patched.setattr(Transcription, "solve_on", fails_later)
         solution = dd.solve(problem, refine=refine, method="collocation")
     np.testing.assert_array_equal(solution.xs, coarse.xs)
     assert solution.status is dd.Status.CONVERGED_NOT_VERIFIED

@@ -20,7 +20,7 @@ PUBLIC = """
 Bounds BoxObstacle CenterOfMassGoal Constraint Dynamics FrameGoal FrameVelocityGoal JointGoal KeepLevel LQR Model PD
 Problem QuadraticCost Recording SelfCollision Solution SphereObstacle Status TVLQR audit certify certify_rollout compare
 contact_modes differentiate_rollout differentiate_step example_model linearize list_parameters load_model load_record
-model_from_diagram read_trace robustness rollout save smooth smooth_step solve step verify
+model_from_diagram read_trace robustness rollout save sensitivity smooth smooth_step solve step verify
 """.split()
 MOST = 58  # names at the root: more cannot be read as a table of contents
 

@@ -471,7 +471,7 @@ class Transcription:
         start, mesh = time.monotonic(), self.mesh
         first = float(np.clip(self.problem.start_horizon if horizon is None else horizon, *self.task.horizon))
         begun = self.nodes_at(mesh, guess)
-        motion = self._solve_on(mesh, begun, first, limits, report)
+        motion = self.solve_on(mesh, begun, first, limits, report)
         tolerance, most = (np.inf, MOST_INTERVALS) if refinement is None else (refinement.tolerance, refinement.most)
         rounds, near = [(len(mesh) - 1, motion.largest_error)], [_nearer(motion)]
         while motion.result.outcome in FOUND:
@@ -492,9 +492,9 @@ class Transcription:
             if entered:  # what goes through an obstacle is no place to go on from
                 now, then = (self.task.scheme.node_fractions(each) for each in (mesh, self.mesh))
                 nodes = np.array([np.interp(now, then, column) for column in begun.T]).T
-                motion = self._solve_on(mesh, nodes, first, left, report)
+                motion = self.solve_on(mesh, nodes, first, left, report)
             else:
-                motion = self._solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, left, report)
+                motion = self.solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, left, report)
             if motion.result.outcome not in FOUND and not entered:
                 motion = kept(last, motion)
                 break
@@ -518,11 +518,9 @@ class Transcription:
             return None
         if report is not None:
             report.say(f"what is found does not hold with {len(motion.mesh) - 1} intervals: refined to {len(mesh) - 1}")
-        return self._solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, limits, report)
+        return self.solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, limits, report)
 
-    def _solve_on(
-        self, mesh: Array, nodes: Array, horizon: float, limits: Limits, report: Report | None
-    ) -> Transcribed:
+    def solve_on(self, mesh: Array, nodes: Array, horizon: float, limits: Limits, report: Report | None) -> Transcribed:
         """IPOPT on one mesh, from `nodes` (K, nx + nu) and `horizon` [s]."""
         from drake_diff.optimize.transcription.program import NOT_FINITE, TranscribedProgram, solve_ipopt
 

@@ -1,0 +1,139 @@
+"""The derivative of an optimal plan: closed forms, whole solves again, and the corners at which there is none."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.table import each_row
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.optimize import sensitivity as module
+
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+
+
+def block(limit=np.inf, **asked):
+    """x'' = u from rest at 0 to rest at 1 in T = 1: u = 6 - 12 t."""
+    push = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1, u_lower=[-limit], u_upper=[limit])
+    rest = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 10, "horizon": 1.0, "running_cost": EFFORT}
+    return dd.Problem(push, **rest | asked)
+
+
+@each_row("scheme", ["hermite_simpson", "trapezoid"])
+def test_a_block_between_two_states_has_the_closed_forms_derivative(scheme):
+    """cost = 12 d^2 - 12 d (v0 + v1) + 4 (v0^2 + v0 v1 + v1^2), d the way and v0, v1 the speeds at the ends."""
+    solution = dd.solve(block(), scheme=scheme)
+    by_goal, by_x0 = dd.sensitivity(solution, "goal"), dd.sensitivity(solution, "x0")
+    exact = scheme == "hermite_simpson"  # of order 2 the other's is off by 4 % in ten intervals
+    np.testing.assert_allclose(by_goal.cost, [24, -12], rtol=1e-9 if exact else 0.05)
+    np.testing.assert_allclose(by_x0.cost, [-24, -12], rtol=1e-9 if exact else 0.05)
+    assert by_goal.verdict == by_x0.verdict == "agree"
+    t = solution.times
+    if exact:
+        np.testing.assert_allclose(by_goal.xs[:, 0, 0], 3 * t**2 - 2 * t**3, atol=1e-9)
+        np.testing.assert_allclose(by_goal.us[:, 0, 0], 6 - 12 * t[:-1], atol=1e-8)
+        np.testing.assert_allclose(by_goal.us[:, 0, 1], 6 * t[:-1] - 2, atol=1e-8)
+    np.testing.assert_allclose(by_x0.xs[0, :, :], np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(by_x0.xs[-1], 0.0, atol=1e-12)
+
+
+def test_least_time_with_a_limited_input_has_the_closed_forms_derivative():
+    """T = 2 sqrt(d): dT/dd = 1 / sqrt(d), with the input held by its limit in every interval."""
+    for way in (0.5, 1.0, 3.0):
+        problem = block(1.0, x_goal=[way, 0], num_steps=20, horizon=(0.1, 10), running_cost=1.0)
+        found = dd.sensitivity(dd.solve(problem), "goal")
+        assert found.horizon[0] == pytest.approx(1 / np.sqrt(way), rel=2e-3)  # the one interval of the switch
+        assert found.active >= 36
+        assert found.differences[0] < 1e-4
+
+
+def test_by_the_mass_of_a_block(write_urdf):
+    """u = m a: cost = 12 m^2 d^2 / T^3."""
+    problem = dd.Problem(
+        write_urdf(mass=1.5, time_step=0.1), x0=[0, 0], x_goal=[1, 0], num_steps=10, running_cost=EFFORT
+    )
+    found = dd.sensitivity(dd.solve(problem, method="collocation"), ["block.mass"])
+    assert found.columns == ("block.mass",)
+    assert found.cost[0] == pytest.approx(24 * 1.5, rel=1e-7)
+    np.testing.assert_allclose(found.us[:, 0, 0], 6 - 12 * np.arange(10) / 10, atol=1e-6)
+    assert found.verdict == "agree"
+
+
+@pytest.mark.slow
+@each_row("limit", [np.inf, 10.0])
+def test_a_swing_up_is_what_whole_solves_differ_by(limit):
+    """Solved again from a straight line by `solve` itself, on both sides; 1e-4 of each column is asked."""
+    model = dd.example_model("cart_pole", time_step=0.02)
+    asked = {"num_steps": 100, "running_cost": EFFORT, "bounds": dd.Bounds(u_lower=[-limit], u_upper=[limit])}
+    problem = dd.Problem(model, x0=[0] * 4, x_goal=[1, np.pi, 0, 0], **asked)
+    solution = dd.solve(problem, method="collocation", tolerance=1e-10)
+    found = dd.sensitivity(solution, "goal")
+    assert found.verdict == "agree", found
+    assert (found.active > 0) == np.isfinite(limit)
+    for i, step in enumerate(np.diag([2e-4] * 4)):
+        ends = []
+        for side in (-1, 1):
+            moved = replace(problem, x_goal=problem.x_goal + side * step)
+            ends.append(dd.solve(moved, method="collocation", tolerance=1e-10))
+        us, cost = ((getattr(ends[1], name) - getattr(ends[0], name)) / 4e-4 for name in ("us", "cost"))
+        assert found.cost[i] == pytest.approx(cost, abs=1e-4 * np.abs(found.cost).max())
+        np.testing.assert_allclose(found.us[..., i], us, atol=1e-4 * np.abs(us).max())
+
+
+def test_a_limit_that_is_touched_without_force_is_a_corner():
+    """u = 6 at both ends is just what the limit allows: a farther goal is held by it, a nearer one is not."""
+    found = dd.sensitivity(dd.solve(block(6.0)), "goal")
+    assert found.verdict == "discontinuous"
+    assert "u0 at node 0" in found.weak
+    assert dd.sensitivity(dd.solve(block(6.5)), "goal").verdict == "agree"
+    held = dd.sensitivity(dd.solve(block(5.0)), "goal")
+    assert held.verdict == "agree"
+    assert held.active > 0
+
+
+def test_a_constraint_that_holds_the_plan_is_kept():
+    """v <= 1.3 holds in the middle; a goal that is farther by 1 moves the middle by what the ends leave."""
+    slow = dd.Constraint(lambda x: x[1], upper=1.3, name="slow")
+    found = dd.sensitivity(dd.solve(block(constraints=slow, num_steps=20)), "goal")
+    held = found.solution.xs[:, 1] > 1.3 - 1e-6
+    assert held.any()
+    np.testing.assert_allclose(found.xs[held, 1, 0], 0.0, atol=1e-8)
+    assert found.differences[0] < 1e-4
+
+
+def test_a_wrong_derivative_is_told(monkeypatch):
+    """Planted: the Hessian of the inputs is off by 1 %, and a tenth of that."""
+    honest = module._System._hessian
+    for part in (0.01, 0.001):
+        with monkeypatch.context() as patched:
+            patched.setattr(
+                module._System,
+                "_hessian",
+                lambda self, y, part=part: honest(self, y) * (1 + part * np.linspace(0, 1, len(self.z))[:, None]),
+            )
+            found = dd.sensitivity(dd.solve(block()), "goal")
+        assert found.verdict == "disagree"
+        assert "differences of re-solves" in repr(found)
+    assert dd.sensitivity(dd.solve(block()), "goal", certified=False).verdict == "not certified"
+
+
+def test_what_has_no_sensitivity_is_refused(write_urdf):
+    model = write_urdf(time_step=0.1)
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=10, running_cost=EFFORT)
+    solution = dd.solve(problem, method="collocation")
+    for given, by, match in (
+        (problem, "x0", "solution: expected a Solution"),
+        (dd.solve(problem, method="ilqr"), "x0", "expected one by collocation"),
+        (dd.solve(block(3.9)), "x0", "expected one that is a success"),
+        (dd.solve(problem, method="collocation", scheme="drake"), "x0", "hermite_simpson or trapezoid"),
+        (solution, (), 'expected "x0", "goal", or names of parameters'),
+        (dd.solve(block(x_goal=None, final_cost=lambda x: (x[0] - 1) ** 2)), "goal", "all of its entries are free"),
+    ):
+        with pytest.raises(InputError, match=re.escape(match)):
+            dd.sensitivity(given, by)
+    with pytest.raises(UnknownNameError):
+        dd.sensitivity(solution, ["block.colour"])
+    with pytest.raises(UnknownNameError):
+        dd.sensitivity(dd.solve(block()), ["block.mass"])
