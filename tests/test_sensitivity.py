@@ -9,7 +9,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.optimize import sensitivity as module
+from drake_diff.optimize.transcription.kkt import HeldPlan
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
@@ -105,11 +105,11 @@ def test_a_constraint_that_holds_the_plan_is_kept():
 
 def test_a_wrong_derivative_is_told(monkeypatch):
     """Planted: the Hessian of the inputs is off by 1 %, and a tenth of that."""
-    honest = module._System._hessian
+    honest = HeldPlan._hessian
     for part in (0.01, 0.001):
         with monkeypatch.context() as patched:
             patched.setattr(
-                module._System,
+                HeldPlan,
                 "_hessian",
                 lambda self, y, part=part: honest(self, y) * (1 + part * np.linspace(0, 1, len(self.z))[:, None]),
             )

@@ -1,0 +1,200 @@
+"""The Karush-Kuhn-Tucker system of a collocated plan: how its variables change where the problem does.
+
+With the multipliers y of the rows that hold the plan z, the stationarity of the Lagrangian and these rows stay true as
+the problem changes by p, so that, the active set kept,
+
+    [ H  A' ] [ dz ]      [ d^2 L / dz dp ]
+    [ A  0  ] [ dy ]  = - [ dg / dp       ]
+
+(Fiacco, "Introduction to Sensitivity and Stability Analysis in Nonlinear Programming", 1983, ch. 3).
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_diff._base.arrays import Array, Indices
+from drake_diff.exceptions import ModelError
+from drake_diff.model.parameters import Parameters, applied, select
+from drake_diff.optimize.problem.dynamics import plant_dynamics
+from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.transcription.collocation import Collocated
+from drake_diff.optimize.transcription.expressions import knot_functions
+from drake_diff.optimize.transcription.program import TranscribedProgram
+
+NEAR_BOUND = 1e-4  # of max(1, |bound|): a value this near may lie on it: an interior point method leaves sqrt(mu)
+WEAK = 1e-4  # of the cost's largest slope: a smaller multiplier may hold nothing
+SINGULAR, REFINEMENTS = 1e-10, 4  # on the diagonal, of rows that say the same, and how often its error is taken out
+DIFFERENCE = 1e-5  # of max(1, |p|): of derivatives by a parameter of the model, which are exact by the state
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """What the problem changes by: entries of the first or last node, or parameters of the model."""
+
+    columns: tuple[str, ...]
+    values: Array  # (p,)
+    ends: Indices | None  # the entries of the state
+    end: str = ""
+    parameters: Parameters = ()
+
+    @contextmanager
+    def moved(self, problem: Problem, column: int, step: float) -> Iterator[Problem]:
+        """The problem with one column moved by `step`."""
+        if self.ends is None:
+            values = np.array(self.values)
+            values[column] += step
+            with applied(select(problem.model, self.parameters).at(values)) as model:
+                yield replace(problem, system=model)
+            return
+        first = self.end == "x0"
+        state = np.array(problem.x0 if first else problem.x_goal)
+        state[self.ends[column]] += step
+        yield replace(problem, x0=state) if first else replace(problem, x_goal=state)
+
+
+class HeldPlan:
+    """The Lagrangian's second derivatives and the rows that hold a solution, in the variables that nothing holds."""
+
+    def __init__(self, problem: Problem, motion: Collocated):
+        self.problem, self.motion, self.task = problem, motion, motion.task
+        functions = knot_functions(self.task)
+        if functions.why_not:
+            raise ModelError(f"{self.problem.name}: no second derivatives: {functions.why_not}")
+        self.program = program = TranscribedProgram(self.task, motion.mesh, functions)
+        self.z = program.pack(np.asarray(motion.nodes), motion.horizon)
+        self.derivatives = program.derivatives(exact=True)
+        self.slope = np.asarray(self.derivatives["grad_f"](self.z, [])[1]).ravel()
+        self.values, self.rows = self.derivatives["jac_g"](self.z, [])
+        self.values = np.asarray(self.values).ravel()
+
+    @cached_property
+    def fixed(self) -> Mask:
+        """(n,) the variables that are given."""
+        return self.program.lower >= self.program.upper
+
+    def solve(self, change: Change) -> tuple[Array, tuple[str, ...], int]:
+        """(n, p) the derivative of the variables, what holds the plan without force, and how many rows hold it."""
+        on_bound, on_row, multipliers, weak = self._active()
+        held = self.fixed | on_bound
+        free = np.flatnonzero(~held)
+        dz = np.zeros((len(self.z), len(change.values)))
+        right = np.zeros((len(self.z) + len(self.values), len(change.values)))
+        if change.ends is not None:
+            node = 0 if change.end == "x0" else self.program.every[-1]
+            dz[node * self.program.width + change.ends, np.arange(len(change.ends))] = 1.0
+        else:
+            right = self._by_parameters(change, multipliers)
+        hessian = self._hessian(multipliers)
+        rows = self.rows[np.flatnonzero(on_row).tolist(), :]
+        first = -(np.asarray(ca.mtimes(hessian, ca.DM(dz))) + right[: len(self.z)])[free]
+        second = -(np.asarray(ca.mtimes(rows, ca.DM(dz))) + right[len(self.z) :][on_row])
+        kept = free.tolist()
+        found = _kkt(hessian[kept, kept], rows[:, kept], first, second)
+        dz[free] = found[: len(free)]
+        return dz, weak, int(np.sum(on_bound) + np.sum(on_row & (self.program.sides[0] < self.program.sides[1])))
+
+    def _hessian(self, multipliers: Array) -> Any:
+        upper = self.derivatives["hess_lag"](self.z, [], 1.0, multipliers)
+        return ca.triu2symm(upper)
+
+    def _active(self) -> tuple[Mask, Mask, Array, tuple[str, ...]]:
+        """The bounds and rows that hold the plan, the multipliers of all rows, and what holds without force."""
+        program, (least, most) = self.program, self.program.sides
+        low, high = _near(self.z, program.lower), _near(program.upper, self.z)
+        row_low, row_high = _near(self.values, least), _near(most, self.values)
+        equal = least >= most
+        scale = max(float(np.max(np.abs(self.slope))), 1e-300)
+        on_bound, holds = (low | high) & ~self.fixed, row_low | row_high | equal
+        while True:  # one after the other, as of bounds and rows that say the same only one pushes
+            on_row = holds & (equal | self._moves(on_bound))
+            multipliers, left = self._multipliers(on_bound, on_row)
+            by_bound = np.where(on_bound, -left, 0.0)
+            pull = np.where(on_bound & ~(low & high), np.where(low, by_bound, -by_bound), 0.0)
+            pull_row = np.where(on_row & ~equal & ~(row_low & row_high), np.where(row_low, 1, -1) * multipliers, 0.0)
+            worst, worst_row = int(np.argmax(pull)), int(np.argmax(pull_row)) if len(pull_row) else 0
+            if max(pull[worst], pull_row[worst_row]) <= WEAK * scale:
+                break
+            if pull[worst] >= pull_row[worst_row]:
+                on_bound[worst] = False
+            else:
+                holds[worst_row] = False
+        weak_bound = on_bound & (np.abs(by_bound) <= WEAK * scale)
+        weak_row = on_row & ~equal & (np.abs(multipliers) <= WEAK * scale)
+        return (
+            on_bound,
+            on_row,
+            multipliers,
+            (*self._names(weak_bound), *[f"row {i}" for i in np.flatnonzero(weak_row)]),
+        )
+
+    def _moves(self, on_bound: Mask) -> Mask:
+        """(m,) the rows in which a variable has a part that nothing holds; the others follow from bounds."""
+        of_row = np.asarray(ca.sum2(ca.fabs(self.rows[:, np.flatnonzero(~(self.fixed | on_bound)).tolist()]))).ravel()
+        return of_row > 0
+
+    def _names(self, which: Mask) -> list[str]:
+        names, width = (*self.problem.state_names, *self.problem.input_names), self.program.width
+        nodes = len(self.program.every) * width
+        return [f"{names[i % width]} at node {i // width}" if i < nodes else "horizon" for i in np.flatnonzero(which)]
+
+    def _multipliers(self, on_bound: Mask, on_row: Mask) -> tuple[Array, Array]:
+        """(m,) those of the rows that leave the least of the Lagrangian's gradient, and what they leave (n,)."""
+        free, rows = np.flatnonzero(~(self.fixed | on_bound)), np.flatnonzero(on_row)
+        jacobian = self.rows[rows.tolist(), free.tolist()]
+        found = _kkt(ca.DM.eye(len(free)), jacobian, -self.slope[free][:, None], np.zeros((len(rows), 1)))
+        multipliers = np.zeros(len(self.values))
+        multipliers[rows] = found[len(free) :, 0]
+        left = self.slope + np.asarray(ca.mtimes(self.rows.T, ca.DM(multipliers))).ravel()
+        return multipliers, left
+
+    def _by_parameters(self, change: Change, multipliers: Array) -> Array:
+        """(n + m, p) of the Lagrangian's gradient and of the rows: by differences of the dynamics' exact Jacobians."""
+        program, horizon = self.program, self.motion.horizon
+        nu = np.asarray(ca.mtimes(program._D.T, ca.DM(multipliers[: program.num_links])))
+        nu = nu.reshape(len(program.every), program.nx)
+        columns = []
+        for i, value in enumerate(change.values):
+            step = DIFFERENCE * max(1.0, abs(value))
+            (f_low, j_low), (f_high, j_high) = (self._dynamics(change, i, side * step) for side in (-1, 1))
+            by_f, by_j = (f_high - f_low) / (2 * step), (j_high - j_low) / (2 * step)
+            of_nodes = -horizon * np.einsum("ki,kij->kj", nu, by_j).ravel()
+            of_time = [-float(np.sum(nu * by_f))] * program.free
+            links = -horizon * np.asarray(ca.mtimes(program._D, ca.DM(by_f.ravel()))).ravel()
+            of_rows = np.zeros(len(self.values))
+            of_rows[: program.num_links] = links
+            columns.append(np.concatenate([of_nodes, of_time, of_rows]))
+        return np.array(columns).T
+
+    def _dynamics(self, change: Change, column: int, step: float) -> tuple[Array, Array]:
+        """(K, nx) and (K, nx, nx + nu) the rates and their Jacobians at the nodes with one parameter moved."""
+        with change.moved(self.problem, column, step) as problem:
+            return plant_dynamics(problem.model).linearize(np.asarray(self.motion.nodes))
+
+
+def _near(values: Array, bound: Array) -> Mask:
+    """Where `values` are not above `bound` by more than NEAR_BOUND; False where it is infinite."""
+    with np.errstate(invalid="ignore"):
+        gap = values - bound
+        finite = np.isfinite(gap)
+        size = np.maximum(1.0, np.where(finite, np.minimum(np.abs(values), np.abs(bound)), 1.0))
+        return np.asarray(finite & (gap <= NEAR_BOUND * size))
+
+
+def _kkt(hessian: Any, rows: Any, first: Array, second: Array) -> Array:
+    """The solution of [H A'; A 0] z = [first; second], sparse, where rows may say the same."""
+    m = rows.shape[0]
+    exact = ca.blockcat([[hessian, rows.T], [rows, ca.DM(m, m)]])
+    matrix = ca.blockcat([[hessian, rows.T], [rows, -SINGULAR * ca.DM.eye(m)]])
+    solver, right = ca.Linsol("kkt", "qr", matrix.sparsity()), ca.DM(np.vstack([first, second]))
+    found = solver.solve(matrix, right)
+    for _ in range(REFINEMENTS):
+        found += solver.solve(matrix, right - ca.mtimes(exact, found))
+    return np.asarray(found)
