@@ -167,19 +167,26 @@ def test_where_a_finer_mesh_fails_the_last_motion_is_kept(monkeypatch, refine):
     coarse = dd.solve(problem, refine=False)
     honest = Transcription.solve_on
 
-    def fails_later(self, mesh, *arguments):
-        found = honest(self, mesh, *arguments)
-        if len(mesh) == 5:
-            return found
-        return dataclasses.replace(found, result=dataclasses.replace(found.result, outcome=Outcome.INFEASIBLE))
+    def fails_later(outcome):
+        def solve_on(self, mesh, *arguments):
+            found = honest(self, mesh, *arguments)
+            if len(mesh) == 5:
+                return found
+            return dataclasses.replace(found, result=dataclasses.replace(found.result, outcome=outcome))
 
-    with monkeypatch.context() as patched:
-        patched.setattr(Transcription, "solve_on", fails_later)
-        solution = dd.solve(problem, refine=refine, method="collocation")
-    np.testing.assert_array_equal(solution.xs, coarse.xs)
-    assert solution.status is dd.Status.CONVERGED_NOT_VERIFIED
-    assert "intervals no motion was found" in solution.message
-    assert "that on 4 is kept" in solution.message
+        return solve_on
+
+    for outcome in (Outcome.INFEASIBLE, Outcome.TIME_LIMIT, Outcome.INTERRUPTED):
+        with monkeypatch.context() as patched:
+            patched.setattr(Transcription, "solve_on", fails_later(outcome))
+            solution = dd.solve(problem, refine=refine, method="collocation", time_limit=60)
+        np.testing.assert_array_equal(solution.xs, coarse.xs)
+        if outcome is Outcome.INFEASIBLE:
+            assert solution.status is dd.Status.CONVERGED_NOT_VERIFIED
+            assert "intervals no motion was found" in solution.message
+            assert "that on 4 is kept" in solution.message
+        else:  # without the limit it would have gone further, which is what `verify` does
+            assert solution.status.value == outcome.value
 
 
 def test_a_models_mesh_is_refined_and_its_plan_replayed(load, tmp_path):

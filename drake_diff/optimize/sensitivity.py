@@ -21,10 +21,10 @@ from drake_diff.optimize.transcription.kkt import Change, HeldPlan
 from drake_diff.optimize.transcription.task import SCHEMES
 
 ENDS = ("x0", "goal")
-RESOLVED = (1e-4, 1e-5)  # of max(1, |p|): how far away the problem is solved again
+RESOLVED = (1e-3, 1e-4, 1e-5)  # of max(1, |p|): how far away the problem is solved again
 LEAST = 1e-3  # of a quantity's size per that of p: a column whose entries are less counts as that large
 SAME = 1e-4  # of the largest entry of a column: what a derivative and differences of re-solves may differ by
-EXACT = Limits(500, np.inf, 1e-10)  # of re-solves
+EXACT = Limits(500, np.inf, 1e-12)  # of re-solves
 
 
 @dataclass(frozen=True, eq=False, repr=False)

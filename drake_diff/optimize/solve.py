@@ -512,19 +512,19 @@ class Run:
         """`solution`, or that on a mesh which is made finer for as long as the plan does not hold."""
         rounds = list(motion.refinements)
         for _ in range(FINER_ROUNDS):
-            left = self.limits.time_limit - (time.monotonic() - self.start)
-            if left <= 0 or not may_be_too_coarse(solution):
+            if not may_be_too_coarse(solution):
                 break
             exceeded = violation_between_nodes(motion).intervals
             if motion.largest_error <= until.tolerance and not exceeded:
                 break  # what does not hold is not the mesh's
-            limits = dataclasses.replace(self.limits, time_limit=left)
+            left = self.limits.time_limit - (time.monotonic() - self.start)
+            limits = dataclasses.replace(self.limits, time_limit=max(left, 0.0))
             finer = transcription.finer(motion, exceeded, until.most, limits, self.report)
             if finer is None:
                 break
             if finer.result.outcome not in FOUND:
                 last = kept(motion, finer).result
-                if last.outcome is Outcome.INTERRUPTED:
+                if last.outcome not in FOUND:
                     return self._judge(solution, last)
                 return solution.told(message=f"{solution.message}; {last.note}")
             motion = finer

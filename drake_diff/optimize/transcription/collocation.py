@@ -542,8 +542,11 @@ def _left(limits: Limits, start: float) -> Limits:
 
 
 def kept(last: Transcribed, failed: Transcribed) -> Transcribed:
-    """The last motion that was found, with a note on the finer mesh on which none was, or interrupted as that was."""
-    if failed.result.outcome is Outcome.INTERRUPTED:
+    """The last motion that was found, with a note on the finer mesh on which none was.
+
+    Where that was cut short, by Ctrl-C or by the time limit, the whole search was: where it leads is not known.
+    """
+    if failed.result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
         return replace(last, result=replace(failed.result, z=last.result.z))
     counts = len(failed.mesh) - 1, len(last.mesh) - 1
     note = f"on {counts[0]} intervals no motion was found ({failed.result.message}): that on {counts[1]} is kept"
