@@ -75,6 +75,19 @@ def test_a_false_plan_is_not(judge, step, changes, miss):
     assert found == pytest.approx(miss, abs=0.012) or found > miss
 
 
+@each_row("asked, miss", [(1.0, 0.0), (1.02, 0.02)])
+def test_what_is_asked_besides_is_measured_in_the_plants_own_motion(judge, asked, miss):
+    """Where it ends, and that it is halfway at half the time."""
+    asks = (
+        ("end [m]", lambda times, xs: abs(xs[-1, 0] - asked), 0.01),
+        ("middle [m]", lambda times, xs: abs(np.interp(0.5, times, xs[:, 0]) - 0.5), 0.01),
+    )
+    why, _ = judge(plan(asks=asks), 0.0, 0.05)
+    assert (why == "") == (miss == 0)
+    assert miss == 0 or "end [m]: 0.02, 0.01 allowed" in why
+    assert "middle" not in why
+
+
 def test_feedback_makes_an_unstable_motion_true_and_a_limit_makes_it_false(judge):
     """x'' = 9 x + u, kept at 0 from 1 mm off: open loop it is 10 cm off after 1.8 s; 5 mN are too little to hold it."""
     rest = plan(

@@ -1,4 +1,4 @@
-"""Where a search starts: a line to the goal, arrays, Drake's trajectories, or a solution on whatever knots it has.
+"""Where a search starts: a line to the goal, a reference, arrays, Drake's trajectories, or a solution on its own knots.
 
 What has another length or other knots is stretched to the problem's: its first state is the first, its last the last.
 """
@@ -15,6 +15,7 @@ from drake_diff.exceptions import DrakeDiffError, InputError, ShapeError
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.timed import TimedCost
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.transcription.collocation import Collocated
 
@@ -112,10 +113,11 @@ def _values(name: str, trajectory: Any, times: Array) -> Array:
 
 
 def _line(problem: Problem, method: str, seed: int) -> Guess:
-    """A straight line to the goal, with the problem's inputs, or inputs near zero."""
-    end = np.where(np.isnan(problem.goal), problem.x0, problem.goal)
-    xs = problem.x0 + np.linspace(0, 1, problem.num_steps + 1)[:, None] * (end - problem.x0)
+    """A straight line to the goal, or the reference, with the problem's inputs, or inputs near zero."""
+    xs, followed = _way(problem)
     us = np.array(problem.us)
+    if problem.optimizes_controls and not us.any() and followed is not None:
+        us = (followed[:-1] + followed[1:]) / 2
     if problem.optimizes_controls and not us.any():
         us = us + _holding(problem)
     if method == "shooting" and problem.optimizes_controls and not us.any():
@@ -126,6 +128,22 @@ def _line(problem: Problem, method: str, seed: int) -> Guess:
     return Guess(xs, inside if problem.optimizes_controls else us)
 
 
+def _way(problem: Problem) -> tuple[Array, Array | None]:
+    """(N+1, nx) the straight line to the goal, and where a running cost follows a reference that, bent to the ends.
+
+    The inputs (N+1, nu) of the reference are the second, where it has some.
+    """
+    s, goal = np.linspace(0, 1, problem.num_steps + 1)[:, None], np.array(problem.goal)
+    line = problem.x0 + s * (np.where(np.isnan(goal), problem.x0, goal) - problem.x0)
+    cost = problem.running_cost
+    found = cost.followed(problem.start_horizon * s[:, 0]) if isinstance(cost, TimedCost) else None
+    if found is None:
+        return line, None
+    xs, us = found
+    bent = xs + (1 - s) * (problem.x0 - xs[0]) + s * (np.where(np.isnan(goal), xs[-1], goal) - xs[-1])
+    return np.where(np.isnan(bent), line, bent), us
+
+
 def another_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
     """A random smooth motion about the straight line, for collocation: xs (N+1, nx), us (N+1, nu) and a horizon.
 
@@ -134,12 +152,12 @@ def another_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
     """
     random = np.random.default_rng([seed, number])
     far, s = WANDER[number % len(WANDER)], np.linspace(0, 1, problem.num_steps + 1)[:, None]
-    b, end = problem.bounds, np.where(np.isnan(problem.goal), problem.x0, problem.goal)
+    b, way = problem.bounds, _way(problem)[0]
     limit = np.minimum(np.abs(b.u_lower), np.abs(b.u_upper))
     size = np.where(np.isfinite(limit), np.minimum(limit, 100.0) / 2, 1.0)
     waves = [random.standard_normal(problem.nx) * np.sin(j * np.pi * s) / j for j in range(1, WAVES)]
     swings = [random.standard_normal(problem.nu) * np.cos(j * np.pi * s) / (j + 1) for j in range(WAVES)]
-    xs = problem.x0 + s * (end - problem.x0) + far * np.maximum(1.0, np.abs(end - problem.x0)) * sum(waves)
+    xs = way + far * np.maximum(1.0, np.abs(way[-1] - problem.x0)) * sum(waves)
     us = np.clip(size * sum(swings), b.u_lower, b.u_upper)
     xs[1:] = np.clip(xs[1:], b.x_lower, b.x_upper)
     for start in tangent_space(problem.model).quaternions if problem.has_model else ():

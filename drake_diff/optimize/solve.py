@@ -95,9 +95,10 @@ def solve(
         problem: what to optimize, of a model or of plain `Dynamics`.
         method: "collocation" (in continuous time, for models without contact and for plain dynamics), "shooting"
             (through Drake's own steps, contact included), "ilqr" (the same by Riccati sweeps) or "auto".
-        initial_guess: None (a straight line to the goal with inputs near zero), a Solution of any method, number of
-            steps and horizon, a pair of Drake's trajectories (state, input) as `Solution.trajectory` gives, or (xs, us)
-            with shapes (N+1, nx) and (N, nu). Collocation also takes us (N+1, nu), and a third entry, the horizon [s].
+        initial_guess: None (a straight line to the goal with inputs near zero; a `TrackingCost`'s reference), a
+            Solution of any method, number of steps and horizon, a pair of Drake's trajectories (state, input) as
+            `Solution.trajectory` gives, or (xs, us) with shapes (N+1, nx) and (N, nu). Collocation also takes us
+            (N+1, nu), and a third entry, the horizon [s].
         scheme: of collocation: "hermite_simpson" (order 4, the default), "trapezoid" (order 2), or "drake", which is
             what Drake's DirectCollocation transcribes.
         solver: "ipopt" or "snopt"; the latter with method="shooting", or with scheme="drake", which then is Drake's

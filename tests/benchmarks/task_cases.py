@@ -414,10 +414,8 @@ def panda_past_a_ball(random):
     return Case(dd.Problem(model, goals=goals, **problem), touching(PANDA), asks)
 
 
-def panda_payload(random):
-    """The hand's mass is a parameter of the problem: up to 2 kg more than its own. The referee reads it in a file."""
-    mass = 0.73 + random.uniform(0.3, 2.0)
-    model, problem, target, asks = panda(random)
+def heavier_panda(mass):
+    """A file in which the Panda's hand weighs more."""
     text = PANDA.read_text().replace(
         '<mass value="0.73"/>\n      <inertia ixx="0.001" iyy="0.0025" izz="0.0017"',
         f'<mass value="{mass!r}"/>\n      <inertia ixx="{0.001 * mass / 0.73!r}" iyy="{0.0025 * mass / 0.73!r}" '
@@ -427,13 +425,29 @@ def panda_payload(random):
         raise ValueError("the Panda's hand is another one than it was")
     path = Path(FOLDER.name) / f"panda_{mass:.8f}.urdf"
     path.write_text(text)
+    return path
+
+
+def panda_payload(random):
+    """Its hand carries up to 2 kg, in its file."""
+    path = heavier_panda(0.73 + random.uniform(0.3, 2.0))
+    _, problem, target, asks = panda(random)
+    model = dd.load_model(path, time_step=0.03)
+    problem = dd.Problem(model, goals=[dd.FrameGoal("panda_hand", position=target)], **problem)
+    return Case(problem, touching(path), tuple(asks))
+
+
+def panda_payload_as_a_parameter(random):
+    """The same, where the hand's mass is a parameter of the problem; the referee reads it in a file."""
+    mass = 0.73 + random.uniform(0.3, 2.0)
+    model, problem, target, asks = panda(random)
     problem = dd.Problem(
         model,
         goals=[dd.FrameGoal("panda_hand", position=target)],
         parameters={"panda_hand.mass": mass},
         **problem,
     )
-    return Case(problem, touching(path), tuple(asks))
+    return Case(problem, touching(heavier_panda(mass)), tuple(asks))
 
 
 def two_rods_past_a_ball(random):
@@ -750,7 +764,7 @@ FAMILIES: dict[str, list[Callable[[np.random.Generator], Case]]] = {
     ],
     "arms": [
         ur5_joint_goal, ur5_hand_goal, ur5_past_a_ball, ur5_least_time, kinova_joint_goal, panda_joint_goal,
-        panda_hand_goal, panda_past_a_ball, panda_payload, two_rods_past_a_ball,
+        panda_hand_goal, panda_past_a_ball, panda_payload, panda_payload_as_a_parameter, two_rods_past_a_ball,
     ],
     "cars and quadrotors": [
         parallel_parking, car_turns_around, bicycle_around_disks, dubins_least_time, planar_quadrotor_least_time,

@@ -45,6 +45,10 @@ TASKS = {task.__name__: (family, task) for family, tasks in FAMILIES.items() for
 Row = dict[str, Any]
 
 
+def chosen(name: str, only: str) -> bool:
+    return any(fnmatch.fnmatch(name, pattern) for pattern in only.split(","))
+
+
 def drawn(name: str, seed: int, number: int) -> Case:
     """The case of a task: its number, and not that of the task in the list, decides."""
     return TASKS[name][1](np.random.default_rng([seed, zlib.crc32(name.encode()), number]))
@@ -169,7 +173,7 @@ def told(rows: dict[str, Row], only: str) -> list[str]:
     rate = success_rate(solved, max(len(expressed), 1))
     share = solved / max(len(expressed), 1)
     names = {row["name"] for row in expressed.values()}
-    left = [name for name in NOT_EXPRESSED if fnmatch.fnmatch(name, only)]
+    left = [name for name in NOT_EXPRESSED if chosen(name, only)]
     each = len(expressed) / max(len(names), 1)
     whole = solved / max(len(expressed) + each * len(left), 1)
     seconds = sorted(row["seconds"] for row in expressed.values()) or [0.0]
@@ -200,7 +204,7 @@ def table(rows: dict[str, Row], only: str) -> list[str]:
             f"{attempts} | {seconds:.1f} | {why} |"
         )
     for name, (family, why) in NOT_EXPRESSED.items():
-        if fnmatch.fnmatch(name, only):
+        if chosen(name, only):
             lines.append(f"| {name.replace('_', ' ')} | {family} | cannot be said | 0 | 0 | - | {why} |")
     return lines
 
@@ -218,7 +222,7 @@ def markdown(rows: dict[str, Row], seed: int, only: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", default="*", help="a pattern of names, such as '*pendulum*'")
+    parser.add_argument("--only", default="*", help="patterns of names with commas between them, such as '*pendulum*'")
     parser.add_argument("--count", type=int, default=20, help="random starts of each task")
     parser.add_argument("--seed", type=int, default=0)
     help_wall = f"[s] of a solve on the wall, more than {TIME_LIMIT:g} where the machine is busy with other work"
@@ -229,7 +233,7 @@ def main() -> None:
     given = parser.parse_args()
     warnings.simplefilter("ignore", ModelWarning)
     logging.getLogger("drake").setLevel(logging.ERROR)
-    names = [name for name in TASKS if fnmatch.fnmatch(name, given.only)]
+    names = [name for name in TASKS if chosen(name, given.only)]
     if given.beside:
         beside(names, given.seed, given.count)
         return
@@ -246,7 +250,7 @@ def main() -> None:
             print(f"{word:5} {row['seconds']:6.1f} s  {key}  {(row['false'] or row['message'])[:300]}", flush=True)
             if given.out:
                 given.out.write_text(json.dumps(rows, indent=1))
-    shown = {key: row for key, row in rows.items() if fnmatch.fnmatch(row["name"], given.only)}
+    shown = {key: row for key, row in rows.items() if chosen(row["name"], given.only)}
     print("\n".join(told(shown, given.only)))
     if given.markdown:
         given.markdown.write_text(markdown(shown, given.seed, given.only))

@@ -36,6 +36,10 @@ class TimedCost:
         known = self.known_at(np.array([time]))[0]
         return lambda x, u: self.of(x, u, known)
 
+    def followed(self, times: Array) -> tuple[Array, Array | None] | None:
+        """The states (K, nx), and inputs (K, nu) if any, that are followed at `times`, NaN where none is; or None."""
+        return None
+
     def check_sizes(self, name: str, nx: int, nu: int) -> None:
         """Raise ShapeError where a part has not the size of the states (nx,) or inputs (nu,)."""
 
@@ -122,6 +126,13 @@ class TrackingCost(TimedCost):
         columns = xs if us is None else np.hstack([xs, us])
         return np.array([np.interp(times, known, column) for column in columns.T]).T
 
+    def followed(self, times: Array) -> tuple[Array, Array | None] | None:
+        if self.Q is None:
+            return None
+        known, nx = self.known_at(times), self.reference[1].shape[1]
+        xs = np.where(np.diag(self.Q) > 0, known[:, :nx], np.nan)
+        return xs, known[:, nx:] if self.reference[2] is not None and self.R is not None else None
+
     def of(self, x: Any, u: Any, known: Any) -> Any:
         nx, total = len(x), 0.0 * x[0]
         held = self.reference[2] is not None
@@ -156,6 +167,10 @@ class SumOfCosts(TimedCost):
         none = np.empty((len(times), 0))
         return np.hstack([none, *(cost.known_at(times) for cost in self.costs if isinstance(cost, TimedCost))])
 
+    def followed(self, times: Array) -> tuple[Array, Array | None] | None:
+        found = (cost.followed(times) for cost in self.costs if isinstance(cost, TimedCost))
+        return next((each for each in found if each is not None), None)
+
     def of(self, x: Any, u: Any, known: Any) -> Any:
         total: Any = 0.0
         for cost in self.costs:
@@ -176,6 +191,9 @@ class Later(TimedCost):
 
     def known_at(self, times: Array) -> Array:
         return self.cost.known_at(np.asarray(times) + self.start)
+
+    def followed(self, times: Array) -> tuple[Array, Array | None] | None:
+        return self.cost.followed(np.asarray(times) + self.start)
 
     def of(self, x: Any, u: Any, known: Any) -> Any:
         return self.cost.of(x, u, known)
