@@ -96,6 +96,8 @@ SOURCES = {
     "docs/plan.md": {
         "0": CODES["0"],
         "7": "drake_diff.planning.planner:SMALL",
+        "0.7": "drake_diff.planning.standing:OF_FRICTION",
+        "0.8": "drake_diff.planning.standing:OF_EFFORT",
         "1e-4": "drake_diff.planning.posture:TOUCHING",
     },
     "docs/contact.md": {
