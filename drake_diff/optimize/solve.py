@@ -300,7 +300,8 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
             continue
         found.append(make())
         last = found[-1]
-        task.report.say(f"{attempt.method} ({attempt.reason}): {last.status.value}")
+        if last.status is not Status.INTERRUPTED:
+            task.report.say(f"{attempt.method} ({attempt.reason}): {last.status.value}")
         chain.append({"method": attempt.method, "reason": attempt.reason, "ended": last.status.value})
         if attempt.continuation is not None:
             chain[-1]["continuation"] = "auto"
