@@ -143,7 +143,10 @@ class HeldPlan:
     def _names(self, which: Mask) -> list[str]:
         names, width = (*self.problem.state_names, *self.problem.input_names), self.program.width
         nodes = len(self.program.every) * width
-        return [f"{names[i % width]} at node {i // width}" if i < nodes else "horizon" for i in np.flatnonzero(which)]
+        return [
+            f"{names[i % width]} at node {i // width}" if i < nodes else "horizon"
+            for i in np.flatnonzero(which).tolist()
+        ]
 
     def _multipliers(self, on_bound: Mask, on_row: Mask) -> tuple[Array, Array]:
         """(m,) those of the rows that leave the least of the Lagrangian's gradient, and what they leave (n,)."""
