@@ -33,7 +33,8 @@ def test_every_file_that_a_document_names_is_there(path):
     text = path.read_text()
     named = re.findall(r"(?:examples|models|tests|docs)(?:/\w+)*/\w+\.\w+", text)
     linked = [link for link in re.findall(r"\]\(([^)#]+)\)", text) if "://" not in link]
-    assert not [name for name in named if not (ROOT / name).is_file()]
+    if path.name != "zoo.md":  # which names files of other packages
+        assert not [name for name in named if not (ROOT / name).is_file()]
     assert not [link for link in linked if not (path.parent / link).is_file()]
 
 
