@@ -24,7 +24,7 @@ from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.differences import Many, plateau, sweep_of
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import Analytic
-from drake_diff.derivatives.implicit import Implicit
+from drake_diff.derivatives.implicit import Implicit, form_of
 from drake_diff.derivatives.methods import METHODS
 from drake_diff.derivatives.polish import polished_steps, solves_the_step
 from drake_diff.derivatives.steps import Jacobians, Source, Steps, take_step, take_steps
@@ -72,8 +72,11 @@ class Autodiff:
 
 
 def _by_autodiff(steps: Steps, k: int) -> Array:
-    model, vector = steps.model, steps.vector
-    variables = InitializeAutoDiff(np.concatenate([steps.xs[k], steps.us[k], vector.values])).ravel()
+    model, vector, u = steps.model, steps.vector, steps.us[k]
+    at_limit = np.abs(u) == form_of(model).limit
+    if at_limit.any():  # which side Drake's derivative is of depends on the limit's sign and on its version
+        u = np.where(at_limit, np.nextafter(u, 0.0), u)
+    variables = InitializeAutoDiff(np.concatenate([steps.xs[k], u, vector.values])).ravel()
     twin, end = model.autodiff, model.nx + model.nu
     write_autodiff(vector, model, variables[end:])
     result = advance(twin, variables[: model.nx], variables[model.nx : end])
