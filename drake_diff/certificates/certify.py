@@ -10,6 +10,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.differences import one_by_one
 from drake_diff.certificates.certificate import JITTER, Certificate, ModeChange, certificate_of, jitter
 from drake_diff.certificates.neighbourhood import Neighbourhood, look_around
+from drake_diff.derivatives.implicit import form_of
 from drake_diff.derivatives.polish import polished_steps
 from drake_diff.derivatives.sources import check_method, step_at
 from drake_diff.derivatives.step import StepDerivatives, step_jacobians
@@ -125,7 +126,7 @@ def certify_inside(model: Model, x: Array, u: Array, *, parameters: Parameters =
     Drake cuts inputs off at the limit, which is a corner: differences are taken beside it, where they have room. By
     what the derivative exactly at the limit differs from the one just inside, what is certified is off.
     """
-    limits = _clips(model)
+    limits = form_of(model).cut
     room = np.minimum(EFFORT_ROOM * np.maximum(1.0, np.abs(u)), EFFORT_PART * limits)
     inside = np.minimum(np.maximum(u, room - limits), limits - room)
     found = certify(model, x, inside, parameters=parameters)
@@ -139,13 +140,6 @@ def certify_inside(model: Model, x: Array, u: Array, *, parameters: Parameters =
         told += f", at which the derivative is another one, by up to {np.max(np.abs(leap)):.3g}"
         found = replace(found.of(found.derivative + leap), mode_changes=found.mode_changes)
     return replace(found, told=told)
-
-
-def _clips(model: Model) -> Array:
-    """(nu,) beyond what Drake cuts each input off; infinite where it does not."""
-    inputs = model.inputs
-    limits = [np.inf if a.has_controller() else a.effort_limit() for a in actuators(model.plant)]
-    return np.where(inputs.actuator >= 0, inputs.of_actuators(limits), np.inf)
 
 
 def _leap(model: Model, x: Array, u: Array, inward: Array, parameters: Parameters) -> Array:

@@ -163,6 +163,7 @@ class Form:
     position: NDArray[np.int64]
     actuation: Array  # (nv, nu)
     limit: Array
+    cut: Array  # (nu,) beyond what Drake cuts off an input itself: infinite under PD control, whose sum it cuts off
     reference: Array  # (2, nu) the positions and velocities that PD control holds
     diagonal: tuple[Any, ...]  # the indices of that of (nv, nv)
     pd: bool
@@ -198,6 +199,7 @@ def _read_form(model: Model) -> Form:
     joined = [(a.joint().velocity_start(), a.joint().position_start(), a.effort_limit()) for a in found]
     at = inputs.of_actuators(np.reshape(joined, (len(found), 3)))
     velocity, position = at[:, 0].astype(int), at[:, 1].astype(int)
+    controlled = inputs.of_actuators([a.has_controller() for a in found]).astype(bool)
     if model.coupling is not None:  # of inputs with PD control only, which such a model has not
         velocity, position = model.coupling.of_v[velocity], model.coupling.of_q[position]
     references = np.zeros((2, len(found)))
@@ -213,6 +215,7 @@ def _read_form(model: Model) -> Form:
         position=position,
         actuation=model.actuation,
         limit=np.where(inputs.actuator >= 0, at[:, 2], np.inf),
+        cut=np.where((inputs.actuator >= 0) & ~controlled, at[:, 2], np.inf),
         reference=references,
         diagonal=np.diag_indices(model.nv),
         pd=any(a.has_controller() for a in found),

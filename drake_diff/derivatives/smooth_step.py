@@ -216,7 +216,6 @@ def build_analytic(model: Model) -> SmoothStep:
     for i, j in description.coordinates.single:
         positions[j] = i
         limits[:, j] = model.plant.GetPositionLowerLimits()[i], model.plant.GetPositionUpperLimits()[i]
-    controlled = np.array([a.has_controller() for a in form.actuators], dtype=bool)
     return SmoothStep(
         pinocchio=built,
         data=data,
@@ -225,7 +224,7 @@ def build_analytic(model: Model) -> SmoothStep:
         coordinates=description.coordinates,
         form=form,
         time_step=model.time_step,
-        limit=np.where(controlled, np.inf, form.limit),
+        limit=form.cut,
         stiffness=stiffness,
         damping=damping,
         rest=rest,

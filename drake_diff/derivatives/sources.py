@@ -73,7 +73,7 @@ class Autodiff:
 
 def _by_autodiff(steps: Steps, k: int) -> Array:
     model, vector, u = steps.model, steps.vector, steps.us[k]
-    at_limit = np.abs(u) == form_of(model).limit
+    at_limit = np.abs(u) == form_of(model).cut
     if at_limit.any():  # which side Drake's derivative is of depends on the limit's sign and on its version
         u = np.where(at_limit, np.nextafter(u, 0.0), u)
     variables = InitializeAutoDiff(np.concatenate([steps.xs[k], u, vector.values])).ravel()

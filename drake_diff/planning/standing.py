@@ -23,6 +23,7 @@ from drake_diff.model.repairs import frame_named
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.planning.feet import Foot, bottoms, center_of_mass, find_feet, own_velocities, upright
+from drake_diff.planning.posture import effort_limits
 
 GRAVITY = 9.81  # [m/s^2] of the weight, a scale
 FOOT_SHARE = 0.1  # of an even share of the weight: what each foot carries at least, so that none lifts off
@@ -259,7 +260,7 @@ def hold(robot: Legged, q: Array, needed: Array | None = None) -> Stance | Refus
     points, by_v, owners = robot.soles(q)
     friction = OF_FRICTION * robot.frictions()[owners]
     needed = model.double.inverse_dynamics(np.zeros(model.nv)) if needed is None else needed
-    limits = np.array([min(abs(u.lower), abs(u.upper)) for u in model.contract.inputs])
+    limits = effort_limits(model)
     count, share = len(points), robot.weight / len(robot.feet)
     scale = np.where(np.isfinite(limits), limits, robot.weight)
     program = MathematicalProgram()
