@@ -8,7 +8,7 @@ import pytest
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.exceptions import GradientError, InputError, UnknownNameError
 from drake_diff.optimize.transcription.kkt import HeldPlan
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
@@ -117,6 +117,15 @@ def test_a_wrong_derivative_is_told(monkeypatch):
         assert found.verdict == "disagree"
         assert "differences of re-solves" in repr(found)
     assert dd.sensitivity(dd.solve(block()), "goal", certified=False).verdict == "not certified"
+
+
+def test_a_plan_that_is_one_of_many_has_no_derivative():
+    """The second input moves a state that nothing asks for and costs nothing."""
+    slide = dd.Dynamics(lambda x, u: [u[0], u[1]], nx=2, nu=2)
+    free = dd.QuadraticCost(R=np.diag([1.0, 0.0]))
+    problem = dd.Problem(slide, x0=[0, 0], x_goal=[1, None], num_steps=10, horizon=1.0, running_cost=free)
+    with pytest.raises(GradientError, match="not the only optimum"):
+        dd.sensitivity(dd.solve(problem), "goal")
 
 
 def test_what_has_no_sensitivity_is_refused(write_urdf):

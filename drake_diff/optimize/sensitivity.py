@@ -93,6 +93,7 @@ def sensitivity(solution: Solution, by: Any = "x0", *, certified: bool = True) -
         InputError: The solution is no success or not by collocation, or nothing is asked for.
         UnknownNameError: There is no such parameter.
         ModelError: Its equations have no second derivatives here.
+        GradientError: Some change of the plan costs nothing, so that it is not the only optimum.
 
     Source:
         Fiacco, "Introduction to Sensitivity and Stability Analysis in Nonlinear Programming", 1983, ch. 3.

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff.exceptions import ModelError
+from drake_diff.exceptions import GradientError, ModelError
 from drake_diff.model.parameters import Parameters, applied, select
 from drake_diff.optimize.problem.dynamics import plant_dynamics
 from drake_diff.optimize.problem.problem import Problem
@@ -32,6 +32,7 @@ NEAR_BOUND = 1e-4  # of max(1, |bound|): a value this near may lie on it: an int
 WEAK = 1e-4  # of the cost's largest slope: a smaller multiplier may hold nothing
 SINGULAR, REFINEMENTS = 1e-10, 4  # on the diagonal, of rows that say the same, and how often its error is taken out
 DIFFERENCE = 1e-5  # of max(1, |p|): of derivatives by a parameter of the model, which are exact by the state
+FLAT = "the plan has no derivative: some change of it costs nothing, so that it is not the only optimum"
 Mask = NDArray[np.bool_]
 
 
@@ -197,7 +198,12 @@ def _kkt(hessian: Any, rows: Any, first: Array, second: Array) -> Array:
     exact = ca.blockcat([[hessian, rows.T], [rows, ca.DM(m, m)]])
     matrix = ca.blockcat([[hessian, rows.T], [rows, -SINGULAR * ca.DM.eye(m)]])
     solver, right = ca.Linsol("kkt", "qr", matrix.sparsity()), ca.DM(np.vstack([first, second]))
-    found = solver.solve(matrix, right)
-    for _ in range(REFINEMENTS):
-        found += solver.solve(matrix, right - ca.mtimes(exact, found))
+    try:
+        found = solver.solve(matrix, right)
+        for _ in range(REFINEMENTS):
+            found += solver.solve(matrix, right - ca.mtimes(exact, found))
+    except RuntimeError as error:  # CasADi's, of a matrix without an inverse
+        raise GradientError(FLAT) from error
+    if not np.all(np.isfinite(np.asarray(found))):
+        raise GradientError(FLAT)
     return np.asarray(found)
