@@ -203,13 +203,13 @@ class Collocated:
         return self._led(None)
 
     def _led(self, gains: Array | None) -> Array:
-        z = np.append(self.xs[0], 0.0)[None]
+        z = self.xs[:1]
         found = [z]
         for k in range(len(self.mesh) - 1):
             path = self._integrate(np.array([k]), z, None if gains is None else gains[k])
             found.append(path[1:, 0])
             z = path[-1]
-        return np.concatenate(found)[:, : self.task.dynamics.nx]
+        return np.concatenate(found)
 
     def _gains(self) -> Array:
         """(N, nu, nx) of each interval, by Riccati's recursion with Bryson's weights, as a replay's TVLQR has them."""
@@ -234,20 +234,23 @@ class Collocated:
         return self._integrate(every, np.column_stack([self.xs[:-1], np.zeros(len(every))]))
 
     def _integrate(self, k: Indices, z: Array, gains: Array | None = None) -> Array:
-        """(11, S, nx + 1) where `z` at the starts of the intervals `k` (S,) leads in ten steps: states and cost.
+        """(11, S, nx or nx + 1) where `z` at the starts of the intervals `k` (S,) leads in ten steps.
 
-        With `gains` (nu, nx), under feedback about the motion too.
+        Its last column is the cost, where it has one more than the states. With `gains` (nu, nx), under feedback about
+        the motion too.
         """
         dynamics, nx = self.task.dynamics, self.task.dynamics.nx
         dt, found = self._lengths[k, None] / SUBSTEPS, [z]
 
         def rate(z: Array, step: float) -> Array:
+            us, b = self._held[k, round(2 * step)], self.task.bounds
             tau = np.full(len(k), step / SUBSTEPS)
-            us, b = self._applied(k, tau), self.task.bounds
             if gains is not None:
                 us = us + (self._between(k, tau)[0] - z[:, :nx]) @ gains.T
                 us = self._cut_off(np.clip(us, b.u_lower, b.u_upper))
             knots = np.hstack([z[:, :nx], us])
+            if z.shape[1] == nx:
+                return dynamics.values(knots)
             return np.column_stack([dynamics.values(knots), self.task.rates(knots, self._times(k, tau))])
 
         with np.errstate(all="ignore"):
@@ -258,6 +261,13 @@ class Collocated:
                 z = z + dt / 6 * (k1 + 2 * k2 + 2 * k3 + rate(z + dt * k3, i + 1))
                 found.append(z)
         return np.array(found)
+
+    @cached_property
+    def _held(self) -> Array:
+        """(N, 21, nu) the inputs as the plant applies them at every half of the ten steps of each interval."""
+        count, halves = len(self.mesh) - 1, np.arange(2 * SUBSTEPS + 1)
+        k, tau = np.repeat(np.arange(count), len(halves)), np.tile(halves / (2 * SUBSTEPS), count)
+        return self._applied(k, tau).reshape(count, len(halves), -1)
 
     def _applied(self, k: Indices, tau: Array) -> Array:
         """(S, nu) the inputs in the intervals `k` at `tau` as the plant applies them."""

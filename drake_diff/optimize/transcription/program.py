@@ -40,6 +40,7 @@ OUTCOMES = {
 }
 OPTIONS = {
     "ipopt.mu_strategy": "adaptive",  # the monotone one ends minimum times of a pendulum as infeasible
+    "ipopt.max_hessian_perturbation": 1e8,  # of IPOPT's 1e20 it takes tens of iterations to come down again
     "print_time": False,
     "show_eval_warnings": False,
     "calc_lam_p": False,
