@@ -1,3 +1,4 @@
+from .problem.dynamics import DiscreteMap as DiscreteMap
 from .problem.dynamics import plant_dynamics as plant_dynamics
 from .problem.timed import TrackingCost as TrackingCost
 from .transcription.collocation import violation_between_nodes as violation_between_nodes

@@ -21,6 +21,7 @@ REFINED = "raise max_num_steps, or take more steps (num_steps)"  # where it was 
 _ALIKE = ("ITERATION_LIMIT", "TIME_LIMIT", "INFEASIBLE", "INTERRUPTED", "DIVERGED", "NO_GRADIENT", "FAILED")
 # Where the solver stopped short of its own tolerance, or gave up: our own measures say at what.
 STOPPED = (Outcome.INACCURATE, Outcome.INFEASIBLE, Outcome.ITERATION_LIMIT, Outcome.NO_GRADIENT, Outcome.FAILED)
+_LED = "integrated accurately", "mapped step by step"
 STATIONARY = 1e-6  # of the terms of the Lagrangian's gradient: what is left to gain is of its square
 _STATUSES = {Outcome.UNBOUNDED: Status.DIVERGED, **{Outcome[name]: Status[name] for name in _ALIKE}}
 
@@ -73,7 +74,7 @@ def _stationarity(draft: Solution, result: NlpResult) -> float:
 def may_be_too_coarse(solution: Solution) -> bool:
     """Whether a collocated plan keeps all that was asked at its nodes, and yet is none: a finer mesh may mend that."""
     motion = solution.transcribed
-    if solution.status is not Status.CONVERGED_NOT_VERIFIED or motion is None:
+    if solution.status is not Status.CONVERGED_NOT_VERIFIED or motion is None or motion.task.is_map:
         return False
     agree = all(certificate.verdict == "agree" for certificate in solution.certificates)
     if not agree or not np.isfinite(solution.cost) or next(_infeasibilities(solution), ""):
@@ -163,7 +164,7 @@ def _followed(solution: Solution, motion: Collocated) -> tuple[bool, str]:
         if max(apart[i] / ranges[i], excess[j] / ranges[j]) <= INTEGRATION_TOLERANCE:
             how = control if control == "open loop" else f"under {control}"
             return True, (
-                f"integrated accurately {how}, {names[i]} is at most {apart[i]:.2g} from the plan, "
+                f"{_LED[motion.task.is_map]} {how}, {names[i]} is at most {apart[i]:.2g} from the plan, "
                 f"{apart[i] / ranges[i]:.1%} of its range, of {INTEGRATION_TOLERANCE:.0%} allowed"
             )
         bound = excess[j] / ranges[j] > apart[i] / ranges[i]
@@ -172,9 +173,10 @@ def _followed(solution: Solution, motion: Collocated) -> tuple[bool, str]:
             if bound
             else f"{control}, {names[i]} is {apart[i]:.3g} from the plan"
         )
+    remedy = "" if motion.task.is_map else f": {FINER}"
     return False, (
-        f"integrated accurately from its first state the plan does not hold: {'; '.join(told)}; tolerance "
-        f"{INTEGRATION_TOLERANCE:.0%} of each state's range: {FINER}"
+        f"{_LED[motion.task.is_map]} from its first state the plan does not hold: {'; '.join(told)}; tolerance "
+        f"{INTEGRATION_TOLERANCE:.0%} of each state's range{remedy}"
     )
 
 

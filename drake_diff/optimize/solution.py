@@ -152,7 +152,8 @@ class Solution(ShowsItsRepr):
         lines = [
             f"Solution of {self.problem.name} by {self.method}{f' ({how})' if how else ''}: {self.status.value}",
             self.message,
-            f"cost {self.cost:.6g} over {self.horizon:g} s in {len(self.us)} intervals",
+            f"cost {self.cost:.6g} over "
+            + (f"{len(self.us)} steps" if self.problem.is_map else f"{self.horizon:g} s in {len(self.us)} intervals"),
             f"defect {self.defect:.2g}, integration error {self.integration_error:.2g}",
             f"goal error {self.goal_error:.2g}, {beyond}",
             f"{len(self.iterations)} iterations in {self.wall_time:.2g} s; certificates: {told}",
@@ -223,8 +224,10 @@ class Solution(ShowsItsRepr):
         """The motion of a collocation scheme, from xs, us, us_mid and u_final; None where they are no such motion."""
         if self.scheme == "step" or not self._is_whole:
             return None
-        mesh = np.linspace(0, 1, len(self.xs)) if self.mesh is None else self.mesh
-        return collocated(self.problem, self.scheme, self.xs, self.inputs_at_knots, self.us_mid, self.horizon, mesh)
+        mesh, us = np.linspace(0, 1, len(self.xs)) if self.mesh is None else self.mesh, self.inputs_at_knots
+        if self.problem.is_map:  # after the last step there is no input
+            us = np.vstack([us, np.clip(0.0, self.problem.bounds.u_lower, self.problem.bounds.u_upper)])
+        return collocated(self.problem, self.scheme, self.xs, us, self.us_mid, self.horizon, mesh)
 
     def trajectory(self) -> "Trajectories":
         """The state and the input as Drake's piecewise polynomials, for its own controllers and `Simulator`.
@@ -329,7 +332,7 @@ class Solution(ShowsItsRepr):
 
         Collocation keeps constraints of all knots at its midpoints too, which count to the knot before them.
         """
-        if self.transcribed is None:
+        if self.transcribed is None or self.problem.is_map:
             return self.problem.constraint_excess(self.xs, self.inputs_at_knots)
         nodes, every = self.transcribed.nodes, self.transcribed.task.scheme.nodes
         xs, us = np.split(nodes, [self.problem.nx], axis=1)
@@ -455,9 +458,10 @@ def trajectories(solution: Solution) -> Trajectories:
     """See `Solution.trajectory`."""
     times, motion = solution.times, solution.transcribed
     xs, us = np.asarray(solution.xs), np.asarray(solution.inputs_at_knots)
-    if motion is None:
+    if motion is None or solution.problem.is_map:
         held = PiecewisePolynomial.ZeroOrderHold(times, np.vstack([us, us[-1:]]).T)
-        return Trajectories(PiecewisePolynomial.FirstOrderHold(times, xs.T), held)
+        between = PiecewisePolynomial.ZeroOrderHold if solution.problem.is_map else PiecewisePolynomial.FirstOrderHold
+        return Trajectories(between(times, xs.T), held)
     state = PiecewisePolynomial.CubicHermite(times, xs.T, motion.rates.T)
     if solution.us_mid is None:
         return Trajectories(state, PiecewisePolynomial.FirstOrderHold(times, us.T))

@@ -25,6 +25,7 @@ from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
 from drake_diff.optimize.ilqr.ilqr import check_problem, is_unconstrained, solve_ilqr
 from drake_diff.optimize.ilqr.through_contact import check_schedule, solve_continuation, solve_through_jumps
 from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, overlaps, refused
+from drake_diff.optimize.problem.dynamics import DiscreteMap
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import lacking_between, swept
 from drake_diff.optimize.problem.problem import Problem
@@ -43,7 +44,7 @@ from drake_diff.optimize.transcription.collocation import (
     violation_between_nodes,
 )
 from drake_diff.optimize.transcription.drake import solve_collocation
-from drake_diff.optimize.transcription.task import DEFAULT_SCHEME, SCHEMES, OptimalControl
+from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl, default_scheme
 
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": "riccati"}
@@ -410,9 +411,7 @@ def _check_attempt(problem: Problem, attempt: Attempt) -> str:
 
 
 def _check_collocation(problem: Problem, attempt: Attempt) -> str:
-    scheme = DEFAULT_SCHEME if attempt.scheme is None else attempt.scheme
-    if scheme not in SCHEMES:
-        raise UnknownNameError("scheme", got=scheme, known=SCHEMES)
+    scheme = _check_scheme(problem, attempt)
     if attempt.solver == "snopt" and scheme != "drake":
         raise InputError("solver", got='"snopt"', expected=f'"ipopt" for scheme="{scheme}"; scheme="drake" takes both')
     if problem.parameters.parameters or problem.trajectory_cost is not None:
@@ -440,10 +439,23 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
     return scheme
 
 
+def _check_scheme(problem: Problem, attempt: Attempt) -> str:
+    scheme = default_scheme(problem) if attempt.scheme is None else attempt.scheme
+    if scheme not in SCHEMES:
+        raise UnknownNameError("scheme", got=scheme, known=SCHEMES)
+    if (scheme == MAP) != problem.is_map:
+        expected = f"{MAP!r}, as the system is a DiscreteMap" if problem.is_map else "one of motions in time"
+        raise InputError("scheme", got=repr(scheme), expected=expected)
+    if problem.is_map and attempt.refine:
+        raise InputError("refine", got=True, expected="None or False: a DiscreteMap has no intervals to split")
+    return scheme
+
+
 def choose_method(problem: Problem) -> tuple[str, str]:
     """(method, why)."""
     if not problem.has_model:
-        return "collocation", "plain dynamics have no discrete step"
+        told = "a discrete map is one sparse program" if problem.is_map else "plain dynamics have no discrete step"
+        return "collocation", told
     contract = problem.model.contract
     if problem.horizon is not None:
         return "collocation", "the horizon is " + ("free" if problem.horizon[0] < problem.horizon[1] else "given")
@@ -562,7 +574,7 @@ class Run:
         draft = self._draft(
             xs,
             us,
-            u_final=motion.us[-1],
+            u_final=None if self.problem.is_map else motion.us[-1],
             us_mid=None if self.scheme == "drake" else motion.us_mid,
             free_horizon=motion.horizon if self.problem.horizon else None,
             mesh=motion.mesh if len(us) > self.problem.num_steps else None,
@@ -693,17 +705,18 @@ class Run:
     def _certify_equations(self, jacobian: Any, xs: Array, us: Array) -> tuple[Certificate, ...]:
         """Certificates, at some knots, of the Jacobian that the solver gets against the equations themselves."""
         problem = self.problem
+        system, is_map = problem.system, problem.is_map
         values = EquationsOfMotion(problem.model).values if problem.has_model else problem.dynamics.values
         return tuple(
             certify_jacobian(
-                values,
+                system.at_step(int(k)).values if isinstance(system, DiscreteMap) else values,
                 np.concatenate([xs[k], us[k]]),
-                jacobian,
+                partial(jacobian, k=int(k)) if is_map else jacobian,
                 batched=True,
-                rows=tuple(f"d({name})/dt" for name in problem.state_names),
+                rows=tuple(f"next {name}" if is_map else f"d({name})/dt" for name in problem.state_names),
                 columns=problem.state_names + problem.input_names,
-                method="continuous time",
-                subject=f"the equations of motion of {problem.name}",
+                method="discrete map" if is_map else "continuous time",
+                subject=f"the map of {problem.name}" if is_map else f"the equations of motion of {problem.name}",
             )
             for k in _certified(us)
         )

@@ -4,7 +4,8 @@ A knot is a row [x, u] of (K, nx + nu). A function that also takes columns, x (n
 all knots; whether it does is tried once, against single calls.
 """
 
-from collections.abc import Callable, Sequence
+import inspect
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -165,6 +166,71 @@ class Dynamics:
         return np.concatenate([finite_array("x", x, (self.nx,)), finite_array("u", u, (self.nu,))])[None]
 
 
+class DiscreteMap(Dynamics):
+    """A map x_(k+1) = f(x_k, u_k), or f(x_k, u_k, k), with exact derivatives, as the system of a `Problem`.
+
+    Its time counts steps: the cost is sum_k running_cost(x_k, u_k) + final_cost(x_N), or running_cost(x, u, t) at
+    t = k. Events at known steps, such as a reset, are part of `f`: k is a plain whole number there.
+
+    Args:
+        f: a function of x (nx,), u (nu,) and, if it has a third argument, the step k, that returns the nx next states.
+            Write it as that of `Dynamics`; it may branch on k.
+        nx, nu: numbers of states and inputs.
+        x_lower, x_upper, u_lower, u_upper, state_names, input_names: as for `Dynamics`.
+
+    Raises:
+        InputError, ShapeError, GradientError: as for `Dynamics`.
+
+    Example:
+        >>> saved = dd.optimize.DiscreteMap(lambda x, u, k: [1.1 * x[0] - u[0] + (5.0 if k == 2 else 0.0)], nx=1, nu=1)
+        >>> [float(saved.values([[10.0, 1.0]], [k])[0, 0]) for k in (0, 2)]
+        [10.0, 15.0]
+    """
+
+    def __init__(self, f: Any, nx: int, nu: int, **limits: Any):
+        self.f, self.counts = f, _takes_a_step(f)
+        self.steps: dict[int, Pointwise] = {}
+        super().__init__((lambda x, u: f(x, u, 0)) if self.counts else f, nx, nu, **limits)
+
+    def __repr__(self) -> str:
+        return super().__repr__().replace("Dynamics", "DiscreteMap", 1)
+
+    def at_step(self, k: int) -> Any:
+        """The map of step `k` alone, with the methods `values` and `linearize`."""
+        if not self.counts:
+            return self.form
+        if k not in self.steps:
+            self.steps[k] = Pointwise(
+                f"dynamics at step {k}", lambda x, u: self.f(x, u, k), self.nx, (self.nx,), self.probe()
+            )
+        return self.steps[k]
+
+    def values(self, knots: Array, steps: Any = None) -> Array:
+        """(K, nx) the next states at `knots` (K, nx + nu), rows [x, u], of the `steps` (K,); of step 0 where None."""
+        knots = np.asarray(knots, dtype=float)
+        found = np.empty((len(knots), self.nx))
+        for k, rows in self._by_step(len(knots), steps):
+            found[rows] = self.at_step(k).values(knots[rows])
+        return found
+
+    def linearize(self, knots: Array, steps: Any = None) -> tuple[Array, Array]:
+        """(K, nx) the next states and (K, nx, nx + nu) their Jacobians [A, B], as `values`."""
+        knots = np.asarray(knots, dtype=float)
+        found, slopes = np.empty((len(knots), self.nx)), np.empty((len(knots), self.nx, self.nx + self.nu))
+        for k, rows in self._by_step(len(knots), steps):
+            found[rows], slopes[rows] = self.at_step(k).linearize(knots[rows])
+        return found, slopes
+
+    def _by_step(self, count: int, steps: Any) -> Iterator[tuple[int, Any]]:
+        """Each step and its rows."""
+        if steps is None or not self.counts:
+            yield 0, slice(None)
+            return
+        every = np.asarray(steps)
+        for k in np.unique(every):
+            yield int(k), np.flatnonzero(every == k)
+
+
 def plant_dynamics(model: Model) -> Dynamics:
     """A model's equations of motion in continuous time, with its own limits of positions, velocities and efforts.
 
@@ -242,6 +308,18 @@ class PlantKnots:
         by_knot[:, model.nx :] -= equations.actuation
         rows[model.nq :] = -np.linalg.solve(mass, by_knot)
         return np.concatenate([q_dot, acceleration]), rows
+
+
+def _takes_a_step(f: Any) -> bool:
+    """Whether `f` has a third argument."""
+    if not callable(f) or hasattr(f, "linearize"):
+        return False
+    try:
+        parameters = inspect.signature(f).parameters.values()
+    except (TypeError, ValueError):
+        return False
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return len([p for p in parameters if p.kind in kinds and p.default is p.empty]) > 2
 
 
 def _names(subject: str, given: Sequence[str] | None, letter: str, count: int) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, select
 from drake_diff.optimize.problem.constraint import Constraint, check_inside, plant_limits, resolve_bounds, short
 from drake_diff.optimize.problem.cost import ConstantCost, FinalCost, QuadraticCost
-from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
+from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, plant_dynamics
 from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGoals, in_words
 from drake_diff.optimize.problem.names import bounds_of, state_of
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, doubts_of
@@ -37,7 +37,8 @@ class Problem(ShowsItsRepr):
     takes the quadrature of its scheme. Bounds hold at every state that is not given and for every input.
 
     Args:
-        system: a Model, or `Dynamics` x' = f(x, u), which only method="collocation" takes.
+        system: a Model, or `Dynamics` x' = f(x, u), which only method="collocation" takes; or an
+            `optimize.DiscreteMap` x_(k+1) = f(x_k, u_k), whose time counts steps.
         x0: (nx,) the initial state; or a mapping from names of coordinates to values, the model's default elsewhere. A
             name is one of `state_names`, or that of a joint with one position, which it then is.
         num_steps: number N of intervals, of model.time_step each where no `horizon` is given.
@@ -130,9 +131,11 @@ class Problem(ShowsItsRepr):
         self._set("constraints", self._check_constraints())
         self._set("goals", self._check_goals())
         self._check_kept()
+        if self.horizon is not None and self.is_map:
+            raise InputError("horizon", got="given", expected="none for a DiscreteMap, whose time counts its steps")
         if self.horizon is not None:
             self._set("horizon", _check_horizon(self.horizon))
-        elif not self.has_model:
+        elif not self.has_model and not self.is_map:
             raise InputError("horizon", got="none", expected="a number of seconds, or (lower, upper)")
         self._check_costs()
         self._check_quantities()
@@ -145,8 +148,9 @@ class Problem(ShowsItsRepr):
         sizes = ", ".join(f"{n} {word}{'s' * (n != 1)}" for n, word in counts)
         free = self.horizon is not None and self.horizon[0] < self.horizon[1]
         time = f"{self.horizon[0]:g} to {self.horizon[1]:g}" if free else f"{self.start_horizon:g}"
+        time = "" if self.is_map else f" in {time} s"
         goal = "" if self.x_goal is None else f" to x_goal = {short(self.x_goal)}"
-        lines = [f"Problem of {self.name}: {sizes} in {time} s", f"from x0 = {short(self.x0)}{goal}"]
+        lines = [f"Problem of {self.name}: {sizes}{time}", f"from x0 = {short(self.x0)}{goal}"]
         for name in ("running_cost", "final_cost", "trajectory_cost"):
             cost = getattr(self, name)
             if cost is not None:
@@ -165,6 +169,11 @@ class Problem(ShowsItsRepr):
     def has_model(self) -> bool:
         """Whether this is a problem of a model, and not of plain dynamics."""
         return isinstance(self.system, Model)
+
+    @property
+    def is_map(self) -> bool:
+        """Whether the system is a `DiscreteMap`, and time counts steps."""
+        return isinstance(self.system, DiscreteMap)
 
     @property
     def model(self) -> Model:
@@ -205,6 +214,8 @@ class Problem(ShowsItsRepr):
         if isinstance(self.system, Model):
             whole = self.num_steps * self.system.time_step
             return whole if self.horizon is None else float(np.clip(whole, *self.horizon))
+        if self.is_map:
+            return float(self.num_steps)
         return float(sum(self.horizon) / 2)
 
     @property

@@ -28,6 +28,7 @@ DENSE = np.linspace(0, 1, 41)[1:-1]  # where the input is looked at between two 
 EXCESS_TOLERANCE = 1e-3
 EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in TVLQR, over that of the states
 CLEARANCE_ROUNDS, MOST_INTERVALS = 5, 1000  # where a plan comes too near to an obstacle between its knots
+ROUNDED = 1e-9  # of an interval: so near to its end is the end
 SMALLEST_ERROR = 1e-12  # of an interval: rounding, which no finer mesh makes less
 MOST_PIECES = 4  # of one interval in one round of refinement
 FOUND = (Outcome.SOLVED, Outcome.INACCURATE)
@@ -158,7 +159,7 @@ class Collocated:
 
     @cached_property
     def _rates(self) -> Array:
-        return self.task.dynamics.values(self.nodes)
+        return self.task.moved(self.nodes, self.task.interval_of(len(self.nodes)))
 
     @property
     def _cost_rates(self) -> Array:
@@ -186,6 +187,8 @@ class Collocated:
         """xs and us in the intervals `k` (S,) at `tau` (S,) of each."""
         scheme, nx = self.task.scheme, self.task.dynamics.nx
         us = scheme.per_interval(self.nodes[:, nx:])[k]
+        if self.task.is_map:  # between two steps nothing moves
+            return self.xs[k + (tau > 1 - ROUNDED)], np.einsum("sj,sju->su", scheme.at(tau), us)
         moved = np.einsum("sj,sjx->sx", scheme.integrated(tau), scheme.per_interval(self._rates)[k])
         return self.xs[k] + self._lengths[k, None] * moved, np.einsum("sj,sju->su", scheme.at(tau), us)
 
@@ -196,14 +199,15 @@ class Collocated:
 
     def led(self, control: str) -> Array:
         """(10 N + 1, nx) the same at every substep, by "open loop", or by "TVLQR" about the motion."""
-        return self._open_loop if control == "open loop" else self._led(self._gains())
+        return self._open_loop if control == "open loop" else self.led_from(self.xs[0], self.gains()[0])
 
     @cached_property
     def _open_loop(self) -> Array:
-        return self._led(None)
+        return self.led_from(self.xs[0], None)
 
-    def _led(self, gains: Array | None) -> Array:
-        z = self.xs[:1]
+    def led_from(self, x: Array, gains: Array | None) -> Array:
+        """(10 N + 1, nx) where the dynamics lead from `x` (nx,), with feedback by `gains` (N, nu, nx) if there are."""
+        z = x[None]
         found = [z]
         for k in range(len(self.mesh) - 1):
             path = self._integrate(np.array([k]), z, None if gains is None else gains[k])
@@ -211,21 +215,25 @@ class Collocated:
             z = path[-1]
         return np.concatenate(found)
 
-    def _gains(self) -> Array:
-        """(N, nu, nx) of each interval, by Riccati's recursion with Bryson's weights, as a replay's TVLQR has them."""
-        nx, nu = self.task.dynamics.nx, self.task.dynamics.nu
+    def gains(self, at_end: Array | None = None) -> tuple[Array, Array]:
+        """(N, nu, nx) of each interval, by Riccati's recursion with Bryson's weights, as a replay's TVLQR has them.
+
+        And (nx, nx) what a distance from the first state then costs; `at_end` (nx, nx) is what one from the last does.
+        """
+        nx, nu, is_map = self.task.dynamics.nx, self.task.dynamics.nu, self.task.is_map
         effort = np.maximum(np.max(np.abs(self.us), axis=0), SMALLEST_RANGE)
         Q, R = np.diag(1 / self.task.problem.ranges(self.xs) ** 2), EFFORT_WEIGHT * np.diag(1 / effort**2)
-        by_knot = self.task.dynamics.linearize(np.hstack([self.xs, self.us])[:-1])[1]
-        P, gains = FINAL_WEIGHT * Q, np.empty((len(by_knot), nu, nx))
-        for k in range(len(by_knot) - 1, -1, -1):
-            h = self._lengths[k]
-            implicit = np.eye(nx) - h / 2 * by_knot[k][:, :nx]  # the step by the implicit midpoint rule
-            A = np.linalg.solve(implicit, np.eye(nx) + h / 2 * by_knot[k][:, :nx])
-            B = np.linalg.solve(implicit, h * by_knot[k][:, nx:])
+        count = len(self.xs) - 1
+        by_knot = self.task.linearized(np.hstack([self.xs, self.us])[:-1], np.arange(count))
+        P, gains = FINAL_WEIGHT * Q if at_end is None else at_end, np.empty((count, nu, nx))
+        for k in range(count - 1, -1, -1):
+            h, A, B = self._lengths[k], by_knot[k][:, :nx], by_knot[k][:, nx:]
+            if not is_map:  # the step by the implicit midpoint rule
+                implicit = np.eye(nx) - h / 2 * A
+                A, B = np.linalg.solve(implicit, np.eye(nx) + h / 2 * A), np.linalg.solve(implicit, h * B)
             gains[k] = np.linalg.solve(h * R + B.T @ P @ B, B.T @ P @ A)
             P = h * Q + A.T @ P @ (A - B @ gains[k])
-        return gains
+        return gains, P
 
     @cached_property
     def _integrated(self) -> Array:
@@ -239,7 +247,7 @@ class Collocated:
         Its last column is the cost, where it has one more than the states. With `gains` (nu, nx), under feedback about
         the motion too.
         """
-        dynamics, nx = self.task.dynamics, self.task.dynamics.nx
+        nx, is_map = self.task.dynamics.nx, self.task.is_map
         dt, found = self._lengths[k, None] / SUBSTEPS, [z]
 
         def rate(z: Array, step: float) -> Array:
@@ -250,10 +258,14 @@ class Collocated:
                 us = self._cut_off(np.clip(us, b.u_lower, b.u_upper))
             knots = np.hstack([z[:, :nx], us])
             if z.shape[1] == nx:
-                return dynamics.values(knots)
-            return np.column_stack([dynamics.values(knots), self.task.rates(knots, self._times(k, tau))])
+                return self.task.moved(knots, k)
+            return np.column_stack([self.task.moved(knots, k), self.task.rates(knots, self._times(k, tau))])
 
         with np.errstate(all="ignore"):
+            if is_map:  # the state is held until the next step
+                stepped = rate(z, 0.0)
+                stepped[:, nx:] += z[:, nx:]
+                return np.array([z] * SUBSTEPS + [stepped])
             for i in range(SUBSTEPS):
                 k1 = rate(z, i)
                 k2 = rate(z + dt / 2 * k1, i + 0.5)
@@ -325,6 +337,8 @@ def violation_between_nodes(motion: Collocated) -> Excess:
         (0.0, 0.0, 0.004, 'converged_not_verified')
     """
     task, b, count = motion.task, motion.task.bounds, len(motion.mesh) - 1
+    if task.is_map:
+        return Excess(0.0, 0.0, 0.0, 0.0, "nowhere", (), ())
     inside, states, inputs = np.arange(1, SUBSTEPS) / SUBSTEPS, task.dynamics.state_names, task.dynamics.input_names
     k, tau = np.tile(np.arange(count), len(inside)), np.repeat(inside, count)
     applied, ranges, (times, xs) = motion._applied(k, tau), task.problem.ranges(motion.xs), motion.between_knots
@@ -450,9 +464,9 @@ class Transcription:
         self.mesh = np.linspace(0, 1, problem.num_steps + 1)
         self.functions = knot_functions(self.task)
 
-    def jacobian(self, knot: Array) -> Array:
-        """(nx, nx + nu) of the rates at `knot` (nx + nu,), as the solver gets it."""
-        return np.asarray(self.functions.dynamics.jacobian_of(knot))
+    def jacobian(self, knot: Array, k: int = 0) -> Array:
+        """(nx, nx + nu) of the rates at `knot` (nx + nu,), or of a map's step `k`, as the solver gets it."""
+        return np.asarray(self.functions.dynamics.jacobian_of(knot, k))
 
     def nodes_at(self, mesh: Array, guess: Any) -> Array:
         """(K, nx + nu) the nodes of a guess, xs (N+1, nx) and us (N+1, nu) or a motion, within the input's bounds."""

@@ -22,7 +22,7 @@ from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.refusal import Refusal
 from drake_diff.mechanics.casadi_tree import PlantFunctions, agrees, symbolic_plant
 from drake_diff.optimize.problem.constraint import Constraint
-from drake_diff.optimize.problem.dynamics import Dynamics, PlantKnots, Pointwise
+from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, PlantKnots, Pointwise
 from drake_diff.optimize.transcription.task import OptimalControl, TimedRate
 
 SAME_VALUES = 1e-10  # of the largest value at a knot: the same operations, rounded in another order
@@ -123,8 +123,8 @@ class Symbolic:
     def jacobian(self, knots: Any) -> Any:
         return ca.vec(_at_all(self._jacobian, knots, *self.known).nz[:])
 
-    def jacobian_of(self, knot: Array) -> Array:
-        """(m, nx + nu) at one `knot` (nx + nu,)."""
+    def jacobian_of(self, knot: Array, step: int = 0) -> Array:
+        """(m, nx + nu) at one `knot` (nx + nu,), the same of every step."""
         return np.asarray(self._jacobian(knot).full())
 
     def hessian(self, knots: Any, weights: Any) -> Any:
@@ -205,10 +205,19 @@ class SymbolicPlant(Symbolic):
 class Called:
     """A function that is called back, with dense Jacobians; the first error of a call is kept, and fails the call."""
 
-    def __init__(self, why_not: str, values: Values, linearize: Linearize, rows: int, width: int):
+    def __init__(
+        self,
+        why_not: str,
+        values: Values,
+        linearize: Linearize,
+        rows: int,
+        width: int,
+        at_step: Callable[[int], Any] | None = None,
+    ):
         self.why_not, self.rows, self.width = why_not, rows, width
         self.evaluate, self.linearize = values, linearize
         self.error: Exception | None = None
+        self.at_step = at_step  # of a map that is another one at each step
         self.jacobian_at = _places(ca.Sparsity.dense(rows, width))
         self._kept: list[Any] = []  # CasADi holds no reference to its callbacks
 
@@ -223,9 +232,10 @@ class Called:
         self._kept.append(_KnotCallback(self, knots.shape[1], self.rows * self.width, rows))
         return ca.vec(self._kept[-1](knots))
 
-    def jacobian_of(self, knot: Array) -> Array:
-        """(m, nx + nu) at one `knot` (nx + nu,)."""
-        return np.asarray(self.linearize(knot[None])[1][0])
+    def jacobian_of(self, knot: Array, step: int = 0) -> Array:
+        """(m, nx + nu) at one `knot` (nx + nu,), of a step where it changes from step to step."""
+        linearize = self.linearize if self.at_step is None else self.at_step(step).linearize
+        return np.asarray(linearize(knot[None])[1][0])
 
 
 class _KnotCallback(ca.Callback):  # type: ignore[misc]
@@ -316,7 +326,51 @@ class Timed:
         return Called(self.why_not, kept(self.rate.values), kept(self.rate.linearize), 1, self.width)
 
 
-KnotFunction = Symbolic | Called
+class Stepwise:
+    """A map whose expression is another one at each step, of all nodes of its mesh at once; see `Symbolic`."""
+
+    why_not = ""
+
+    def __init__(self, functions: list[Any]):
+        self.functions, self.rows, self.width = functions, functions[0].size1_out(0), functions[0].size1_in(0)
+        knot, weights = ca.SX.sym("knot", self.width), ca.SX.sym("weights", self.rows)
+        slopes = [ca.jacobian(f(knot), knot) for f in functions]
+        curves = [ca.triu(ca.hessian(ca.dot(weights, f(knot)), knot)[0]) for f in functions]
+        self._jacobians, places = _alike("jacobian", [knot], slopes)
+        self._hessians, self._curved = _alike("hessian", [knot, weights], curves)
+        self.jacobian_at = _places(places)
+
+    def values(self, knots: Any) -> Any:
+        return ca.horzcat(*[f(knots[:, k]) for k, f in enumerate(self.functions)])
+
+    def jacobian(self, knots: Any) -> Any:
+        return ca.vertcat(*[f(knots[:, k]) for k, f in enumerate(self._jacobians)])
+
+    def jacobian_of(self, knot: Array, step: int = 0) -> Array:
+        """(m, nx + nu) at one `knot` (nx + nu,) of a step."""
+        found = np.zeros((self.rows, self.width))
+        found[self.jacobian_at] = np.asarray(self._jacobians[step](knot)).ravel()
+        return found
+
+    def hessian(self, knots: Any, weights: Any) -> Any:
+        return ca.vertcat(*[f(knots[:, k], weights[:, k]) for k, f in enumerate(self._hessians)])
+
+    @property
+    def hessian_at(self) -> tuple[Indices, Indices]:
+        return _places(self._curved)
+
+
+def _alike(name: str, arguments: list[Any], matrices: list[Any]) -> tuple[list[Any], Any]:
+    """Functions of the nonzeros of `matrices`, all at the places at which one of them has some, and these places."""
+    places = matrices[0].sparsity()
+    for matrix in matrices[1:]:
+        places = places.unite(matrix.sparsity())
+    return [
+        ca.Function(name, arguments, [ca.vertcat(*ca.project(m, places).nz[:].elements())]) for m in matrices
+    ], places
+
+
+KnotFunction = Symbolic | Called | Stepwise
 
 
 def _places(sparsity: Any) -> tuple[Indices, Indices]:
@@ -370,11 +424,29 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
         return choose(c.function if c.takes_input else lambda x, u: c.function(x), values, linearize, len(c.lower))
 
     return KnotFunctions(
-        _dynamics(task.dynamics),
+        _map(task.dynamics, task.problem.num_steps)
+        if isinstance(task.dynamics, DiscreteMap)
+        else _dynamics(task.dynamics),
         Timed(rate, nx) if isinstance(rate, TimedRate) else choose(rate.f, rate.values, rate.linearize, 1),
         final if final is None else choose(final.f, final.values, final.linearize, 1),
         tuple(path(constraint) for constraint in task.problem.kept),
     )
+
+
+def _map(f: DiscreteMap, count: int) -> KnotFunction:
+    """Of all nodes of `count` steps; after the last there is none, and the last step's stands there."""
+    if not f.counts:
+        return _dynamics(f)
+    probe, steps = f.probe(), np.minimum(np.arange(count + 1), count - 1)
+    found = [trace(f.at_step(k).f, f.nx, probe, f.at_step(k).values(probe)) for k in range(count)]
+    why = next((each.reason for each in found if isinstance(each, Refusal)), None)
+    if why is None:
+        return Stepwise([*found, found[-1]])
+
+    def of(function: Any) -> Any:
+        return lambda knots: function(knots, steps)
+
+    return Called(why, of(f.values), of(f.linearize), f.nx, f.nx + f.nu, f.at_step)
 
 
 def _dynamics(dynamics: Dynamics) -> KnotFunction:

@@ -24,7 +24,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost, differentiate_cost
-from drake_diff.optimize.problem.dynamics import Pointwise
+from drake_diff.optimize.problem.dynamics import DiscreteMap, Pointwise
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.timed import TimedCost
 
@@ -99,12 +99,20 @@ _TRAPEZOID = (
     np.array([[1.0, 0]]),
     np.array([[-0.5, 0]]),
 )
+_MAP = np.array([[0.0, 1]]), np.array([[1.0, 0]]), np.array([[1.0], [0]]), np.zeros((0, 2)), np.zeros((0, 2))
+MAP = "map"  # of a DiscreteMap: x_1 - f(x_0, u_0) = 0 with intervals of length 1, and inputs that are held
 SCHEMES = {
     "hermite_simpson": Scheme(4, *_SIMPSON),
     "trapezoid": Scheme(2, *_TRAPEZOID),
     "drake": Scheme(2, *_SIMPSON, input_is_linear=True),
+    MAP: Scheme(1, *_MAP),
 }
 DEFAULT_SCHEME = "hermite_simpson"
+
+
+def default_scheme(problem: Problem) -> str:
+    """The scheme where none is asked for."""
+    return MAP if problem.is_map else DEFAULT_SCHEME
 
 
 class KnownRate:
@@ -154,6 +162,7 @@ class OptimalControl:
 
     def __init__(self, problem: Problem, scheme: str):
         self.problem, self.scheme = problem, SCHEMES[scheme]
+        self.is_map = scheme == MAP
         self.dynamics, self.bounds = problem.dynamics, problem.bounds
         self.horizon: tuple[float, float] = problem.horizon or (problem.start_horizon,) * 2  # (lower, upper) [s]
         running, cost, nx = problem.total_running_cost, problem.total_final_cost, self.dynamics.nx
@@ -169,6 +178,20 @@ class OptimalControl:
         if cost is not None:
             self.final = Pointwise("final_cost", lambda x, u: cost(x), nx, (), self.dynamics.probe())
 
+    def moved(self, knots: Array, k: Indices) -> Array:
+        """(K, nx) what the dynamics say at `knots` (K, nx + nu) in the intervals `k` (K,): rates, or a map's states."""
+        dynamics = self.dynamics
+        return dynamics.values(knots, k) if isinstance(dynamics, DiscreteMap) else dynamics.values(knots)
+
+    def linearized(self, knots: Array, k: Indices) -> Array:
+        """(K, nx, nx + nu) the Jacobians of the same."""
+        dynamics = self.dynamics
+        return (dynamics.linearize(knots, k) if isinstance(dynamics, DiscreteMap) else dynamics.linearize(knots))[1]
+
+    def interval_of(self, count: int) -> Indices:
+        """(K,) the interval that each of `count` nodes begins or lies in; the last node is the last interval's."""
+        return np.minimum(np.arange(count) // self.scheme.nodes, (count - 1) // self.scheme.nodes - 1)
+
     def rates(self, knots: Array, times: Array) -> Array:
         """(K,) the running cost at `knots` (K, nx + nu) and `times` (K,) [s]."""
         with_known = self.rate.with_known(knots, times) if isinstance(self.rate, TimedRate) else knots
@@ -176,7 +199,9 @@ class OptimalControl:
 
     def nodes_of(self, constraint: Constraint, mesh: Array) -> Indices:
         """The nodes of `mesh` (N+1,) where `constraint` holds: its knots, or all nodes but a given first one."""
-        knots = self.problem.knots_of(constraint, input_at_end=True)
+        knots = self.problem.knots_of(constraint, input_at_end=not self.is_map)
+        if self.is_map:
+            return np.array(knots)
         if constraint.knots is None:
             return np.arange(knots[0], self.scheme.nodes * (len(mesh) - 1) + 1)
         return self._nodes_at(knots, mesh)
@@ -187,6 +212,8 @@ class OptimalControl:
         sides = [np.tile(np.concatenate(s), (count, 1)) for s in ((b.x_lower, b.u_lower), (b.x_upper, b.u_upper))]
         if self.scheme.input_is_linear:  # Drake bounds knots alone
             sides[0][1::2], sides[1][1::2] = -np.inf, np.inf
+        if self.is_map:  # there is no input after the last step
+            sides[0][-1, nx:] = sides[1][-1, nx:] = np.clip(0.0, b.u_lower, b.u_upper)
         knots = self._nodes_at(range(self.problem.num_steps + 1), mesh)
         for side, states in zip(sides, self.problem.state_limits(), strict=True):
             side[knots, :nx] = states
