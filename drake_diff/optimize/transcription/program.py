@@ -41,6 +41,10 @@ OUTCOMES = {
 OPTIONS = {
     "ipopt.mu_strategy": "adaptive",  # the monotone one ends minimum times of a pendulum as infeasible
     "ipopt.max_hessian_perturbation": 1e8,  # of IPOPT's 1e20 it takes tens of iterations to come down again
+    # Larger pivots fill the factors where the final time is free, whose column is dense, up to ten times.
+    "ipopt.mumps_pivtol": 1e-8,
+    "ipopt.mumps_permuting_scaling": 0,
+    "ipopt.mumps_scaling": 1,
     "print_time": False,
     "show_eval_warnings": False,
     "calc_lam_p": False,
