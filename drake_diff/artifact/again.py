@@ -28,7 +28,7 @@ GIVEN = ("name", "provenance", "wall_clock")
 SEARCHED = ("events", "failures", "gradient", "inputs", "sentence", "solver", "verdict")
 SEARCH_TOPICS = ("/solver/", "/gradient/", "/events", "/replays")
 # What a constraint that is a user's function decides, beside the search.
-CONSTRAINED = ("metrics[constraint violation]", "problem.constraints")
+CONSTRAINED = ("metrics[constraint violation]", "problem.constraints", "problem.couplings")
 JUDGED = ("holds", "failures")  # of each replay
 SAME_PLAN = 1e-6  # of the largest number of its array: plans that are no further apart are the same
 NOT_REPEATED = {

@@ -45,6 +45,8 @@ def _of_a_solve(record: EvidenceRecord) -> Iterator[str]:
         yield f"goal {shown(goal)}"
     for c in p.get("constraints") or ():
         yield f"constraint {shown(c)}"
+    for c in p.get("couplings") or ():
+        yield f"coupling {shown(c)}"
     yield from (f"{name.replace('_', ' ')} {shown(p[name])}" for name in COSTS if p.get(name) is not None)
     started = [f"{e.name} from {e.start:.9g} within [{shown(e.lower)}, {shown(e.upper)}]" for e in record.parameters]
     mask = p.get("initial_state_free")

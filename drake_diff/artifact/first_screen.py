@@ -45,6 +45,8 @@ def asked_for(problem: Problem, times: Array) -> str:
         tasks.append(f"pass {len(problem.waypoints)} given state{'s' * (len(problem.waypoints) > 1)} on the way")
     if problem.constraints:
         tasks.append("keep " + _listed([f"“{c.label}”" for c in problem.constraints]))
+    if problem.couplings:
+        tasks.append("keep " + _listed([c.label for c in problem.couplings]))
     if not tasks:
         tasks.append("move at the least cost")
     time = f"in {times[-1]:.3g} s"

@@ -181,7 +181,9 @@ def _rebuild_guess(problem: Problem, kind: Any, plan: dict[str, Array]) -> Any:
     if kind == "arrays":
         return tuple(given[name] for name in ("xs", "us", "horizon") if name in given)
     fields: dict[str, Any] = {name: given[name] for name in ("xs", "us", "us_mid", "u_final", "mesh") if name in given}
-    like = replace(problem, num_steps=int(given["num_steps"]), us=None, waypoints={}, constraints=(), goals=())
+    like = replace(
+        problem, num_steps=int(given["num_steps"]), us=None, waypoints={}, constraints=(), couplings=(), goals=()
+    )
     horizon = float(given["horizon"])
     return Solution(
         problem=like,

@@ -17,6 +17,7 @@ from drake_diff.model.plant import FLOATING, joints
 from drake_diff.model.quantities import description_of, made_from
 from drake_diff.optimize.problem.constraint import Bounds, Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost
+from drake_diff.optimize.problem.coupling import Couples, Periodic
 from drake_diff.optimize.problem.goals import CenterOfMassGoal, FrameGoal, FrameVelocityGoal, Goal, JointGoal, KeepLevel
 from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
@@ -69,6 +70,7 @@ UNITS = {
     "sap_near_rigid_threshold": "1",
     "collision_pairs, constraints, num_steps": "1",
 }
+COUPLED = "those of the states and inputs that they join, and per s of rates"
 UNKNOWN = "unknown"  # the unit of a number of plain dynamics
 LIMITATIONS = [
     "of the model in simulation only: nothing here was measured on a robot",
@@ -93,13 +95,15 @@ KINDS_OF_OBSTACLES = (SphereObstacle, BoxObstacle, SelfCollision)
 # By the names that a record has.
 GOALS: dict[str, Any] = {kind.__name__: kind for kind in (*KINDS_OF_GOALS, *KINDS_OF_OBSTACLES)}
 
+COUPLINGS: dict[str, Any] = {kind.__name__: kind for kind in (Periodic,)}
+
 
 def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
     """The sections that are known when a run begins; with its `solution` those that it decides are exact."""
     time_step = problem.time_step if solution is None else solution.time_step
     options = {} if solution is None else solution.options
     goal = "" if np.all(np.isnan(problem.goal)) else " and ends in x_goal"
-    goals = ", goals" if problem.goals else ""
+    goals = (", goals" if problem.goals else "") + (", couplings" if problem.couplings else "")
     equations = "Drake's equations" if problem.has_model else "the given equations"
     statement = (
         f"{problem.name}, by {equations}, starts in x0{goal} after {problem.num_steps} intervals, and "
@@ -115,7 +119,7 @@ def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
         ),
         "problem": describe_problem(problem),
         "contract": problem.model.contract.to_dict() if problem.has_model else {},
-        "units": UNITS,
+        "units": UNITS | ({"couplings": COUPLED} if problem.couplings else {}),
         "observation": _observation(problem, time_step),
         "action": _action(problem, time_step, options.get("time_limit")),
         "model": model_input(problem.model) if problem.has_model else ModelInput(file=None, options=None),
@@ -274,6 +278,7 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
             }
             for c, at in zip(problem.constraints, knots, strict=True)
         ],
+        **({"couplings": [c.to_dict() for c in problem.couplings]} if problem.couplings else {}),
         "goals": [goal.to_dict() for goal in problem.goals],
         "free_horizon_s": None if problem.horizon is None else list(problem.horizon),
         **{name: finite_list(getattr(problem.bounds, name)) for name in LIMITS},
@@ -316,7 +321,9 @@ def unknown_functions(record: EvidenceRecord) -> tuple[list[str], list[str]]:
     listed = record.problem.get("constraints")
     constraints: list[Any] = listed if isinstance(listed, list) else []
     unknown = [c for c in constraints if isinstance(c, dict) and c.get("quantity") is None]
-    return costs, [str(c.get("name")) for c in unknown]
+    coupled: Any = record.problem.get("couplings", [])
+    joining = [c["Coupling"] for c in coupled if "Coupling" in c]
+    return costs, [str(c.get("name")) for c in (*unknown, *joining)]
 
 
 def rebuild_problem(record: EvidenceRecord, model: Model, us: Array, start_us: Array | None) -> Problem:
@@ -346,6 +353,7 @@ def rebuild_problem(record: EvidenceRecord, model: Model, us: Array, start_us: A
         x_goal=goal,
         waypoints={int(k): _numbers(x, np.nan) for k, x in p["waypoints"].items()},
         constraints=[_rebuild_constraint(c, model) for c in p["constraints"] if c["quantity"] is not None],
+        couplings=[rebuild_coupling(each) for each in p.get("couplings", ()) if "Coupling" not in each],
         goals=goals,
         horizon=p["free_horizon_s"],
         bounds=Bounds(**bounds),
@@ -372,6 +380,15 @@ def rebuild_goal(told: Any) -> Goal:
         raise InputError("goal", got=repr(told)[:80], expected=f"one of {', '.join(GOALS)} with its values")
     ((kind, values),) = told.items()
     found: Goal = GOALS[kind](**values)
+    return found
+
+
+def rebuild_coupling(told: Any) -> Couples:
+    """A coupling from what a record tells of it; InputError where that is none."""
+    if not (isinstance(told, dict) and len(told) == 1 and next(iter(told)) in COUPLINGS):
+        raise InputError("coupling", got=repr(told)[:80], expected=f"one of {', '.join(COUPLINGS)} with its values")
+    ((kind, values),) = told.items()
+    found: Couples = COUPLINGS[kind](**values)
     return found
 
 

@@ -69,7 +69,7 @@ class MPC:
         if not isinstance(problem, Problem):
             raise InputError("problem", got=type(problem).__name__, expected="a Problem")
         check_problem(problem)
-        for subject in ("horizon", "waypoints", "constraints", "goals"):
+        for subject in ("horizon", "waypoints", "constraints", "couplings", "goals"):
             if getattr(problem, subject):
                 raise InputError(subject, got="given", expected="none: MPC cannot keep it")
         if not problem.initial_state_is_given:

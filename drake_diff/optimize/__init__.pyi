@@ -1,3 +1,5 @@
+from .problem.coupling import Coupling as Coupling
+from .problem.coupling import Periodic as Periodic
 from .problem.dynamics import DiscreteMap as DiscreteMap
 from .problem.dynamics import plant_dynamics as plant_dynamics
 from .problem.timed import TrackingCost as TrackingCost

@@ -17,6 +17,7 @@ from drake_diff._base.arrays import Array, frozen
 from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.motion.gradient import Totals, accumulate
 from drake_diff.optimize.ilqr.riccati import minimize_in_box
+from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.shooting import RolloutCost, ShootingVariables
@@ -42,11 +43,11 @@ class Optimality:
 
 @dataclass(frozen=True, eq=False)
 class _Row:
-    """A row that holds the plan: its derivative by a state and an input, and the signs that its multiplier may have."""
+    """A row that holds the plan: its derivatives by states and inputs, and the signs that its multiplier may have."""
 
-    knot: int
-    by_x: Array  # (nx,)
-    by_u: Array  # (nu,)
+    knots: tuple[int, ...]
+    by_x: Array  # (knots, nx)
+    by_u: Array  # (knots, nu)
     lowest: float  # -inf or 0
     highest: float  # inf or 0
 
@@ -77,9 +78,10 @@ def optimality(problem: Problem, variables: ShootingVariables, z: Array) -> Opti
     free = ~(sides[0] | sides[1])
     multipliers = _multipliers(of_cost[free], jacobian[free], rows)
     for row, multiplier in zip(rows, multipliers, strict=True):
-        direct_xs[row.knot] += multiplier * row.by_x
-        if row.knot < len(us):
-            direct_us[row.knot] += multiplier * row.by_u
+        for knot, by_x, by_u in zip(row.knots, row.by_x, row.by_u, strict=True):
+            direct_xs[knot] += multiplier * by_x
+            if knot < len(us):
+                direct_us[knot] += multiplier * by_u
     totals = accumulate(linearization, direct_xs, direct_us)
     left = variables.gradient(z, totals)
     left = np.where(sides[0], np.minimum(left, 0.0), np.where(sides[1], np.maximum(left, 0.0), left))
@@ -99,25 +101,36 @@ def optimality(problem: Problem, variables: ShootingVariables, z: Array) -> Opti
 
 def _totals(linearization: list[StepDerivatives], row: _Row, xs: Array, us: Array) -> Totals:
     by_xs, by_us = np.zeros_like(xs), np.zeros_like(us)
-    by_xs[row.knot] = row.by_x
-    if row.knot < len(us):
-        by_us[row.knot] = row.by_u
+    for knot, by_x, by_u in zip(row.knots, row.by_x, row.by_u, strict=True):
+        by_xs[knot] = by_x
+        if knot < len(us):
+            by_us[knot] = by_u
     return accumulate(linearization, by_xs, by_us)
 
 
 def _rows(problem: Problem, xs: Array, us: Array) -> Iterator[_Row]:
-    """Goal, waypoints, and each bound of a state after the first and each constraint that the plan lies on."""
+    """Goal, waypoints, and each bound of a state after the first, constraint and coupling that the plan lies on."""
     none = np.zeros(us.shape[1])
     lower, upper = problem.state_limits()
     for k, i in np.argwhere((xs <= lower + FEASIBILITY_TOLERANCE) | (xs >= upper - FEASIBILITY_TOLERANCE)):
         if k:
-            yield _Row(int(k), np.eye(problem.nx)[i], none, *_signs(xs[k, i], lower[k, i], upper[k, i]))
+            yield _Row((int(k),), np.eye(problem.nx)[[i]], none[None], *_signs(xs[k, i], lower[k, i], upper[k, i]))
     for constraint in problem.kept:
         for k in problem.knots_of(constraint, input_at_end=False):
-            values, by_xu = constraint.differentiate(xs[k], us[min(k, len(us) - 1)])
-            for value, slopes, least, most in zip(values, by_xu, constraint.lower, constraint.upper, strict=True):
-                if value <= least + FEASIBILITY_TOLERANCE or value >= most - FEASIBILITY_TOLERANCE:
-                    yield _Row(k, slopes[: problem.nx], slopes[problem.nx :], *_signs(value, least, most))
+            yield from _held(constraint, (k,), xs[k], us[min(k, len(us) - 1)])
+    for coupling in problem.coupled(input_at_end=False):
+        for at in coupling.knots:
+            yield from _held(coupling.rows, tuple(at.tolist()), *coupling.packed(xs, us, at))
+
+
+def _held(constraint: Constraint, knots: tuple[int, ...], x: Array, u: Array) -> Iterator[_Row]:
+    """The rows of `constraint` that lie on a bound, with x and u the states and inputs at the `knots` side by side."""
+    values, by_xu = constraint.differentiate(x, u)
+    count = len(knots)
+    for value, slopes, least, most in zip(values, by_xu, constraint.lower, constraint.upper, strict=True):
+        if value <= least + FEASIBILITY_TOLERANCE or value >= most - FEASIBILITY_TOLERANCE:
+            by_x, by_u = slopes[: len(x)].reshape(count, -1), slopes[len(x) :].reshape(count, -1)
+            yield _Row(knots, by_x, by_u, *_signs(value, least, most))
 
 
 def _signs(value: float, lower: float, upper: float) -> tuple[float, float]:

@@ -375,7 +375,7 @@ def too_deep(model: Model, motion: Rollout) -> Iterator[str]:
 
 
 def _broken_constraints(plan: Plan, xs: Array, us: Array) -> Iterator[str]:
-    """Of the constraints and waypoints, by a replay's states xs (N+1, nx) and us (N, nu) at the plan's knots."""
+    """Of constraints, couplings and waypoints, by a replay's states xs (N+1, nx) and us (N, nu) at the plan's knots."""
     problem, tolerances = plan.problem, dict[str, float]()
     planned_xs, planned_us = plan.sample(1)
     for c in problem.constraints:  # its range is that along the whole plan: at a single knot it has none
@@ -383,6 +383,9 @@ def _broken_constraints(plan: Plan, xs: Array, us: Array) -> Iterator[str]:
             values = np.array([c(x, u) for x, u in zip(planned_xs, [*planned_us, planned_us[-1]], strict=True)])
         values = values[np.isfinite(values).all(axis=1)]
         tolerances[c.label] = STATE_TOLERANCE * max(float(np.ptp(values, axis=0).max()), SMALLEST_RANGE)
+    for coupling in problem.coupled(input_at_end=False):
+        reach = max(coupling.reach(planned_xs, planned_us), SMALLEST_RANGE)
+        tolerances[coupling.label] = max(STATE_TOLERANCE * reach, tolerances.get(coupling.label, 0.0))
     goals = {c.label for c in problem.kept_goals}.difference(tolerances)  # they say themselves how near is near enough
     for name, (excess, knot) in problem.constraint_excess(xs, us).items():
         tolerance = tolerances.get(name, STATE_TOLERANCE * float(np.max(plan.scale)))

@@ -7,7 +7,7 @@ what a late input does need not be seen through all the steps before it. One seg
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -26,6 +26,7 @@ from drake_diff.motion.gradient import Totals, accumulate, differentiate_loss
 from drake_diff.motion.rollout import roll_states
 from drake_diff.optimize.drake_program import solve_program
 from drake_diff.optimize.problem.cost import differentiate_cost, differentiate_final_cost
+from drake_diff.optimize.problem.coupling import BoundCoupling
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.timed import cost_at
 from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report
@@ -137,6 +138,22 @@ class SegmentedMotion:
         starts = [xs[segment.steps.start] for segment in self.segments[1:]]
         return np.concatenate([self.whole.pack(xs[0], us, parameters), *starts])
 
+    def inputs(self, z: Array) -> Array:
+        """(N, nu) the inputs."""
+        return self.whole.unpack(z[: self.whole.size])[1]
+
+    def sensitivities(self, z: Array, knots: Iterable[int]) -> dict[int, Array]:
+        """(nx, size) d x_k / d z of each of `knots`."""
+        found, wanted = {}, set(knots)
+        for i, segment in enumerate(self.segments):
+            own = self.indices_of(i)
+            here = range(segment.steps.start, segment.steps.stop + segment.is_last)
+            for k, sensitivity in zip(here, _sensitivities(segment, z[own]), strict=False):
+                if k in wanted:
+                    found[k] = np.zeros((len(sensitivity), self.size))
+                    found[k][:, own] = sensitivity
+        return found
+
     def states(self, z: Array) -> Array:
         """(N+1, nx): each segment's rollout from its own start."""
         rolled = [segment.states(z[self.indices_of(i)]) for i, segment in enumerate(self.segments)]
@@ -159,6 +176,9 @@ class SegmentedMotion:
             if not segment.is_last:
                 rows, both = defect(segment), np.concatenate([own, z[self.start_of(i + 1)]])
                 program.AddConstraint(rows, rows.lower, rows.upper, vars=both, description="defect")
+        for coupling in problem.coupled(input_at_end=False):
+            rows = limits_of_coupling(self, coupling)
+            program.AddConstraint(rows, rows.lower, rows.upper, vars=z, description=f"coupling {coupling.label}")
         return program
 
     def _bounds(self) -> tuple[Array, Array]:
@@ -423,6 +443,36 @@ def limits_of_constraints(problem: Problem, variables: ShootingVariables) -> Row
     none = [np.zeros(0)]
     lower, upper = (np.concatenate([getattr(c, side) for _, c in here] or none) for side in ("lower", "upper"))
     return Rows(variables, lower, upper, values, jacobian)
+
+
+def limits_of_coupling(motion: SegmentedMotion, coupling: BoundCoupling) -> Rows:
+    """What joins several knots, by the z of the whole motion, whatever segments these are in."""
+    problem, rows, first = motion.problem, coupling.rows, motion.whole.inputs.start
+    (nx, nu), n = (problem.model.nx, problem.model.nu), coupling.knots.shape[1]
+
+    def values(z: Array) -> Array:
+        xs, us = motion.states(z), motion.inputs(z)
+        with np.errstate(all="ignore"):
+            return np.concatenate([rows(*coupling.packed(xs, us, at)) for at in coupling.knots])
+
+    def jacobian(z: Array) -> Array:
+        xs, us = motion.states(z), motion.inputs(z)
+        slopes = [rows.differentiate(*coupling.packed(xs, us, at))[1] for at in coupling.knots]
+        moved = {k for slope, at in zip(slopes, coupling.knots, strict=True) for k in at if np.any(slope[:, : n * nx])}
+        by_z, found = motion.sensitivities(z, moved), []
+        for slope, at in zip(slopes, coupling.knots, strict=True):
+            row = np.zeros((len(slope), len(z)))
+            for i, k in enumerate(at):
+                if k in by_z:
+                    row += slope[:, i * nx : (i + 1) * nx] @ by_z[k]
+                if coupling.takes_input and problem.optimizes_controls:
+                    start = first + k * nu
+                    row[:, start : start + nu] += slope[:, n * nx + i * nu : n * nx + (i + 1) * nu]
+            found.append(row)
+        return np.concatenate(found)
+
+    lower, upper = (np.tile(side, len(coupling.knots)) for side in (rows.lower, rows.upper))
+    return Rows(motion.whole, lower, upper, values, jacobian)
 
 
 def defect(variables: ShootingVariables) -> Rows:

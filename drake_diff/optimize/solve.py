@@ -341,7 +341,7 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
         yield from _kept_apart(problem, first, found)
     if found[-1].status is Status.NO_GRADIENT and method == "ilqr":
         yield Attempt("ilqr", "the guess has no gradient", continuation="auto"), given
-    if method == "shooting" or not problem.has_model:
+    if method == "shooting" or not problem.has_model or problem.couplings:  # which iLQR does not take
         return
     if method == "collocation":
         reason = "collocation was not verified: a guess for it"
@@ -428,6 +428,7 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
             "dynamics": not problem.has_model,
             "waypoints": problem.waypoints,
             "constraints": problem.constraints,
+            "couplings": problem.couplings,
             "goals": problem.goals,
             "horizon": problem.horizon,
             "a running_cost that changes in time": isinstance(problem.running_cost, TimedCost),
@@ -463,9 +464,12 @@ def choose_method(problem: Problem) -> tuple[str, str]:
         return "shooting", "the controls are not optimized"
     if problem.parameters.parameters or problem.trajectory_cost is not None:
         return "shooting", "collocation and iLQR take neither parameters nor a cost of the whole trajectory"
+    smooth = not contract.constraints and all(actuator.kp is None for actuator in contract.actuators)
+    if problem.couplings and (contract.contact.collision_pairs or not smooth):
+        return "shooting", "iLQR takes no couplings of knots, and collocation leaves out what acts on the model"
     if contract.contact.collision_pairs:
         return "ilqr", "the model has geometries that can touch, which collocation leaves out"
-    if contract.constraints or any(actuator.kp is not None for actuator in contract.actuators):
+    if not smooth:
         return "ilqr", "the model has constraints or PD control, which collocation leaves out"
     return "collocation", "the model is smooth"
 

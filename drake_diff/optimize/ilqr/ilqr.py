@@ -61,6 +61,8 @@ def _unkept(problem: Problem) -> Iterator[str]:
         yield "parameters"
     if problem.trajectory_cost is not None:
         yield "trajectory_cost"
+    if problem.couplings:
+        yield "couplings"
 
 
 def solve_ilqr(

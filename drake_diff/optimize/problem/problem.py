@@ -15,6 +15,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, select
 from drake_diff.optimize.problem.constraint import Constraint, check_inside, plant_limits, resolve_bounds, short
 from drake_diff.optimize.problem.cost import ConstantCost, FinalCost, QuadraticCost
+from drake_diff.optimize.problem.coupling import BoundCoupling, Couples, checked_couplings, excess_of
 from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, plant_dynamics
 from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGoals, in_words
 from drake_diff.optimize.problem.names import bounds_of, state_of
@@ -24,6 +25,7 @@ from drake_diff.optimize.problem.timed import SumOfCosts, TimedCost, TrackingCos
 OPTIMIZABLE = ("controls", "initial_state", "parameters")
 # A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
 SMALLEST_PART = 1e-3
+SAME_STATE = 1e-6  # [the coupling's unit] of states that are typed by hand
 SMALLEST_RANGE = 1e-3  # of a number along a motion: less counts as this, in its unit
 TRIED, NO_SLOPE = 3, 1e-9  # states at which a goal's slopes are looked at, and what counts as none: rounding
 SMALLEST_SHARE = 0.2  # of the largest range of its kind (positions, velocities): a state's own is at least that
@@ -49,6 +51,8 @@ class Problem(ShowsItsRepr):
         x_goal: (nx,) final state, a hard equality; NaN entries are free. Or a mapping as `x0`, the rest free.
         waypoints: mapping from knots (1 ... N-1) to states (nx,), with NaN where free, or mappings as `x_goal`.
         constraints: a `Constraint`, or several.
+        couplings: what joins several knots, such as `optimize.Periodic`, or several of these; for collocation and
+            shooting.
         goals: a goal in the robot's own words, such as a `FrameGoal`, or several; each keeps what it says of a motion
             of the model.
         horizon: [s] time from the first state to the last, in N equal intervals, for collocation: a number, or
@@ -88,6 +92,7 @@ class Problem(ShowsItsRepr):
     x_goal: Any = None
     waypoints: Any = None  # becomes a dict
     constraints: Any = ()  # becomes a tuple of Constraints
+    couplings: Any = ()  # becomes a tuple of Couples
     goals: Any = ()  # becomes a tuple of Goals
     horizon: Any = None  # becomes a pair, or stays None
     bounds: Any = None  # Bounds
@@ -129,6 +134,7 @@ class Problem(ShowsItsRepr):
             self._set("x_goal", self._check_state("x_goal", self.x_goal))
         self._set("waypoints", self._check_waypoints())
         self._set("constraints", self._check_constraints())
+        self._set("couplings", self._check_couplings())
         self._set("goals", self._check_goals())
         self._check_kept()
         if self.horizon is not None and self.is_map:
@@ -160,6 +166,7 @@ class Problem(ShowsItsRepr):
         if self.waypoints:
             lines.append(f"waypoints at knots {', '.join(map(str, self.waypoints))}")
         lines += [f"constraint: {constraint!r}" for constraint in self.constraints]
+        lines += [f"coupling: {coupling!r}" for coupling in self.couplings]
         lines += [f"goal: {goal!r}" for goal in self.goals]
         named = f" ({', '.join(self.parameters.names)})" if self.parameters.names else ""
         lines.append(f"optimize: {', '.join(self.optimize)}{named}")
@@ -299,11 +306,16 @@ class Problem(ShowsItsRepr):
         """The knots at which `c` holds; a discrete method has no input at knot N, collocation has one at the end."""
         return c.at_knots(self.num_steps + int(input_at_end and c.takes_input), self.initial_state_is_given)
 
+    def coupled(self, *, input_at_end: bool) -> tuple[BoundCoupling, ...]:
+        """What the couplings come to on the problem's knots; see `knots_of`."""
+        sizes = self.num_steps, self.nx, self.nu
+        return tuple(each for c in self.couplings for each in c.bound(*sizes, input_at_end=input_at_end))
+
     def constraint_excess(self, xs: Array, us: Array, knots: Indices | None = None) -> dict[str, tuple[float, int]]:
         """The largest excess over its bounds of each constraint, and the row it is at, along xs (M+1, nx) under us.
 
         us is (M, nu), or (M+1, nu) at the knots; `knots` (N+1,) are the rows of the problem's own knots where a mesh
-        was refined, and a constraint of all knots is one of all rows. Waypoints are constraints here too.
+        was refined, and a constraint of all knots is one of all rows. Waypoints and couplings are constraints here too.
         """
         found: dict[str, tuple[float, int]] = {}
         where = np.arange(len(xs)) if knots is None else knots
@@ -316,7 +328,7 @@ class Problem(ShowsItsRepr):
         for knot, wanted in self.waypoints.items():
             distance = np.abs(xs[where[knot]] - wanted)[~np.isnan(wanted)]
             found[f"waypoint at knot {knot}"] = (float(np.max(distance, initial=0.0)), int(where[knot]))
-        return found
+        return found | excess_of(self.coupled(input_at_end=len(us) == len(xs)), xs, us, where)
 
     def ranges(self, xs: Array) -> Array:
         """(nx,) the range of each state along xs (M, nx), a tolerance's scale; see SMALLEST_RANGE, SMALLEST_SHARE."""
@@ -405,6 +417,27 @@ class Problem(ShowsItsRepr):
                 raise InputError("constraints", got=type(constraint).__name__, expected="a Constraint or several")
         return tuple(constraint.resolved(self.x0, np.zeros(self.nu)) for constraint in given)
 
+    def _check_couplings(self) -> tuple[Couples, ...]:
+        couplings = checked_couplings(self.couplings)
+        taken = {c.label for c in self.constraints}
+        for c in couplings:
+            if c.label in taken:
+                raise InputError("couplings", got=f"two of name {c.label}", expected="a name of its own for each")
+            taken.add(c.label)
+            for bound in c.bound(self.num_steps, self.nx, self.nu, input_at_end=not (self.has_model or self.is_map)):
+                self._check_given(bound)
+        return couplings
+
+    def _check_given(self, bound: BoundCoupling) -> None:
+        """Refuse a coupling of states that are all given and do not keep it."""
+        lower, upper = self.state_limits()
+        at = np.unique(bound.knots)
+        if bound.takes_input or np.any(lower[at] != upper[at]):
+            return
+        excess, _ = bound.excess(lower, np.zeros((len(lower), self.nu)), np.arange(len(lower)))
+        if not excess <= SAME_STATE:
+            raise InputError(f"coupling {bound.label}", got=f"states that break it by {excess:.3g}", expected="0")
+
     def _check_goals(self) -> tuple[Goal, ...]:
         given = self.goals if isinstance(self.goals, (tuple, list)) else (self.goals,)
         for goal in given:
@@ -470,6 +503,7 @@ class Problem(ShowsItsRepr):
         with applied(self.parameters), np.errstate(all="ignore"):
             for constraint in self.kept:
                 constraint(x, u)
+            self.constraint_excess(np.tile(x, (self.num_steps + 1, 1)), self.us)
             if self.total_running_cost is not None:
                 cost_at(self.total_running_cost, 0.0)(x, u)
             if self.total_final_cost is not None:

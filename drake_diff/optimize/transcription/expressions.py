@@ -22,6 +22,7 @@ from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.refusal import Refusal
 from drake_diff.mechanics.casadi_tree import PlantFunctions, agrees, symbolic_plant
 from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.coupling import BoundCoupling
 from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, PlantKnots, Pointwise
 from drake_diff.optimize.transcription.task import OptimalControl, TimedRate
 
@@ -379,24 +380,29 @@ def _places(sparsity: Any) -> tuple[Indices, Indices]:
 
 @dataclass(frozen=True, eq=False)
 class KnotFunctions:
-    """Those of a task; the final cost is one of the last knot, `paths` are its constraints."""
+    """Those of a task; the final cost is one of the last knot, `paths` are its constraints.
+
+    `joined` are its couplings, of the states of several knots side by side and the inputs there.
+    """
 
     dynamics: KnotFunction
     rate: KnotFunction | Timed
     final: KnotFunction | None
     paths: tuple[KnotFunction, ...]
+    joined: tuple[KnotFunction, ...] = ()
 
     @property
     def why_not(self) -> str:
         """Which of them has no second derivative and why, "" where all have."""
         named = [("dynamics", self.dynamics), ("running_cost", self.rate), ("final_cost", self.final)]
         named += [(f"constraint {i}", path) for i, path in enumerate(self.paths)]
+        named += [(f"coupling {i}", coupling) for i, coupling in enumerate(self.joined)]
         return next((f"{name}: {f.why_not}" for name, f in named if f is not None and f.why_not), "")
 
     @property
     def error(self) -> Exception | None:
         """The first error that one of them raised."""
-        every = (self.dynamics, self.rate, self.final, *self.paths)
+        every = (self.dynamics, self.rate, self.final, *self.paths, *self.joined)
         called = [f for f in every if isinstance(f, (Called, SymbolicPlant, Timed))]
         return next((f.error for f in called if f.error is not None), None)
 
@@ -413,15 +419,11 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
             return Called(found.reason, values, linearize, rows, width)
         return Symbolic(found)
 
-    def path(c: Constraint) -> KnotFunction:
-        def values(knots: Array) -> Array:
-            return np.array([c(knot[:nx], knot[nx:]) for knot in knots])
-
-        def linearize(knots: Array) -> tuple[Array, Array]:
-            found = [c.differentiate(knot[:nx], knot[nx:]) for knot in knots]
-            return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
-
-        return choose(c.function if c.takes_input else lambda x, u: c.function(x), values, linearize, len(c.lower))
+    def joined(c: BoundCoupling) -> KnotFunction:
+        count = c.knots.shape[1]
+        several = [np.roll(probe, i, axis=0) for i in range(count)]  # so that no two of a place are the same knot
+        beside = np.hstack([*(knots[:, :nx] for knots in several), *(knots[:, nx:] for knots in several)])
+        return constraint_function(c.rows, count * nx, beside)
 
     return KnotFunctions(
         _map(task.dynamics, task.problem.num_steps)
@@ -429,7 +431,8 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
         else _dynamics(task.dynamics),
         Timed(rate, nx) if isinstance(rate, TimedRate) else choose(rate.f, rate.values, rate.linearize, 1),
         final if final is None else choose(final.f, final.values, final.linearize, 1),
-        tuple(path(constraint) for constraint in task.problem.kept),
+        tuple(constraint_function(constraint, nx, probe) for constraint in task.problem.kept),
+        tuple(joined(coupling) for coupling in task.couplings),
     )
 
 
@@ -447,6 +450,23 @@ def _map(f: DiscreteMap, count: int) -> KnotFunction:
         return lambda knots: function(knots, steps)
 
     return Called(why, of(f.values), of(f.linearize), f.nx, f.nx + f.nu, f.at_step)
+
+
+def constraint_function(c: Constraint, nx: int, probe: Array) -> KnotFunction:
+    """That of a constraint's values, tried at the knots `probe` (P, nx + nu)."""
+
+    def values(knots: Array) -> Array:
+        return np.array([c(knot[:nx], knot[nx:]) for knot in knots])
+
+    def linearize(knots: Array) -> tuple[Array, Array]:
+        found = [c.differentiate(knot[:nx], knot[nx:]) for knot in knots]
+        return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
+
+    with np.errstate(all="ignore"):
+        found = trace(c.function if c.takes_input else lambda x, u: c.function(x), nx, probe, values(probe))
+    if isinstance(found, Refusal):
+        return Called(found.reason, values, linearize, len(c.lower), probe.shape[1])
+    return Symbolic(found)
 
 
 def _dynamics(dynamics: Dynamics) -> KnotFunction:

@@ -6,7 +6,7 @@ With the rates F and their Jacobians J at all nodes, each computed once, the res
 
 with constant sparse S and D from the scheme's states and slopes, so that the Hessian has one block a node, and a column
 for a free final time T. The Bernstein coefficients of bounded states are rows of the same form, those of bounded inputs
-linear ones. Path constraints add rows to g and terms to the blocks of their nodes.
+linear ones. Path constraints add rows to g and terms to the blocks of their nodes, couplings between them.
 """
 
 import math
@@ -28,6 +28,7 @@ from drake_diff.optimize.program import (
     Watch,
     ctrl_c,
 )
+from drake_diff.optimize.transcription.coupled import rows_of
 from drake_diff.optimize.transcription.expressions import KnotFunctions, Timed
 from drake_diff.optimize.transcription.task import OptimalControl
 
@@ -71,6 +72,9 @@ class TranscribedProgram:
         self.time = self.z[-1] if self.free else ca.MX(task.horizon[0])
         paths = zip(functions.paths, task.problem.kept, strict=True)
         self.paths = [(f, task.nodes_of(constraint, mesh), constraint) for f, constraint in paths]
+        couplings = zip(task.couplings, functions.joined, strict=True)
+        knots = task.nodes_at(range(task.problem.num_steps + 1), mesh)
+        self.coupled = [rows_of(c, function, knots, self.nx, self.width) for c, function in couplings]
         times = task.horizon[0] * task.scheme.node_fractions(mesh)  # of a cost that changes in time, which fixes it
         self.rate = functions.rate.at(times) if isinstance(functions.rate, Timed) else functions.rate
         self.rates, self.costs = functions.dynamics.values(self.knots), self.rate.values(self.knots)
@@ -88,17 +92,12 @@ class TranscribedProgram:
 
     @cached_property
     def sides(self) -> tuple[Array, Array]:
-        """(lower, upper) of g: 0 for the defects, then each path constraint's own, node by node."""
-        found = []
-        for links, path, linear in zip(
-            ([b.lower for b in self._links], [b.upper for b in self._links]),
-            ([c.lower for _, _, c in self.paths], [c.upper for _, _, c in self.paths]),
-            self._linear_sides,
-            strict=True,
-        ):
-            paths = [np.tile(side, len(at)) for side, (_, at, _) in zip(path, self.paths, strict=True)]
-            found.append(np.concatenate([*links, *paths, linear]))
-        return found[0], found[1]
+        """(lower, upper) of g: 0 for the defects, each path constraint's own, node by node, and each coupling's."""
+        parts = [(b.lower, b.upper) for b in self._links]
+        parts += [(np.tile(c.lower, len(at)), np.tile(c.upper, len(at))) for _, at, c in self.paths]
+        parts += [*(c.sides for c in self.coupled), self._linear_sides]
+        lower, upper = zip(*parts, strict=True)
+        return np.concatenate(lower), np.concatenate(upper)
 
     @cached_property
     def nlp(self) -> dict[str, Any]:
@@ -108,6 +107,7 @@ class TranscribedProgram:
             f += self.functions.final.values(self.knots[:, -1])
         g = [ca.mtimes(self._S, self.z) - self.time * ca.mtimes(self._D, ca.vec(self.rates))]
         g += [ca.vec(f.values(self.knots[:, at.tolist()])) for f, at, _ in self.paths]
+        g += [c.values(self.z) for c in self.coupled]
         if self._linear is not None:
             g.append(ca.mtimes(self._linear, self.z))
         return {"x": self.z, "f": f, "g": ca.vertcat(*g)}
@@ -202,6 +202,10 @@ class TranscribedProgram:
             source = path.jacobian(self.knots[:, nodes.tolist()])
             total.add(first + b.place * path.rows + b.rows, b.column, 1.0, source, b.index)
             first += path.rows * len(nodes)
+        for c in self.coupled:
+            (rows, columns, index), source = c.jacobian(self.z)
+            total.add(first + rows, columns, 1.0, source, index)
+            first += c.count
         if self._linear is not None:
             rows, columns = (np.array(a) for a in self._linear.sparsity().get_triplet())
             total.add(first + rows, columns, np.array(self._linear.nonzeros()), ca.DM(1), 0)
@@ -223,6 +227,10 @@ class TranscribedProgram:
             last = first + path.rows * len(nodes)
             terms.append((path, nodes, ca.reshape(multipliers[first:last], path.rows, len(nodes))))
             first = last
+        for c in self.coupled:
+            (rows, columns, index), source = c.hessian(self.z, multipliers[first : first + c.count])
+            total.add(rows, columns, 1.0, source, index)
+            first += c.count
         for function, nodes, seeds in terms:
             b = _Blocks(function.hessian_at, nodes, self.width)
             source = function.hessian(self.knots[:, nodes.tolist()], seeds)

@@ -24,6 +24,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost, differentiate_cost
+from drake_diff.optimize.problem.coupling import BoundCoupling
 from drake_diff.optimize.problem.dynamics import DiscreteMap, Pointwise
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.timed import TimedCost
@@ -197,6 +198,11 @@ class OptimalControl:
         with_known = self.rate.with_known(knots, times) if isinstance(self.rate, TimedRate) else knots
         return self.rate.values(with_known)[:, 0]
 
+    @cached_property
+    def couplings(self) -> tuple[BoundCoupling, ...]:
+        """The problem's, on its knots."""
+        return self.problem.coupled(input_at_end=not self.is_map)
+
     def nodes_of(self, constraint: Constraint, mesh: Array) -> Indices:
         """The nodes of `mesh` (N+1,) where `constraint` holds: its knots, or all nodes but a given first one."""
         knots = self.problem.knots_of(constraint, input_at_end=not self.is_map)
@@ -204,7 +210,7 @@ class OptimalControl:
             return np.array(knots)
         if constraint.knots is None:
             return np.arange(knots[0], self.scheme.nodes * (len(mesh) - 1) + 1)
-        return self._nodes_at(knots, mesh)
+        return self.nodes_at(knots, mesh)
 
     def node_limits(self, mesh: Array) -> tuple[Array, Array]:
         """(lower, upper), each (K, nx + nu): the bounds of the nodes, equal where an end or a waypoint is given."""
@@ -214,12 +220,12 @@ class OptimalControl:
             sides[0][1::2], sides[1][1::2] = -np.inf, np.inf
         if self.is_map:  # there is no input after the last step
             sides[0][-1, nx:] = sides[1][-1, nx:] = np.clip(0.0, b.u_lower, b.u_upper)
-        knots = self._nodes_at(range(self.problem.num_steps + 1), mesh)
+        knots = self.nodes_at(range(self.problem.num_steps + 1), mesh)
         for side, states in zip(sides, self.problem.state_limits(), strict=True):
             side[knots, :nx] = states
         return sides[0], sides[1]
 
-    def _nodes_at(self, knots: Iterable[int], mesh: Array) -> Indices:
+    def nodes_at(self, knots: Iterable[int], mesh: Array) -> Indices:
         """The nodes that the problem's own `knots` are, which stay knots of a refined mesh."""
         fractions = np.linspace(0, 1, self.problem.num_steps + 1)[list(knots)]
         return self.scheme.nodes * np.argmin(np.abs(mesh[None] - fractions[:, None]), axis=1)

@@ -1,0 +1,272 @@
+"""What joins several knots of a motion: functions of the states and inputs at some knots, and the motion that repeats.
+
+`Coupling.bound` gives a `BoundCoupling`: one `Constraint` on the states, and inputs, of its knots side by side, so that
+each method takes it as it takes any constraint.
+"""
+
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, Indices, finite_array
+from drake_diff.exceptions import InputError
+from drake_diff.optimize.problem.constraint import Constraint, short
+
+FORM = "a function of the states at its knots, or of these and of the inputs there, that gives numbers (m,)"
+
+
+class Couples:
+    """The base of all that joins several knots; a `Problem` binds it to its own knots."""
+
+    name: str
+
+    @property
+    def label(self) -> str:
+        """What it is called in messages."""
+        return self.name
+
+    def bound(self, num_steps: int, nx: int, nu: int, *, input_at_end: bool) -> "tuple[BoundCoupling, ...]":
+        """What has to hold of a motion of `num_steps` intervals; InputError where there are no such knots or entries.
+
+        A discrete method has no input at the last knot, collocation has one (`input_at_end`).
+        """
+        raise NotImplementedError
+
+    def to_dict(self) -> dict[str, Any]:
+        """The kind and its values, for a record; a user's function is told by its name."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class BoundCoupling:
+    """lower <= rows(x, u) <= upper at each of some places: x the states at its knots side by side, u the inputs there.
+
+    `knots` (K, n) are those of each of K places, 0 ... N, with the last of a place at its end.
+    """
+
+    rows: Constraint
+    knots: Indices
+
+    @property
+    def label(self) -> str:
+        """What it is called in messages."""
+        return self.rows.label
+
+    @property
+    def takes_input(self) -> bool:
+        """Whether it joins the inputs too."""
+        return self.rows.takes_input
+
+    def packed(self, xs: Array, us: Array, at: Indices) -> tuple[Array, Array]:
+        """(x, u) that `rows` takes at the rows `at` (n,) of a motion xs (M+1, nx), us (M, nu) or (M+1, nu)."""
+        return xs[at].ravel(), us[np.minimum(at, len(us) - 1)].ravel()
+
+    def excess(self, xs: Array, us: Array, where: Indices) -> tuple[float, int]:
+        """The largest excess over a bound, and the row of the last knot of its place; inf where a value is no number.
+
+        The rows `where` (N+1,) of the motion are the problem's knots.
+        """
+        with np.errstate(all="ignore"):
+            return max((self.rows.excess(*self.packed(xs, us, where[at])), int(where[at[-1]])) for at in self.knots)
+
+    def reach(self, xs: Array, us: Array) -> float:
+        """The largest range of a value as the last knot of a place moves along a motion: a tolerance's scale."""
+        values = []
+        with np.errstate(all="ignore"):
+            if len(self.knots) > 1:
+                values = [self.rows(*self.packed(xs, us, at)) for at in self.knots]
+            else:
+                values = [self.rows(*self.packed(xs, us, np.append(self.knots[0, :-1], k))) for k in range(len(xs))]
+        found = np.array(values)
+        return float(np.max(np.ptp(found[np.isfinite(found).all(axis=1)], axis=0), initial=0.0))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Coupling(Couples):
+    """A constraint of a `Problem` that joins several knots: lower <= function(x_a, x_b, ...) <= upper.
+
+    Collocation and shooting keep it. A first state, input or waypoint that is given is no variable in it.
+
+    Args:
+        function: Takes the states (nx,) at the `knots`, in their order, and returns a number or (m,) numbers. With
+            twice as many arguments it takes the inputs (nu,) at the knots too, after the states. In ordinary arithmetic
+            and NumPy functions, through which AutoDiffXd can flow.
+        knots: Two or more whole numbers 0 ... N, where negative ones count from the end. A discrete method has no input
+            at knot N: of a function of inputs, -1 is knot N-1 there.
+        lower: A number or (m,) numbers; no limit where None.
+        upper: The same; one of the two must be given.
+        name: What it is called in messages; the function's own name where not given.
+
+    Raises:
+        InputError: No function, no limit, or limits that cross; or, by the Problem, knots that it has not.
+
+    Example:
+        >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+        >>> there = dd.optimize.Coupling(lambda a, b: b[0] - a[0], knots=(5, 15), lower=0.4, upper=0.4, name="way")
+        >>> effort = dd.QuadraticCost(R=[[1.0]])
+        >>> problem = dd.Problem(
+        ...     block, x0=[0, 0], x_goal=[1, 0], num_steps=20, horizon=1.0, running_cost=effort, couplings=there
+        ... )
+        >>> solution = dd.solve(problem)
+        >>> solution.success, round(float(solution.xs[15, 0] - solution.xs[5, 0]), 6)
+        (True, 0.4)
+    """
+
+    function: Callable[..., Any]
+    knots: Any = (0, -1)
+    lower: Any = None
+    upper: Any = None
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if not callable(self.function):
+            raise InputError("Coupling.function", got=type(self.function).__name__, expected=FORM)
+        knots = np.asarray(self.knots)
+        if knots.ndim != 1 or len(knots) < 2 or not np.issubdtype(knots.dtype, np.integer):
+            raise InputError("Coupling.knots", got=repr(self.knots), expected="two or more whole numbers")
+        object.__setattr__(self, "knots", tuple(knots.tolist()))
+        limits = Constraint(lambda x: x, self.lower, self.upper, name=self.label)  # checks them
+        object.__setattr__(self, "lower", limits.lower)
+        object.__setattr__(self, "upper", limits.upper)
+        if self._arguments() not in (len(self.knots), 2 * len(self.knots)):
+            told = f"{self._arguments()} arguments for {len(self.knots)} knots"
+            raise InputError(f"coupling {self.label}", got=told, expected=FORM)
+
+    def __repr__(self) -> str:
+        lower, upper = (short(side[0] if len(side) == 1 else side) for side in (self.lower, self.upper))
+        what = "x, u" if self.takes_input else "x"
+        return f"Coupling {self.label} of knots {list(self.knots)}: {lower} <= f({what}) <= {upper}"
+
+    @property
+    def label(self) -> str:
+        return self.name or str(getattr(self.function, "__qualname__", type(self.function).__name__))
+
+    @property
+    def takes_input(self) -> bool:
+        """Whether the function takes the inputs too."""
+        return self._arguments() == 2 * len(self.knots)
+
+    def _arguments(self) -> int:
+        kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        parameters = list(inspect.signature(self.function).parameters.values())
+        if any(p.kind is inspect.Parameter.VAR_POSITIONAL for p in parameters):
+            return len(self.knots)
+        return sum(p.kind in kinds and p.default is p.empty for p in parameters)
+
+    def bound(self, num_steps: int, nx: int, nu: int, *, input_at_end: bool) -> tuple[BoundCoupling, ...]:
+        last = num_steps - 1 if self.takes_input and not input_at_end else num_steps
+        given, wanted = np.array(self.knots), f"whole numbers from {-last - 1} to {last}, each once"
+        knots = tuple((given % (last + 1)).tolist())
+        if (given > last).any() or (given < -last - 1).any() or len(set(knots)) < len(knots):
+            raise InputError(f"knots of coupling {self.label}", got=list(self.knots), expected=wanted)
+        count, function = len(knots), self.function
+
+        def of_states(x: Any) -> Any:
+            return function(*np.split(x, count))
+
+        def of_both(x: Any, u: Any) -> Any:
+            return function(*np.split(x, count), *np.split(u, count))
+
+        packed = of_both if self.takes_input else of_states
+        rows = Constraint(packed, self.lower, self.upper, name=self.label)
+        return (BoundCoupling(rows.resolved(np.zeros(count * nx), np.zeros(count * nu)), np.array([knots])),)
+
+    def to_dict(self) -> dict[str, Any]:
+        lower, upper = ([float(v) if np.isfinite(v) else None for v in side] for side in (self.lower, self.upper))
+        return {"Coupling": {"name": self.label, "knots": list(self.knots), "lower": lower, "upper": upper}}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Periodic(Couples):
+    """A motion that repeats: x_N = M x_0 + offset, in all entries of the state or in some.
+
+    The first state is usually free, `optimize=("controls", "initial_state")`: a mask then says in which entries. With
+    an `offset` a motion repeats further on, such as a step of a walk, or a full turn. Collocation and shooting keep it.
+
+    Args:
+        M: (n, nx) what of the first state the entries of the last one are; where None, each is its own. A mirror image
+            swaps left and right.
+        offset: (n,) what is added, in the states' units; 0 where None.
+        entries: The n entries of the state that repeat, as whole numbers; all nx of them where None.
+
+    Raises:
+        InputError: Values that are none; or, by the Problem, entries that its state has not.
+        ShapeError: Sizes that do not fit.
+
+    Example:
+        >>> spring = dd.Dynamics(lambda x, u: [x[1], u[0] - 4.0 * x[0]], nx=2, nu=1)
+        >>> problem = dd.Problem(
+        ...     spring, x0=[0.3, 0], num_steps=20, horizon=3.0, optimize=("controls", "initial_state"),
+        ...     initial_state_mask=[False, True], running_cost=dd.QuadraticCost(R=[[1.0]]),
+        ...     couplings=dd.optimize.Periodic(),
+        ... )
+        >>> solution = dd.solve(problem)
+        >>> solution.success, bool(np.abs(solution.xs[-1] - solution.xs[0]).max() < 1e-6)
+        (True, True)
+    """
+
+    M: Any = None
+    offset: Any = None
+    entries: Any = None
+    name: str = "periodic"
+
+    def __post_init__(self) -> None:
+        entries = self.entries
+        if entries is not None:
+            array = np.asarray(entries)
+            whole = array.ndim == 1 and len(array) and np.issubdtype(array.dtype, np.integer)
+            if not whole or len(set(array.tolist())) < len(array) or np.any(array < 0):
+                raise InputError("Periodic.entries", got=repr(entries)[:80], expected="whole numbers, each once")
+            entries = tuple(array.tolist())
+        size: Any = "n" if entries is None else len(entries)
+        offset = None if self.offset is None else finite_array("Periodic.offset", self.offset, (size,))
+        size = size if offset is None else len(offset)
+        M = None if self.M is None else finite_array("Periodic.M", self.M, (size, "nx"))
+        for field, value in (("M", M), ("offset", offset), ("entries", entries)):
+            object.__setattr__(self, field, value)
+
+    def __repr__(self) -> str:
+        given = {"M": self.M, "offset": self.offset, "entries": self.entries}
+        told = ", ".join(f"{name}={short(value)}" for name, value in given.items() if value is not None)
+        return f"Periodic({told})"
+
+    def bound(self, num_steps: int, nx: int, nu: int, *, input_at_end: bool) -> tuple[BoundCoupling, ...]:
+        entries = np.arange(nx) if self.entries is None else np.array(self.entries)
+        if np.max(entries) >= nx:
+            raise InputError("Periodic.entries", got=entries.tolist(), expected=f"from 0 to {nx - 1}")
+        offset = np.zeros(len(entries)) if self.offset is None else finite_array("offset", self.offset, (len(entries),))
+        M = np.eye(nx)[entries] if self.M is None else finite_array("Periodic.M", self.M, (len(entries), nx))
+
+        def apart(first: Any, last: Any) -> Any:
+            """Sums over nonzeros alone, so that each row is one of the entries that it needs."""
+            moved = [sum(M[i, j] * first[j] for j in np.flatnonzero(M[i])) for i in range(len(entries))]
+            return np.array([last[e] - m - offset[i] for i, (e, m) in enumerate(zip(entries, moved, strict=True))])
+
+        found = Coupling(apart, lower=0.0, upper=0.0, name=self.label)
+        return found.bound(num_steps, nx, nu, input_at_end=input_at_end)
+
+    def to_dict(self) -> dict[str, Any]:
+        name = None if self.name == "periodic" else self.name
+        given = {"M": self.M, "offset": self.offset, "entries": self.entries, "name": name}
+        return {"Periodic": {name: np.asarray(value).tolist() for name, value in given.items() if value is not None}}
+
+
+def checked_couplings(given: Any) -> tuple[Couples, ...]:
+    """One or several as a tuple; InputError of anything else."""
+    several = tuple(given) if isinstance(given, (tuple, list)) else (given,)
+    for each in several:
+        if not isinstance(each, Couples):
+            raise InputError("couplings", got=type(each).__name__, expected="a Coupling such as Periodic, or several")
+    return several
+
+
+def excess_of(couplings: Sequence[BoundCoupling], xs: Array, us: Array, where: Indices) -> dict[str, tuple[float, int]]:
+    """The largest excess of each by its label, and the row of its last knot; see `BoundCoupling.excess`."""
+    found: dict[str, tuple[float, int]] = {}
+    for c in couplings:
+        worst = c.excess(xs, us, where)
+        found[c.label] = max(worst, found.get(c.label, worst))
+    return found
