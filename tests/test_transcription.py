@@ -25,7 +25,8 @@ from drake_diff.exceptions import GradientError, InputError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.optimize.judge import complaints_about
 from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
-from drake_diff.optimize.transcription.collocation import collocated, violation_between_nodes
+from drake_diff.optimize.transcription.between import violation_between_nodes
+from drake_diff.optimize.transcription.collocation import collocated
 from drake_diff.optimize.transcription.expressions import knot_functions
 from drake_diff.optimize.transcription.program import TranscribedProgram
 from drake_diff.optimize.transcription.task import SCHEMES as SCHEMES_OF

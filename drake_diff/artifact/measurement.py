@@ -24,7 +24,7 @@ from drake_diff.motion.rollout import Rollout, drift, smooth_mean
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.replay import PENETRATION_PART, Replay, energy_tolerance
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
-from drake_diff.optimize.transcription.collocation import violation_between_nodes
+from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.record.parts import Event, Failure, Label, Metric
 from drake_diff.record.solve import ReplayEvidence
 
@@ -209,7 +209,10 @@ def _metrics_of_the_plan(s: Solution, states: Sequence[Column], inputs: Sequence
     for name, value, unit in (*excesses, ("constraint", between.constraint, "the constraint's")):
         definition = f"largest excess of the {name} over its bounds between the nodes, as the dynamics move there"
         yield measured(f"{name} excess between nodes", definition, value, unit)
-    definition = "the worst of these as a part of its tolerance, 1e-3 of its range along the plan or 1e-5"
+    tolerances = (
+        "1e-3 of its range along the plan or 1e-5, and 1e-3 of the ranges of states and inputs to where it holds"
+    )
+    definition = f"the worst of these as a part of its tolerance, {tolerances}"
     yield measured("excess between nodes", definition, between.worst, "1", 1.0)
     if s.integrated is not None and not s.problem.has_model:
         definition = "largest distance of the final state from where the equations lead from the first, unstable or not"

@@ -3,4 +3,4 @@ from .problem.coupling import Periodic as Periodic
 from .problem.dynamics import DiscreteMap as DiscreteMap
 from .problem.dynamics import plant_dynamics as plant_dynamics
 from .problem.timed import TrackingCost as TrackingCost
-from .transcription.collocation import violation_between_nodes as violation_between_nodes
+from .transcription.between import violation_between_nodes as violation_between_nodes

@@ -14,7 +14,8 @@ from drake_diff.optimize.problem.obstacles import along_steps, clearances
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, NlpResult, Outcome
 from drake_diff.optimize.replay import broken_variants, told_of_controls, told_of_goals, told_of_tolerance
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
-from drake_diff.optimize.transcription.collocation import SUBSTEPS, Collocated, violation_between_nodes
+from drake_diff.optimize.transcription.between import passed_between_steps, violation_between_nodes
+from drake_diff.optimize.transcription.collocation import SUBSTEPS, Collocated
 
 FINER = "pass refine=True, or take more steps (num_steps)"
 REFINED = "raise max_num_steps, or take more steps (num_steps)"  # where it was refined
@@ -111,6 +112,8 @@ def complaints_about(solution: Solution) -> Iterator[str]:
         for c in clearances(solution.problem.kept):
             for told in c.too_near(*along_steps(solution.times, solution.xs), c.between):
                 yield f"between the knots {told}, tolerance {in_words(c.between, 'm')}: take a smaller time step"
+        for told in passed_between_steps(solution.problem, solution.times, solution.xs, solution.us):
+            yield f"{told}: take a smaller time step"
     if solution.transcribed is not None and solution.problem.has_model:
         yield from _overlaps(solution, solution.transcribed)
     for certificate in solution.certificates:

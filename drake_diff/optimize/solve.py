@@ -35,13 +35,13 @@ from drake_diff.optimize.reach import out_of_reach, why_blind
 from drake_diff.optimize.shooting import DEFAULT_SOLVER as SHOOTING_SOLVER
 from drake_diff.optimize.shooting import ShootingVariables, check_segments, roll_segments, solve_shooting
 from drake_diff.optimize.solution import Search, Solution, Status
+from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.optimize.transcription.collocation import (
     FOUND,
     MeshRefinement,
     Transcribed,
     Transcription,
     kept,
-    violation_between_nodes,
 )
 from drake_diff.optimize.transcription.drake import solve_collocation
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl, default_scheme

@@ -18,38 +18,16 @@ from drake_diff._base.arrays import Array, Indices, frozen
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, clearances
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
-from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Limits, NlpResult, Outcome, Report
+from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report
 from drake_diff.optimize.transcription.task import OptimalControl
 
 SUBSTEPS = 10  # of the Runge-Kutta method that measures an interval
-DENSE = np.linspace(0, 1, 41)[1:-1]  # where the input is looked at between two knots
-# Of a number's range along the motion: how far beyond its bound it may be between nodes. The solver keeps the scheme's
-# polynomials of states and inputs within; what the dynamics do in between differs from these by the integration error.
-EXCESS_TOLERANCE = 1e-3
 EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in TVLQR, over that of the states
 CLEARANCE_ROUNDS, MOST_INTERVALS = 5, 1000  # where a plan comes too near to an obstacle between its knots
 ROUNDED = 1e-9  # of an interval: so near to its end is the end
 SMALLEST_ERROR = 1e-12  # of an interval: rounding, which no finer mesh makes less
 MOST_PIECES = 4  # of one interval in one round of refinement
 FOUND = (Outcome.SOLVED, Outcome.INACCURATE)
-
-
-@dataclass(frozen=True)
-class Excess:
-    """The largest excess over a bound of a state, an input and a constraint between the nodes.
-
-    The tolerance of each is 1e-3 of its range along the motion, or 1e-5 where that is more. `worst` is the largest
-    excess as a part of its tolerance, `where` that is, and `broken` has a clause for each that is above, in one of the
-    `intervals`.
-    """
-
-    state: float
-    input: float
-    constraint: float
-    worst: float
-    where: str
-    broken: tuple[str, ...]
-    intervals: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +72,7 @@ class Collocated:
         else:
             ends = np.arange(parts * count + 1) / (parts * count)
             us, (k, tau) = self.means(ends), self._place(ends[:-1])
-        return np.vstack([self._between(k, tau)[0], self.xs[-1]]), us
+        return np.vstack([self.between(k, tau)[0], self.xs[-1]]), us
 
     def means(self, ends: Array) -> Array:
         """(M, nu) the mean inputs between `ends` (M+1,), fractions of the horizon, which may lie within intervals."""
@@ -138,7 +116,7 @@ class Collocated:
     def between_knots(self) -> tuple[Array, Array]:
         """(9 N,) times [s] within the intervals, and the states (9 N, nx) that the knots before them lead to."""
         count, inside = len(self.mesh) - 1, np.arange(1, SUBSTEPS) / SUBSTEPS
-        times = self._times(np.tile(np.arange(count), len(inside)), np.repeat(inside, count))
+        times = self.times(np.tile(np.arange(count), len(inside)), np.repeat(inside, count))
         return times, self._integrated[1:-1, :, :-1].reshape(len(times), -1)
 
     @property
@@ -150,7 +128,7 @@ class Collocated:
 
     def at(self, times: Any) -> tuple[Array, Array]:
         """xs (S, nx) and us (S, nu) at `times` (S,) [s] by the scheme's own polynomials."""
-        return self._between(*self._place(np.asarray(times, dtype=float) / self.horizon))
+        return self.between(*self._place(np.asarray(times, dtype=float) / self.horizon))
 
     @property
     def rates(self) -> Array:
@@ -179,11 +157,11 @@ class Collocated:
         k = np.clip(np.searchsorted(self.mesh, fractions, side="right") - 1, 0, len(self.mesh) - 2)
         return k, (fractions - self.mesh[k]) / np.diff(self.mesh)[k]
 
-    def _times(self, k: Indices, tau: Array) -> Array:
+    def times(self, k: Indices, tau: Array) -> Array:
         """[s] (S,) of the places `tau` in the intervals `k`."""
         return np.asarray(self.horizon * self.mesh[k] + tau * self._lengths[k])
 
-    def _between(self, k: Any, tau: Array) -> tuple[Array, Array]:
+    def between(self, k: Any, tau: Array) -> tuple[Array, Array]:
         """xs and us in the intervals `k` (S,) at `tau` (S,) of each."""
         scheme, nx = self.task.scheme, self.task.dynamics.nx
         us = scheme.per_interval(self.nodes[:, nx:])[k]
@@ -254,12 +232,12 @@ class Collocated:
             us, b = self._held[k, round(2 * step)], self.task.bounds
             tau = np.full(len(k), step / SUBSTEPS)
             if gains is not None:
-                us = us + (self._between(k, tau)[0] - z[:, :nx]) @ gains.T
+                us = us + (self.between(k, tau)[0] - z[:, :nx]) @ gains.T
                 us = self._cut_off(np.clip(us, b.u_lower, b.u_upper))
             knots = np.hstack([z[:, :nx], us])
             if z.shape[1] == nx:
                 return self.task.moved(knots, k)
-            return np.column_stack([self.task.moved(knots, k), self.task.rates(knots, self._times(k, tau))])
+            return np.column_stack([self.task.moved(knots, k), self.task.rates(knots, self.times(k, tau))])
 
         with np.errstate(all="ignore"):
             if is_map:  # the state is held until the next step
@@ -279,11 +257,26 @@ class Collocated:
         """(N, 21, nu) the inputs as the plant applies them at every half of the ten steps of each interval."""
         count, halves = len(self.mesh) - 1, np.arange(2 * SUBSTEPS + 1)
         k, tau = np.repeat(np.arange(count), len(halves)), np.tile(halves / (2 * SUBSTEPS), count)
-        return self._applied(k, tau).reshape(count, len(halves), -1)
+        return self.applied(k, tau).reshape(count, len(halves), -1)
 
-    def _applied(self, k: Indices, tau: Array) -> Array:
+    def applied_at(self, times: Array) -> Array:
+        """(S, nu) the inputs at `times` (S,) [s] as the plant applies them."""
+        return self._cut_off(self.at(times)[1])
+
+    def applied(self, k: Indices, tau: Array) -> Array:
         """(S, nu) the inputs in the intervals `k` at `tau` as the plant applies them."""
-        return self._cut_off(self._between(k, tau)[1])
+        return self._cut_off(self.between(k, tau)[1])
+
+    def seen(self, c: ClearanceConstraint) -> tuple[Array, Array]:
+        """Times (S,) [s] between the knots and states (S, nx): where the dynamics lead, and what `c` looks at besides.
+
+        The latter are by the scheme's polynomials.
+        """
+        times, xs = self.between_knots
+        knots = self.horizon * self.mesh
+        when, where = c.seen(np.unique(np.concatenate([knots, times])), lambda at: self.at(at)[0], c.between)
+        between = ~np.isin(when, knots)
+        return np.concatenate([times, when[between]]), np.vstack([xs, where[between]])
 
     def _cut_off(self, us: Array) -> Array:
         """`us` (S, nu) at the plant's own limits."""
@@ -309,126 +302,6 @@ class Transcribed(Collocated):
 def _finite(values: Array) -> Array:
     """With inf for what is no number."""
     return np.asarray(np.nan_to_num(values, nan=np.inf, posinf=np.inf))
-
-
-def violation_between_nodes(motion: Collocated) -> Excess:
-    """How far a collocated motion leaves its bounds and constraints between the nodes.
-
-    The states are those that an accurate integration from each knot passes through, under the input as the plant
-    applies it, cut off at its own limits. A cost below the optimum of the problem goes together with an excess here.
-
-    Args:
-        motion: `Solution.transcribed` of a solution by collocation.
-
-    Returns:
-        An `Excess`: the largest of a `state`, an `input` and a `constraint` over a bound, each in its own unit, `where`
-        the worst is, and what is `broken` by more than its tolerance. States and constraints are looked at in 9 places
-        within each interval, inputs in 39; a constraint that holds at some knots only is left out.
-
-    Example:
-        >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
-        >>> effort, slow = dd.QuadraticCost(R=[[0.5]]), dd.Constraint(lambda x: x[1], upper=1.3, name="slow")
-        >>> problem = dd.Problem(
-        ...     block, x0=[0, 0], x_goal=[1, 0], num_steps=4, horizon=1.0, running_cost=effort, constraints=slow
-        ... )
-        >>> solution = dd.solve(problem, refine=False)
-        >>> excess = dd.optimize.violation_between_nodes(solution.transcribed)
-        >>> excess.state, excess.input, round(excess.constraint, 3), solution.status.value
-        (0.0, 0.0, 0.004, 'converged_not_verified')
-    """
-    task, b, count = motion.task, motion.task.bounds, len(motion.mesh) - 1
-    if task.is_map:
-        return Excess(0.0, 0.0, 0.0, 0.0, "nowhere", (), ())
-    inside, states, inputs = np.arange(1, SUBSTEPS) / SUBSTEPS, task.dynamics.state_names, task.dynamics.input_names
-    k, tau = np.tile(np.arange(count), len(inside)), np.repeat(inside, count)
-    applied, ranges, (times, xs) = motion._applied(k, tau), task.problem.ranges(motion.xs), motion.between_knots
-    found = [_beyond("state", states, xs, b.x_lower, b.x_upper, ranges, times)]
-    for c in task.problem.kept:
-        if isinstance(c, ClearanceConstraint):
-            moments, places = _seen(motion, c)
-            lacking = c.lacking(places)
-            row = int(np.argmax(lacking))
-            far, when, told = max(float(lacking[row]), 0.0), float(moments[row]), c.told_at(places[row], moments[row])
-            beyond = moments[~(lacking <= c.between)]
-            found.append([_Beyond("constraint", c.label, far, c.between, when, beyond, told)])
-        elif c.knots is None:
-            rows = np.flatnonzero((k > 0) | (tau > 0.5) | (not task.problem.initial_state_is_given))
-            with np.errstate(all="ignore"):
-                values = np.array([c(xs[i], applied[i]) for i in rows])
-            extent = np.maximum(np.ptp(np.nan_to_num(values), axis=0), SMALLEST_RANGE)
-            names = (c.label,) * values.shape[1]
-            found.append(_beyond("constraint", names, values, c.lower, c.upper, extent, times[rows]))
-    k, tau = np.repeat(np.arange(count), len(DENSE)), np.tile(DENSE, count)
-    us = motion._between(k, tau)[1]
-    extent = np.maximum(np.ptp(us, axis=0), SMALLEST_RANGE)
-    found.append(_beyond("input", inputs, us, b.u_lower, b.u_upper, extent, motion._times(k, tau)))
-    every = [each for kind in found for each in kind]
-    largest = {kind: max((e.excess for e in every if e.kind == kind), default=0.0) for kind in KINDS}
-    worst = max(every, key=lambda e: e.excess / e.tolerance)
-    where = f"{worst.name} by {worst.excess:.3g} at {worst.time:.4g} s" if worst.excess > 0 else "nowhere"
-    return Excess(
-        **largest,
-        worst=worst.excess / worst.tolerance,
-        where=where,
-        broken=tuple(str(e) for e in every if not e.excess <= e.tolerance),
-        intervals=tuple(np.unique(motion.interval_at(np.concatenate([e.when for e in every]))).tolist()),
-    )
-
-
-def _seen(motion: Collocated, c: ClearanceConstraint) -> tuple[Array, Array]:
-    """Times (S,) [s] between the knots and states (S, nx): where the dynamics lead, and what `c` looks at besides.
-
-    The latter are by the scheme's polynomials.
-    """
-    times, xs = motion.between_knots
-    every = np.unique(np.concatenate([motion.horizon * motion.mesh, times]))
-    when, where = c.seen(every, lambda at: motion.at(at)[0], c.between)
-    between = ~np.isin(when, motion.horizon * motion.mesh)
-    return np.concatenate([times, when[between]]), np.vstack([xs, where[between]])
-
-
-KINDS = ("state", "input", "constraint")
-
-
-@dataclass(frozen=True)
-class _Beyond:
-    """The largest excess of one number over its bounds, and when."""
-
-    kind: str
-    name: str
-    excess: float
-    tolerance: float
-    time: float
-    when: Array  # [s] the times at which it is above its tolerance
-    told: str = ""  # in other words
-
-    def __str__(self) -> str:
-        if self.told:
-            return f"between the nodes {self.told}, tolerance {in_words(self.tolerance, 'm')}"
-        return (
-            f"between the nodes {self.name} is {self.excess:.3g} beyond its bound at {self.time:.4g} s, "
-            f"tolerance {self.tolerance:.3g}"
-        )
-
-
-def _beyond(
-    kind: str, names: Sequence[str], values: Array, lower: Array, upper: Array, ranges: Array, times: Array
-) -> list[_Beyond]:
-    """One for each column of `values` (S, n); what is no number is infinitely far."""
-    excess = np.maximum(np.maximum(lower - values, values - upper), 0.0)
-    excess = np.where(np.isfinite(values), excess, np.inf)
-    tolerance, at = np.maximum(EXCESS_TOLERANCE * ranges, FEASIBILITY_TOLERANCE), np.argmax(excess, axis=0)
-    return [
-        _Beyond(
-            kind,
-            name,
-            float(excess[k, i]),
-            float(tolerance[i]),
-            float(times[k]),
-            times[~(excess[:, i] <= tolerance[i])],
-        )
-        for i, (name, k) in enumerate(zip(names, at, strict=True))
-    ]
 
 
 def collocated(
@@ -585,7 +458,7 @@ def _nearer(motion: Transcribed) -> Array:
     """(N,) [m] how much more than its tolerance each interval lacks of a margin, 0 where nothing does."""
     lacking = np.zeros(len(motion.mesh) - 1)
     for c in clearances(motion.task.problem.kept):
-        times, xs = _seen(motion, c)
+        times, xs = motion.seen(c)
         each = np.nan_to_num(c.lacking(xs), posinf=0.0)
         np.maximum.at(lacking, motion.interval_at(times), np.where(each > c.between, each, 0.0))
     return lacking

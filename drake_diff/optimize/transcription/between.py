@@ -1,0 +1,273 @@
+"""How far a collocated motion leaves its bounds and constraints between the nodes at which the solver keeps them."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import GradientError
+from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.goals import in_words
+from drake_diff.optimize.problem.obstacles import ClearanceConstraint
+from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
+from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
+from drake_diff.optimize.transcription.collocation import SUBSTEPS, Collocated
+
+DENSE = np.linspace(0, 1, 41)[1:-1]  # where the input is looked at between two knots
+# Of a number's range along the motion: how far beyond its bound it may be between nodes. The solver keeps the scheme's
+# polynomials of states and inputs within; what the dynamics do in between differs from these by the integration error.
+EXCESS_TOLERANCE = 1e-3
+DEPTH_TOLERANCE = 1e-3  # of the ranges of states and inputs: how far away a constraint that does not hold may hold
+SOLVED = 1e-8  # of max(1, |bound|): what the solver may leave of a constraint that it keeps
+CLOSER, CLOSER_ROUNDS = 9, 2  # places about a constraint's nearest approach to its bound, and how often
+KINDS = ("state", "input", "constraint")
+
+
+@dataclass(frozen=True)
+class Excess:
+    """The largest excess over a bound of a state, an input and a constraint between the nodes.
+
+    The tolerance of each is 1e-3 of its range along the motion, or 1e-5 where that is more. A constraint has to hold
+    within 1e-3 of the ranges of states and inputs besides. `worst` is the largest excess as a part of its tolerance,
+    `where` that is, and `broken` has a clause for each that is above, in one of the `intervals`.
+    """
+
+    state: float
+    input: float
+    constraint: float
+    worst: float
+    where: str
+    broken: tuple[str, ...]
+    intervals: tuple[int, ...]
+
+
+def violation_between_nodes(motion: Collocated) -> Excess:
+    """How far a collocated motion leaves its bounds and constraints between the nodes.
+
+    The states are those that an accurate integration from each knot passes through, under the input as the plant
+    applies it, cut off at its own limits. A cost below the optimum of the problem goes together with an excess here.
+
+    Args:
+        motion: `Solution.transcribed` of a solution by collocation.
+
+    Returns:
+        An `Excess`: the largest of a `state`, an `input` and a `constraint` over a bound, each in its own unit, `where`
+        the worst is, and what is `broken` by more than its tolerance. States and constraints are looked at in 9 places
+        within each interval, inputs in 39, and constraints also where they come nearest to a bound between these; a
+        constraint that holds at some knots only is left out.
+
+    Example:
+        >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+        >>> effort, slow = dd.QuadraticCost(R=[[0.5]]), dd.Constraint(lambda x: x[1], upper=1.3, name="slow")
+        >>> problem = dd.Problem(
+        ...     block, x0=[0, 0], x_goal=[1, 0], num_steps=4, horizon=1.0, running_cost=effort, constraints=slow
+        ... )
+        >>> solution = dd.solve(problem, refine=False)
+        >>> excess = dd.optimize.violation_between_nodes(solution.transcribed)
+        >>> excess.state, excess.input, round(excess.constraint, 3), solution.status.value
+        (0.0, 0.0, 0.004, 'converged_not_verified')
+    """
+    task, b, count = motion.task, motion.task.bounds, len(motion.mesh) - 1
+    if task.is_map:
+        return Excess(0.0, 0.0, 0.0, 0.0, "nowhere", (), ())
+    states, inputs = task.dynamics.state_names, task.dynamics.input_names
+    ranges, (times, xs) = task.problem.ranges(motion.xs), motion.between_knots
+    found = [_beyond("state", states, xs, b.x_lower, b.x_upper, ranges, times)]
+    for c in task.problem.kept:
+        if isinstance(c, ClearanceConstraint):
+            found.append([_too_near(motion, c)])
+        elif c.knots is None:
+            found.append(_of_constraint(motion, c, ranges))
+    k, tau = np.repeat(np.arange(count), len(DENSE)), np.tile(DENSE, count)
+    us = motion.between(k, tau)[1]
+    found.append(_beyond("input", inputs, us, b.u_lower, b.u_upper, _extent(us), motion.times(k, tau)))
+    every = [each for kind in found for each in kind]
+    largest = {kind: max((e.excess for e in every if e.kind == kind), default=0.0) for kind in KINDS}
+    worst = max(every, key=lambda e: e.part)
+    where = f"{worst.name} by {worst.excess:.3g} at {worst.time:.4g} s" if worst.excess > 0 else "nowhere"
+    return Excess(
+        **largest,
+        worst=worst.part,
+        where=where,
+        broken=tuple(str(e) for e in every if not e.part <= 1),
+        intervals=tuple(np.unique(motion.interval_at(np.concatenate([e.when for e in every]))).tolist()),
+    )
+
+
+def passed_between_steps(problem: Problem, times: Array, xs: Array, us: Array) -> Iterator[str]:
+    """A clause for each constraint that a motion in steps, xs (N+1, nx) under us (N, nu), goes through between two."""
+    every = np.unique(
+        np.concatenate([times, np.interp(np.arange(0, len(us), 1 / SUBSTEPS), np.arange(len(xs)), times)])
+    )
+    scale = np.concatenate([problem.ranges(xs), np.maximum(np.ptp(us, axis=0), SMALLEST_RANGE)])
+
+    def at(when: Array) -> tuple[Array, Array]:
+        held = np.clip(np.searchsorted(times, when, side="right") - 1, 0, len(us) - 1)
+        return np.array([np.interp(when, times, column) for column in xs.T]).T, us[held]
+
+    for c in problem.constraints:
+        if c.knots is None:
+            moments, between, applied = _looked_at(c, every, *at(every), at)
+            values = _values(c, between, applied)
+            through = _depth(c, between, applied, _excess(values, c.lower, c.upper), scale)[1]
+            if np.any(through):
+                when = moments[np.flatnonzero(np.any(through, axis=1))[0]]
+                yield f"between the knots the motion goes through what {c.label} forbids, at {when:.4g} s"
+
+
+@dataclass(frozen=True)
+class _Beyond:
+    """The largest excess of one number over its bounds, and when."""
+
+    kind: str
+    name: str
+    excess: float
+    part: float  # of its tolerance
+    time: float
+    when: Array  # [s] the times at which it is above its tolerance
+    told: str
+
+    def __str__(self) -> str:
+        return f"between the nodes {self.told}"
+
+
+def _beyond(
+    kind: str, names: Sequence[str], values: Array, lower: Array, upper: Array, ranges: Array, times: Array
+) -> list[_Beyond]:
+    """One for each column of `values` (S, n)."""
+    excess, tolerance = _excess(values, lower, upper), _tolerance(ranges)
+    found = []
+    for i, k in enumerate(np.argmax(excess, axis=0).tolist()):
+        far, when = float(excess[k, i]), float(times[k])
+        told = f"{_told(names[i], far, when)}, tolerance {tolerance[i]:.3g}"
+        part = far / float(tolerance[i])
+        found.append(_Beyond(kind, names[i], far, part, when, times[~(excess[:, i] <= tolerance[i])], told))
+    return found
+
+
+def _told(name: str, far: float, when: float) -> str:
+    return f"{name} is {far:.3g} beyond its bound at {when:.4g} s"
+
+
+def _excess(values: Array, lower: Array, upper: Array) -> Array:
+    """How far beyond their bounds `values` (S, n) are; what is no number is infinitely far."""
+    excess = np.maximum(np.maximum(lower - values, values - upper), 0.0)
+    return np.where(np.isfinite(values), excess, np.inf)
+
+
+def _extent(values: Array) -> Array:
+    return np.maximum(np.ptp(values, axis=0), SMALLEST_RANGE)
+
+
+def _tolerance(ranges: Array) -> Array:
+    return np.maximum(EXCESS_TOLERANCE * ranges, FEASIBILITY_TOLERANCE)
+
+
+def _too_near(motion: Collocated, c: ClearanceConstraint) -> _Beyond:
+    moments, places = motion.seen(c)
+    lacking = c.lacking(places)
+    row = int(np.argmax(lacking))
+    far, when = max(float(lacking[row]), 0.0), float(moments[row])
+    told = f"{c.told_at(places[row], when)}, tolerance {in_words(c.between, 'm')}"
+    return _Beyond("constraint", c.label, far, far / c.between, when, moments[~(lacking <= c.between)], told)
+
+
+def _of_constraint(motion: Collocated, c: Constraint, ranges: Array) -> list[_Beyond]:
+    """One for each number of a constraint of all knots.
+
+    Its range tells little where its slope is small at the bound: (x - a)^2 >= r^2 is a wall of any width. So it must
+    not be far to where it holds, by its slope or by where the motion enters and leaves what is forbidden, and the
+    motion must not come out on the other side of that.
+    """
+    times, xs = motion.between_knots
+    order = np.argsort(times)
+    times, xs = times[order], xs[order]
+    first = motion.horizon * (motion.mesh[0] + motion.mesh[1]) / 2
+    kept = times > (first if motion.task.problem.initial_state_is_given else 0.0)  # what is given nothing can keep
+    times, xs = times[kept], xs[kept]
+
+    def at(more: Array) -> tuple[Array, Array]:
+        return motion.at(more)[0], motion.applied_at(more)
+
+    times, xs, us = _looked_at(c, times, xs, motion.applied_at(times), at)
+    values = _values(c, xs, us)
+    excess, tolerance = _excess(values, c.lower, c.upper), _tolerance(_extent(np.nan_to_num(values)))
+    scale = np.concatenate([ranges, np.maximum(np.ptp(motion.us, axis=0), SMALLEST_RANGE)])
+    depth, through = _depth(c, xs, us, excess, scale)
+    depth = np.where(through, 1.0, depth)
+    part = np.maximum(excess / tolerance, depth / DEPTH_TOLERANCE)
+    found = []
+    for i in range(values.shape[1]):
+        k = int(np.lexsort((excess[:, i], part[:, i]))[-1])
+        far, when = float(excess[k, i]), float(times[k])
+        told = f"{_told(c.label, far, when)}, tolerance {tolerance[i]:.3g}"
+        if through[k, i]:
+            told = f"{_told(c.label, far, when)}: the motion goes through what it forbids"
+        elif depth[k, i] / DEPTH_TOLERANCE > far / tolerance[i]:
+            away = f"{depth[k, i]:.2%} of the ranges of states and inputs away, tolerance {DEPTH_TOLERANCE:.1%}"
+            told = f"{_told(c.label, far, when)}, and holds only {away}"
+        found.append(_Beyond("constraint", c.label, far, float(part[k, i]), when, times[~(part[:, i] <= 1)], told))
+    return found
+
+
+def _values(c: Constraint, xs: Array, us: Array) -> Array:
+    """(S, m) along xs (S, nx) and us (S, nu)."""
+    with np.errstate(all="ignore"):
+        return np.array([c(x, u) for x, u in zip(xs, us, strict=True)]).reshape(len(xs), -1)
+
+
+def _looked_at(
+    c: Constraint, times: Array, xs: Array, us: Array, at: Callable[[Array], tuple[Array, Array]]
+) -> tuple[Array, Array, Array]:
+    """`times` (S,) [s] in order, states and inputs (S, ...) at them, and more by `at` where a constraint may not hold.
+
+    These are about each place where it comes nearer to a bound than before and after.
+    """
+    for _ in range(CLOSER_ROUNDS):
+        values = _values(c, xs, us)
+        slack = np.nan_to_num(np.minimum(values - c.lower, c.upper - values), nan=-np.inf)
+        before, here, after = slack[:-2], slack[1:-1], slack[2:]
+        with np.errstate(invalid="ignore"):
+            may_be_beyond = here <= 2 * (np.maximum(before, after) - here)
+            dips = (here <= before) & (here <= after) & may_be_beyond & np.isfinite(here)
+        places = 1 + np.flatnonzero(np.any(dips, axis=1))
+        if not len(places):
+            break
+        inside = np.arange(1, CLOSER + 1) / (CLOSER + 1)
+        ends = np.stack([times[places - 1], times[places + 1]])
+        more = np.setdiff1d((ends[0] + inside[:, None] * (ends[1] - ends[0])).ravel(), times)
+        every = np.concatenate([times, more])
+        order = np.argsort(every)
+        found_xs, found_us = at(more)
+        times, xs, us = every[order], np.vstack([xs, found_xs])[order], np.vstack([us, found_us])[order]
+    return times, xs, us
+
+
+def _depth(c: Constraint, xs: Array, us: Array, excess: Array, scale: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """(S, m) how far it is to where the constraint holds, as a part of `scale` (nx + nu,), and where motions pass it.
+
+    The less of two: to first order in its slope, and half of the way between the places before and after on the motion
+    at which it holds. Where the slopes at the first and the last place between these point against each other, the
+    motion has gone through what is forbidden.
+    """
+    z, depth, through = np.hstack([xs, us]) / scale, np.zeros_like(excess), np.zeros(excess.shape, dtype=bool)
+    bound = np.maximum(1.0, np.where(np.isfinite(c.lower), np.abs(c.lower), np.abs(c.upper)))
+    outside = excess > SOLVED * bound
+    slopes = np.zeros((*excess.shape, len(scale)))
+    for k in np.flatnonzero(np.any(outside, axis=1)):
+        try:
+            slopes[k] = c.differentiate(xs[k], us[k])[1] * scale
+        except GradientError:  # it has none here: then the way along the motion tells
+            continue
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_slope = np.where(outside, excess / np.sum(np.abs(slopes), axis=2), 0.0)
+    for i in range(excess.shape[1]):
+        rows = np.flatnonzero(outside[:, i])
+        for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []:
+            on_the_way = z[max(run[0] - 1, 0) : run[-1] + 2]
+            half = float(np.max(np.ptp(on_the_way, axis=0))) / 2
+            depth[run, i] = np.minimum(by_slope[run, i], half)
+            through[run, i] = slopes[run[0], i] @ slopes[run[-1], i] < 0
+    return depth, through

@@ -1,0 +1,73 @@
+"""What a plan forbids between its nodes: walls of any width, by seed, that no motion can keep from."""
+
+import numpy as np
+import pytest
+from helpers.plants import block
+
+import drake_diff as dd
+from drake_diff.optimize.transcription.between import violation_between_nodes
+
+
+def pushed():
+    return dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+
+
+def wall(random):
+    """A wall of 1 mm to 10 cm on the only way from 0 to 1 m, written in one of four ways."""
+    half, at = 10 ** random.uniform(-3.3, -1.3), random.uniform(0.2, 0.8)
+    forms = (
+        (lambda x: (x[0] - at) ** 2, half**2),
+        (lambda x: 1e3 * (x[0] - at) ** 2, 1e3 * half**2),
+        (lambda x: abs(x[0] - at), half),
+        (lambda x: -np.exp(-(((x[0] - at) / half) ** 2)), -np.exp(-1.0)),
+    )
+    function, lower = forms[random.integers(len(forms))]
+    return dd.Constraint(function, lower=lower, name="wall"), half
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_a_wall_between_start_and_goal_is_not_crossed_between_two_nodes(seed):
+    random = np.random.default_rng(seed)
+    constraint, half = wall(random)
+    problem = dd.Problem(
+        pushed(),
+        x0=[0, 0],
+        x_goal=[1, 0],
+        num_steps=int(random.integers(8, 40)),
+        horizon=1.0,
+        running_cost=dd.QuadraticCost(R=[[0.5]]),
+        constraints=constraint,
+    )
+    solution = dd.solve(problem, max_iterations=60, time_limit=10)
+    assert not solution.success, (half, solution.message)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("method", ["ilqr", "shooting"])
+def test_steps_do_not_jump_over_a_wall(method, seed):
+    """1 kg on a rail, whose knots may lie on both sides of a wall that is thinner than a step."""
+    constraint, half = wall(np.random.default_rng(100 + seed))
+    effort = dd.QuadraticCost(R=[[0.5]])
+    problem = dd.Problem(block(), x0=[0, 0], x_goal=[1, 0], num_steps=10, running_cost=effort, constraints=constraint)
+    solution = dd.solve(problem, method=method, max_iterations=60, time_limit=10)
+    assert not solution.success, (half, solution.message)
+
+
+def test_what_is_kept_beside_a_disk_holds_between_the_nodes():
+    """Around a disk of 0.2 m by 40 intervals the dense motion is out of it by less than a thousandth of its way."""
+    point = dd.Dynamics(lambda x, u: [x[2], x[3], u[0], u[1]], nx=4, nu=2)
+    disk = dd.Constraint(lambda x: (x[0] - 0.5) ** 2 + (x[1] - 0.01) ** 2, lower=0.04, name="disk")
+    problem = dd.Problem(
+        point,
+        x0=[0, 0, 0, 0],
+        x_goal=[1, 0, 0, 0],
+        num_steps=40,
+        horizon=1.0,
+        running_cost=dd.QuadraticCost(R=np.eye(2)),
+        constraints=disk,
+    )
+    solution = dd.solve(problem)
+    assert solution.success, solution.message
+    xs = solution.transcribed.at(np.linspace(0, 1, 4001))[0]
+    assert np.min(np.hypot(xs[:, 0] - 0.5, xs[:, 1] - 0.01)) > 0.2 - 1e-3
+    assert violation_between_nodes(solution.transcribed).worst <= 1
