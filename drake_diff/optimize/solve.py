@@ -443,7 +443,7 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
 def _check_scheme(problem: Problem, attempt: Attempt) -> str:
     scheme = default_scheme(problem) if attempt.scheme is None else attempt.scheme
     if scheme not in SCHEMES:
-        raise UnknownNameError("scheme", got=scheme, known=SCHEMES)
+        raise UnknownNameError("scheme", got=scheme, known=[name for name in SCHEMES if name != MAP])
     if (scheme == MAP) != problem.is_map:
         expected = f"{MAP!r}, as the system is a DiscreteMap" if problem.is_map else "one of motions in time"
         raise InputError("scheme", got=repr(scheme), expected=expected)
