@@ -158,8 +158,11 @@ def another_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
     waves = [random.standard_normal(problem.nx) * np.sin(j * np.pi * s) / j for j in range(1, WAVES)]
     swings = [random.standard_normal(problem.nu) * np.cos(j * np.pi * s) / (j + 1) for j in range(WAVES)]
     xs = way + far * np.maximum(1.0, np.abs(way[-1] - problem.x0)) * sum(waves)
+    if problem.initial_state_mask.any():  # a first state that is free is another one too
+        xs = xs + far * (1 - s) * np.where(problem.initial_state_mask, random.standard_normal(problem.nx), 0.0)
     us = np.clip(size * sum(swings), b.u_lower, b.u_upper)
-    xs[1:] = np.clip(xs[1:], b.x_lower, b.x_upper)
+    first = int(problem.initial_state_is_given)
+    xs[first:] = np.clip(xs[first:], b.x_lower, b.x_upper)
     for start in tangent_space(problem.model).quaternions if problem.has_model else ():
         xs[:, start : start + 4] /= np.linalg.norm(xs[:, start : start + 4], axis=1, keepdims=True)
     if not problem.horizon or problem.horizon[0] == problem.horizon[1]:

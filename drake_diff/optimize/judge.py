@@ -53,6 +53,11 @@ def judged(draft: Solution, result: NlpResult) -> Solution:
     return ended(draft, status, "; ".join([*complaints, *notes]), **fields)
 
 
+def status_of(outcome: Outcome) -> Status | None:
+    """What a solver's outcome is by itself; None where it says that it found a solution."""
+    return _STATUSES.get(outcome)
+
+
 def _by_our_measures(draft: Solution, result: NlpResult) -> tuple[Outcome, tuple[str, ...]]:
     """The outcome of a solve whose plan keeps all that was asked, and how that differs from what the solver says."""
     if result.outcome not in STOPPED:

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from hashlib import sha256
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen, positive_float, positive_int
-from drake_diff.certificates.certificate import Certificate, certify_jacobian
+from drake_diff.certificates.certificate import Certificate
 from drake_diff.certificates.certify import certify_inside
 from drake_diff.exceptions import DrakeDiffError, GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.model.contact import penetration
@@ -20,14 +20,16 @@ from drake_diff.model.soft_contact import SoftContact
 from drake_diff.model.step import set_state
 from drake_diff.optimize.advice import advice
 from drake_diff.optimize.apart import is_kept_apart, kept_apart
+from drake_diff.optimize.certified import certified_knots, certify_equations
 from drake_diff.optimize.drake_program import SOLVERS
 from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
 from drake_diff.optimize.ilqr.ilqr import check_problem, is_unconstrained, solve_ilqr
 from drake_diff.optimize.ilqr.through_contact import check_schedule, solve_continuation, solve_through_jumps
 from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, overlaps, refused
-from drake_diff.optimize.problem.dynamics import DiscreteMap
+from drake_diff.optimize.phased import PhasedSolution, solve_phased
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import lacking_between, swept
+from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.timed import TimedCost
 from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report
@@ -48,7 +50,6 @@ from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl,
 
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": "riccati"}
-CERTIFIED_KNOTS = 5
 CLEARANCE_PARTS = (4, 8, 16)  # of a step: looked at where a discrete plan comes too near to an obstacle in between
 OTHER_GUESSES = 8  # of a collocation that finds no motion from a straight line
 OTHER_ITERATIONS = 200  # of each
@@ -64,6 +65,7 @@ Progress = Callable[[str], None]
 Searcher = Callable[[Problem, Array, Array], tuple[NlpResult, Array, Array]]
 
 
+@overload
 def solve(
     problem: Problem,
     *,
@@ -83,7 +85,45 @@ def solve(
     progress: bool | Progress = False,
     callback: Callable[[Iteration], None] | None = None,
     on_start: Callable[[], None] | None = None,
-) -> Solution:
+) -> Solution: ...
+@overload
+def solve(
+    problem: PhasedProblem,
+    *,
+    method: str = "auto",
+    initial_guess: Any = None,
+    scheme: str | None = None,
+    max_iterations: int = 500,
+    time_limit: float | None = None,
+    tolerance: float = 1e-8,
+    seed: int = 0,
+    refine: bool | None = None,
+    error_tolerance: float = 1e-6,
+    max_num_steps: int = 1000,
+    progress: bool | Progress = False,
+    callback: Callable[[Iteration], None] | None = None,
+    on_start: Callable[[], None] | None = None,
+) -> PhasedSolution: ...
+def solve(
+    problem: Problem | PhasedProblem,
+    *,
+    method: str = "auto",
+    initial_guess: Any = None,
+    scheme: str | None = None,
+    solver: str | None = None,
+    max_iterations: int = 500,
+    time_limit: float | None = None,
+    tolerance: float = 1e-8,
+    seed: int = 0,
+    segments: int = 1,
+    continuation: Any = None,
+    refine: bool | None = None,
+    error_tolerance: float = 1e-6,
+    max_num_steps: int = 1000,
+    progress: bool | Progress = False,
+    callback: Callable[[Iteration], None] | None = None,
+    on_start: Callable[[], None] | None = None,
+) -> Solution | PhasedSolution:
     """Solve `problem`, certify the derivatives that were used, and measure the result again on Drake's plant.
 
     "auto" chains methods until one is verified: collocation where the model is smooth, or where every coordinate is
@@ -93,13 +133,14 @@ def solve(
     `Solution.options["chain"]` says what was tried, why, and how it ended.
 
     Args:
-        problem: what to optimize, of a model or of plain `Dynamics`.
+        problem: what to optimize, of a model or of plain `Dynamics`; or an `optimize.PhasedProblem`, which collocation
+            takes and of which the solution is an `optimize.PhasedSolution`.
         method: "collocation" (in continuous time, for models without contact and for plain dynamics), "shooting"
             (through Drake's own steps, contact included), "ilqr" (the same by Riccati sweeps) or "auto".
         initial_guess: None (a straight line to the goal with inputs near zero; a `TrackingCost`'s reference), a
             Solution of any method, number of steps and horizon, a pair of Drake's trajectories (state, input) as
             `Solution.trajectory` gives, or (xs, us) with shapes (N+1, nx) and (N, nu). Collocation also takes us
-            (N+1, nu), and a third entry, the horizon [s].
+            (N+1, nu), and a third entry, the horizon [s]. In phases: a PhasedSolution, or a list, one for each phase.
         scheme: of collocation: "hermite_simpson" (order 4, the default), "trapezoid" (order 2), or "drake", which is
             what Drake's DirectCollocation transcribes.
         solver: "ipopt" or "snopt"; the latter with method="shooting", or with scheme="drake", which then is Drake's
@@ -140,14 +181,7 @@ def solve(
         >>> solution.success, solution.xs.shape, solution.us.shape
         (True, (21, 2), (20, 1))
     """
-    if not isinstance(problem, Problem):
-        raise InputError("problem", got=type(problem).__name__, expected="a Problem")
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise InputError("seed", got=repr(seed), expected="a whole number of at least 0")
-    if not (callback is None or callable(callback)):
-        raise InputError("callback", got=repr(callback), expected="None or a function of an Iteration")
-    if not (isinstance(progress, bool) or callable(progress)):
-        raise InputError("progress", got=repr(progress), expected="True, False or a function")
+    _check_common(problem, seed, callback, progress)
     if method not in METHODS:
         raise UnknownNameError("method", got=method, known=METHODS)
     if solver is not None and solver not in SOLVERS:
@@ -165,14 +199,6 @@ def solve(
     if refine not in (None, True, False):
         raise InputError("refine", got=repr(refine), expected="None, True or False")
     report = Report(print if progress is True else (progress or None), callback)
-    task = _Task(problem, limits, seed, report, on_start)
-    asked = Attempt(method, "asked for", scheme, solver, segments, continuation, int(seed), refine, refinement)
-    if method == "auto" and continuation is not None:
-        asked = dataclasses.replace(asked, method="ilqr", reason="a continuation is asked for")
-    initial_guess = sampled(problem, asked.method, initial_guess)
-    in_chain = asked.method in ("auto", "collocation") and segments == 1
-    make = partial(_solve_in_chain, task, asked, initial_guess) if in_chain else task.prepare(asked, initial_guess)
-    solution = make()
     arguments: dict[str, Any] = {
         "method": method,
         "scheme": scheme,
@@ -187,12 +213,33 @@ def solve(
         "error_tolerance": refinement.tolerance,
         "max_num_steps": refinement.most,
     }
+    if isinstance(problem, PhasedProblem):
+        return solve_phased(problem, arguments, initial_guess, report, on_start)
+    task = _Task(problem, limits, seed, report, on_start)
+    asked = Attempt(method, "asked for", scheme, solver, segments, continuation, int(seed), refine, refinement)
+    if method == "auto" and continuation is not None:
+        asked = dataclasses.replace(asked, method="ilqr", reason="a continuation is asked for")
+    initial_guess = sampled(problem, asked.method, initial_guess)
+    in_chain = asked.method in ("auto", "collocation") and segments == 1
+    make = partial(_solve_in_chain, task, asked, initial_guess) if in_chain else task.prepare(asked, initial_guess)
+    solution = make()
     tried = {link["method"] for link in solution.options.get("chain", ())} | {solution.method}
     told = advice(
         solution, arguments, [other for other in METHODS[1:] if other not in tried and _takes(problem, other)]
     )
     message = f"{solution.message}; {told}" if told else solution.message
     return solution.told(message=message, search=Search(arguments, initial_guess))
+
+
+def _check_common(problem: Any, seed: Any, callback: Any, progress: Any) -> None:
+    if not isinstance(problem, (Problem, PhasedProblem)):
+        raise InputError("problem", got=type(problem).__name__, expected="a Problem or a PhasedProblem")
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InputError("seed", got=repr(seed), expected="a whole number of at least 0")
+    if not (callback is None or callable(callback)):
+        raise InputError("callback", got=repr(callback), expected="None or a function of an Iteration")
+    if not (isinstance(progress, bool) or callable(progress)):
+        raise InputError("progress", got=repr(progress), expected="True, False or a function")
 
 
 def _takes(problem: Problem, method: str) -> bool:
@@ -499,7 +546,7 @@ class Run:
         problem, limits, report = self.problem, self.limits, self.report
         transcription = Transcription(self.searched or problem, self.scheme)
         try:
-            before = self._certify_equations(transcription.jacobian, guess.xs, guess.us)
+            before = certify_equations(self.problem, transcription.jacobian, guess.xs, guess.us)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(guess.xs, guess.us), error)
         us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
@@ -558,14 +605,14 @@ class Run:
         """By Drake's own DirectCollocation."""
         jacobian = EquationsOfMotion(self.problem.model).jacobian
         try:
-            certificates = self._certify_equations(jacobian, guess.xs, guess.us)
+            certificates = certify_equations(self.problem, jacobian, guess.xs, guess.us)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(guess.xs, guess.us), error)
         result, xs, us, u_final = solve_collocation(
             self.problem, guess.xs, guess.us, solver=self.solver, limits=self.limits, report=self.report
         )
         if np.all(np.isfinite(xs)):
-            certificates += self._certify_equations(jacobian, xs, us)
+            certificates += certify_equations(self.problem, jacobian, xs, us)
         return self._judge(self._draft(xs, us, u_final=u_final, certificates=certificates), result)
 
     def _judge_collocated(
@@ -574,7 +621,7 @@ class Run:
         xs, us = motion.xs, motion.us[:-1]
         self.options["derivatives"] = motion.derivatives
         if np.all(np.isfinite(xs)):
-            certificates += self._certify_equations(transcription.jacobian, xs, us)
+            certificates += certify_equations(self.problem, transcription.jacobian, xs, us)
         draft = self._draft(
             xs,
             us,
@@ -703,29 +750,5 @@ class Run:
                 self.certified[at] = certify_inside(model, x, u, parameters=parameters)
             return self.certified[at]
 
-        certificates = tuple(certificate(xs[k], us[k]) for k in _certified(us))
+        certificates = tuple(certificate(xs[k], us[k]) for k in certified_knots(us))
         return xs, us, certificates, why_blind(self.problem, variables, z)
-
-    def _certify_equations(self, jacobian: Any, xs: Array, us: Array) -> tuple[Certificate, ...]:
-        """Certificates, at some knots, of the Jacobian that the solver gets against the equations themselves."""
-        problem = self.problem
-        system, is_map = problem.system, problem.is_map
-        values = EquationsOfMotion(problem.model).values if problem.has_model else problem.dynamics.values
-        return tuple(
-            certify_jacobian(
-                system.at_step(int(k)).values if isinstance(system, DiscreteMap) else values,
-                np.concatenate([xs[k], us[k]]),
-                partial(jacobian, k=int(k)) if is_map else jacobian,
-                batched=True,
-                rows=tuple(f"next {name}" if is_map else f"d({name})/dt" for name in problem.state_names),
-                columns=problem.state_names + problem.input_names,
-                method="discrete map" if is_map else "continuous time",
-                subject=f"the map of {problem.name}" if is_map else f"the equations of motion of {problem.name}",
-            )
-            for k in _certified(us)
-        )
-
-
-def _certified(us: Array) -> Array:
-    """The knots, out of those of us (N, nu), at which derivatives are certified."""
-    return np.unique(np.linspace(0, len(us) - 1, CERTIFIED_KNOTS).astype(int))

@@ -486,8 +486,9 @@ class Problem(ShowsItsRepr):
             self._set("running_cost", ConstantCost(positive_float("running_cost", self.running_cost)))
         self._set("running_cost", running_cost_of(self.running_cost))
         costs = (self.running_cost, self.final_cost, self.trajectory_cost)
-        if all(cost is None for cost in costs) and np.all(np.isnan(self.goal)) and not self.goals:
-            raise InputError("problem", got="no cost and no goal", expected="a cost, an x_goal or goals")
+        asked = self.goals or self.constraints or self.couplings
+        if all(cost is None for cost in costs) and np.all(np.isnan(self.goal)) and not asked:
+            raise InputError("problem", got="no cost and no goal", expected="a cost, an x_goal, goals or constraints")
         for name in ("running_cost", "final_cost", "trajectory_cost"):
             cost = getattr(self, name)
             if cost is not None and not callable(cost) and not (name == "running_cost" and isinstance(cost, TimedCost)):

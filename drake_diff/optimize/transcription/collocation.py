@@ -407,11 +407,8 @@ class Transcription:
 
         None where that has more than `most` intervals.
         """
-        lacking = np.zeros(len(motion.mesh) - 1)
-        lacking[list(exceeded)] = 1.0
-        tolerance = motion.largest_error / 2 ** (motion.task.scheme.order + 1)  # what halving all would bring
-        mesh = _split(motion, max(tolerance, SMALLEST_ERROR), lacking)
-        if len(mesh) - 1 > most or len(mesh) == len(motion.mesh):
+        mesh = finer_mesh(motion, exceeded, most)
+        if mesh is None:
             return None
         if report is not None:
             report.say(f"what is found does not hold with {len(motion.mesh) - 1} intervals: refined to {len(mesh) - 1}")
@@ -431,6 +428,18 @@ class Transcription:
                 told, result = "symbolic, limited-memory Hessian: the exact one is not finite at an iterate", again
         found, horizon = program.unpack(result.z)
         return Transcribed(self.task, frozen(mesh), frozen(found), horizon, result, told)
+
+
+def finer_mesh(motion: Transcribed, exceeded: Sequence[int], most: int) -> Array | None:
+    """The mesh of `motion` with its coarsest intervals split, those `exceeded` among them.
+
+    None where that has more than `most` intervals, or no other ones.
+    """
+    lacking = np.zeros(len(motion.mesh) - 1)
+    lacking[list(exceeded)] = 1.0
+    tolerance = motion.largest_error / 2 ** (motion.task.scheme.order + 1)  # what halving all would bring
+    mesh = _split(motion, max(tolerance, SMALLEST_ERROR), lacking)
+    return None if len(mesh) - 1 > most or len(mesh) == len(motion.mesh) else mesh
 
 
 def _left(limits: Limits, start: float) -> Limits:

@@ -11,7 +11,7 @@ linear ones. Path constraints add rows to g and terms to the blocks of their nod
 
 import math
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
@@ -173,7 +173,7 @@ class TranscribedProgram:
                     hull.lower[at], hull.upper[at] = -np.inf, np.inf
 
     def _gradient(self) -> Any:
-        total, last = _Sum((self.z.numel(), 1)), self.every[-1:]
+        total, last = SparseSum((self.z.numel(), 1)), self.every[-1:]
         b = _Blocks(self.rate.jacobian_at, self.every, self.width)
         total.add(b.column, 0, self.weights[b.node], self.time * self.cost_rows, b.index)
         if self.free:
@@ -184,7 +184,7 @@ class TranscribedProgram:
         return ca.densify(total.matrix())
 
     def _jacobian(self) -> Any:
-        f, total = self.functions.dynamics, _Sum((self.nlp["g"].numel(), self.z.numel()))
+        f, total = self.functions.dynamics, SparseSum((self.nlp["g"].numel(), self.z.numel()))
         rows, columns = f.jacobian_at
         for links in self._links:
             total.add(links.rows, links.columns, links.state, ca.DM(1), 0)
@@ -213,7 +213,7 @@ class TranscribedProgram:
 
     def _hessian(self, sigma: Any, multipliers: Any) -> Any:
         """The upper triangle of d^2 (sigma f + multipliers' g) / dz^2."""
-        f, rate, total = self.functions.dynamics, self.rate, _Sum((self.z.numel(), self.z.numel()))
+        f, rate, total = self.functions.dynamics, self.rate, SparseSum((self.z.numel(), self.z.numel()))
         nu = ca.mtimes(self._D.T, multipliers[: self.num_links])
         weights = ca.DM(self.weights).T
         terms: list[tuple[Any, Indices, Any]] = [
@@ -245,9 +245,24 @@ class TranscribedProgram:
         return total.matrix()
 
 
-def solve_ipopt(
-    program: TranscribedProgram, guess: Array, limits: Limits, report: Report | None, *, exact: bool
-) -> NlpResult:
+class Program(Protocol):
+    """What IPOPT solves; see `TranscribedProgram`."""
+
+    z: Any
+    lower: Array
+    upper: Array
+    functions: Any
+
+    @property
+    def sides(self) -> tuple[Array, Array]: ...
+
+    @property
+    def nlp(self) -> dict[str, Any]: ...
+
+    def derivatives(self, exact: bool) -> dict[str, Any]: ...
+
+
+def solve_ipopt(program: Program, guess: Array, limits: Limits, report: Report | None, *, exact: bool) -> NlpResult:
     """Solve `program` from `guess` (n,), with its `exact` Hessian or IPOPT's limited-memory one.
 
     `report` gets a line of progress a few times a second. Ctrl-C ends the solve with the best iterate so far.
@@ -285,7 +300,7 @@ def solve_ipopt(
     return NlpResult(z, outcome, f"IPOPT: {words.replace('_', ' ')}", table, stationarity=left)
 
 
-def _stationarity(program: TranscribedProgram, derivatives: Any, found: Any) -> float:
+def _stationarity(program: Program, derivatives: Any, found: Any) -> float:
     """What IPOPT's multipliers leave of the Lagrangian's gradient, those of what does not hold the plan left out."""
     z, slope = found["x"], ca.DM(derivatives["grad_f"](found["x"], [])[1])
     rows, jacobian = derivatives["jac_g"](z, [])
@@ -311,7 +326,7 @@ def _holding(multipliers: Array, values: Array, lower: Array, upper: Array) -> A
 class _IterateCallback(ca.Callback):  # type: ignore[misc]
     """Called by the solver at every iterate: reports, keeps the best, says when to stop."""
 
-    def __init__(self, program: TranscribedProgram, watch: Watch, report: Report | None):
+    def __init__(self, program: Program, watch: Watch, report: Report | None):
         ca.Callback.__init__(self)
         self.program, self.watch, self.report = program, watch, report
         self.sizes = {"x": program.z.numel(), "f": 1, "g": program.nlp["g"].numel(), "lam_x": program.z.numel()}
@@ -384,7 +399,7 @@ class _Blocks:
         self.index = np.arange(self.rows.size).reshape(self.rows.shape)
 
 
-class _Sum:
+class SparseSum:
     """A sparse matrix whose entries are sums: matrix[row, column] += coefficient * source[index]."""
 
     def __init__(self, shape: tuple[int, int]):

@@ -1,0 +1,482 @@
+"""Problems in phases: solved as one program, each phase judged as a solution, and their links and their chain as well.
+
+A chain is the motion that the dynamics make from the first state of all, through the resets at the times of the plan,
+open loop or under TVLQR whose cost to go is led back through the resets too.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, frozen, positive_float, positive_int
+from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff.certificates.certificate import Certificate, certify_jacobian
+from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
+from drake_diff.optimize.certified import certify_equations
+from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
+from drake_diff.optimize.judge import judged, may_be_too_coarse, status_of
+from drake_diff.optimize.problem.phases import PhasedProblem
+from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Report
+from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Search, Solution, Status
+from drake_diff.optimize.transcription.between import violation_between_nodes
+from drake_diff.optimize.transcription.collocation import (
+    FOUND,
+    SUBSTEPS,
+    Collocated,
+    Transcribed,
+    Transcription,
+    finer_mesh,
+)
+from drake_diff.optimize.transcription.task import MAP, SCHEMES, default_scheme
+
+OTHER_GUESSES = 8  # where no motion is found from the first
+FINER_ROUNDS = 6  # of meshes whose plan does not hold
+NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
+PLANS = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PhasedSolution(ShowsItsRepr):
+    """The motion that `solve` found for a `PhasedProblem`, and what it measures.
+
+    Each phase is a `Solution` with its own measures and status. `link_errors` and `chain` are computed from the states
+    when they are first asked for, and never taken from the solver. `success` holds where the solver converged and all
+    of that holds.
+
+    Attributes:
+        problem: What was asked.
+        status, message: How it ended, as a `Status` and in words.
+        phases: A `Solution` of each phase, from its own time 0 on.
+        iterations: The solver's own table.
+        link_certificates: Of the derivatives of the resets, at the states of the plan.
+        options: What was asked of the solver, and what it chose.
+        wall_time: [s] what the solve took.
+        search: The arguments of `solve`.
+
+    Example:
+        >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+        >>> effort = dd.QuadraticCost(R=[[1.0]])
+        >>> way = dict(num_steps=5, horizon=0.5, running_cost=effort)
+        >>> parts = [dd.Problem(block, x0=[0, 0], **way), dd.Problem(block, x0=[0.5, 0], x_goal=[1, 0], **way)]
+        >>> solution = dd.solve(dd.optimize.PhasedProblem(parts))
+        >>> solution.status.value, round(solution.cost, 6), solution.starts.tolist()
+        ('converged', 12.0, [0.0, 0.5])
+    """
+
+    problem: PhasedProblem
+    status: Status
+    message: str
+    phases: tuple[Solution, ...]
+    iterations: tuple[Iteration, ...] = ()
+    link_certificates: tuple[Certificate, ...] = ()
+    options: dict[str, Any] = field(default_factory=dict)
+    solver_message: str = ""
+    wall_time: float = 0.0
+    search: Search | None = None
+
+    def __str__(self) -> str:
+        return f"{self.problem.name} in {len(self.phases)} phases: {self.status.value}, cost {self.cost:.6g}"
+
+    def __repr__(self) -> str:
+        lines = [f"PhasedSolution of {self.problem.name}: {self.status.value}", self.message]
+        lines.append(f"cost {self.cost:.6g}, link error {self.link_error:.2g}")
+        for name, phase in zip(self.problem.names, self.phases, strict=True):
+            lasts = f"{len(phase.us)} steps" if phase.problem.is_map else f"{phase.horizon:.4g} s"
+            lines.append(f"{name}: {lasts}, cost {phase.cost:.6g}, defect {phase.defect:.2g}, {phase.status.value}")
+        return "\n  ".join(lines)
+
+    @property
+    def success(self) -> bool:
+        """Whether the solver converged and everything measured again holds."""
+        return self.status is Status.CONVERGED
+
+    @property
+    def cost(self) -> float:
+        """The sum of the phases' costs; inf where one is not finite."""
+        return sum(phase.cost for phase in self.phases)
+
+    @property
+    def horizon(self) -> float:
+        """[s] from the first state to the last, or steps."""
+        return sum(phase.horizon for phase in self.phases)
+
+    @property
+    def starts(self) -> Array:
+        """(P,) [s] when each phase begins, or steps."""
+        return np.cumsum([0.0, *(phase.horizon for phase in self.phases[:-1])])
+
+    @cached_property
+    def link_errors(self) -> dict[str, Array]:
+        """By the name of each reset: (n,) how far the first state after it is from where it leads; inf if unknown."""
+        found = {}
+        for s in self.problem.switches:
+            before, after = self.phases[s.before].xs[-1], self.phases[s.after].xs[0]
+            with np.errstate(all="ignore"):
+                found[s.label] = np.nan_to_num(np.abs(s.link(before, after)), nan=np.inf)
+        return found
+
+    @property
+    def link_error(self) -> float:
+        """The largest of all, in its state's unit."""
+        return max((float(np.max(errors)) for errors in self.link_errors.values()), default=0.0)
+
+    @cached_property
+    def chain(self) -> "Chain":
+        """Where the dynamics lead from the first state of all through all phases, open loop or under TVLQR."""
+        return _chained(self)
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Whether the chain of all phases follows the plan, under which control, and in words how far it is from it."""
+
+    holds: bool
+    control: str
+    told: str
+    worst: float  # the largest distance from the plan or beyond a bound, as a part of the state's range in its phase
+
+
+def _chained(solution: PhasedSolution) -> Chain:
+    motions = [phase.transcribed for phase in solution.phases]
+    tried = []
+    for control in ("open loop", "TVLQR"):
+        if any(motion is None for motion in motions):
+            return Chain(False, control, "a phase has entries that are no numbers", float("inf"))
+        worst, where = _led_through(solution, [m for m in motions if m is not None], control)
+        how = control if control == "open loop" else f"under {control}"
+        told = f"{how} through all phases, {where}, {worst:.1%} of its range, of {INTEGRATION_TOLERANCE:.0%} allowed"
+        tried.append(Chain(worst <= INTEGRATION_TOLERANCE, control, told, worst))
+        if tried[-1].holds:
+            return tried[-1]
+    return min(tried, key=lambda chain: chain.worst)
+
+
+def _led_through(solution: PhasedSolution, motions: Sequence[Collocated], control: str) -> tuple[float, str]:
+    """The largest distance from the plan, or beyond a bound, as a part of the state's range, and where it is."""
+    problem = solution.problem
+    gains = [None] * len(motions) if control == "open loop" else _gains(problem, motions)
+    x, worst, where = np.asarray(motions[0].xs[0]), -1.0, ""
+    for i, (name, motion) in enumerate(zip(problem.names, motions, strict=True)):
+        b, ranges, names = motion.task.bounds, motion.task.problem.ranges(motion.xs), motion.task.dynamics.state_names
+        xs = motion.led_from(x, gains[i])
+        beyond = np.max(np.maximum(np.maximum(b.x_lower - xs, xs - b.x_upper), 0.0)[1:], axis=0)
+        apart = np.max(np.abs(xs[::SUBSTEPS] - motion.xs), axis=0)
+        found = [(f"at most {{:.2g}} from the plan in {name}", apart), (f"{{:.2g}} beyond its bound in {name}", beyond)]
+        for switch in problem.switches:
+            if switch.before == i:
+                with np.errstate(all="ignore"):
+                    x = switch(xs[-1])
+                if switch.after == 0:
+                    found.append((f"{{:.2g}} from its first value after {name}", np.abs(x - motions[0].xs[0])))
+                    ranges = np.concatenate([ranges, motions[0].task.problem.ranges(motions[0].xs)])
+        for k, (told, values) in enumerate(found):
+            scale = ranges[-len(values) :] if k == 2 else ranges[: len(values)]
+            part = np.nan_to_num(values / scale, nan=np.inf)
+            j = int(np.argmax(part))
+            if part[j] > worst:
+                label = names[j] if k < 2 else motions[0].task.dynamics.state_names[j]
+                worst, where = float(part[j]), f"{label} is {told.format(values[j])}"
+    return worst, where
+
+
+def _gains(problem: PhasedProblem, motions: Sequence[Collocated]) -> list[Array | None]:
+    """TVLQR's gains of each phase, whose cost to go at its end is that of the next phase through the reset."""
+    found: list[Array | None] = [None] * len(motions)
+    at_end: Array | None = None
+    for i in range(len(motions) - 1, -1, -1):
+        found[i], P = motions[i].gains(at_end)
+        for switch in problem.switches:
+            if switch.after == i and switch.before == i - 1:
+                slope = switch.jacobian(motions[i - 1].xs[-1])
+                at_end = slope.T @ P @ slope
+    return found
+
+
+def solve_phased(
+    problem: PhasedProblem,
+    arguments: dict[str, Any],
+    given: Any,
+    report: Report,
+    on_start: Callable[[], None] | None,
+) -> PhasedSolution:
+    """See `solve`, whose other `arguments` are given by name."""
+    limits, scheme = _checked(problem, arguments)
+    guesses = _first_guesses(problem, given, arguments["seed"])
+    run = _PhasedRun(problem, scheme, limits, arguments, report, given is None)
+    if on_start is not None:
+        on_start()
+    found, chain = [], []
+    for number, begun in enumerate(_guesses(problem, guesses, given, arguments["seed"])):
+        found.append(run.attempt(begun, other=number > 0))
+        reason = "a straight line" if given is None else "given"
+        chain.append({"guess": reason if number == 0 else f"random {number}", "ended": found[-1].status.value})
+        report.say(f"from the guess {chain[-1]['guess']}: {found[-1].status.value}")
+        if found[-1].status not in NOT_FOUND:
+            break
+    best = min(found, key=_preference)
+    told = best.message
+    if len(found) > 1 and best.status not in PLANS:
+        told += f"; from none of {len(found)} first guesses was a plan found"
+    return replace(best, message=told, options={**best.options, "chain": chain}, search=Search(arguments, given))
+
+
+def _preference(solution: PhasedSolution) -> tuple[int, float]:
+    order = (*PLANS, Status.INTERRUPTED, Status.TIME_LIMIT)
+    rank = order.index(solution.status) if solution.status in order else len(order)
+    return rank, solution.link_error + sum(phase.defect + phase.goal_error for phase in solution.phases)
+
+
+def _checked(problem: PhasedProblem, asked: dict[str, Any]) -> tuple[Limits, str]:
+    """The limits and the scheme; refuses what phases cannot be asked."""
+    if asked["method"] not in ("auto", "collocation"):
+        expected = '"auto" or "collocation" for a PhasedProblem'
+        raise InputError("method", got=repr(asked["method"]), expected=expected)
+    if asked["solver"] not in (None, "ipopt"):
+        raise InputError("solver", got=repr(asked["solver"]), expected='"ipopt" for a PhasedProblem')
+    for name, none in (("segments", 1), ("continuation", None)):
+        if asked[name] != none:
+            raise InputError(name, got=repr(asked[name]), expected="none for a PhasedProblem")
+    scheme = default_scheme(problem.phases[0]) if asked["scheme"] is None else asked["scheme"]
+    if scheme not in SCHEMES:
+        raise UnknownNameError("scheme", got=scheme, known=[name for name in SCHEMES if name != MAP])
+    if scheme == "drake" or (scheme == MAP) != problem.is_map:
+        expected = repr(MAP) if problem.is_map else '"hermite_simpson" or "trapezoid" for a PhasedProblem in time'
+        raise InputError("scheme", got=repr(scheme), expected=expected)
+    if problem.is_map and asked["refine"]:
+        raise InputError("refine", got=True, expected="None or False: a DiscreteMap has no intervals to split")
+    most = positive_int("max_iterations", asked["max_iterations"])
+    seconds = np.inf if asked["time_limit"] is None else positive_float("time_limit [s]", asked["time_limit"])
+    return Limits(most, seconds, positive_float("tolerance", asked["tolerance"])), scheme
+
+
+def _first_guesses(problem: PhasedProblem, given: Any, seed: int) -> list[Guess]:
+    """One for each phase: of `given`, a PhasedSolution or one of each, or straight lines."""
+    parts: Sequence[Any] = [None] * len(problem.phases)
+    if isinstance(given, PhasedSolution):
+        parts = given.phases
+    elif given is not None:
+        parts = given if isinstance(given, (tuple, list)) else [given]
+    if len(parts) != len(problem.phases):
+        expected = f"None, a PhasedSolution, or {len(problem.phases)} guesses, one for each phase"
+        raise InputError("initial_guess", got=f"{len(parts)} guesses", expected=expected)
+    pairs = zip(problem.phases, parts, strict=True)
+    return [first_guess(phase, "collocation", sampled(phase, "collocation", part), seed) for phase, part in pairs]
+
+
+def _guesses(problem: PhasedProblem, first: list[Guess], given: Any, seed: int) -> Iterator[list[Guess]]:
+    """The first guesses, and where they are not given others, by `seed`."""
+    yield first
+    for number in range(1, OTHER_GUESSES + 1) if given is None else ():
+        every = enumerate(problem.phases)
+        others = [another_guess(phase, seed * len(problem.phases) + i, number) for i, phase in every]
+        pairs = zip(problem.phases, others, strict=True)
+        yield [first_guess(phase, "collocation", other, seed) for phase, other in pairs]
+
+
+@dataclass(frozen=True, eq=False)
+class _PhasedRun:
+    """One solve: certify at the guess, search, refine for as long as the plan does not hold, measure, judge."""
+
+    problem: PhasedProblem
+    scheme: str
+    limits: Limits
+    asked: dict[str, Any]
+    report: Report
+    by_default: bool
+    start: float = field(default_factory=time.monotonic)
+
+    @cached_property
+    def transcriptions(self) -> list[Transcription]:
+        return [Transcription(phase, self.scheme) for phase in self.problem.phases]
+
+    @cached_property
+    def links(self) -> Any:
+        from drake_diff.optimize.transcription.phased import link_functions  # loads CasADi
+
+        return link_functions(self.problem)
+
+    def attempt(self, guesses: list[Guess], *, other: bool) -> PhasedSolution:
+        """From one guess of each phase."""
+        most = min(self.limits.max_iterations, 200) if other else self.limits.max_iterations
+        meshes = [t.mesh for t in self.transcriptions]
+        horizons = [t.problem.start_horizon if g.horizon is None else g.horizon for t, g in self._with(guesses)]
+        begun = []
+        for t, guess in self._with(guesses):
+            us_end = guess.us[-1:] if guess.u_final is None else guess.u_final[None]
+            begun.append(t.nodes_at(t.mesh, guess.motion or (guess.xs, np.vstack([guess.us, us_end]))))
+        result, motions, told = self._solve_on(meshes, begun, horizons, most)
+        solution = self._judged(result, motions, told)
+        rounds = [[len(motion.mesh) - 1 for motion in motions]]
+        while len(rounds) <= FINER_ROUNDS and self.asked["refine"] is not False:
+            finer = self._finer(solution, motions)
+            if finer is None:
+                break
+            rounds.append([len(mesh) - 1 for mesh in finer])
+            self.report.say(f"what is found does not hold: refined to {rounds[-1]} intervals")
+            nodes = [t.nodes_at(mesh, m) for t, mesh, m in zip(self.transcriptions, finer, motions, strict=True)]
+            again = self._solve_on(finer, nodes, [motion.horizon for motion in motions], most)
+            if again[0].outcome not in FOUND:
+                note = (
+                    f"on {rounds[-1]} intervals no motion was found ({again[0].message}): that on {rounds[-2]} is kept"
+                )
+                return replace(solution, message=f"{solution.message}; {note}")
+            result, motions, told = again
+            solution = self._judged(result, motions, told)
+        return replace(solution, options={**solution.options, "refinements": rounds}) if len(rounds) > 1 else solution
+
+    def _with(self, guesses: list[Guess]) -> Iterator[tuple[Transcription, Guess]]:
+        return zip(self.transcriptions, guesses, strict=True)
+
+    def _solve_on(
+        self, meshes: list[Array], nodes: list[Array], horizons: list[float], most: int
+    ) -> tuple[NlpResult, list[Transcribed], str]:
+        from drake_diff.optimize.transcription.phased import PhasedProgram
+        from drake_diff.optimize.transcription.program import NOT_FINITE, TranscribedProgram, solve_ipopt
+
+        parts = zip(self.transcriptions, meshes, strict=True)
+        programs = [TranscribedProgram(t.task, mesh, t.functions) for t, mesh in parts]
+        program = PhasedProgram(self.problem, programs, self.links)
+        inside = [float(np.clip(T, *t.task.horizon)) for T, t in zip(horizons, self.transcriptions, strict=True)]
+        guess = np.concatenate([p.pack(z, T) for p, z, T in zip(programs, nodes, inside, strict=True)])
+        left = max(0.0, self.limits.time_limit - (time.monotonic() - self.start))
+        limits, why = replace(self.limits, time_limit=left, max_iterations=most), program.functions.why_not
+        told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
+        result = solve_ipopt(program, guess, limits, self.report, exact=not why)
+        if not why and result.message == NOT_FINITE:
+            again = solve_ipopt(program, guess, limits, self.report, exact=False)
+            if again.message != NOT_FINITE:  # then it was the Hessian
+                told, result = "symbolic, limited-memory Hessian: the exact one is not finite at an iterate", again
+        motions = []
+        for p, mesh, z in zip(programs, meshes, program.split(result.z), strict=True):
+            found, horizon = p.unpack(z)
+            motions.append(Transcribed(p.task, frozen(mesh), frozen(found), horizon, result, told))
+        return result, motions, told
+
+    def _finer(self, solution: PhasedSolution, motions: list[Transcribed]) -> list[Array] | None:
+        """The meshes to try next; None where the plan holds, or where finer ones cannot mend it."""
+        until, most = self.asked["error_tolerance"], self.asked["max_num_steps"]
+        if self.problem.is_map or solution.status not in PLANS:
+            return None
+        coarse = [motion.largest_error > until for motion in motions]
+        if not self.asked["refine"]:
+            of_phases = [may_be_too_coarse(phase) for phase in solution.phases]
+            drifts = solution.status is not Status.CONVERGED and not any(of_phases) and not solution.chain.holds
+            exceeded = [bool(violation_between_nodes(motion).intervals) for motion in motions]
+            every = zip(of_phases, coarse, exceeded, strict=True)
+            coarse = [(wanted or drifts) and (far or beyond) for wanted, far, beyond in every]
+        if not any(coarse):
+            return None
+        found = []
+        for motion, wanted in zip(motions, coarse, strict=True):
+            mesh = finer_mesh(motion, violation_between_nodes(motion).intervals, most) if wanted else motion.mesh
+            if mesh is None:
+                return None
+            found.append(mesh)
+        return found
+
+    def _judged(self, result: NlpResult, motions: list[Transcribed], derivatives: str) -> PhasedSolution:
+        drafts, error = [], None
+        options = {"derivatives": derivatives, "initial_guess": "default" if self.by_default else "given"}
+        for t, motion in zip(self.transcriptions, motions, strict=True):
+            xs, us = motion.xs, motion.us[:-1]
+            certificates: tuple[Certificate, ...] = ()
+            if np.all(np.isfinite(xs)):
+                try:
+                    certificates = certify_equations(t.problem, t.jacobian, xs, us)
+                except (GradientError, SimulationError) as refusal:
+                    error = refusal
+            found = {name: value for name, value in _arrays(motion).items() if value is not None}
+            found |= {"scheme": self.scheme, "certificates": certificates, "options": dict(options)}
+            by = t.problem, "collocation", "ipopt", Status.FAILED, ""
+            drafts.append(Solution(*by, frozen(xs), frozen(us), **found))
+        phases = tuple(judged(draft, result) for draft in drafts)
+        draft = PhasedSolution(
+            self.problem,
+            Status.FAILED,
+            "",
+            phases,
+            iterations=result.iterations,
+            link_certificates=self._certified_links(motions),
+            options=options | {"seed": self.asked["seed"]},
+            solver_message=result.message,
+            wall_time=time.monotonic() - self.start,
+        )
+        return judged_phases(draft, result) if error is None else _ended(draft, Status.NO_GRADIENT, [str(error)])
+
+    def _certified_links(self, motions: list[Transcribed]) -> tuple[Certificate, ...]:
+        found = []
+        for s, function in zip(self.problem.switches, self.links, strict=True):
+            at, count = np.concatenate([motions[s.before].xs[-1], motions[s.after].xs[0]]), len(s.columns)
+            if np.all(np.isfinite(at)):
+                found.append(
+                    certify_jacobian(
+                        lambda x, s=s, count=count: s.link(x[:count], x[count:]),
+                        at,
+                        function.jacobian_of,
+                        rows=s.rows,
+                        columns=[*(f"last {name}" for name in s.columns), *(f"first {name}" for name in s.rows)],
+                        method="reset",
+                        subject=s.label,
+                    )
+                )
+        return tuple(found)
+
+
+def _arrays(motion: Transcribed) -> dict[str, Any]:
+    """Those of a Solution that are beside its states and inputs."""
+    problem = motion.task.problem
+    refined = len(motion.mesh) - 1 > problem.num_steps
+    return {
+        "u_final": None if problem.is_map else frozen(motion.us[-1]),
+        "us_mid": motion.us_mid,
+        "mesh": motion.mesh if refined else None,
+        "free_horizon": motion.horizon if problem.horizon else None,
+    }
+
+
+def judged_phases(draft: PhasedSolution, result: NlpResult) -> PhasedSolution:
+    """The draft, whose phases are judged, with the status that they, the links and the chain allow."""
+    statuses, complaints = [phase.status for phase in draft.phases], list(_broken_links(draft))
+    details = [
+        f"{name}: {phase.message.removeprefix(phase.status.sentence).removeprefix(': ')}"
+        for name, phase in zip(draft.problem.names, draft.phases, strict=True)
+        if phase.status is not Status.CONVERGED
+    ]
+    failed = next((status for status in statuses if status not in PLANS), None)
+    if failed is None and complaints and result.outcome not in FOUND:
+        failed = status_of(result.outcome)
+    if failed is not None:
+        return _ended(draft, failed, [*complaints, *details] or [result.message])
+    if not complaints and not details:
+        (complaints if not draft.chain.holds else details).append(
+            f"{'mapped step by step' if draft.problem.is_map else 'integrated accurately'} {draft.chain.told}"
+        )
+        if not complaints:
+            return _ended(draft, Status.CONVERGED, details)
+    return _ended(draft, Status.CONVERGED_NOT_VERIFIED, [*complaints, *details])
+
+
+def _broken_links(draft: PhasedSolution) -> Iterator[str]:
+    """Resets that the plan does not keep, a sum of durations that is none, derivatives that do not agree."""
+    for s in draft.problem.switches:
+        errors = draft.link_errors[s.label]
+        i = int(np.argmax(errors))
+        if not errors[i] <= FEASIBILITY_TOLERANCE:
+            yield f"{s.label} is missed by {errors[i]:.3g} in {s.rows[i]}, above {FEASIBILITY_TOLERANCE:g}"
+    if draft.problem.horizon is not None:
+        lower, upper = draft.problem.horizon
+        beyond = max(lower - draft.horizon, draft.horizon - upper)
+        if not beyond <= FEASIBILITY_TOLERANCE:
+            yield f"all phases take {draft.horizon:.6g} s, {beyond:.3g} s beyond the horizon [{lower:g}, {upper:g}]"
+    for certificate in draft.link_certificates:
+        if certificate.verdict != "agree":
+            yield f"the certificate of {certificate.subject} says {certificate.verdict}: {certificate.worst}"
+
+
+def _ended(draft: PhasedSolution, status: Status, details: Sequence[str]) -> PhasedSolution:
+    told = "; ".join(detail for detail in details if detail)
+    return replace(draft, status=status, message=f"{status.sentence}: {told}" if told else status.sentence)
