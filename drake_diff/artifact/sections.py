@@ -21,6 +21,7 @@ from drake_diff.optimize.problem.coupling import Couples, Periodic
 from drake_diff.optimize.problem.goals import CenterOfMassGoal, FrameGoal, FrameVelocityGoal, Goal, JointGoal, KeepLevel
 from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.rates import InputRate, Jerk
 from drake_diff.optimize.problem.timed import SumOfCosts, TrackingCost
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.parts import ModelInput, Quantity
@@ -95,7 +96,7 @@ KINDS_OF_OBSTACLES = (SphereObstacle, BoxObstacle, SelfCollision)
 # By the names that a record has.
 GOALS: dict[str, Any] = {kind.__name__: kind for kind in (*KINDS_OF_GOALS, *KINDS_OF_OBSTACLES)}
 
-COUPLINGS: dict[str, Any] = {kind.__name__: kind for kind in (Periodic,)}
+COUPLINGS: dict[str, Any] = {kind.__name__: kind for kind in (Periodic, InputRate, Jerk)}
 
 
 def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:

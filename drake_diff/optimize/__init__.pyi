@@ -4,5 +4,7 @@ from .problem.coupling import Periodic as Periodic
 from .problem.dynamics import DiscreteMap as DiscreteMap
 from .problem.dynamics import plant_dynamics as plant_dynamics
 from .problem.phases import PhasedProblem as PhasedProblem
+from .problem.rates import InputRate as InputRate
+from .problem.rates import Jerk as Jerk
 from .problem.timed import TrackingCost as TrackingCost
 from .transcription.between import violation_between_nodes as violation_between_nodes

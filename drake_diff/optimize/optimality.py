@@ -118,7 +118,7 @@ def _rows(problem: Problem, xs: Array, us: Array) -> Iterator[_Row]:
     for constraint in problem.kept:
         for k in problem.knots_of(constraint, input_at_end=False):
             yield from _held(constraint, (k,), xs[k], us[min(k, len(us) - 1)])
-    for coupling in problem.coupled(input_at_end=False):
+    for coupling in problem.coupled_steps():
         for at in coupling.knots:
             yield from _held(coupling.rows, tuple(at.tolist()), *coupling.packed(xs, us, at))
 

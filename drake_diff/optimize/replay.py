@@ -10,6 +10,7 @@ successive ones of h, h/2, ... h/64. Under feedback less is allowed, since the e
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -265,12 +266,29 @@ def _replay_in(
 
 
 def track(plan: Plan, model: Model, xs: Array, us: Array) -> Policy:
-    """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan, within the input's bounds."""
+    """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan, within the input's bounds and limits of its rate.
+
+    The latter make it remember its last input: it is for one rollout.
+    """
     bounds = plan.problem.bounds
     Q, R, final = regulator_weights(plan, us)
     part = model.time_step / plan.time_step  # a running cost is summed over more steps where they are finer
     policy = TVLQR(model, xs, us, part * Q, part * R, final)
-    return lambda x, t: np.minimum(np.maximum(policy(x, t), bounds.u_lower), bounds.u_upper)
+    slew, last = np.full(model.nu, np.inf), list[Array]()
+    period = model.time_step if plan.continuous else plan.time_step  # a held input jumps at the plan's own knots
+    for limit in plan.problem.rate_limits:
+        if limit.of_inputs:
+            entries, limits = limit.entries(plan.problem.system)
+            slew[entries] = np.minimum(slew[entries], limits * period)
+
+    def kept(x: Any, t: float) -> Any:
+        wanted = np.minimum(np.maximum(policy(x, t), bounds.u_lower), bounds.u_upper)
+        if np.all(np.isinf(slew)):
+            return wanted
+        last[:] = [wanted if not last else np.clip(wanted, last[0] - slew, last[0] + slew)]
+        return last[0]
+
+    return kept
 
 
 def regulator_weights(plan: Plan, us: Array) -> tuple[Array, Array, Array]:
@@ -383,11 +401,12 @@ def _broken_constraints(plan: Plan, xs: Array, us: Array) -> Iterator[str]:
             values = np.array([c(x, u) for x, u in zip(planned_xs, [*planned_us, planned_us[-1]], strict=True)])
         values = values[np.isfinite(values).all(axis=1)]
         tolerances[c.label] = STATE_TOLERANCE * max(float(np.ptp(values, axis=0).max()), SMALLEST_RANGE)
-    for coupling in problem.coupled(input_at_end=False):
+    couplings = problem.coupled_steps(plan.time_step)
+    for coupling in couplings:
         reach = max(coupling.reach(planned_xs, planned_us), SMALLEST_RANGE)
         tolerances[coupling.label] = max(STATE_TOLERANCE * reach, tolerances.get(coupling.label, 0.0))
     goals = {c.label for c in problem.kept_goals}.difference(tolerances)  # they say themselves how near is near enough
-    for name, (excess, knot) in problem.constraint_excess(xs, us).items():
+    for name, (excess, knot) in problem.constraint_excess(xs, us, coupled=couplings).items():
         tolerance = tolerances.get(name, STATE_TOLERANCE * float(np.max(plan.scale)))
         if not (name in goals or excess <= tolerance):
             yield f"{name} is broken by {excess:.3g} at knot {knot}, tolerance {tolerance:.3g}"

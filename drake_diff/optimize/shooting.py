@@ -176,7 +176,7 @@ class SegmentedMotion:
             if not segment.is_last:
                 rows, both = defect(segment), np.concatenate([own, z[self.start_of(i + 1)]])
                 program.AddConstraint(rows, rows.lower, rows.upper, vars=both, description="defect")
-        for coupling in problem.coupled(input_at_end=False):
+        for coupling in problem.coupled_steps():
             rows = limits_of_coupling(self, coupling)
             program.AddConstraint(rows, rows.lower, rows.upper, vars=z, description=f"coupling {coupling.label}")
         return program

@@ -336,8 +336,8 @@ class Solution(ShowsItsRepr):
             return self.problem.constraint_excess(self.xs, self.inputs_at_knots)
         nodes, every = self.transcribed.nodes, self.transcribed.task.scheme.nodes
         xs, us = np.split(nodes, [self.problem.nx], axis=1)
-        found = self.problem.constraint_excess(xs, us, every * self.knots)
-        return {name: (excess, row // every) for name, (excess, row) in found.items()}
+        found = self.problem.constraint_excess(xs, us, every * self.knots, self.transcribed.task.couplings)
+        return {name: (excess, row // every) for name, (excess, row) in found.items()} | self.transcribed.rate_excess
 
     @property
     def constraint_violation(self) -> float:

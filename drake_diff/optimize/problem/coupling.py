@@ -19,7 +19,7 @@ FORM = "a function of the states at its knots, or of these and of the inputs the
 
 
 class Couples:
-    """The base of all that joins several knots; a `Problem` binds it to its own knots."""
+    """The base of all that joins several knots: plain values and functions, which hold no problem."""
 
     name: str
 
@@ -28,15 +28,19 @@ class Couples:
         """What it is called in messages."""
         return self.name
 
-    def bound(self, num_steps: int, nx: int, nu: int, *, input_at_end: bool) -> "tuple[BoundCoupling, ...]":
+    def to_dict(self) -> dict[str, Any]:
+        """The kind and its values, for a record; a user's function is told by its name."""
+        raise NotImplementedError
+
+
+class Joins(Couples):
+    """The base of what joins chosen knots."""
+
+    def bound(self, num_steps: int, nx: int, nu: int, *, input_at_end: bool) -> "BoundCoupling":
         """What has to hold of a motion of `num_steps` intervals; InputError where there are no such knots or entries.
 
         A discrete method has no input at the last knot, collocation has one (`input_at_end`).
         """
-        raise NotImplementedError
-
-    def to_dict(self) -> dict[str, Any]:
-        """The kind and its values, for a record; a user's function is told by its name."""
         raise NotImplementedError
 
 
@@ -69,6 +73,8 @@ class BoundCoupling:
 
         The rows `where` (N+1,) of the motion are the problem's knots.
         """
+        if not len(self.knots):
+            return 0.0, 0
         with np.errstate(all="ignore"):
             return max((self.rows.excess(*self.packed(xs, us, where[at])), int(where[at[-1]])) for at in self.knots)
 
@@ -85,7 +91,7 @@ class BoundCoupling:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Coupling(Couples):
+class Coupling(Joins):
     """A constraint of a `Problem` that joins several knots: lower <= function(x_a, x_b, ...) <= upper.
 
     Collocation and shooting keep it. A first state, input or waypoint that is given is no variable in it.
@@ -156,7 +162,7 @@ class Coupling(Couples):
             return len(self.knots)
         return sum(p.kind in kinds and p.default is p.empty for p in parameters)
 
-    def bound(self, num_steps: int, nx: int, nu: int, *, input_at_end: bool) -> tuple[BoundCoupling, ...]:
+    def bound(self, num_steps: int, nx: int, nu: int, *, input_at_end: bool) -> BoundCoupling:
         last = num_steps - 1 if self.takes_input and not input_at_end else num_steps
         given, wanted = np.array(self.knots), f"whole numbers from {-last - 1} to {last}, each once"
         knots = tuple((given % (last + 1)).tolist())
@@ -172,7 +178,7 @@ class Coupling(Couples):
 
         packed = of_both if self.takes_input else of_states
         rows = Constraint(packed, self.lower, self.upper, name=self.label)
-        return (BoundCoupling(rows.resolved(np.zeros(count * nx), np.zeros(count * nu)), np.array([knots])),)
+        return BoundCoupling(rows.resolved(np.zeros(count * nx), np.zeros(count * nu)), np.array([knots]))
 
     def to_dict(self) -> dict[str, Any]:
         lower, upper = ([float(v) if np.isfinite(v) else None for v in side] for side in (self.lower, self.upper))
@@ -180,7 +186,7 @@ class Coupling(Couples):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Periodic(Couples):
+class Periodic(Joins):
     """A motion that repeats: x_N = M x_0 + offset, in all entries of the state or in some.
 
     The first state is usually free, `optimize=("controls", "initial_state")`: a mask then says in which entries. With
@@ -233,7 +239,7 @@ class Periodic(Couples):
         told = ", ".join(f"{name}={short(value)}" for name, value in given.items() if value is not None)
         return f"Periodic({told})"
 
-    def bound(self, num_steps: int, nx: int, nu: int, *, input_at_end: bool) -> tuple[BoundCoupling, ...]:
+    def bound(self, num_steps: int, nx: int, nu: int, *, input_at_end: bool) -> BoundCoupling:
         entries = np.arange(nx) if self.entries is None else np.array(self.entries)
         if np.max(entries) >= nx:
             raise InputError("Periodic.entries", got=entries.tolist(), expected=f"from 0 to {nx - 1}")
@@ -259,7 +265,9 @@ def checked_couplings(given: Any) -> tuple[Couples, ...]:
     several = tuple(given) if isinstance(given, (tuple, list)) else (given,)
     for each in several:
         if not isinstance(each, Couples):
-            raise InputError("couplings", got=type(each).__name__, expected="a Coupling such as Periodic, or several")
+            raise InputError(
+                "couplings", got=type(each).__name__, expected="Periodic, Coupling, InputRate, Jerk, or several"
+            )
     return several
 
 

@@ -15,11 +15,12 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, select
 from drake_diff.optimize.problem.constraint import Constraint, check_inside, plant_limits, resolve_bounds, short
 from drake_diff.optimize.problem.cost import ConstantCost, FinalCost, QuadraticCost
-from drake_diff.optimize.problem.coupling import BoundCoupling, Couples, checked_couplings, excess_of
+from drake_diff.optimize.problem.coupling import BoundCoupling, Couples, Joins, checked_couplings, excess_of
 from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, plant_dynamics
 from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGoals, in_words
 from drake_diff.optimize.problem.names import bounds_of, state_of
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, doubts_of
+from drake_diff.optimize.problem.rates import RateLimit
 from drake_diff.optimize.problem.timed import SumOfCosts, TimedCost, TrackingCost, cost_at, running_cost_of
 
 OPTIMIZABLE = ("controls", "initial_state", "parameters")
@@ -307,15 +308,29 @@ class Problem(ShowsItsRepr):
         return c.at_knots(self.num_steps + int(input_at_end and c.takes_input), self.initial_state_is_given)
 
     def coupled(self, *, input_at_end: bool) -> tuple[BoundCoupling, ...]:
-        """What the couplings come to on the problem's knots; see `knots_of`."""
+        """The couplings of chosen knots; see `knots_of`."""
         sizes = self.num_steps, self.nx, self.nu
-        return tuple(each for c in self.couplings for each in c.bound(*sizes, input_at_end=input_at_end))
+        return tuple(c.bound(*sizes, input_at_end=input_at_end) for c in self.couplings if isinstance(c, Joins))
 
-    def constraint_excess(self, xs: Array, us: Array, knots: Indices | None = None) -> dict[str, tuple[float, int]]:
+    @property
+    def rate_limits(self) -> tuple[RateLimit, ...]:
+        """The couplings of all neighbouring knots."""
+        return tuple(c for c in self.couplings if isinstance(c, RateLimit))
+
+    def coupled_steps(self, time_step: float | None = None) -> tuple[BoundCoupling, ...]:
+        """All couplings of a motion in steps of `time_step` [s], the problem's own where None."""
+        h = self.time_step if time_step is None else time_step
+        rates = [rate.of_steps(self.system, self.num_steps, h) for rate in self.rate_limits]
+        return (*self.coupled(input_at_end=False), *rates)
+
+    def constraint_excess(
+        self, xs: Array, us: Array, knots: Indices | None = None, coupled: Sequence[BoundCoupling] | None = None
+    ) -> dict[str, tuple[float, int]]:
         """The largest excess over its bounds of each constraint, and the row it is at, along xs (M+1, nx) under us.
 
         us is (M, nu), or (M+1, nu) at the knots; `knots` (N+1,) are the rows of the problem's own knots where a mesh
-        was refined, and a constraint of all knots is one of all rows. Waypoints and couplings are constraints here too.
+        was refined, and a constraint of all knots is one of all rows. Waypoints are constraints here too, and so are
+        couplings: those of steps, where they are not given.
         """
         found: dict[str, tuple[float, int]] = {}
         where = np.arange(len(xs)) if knots is None else knots
@@ -328,7 +343,7 @@ class Problem(ShowsItsRepr):
         for knot, wanted in self.waypoints.items():
             distance = np.abs(xs[where[knot]] - wanted)[~np.isnan(wanted)]
             found[f"waypoint at knot {knot}"] = (float(np.max(distance, initial=0.0)), int(where[knot]))
-        return found | excess_of(self.coupled(input_at_end=len(us) == len(xs)), xs, us, where)
+        return found | excess_of(self.coupled_steps() if coupled is None else coupled, xs, us, where)
 
     def ranges(self, xs: Array) -> Array:
         """(nx,) the range of each state along xs (M, nx), a tolerance's scale; see SMALLEST_RANGE, SMALLEST_SHARE."""
@@ -419,13 +434,16 @@ class Problem(ShowsItsRepr):
 
     def _check_couplings(self) -> tuple[Couples, ...]:
         couplings = checked_couplings(self.couplings)
+        self._set("couplings", couplings)
         taken = {c.label for c in self.constraints}
         for c in couplings:
             if c.label in taken:
                 raise InputError("couplings", got=f"two of name {c.label}", expected="a name of its own for each")
             taken.add(c.label)
-            for bound in c.bound(self.num_steps, self.nx, self.nu, input_at_end=not (self.has_model or self.is_map)):
-                self._check_given(bound)
+            if isinstance(c, RateLimit):
+                c.entries(self.system)
+        for bound in self.coupled(input_at_end=not (self.has_model or self.is_map)):
+            self._check_given(bound)
         return couplings
 
     def _check_given(self, bound: BoundCoupling) -> None:

@@ -80,6 +80,10 @@ def violation_between_nodes(motion: Collocated) -> Excess:
             found.append([_too_near(motion, c)])
         elif c.knots is None:
             found.append(_of_constraint(motion, c, ranges))
+    for limit in task.problem.rate_limits:
+        _, most = limit.entries(task.problem.system)
+        rates, when = motion.rates_of(limit)
+        found.append(_beyond("constraint", (limit.label,) * len(most), rates, -most, most, _extent(rates), when))
     k, tau = np.repeat(np.arange(count), len(DENSE)), np.tile(DENSE, count)
     us = motion.between(k, tau)[1]
     found.append(_beyond("input", inputs, us, b.u_lower, b.u_upper, _extent(us), motion.times(k, tau)))

@@ -18,9 +18,11 @@ from drake_diff._base.arrays import Array, Indices, frozen
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, clearances
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
+from drake_diff.optimize.problem.rates import RateLimit
 from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report
 from drake_diff.optimize.transcription.task import OptimalControl
 
+SLOPED = np.linspace(0, 1, 11)  # where slopes are looked at within an interval, its ends among them
 SUBSTEPS = 10  # of the Runge-Kutta method that measures an interval
 EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in TVLQR, over that of the states
 CLEARANCE_ROUNDS, MOST_INTERVALS = 5, 1000  # where a plan comes too near to an obstacle between its knots
@@ -90,6 +92,41 @@ class Collocated:
         weights = self.horizon * self.task.scheme.node_weights(self.mesh)
         final = 0.0 if self.task.final is None else float(self.task.final.values(self.nodes[-1:])[0, 0])
         return float(weights @ self._cost_rates) + final
+
+    @property
+    def rate_excess(self) -> dict[str, tuple[float, int]]:
+        """The largest excess of each rate limit of the problem, and the interval that it is in, by differences.
+
+        Those are of the scheme's own polynomials: of the input, and of x'.
+        """
+        found: dict[str, tuple[float, int]] = {}
+        for limit in self.task.problem.rate_limits:
+            of = self.nodes[:, self.task.dynamics.nx :] if limit.of_inputs else self._rates
+            entries, limits = limit.entries(self.task.problem.system)
+            values = self.task.scheme.at(SLOPED) @ self.task.scheme.per_interval(of[:, entries])
+            excess = np.maximum(np.abs(self._slopes(values)) - limits, 0.0)
+            worst = np.nan_to_num(np.max(excess, axis=(1, 2)), nan=np.inf)
+            found[limit.label] = float(np.max(worst)), int(np.argmax(worst))
+        return found
+
+    def rates_of(self, limit: RateLimit) -> tuple[Array, Array]:
+        """(S, n) slopes by time, at places from end to end of all intervals, of what `limit` is of; and the times (S,).
+
+        Those of accelerations are of the dynamics' own, where the plan's states and inputs lead.
+        """
+        count = len(self.mesh) - 1
+        k, tau = np.repeat(np.arange(count), len(SLOPED)), np.tile(SLOPED, count)
+        xs, us = self.between(k, tau)
+        with np.errstate(all="ignore"):
+            of = us if limit.of_inputs else self.task.dynamics.values(np.hstack([xs, us]))
+        entries, _ = limit.entries(self.task.problem.system)
+        found = self._slopes(of[:, entries].reshape(count, len(SLOPED), -1))
+        return found.reshape(len(k), -1), self.times(k, tau)
+
+    def _slopes(self, values: Array) -> Array:
+        """Of `values` (N, S, n) by time, exact for parabolas."""
+        by_tau = np.gradient(values, SLOPED, axis=1, edge_order=2)
+        return np.asarray(by_tau / self._lengths[:, None, None])
 
     @cached_property
     def defects(self) -> Array:

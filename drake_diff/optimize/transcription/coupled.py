@@ -13,7 +13,9 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.optimize.problem.coupling import BoundCoupling
+from drake_diff.optimize.problem.rates import RateLimit
 from drake_diff.optimize.transcription.expressions import KnotFunction
+from drake_diff.optimize.transcription.task import OptimalControl
 
 Entries = tuple[Any, Any, Any]  # rows, columns (K, nonzeros) and where in `values` the nonzeros are
 
@@ -67,6 +69,69 @@ class CoupledRows:
         """The place of each nonzero (K, nonzeros), and its number."""
         index = np.arange(len(self.columns) * nonzeros).reshape(len(self.columns), nonzeros)
         return np.arange(len(self.columns))[:, None], index
+
+
+@dataclass(frozen=True, eq=False)
+class SlopeRows:
+    """|slopes| <= limit at the ends of all intervals, where the slope by time of a line or parabola is largest.
+
+    As rows weights @ y within limit * T, with y the variables z or, `of_rates`, the rates F of all nodes: linear in T.
+    With a free T there are two rows for each, one for either side.
+    """
+
+    of_rates: bool
+    places: Indices  # (m, s+1) of the nodes' values in y
+    weights: Array  # (m, s+1)
+    limits: Array  # (m,) [per s]
+    horizon: float | None  # [s] None where it is free
+
+    @property
+    def count(self) -> int:
+        """How many rows of the program they are."""
+        return len(self.limits) * (2 if self.horizon is None else 1)
+
+    @property
+    def sides(self) -> tuple[Array, Array]:
+        """(lower, upper), each (count,)."""
+        if self.horizon is not None:
+            return -self.horizon * self.limits, self.horizon * self.limits
+        zero, none = np.zeros(len(self.limits)), np.full(len(self.limits), np.inf)
+        return np.append(-none, zero), np.append(zero, none)
+
+    @property
+    def by_time(self) -> Array:
+        """(count,) the derivative by a free T."""
+        return np.append(-self.limits, self.limits)
+
+    @property
+    def entries(self) -> tuple[Indices, Indices, Array]:
+        """Rows, places in y and weights, each (count, s+1)."""
+        times = self.count // max(len(self.limits), 1)
+        rows = np.repeat(np.arange(self.count)[:, None], self.places.shape[1], axis=1)
+        return rows, np.tile(self.places, (times, 1)), np.tile(self.weights, (times, 1))
+
+
+def slopes_of(limit: RateLimit, task: OptimalControl, mesh: Array) -> SlopeRows:
+    """The rows of a rate limit on `mesh` (N+1,)."""
+    f, scheme = task.dynamics, task.scheme
+    entries, limits = limit.entries(task.problem.system)
+    ends, size, first = scheme.end_slopes, f.nx, entries
+    if limit.of_inputs:
+        ends = np.array([[-1.0, 0.0, 1.0]]) if scheme.input_is_linear else ends
+        size, first = f.nx + f.nu, f.nx + entries
+    lengths, shape = np.diff(mesh), (len(mesh) - 1, len(ends), len(entries))
+    nodes = scheme.nodes * np.arange(len(lengths))[:, None] + np.arange(scheme.nodes + 1)
+    places = nodes[:, None, None, :] * size + first[None, None, :, None]
+    weights = ends[None, :, None, :] / lengths[:, None, None, None]
+    whole = (*shape, scheme.nodes + 1)
+    free = task.horizon[0] < task.horizon[1]
+    return SlopeRows(
+        of_rates=not limit.of_inputs,
+        places=np.broadcast_to(places, whole).reshape(-1, scheme.nodes + 1),
+        weights=np.broadcast_to(weights, whole).reshape(-1, scheme.nodes + 1),
+        limits=np.broadcast_to(limits, shape).ravel(),
+        horizon=None if free else task.horizon[0],
+    )
 
 
 def rows_of(c: BoundCoupling, function: KnotFunction, nodes: Indices, nx: int, width: int) -> CoupledRows:

@@ -161,7 +161,8 @@ class HeldPlan:
 
     def _by_parameters(self, change: Change, multipliers: Array) -> Array:
         """(n + m, p) of the Lagrangian's gradient and of the rows: by differences of the dynamics' exact Jacobians."""
-        program, horizon = self.program, self.motion.horizon
+        program, horizon, given = self.program, self.motion.horizon, ca.DM(multipliers)
+        pulled = np.asarray(program.pulled(given, horizon)).reshape(len(program.every), program.nx)
         nu = np.asarray(ca.mtimes(program._D.T, ca.DM(multipliers[: program.num_links])))
         nu = nu.reshape(len(program.every), program.nx)
         columns = []
@@ -169,12 +170,9 @@ class HeldPlan:
             step = DIFFERENCE * max(1.0, abs(value))
             (f_low, j_low), (f_high, j_high) = (self._dynamics(change, i, side * step) for side in (-1, 1))
             by_f, by_j = (f_high - f_low) / (2 * step), (j_high - j_low) / (2 * step)
-            of_nodes = -horizon * np.einsum("ki,kij->kj", nu, by_j).ravel()
+            of_nodes = np.einsum("ki,kij->kj", pulled, by_j).ravel()
             of_time = [-float(np.sum(nu * by_f))] * program.free
-            links = -horizon * np.asarray(ca.mtimes(program._D, ca.DM(by_f.ravel()))).ravel()
-            of_rows = np.zeros(len(self.values))
-            of_rows[: program.num_links] = links
-            columns.append(np.concatenate([of_nodes, of_time, of_rows]))
+            columns.append(np.concatenate([of_nodes, of_time, program.pushed(by_f.ravel(), horizon)]))
         return np.array(columns).T
 
     def _dynamics(self, change: Change, column: int, step: float) -> tuple[Array, Array]:

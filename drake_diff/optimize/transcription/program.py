@@ -10,6 +10,7 @@ linear ones. Path constraints add rows to g and terms to the blocks of their nod
 """
 
 import math
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -28,7 +29,7 @@ from drake_diff.optimize.program import (
     Watch,
     ctrl_c,
 )
-from drake_diff.optimize.transcription.coupled import rows_of
+from drake_diff.optimize.transcription.coupled import SlopeRows, rows_of, slopes_of
 from drake_diff.optimize.transcription.expressions import KnotFunctions, Timed
 from drake_diff.optimize.transcription.task import OptimalControl
 
@@ -75,6 +76,7 @@ class TranscribedProgram:
         couplings = zip(task.couplings, functions.joined, strict=True)
         knots = task.nodes_at(range(task.problem.num_steps + 1), mesh)
         self.coupled = [rows_of(c, function, knots, self.nx, self.width) for c, function in couplings]
+        self.slopes = [slopes_of(limit, task, mesh) for limit in task.problem.rate_limits]
         times = task.horizon[0] * task.scheme.node_fractions(mesh)  # of a cost that changes in time, which fixes it
         self.rate = functions.rate.at(times) if isinstance(functions.rate, Timed) else functions.rate
         self.rates, self.costs = functions.dynamics.values(self.knots), self.rate.values(self.knots)
@@ -95,9 +97,15 @@ class TranscribedProgram:
         """(lower, upper) of g: 0 for the defects, each path constraint's own, node by node, and each coupling's."""
         parts = [(b.lower, b.upper) for b in self._links]
         parts += [(np.tile(c.lower, len(at)), np.tile(c.upper, len(at))) for _, at, c in self.paths]
-        parts += [*(c.sides for c in self.coupled), self._linear_sides]
+        parts += [*(c.sides for c in self.coupled), *(c.sides for c in self.slopes), self._linear_sides]
         lower, upper = zip(*parts, strict=True)
         return np.concatenate(lower), np.concatenate(upper)
+
+    @cached_property
+    def _slope_weights(self) -> list[Any]:
+        """Sparse, of the rates of all nodes or of z."""
+        sizes = {True: self.every.size * self.nx, False: self.z.numel()}
+        return [_sparse(*c.entries, (c.count, sizes[c.of_rates])) for c in self.slopes]
 
     @cached_property
     def nlp(self) -> dict[str, Any]:
@@ -108,6 +116,9 @@ class TranscribedProgram:
         g = [ca.mtimes(self._S, self.z) - self.time * ca.mtimes(self._D, ca.vec(self.rates))]
         g += [ca.vec(f.values(self.knots[:, at.tolist()])) for f, at, _ in self.paths]
         g += [c.values(self.z) for c in self.coupled]
+        for c, weights in zip(self.slopes, self._slope_weights, strict=True):
+            g.append(ca.mtimes(weights, ca.vec(self.rates) if c.of_rates else self.z))
+            g[-1] += ca.DM(c.by_time) * self.time if self.free else 0
         if self._linear is not None:
             g.append(ca.mtimes(self._linear, self.z))
         return {"x": self.z, "f": f, "g": ca.vertcat(*g)}
@@ -206,10 +217,52 @@ class TranscribedProgram:
             (rows, columns, index), source = c.jacobian(self.z)
             total.add(first + rows, columns, 1.0, source, index)
             first += c.count
+        for slopes in self.slopes:
+            self._add_slopes(total, first, slopes)
+            first += slopes.count
         if self._linear is not None:
             rows, columns = (np.array(a) for a in self._linear.sparsity().get_triplet())
             total.add(first + rows, columns, np.array(self._linear.nonzeros()), ca.DM(1), 0)
         return total.matrix()
+
+    def _add_slopes(self, total: "_Sum", first: int, c: SlopeRows) -> None:
+        """The Jacobian of the rows of a rate limit, which begin at `first`."""
+        rows, places, weights = c.entries
+        if self.free:
+            total.add(first + np.arange(c.count), self.z.numel() - 1, c.by_time, ca.DM(1), 0)
+        if not c.of_rates:
+            total.add(first + rows, places, weights, ca.DM(1), 0)
+            return
+        of, columns = self.functions.dynamics.jacobian_at
+        nodes, entries = np.divmod(places, self.nx)
+        for entry in np.unique(entries):
+            here, kept = entries == entry, np.flatnonzero(of == entry)
+            node = nodes[here][:, None]
+            at = first + rows[here][:, None], node * self.width + columns[kept]
+            total.add(*at, weights[here][:, None], self.rate_rows, node * len(of) + kept)
+
+    def pulled(self, multipliers: Any, horizon: Any) -> Any:
+        """(K nx,) what the rows' multipliers (m,) weigh the rates of all nodes by; MX or DM."""
+        found = -horizon * ca.mtimes(self._D.T, multipliers[: self.num_links])
+        for first, weights in self._of_rates():
+            found += ca.mtimes(weights.T, multipliers[first : first + weights.shape[0]])
+        return found
+
+    def pushed(self, rates: Array, horizon: float) -> Array:
+        """(m,) the part of all rows that is linear in the `rates` (K nx,) of all nodes; 0 of the others."""
+        found = np.zeros(self.nlp["g"].numel())
+        found[: self.num_links] = -horizon * np.asarray(ca.mtimes(self._D, ca.DM(rates))).ravel()
+        for first, weights in self._of_rates():
+            found[first : first + weights.shape[0]] = np.asarray(ca.mtimes(weights, ca.DM(rates))).ravel()
+        return found
+
+    def _of_rates(self) -> Iterator[tuple[int, Any]]:
+        """Where the rows of limits of accelerations begin, and the weights of the rates in them."""
+        first = self.num_links + sum(f.rows * len(at) for f, at, _ in self.paths) + sum(c.count for c in self.coupled)
+        for c, weights in zip(self.slopes, self._slope_weights, strict=True):
+            if c.of_rates:
+                yield first, weights
+            first += c.count
 
     def _hessian(self, sigma: Any, multipliers: Any) -> Any:
         """The upper triangle of d^2 (sigma f + multipliers' g) / dz^2."""
@@ -217,7 +270,7 @@ class TranscribedProgram:
         nu = ca.mtimes(self._D.T, multipliers[: self.num_links])
         weights = ca.DM(self.weights).T
         terms: list[tuple[Any, Indices, Any]] = [
-            (f, self.every, -self.time * ca.reshape(nu, self.nx, self.every.size)),
+            (f, self.every, ca.reshape(self.pulled(multipliers, self.time), self.nx, self.every.size)),
             (rate, self.every, sigma * self.time * weights),
         ]
         if self.functions.final is not None:

@@ -55,6 +55,13 @@ class Scheme:
         """(s+1,) the quadrature of an interval of length 1."""
         return np.array([0.5, 0, 0.5]) if self.input_is_linear else self.integrated(np.ones(1))[0]
 
+    @cached_property
+    def end_slopes(self) -> Array:
+        """(e, s+1) the weight of each node's value in the slope by tau at the ends of an interval: one of a line."""
+        tau = np.array([0.0, 1.0] if self.basis.shape[1] > 2 else [0.0])
+        powers = np.arange(1, self.basis.shape[1])
+        return np.asarray(tau[:, None] ** (powers - 1) * powers @ self.basis[:, 1:].T)
+
     def at(self, tau: Array) -> Array:
         """(S, s+1) the weight of each node's value at `tau` (S,) within an interval."""
         return np.asarray(tau[:, None] ** np.arange(self.basis.shape[1]) @ self.basis.T)

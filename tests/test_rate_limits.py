@@ -1,0 +1,155 @@
+"""Limits of how fast inputs and accelerations change: least times in closed form, and what breaks them is seen."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from helpers.models import MODELS
+from helpers.table import each_row
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.optimize import InputRate, Jerk
+from drake_diff.optimize.transcription.collocation import Transcription
+from drake_diff.optimize.transcription.program import TranscribedProgram
+
+BLOCK = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+ENDS = dd.Constraint(lambda x, u: u, 0.0, 0.0, knots=(0, -1), name="no force at the ends")
+
+
+def least_time(way, most, rate, couplings, **more):
+    limits = dd.Bounds(u_lower=[-most], u_upper=[most])
+    asked = {"num_steps": 40, "horizon": (0.2, 10), "running_cost": 1.0, "bounds": limits, "constraints": ENDS}
+    return dd.Problem(BLOCK, x0=[0, 0], x_goal=[way, 0], couplings=couplings, **asked | more)
+
+
+@each_row("limit", [InputRate(2.0), Jerk({"x1": 2.0})])
+@each_row("way", [0.1, 1.0])
+def test_the_least_time_from_rest_to_rest_is_that_of_the_s_curve(way, limit):
+    """|a| <= 1, |a'| <= 2: four ramps, of (way / (2 J))^(1/3) each, with plateaus where these would pass A."""
+    A, J = 1.0, 2.0
+    wanted = 4 * (way / (2 * J)) ** (1 / 3) if way < 2 * A**3 / J**2 else A / J + np.sqrt((A / J) ** 2 + 4 * way / A)
+    solution = dd.solve(least_time(way, A, J, limit))
+    assert solution.success
+    assert solution.horizon == pytest.approx(wanted, rel=1e-3)  # its switches are not at the knots of 40 intervals
+    assert solution.horizon > wanted * (1 - 1e-6)
+
+
+@each_row("scheme", ["hermite_simpson", "trapezoid", "drake"])
+@each_row("horizon", [None, (0.3, 2.0)])
+def test_rows_of_rates_have_the_derivatives_of_differences(scheme, horizon):
+    model = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.05)
+    limits = [Jerk({"elbow": 80.0}, name="elbow"), InputRate(50.0), Jerk(100.0)]
+    cost = dd.QuadraticCost(R=np.eye(2))
+    problem = dd.Problem(model, x0=np.zeros(4), num_steps=6, horizon=horizon, running_cost=cost, couplings=limits)
+    transcription = Transcription(problem, scheme)
+    program = TranscribedProgram(transcription.task, transcription.mesh, transcription.functions)
+    own = program.derivatives(exact=True)
+    random = np.random.default_rng(0)
+    z, step = random.uniform(0.3, 1.0, program.z.numel()), 1e-6
+    weigh = random.standard_normal(program.nlp["g"].numel())
+
+    def rows(z):
+        return np.asarray(own["jac_g"](z, [])[0]).ravel()
+
+    def pulled(z):
+        return np.asarray(own["jac_g"](z, [])[1]).T @ weigh
+
+    jacobian, hessian = np.asarray(own["jac_g"](z, [])[1]), own["hess_lag"](z, [], 0.0, weigh)
+    hessian = np.asarray(ca.triu2symm(hessian))
+    for found, f in ((jacobian, rows), (hessian, pulled)):
+        wanted = np.array([(f(z + step * e) - f(z - step * e)) / (2 * step) for e in np.eye(len(z))]).T
+        assert np.max(np.abs(found - wanted)) < 1e-8 * np.max(np.abs(wanted))  # of central differences
+
+
+@each_row("method", ["collocation", "shooting"])
+def test_a_pendulum_swings_up_with_a_slow_motor(method):
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
+    problem = dd.Problem(
+        model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=60, running_cost=EFFORT, couplings=InputRate(10.0),
+        bounds=dd.Bounds(u_lower=[-3.0], u_upper=[3.0]),
+    )  # fmt: skip
+    solution = dd.solve(problem, method=method)
+    assert solution.success, solution.message
+    assert np.max(np.abs(np.diff(solution.us[:, 0]))) <= 10 * 0.05 + 1e-6
+    for replay in solution.replays:  # feedback goes no faster either
+        assert np.max(np.abs(np.diff(replay.motion.us[:, 0]))) <= 10 * 0.05 * 1.05
+
+
+def test_an_arm_moves_without_jerks_and_its_motion_is_smooth_between_its_knots():
+    model = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.05)
+    problem = dd.Problem(
+        model, x0=np.zeros(4), x_goal=[1, -1, 0, 0], num_steps=20, running_cost=dd.QuadraticCost(R=np.eye(2)),
+        couplings=Jerk(60.0),
+    )  # fmt: skip
+    solution = dd.solve(problem)
+    assert solution.success, solution.message
+    state, given = solution.trajectory()
+    times = np.linspace(0, solution.horizon, 2001)
+    knots = np.hstack([state.vector_values(times).T, given.vector_values(times).T])
+    accelerations = problem.dynamics.values(knots)[:, 2:]
+    # By differences of the plant's accelerations; the verdict allows 1e-3 of a range of 120
+    assert np.max(np.abs(np.diff(accelerations, axis=0))) / times[1] <= 60.2
+
+
+def test_whatever_breaks_a_limit_is_seen():
+    """Inputs that are moved at random: what they break is known from the slopes of the parabolas through them."""
+    for limit in (InputRate(2.0), Jerk({"x1": 2.0})):
+        solution = dd.solve(least_time(1.0, 1.0, 2.0, limit, horizon=3.0, running_cost=EFFORT))
+        assert solution.success
+        random, tau, planted = np.random.default_rng(0), np.array([0, 0.5, 1.0]), 0
+        for _ in range(100):
+            us, us_mid = np.array(solution.us), np.array(solution.us_mid)
+            moved = us if random.random() < 0.5 else us_mid
+            moved[random.integers(1, len(us))] += random.choice([-1, 1]) * 10 ** random.uniform(-4, 0)
+            changed = replace(solution, us=us, us_mid=us_mid)
+            ends, h = np.vstack([us, solution.u_final[None]])[:, 0], np.diff(solution.times)
+            parabolas = [np.polyfit(tau, [ends[k], us_mid[k, 0], ends[k + 1]], 2) for k in range(len(us))]
+            slopes = [abs(np.polyval(np.polyder(p), t)) / length for p, length in zip(parabolas, h, strict=True)
+                      for t in (0, 1)]  # fmt: skip
+            excess = max(slopes) - 2.0
+            found = changed.constraint_excess[limit.label][0]
+            assert found == pytest.approx(max(excess, 0.0), abs=1e-9)
+            planted += excess > 1e-5
+        assert planted > 50
+
+
+def test_a_record_of_it_is_verified_and_one_that_breaks_it_fails(tmp_path):
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
+    problem = dd.Problem(
+        model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=EFFORT,
+        couplings=[InputRate({"motor": 60.0}), Jerk(300.0)],
+    )  # fmt: skip
+    solution = dd.solve(problem)
+    assert dd.save(solution, tmp_path / "a").verdict == "pass"
+    found = dd.verify(tmp_path / "a")
+    assert found.holds
+    assert sum("coupling" in line for line in found.claimed) == 2
+    us = np.array(solution.us)
+    us[5] += 1.0
+    assert dd.save(replace(solution, us=us), tmp_path / "b").verdict == "fail"
+
+
+@each_row(
+    "couplings, error, told",
+    [
+        (lambda: InputRate(0), InputError, "above 0"),
+        (lambda: InputRate({}), InputError, "no names"),
+        (lambda: Jerk(-1.0), InputError, "above 0"),
+        (lambda: InputRate({"none": 1.0}), UnknownNameError, "none"),
+        (lambda: Jerk(3.0), InputError, "by name"),
+        (lambda: Jerk({"x5": 3.0}), UnknownNameError, "x5"),
+    ],
+)
+def test_what_is_no_limit_is_refused_at_once(couplings, error, told):
+    with pytest.raises(error, match=told):
+        least_time(1.0, 1.0, 1.0, couplings())
+
+
+def test_a_sensitivity_counts_them():
+    """d cost / d goal of the least time of the S-curve with a plateau: T = A/J + sqrt((A/J)^2 + 4 d/A)."""
+    solution = dd.solve(least_time(1.0, 1.0, 2.0, InputRate(2.0), horizon=3.0, running_cost=EFFORT))
+    found = dd.sensitivity(solution, "goal")
+    assert found.verdict == "agree", found
