@@ -225,7 +225,7 @@ class TranscribedProgram:
             total.add(first + rows, columns, np.array(self._linear.nonzeros()), ca.DM(1), 0)
         return total.matrix()
 
-    def _add_slopes(self, total: "_Sum", first: int, c: SlopeRows) -> None:
+    def _add_slopes(self, total: "SparseSum", first: int, c: SlopeRows) -> None:
         """The Jacobian of the rows of a rate limit, which begin at `first`."""
         rows, places, weights = c.entries
         if self.free:
