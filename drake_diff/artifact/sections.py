@@ -87,7 +87,7 @@ STATIONARITY = (
     "the largest |d L / d z| of an optimized variable that no bound holds, over the largest sum of magnitudes that one "
     "is made of: 0 at an optimum; multipliers by least squares, not the solver's"
 )
-COSTS = ("running_cost", "final_cost", "trajectory_cost")
+COSTS = ("running_cost", "final_cost", "trajectory_cost", "parameter_cost")
 LIMITS = ("x_lower", "x_upper", "u_lower", "u_upper")
 GAPS = {"lower": -np.inf, "upper": np.inf}  # what null is, of a bound
 GUESS = ("initial_guess", "initial_guess_sha256")

@@ -183,6 +183,7 @@ def certify_jacobian(
     solver_tolerance: float = 0.0,
     method: str = "given",
     subject: str = "the derivative",
+    scale: ArrayLike | None = None,
 ) -> Certificate:
     """Certify the Jacobian of any function R^n -> R^m at a point.
 
@@ -196,6 +197,7 @@ def certify_jacobian(
         solver_tolerance: how accurately `f` is solved, relative to max(1, |f|), if it is solved iteratively.
         method: how the Jacobian was computed, for the record.
         subject: what is certified, for messages.
+        scale: (n,) sizes of the variables, which differences move by parts of; max(1, |x|) where not given.
 
     Returns:
         The certificate; its derivatives have the units of `f` per unit of `x`.
@@ -214,7 +216,7 @@ def certify_jacobian(
         'discontinuous'
     """
     x = finite_array("x", x, ("n",))
-    scale = np.maximum(1.0, np.abs(x))
+    scale = np.maximum(1.0, np.abs(x)) if scale is None else finite_array("scale", scale, x.shape)
     at_x, beside = np.asarray(jacobian(x) if callable(jacobian) else jacobian, dtype=float), None
     if callable(jacobian):
         beside = np.asarray(jacobian(x + jitter(scale)), dtype=float) * scale

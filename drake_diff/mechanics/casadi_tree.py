@@ -8,6 +8,9 @@ are with zeros and ones and vanish. Derivatives of dv/dt = a(z) come from those 
 
     a_z = -M^-1 (r_z - B_z),    d^2 (w' a) = -(H_zz + H_za a_z + (H_za a_z)'),    H = d^2 (mu' r), mu = M^-1 w fixed
 
+Parameters of the model may be symbols too, at the end of the knot: z = [q, v, u, c], c their coordinates. What of r is
+quadratic in v and linear in a stays so.
+
 Whatever the tree leaves out shows in the comparison with Drake's plant, and the model is then refused.
 """
 
@@ -19,13 +22,17 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, skew
 from drake_diff._base.refusal import Refusal
+from drake_diff.mechanics.description import Link, names_of, read_links, springs_of, without_welds
 from drake_diff.mechanics.tree import TreeDynamics, tree_for, tree_of
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.model import Model
+from drake_diff.model.parameters import ParameterCoordinates, ParameterVector, applied
+from drake_diff.model.plant import actuators, labelled
 from drake_diff.model.step import set_state
 
 SAME_PLANT = 1e-9  # of the largest rate: rounding, as a badly conditioned mass matrix magnifies it
 ROUNDED = 1e-15  # of the frames' entries (sines of pi): zeros that would keep products alive
+TRIED = 0.1  # of a parameter's coordinate: how far away from its first value it is tried, too
 Z = ca.DM([0, 0, 1])
 
 
@@ -41,64 +48,111 @@ class PlantFunctions:
     hessian: Any
 
 
-def symbolic_plant(model: Model) -> PlantFunctions | Refusal:
+def symbolic_plant(
+    model: Model, vector: ParameterVector | None = None, coordinates: ParameterCoordinates | None = None
+) -> PlantFunctions | Refusal:
     """The equations of motion as SX functions, compared with Drake's plant at two states; or why there are none.
 
-    They are made once, and are those of the model's own parameters: while others are applied there are none.
+    They are of the parameters `vector`, which `coordinates` makes the end of the knot. While parameters are applied
+    to the model there are none.
     """
     if model.has_other_parameters:
         return Refusal("parameters are applied that are not the model's own")
-
-    def compared() -> PlantFunctions | Refusal:
-        tree = tree_for(model)
-        if tree is None:
-            found = tree_of(model)
-            return found if isinstance(found, Refusal) else Refusal("its tree differs from Drake's inverse dynamics")
-        equations, random = EquationsOfMotion(model), np.random.default_rng(1)
-        here = model.double.state()
-        functions = _functions(tree, model, ca.DM(equations.actuation))
-        probe = random.standard_normal((2, model.nx + model.nu))
-        wanted = np.array([equations(row[: model.nx], row[model.nx :]) for row in probe])
-        set_state(model.double, here)
-        same = agrees(functions.function, probe, wanted, SAME_PLANT)
-        return functions if same else Refusal("its symbolic form differs from Drake's plant")
-
-    return model.cache("symbolic plant", compared)
+    if vector is None or not vector.parameters:
+        return model.cache("symbolic plant", lambda: _compared(model, None, None))
+    start = None if coordinates is None else coordinates.start.values.tobytes()
+    key = "symbolic plant", vector.names, vector.values.tobytes() if start is None else b"", start
+    return model.cache(key, lambda: _compared(model, vector, coordinates))
 
 
-def _functions(tree: TreeDynamics, model: Model, actuation: Any) -> PlantFunctions:
-    n, width = model.nv, model.nx + model.nu
-    knot, weights, mu, a = (ca.SX.sym(s, k) for s, k in (("knot", width), ("w", 2 * n), ("mu", n), ("a", n)))
-    q, v, u = knot[:n], knot[n : 2 * n], knot[2 * n :]
+def _compared(
+    model: Model, vector: ParameterVector | None, coordinates: ParameterCoordinates | None
+) -> PlantFunctions | Refusal:
+    tree = tree_for(model)
+    if tree is None:
+        found = tree_of(model)
+        return found if isinstance(found, Refusal) else Refusal("its tree differs from Drake's inverse dynamics")
+    equations, random = EquationsOfMotion(model), np.random.default_rng(1)
+    here = model.double.state()
+    tail = np.zeros(0) if coordinates is None else coordinates.from_values(coordinates.start.values)
+    symbols = ca.SX.sym("c", len(tail))
+    plant = _Plant(tree, model)
+    if vector is not None:
+        values = ca.DM(np.asarray(vector.values)) if coordinates is None else _values(coordinates, symbols)
+        unknown = plant.move(model, vector, values)
+        if unknown:
+            return Refusal(f"its parameter {unknown} is no symbol here")
+    functions = _functions(plant, tree, model, symbols, ca.DM(equations.actuation))
+    probe = random.standard_normal((2, model.nx + model.nu))
+    tails = tail + TRIED * random.uniform(0, 1, (2, len(tail))) * np.where(tail == 0, 1.0, tail)
+    wanted = []
+    for knot, c in zip(probe, tails, strict=True):
+        moved = vector if coordinates is None or vector is None else vector.at(coordinates.to_values(c))
+        with applied(moved if moved is not None else ParameterVector(model, (), np.zeros(0))):
+            wanted.append(equations(knot[: model.nx], knot[model.nx :]))
+    set_state(model.double, here)
+    same = agrees(functions.function, np.hstack([probe, tails]), np.array(wanted), SAME_PLANT)
+    return functions if same else Refusal("its symbolic form differs from Drake's plant")
+
+
+def _values(coordinates: ParameterCoordinates, c: Any) -> Any:
+    """(np,) the values of the parameters at the coordinates c, an SX: see `ParameterCoordinates.to_values`."""
+    values = c * ca.DM(coordinates.scale)
+    for s in coordinates.inertias:
+        lower, (a, b, d, l10, l20, l21) = ca.SX.zeros(3, 3), ca.vertsplit(c[s])
+        lower[0, 0], lower[1, 1], lower[2, 2] = ca.exp(a), ca.exp(b), ca.exp(d)
+        lower[1, 0], lower[2, 0], lower[2, 1] = l10, l20, l21
+        S = lower @ lower.T
+        full = ca.trace(S) * ca.DM.eye(3) - S
+        values[s] = ca.vertcat(full[0, 0], full[1, 1], full[2, 2], full[0, 1], full[0, 2], full[1, 2])
+    return values
+
+
+def _functions(plant: "_Plant", tree: TreeDynamics, model: Model, c: Any, actuation: Any) -> PlantFunctions:
+    n, width, more = model.nv, model.nx + model.nu, c.numel()
+    xu, weights, mu, a = (ca.SX.sym(s, k) for s, k in (("knot", width), ("w", 2 * n), ("mu", n), ("a", n)))
+    knot = ca.vertcat(xu, c)
+    q, v, u = xu[:n], xu[n : 2 * n], xu[2 * n :]
     coupling, all_q, all_v, E = tree.coupling, q, v, ca.DM.eye(n)
     if coupling is not None:
         E = ca.sparsify(ca.DM(coupling.spread))
         all_q, all_v = E @ q + ca.DM(coupling.offset), E @ v
-    links = _links(tree, model)
+    links = _regrouped(plant.links, tree)
     order = sorted(range(len(links)), key=lambda k: tree.ancestors[k].sum())  # parents first
     frames = [_frame(link, tree.hinge[k], all_q[k]) for k, link in enumerate(links)]
-    factors = ca.ldl(E.T @ (_mass(links, frames, tree.hinge, order) + ca.diag(tree.reflected)) @ E)
+    factors = ca.ldl(E.T @ (_mass(links, frames, tree.hinge, order) + ca.diag(plant.reflected)) @ E)
 
     def residual(a: Any) -> Any:
         a = E @ a
-        motion = _inverse_dynamics(links, frames, tree.hinge, order, all_v, a, tree.gravity) + ca.DM(tree.reflected) * a
-        return E.T @ (motion + ca.DM(tree.stiffness) * (all_q - ca.DM(tree.rest)) + ca.DM(tree.damping) * all_v)
+        motion = _inverse_dynamics(links, frames, tree.hinge, order, all_v, a, plant.gravity) + plant.reflected * a
+        return E.T @ (motion + plant.stiffness * (all_q - plant.rest) + plant.damping * all_v)
 
     solved = ca.ldl_solve(actuation @ u - residual(ca.SX.zeros(n)), *factors)
     r = residual(a)
     rows = [ca.gradient(r[i], knot).T for i in range(n)]  # backwards: a fifth shorter than CasADi's own choice
     slopes = ca.Function("slopes", [knot, a], [ca.vertcat(*rows)])
-    slope = ca.gradient(ca.dot(mu, r), ca.vertcat(q, v, a))  # of mu' r, linear in a, whose factor is of q alone
-    curves = ca.Function("curves", [knot, a, mu], [ca.jacobian(slope, q), ca.jacobian(slope[n : 2 * n], v)])
-    by_knot = -ca.ldl_solve(slopes(knot, solved) - ca.horzcat(ca.SX(n, 2 * n), actuation), *factors)
-    identity = ca.horzcat(ca.SX(n, n), ca.SX.eye(n), ca.SX(n, model.nu))
+    slope = ca.gradient(ca.dot(mu, r), ca.vertcat(q, v, a, c))  # of mu' r, linear in a, whose factor is of q and c
+    by_v = ca.jacobian(slope[n : 2 * n], v)
+    curves = ca.Function("curves", [knot, a, mu], [ca.jacobian(slope, q), by_v, ca.jacobian(slope, c)])
+    driven = ca.horzcat(ca.SX(n, 2 * n), actuation, ca.SX(n, more))
+    by_knot = -ca.ldl_solve(slopes(knot, solved) - driven, *factors)
+    identity = ca.horzcat(ca.SX(n, n), ca.SX.eye(n), ca.SX(n, model.nu + more))
     jacobian = ca.Function("jacobian", [knot], [ca.vertcat(identity, by_knot)])
     rows = ca.SX.sym("rows", jacobian.sparsity_out(0))
-    by_q, by_v = curves(knot, solved, ca.ldl_solve(weights[n:], *factors))
-    qv, aq = by_q[n : 2 * n, :].T, by_q[2 * n :, :]
-    S = ca.vertcat(aq.T @ rows[n:, :], ca.SX(n + model.nu, width))
-    H = ca.blockcat([[by_q[:n, :], qv], [qv.T, by_v]])
-    hessian = -(ca.diagcat(H, ca.SX(model.nu, model.nu)) + S + S.T)
+    by_q, by_v, by_c = curves(knot, solved, ca.ldl_solve(weights[n:], *factors))
+    qv, aq = by_q[n : 2 * n, :].T, by_q[2 * n : 3 * n, :]
+    qc, vc, ac, cc = by_c[:n, :], by_c[n : 2 * n, :], by_c[2 * n : 3 * n, :], by_c[3 * n :, :]
+    S = ca.vertcat(aq.T @ rows[n:, :], ca.SX(n + model.nu, width + more), ac.T @ rows[n:, :])
+    qu, uc = ca.SX(n, model.nu), ca.SX(model.nu, more)
+    H = ca.blockcat(
+        [
+            [by_q[:n, :], qv, qu, qc],
+            [qv.T, by_v, qu, vc],
+            [qu.T, qu.T, ca.SX(model.nu, model.nu), uc],
+            [qc.T, vc.T, uc.T, cc],
+        ]
+    )
+    hessian = -(H + S + S.T)
     return PlantFunctions(
         ca.Function("plant", [knot], [ca.vertcat(v, solved)]),
         jacobian,
@@ -116,8 +170,113 @@ class _Link:
     weight: tuple[Any, Any, Any]  # mass, mass times centre of mass, inertia about the joint's origin
 
 
-def _links(tree: TreeDynamics, model: Model) -> list[_Link]:
-    """The bodies in the order of the joints."""
+class _Plant:
+    """The numbers of a tree, of which `move` makes some symbols."""
+
+    def __init__(self, tree: TreeDynamics, model: Model):
+        self.tree = tree
+        self.links, self.frames, self.turns = _links(tree, model)
+        self.stiffness, self.rest, self.damping, self.reflected = (
+            ca.SX(ca.DM(each)) for each in (tree.stiffness, tree.rest, tree.damping, tree.reflected)
+        )
+        self.gravity = ca.DM(tree.gravity)
+
+    def move(self, model: Model, vector: ParameterVector, values: Any) -> str:
+        """Set the parameters of `vector` to `values` (np,), an SX; the name of one that it does not know, or ""."""
+        given: dict[tuple[str, str], Any] = {(p.label, p.kind.quantity): values[s] for p, s in vector.pairs}
+        springs = springs_of(model.plant)
+        listed = read_links(model.plant, {} if isinstance(springs, Refusal) else springs)
+        bodies_moved = {label for label, quantity in given if quantity in WEIGHS}
+        joints = {link.joint: link for link in listed if link.kind != "weld"}
+        for (label, quantity), value in given.items():
+            if quantity == "gravity":
+                self.gravity = value
+            elif quantity in OF_JOINTS and label in joints:
+                k = joints[label].v_start
+                if quantity == "offset":
+                    self._shift(model, joints[label], k, value)
+                else:
+                    getattr(self, OF_JOINTS[quantity])[k] = value
+            elif quantity not in (*WEIGHS, *OF_MOTORS):
+                return f"{label}.{quantity}"
+        self._reflect(model, given)
+        self._weigh(listed, bodies_moved, given)
+        return ""
+
+    def _shift(self, model: Model, joint: Link, k: int, value: Any) -> None:
+        """Put joint k to `value` (3,) on its parent."""
+        plant, names = model.plant, names_of(model.plant)[0]
+        body = next(plant.get_body(index) for index, name in names.items() if name == joint.parent)
+        plant.SetPositions(model.double.context, np.zeros(plant.num_positions()))
+        link = self.links[k]
+        R = self.frames[link.parent][0] if link.parent >= 0 else np.eye(3)
+        turn = R.T @ plant.EvalBodyPoseInWorld(model.double.context, body).rotation().matrix()
+        moved = ca.DM(turn) @ (value - ca.DM(joint.on_parent.translation()))
+        self.links[k] = replace(link, offset=link.offset + moved)
+
+    def _reflect(self, model: Model, given: dict[tuple[str, str], Any]) -> None:
+        """The rotor inertia of each joint whose motors are among what is given."""
+        labels = {a.index(): label for label, a in labelled(actuators(model.plant)).items()}
+        moved = [a for a in actuators(model.plant) if any((labels[a.index()], q) in given for q in OF_MOTORS)]
+        for index in {a.joint().index() for a in moved}:
+            total = ca.SX(0)
+            for a in actuators(model.plant):
+                if a.joint().index() == index:
+                    label = labels[a.index()]
+                    rotor = given.get((label, "rotor_inertia"), a.default_rotor_inertia())
+                    total += rotor * given.get((label, "gear_ratio"), a.default_gear_ratio()) ** 2
+            self.reflected[model.plant.get_joint(index).velocity_start()] = total
+
+    def _weigh(self, listed: list[Link], labels: set[str], given: dict[tuple[str, str], Any]) -> None:
+        """What the bodies `labels` weigh, on the links that carry them."""
+        by_tree, on, _ = without_welds(listed)
+        for body in listed:
+            place, pose = on[body.body]
+            if body.body not in labels or place < 0:
+                continue
+            carrier = by_tree[place].joint
+            k = carrier.v_start
+            turn = self.turns[k].T @ carrier.on_child.rotation().matrix()
+            R, t = ca.DM(turn @ pose.rotation().matrix()), ca.DM(turn @ pose.translation())
+            own = body.mass, body.center_of_mass, body.inertia
+            before = _moved(_weight(*own, about_center=True), R, t)
+            after = _moved(_weight_of(body, given), R, t)
+            change = (ca.sparsify(ca.SX(new - old)) for new, old in zip(after, before, strict=True))
+            self.links[k] = replace(self.links[k], weight=_sum(self.links[k].weight, change))
+
+
+WEIGHS = ("mass", "center_of_mass", "inertia")
+OF_JOINTS = {
+    "damping": "damping",
+    "offset": "",
+    "spring_stiffness": "stiffness",
+    "spring_rest_angle": "rest",
+    "spring_rest_length": "rest",
+}
+OF_MOTORS = ("gear_ratio", "rotor_inertia")
+
+
+def _weight(mass: Any, center: Any, inertia: Any, *, about_center: bool) -> tuple[Any, Any, Any]:
+    """Mass, mass times centre of mass, and inertia about the body's origin."""
+    h, C = mass * center, ca.skew(center)
+    return mass, ca.SX(h), ca.SX(inertia) - mass * C @ C if about_center else ca.SX(inertia)
+
+
+def _weight_of(body: Link, given: dict[tuple[str, str], Any]) -> tuple[Any, Any, Any]:
+    """That of a body with parameters, as Drake takes them: see `parameter_kinds`."""
+    mass = given.get((body.body, "mass"), ca.SX(body.mass))
+    center = given.get((body.body, "center_of_mass"), ca.SX(ca.DM(body.center_of_mass)))
+    if (body.body, "inertia") in given:
+        six = ca.vertsplit(given[body.body, "inertia"])
+        xx, yy, zz, xy, xz, yz = six
+        full = ca.blockcat([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        return _weight(mass, center, full, about_center=True)
+    own = _weight(body.mass, ca.DM(body.center_of_mass), ca.DM(body.inertia), about_center=True)[2]
+    return _weight(mass, center, mass * own / body.mass if body.mass else own, about_center=False)  # its unit inertia
+
+
+def _links(tree: TreeDynamics, model: Model) -> tuple[list["_Link"], list[tuple[Array, Array]], list[Array]]:
+    """The bodies in the order of the joints, their frames in the world at q = 0, and how they lie in the bodies."""
     poses = tree.place_all(model, np.zeros((1, len(tree.mass))))[0]
     turns = [_with_z(axis) for axis in tree.axis]
     frames = [(p[:, :3] @ t, p[:, :3] @ o + p[:, 3]) for p, t, o in zip(poses, turns, tree.origin, strict=True)]
@@ -133,7 +292,7 @@ def _links(tree: TreeDynamics, model: Model) -> list[_Link]:
         parts = (R.T @ frames[k][0], R.T @ (frames[k][1] - p), turn.T @ moment, turn.T @ inertia @ turn)
         rotation, offset, moment, inertia = (ca.DM(np.where(np.abs(a) < ROUNDED, 0.0, a)) for a in parts)
         links.append(_Link(int(parent), rotation, offset, (ca.DM(m), moment, inertia)))
-    return _regrouped(links, tree)
+    return links, frames, turns
 
 
 def _regrouped(links: list[_Link], tree: TreeDynamics) -> list[_Link]:
@@ -148,7 +307,7 @@ def _regrouped(links: list[_Link], tree: TreeDynamics) -> list[_Link]:
         link, (m, h, inertia) = links[k], links[k].weight
         unseen = m, h[2] * Z, inertia[1, 1] * ca.diag(ca.DM([1, 1, 0]))
         own = inertia - unseen[2]
-        links[k] = replace(link, weight=(0.0, ca.DM([h[0], h[1], 0]), own))
+        links[k] = replace(link, weight=(0.0, ca.vertcat(h[0], h[1], 0), own))
         if link.parent >= 0:
             parent = links[link.parent]
             weight = _sum(parent.weight, _moved(unseen, link.rotation, link.offset))
@@ -178,11 +337,11 @@ def _frame(link: _Link, hinge: bool, q: Any) -> tuple[Any, Any]:
 
 
 def _inverse_dynamics(
-    links: list[_Link], frames: list[Any], hinge: Any, order: list[int], v: Any, acceleration: Any, gravity: Array
+    links: list[_Link], frames: list[Any], hinge: Any, order: list[int], v: Any, acceleration: Any, gravity: Any
 ) -> Any:
     """(n,) the joints' forces of the bodies' inertia and weight: motion outwards, forces inwards."""
     n, zero = len(links), ca.DM.zeros(3)
-    motions: dict[int, Any] = {-1: (zero, zero, ca.DM(-gravity))}
+    motions: dict[int, Any] = {-1: (zero, zero, -gravity)}
     forces: dict[int, Any] = {}
     for k in order:
         link, (R, p) = links[k], frames[k]

@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoD
 from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.model.model import Model
-from drake_diff.model.parameter_kinds import CONTACT_KINDS, MECHANISM_KINDS, Kind
+from drake_diff.model.parameter_kinds import AUTODIFF, CONTACT_KINDS, MECHANISM_KINDS, Kind
 from drake_diff.model.twin import Twin
 
 KINDS = (*MECHANISM_KINDS, *CONTACT_KINDS)
@@ -226,6 +226,18 @@ def select(model: Model, parameters: Parameters) -> ParameterVector:
     return ParameterVector(model, found, frozen(np.concatenate(values)))
 
 
+def plain_parameters(values: Mapping[str, Any]) -> ParameterVector:
+    """Named numbers of no model, in the order of `values`."""
+    found = []
+    for name, value in values.items():
+        if not (isinstance(name, str) and name):
+            raise InputError("parameters", got=repr(name), expected="names with their values")
+        kind = Kind("", AUTODIFF, lambda model: {}, "", lambda element: None, lambda twin, label, value: None)
+        value = finite_array(f"parameter {name}", np.atleast_1d(value), (1,))
+        found.append(Parameter(name, "", value, -np.inf, np.inf, AUTODIFF, kind))
+    return ParameterVector(cast(Model, None), tuple(found), frozen([p.value[0] for p in found]))
+
+
 def _check_value(p: Parameter, given: Any) -> Array:
     value = finite_array(p.name, np.atleast_1d(given), (len(p.value),))
     if np.any(value < p.lower):
@@ -279,32 +291,33 @@ class ParameterCoordinates:
         """(np,) the size of a parameter's first value; 1 where that is zero, or its coordinate is no quotient."""
         size = np.abs(self.start.values)
         scale = np.where(size > 0, size, 1.0)
-        for s in self._inertias:
+        for s in self.inertias:
             scale[s] = 1.0
         return scale
 
     @property
-    def _inertias(self) -> list[slice]:
+    def inertias(self) -> list[slice]:
+        """Where the inertias stand in the vector."""
         return [s for p, s in self.start.pairs if p.kind.quantity == "inertia"]
 
     def from_values(self, values: Array) -> Array:
         """z of parameter values (np,); bounds of an inertia are the whole line."""
         z = values / self.scale
-        for s in self._inertias:
+        for s in self.inertias:
             z[s] = to_log_cholesky(values[s]) if np.all(np.isfinite(values[s])) else values[s]
         return z
 
     def to_values(self, z: Array) -> Array:
         """(np,) parameter values of z."""
         values = z * self.scale
-        for s in self._inertias:
+        for s in self.inertias:
             values[s] = from_log_cholesky(z[s])
         return values
 
     def pull_back(self, z: Array, by_values: Array) -> Array:
         """(..., np) a derivative by z from one by the values (..., np)."""
         by_z = by_values * self.scale
-        for s in self._inertias:
+        for s in self.inertias:
             by_z[..., s] = by_values[..., s] @ derivative_of_from_log_cholesky(z[s])[1]
         return np.asarray(by_z)
 

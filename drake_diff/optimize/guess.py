@@ -3,7 +3,7 @@
 What has another length or other knots is stretched to the problem's: its first state is the first, its last the last.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,13 +29,17 @@ FORMS = "None, (xs, us), two of Drake's trajectories (state, input) or a Solutio
 
 @dataclass(frozen=True, eq=False)
 class Guess:
-    """Where a search starts: xs (N+1, nx), us (N, nu); for collocation also the last input, a horizon, or a motion."""
+    """Where a search starts: xs (N+1, nx), us (N, nu); for collocation also the last input, a horizon, or a motion.
+
+    Parameters (np,) that are optimized start at the problem's values where it has none.
+    """
 
     xs: Array
     us: Array
     u_final: Array | None = None
     horizon: float | None = None  # [s]
     motion: Collocated | None = None
+    parameters: Array | None = None
 
 
 def first_guess(problem: Problem, method: str, given: Any, seed: int) -> Guess:
@@ -44,7 +48,9 @@ def first_guess(problem: Problem, method: str, given: Any, seed: int) -> Guess:
     if given is None:
         return _line(problem, method, seed)
     if isinstance(given, Solution):
-        return _of_solution(problem, given, continuous)
+        same = problem.optimizes_parameters and given.vector.names == problem.parameters.names
+        values = np.asarray(given.vector.values) if same else None
+        return replace(_of_solution(problem, given, continuous), parameters=values)
     if not (isinstance(given, (tuple, list)) and 2 <= len(given) <= 2 + continuous):
         forms = FORMS.replace("(xs, us)", "(xs, us), (xs, us, horizon)") if continuous else FORMS
         raise InputError("initial_guess", got=type(given).__name__, expected=forms)

@@ -8,6 +8,7 @@ import numpy as np
 from drake_diff._base.refusal import Refusal
 from drake_diff.exceptions import GradientError
 from drake_diff.model.contact import penetration
+from drake_diff.model.parameters import applied
 from drake_diff.model.step import set_state
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import along_steps, clearances
@@ -134,9 +135,10 @@ def _overlaps(solution: Solution, motion: Collocated) -> Iterator[str]:
         return
     times, between = motion.between_knots
     xs = np.vstack([motion.xs, between])
-    for x in xs[np.isfinite(xs).all(axis=1)]:
-        set_state(model.double, x)
-        depths.append(penetration(model))
+    with applied(solution.vector):
+        for x in xs[np.isfinite(xs).all(axis=1)]:
+            set_state(model.double, x)
+            depths.append(penetration(model))
     if max(depths) > 0:
         when = np.append(solution.times, times)[np.isfinite(xs).all(axis=1)][int(np.argmax(depths))]
         yield f"geometries overlap by {max(depths):.3g} m at {when:.4g} s, and collocation leaves contact out"

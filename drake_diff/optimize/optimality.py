@@ -72,7 +72,8 @@ def optimality(problem: Problem, variables: ShootingVariables, z: Array) -> Opti
     direct_xs, direct_us = RolloutCost(problem, variables).partials(z)[1:]
     rows = list(_rows(problem, xs, us))
     columns = [variables.gradient(z, _totals(linearization, row, xs, us)) for row in rows]
-    of_cost = variables.gradient(z, accumulate(linearization, direct_xs, direct_us))
+    of_parameters = variables.cost_of_parameters(z)[1]
+    of_cost = of_parameters + variables.gradient(z, accumulate(linearization, direct_xs, direct_us))
     jacobian = np.array(columns).reshape(len(rows), len(of_cost)).T
     sides = _sides(problem, variables, z)
     free = ~(sides[0] | sides[1])
@@ -83,14 +84,14 @@ def optimality(problem: Problem, variables: ShootingVariables, z: Array) -> Opti
             if knot < len(us):
                 direct_us[knot] += multiplier * by_u
     totals = accumulate(linearization, direct_xs, direct_us)
-    left = variables.gradient(z, totals)
+    left = of_parameters + variables.gradient(z, totals)
     left = np.where(sides[0], np.minimum(left, 0.0), np.where(sides[1], np.maximum(left, 0.0), left))
     terms = np.abs(variables.gradient(z, Totals(direct_xs, direct_us, 0 * totals.parameters, totals.policy)))
     steps = [d.A.T @ state for d, state in zip(linearization[:1], totals.states[1:], strict=False)]
     by_us = [d.B.T @ state for d, state in zip(linearization, totals.states[1:], strict=True)]
     by_p = sum(np.abs(d.C.T @ state) for d, state in zip(linearization, totals.states[1:], strict=True))
     through = Totals(np.array([*steps, *totals.states[1:]]), np.array(by_us), np.asarray(by_p), totals.policy)
-    terms += np.abs(variables.gradient(z, through))
+    terms += np.abs(variables.gradient(z, through)) + np.abs(of_parameters)
     return Optimality(
         multipliers=frozen(multipliers),
         state_norms=frozen(np.linalg.norm(totals.states, axis=1)),

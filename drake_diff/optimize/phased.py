@@ -386,7 +386,7 @@ class _PhasedRun:
             certificates: tuple[Certificate, ...] = ()
             if np.all(np.isfinite(xs)):
                 try:
-                    certificates = certify_equations(t.problem, t.jacobian, xs, us)
+                    certificates = certify_equations(t.problem, t.jacobian, xs, us, t.task)
                 except (GradientError, SimulationError) as refusal:
                     error = refusal
             found = {name: value for name, value in _arrays(motion).items() if value is not None}

@@ -140,6 +140,9 @@ def _change(solution: Solution, by: Any) -> Change:
     vector = select(problem.model, by)
     if not vector.parameters:
         raise InputError("by", got=repr(by), expected='"x0", "goal", or names of parameters')
+    if problem.parameters.parameters:
+        expected = '"x0" or "goal", as the problem has parameters of its own'
+        raise InputError("by", got=repr(by), expected=expected)
     return Change(vector.names, np.array(vector.values), None, parameters=by)
 
 
@@ -200,4 +203,5 @@ def _resolved(problem: Problem, motion: Collocated) -> Transcribed:
     """What the same search finds for a problem, from a solution and on its mesh."""
     scheme = next(name for name, scheme in SCHEMES.items() if scheme is motion.task.scheme)
     nodes = np.array(motion.nodes)
-    return Transcription(problem, scheme).solve_on(motion.mesh, nodes, motion.horizon, EXACT, None)
+    values = motion.task.parameters if problem.optimizes_parameters else None
+    return Transcription(problem, scheme).solve_on(motion.mesh, nodes, motion.horizon, EXACT, None, values)

@@ -257,6 +257,15 @@ class ShootingVariables:
             return np.zeros((*by_parameters.shape[:-1], 0))
         return self.coordinates.pull_back(z[self.inputs.stop :], by_parameters)
 
+    def cost_of_parameters(self, z: Array) -> tuple[float, Array]:
+        """(value, gradient (size,) by z) of the problem's `parameter_cost`; zeros where there is none."""
+        gradient, cost = np.zeros(self.size), self.problem.parameter_cost
+        if cost is None:
+            return 0.0, gradient
+        value, by_values = differentiate_final_cost(cost, np.array(self.parameters(z).values))
+        gradient[self.inputs.stop :] = self.pull_back(z, by_values)
+        return value, gradient
+
     def linearization(self, z: Array) -> list[StepDerivatives]:
         """The step derivatives along the states of z."""
         if z.tobytes() != self._at:
@@ -325,11 +334,12 @@ class RolloutCost:
         self.variables, self.time_step, self.running = variables, problem.model.time_step, problem.total_running_cost
         self.final = problem.total_final_cost if variables.is_last else None
         self.trajectory = problem.trajectory_cost
+        self.of_parameters = problem.parameter_cost if variables.is_last else None
 
     @property
     def any(self) -> bool:
         """Whether there is a cost here."""
-        return any(cost is not None for cost in (self.running, self.final, self.trajectory))
+        return any(cost is not None for cost in (self.running, self.final, self.trajectory, self.of_parameters))
 
     def __call__(self, z: Any) -> Any:
         if z.dtype == float:
@@ -343,6 +353,8 @@ class RolloutCost:
         """The cost at z."""
         xs, us = self.variables.states(z), self.variables.unpack(z)[1]
         total = 0.0 if self.final is None else float(self.final(xs[-1]))
+        if self.of_parameters is not None:
+            total += float(self.of_parameters(self.variables.parameters(z).values))
         if self.running is not None:
             total += self.time_step * sum(
                 float(self._rate(k)(x, u)) for k, (x, u) in enumerate(zip(xs, us, strict=False))
@@ -356,7 +368,9 @@ class RolloutCost:
     def differentiate(self, z: Array) -> tuple[float, Array]:
         """(value, gradient by z) at z."""
         total, by_xs, by_us = self.partials(z)
-        return total, self.variables.gradient(z, accumulate(self.variables.linearization(z), by_xs, by_us))
+        gradient = self.variables.gradient(z, accumulate(self.variables.linearization(z), by_xs, by_us))
+        added, by_z = self.variables.cost_of_parameters(z) if self.of_parameters is not None else (0.0, 0.0)
+        return total + added, gradient + by_z
 
     def partials(self, z: Array) -> tuple[float, Array, Array]:
         """(value, its derivatives by the states (n+1, nx) and the inputs (n, nu) themselves, the steps apart) at z."""

@@ -196,7 +196,11 @@ class Solution(ShowsItsRepr):
         """The objective of xs and us, as `Problem` defines it; inf where it is not finite."""
         if not self._is_whole:
             return float("inf")
-        total = self.problem.objective(self.xs, self.us) if self.transcribed is None else self.transcribed.cost
+        total = float("nan")
+        if self.transcribed is not None:
+            total = self.transcribed.cost
+        else:
+            total = self.problem.objective(self.xs, self.us) + self.problem.cost_of_parameters(self.vector.values)
         return total if np.isfinite(total) else float("inf")
 
     @property
@@ -227,7 +231,7 @@ class Solution(ShowsItsRepr):
         mesh, us = np.linspace(0, 1, len(self.xs)) if self.mesh is None else self.mesh, self.inputs_at_knots
         if self.problem.is_map:  # after the last step there is no input
             us = np.vstack([us, np.clip(0.0, self.problem.bounds.u_lower, self.problem.bounds.u_upper)])
-        return collocated(self.problem, self.scheme, self.xs, us, self.us_mid, self.horizon, mesh)
+        return collocated(self.problem, self.scheme, self.xs, us, self.us_mid, self.horizon, mesh, self.vector.values)
 
     def trajectory(self) -> "Trajectories":
         """The state and the input as Drake's piecewise polynomials, for its own controllers and `Simulator`.

@@ -461,8 +461,8 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
     scheme = _check_scheme(problem, attempt)
     if attempt.solver == "snopt" and scheme != "drake":
         raise InputError("solver", got='"snopt"', expected=f'"ipopt" for scheme="{scheme}"; scheme="drake" takes both')
-    if problem.parameters.parameters or problem.trajectory_cost is not None:
-        raise InputError("parameters, trajectory_cost", got="given", expected='method="shooting"')
+    if problem.trajectory_cost is not None:
+        raise InputError("trajectory_cost", got="given", expected='method="shooting"')
     if not problem.optimizes_controls:
         raise InputError("optimize", got=list(problem.optimize), expected='"controls" for method="collocation"')
     if isinstance(problem.running_cost, TimedCost) and problem.horizon and problem.horizon[0] < problem.horizon[1]:
@@ -478,6 +478,7 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
             "couplings": problem.couplings,
             "goals": problem.goals,
             "horizon": problem.horizon,
+            "parameters": problem.parameters.parameters,
             "a running_cost that changes in time": isinstance(problem.running_cost, TimedCost),
             "refine": attempt.refine,
         }
@@ -509,8 +510,8 @@ def choose_method(problem: Problem) -> tuple[str, str]:
         return "collocation", "the horizon is " + ("free" if problem.horizon[0] < problem.horizon[1] else "given")
     if not problem.optimizes_controls:
         return "shooting", "the controls are not optimized"
-    if problem.parameters.parameters or problem.trajectory_cost is not None:
-        return "shooting", "collocation and iLQR take neither parameters nor a cost of the whole trajectory"
+    if problem.trajectory_cost is not None:
+        return "shooting", "collocation and iLQR take no cost of the whole trajectory"
     smooth = not contract.constraints and all(actuator.kp is None for actuator in contract.actuators)
     if problem.couplings and (contract.contact.collision_pairs or not smooth):
         return "shooting", "iLQR takes no couplings of knots, and collocation leaves out what acts on the model"
@@ -518,6 +519,8 @@ def choose_method(problem: Problem) -> tuple[str, str]:
         return "ilqr", "the model has geometries that can touch, which collocation leaves out"
     if not smooth:
         return "ilqr", "the model has constraints or PD control, which collocation leaves out"
+    if problem.optimizes_parameters:
+        return "collocation", f"the model is smooth, and {', '.join(problem.parameters.names[:3])} are variables of it"
     return "collocation", "the model is smooth"
 
 
@@ -546,13 +549,15 @@ class Run:
         problem, limits, report = self.problem, self.limits, self.report
         transcription = Transcription(self.searched or problem, self.scheme)
         try:
-            before = certify_equations(self.problem, transcription.jacobian, guess.xs, guess.us)
+            before = certify_equations(self.problem, transcription.jacobian, guess.xs, guess.us, transcription.task)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(guess.xs, guess.us), error)
         us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
         begun = guess.motion or (guess.xs, np.vstack([guess.us, us_end]))
         asked = refinement if refine else None
-        motion = transcription.solve(begun, horizon=guess.horizon, limits=limits, report=report, refinement=asked)
+        motion = transcription.solve(
+            begun, horizon=guess.horizon, limits=limits, report=report, refinement=asked, parameters=guess.parameters
+        )
         if refine:
             self.options["refinements"] = [list(each) for each in motion.refinements]
         if motion.cleared:
@@ -621,7 +626,7 @@ class Run:
         xs, us = motion.xs, motion.us[:-1]
         self.options["derivatives"] = motion.derivatives
         if np.all(np.isfinite(xs)):
-            certificates += certify_equations(self.problem, transcription.jacobian, xs, us)
+            certificates += certify_equations(self.problem, transcription.jacobian, xs, us, motion.task)
         draft = self._draft(
             xs,
             us,
@@ -629,6 +634,7 @@ class Run:
             us_mid=None if self.scheme == "drake" else motion.us_mid,
             free_horizon=motion.horizon if self.problem.horizon else None,
             mesh=motion.mesh if len(us) > self.problem.num_steps else None,
+            parameters=frozen(motion.task.parameters),
             certificates=certificates,
         )
         return self._judge(draft, motion.result)

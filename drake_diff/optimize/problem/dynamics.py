@@ -1,11 +1,12 @@
 """Dynamics x' = f(x, u) at many knots at once, with exact derivatives: a plain function, or a model's equations.
 
-A knot is a row [x, u] of (K, nx + nu). A function that also takes columns, x (nx, K) and u (nu, K), is called once for
-all knots; whether it does is tried once, against single calls.
+A knot is a row [x, u] of (K, nx + nu), or [x, u, p] where there are parameters p. A function that also takes columns,
+x (nx, K) and u (nu, K), is called once for all knots; whether it does is tried once, against single calls.
 """
 
+import copy
 import inspect
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,13 +14,23 @@ from pydrake.autodiffutils import AutoDiffXd, InitializeAutoDiff
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
 from drake_diff._base.autodiff import gradient_rows
-from drake_diff.exceptions import InputError, ShapeError
+from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
 from drake_diff.mechanics.tree import tree_for
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.model import Model
+from drake_diff.model.parameter_kinds import CONTACT_KINDS
+from drake_diff.model.parameters import (
+    ParameterCoordinates,
+    ParameterVector,
+    applied,
+    plain_parameters,
+    select,
+    write_autodiff,
+)
 from drake_diff.model.step import set_state
 from drake_diff.optimize.problem.constraint import Bounds, carried, plant_limits, resolve_bounds
 
+SMALLEST_TRIED = 1e-3  # of a parameter's first value: where a smaller one's derivatives are certified
 PROBED = 3  # knots at which a function is tried before it is used
 ORDINARY = "a function of x and u in ordinary arithmetic and NumPy functions, without float()"
 
@@ -96,6 +107,8 @@ class Dynamics:
         u_lower, u_upper: (nu,) limits of the inputs; infinite where not given or NaN.
         state_names: nx names; x0, x1, ... where not given.
         input_names: nu names; u0, u1, ... where not given.
+        parameters: mapping from names to values of numbers that a `Problem` may optimize, or set to others. `f` then is
+            a function of x, u and p (np,), in the mapping's order.
 
     Raises:
         InputError: `f` is not such a function, or a limit or name does not fit; says what `f` did.
@@ -121,14 +134,25 @@ class Dynamics:
         u_upper: Any = None,
         state_names: Sequence[str] | None = None,
         input_names: Sequence[str] | None = None,
+        parameters: Mapping[str, Any] | ParameterVector | None = None,
     ):
         self.nx, self.nu = positive_int("nx", nx), positive_int("nu", nu)
         self.state_names = _names("state_names", state_names, "x", self.nx)
         self.input_names = _names("input_names", input_names, "u", self.nu)
         self.bounds = Bounds(*(frozen(np.full(n, v)) for n in (self.nx, self.nu) for v in (-np.inf, np.inf)))
         self.bounds = self.limits(Bounds(x_lower, x_upper, u_lower, u_upper))
-        own = hasattr(f, "linearize")
-        self.form = f if own else Pointwise("dynamics", f, self.nx, (self.nx,), self.probe())
+        given = isinstance(parameters, ParameterVector)
+        self.parameters: ParameterVector = (
+            parameters if isinstance(parameters, ParameterVector) else plain_parameters(parameters or {})
+        )
+        if hasattr(f, "linearize"):
+            if self.parameters.names and not given:
+                raise InputError("parameters", got="given", expected="a function f(x, u, p) that they are of")
+            self.form = f
+            return
+        inputs = self.nu
+        by_knot = (lambda x, z: f(x, z[:inputs], z[inputs:])) if self.parameters.names else f
+        self.form = Pointwise("dynamics", by_knot, self.nx, (self.nx,), self.whole(self.probe()))
 
     def __repr__(self) -> str:
         states, inputs = ", ".join(self.state_names), ", ".join(self.input_names)
@@ -143,14 +167,68 @@ class Dynamics:
         values, rows = self.linearize(self._knot(x, u))
         return values[0], rows[0][:, : self.nx], rows[0][:, self.nx :]
 
+    def at(self, values: Any) -> "Dynamics":
+        """The same dynamics with their parameters at `values` (np,)."""
+        moved = copy.copy(self)
+        moved.parameters = self.parameters.at(values)
+        return moved
+
+    def with_parameters(self, given: Any) -> "Dynamics":
+        """These dynamics of the parameters that `given` names alone, or also sets; the others stay as they are."""
+        own = self.parameters
+        if isinstance(given, ParameterVector):
+            given = given.to_dict()
+        names = (given,) if isinstance(given, str) else tuple(given)
+        if not names:
+            return self.of_no_parameters if own.names else self
+        if not own.names:
+            expected = "none: these dynamics have no parameters, as Dynamics(f, ..., parameters={name: value}) has"
+            raise InputError("parameters", got=", ".join(map(str, names)), expected=expected)
+        for name in names:
+            if name not in own.names:
+                raise UnknownNameError("parameter", got=name, known=own.names)
+        if len(set(names)) < len(names):
+            raise InputError("parameters", got=", ".join(names), expected="each name once")
+        values = given if isinstance(given, Mapping) else {name: own.to_dict()[name] for name in names}
+        found, place = copy.copy(self), {name: i for i, name in enumerate(names)}
+        found.parameters = plain_parameters({name: np.ravel(values[name])[0] for name in names})
+        if names != own.names:
+            found.form = self._chosen(lambda p: [p[place[n]] if n in place else v for n, v in self._named])
+        return found
+
+    @property
+    def of_no_parameters(self) -> "Dynamics":
+        """These dynamics with all parameters at their values."""
+        found = copy.copy(self)
+        found.parameters, values = plain_parameters({}), self.parameters.values
+        found.form = self._chosen(lambda p: values)
+        return found
+
+    @property
+    def _named(self) -> list[tuple[str, float]]:
+        return list(zip(self.parameters.names, self.parameters.values.tolist(), strict=True))
+
+    def _chosen(self, whole: Callable[[Any], Any]) -> Any:
+        """The form of other parameters p, where `whole` makes all of these dynamics' of p."""
+        f, nu = self.form.f, self.nu
+        found = copy.copy(self.form)
+        found.takes_columns = False
+        found.f = lambda x, z: f(x, np.concatenate([z[:nu], np.array(whole(z[nu:]))]))
+        return found
+
     def values(self, knots: Array) -> Array:
         """(K, nx) the rates at `knots` (K, nx + nu), rows [x, u]."""
-        return np.asarray(self.form.values(knots))
+        return np.asarray(self.form.values(self.whole(knots)))
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
         """(K, nx) the rates and (K, nx, nx + nu) their Jacobians [A, B] at `knots` (K, nx + nu)."""
-        values, rows = self.form.linearize(knots)
-        return values, rows
+        values, rows = self.form.linearize(self.whole(knots))
+        return values, rows[:, :, : self.nx + self.nu]
+
+    def whole(self, knots: Array) -> Array:
+        """(K, nx + nu + np) `knots` (K, nx + nu) with the parameters' values at their end."""
+        values = self.parameters.values
+        return np.hstack([knots, np.tile(values, (len(knots), 1))]) if len(values) else knots
 
     def probe(self) -> Array:
         """(3, nx + nu) some knots within the bounds, to try a function at."""
@@ -231,27 +309,76 @@ class DiscreteMap(Dynamics):
             yield int(k), np.flatnonzero(every == k)
 
 
-def plant_dynamics(model: Model) -> Dynamics:
+class Moved:
+    """x' = f(x, u, p) at knots [x, u, c], c (np,) the coordinates in which a solver moves the parameters."""
+
+    def __init__(self, dynamics: Dynamics, coordinates: ParameterCoordinates):
+        self.dynamics, self.coordinates = dynamics, coordinates
+        self.width = dynamics.nx + dynamics.nu
+
+    def values(self, knots: Array) -> Array:
+        """(K, nx) the rates at `knots` (K, nx + nu + np)."""
+        return np.asarray(self.dynamics.form.values(self._by_values(knots)))
+
+    def linearize(self, knots: Array) -> tuple[Array, Array]:
+        """(K, nx) the rates and (K, nx, nx + nu + np) their Jacobians."""
+        values, rows = self.dynamics.form.linearize(self._by_values(knots))
+        rows = np.array(rows)
+        for k, c in enumerate(knots[:, self.width :]):
+            rows[k][:, self.width :] = self.coordinates.pull_back(c, rows[k][:, self.width :])
+        return values, rows
+
+    def probe(self) -> Array:
+        """(3, nx + nu + np) some knots to try a function at."""
+        knots, start = self.dynamics.probe(), self.coordinates.start
+        tail = self.coordinates.from_values(np.array(start.values))
+        return np.hstack([knots, tail + 0.1 * np.linspace(0, 1, len(knots))[:, None] * np.where(tail == 0, 1.0, tail)])
+
+    def tried_at(self, c: Array) -> tuple[Array, Array]:
+        """Coordinates (np,) near `c` whose derivatives can be told by differences, and how large each counts.
+
+        A parameter that Drake takes no negative value of is moved by parts of its own value, which is above 0.
+        """
+        at, sizes = np.array(c), np.maximum(1.0, np.abs(c))
+        for parameter, s in self.coordinates.start.pairs:
+            if parameter.kind.positive:
+                at[s] = sizes[s] = np.maximum(c[s], SMALLEST_TRIED)
+        return at, sizes
+
+    def _by_values(self, knots: Array) -> Array:
+        values = [self.coordinates.to_values(c) for c in knots[:, self.width :]]
+        return np.hstack([knots[:, : self.width], values])
+
+
+def plant_dynamics(model: Model, parameters: Any = ()) -> Dynamics:
     """A model's equations of motion in continuous time, with its own limits of positions, velocities and efforts.
 
     Args:
         model: a model without PD control and without constraints. Contact is left out.
+        parameters: names of the model's parameters, or a mapping from names to values, that the dynamics have.
 
     Returns:
         `Dynamics` of x = [q; v] (nx,) under the actuation u (nu,), in the model's units.
 
     Raises:
         ModelError: the model has no continuous form.
+        InputError: a parameter is one of contact, which is left out.
 
     Example:
         >>> dynamics = dd.optimize.plant_dynamics(dd.load_model("models/pendulum.urdf", time_step=0.01))
         >>> dynamics([0.0, 1.0], [0.0]).round(3).tolist()  # its speed, and damping 0.1 over an inertia of 0.25
         [1.0, -0.4]
     """
+    vector = select(model, parameters)
+    for parameter in vector.parameters:
+        if parameter.kind in CONTACT_KINDS:
+            expected = "one that moves the model without contact, which collocation leaves out"
+            raise InputError("parameters", got=parameter.name, expected=expected)
     return Dynamics(
-        PlantKnots(model),
+        PlantKnots(model, vector),
         model.nx,
         model.nu,
+        parameters=vector,
         **plant_limits(model),
         state_names=model.state_names,
         input_names=model.input_names,
@@ -262,17 +389,40 @@ class PlantKnots:
     """`EquationsOfMotion` at many knots: with r the residual by inverse dynamics at the solved acceleration a,
 
     da = -M^-1 dr and dr/du = -B, so that AutoDiffXd takes one inverse dynamics by x alone; a tree of hinges and slides
-    gives dr for all knots in one call.
+    gives dr for all knots in one call. Knots [x, u, p] where the model has parameters p, all knots the same or not.
     """
 
-    def __init__(self, model: Model):
-        self.equations, self.model = EquationsOfMotion(model), model
-        self.tree = tree_for(model)
+    def __init__(self, model: Model, vector: ParameterVector):
+        self.equations, self.model, self.vector = EquationsOfMotion(model), model, vector
+        self.tree = None if vector.parameters else tree_for(model)
+        self.width = model.nx + model.nu
 
     def values(self, knots: Array) -> Array:
-        return self.equations.values(knots)
+        if not self.vector.parameters:
+            return self.equations.values(knots)
+        found = np.full((len(knots), self.model.nx), np.nan)
+        for rows, vector in self._alike(knots):
+            with applied(vector):
+                found[rows] = self.equations.values(knots[rows, : self.width])
+        return found
+
+    def _alike(self, knots: Array) -> Iterator[tuple[Any, ParameterVector]]:
+        """The knots that have the same parameters; those with none that Drake takes are left out."""
+        every, group = np.unique(knots[:, self.width :], axis=0, return_inverse=True)
+        for i, values in enumerate(every):
+            lower = np.concatenate([np.full(len(p.value), p.lower) for p in self.vector.parameters])
+            if np.all(np.isfinite(values)) and np.all(values >= lower):
+                yield np.flatnonzero(np.ravel(group) == i), self.vector.at(values)
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
+        if self.vector.parameters:
+            values = np.full((len(knots), self.model.nx), np.nan)
+            rows = np.full((len(knots), self.model.nx, knots.shape[1]), np.nan)
+            for alike, vector in self._alike(knots):
+                with applied(vector):
+                    for k in alike:
+                        values[k], rows[k] = self._linearize(knots[k, : self.model.nx], knots[k, self.model.nx :])
+            return values, rows
         if self.tree is None:
             found = [self._linearize(k[: self.model.nx], k[self.model.nx :]) for k in knots]
             return np.array([value for value, _ in found]), np.array([rows for _, rows in found])
@@ -285,27 +435,31 @@ class PlantKnots:
         rows[:, n:] = -np.linalg.solve(d.mass, np.concatenate([d.by_q, d.by_v, by_u], axis=2))
         return values, rows
 
-    def _linearize(self, x: Array, u: Array) -> tuple[Array, Array]:
+    def _linearize(self, x: Array, z: Array) -> tuple[Array, Array]:
+        """At a knot of x (nx,) and z = [u, p]; with parameters, which are applied."""
         equations, model, twin = self.equations, self.model, self.model.autodiff
+        u, p = z[: model.nu], z[model.nu :]
         set_state(model.double, x)
         acceleration, mass = equations.acceleration(u)
         q_dot = equations.q_dot(model.double, x)
         systems = equations.systems  # whose forces depend on u
-        variables = InitializeAutoDiff(np.concatenate([x, u]) if systems else x).ravel()
+        variables = InitializeAutoDiff(np.concatenate([x, u, p]) if systems or len(p) else x).ravel()
+        if len(p):
+            write_autodiff(self.vector, model, variables[self.width :])
         set_state(twin, variables[: model.nx])
         if systems:
-            twin.set_input(variables[model.nx :])
+            twin.set_input(variables[model.nx : self.width])
         constant = np.array([AutoDiffXd(a) for a in acceleration])
         residual = twin.inverse_dynamics(constant)
-        rows = np.zeros((model.nx, model.nx + model.nu))
+        rows = np.zeros((model.nx, self.width + len(p)))
         if equations.plain_rates:
             rows[: model.nq, model.nq : model.nx] = np.eye(model.nq)
         else:
             q_dot_rows = gradient_rows(equations.q_dot(twin, variables[: model.nx]), len(variables))
             rows[: model.nq, : model.nx] = q_dot_rows[:, : model.nx]
-        by_knot = np.zeros((model.nv, model.nx + model.nu))
+        by_knot = np.zeros((model.nv, self.width + len(p)))
         by_knot[:, : len(variables)] = gradient_rows(residual, len(variables))
-        by_knot[:, model.nx :] -= equations.actuation
+        by_knot[:, model.nx : self.width] -= equations.actuation
         rows[model.nq :] = -np.linalg.solve(mass, by_knot)
         return np.concatenate([q_dot, acceleration]), rows
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, array_with_gaps, finite_array, frozen, positive_float, positive_int
 from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff.exceptions import InputError, ModelError, ModelWarning, ShapeError, UnknownNameError
+from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, ShapeError, UnknownNameError
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, select
+from drake_diff.model.parameters import TIME_STEP, applied, select
 from drake_diff.optimize.problem.constraint import Constraint, check_inside, plant_limits, resolve_bounds, short
-from drake_diff.optimize.problem.cost import ConstantCost, FinalCost, QuadraticCost
+from drake_diff.optimize.problem.cost import ConstantCost, FinalCost, QuadraticCost, differentiate_final_cost
 from drake_diff.optimize.problem.coupling import BoundCoupling, Couples, Joins, checked_couplings, excess_of
 from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, plant_dynamics
 from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGoals, in_words
@@ -63,12 +63,14 @@ class Problem(ShowsItsRepr):
         optimize: what may change: "controls", "initial_state", "parameters", or several of them.
         initial_state_mask: (nx,) booleans, True where "initial_state" may change; x0 is its first guess there.
         us: (N, nu) inputs where they are not optimized, their first guess where they are; 0 if not given.
-        parameters: names of model parameters (see `list_parameters`), or a mapping from names to values. They hold
-            in all steps; with "parameters" in `optimize` the search starts from them.
+        parameters: names of model parameters (see `list_parameters`) or of those of the `Dynamics`, or a mapping from
+            names to values. They hold at all times; with "parameters" in `optimize` the search starts from them.
         parameter_bounds: mapping from names to (lower, upper). What cannot be negative stays above 1e-3 of its start
             where no bound is given, and an inertia stays one that a body can have.
         trajectory_cost: a function (xs, us) -> scalar that is added to the cost, such as the distance from a
             measured motion.
+        parameter_cost: a function (p) -> scalar of the values (np,) of `parameters` that is added to the cost, such as
+            what a stronger motor costs.
 
     Raises:
         InputError: something does not fit; also ShapeError, NonFiniteError and UnknownNameError, all with what was
@@ -103,6 +105,7 @@ class Problem(ShowsItsRepr):
     parameters: Any = ()  # becomes a ParameterVector
     parameter_bounds: Mapping[str, tuple[Any, Any]] | None = None
     trajectory_cost: Callable[[Any, Any], Any] | None = None
+    parameter_cost: Callable[[Any], Any] | None = None
 
     def __post_init__(self) -> None:
         system = self.system
@@ -116,10 +119,7 @@ class Problem(ShowsItsRepr):
             self._set("parameters", select(system, self.parameters))
             own = plant_limits(system)
         else:
-            given = self.parameters.names if isinstance(self.parameters, ParameterVector) else self.parameters
-            if given:
-                raise InputError("parameters", got=given, expected="none for plain dynamics: only a model has some")
-            self._set("parameters", ParameterVector(cast(Model, None), (), frozen([])))  # none of no model
+            self._set("parameters", system.with_parameters(self.parameters).parameters)
             own = vars(system.bounds)
         self._check_parameters()
         bounds = resolve_bounds(bounds_of(system, self.bounds), own, self.state_names, self.input_names)
@@ -158,7 +158,7 @@ class Problem(ShowsItsRepr):
         time = "" if self.is_map else f" in {time} s"
         goal = "" if self.x_goal is None else f" to x_goal = {short(self.x_goal)}"
         lines = [f"Problem of {self.name}: {sizes}{time}", f"from x0 = {short(self.x0)}{goal}"]
-        for name in ("running_cost", "final_cost", "trajectory_cost"):
+        for name in ("running_cost", "final_cost", "trajectory_cost", "parameter_cost"):
             cost = getattr(self, name)
             if cost is not None:
                 own = isinstance(cost, (QuadraticCost, ConstantCost, TrackingCost, SumOfCosts))
@@ -192,8 +192,13 @@ class Problem(ShowsItsRepr):
 
     @cached_property
     def dynamics(self) -> Dynamics:
-        """x' = f(x, u): the model's equations of motion, or the plain dynamics; ModelError where there are none."""
-        return plant_dynamics(self.system) if isinstance(self.system, Model) else self.system
+        """x' = f(x, u): the model's equations of motion, or the plain dynamics, with the problem's parameters.
+
+        ModelError where there are none.
+        """
+        if isinstance(self.system, Model):
+            return plant_dynamics(self.system, self.parameters)
+        return self.system.with_parameters(self.parameters)
 
     @property
     def name(self) -> str:
@@ -358,8 +363,12 @@ class Problem(ShowsItsRepr):
         goal = self.goal
         return np.where(np.isnan(goal), 0.0, x - goal)
 
+    def cost_of_parameters(self, values: Array) -> float:
+        """What `parameter_cost` says of the values (np,), a part of the cost; 0 where there is none."""
+        return 0.0 if self.parameter_cost is None else float(self.parameter_cost(values))
+
     def objective(self, xs: Array, inputs: Array) -> float:
-        """The objective of xs (N+1, nx) under inputs (N, nu) held over each step.
+        """The objective of xs (N+1, nx) under inputs (N, nu) held over each step, but for that of the parameters.
 
         Inputs (N+1, nu) are at the knots, and the running cost is integrated by the trapezoid rule.
         """
@@ -503,20 +512,34 @@ class Problem(ShowsItsRepr):
         if isinstance(self.running_cost, (int, float)) and self.horizon is not None:
             self._set("running_cost", ConstantCost(positive_float("running_cost", self.running_cost)))
         self._set("running_cost", running_cost_of(self.running_cost))
-        costs = (self.running_cost, self.final_cost, self.trajectory_cost)
+        costs = (self.running_cost, self.final_cost, self.trajectory_cost, self.parameter_cost)
         asked = self.goals or self.constraints or self.couplings
         if all(cost is None for cost in costs) and np.all(np.isnan(self.goal)) and not asked:
             raise InputError("problem", got="no cost and no goal", expected="a cost, an x_goal, goals or constraints")
-        for name in ("running_cost", "final_cost", "trajectory_cost"):
+        for name in ("running_cost", "final_cost", "trajectory_cost", "parameter_cost"):
             cost = getattr(self, name)
             if cost is not None and not callable(cost) and not (name == "running_cost" and isinstance(cost, TimedCost)):
                 raise InputError(name, got=type(cost).__name__, expected="a function or a QuadraticCost")
             if isinstance(cost, (QuadraticCost, TimedCost)):
                 cost.check_sizes(name, self.nx, self.nu)
 
+    def _check_parameter_cost(self, cost: Callable[[Any], Any]) -> None:
+        """Call it once, with AutoDiffXd."""
+        if not self.optimizes_parameters:
+            raise InputError(
+                "parameter_cost", got="given", expected='"parameters" in optimize: nothing changes it else'
+            )
+        try:
+            differentiate_final_cost(cost, np.array(self.parameters.values))
+        except (GradientError, TypeError, ValueError, IndexError, AttributeError) as error:
+            expected = "a function of the parameters' values (np,) in ordinary arithmetic, without float()"
+            raise InputError("parameter_cost", got=f"{type(error).__name__}: {error}", expected=expected) from error
+
     def _check_quantities(self) -> None:
         """Call each function once with the parameters applied: what depends on the model's own refuses them."""
-        if not self.parameters.parameters:
+        if self.parameter_cost is not None:
+            self._check_parameter_cost(self.parameter_cost)
+        if not self.parameters.parameters or not self.has_model:
             return
         x, u = self.x0, np.zeros(self.nu)
         with applied(self.parameters), np.errstate(all="ignore"):

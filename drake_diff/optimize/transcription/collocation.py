@@ -91,7 +91,7 @@ class Collocated:
         """The scheme's own quadrature of the running cost, and the final cost."""
         weights = self.horizon * self.task.scheme.node_weights(self.mesh)
         final = 0.0 if self.task.final is None else float(self.task.final.values(self.nodes[-1:])[0, 0])
-        return float(weights @ self._cost_rates) + final
+        return float(weights @ self._cost_rates) + final + self.task.problem.cost_of_parameters(self.task.parameters)
 
     @property
     def rate_excess(self) -> dict[str, tuple[float, int]]:
@@ -342,10 +342,21 @@ def _finite(values: Array) -> Array:
 
 
 def collocated(
-    problem: Problem, scheme: str, xs: Array, us: Array, us_mid: Array | None, horizon: float, mesh: Array
+    problem: Problem,
+    scheme: str,
+    xs: Array,
+    us: Array,
+    us_mid: Array | None,
+    horizon: float,
+    mesh: Array,
+    parameters: Array | None = None,
 ) -> Collocated:
-    """The motion with knots xs (N+1, nx), us (N+1, nu) and midpoint inputs (N, nu), linear in between where None."""
+    """The motion with knots xs (N+1, nx), us (N+1, nu) and midpoint inputs (N, nu), linear in between where None.
+
+    `parameters` (np,) are values of the problem's, its own where None.
+    """
     task, knots = OptimalControl(problem, scheme), np.hstack([xs, us])
+    task = task if parameters is None else task.at(parameters)
     if task.scheme.nodes == 1:
         return Collocated(task, mesh, knots, horizon)
     rates, h = task.dynamics.values(knots), horizon * np.diff(mesh)[:, None]
@@ -375,7 +386,9 @@ class Transcription:
         self.functions = knot_functions(self.task)
 
     def jacobian(self, knot: Array, k: int = 0) -> Array:
-        """(nx, nx + nu) of the rates at `knot` (nx + nu,), or of a map's step `k`, as the solver gets it."""
+        """(nx, nx + nu) of the rates at `knot` (nx + nu,), or of a map's step `k`, as the solver gets it.
+
+        A knot has the coordinates of parameters where they are optimized."""
         return np.asarray(self.functions.dynamics.jacobian_of(knot, k))
 
     def nodes_at(self, mesh: Array, guess: Any) -> Array:
@@ -396,8 +409,11 @@ class Transcription:
         limits: Limits,
         report: Report | None,
         refinement: MeshRefinement | None = None,
+        parameters: Array | None = None,
     ) -> Transcribed:
         """From a guess that `nodes_at` takes, and of `horizon` [s]; `limits.max_iterations` hold for each round.
+
+        Parameters that are optimized start at `parameters` (np,), at the problem's own where None.
 
         A refinement splits the intervals whose error is above its tolerance and solves again from what was found.
         Intervals that come nearer to an obstacle than a plan may are split in any case, up to CLEARANCE_ROUNDS times.
@@ -405,7 +421,7 @@ class Transcription:
         start, mesh = time.monotonic(), self.mesh
         first = float(np.clip(self.problem.start_horizon if horizon is None else horizon, *self.task.horizon))
         begun = self.nodes_at(mesh, guess)
-        motion = self.solve_on(mesh, begun, first, limits, report)
+        motion = self.solve_on(mesh, begun, first, limits, report, parameters)
         tolerance, most = (np.inf, MOST_INTERVALS) if refinement is None else (refinement.tolerance, refinement.most)
         rounds, near = [(len(mesh) - 1, motion.largest_error)], [_nearer(motion)]
         while motion.result.outcome in FOUND:
@@ -426,9 +442,10 @@ class Transcription:
             if entered:  # what goes through an obstacle is no place to go on from
                 now, then = (self.task.scheme.node_fractions(each) for each in (mesh, self.mesh))
                 nodes = np.array([np.interp(now, then, column) for column in begun.T]).T
-                motion = self.solve_on(mesh, nodes, first, left, report)
+                motion = self.solve_on(mesh, nodes, first, left, report, parameters)
             else:
-                motion = self.solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, left, report)
+                values = motion.task.parameters
+                motion = self.solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, left, report, values)
             if motion.result.outcome not in FOUND and not entered:
                 motion = kept(last, motion)
                 break
@@ -449,14 +466,24 @@ class Transcription:
             return None
         if report is not None:
             report.say(f"what is found does not hold with {len(motion.mesh) - 1} intervals: refined to {len(mesh) - 1}")
-        return self.solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, limits, report)
+        values = motion.task.parameters
+        return self.solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, limits, report, values)
 
-    def solve_on(self, mesh: Array, nodes: Array, horizon: float, limits: Limits, report: Report | None) -> Transcribed:
-        """IPOPT on one mesh, from `nodes` (K, nx + nu) and `horizon` [s]."""
+    def solve_on(
+        self,
+        mesh: Array,
+        nodes: Array,
+        horizon: float,
+        limits: Limits,
+        report: Report | None,
+        parameters: Array | None = None,
+    ) -> Transcribed:
+        """IPOPT on one mesh, from `nodes` (K, nx + nu), `horizon` [s] and `parameters` (np,), the problem's if None."""
         from drake_diff.optimize.transcription.program import NOT_FINITE, TranscribedProgram, solve_ipopt
 
         program, why = TranscribedProgram(self.task, mesh, self.functions), self.functions.why_not
-        guess = program.pack(nodes, horizon)
+        moved = None if parameters is None else self.task.at(self._inside(parameters)).coordinates
+        guess = program.pack(nodes, horizon, moved)
         told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
         result = solve_ipopt(program, guess, limits, report, exact=not why)
         if not why and result.message == NOT_FINITE:
@@ -464,7 +491,11 @@ class Transcription:
             if again.message != NOT_FINITE:  # then it was the Hessian
                 told, result = "symbolic, limited-memory Hessian: the exact one is not finite at an iterate", again
         found, horizon = program.unpack(result.z)
-        return Transcribed(self.task, frozen(mesh), frozen(found), horizon, result, told)
+        task = self.task.at(program.parameter_values(result.z)) if self.task.varied else self.task
+        return Transcribed(task, frozen(mesh), frozen(found), horizon, result, told)
+
+    def _inside(self, values: Array) -> Array:
+        return np.clip(values, *self.problem.bounds_of_parameters())
 
 
 def finer_mesh(motion: Transcribed, exceeded: Sequence[int], most: int) -> Array | None:

@@ -23,7 +23,7 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.mechanics.casadi_tree import PlantFunctions, agrees, symbolic_plant
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.coupling import BoundCoupling
-from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, PlantKnots, Pointwise
+from drake_diff.optimize.problem.dynamics import DiscreteMap, PlantKnots, Pointwise
 from drake_diff.optimize.transcription.task import OptimalControl, TimedRate
 
 SAME_VALUES = 1e-10  # of the largest value at a knot: the same operations, rounded in another order
@@ -390,11 +390,13 @@ class KnotFunctions:
     final: KnotFunction | None
     paths: tuple[KnotFunction, ...]
     joined: tuple[KnotFunction, ...] = ()
+    parameters: KnotFunction | None = None  # the cost of the parameters, of their coordinates
 
     @property
     def why_not(self) -> str:
         """Which of them has no second derivative and why, "" where all have."""
         named = [("dynamics", self.dynamics), ("running_cost", self.rate), ("final_cost", self.final)]
+        named += [("parameter_cost", self.parameters)]
         named += [(f"constraint {i}", path) for i, path in enumerate(self.paths)]
         named += [(f"coupling {i}", coupling) for i, coupling in enumerate(self.joined)]
         return next((f"{name}: {f.why_not}" for name, f in named if f is not None and f.why_not), "")
@@ -402,21 +404,23 @@ class KnotFunctions:
     @property
     def error(self) -> Exception | None:
         """The first error that one of them raised."""
-        every = (self.dynamics, self.rate, self.final, *self.paths, *self.joined)
+        every = (self.dynamics, self.rate, self.final, self.parameters, *self.paths, *self.joined)
         called = [f for f in every if isinstance(f, (Called, SymbolicPlant, Timed))]
         return next((f.error for f in called if f.error is not None), None)
 
 
 def knot_functions(task: OptimalControl) -> KnotFunctions:
     """The functions of `task`, each symbolic if it can be."""
-    nx, width, probe = task.dynamics.nx, task.dynamics.nx + task.dynamics.nu, task.dynamics.probe()
+    nx, probe = task.dynamics.nx, task.dynamics.probe()
     rate, final = task.rate, task.final
 
-    def choose(function: Any, values: Values, linearize: Linearize, rows: int) -> KnotFunction:
+    def choose(
+        function: Any, values: Values, linearize: Linearize, rows: int, nx: int = nx, probe: Array = probe
+    ) -> KnotFunction:
         with np.errstate(all="ignore"):
             found = trace(function, nx, probe, values(probe))
         if isinstance(found, Refusal):
-            return Called(found.reason, values, linearize, rows, width)
+            return Called(found.reason, values, linearize, rows, probe.shape[1])
         return Symbolic(found)
 
     def joined(c: BoundCoupling) -> KnotFunction:
@@ -425,21 +429,25 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
         beside = np.hstack([*(knots[:, :nx] for knots in several), *(knots[:, nx:] for knots in several)])
         return constraint_function(c.rows, count * nx, beside)
 
+    cost, parameters = task.parameter_cost, None
+    if cost is not None and task.varied is not None:
+        tails = task.varied.probe()[:, task.varied.width :]
+        parameters = choose(cost.f, cost.values, cost.linearize, 1, cost.nx, tails)
     return KnotFunctions(
-        _map(task.dynamics, task.problem.num_steps)
-        if isinstance(task.dynamics, DiscreteMap)
-        else _dynamics(task.dynamics),
+        _map(task) if isinstance(task.dynamics, DiscreteMap) else _dynamics(task),
         Timed(rate, nx) if isinstance(rate, TimedRate) else choose(rate.f, rate.values, rate.linearize, 1),
         final if final is None else choose(final.f, final.values, final.linearize, 1),
         tuple(constraint_function(constraint, nx, probe) for constraint in task.problem.kept),
         tuple(joined(coupling) for coupling in task.couplings),
+        parameters,
     )
 
 
-def _map(f: DiscreteMap, count: int) -> KnotFunction:
-    """Of all nodes of `count` steps; after the last there is none, and the last step's stands there."""
-    if not f.counts:
-        return _dynamics(f)
+def _map(task: OptimalControl) -> KnotFunction:
+    """Of all nodes of N steps; after the last there is none, and the last step's stands there."""
+    f, count = task.dynamics, task.problem.num_steps
+    if not (isinstance(f, DiscreteMap) and f.counts):
+        return _dynamics(task)
     probe, steps = f.probe(), np.minimum(np.arange(count + 1), count - 1)
     found = [trace(f.at_step(k).f, f.nx, probe, f.at_step(k).values(probe)) for k in range(count)]
     why = next((each.reason for each in found if isinstance(each, Refusal)), None)
@@ -469,13 +477,21 @@ def constraint_function(c: Constraint, nx: int, probe: Array) -> KnotFunction:
     return Symbolic(found)
 
 
-def _dynamics(dynamics: Dynamics) -> KnotFunction:
-    form, probe = dynamics.form, dynamics.probe()
+def _dynamics(task: OptimalControl) -> KnotFunction:
+    dynamics, moved = task.dynamics, task.varied
+    form, source = dynamics.form, moved or dynamics
+    probe, nu = source.probe(), dynamics.nu
     found: Any = Refusal("an object with derivatives of its own")
     if isinstance(form, PlantKnots):
-        found = symbolic_plant(form.model)
+        found = symbolic_plant(form.model, dynamics.parameters, None if moved is None else moved.coordinates)
     elif isinstance(form, Pointwise):
-        found = trace(form.f, dynamics.nx, probe, form.values(probe))
+        start = dynamics.parameters.values
+
+        def by_knot(x: Any, z: Any) -> Any:
+            tail = start if moved is None else moved.coordinates.to_values(z[nu:])
+            return form.f(x, np.concatenate([z[:nu], tail]) if len(start) else z)
+
+        found = trace(by_knot, dynamics.nx, probe, source.values(probe))
     if isinstance(found, Refusal):
-        return Called(found.reason, dynamics.values, dynamics.linearize, dynamics.nx, dynamics.nx + dynamics.nu)
+        return Called(found.reason, source.values, source.linearize, dynamics.nx, probe.shape[1])
     return SymbolicPlant(found) if isinstance(found, PlantFunctions) else Symbolic(found)

@@ -144,8 +144,9 @@ class HeldPlan:
     def _names(self, which: Mask) -> list[str]:
         names, width = (*self.problem.state_names, *self.problem.input_names), self.program.width
         nodes = len(self.program.every) * width
+        others = (*(self.problem.parameters.names if self.task.varied else ()), "horizon")
         return [
-            f"{names[i % width]} at node {i // width}" if i < nodes else "horizon"
+            f"{names[i % width]} at node {i // width}" if i < nodes else others[i - nodes]
             for i in np.flatnonzero(which).tolist()
         ]
 

@@ -58,7 +58,10 @@ NOT_FINITE = "IPOPT: Invalid Number Detected"
 
 
 class TranscribedProgram:
-    """The program of an `OptimalControl` on a mesh (N+1,) of fractions of the horizon: z = [nodes row by row, T]."""
+    """The program of an `OptimalControl` on a mesh (N+1,) of fractions of the horizon: z = [nodes row by row, c, T].
+
+    c (np,) are the coordinates of parameters that are optimized.
+    """
 
     def __init__(self, task: OptimalControl, mesh: Array, functions: KnotFunctions):
         self.task, self.mesh, self.functions = task, mesh, functions
@@ -66,10 +69,14 @@ class TranscribedProgram:
         self.weights = task.scheme.node_weights(mesh)
         self.every = np.arange(len(self.weights))
         self.free = int(task.horizon[0] < task.horizon[1])
-        nodes = zip(task.node_limits(mesh), task.horizon, strict=True)
-        self.lower, self.upper = (np.append(side.ravel(), [time] * self.free) for side, time in nodes)
+        self.first_parameter = self.every.size * self.width  # where in z they are
+        limits = zip(task.node_limits(mesh), task.coordinate_limits(), task.horizon, strict=True)
+        self.lower, self.upper = (np.concatenate([a.ravel(), c, [time] * self.free]) for a, c, time in limits)
         self.z = ca.MX.sym("z", len(self.lower))
-        self.knots = ca.reshape(self.z[: self.every.size * self.width], self.width, self.every.size)
+        self.knots = ca.reshape(self.z[: self.first_parameter], self.width, self.every.size)
+        self.parameters = self.z[self.first_parameter : self.first_parameter + len(task.coordinates)]
+        tails = ca.repmat(self.parameters, 1, self.every.size)
+        self.moved = ca.vertcat(self.knots, tails) if task.varied else self.knots
         self.time = self.z[-1] if self.free else ca.MX(task.horizon[0])
         paths = zip(functions.paths, task.problem.kept, strict=True)
         self.paths = [(f, task.nodes_of(constraint, mesh), constraint) for f, constraint in paths]
@@ -79,13 +86,26 @@ class TranscribedProgram:
         self.slopes = [slopes_of(limit, task, mesh) for limit in task.problem.rate_limits]
         times = task.horizon[0] * task.scheme.node_fractions(mesh)  # of a cost that changes in time, which fixes it
         self.rate = functions.rate.at(times) if isinstance(functions.rate, Timed) else functions.rate
-        self.rates, self.costs = functions.dynamics.values(self.knots), self.rate.values(self.knots)
-        self.rate_rows, self.cost_rows = functions.dynamics.jacobian(self.knots), self.rate.jacobian(self.knots)
+        self.rates, self.costs = functions.dynamics.values(self.moved), self.rate.values(self.knots)
+        self.rate_rows, self.cost_rows = functions.dynamics.jacobian(self.moved), self.rate.jacobian(self.knots)
         self._set_links()
 
-    def pack(self, nodes: Array, horizon: float) -> Array:
-        """The decision variables of `nodes` (K, nx + nu) and `horizon` [s]."""
-        return np.append(nodes.ravel(), [horizon] * self.free)
+    def pack(self, nodes: Array, horizon: float, coordinates: Array | None = None) -> Array:
+        """The decision variables of `nodes` (K, nx + nu), `horizon` [s] and `coordinates` (np,), the task's if None."""
+        found = self.task.coordinates if coordinates is None else coordinates
+        return np.concatenate([nodes.ravel(), found, [horizon] * self.free])
+
+    def parameter_values(self, z: Array) -> Array:
+        """The values (np,) of the problem's parameters at the decision variables."""
+        moved = self.task.varied
+        if moved is None:
+            return self.task.parameters
+        c = z[self.first_parameter : self.first_parameter + len(self.task.coordinates)]
+        return np.clip(moved.coordinates.to_values(c), *self.task.problem.bounds_of_parameters())
+
+    def column(self, node: Any, columns: Any) -> Any:
+        """Where in z the entries `columns` of a knot [x, u, c] at `node` are."""
+        return np.where(columns < self.width, node * self.width + columns, self.first_parameter + columns - self.width)
 
     def unpack(self, z: Array) -> tuple[Array, float]:
         """The nodes (K, nx + nu) and the horizon [s] of the decision variables."""
@@ -113,6 +133,8 @@ class TranscribedProgram:
         f = self.time * ca.dot(self.costs, ca.DM(self.weights).T)
         if self.functions.final is not None:
             f += self.functions.final.values(self.knots[:, -1])
+        if self.functions.parameters is not None:
+            f += self.functions.parameters.values(self.parameters)
         g = [ca.mtimes(self._S, self.z) - self.time * ca.mtimes(self._D, ca.vec(self.rates))]
         g += [ca.vec(f.values(self.knots[:, at.tolist()])) for f, at, _ in self.paths]
         g += [c.values(self.z) for c in self.coupled]
@@ -176,8 +198,9 @@ class TranscribedProgram:
         count = self.every.size * self.width
         lower, upper = (side[:count].reshape(-1, self.width) for side in (self.lower, self.upper))
         rows, columns = self.functions.dynamics.jacobian_at
+        moved = slice(count, count + len(self.task.coordinates))
         for node in (0, self.every[-1]):
-            given = lower[node] == upper[node]
+            given = np.append(lower[node] == upper[node], self.lower[moved] == self.upper[moved])
             for place, state in enumerate(hull.each):
                 if given[state] and np.all(given[columns[rows == state]]):
                     at = hull.rows[(hull.node == node) & (hull.state[:, 0] != 0), place] - hull.first
@@ -192,6 +215,10 @@ class TranscribedProgram:
         if self.functions.final is not None:
             b = _Blocks(self.functions.final.jacobian_at, last, self.width)
             total.add(b.column, 0, 1.0, self.functions.final.jacobian(self.knots[:, -1]), b.index)
+        if self.functions.parameters is not None:
+            of = self.functions.parameters
+            places = self.first_parameter + of.jacobian_at[1]
+            total.add(places, 0, 1.0, of.jacobian(self.parameters), np.arange(len(places)))
         return ca.densify(total.matrix())
 
     def _jacobian(self) -> Any:
@@ -203,7 +230,7 @@ class TranscribedProgram:
             place[links.each] = np.arange(len(links.each))
             kept = np.flatnonzero(place[rows] >= 0)
             index = links.node[:, None] * len(rows) + kept
-            at = links.starts[:, None] + place[rows[kept]], links.node[:, None] * self.width + columns[kept]
+            at = links.starts[:, None] + place[rows[kept]], self.column(links.node[:, None], columns[kept])
             total.add(*at, -links.slope, self.time * self.rate_rows, index)
             if self.free:
                 total.add(links.rows, self.z.numel() - 1, -links.slope, ca.vec(self.rates), links.rates)
@@ -286,12 +313,18 @@ class TranscribedProgram:
             first += c.count
         for function, nodes, seeds in terms:
             b = _Blocks(function.hessian_at, nodes, self.width)
-            source = function.hessian(self.knots[:, nodes.tolist()], seeds)
-            total.add(b.node * self.width + b.rows, b.column, 1.0, source, b.index)
+            knots = self.moved if function is f else self.knots
+            source = function.hessian(knots[:, nodes.tolist()], seeds)
+            columns = function.hessian_at[1]
+            total.add(self.column(b.node, b.rows), self.column(b.node, columns), 1.0, source, b.index)
+        if self.functions.parameters is not None:
+            of: Any = self.functions.parameters
+            rows, columns = (self.first_parameter + places for places in of.hessian_at)
+            total.add(rows, columns, 1.0, of.hessian(self.parameters, sigma), np.arange(len(rows)))
         if self.free:
             b = _Blocks(f.jacobian_at, self.every, self.width)
             source = self.rate_rows * nu[(b.node * self.nx + b.rows).ravel().tolist()]
-            total.add(b.column, self.z.numel() - 1, -1.0, source, b.index)
+            total.add(self.column(b.node, f.jacobian_at[1]), self.z.numel() - 1, -1.0, source, b.index)
             b = _Blocks(rate.jacobian_at, self.every, self.width)
             source = sigma * self.cost_rows
             total.add(b.column, self.z.numel() - 1, self.weights[b.node], source, b.index)

@@ -15,6 +15,7 @@ of a cubic the inner two are x_0 + h f_0 / 3 and x_1 - h f_1 / 3, of a parabola 
 its values, 2 u_mid - (u_0 + u_1) / 2. Bounds of the nodes alone let an input between them be 1/8 above.
 """
 
+import copy
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,10 +23,11 @@ from functools import cached_property
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
+from drake_diff.model.parameters import ParameterCoordinates
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost, differentiate_cost
 from drake_diff.optimize.problem.coupling import BoundCoupling
-from drake_diff.optimize.problem.dynamics import DiscreteMap, Pointwise
+from drake_diff.optimize.problem.dynamics import DiscreteMap, Moved, Pointwise
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.timed import TimedCost
 
@@ -115,6 +117,7 @@ SCHEMES = {
     "drake": Scheme(2, *_SIMPSON, input_is_linear=True),
     MAP: Scheme(1, *_MAP),
 }
+INSIDE = 2e-8  # of a bound of parameters: twice what IPOPT relaxes it by, which must not make a mass negative
 DEFAULT_SCHEME = "hermite_simpson"
 
 
@@ -165,6 +168,9 @@ class TimedRate:
 class OptimalControl:
     """What `problem` asks of a collocation scheme; ModelError where its model has no continuous form.
 
+    `dynamics` are those at the parameters' own values; where they are optimized, `varied` are those that a program has,
+    of knots [x, u, c] with c (np,) the parameters' coordinates, and `parameter_cost` is one of knots [c].
+
     Raises InputError or GradientError where a cost is no function that can be differentiated.
     """
 
@@ -173,6 +179,17 @@ class OptimalControl:
         self.is_map = scheme == MAP
         self.dynamics, self.bounds = problem.dynamics, problem.bounds
         self.horizon: tuple[float, float] = problem.horizon or (problem.start_horizon,) * 2  # (lower, upper) [s]
+        self.varied: Moved | None = None
+        self.parameter_cost: Pointwise | None = None
+        if problem.optimizes_parameters:
+            self.varied = Moved(self.dynamics, ParameterCoordinates(problem.parameters))
+            of_values = problem.parameter_cost
+            if of_values is not None:
+                probe = self.varied.probe()[:, self.varied.width :]
+                to_values, count = self.varied.coordinates.to_values, probe.shape[1]
+                self.parameter_cost = Pointwise(
+                    "parameter_cost", lambda c, _: of_values(to_values(c)), count, (), probe
+                )
         running, cost, nx = problem.total_running_cost, problem.total_final_cost, self.dynamics.nx
         running = ConstantCost(0.0) if running is None else running
         self.rate: KnownRate | Pointwise | TimedRate
@@ -199,6 +216,32 @@ class OptimalControl:
     def interval_of(self, count: int) -> Indices:
         """(K,) the interval that each of `count` nodes begins or lies in; the last node is the last interval's."""
         return np.minimum(np.arange(count) // self.scheme.nodes, (count - 1) // self.scheme.nodes - 1)
+
+    @property
+    def parameters(self) -> Array:
+        """(np,) the values of the problem's parameters that `dynamics` have."""
+        return self.dynamics.parameters.values
+
+    def at(self, values: Array) -> "OptimalControl":
+        """The same with the parameters at `values` (np,)."""
+        found = copy.copy(self)
+        found.dynamics = self.dynamics.at(values)
+        return found
+
+    @property
+    def coordinates(self) -> Array:
+        """(np,) those of `parameters` where they are optimized, else (0,)."""
+        return np.zeros(0) if self.varied is None else self.varied.coordinates.from_values(self.parameters)
+
+    def coordinate_limits(self) -> tuple[Array, Array]:
+        """(lower, upper), each as `coordinates`."""
+        if self.varied is None:
+            return np.zeros(0), np.zeros(0)
+        lower, upper = (self.varied.coordinates.from_values(side) for side in self.problem.bounds_of_parameters())
+        inside = [INSIDE * np.maximum(1.0, np.where(np.isfinite(side), np.abs(side), 1.0)) for side in (lower, upper)]
+        lower_in, upper_in = lower + inside[0], upper - inside[1]
+        apart = lower_in < upper_in
+        return np.where(apart, lower_in, lower), np.where(apart, upper_in, upper)
 
     def rates(self, knots: Array, times: Array) -> Array:
         """(K,) the running cost at `knots` (K, nx + nu) and `times` (K,) [s]."""

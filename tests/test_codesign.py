@@ -1,0 +1,352 @@
+"""Parameters as variables of collocation, against closed forms, AutoDiffXd and differences."""
+
+import dataclasses
+
+import casadi as ca
+import numpy as np
+import pytest
+from helpers.models import MODELS, robot_file
+from helpers.plants import block, pd_pendulum, random_tree, springs_and_motors
+from helpers.table import each_row
+
+import drake_diff as dd
+from drake_diff._base.refusal import Refusal
+from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.mechanics.casadi_tree import symbolic_plant
+from drake_diff.model.parameters import ParameterCoordinates, applied, select
+from drake_diff.optimize.problem.dynamics import Moved, plant_dynamics
+from drake_diff.optimize.transcription.collocation import Transcription
+from drake_diff.optimize.transcription.program import TranscribedProgram
+
+BOTH = ("controls", "parameters")
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+
+
+def named(name):
+    if name.startswith("tree"):
+        return random_tree(int(name[-1]))
+    if name == "motors":
+        return springs_and_motors(gear=3.0)
+    if name.endswith("robot.urdf"):
+        return dd.load_model(robot_file(name), time_step=0.01)
+    return dd.load_model(MODELS / name, time_step=0.01)
+
+
+def movable(model, random, count=5):
+    """Some parameters that collocation moves and that are in no corner of their range."""
+    found = []
+    for p in dd.list_parameters(model):
+        known = p.kind.source != "finite_difference" and not (p.kind.positive and p.value[0] == 0)
+        if known and not (p.kind.quantity == "inertia" and _is_a_rod(p.value)):
+            found.append(p.name)
+    return tuple(random.permutation(found)[:count])
+
+
+def _is_a_rod(inertia):
+    xx, yy, zz = inertia[:3]
+    return min(xx + yy - zz, yy + zz - xx, zz + xx - yy) <= 1e-9 * max(xx, yy, zz)
+
+
+MODELS_TRIED = ["acrobot.xml", "cart_pole.urdf", "mass_spring_damper.sdf", "ur5_robot.urdf", "motors", "tree0", "tree2"]
+
+
+@each_row("name", MODELS_TRIED)
+def test_an_expression_of_parameters_and_its_derivatives_are_drakes(name):
+    """Any kind of parameter, five at a time: values and Jacobian by AutoDiffXd, the Hessian by CasADi's own.
+
+    1e-9 of the largest entry: the mass matrices' condition.
+    """
+    model, random = named(name), np.random.default_rng(7)
+    vector = select(model, movable(model, random))
+    coordinates = ParameterCoordinates(vector)
+    plant = symbolic_plant(model, vector, coordinates)
+    assert not isinstance(plant, Refusal), plant
+    moved = Moved(plant_dynamics(model, vector), coordinates)
+    start = coordinates.from_values(np.array(vector.values))
+    width = model.nx + model.nu + len(start)
+    knot, weights = ca.SX.sym("knot", width), random.standard_normal(model.nx)
+    by_casadi = ca.Function("h", [knot], [ca.triu(ca.hessian(ca.dot(ca.DM(weights), plant.function(knot)), knot)[0])])
+    for _ in range(3):
+        tail = start + 0.2 * random.uniform(0, 1, len(start)) * np.where(start == 0, 1.0, start)
+        at = np.concatenate([random.uniform(-1, 1, model.nx), random.standard_normal(model.nu), tail])
+        values, rows = moved.linearize(at[None])
+        assert plant.function(at).full().ravel() == pytest.approx(values[0], abs=1e-9 * max(1, np.abs(values).max()))
+        assert plant.jacobian(at).full() == pytest.approx(rows[0], abs=1e-9 * max(1, np.abs(rows).max()))
+        curves = by_casadi(at).full()
+        found = plant.hessian(at, weights, plant.jacobian(at)).full()
+        assert found == pytest.approx(curves, abs=1e-9 * max(1, np.abs(curves).max()))
+
+
+def test_a_programs_derivatives_by_parameters_and_horizon_are_those_of_casadi():
+    """The whole program's: parameters have one column each for all nodes, beside that of the horizon."""
+    model = named("cart_pole.urdf")
+    problem = dd.Problem(
+        model,
+        x0=np.zeros(4),
+        x_goal=[0.5, 0.2, 0, 0],
+        num_steps=3,
+        running_cost=EFFORT,
+        horizon=(0.5, 2.0),
+        optimize=BOTH,
+        parameters=("pole.mass", "cart.mass", "pole.center_of_mass"),
+        parameter_cost=lambda p: p[0] ** 3 + p[1] * p[2],
+        bounds=dd.Bounds(x_upper=[1, 2, 3, 4], u_upper=[5], u_lower=[-5]),
+    )
+    transcription = Transcription(problem, "hermite_simpson")
+    program = TranscribedProgram(transcription.task, transcription.mesh, transcription.functions)
+    made, random = program.derivatives(exact=True), np.random.default_rng(0)
+    z = random.uniform(0.5, 1, len(program.lower))
+    multipliers, step = random.standard_normal(program.nlp["g"].numel()), 1e-6
+
+    def lagrangian_slope(z):
+        jacobian = made["jac_g"](z, [])[1].full()
+        return 0.7 * made["grad_f"](z, [])[1].full().ravel() + multipliers @ jacobian
+
+    def of(function, z):
+        return np.asarray(function(z, [])[0]).ravel()
+
+    for function, rows in (("grad_f", made["grad_f"](z, [])[1].full().T), ("jac_g", made["jac_g"](z, [])[1].full())):
+        wanted = np.array(
+            [(of(made[function], z + e) - of(made[function], z - e)) / (2 * step) for e in step * np.eye(len(z))]
+        ).T
+        assert rows == pytest.approx(wanted, abs=1e-7 * max(1, np.abs(wanted).max()))
+    wanted = np.array([(lagrangian_slope(z + e) - lagrangian_slope(z - e)) / (2 * step) for e in step * np.eye(len(z))])
+    found = made["hess_lag"](z, [], 0.7, multipliers).full()
+    assert found == pytest.approx(np.triu(wanted), abs=1e-6 * np.abs(wanted).max())
+
+
+# ------------------------------------------------------------------------------ closed forms
+
+
+def test_the_gear_ratio_of_least_time_is_the_root_of_the_inertias():
+    """A limited motor turns a load by 1 rad: t = 2 sqrt(J / torque), least where n^2 = J_load / J_motor."""
+    load, motor, torque = 2.0, 0.01, 0.5
+
+    def rates(x, u, p):
+        return [x[1], p[0] * u[0] / (load + p[0] ** 2 * motor)]
+
+    geared = dd.Dynamics(rates, 2, 1, u_lower=[-torque], u_upper=[torque], parameters={"ratio": 5.0})
+    problem = dd.Problem(
+        geared,
+        x0=[0, 0],
+        x_goal=[1, 0],
+        num_steps=40,
+        horizon=(0.1, 20),
+        running_cost=1.0,
+        optimize=BOTH,
+        parameters=("ratio",),
+        parameter_bounds={"ratio": (1, 100)},
+    )
+    solution = dd.solve(problem)
+    assert solution.success, solution.message
+    assert solution.vector.to_dict()["ratio"] == pytest.approx([np.sqrt(load / motor)], rel=1e-6)
+    ratio = np.sqrt(load / motor)
+    whole = 2 * np.sqrt((load + ratio**2 * motor) / (ratio * torque))
+    assert solution.horizon == pytest.approx(whole, rel=1e-3)  # the switch takes one of 40 intervals
+
+
+def test_the_spring_of_an_oscillator_that_arrives_in_time():
+    """m x'' = -k x + u from rest at 1 is at 0 without any input after a quarter of its period: k = m (pi / 2T)^2."""
+    springs = dd.Dynamics(lambda x, u, p: [x[1], -p[0] / 2.0 * x[0] + u[0]], 2, 1, parameters={"stiffness": 1.0})
+    time = 0.8
+    problem = dd.Problem(
+        springs,
+        x0=[1, 0],
+        x_goal=[0, np.nan],
+        num_steps=30,
+        horizon=time,
+        running_cost=EFFORT,
+        optimize=BOTH,
+        parameters=("stiffness",),
+    )
+    solution = dd.solve(problem)
+    assert solution.success, solution.message
+    assert solution.parameters == pytest.approx([2.0 * (np.pi / 2 / time) ** 2], rel=1e-4)  # of order 4 in 1/30
+    assert solution.cost == pytest.approx(0.0, abs=1e-6)
+
+
+@each_row("method, steps, close", [("collocation", 20, 1e-6), ("shooting", 20, 1e-5)])
+def test_a_block_whose_lightness_has_its_price(method, steps, close):
+    """Moving m by d in T costs 12 m^2 d^2 / T^3 in effort; with w (m0 - m)^2 beside it m = w m0 / (w + 12 d^2 / T^3).
+
+    A discrete step's effort is 12 / (1 - 1/N^2) instead of 12.
+    """
+    price, heaviest, way, time = 8.0, 2.0, 1.0, 2.0
+    problem = dd.Problem(
+        block(mass=1.5, time_step=time / steps),
+        x0=[0, 0],
+        x_goal=[way, 0],
+        num_steps=steps,
+        running_cost=EFFORT,
+        optimize=BOTH,
+        parameters=("block_0.mass",),
+        parameter_cost=lambda p: price * (heaviest - p[0]) ** 2,
+    )
+    factor = 12.0 if method == "collocation" else 12.0 / (1 - 1 / steps**2)
+    effort = factor * way**2 / time**3
+    mass = price * heaviest / (price + effort)
+    solution = dd.solve(problem, method=method)
+    assert solution.status.value in ("converged", "converged_not_verified"), solution.message
+    assert solution.parameters == pytest.approx([mass], rel=close)
+    assert solution.cost == pytest.approx(effort * mass**2 + price * (heaviest - mass) ** 2, rel=close)
+
+
+def test_a_parameter_at_its_bound_stays_within_it():
+    """A lighter pole always needs less."""
+    problem = dd.Problem(
+        named("pendulum.urdf"),
+        x0=[0, 0],
+        x_goal=[2, 0],
+        num_steps=100,
+        running_cost=EFFORT,
+        optimize=BOTH,
+        parameters=("pole.mass",),
+        parameter_bounds={"pole.mass": (0.5, 2.0)},
+    )
+    solution = dd.solve(problem)
+    assert solution.method == "collocation"
+    assert solution.success, solution.message
+    assert 0.5 <= solution.parameters[0] <= 0.5 + 1e-6
+    assert solution.bound_violation == 0
+
+
+def test_a_parameter_that_is_only_given_moves_the_collocated_plan():
+    """The same as a model whose file has that mass."""
+    asked = {"x0": [0, 0], "x_goal": [2, 0], "num_steps": 40, "running_cost": EFFORT}
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
+    given = dd.solve(dd.Problem(model, parameters={"pole.mass": 1.7}, **asked))
+    assert given.method == "collocation"
+    assert given.success, given.message
+    with applied(select(model, {"pole.mass": 1.7})):
+        assert dd.optimize.plant_dynamics(model, {"pole.mass": 1.7})([1, 0], [0]) == pytest.approx(
+            dd.optimize.plant_dynamics(model)([1, 0], [0])
+        )
+    other = dd.solve(dd.Problem(model, parameters={"pole.mass": 1.0}, **asked))
+    assert given.cost > 1.2 * other.cost
+
+
+# ------------------------------------------------------------------------------ refusals
+
+
+@each_row("wrong", ["negated", "one percent", "swapped"])
+def test_a_column_of_a_parameter_that_is_wrong_is_refused(wrong, monkeypatch):
+    from drake_diff.optimize.transcription import expressions
+
+    honest = expressions.symbolic_plant
+
+    def planted(*asked):
+        found = honest(*asked)
+        knot = ca.SX.sym("knot", found.function.size1_in(0))
+        rows = found.jacobian(knot)
+        p, q = rows[:, -1], rows[:, -2]
+        changed = {"negated": (q, -p), "one percent": (q, 1.01 * p), "swapped": (p, q)}[wrong]
+        jacobian = ca.Function("wrong", [knot], [ca.horzcat(rows[:, :-2], *changed)])
+        return dataclasses.replace(found, jacobian=jacobian)
+
+    monkeypatch.setattr(expressions, "symbolic_plant", planted)
+    problem = dd.Problem(
+        named("cart_pole.urdf"),
+        x0=np.zeros(4),
+        x_goal=[0.3, 0.5, 0, 0],
+        num_steps=100,
+        running_cost=EFFORT,
+        optimize=BOTH,
+        parameters=("pole.mass", "cart.mass"),
+    )
+    guess = np.linspace(0, 1, 101)[:, None] * [0.3, 0.5, 1.0, 2.0], np.full((100, 1), 3.0)
+    solution = dd.solve(problem, method="collocation", initial_guess=guess, max_iterations=3)
+    verdicts = {c.verdict for c in solution.certificates}
+    assert "agree" not in verdicts
+    assert not solution.success
+    assert any("mass" in str(c.worst) for c in solution.certificates)
+
+
+def test_what_collocation_cannot_move_is_named():
+    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01)
+    name = next(p.name for p in dd.list_parameters(model) if p.name.endswith(".friction"))
+    with pytest.raises(InputError, match=rf"parameters: expected one that moves the model without contact.*{name}"):
+        dd.optimize.plant_dynamics(model, (name,))
+    asked = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 5, "optimize": BOTH}
+    with pytest.raises(dd.exceptions.ModelError, match="PD-controlled"):
+        dd.solve(dd.Problem(pd_pendulum(), parameters=("motor.kp",), **asked), method="collocation")
+
+
+def test_bad_parameters_of_dynamics_are_named():
+    def rates(x, u, p):
+        return [x[1], p[0] * u[0]]
+
+    geared = dd.Dynamics(rates, 2, 1, parameters={"gain": 2.0, "unused": 1.0})
+    asked = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 5, "horizon": 1.0, "running_cost": EFFORT}
+    with pytest.raises(UnknownNameError, match="gain, unused"):
+        dd.Problem(geared, parameters=("mass",), **asked)
+    with pytest.raises(InputError, match=r"parameter_cost: expected .parameters. in optimize"):
+        dd.Problem(geared, parameter_cost=lambda p: p[0], **asked)
+    with pytest.raises(InputError, match="parameter_cost: expected a function of the parameters' values"):
+        dd.Problem(geared, parameters=("gain",), optimize=BOTH, parameter_cost=lambda p: float(p[0]), **asked)
+    with pytest.raises(InputError, match="dynamics: expected a function"):
+        dd.Dynamics(lambda x, u: [x[1], u[0]], 2, 1, parameters={"gain": 2.0})
+    with pytest.raises(InputError, match="names with their values"):
+        dd.Dynamics(rates, 2, 1, parameters={"": 2.0})
+
+
+def test_parameters_of_dynamics_that_are_not_asked_for_keep_their_values():
+    three = dd.Dynamics(
+        lambda x, u, p: [p[0] + 10 * p[1] + 100 * p[2]], 1, 1, parameters={"a": 1.0, "b": 2.0, "c": 3.0}
+    )
+    asked = {"x0": [0], "num_steps": 5, "horizon": 1.0, "running_cost": EFFORT}
+    assert dd.Problem(three, **asked).dynamics([0.0], [0.0]) == pytest.approx([321])
+    assert dd.Problem(three, parameters={"c": 5.0, "a": 4.0}, **asked).dynamics([0], [0]) == pytest.approx([524])
+    assert dd.Problem(three, parameters=("b",), **asked).dynamics.at([7.0])([0], [0]) == pytest.approx([371])
+
+
+# ------------------------------------------------------------------------------ the artifact
+
+
+def test_a_record_has_the_parameters_and_a_forged_value_is_refused(tmp_path):
+    problem = dd.Problem(
+        dd.load_model(MODELS / "pendulum.urdf", time_step=0.05),
+        x0=[0, 0],
+        x_goal=[2, 0],
+        num_steps=40,
+        running_cost=1.0,
+        horizon=(0.2, 10),
+        bounds=dd.Bounds(u_lower=[-5], u_upper=[5]),
+        optimize=BOTH,
+        parameters=("pole.mass",),
+        parameter_bounds={"pole.mass": (0.5, 2.0)},
+    )
+    solution = dd.solve(problem)
+    assert solution.success, solution.message
+    record = dd.save(solution, tmp_path / "run")
+    entry = record.parameters[0]
+    assert (entry.name, entry.optimized, entry.lower, entry.upper) == ("pole.mass", True, 0.5, 2.0)
+    assert entry.value == solution.parameters[0]
+    assert dd.verify(tmp_path / "run").holds
+    forged = dataclasses.replace(solution, parameters=np.array([1.2 * solution.parameters[0]]))
+    dd.save(forged, tmp_path / "forged")
+    assert not dd.verify(tmp_path / "forged").holds
+
+
+def test_a_plans_derivative_with_a_parameter_that_follows_it():
+    """The lightest price of a block: the cost is that of the closed form, whose mass is another for another goal."""
+    price, heaviest, way, time = 8.0, 2.0, 1.0, 2.0
+    block_of = dd.Dynamics(lambda x, u, p: [x[1], u[0] / p[0]], 2, 1, parameters={"mass": 1.5})
+    problem = dd.Problem(
+        block_of,
+        x0=[0, 0],
+        x_goal=[way, 0],
+        num_steps=10,
+        horizon=time,
+        running_cost=EFFORT,
+        optimize=BOTH,
+        parameters=("mass",),
+        parameter_cost=lambda p: price * (heaviest - p[0]) ** 2,
+    )
+    solution = dd.solve(problem)
+    found = dd.sensitivity(solution, "goal")
+    mass = price * heaviest / (price + 12 * way**2 / time**3)
+    assert solution.parameters == pytest.approx([mass], rel=1e-6)
+    assert found.verdict == "agree"
+    assert found.cost[0] == pytest.approx(24 * mass**2 * way / time**3, rel=1e-5)  # d cost / d way at the best mass
+    with pytest.raises(UnknownNameError, match="goal, x0"):
+        dd.sensitivity(solution, ("mass",))
