@@ -47,6 +47,8 @@ class EquationsOfMotion:
 
     def values(self, knots: Array) -> Array:
         """(K, nx) dx/dt at `knots` (K, nx + nu), rows [x, u]; NaN where a knot is not finite."""
+        if len(knots) == 1:
+            return self._at(knots[0])[None]
         model, twin = self.model, self.model.double
         finite = np.isfinite(knots).all(axis=1)
         rates, still = np.full((len(knots), model.nx), np.nan), np.zeros(model.nv)
@@ -62,6 +64,16 @@ class EquationsOfMotion:
         force = knots[:, model.nx :] @ self.actuation.T - rest
         rates[finite, model.nq :] = np.linalg.solve(mass, force[..., None])[finite, :, 0]
         return rates
+
+    def _at(self, knot: Array) -> Array:
+        """(nx,) dx/dt at one `knot`, without the arrays of many."""
+        model, twin, nx = self.model, self.model.double, self.model.nx
+        if not np.isfinite(knot).all():
+            return np.full(nx, np.nan)
+        x, u = knot[:nx], knot[nx:]
+        twin.set_state(x)
+        acceleration = self.acceleration(u)[0]
+        return np.concatenate((x[model.nq :] if self.plain_rates else self.q_dot(twin, x), acceleration))
 
     def autodiff(self, x: Any, u: Any) -> Any:
         """The same with AutoDiffXd in and out."""

@@ -262,39 +262,38 @@ class Collocated:
         Its last column is the cost, where it has one more than the states. With `gains` (nu, nx), under feedback about
         the motion too.
         """
-        nx, is_map = self.task.dynamics.nx, self.task.is_map
-        dt, found = self._lengths[k, None] / SUBSTEPS, [z]
+        nx, task, held = self.task.dynamics.nx, self.task, self._held
+        dt, found, b = self._lengths[k, None] / SUBSTEPS, [z], self.task.bounds
 
-        def rate(z: Array, step: float) -> Array:
-            us, b = self._held[k, round(2 * step)], self.task.bounds
-            tau = np.full(len(k), step / SUBSTEPS)
+        def rate(z: Array, half: int) -> Array:
+            us, xs = held[k, half, nx:], z[:, :nx]
             if gains is not None:
-                us = us + (self.between(k, tau)[0] - z[:, :nx]) @ gains.T
-                us = self._cut_off(np.clip(us, b.u_lower, b.u_upper))
-            knots = np.hstack([z[:, :nx], us])
+                us = self._cut_off(np.clip(us + (held[k, half, :nx] - xs) @ gains.T, b.u_lower, b.u_upper))
+            knots = np.concatenate((xs, us), axis=1)
             if z.shape[1] == nx:
-                return self.task.moved(knots, k)
-            return np.column_stack([self.task.moved(knots, k), self.task.rates(knots, self.times(k, tau))])
+                return task.moved(knots, k)
+            times = self.times(k, np.full(len(k), half / (2 * SUBSTEPS)))
+            return np.column_stack([task.moved(knots, k), task.rates(knots, times)])
 
         with np.errstate(all="ignore"):
-            if is_map:  # the state is held until the next step
-                stepped = rate(z, 0.0)
+            if task.is_map:  # the state is held until the next step
+                stepped = rate(z, 0)
                 stepped[:, nx:] += z[:, nx:]
                 return np.array([z] * SUBSTEPS + [stepped])
-            for i in range(SUBSTEPS):
+            for i in range(0, 2 * SUBSTEPS, 2):
                 k1 = rate(z, i)
-                k2 = rate(z + dt / 2 * k1, i + 0.5)
-                k3 = rate(z + dt / 2 * k2, i + 0.5)
-                z = z + dt / 6 * (k1 + 2 * k2 + 2 * k3 + rate(z + dt * k3, i + 1))
+                k2 = rate(z + dt / 2 * k1, i + 1)
+                k3 = rate(z + dt / 2 * k2, i + 1)
+                z = z + dt / 6 * (k1 + 2 * k2 + 2 * k3 + rate(z + dt * k3, i + 2))
                 found.append(z)
         return np.array(found)
 
     @cached_property
     def _held(self) -> Array:
-        """(N, 21, nu) the inputs as the plant applies them at every half of the ten steps of each interval."""
+        """(N, 21, nx + nu) the motion, inputs as the plant applies them, at every half of an interval's ten steps."""
         count, halves = len(self.mesh) - 1, np.arange(2 * SUBSTEPS + 1)
-        k, tau = np.repeat(np.arange(count), len(halves)), np.tile(halves / (2 * SUBSTEPS), count)
-        return self.applied(k, tau).reshape(count, len(halves), -1)
+        xs, us = self.between(np.repeat(np.arange(count), len(halves)), np.tile(halves / (2 * SUBSTEPS), count))
+        return np.hstack([xs, self._cut_off(us)]).reshape(count, len(halves), -1)
 
     def applied_at(self, times: Array) -> Array:
         """(S, nu) the inputs at `times` (S,) [s] as the plant applies them."""
