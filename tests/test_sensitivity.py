@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.models import MODELS
 from helpers.table import each_row
 
 import drake_diff as dd
@@ -134,9 +135,9 @@ def test_what_has_no_sensitivity_is_refused(write_urdf):
     solution = dd.solve(problem, method="collocation")
     for given, by, match in (
         (problem, "x0", "solution: expected a Solution"),
-        (dd.solve(problem, method="ilqr"), "x0", "expected one by collocation"),
+        (dd.solve(problem, method="ilqr"), (), 'expected "x0", "goal", or names of parameters'),
         (dd.solve(block(3.9)), "x0", "expected one that is a success"),
-        (dd.solve(problem, method="collocation", scheme="drake"), "x0", "hermite_simpson or trapezoid"),
+        (dd.solve(problem, method="collocation", scheme="drake"), "x0", "hermite_simpson, trapezoid, iLQR or shooting"),
         (solution, (), 'expected "x0", "goal", or names of parameters'),
         (dd.solve(block(x_goal=None, final_cost=lambda x: (x[0] - 1) ** 2)), "goal", "all of its entries are free"),
     ):
@@ -146,3 +147,137 @@ def test_what_has_no_sensitivity_is_refused(write_urdf):
         dd.sensitivity(solution, ["block.colour"])
     with pytest.raises(UnknownNameError):
         dd.sensitivity(dd.solve(block()), ["block.mass"])
+
+
+# ------------------------------------------------------------------------------ plans by Drake's own steps
+
+
+def regulated(write_urdf, x0=(1.0, 0.5), **asked):
+    """A block of 1.5 kg that is brought to rest, by iLQR."""
+    given = {"num_steps": 20, "running_cost": dd.QuadraticCost(Q=np.diag([1.0, 0.1]), R=[[0.2]])}
+    model = write_urdf(mass=1.5, time_step=0.1)
+    return dd.Problem(model, x0=x0, final_cost=dd.QuadraticCost(Q=np.diag([5.0, 2.0])), **given | asked)
+
+
+@each_row("method", ["ilqr", "shooting"])
+def test_a_linear_regulator_has_the_gains_of_its_riccati_equation(write_urdf, method):
+    """du_0/dx0 = -K_0, dx_k/dx0 the closed loop, d cost/dx0 = 2 P_0 x0: the discrete Riccati recursion."""
+    problem = regulated(write_urdf)
+    h, m, count = 0.1, 1.5, 20
+    A, B = np.array([[1, h], [0, 1]]), np.array([[h * h / m], [h / m]])
+    Q, R, P = h * np.diag([1.0, 0.1]), h * np.array([[0.2]]), np.diag([5.0, 2.0])
+    gains = []
+    for _ in range(count):
+        K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+        P = Q + A.T @ P @ (A - B @ K)
+        gains.insert(0, K)
+    found = dd.sensitivity(dd.solve(problem, method=method))
+    states = [np.eye(2)]
+    for K in gains:
+        states.append((A - B @ K) @ states[-1])
+    np.testing.assert_allclose(found.xs, states, atol=1e-9)
+    np.testing.assert_allclose(found.us, [-K @ x for K, x in zip(gains, states, strict=False)], atol=1e-8)
+    np.testing.assert_allclose(found.cost, 2 * P @ problem.x0, rtol=1e-8)
+    assert found.verdict == "agree"
+    assert "Jacobians" in found.derivatives
+
+
+def test_a_discrete_plan_between_two_states_is_a_least_norm(write_urdf):
+    """u = S' (S S')^-1 (goal - free motion), S from inputs to the last state; u and cost scale with the mass."""
+    h, m, count = 0.1, 1.5, 10
+    A, B = np.array([[1, h], [0, 1]]), np.array([[h * h / m], [h / m]])
+    S = np.hstack([np.linalg.matrix_power(A, count - 1 - k) @ B for k in range(count)])
+    model = write_urdf(mass=m, time_step=h)
+    problem = dd.Problem(model, x0=[0.2, 0], x_goal=[1, 0], num_steps=count, running_cost=EFFORT)
+    solution = dd.solve(problem, method="ilqr")
+    by_goal, by_mass = dd.sensitivity(solution, "goal"), dd.sensitivity(solution, ["block.mass"])
+    pull = S.T @ np.linalg.inv(S @ S.T)
+    np.testing.assert_allclose(by_goal.us[:, 0], pull, atol=1e-7)
+    np.testing.assert_allclose(by_mass.us[:, 0, 0], pull @ [0.8, 0] / m, atol=1e-6)
+    assert by_mass.cost[0] == pytest.approx(2 * solution.cost / m, rel=1e-6)
+    assert by_goal.verdict == by_mass.verdict == "agree"
+
+
+def test_discrete_plans_keep_what_holds_them(write_urdf):
+    """A waypoint, a constraint, a coupling, a free entry of the first state, and a bound of the input."""
+    model = write_urdf(mass=1.0, time_step=0.1)
+    asked = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 20, "running_cost": EFFORT}
+    slow = dd.Constraint(lambda x: x[1] ** 2, upper=0.7**2, name="slow")
+    way = dd.optimize.Coupling(lambda a, b: b[0] - a[0], knots=(5, 15), lower=0.6, upper=0.6, name="way")
+    bounded = dd.Bounds(u_lower=[-2.0], u_upper=[2.0])
+    free = {"optimize": ("controls", "initial_state"), "initial_state_mask": [False, True]}
+    for more, method in (
+        ({"waypoints": {8: [0.3, None]}}, "ilqr"),
+        ({"constraints": slow}, "ilqr"),
+        ({"couplings": way}, "shooting"),
+        ({"bounds": bounded, "num_steps": 15}, "ilqr"),
+        (free, "ilqr"),
+    ):
+        solution = dd.solve(dd.Problem(model, **asked | more), method=method)
+        found = dd.sensitivity(solution, "goal")
+        assert found.verdict == "agree", (more, found)
+        assert (found.active > 0) == bool({"constraints", "bounds"} & set(more))
+        if "waypoints" in more:
+            np.testing.assert_allclose(found.xs[8, 0], 0.0, atol=1e-9)
+        if "couplings" in more:
+            np.testing.assert_allclose(found.xs[15, 0] - found.xs[5, 0], 0.0, atol=1e-9)
+        if "optimize" in more:
+            assert np.abs(found.xs[0, 1]).max() > 0.1
+
+
+def test_a_mass_that_the_plan_chooses_moves_with_the_goal(write_urdf):
+    """Effort k m^2 d^2: the least at the bound of m; with 20 / m besides it is inside, and d cost / dd = 2 k m^2 d."""
+    model = write_urdf(mass=1.0, time_step=0.1)
+    asked = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 10, "running_cost": EFFORT}
+    chosen = {"optimize": ("controls", "parameters"), "parameters": ("block.mass",)}
+    for held, price in ((1, 0.0), (0, 20.0)):
+        bounds = {"block.mass": (0.7, 2.0)} if held else None
+        cost = {"parameter_cost": lambda p: 20.0 / p[0]} if price else {}
+        problem = dd.Problem(model, parameter_bounds=bounds, **asked, **chosen, **cost)
+        solution = dd.solve(problem, method="shooting")
+        found = dd.sensitivity(solution, "goal")
+        assert (found.verdict, found.active) == ("agree", held)
+        effort = solution.cost - price / solution.parameters[0]
+        assert found.cost[0] == pytest.approx(2 * effort, rel=1e-6)
+        with pytest.raises(InputError, match="does not choose itself"):
+            dd.sensitivity(solution, ["block.mass"])
+
+
+@pytest.mark.slow
+def test_a_contact_that_is_about_to_begin_is_a_corner():
+    """A ball is driven to 4 um before or behind where it touches another; 0.1 mm away it is none, on either side."""
+    model = dd.load_model(MODELS / "two_spheres.sdf", time_step=0.01)
+    slopes = {}
+    for off, verdict in ((-4e-6, "discontinuous"), (-2e-4, "agree"), (1e-4, "agree")):
+        asked = {"x0": [0, 0.25, 0, 0], "x_goal": [0.05 + off, None, 0, None], "num_steps": 40}
+        solution = dd.solve(dd.Problem(model, running_cost=dd.QuadraticCost(R=[[1e-3]]), **asked), method="ilqr")
+        found = dd.sensitivity(solution, "goal")
+        assert found.verdict == verdict, found
+        slopes[off] = found.us[-1, 0, 0]
+        if verdict == "discontinuous":
+            assert "contact of ball/ball with pusher/pusher at knot 39" in found.weak
+            assert any("the two sides of push_x differ" in told for told in found.weak)
+    assert slopes[1e-4] > slopes[-2e-4] + 10  # both are right, and the corner is between them
+
+
+def test_a_wrong_derivative_of_a_discrete_plan_is_told(monkeypatch, write_urdf):
+    """Planted: the steps' Jacobians in the matrix are off by 0.1 %; re-solves have the honest ones."""
+    solution = dd.solve(regulated(write_urdf), method="ilqr")
+    honest = HeldPlan._hessian
+    monkeypatch.setattr(
+        HeldPlan, "_hessian", lambda self, y: honest(self, y) * (1 + 1e-3 * np.linspace(0, 1, len(self.z))[:, None])
+    )
+    assert dd.sensitivity(solution).verdict == "disagree"
+
+
+def test_a_plan_that_is_no_optimum_has_no_derivative(write_urdf):
+    problem = regulated(write_urdf)
+    solution = dd.solve(problem, method="ilqr")
+    us = np.array(solution.us) + 0.5
+    other = replace(solution, us=us, xs=dd.rollout(problem.model, problem.x0, us).xs)
+    with pytest.raises(GradientError, match="no stationary point"):
+        dd.sensitivity(other)
+    other_cost = {"running_cost": None, "final_cost": None}
+    whole = replace(problem, trajectory_cost=lambda xs, us: (us**2).sum() + xs[-1, 0] ** 2, **other_cost)
+    with pytest.raises(InputError, match="trajectory_cost"):
+        dd.sensitivity(dd.solve(whole, method="shooting"))

@@ -82,6 +82,14 @@ class Limits:
 
 
 @dataclass(frozen=True, eq=False)
+class Multipliers:
+    """Those of a program's variables (n,), positive on an upper bound and negative on a lower one, and rows (m,)."""
+
+    variables: Array
+    rows: Array
+
+
+@dataclass(frozen=True, eq=False)
 class NlpResult:
     """The final, or the best, values of the decision variables (n,), how they were reached, and a claim's limits."""
 
@@ -92,6 +100,7 @@ class NlpResult:
     note: str = ""  # what a claim of a minimum is limited to, if it is
     # What multipliers of rows that hold leave of the Lagrangian's gradient, over its largest term; NaN if not known.
     stationarity: float = math.nan
+    multipliers: Multipliers | None = None  # where the solver has them
 
 
 class Watch:

@@ -1,9 +1,10 @@
 """How an optimal plan changes with its problem: the derivative of states, inputs, horizon and cost of a solution.
 
 It is that of the Karush-Kuhn-Tucker conditions (`transcription.kkt`), by the implicit function theorem, and holds on
-both sides where no active row has a multiplier of 0; else the plan has a corner there.
+both sides where no active row has a multiplier of 0 and no contact is about to change; else the plan has a corner.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,20 +12,28 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.model.parameters import select
+from drake_diff.exceptions import GradientError, InputError, ModelError, SimulationError, UnknownNameError
+from drake_diff.model.contact import active_modes
+from drake_diff.model.parameters import applied, select
+from drake_diff.model.step import advance
+from drake_diff.optimize.problem.obstacles import swept
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import Limits
+from drake_diff.optimize.program import Limits, Multipliers
 from drake_diff.optimize.solution import Solution
-from drake_diff.optimize.transcription.collocation import FOUND, Collocated, Transcribed, Transcription
-from drake_diff.optimize.transcription.kkt import Change, HeldPlan
-from drake_diff.optimize.transcription.task import SCHEMES
+from drake_diff.optimize.transcription.collocation import FOUND
+from drake_diff.optimize.transcription.expressions import knot_functions
+from drake_diff.optimize.transcription.kkt import WEAK, Change, Held, HeldPlan, KnotProgram
+from drake_diff.optimize.transcription.program import TranscribedProgram, solve_ipopt
+from drake_diff.optimize.transcription.steps import CALLED_BACK, StepProgram
+from drake_diff.optimize.transcription.task import OptimalControl
 
 ENDS = ("x0", "goal")
 RESOLVED = (1e-3, 1e-4, 1e-5)  # of max(1, |p|): how far away the problem is solved again
 LEAST = 1e-3  # of a quantity's size per that of p: a column whose entries are less counts as that large
 SAME = 1e-4  # of the largest entry of a column: what a derivative and differences of re-solves may differ by
-EXACT = Limits(500, np.inf, 1e-12)  # of re-solves
+EXACT = Limits(100, np.inf, 1e-12)  # of re-solves, which begin at an optimum beside theirs
+NEAR = 1e-2  # of max(1, |z|): what a variable may move by as the plan is solved to rounding, or it is another plan
+TWO_SIDED = 10  # times SAME: what the two one-sided slopes differ by at a corner
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -40,9 +49,11 @@ class Sensitivity(ShowsItsRepr):
         horizon: (p,) [s] of a free horizon; 0 of one that is given.
         cost: (p,) of the cost.
         active: How many bounds and inequalities hold the plan.
-        weak: Those that hold it without force: the plan has a corner there, and this is the derivative of one side.
+        weak: What makes a corner of the plan, of which this is the derivative of one side: bounds that hold it without
+            force, contacts that begin, end or slip as it changes, and columns whose two sides differ.
         differences: (p,) the largest distance from differences of re-solves, as a part of the column; None if not
             asked for, NaN where a re-solve failed.
+        derivatives: Where the second derivatives came from.
         verdict: "agree", "disagree", "discontinuous" where something is weak, or "not certified".
     """
 
@@ -55,6 +66,7 @@ class Sensitivity(ShowsItsRepr):
     cost: Array
     active: int
     weak: tuple[str, ...]
+    derivatives: str = "symbolic"
     differences: Array | None = None
 
     @property
@@ -72,7 +84,7 @@ class Sensitivity(ShowsItsRepr):
         if self.differences is not None:
             worst = float(np.max(np.nan_to_num(self.differences, nan=np.inf)))
             lines.append(f"{worst:.2g} of a column from differences of re-solves, {SAME:g} allowed")
-        lines += [f"held without force: {', '.join(self.weak)}"] * bool(self.weak)
+        lines += [f"a corner: {', '.join(self.weak)}"] * bool(self.weak)
         lines.append(f"d cost = {np.array2string(self.cost, precision=4, threshold=10)}")
         return "\n  ".join(lines)
 
@@ -80,20 +92,23 @@ class Sensitivity(ShowsItsRepr):
 def sensitivity(solution: Solution, by: Any = "x0", *, certified: bool = True) -> Sensitivity:
     """The derivative of a solution by its first state, its goal, or parameters of its model.
 
+    Plans of every method have one. That of a plan by iLQR or shooting is of Drake's own steps, contact included.
+
     Args:
-        solution: A plan by collocation that is a success.
+        solution: A plan that is a success.
         by: "x0" or "goal" (of their entries that are given), or names of the model's parameters.
         certified: Whether the problem is solved again on both sides of each column, and the differences are compared.
 
     Returns:
-        A `Sensitivity`. Where a bound holds the plan without force its `verdict` is "discontinuous": a plan that is
-        pushed to one side changes otherwise than one that is pushed to the other.
+        A `Sensitivity`. Where a bound holds the plan without force, or a contact is about to change, its `verdict` is
+        "discontinuous": a plan that is pushed to one side changes otherwise than one that is pushed to the other.
 
     Raises:
-        InputError: The solution is no success or not by collocation, or nothing is asked for.
+        InputError: The solution is no success, its cost is one of the whole trajectory, or nothing is asked for.
         UnknownNameError: There is no such parameter.
         ModelError: Its equations have no second derivatives here.
-        GradientError: Some change of the plan costs nothing, so that it is not the only optimum.
+        GradientError: Some change of the plan costs nothing, so that it is not the only optimum, or the plan is no
+            stationary point of its problem.
 
     Source:
         Fiacco, "Introduction to Sensitivity and Stability Analysis in Nonlinear Programming", 1983, ch. 3.
@@ -110,21 +125,83 @@ def sensitivity(solution: Solution, by: Any = "x0", *, certified: bool = True) -
         raise InputError("solution", got=type(solution).__name__, expected="a Solution")
     if not solution.success:
         raise InputError("solution", got=solution.status.value, expected="one that is a success: its message says why")
-    motion = solution.transcribed
-    if motion is None or solution.scheme == "drake":
-        how = solution.method if motion is None else 'scheme="drake"'
-        raise InputError("solution", got=how, expected="one by collocation: hermite_simpson or trapezoid")
+    if solution.scheme == "drake":
+        raise InputError(
+            "solution", got='scheme="drake"', expected="one by hermite_simpson, trapezoid, iLQR or shooting"
+        )
     change = _change(solution, by)
-    sharper = _resolved(solution.problem, motion)  # of what `solve` found within its tolerance
-    motion = sharper if sharper.result.outcome in FOUND else motion
-    system = HeldPlan(solution.problem, motion)
-    dz, weak, active = system.solve(change)
-    found = _assembled(solution, system, change, dz, weak, active)
-    return (
-        replace(found, differences=frozen(_differences(solution.problem, motion, change, found)))
-        if certified
-        else found
+    plan = _plan(solution)
+    plan_held = _held(plan)
+    program, found = plan_held.program, plan_held.solve(change)
+    dz, knots = found.dz, len(program.states_at) - 1
+    sensitive = Sensitivity(
+        solution=solution,
+        columns=change.columns,
+        xs=frozen(dz[program.states_at]),
+        us=frozen(dz[program.inputs_at[:knots]]),
+        u_final=frozen(dz[program.inputs_at[-1]]),
+        horizon=frozen(np.zeros(dz.shape[1]) if program.horizon_at is None else dz[program.horizon_at]),
+        cost=frozen(found.cost),
+        active=found.active,
+        weak=(*found.weak, *_changes_of_contact(plan, plan_held, change, dz)),
+        derivatives=plan.derivatives(program),
     )
+    if not certified:
+        return sensitive
+    apart, corners = _differences(plan, plan_held, change, found)
+    return replace(sensitive, differences=frozen(apart), weak=(*sensitive.weak, *corners))
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """The variables z (n,) of a solution, the program they are of, and whether that is one of discrete steps."""
+
+    problem: Problem
+    make: Callable[[Problem], KnotProgram]
+    z: Array
+    discrete: bool
+
+    def derivatives(self, program: KnotProgram) -> str:
+        """Where the second derivatives came from."""
+        if not isinstance(program, StepProgram):
+            return "symbolic"
+        return f"differences of the steps' Jacobians by {' and '.join(sorted(program.methods))}"
+
+
+def _plan(solution: Solution) -> _Plan:
+    motion, problem = solution.transcribed, solution.problem
+    if motion is not None:
+        scheme, mesh = solution.scheme, motion.mesh
+
+        def collocated(problem: Problem) -> TranscribedProgram:
+            task = OptimalControl(problem, scheme)
+            return TranscribedProgram(task, mesh, knot_functions(task))
+
+        program = collocated(problem)
+        if program.functions.why_not:
+            raise ModelError(f"{problem.name}: no second derivatives: {program.functions.why_not}")
+        z = program.pack(np.asarray(motion.nodes), motion.horizon, motion.task.coordinates)
+        return _Plan(problem, collocated, z, False)
+    rounds = solution.options.get("clearance_rounds", ())
+    if rounds:  # what it was searched with besides
+        more = swept(problem.kept, problem.time_step, int(rounds[-1][0]))
+        problem = replace(problem, constraints=(*problem.constraints, *more))
+    z = StepProgram(problem).pack(np.asarray(solution.xs), np.asarray(solution.us), solution.vector.values)
+    return _Plan(problem, StepProgram, z, True)
+
+
+def _held(plan: _Plan) -> HeldPlan:
+    """The plan, solved to rounding from where `solve` stopped; GradientError if it is no optimum."""
+    held = HeldPlan(plan.problem, plan.make, plan.z)
+    sharper, solved = _resolved(held.program, plan.z, held.multipliers)
+    if solved and np.all(np.abs(sharper - plan.z) <= NEAR * np.maximum(1.0, np.abs(plan.z))):
+        return HeldPlan(plan.problem, plan.make, sharper)
+    if held.left > WEAK:
+        raise GradientError(
+            f"the plan has no derivative: it is no stationary point of its problem, {held.left:.2g} of the cost's "
+            "slope is left; it ended at a kink, as where a contact begins, or short of its optimum"
+        )
+    return held
 
 
 def _change(solution: Solution, by: Any) -> Change:
@@ -140,47 +217,85 @@ def _change(solution: Solution, by: Any) -> Change:
     vector = select(problem.model, by)
     if not vector.parameters:
         raise InputError("by", got=repr(by), expected='"x0", "goal", or names of parameters')
-    if problem.parameters.parameters:
+    if problem.parameters.parameters and solution.transcribed is not None:
         expected = '"x0" or "goal", as the problem has parameters of its own'
         raise InputError("by", got=repr(by), expected=expected)
+    chosen = {p.name for p in problem.parameters.parameters} & {p.name for p in vector.parameters}
+    if chosen and problem.optimizes_parameters:
+        raise InputError("by", got=sorted(chosen), expected="parameters that the plan does not choose itself")
     return Change(vector.names, np.array(vector.values), None, parameters=by)
 
 
-def _assembled(
-    solution: Solution, system: HeldPlan, change: Change, dz: Array, weak: tuple[str, ...], active: int
-) -> Sensitivity:
-    program, nx = system.program, solution.problem.nx
-    nodes = dz[: len(program.every) * program.width].reshape(len(program.every), program.width, -1)
-    knots = nodes[:: system.task.scheme.nodes]
-    return Sensitivity(
-        solution=solution,
-        columns=change.columns,
-        xs=frozen(knots[:, :nx]),
-        us=frozen(knots[:-1, nx:]),
-        u_final=frozen(knots[-1, nx:]),
-        horizon=frozen(dz[-1] if program.free else np.zeros(dz.shape[1])),
-        cost=frozen(system.slope @ dz),
-        active=active,
-        weak=weak,
-    )
-
-
-def _differences(problem: Problem, motion: Collocated, change: Change, found: Sensitivity) -> Array:
-    """(p,) how far the derivative is from central differences of re-solves, extrapolated, as a part of each column."""
-    apart = []
+def _changes_of_contact(plan: _Plan, held: HeldPlan, change: Change, dz: Array) -> list[str]:
+    """The contacts that are others a little way along a column: they begin, end, or begin to slip or to stick."""
+    if not plan.discrete or not plan.problem.model.contract.contact.collision_pairs:
+        return []
+    found: dict[str, None] = {}
+    here = _modes(plan.problem, held.program, held.z)
     for i, value in enumerate(change.values):
-        unit, ours = max(1.0, abs(value)), (found.xs[..., i], found.us[..., i], found.cost[i : i + 1])
-        least = [LEAST * _size(each) / unit for each in (motion.xs, motion.us, np.array(motion.cost))]
-        off = np.inf
+        for side in (-1, 1):
+            step = side * RESOLVED[-1] * max(1.0, abs(value))
+            with change.moved(plan.problem, i, step) as problem:
+                there = _modes(problem, held.program, held.z + step * dz[:, i])
+            for k, (before, after) in enumerate(zip(here, there, strict=True)):
+                pairs = sorted({pair for pair, _ in before.items() ^ after.items()})
+                found |= {f"contact of {a} with {b} at knot {k}": None for a, b in pairs}
+    return list(found)
+
+
+def _modes(problem: Problem, program: KnotProgram, z: Array) -> list[dict[tuple[str, str], str]]:
+    """(N,) the modes of the pairs that push each other in each step; one that cannot be taken has a mode of its own."""
+    found: list[dict[tuple[str, str], str]] = []
+    with applied(problem.parameters) as model:
+        for x, u in zip(z[program.states_at[:-1]], z[program.inputs_at], strict=True):
+            try:
+                advance(model.double, x, u)
+                found.append(active_modes(model))
+            except SimulationError:
+                found.append({("a step", "nothing, as it cannot be taken"): ""})
+    return found
+
+
+def _differences(plan: _Plan, held: HeldPlan, change: Change, found: Held) -> tuple[Array, list[str]]:
+    """(p,) how far the derivative is from central differences of re-solves, extrapolated, as a part of each column.
+
+    And the columns whose two sides differ, where it is far.
+    """
+    base, apart, corners = _read(held.program, held.z), [], []
+    derivative = [found.dz[held.program.states_at], found.dz[held.program.inputs_at], found.cost[None]]
+    for i, value in enumerate(change.values):
+        unit, ours = max(1.0, abs(value)), [each[..., i] for each in derivative]
+        least = [LEAST * _size(each) / unit for each in base]
+        off, sides = np.inf, 0.0
         for part in RESOLVED:  # nearer, where another bound begins to hold on the way
-            coarse, fine = (_quotients(problem, motion, change, i, part * unit / n) for n in (1, 2))
+            slopes = [
+                _one_sided(plan, held, change, i, side * part * unit / n, base) for n in (1, 2) for side in (-1, 1)
+            ]
+            low, high, near_low, near_high = slopes
+            coarse, fine = _means(low, high), _means(near_low, near_high)
             wanted = [b + (b - a) / 3 for a, b in zip(coarse, fine, strict=True)]  # Richardson
-            pairs = zip(ours, wanted, least, strict=True)
-            off = max(_size(a - b) / max(_size(a), _size(b), smallest, 1e-300) for a, b, smallest in pairs)
+            off = _distance(ours, wanted, least)
             if off <= SAME:
                 break
+            # at a corner these go to two limits; elsewhere to one, with the step
+            left, right = (
+                [2 * b - a for a, b in zip(*each, strict=True)] for each in ((low, near_low), (high, near_high))
+            )
+            sides = _distance(left, right, least)
         apart.append(off)
-    return np.array(apart)
+        if off > SAME and sides > TWO_SIDED * SAME:
+            corners.append(f"the two sides of {change.columns[i]} differ by {sides:.2g} of it")
+    return np.array(apart), corners
+
+
+def _means(low: list[Array], high: list[Array]) -> list[Array]:
+    return [(a + b) / 2 for a, b in zip(low, high, strict=True)]
+
+
+def _distance(one: list[Array], other: list[Array], least: list[float]) -> float:
+    """The largest of their entries' differences, as a part of the largest entry; NaN where one is no number."""
+    pairs = zip(one, other, least, strict=True)
+    return float(np.max([_size(a - b) / max(_size(a), _size(b), smallest, 1e-300) for a, b, smallest in pairs]))
 
 
 def _size(values: Array) -> float:
@@ -188,20 +303,24 @@ def _size(values: Array) -> float:
     return float(np.max(np.abs(values), initial=0.0))
 
 
-def _quotients(problem: Problem, motion: Collocated, change: Change, column: int, step: float) -> list[Array]:
-    """Those of the states (N+1, nx), inputs (N, nu) and cost (1,); NaN where the problem was not solved again."""
-    found = []
-    for side in (-1, 1):
-        with change.moved(problem, column, side * step) as moved:
-            again = _resolved(moved, motion)
-            part = 1.0 if again.result.outcome in FOUND else np.nan
-            found.append((part * again.xs, part * again.us[:-1], np.array([part * again.cost])))
-    return [(high - low) / (2 * step) for low, high in zip(*found, strict=True)]
+def _read(program: KnotProgram, z: Array) -> list[Array]:
+    """The states (N+1, nx), the inputs (M, nu) and the cost (1,) of the variables."""
+    cost = np.asarray(program.derivatives(exact=False)["grad_f"](z, [])[0]).ravel()
+    return [z[program.states_at], z[program.inputs_at], cost]
 
 
-def _resolved(problem: Problem, motion: Collocated) -> Transcribed:
-    """What the same search finds for a problem, from a solution and on its mesh."""
-    scheme = next(name for name, scheme in SCHEMES.items() if scheme is motion.task.scheme)
-    nodes = np.array(motion.nodes)
-    values = motion.task.parameters if problem.optimizes_parameters else None
-    return Transcription(problem, scheme).solve_on(motion.mesh, nodes, motion.horizon, EXACT, None, values)
+def _one_sided(plan: _Plan, held: HeldPlan, change: Change, column: int, step: float, base: list[Array]) -> list[Array]:
+    """The quotients of what `_read` gives, from the problem moved by `step`; NaN where that was not solved again."""
+    with change.moved(plan.problem, column, step) as moved:
+        program = plan.make(moved)
+        z, solved = _resolved(program, held.z, held.multipliers)
+        found = _read(program, z)
+    return [(a - b) / step if solved else np.full_like(a, np.nan) for a, b in zip(found, base, strict=True)]
+
+
+def _resolved(program: KnotProgram, z: Array, multipliers: Multipliers) -> tuple[Array, bool]:
+    """What IPOPT finds from a plan, and whether that is a solution."""
+    more = CALLED_BACK if isinstance(program, StepProgram) else None
+    exact = not program.functions.why_not
+    result = solve_ipopt(program, z, EXACT, None, exact=exact, begun=multipliers, more=more)
+    return result.z, result.outcome in FOUND

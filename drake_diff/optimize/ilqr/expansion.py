@@ -61,7 +61,7 @@ class Motion:
 def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: AugmentedLagrangian) -> LinearQuadratic:
     """`problem` around `motion`, the constraints being part of its cost."""
     model, xs, us = problem.model, motion.xs, motion.us
-    gradients, hessians = _expand_running_cost(problem, xs, us)
+    gradients, hessians = expand_running_cost(problem, xs, us)
     final_gradient, final_hessian = np.zeros(model.nx), np.zeros((model.nx, model.nx))
     if problem.total_final_cost is not None:
         final_gradient = differentiate_final_cost(problem.total_final_cost, xs[-1])[1]
@@ -87,7 +87,7 @@ def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: Augm
     )
 
 
-def _expand_running_cost(problem: Problem, xs: Array, us: Array) -> tuple[Array, Array]:
+def expand_running_cost(problem: Problem, xs: Array, us: Array) -> tuple[Array, Array]:
     """(gradients (N, nx + nu), Hessians (N, nx + nu, nx + nu)) of h times the running cost."""
     h, (nx, nu), cost = problem.model.time_step, (xs.shape[1], us.shape[1]), problem.total_running_cost
     gradients, hessians = np.zeros((len(us), nx + nu)), np.zeros((len(us), nx + nu, nx + nu))

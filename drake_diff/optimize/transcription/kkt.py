@@ -9,24 +9,22 @@ the problem changes by p, so that, the active set kept,
 (Fiacco, "Introduction to Sensitivity and Stability Analysis in Nonlinear Programming", 1983, ch. 3).
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff.exceptions import GradientError, ModelError
+from drake_diff.exceptions import GradientError
 from drake_diff.model.parameters import Parameters, applied, select
-from drake_diff.optimize.problem.dynamics import plant_dynamics
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.transcription.collocation import Collocated
-from drake_diff.optimize.transcription.expressions import knot_functions
-from drake_diff.optimize.transcription.program import TranscribedProgram
+from drake_diff.optimize.program import Multipliers
+from drake_diff.optimize.transcription.program import Program
 
 NEAR_BOUND = 1e-4  # of max(1, |bound|): a value this near may lie on it: an interior point method leaves sqrt(mu)
 WEAK = 1e-4  # of the cost's largest slope: a smaller multiplier may hold nothing
@@ -61,38 +59,86 @@ class Change:
         yield replace(problem, x0=state) if first else replace(problem, x_goal=state)
 
 
-class HeldPlan:
-    """The Lagrangian's second derivatives and the rows that hold a solution, in the variables that nothing holds."""
+class KnotProgram(Program, Protocol):
+    """A program whose variables have names; the knots' states (N+1, nx) and inputs (M, nu) are at these places in it.
 
-    def __init__(self, problem: Problem, motion: Collocated):
-        self.problem, self.motion, self.task = problem, motion, motion.task
-        functions = knot_functions(self.task)
-        if functions.why_not:
-            raise ModelError(f"{self.problem.name}: no second derivatives: {functions.why_not}")
-        self.program = program = TranscribedProgram(self.task, motion.mesh, functions)
-        self.z = program.pack(np.asarray(motion.nodes), motion.horizon)
+    `horizon_at` is where a free horizon is.
+    """
+
+    horizon_at: int | None
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def states_at(self) -> Indices: ...
+
+    @property
+    def inputs_at(self) -> Indices: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """(n, p) the derivative of the variables, (p,) that of the cost, what holds the plan without force, how many do."""
+
+    dz: Array
+    cost: Array
+    weak: tuple[str, ...]
+    active: int
+
+
+class HeldPlan:
+    """The Lagrangian's second derivatives and the rows that hold a solution, in the variables that nothing holds.
+
+    `make` gives the program of which z (n,) are the variables of the plan; that of the problem when it has changed too.
+    """
+
+    def __init__(self, problem: Problem, make: Callable[[Problem], KnotProgram], z: Array):
+        self.problem, self.make, self.z = problem, make, z
+        self.program = program = make(problem)
         self.derivatives = program.derivatives(exact=True)
-        self.slope = np.asarray(self.derivatives["grad_f"](self.z, [])[1]).ravel()
-        self.values, self.rows = self.derivatives["jac_g"](self.z, [])
-        self.values = np.asarray(self.values).ravel()
+        self.slope, self.values, self.rows = self._first_derivatives(self.derivatives)
+
+    def _first_derivatives(self, derivatives: dict[str, Any]) -> tuple[Array, Array, Any]:
+        """The cost's gradient (n,), the rows' values (m,) and their Jacobian; GradientError where one is refused."""
+        slope = np.asarray(derivatives["grad_f"](self.z, [])[1]).ravel()
+        values, rows = derivatives["jac_g"](self.z, [])
+        if not (np.all(np.isfinite(slope)) and np.all(np.isfinite(rows.nonzeros()))):
+            raise GradientError("the plan has no derivative: a step or a cost cannot be differentiated there")
+        return slope, np.asarray(values).ravel(), rows
 
     @cached_property
     def fixed(self) -> Mask:
         """(n,) the variables that are given."""
         return self.program.lower >= self.program.upper
 
-    def solve(self, change: Change) -> tuple[Array, tuple[str, ...], int]:
-        """(n, p) the derivative of the variables, what holds the plan without force, and how many rows hold it."""
-        on_bound, on_row, multipliers, weak = self._active()
-        held = self.fixed | on_bound
-        free = np.flatnonzero(~held)
+    @cached_property
+    def multipliers(self) -> Multipliers:
+        """Those that leave the least of the Lagrangian's gradient."""
+        on_bound, _, of_rows, left, _ = self._active
+        return Multipliers(np.where(on_bound | self.fixed, -left, 0.0), of_rows)
+
+    @cached_property
+    def left(self) -> float:
+        """What they leave, as a part of the cost's largest slope: 0 at an optimum."""
+        on_bound, _, _, left, _ = self._active
+        return float(np.max(np.abs(left[~(on_bound | self.fixed)]), initial=0.0)) / self._scale
+
+    @property
+    def _scale(self) -> float:
+        return max(float(np.max(np.abs(self.slope))), 1e-300)
+
+    def solve(self, change: Change) -> Held:
+        """How the variables change by `change`, the active set kept."""
+        on_bound, on_row, multipliers, _, weak = self._active
+        free = np.flatnonzero(~(self.fixed | on_bound))
         dz = np.zeros((len(self.z), len(change.values)))
-        right = np.zeros((len(self.z) + len(self.values), len(change.values)))
+        right, of_cost = np.zeros((len(self.z) + len(self.values), len(change.values))), np.zeros(len(change.values))
         if change.ends is not None:
-            node = 0 if change.end == "x0" else self.program.every[-1]
-            dz[node * self.program.width + change.ends, np.arange(len(change.ends))] = 1.0
+            ends = self.program.states_at[0 if change.end == "x0" else -1]
+            dz[ends[change.ends], np.arange(len(change.ends))] = 1.0
         else:
-            right = self._by_parameters(change, multipliers)
+            of_cost, right = self._by_parameters(change, multipliers)
         hessian = self._hessian(multipliers)
         rows = self.rows[np.flatnonzero(on_row).tolist(), :]
         first = -(np.asarray(ca.mtimes(hessian, ca.DM(dz))) + right[: len(self.z)])[free]
@@ -100,19 +146,21 @@ class HeldPlan:
         kept = free.tolist()
         found = _kkt(hessian[kept, kept], rows[:, kept], first, second)
         dz[free] = found[: len(free)]
-        return dz, weak, int(np.sum(on_bound) + np.sum(on_row & (self.program.sides[0] < self.program.sides[1])))
+        holding = int(np.sum(on_bound) + np.sum(on_row & (self.program.sides[0] < self.program.sides[1])))
+        return Held(dz, self.slope @ dz + of_cost, weak, holding)
 
     def _hessian(self, multipliers: Array) -> Any:
         upper = self.derivatives["hess_lag"](self.z, [], 1.0, multipliers)
         return ca.triu2symm(upper)
 
-    def _active(self) -> tuple[Mask, Mask, Array, tuple[str, ...]]:
-        """The bounds and rows that hold the plan, the multipliers of all rows, and what holds without force."""
+    @cached_property
+    def _active(self) -> tuple[Mask, Mask, Array, Array, tuple[str, ...]]:
+        """The bounds and rows that hold the plan, the multipliers of all rows, what these leave, and what is weak."""
         program, (least, most) = self.program, self.program.sides
         low, high = _near(self.z, program.lower), _near(program.upper, self.z)
         row_low, row_high = _near(self.values, least), _near(most, self.values)
         equal = least >= most
-        scale = max(float(np.max(np.abs(self.slope))), 1e-300)
+        scale = self._scale
         on_bound, holds = (low | high) & ~self.fixed, row_low | row_high | equal
         while True:  # one after the other, as of bounds and rows that say the same only one pushes
             on_row = holds & (equal | self._moves(on_bound))
@@ -133,6 +181,7 @@ class HeldPlan:
             on_bound,
             on_row,
             multipliers,
+            left,
             (*self._names(weak_bound), *[f"row {i}" for i in np.flatnonzero(weak_row)]),
         )
 
@@ -142,13 +191,7 @@ class HeldPlan:
         return of_row > 0
 
     def _names(self, which: Mask) -> list[str]:
-        names, width = (*self.problem.state_names, *self.problem.input_names), self.program.width
-        nodes = len(self.program.every) * width
-        others = (*(self.problem.parameters.names if self.task.varied else ()), "horizon")
-        return [
-            f"{names[i % width]} at node {i // width}" if i < nodes else others[i - nodes]
-            for i in np.flatnonzero(which).tolist()
-        ]
+        return [self.program.names[i] for i in np.flatnonzero(which).tolist()]
 
     def _multipliers(self, on_bound: Mask, on_row: Mask) -> tuple[Array, Array]:
         """(m,) those of the rows that leave the least of the Lagrangian's gradient, and what they leave (n,)."""
@@ -160,26 +203,20 @@ class HeldPlan:
         left = self.slope + np.asarray(ca.mtimes(self.rows.T, ca.DM(multipliers))).ravel()
         return multipliers, left
 
-    def _by_parameters(self, change: Change, multipliers: Array) -> Array:
-        """(n + m, p) of the Lagrangian's gradient and of the rows: by differences of the dynamics' exact Jacobians."""
-        program, horizon, given = self.program, self.motion.horizon, ca.DM(multipliers)
-        pulled = np.asarray(program.pulled(given, horizon)).reshape(len(program.every), program.nx)
-        nu = np.asarray(ca.mtimes(program._D.T, ca.DM(multipliers[: program.num_links])))
-        nu = nu.reshape(len(program.every), program.nx)
-        columns = []
-        for i, value in enumerate(change.values):
-            step = DIFFERENCE * max(1.0, abs(value))
-            (f_low, j_low), (f_high, j_high) = (self._dynamics(change, i, side * step) for side in (-1, 1))
-            by_f, by_j = (f_high - f_low) / (2 * step), (j_high - j_low) / (2 * step)
-            of_nodes = np.einsum("ki,kij->kj", pulled, by_j).ravel()
-            of_time = [-float(np.sum(nu * by_f))] * program.free
-            columns.append(np.concatenate([of_nodes, of_time, program.pushed(by_f.ravel(), horizon)]))
-        return np.array(columns).T
+    def _by_parameters(self, change: Change, multipliers: Array) -> tuple[Array, Array]:
+        """(p,) of the cost, (n + m, p) of the Lagrangian's gradient and of the rows, by differences of these."""
 
-    def _dynamics(self, change: Change, column: int, step: float) -> tuple[Array, Array]:
-        """(K, nx) and (K, nx, nx + nu) the rates and their Jacobians at the nodes with one parameter moved."""
-        with change.moved(self.problem, column, step) as problem:
-            return plant_dynamics(problem.model).linearize(np.asarray(self.motion.nodes))
+        def at(column: int, step: float) -> Array:
+            with change.moved(self.problem, column, step) as problem:
+                derivatives = self.make(problem).derivatives(exact=False)
+                slope, values, rows = self._first_derivatives(derivatives)
+                cost = np.asarray(derivatives["grad_f"](self.z, [])[0]).ravel()
+            gradient = slope + np.asarray(ca.mtimes(rows.T, ca.DM(multipliers))).ravel()
+            return np.concatenate([cost, gradient, values])
+
+        steps = DIFFERENCE * np.maximum(1.0, np.abs(change.values))
+        found = np.array([(at(i, step) - at(i, -step)) / (2 * step) for i, step in enumerate(steps.tolist())]).T
+        return found[0], found[1:]
 
 
 def _near(values: Array, bound: Array) -> Mask:

@@ -23,6 +23,7 @@ from drake_diff.optimize.program import (
     FEASIBILITY_TOLERANCE,
     Iteration,
     Limits,
+    Multipliers,
     NlpResult,
     Outcome,
     Report,
@@ -53,6 +54,13 @@ OPTIONS = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
     "ipopt.print_user_options": "no",
+}
+# From multipliers: a point that lies on its bounds stays there, and what is nearly right is not made wrong first.
+BEGUN = {
+    "ipopt.warm_start_init_point": "yes",
+    "ipopt.mu_init": 1e-6,
+    **dict.fromkeys([f"ipopt.warm_start_{part}" for part in ("bound_push", "bound_frac", "mult_bound_push")], 1e-6),
+    **dict.fromkeys([f"ipopt.warm_start_slack_{part}" for part in ("bound_push", "bound_frac")], 1e-6),
 }
 NOT_FINITE = "IPOPT: Invalid Number Detected"
 
@@ -89,6 +97,24 @@ class TranscribedProgram:
         self.rates, self.costs = functions.dynamics.values(self.moved), self.rate.values(self.knots)
         self.rate_rows, self.cost_rows = functions.dynamics.jacobian(self.moved), self.rate.jacobian(self.knots)
         self._set_links()
+        self.horizon_at = len(self.lower) - 1 if self.free else None
+
+    @property
+    def states_at(self) -> Indices:
+        """(N+1, nx) where the states at the knots are in z."""
+        return self.every[:: self.task.scheme.nodes, None] * self.width + np.arange(self.nx)
+
+    @property
+    def inputs_at(self) -> Indices:
+        """(N+1, nu)"""
+        return self.every[:: self.task.scheme.nodes, None] * self.width + np.arange(self.nx, self.width)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(n,) of the variables."""
+        own = (*self.task.dynamics.state_names, *self.task.dynamics.input_names)
+        others = self.task.problem.parameters.names if self.task.varied else ()
+        return (*[f"{name} at node {k}" for k in self.every for name in own], *others, *["horizon"] * self.free)
 
     def pack(self, nodes: Array, horizon: float, coordinates: Array | None = None) -> Array:
         """The decision variables of `nodes` (K, nx + nu), `horizon` [s] and `coordinates` (np,), the task's if None."""
@@ -348,13 +374,25 @@ class Program(Protocol):
     def derivatives(self, exact: bool) -> dict[str, Any]: ...
 
 
-def solve_ipopt(program: Program, guess: Array, limits: Limits, report: Report | None, *, exact: bool) -> NlpResult:
+def solve_ipopt(
+    program: Program,
+    guess: Array,
+    limits: Limits,
+    report: Report | None,
+    *,
+    exact: bool,
+    begun: Multipliers | None = None,
+    more: dict[str, Any] | None = None,
+) -> NlpResult:
     """Solve `program` from `guess` (n,), with its `exact` Hessian or IPOPT's limited-memory one.
+
+    With multipliers `begun` the guess is taken for nearly optimal. `more` are options of nlpsol.
 
     `report` gets a line of progress a few times a second. Ctrl-C ends the solve with the best iterate so far.
     An error that a function of the user's raised is raised again, but that of a simulation or gradient is told.
     """
-    options = OPTIONS | {
+    options = OPTIONS | (BEGUN if begun else {}) | (more or {})
+    options |= {
         "ipopt.tol": limits.tolerance,
         "ipopt.constr_viol_tol": limits.tolerance,
         "ipopt.max_iter": limits.max_iterations,
@@ -367,7 +405,8 @@ def solve_ipopt(program: Program, guess: Array, limits: Limits, report: Report |
         options |= program.derivatives(exact) | {"iteration_callback": callback}
         solver = ca.nlpsol("solver", "ipopt", program.nlp, options)
         lower, upper = program.sides
-        found = solver(x0=guess, lbx=program.lower, ubx=program.upper, lbg=lower, ubg=upper)
+        known = {} if begun is None else {"lam_x0": begun.variables, "lam_g0": begun.rows}
+        found = solver(x0=guess, lbx=program.lower, ubx=program.upper, lbg=lower, ubg=upper, **known)
         stats = solver.stats()
     columns = [stats.get("iterations", {}).get(name, ()) for name in ("obj", "inf_pr", "inf_du", "alpha_pr")]
     table = tuple(Iteration(i, *map(float, row)) for i, row in enumerate(zip(*columns, strict=True)))
@@ -383,7 +422,9 @@ def solve_ipopt(program: Program, guess: Array, limits: Limits, report: Report |
     words = str(stats["return_status"])
     outcome, left = OUTCOMES.get(words, Outcome.FAILED), _stationarity(program, options, found)
     z = np.asarray(found["x"]).ravel()
-    return NlpResult(z, outcome, f"IPOPT: {words.replace('_', ' ')}", table, stationarity=left)
+    multipliers = Multipliers(*(np.asarray(found[name]).ravel() for name in ("lam_x", "lam_g")))
+    told = f"IPOPT: {words.replace('_', ' ')}"
+    return NlpResult(z, outcome, told, table, stationarity=left, multipliers=multipliers)
 
 
 def _stationarity(program: Program, derivatives: Any, found: Any) -> float:
@@ -415,7 +456,8 @@ class _IterateCallback(ca.Callback):  # type: ignore[misc]
     def __init__(self, program: Program, watch: Watch, report: Report | None):
         ca.Callback.__init__(self)
         self.program, self.watch, self.report = program, watch, report
-        self.sizes = {"x": program.z.numel(), "f": 1, "g": program.nlp["g"].numel(), "lam_x": program.z.numel()}
+        size = len(program.lower)
+        self.sizes = {"x": size, "f": 1, "g": program.nlp["g"].numel(), "lam_x": size}
         self.sizes |= {"lam_g": self.sizes["g"], "lam_p": 0}
         self.iterates = 0
         self.error: Exception | None = None

@@ -1,0 +1,340 @@
+"""A plan by Drake's own steps as a sparse program: z = [x_0, u_0, x_1, u_1, ..., x_N, parameters], each step a row.
+
+    g = x_(k+1) - f(x_k, u_k, p),    d^2 (lambda' g) = -sum_k lambda_k' d^2 f
+
+First derivatives are those of the steps, exact; second ones are central differences of these, by blocks, as no two
+states are in one step's Jacobian but the first and the last of it. It says what is an optimum of plans by iLQR and by
+shooting alike, and IPOPT solves it again.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from drake_diff._base.arrays import Array, Indices
+from drake_diff.derivatives.step import StepDerivatives, derivatives_along
+from drake_diff.exceptions import GradientError, InputError, SimulationError
+from drake_diff.model.parameters import ParameterCoordinates, ParameterVector, applied
+from drake_diff.optimize.ilqr.expansion import expand_running_cost
+from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.cost import differentiate_final_cost, final_cost_hessian
+from drake_diff.optimize.problem.problem import Problem
+
+DIFFERENCE = 1e-5  # of max(1, |z|): of exact Jacobians, known to 1e-12
+ROUGH_DIFFERENCE = 1e-4  # of Jacobians that are differences themselves
+ROUGH = "finite_difference"
+# Beyond a limit the plant cuts inputs off; CasADi makes no derivatives of what is called back.
+CALLED_BACK = {"ipopt.bound_relax_factor": 0.0, "no_nlp_grad": True}
+
+
+@dataclass(eq=False)
+class Called:
+    """What a program calls back: it has second derivatives, and keeps the first error that is none of a step."""
+
+    why_not: str = ""
+    error: Exception | None = None
+
+
+class StepProgram:
+    """The program of a `Problem` whose model takes discrete steps, with derivatives as CasADi's nlpsol takes them.
+
+    `states_at` (N+1, nx), `inputs_at` (N, nu) and `parameters_at` (np,) say where in z they are.
+    """
+
+    def __init__(self, problem: Problem):
+        if problem.trajectory_cost is not None:
+            raise InputError("trajectory_cost", got="given", expected="none: it joins all states, and no step does")
+        self.problem = problem
+        self.horizon_at: int | None = None
+        nx, nu, count = problem.nx, problem.nu, problem.num_steps
+        self.coordinates = ParameterCoordinates(problem.parameters) if problem.optimizes_parameters else None
+        width, free = nx + nu, len(problem.parameters.values) if problem.optimizes_parameters else 0
+        self.states_at = np.arange(count + 1)[:, None] * width + np.arange(nx)
+        self.inputs_at = np.arange(count)[:, None] * width + nx + np.arange(nu)
+        self.parameters_at = count * width + nx + np.arange(free)
+        self.size = count * width + nx + free
+        single = [(c, np.array([k])) for c in problem.kept for k in problem.knots_of(c, input_at_end=False)]
+        several = [(c.rows, at) for c in problem.coupled_steps() for at in c.knots]
+        self.paths = [_Path(self, rows, at) for rows, at in (*single, *several)]
+        self.functions: Any = Called()
+        self.z = ca.MX.sym("z", self.size)
+        self.lower, self.upper = self._bounds(0), self._bounds(1)  # equal where a variable is given
+        self.methods: set[str] = set()  # where Jacobians came from
+        self._kept: tuple[bytes, list[StepDerivatives]] = b"", []
+        self._callbacks: list[Any] = []  # CasADi holds no reference to its callbacks
+        self._blocks = [self._block(k) for k in range(count + 1)]
+        self._set_places()
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """(n,) of the variables."""
+        names = np.full(self.size, "", dtype=object)
+        for at, own in ((self.states_at, self.problem.state_names), (self.inputs_at, self.problem.input_names)):
+            for k, row in enumerate(at):
+                names[row] = [f"{name} at knot {k}" for name in own]
+        if len(self.parameters_at):
+            names[self.parameters_at] = self.problem.parameters.names
+        return tuple(names)
+
+    def pack(self, xs: Array, us: Array, parameters: Array | None = None) -> Array:
+        """z (n,) of xs (N+1, nx), us (N, nu) and parameter values (np,), the problem's where None."""
+        z = np.empty(self.size)
+        z[self.states_at], z[self.inputs_at] = xs, us
+        if self.coordinates is not None:
+            values = self.problem.parameters.values if parameters is None else parameters
+            z[self.parameters_at] = self.coordinates.from_values(np.array(values))
+        return z
+
+    def _bounds(self, side: int) -> Array:
+        problem, b = self.problem, self.problem.bounds
+        inputs = np.tile((b.u_lower, b.u_upper)[side], (problem.num_steps, 1))
+        inputs = inputs if problem.optimizes_controls else np.asarray(problem.us)
+        return self.pack(problem.state_limits()[side], inputs, problem.bounds_of_parameters()[side])
+
+    @cached_property
+    def sides(self) -> tuple[Array, Array]:
+        """(lower, upper) of the rows: 0 of the steps, then those of the constraints and of the couplings."""
+        steps = np.zeros(self.problem.num_steps * self.problem.nx)
+        lower, upper = ([steps, *(getattr(p.rows, s) for p in self.paths)] for s in ("lower", "upper"))
+        return np.concatenate(lower), np.concatenate(upper)
+
+    @cached_property
+    def nlp(self) -> dict[str, Any]:
+        """x, f and g as CasADi's nlpsol takes them."""
+        rows = len(self.sides[0])
+        dense = [ca.Sparsity.dense(1, 1), ca.Sparsity.dense(rows, 1)]
+        f, g = self._callback("values", [self.size], dense, self._values)(self.z)
+        return {"x": self.z, "f": f, "g": g}
+
+    def derivatives(self, exact: bool = True) -> dict[str, Any]:
+        """CasADi Functions by the names of nlpsol's options; the Hessian is there in any case."""
+        n, m = self.size, len(self.sides[0])
+        one, vector, rows = ca.Sparsity.dense(1, 1), ca.Sparsity.dense(n, 1), ca.Sparsity.dense(m, 1)
+        return {
+            "grad_f": self._callback("grad_f", [n, 0], [one, vector], self._gradient),
+            "jac_g": self._callback("jac_g", [n, 0], [rows, self._rows_at.sparsity], self._jacobian),
+            "hess_lag": self._callback("hess_lag", [n, 0, 1, m], [self._hessian_at.sparsity], self._hessian),
+        }
+
+    def _callback(self, name: str, sizes: list[int], outputs: list[Any], evaluate: Callable[..., list[Any]]) -> Any:
+        self._callbacks.append(_Callback(name, sizes, outputs, evaluate, self))
+        return self._callbacks[-1]
+
+    def _block(self, k: int) -> Indices:
+        """Where in z the variables of knot `k` are, parameters last; of the last knot its state alone."""
+        if k == self.problem.num_steps:
+            return self.states_at[k]
+        return np.concatenate([self.states_at[k], self.inputs_at[k], self.parameters_at])
+
+    def _set_places(self) -> None:
+        nx, rows, columns = self.problem.nx, [], []
+        for k, block in enumerate(self._blocks[:-1]):
+            here = k * nx + np.arange(nx)
+            rows += [here, np.repeat(here, len(block))]
+            columns += [self.states_at[k + 1], np.tile(block, nx)]
+        first = self.problem.num_steps * nx
+        for each in self.paths:
+            here = first + np.arange(each.count)
+            rows.append(np.repeat(here, len(each.columns)))
+            columns.append(np.tile(each.columns, each.count))
+            first += each.count
+        self._rows_at = _Places(rows, columns, (first, self.size))
+        pairs = [each[np.array(np.triu_indices(len(each)))] for each in self._hessian_blocks]
+        ends = [np.min(each, axis=0) for each in pairs], [np.max(each, axis=0) for each in pairs]
+        self._hessian_at = _Places(*ends, (self.size, self.size))
+
+    @property
+    def _hessian_blocks(self) -> list[Indices]:
+        """Which variables have second derivatives by each other: those of a knot, and of a constraint."""
+        return [*self._blocks, *(path.columns for path in self.paths)]
+
+    # ------------------------------------------------------------------------------ what it evaluates
+
+    def _read(self, z: Array) -> tuple[Array, Array, ParameterVector]:
+        """xs (N+1, nx), us (N, nu) and the parameters; inputs are taken inside their bounds by rounding.
+
+        A bound is often an actuator's limit, beyond which the plant cuts an input off.
+        """
+        b, vector = self.problem.bounds, self.problem.parameters
+        us = z[self.inputs_at]
+        us = np.where(us >= b.u_upper, np.nextafter(b.u_upper, b.u_lower), us)
+        us = np.where(us <= b.u_lower, np.nextafter(b.u_lower, b.u_upper), us)
+        if self.coordinates is not None:
+            vector = vector.at(self.coordinates.to_values(z[self.parameters_at]))
+        return z[self.states_at], us, vector
+
+    def _steps(self, z: Array) -> list[StepDerivatives]:
+        if self._kept[0] != z.tobytes():
+            xs, us, vector = self._read(z)
+            with applied(vector) as model:
+                found = derivatives_along(model, xs[0], us, vector=vector, xs=xs[:-1])
+            self.methods |= {d.method for d in found}
+            self._kept = z.tobytes(), found
+        return self._kept[1]
+
+    def _values(self, z: Array) -> list[Any]:
+        xs, us = self._read(z)[:2]
+        ends = np.array([d.x_next for d in self._steps(z)])
+        with np.errstate(all="ignore"):
+            paths = [path.rows(*path.packed(xs, us)) for path in self.paths]
+            return [self._cost(z), np.concatenate([(xs[1:] - ends).ravel(), *paths])]
+
+    def _cost(self, z: Array) -> float:
+        xs, us, vector = self._read(z)
+        return self.problem.objective(xs, us) + self.problem.cost_of_parameters(np.array(vector.values))
+
+    def _gradient(self, z: Array, _: Array) -> list[Any]:
+        xs, us = self._read(z)[:2]
+        gradient = np.zeros(self.size)
+        by_nodes = expand_running_cost(self.problem, xs, us)[0]
+        gradient[np.hstack([self.states_at[:-1], self.inputs_at])] = by_nodes
+        if self.problem.total_final_cost is not None:
+            gradient[self.states_at[-1]] += differentiate_final_cost(self.problem.total_final_cost, xs[-1])[1]
+        gradient[self.parameters_at] = self._by_coordinates(z[self.parameters_at])
+        return [self._cost(z), gradient]
+
+    def _by_coordinates(self, at: Array) -> Array:
+        """(np,) the gradient of `parameter_cost` by the coordinates."""
+        cost = self.problem.parameter_cost
+        if cost is None or self.coordinates is None:
+            return np.zeros(len(at))
+        return self.coordinates.pull_back(at, differentiate_final_cost(cost, self.coordinates.to_values(at))[1])
+
+    def _jacobians(self, z: Array) -> Array:
+        """(N, nx, nx + nu + np) of the steps."""
+        found = [np.hstack([d.A, d.B, d.C]) for d in self._steps(z)]
+        if self.coordinates is None:
+            return np.array(found)
+        width, at = self.problem.nx + self.problem.nu, z[self.parameters_at]
+        return np.array([np.hstack([j[:, :width], self.coordinates.pull_back(at, j[:, width:])]) for j in found])
+
+    def _jacobian(self, z: Array, _: Array) -> list[Any]:
+        xs, us = self._read(z)[:2]
+        ones, values = np.ones(self.problem.nx), []
+        for rows in self._jacobians(z):
+            values += [ones, -rows.ravel()]
+        values += [path.jacobian(*path.packed(xs, us)).ravel() for path in self.paths]
+        return [self._values(z)[1], self._rows_at.matrix(values)]
+
+    def _hessian(self, z: Array, _: Array, sigma: Array, multipliers: Array) -> list[Any]:
+        xs, us = self._read(z)[:2]
+        count, nx, nu = self.problem.num_steps, self.problem.nx, self.problem.nu
+        blocks = list(-self._curvature(z, multipliers[: count * nx].reshape(count, nx)))
+        blocks.append(np.zeros((nx, nx)))
+        for block, cost in zip(blocks, expand_running_cost(self.problem, xs, us)[1], strict=False):
+            block[: nx + nu, : nx + nu] += sigma[0] * cost
+        if self.problem.total_final_cost is not None:
+            blocks[-1] += sigma[0] * final_cost_hessian(self.problem.total_final_cost, xs[-1])
+        at = z[self.parameters_at]
+        for j, step in enumerate(np.diag(DIFFERENCE * np.maximum(1.0, np.abs(at)))):
+            apart = self._by_coordinates(at + step) - self._by_coordinates(at - step)
+            blocks[0][nx + nu :, nx + nu + j] += sigma[0] * apart / (2 * step[j])
+        first = count * nx
+        for path in self.paths:
+            blocks.append(path.curvature(*path.packed(xs, us), multipliers[first : first + path.count]))
+            first += path.count
+        return [self._hessian_at.matrix([b[np.triu_indices(len(b))] for b in blocks])]
+
+    def _curvature(self, z: Array, weights: Array) -> Array:
+        """(N, w, w), w = nx + nu + np: the second derivatives of weights (N, nx) times the steps."""
+        at, b = np.array(self._blocks[:-1]), self.problem.bounds
+        lower, upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
+        lower[self.inputs_at], upper[self.inputs_at] = b.u_lower, b.u_upper  # beyond them the plant may cut off
+        self._steps(z)
+        part = ROUGH_DIFFERENCE if ROUGH in self.methods else DIFFERENCE
+        found = np.zeros((*at.shape, at.shape[1]))
+        for j, column in enumerate(at.T):
+            where, ends = np.unique(column), []
+            for side in (-1, 1):
+                moved = np.array(z)
+                moved[where] += side * part * np.maximum(1.0, np.abs(z[where]))
+                moved = np.clip(moved, lower, upper)
+                ends.append((moved[column], np.einsum("kij,ki->kj", self._jacobians(moved), weights)))
+            (low, before), (high, after) = ends
+            apart = np.where(high > low, high - low, np.inf)
+            found[:, :, j] = (after - before) / apart[:, None]
+        self._kept = b"", []
+        return (found + found.swapaxes(1, 2)) / 2
+
+
+class _Path:
+    """A constraint on the states at the knots `at` (n,) side by side, and on the inputs there."""
+
+    def __init__(self, program: StepProgram, rows: Constraint, at: Indices):
+        self.rows, self.at, self.count = rows, at, len(rows.lower)
+        self.columns = program.states_at[at].ravel()
+        if rows.takes_input:
+            self.columns = np.concatenate([self.columns, program.inputs_at[at].ravel()])
+
+    def packed(self, xs: Array, us: Array) -> tuple[Array, Array]:
+        """What `rows` takes; a function of states alone takes any input."""
+        return xs[self.at].ravel(), us[np.minimum(self.at, len(us) - 1)].ravel()
+
+    def jacobian(self, x: Array, u: Array) -> Array:
+        """(m, w) by the columns."""
+        return np.asarray(self.rows.differentiate(x, u)[1][:, : len(self.columns)])
+
+    def curvature(self, x: Array, u: Array, weights: Array) -> Array:
+        """(w, w) the second derivative of weights (m,) times the values, by differences of their Jacobian."""
+        z, found = np.concatenate([x, u]), np.zeros((len(self.columns), len(self.columns)))
+        if not np.any(weights):
+            return found
+        for j in range(len(found)):
+            step = np.zeros(len(z))
+            step[j] = DIFFERENCE * max(1.0, abs(z[j]))
+            low, high = (self.jacobian(*np.split(z + side * step, [len(x)])) for side in (-1, 1))
+            found[j] = weights @ (high - low) / (2 * step[j])
+        return (found + found.T) / 2
+
+
+class _Places:
+    """A sparse matrix whose entries are sums of values in one order."""
+
+    def __init__(self, rows: list[Any], columns: list[Any], shape: tuple[int, int]):
+        at = np.concatenate(columns) * shape[0] + np.concatenate(rows)
+        places, self.targets = np.unique(at, return_inverse=True)
+        down, across = places % shape[0], places // shape[0]
+        starts = np.searchsorted(across, np.arange(shape[1] + 1))
+        self.sparsity = ca.Sparsity(*shape, starts.tolist(), down.tolist())
+
+    def matrix(self, values: list[Array]) -> Any:
+        """A DM of the entries, in parts."""
+        return ca.DM(self.sparsity, np.bincount(self.targets, np.concatenate(values), self.sparsity.nnz()))
+
+
+class _Callback(ca.Callback):  # type: ignore[misc]
+    """A function of vectors; NaN where a step cannot be taken or differentiated, so that a search shortens its step."""
+
+    def __init__(
+        self, name: str, sizes: list[int], outputs: list[Any], evaluate: Callable[..., list[Any]], owner: StepProgram
+    ):
+        ca.Callback.__init__(self)
+        self.sizes, self.outputs, self.evaluate, self.owner = sizes, outputs, evaluate, owner
+        self.construct(name, {})
+
+    def get_n_in(self) -> int:
+        return len(self.sizes)
+
+    def get_n_out(self) -> int:
+        return len(self.outputs)
+
+    def get_sparsity_in(self, i: int) -> Any:
+        return ca.Sparsity.dense(self.sizes[i], 1)
+
+    def get_sparsity_out(self, i: int) -> Any:
+        return self.outputs[i]
+
+    def eval(self, arguments: Any) -> Any:
+        """The outputs; an error that is none of a step is kept for the solve to raise, as C++ must not see it."""
+        try:
+            found = self.evaluate(*[np.asarray(a).ravel() for a in arguments])
+        except (GradientError, SimulationError):
+            return [ca.DM(sparsity, np.nan) for sparsity in self.outputs]
+        except Exception as error:
+            self.owner.functions.error = self.owner.functions.error or error
+            return [ca.DM(sparsity, np.nan) for sparsity in self.outputs]
+        return [ca.DM(value) for value in found]
