@@ -14,6 +14,7 @@ quadratic in v and linear in a stays so.
 Whatever the tree leaves out shows in the comparison with Drake's plant, and the model is then refused.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -113,20 +114,8 @@ def _functions(plant: "_Plant", tree: TreeDynamics, model: Model, c: Any, actuat
     xu, weights, mu, a = (ca.SX.sym(s, k) for s, k in (("knot", width), ("w", 2 * n), ("mu", n), ("a", n)))
     knot = ca.vertcat(xu, c)
     q, v, u = xu[:n], xu[n : 2 * n], xu[2 * n :]
-    coupling, all_q, all_v, E = tree.coupling, q, v, ca.DM.eye(n)
-    if coupling is not None:
-        E = ca.sparsify(ca.DM(coupling.spread))
-        all_q, all_v = E @ q + ca.DM(coupling.offset), E @ v
-    links = _regrouped(plant.links, tree)
-    order = sorted(range(len(links)), key=lambda k: tree.ancestors[k].sum())  # parents first
-    frames = [_frame(link, tree.hinge[k], all_q[k]) for k, link in enumerate(links)]
-    factors = ca.ldl(E.T @ (_mass(links, frames, tree.hinge, order) + ca.diag(plant.reflected)) @ E)
-
-    def residual(a: Any) -> Any:
-        a = E @ a
-        motion = _inverse_dynamics(links, frames, tree.hinge, order, all_v, a, plant.gravity) + plant.reflected * a
-        return E.T @ (motion + plant.stiffness * (all_q - plant.rest) + plant.damping * all_v)
-
+    mass, residual = mass_and_residual(plant, tree, q, v)
+    factors = ca.ldl(mass)
     solved = ca.ldl_solve(actuation @ u - residual(ca.SX.zeros(n)), *factors)
     r = residual(a)
     rows = [ca.gradient(r[i], knot).T for i in range(n)]  # backwards: a fifth shorter than CasADi's own choice
@@ -158,6 +147,29 @@ def _functions(plant: "_Plant", tree: TreeDynamics, model: Model, c: Any, actuat
         jacobian,
         ca.Function("hessian", [knot, weights, rows], [ca.triu(hessian)]),
     )
+
+
+def plant_of(tree: TreeDynamics, model: Model) -> "_Plant":
+    """The constants of the model's own parameters, for `mass_and_residual`."""
+    return _Plant(tree, model)
+
+
+def mass_and_residual(plant: "_Plant", tree: TreeDynamics, q: Any, v: Any) -> tuple[Any, Callable[[Any], Any]]:
+    """M(q) (n, n), and r (n,) as a function of the acceleration a (n,), at the SX columns q and v (n,)."""
+    coupling, all_q, all_v, E = tree.coupling, q, v, ca.DM.eye(q.numel())
+    if coupling is not None:
+        E = ca.sparsify(ca.DM(coupling.spread))
+        all_q, all_v = E @ q + ca.DM(coupling.offset), E @ v
+    links = _regrouped(plant.links, tree)
+    order = sorted(range(len(links)), key=lambda k: tree.ancestors[k].sum())  # parents first
+    frames = [_frame(link, tree.hinge[k], all_q[k]) for k, link in enumerate(links)]
+
+    def residual(a: Any) -> Any:
+        a = E @ a
+        motion = _inverse_dynamics(links, frames, tree.hinge, order, all_v, a, plant.gravity) + plant.reflected * a
+        return E.T @ (motion + plant.stiffness * (all_q - plant.rest) + plant.damping * all_v)
+
+    return E.T @ (_mass(links, frames, tree.hinge, order) + ca.diag(plant.reflected)) @ E, residual
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@ from .problem.coupling import Coupling as Coupling
 from .problem.coupling import Periodic as Periodic
 from .problem.dynamics import DiscreteMap as DiscreteMap
 from .problem.dynamics import plant_dynamics as plant_dynamics
+from .problem.held import HeldContacts as HeldContacts
 from .problem.phases import PhasedProblem as PhasedProblem
 from .problem.rates import InputRate as InputRate
 from .problem.rates import Jerk as Jerk

@@ -137,6 +137,8 @@ class Dynamics:
         parameters: Mapping[str, Any] | ParameterVector | None = None,
     ):
         self.nx, self.nu = positive_int("nx", nx), positive_int("nu", nu)
+        self.model: Model | None = None  # whose states these are, where they are a model's
+        self.default_state = frozen(np.zeros(self.nx))
         self.state_names = _names("state_names", state_names, "x", self.nx)
         self.input_names = _names("input_names", input_names, "u", self.nu)
         self.bounds = Bounds(*(frozen(np.full(n, v)) for n in (self.nx, self.nu) for v in (-np.inf, np.inf)))

@@ -32,9 +32,10 @@ def coordinates(system: Model | Dynamics, subject: str, given: Mapping[str, Any]
 def places_of(system: Model | Dynamics) -> dict[str, int]:
     """The place in the state of each of its names, and of joints with one position by the joint's own name."""
     found = {name: i for i, name in enumerate(system.state_names)}
-    if isinstance(system, Model):
-        for name, joint in labelled(joints(system.plant)).items():
-            positions, _ = system.places(joint)
+    model = system if isinstance(system, Model) else system.model
+    if model is not None:
+        for name, joint in labelled(joints(model.plant)).items():
+            positions, _ = model.places(joint)
             if joint.num_positions() == 1 and len(positions) == 1:  # none of a joint that follows another
                 found.setdefault(name, positions[0])
     return found

@@ -111,7 +111,7 @@ class Problem(ShowsItsRepr):
         system = self.system
         if not isinstance(system, (Model, Dynamics)):
             raise InputError("system", got=type(system).__name__, expected="a Model or Dynamics")
-        x0 = state_of(system, "x0", self.x0, system.default_state if isinstance(system, Model) else np.zeros(self.nx))
+        x0 = state_of(system, "x0", self.x0, system.default_state)
         self._set("x0", finite_array("x0", x0, (self.nx,)))
         self._set("num_steps", positive_int("num_steps", self.num_steps))
         self._set("optimize", _check_optimize(self.nu, self.optimize))

@@ -1,14 +1,10 @@
 """Functions of a knot [x, u] within a CasADi program: traced to expressions where that is possible, else called back.
 
-A `Symbol` goes through a function as AutoDiffXd does: NumPy computes with arrays of it. It has no float() and no truth
-value, so that a function that branches on its numbers cannot pass for one that does not.
-
 Both kinds give `values` (m, K) at all K knots in one call, and the nonzeros of the K Jacobians by the knot; expressions
 also those of the Hessians of weights (m, K) times values. `jacobian_at` and `hessian_at` are (rows, columns) of the
 nonzeros of one knot.
 """
 
-import operator
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +17,8 @@ import numpy as np
 from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.refusal import Refusal
 from drake_diff.mechanics.casadi_tree import PlantFunctions, agrees, symbolic_plant
+from drake_diff.mechanics.held import HeldPlant
+from drake_diff.mechanics.symbol import Symbol, symbols
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.coupling import BoundCoupling
 from drake_diff.optimize.problem.dynamics import DiscreteMap, PlantKnots, Pointwise
@@ -29,76 +27,20 @@ from drake_diff.optimize.transcription.task import OptimalControl, TimedRate
 SAME_VALUES = 1e-10  # of the largest value at a knot: the same operations, rounded in another order
 
 
-class Symbol:
-    """A scalar SX expression as an entry of a NumPy array of objects."""
-
-    __slots__ = ("sx",)
-
-    def __init__(self, sx: Any):
-        self.sx = sx
-
-    def __neg__(self) -> "Symbol":
-        return Symbol(-self.sx)
-
-    def __pos__(self) -> "Symbol":
-        return self
-
-    def __abs__(self) -> "Symbol":
-        return Symbol(ca.fabs(self.sx))
-
-    def sign(self) -> "Symbol":
-        """1 where it is not negative, else -1."""
-        return Symbol(ca.if_else(self.sx < 0, -1.0, 1.0))
-
-    def __bool__(self) -> bool:
-        raise TypeError("it branches on its numbers")
-
-
-def _binary(operation: Callable[[Any, Any], Any], *, turned: bool = False) -> Callable[[Symbol, Any], Any]:
-    def apply(self: Symbol, other: Any) -> Any:
-        if not isinstance(other, (Symbol, int, float, np.integer, np.floating)):
-            return NotImplemented
-        sx = other.sx if isinstance(other, Symbol) else float(other)
-        return Symbol(operation(sx, self.sx) if turned else operation(self.sx, sx))
-
-    return apply
-
-
-def _unary(name: str) -> Callable[[Symbol], Symbol]:
-    return lambda self: Symbol(getattr(self.sx, name)())
-
-
-def _compare(self: Symbol, other: Any) -> bool:
-    raise TypeError("it compares its numbers")
-
-
-for _name in ("add", "sub", "mul", "truediv", "pow"):
-    setattr(Symbol, f"__{_name}__", _binary(getattr(operator, _name)))
-    setattr(Symbol, f"__r{_name}__", _binary(getattr(operator, _name), turned=True))
-for _name in ("lt", "le", "gt", "ge", "eq", "ne"):
-    setattr(Symbol, f"__{_name}__", _compare)
-for _name in (
-    *("sin", "cos", "tan", "arcsin", "arccos", "arctan", "sinh", "cosh", "tanh", "arcsinh", "arccosh", "arctanh"),
-    *("exp", "log", "log10", "sqrt", "fabs"),
-):
-    setattr(Symbol, _name, _unary(_name))
-setattr(Symbol, "arctan2", _binary(ca.atan2))  # noqa: B010  (mypy: the class has none)
-
-
 def trace(f: Callable[[Any, Any], Any], nx: int, probe: Array, wanted: Array) -> Any | Refusal:
     """The function (x, u) -> (m,) as an SX function of a knot [x, u], or why there is none.
 
     It must give the values `wanted` (P, m) at the knots `probe` (P, nx + nu).
     """
     knot = ca.SX.sym("knot", probe.shape[1])
-    symbols = np.array([Symbol(knot[i]) for i in range(probe.shape[1])], dtype=object)
+    entries = symbols(knot)
     try:
         with np.errstate(all="ignore"):
-            result = np.asarray(f(symbols[:nx], symbols[nx:])).ravel()
-            entries = [entry.sx if isinstance(entry, Symbol) else float(entry) for entry in result]
+            result = np.asarray(f(entries[:nx], entries[nx:])).ravel()
+            found = [entry.sx if isinstance(entry, Symbol) else float(entry) for entry in result]
     except Exception as error:  # whatever it is that f cannot do with symbols: it need not
         return Refusal(f"{type(error).__name__}: {str(error).splitlines()[0][:100] if str(error) else ''}")
-    function = ca.Function("traced", [knot], [ca.vertcat(*entries)])
+    function = ca.Function("traced", [knot], [ca.vertcat(*found)])
     if not agrees(function, probe, wanted, SAME_VALUES):
         return Refusal("its symbolic form gives other values")
     return function
@@ -484,6 +426,8 @@ def _dynamics(task: OptimalControl) -> KnotFunction:
     found: Any = Refusal("an object with derivatives of its own")
     if isinstance(form, PlantKnots):
         found = symbolic_plant(form.model, dynamics.parameters, None if moved is None else moved.coordinates)
+    elif isinstance(form, HeldPlant):
+        found = form.rates.function
     elif isinstance(form, Pointwise):
         start = dynamics.parameters.values
 

@@ -1,0 +1,161 @@
+"""A tree of hinges and slides with points that the world holds: equations of motion, the holding forces, an impact.
+
+    [M  -J'] [dv/dt ]   [B u - r(q, v, 0)]        [M  -J'] [v+    ]   [M v-]
+    [J   0 ] [forces] = [-(dJ/dt) v      ],       [J   0 ] [impact] = [0   ]
+
+with the points' velocities J v (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 8 and 11). Drake evaluates
+them for the motion that is judged; the same as CasADi expressions, compared with Drake's, is what a solver gets.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from pydrake.autodiffutils import InitializeAutoDiff
+
+from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.autodiff import gradient_rows
+from drake_diff._base.refusal import Refusal
+from drake_diff.mechanics.casadi_tree import SAME_PLANT, agrees, mass_and_residual, plant_of
+from drake_diff.mechanics.symbol import Symbol, called, symbols
+from drake_diff.mechanics.tree import TreeDynamics, tree_for, tree_of
+from drake_diff.model.equations import EquationsOfMotion
+from drake_diff.model.model import Model
+from drake_diff.model.step import set_state
+
+NO_WAY = 1e-9  # of the largest: a direction in which no joint moves a point
+DEPENDENT = 1e-6  # of the largest: the least singular value of points that can be held one by one
+TRIED = 3  # states
+
+
+class _Expression:
+    """An SX function of a knot, in any arithmetic."""
+
+    def __init__(self, symbol: Any, value: Any):
+        self.function = ca.Function("held", [symbol], [ca.densify(value)])
+        self._jacobian = ca.Function("slopes", [symbol], [ca.densify(ca.jacobian(value, symbol))])
+
+    def __call__(self, knot: Any) -> Any:
+        return called(self.function, self._jacobian, knot)
+
+    def jacobian(self, knot: Array) -> Array:
+        return np.asarray(self._jacobian(knot).full())
+
+
+@dataclass(frozen=True, eq=False)
+class HeldPlant:
+    """What the equations come to for the `rows` of all points' coordinates that are held; see `held_plant`."""
+
+    model: Model
+    places: Callable[[Any], Any]  # x -> (P,) all coordinates of the points
+    speeds: Callable[[Any], Any]
+    rows: Indices  # (m,) of those, that some joint moves
+    equations: EquationsOfMotion
+    tree: TreeDynamics
+
+    def values(self, knots: Array) -> Array:
+        """(K, nx) dx/dt at `knots` (K, nx + nu), by Drake's own mass matrix, bias and velocities."""
+        return np.array([self._solved(knot)[0] for knot in knots]).reshape(len(knots), self.model.nx)
+
+    def forces_at(self, knot: Array) -> Array:
+        """(m,) the forces that hold the points, by Drake."""
+        return self._solved(knot)[1]
+
+    def linearize(self, knots: Array) -> tuple[Array, Array]:
+        """(K, nx) the rates and (K, nx, nx + nu) their Jacobians, these by CasADi."""
+        return self.values(knots), np.array([self.rates.jacobian(knot) for knot in knots])
+
+    def _solved(self, knot: Array) -> tuple[Array, Array]:
+        model, n, m = self.model, self.model.nv, len(self.rows)
+        if not np.all(np.isfinite(knot)):
+            return np.full(model.nx, np.nan), np.full(m, np.nan)
+        x, u = knot[: model.nx], knot[model.nx :]
+        slopes = gradient_rows(np.asarray(self.speeds(InitializeAutoDiff(x).ravel())).ravel()[self.rows], model.nx)
+        J, bias = slopes[:, n:], slopes[:, :n] @ x[n:]
+        twin = model.double
+        set_state(twin, x)
+        force, mass = self.equations.actuation @ u - twin.inverse_dynamics(np.zeros(n)), twin.mass_matrix()
+        whole = np.block([[mass, -J.T], [J, np.zeros((m, m))]])
+        try:
+            found = np.linalg.solve(whole, np.concatenate([force, -bias]))
+        except np.linalg.LinAlgError:
+            found = np.full(n + m, np.nan)
+        return np.concatenate([x[n:], found[:n]]), found[n:]
+
+    @cached_property
+    def _symbolic(self) -> dict[str, Any]:
+        """Expressions of a knot: rates, forces, and the state after an impact."""
+        model, n = self.model, self.model.nv
+        knot = ca.SX.sym("knot", model.nx + model.nu)
+        q, v, u = knot[:n], knot[n : 2 * n], knot[2 * n :]
+        speed = _column(np.asarray(self.speeds(symbols(knot[: 2 * n]))).ravel()[self.rows])
+        J = ca.jacobian(speed, v)
+        mass, residual = mass_and_residual(plant_of(self.tree, model), self.tree, q, v)
+        factors = ca.ldl(mass)
+        free = ca.ldl_solve(ca.DM(self.equations.actuation) @ u - residual(ca.SX.zeros(n)), *factors)
+        pushed = ca.ldl_solve(ca.SX(ca.densify(J.T)), *factors)
+        inner = ca.ldl(ca.densify(J @ pushed))
+        forces = ca.ldl_solve(-(ca.jacobian(speed, q) @ v + J @ free), *inner)
+        after = v - pushed @ ca.ldl_solve(speed, *inner)
+        found = {"rates": ca.vertcat(v, free + pushed @ forces), "forces": forces, "after": ca.vertcat(q, after)}
+        return {name: (knot, value) for name, value in found.items()}
+
+    @cached_property
+    def rates(self) -> _Expression:
+        """dx/dt of a knot."""
+        return _Expression(*self._symbolic["rates"])
+
+    @cached_property
+    def forces(self) -> _Expression:
+        """(m,) the holding forces of a knot."""
+        return _Expression(*self._symbolic["forces"])
+
+    @cached_property
+    def after(self) -> _Expression:
+        """(nx,) the state after an impact that stops the points, of a knot whose input has no part in it."""
+        return _Expression(*self._symbolic["after"])
+
+
+def held_plant(model: Model, places: Callable[[Any], Any], speeds: Callable[[Any], Any]) -> HeldPlant | Refusal:
+    """The equations with the points at `places` held, whose velocities are `speeds`; why there are none.
+
+    What no joint moves is not held: the y of a planar leg. Both functions take the state in any arithmetic.
+    """
+    if model.has_other_parameters:
+        return Refusal("parameters are applied that are not the model's own")
+    tree = tree_for(model)
+    if tree is None:
+        found = tree_of(model)
+        return found if isinstance(found, Refusal) else Refusal("its tree differs from Drake's inverse dynamics")
+    if tree.coupling is not None:
+        return Refusal("its mimic joints are reduced")
+    random, here, n = np.random.default_rng(2), model.double.state(), model.nv
+    states = 0.5 * random.standard_normal((TRIED, model.nx))
+    every = np.array(
+        [gradient_rows(np.asarray(speeds(InitializeAutoDiff(x).ravel())).ravel(), model.nx) for x in states]
+    )
+    J = every[:, :, n:]
+    size = np.max(np.abs(J), initial=0.0)
+    rows = np.flatnonzero(np.max(np.abs(J), axis=(0, 2)) > NO_WAY * max(size, 1.0))
+    if not len(rows):
+        return Refusal("no joint moves any of the points")
+    singular = np.array([np.linalg.svd(J[k][rows], compute_uv=False) for k in range(TRIED)])
+    if len(rows) > n or np.max(singular[:, -1] / singular[:, 0]) < DEPENDENT:
+        return Refusal(
+            f"the {len(rows)} coordinates that are held depend on each other, so that their forces are not unique: "
+            "hold fewer axes of some points"
+        )
+    plant = HeldPlant(model, places, speeds, rows, EquationsOfMotion(model), tree)
+    probe = np.hstack([states, random.standard_normal((TRIED, model.nu))])
+    same = agrees(plant.rates.function, probe, plant.values(probe), SAME_PLANT)
+    wanted = np.array([plant.forces_at(knot) for knot in probe])
+    same = same and agrees(plant.forces.function, probe, wanted, SAME_PLANT)
+    set_state(model.double, here)
+    return plant if same else Refusal("its symbolic form differs from Drake's plant")
+
+
+def _column(entries: Array) -> Any:
+    return ca.vertcat(*[entry.sx if isinstance(entry, Symbol) else float(entry) for entry in entries])
