@@ -7,12 +7,13 @@ Each takes a random generator and gives a `Case`. Constants are drawn such that 
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import task_formulas
 from helpers.models import MODELS
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
@@ -23,6 +24,7 @@ from pydrake.multibody.plant import (
     PropellerInfo,
 )
 from pydrake.systems.framework import DiagramBuilder, InputPortIndex
+from task_formulas import bicycle, dubins, planar
 from trust_solve import FOLDER, FREE, arm_file, block_file, effort, formula, loaded, plant_of, touching
 
 import drake_diff as dd
@@ -37,13 +39,34 @@ TWICE = 2.0  # a hand's tolerance: the referee's plant takes other steps than th
 
 @dataclass(frozen=True)
 class Case:
-    """`asks` are what a referee measures besides the goal and the bounds; `peer` is x' = f(x, u, math), by hand."""
+    """`asks` are what a referee measures besides the goal and the bounds; `peer` is x' = f(x, u, math), by hand.
+
+    `file` is the model's, for peers that read it; `disks` are what they are told to keep off. `optimum` is the least
+    cost, in closed form.
+    """
 
     problem: dd.Problem
     build: Callable[[float], Any]
     asks: tuple[Ask, ...] = ()
     peer: Callable[..., Any] | None = None
     model_file: Callable[[dd.Solution], Callable[[float], Any]] | None = field(default=None)  # where a plan chooses it
+    file: Path | None = None
+    disks: tuple[tuple[float, float, float], ...] = ()  # x, y, radius
+    optimum: float | None = None  # in closed form
+
+
+TWO_LINKS = {
+    "acrobot.xml": {"first": (1, 1, 0.5, 0.083), "second": (1, 2, 1, 0.33), "damping": 0.1, "motors": [1]},
+    "double_pendulum.urdf": {
+        "first": (1, 0.8, 0.4, 0.16 / 3),
+        "second": (0.7, 0.5, 0.25, 0.175 / 12),
+        "damping": 0,
+        "motors": [0, 1],
+    },
+}
+BY_HAND = {"pendulum.urdf": partial(task_formulas.pendulum), "cart_pole.urdf": partial(task_formulas.cart_pole)}
+BY_HAND |= {name: partial(task_formulas.two_links, **constants) for name, constants in TWO_LINKS.items()}
+BY_HAND["pendubot.urdf"] = partial(task_formulas.two_links, **TWO_LINKS["double_pendulum.urdf"] | {"motors": [0]})
 
 
 def bounded(model: dd.Model, limit: float | list[float], **more: Any) -> dd.Bounds:
@@ -66,7 +89,7 @@ def swing(path, x0, goal, limit, h, count, *, horizon=None, **bounds):
         bounds=bounded(model, limit, **bounds),
         horizon=horizon,
     )
-    return Case(problem, plant_of(path))
+    return Case(problem, plant_of(path), peer=BY_HAND[path.name], file=path)
 
 
 def near_rest(random, nq, size=0.3):
@@ -151,7 +174,7 @@ def crane(random, cost, count=40, horizon=None, goals=(), bounds=None, way=None)
         goals=goals,
         bounds=bounds or bounded(model, random.uniform(4, 15)),
     )
-    return Case(problem, plant_of(path))
+    return Case(problem, plant_of(path), peer=None if goals else BY_HAND[path.name], file=path)
 
 
 def crane_least_time(random):
@@ -193,7 +216,8 @@ def block_least_time(random):
     path, count = block_file(mass, force, 0.0), int(random.integers(8, 30))
     model = dd.load_model(path, time_step=2 * np.sqrt(way * mass / force) / count)
     problem = dd.Problem(model, x0=[0, 0], x_goal=[way, 0], num_steps=count, horizon=(0.05, 30), running_cost=1.0)
-    return Case(problem, plant_of(path))
+    by_hand, least = partial(task_formulas.block, mass=mass, damping=0.0), 2 * np.sqrt(way * mass / force)
+    return Case(problem, plant_of(path), peer=by_hand, file=path, optimum=least)
 
 
 def block_top_speed(random):
@@ -210,7 +234,7 @@ def block_top_speed(random):
         running_cost=1.0,
         bounds=dd.Bounds(x_lower=[FREE, -top], x_upper=[FREE, top]),
     )
-    return Case(problem, plant_of(path))
+    return Case(problem, plant_of(path), peer=partial(task_formulas.block, mass=mass, damping=0.1), file=path)
 
 
 def ball_pushes_a_ball(random):
@@ -324,7 +348,7 @@ def arm(name, random, *, hand=None, ball=False, horizon=None, time=1.5, count=30
         horizon=horizon,
     )
     del plant
-    return Case(problem, plant_of(path), tuple(asks))
+    return Case(problem, plant_of(path), tuple(asks), file=None if goals else path)
 
 
 def ur5_joint_goal(random):
@@ -374,7 +398,7 @@ def panda_hand_goal(random):
 def panda_joint_goal(random):
     model, problem, _, _ = panda(random)
     problem |= {"x_goal": [*(HOME + random.uniform(-0.5, 0.5, 7)), *np.zeros(7)]}
-    return Case(dd.Problem(model, **problem), touching(PANDA))
+    return Case(dd.Problem(model, **problem), touching(PANDA), file=PANDA)
 
 
 def ball_distance(radius, center):
@@ -476,20 +500,15 @@ def two_rods_past_a_ball(random):
 # ------------------------------------------------------------------------------ cars and quadrotors
 
 
-def plain(f, nx, nu, *, limits, x0, goal, count, horizon, cost, peer=True, **more):
+def plain(f, nx, nu, *, limits, x0, goal, count, horizon, cost, **more):
     """x' = f(x, u, math) in plain formulas; `limits` are pairs for states and inputs."""
     (xl, xu), (ul, uu) = limits
     dynamics = dd.Dynamics(lambda x, u: f(x, u, np), nx, nu, x_lower=xl, x_upper=xu, u_lower=ul, u_upper=uu)
     problem = dd.Problem(dynamics, x0=x0, x_goal=goal, num_steps=count, horizon=horizon, running_cost=cost, **more)
-    return Case(problem, formula(f, nx, nu), peer=f if peer else None)
+    return Case(problem, formula(f, nx, nu), peer=partial(f))
 
 
 ANY = np.inf
-
-
-def bicycle(x, u, math=np):
-    """Position, heading, speed; acceleration and steering; 1 m between the axles."""
-    return [x[3] * math.cos(x[2]), x[3] * math.sin(x[2]), x[3] * math.tan(u[1]), u[0]]
 
 
 def parallel_parking(random):
@@ -534,13 +553,8 @@ def bicycle_around_disks(random):
         horizon=6.0,
         cost=cost,
         constraints=kept,
-        peer=False,
     )
-    return Case(case.problem, case.build, asks)
-
-
-def dubins(x, u, math=np):
-    return [math.cos(x[2]), math.sin(x[2]), u[0]]
+    return Case(case.problem, case.build, asks, case.peer, disks=tuple(disks))
 
 
 def dubins_least_time(random):
@@ -548,13 +562,6 @@ def dubins_least_time(random):
     limits = ([-ANY] * 3, [ANY] * 3), ([-1], [1])
     goal = [*random.uniform(-5, 5, 2), random.uniform(-np.pi, np.pi)]
     return plain(dubins, 3, 1, limits=limits, x0=np.zeros(3), goal=goal, count=40, horizon=(0.3, 25), cost=1.0)
-
-
-def planar(x, u, math=np):
-    """Drake's planar quadrotor."""
-    m, r, inertia = 0.486, 0.25, 0.00383
-    push = (u[0] + u[1]) / m
-    return [x[3], x[4], x[5], -push * math.sin(x[2]), push * math.cos(x[2]) - 9.81, r * (u[0] - u[1]) / inertia]
 
 
 def planar_limits(random):
@@ -591,9 +598,8 @@ def planar_quadrotor_among_disks(random):
         horizon=3.0,
         cost=cost,
         constraints=kept,
-        peer=False,
     )
-    return Case(case.problem, case.build, asks)
+    return Case(case.problem, case.build, asks, case.peer, disks=tuple(disks))
 
 
 def rotor_points():
@@ -700,7 +706,7 @@ def car_follows_an_eight(random):
     cost = dd.optimize.TrackingCost((times, wanted), Q=np.diag([10.0, 10.0, 1.0, 1.0]), R=0.05 * np.eye(2))
     limits = ([-ANY] * 4, [ANY] * 4), ([-2, -1.2], [2, 1.2])
     start = wanted[0] + random.uniform(-0.1, 0.1, 4)
-    case = plain(bicycle, 4, 2, limits=limits, x0=start, goal=None, count=80, horizon=time, cost=cost, peer=False)
+    case = plain(bicycle, 4, 2, limits=limits, x0=start, goal=None, count=80, horizon=time, cost=cost)
     return Case(case.problem, case.build, (follows(times, at, [0, 1], 0.1),))
 
 

@@ -2,15 +2,15 @@
 
     pip install -e '.[test]'
     python tests/benchmarks/tasks.py [--only PATTERN] [--count 20] [--seed 0] [--out tasks.json] [--markdown FILE]
-    python tests/benchmarks/tasks.py --beside CasADi [--count 3]
+    python tests/benchmarks/tasks.py --beside CasADi [--count 3] [--peers peers.json] [--python PYTHON]
 
 The tasks are those of `task_cases.py`, each with --count random starts and constants by --seed, and 60 s of one core
-for a solve. One that says converged in that time is judged by `referee.py`, which has pydrake alone. What is in --out
-already is not run again, so that a run that was ended goes on; --markdown writes docs/tasks_solved.md from it. Seconds
-are of processor time.
+for a solve. One that says converged in that time is judged by `referee.py`, which has pydrake alone; a cost is compared
+with the closed form where there is one. What is in --out already is not run again, so that a run that was ended goes
+on; --markdown writes docs/tasks_solved.md from it, and from --peers. Seconds are of processor time.
 
---beside CasADi times the solves in turns with the same transcription written by hand in CasADi (Hermite-Simpson in one
-SX expression, IPOPT, the same tolerance, a straight line as guess), where a task is one of plain formulas.
+--beside times the solves in turns with a peer's, see `task_peers.py`: CasADi by hand, Drake's DirectCollocation with
+IPOPT or SNOPT, Crocoddyl and acados, the last two by the --python of an environment that has them.
 """
 
 import argparse
@@ -19,6 +19,7 @@ import json
 import logging
 import os
 import statistics
+import subprocess
 import sys
 import time
 import warnings
@@ -30,8 +31,8 @@ for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(threads, "1")  # read when NumPy is imported: small matrices are slower on threads
 sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
-import casadi as ca  # noqa: E402
 import numpy as np  # noqa: E402
+import task_peers  # noqa: E402
 from referee import judge  # noqa: E402
 from task_cases import FAMILIES, NOT_EXPRESSED, Case  # noqa: E402
 from trust_solve import NAMED, plan_of  # noqa: E402
@@ -81,80 +82,10 @@ def attempt(name: str, seed: int, number: int, wall_limit: float) -> Row:
         "method": f"{solution.method} {solution.scheme}",
         "attempts": max(1, len(chain)),
         "intervals": [case.problem.num_steps, len(solution.us)],
+        "optimum": case.optimum,
         "seconds": round(seconds, 2),
         "wall": round(wall, 2),
     }
-
-
-# ------------------------------------------------------------------------------ by hand, in CasADi
-
-
-class CasadiMath:
-    sin, cos, tan = ca.sin, ca.cos, ca.tan
-
-
-def by_hand(case: Case) -> tuple[float, str, float]:
-    """(seconds, how it ended, cost): the problem's formulas in one SX expression."""
-    problem, f, begun = case.problem, case.peer, time.process_time()
-    nx, nu, count, b = problem.nx, problem.nu, problem.num_steps, problem.bounds
-    free = problem.horizon[0] < problem.horizon[1]
-    z, horizon = ca.SX.sym("z", nx + nu, 2 * count + 1), ca.SX.sym("T") if free else problem.horizon[0]
-    h, columns = horizon / count, [z[:, k] for k in range(2 * count + 1)]
-    rates = [ca.vertcat(*f(ca.vertsplit(c[:nx]), ca.vertsplit(c[nx:]), CasadiMath)) for c in columns]
-    g, cost = [], horizon if free else 0
-    for k in range(0, 2 * count, 2):
-        (x, middle, end), (fx, fm, fe) = (c[:nx] for c in columns[k : k + 3]), rates[k : k + 3]
-        g += [end - x - h / 6 * (fx + 4 * fm + fe), middle - (x + end) / 2 - h / 8 * (fx - fe)]
-        if not free:
-            apart = [c[nx:] - problem.running_cost.u_ref for c in columns[k : k + 3]]
-            cost += h / 6 * (ca.sumsqr(apart[0]) + 4 * ca.sumsqr(apart[1]) + ca.sumsqr(apart[2]))
-    variables = ca.vertcat(ca.vec(z), *[horizon] * free)
-    options = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "ipopt.tol": 1e-8, "ipopt.max_iter": 500}
-    solver = ca.nlpsol("solver", "ipopt", {"x": variables, "f": cost, "g": ca.vertcat(*g)}, options)
-    lower, upper = (
-        np.tile(np.concatenate(side), (2 * count + 1, 1)) for side in ((b.x_lower, b.u_lower), (b.x_upper, b.u_upper))
-    )
-    lower[0, :nx] = upper[0, :nx] = problem.x0
-    lower[-1, :nx] = upper[-1, :nx] = problem.x_goal
-    line = np.linspace(problem.x0, problem.x_goal, 2 * count + 1)
-    guess = np.hstack([line, np.tile(np.clip(np.zeros(nu), b.u_lower, b.u_upper), (2 * count + 1, 1))])
-    times = [[value] * free for value in (problem.start_horizon, *problem.horizon)]
-    found = solver(
-        x0=np.concatenate([guess.ravel(), times[0]]),
-        lbx=np.concatenate([lower.ravel(), times[1]]),
-        ubx=np.concatenate([upper.ravel(), times[2]]),
-        lbg=0,
-        ubg=0,
-    )
-    ended = solver.stats()
-    told = "solved" if ended["success"] else ended["return_status"]
-    return time.process_time() - begun, told, float(found["f"])
-
-
-def beside(names: list[str], seed: int, count: int) -> list[str]:
-    """A line each: how many each solved, and the median of the ratios of times, where both did."""
-    lines, every = [], []
-    for name in names:
-        if drawn(name, seed, 0).peer is None:
-            continue
-        ours, theirs, ratios = 0, 0, []
-        for number in range(count):
-            case = drawn(name, seed, number)
-            begun = time.process_time()
-            solution = dd.solve(case.problem, time_limit=TIME_LIMIT)
-            seconds = time.process_time() - begun
-            hand, told, _ = by_hand(case)
-            ours, theirs = ours + solution.success, theirs + (told == "solved")
-            if solution.success and told == "solved":
-                ratios.append(seconds / hand)
-        every += ratios
-        middle = f"{statistics.median(ratios):.2f}" if ratios else "-"
-        lines.append(f"{name}: verified {ours} of {count}, by hand solved {theirs} of {count}; time ratio {middle}")
-        print(lines[-1], flush=True)
-    middle = f"{statistics.median(every):.2f} over {len(every)} solves of both" if every else "-"
-    lines.append(f"time of dd.solve, verification included, over CasADi by hand: median {middle}")
-    print(lines[-1])
-    return lines
 
 
 # ------------------------------------------------------------------------------ what is told
@@ -212,24 +143,79 @@ def table(rows: dict[str, Row], only: str) -> list[str]:
     return lines
 
 
-def markdown(rows: dict[str, Row], seed: int, only: str) -> str:
+def optima(rows: dict[str, Row]) -> list[str]:
+    """A line for each task whose optimum is known: how far the costs of what is solved are from it."""
+    lines = []
+    for name in TASKS:
+        own = [row for row in rows.values() if row["name"] == name and is_solved(row) and row.get("optimum")]
+        apart = [100 * (row["cost"] / row["optimum"] - 1) for row in own]
+        if apart:
+            within = f"{min(apart):+.2g} to {max(apart):+.2g} %"
+            lines.append(f"| {name.replace('_', ' ')} | {len(own)} | {within} |")
+    head = ["| Task | Solves | Cost apart from the optimum |", "|---|---|---|"]
+    return ["", "Costs against the optimum in closed form, where it is known:", "", *head, *lines] if lines else []
+
+
+def ran(rows: list[Row]) -> str:
+    """Of which commits and days the rows are."""
+    commits, days = (sorted({row[name] for row in rows if name in row}) for name in ("commit", "date"))
+    span = " to ".join(dict.fromkeys([*days[:1], *days[-1:]]))
+    return f"commit {', '.join(commits) or 'not known'}, {span or 'no date'}"
+
+
+def markdown(rows: dict[str, Row], peers: list[Row], seed: int, only: str) -> str:
     """docs/tasks_solved.md."""
-    text = ["# What `dd.solve(problem)` solves, defaults only", ""]
-    text += [
-        "Tasks as a practitioner asks them, with random starts and constants, no method and no option but a limit on"
-    ]
-    text += [
-        "time. A solve counts where it says converged within 60 s of one core and a referee that has pydrake alone"
-    ]
-    text += [
-        f"agrees. Written by `python tests/benchmarks/tasks.py --markdown docs/tasks_solved.md`, seed {seed}. Times"
-    ]
-    text += [
-        "depend on the machine. Tasks with fewer starts are slower ones in a run that was ended. Attempts are the most"
-    ]
-    text += ["first guesses and methods that a solve took.", ""]
-    text += [*(f"- {line}" for line in told(rows, only)), "", *table(rows, only)]
-    return "\n".join(text) + "\n"
+    text = f"""# What `dd.solve(problem)` solves, defaults only
+
+Tasks as a practitioner asks them, with random starts and constants, no method and no option but a limit on time. A
+solve counts where it says converged within 60 s of one core and a referee that has pydrake alone agrees. Written by
+`python tests/benchmarks/tasks.py --markdown docs/tasks_solved.md`, seed {seed}, {ran(list(rows.values()))}. Times
+depend on the machine. Tasks with fewer starts are slower ones in a run that was ended. Attempts are the most first
+guesses and methods that a solve took.
+
+"""
+    text += "\n".join([*(f"- {line}" for line in told(rows, only)), "", *table(rows, only), *optima(rows)]) + "\n"
+    if peers:
+        text += f"""
+## Beside other solvers
+
+The same tasks with the same constants, intervals and first guess, run in turns on one core, {ran(peers)}. Seconds are
+of processor time, and ratios below 1 are in our favour: the median, and the quartiles in brackets, where both say
+solved. Ours is all of `dd.solve`, with its certificates and the measures of its plan, or its search alone; a peer's is
+building the problem and solving it, or its solver alone. A peer's plan is judged by the same referee, which knows of no
+certificate: one that is false leaves limits by more than a thousandth of their range or misses the goal. Cheaper are
+plans of more than 1 % less cost, another optimum. How to run it, and what peers are told, is in
+[benchmarks](benchmarks.md).
+
+"""
+        text += "\n".join(task_peers.told(peers)) + "\n"
+    return text
+
+
+def marked() -> Row:
+    """What a row is marked with: the commit and the day."""
+    asked = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    found = subprocess.run(asked, capture_output=True, text=True, check=False)
+    return {"commit": found.stdout.strip() or "not known", "date": time.strftime("%Y-%m-%d", time.gmtime())}
+
+
+def compared(given: argparse.Namespace, names: list[str]) -> None:
+    """Our solves beside those of a peer; in --peers the rows of other tasks and other peers stay."""
+    mark = marked()
+    rows = task_peers.beside(
+        given.beside,
+        given.python,
+        lambda name, number: drawn(name, given.seed, number),
+        names,
+        given.count,
+        TIME_LIMIT,
+    )
+    rows = [row | mark for row in rows]
+    if given.peers:
+        old = json.loads(given.peers.read_text()) if given.peers.is_file() else []
+        kept = [row for row in old if row["peer"] != given.beside or row["name"] not in names]
+        given.peers.write_text(json.dumps(kept + rows, indent=1))
+    print("\n".join(task_peers.told(rows)))
 
 
 def main() -> None:
@@ -241,31 +227,36 @@ def main() -> None:
     parser.add_argument("--wall", type=float, default=TIME_LIMIT, help=help_wall)
     parser.add_argument("--out", type=Path, help="a JSON file; what is in it already is not run again")
     parser.add_argument("--markdown", type=Path, help="write the table there")
-    parser.add_argument("--beside", choices=["CasADi"], help="time the solves beside the same by hand instead")
+    parser.add_argument("--beside", choices=list(task_peers.PEERS), help="time the solves beside a peer's instead")
+    parser.add_argument("--python", default=sys.executable, help="of the peer's environment, with --beside")
+    help_peers = "a JSON file of --beside, which adds to it; --markdown writes it into the page"
+    parser.add_argument("--peers", type=Path, help=help_peers)
     given = parser.parse_args()
     warnings.simplefilter("ignore", ModelWarning)
     logging.getLogger("drake").setLevel(logging.ERROR)
     names = [name for name in TASKS if chosen(name, given.only)]
     if given.beside:
-        beside(names, given.seed, given.count)
+        compared(given, names)
         return
     rows: dict[str, Row] = {}
     if given.out and given.out.is_file():
         rows = json.loads(given.out.read_text())
+    mark = marked()
     for number in range(given.count):
         for name in names:
             key = f"{name}, seed {given.seed}, {number}"
             if key in rows:
                 continue
-            rows[key] = row = {"name": name, **attempt(name, given.seed, number, given.wall)}
+            rows[key] = row = {"name": name, **attempt(name, given.seed, number, given.wall), **mark}
             word = "FALSE" if row["false"] else "yes" if row["claimed"] else "no"
             print(f"{word:5} {row['seconds']:6.1f} s  {key}  {(row['false'] or row['message'])[:300]}", flush=True)
             if given.out:
                 given.out.write_text(json.dumps(rows, indent=1))
     shown = {key: row for key, row in rows.items() if chosen(row["name"], given.only)}
-    print("\n".join(told(shown, given.only)))
+    print("\n".join([*told(shown, given.only), *optima(shown)]))
     if given.markdown:
-        given.markdown.write_text(markdown(shown, given.seed, given.only))
+        peers = json.loads(given.peers.read_text()) if given.peers else []
+        given.markdown.write_text(markdown(shown, peers, given.seed, given.only))
 
 
 if __name__ == "__main__":
