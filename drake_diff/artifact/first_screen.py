@@ -11,9 +11,11 @@ from drake_diff._base.arrays import Array
 from drake_diff.artifact.measurement import Measurement
 from drake_diff.artifact.sections import UNKNOWN, units_of
 from drake_diff.optimize.problem.cost import ConstantCost
+from drake_diff.optimize.problem.dwell import Dwell
 from drake_diff.optimize.problem.goals import CenterOfMassGoal, FrameGoal, FrameVelocityGoal, Goal, JointGoal, KeepLevel
 from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.terminal import TerminalSet
 from drake_diff.optimize.solution import Status
 
 STILL = 1e-3  # [rad/s or m/s] what is no faster is at rest
@@ -84,7 +86,8 @@ def _of_goal(goal: Goal, problem: Problem, times: Array) -> str:
         return "keep its links clear of each other"
     if isinstance(goal, (SphereObstacle, BoxObstacle)):
         return f"keep clear of obstacle {goal.label}"
-    return _act(goal) + _when(getattr(goal, "knots", None), problem, times)
+    knots = goal.knots_in(problem) if isinstance(goal, Dwell) else getattr(goal, "knots", None)
+    return _act(goal) + _when(knots, problem, times)
 
 
 def _act(goal: Goal) -> str:
@@ -99,6 +102,10 @@ def _act(goal: Goal) -> str:
         return "have " + _listed([f"{name} = {value:.3g}" for name, value in goal.values.items()])
     if isinstance(goal, KeepLevel):
         return f"keep {goal.frame} level"
+    if isinstance(goal, Dwell):
+        return f"{_act(goal.goal)} for {goal.seconds:.3g} s"
+    if isinstance(goal, TerminalSet):
+        return "end where a linear regulator takes over"
     return "keep the " + re.sub(r"(?<!^)(?=[A-Z])", " ", type(goal).__name__).lower()
 
 

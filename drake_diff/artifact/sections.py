@@ -18,10 +18,12 @@ from drake_diff.model.quantities import description_of, made_from
 from drake_diff.optimize.problem.constraint import Bounds, Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost
 from drake_diff.optimize.problem.coupling import Couples, Periodic
+from drake_diff.optimize.problem.dwell import Dwell
 from drake_diff.optimize.problem.goals import CenterOfMassGoal, FrameGoal, FrameVelocityGoal, Goal, JointGoal, KeepLevel
 from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.rates import InputRate, Jerk
+from drake_diff.optimize.problem.terminal import TerminalSet
 from drake_diff.optimize.problem.timed import SumOfCosts, TrackingCost
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.parts import ModelInput, Quantity
@@ -91,7 +93,7 @@ COSTS = ("running_cost", "final_cost", "trajectory_cost", "parameter_cost")
 LIMITS = ("x_lower", "x_upper", "u_lower", "u_upper")
 GAPS = {"lower": -np.inf, "upper": np.inf}  # what null is, of a bound
 GUESS = ("initial_guess", "initial_guess_sha256")
-KINDS_OF_GOALS = (FrameGoal, FrameVelocityGoal, JointGoal, CenterOfMassGoal, KeepLevel)
+KINDS_OF_GOALS = (FrameGoal, FrameVelocityGoal, JointGoal, CenterOfMassGoal, KeepLevel, Dwell, TerminalSet)
 KINDS_OF_OBSTACLES = (SphereObstacle, BoxObstacle, SelfCollision)
 # By the names that a record has.
 GOALS: dict[str, Any] = {kind.__name__: kind for kind in (*KINDS_OF_GOALS, *KINDS_OF_OBSTACLES)}
@@ -380,6 +382,8 @@ def rebuild_goal(told: Any) -> Goal:
     if not (isinstance(told, dict) and len(told) == 1 and next(iter(told)) in GOALS):
         raise InputError("goal", got=repr(told)[:80], expected=f"one of {', '.join(GOALS)} with its values")
     ((kind, values),) = told.items()
+    if kind == Dwell.__name__:
+        values = {**values, "goal": rebuild_goal(values.get("goal"))}
     found: Goal = GOALS[kind](**values)
     return found
 

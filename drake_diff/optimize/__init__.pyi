@@ -1,11 +1,13 @@
 from .phased import PhasedSolution as PhasedSolution
 from .problem.coupling import Coupling as Coupling
 from .problem.coupling import Periodic as Periodic
+from .problem.dwell import Dwell as Dwell
 from .problem.dynamics import DiscreteMap as DiscreteMap
 from .problem.dynamics import plant_dynamics as plant_dynamics
 from .problem.held import HeldContacts as HeldContacts
 from .problem.phases import PhasedProblem as PhasedProblem
 from .problem.rates import InputRate as InputRate
 from .problem.rates import Jerk as Jerk
+from .problem.terminal import TerminalSet as TerminalSet
 from .problem.timed import TrackingCost as TrackingCost
 from .transcription.between import violation_between_nodes as violation_between_nodes

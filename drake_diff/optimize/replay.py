@@ -27,6 +27,7 @@ from drake_diff.motion.rollout import Policy, Rollout, rollout
 from drake_diff.optimize.problem.goals import GoalConstraint, in_words
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, along_steps, clearances
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
+from drake_diff.optimize.problem.terminal import TerminalConstraint
 from drake_diff.optimize.transcription.collocation import EFFORT_WEIGHT, FINAL_WEIGHT
 
 # Of a coordinate's range in the plan: how far from goal, bound or waypoint a replay may be. Discretizations differ by
@@ -204,7 +205,10 @@ def told_of_goals(plan: Plan, found: Sequence[Replay]) -> str:
 def _miss(c: GoalConstraint, motion: Rollout, plan: Plan) -> float:
     """The largest distance of a replay from a goal at the knots of the plan."""
     parts = (len(motion.xs) - 1) // plan.problem.num_steps
-    return max(c.miss(motion.xs[parts * k]) for k in plan.problem.knots_of(c, input_at_end=False))
+    knots = plan.problem.knots_of(c, input_at_end=False)
+    if c.dwells:
+        return max(c.miss(x) for x in motion.xs[parts * knots[0] : parts * knots[-1] + 1])
+    return max(c.miss(motion.xs[parts * k]) for k in knots)
 
 
 def _missed_goals(plan: Plan, motion: Rollout) -> Iterator[str]:
@@ -215,6 +219,13 @@ def _missed_goals(plan: Plan, motion: Rollout) -> Iterator[str]:
         miss = _miss(c, motion, plan)
         if not miss <= c.tolerance:
             yield f"{c.told(miss)}, tolerance {in_words(c.tolerance, c.unit)}"
+
+
+def _left_alone(plan: Plan, model: Model, motion: Rollout) -> Iterator[str]:
+    """The terminal sets whose regulator, followed from the end of a replay, does not bring the plant to rest."""
+    for c in plan.problem.kept_goals:
+        if isinstance(c, TerminalConstraint) and not c.region.converges(model, motion.xs[-1]):
+            yield f"from its end the regulator of its {c.label} does not converge"
 
 
 def told_of_tolerance(plan: Plan, found: Sequence[Replay]) -> str:
@@ -330,6 +341,7 @@ def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, kn
             *missed_goal(plan, plan.problem.goal_error(motion.xs[-1]), goal_tolerance(control, law_is_another)),
             *left_bounds(plan, motion),
             *_missed_goals(plan, motion),
+            *_left_alone(plan, model, motion),
             *_broken_constraints(plan, motion.xs[::parts], motion.us[::parts]),
             *came_too_near(plan, motion),
             *_broken_balance(motion),

@@ -108,6 +108,11 @@ class Constraint:
         parameters = inspect.signature(self.function).parameters.values()
         return len([p for p in parameters if p.kind in kinds and p.default is p.empty]) > 1
 
+    @property
+    def whole(self) -> bool:
+        """Whether it holds between its knots too, from the first of them to the last."""
+        return self.knots is None
+
     def at_knots(self, count: int, first_is_given: bool) -> tuple[int, ...]:
         """The knots out of 0 ... `count` at which it holds, in order; InputError where there is no such knot."""
         last = count - 1 if self.takes_input else count

@@ -68,7 +68,12 @@ class GoalConstraint(Constraint):
     unit: str = "m"
     words: Callable[[str], str] = str
     norm: float = 2.0
+    dwells: bool = False  # whether it holds all along between its knots
     measured: Any = None  # a function of the state whose norm the miss is, where the bounded one is another
+
+    @property
+    def whole(self) -> bool:
+        return self.knots is None or self.dwells
 
     @property
     def wanted(self) -> Array:
@@ -113,6 +118,10 @@ class Goal:
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
         """What has to hold of a motion of `model`; UnknownNameError where it has no such frame or joint."""
         raise NotImplementedError
+
+    def bind_to(self, problem: Any) -> tuple[GoalConstraint, ...]:
+        """The same of a motion that a `Problem` asks for, where more than its model matters."""
+        return self.bind(problem.model)
 
     def marks(self) -> tuple[Mark, ...]:
         """What a page draws of it."""
@@ -319,7 +328,7 @@ class JointGoal(Goal):
         self._set(
             values={
                 name_of("JointGoal", name): float(finite_array(f"JointGoal {name}", value, ()))
-                for name, value in self.values.items()
+                for name, value in sorted(self.values.items(), key=lambda item: str(item[0]))  # a record has them so
             },
             tolerance=positive_float("JointGoal.tolerance", self.tolerance),
             knots=checked_knots("JointGoal.knots", self.knots),

@@ -247,7 +247,7 @@ class Problem(ShowsItsRepr):
         return tuple(constraint for goal in self.goals if goal.weight is None for constraint in self._bound(goal))
 
     def _bound(self, goal: Goal) -> Iterator[GoalConstraint]:
-        for constraint in goal.bind(self.model):
+        for constraint in goal.bind_to(self):
             yield cast(GoalConstraint, constraint.resolved(self.x0, np.zeros(self.nu)))
 
     @cached_property
@@ -343,6 +343,8 @@ class Problem(ShowsItsRepr):
             at = self.knots_of(c, input_at_end=len(us) == len(xs))
             every = range(at[0], len(us) if c.takes_input else len(xs))  # from 1 where the first state is given
             rows: Any = every if c.knots is None else where[list(at)]
+            if c.whole and c.knots is not None:
+                rows = range(where[at[0]], where[at[-1]] + 1)
             worst = max((c.excess(xs[k], us[min(k, len(us) - 1)]), int(k)) for k in rows)
             found[c.label] = max(worst, found.get(c.label, worst))
         for knot, wanted in self.waypoints.items():

@@ -81,7 +81,7 @@ class RateLimit(Couples):
             if not self.limit:
                 raise InputError(f"{kind}.limit", got="no names", expected="a limit for each name")
             given = {str(name): positive_float(f"{kind}, {name}", limit) for name, limit in self.limit.items()}
-            object.__setattr__(self, "limit", given)
+            object.__setattr__(self, "limit", dict(sorted(given.items())))  # the order that a record has
         else:
             object.__setattr__(self, "limit", positive_float(f"{kind}.limit [per s]", self.limit))
 

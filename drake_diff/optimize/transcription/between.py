@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import GradientError
 from drake_diff.optimize.problem.constraint import Constraint
-from drake_diff.optimize.problem.goals import in_words
+from drake_diff.optimize.problem.goals import GoalConstraint, in_words
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
@@ -78,6 +78,8 @@ def violation_between_nodes(motion: Collocated) -> Excess:
     for c in task.problem.kept:
         if isinstance(c, ClearanceConstraint):
             found.append([_too_near(motion, c)])
+        elif isinstance(c, GoalConstraint) and c.dwells:
+            found.append([_of_stay(motion, c)])
         elif c.knots is None:
             found.append(_of_constraint(motion, c, ranges))
     for limit in task.problem.rate_limits:
@@ -176,6 +178,19 @@ def _too_near(motion: Collocated, c: ClearanceConstraint) -> _Beyond:
     far, when = max(float(lacking[row]), 0.0), float(moments[row])
     told = f"{c.told_at(places[row], when)}, tolerance {in_words(c.between, 'm')}"
     return _Beyond("constraint", c.label, far, far / c.between, when, moments[~(lacking <= c.between)], told)
+
+
+def _of_stay(motion: Collocated, c: GoalConstraint) -> _Beyond:
+    """How far beyond its tolerance a goal is missed while it is to hold, where the dynamics lead between the knots."""
+    problem, (times, xs) = motion.task.problem, motion.between_knots
+    knots = problem.knots_of(c, input_at_end=True)
+    begin, end = (motion.horizon * knots[i] / problem.num_steps for i in (0, -1))
+    here = (times >= begin) & (times <= end)
+    times, misses = times[here], np.array([c.miss(x) for x in xs[here]])
+    k = int(np.argmax(misses))
+    told = f"{c.told(float(misses[k]))} at {times[k]:.4g} s, tolerance {in_words(c.tolerance, c.unit)}"
+    beyond, far = times[misses > c.tolerance], max(float(misses[k]) - c.tolerance, 0.0)
+    return _Beyond("constraint", c.label, far, float(misses[k]) / c.tolerance, float(times[k]), beyond, told)
 
 
 def _of_constraint(motion: Collocated, c: Constraint, ranges: Array) -> list[_Beyond]:

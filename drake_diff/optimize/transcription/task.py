@@ -260,7 +260,8 @@ class OptimalControl:
             return np.array(knots)
         if constraint.knots is None:
             return np.arange(knots[0], self.scheme.nodes * (len(mesh) - 1) + 1)
-        return self.nodes_at(knots, mesh)
+        at = self.nodes_at(knots, mesh)
+        return np.arange(at[0], at[-1] + 1) if constraint.whole else at
 
     def node_limits(self, mesh: Array) -> tuple[Array, Array]:
         """(lower, upper), each (K, nx + nu): the bounds of the nodes, equal where an end or a waypoint is given."""

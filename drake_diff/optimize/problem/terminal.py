@@ -1,0 +1,255 @@
+"""A motion ends where a linear regulator takes over: in a level set of its cost-to-go from which it was seen to arrive.
+
+Within the level the regulator's inputs keep their limits, by formula, and so do the state's bounds. That the nonlinear
+plant comes to rest from there is evidence by sampling: random states in the set are stepped, under the regulator, until
+they have converged, and the level is lowered until as many as are asked for have done so one after the other
+(after Tedrake, Manchester, Tobenkin and Roberts, "LQR-trees", IJRR 29(8), 2010, and Reist and Tedrake,
+"Simulation-based LQR-trees with input and state constraints", ICRA 2010).
+"""
+
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, finite_array, positive_int
+from drake_diff.derivatives.step import differentiate_step
+from drake_diff.exceptions import InputError, ModelError, SimulationError
+from drake_diff.model.model import Model
+from drake_diff.model.step import advance
+from drake_diff.model.tangent import tangent_space
+from drake_diff.motion.policy import LQR
+from drake_diff.optimize.problem.constraint import Bounds
+from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint
+
+AIMED = 0.75  # of the level: what a plan may use of it
+GONE = 1e6  # [the state's units] from the goal: nothing comes back from there
+ARRIVED = 1e-2  # of the level: what is left of the cost-to-go of a state that has converged
+SLOWEST, PATIENCE, MOST_STEPS = 1e-3, 3.0, 20_000  # the linear motion's part that is left when a search gives up, times
+LOWERED, TRIED = 0.7, 10  # the level while one of the first states fails; how many states make it worth counting
+WITHIN = 0.95  # of the level that was seen to converge: what is given out, so that its edge lies inside
+FLAT = np.pi  # [rad, m] how far from the goal a position without a bound may be
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """d' S d <= level about a fixed point: where u = u_goal - K d keeps its limits and is seen to converge."""
+
+    x_goal: Array  # (nx,)
+    u_goal: Array  # (nu,)
+    gain: Array  # (nu, nx) K
+    cost_to_go: Array  # (nx, nx) S
+    level: float
+    linear_level: float  # within which limits are kept, by formula
+    samples: int  # random states that converged, one after the other
+    period: float  # [s] of the regulator
+    patience: int  # [steps] that a state gets to converge
+    bounds: Bounds
+
+    def value(self, x: Any) -> Any:
+        """The part of the level that x (nx,) is at: at most 1 within."""
+        d = x - self.x_goal
+        return d @ (self.cost_to_go / self.level) @ d
+
+    def converges(self, model: Model, x: Array) -> bool:
+        """Whether `model`, in steps of the period or shorter, comes from x (nx,) to a hundredth of the level."""
+        held, b = max(1, round(self.period / model.time_step)), self.bounds
+        for _ in range(self.patience):
+            if not np.max(np.abs(x - self.x_goal)) < GONE:
+                return False
+            if self.value(x) <= ARRIVED:
+                return True
+            u = np.clip(self.u_goal - self.gain @ (x - self.x_goal), b.u_lower, b.u_upper)
+            try:
+                for _ in range(held):
+                    x = advance(model.double, x, u)
+            except SimulationError:
+                return False
+            if not np.all((b.x_lower <= x) & (x <= b.x_upper)):
+                return False
+        return False
+
+    def random_state(self, random: np.random.Generator) -> Array:
+        """(nx,) one uniform in the set."""
+        direction = random.standard_normal(len(self.x_goal))
+        part = random.random() ** (1 / len(direction)) / np.linalg.norm(direction)
+        square_root = np.linalg.cholesky(self.cost_to_go / self.level)
+        return self.x_goal + np.linalg.solve(square_root.T, part * direction)
+
+
+_KNOWN: "WeakKeyDictionary[Model, dict[Any, Region]]" = WeakKeyDictionary()
+
+
+@dataclass(frozen=True, repr=False)
+class TerminalSet(Goal):
+    """A motion ends in a set from which a linear quadratic regulator brings the plant to rest at x_goal.
+
+    The set is (x - x_goal)' S (x - x_goal) <= level, S the regulator's cost-to-go in the model's own steps. There the
+    regulator keeps the inputs' limits and the state's bounds, by formula. That the plant converges is evidence by
+    sampling, not a proof: the level is lowered until `samples` random states of the set converge one after the other,
+    in steps of the plant under the regulator. A plan uses three quarters of the level, and each replay is followed by
+    the regulator from where it ends: one that does not converge does not hold. Every method keeps it.
+
+    Args:
+        x_goal: (nx,) where the plant is to rest, a state that some input within its limits holds.
+        Q: (nx, nx) weights of the regulator, per step; the identity where None.
+        R: (nu, nu) the same of the inputs.
+        level: The level to be used; the largest that was seen to converge where None. One that is larger is refused.
+        samples: How many random states have to converge; of n all of which do, at most 3/n of the set's volume does not
+            with 95 % confidence.
+        seed: Of the random states.
+
+    Raises:
+        InputError: By the Problem: no input holds x_goal or none stabilizes it, its limits leave no set, or the `level`
+            is larger than what was seen to converge.
+        ModelError: By the Problem: the state has quaternions.
+
+    Source:
+        Reist and Tedrake, "Simulation-based LQR-trees with input and state constraints", ICRA 2010.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
+        >>> upright = dd.optimize.TerminalSet([np.pi, 0])
+        >>> problem = dd.Problem(
+        ...     model, x0=[0, 0], num_steps=60, goals=[upright], bounds={"motor": (-3, 3)},
+        ...     running_cost=dd.QuadraticCost(R=[[1.0]]),
+        ... )
+        >>> solution = dd.solve(problem)
+        >>> solution.success, bool(upright.region(model, problem.bounds).value(solution.xs[-1]) < 0.76)
+        (True, True)
+    """
+
+    x_goal: Any  # becomes a tuple
+    Q: Any = None  # becomes a tuple of rows
+    R: Any = None
+    _: KW_ONLY
+    level: float | None = None
+    samples: int = 200
+    seed: int = 0
+
+    weight = None
+
+    def __post_init__(self) -> None:
+        x_goal = finite_array("TerminalSet.x_goal", self.x_goal, ("nx",))
+        weights = {
+            name: None
+            if value is None
+            else tuple(map(tuple, finite_array(f"TerminalSet.{name}", value, ("n", "n")).tolist()))
+            for name, value in (("Q", self.Q), ("R", self.R))
+        }
+        if self.level is not None and not (np.isfinite(self.level) and self.level > 0):
+            raise InputError("TerminalSet.level", got=self.level, expected="a number above 0")
+        if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)) or self.seed < 0:
+            raise InputError("TerminalSet.seed", got=repr(self.seed), expected="a whole number of at least 0")
+        samples = positive_int("TerminalSet.samples", self.samples)
+        self._set(x_goal=tuple(x_goal.tolist()), samples=samples, seed=int(self.seed), **weights)
+
+    def region(self, model: Model, bounds: Bounds) -> Region:
+        """The set on a `model` within resolved `bounds`, as a `Problem` has them; looked for once."""
+        key = (self, *(np.asarray(side).tobytes() for side in vars(bounds).values()))
+        known = _KNOWN.setdefault(model, {})
+        if key not in known:
+            known[key] = _found(self, model, bounds)
+        return known[key]
+
+    def bind_to(self, problem: Any) -> tuple[GoalConstraint, ...]:
+        if problem.optimizes_parameters:
+            raise InputError("TerminalSet", got='"parameters" in optimize', expected="a model that does not change")
+        region = self.region(problem.model, problem.bounds)
+        evidence = f"{region.level:.4g} from which {region.samples} of {region.samples} random states converged"
+        return (
+            TerminalConstraint(
+                region.value,
+                upper=AIMED,
+                knots=LAST,
+                name="terminal set",
+                tolerance=1.0,
+                unit="of the level",
+                words=lambda part: f"the end is at {part} {evidence}",
+                measured=lambda x: np.array([region.value(x)]),
+                region=region,
+            ),
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TerminalConstraint(GoalConstraint):
+    """What a `TerminalSet` comes to; a replay that ends in it has to `converge` besides."""
+
+    region: Any = None
+
+
+def _found(asked: TerminalSet, model: Model, bounds: Bounds) -> Region:
+    """The region of `asked`, by formula and then by sampling; InputError where there is none."""
+    x_goal = finite_array("TerminalSet.x_goal", asked.x_goal, (model.nx,))
+    if tangent_space(model).quaternions:
+        raise ModelError("TerminalSet: the state has quaternions, and the set is one of states that can be subtracted")
+    if np.any((x_goal <= bounds.x_lower) | (x_goal >= bounds.x_upper)):
+        raise InputError("TerminalSet.x_goal", got=x_goal.tolist(), expected="a state within its bounds, not on one")
+    d = differentiate_step(model, x_goal, np.zeros(model.nu))
+    u_goal = np.asarray(np.linalg.lstsq(d.B, x_goal - d.x_next, rcond=None)[0])
+    if np.any((u_goal <= bounds.u_lower) | (u_goal >= bounds.u_upper)):
+        told = f"a state that takes u = {u_goal.round(4).tolist()}"
+        raise InputError("TerminalSet.x_goal", got=told, expected="one that inputs within their limits hold")
+    Q = np.eye(model.nx) if asked.Q is None else finite_array("TerminalSet.Q", asked.Q, (model.nx, model.nx))
+    R = np.eye(model.nu) if asked.R is None else finite_array("TerminalSet.R", asked.R, (model.nu, model.nu))
+    regulator = LQR(model, x_goal, u_goal, Q, R)
+    K, S = np.asarray(regulator.gain), np.asarray(regulator.cost_to_go)
+    if np.min(np.linalg.eigvalsh(S)) <= 0:
+        raise InputError("TerminalSet.Q", got="weights that see not all of the state", expected="a cost-to-go above 0")
+    most = linear_level(K, S, x_goal, u_goal, bounds, model.nq)
+    d = differentiate_step(model, x_goal, u_goal)
+    slowest = float(np.max(np.abs(np.linalg.eigvals(d.A - d.B @ K))))
+    steps = min(int(np.ceil(PATIENCE * np.log(SLOWEST) / np.log(min(slowest, 1 - 1e-12)))) + 1, MOST_STEPS)
+
+    def at(level: float, samples: int) -> Region:
+        return Region(x_goal, u_goal, K, S, level, most, samples, model.time_step, steps, bounds)
+
+    wanted = asked.level
+    if wanted is not None and wanted > most:
+        expected = f"at most {most:.4g}, within which limits are kept"
+        raise InputError("TerminalSet.level", got=f"{wanted:g}", expected=expected)
+    level = _sampled(model, at, most if wanted is None else wanted, asked.samples, asked.seed, fixed=wanted is not None)
+    return at(level, asked.samples)
+
+
+def _sampled(
+    model: Model, at: Callable[[float, int], Region], level: float, samples: int, seed: int, *, fixed: bool
+) -> float:
+    """The level, lowered until `samples` random states in a row converge; a `fixed` one that fails is refused."""
+    random, least, most = np.random.default_rng(seed), 1e-12 * level, level
+    in_a_row = 0
+    while in_a_row < samples:
+        region = at(level, 0)
+        x = region.random_state(random)
+        if region.converges(model, x):
+            in_a_row += 1
+            continue
+        told = f"a state at {float(region.value(x)):.2g} of it that does not converge, {x.round(4).tolist()}"
+        if fixed:
+            raise InputError("TerminalSet.level", got=told, expected="a level from which all random states converge")
+        level = min(LOWERED * level, WITHIN * float(region.value(x)) * level) if in_a_row < TRIED else WITHIN * level
+        in_a_row = 0
+        if level < least:
+            raise InputError("TerminalSet", got=told, expected=f"a level below {most:.3g} that converges")
+    return level if fixed or level == most else WITHIN * level
+
+
+def linear_level(K: Array, S: Array, x_goal: Array, u_goal: Array, bounds: Bounds, nq: int) -> float:
+    """The largest level of d' S d within which u_goal - K d and x_goal + d keep their limits.
+
+    Over it the largest a' d is sqrt(level a' S^-1 a). A position without a bound stays within FLAT of its goal.
+    """
+    rows = np.vstack([-K, np.eye(len(S))])
+    at = np.concatenate([u_goal, x_goal])
+    lower, upper = (
+        np.concatenate(sides) for sides in ((bounds.u_lower, bounds.x_lower), (bounds.u_upper, bounds.x_upper))
+    )
+    room = np.minimum(at - lower, upper - at)
+    positions = slice(len(u_goal), len(u_goal) + nq)
+    room[positions] = np.minimum(room[positions], FLAT)
+    widths = np.einsum("ri,ij,rj->r", rows, np.linalg.inv(S), rows)
+    limited = np.isfinite(room) & (widths > 0)
+    return float(np.min(room[limited] ** 2 / widths[limited]))
