@@ -291,7 +291,7 @@ class TranscribedProgram:
         for entry in np.unique(entries):
             here, kept = entries == entry, np.flatnonzero(of == entry)
             node = nodes[here][:, None]
-            at = first + rows[here][:, None], node * self.width + columns[kept]
+            at = first + rows[here][:, None], self.column(node, columns[kept])
             total.add(*at, weights[here][:, None], self.rate_rows, node * len(of) + kept)
 
     def pulled(self, multipliers: Any, horizon: Any) -> Any:
