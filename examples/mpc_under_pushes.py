@@ -28,7 +28,7 @@ def cart_pole() -> tuple[dd.loop.MPC, dd.Problem, dd.loop.Loop, int]:
     )
     pushes = [dd.loop.Push("pole", [1.5, 0, 0], 0.8), dd.loop.Push("pole", [-0.5, 0, 0], 2.6)]
     loop = dd.loop.Loop(pushes=pushes)
-    return dd.loop.MPC(problem, horizon=30, max_iterations=2), problem, loop, 300
+    return dd.loop.MPC(problem, horizon=30), problem, loop, 300
 
 
 def panda(path: Path) -> tuple[dd.loop.MPC, dd.Problem, dd.loop.Loop, int]:
@@ -40,7 +40,7 @@ def panda(path: Path) -> tuple[dd.loop.MPC, dd.Problem, dd.loop.Loop, int]:
     problem = dd.Problem(model, x0=x0, x_goal=goal, num_steps=50, running_cost=cost)
     loop = dd.loop.Loop(pushes=[dd.loop.Push("panda_hand", [2.0, 2.0, 0.0], 0.4)])
     guess = np.linspace(x0, goal, 51), np.tile(holding(model, goal), (50, 1))
-    return dd.loop.MPC(problem, horizon=10, plan=guess, max_iterations=1), problem, loop, 100
+    return dd.loop.MPC(problem, horizon=10, plan=guess), problem, loop, 100
 
 
 def holding(model: dd.Model, x: np.ndarray) -> np.ndarray:

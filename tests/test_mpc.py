@@ -85,7 +85,7 @@ def test_the_pushed_cart_pole_ends_upright(swung):
     problem, pushes = swung.problem, [dd.loop.Push("pole", [1.5, 0, 0], 0.8), dd.loop.Push("pole", [-0.5, 0, 0], 2.6)]
     runs = {}
     for name, controller in (
-        ("mpc", dd.loop.MPC(problem, horizon=30, plan=swung, max_iterations=3)),
+        ("mpc", dd.loop.MPC(problem, horizon=30, plan=swung)),
         ("open loop", dd.loop.OpenLoop(swung.us, 0.02)),
     ):
         runs[name] = dd.loop.closed_loop(problem.model, controller, problem.x0, 300, dd.loop.Loop(pushes=pushes))
@@ -111,7 +111,7 @@ def test_between_two_plans_the_first_ones_inputs_are_given(swung):
     """Only steps 0, 3 and 6 look at the state, and there it is as planned: 1e-4 of 3 N is what two minima of a cost of
     59 can differ by that both leave 1e-16 of it."""
     mpc = dd.loop.MPC(swung.problem, horizon=30, plan=swung, replan_every=3)
-    xs, us = mpc._reference
+    xs, us = mpc._reference.xs, mpc._reference.us
     given = [mpc(xs[k] + (0.1 if k % 3 else 0.0), 0.02 * k) for k in range(7)]
     np.testing.assert_allclose(np.array(given), us[:7], atol=1e-4)
     assert not np.allclose(mpc(xs[9] + 0.1, 0.18), us[9], atol=1e-2)
@@ -120,20 +120,21 @@ def test_between_two_plans_the_first_ones_inputs_are_given(swung):
 def test_a_refused_solve_is_told_and_the_last_plan_followed(swung, monkeypatch):
     mpc = dd.loop.MPC(swung.problem, horizon=30, plan=swung)
     x1 = advance(swung.problem.model.double, np.zeros(4), mpc(np.zeros(4), 0.0))
-    planned = np.array(mpc._last[1])
+    planned, reference = np.array(mpc.plan[1]), mpc._reference
     with monkeypatch.context() as patch:
 
         def refuse(*_, **__):
             raise GradientError("this far and no further")
 
-        patch.setattr("drake_diff.optimize.ilqr.expansion.linearize", refuse)
+        patch.setattr("drake_diff.optimize.realtime.step.linearize", refuse)
         for k in (1, 2, 35):
             command = mpc(x1, 0.02 * k)
             assert mpc.status == "the last plan is followed further: GradientError: this far and no further"
-            assert np.array_equal(command, planned[k] if k < 30 else mpc._reference[1][k])
-    assert mpc(np.full(4, np.nan), 0.02 * 36) == pytest.approx(mpc._reference[1][36])
+            assert np.array_equal(command, planned[k] if k < 30 else reference.us[k])
+            assert mpc.gains is None  # of no step that was solved
+    assert mpc(np.full(4, np.nan), 0.02 * 36) == pytest.approx(reference.us[36])
     assert "NonFiniteError" in mpc.status
-    assert mpc(mpc._reference[0][37], 0.02 * 37) == pytest.approx(mpc._reference[1][37], abs=1e-4)
+    assert mpc(reference.xs[37], 0.02 * 37) == pytest.approx(reference.us[37], abs=1e-4)
     assert mpc.status == "ok"
 
 
@@ -141,15 +142,15 @@ def test_a_loop_logs_the_steps_whose_solve_failed(swung, monkeypatch):
     """Steps 4 to 6 by the shifted plan, which unperturbed is what would be planned: the motion is the same."""
     mpc = dd.loop.MPC(swung.problem, horizon=30, plan=swung)
     undisturbed = dd.loop.closed_loop(swung.problem.model, mpc, np.zeros(4), 10)
-    original, calls = mpc._ahead, []
+    original, calls = mpc._rolling.stretch, []
 
-    def refusing(x, k):
+    def refusing(k, count):
         calls.append(k)
         if 4 <= k <= 6:
             raise SimulationError("no")
-        return original(x, k)
+        return original(k, count)
 
-    monkeypatch.setattr(mpc, "_ahead", refusing)
+    monkeypatch.setattr(mpc._rolling, "stretch", refusing)
     found = dd.loop.closed_loop(swung.problem.model, mpc, np.zeros(4), 10)
     told = "the last plan is followed further: SimulationError: no"
     assert found.controller_status == ("ok",) * 4 + (told,) * 3 + ("ok",) * 3
@@ -158,34 +159,21 @@ def test_a_loop_logs_the_steps_whose_solve_failed(swung, monkeypatch):
     np.testing.assert_allclose(found.motion.xs, undisturbed.motion.xs, atol=1e-4)  # as above: two minima's distance
 
 
-def test_too_few_iterations_are_told(swung):
-    mpc = dd.loop.MPC(swung.problem, horizon=30, plan=swung, max_iterations=1)
-    mpc(np.array([0.3, 0.5, 0, 0]), 0.0)
-    assert mpc.status == "iLQR: iteration limit after 1 steps"
-
-
-def test_ctrl_c_is_no_bad_solve(swung, monkeypatch):
-    from drake_diff.optimize.program import NlpResult, Outcome
-
-    mpc = dd.loop.MPC(swung.problem, horizon=30, plan=swung)
-    interrupted = NlpResult(np.zeros(30), Outcome.INTERRUPTED, "", ())
-    monkeypatch.setattr("drake_diff.loop.mpc.solve_ilqr", lambda *_, **__: (interrupted, None, None))
-    with pytest.raises(KeyboardInterrupt):
-        mpc(np.zeros(4), 0.0)
-
-
 @each_row(
     "changes, options, said",
     [
         ({}, {"horizon": 0}, "horizon"),
         ({}, {"replan_every": 0}, "replan_every"),
-        ({}, {"max_iterations": 0}, "max_iterations"),
+        ({}, {"iterations": 0}, "iterations"),
         ({}, {"plan": "a plan"}, "plan"),
         ({}, {"plan": (np.zeros((5, 2)), np.zeros((20, 1)))}, "plan xs"),
-        ({"waypoints": {3: [0.5, 0]}}, {}, "waypoints"),
-        ({"constraints": dd.Constraint(lambda x, u: x[0], upper=3.0)}, {}, "constraints"),
+        ({}, {"budget": 0.0}, "budget"),
+        ({"us": np.zeros((20, 1)), "optimize": ("initial_state",)}, {}, "fixed controls"),
+        ({"parameters": ["block_0.mass"]}, {}, "parameters"),
+        ({"trajectory_cost": lambda xs, us: xs[0, 0]}, {}, "trajectory_cost"),
+        ({"couplings": dd.optimize.InputRate(5.0)}, {}, "couplings"),
         ({"horizon": (1.0, 3.0)}, {}, "horizon"),
-        ({"x_goal": [0, np.nan]}, {}, "free entries"),
+        ({"bounds": dd.Bounds(x_lower=[-2.0, -0.01])}, {}, r"x.* gives way by"),
         ({"x_goal": [0, 1]}, {}, "fixed point"),
         ({"optimize": ("controls", "initial_state"), "initial_state_mask": [True, False]}, {}, "optimize"),
     ],

@@ -1,34 +1,41 @@
-"""Model predictive control by a few iLQR steps over a horizon that moves on, warm-started from the last plan.
+"""Model predictive control by real-time iterations: one step of sequential quadratic programming a tick, shifted on.
 
 Where the horizon ends before the problem does, it ends in the problem's cost-to-go about a plan of the whole: with
-linear dynamics and quadratic costs its length then changes nothing. A hard goal cannot be kept in a few steps, so it
-becomes a cost: that of staying at the goal from the end on under LQR. After the problem's end that cost is minimized;
-without a goal, the problem's own costs over the moving horizon.
+linear dynamics, quadratic costs and no limit its length then changes nothing. Where the problem has a goal at its end,
+that is stayed at from then on: in the plan, whose steps beyond the end cost what is off the goal, and after it under
+LQR. Without a goal, the problem's own costs go on over the moving horizon.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, finite_array, positive_int
+from drake_diff._base.arrays import Array, finite_array, frozen, positive_float, positive_int
+from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, InputError
-from drake_diff.loop.run import OK
+from drake_diff.loop.run import LATE, OK
+from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import LQR
-from drake_diff.optimize.ilqr.ilqr import check_problem, costs_to_go, solve_ilqr
-from drake_diff.optimize.problem.constraint import Bounds
-from drake_diff.optimize.problem.cost import QuadraticCost
+from drake_diff.optimize.ilqr.ilqr import check_problem
+from drake_diff.optimize.problem.cost import CostToGo, QuadraticCost
+from drake_diff.optimize.problem.goals import LAST
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.problem.timed import Later, TimedCost
-from drake_diff.optimize.program import Limits, Outcome
+from drake_diff.optimize.realtime.rolling import Rolling, Staying
+from drake_diff.optimize.realtime.step import Motion, Step, take_step
 from drake_diff.optimize.replay import Plan, held, regulator_weights
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
 
-TOLERANCE = 1e-8
-PLAN_ITERATIONS = 500  # of the first plan, made once
+PLAN_STEPS = 300  # of the first plan, made once
+PLENTY, NEAR = 100, 1e-6  # after so many, with limits that hold, a plan will do of which a step promises no more
+FOLLOWED = "the last plan is followed further"
+FIXED_POINT_STEPS, AT_REST = 20, 1e-10
+RANK = 1e-9  # positions follow velocities: what their rows say beside those is rounding
+GAP = 1e-3  # of a state's range: what a plan's steps may be off, which a call closes
 # What one step costs that is off the goal by a whole range, in units of the plan's mean cost of a step. With it the
 # cart-pole's swing-up misses its goal by about 0.2 % of a range; with a tenth of it, by 1 %.
 STAY = 1e4
@@ -37,145 +44,272 @@ STAY = 1e4
 class MPC:
     """A controller, u (nu,) = mpc(x (nx,), t [s]): the first input of a plan over the next steps of a problem.
 
-    `t` is rounded to a step of the problem. Input bounds are kept; state bounds as well as a few iLQR steps can keep
-    them. `status` is "ok" where the last plan is a minimum, or else what the solver said of it; where no plan could be
-    made, the last one is followed further and `status` says why. The same calls give the same bytes, because no clock
-    is read.
+    Each call shifts the last plan by the time that has passed, puts the state measured in its place, and takes
+    `iterations` steps towards the best plan. `t` is rounded to a step of the problem, which is the model's time step.
+
+    Inputs keep their bounds. All else that the problem asks for (bounds of states, constraints, waypoints, goals and
+    obstacles) is kept wherever it can be; where it cannot, it gives way at a high price, and `status` says what, by how
+    much and when. Knots are those of the problem, wherever the horizon is. Goals at the problem's end are kept as the
+    plan's last state, which is stayed at.
+
+    `status` is "ok" where a whole step was taken and nothing gives way. It says so where a step was cut because the
+    plant's steps do not follow their derivatives that far, and where none could be made: then the last plan is followed
+    further. With a `budget` it is "late" where the answer took longer; the input of the last plan is given then, and
+    the new one is used from the next call on. Without one no clock changes anything: the same calls give the same
+    bytes.
 
     Args:
-        problem: with given x0, without waypoints, constraints or a free horizon.
-        horizon: how many steps are planned; fewer where the problem ends before.
-        plan: a Solution or (xs (N+1, nx), us (N, nu)) to start from; where None, the problem is solved.
-        replan_every: after how many steps there is a new plan.
-        max_iterations: how many iLQR steps a plan may take.
+        problem: With a given x0 and no free horizon.
+        horizon: How many steps are planned; fewer where the problem ends before and has no goal.
+        plan: A Solution of the problem by any method, or (xs (N+1, nx), us (N, nu)), to start from; where None, the
+            problem is solved.
+        iterations: How many steps a call takes.
+        budget: [s] that a call may take; None waits for every answer.
+        replan_every: After how many steps there is a new plan.
+        clock: What tells the time [s].
 
     Raises:
-        InputError: the problem has something that MPC cannot keep, a goal with free entries or one that no input
-            within the bounds holds, or it is not solved and no `plan` is given.
-        GradientError, SimulationError: the whole cannot be planned from `plan`.
+        InputError: The problem has something that MPC cannot keep, a goal that no input within the bounds holds, or it
+            is not solved and no `plan` is given.
+        GradientError, SimulationError: The whole cannot be planned from `plan`.
+
+    Source:
+        Diehl, Bock and Schloeder, "A real-time iteration scheme for nonlinear optimization in optimal feedback
+        control", 2005.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
         >>> cost = dd.QuadraticCost(Q=np.eye(2), R=np.eye(1))
-        >>> problem = dd.Problem(model, x0=[0.3, 0], num_steps=10, running_cost=cost)
+        >>> limits = dd.Bounds(x_lower=[-1, -0.5], x_upper=[1, 0.5])
+        >>> problem = dd.Problem(model, x0=[0.3, 0], num_steps=10, running_cost=cost, bounds=limits)
         >>> mpc = dd.loop.MPC(problem, horizon=5, plan=(np.zeros((11, 2)), np.zeros((10, 1))))
-        >>> mpc([0.3, 0.0], t=0.0).shape, mpc.status
-        ((1,), 'ok')
+        >>> mpc([0.3, 0.0], t=0.0).shape, mpc.status, mpc.gains.shape
+        ((1,), 'ok', (5, 1, 2))
     """
 
     def __init__(
-        self, problem: Problem, *, horizon: int, plan: Any = None, replan_every: int = 1, max_iterations: int = 5
+        self,
+        problem: Problem,
+        *,
+        horizon: int,
+        plan: Any = None,
+        iterations: int = 1,
+        budget: float | None = None,
+        replan_every: int = 1,
+        clock: Callable[[], float] = perf_counter,
     ):
         if not isinstance(problem, Problem):
             raise InputError("problem", got=type(problem).__name__, expected="a Problem")
+        if not problem.has_model:
+            raise InputError("system", got="plain dynamics", expected="a Model: MPC steps its plant")
         check_problem(problem)
-        for subject in ("horizon", "waypoints", "constraints", "couplings", "goals"):
-            if getattr(problem, subject):
-                raise InputError(subject, got="given", expected="none: MPC cannot keep it")
+        if problem.horizon:
+            raise InputError("horizon", got="given", expected="none: the steps of MPC are the model's")
         if not problem.initial_state_is_given:
             raise InputError("optimize", got=list(problem.optimize), expected='("controls",) for MPC')
         self.horizon = positive_int("horizon", horizon)
         self.replan_every = positive_int("replan_every", replan_every)
-        self._limits = Limits(positive_int("max_iterations", max_iterations), np.inf, TOLERANCE)
+        self.iterations = positive_int("iterations", iterations)
+        self.budget = None if budget is None else positive_float("budget [s]", budget)
+        self._clock, self._problem = clock, problem
         xs, us = _first_plan(problem, plan)
-        self._stay = None if problem.x_goal is None else _staying(problem, xs, us)
-        self._problem = problem
-        if self._stay is not None:  # the cost of staying at the goal in place of the goal
-            own, stay = problem.final_cost, self._stay.final
-            both = stay if own is None else lambda x: own(x) + stay(x)
-            self._problem = replace(problem, x_goal=None, final_cost=both)
-        limits = replace(self._limits, max_iterations=PLAN_ITERATIONS)
-        result, xs, us = solve_ilqr(self._problem, xs, us, limits=limits, report=None)
-        if result.outcome not in (Outcome.SOLVED, Outcome.INACCURATE):
-            raise InputError("plan", got=result.message, expected="a plan from which iLQR finds a minimum")
-        self._reference = xs, us
-        self._tails = costs_to_go(self._problem, *self._reference)
+        self._rolling = Rolling(problem, _staying(problem, xs, us), xs, us)
+        self._reference = self._plan_the_whole(xs, us)
         self.start(problem.x0)
 
     def start(self, x0: Array) -> None:
         """Forget all but the first plan; the first call plans from its own estimate, whatever `x0` (nx,) is."""
         self._begin, self._last, self._fresh = 0, self._reference, True
+        self._step: Step | None = None
+        self._solved_at = 0
+        self._latencies: list[float] = []
+        self.missed = 0  # answers that took longer than the budget
         self.status = OK
 
     def __call__(self, x: Any, t: float) -> Array:
-        k = max(round(t / self._problem.model.time_step), 0)
+        start, k = self._clock(), max(round(t / self._problem.model.time_step), 0)
         if self._fresh or not self._begin <= k < self._begin + self.replan_every:
-            self._replan(x, k)
+            before = self._row(k, 1)
+            self._replan(x, k, start)
+            taken = self._clock() - start
+            self._latencies.append(taken)
+            if self.budget is not None and taken > self.budget:
+                self.missed += 1
+                self.status = f"{LATE}: {taken:.3g} s, expected at most {self.budget:.3g} s"
+                return np.array(before)
         return np.array(self._row(k, 1))
 
-    def _replan(self, x: Any, k: int) -> None:
+    @property
+    def latencies(self) -> Array:
+        """(calls,) [s] that each new plan took since `start`, on this machine."""
+        return frozen(np.array(self._latencies))
+
+    @property
+    def plan(self) -> tuple[Array, Array]:
+        """xs (n+1, nx), us (n, nu): the last plan, from the step on that it was made at."""
+        return frozen(self._last.xs), frozen(self._last.us)
+
+    @property
+    def gains(self) -> Array | None:
+        """(n, nu, nx) K: about `plan`, us[k] + K[k] (x - xs[k]) is what would be planned from x nearby at each step.
+
+        What holds the plan, of the bounds and limits, goes on to hold it. None where the last plan is of no step that
+        was solved, or that has no minimum.
+        """
+        policy = self._policy()
+        return None if policy is None else frozen(policy.feedback)
+
+    @property
+    def value(self) -> CostToGo | None:
+        """What remains to be paid from the first state of `plan` on, but for a constant; None as of `gains`."""
+        policy = self._policy()
+        if policy is None:
+            return None
+        return CostToGo(self._last.xs[0], policy.value_gradients[0], policy.value_hessians[0])
+
+    def _policy(self) -> Any:
+        return None if self._step is None or self._solved_at != self._begin else self._step.policy
+
+    def _replan(self, x: Any, k: int, start: float) -> None:
         """Plan from step `k` on; where that fails, keep the last plan, moved on to `k`."""
-        count = self._count(k)
+        count = self._rolling.count(k, self.horizon)
         xs = np.array([self._row(i, 0) for i in range(k, k + count + 1)])
         us = np.array([self._row(i, 1) for i in range(k, k + count)])
+        motion = Motion(xs, us, xs[1:])
+        self.status = OK
         try:
-            x = finite_array("x", x, (self._problem.model.nx,))
-            result, found_xs, found_us = solve_ilqr(self._ahead(x, k), xs, us, limits=self._limits, report=None)
+            motion = self._measured(finite_array("x", x, (self._problem.nx,)), k, xs, us)
+            stretch = self._rolling.stretch(k, count)
+            for _ in range(self.iterations):
+                begin = self._clock()
+                step = take_step(stretch, motion)
+                if isinstance(step, Refusal):
+                    self.status = f"{FOLLOWED}: {step.reason}"
+                    break
+                self._step, self._solved_at, motion = step, k, step.motion
+                self.status = self._told(step, k)
+                now = self._clock()
+                is_late = self.budget is not None and now - start + (now - begin) > self.budget
+                if step.is_reached or not step.size or is_late:  # the next one would be late
+                    break
         except (DrakeDiffError, np.linalg.LinAlgError) as error:
-            self.status = f"the last plan is followed further: {type(error).__name__}: {error}"
-        else:
-            if result.outcome is Outcome.INTERRUPTED:
-                raise KeyboardInterrupt
-            xs, us = found_xs, found_us
-            self.status = OK if result.outcome is Outcome.SOLVED else result.message
-        self._begin, self._last, self._fresh = k, (xs, us), False
+            self.status = f"{FOLLOWED}: {type(error).__name__}: {error}"
+        self._begin, self._last, self._fresh = k, motion, False
 
-    def _count(self, k: int) -> int:
-        """How many steps are planned from step `k`."""
-        left = self._problem.num_steps - k
-        return min(self.horizon, left) if left > 0 else self.horizon
+    def _measured(self, x: Array, k: int, xs: Array, us: Array) -> Motion:
+        """The plan xs, us from step `k` on, from the state measured."""
+        twin, last = self._problem.model.double, self._last
+        xs[0] = self._same_sign(x, xs[0])
+        known = range(self._begin + (k == self._begin), self._begin + len(last.us))
+        ends = [last.ends[k + j - self._begin] if j and k + j in known else advance(twin, xs[j], us[j])
+                for j in range(len(us))]  # fmt: skip
+        return Motion(xs, us, np.array(ends))
 
-    def _ahead(self, x: Array, k: int) -> Problem:
-        """What is minimized from `x` at step `k`."""
-        problem, count = self._problem, self._count(k)
-        running, final = problem.running_cost, problem.final_cost
-        if isinstance(running, TimedCost):
-            running = Later(running, k * problem.model.time_step)
-        if k + count < problem.num_steps:
-            final = self._tails[k + count]
-        elif k >= problem.num_steps and self._stay is not None:
-            running, final = self._stay.running, self._stay.final
-        b = problem.bounds
-        bounds = Bounds(np.minimum(b.x_lower, x), np.maximum(b.x_upper, x), b.u_lower, b.u_upper)
-        return replace(problem, x0=x, num_steps=count, us=None, running_cost=running, final_cost=final, bounds=bounds)
+    def _same_sign(self, x: Array, planned: Array) -> Array:
+        """`x` with its quaternions as near to those of `planned` as they can be: either sign is the same rotation."""
+        x = np.array(x)
+        for start in tangent_space(self._problem.model).quaternions:
+            part = slice(start, start + 4)
+            if x[part] @ planned[part] < 0:
+                x[part] *= -1
+        return x
+
+    def _told(self, step: Step, k: int) -> str:
+        """What is to be said of a step at the problem's step `k`."""
+        said = []
+        if not step.size and not step.is_reached:
+            said.append(f"{FOLLOWED}: no step lowers what is paid, though the derivatives promise it")
+        elif step.size and step.is_doubtful:
+            said.append("the derivatives are not those of the plant's steps")
+        elif 0 < step.size < 1:
+            said.append(f"a step of {step.size:g}: the plant does not follow its derivatives further")
+        if step.given_way is not None:
+            label, far, knot = step.given_way
+            said.append(f"{label} gives way by {far:.3g} at {(k + knot) * self._problem.model.time_step:.4g} s")
+        return "; ".join(said) or OK
 
     def _row(self, k: int, i: int) -> Array:
         """State (i = 0) or input (1) `k` of the last plan, else of the first, and after its end what stays there."""
-        last, first = self._last[i], self._reference[i]
+        last, first = ((m.xs, m.us)[i] for m in (self._last, self._reference))
         if self._begin <= k < self._begin + len(last):
             return last[k - self._begin]
         if k < len(first):
             return first[k]
-        return first[-1] if self._stay is None else self._stay.point[i]
+        return first[-1] if self._rolling.staying is None else self._rolling.staying.point[i]
+
+    def _plan_the_whole(self, xs: Array, us: Array) -> Motion:
+        """A minimum near the given plan, whose costs-to-go are the tails."""
+        problem, rolling = self._problem, self._rolling
+        stretch = rolling.stretch(0, problem.num_steps)
+        xs, us = np.array(xs), np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
+        xs[0] = problem.x0
+        motion, ranges = Motion(xs, us, stretch.ends(xs[:-1], us)), problem.ranges(xs)
+        for i in range(PLAN_STEPS):
+            found = take_step(stretch, motion)
+            if isinstance(found, Refusal):
+                raise InputError("plan", got=found.reason, expected="a plan near which a minimum is found")
+            step, motion = found, found.motion
+            is_near = i >= PLENTY and not step.whole and step.promised <= NEAR * (1 + abs(step.merit))
+            if step.is_reached or not step.size or is_near:
+                break
+        apart = float(np.max(np.abs(motion.gaps) / ranges))
+        if apart > GAP or step.given_way is not None:
+            got = f"steps that are {apart:.2g} of a range off" if apart > GAP else self._told(step, 0)
+            raise InputError("plan", got=got, expected="a plan near which a motion keeps all that the problem asks for")
+        if step.tails is None:
+            raise InputError("running_cost", got="no positive curvature by the inputs", expected="one with a minimum")
+        rolling.tails = step.tails
+        return motion
 
 
-@dataclass(frozen=True, eq=False)
-class _Staying:
-    """Staying at `point`, the goal and its input; `final` is what staying costs from a state nearby."""
+def _staying(problem: Problem, xs: Array, us: Array) -> Staying | None:
+    """Regulation at the problem's end: Bryson's weights along the plan, in the unit of its mean cost a step.
 
-    point: tuple[Array, Array]
-    running: QuadraticCost
-    final: QuadraticCost
-
-
-def _staying(problem: Problem, xs: Array, us: Array) -> _Staying:
-    """Regulation at the goal: Bryson's weights along the plan, in the unit of its mean cost a step, and LQR's tail."""
-    model, goal, bounds = problem.model, np.asarray(problem.x_goal), problem.bounds
-    if np.any(np.isnan(goal)):
-        raise InputError("x_goal", got="free entries", expected="a whole state, or a final_cost in its place")
-    # The input that comes closest to a step from the goal to itself; without contact the step is linear in it.
-    d = differentiate_step(model, goal, np.zeros(model.nu))
-    u = np.asarray(np.linalg.lstsq(d.B, goal - d.x_next, rcond=None)[0])
+    None where it has no goal there.
+    """
+    model, bounds = problem.model, problem.bounds
+    at_end = [c for c in problem.kept_goals if c.knots == LAST]
+    if problem.x_goal is None and not at_end:
+        return None
+    goal, u = _fixed_point(problem, xs[-1], us[-1])
     if np.any(u < bounds.u_lower) or np.any(u > bounds.u_upper):
         raise InputError("x_goal", got=f"held by u = {u}", expected="a state that inputs within their bounds can hold")
+    for constraint in at_end:
+        if constraint.miss(goal) > constraint.tolerance:
+            got = f"{constraint.told(constraint.miss(goal))} where inputs can hold the model"
+            raise InputError(f"goal {constraint.label}", got=got, expected="one that can be stayed at")
     plan = Plan(problem, problem.parameters, model.time_step, held(xs, us), False)
     cost = problem.objective(xs, us)
-    unit = STAY * (cost if cost > 0 else 1.0) / problem.num_steps
-    Q, R, _ = (unit * weight for weight in regulator_weights(plan, us))
+    cost = cost if cost > 0 else 1.0
+    Q, R, _ = (STAY * cost / problem.num_steps * weight for weight in regulator_weights(plan, us))
     regulator, to_tangent = LQR(model, goal, u, Q, R), tangent_space(model).derivative_of_minus(goal)
     h, Q, P = model.time_step, to_tangent.T @ Q @ to_tangent, to_tangent.T @ regulator.cost_to_go @ to_tangent
     running = QuadraticCost(Q=Q / h, R=R / h, x_ref=goal, u_ref=u)
-    return _Staying((goal, u), running, QuadraticCost(Q=(P + P.T) / 2, x_ref=goal))
+    return Staying((goal, u), running, QuadraticCost(Q=(P + P.T) / 2, x_ref=goal), cost)
+
+
+def _fixed_point(problem: Problem, x: Array, u: Array) -> tuple[Array, Array]:
+    """The state at rest nearest to `x` (nx,), and its input, that a step leaves where it is, with the goal's entries.
+
+    By the input alone where that is enough, else by Newton's method, each step the shortest; LQR refuses what is no
+    fixed point in the end.
+    """
+    model = problem.model
+    x, free = np.where(np.isnan(problem.goal), x, problem.goal), np.isnan(problem.goal)
+    x[model.nq :] = np.where(free[model.nq :], 0.0, x[model.nq :])
+    free[model.nq :] = False
+    quaternions = [slice(start, start + 4) for start in tangent_space(model).quaternions]
+    for i in range(FIXED_POINT_STEPS):
+        for part in quaternions:
+            x[part] /= np.linalg.norm(x[part])
+        d = differentiate_step(model, x, u)
+        if np.max(np.abs(d.x_next - x)) <= AT_REST:
+            break
+        slopes = np.hstack([(d.A - np.eye(model.nx))[:, free] * (i > 0), d.B])
+        move = np.linalg.lstsq(slopes, x - d.x_next, rcond=RANK)[0]
+        x[free] += move[: np.sum(free)]
+        u = u + move[np.sum(free) :]
+    return x, u
 
 
 def _first_plan(problem: Problem, plan: Any) -> tuple[Array, Array]:
@@ -185,8 +319,20 @@ def _first_plan(problem: Problem, plan: Any) -> tuple[Array, Array]:
             expected = "a problem that `solve` solves, or a plan"
             raise InputError("problem", got=f"solve: {plan.message}", expected=expected)
     if isinstance(plan, Solution):
-        plan = (plan.xs, plan.us)
+        plan = _sampled(problem, plan)
     if not (isinstance(plan, (tuple, list)) and len(plan) == 2):
         raise InputError("plan", got=type(plan).__name__, expected="None, (xs, us) or a Solution")
     xs = finite_array("plan xs", plan[0], (problem.num_steps + 1, problem.model.nx))
     return xs, finite_array("plan us", plan[1], (problem.num_steps, problem.model.nu))
+
+
+def _sampled(problem: Problem, solution: Solution) -> tuple[Array, Array]:
+    """Its states and inputs at the problem's steps; of another horizon the last ones where it ends before."""
+    if len(solution.xs[0]) != problem.nx:
+        raise InputError("plan", got=f"a Solution of {len(solution.xs[0])} states", expected=f"one of {problem.nx}")
+    h = problem.time_step
+    if solution.problem.num_steps == problem.num_steps and np.isclose(solution.time_step, h, rtol=1e-9, atol=0.0):
+        return solution.plan.sample(1)
+    state, input_ = solution.trajectory()
+    times = np.minimum(h * np.arange(problem.num_steps + 1), state.end_time())
+    return state.vector_values(times).T, input_.vector_values(times[:-1]).T

@@ -1,0 +1,198 @@
+"""The quadratic program of one step: linear dynamics and hard input bounds, every other row with a slack at a price.
+
+Over the moves d of inputs and states, knot by knot (that of the first state is 0),
+
+    minimize  sum_k g_k' d_k + d_k' H_k d_k / 2 + price' slack
+    where     dx_(k+1) = F_k d_k + gap_k,  du within its bounds,  lower - slack <= J d <= upper + slack,  slack >= 0,
+
+so that it always has a solution. A price above a row's multiplier keeps the row wherever it can be kept (an exact
+penalty; Nocedal and Wright, "Numerical Optimization", 2006, section 17.2). PIQP solves it, which CasADi carries:
+Schwan, Jiang, Kuhn and Jones, "PIQP: A Proximal Interior-Point Quadratic Programming Solver", 2023.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.refusal import Refusal
+from drake_diff.derivatives.steps import Flags
+from drake_diff.optimize.ilqr.riccati import LinearQuadratic
+
+OPTIONS = {"error_on_fail": False, "piqp": {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100}}
+FREE = 1e30  # what PIQP takes for no limit
+FAR = 1e3  # ranges: a limit there is as good as none
+DEAREST = 1e3  # price: dearer ones cost PIQP its digits, so that the cost is taken in another unit
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Limits of one function of a knot, at the knots first ... last."""
+
+    first: int
+    last: int
+    columns: Indices  # of z = [x, u] that it depends on
+    has_lower: Flags  # (m,) whether there is ever such a limit
+    has_upper: Flags
+
+    @property
+    def size(self) -> int:
+        """m"""
+        return len(self.has_lower)
+
+    @property
+    def count(self) -> int:
+        """The number of knots."""
+        return self.last - self.first + 1
+
+
+@dataclass(frozen=True, eq=False)
+class Limited:
+    """What `Rows` are at a point: Jacobians (K, m, nx + nu), and how far the limits are from the values (K, m)."""
+
+    jacobians: Array
+    lower: Array
+    upper: Array
+    prices: Array  # (m,)
+    ranges: Array  # (m,) of the values
+
+    @property
+    def beyond(self) -> Array:
+        """(K, m) how far the values are beyond a limit."""
+        return np.maximum(np.maximum(self.lower, -self.upper), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Moves:
+    """A solution. Multipliers are positive at an upper limit and negative at a lower one."""
+
+    dxs: Array  # (N+1, nx)
+    dus: Array  # (N, nu)
+    slacks: tuple[Array, ...]  # (K, m) of each of the rows
+    multipliers: tuple[Array, ...]  # (K, m)
+    bounds: Array  # (N, nu) multipliers of the inputs' bounds
+    dynamics: Array  # (N, nx) of each step: d cost / d gap
+
+
+class SoftProgram:
+    """The program for `count` steps; its structure never changes, and is set up once."""
+
+    def __init__(self, nx: int, nu: int, count: int, rows: Sequence[Rows]):
+        self.nx, self.nu, self.count, self.rows = nx, nu, count, tuple(rows)
+        n, moves = nx + nu, count * (nx + nu)
+        self.slack_at = np.cumsum([moves, *(r.count * r.size for r in self.rows)])
+        self.size = int(self.slack_at[-1])
+        places, sides = [self._dynamics()], count * nx
+        self.sides: list[tuple[int, Indices, Indices]] = []  # (+1 upper or -1 lower, index of the rows, kept (m,))
+        for i, r in enumerate(self.rows):
+            for sign, has in ((1, r.has_upper), (-1, r.has_lower)):
+                kept = np.flatnonzero(has)
+                self.sides.append((sign, np.array([i]), kept))
+                places.append(self._soft(i, kept, sides))
+                sides += r.count * len(kept)
+        self.height = sides
+        at = np.concatenate([np.stack(place) for place in places], axis=1)
+        self._inside = at[1] >= 0  # what depends on the first state, which is given, has no column
+        self._order = np.lexsort((at[0][self._inside], at[1][self._inside]))
+        a = _sparsity(at[:, self._inside][:, self._order], (sides, self.size))
+        h = self._set_hessian(n)
+        self._solver = ca.conic("step", "piqp", {"h": h, "a": a}, OPTIONS)
+        self._a, self._h = a, h
+        self._free = np.full(self.size - moves, FREE)
+
+    def _dynamics(self) -> tuple[Indices, Indices]:
+        """(rows, columns) of dx_(k+1), then of -F_k."""
+        nx, n = self.nx, self.nx + self.nu
+        k, i = _all(self.count, nx)
+        each, of, j = _all(self.count, nx, n)
+        rows = np.concatenate([k * nx + i, each * nx + of])
+        return rows, np.concatenate([k * n + self.nu + i, self._column(each, j)])
+
+    def _column(self, k: Indices, j: Indices) -> Indices:
+        """Where entry j of [x, u] at knot k is among the variables; negative for the first state, which is given."""
+        n = self.nx + self.nu
+        found = np.where(j < self.nx, (k - 1) * n + self.nu + j, k * n + j - self.nx)
+        return np.where((k == 0) & (j < self.nx), -1, found)
+
+    def _soft(self, i: int, kept: Indices, first: int) -> tuple[Indices, Indices]:
+        """(rows, columns) of one side's Jacobian, then of its slacks."""
+        r = self.rows[i]
+        k, a = _all(r.count, len(kept))
+        each, of, j = _all(r.count, len(kept), len(r.columns))
+        rows = np.concatenate([each * len(kept) + of, k * len(kept) + a])
+        slacks = self.slack_at[i] + k * r.size + kept[a]
+        return first + rows, np.concatenate([self._column(each + r.first, r.columns[j]), slacks])
+
+    def _set_hessian(self, n: int) -> ca.Sparsity:
+        k, i, j = _all(self.count + 1, n, n)
+        last = (k == self.count) & ((i >= self.nx) | (j >= self.nx))
+        rows, columns = self._column(k, i), self._column(k, j)
+        self._curved = (rows >= 0) & (columns >= 0) & ~last
+        at = np.stack([rows[self._curved], columns[self._curved]])
+        self._hessian_order = np.lexsort((at[0], at[1]))
+        return _sparsity(at[:, self._hessian_order], (self.size, self.size))
+
+    def solve(self, model: LinearQuadratic, limited: Sequence[Limited]) -> Moves | Refusal:
+        """A Refusal where PIQP finds no solution, as of numbers that are not finite or far too large."""
+        n, nx, nu, count = self.nx + self.nu, self.nx, self.nu, self.count
+        dearest = max((float(np.max(one.prices, initial=0.0)) for one in limited), default=0.0)
+        unit = DEAREST / dearest if dearest > DEAREST else 1.0  # of the cost
+        data = [np.ones(count * nx), -model.F.ravel()]
+        lower, upper = [model.gaps.ravel()], [model.gaps.ravel()]
+        for sign, (i,), kept in self.sides:
+            r, one = self.rows[i], limited[i]
+            data += [one.jacobians[:, kept][:, :, r.columns].ravel(), np.full(r.count * len(kept), -float(sign))]
+            side, far = (one.upper if sign > 0 else one.lower)[:, kept], FAR * one.ranges[kept]
+            side = np.clip(side, -far, far).ravel()  # PIQP complains of rows without a limit
+            lower.append(side if sign < 0 else np.full(side.size, -np.inf))
+            upper.append(side if sign > 0 else np.full(side.size, np.inf))
+        a = np.concatenate(data)[self._inside][self._order]
+        hessians = np.zeros((count + 1, n, n))
+        hessians[:-1], hessians[-1, :nx, :nx] = model.hessians, model.final_hessian
+        h = hessians.ravel()[self._curved][self._hessian_order]
+        g = np.zeros(self.size)
+        g[: count * n] = np.append(model.gradients.ravel()[nx:], model.final_gradient)
+        for start, r, one in zip(self.slack_at[:-1], self.rows, limited, strict=True):
+            g[start : start + r.count * r.size] = np.tile(one.prices, r.count)
+        least, most = np.full((count, n), -np.inf), np.full((count, n), np.inf)
+        least[:, :nu], most[:, :nu] = model.lower, model.upper
+        sides = {"lba": np.concatenate(lower), "uba": np.concatenate(upper)}
+        sides |= {"lbx": np.append(least.ravel(), 0.0 * self._free), "ubx": np.append(most.ravel(), self._free)}
+        found = self._solver(h=ca.DM(self._h, unit * h), g=unit * g, a=ca.DM(self._a, a), **sides)
+        stats = self._solver.stats()
+        z = np.asarray(found["x"]).ravel()
+        if not stats["success"] or not np.all(np.isfinite(z)):
+            return Refusal(f"PIQP: {stats['return_status']}")
+        return self._unpacked(z, *(np.asarray(found[name]).ravel() / unit for name in ("lam_a", "lam_x")))
+
+    def _unpacked(self, z: Array, by_row: Array, by_variable: Array) -> Moves:
+        count, nx, nu = self.count, self.nx, self.nu
+        moves = z[: count * (nx + nu)].reshape(count, nx + nu)
+        multipliers = [np.zeros((r.count, r.size)) for r in self.rows]
+        first = count * nx
+        for _, (i,), kept in self.sides:
+            size = self.rows[i].count * len(kept)
+            multipliers[i][:, kept] += by_row[first : first + size].reshape(self.rows[i].count, len(kept))
+            first += size
+        places = zip(self.slack_at[:-1], self.rows, strict=True)
+        return Moves(
+            dxs=np.concatenate([np.zeros((1, nx)), moves[:, nu:]]),
+            dus=moves[:, :nu],
+            slacks=tuple(z[start : start + r.count * r.size].reshape(r.count, r.size) for start, r in places),
+            multipliers=tuple(multipliers),
+            bounds=by_variable[: count * (nx + nu)].reshape(count, nx + nu)[:, :nu],
+            dynamics=-by_row[: count * nx].reshape(count, nx),
+        )
+
+
+def _all(*counts: int) -> Indices:
+    """All indices below `counts`, in order: one row for each of them."""
+    return np.indices(counts, dtype=np.intp).reshape(len(counts), -1)
+
+
+def _sparsity(at: Array, shape: tuple[int, int]) -> ca.Sparsity:
+    """Of (rows, columns), in the order of columns and then rows."""
+    starts = np.searchsorted(at[1], np.arange(shape[1] + 1))
+    return ca.Sparsity(*shape, starts.tolist(), at[0].tolist())

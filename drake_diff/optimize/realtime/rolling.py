@@ -1,0 +1,190 @@
+"""A problem as stretches that begin at any of its steps and may reach beyond its end."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import InputError
+from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.cost import CostToGo, QuadraticCost
+from drake_diff.optimize.problem.goals import LAST, GoalConstraint
+from drake_diff.optimize.problem.obstacles import ClearanceConstraint
+from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.realtime.knots import KnotFunction, Selected, knot_cost, knot_function
+from drake_diff.optimize.realtime.qp import Rows, SoftProgram
+from drake_diff.optimize.realtime.step import DEAR, NO_SLOPE, Limits, Motion, Stage, Stretch, expand, free_policy
+
+# A price above a limit's multiplier keeps it wherever it can be kept. Where an end is stayed at, prices are this many
+# costs of the plan for a whole range of what is limited: ten times what staying costs that is off by as much. Elsewhere
+# they are so many times what the cost-to-go says that a unit is worth.
+DEAR_BESIDE_STAYING = 1e5
+PERTURBED, SPREAD = 8, 0.3  # motions at which slopes are looked at, in ranges of the states beside the plan
+
+
+@dataclass(frozen=True, eq=False)
+class Staying:
+    """Staying at `point`, a state (nx,) and its input (nu,); `final` is what staying costs from a state nearby."""
+
+    point: tuple[Array, Array]
+    running: QuadraticCost
+    final: QuadraticCost
+    unit: float  # the cost of the plan
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Rows of one function; `limits` (m,) hold at the knots `at` of the problem, at all where None."""
+
+    labels: tuple[str, ...]
+    function: KnotFunction
+    takes_input: bool
+    lower: Array
+    upper: Array
+    at: frozenset[int] | None
+    special: dict[int, Array]  # (m,) values to be met at a knot, NaN where free
+    prices: Array
+    ranges: Array
+
+
+class Rolling:
+    """`problem` around a plan xs (N+1, nx), us (N, nu); with `staying`, its end is stayed at.
+
+    Without, a stretch ends where the problem does, and those that begin later are of its own costs again.
+    """
+
+    def __init__(self, problem: Problem, staying: Staying | None, xs: Array, us: Array):
+        self.problem, self.staying = problem, staying
+        self.nx, self.nu = problem.nx, problem.nu
+        middle = len(us) // 2
+        probe = np.array([np.concatenate([xs[k], us[k]]) for k in (0, middle, len(us) - 1)])
+        states = probe[:, : self.nx]
+        self._running = knot_cost(problem.total_running_cost, self.nx, self.nu, probe)
+        self._final = knot_cost(problem.total_final_cost, self.nx, 0, states)
+        if staying is not None:
+            self._stay = knot_cost(staying.running, self.nx, self.nu, probe)
+            self._stayed = knot_cost(staying.final, self.nx, 0, states)
+        self.tails: tuple[CostToGo, ...] = ()  # of the states of a plan of the whole
+        self._programs: dict[int, SoftProgram] = {}
+        self.groups = tuple(self._groups(probe))
+        self._set_prices(xs, us)
+
+    def stretch(self, begin: int, count: int) -> Stretch:
+        """The steps `begin` ... `begin` + `count`."""
+        limits = tuple(self._limits(group, begin, count) for group in self.groups)
+        if count not in self._programs:
+            self._programs[count] = SoftProgram(self.nx, self.nu, count, [limit.rows for limit in limits])
+        running, final = self._costs(begin, count)
+        return Stretch(self.problem.model, self.problem.bounds, running, final, limits, self._programs[count])
+
+    def count(self, begin: int, horizon: int) -> int:
+        """How many steps are planned at most from step `begin` on."""
+        left = self.problem.num_steps - begin
+        return min(horizon, left) if self.staying is None and left > 0 else horizon
+
+    def _costs(self, begin: int, count: int) -> tuple[list[Stage], list[Stage]]:
+        h, end, last = self.problem.model.time_step, begin + count, self.problem.num_steps
+        times: Array = h * np.arange(begin, end + 1, dtype=float)
+        own = count if self.staying is None else int(np.clip(last - begin, 0, count))
+        running, final = [Stage(self._running, slice(0, own), times[:own], h)], []
+        if own < count:
+            running.append(Stage(self._stay, slice(own, count), times[own:count], h))
+        at_end = slice(count, count + 1), times[count:], 1.0
+        if end < last:
+            final.append(Stage(knot_cost(self.tails[end], self.nx, 0, np.empty((0, self.nx))), *at_end))
+            return running, final
+        if self.staying is None:
+            return running, [Stage(self._final, *at_end)]
+        if begin < last:
+            final.append(Stage(self._final, slice(last - begin, last - begin + 1), times[last - begin :][:1], 1.0))
+        final.append(Stage(self._stayed, *at_end))
+        return running, final
+
+    def _groups(self, probe: Array) -> list[_Group]:
+        problem, b = self.problem, self.problem.bounds
+        limited = np.isfinite(b.x_lower) | np.isfinite(b.x_upper)
+        for wanted in problem.waypoints.values():
+            limited |= ~np.isnan(wanted)
+        which, ones = np.flatnonzero(limited), np.ones(int(np.sum(limited)))
+        found = []
+        if len(which):
+            labels = tuple(problem.state_names[i] for i in which)
+            special = {k: wanted[which] for k, wanted in problem.waypoints.items()}
+            lower, upper = b.x_lower[which], b.x_upper[which]
+            states = Selected(which, self.nx + self.nu)
+            found.append(_Group(labels, states, False, lower, upper, None, special, ones, ones))
+        for c in problem.kept:
+            if self.staying is not None and isinstance(c, GoalConstraint) and c.knots == LAST:
+                continue  # the plan keeps it, and its end is stayed at
+            at = None if c.knots is None else frozenset(problem.knots_of(c, input_at_end=False))
+            function = knot_function(c, self.nx, self.nu, probe)
+            ones = np.ones(len(c.lower))
+            found.append(_Group(_labels(c), function, c.takes_input, c.lower, c.upper, at, {}, ones, ones))
+        return found
+
+    def _limits(self, group: _Group, begin: int, count: int) -> Limits:
+        first, last = (0, count - 1) if group.takes_input else (1, count)
+        knots, m = np.arange(begin + first, begin + last + 1), len(group.lower)
+        lower, upper = np.tile(group.lower, (len(knots), 1)), np.tile(group.upper, (len(knots), 1))
+        if group.at is not None:
+            away = np.array([k not in group.at for k in knots])
+            lower[away], upper[away] = -np.inf, np.inf
+        for knot, wanted in group.special.items():
+            if begin + first <= knot <= begin + last:
+                row = knot - begin - first
+                given = ~np.isnan(wanted)
+                lower[row, given] = upper[row, given] = wanted[given]
+        met = np.zeros(m, dtype=bool)
+        for wanted in group.special.values():
+            met |= ~np.isnan(wanted)
+        rows = Rows(first, last, group.function.columns, np.isfinite(group.lower) | met, np.isfinite(group.upper) | met)
+        return Limits(group.labels, group.function, rows, lower, upper, group.prices, group.ranges)
+
+    def _set_prices(self, xs: Array, us: Array) -> None:
+        """Prices by what a unit of each state and input is worth along the plan, and by the slopes of the rows."""
+        problem, b = self.problem, self.problem.bounds
+        whole = replace(self.stretch(0, problem.num_steps), limits=())
+        expansion = expand(whole, Motion(xs, us, whole.ends(xs[:-1], us)))
+        policy = free_policy(expansion.quadratic)
+        if policy is None:
+            raise InputError(
+                "running_cost", got="no positive curvature by the inputs", expected="a cost with a minimum"
+            )
+        ranges = problem.ranges(xs)
+        for side in (b.x_lower, b.x_upper):
+            apart = np.max(np.abs(xs - side), axis=0)
+            ranges = np.where(np.isfinite(apart), np.maximum(ranges, apart), ranges)
+        wide = b.u_upper - b.u_lower
+        efforts = np.where(np.isfinite(wide), wide, 1.0 + np.ptp(us, axis=0))
+        P = np.max(np.diagonal(policy.value_hessians, axis1=1, axis2=2), axis=0)
+        worth = np.max(np.abs(policy.value_gradients), axis=0) + P * ranges
+        B = expansion.quadratic.F[:, :, self.nx :]
+        curved = np.einsum("kij,kil,klj->kj", B, policy.value_hessians[1:], B)
+        curved = curved + np.diagonal(expansion.quadratic.hessians, axis1=1, axis2=2)[:, self.nx :]
+        worth = np.concatenate([worth, np.max(curved, axis=0) * efforts])
+        spans, random = np.concatenate([ranges, efforts]), np.random.default_rng(0)
+        knots = np.hstack([xs[:-1], us])
+        near = [knots + SPREAD * spans * random.standard_normal(knots.shape) for _ in range(PERTURBED)]
+        looked = np.concatenate([knots, *near])
+        unit = None if self.staying is None else self.staying.unit
+        self.groups = tuple(_priced(group, looked, worth, spans, unit) for group in self.groups)
+
+
+def _priced(group: _Group, knots: Array, worth: Array, spans: Array, unit: float | None) -> _Group:
+    with np.errstate(all="ignore"):
+        slopes = np.abs(group.function.linearize(knots)[1])
+    slopes = slopes[np.all(np.isfinite(slopes), axis=(1, 2))]
+    steepest = np.max(slopes, axis=0, initial=0.0)  # (m, n)
+    squared = np.sum(steepest**2, axis=1)
+    flat = squared <= NO_SLOPE
+    ranges = np.where(flat, 1.0, steepest @ spans)
+    if unit is not None:
+        return replace(group, prices=DEAR_BESIDE_STAYING * unit / ranges, ranges=ranges)
+    prices = np.where(flat, np.sum(worth), steepest @ worth / np.where(flat, 1.0, squared))
+    return replace(group, prices=DEAR * prices, ranges=ranges)
+
+
+def _labels(c: Constraint) -> tuple[str, ...]:
+    if isinstance(c, ClearanceConstraint):
+        return tuple(f"{c.label} ({row})" for row in c.clearance.labels)
+    return (c.label,) * len(c.lower)
