@@ -22,16 +22,17 @@ from drake_diff.optimize.program import Limits, Multipliers
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.transcription.collocation import FOUND
 from drake_diff.optimize.transcription.expressions import knot_functions
-from drake_diff.optimize.transcription.kkt import WEAK, Change, Held, HeldPlan, KnotProgram
+from drake_diff.optimize.transcription.kkt import NEAREST, WEAK, Change, Held, HeldPlan, KnotProgram
 from drake_diff.optimize.transcription.program import TranscribedProgram, solve_ipopt
 from drake_diff.optimize.transcription.steps import CALLED_BACK, StepProgram
 from drake_diff.optimize.transcription.task import OptimalControl
 
 ENDS = ("x0", "goal")
-RESOLVED = (1e-3, 1e-4, 1e-5)  # of max(1, |p|): how far away the problem is solved again
+RESOLVED = (1e-3, 1e-4, NEAREST)  # of max(1, |p|): how far away the problem is solved again
 LEAST = 1e-3  # of a quantity's size per that of p: a column whose entries are less counts as that large
 SAME = 1e-4  # of the largest entry of a column: what a derivative and differences of re-solves may differ by
 EXACT = Limits(100, np.inf, 1e-12)  # of re-solves, which begin at an optimum beside theirs
+CLOSE = {"ipopt.compl_inf_tol": 1e-14, "ipopt.mu_min": 1e-16}  # a barrier is stiff near a bound that holds nothing
 NEAR = 1e-2  # of max(1, |z|): what a variable may move by as the plan is solved to rounding, or it is another plan
 TWO_SIDED = 10  # times SAME: what the two one-sided slopes differ by at a corner
 
@@ -49,8 +50,8 @@ class Sensitivity(ShowsItsRepr):
         horizon: (p,) [s] of a free horizon; 0 of one that is given.
         cost: (p,) of the cost.
         active: How many bounds and inequalities hold the plan.
-        weak: What makes a corner of the plan, of which this is the derivative of one side: bounds that hold it without
-            force, contacts that begin, end or slip as it changes, and columns whose two sides differ.
+        weak: What makes a corner of the plan, of which this is the derivative of one side: bounds that begin or cease
+            to hold it, contacts that begin, end or slip as it changes, and columns whose two sides differ.
         differences: (p,) the largest distance from differences of re-solves, as a part of the column; None if not
             asked for, NaN where a re-solve failed.
         derivatives: Where the second derivatives came from.
@@ -234,7 +235,7 @@ def _changes_of_contact(plan: _Plan, held: HeldPlan, change: Change, dz: Array) 
     here = _modes(plan.problem, held.program, held.z)
     for i, value in enumerate(change.values):
         for side in (-1, 1):
-            step = side * RESOLVED[-1] * max(1.0, abs(value))
+            step = side * NEAREST * max(1.0, abs(value))
             with change.moved(plan.problem, i, step) as problem:
                 there = _modes(problem, held.program, held.z + step * dz[:, i])
             for k, (before, after) in enumerate(zip(here, there, strict=True)):
@@ -320,7 +321,7 @@ def _one_sided(plan: _Plan, held: HeldPlan, change: Change, column: int, step: f
 
 def _resolved(program: KnotProgram, z: Array, multipliers: Multipliers) -> tuple[Array, bool]:
     """What IPOPT finds from a plan, and whether that is a solution."""
-    more = CALLED_BACK if isinstance(program, StepProgram) else None
+    more = CLOSE | (CALLED_BACK if isinstance(program, StepProgram) else {})
     exact = not program.functions.why_not
     result = solve_ipopt(program, z, EXACT, None, exact=exact, begun=multipliers, more=more)
     return result.z, result.outcome in FOUND

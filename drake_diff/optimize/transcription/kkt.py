@@ -28,6 +28,9 @@ from drake_diff.optimize.transcription.program import Program
 
 NEAR_BOUND = 1e-4  # of max(1, |bound|): a value this near may lie on it: an interior point method leaves sqrt(mu)
 WEAK = 1e-4  # of the cost's largest slope: a smaller multiplier may hold nothing
+LEFT = 3e-7  # of both, at most, where their product is 1e-14: an interior point method leaves its root
+NEAREST = 1e-5  # of max(1, |p|): a corner that is nearer is one of the plan
+ROUNDED = 1e-7  # of the largest derivative of a kind: less is none
 SINGULAR, REFINEMENTS = 1e-10, 4  # on the diagonal, of rows that say the same, and how often its error is taken out
 DIFFERENCE = 1e-5  # of max(1, |p|): of derivatives by a parameter of the model, which are exact by the state
 FLAT = "the plan has no derivative: some change of it costs nothing, so that it is not the only optimum"
@@ -115,13 +118,13 @@ class HeldPlan:
     @cached_property
     def multipliers(self) -> Multipliers:
         """Those that leave the least of the Lagrangian's gradient."""
-        on_bound, _, of_rows, left, _ = self._active
+        on_bound, _, of_rows, left = self._active
         return Multipliers(np.where(on_bound | self.fixed, -left, 0.0), of_rows)
 
     @cached_property
     def left(self) -> float:
         """What they leave, as a part of the cost's largest slope: 0 at an optimum."""
-        on_bound, _, _, left, _ = self._active
+        on_bound, _, _, left = self._active
         return float(np.max(np.abs(left[~(on_bound | self.fixed)]), initial=0.0)) / self._scale
 
     @property
@@ -130,7 +133,7 @@ class HeldPlan:
 
     def solve(self, change: Change) -> Held:
         """How the variables change by `change`, the active set kept."""
-        on_bound, on_row, multipliers, _, weak = self._active
+        on_bound, on_row, multipliers, _ = self._active
         free = np.flatnonzero(~(self.fixed | on_bound))
         dz = np.zeros((len(self.z), len(change.values)))
         right, of_cost = np.zeros((len(self.z) + len(self.values), len(change.values))), np.zeros(len(change.values))
@@ -146,16 +149,40 @@ class HeldPlan:
         kept = free.tolist()
         found = _kkt(hessian[kept, kept], rows[:, kept], first, second)
         dz[free] = found[: len(free)]
+        of_rows = np.zeros((len(self.values), len(change.values)))
+        of_rows[on_row] = found[len(free) :]
+        moved = np.asarray(ca.mtimes(self.rows, ca.DM(dz))) + right[len(self.z) :]
+        left = np.asarray(ca.mtimes(hessian, ca.DM(dz)) + ca.mtimes(self.rows.T, ca.DM(of_rows))) + right[: len(self.z)]
+        weak = self._weak(np.maximum(1.0, np.abs(change.values)), dz, left, moved, of_rows)
         holding = int(np.sum(on_bound) + np.sum(on_row & (self.program.sides[0] < self.program.sides[1])))
         return Held(dz, self.slope @ dz + of_cost, weak, holding)
+
+    def _weak(self, units: Array, dz: Array, left: Array, moved: Array, of_rows: Array) -> tuple[str, ...]:
+        """What begins or ceases to hold the plan, to first order, as a column moves by NEAREST of its unit.
+
+        The derivatives are of the variables, of what the rows' multipliers leave, of the rows and of their multipliers.
+        """
+        on_bound, on_row, multipliers, remains = self._active
+        lower, upper = self.program.lower, self.program.upper
+        equal = self.program.sides[0] >= self.program.sides[1]
+        apart, row_apart = _apart(self.z, lower, upper), _apart(self.values, *self.program.sides)
+        free, free_row = ~(self.fixed | on_bound), ~(on_row | equal)
+        weak = free & _crosses(apart, dz, units)
+        weak |= on_bound & _crosses(np.abs(remains) / self._scale, left / self._scale, units)
+        weak_row = free_row & _crosses(row_apart, moved, units)
+        weak_row |= on_row & ~equal & _crosses(np.abs(multipliers) / self._scale, of_rows / self._scale, units)
+        return (*self._names(weak), *[f"row {i}" for i in np.flatnonzero(weak_row)])
 
     def _hessian(self, multipliers: Array) -> Any:
         upper = self.derivatives["hess_lag"](self.z, [], 1.0, multipliers)
         return ca.triu2symm(upper)
 
     @cached_property
-    def _active(self) -> tuple[Mask, Mask, Array, Array, tuple[str, ...]]:
-        """The bounds and rows that hold the plan, the multipliers of all rows, what these leave, and what is weak."""
+    def _active(self) -> tuple[Mask, Mask, Array, Array]:
+        """The bounds and rows that hold the plan, the multipliers of all rows, and what these leave (n,).
+
+        What lies further from the plan than it pushes, both as parts of their size, does not hold it.
+        """
         program, (least, most) = self.program, self.program.sides
         low, high = _near(self.z, program.lower), _near(program.upper, self.z)
         row_low, row_high = _near(self.values, least), _near(most, self.values)
@@ -175,15 +202,13 @@ class HeldPlan:
                 on_bound[worst] = False
             else:
                 holds[worst_row] = False
-        weak_bound = on_bound & (np.abs(by_bound) <= WEAK * scale)
-        weak_row = on_row & ~equal & (np.abs(multipliers) <= WEAK * scale)
-        return (
-            on_bound,
-            on_row,
-            multipliers,
-            left,
-            (*self._names(weak_bound), *[f"row {i}" for i in np.flatnonzero(weak_row)]),
-        )
+        idle = on_bound & (np.abs(by_bound) <= scale * np.maximum(LEFT, _apart(self.z, program.lower, program.upper)))
+        idle_row = on_row & ~equal & (np.abs(multipliers) <= scale * np.maximum(LEFT, _apart(self.values, least, most)))
+        if np.any(idle) or np.any(idle_row):
+            on_bound, holds = on_bound & ~idle, holds & ~idle_row
+            on_row = holds & (equal | self._moves(on_bound))
+            multipliers, left = self._multipliers(on_bound, on_row)
+        return on_bound, on_row, multipliers, left
 
     def _moves(self, on_bound: Mask) -> Mask:
         """(m,) the rows in which a variable has a part that nothing holds; the others follow from bounds."""
@@ -226,6 +251,20 @@ def _near(values: Array, bound: Array) -> Mask:
         finite = np.isfinite(gap)
         size = np.maximum(1.0, np.where(finite, np.minimum(np.abs(values), np.abs(bound)), 1.0))
         return np.asarray(finite & (gap <= NEAR_BOUND * size))
+
+
+def _apart(values: Array, lower: Array, upper: Array) -> Array:
+    """(n,) how far values are from the nearer of their bounds, as a part of its size; inf where there is none."""
+    with np.errstate(invalid="ignore"):
+        sides = [np.abs(values - bound) / np.maximum(1.0, np.abs(bound)) for bound in (lower, upper)]
+    return np.asarray(np.minimum(*[np.where(np.isfinite(side), side, np.inf) for side in sides]))
+
+
+def _crosses(distance: Array, derivative: Array, units: Array) -> Mask:
+    """(n,) what is 0 within NEAREST of a column's unit, its derivative being (n, p)."""
+    noise = ROUNDED * np.max(np.abs(derivative), axis=0, initial=0.0)
+    goes = np.where(np.abs(derivative) > noise, np.abs(derivative), 0.0) * units * NEAREST
+    return np.asarray(np.any((goes > 0) & (goes >= (distance - LEFT)[:, None]), axis=1))
 
 
 def _kkt(hessian: Any, rows: Any, first: Array, second: Array) -> Array:
