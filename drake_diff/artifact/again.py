@@ -70,13 +70,18 @@ def made_again(record: EvidenceRecord, model: Model, plan: dict[str, Array]) -> 
     if unrepeated:
         return _without_the_search(told, record, unrepeated)
     found = solve_again(record, model, plan)
-    apart = _apart(found, told) if _shapes(found) == _shapes(told) else np.inf
+    apart = apart_from(found, told)
     if apart == 0:
         return _written(found, record, 0.0)
     if apart == np.inf or (found.method, found.scheme, found.solver) != (told.method, told.scheme, told.solver):
         ended = f"run again, it ends by {found.method} ({found.scheme}) in {len(found.us)} intervals at another plan"
         return _without_the_search(told, record, (ended,))
     return _written(replace(found, **plan_fields(plan)), record, apart)
+
+
+def apart_from(found: Solution, told: Solution) -> float:
+    """How far two plans are apart, relative to the largest number of each array; inf where their shapes differ."""
+    return _apart(found, told) if _shapes(found) == _shapes(told) else float("inf")
 
 
 def _shapes(solution: Solution) -> list[Any]:

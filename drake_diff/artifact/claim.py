@@ -6,6 +6,7 @@ from typing import Any
 from drake_diff.artifact.differences import shown
 from drake_diff.artifact.sections import COSTS, LIMITS
 from drake_diff.record.certification import CertificationRecord
+from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.sealed import SealedRecord
 from drake_diff.record.solve import EvidenceRecord
 
@@ -14,6 +15,8 @@ MOST = 8  # entries of a list: of a longer one the others are counted
 
 def claims_of(record: SealedRecord) -> tuple[str, ...]:
     """The lines: the verdict, the model and how it was loaded, and what was asked."""
+    if isinstance(record, PhasesRecord):
+        return (f"{record.verdict}: {record.sentence}", *_of_phases(record))
     file = record.model.file
     options = ", ".join(f"{k} {shown(v)}" for k, v in sorted((record.model.options or {}).items()) if v is not None)
     model = (
@@ -29,6 +32,20 @@ def claims_of(record: SealedRecord) -> tuple[str, ...]:
     return tuple(lines)
 
 
+def _of_phases(record: PhasesRecord) -> Iterator[str]:
+    unit = "steps" if record.counts_steps else "s"
+    for phase in record.phases:
+        yield f"{phase.name}, {phase.duration:.6g} {unit}, {phase.status}: what it asks is in {phase.directory}"
+    names = [phase.name for phase in record.phases]
+    for link in record.links:
+        one, other = (names[i] if 0 <= i < len(names) else i for i in (link.before, link.after))
+        yield f"from {one} to {other}: {link.told}, {shown(link.reset)}, within {link.tolerance:g}"
+    if record.horizon_s is not None:
+        yield f"in all {listed(record.horizon_s)} s"
+    search = ", ".join(f"{k} {shown(v)}" for k, v in sorted((record.search or {}).items()) if v is not None)
+    yield f"by solve with {search or 'arguments that are not recorded'}"
+
+
 def _of_a_solve(record: EvidenceRecord) -> Iterator[str]:
     p: dict[str, Any] = dict(record.problem)
     names, inputs = p.get("state_names"), p.get("input_names")
@@ -39,6 +56,8 @@ def _of_a_solve(record: EvidenceRecord) -> Iterator[str]:
     yield f"from {named(names, p.get('x0'))} to {to} in {count}"
     bounds = [(side, named(of, p.get(side))) for side, of in zip(LIMITS, (names, names, inputs, inputs), strict=True)]
     yield "bounds: " + ("; ".join(f"{side} {told}" for side, told in bounds if told) or "none")
+    if p.get("held"):
+        yield f"with points that are held: {shown(p['held'])}"
     if p.get("waypoints"):
         yield f"waypoints {shown(p['waypoints'])}"
     for goal in p.get("goals") or ():

@@ -5,14 +5,18 @@ record.json is complete last, so that a run that is killed leaves a record that 
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 from drake_diff.artifact.measurement import Measurement, failure_of, measure, replay_evidence
+from drake_diff.artifact.phased import begin_phases, phases_record, save_phases
 from drake_diff.artifact.rerun import PLAN, TRACE, write_plan
 from drake_diff.artifact.sections import asked, found
+from drake_diff.optimize.phased import PhasedSolution
+from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.parts import Event
+from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.provenance import provenance_of, written_now
 from drake_diff.record.sealed import WallClock, canonical, reproducible
 from drake_diff.record.solve import EvidenceRecord
@@ -21,24 +25,32 @@ REPLAY, REPORT = "replay.html", "report.html"
 FILES = (PLAN, TRACE, REPLAY, REPORT)  # what `save` writes besides the record and its schema
 
 
-def begin(directory: str | Path, problem: Problem) -> None:
+def begin(directory: str | Path, problem: Problem | PhasedProblem) -> None:
     """Mark `directory` as a run that is under way: whatever happens next, its record says "incomplete".
 
     What an earlier run left there under the names of ours is removed.
     """
     folder = Path(directory)
+    if isinstance(problem, PhasedProblem):
+        begin_phases(folder, problem, FILES)
+        return
     sentence = "the run has started and not finished: it is still running, or it was killed or broke off"
     _record(folder, verdict="incomplete", sentence=sentence, **asked(problem)).begin(folder, FILES)
 
 
-def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
+@overload
+def save(solution: Solution, directory: str | Path) -> EvidenceRecord: ...
+@overload
+def save(solution: PhasedSolution, directory: str | Path) -> PhasesRecord: ...
+def save(solution: Solution | PhasedSolution, directory: str | Path) -> EvidenceRecord | PhasesRecord:
     """Measure a solution and write its directory: record, plan, trace, replay and report.
 
     Each file is written aside and moved into place, record.json last, so that at any moment the record is complete
     only if everything that it names is.
 
     Args:
-        solution: A result of `solve`, of any status.
+        solution: A result of `solve`, of any status. Of one in phases, phases.json says how they are linked, and each
+            phase has a directory phase_0, phase_1, ... of its own with all these files; there is no page of the whole.
         directory: Where to write record.json, record.schema.json, plan.npz, trace.mcap, replay.html and report.html.
             It is made where there is none; files of these names are replaced. Plain dynamics have nothing to draw
             in 3D, and so no replay.html.
@@ -59,6 +71,8 @@ def save(solution: Solution, directory: str | Path) -> EvidenceRecord:
         ('pass', ['plan.npz', 'record.schema.json', 'replay.html', 'report.html', 'trace.mcap'])
     """
     folder = Path(directory)
+    if isinstance(solution, PhasedSolution):
+        return save_phases(solution, folder, save, FILES)
     begin(folder, solution.problem)
     write_plan(folder / PLAN, solution)  # what is measured next may take long
     measurement = measure(solution)
@@ -78,9 +92,14 @@ def write_files(folder: Path, measurement: Measurement, record: EvidenceRecord) 
     write_pages(folder / REPLAY, folder / REPORT, measurement, fields)
 
 
-def save_failure(error: Exception, directory: str | Path, problem: Problem) -> EvidenceRecord:
+def save_failure(
+    error: Exception, directory: str | Path, problem: Problem | PhasedProblem
+) -> EvidenceRecord | PhasesRecord:
     """Write the record of a run that `error` ended before there was a solution."""
     folder, failure = Path(directory), failure_of(error)
+    if isinstance(problem, PhasedProblem):
+        sentence = f"the run ended with an error: {failure.message}"
+        return phases_record(folder, problem, "fail", sentence).write(folder)
     told: dict[str, Any] = {
         "verdict": "fail",
         "sentence": f"the run ended with an error: {failure.message}",

@@ -20,6 +20,7 @@ from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCo
 from drake_diff.optimize.problem.coupling import Couples, Periodic
 from drake_diff.optimize.problem.dwell import Dwell
 from drake_diff.optimize.problem.goals import CenterOfMassGoal, FrameGoal, FrameVelocityGoal, Goal, JointGoal, KeepLevel
+from drake_diff.optimize.problem.held import QUANTITIES, HeldContacts, HeldQuantity, held_quantity
 from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.rates import InputRate, Jerk
@@ -107,7 +108,7 @@ def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
     options = {} if solution is None else solution.options
     goal = "" if np.all(np.isnan(problem.goal)) else " and ends in x_goal"
     goals = (", goals" if problem.goals else "") + (", couplings" if problem.couplings else "")
-    equations = "Drake's equations" if problem.has_model else "the given equations"
+    equations = "the given equations" if problem.moved is None else "Drake's equations"
     statement = (
         f"{problem.name}, by {equations}, starts in x0{goal} after {problem.num_steps} intervals, and "
         f"keeps bounds{goals} and constraints at every knot; optimized: {', '.join(problem.optimize)}"
@@ -121,11 +122,11 @@ def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
             search=None if solution is None else _search(solution),
         ),
         "problem": describe_problem(problem),
-        "contract": problem.model.contract.to_dict() if problem.has_model else {},
+        "contract": {} if problem.moved is None else problem.moved.contract.to_dict(),
         "units": UNITS | ({"couplings": COUPLED} if problem.couplings else {}),
         "observation": _observation(problem, time_step),
         "action": _action(problem, time_step, options.get("time_limit")),
-        "model": model_input(problem.model) if problem.has_model else ModelInput(file=None, options=None),
+        "model": ModelInput(file=None, options=None) if problem.moved is None else model_input(problem.moved),
     }
 
 
@@ -172,15 +173,15 @@ def found(solution: Solution) -> dict[str, Any]:
 
 def units_of(problem: Problem) -> tuple[str, ...]:
     """(nx + nu,) the units of the states and inputs."""
-    if not problem.has_model:
+    if problem.moved is None:
         return (UNKNOWN,) * (problem.nx + problem.nu)
-    contract = problem.model.contract
+    contract = problem.moved.contract
     return tuple(c.unit for c in contract.positions + contract.velocities + contract.inputs)
 
 
 def _observation(problem: Problem, time_step: float) -> Observation:
     """The state as it is observed: exactly, at every step."""
-    frames = _frames(problem.model) if problem.has_model else ["none: plain dynamics"] * problem.nx
+    frames = ["none: plain dynamics"] * problem.nx if problem.moved is None else _frames(problem.moved)
     exact = "exact simulation state: there is no sensor and no noise"
     variables = [
         ObservedVariable(name=name, unit=unit, frame=frame, uncertainty=Quantity(value=0.0, unit=unit, reason=exact))
@@ -259,7 +260,8 @@ def _gradient(solution: Solution) -> GradientEvidence:
 
 def describe_problem(problem: Problem) -> dict[str, Any]:
     """The problem for a record; functions by their names."""
-    knots = [list(problem.knots_of(c, input_at_end=not problem.has_model)) for c in problem.constraints]
+    at_end = not (problem.has_model or problem.is_map)
+    knots = [list(problem.knots_of(c, input_at_end=at_end)) for c in problem.constraints]
     return {
         "system": problem.name,
         "num_steps": problem.num_steps,
@@ -277,7 +279,7 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
                 "upper": finite_list(c.upper),
                 "knots": at,
                 "every_knot": c.knots is None,
-                "quantity": description_of(c.function),  # null: a user's function
+                "quantity": _quantity(c.function),  # null: a user's function
             }
             for c, at in zip(problem.constraints, knots, strict=True)
         ],
@@ -289,7 +291,13 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
         "parameters": [p.name for p in problem.parameters.parameters],
         **{name: _cost(getattr(problem, name)) for name in COSTS},
         "initial_state_free": [bool(free) for free in problem.initial_state_mask],
+        **({"held": problem.system.to_dict()} if isinstance(problem.system, HeldContacts) else {}),
     }
+
+
+def _quantity(function: Any) -> dict[str, Any] | None:
+    """What made a constraint's function; None of a user's own."""
+    return function.to_dict() if isinstance(function, HeldQuantity) else description_of(function)
 
 
 def finite_list(values: Any) -> list[float | None]:
@@ -345,18 +353,22 @@ def rebuild_problem(record: EvidenceRecord, model: Model, us: Array, start_us: A
     running, final = _rebuild_cost(p["running_cost"]), _rebuild_cost(p["final_cost"])
     goal = _numbers(p["x_goal"], np.nan)
     goals = [rebuild_goal(each) for each in p["goals"]]
-    if running is None and final is None and np.all(np.isnan(goal)) and not goals:
-        final = QuadraticCost(Q=np.zeros((model.nx, model.nx)))  # a Problem wants a cost or a goal
+    system = HeldContacts(model, **p["held"]) if p.get("held") else model
+    constraints = [_rebuild_constraint(c, system) for c in p["constraints"] if c["quantity"] is not None]
+    couplings = [rebuild_coupling(each) for each in p.get("couplings", ()) if "Coupling" not in each]
+    asked = goals or constraints or couplings or running is not None or final is not None
+    if not asked and np.all(np.isnan(goal)):
+        final = QuadraticCost(Q=np.zeros((model.nx, model.nx)))  # a Problem wants something to be asked
     return Problem(
-        model,
+        system,
         x0=_numbers(p["x0"], np.nan),
         num_steps=p["num_steps"],
         running_cost=running,
         final_cost=final,
         x_goal=goal,
         waypoints={int(k): _numbers(x, np.nan) for k, x in p["waypoints"].items()},
-        constraints=[_rebuild_constraint(c, model) for c in p["constraints"] if c["quantity"] is not None],
-        couplings=[rebuild_coupling(each) for each in p.get("couplings", ()) if "Coupling" not in each],
+        constraints=constraints,
+        couplings=couplings,
         goals=goals,
         horizon=p["free_horizon_s"],
         bounds=Bounds(**bounds),
@@ -370,8 +382,14 @@ def rebuild_problem(record: EvidenceRecord, model: Model, us: Array, start_us: A
     )
 
 
-def _rebuild_constraint(c: dict[str, Any], model: Model) -> Constraint:
-    function = made_from(model, c["quantity"])
+def _rebuild_constraint(c: dict[str, Any], system: Model | HeldContacts) -> Constraint:
+    told = c["quantity"]
+    if isinstance(system, Model):
+        function: Any = made_from(system, told)
+    else:
+        function = (
+            held_quantity(system, told) if next(iter(told)) in QUANTITIES else made_from(system.plant.model, told)
+        )
     lower, upper = (_numbers(c[side], gap) for side, gap in GAPS.items())
     knots = None if c["every_knot"] else c["knots"]
     return Constraint(function, lower=lower, upper=upper, knots=knots, name=c["name"])

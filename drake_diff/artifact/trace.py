@@ -48,8 +48,8 @@ def write_trace(path: Path, m: Measurement, attachments: Mapping[str, tuple[str,
         "options": json.loads(json.dumps(solution.options, default=str), parse_constant=str),
     }
     files = {CONFIGURATION: ("application/json", canonical(configuration).encode()), **attachments}
-    if problem.has_model and problem.model.source is not None:
-        source = problem.model.source
+    if problem.moved is not None and problem.moved.source is not None:
+        source = problem.moved.source
         files[source.name] = (MEDIA_TYPES.get(source.suffix, "application/octet-stream"), source.read_bytes())
     metadata = {
         "status": solution.status.value,

@@ -20,6 +20,7 @@ from drake_diff.artifact.differences import (
     compare_text,
     compare_traces,
 )
+from drake_diff.artifact.phases_again import PhasesAgain, inconsistencies, phases_again
 from drake_diff.artifact.rerun import PLAN, TRACE, read_plan, rebuilt, resolve
 from drake_diff.artifact.save import FILES
 from drake_diff.artifact.trace import CONFIGURATION, Trace, read_trace
@@ -27,6 +28,7 @@ from drake_diff.exceptions import ArtifactError, DrakeDiffError, MissingDependen
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.certification import CertificationRecord, certify_model
 from drake_diff.record.parts import FileEvidence
+from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.provenance import provenance_of
 from drake_diff.record.read import KINDS, kind_of
 from drake_diff.record.sealed import SCHEMA_VERSION, SealedRecord, canonical, own_sha256, read_fields, reproducible
@@ -41,6 +43,12 @@ UNCHECKED = (
     "name and contract.source: what it was called, and where the model file was",
 )
 GIVEN = "problem, model and inputs.search: they are what was asked; a record that asks for less can be just as true"
+GIVEN_IN_PHASES = "in each phase's record problem and model, and here links and search: they are what was asked"
+WITHIN_PHASES = "the record does not say what solve was called with"  # of a phase: that of all says it
+OF_FUNCTIONS = (
+    "all that rests on the functions: only the plan's first and last state and its bounds were compared with the "
+    "metrics, and the plan with the trace"
+)
 NOT_RERUN = {"comparison": "the engines were not run again", "robustness": "the trials were not run again"}
 
 
@@ -177,7 +185,7 @@ def verify(directory: str | Path) -> Verification:
     found = Verification(folder, record, problems, claimed=claims_of(record), notes=_other_versions(record))
     if problems:
         return replace(found, unchecked=("anything else: it is damaged",))
-    if record.state == "incomplete" or (isinstance(record, EvidenceRecord) and record.solver is None):
+    if record.state == "incomplete" or (isinstance(record, (EvidenceRecord, PhasesRecord)) and record.solver is None):
         return replace(found, undecided=(f"there is nothing to run again: {record.sentence}",))
     return _run_again(found, record)
 
@@ -189,14 +197,30 @@ def _run_again(found: Verification, record: SealedRecord) -> Verification:
             return _solve_again(found, record)
         if isinstance(record, CertificationRecord):
             return _certify_again(found, record)
+        if isinstance(record, PhasesRecord):
+            return _phases_again(found, record)
     except (ModelError, MissingDependencyError) as error:
-        return replace(found, undecided=(f"not run again: {error}",), unchecked=("everything but the hashes",))
+        return _without_its_functions(found, record, error)
     except ArtifactError as error:
         return _judged(found, [str(error)], [])
     except (ArithmeticError, AttributeError, DrakeDiffError, LookupError, RuntimeError, TypeError, ValueError) as error:
         # what a forger put together need not fit in any way
         return _judged(found, [f"it cannot be made again: {type(error).__name__}: {error}"], [])
     return replace(found, unchecked=(f"every number: {NOT_RERUN[record.kind]}",))
+
+
+def _without_its_functions(found: Verification, record: SealedRecord, error: Exception) -> Verification:
+    """What the files of a run that cannot be made again say of each other."""
+    told = (f"not run again: {error}",)
+    if not isinstance(record, EvidenceRecord):
+        return replace(found, undecided=told, unchecked=("everything but the hashes",))
+    plan = read_plan(found.directory / PLAN)
+    try:
+        trace = read_trace(found.directory / TRACE)
+        problems = [*_odd_schema(record), *_odd_trace(trace, plan, record), *inconsistencies(record, plan)]
+    except (ArtifactError, KeyError, LookupError, TypeError, ValueError) as wrong:
+        problems = [f"its files do not go together: {type(wrong).__name__}: {wrong}"]
+    return _judged(replace(found, unchecked=(OF_FUNCTIONS,)), problems, told)
 
 
 @contextmanager
@@ -282,6 +306,31 @@ def _solve_again(found: Verification, record: EvidenceRecord) -> Verification:
             compare_text(one, recorded, again.files[name])
         compared.append(one)
     return _told_of_a_solve(found, again, problems, compared, unchecked)
+
+
+def _phases_again(found: Verification, record: PhasesRecord) -> Verification:
+    """All phases, their links, and the chain of all; what no artifact holds is undecided."""
+
+    def of_phase(folder: Path) -> PhasesAgain:
+        own, problems = _read_checked(folder, EvidenceRecord)
+        one, again = _run_again(Verification(folder, own), own), PhasesAgain()
+        again.problems = [*problems, *one.complaints]
+        again.undecided = [line for line in one.undecided if WITHIN_PHASES not in line]
+        again.unchecked = [line for line in one.unchecked if line.startswith(OF_FUNCTIONS)]
+        again.rounded, again.checked = list(one.rounded), one.checked
+        return again
+
+    again = phases_again(found.directory, record, of_phase)
+    unchecked = (*UNCHECKED, GIVEN_IN_PHASES, *again.unchecked, *_other_directories(record))
+    told = replace(found, unchecked=unchecked, rounded=tuple(again.rounded), checked=again.checked)
+    return _judged(told, [*_odd_schema(record), *again.problems], again.undecided)
+
+
+def _other_directories(record: PhasesRecord) -> Iterator[str]:
+    """Files that were in the directory and are none that drake_diff writes there."""
+    written = (*FILES, EvidenceRecord.FILE, EvidenceRecord.schema_file())
+    known = {f"{phase.directory}/{name}" for phase in record.phases for name in written}
+    yield from _others(record, tuple(known))
 
 
 def _others(record: SealedRecord, known: Sequence[str]) -> Iterator[str]:

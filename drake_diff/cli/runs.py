@@ -43,17 +43,19 @@ def run(
     directory = out or Path("artifacts") / script.stem
     # Only here: a script that is missing or wrong is refused before Drake is loaded.
     from drake_diff.artifact.save import begin, save, save_failure
+    from drake_diff.optimize.problem.phases import PhasedProblem
     from drake_diff.optimize.problem.problem import Problem
     from drake_diff.optimize.solve import solve
 
-    if not isinstance(problem, Problem):
-        raise InputError("problem()", got=type(problem).__name__, expected="a Problem")
+    if not isinstance(problem, (Problem, PhasedProblem)):
+        raise InputError("problem()", got=type(problem).__name__, expected="a Problem or a PhasedProblem")
     if not isinstance(options, dict):
         raise InputError("solve_options", got=type(options).__name__, expected="a dictionary")
     known = [name for name in inspect.signature(solve).parameters if name not in ("problem", "progress", "on_start")]
     for name in options.keys() - set(known):
         raise UnknownNameError("solve_options", got=name, known=known)
-    show(plain(script.name, "bold"), f"{problem.system}, {problem.num_steps} steps")
+    parts = problem.phases if isinstance(problem, PhasedProblem) else (problem,)
+    show(plain(script.name, "bold"), "; ".join(f"{part.system}, {part.num_steps} steps" for part in parts))
     begun: list[Path] = []
 
     def on_start() -> None:
@@ -68,9 +70,21 @@ def run(
             save_failure(error, directory, problem)
         raise
     record = save(solution, directory)
-    _show_record(record)
-    show(f"wrote {directory}: record.json, {', '.join(sorted(record.files))}")
+    (_show_phases if isinstance(problem, PhasedProblem) else _show_record)(record)
+    show(f"wrote {directory}: {record.FILE}, {', '.join(sorted(record.files))}")
     raise typer.Exit(0 if record.verdict == "pass" else 1)
+
+
+def _show_phases(record: Any) -> None:
+    show(judged(record.verdict), f" {record.solver.status}: {record.sentence}")
+    rows = table("phase", "ended", "cost", "steps" if record.counts_steps else "seconds")
+    for phase in record.phases:
+        rows.add_row(plain(phase.name), plain(phase.status), plain(phase.cost), plain(phase.duration))
+    show(rows)
+    for link in record.links:
+        errors = [float("inf") if error is None else error for error in link.errors]
+        show(f"link {link.before} to {link.after}: missed by {max(errors):.3g}, tolerance {link.tolerance:g}")
+    show(f"the chain of all phases: {plain(record.chain.told)}")
 
 
 def _loaded(script: Path) -> ModuleType:

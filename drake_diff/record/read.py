@@ -5,11 +5,18 @@ from pathlib import Path
 from drake_diff.exceptions import ArtifactError
 from drake_diff.record.certification import CertificationRecord
 from drake_diff.record.comparison import ComparisonRecord
+from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.robustness import RobustnessRecord
 from drake_diff.record.sealed import SealedRecord
 from drake_diff.record.solve import EvidenceRecord
 
-KINDS: tuple[type[SealedRecord], ...] = (EvidenceRecord, ComparisonRecord, RobustnessRecord, CertificationRecord)
+KINDS: tuple[type[SealedRecord], ...] = (
+    EvidenceRecord,
+    ComparisonRecord,
+    RobustnessRecord,
+    CertificationRecord,
+    PhasesRecord,
+)
 
 
 def kind_of(directory: str | Path) -> type[SealedRecord] | None:
@@ -23,10 +30,11 @@ def load_record(directory: str | Path) -> SealedRecord:
     It is read, not verified: see `verify`.
 
     Args:
-        directory: The directory that holds record.json, comparison.json, robustness.json or certification.json.
+        directory: The directory that holds record.json, phases.json, comparison.json, robustness.json or
+            certification.json.
 
     Returns:
-        An `EvidenceRecord`, `ComparisonRecord`, `RobustnessRecord` or `CertificationRecord`.
+        An `EvidenceRecord`, `PhasesRecord`, `ComparisonRecord`, `RobustnessRecord` or `CertificationRecord`.
 
     Raises:
         ArtifactError: There is no such record, or it does not follow its schema.

@@ -1,7 +1,7 @@
 """A model whose points the world holds while a phase lasts: a foot that stands, a hand that holds on."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -77,6 +77,10 @@ class HeldContacts(Dynamics):
     def _columns(self) -> list[int]:
         return [AXES.index(axis) for axis in self.axes]
 
+    def to_dict(self) -> dict[str, Any]:
+        """The points and axes, for a record."""
+        return {"points": {name: point.tolist() for name, point in self.points.items()}, "axes": self.axes}
+
     def forces(self, x: Any, u: Any) -> Any:
         """(m,) [N] the forces on the model that hold the points, one for each of `rows`, in any arithmetic."""
         return self.plant.forces(np.concatenate([np.asarray(x), np.asarray(u)]))
@@ -89,7 +93,12 @@ class HeldContacts(Dynamics):
         """(m,) [m/s] the velocities of these."""
         return np.asarray(self.plant.speeds(x))[self.plant.rows]
 
-    def impact(self, x: Any) -> Any:
+    @property
+    def impact(self) -> "Impact":
+        """The reset of a rigid, inelastic impact that stops the points: from the state before, the state after."""
+        return Impact(self)
+
+    def _after(self, x: Any) -> Any:
         """(nx,) the state after a rigid, inelastic impact that stops the points, from the state `x` (nx,) before."""
         return self.plant.after(np.concatenate([np.asarray(x), np.zeros(self.nu)]))
 
@@ -117,12 +126,12 @@ class HeldContacts(Dynamics):
         """
         reach = positive_float("tolerance [m]", tolerance)
         zero = np.zeros(len(self.rows))
-        found = [Constraint(self.speeds, zero, zero, knots=0, name="held points at rest")]
+        found = [Constraint(HeldSpeeds(self), zero, zero, knots=0, name="held points at rest")]
         where = self._where(at)
         if not np.all(np.isnan(where)):
             given = np.flatnonzero(~np.isnan(where))
             lower, upper = where[given] - reach, where[given] + reach
-            found.append(Constraint(_PlacesOf(self.places, given), lower, upper, name="held points in place"))
+            found.append(Constraint(HeldPlaces(self, given.tolist()), lower, upper, name="held points in place"))
         if friction is not None:
             found += self._pushing(positive_float("friction", friction))
         return found
@@ -142,14 +151,12 @@ class HeldContacts(Dynamics):
             own = {row[-1]: i for i, row in enumerate(self.rows) if row[:-2] == name}
             if "z" not in own:
                 raise InputError("friction", got=f"{name}, which is not held along z", expected="points held along z")
-            yield Constraint(_Force(self.forces, own["z"]), lower=0.0, name=f"{name} pushes")
+            yield Constraint(HeldForce(self, own["z"]), lower=0.0, name=f"{name} pushes")
             along = [own[axis] for axis in "xy" if axis in own]
-            if len(along) == 1:  # the cone is two half planes
-                sides = _Sides(self.forces, own["z"], along[0], friction)
-                yield Constraint(sides, lower=np.zeros(2), name=f"{name} does not slide")
-            elif along:
-                cone = _Cone(self.forces, own["z"], tuple(along), friction)
-                yield Constraint(cone, lower=0.0, name=f"{name} does not slide")
+            if along:  # of one direction the cone is two half planes
+                cone = FrictionCone(self, own["z"], along, friction)
+                lower = np.zeros(2) if len(along) == 1 else 0.0
+                yield Constraint(cone, lower=lower, name=f"{name} does not slide")
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,51 +171,80 @@ class _Stacked:
 
 
 @dataclass(frozen=True, eq=False)
-class _PlacesOf:
-    """Some of the places."""
+class Impact:
+    """A reset: from the state `x` (nx,) before a rigid impact the state after it."""
 
-    function: Any
-    rows: Any
+    held: HeldContacts
 
     def __call__(self, x: Any) -> Any:
-        return self.function(x)[self.rows]
+        return self.held._after(x)
+
+
+class HeldQuantity:
+    """The base of the functions that a stance's constraints are of; a record tells them by `to_dict`."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The kind and its values."""
+        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "held"}  # type: ignore[arg-type]
+        return {type(self).__name__: values}
 
 
 @dataclass(frozen=True, eq=False)
-class _Force:
+class HeldSpeeds(HeldQuantity):
+    """The velocities of the held coordinates."""
+
+    held: HeldContacts
+
+    def __call__(self, x: Any) -> Any:
+        return self.held.speeds(x)
+
+
+@dataclass(frozen=True, eq=False)
+class HeldPlaces(HeldQuantity):
+    """Some of the held coordinates."""
+
+    held: HeldContacts
+    rows: list[int]
+
+    def __call__(self, x: Any) -> Any:
+        return self.held.places(x)[self.rows]
+
+
+@dataclass(frozen=True, eq=False)
+class HeldForce(HeldQuantity):
     """One of the forces."""
 
-    function: Any
+    held: HeldContacts
     row: int
 
     def __call__(self, x: Any, u: Any) -> Any:
-        return self.function(x, u)[self.row]
+        return self.held.forces(x, u)[self.row]
 
 
 @dataclass(frozen=True, eq=False)
-class _Sides:
-    """friction f_z - f_t and friction f_z + f_t."""
+class FrictionCone(HeldQuantity):
+    """friction f_z - f_t and friction f_z + f_t, or of two directions friction^2 f_z^2 - f_x^2 - f_y^2."""
 
-    forces: Any
+    held: HeldContacts
     z: int
-    t: int
+    along: list[int]
     friction: float
 
     def __call__(self, x: Any, u: Any) -> Any:
-        f = self.forces(x, u)
-        most = self.friction * f[self.z]
-        return np.array([most - f[self.t], most + f[self.t]])
-
-
-@dataclass(frozen=True, eq=False)
-class _Cone:
-    """friction^2 f_z^2 - f_x^2 - f_y^2."""
-
-    forces: Any
-    z: int
-    along: tuple[int, ...]
-    friction: float
-
-    def __call__(self, x: Any, u: Any) -> Any:
-        f = self.forces(x, u)
+        f = self.held.forces(x, u)
+        if len(self.along) == 1:
+            most, t = self.friction * f[self.z], f[self.along[0]]
+            return np.array([most - t, most + t])
         return self.friction**2 * f[self.z] ** 2 - sum(f[i] ** 2 for i in self.along)
+
+
+QUANTITIES: dict[str, Any] = {kind.__name__: kind for kind in (HeldSpeeds, HeldPlaces, HeldForce, FrictionCone)}
+
+
+def held_quantity(held: HeldContacts, told: dict[str, Any]) -> HeldQuantity:
+    """The function that `HeldQuantity.to_dict` told of, of `held`; InputError where that is none."""
+    if not (len(told) == 1 and next(iter(told)) in QUANTITIES):
+        raise InputError("quantity", got=repr(told)[:80], expected=f"one of {', '.join(QUANTITIES)} with its values")
+    ((kind, values),) = told.items()
+    found: HeldQuantity = QUANTITIES[kind](held, **values)
+    return found

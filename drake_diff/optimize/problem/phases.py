@@ -143,6 +143,7 @@ class Switch:
     def __init__(self, problem: PhasedProblem, before: int, after: int, reset: Any):
         self.before, self.after = before, after
         one, other = problem.phases[before], problem.phases[after]
+        self.reset = reset
         self.label = f"the reset from {problem.names[before]} to {problem.names[after]}"
         self.rows, self.columns = other.state_names, one.state_names
         self.matrix: Array | None = None  # of a linear reset

@@ -184,6 +184,11 @@ class Problem(ShowsItsRepr):
         return isinstance(self.system, DiscreteMap)
 
     @property
+    def moved(self) -> Model | None:
+        """The model whose states these are, held or not; None of plain functions."""
+        return self.system if isinstance(self.system, Model) else self.system.model
+
+    @property
     def model(self) -> Model:
         """The model; ModelError where the problem is one of plain dynamics."""
         if not isinstance(self.system, Model):
@@ -203,7 +208,7 @@ class Problem(ShowsItsRepr):
     @property
     def name(self) -> str:
         """What is moved: the model's name."""
-        return self.system.name if isinstance(self.system, Model) else "plain dynamics"
+        return "plain dynamics" if self.moved is None else self.moved.name
 
     @property
     def nx(self) -> int:

@@ -1,0 +1,240 @@
+"""The directory of a solve in phases: made again, and forged ones that are refused."""
+
+import io
+import json
+from hashlib import sha256
+
+import numpy as np
+import pytest
+from helpers.models import MODELS
+
+import drake_diff as dd
+from drake_diff.record.phases import PhasesRecord
+from drake_diff.record.sealed import canonical, own_sha256
+
+pytestmark = pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+
+
+def hopping():
+    """A hopper that stands, then flies: models and their quantities alone, so that all of it can be made again."""
+    model = dd.load_model(MODELS / "hopper.sdf", time_step=0.01, contact=False)
+    stance = dd.optimize.HeldContacts(model, {"foot": [0, 0, -0.05]})
+    effort, x0 = dd.QuadraticCost(R=np.diag([0.1, 0.01])), np.array([0, 0.3, 0, 0.25, 0, 0, 0, 0])
+    leg = {"leg_x": (0.1, 0.4), "swing_x": (-0.2, 0.2)}
+    push = dd.Problem(
+        stance, x0=x0, num_steps=8, horizon=(0.1, 1.0), running_cost=effort, bounds=leg,
+        constraints=stance.kept(at=0.0, friction=0.7),
+    )  # fmt: skip
+    fly = dd.Problem(model, x0=x0, num_steps=6, horizon=(0.05, 1.0), bounds=leg, x_goal={"z": 0.6, "z_v": 0.0})
+    return dd.optimize.PhasedProblem([push, fly], names=["stance", "flight"])
+
+
+def swinging():
+    """A pendulum that swings to where it hangs at an angle, by way of an angle it chooses, in two phases."""
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
+    parts = {"num_steps": 6, "horizon": (0.2, 0.6), "running_cost": dd.QuadraticCost(R=[[1.0]])}
+    first = dd.Problem(model, x0=[0, 0], **parts)
+    return dd.optimize.PhasedProblem(
+        [first, dd.Problem(model, x0=[0.5, 0], x_goal=[0.8, 0], **parts)], names=["up", "on"]
+    )
+
+
+def bouncing():
+    """Plain functions, linked by a matrix: no artifact holds the functions."""
+    ball = dd.Dynamics(lambda x, u: [x[1], u[0] - 9.81], 2, 1, u_lower=[0], u_upper=[0])
+    kept = {"num_steps": 4, "horizon": (0.01, 5.0), "bounds": dd.Bounds(x_lower=[0.0, np.nan])}
+    floor = dd.Constraint(lambda x: x[0], 0.0, 0.0, knots=-1, name="floor")
+    fall = dd.Problem(ball, x0=[1.0, 0.0], constraints=floor, **kept)
+    rise = dd.Problem(ball, x0=[0.0, 2.0], x_goal=[np.nan, 0.0], **kept)
+    return dd.optimize.PhasedProblem([fall, rise], resets=[np.diag([1.0, -0.8])])
+
+
+@pytest.fixture(scope="module")
+def swung(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("swing") / "run"
+    assert dd.save(dd.solve(swinging()), folder).verdict == "pass"
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bounced(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bounce") / "run"
+    assert dd.save(dd.solve(bouncing()), folder).verdict == "pass"
+    return folder
+
+
+def copied(folder, to):
+    for path in folder.rglob("*"):
+        if path.is_file():
+            there = to / path.relative_to(folder)
+            there.parent.mkdir(parents=True, exist_ok=True)
+            there.write_bytes(path.read_bytes())
+    return to
+
+
+def sealed_again(folder, name):
+    """Hash what a forger changed: the files below, then the record itself."""
+    fields = json.loads((folder / name).read_text())
+    for path, entry in fields["files"].items():
+        data = (folder / path).read_bytes()
+        entry["bytes"], entry["sha256"] = len(data), sha256(data).hexdigest()
+    fields["record_sha256"] = own_sha256(fields)
+    (folder / name).write_text(canonical(fields))
+
+
+def forged(folder, change, name="phases.json"):
+    fields = json.loads((folder / name).read_text())
+    change(fields)
+    (folder / name).write_text(canonical(fields))
+    if name != "phases.json":
+        sealed_again(folder / name.split("/")[0], "record.json")
+    sealed_again(folder, "phases.json")
+    return dd.verify(folder)
+
+
+def test_a_run_in_phases_is_made_again(swung):
+    found = dd.verify(swung)
+    assert found.verdict == "holds", repr(found)
+    assert found.checked > 500
+    record = dd.load_record(swung)
+    assert isinstance(record, PhasesRecord)
+    assert [phase.name for phase in record.phases] == ["up", "on"]
+
+
+@pytest.mark.slow
+def test_a_stance_is_made_again(tmp_path):
+    record = dd.save(dd.solve(hopping()), tmp_path / "run")
+    assert record.verdict == "pass", record.sentence
+    assert dd.verify(tmp_path / "run").verdict == "holds"
+    held = dd.load_record(tmp_path / "run" / "phase_0").problem["held"]
+    assert held == {"points": {"foot": [0.0, 0.0, -0.05]}, "axes": "xyz"}
+    found = forged(tmp_path / "run", lambda f: f["problem"].update(held={**held, "axes": "z"}), "phase_0/record.json")
+    assert found.verdict == "broken"
+
+
+def test_what_functions_a_run_has_is_undecided_and_said(bounced):
+    found = dd.verify(bounced)
+    assert found.verdict == "undecided"
+    assert any("user's own diagram or function" in line for line in found.undecided)
+    assert any("were compared" in line for line in found.unchecked)
+
+
+def of_links(fields):
+    fields["links"][0]["errors"][1] *= 0.5
+    fields["links"][0]["errors"][1] += 1e-9
+
+
+FORGED = {
+    "a link's error": of_links,
+    "the chain's distance": lambda f: f["chain"].update(worst=f["chain"]["worst"] / 2 + 1e-9),
+    "the cost": lambda f: f.update(cost=f["cost"] * 0.9),
+    "a phase's cost": lambda f: f["phases"][0].update(cost=f["phases"][0]["cost"] * 0.9),
+    "a phase's duration": lambda f: f["phases"][1].update(duration=f["phases"][1]["duration"] * 0.9),
+    "a phase's directory": lambda f: f["phases"][1].update(directory="phase_0"),
+    "the sentence": lambda f: f.update(sentence=f["sentence"] + "!"),
+    "the iterations": lambda f: f["solver"].update(iterations=1),
+    "another horizon": lambda f: f.update(horizon_s=[0.1, 0.2]),
+    "another link": lambda f: f["links"][0].update(before=1, after=0),
+    "no link": lambda f: f.update(links=[]),
+    "another reset": lambda f: f["links"][0].update(reset={"matrix": {"rows": np.diag([1.0, 0.9]).tolist()}}),
+    "an impact": lambda f: f["links"][0].update(reset={"impact": {}}),
+    "a certificate": lambda f: f["links"][0]["certificate"].update(entries=3),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", FORGED)
+def test_a_forged_record_of_the_whole_is_refused(swung, tmp_path, what):
+    found = forged(copied(swung, tmp_path / "run"), FORGED[what])
+    assert found.verdict == "broken", (what, repr(found))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_a_plan_that_was_moved_is_refused(swung, tmp_path, seed):
+    random = np.random.default_rng(seed)
+    folder = copied(swung, tmp_path / "run")
+    phase = folder / f"phase_{seed % 2}"
+    with np.load(phase / "plan.npz") as file:
+        arrays = {name: np.array(file[name]) for name in file.files}
+    name = ["xs", "us"][int(random.integers(2))]
+    at = tuple(int(random.integers(n)) for n in arrays[name].shape)
+    arrays[name][at] += random.choice([-1, 1]) * 10 ** random.uniform(-6, -2)
+    buffer = io.BytesIO()
+    np.savez(buffer, **dict(sorted(arrays.items())))
+    (phase / "plan.npz").write_bytes(buffer.getvalue())
+    sealed_again(phase, "record.json")
+    sealed_again(folder, "phases.json")
+    assert dd.verify(folder).verdict == "broken"
+
+
+def metric(name, value):
+    def change(fields):
+        next(m for m in fields["metrics"] if m["name"] == name)["value"] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("what", "where", "change"),
+    [
+        ("a link's error", "phases.json", of_links),
+        ("a goal error", "phase_1/record.json", metric("goal error", 1e-7)),
+        ("a start", "phase_0/record.json", metric("initial state error", 1e-7)),
+        ("another goal", "phase_1/record.json", lambda f: f["problem"].update(x_goal=[0.7, 0.0])),
+        ("another start", "phase_0/record.json", lambda f: f["problem"].update(x0=[1.1, 0.0])),
+        ("tighter bounds", "phase_0/record.json", lambda f: f["problem"].update(x_lower=[0.5, None])),
+        ("a phase's cost", "phases.json", lambda f: f["phases"][0].update(cost=1.0)),
+        ("another reset", "phases.json", lambda f: f["links"][0]["reset"]["matrix"]["rows"][1].__setitem__(1, -0.9)),
+    ],
+)
+def test_what_functions_do_not_decide_is_refused_where_they_are_unknown(bounced, tmp_path, what, where, change):
+    found = forged(copied(bounced, tmp_path / "run"), change, where)
+    assert found.verdict == "broken", (what, repr(found))
+
+
+def test_a_failed_run_is_saved_as_one(tmp_path):
+    problem = bouncing()
+    up = dd.Problem(
+        problem.phases[1].system, x0=[0.0, 2.0], x_goal=[1.2, 0.0], num_steps=4, horizon=(0.01, 5.0)
+    )  # higher than it fell from
+    solution = dd.solve(dd.optimize.PhasedProblem([problem.phases[0], up], resets=problem.resets), max_iterations=30)
+    record = dd.save(solution, tmp_path / "run")
+    assert record.verdict == "fail"
+    assert not solution.success
+    fields = json.loads((tmp_path / "run" / "phases.json").read_text())
+    fields["verdict"] = "pass"
+    (tmp_path / "run" / "phases.json").write_text(canonical(fields))
+    sealed_again(tmp_path / "run", "phases.json")
+    found = dd.verify(tmp_path / "run")
+    assert found.verdict == "broken"
+    assert 'a verdict "pass" with' in found.complaints[0]
+
+
+def test_the_command_line_runs_and_verifies_phases(tmp_path):
+    from typer.testing import CliRunner
+
+    from drake_diff.cli.main import app
+
+    script = tmp_path / "bounce.py"
+    script.write_text(
+        "import numpy as np\nimport drake_diff as dd\n"
+        "def problem():\n"
+        "    ball = dd.Dynamics(lambda x, u: [x[1], u[0] - 9.81], 2, 1, u_lower=[0], u_upper=[0])\n"
+        "    floor = dd.Constraint(lambda x: x[0], 0.0, 0.0, knots=-1, name='floor')\n"
+        "    kept = dict(num_steps=4, horizon=(0.01, 5.0))\n"
+        "    fall = dd.Problem(ball, x0=[1.0, 0.0], constraints=floor, **kept)\n"
+        "    rise = dd.Problem(ball, x0=[0.0, 2.0], x_goal=[np.nan, 0.0], **kept)\n"
+        "    return dd.optimize.PhasedProblem([fall, rise], resets=[np.diag([1.0, -0.8])])\n"
+    )
+
+    def ended(*arguments):
+        return CliRunner().invoke(app, list(arguments))
+
+    ran = ended("run", str(script), "--out", str(tmp_path / "run"))
+    assert ran.exit_code == 0, ran.output
+    assert "link 0 to 1" in ran.output
+    assert ended("verify", str(tmp_path / "run")).exit_code == 1  # undecided: it has user's functions
+    listed = ended("list", str(tmp_path))
+    assert listed.exit_code == 0
+    assert "phases" in listed.output
