@@ -225,6 +225,120 @@ def test_a_parameter_that_is_only_given_moves_the_collocated_plan():
     assert given.cost > 1.2 * other.cost
 
 
+# ------------------------------------------------------------------------------ the length of a step
+
+
+@each_row("name", ["pendulum.urdf", "cart_pole.urdf", "quadrotor.urdf", "acrobot.xml", "mass_spring_damper.sdf"])
+def test_a_smooth_steps_derivative_by_its_length_is_exact(name):
+    """Against central differences of models with other steps, whose error of 1e-5 of h leaves 1e-9."""
+    model, random = named(name), np.random.default_rng(3)
+    x = model.default_state + 0.1 * random.standard_normal(model.nx)
+    u, h = random.standard_normal(model.nu), model.time_step
+    found = dd.differentiate_step(model, x, u, parameters=("model.time_step",))
+    assert found.sources == ("implicit",)
+    ends = [dd.step(model.at_time_step(h * (1 + side * 1e-5)), x, u) for side in (-1, 1)]
+    wanted = (ends[1] - ends[0]) / (2e-5 * h)
+    assert found.C[:, 0] == pytest.approx(wanted, abs=1e-8 * max(1, np.abs(wanted).max()))
+
+
+def sliding(mass, force, tmp_path):
+    """A block of that mass on a rail, pushed by at most that force, in a file: a diagram has one step only."""
+    path = tmp_path / "block.urdf"
+    path.write_text(BLOCK.format(mass=mass, force=force))
+    return dd.load_model(path, time_step=0.05)
+
+
+BLOCK = """<robot name="block"><link name="rail"/><link name="block"><inertial><mass value="{mass}"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="world" type="fixed"><parent link="world"/><child link="rail"/></joint>
+<joint name="slide" type="prismatic"><parent link="rail"/><child link="block"/><axis xyz="1 0 0"/>
+<limit effort="{force}" lower="-100" upper="100" velocity="100"/></joint>
+<transmission name="push"><type>transmission_interface/SimpleTransmission</type><joint name="slide">
+<hardwareInterface>EffortJointInterface</hardwareInterface></joint><actuator name="push"/></transmission></robot>"""
+
+
+@pytest.mark.slow
+@each_row("method, solver", [("ilqr", None), ("shooting", "ipopt")])
+def test_a_block_in_least_time_by_discrete_steps(method, solver, tmp_path):
+    """T = 2 sqrt(m d / F): with an even number of held inputs the switch is at a knot, and the steps are exact.
+
+    x_N of N semi-implicit steps differs from the time-continuous one by h v: over a way from rest to rest by nothing.
+    """
+    mass, force, way = 1.3, 2.0, 1.0
+    problem = dd.Problem(
+        sliding(mass, force, tmp_path), x0=[0, 0], x_goal=[way, 0], num_steps=20, horizon=(0.2, 10), running_cost=1.0
+    )
+    solution = dd.solve(problem, method=method, solver=solver)
+    assert solution.success, solution.message
+    assert solution.horizon == pytest.approx(2 * np.sqrt(way * mass / force), rel=1e-6)
+    assert solution.time_step == pytest.approx(solution.horizon / 20, rel=1e-12)
+    assert solution.cost == pytest.approx(solution.horizon, rel=1e-12)
+    assert solution.replays[0].time_step == pytest.approx(solution.time_step, rel=1e-12)
+    assert any("time_step" in column for column in solution.certificates[-1].columns)
+
+
+@each_row("method", ["ilqr", "shooting"])
+def test_a_time_that_is_weighed_against_effort(method, tmp_path):
+    """w T + c 12 m^2 d^2 / T^3 is least at T = (36 c m^2 d^2 / w)^(1/4); of N steps c = 1 / (1 - 1/N^2)."""
+    mass, way, weight, steps = 1.3, 1.0, 3.0, 20
+    problem = dd.Problem(
+        sliding(mass, 100.0, tmp_path),
+        x0=[0, 0],
+        x_goal=[way, 0],
+        num_steps=steps,
+        horizon=(0.5, 10),
+        running_cost=lambda x, u: weight + u[0] ** 2,
+    )
+    solution = dd.solve(problem, method=method)
+    assert solution.success, solution.message
+    effort = 36 * mass**2 * way**2 / (1 - 1 / steps**2)
+    assert solution.horizon == pytest.approx((effort / weight) ** 0.25, rel=1e-5)
+
+
+def test_mass_and_time_by_sweeps_through_discrete_steps(tmp_path):
+    """Both at once: for any T the best mass is that of the price, and the best T of it is where the slopes meet."""
+    price, heaviest, weight, steps, way = 8.0, 2.0, 3.0, 20, 1.0
+    problem = dd.Problem(
+        sliding(1.3, 100.0, tmp_path),
+        x0=[0, 0],
+        x_goal=[way, 0],
+        num_steps=steps,
+        horizon=(0.5, 10),
+        running_cost=lambda x, u: weight + u[0] ** 2,
+        optimize=BOTH,
+        parameters=("block.mass",),
+        parameter_cost=lambda p: price * (heaviest - p[0]) ** 2,
+    )
+    solution = dd.solve(problem, method="ilqr")
+    assert solution.success, solution.message
+    mass, time = solution.parameters[0], solution.horizon
+    effort = 12 * way**2 / (1 - 1 / steps**2)
+    assert weight == pytest.approx(3 * effort * mass**2 / time**4, rel=1e-4)
+    assert mass == pytest.approx(price * heaviest / (price + effort / time**3), rel=1e-4)
+
+
+def test_a_diagram_has_one_length_of_a_step():
+    problem = dd.Problem(block(), x0=[0, 0], x_goal=[1, 0], num_steps=5, horizon=(0.5, 1.0), running_cost=EFFORT)
+    for method in ("shooting", "ilqr"):
+        with pytest.raises(
+            InputError, match=r"steps of a diagram, which are of one length: method=.collocation. takes"
+        ):
+            dd.solve(problem, method=method)
+
+
+def test_a_plan_with_a_free_step_is_in_its_record(tmp_path):
+    problem = dd.Problem(
+        sliding(1.0, 2.0, tmp_path), x0=[0, 0], x_goal=[1, 0], num_steps=6, horizon=(0.5, 10), running_cost=1.0
+    )
+    solution = dd.solve(problem, method="ilqr")
+    assert solution.success, solution.message
+    dd.save(solution, tmp_path / "run")
+    assert dd.verify(tmp_path / "run").holds
+    forged = dataclasses.replace(solution, free_horizon=1.1 * solution.horizon)
+    dd.save(forged, tmp_path / "forged")
+    assert not dd.verify(tmp_path / "forged").holds
+
+
 # ------------------------------------------------------------------------------ refusals
 
 

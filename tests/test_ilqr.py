@@ -132,7 +132,6 @@ def test_a_function_is_optimized_like_the_quadratic_cost_it_is():
     ("changes", "words"),
     [
         ({"optimize": ("initial_state",)}, 'fixed controls: expected none for method="ilqr"; method="shooting" takes'),
-        ({"parameters": ["hinge.damping"]}, "parameters: expected none"),
         ({"trajectory_cost": lambda xs, us: xs[3, 0] ** 2}, "trajectory_cost: expected none"),
     ],
 )

@@ -10,8 +10,9 @@ damping D and the PD controllers are implicit. With the inputs clipped at their 
     input_i = clip(u_i - kp_i (q_i + h v'_i - q_ref_i) - kd_i (v'_i - v_ref_i)),
 
 so dv' = -(dr/dv')^-1 dr with dr/dv' = M / h + D + B (kd + h kp) B' for the inputs that are not clipped, and
-q' = q + h N(q) v'. Only r is differentiated, at Drake's own v': of a tree of hinges and slides by its own formulas
-(`mechanics.tree`), for many steps in one call; else, and by parameters, by AutoDiffXd.
+q' = q + h N(q) v'. By the time step dr = (B kp v' - M (v' - v) / h^2) dh. Only r is differentiated, at Drake's own v':
+of a tree of hinges and slides by its own formulas (`mechanics.tree`), for many steps in one call; else, and by
+parameters, by AutoDiffXd.
 r(v') = 0 is checked: where it does not hold, something else acts, or the AutoDiffXd plant is not the double one.
 """
 
@@ -40,7 +41,10 @@ TREE_JOINTS = 5
 
 
 class Implicit:
-    """The Jacobians of smooth steps from their own equation; parameters that are differenced have zeros."""
+    """The Jacobians of smooth steps from their own equation; parameters that are differenced have zeros.
+
+    But for the time step, which is in the equation.
+    """
 
     name = "implicit"
 
@@ -58,14 +62,14 @@ class Implicit:
                 missing[k] = 0.0 if touches else _by_autodiff(form, steps, k, values[k])
         refused: dict[int, DrakeDiffError] = {}
         if not steps.some_touch and np.count_nonzero(missing <= RESIDUAL_TOLERANCE) == len(missing):
-            return Jacobians(values, refused)
+            return Jacobians(values, refused, timed=True)
         for k, (part, touches) in enumerate(zip(missing.tolist(), steps.touching.tolist(), strict=True)):
             if touches:
                 refused[k] = NotSmoothError("geometries touch")
             elif not part <= RESIDUAL_TOLERANCE:
                 why = f"contact, a joint limit or a constraint acts: {part:.3g} of the forces are not accounted for"
                 refused[k] = NotSmoothError(why)
-        return Jacobians(values, refused)
+        return Jacobians(values, refused, timed=True)
 
 
 def takes_many(model: Model) -> bool:
@@ -74,7 +78,10 @@ def takes_many(model: Model) -> bool:
 
 
 def _by_tree(form: "Form", tree: TreeDynamics, steps: Steps) -> tuple[Array, Array]:
-    """(N, nx, nx + nu) the derivatives of N steps, and (N,) the force that is not accounted for, as a part."""
+    """(N, nx, nx + nu) the derivatives of N steps, and (N,) the force that is not accounted for, as a part.
+
+    One more column by the time step where that is a parameter, beside which there is none here.
+    """
     n, h, damping = steps.model.nv, steps.model.time_step, tree.own_damping
     q, v, v_next = steps.xs[:, :n], steps.xs[:, n:], steps.x_next[:, n:]
     effort, free, (kp, kd) = form.effort(q, v_next, steps.us, h)
@@ -88,9 +95,17 @@ def _by_tree(form: "Form", tree: TreeDynamics, steps: Steps) -> tuple[Array, Arr
     if form.pd:
         by_point[:, :, form.position] += pressed * kp
         by_next = by_next + (pressed * (kd + h * kp)) @ form.actuation.T
+    timed = steps.vector.step_entry is not None
+    if timed:
+        by_step = -(d.mass @ ((v_next - v) / h**2)[:, :, None])
+        if form.pd:
+            by_step += (pressed * kp) @ v_next[:, form.velocity, None]
+        by_point = np.concatenate([by_point, by_step], axis=2)
     velocities = -np.linalg.solve(by_next, by_point)
     positions = h * velocities
     positions[:, diagonal, diagonal] += 1.0
+    if timed:
+        positions[:, :, -1] += v_next
     return np.concatenate([positions, velocities], axis=1), _missing(d.tau, rest)
 
 
@@ -126,9 +141,16 @@ def _by_autodiff(form: "Form", steps: Steps, k: int, jacobian: Array) -> float:
     if form.pd:
         by_point[:, form.position] += pressed * kp
         by_next += (pressed * (kd + h * kp)) @ form.actuation.T
+    step = None if vector.step_entry is None else nx + model.nu + vector.step_entry
+    if step is not None:
+        by_point[:, step] = -(model.double.mass_matrix() @ change) / h**2
+        if form.pd:
+            by_point[:, step] += (pressed * kp) @ v_next[form.velocity]
     velocities = -np.linalg.solve(by_next, by_point)
     jacobian[:nq] = _positions(model, form, v_next, velocities, len(vector.values))
     jacobian[nq:] = velocities
+    if step is not None:
+        jacobian[:nq, step] += np.asarray(twin.rates(v_next))
     return missing
 
 

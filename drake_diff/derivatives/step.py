@@ -170,6 +170,8 @@ def _derivatives_of(steps: Steps, chosen: Chosen) -> list[StepDerivatives]:
     for x_next, jacobian, used, reason in rows:
         A, B, C = frozen(jacobian[:, :nx]), frozen(jacobian[:, nx:end]), frozen(jacobian[:, end:])
         sources = (used,) * len(names) if used in OF_ONE_KIND else vector.sources
+        if used == IMPLICIT.name and vector.step_entry is not None:
+            sources = (*sources[: vector.step_entry], used, *sources[vector.step_entry + 1 :])
         found.append(StepDerivatives(frozen(x_next), A, B, C, names, sources, used, reason))
     return found
 

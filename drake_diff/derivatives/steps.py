@@ -99,12 +99,13 @@ class Jacobians:
     """(N, nx, nx + nu + np) the derivatives of N steps by [x; u; parameters].
 
     `refused` has the steps that the source does not know, and why; what stands in `values` for them means nothing.
-    `notes` has what there is to say of others.
+    `notes` has what there is to say of others. The column of the time step is in `values` where it is `timed`.
     """
 
     values: Array
     refused: Mapping[int, DrakeDiffError]
     notes: Mapping[int, str] = field(default_factory=dict)
+    timed: bool = False
 
 
 class Source(Protocol):

@@ -51,7 +51,7 @@ from drake_diff.model.twin import AddedForce, Twin
 
 T = TypeVar("T")
 CONTACT_APPROXIMATIONS = ("sap", "similar", "lagged")
-OTHERS_KEPT = 64  # how many rebuilt models are kept: a certificate by the time step needs 26
+OTHERS_KEPT = 128  # how many rebuilt models are kept: a certificate by the time step needs 91
 NAMES_SHOWN = 12  # in repr: a robot arm's state is shown whole
 
 

@@ -134,12 +134,14 @@ class ParameterVector:
         """The values by parameter name."""
         return {p.name: self.values[s] for p, s in self.pairs}
 
+    @cached_property
+    def step_entry(self) -> int | None:
+        """Where the time step stands in the vector; None where it is not a parameter."""
+        return next((s.start for p, s in self.pairs if p.name == TIME_STEP), None)
+
     def time_step(self, values: Array) -> float:
         """The time step [s] that goes with `values` (np,)."""
-        for p, s in self.pairs:
-            if p.name == TIME_STEP:
-                return float(values[s][0])
-        return self.model.time_step
+        return self.model.time_step if self.step_entry is None else float(values[self.step_entry])
 
     def write(self, twin: Twin, values: Any) -> None:
         """Set every parameter in the twin: floats, or AutoDiffXd where the twin is of that type."""
@@ -258,7 +260,7 @@ def applied(vector: ParameterVector) -> Iterator[Model]:
     model.contract  # noqa: B018  the model's own, so it is read before anything else is set
     try:
         vector.write(model.double, vector.values)
-        model.other_quantities = frozenset(p.kind.quantity for p in vector.parameters)
+        model.other_quantities = frozenset(p.kind.quantity for p in vector.parameters if p.name != TIME_STEP)
         yield model
     finally:
         model.other_quantities = frozenset()

@@ -50,7 +50,8 @@ def first_guess(problem: Problem, method: str, given: Any, seed: int) -> Guess:
     if isinstance(given, Solution):
         same = problem.optimizes_parameters and given.vector.names == problem.parameters.names
         values = np.asarray(given.vector.values) if same else None
-        return replace(_of_solution(problem, given, continuous), parameters=values)
+        horizon = given.horizon if problem.horizon is not None else None
+        return replace(_of_solution(problem, given, continuous), parameters=values, horizon=horizon)
     if not (isinstance(given, (tuple, list)) and 2 <= len(given) <= 2 + continuous):
         forms = FORMS.replace("(xs, us)", "(xs, us), (xs, us, horizon)") if continuous else FORMS
         raise InputError("initial_guess", got=type(given).__name__, expected=forms)

@@ -72,10 +72,10 @@ def optimality(problem: Problem, variables: ShootingVariables, z: Array) -> Opti
     direct_xs, direct_us = RolloutCost(problem, variables).partials(z)[1:]
     rows = list(_rows(problem, xs, us))
     columns = [variables.gradient(z, _totals(linearization, row, xs, us)) for row in rows]
-    of_parameters = variables.cost_of_parameters(z)[1]
+    of_parameters = RolloutCost(problem, variables).by_design(z)[1]
     of_cost = of_parameters + variables.gradient(z, accumulate(linearization, direct_xs, direct_us))
     jacobian = np.array(columns).reshape(len(rows), len(of_cost)).T
-    sides = _sides(problem, variables, z)
+    sides = _sides(variables, z)
     free = ~(sides[0] | sides[1])
     multipliers = _multipliers(of_cost[free], jacobian[free], rows)
     for row, multiplier in zip(rows, multipliers, strict=True):
@@ -140,12 +140,9 @@ def _signs(value: float, lower: float, upper: float) -> tuple[float, float]:
     return -np.inf if on_lower else 0.0, np.inf if on_upper else 0.0
 
 
-def _sides(problem: Problem, variables: ShootingVariables, z: Array) -> tuple[Mask, Mask]:
+def _sides(variables: ShootingVariables, z: Array) -> tuple[Mask, Mask]:
     """Which variables lie on their lower bound, and which on their upper one."""
-    bounds, count = problem.bounds, problem.num_steps
-    least, most = problem.bounds_of_parameters()
-    lower = variables.pack(bounds.x_lower, np.tile(bounds.u_lower, (count, 1)), least)
-    upper = variables.pack(bounds.x_upper, np.tile(bounds.u_upper, (count, 1)), most)
+    lower, upper = variables.limits()
     return z <= lower + FEASIBILITY_TOLERANCE, z >= upper - FEASIBILITY_TOLERANCE
 
 

@@ -99,6 +99,7 @@ class NlpResult:
     iterations: tuple[Iteration, ...]
     note: str = ""  # what a claim of a minimum is limited to, if it is
     # What multipliers of rows that hold leave of the Lagrangian's gradient, over its largest term; NaN if not known.
+    parameters: Array | None = None  # (np,) of iLQR: those of discrete steps that it found
     stationarity: float = math.nan
     multipliers: Multipliers | None = None  # where the solver has them
 

@@ -120,7 +120,9 @@ class _Plan:
         effect = np.zeros(problem.nx)  # of a change of all variables at random: 0 where each of them has none
         effect[self.variables.free] = random.standard_normal(len(self.variables.free))
         moved = np.abs(effect) > NO_EFFECT
-        change = random.standard_normal(len(problem.parameters.values)) * problem.optimizes_parameters
+        design = self.variables.design
+        change = random.standard_normal(len(design.vector.values))
+        change[np.setdiff1d(np.arange(len(change)), design.moved)] = 0.0
         touching = self._touching()
         for k, d in enumerate(self.variables.linearization(self.z)):
             effect = d.A @ effect + d.C @ change
@@ -176,7 +178,7 @@ class _Plan:
             running = problem.total_running_cost
             if running is None:
                 return np.zeros((nx + nu, nx + nu))
-            h = problem.model.time_step
+            h = self.variables.time_step(self.z)
             return h * running_cost_hessian(cost_at(running, k * h), self.xs[k], self.us[k])
         hessian = np.zeros((nx + nu, nx + nu))
         if problem.total_final_cost is not None:

@@ -21,7 +21,7 @@ from drake_diff._base.arrays import Array, positive_int
 from drake_diff._base.autodiff import chain, chain_rows
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import GradientError, InputError, SimulationError
-from drake_diff.model.parameters import ParameterCoordinates, ParameterVector, applied
+from drake_diff.model.parameters import ParameterVector, applied
 from drake_diff.motion.gradient import Totals, accumulate, differentiate_loss
 from drake_diff.motion.rollout import roll_states
 from drake_diff.optimize.drake_program import solve_program
@@ -47,16 +47,26 @@ def check_segments(problem: Problem, method: str, segments: int) -> None:
 
 
 def solve_shooting(
-    problem: Problem, xs: Array, us: Array, *, solver: str, limits: Limits, report: Report | None, segments: int = 1
+    problem: Problem,
+    xs: Array,
+    us: Array,
+    *,
+    solver: str,
+    limits: Limits,
+    report: Report | None,
+    segments: int = 1,
+    values: Array | None = None,
 ) -> tuple[NlpResult, Array, Array]:
     """Solve `problem` from the guess xs (N+1, nx), us (N, nu); gives (result, xs, us).
+
+    `values` (np,) are those of the problem's `design` to begin with, its own where None.
 
     Of xs only the states that segments start from count. The result's z is that of `ShootingVariables` of the whole
     motion. A point that cannot be stepped or differentiated is a step that was too long: the solver goes on from the
     best point before it with shorter ones, which the message counts. Raises GradientError or SimulationError if the
     motion that it ends with is such a point.
     """
-    begin, start, backed, why = time.monotonic(), SegmentedMotion(problem, segments).pack(xs, us), 0, ""
+    begin, start, backed, why = time.monotonic(), SegmentedMotion(problem, segments).pack(xs, us, values), 0, ""
     table: list[Iteration] = []
     while True:
         # IPOPT shortens a step whose end it cannot evaluate; SNOPT, in Drake, has no way to be told.
@@ -184,7 +194,7 @@ class SegmentedMotion:
     def _bounds(self) -> tuple[Array, Array]:
         b, count = self.problem.bounds, self.problem.num_steps
         lower, upper = self.problem.state_limits()
-        lowest, highest = self.problem.bounds_of_parameters()
+        lowest, highest = self.problem.design.lower, self.problem.design.upper
         least, most = np.tile(b.u_lower, (count, 1)), np.tile(b.u_upper, (count, 1))
         return self.pack(lower, least, lowest), self.pack(upper, most, highest)
 
@@ -212,11 +222,10 @@ class ShootingVariables:
         begins, nx = self.steps.start == 0, problem.model.nx
         self.free = np.flatnonzero(problem.initial_state_mask) if begins else np.arange(nx)
         self.shape = (len(self.steps), problem.model.nu)
-        self.coordinates = ParameterCoordinates(problem.parameters) if problem.optimizes_parameters else None
-        self.num_parameters = len(problem.parameters.values) if problem.optimizes_parameters else 0
+        self.design = problem.design
         num_inputs = self.shape[0] * self.shape[1] if problem.optimizes_controls else 0
         self.inputs = slice(len(self.free), len(self.free) + num_inputs)  # where in z they are
-        self.size = self.inputs.stop + self.num_parameters
+        self.size = self.inputs.stop + self.design.count
         self._at: bytes | None = None
         self._linearization: list[StepDerivatives] = []
 
@@ -228,9 +237,14 @@ class ShootingVariables:
     def pack(self, x0: Array, us: Array, parameters: Array | None = None) -> Array:
         """z (size,) from the first state x0 (nx,), us (n, nu) and parameter values (np,), the problem's where None."""
         inputs = us.ravel() if self.problem.optimizes_controls else np.zeros(0)
-        values = self.problem.parameters.values if parameters is None else parameters
-        coordinates = np.zeros(0) if self.coordinates is None else self.coordinates.from_values(values)
-        return np.concatenate([x0[self.free], inputs, coordinates])
+        values = self.design.vector.values if parameters is None else parameters
+        return np.concatenate([x0[self.free], inputs, self.design.of_values(values)])
+
+    def limits(self) -> tuple[Array, Array]:
+        """(lower, upper), each (size,): the bounds of the variables."""
+        b, count = self.problem.bounds, self.shape[0]
+        lower = self.pack(b.x_lower, np.tile(b.u_lower, (count, 1)), self.design.lower)
+        return lower, self.pack(b.x_upper, np.tile(b.u_upper, (count, 1)), self.design.upper)
 
     def unpack(self, z: Array) -> tuple[Array, Array]:
         """x0 (nx,) and us (n, nu) from z (size,)."""
@@ -241,10 +255,12 @@ class ShootingVariables:
         return x0, z[self.inputs].reshape(self.shape)
 
     def parameters(self, z: Array) -> ParameterVector:
-        """The problem's parameters at z (size,)."""
-        if self.coordinates is None:
-            return self.problem.parameters
-        return self.problem.parameters.at(self.coordinates.to_values(z[self.inputs.stop :]))
+        """Those of the problem's `design` at z (size,)."""
+        return self.design.at(z[self.inputs.stop :])
+
+    def time_step(self, z: Array) -> float:
+        """[s] the length of a step at z (size,)."""
+        return self.design.time_step(self.design.values(z[self.inputs.stop :]))
 
     def gradient(self, z: Array, totals: Totals) -> Array:
         """(size,) the gradient by z from those by x0 (nx,), us (n, nu) and parameters (np,)."""
@@ -252,19 +268,8 @@ class ShootingVariables:
         return np.concatenate([totals.states[0][self.free], inputs, self.pull_back(z, totals.parameters)])
 
     def pull_back(self, z: Array, by_parameters: Array) -> Array:
-        """(..., num_parameters) the derivative by the parameters' coordinates in z."""
-        if self.coordinates is None:
-            return np.zeros((*by_parameters.shape[:-1], 0))
-        return self.coordinates.pull_back(z[self.inputs.stop :], by_parameters)
-
-    def cost_of_parameters(self, z: Array) -> tuple[float, Array]:
-        """(value, gradient (size,) by z) of the problem's `parameter_cost`; zeros where there is none."""
-        gradient, cost = np.zeros(self.size), self.problem.parameter_cost
-        if cost is None:
-            return 0.0, gradient
-        value, by_values = differentiate_final_cost(cost, np.array(self.parameters(z).values))
-        gradient[self.inputs.stop :] = self.pull_back(z, by_values)
-        return value, gradient
+        """(..., nc) the derivative by the coordinates of the design in z."""
+        return self.design.pull_back(z[self.inputs.stop :], by_parameters)
 
     def linearization(self, z: Array) -> list[StepDerivatives]:
         """The step derivatives along the states of z."""
@@ -331,7 +336,8 @@ class RolloutCost:
     """What the steps of z add to the objective, as a function of floats or AutoDiffXd, by reverse accumulation."""
 
     def __init__(self, problem: Problem, variables: ShootingVariables):
-        self.variables, self.time_step, self.running = variables, problem.model.time_step, problem.total_running_cost
+        self.variables, self.running = variables, problem.total_running_cost
+        self.first_step = problem.design.time_step(problem.design.vector.values)
         self.final = problem.total_final_cost if variables.is_last else None
         self.trajectory = problem.trajectory_cost
         self.of_parameters = problem.parameter_cost if variables.is_last else None
@@ -354,27 +360,40 @@ class RolloutCost:
         xs, us = self.variables.states(z), self.variables.unpack(z)[1]
         total = 0.0 if self.final is None else float(self.final(xs[-1]))
         if self.of_parameters is not None:
-            total += float(self.of_parameters(self.variables.parameters(z).values))
+            total += float(self.of_parameters(self.variables.design.own(self.variables.parameters(z).values)))
         if self.running is not None:
-            total += self.time_step * sum(
+            total += self.variables.time_step(z) * sum(
                 float(self._rate(k)(x, u)) for k, (x, u) in enumerate(zip(xs, us, strict=False))
             )
         return total + (0.0 if self.trajectory is None else float(self.trajectory(xs, us)))
 
     def _rate(self, k: int) -> Any:
-        """The running cost at step `k` of these."""
-        return cost_at(self.running, (self.variables.steps.start + k) * self.time_step)
+        """The running cost at step `k` of these; one that changes in time has steps of one length."""
+        return cost_at(self.running, (self.variables.steps.start + k) * self.first_step)
 
     def differentiate(self, z: Array) -> tuple[float, Array]:
         """(value, gradient by z) at z."""
         total, by_xs, by_us = self.partials(z)
         gradient = self.variables.gradient(z, accumulate(self.variables.linearization(z), by_xs, by_us))
-        added, by_z = self.variables.cost_of_parameters(z) if self.of_parameters is not None else (0.0, 0.0)
+        added, by_z = self.by_design(z)
         return total + added, gradient + by_z
+
+    def by_design(self, z: Array) -> tuple[float, Array]:
+        """(what the parameters cost, the gradient (size,) by z of that and of the running cost by a step's length)."""
+        design, gradient, total = self.variables.design, np.zeros(self.variables.size), 0.0
+        by_values = np.zeros(len(design.vector.values))
+        if self.of_parameters is not None:
+            own = np.array(design.own(self.variables.parameters(z).values))
+            total, by_values[: len(own)] = differentiate_final_cost(self.of_parameters, own)
+        if design.moves_step and self.running is not None:
+            pairs = zip(self.variables.states(z), self.variables.unpack(z)[1], strict=False)
+            by_values[design.own_count] = sum(float(self._rate(k)(x, u)) for k, (x, u) in enumerate(pairs))
+        gradient[self.variables.inputs.stop :] = self.variables.pull_back(z, by_values)
+        return total, gradient
 
     def partials(self, z: Array) -> tuple[float, Array, Array]:
         """(value, its derivatives by the states (n+1, nx) and the inputs (n, nu) themselves, the steps apart) at z."""
-        xs, us, h = self.variables.states(z), self.variables.unpack(z)[1], self.time_step
+        xs, us, h = self.variables.states(z), self.variables.unpack(z)[1], self.variables.time_step(z)
         by_xs, by_us, total = np.zeros_like(xs), np.zeros_like(us), 0.0
         if self.running is not None:
             for k, u in enumerate(us):

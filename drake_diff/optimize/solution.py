@@ -182,6 +182,12 @@ class Solution(ShowsItsRepr):
         return self.problem.parameters if self.parameters is None else self.problem.parameters.at(self.parameters)
 
     @property
+    def step_vector(self) -> ParameterVector:
+        """The parameters of discrete steps: `vector`, and the step's length where a horizon is asked for."""
+        design = self.problem.design
+        return design.vector.at(design.whole(self.vector.values, self.time_step))
+
+    @property
     def horizon(self) -> float:
         """[s] from the first state to the last."""
         return self.problem.start_horizon if self.free_horizon is None else self.free_horizon
@@ -200,7 +206,8 @@ class Solution(ShowsItsRepr):
         if self.transcribed is not None:
             total = self.transcribed.cost
         else:
-            total = self.problem.objective(self.xs, self.us) + self.problem.cost_of_parameters(self.vector.values)
+            total = self.problem.objective(self.xs, self.us, self.time_step)
+            total += self.problem.cost_of_parameters(self.vector.values)
         return total if np.isfinite(total) else float("inf")
 
     @property
@@ -268,7 +275,7 @@ class Solution(ShowsItsRepr):
         if self.transcribed is not None:
             return np.nan_to_num(self.transcribed.defects, nan=np.inf)
         found = np.full(len(self.us), np.inf)
-        with applied(self.vector) as model:
+        with applied(self.step_vector) as model:
             for k, u in enumerate(self.us):
                 with suppress(SimulationError):
                     found[k] = _largest(np.abs(self.xs[k + 1] - advance(model.double, self.xs[k], u)))
@@ -322,6 +329,9 @@ class Solution(ShowsItsRepr):
             sides += [(states, xs, b.x_lower, b.x_upper) for xs in [self.transcribed.xs_mid] if xs is not None]
         sides += [(names, us, b.u_lower, b.u_upper) for us in (self.inputs_at_knots, self.us_mid) if us is not None]
         sides.append((self.vector.names, self.vector.values[None], *self.problem.bounds_of_parameters()))
+        if self.problem.horizon is not None:
+            shortest, longest = (np.array([end]) for end in self.problem.horizon)
+            sides.append((("horizon",), np.array([[self.horizon]]), shortest, longest))
         found: dict[str, tuple[float, int]] = {}
         for labels, values, lower, upper in sides:
             excess = np.where(np.isfinite(values), np.maximum(lower - values, values - upper), np.inf)
@@ -388,7 +398,7 @@ class Solution(ShowsItsRepr):
             return Refusal("the plan is not finite")
         variables = ShootingVariables(self.problem, around=np.asarray(self.xs))
         try:
-            return optimality(self.problem, variables, variables.pack(self.xs[0], self.us, self.vector.values))
+            return optimality(self.problem, variables, variables.pack(self.xs[0], self.us, self.step_vector.values))
         except (GradientError, SimulationError) as error:
             return Refusal(f"a step or a derivative is refused: {error}")
 

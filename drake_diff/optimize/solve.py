@@ -16,6 +16,7 @@ from drake_diff.certificates.certify import certify_inside
 from drake_diff.exceptions import DrakeDiffError, GradientError, InputError, SimulationError, UnknownNameError
 from drake_diff.model.contact import penetration
 from drake_diff.model.equations import EquationsOfMotion
+from drake_diff.model.parameters import TIME_STEP, applied
 from drake_diff.model.soft_contact import SoftContact
 from drake_diff.model.step import set_state
 from drake_diff.optimize.advice import advice
@@ -24,7 +25,12 @@ from drake_diff.optimize.certified import certified_knots, certify_equations
 from drake_diff.optimize.drake_program import SOLVERS
 from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
 from drake_diff.optimize.ilqr.ilqr import check_problem, is_unconstrained, solve_ilqr
-from drake_diff.optimize.ilqr.through_contact import check_schedule, solve_continuation, solve_through_jumps
+from drake_diff.optimize.ilqr.through_contact import (
+    check_schedule,
+    moves_shapes,
+    solve_continuation,
+    solve_through_jumps,
+)
 from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, overlaps, refused
 from drake_diff.optimize.phased import PhasedSolution, solve_phased
 from drake_diff.optimize.problem.goals import in_words
@@ -62,7 +68,7 @@ PLANS = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
 PREFERENCE = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED, Status.INTERRUPTED, Status.TIME_LIMIT)
 
 Progress = Callable[[str], None]
-Searcher = Callable[[Problem, Array, Array], tuple[NlpResult, Array, Array]]
+Searcher = Callable[[Problem, Array, Array, Array], tuple[NlpResult, Array, Array]]
 
 
 @overload
@@ -299,6 +305,9 @@ class _Task:
         if attempt.continuation is not None and method != "ilqr":
             expected = f'none for method="{method}"; method="ilqr" takes it'
             raise InputError("continuation", got="given", expected=expected)
+        if attempt.continuation is not None and problem.design.vector.parameters:
+            given_too = "with parameters or a horizon"
+            raise InputError("continuation", got=given_too, expected="none of them: leave the continuation out")
         stages = () if attempt.continuation is None else check_schedule(problem, attempt.continuation)
         left = self.limits.time_limit - (time.monotonic() - self.start)
         most = min(attempt.max_iterations or self.limits.max_iterations, self.limits.max_iterations)
@@ -324,9 +333,9 @@ class _Task:
             if method == "collocation":
                 return run.collocate(guess, attempt.refinement, refine=attempt.refine)
             if method == "ilqr":
-                return run.sweep(xs, us, given=given is not None, stages=stages)
+                return run.sweep(guess, given=given is not None, stages=stages)
             improve = given is None and attempt.segments == 1 and is_unconstrained(problem)
-            return run.shoot(xs, us, attempt.segments, improve=improve)
+            return run.shoot(guess, attempt.segments, improve=improve)
 
         return make
 
@@ -394,7 +403,9 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
         reason = "collocation was not verified: a guess for it"
         yield Attempt("ilqr", reason, max_iterations=GUESS_ITERATIONS), given
     if np.all(np.isfinite(found[-1].xs)):
-        begun = found[-1].xs, found[-1].us
+        begun: Any = (found[-1].xs, found[-1].us)
+        if problem.design.vector.parameters:
+            begun = found[-1]
         after = "collocation" if method == "collocation" else "shooting"
         yield dataclasses.replace(asked, method=after, reason="from the motion that iLQR found"), begun
 
@@ -420,6 +431,16 @@ def _kept_apart(problem: Problem, attempt: Attempt, found: list[Solution]) -> It
         return
     if overlaps(last):
         yield dataclasses.replace(attempt, reason="links overlapped: they are kept apart", apart=True), last
+
+
+def _touches_at_first(problem: Problem) -> bool:
+    """Whether geometries touch in x0, so that collocation, which leaves contact out, is no plan of the model."""
+    model = problem.model
+    if not (model.contract.contact.collision_pairs and problem.optimizes_controls and model.can_rebuild):
+        return False
+    with applied(problem.parameters):
+        set_state(model.double, problem.x0)
+        return bool(penetration(model) > 0)
 
 
 def _is_free_at_first(problem: Problem) -> bool:
@@ -448,8 +469,11 @@ def _check_attempt(problem: Problem, attempt: Attempt) -> str:
     if not problem.has_model:
         expected = f'a model for method="{method}"; method="collocation" takes both'
         raise InputError("problem", got="plain dynamics", expected=expected)
-    if problem.horizon is not None:
-        raise InputError("horizon", got="given", expected=f"none for discrete steps: {takes}")
+    if problem.horizon is not None and not problem.model.can_rebuild:
+        raise InputError(
+            "horizon", got="given", expected=f"none for steps of a diagram, which are of one length: {takes}"
+        )
+    _check_timed_cost(problem)
     if attempt.refine:
         raise InputError("refine", got=True, expected=f'None or False for method="{method}": {takes}')
     if method == "ilqr":
@@ -465,10 +489,7 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
         raise InputError("trajectory_cost", got="given", expected='method="shooting"')
     if not problem.optimizes_controls:
         raise InputError("optimize", got=list(problem.optimize), expected='"controls" for method="collocation"')
-    if isinstance(problem.running_cost, TimedCost) and problem.horizon and problem.horizon[0] < problem.horizon[1]:
-        raise InputError(
-            "running_cost", got="one that changes in time", expected="one that does not: the horizon is free"
-        )
+    _check_timed_cost(problem)
     OptimalControl(problem, scheme)  # raises where a cost is no function that can be differentiated
     if attempt.solver == "snopt":  # Drake's DirectCollocation gets bounds, ends and costs alone
         left_out = {
@@ -500,13 +521,20 @@ def _check_scheme(problem: Problem, attempt: Attempt) -> str:
     return scheme
 
 
+def _check_timed_cost(problem: Problem) -> None:
+    if isinstance(problem.running_cost, TimedCost) and problem.horizon and problem.horizon[0] < problem.horizon[1]:
+        raise InputError(
+            "running_cost", got="one that changes in time", expected="one that does not: the horizon is free"
+        )
+
+
 def choose_method(problem: Problem) -> tuple[str, str]:
     """(method, why)."""
     if not problem.has_model:
         told = "a discrete map is one sparse program" if problem.is_map else "plain dynamics have no discrete step"
         return "collocation", told
     contract = problem.model.contract
-    if problem.horizon is not None:
+    if problem.horizon is not None and not _touches_at_first(problem):
         return "collocation", "the horizon is " + ("free" if problem.horizon[0] < problem.horizon[1] else "given")
     if not problem.optimizes_controls:
         return "shooting", "the controls are not optimized"
@@ -639,87 +667,118 @@ class Run:
         )
         return self._judge(draft, motion.result)
 
-    def sweep(self, xs: Array, us: Array, *, given: bool, stages: tuple[SoftContact, ...]) -> Solution:
+    def sweep(self, guess: Guess, *, given: bool, stages: tuple[SoftContact, ...]) -> Solution:
         """iLQR; from the states of a `given` guess, which need not be a rollout, else from the rollout of `us`.
 
         With `stages`, which take the inputs of the guess alone, it need not have a gradient.
         """
+        xs, us = guess.xs, guess.us
         limits, report, first = self.limits, self.report, iter([xs] if given else [])
 
-        def search(problem: Problem, rolled: Array, us: Array) -> tuple[NlpResult, Array, Array]:
+        def search(problem: Problem, rolled: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
             if stages:
                 result, xs_found, us, logs = solve_continuation(problem, us, stages, limits=limits, report=report)
                 self.options["continuation"] = [asdict(log) for log in logs]
                 return result, xs_found, us
-            solve_method = solve_through_jumps if problem.model.contract.contact.collision_pairs else solve_ilqr
-            return solve_method(problem, next(first, rolled), us, limits=limits, report=report)
+            touches = problem.model.contract.contact.collision_pairs and not moves_shapes(problem)
+            solve_method = solve_through_jumps if touches else solve_ilqr
+            return solve_method(problem, next(first, rolled), us, limits=limits, report=report, values=values)
 
-        return self._through_steps(xs, us, search, may_be_blind=bool(stages))
+        return self._through_steps(xs, us, search, guess, may_be_blind=bool(stages))
 
-    def shoot(self, xs: Array, us: Array, segments: int, *, improve: bool) -> Solution:
+    def shoot(self, guess: Guess, segments: int, *, improve: bool) -> Solution:
         """Shooting; `improve` the guess by iLQR, which gets out of curved valleys that shooting crawls along.
 
         Several `segments` are looked at around their own states, which defects part.
         """
-        limits, report = self.limits, self.report
+        limits, report, xs, us = self.limits, self.report, guess.xs, guess.us
         if segments > 1:
             try:
                 xs = roll_segments(self.problem, xs, us, segments)
             except SimulationError as error:
                 return refused(self._draft(xs, us), error)
 
-        def search(problem: Problem, xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
+        def search(problem: Problem, xs: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
             if improve:
                 result, xs, us = solve_ilqr(problem, xs, us, limits=limits, report=report)
                 self.options["initial_guess"] = f"default, then {result.message}"
                 if result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
                     return result, xs, us
-            return solve_shooting(problem, xs, us, solver=self.solver, limits=limits, report=report, segments=segments)
+            options: dict[str, Any] = {"solver": self.solver, "segments": segments, "values": values}
+            return solve_shooting(problem, xs, us, limits=limits, report=report, **options)
 
-        return self._through_steps(xs, us, search, segmented=segments > 1)
+        return self._through_steps(xs, us, search, guess, segmented=segments > 1)
 
     def _through_steps(
-        self, xs: Array, us: Array, search: Searcher, *, segmented: bool = False, may_be_blind: bool = False
+        self,
+        xs: Array,
+        us: Array,
+        search: Searcher,
+        guess: Guess,
+        *,
+        segmented: bool = False,
+        may_be_blind: bool = False,
     ) -> Solution:
         """Certify, search, certify again, on Drake's own steps; at rollouts, or at the states as they are."""
-        variables = ShootingVariables(self.problem, around=xs if segmented else None)
+        variables, values = ShootingVariables(self.problem, around=xs if segmented else None), self._first_values(guess)
         try:
-            xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us))
+            xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us, values))
         except (GradientError, SimulationError) as error:
             return refused(self._draft(xs, us), error)
         if blindness and not may_be_blind:
             return ended(self._draft(xs, us, certificates=before), Status.NO_GRADIENT, blindness)
         try:
-            result, xs, us = self._keeping_clear(search, xs, us)
+            result, xs, us = self._keeping_clear(search, xs, us, values)
             variables = ShootingVariables(self.problem, around=xs if segmented else None)
-            z = result.z if self.method == "shooting" and len(result.z) == variables.size else variables.pack(xs[0], us)
+            z = variables.pack(xs[0], us, result.parameters)
+            if self.method == "shooting" and len(result.z) == variables.size:
+                z = np.clip(result.z, *variables.limits())  # which solvers keep within their tolerance
             xs, us, after, blindness = self._look_at(variables, z)
         except (GradientError, SimulationError) as error:
             return refused(self._draft(xs, us, certificates=before), error)
         values = variables.parameters(z).values
         if result.note:
             self.options["contact_sequence"] = result.note
-        found = {"certificates": before + after, "parameters": values}
+        design, horizon = self.problem.design, None
+        if self.problem.horizon is not None:
+            horizon = float(np.clip(design.time_step(values) * self.problem.num_steps, *self.problem.horizon))
+        found = {"certificates": before + after, "parameters": frozen(design.own(values)), "free_horizon": horizon}
         solution = self._judge(self._draft(xs, us, **found), result)
         return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
 
-    def _keeping_clear(self, search: Searcher, xs: Array, us: Array) -> tuple[NlpResult, Array, Array]:
+    def _first_values(self, guess: Guess) -> Array:
+        """(np,) those of the problem's `design` where a search begins."""
+        problem, design = self.problem, self.problem.design
+        own = problem.parameters.values if guess.parameters is None else guess.parameters
+        first = problem.start_horizon if guess.horizon is None else guess.horizon
+        h = (first if problem.horizon is None else float(np.clip(first, *problem.horizon))) / problem.num_steps
+        return np.clip(design.whole(own, h), design.lower, design.upper)
+
+    def _keeping_clear(self, search: Searcher, xs: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
         """What `search` finds; where it comes too near to an obstacle between two states, again with these in view."""
         problem, rounds, guess = self.problem, list[list[float]](), (xs, us)
-        result, xs, us = search(problem, xs, us)
+        result, xs, us = search(problem, xs, us, values)
         for parts in CLEARANCE_PARTS:
             lacking, enters = lacking_between(problem.kept, xs)
             if not lacking or result.outcome not in (Outcome.SOLVED, Outcome.INACCURATE, Outcome.ITERATION_LIMIT):
                 break
             if self.report is not None:
                 self.report.say(f"{in_words(lacking, 'm')} too near to an obstacle within a step: {parts} parts")
-            more = swept(self.problem.kept, problem.time_step, parts)
+            last = self._values_of(result, values)
+            more = swept(self.problem.kept, problem.design.time_step(last), parts)
             wider = dataclasses.replace(problem, constraints=(*problem.constraints, *more))
-            result, xs, us = search(wider, *(guess if enters else (xs, us)))
+            result, xs, us = search(wider, *((*guess, values) if enters else (xs, us, last)))
             rounds.append([parts, lacking])
         if rounds:
             self.options["clearance_rounds"] = rounds
         return result, xs, us
+
+    def _values_of(self, result: NlpResult, first: Array) -> Array:
+        """(np,) what a search found, that began at `first`."""
+        if result.parameters is not None:
+            return result.parameters
+        variables = ShootingVariables(self.problem)
+        return variables.parameters(result.z).values if len(result.z) == variables.size else first
 
     def _judge(self, draft: Solution, result: NlpResult) -> Solution:
         """`judged`, and no success where the cost asks for a motion that nothing here could have begun."""
@@ -729,7 +788,7 @@ class Run:
         xs, us = solution.plan.sample(1)
         variables = ShootingVariables(problem, around=xs)
         try:
-            found = out_of_reach(problem, variables, variables.pack(xs[0], us, solution.vector.values))
+            found = out_of_reach(problem, variables, variables.pack(xs[0], us, solution.step_vector.values))
         except (GradientError, SimulationError) as error:
             detail = f"whether the cost asks for what nothing moves cannot be told: {error}"
             return ended(solution, Status.CONVERGED_NOT_VERIFIED, detail)
@@ -747,7 +806,9 @@ class Run:
         """xs and us of z, certificates of some of its steps, and why the goal or cost is out of its reach."""
         us = variables.unpack(z)[1]
         xs, parameters = variables.states(z), variables.parameters(z).to_dict()
-        model = self.problem.model
+        model, design = self.problem.model, self.problem.design
+        if design.has_step and not design.moves_step:
+            model = model.at_time_step(float(parameters.pop(TIME_STEP)[0]))
 
         def certificate(x: Array, u: Array) -> Certificate:
             """That of a search which ends where it began is known: it costs as much as the search."""

@@ -4,14 +4,16 @@ All in Drake's own coordinates, quaternions included: the discrete step lets a q
 is a state that inputs move, and on the rotations' tangent space the gradient would be wrong by what is left out.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of
-from drake_diff.derivatives.step import linearize, smooth_jacobians
+from drake_diff.derivatives.step import derivatives_along, linearize, smooth_jacobians
+from drake_diff.model.parameters import applied
 from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic
 from drake_diff.optimize.problem.cost import (
@@ -32,11 +34,15 @@ SAFE_DIVISOR = 1e-6  # of |dz| |r|: SR1 is not defined where dz' r vanishes
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """xs (N+1, nx) and us (N, nu), a rollout where the gaps (N, nx), step(x_k, u_k) - x_(k+1), are zero."""
+    """xs (N+1, nx) and us (N, nu), a rollout where the gaps (N, nx), step(x_k, u_k) - x_(k+1), are zero.
+
+    The steps are of the problem's `design` at the coordinates c (nc,).
+    """
 
     xs: Array
     us: Array
     gaps: Array
+    c: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def point(self) -> tuple[Array, Array]:
@@ -59,9 +65,13 @@ class Motion:
 
 
 def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: AugmentedLagrangian) -> LinearQuadratic:
-    """`problem` around `motion`, the constraints being part of its cost."""
-    model, xs, us = problem.model, motion.xs, motion.us
-    gradients, hessians = expand_running_cost(problem, xs, us)
+    """`problem` around `motion`, the constraints being part of its cost.
+
+    What may change beside states and inputs, c, is constant and part of the state: [x, c].
+    """
+    model, xs, us, design = problem.model, motion.xs, motion.us, problem.design
+    h = design.time_step(design.values(motion.c))
+    gradients, hessians = expand_running_cost(problem, xs, us, h)
     final_gradient, final_hessian = np.zeros(model.nx), np.zeros((model.nx, model.nx))
     if problem.total_final_cost is not None:
         final_gradient = differentiate_final_cost(problem.total_final_cost, xs[-1])[1]
@@ -73,7 +83,7 @@ def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: Augm
         final_gradient = final_gradient + gradient[-1, : model.nx]
         final_hessian = final_hessian + curvature[-1, : model.nx, : model.nx]
     bounds, free = problem.bounds, problem.initial_state_mask
-    return LinearQuadratic(
+    found = LinearQuadratic(
         F=jacobians,
         gaps=motion.gaps,
         gradients=gradients,
@@ -85,11 +95,59 @@ def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: Augm
         start_lower=np.where(free, bounds.x_lower - xs[0], 0.0),
         start_upper=np.where(free, bounds.x_upper - xs[0], 0.0),
     )
+    return _with_design(problem, motion, found, h) if len(motion.c) else found
 
 
-def expand_running_cost(problem: Problem, xs: Array, us: Array) -> tuple[Array, Array]:
-    """(gradients (N, nx + nu), Hessians (N, nx + nu, nx + nu)) of h times the running cost."""
-    h, (nx, nu), cost = problem.model.time_step, (xs.shape[1], us.shape[1]), problem.total_running_cost
+def _with_design(problem: Problem, motion: Motion, model: LinearQuadratic, h: float) -> LinearQuadratic:
+    """The same with c as a part of the state; F has its columns already: (N, nx, nx + nc + nu)."""
+    design, c, (count, nx), nu = problem.design, motion.c, motion.gaps.shape, motion.us.shape[1]
+    nc, kept = len(c), np.r_[:nx, nx + len(c) : nx + len(c) + nu]  # where x and u are in [x, c, u]
+    F, gaps = np.zeros((count, nx + nc, nx + nc + nu)), np.zeros((count, nx + nc))
+    F[:, :nx], gaps[:, :nx] = model.F, motion.gaps
+    F[:, nx:, nx : nx + nc] = np.eye(nc)
+    gradients, hessians = np.zeros((count, nx + nc + nu)), np.zeros((count, nx + nc + nu, nx + nc + nu))
+    gradients[:, kept], hessians[:, kept[:, None], kept] = model.gradients, model.hessians
+    if design.moves_step and problem.total_running_cost is not None:  # h(c) L(x, u): h is linear in c
+        by_step = np.zeros(len(design.vector.values))
+        by_step[design.own_count] = 1.0
+        slope = design.pull_back(c, by_step)
+        along, unit = (
+            zip(motion.xs, motion.us, strict=False),
+            expand_running_cost(problem, motion.xs, motion.us, 1.0)[0],
+        )
+        rates = np.array([float(cost_at(problem.total_running_cost, k * h)(x, u)) for k, (x, u) in enumerate(along)])
+        gradients[:, nx : nx + nc] = rates[:, None] * slope
+        across = unit[:, :, None] * slope
+        hessians[:, kept[:, None], np.arange(nx, nx + nc)] += across
+        hessians[:, np.arange(nx, nx + nc)[:, None], kept] += across.swapaxes(1, 2)
+    final_gradient, final_hessian = np.zeros(nx + nc), np.zeros((nx + nc, nx + nc))
+    final_gradient[:nx], final_hessian[:nx, :nx] = model.final_gradient, model.final_hessian
+    if problem.parameter_cost is not None:
+        cost = problem.parameter_cost
+
+        def of_coordinates(at: Any) -> Any:
+            return cost(design.own_at(at))
+
+        final_gradient[nx:] = differentiate_final_cost(of_coordinates, c)[1]
+        final_hessian[nx:, nx:] = final_cost_hessian(of_coordinates, c)
+    lower, upper = design.limits
+    return replace(
+        model,
+        F=F,
+        gaps=gaps,
+        gradients=gradients,
+        hessians=hessians,
+        final_gradient=final_gradient,
+        final_hessian=final_hessian,
+        start_lower=np.concatenate([model.start_lower, lower - c]),
+        start_upper=np.concatenate([model.start_upper, upper - c]),
+    )
+
+
+def expand_running_cost(problem: Problem, xs: Array, us: Array, h: float | None = None) -> tuple[Array, Array]:
+    """(gradients (N, nx + nu), Hessians (N, nx + nu, nx + nu)) of h [s], the model's step if None, times the running cost."""
+    h = problem.model.time_step if h is None else h
+    (nx, nu), cost = (xs.shape[1], us.shape[1]), problem.total_running_cost
     gradients, hessians = np.zeros((len(us), nx + nu)), np.zeros((len(us), nx + nu, nx + nu))
     if isinstance(cost, QuadraticCost):
         x_ref = np.zeros(nx) if cost.x_ref is None else cost.x_ref
@@ -105,13 +163,19 @@ def expand_running_cost(problem: Problem, xs: Array, us: Array) -> tuple[Array, 
 
 
 def jacobians_along(problem: Problem, motion: Motion) -> Array:
-    """(N, nx, nx + nu): [A_k, B_k]; raises GradientError or SimulationError if one, or a step, is refused.
+    """(N, nx, nx + nc + nu): [A_k, C_k, B_k]; raises GradientError or SimulationError if one, or a step, is refused.
 
     Those of an input on a bound are from inside it: a bound is often the actuator's limit, at which Drake's derivative
     is 0, as beyond it, while a minimization needs to know what leaving the bound would do.
     """
-    A, B, _ = linearize(problem.model, motion.xs, _off_bounds(problem, motion.us), x_next=motion.ends)
-    return np.concatenate([A, B], axis=2)
+    design, us = problem.design, _off_bounds(problem, motion.us)
+    vector = design.at(motion.c)
+    with applied(vector) as model:
+        if not design.count:
+            A, B, _ = linearize(model, motion.xs, us, x_next=motion.ends)
+            return np.concatenate([A, B], axis=2)
+        found = derivatives_along(model, motion.xs[0], us, vector=vector, xs=motion.xs[:-1])
+    return np.array([np.hstack([d.A, design.pull_back(motion.c, d.C), d.B]) for d in found])
 
 
 def _off_bounds(problem: Problem, us: Array) -> Array:
@@ -127,6 +191,8 @@ def curvature_along(problem: Problem, motion: Motion, v: Array) -> Array | None:
     Jacobians are not to be had in one call. Raises what `linearize` raises.
     """
     model, xs, us = problem.model, motion.xs[:-1], _off_bounds(problem, motion.us)
+    if problem.design.vector.parameters:
+        return None  # what is learned has the parameters in it
     here = smooth_jacobians(model, xs, us, motion.ends)
     if here is None:
         return None

@@ -18,6 +18,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import GradientError, InputError, SimulationError
+from drake_diff.model.parameters import applied
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.ilqr.constraints import GROWTH, LARGEST_PENALTY, AugmentedLagrangian
@@ -50,15 +51,13 @@ def check_problem(problem: Problem) -> None:
 
 def is_unconstrained(problem: Problem) -> bool:
     """Whether iLQR can solve `problem` in one minimization: costs and input bounds alone, from the given x0."""
-    hard = AugmentedLagrangian(problem).any or problem.initial_state_mask.any()
+    hard = AugmentedLagrangian(problem).any or problem.initial_state_mask.any() or problem.design.count > 0
     return not hard and not list(_unkept(problem))
 
 
 def _unkept(problem: Problem) -> Iterator[str]:
     if not problem.optimizes_controls:
         yield "fixed controls"
-    if problem.parameters.parameters:
-        yield "parameters"
     if problem.trajectory_cost is not None:
         yield "trajectory_cost"
     if problem.couplings:
@@ -74,21 +73,24 @@ def solve_ilqr(
     report: Report | None,
     patience: float = math.inf,
     least_penalty: float = 0.0,
+    values: Array | None = None,
 ) -> tuple[NlpResult, Array, Array]:
     """Solve `problem` from xs (N+1, nx), us (N, nu), a rollout or not; gives (result, xs, us), result.z being us flat.
 
     After `patience` steps in a row that are shorter than SHORT the search ends as inaccurate: it crawls along a jump.
     Before that it regularizes where steps are short, as the model reaches too far. `least_penalty` is what constraints
-    weigh from the start. A motion on the way that cannot be stepped or differentiated is a step that is too long, which
-    the message counts; raises GradientError or SimulationError if the guess is such a motion.
+    weigh from the start, `values` (np,) are those of the problem's `design` to begin with, its own where None. A motion
+    on the way that cannot be stepped or differentiated is a step that is too long, which the message counts; raises
+    GradientError or SimulationError if the guess is such a motion.
     """
-    search = _Search(problem, xs, us, limits, report, patience)
+    search = _Search(problem, xs, us, limits, report, patience, values)
     search.constraints.penalty = max(search.constraints.penalty, least_penalty)
     with ctrl_c() as interrupted:
         outcome = search.run(interrupted)
     message = f"iLQR: {outcome.value} after {len(search.rows) - 1} steps{search.told_of_refusals}"
-    motion = search.motion
-    return NlpResult(motion.us.ravel(), outcome, message, tuple(search.rows)), motion.xs, motion.us
+    motion, found = search.motion, problem.design.values(search.motion.c)
+    result = NlpResult(motion.us.ravel(), outcome, message, tuple(search.rows), parameters=found)
+    return result, motion.xs, motion.us
 
 
 def costs_to_go(problem: Problem, xs: Array, us: Array) -> tuple[CostToGo, ...]:
@@ -101,7 +103,9 @@ def costs_to_go(problem: Problem, xs: Array, us: Array) -> tuple[CostToGo, ...]:
     policy = _least_regularized(solve_riccati, search._expand())
     if policy is None:
         raise InputError("running_cost", got="no positive curvature by the inputs", expected="a cost with a minimum")
-    parts = zip(search.motion.xs, policy.value_gradients, policy.value_hessians, strict=True)
+    nx = problem.nx
+    gradients, hessians = policy.value_gradients[:, :nx], policy.value_hessians[:, :nx, :nx]
+    parts = zip(search.motion.xs, gradients, hessians, strict=True)
     return tuple(CostToGo(*part) for part in parts)
 
 
@@ -122,16 +126,24 @@ def _promise_at_most(solve: _Solve, models: tuple[LinearQuadratic, ...], limit: 
 
 class _Search:
     def __init__(
-        self, problem: Problem, xs: Array, us: Array, limits: Limits, report: Report | None, patience: float = math.inf
+        self,
+        problem: Problem,
+        xs: Array,
+        us: Array,
+        limits: Limits,
+        report: Report | None,
+        patience: float = math.inf,
+        values: Array | None = None,
     ):
         self.problem, self.limits, self.report, self.patience = problem, limits, report, patience
         self.constraints = AugmentedLagrangian(problem)
         lower, upper = problem.bounds.u_lower, problem.bounds.u_upper
         self.inner = lower * (1 + BESIDE * np.sign(lower)), upper * (1 - BESIDE * np.sign(upper))
-        self.start = time.monotonic()
-        self.motion = self._take_in(xs, us)
+        self.start, self.design = time.monotonic(), problem.design
+        begin = self.design.start if values is None else self.design.of_values(values)
+        self.motion = self._take_in(xs, us, np.clip(begin, *self.design.limits))
         self.expanded, self.curvature = self.motion, DynamicsCurvature()
-        self.cost = problem.objective(self.motion.xs, self.motion.us)
+        self.cost = self._objective(self.motion)
         self.constraints.start(*self.motion.point, self.cost, float(np.sum(self.motion.gaps**2)))
         self.jacobians: Array | None = None
         self.gap_weight = 0.0
@@ -187,7 +199,8 @@ class _Search:
         if self.jacobians is None:
             self.jacobians = jacobians_along(self.problem, new)
         model = expand(self.problem, new, self.jacobians, self.constraints)
-        self.curvature.update(model, np.hstack([new.xs[:-1] - old.xs[:-1], new.us - old.us]))
+        moved = np.tile(new.c - old.c, (len(new.us), 1))
+        self.curvature.update(model, np.hstack([new.xs[:-1] - old.xs[:-1], moved, new.us - old.us]))
         if self.gains[1] > SLOW * self.gains[0]:
             M = curvature_along(self.problem, new, model.multipliers())
             self.curvature.M = self.curvature.M if M is None else M
@@ -243,7 +256,7 @@ class _Search:
             try:
                 motion = self._roll(policy, size)
                 with np.errstate(all="ignore"):  # a merit that is not finite is no decrease
-                    cost = self.problem.objective(motion.xs, motion.us)
+                    cost = self._objective(motion)
                     found = self._merit(motion, cost)
             except SimulationError:
                 continue  # too long a step: a shorter one is tried next
@@ -263,30 +276,40 @@ class _Search:
 
     def _roll(self, policy: AffinePolicy, size: float) -> Motion:
         """Step from x_0 with feedback, each gap shrunk to 1 - `size` of itself."""
-        twin, old = self.problem.model.double, self.motion
+        old, nx = self.motion, self.motion.xs.shape[1]
         xs, us = np.empty_like(old.xs), np.empty_like(old.us)
         gaps = (1 - size) * old.gaps
-        xs[0] = self._inside_start(old.xs[0] + size * policy.start)
+        xs[0] = self._inside_start(old.xs[0] + size * policy.start[:nx])
+        c = np.clip(old.c + size * policy.start[nx:], *self.design.limits)
         wanted = old.us + size * policy.feedforward
-        for k, feedback in enumerate(policy.feedback):
-            us[k] = self._inside(wanted[k] + feedback.dot(xs[k] - old.xs[k]))
-            xs[k + 1] = advance(twin, xs[k], us[k]) - gaps[k]
-        return Motion(xs, us, gaps)
+        if len(c):
+            wanted = wanted + policy.feedback[:, :, nx:] @ (c - old.c)
+        with applied(self.design.at(c)) as model:
+            for k, feedback in enumerate(policy.feedback[:, :, :nx]):
+                us[k] = self._inside(wanted[k] + feedback.dot(xs[k] - old.xs[k]))
+                xs[k + 1] = advance(model.double, xs[k], us[k]) - gaps[k]
+        return Motion(xs, us, gaps, c)
 
-    def _take_in(self, xs: Array, us: Array) -> Motion:
+    def _objective(self, motion: Motion) -> float:
+        values = self.design.values(motion.c)
+        cost = self.problem.objective(motion.xs, motion.us, self.design.time_step(values))
+        return cost + self.problem.cost_of_parameters(self.design.own(values))
+
+    def _take_in(self, xs: Array, us: Array, c: Array) -> Motion:
         """The guess, its inputs taken inside their bounds and its first state the problem's, and its gaps."""
         free = self.problem.initial_state_mask
         xs, us = np.array(xs), self._inside(us)
         xs[0] = self._inside_start(np.where(free, xs[0], self.problem.x0))
         gaps = np.empty_like(xs[1:])
         quaternions = tangent_space(self.problem.model).quaternions
-        for k, u in enumerate(us):
-            x_next = advance(self.problem.model.double, xs[k], u)
-            for part in (slice(start, start + 4) for start in quaternions):
-                if x_next[part] @ xs[k + 1, part] < 0:  # the same rotation, further off
-                    xs[k + 1, part] *= -1
-            gaps[k] = x_next - xs[k + 1]
-        return Motion(xs, us, gaps)
+        with applied(self.design.at(c)) as model:
+            for k, u in enumerate(us):
+                x_next = advance(model.double, xs[k], u)
+                for part in (slice(start, start + 4) for start in quaternions):
+                    if x_next[part] @ xs[k + 1, part] < 0:  # the same rotation, further off
+                        xs[k + 1, part] *= -1
+                gaps[k] = x_next - xs[k + 1]
+        return Motion(xs, us, gaps, c)
 
     def _inside(self, us: Array) -> Array:
         """`us` (..., nu) within its bounds, and on a bound where rounding alone parts it from one."""

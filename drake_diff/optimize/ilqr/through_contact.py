@@ -50,6 +50,7 @@ LARGEST_STIFFNESS = 0.4
 JUST_TOUCHING = 2e-5  # [m], beyond MARGIN; what rests on something presses further into it
 NUDGE = 10.0  # how many gaps the force at x0 alone would move what it acts on, were it to last
 
+OF_SHAPES = ("offset", "radius")  # parameters that change where shapes are, or what they are
 Found = tuple[NlpResult, Array, Array]  # as from `solve_ilqr`
 
 
@@ -172,12 +173,20 @@ def default_schedule(problem: Problem) -> tuple[SoftContact, ...]:
     return tuple(stages)
 
 
+def _cost(problem: Problem, result: NlpResult, xs: Array, us: Array) -> float:
+    """What xs (N+1, nx) under us (N, nu) cost with the parameters of `result`."""
+    design = problem.design
+    values = design.vector.values if result.parameters is None else result.parameters
+    cost = problem.objective(xs, us, design.time_step(values))
+    return cost + problem.cost_of_parameters(design.own(values))
+
+
 def _told(
     problem: Problem, result: NlpResult, xs: Array, us: Array
 ) -> tuple[str, int, float | None, float | None, float | None]:
     """Status, iterations, cost, goal error and gradient of a stage, for its log."""
     last = result.iterations[-1]
-    numbers = problem.objective(xs, us), _miss(problem, xs), last.dual_infeasibility
+    numbers = _cost(problem, result, xs, us), _miss(problem, xs), last.dual_infeasibility
     cost, error, gradient = (value if math.isfinite(value) else None for value in numbers)
     return result.outcome.value, last.iteration, cost, error, gradient
 
@@ -228,21 +237,29 @@ class ContactHold:
         return f"{' and '.join(self.names)} {'apart' if self.apart else 'touching'} at knot {self.knot}"
 
 
-def solve_through_jumps(problem: Problem, xs: Array, us: Array, *, limits: Limits, report: Report | None) -> Found:
+def moves_shapes(problem: Problem) -> bool:
+    """Whether parameters change where the shapes are, or what they are: no touch can be held then."""
+    return any(p.kind.quantity in OF_SHAPES for p in problem.parameters.parameters)
+
+
+def solve_through_jumps(
+    problem: Problem, xs: Array, us: Array, *, limits: Limits, report: Report | None, values: Array | None = None
+) -> Found:
     """What `solve_ilqr` gives, from a search that holds beginnings of touches where it stalls at one.
 
     Where they press, the result's note says which, and what the sequences beyond them cost. `limits` are those of all
     sequences together. Raises as `solve_ilqr` does.
     """
-    search = _Sequences(problem, limits, report)
+    search = _Sequences(problem, limits, report, values)
     with ctrl_c() as interrupted:
         result, xs, us = search.run(xs, us, interrupted)
     return replace(result, z=us.ravel(), iterations=tuple(search.rows)), xs, us
 
 
 class _Sequences:
-    def __init__(self, problem: Problem, limits: Limits, report: Report | None):
+    def __init__(self, problem: Problem, limits: Limits, report: Report | None, values: Array | None):
         self.problem, self.limits, self.report = problem, limits, report
+        self.values = values  # of the problem's design, as the last search left them
         self.deadline, self.rows = time.monotonic() + limits.time_limit, list[Iteration]()
         self.costs = dict[tuple[ContactHold, ...], float]()  # of each sequence's minimum; infinite if none was found
         self.ended = False  # by Ctrl-C or the clock
@@ -268,13 +285,13 @@ class _Sequences:
         while left and len(self.costs) < MOST_SEQUENCES and not interrupted.is_set():
             if time.monotonic() > self.deadline or len(self.rows) > self.limits.max_iterations:
                 break
-            hold = left.pop()
-            cost = self.problem.objective(*best[1:])
+            hold, self.values = left.pop(), best[0].parameters
+            cost = _cost(self.problem, *best)
             other = self._beyond(hold, *best[1:])
             if self.ended:
                 left.append(hold)
                 break
-            new = self.problem.objective(*other[1:]) if isinstance(other, tuple) else other
+            new = _cost(self.problem, *other) if isinstance(other, tuple) else other
             if isinstance(other, tuple) and new < cost:
                 best, told, left = other, [], self._pressing(other[1])
             else:
@@ -282,7 +299,7 @@ class _Sequences:
         told += [f"{hold} (beyond: not tried)" for hold in left]
         if not told:
             return best
-        cost = self.problem.objective(*best[1:])
+        cost = _cost(self.problem, *best)
         note = f"a minimum for its own sequence of contacts, cost {cost:.6g}, held by " + "; ".join(told)
         return replace(best[0], note=note), *best[1:]
 
@@ -317,12 +334,14 @@ class _Sequences:
         if holds:
             self._say("held: " + "; ".join(map(str, holds)))
         penalty, report = HOLDING if holds else 0.0, self.report
-        found = solve_ilqr(held, xs, us, limits=limits, report=report, patience=patience, least_penalty=penalty)
+        options: dict[str, Any] = {"patience": patience, "least_penalty": penalty, "values": self.values}
+        found = solve_ilqr(held, xs, us, limits=limits, report=report, **options)
         result, xs, us = found
         self.ended = result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT)
         first = len(self.rows) - 1 if self.rows else 0
         self.rows += [replace(r, iteration=first + r.iteration) for r in result.iterations[bool(self.rows) :]]
-        self.costs[holds] = self.problem.objective(xs, us) if result.outcome is Outcome.SOLVED else np.inf
+        self.values = result.parameters
+        self.costs[holds] = _cost(self.problem, result, xs, us) if result.outcome is Outcome.SOLVED else np.inf
         return found
 
     def _say(self, text: str) -> None:

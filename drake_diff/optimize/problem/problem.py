@@ -12,10 +12,11 @@ from drake_diff._base.arrays import Array, Indices, array_with_gaps, finite_arra
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, ShapeError, UnknownNameError
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import TIME_STEP, applied, select
+from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, select
 from drake_diff.optimize.problem.constraint import Constraint, check_inside, plant_limits, resolve_bounds, short
 from drake_diff.optimize.problem.cost import ConstantCost, FinalCost, QuadraticCost, differentiate_final_cost
 from drake_diff.optimize.problem.coupling import BoundCoupling, Couples, Joins, checked_couplings, excess_of
+from drake_diff.optimize.problem.design import Design
 from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, plant_dynamics
 from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGoals, in_words
 from drake_diff.optimize.problem.names import bounds_of, state_of
@@ -116,7 +117,10 @@ class Problem(ShowsItsRepr):
         self._set("num_steps", positive_int("num_steps", self.num_steps))
         self._set("optimize", _check_optimize(self.nu, self.optimize))
         if isinstance(system, Model):
-            self._set("parameters", select(system, self.parameters))
+            given = self.parameters
+            if isinstance(given, ParameterVector) and given.model is not system:
+                given = given.to_dict()
+            self._set("parameters", select(system, given))
             own = plant_limits(system)
         else:
             self._set("parameters", system.with_parameters(self.parameters).parameters)
@@ -272,6 +276,19 @@ class Problem(ShowsItsRepr):
             return SumOfCosts((own, WithGoals(None, terms)))
         return WithGoals(own, terms) if terms else own
 
+    @cached_property
+    def design(self) -> Design:
+        """What a search through the model's discrete steps moves beside states and inputs."""
+        return Design(
+            self.model,
+            self.parameters,
+            self.bounds_of_parameters(),
+            free=self.optimizes_parameters,
+            horizon=self.horizon,
+            start=self.start_horizon,
+            num_steps=self.num_steps,
+        )
+
     @property
     def optimizes_controls(self) -> bool:
         return "controls" in self.optimize
@@ -374,11 +391,13 @@ class Problem(ShowsItsRepr):
         """What `parameter_cost` says of the values (np,), a part of the cost; 0 where there is none."""
         return 0.0 if self.parameter_cost is None else float(self.parameter_cost(values))
 
-    def objective(self, xs: Array, inputs: Array) -> float:
+    def objective(self, xs: Array, inputs: Array, time_step: float | None = None) -> float:
         """The objective of xs (N+1, nx) under inputs (N, nu) held over each step, but for that of the parameters.
 
-        Inputs (N+1, nu) are at the knots, and the running cost is integrated by the trapezoid rule.
+        Inputs (N+1, nu) are at the knots, and the running cost is integrated by the trapezoid rule. Steps have the
+        length `time_step` [s], that of the model where None.
         """
+        h = self.time_step if time_step is None else time_step
         running, final = self.total_running_cost, self.total_final_cost
         total = 0.0 if final is None else float(final(xs[-1]))
         if running is not None:
@@ -387,10 +406,10 @@ class Problem(ShowsItsRepr):
                 rates = running.along(before, inputs)
             else:
                 along = enumerate(zip(before, inputs, strict=True))
-                rates = np.array([float(cost_at(running, k * self.time_step)(x, u)) for k, (x, u) in along])
+                rates = np.array([float(cost_at(running, k * h)(x, u)) for k, (x, u) in along])
             if len(inputs) == len(xs):
                 rates[0], rates[-1] = rates[0] / 2, rates[-1] / 2
-            total += self.time_step * float(np.sum(rates))
+            total += h * float(np.sum(rates))
         if self.trajectory_cost is not None:
             total += float(self.trajectory_cost(xs, inputs))
         return total

@@ -1,0 +1,117 @@
+"""What a search through discrete steps may move beside states and inputs: parameters, and the length of a step.
+
+Where a horizon is asked for, the length h = T / N of a step is one more parameter, `model.time_step`, behind the
+problem's own: a model with that step stands in for the model.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, frozen
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import TIME_STEP, ParameterCoordinates, ParameterVector, select
+
+
+class Design:
+    """The parameters of discrete steps, (np,) values, and coordinates c (nc,) of those that may change.
+
+    Args:
+        model: the problem's model.
+        own: the problem's own parameters, with `bounds` (lower, upper) of their values, `free` to change or not.
+        horizon: (lower, upper) [s] of all steps where one is asked for, `start` where a search begins.
+        num_steps: how many there are.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        own: ParameterVector,
+        bounds: tuple[Array, Array],
+        *,
+        free: bool,
+        horizon: tuple[float, float] | None,
+        start: float,
+        num_steps: int,
+    ):
+        self.model, self.own_count = model, len(own.values)
+        self.has_step = horizon is not None and model.can_rebuild
+        self.lower, self.upper = bounds
+        moving, values = own.parameters if free else (), own.values if free else np.zeros(0)
+        self.vector, self.moved = own, np.arange(self.own_count if free else 0)
+        if self.has_step and horizon is not None:
+            step, ends = select(model, (TIME_STEP,)).parameters, np.array(horizon) / num_steps
+            self.vector = ParameterVector(model, (*own.parameters, *step), frozen([*own.values, start / num_steps]))
+            self.lower, self.upper = np.append(self.lower, ends[0]), np.append(self.upper, ends[1])
+            if ends[0] < ends[1]:
+                self.moved = np.append(self.moved, self.own_count)
+                moving, values = (*moving, *step), np.append(values, start / num_steps)
+        self.coordinates = ParameterCoordinates(ParameterVector(model, tuple(moving), frozen(values)))
+
+    @property
+    def count(self) -> int:
+        """nc: how many numbers may change."""
+        return len(self.moved)
+
+    @property
+    def start(self) -> Array:
+        """(nc,) the coordinates where a search begins."""
+        return self.of_values(np.array(self.vector.values))
+
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """(lower (nc,), upper (nc,)) of the coordinates."""
+        return self.of_values(self.lower), self.of_values(self.upper)
+
+    @property
+    def moves_step(self) -> bool:
+        """Whether the length of a step may change."""
+        return self.has_step and self.own_count in self.moved
+
+    def of_values(self, values: Array) -> Array:
+        """(nc,) the coordinates of values (np,)."""
+        return self.coordinates.from_values(np.asarray(values, dtype=float)[self.moved])
+
+    def values(self, c: Array) -> Array:
+        """(np,) the values at coordinates c (nc,)."""
+        values = np.array(self.vector.values)
+        values[self.moved] = self.coordinates.to_values(c)
+        return values
+
+    def own_at(self, c: Any) -> Any:
+        """The problem's own parameters at coordinates c (nc,), which may be AutoDiffXd."""
+        count = len(self.moved) - self.moves_step
+        if not count:
+            return self.vector.values[: self.own_count]
+        tail = np.zeros(len(self.moved) - count)
+        return self.coordinates.to_values(np.concatenate([c[:count], tail]))[:count]
+
+    def at(self, c: Array) -> ParameterVector:
+        """The parameters at coordinates c (nc,)."""
+        return self.vector.at(self.values(c))
+
+    def whole(self, own: Array, time_step: float) -> Array:
+        """(np,) the values with the problem's `own` parameters and the length of a step [s]."""
+        return np.append(own, time_step) if self.has_step else np.asarray(own, dtype=float)
+
+    def own(self, values: Array) -> Array:
+        """Those of the problem's own parameters among all values (np,)."""
+        return np.asarray(values)[: self.own_count]
+
+    def time_step(self, values: Array) -> float:
+        """[s] the length of a step at the values (np,)."""
+        return float(values[self.own_count]) if self.has_step else self.model.time_step
+
+    def pull_back(self, c: Array, by_values: Array) -> Array:
+        """(..., nc) the derivative by the coordinates from that by all values (..., np)."""
+        if not self.count:
+            return np.zeros((*by_values.shape[:-1], 0))
+        return self.coordinates.pull_back(c, by_values[..., self.moved])
+
+    def of_model(self, model: Model) -> "Design":
+        """The same of another model with the same parameters."""
+        found: Any = object.__new__(Design)
+        found.__dict__.update(self.__dict__)
+        found.model, found.vector = model, replace(self.vector, model=model)
+        return found
