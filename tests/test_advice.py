@@ -44,13 +44,9 @@ def test_after_the_chain_no_method_of_it_is_named():
     assert methods_in(to_try(solution)) == {"shooting"}
 
 
-def test_parameters_that_are_only_given_are_better_in_the_models_file():
-    """With them no method but shooting takes the problem."""
-    told = "the parameters' values in the model's own file"
-    weight = {"cart.mass": 1.0}  # which it has anyway
-    assert told in to_try(dd.solve(swing_up(parameters=weight), max_iterations=3))
-    optimized = swing_up(parameters=weight, optimize=("controls", "parameters"))
-    assert told not in to_try(dd.solve(optimized, max_iterations=3))
+def test_parameters_that_are_only_given_keep_no_method_away():
+    solution = dd.solve(swing_up(parameters={"cart.mass": 1.0}), method="shooting", max_iterations=3)
+    assert methods_in(to_try(solution)) == {"collocation", "ilqr"}
 
 
 def test_a_continuation_is_named_until_it_was_tried(two_spheres):

@@ -35,20 +35,12 @@ def _remedies(solution: Solution, arguments: dict[str, Any], other_methods: Sequ
         yield from _nearer_goals(solution)
     if status is Status.DIVERGED:
         yield "a smaller time step"
-    yield from _in_the_file(solution)
     if status is not Status.NO_GRADIENT:
         yield from (f'method="{method}"' for method in other_methods)
     if status is Status.NO_GRADIENT and touching:
         yield "an initial_guess in which the bodies touch"
     else:
         yield "another initial_guess"
-
-
-def _in_the_file(solution: Solution) -> Iterator[str]:
-    """That parameters which are only given keep collocation and iLQR from a problem."""
-    problem = solution.problem
-    if problem.parameters.parameters and "parameters" not in problem.optimize:
-        yield "the parameters' values in the model's own file: collocation and iLQR take no others"
 
 
 def _nearer_goals(solution: Solution) -> Iterator[str]:

@@ -130,6 +130,9 @@ def sensitivity(solution: Solution, by: Any = "x0", *, certified: bool = True) -
         raise InputError(
             "solution", got='scheme="drake"', expected="one by hermite_simpson, trapezoid, iLQR or shooting"
         )
+    if solution.scheme == "step" and solution.problem.design.has_step:
+        expected = 'one by method="collocation", or without a horizon'
+        raise InputError("solution", got="a plan by discrete steps with a horizon", expected=expected)
     change = _change(solution, by)
     plan = _plan(solution)
     plan_held = _held(plan)

@@ -145,7 +145,10 @@ def _with_design(problem: Problem, motion: Motion, model: LinearQuadratic, h: fl
 
 
 def expand_running_cost(problem: Problem, xs: Array, us: Array, h: float | None = None) -> tuple[Array, Array]:
-    """(gradients (N, nx + nu), Hessians (N, nx + nu, nx + nu)) of h [s], the model's step if None, times the running cost."""
+    """(gradients (N, nx + nu), Hessians (N, nx + nu, nx + nu)) of h times the running cost.
+
+    h [s] is the model's time step where it is None.
+    """
     h = problem.model.time_step if h is None else h
     (nx, nu), cost = (xs.shape[1], us.shape[1]), problem.total_running_cost
     gradients, hessians = np.zeros((len(us), nx + nu)), np.zeros((len(us), nx + nu, nx + nu))
