@@ -44,6 +44,7 @@ def plan(
     time: Annotated[str | None, typer.Option(help="least: as fast as can be; else with the least effort.")] = None,
     out: Annotated[Path | None, out_option("artifacts/plan_<robot>")] = None,
     seed: Seed = 0,
+    restarts: Annotated[int, typer.Option(min=0, help="More first guesses, to list other optima.")] = 0,
 ) -> None:
     """Plan a motion of ROBOT: mend its file, solve, write the run directory and verify it.
 
@@ -64,7 +65,9 @@ def plan(
 
     file = robot or example_files()[EXAMPLE]
     with _live(file.name) as report:
-        done = planned(file, goals=goals, avoid=obstacles, time=time, out=out, seed=seed, report=report)
+        done = planned(
+            file, goals=goals, avoid=obstacles, time=time, out=out, seed=seed, restarts=restarts, report=report
+        )
     show(judged("pass" if done.success else "fail"), f" {file.name}: {done.solution.status.value}")
     for line in done.lines:
         show(plain(line))

@@ -31,7 +31,15 @@ from drake_diff.optimize.transcription.collocation import Collocated, collocated
 # Between two knots the transcription is a cubic; further than this [state units] from an accurate integration
 # its motion is not the model's.
 INTEGRATION_TOLERANCE = 1e-2
-TOLD = ("status", "message", "iterations", "solver_message", "options", "search")  # fields that no measure depends on
+TOLD = (
+    "status",
+    "message",
+    "iterations",
+    "solver_message",
+    "options",
+    "search",
+    "optima",
+)  # fields that no measure depends on
 
 
 class Status(enum.Enum):
@@ -106,6 +114,7 @@ class Solution(ShowsItsRepr):
         certificates: of the derivatives that the solver used, at some knots of the guess and of the result.
         options: what was asked of the solver, and what it chose.
         wall_time: [s] what the solve took.
+        optima: with `restarts`, the verified solutions that differ in cost or motion, the cheapest first.
         search: the arguments of `solve`, None of a solution that it did not make.
 
     Example:
@@ -136,6 +145,7 @@ class Solution(ShowsItsRepr):
     solver_message: str = ""
     wall_time: float = 0.0
     search: Search | None = None
+    optima: tuple["Solution", ...] = ()
 
     def __str__(self) -> str:
         measures = f"cost {self.cost:.6g}, defect {self.defect:.2g}, goal error {self.goal_error:.2g}"

@@ -32,6 +32,7 @@ from drake_diff.optimize.ilqr.through_contact import (
     solve_through_jumps,
 )
 from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, overlaps, refused
+from drake_diff.optimize.optima import distinct
 from drake_diff.optimize.phased import PhasedSolution, solve_phased
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import lacking_between, swept
@@ -59,6 +60,7 @@ DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": SHOOTING_SOLVER, "ilqr": 
 CLEARANCE_PARTS = (4, 8, 16)  # of a step: looked at where a discrete plan comes too near to an obstacle in between
 OTHER_GUESSES = 8  # of a collocation that finds no motion from a straight line
 OTHER_ITERATIONS = 200  # of each
+OTHER_GUESS = "another first guess"
 NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
 FINER_ROUNDS = 6  # of a mesh whose plan does not hold
 GUESS_ITERATIONS = 100  # of an attempt that is to find a guess for the next one
@@ -88,6 +90,7 @@ def solve(
     refine: bool | None = None,
     error_tolerance: float = 1e-6,
     max_num_steps: int = 1000,
+    restarts: int = 0,
     progress: bool | Progress = False,
     callback: Callable[[Iteration], None] | None = None,
     on_start: Callable[[], None] | None = None,
@@ -126,6 +129,7 @@ def solve(
     refine: bool | None = None,
     error_tolerance: float = 1e-6,
     max_num_steps: int = 1000,
+    restarts: int = 0,
     progress: bool | Progress = False,
     callback: Callable[[Iteration], None] | None = None,
     on_start: Callable[[], None] | None = None,
@@ -164,6 +168,8 @@ def solve(
         error_tolerance: of an interval, against an accurate integration, in the states' units; and of its part of
             the cost, relative to the whole.
         max_num_steps: the most intervals of a refined mesh.
+        restarts: how many more first guesses are tried, one after the other, smooth random ones by `seed`, also where
+            one was verified: the cheapest verified plan is kept, and `Solution.optima` has those that differ.
         progress: True prints a line a few times a second, a function gets each line.
         callback: gets an `Iteration` for each of the solver's (of SNOPT, and of IPOPT by shooting, a few times a
             second). What it raises ends the solve.
@@ -218,8 +224,11 @@ def solve(
         "refine": refine,
         "error_tolerance": refinement.tolerance,
         "max_num_steps": refinement.most,
+        "restarts": _count("restarts", restarts),
     }
     if isinstance(problem, PhasedProblem):
+        if restarts:
+            raise InputError("restarts", got=restarts, expected="0 for a PhasedProblem")
         return solve_phased(problem, arguments, initial_guess, report, on_start)
     task = _Task(problem, limits, seed, report, on_start)
     asked = Attempt(method, "asked for", scheme, solver, segments, continuation, int(seed), refine, refinement)
@@ -229,6 +238,8 @@ def solve(
     in_chain = asked.method in ("auto", "collocation") and segments == 1
     make = partial(_solve_in_chain, task, asked, initial_guess) if in_chain else task.prepare(asked, initial_guess)
     solution = make()
+    if restarts:
+        solution = _restarted(task, asked, solution, restarts)
     tried = {link["method"] for link in solution.options.get("chain", ())} | {solution.method}
     told = advice(
         solution, arguments, [other for other in METHODS[1:] if other not in tried and _takes(problem, other)]
@@ -246,6 +257,12 @@ def _check_common(problem: Any, seed: Any, callback: Any, progress: Any) -> None
         raise InputError("callback", got=repr(callback), expected="None or a function of an Iteration")
     if not (isinstance(progress, bool) or callable(progress)):
         raise InputError("progress", got=repr(progress), expected="True, False or a function")
+
+
+def _count(name: str, given: Any) -> int:
+    if isinstance(given, bool) or not isinstance(given, (int, np.integer)) or given < 0:
+        raise InputError(name, got=repr(given), expected="a whole number of at least 0")
+    return int(given)
 
 
 def _takes(problem: Problem, method: str) -> bool:
@@ -365,16 +382,58 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Solution:
         if last.status in ENDED:
             break
 
-    def preference(solution: Solution) -> tuple[int, float, float]:
-        rank = PREFERENCE.index(solution.status) if solution.status in PREFERENCE else len(PREFERENCE)
-        return rank, solution.defect + solution.goal_error, solution.cost
-
-    best = min(found, key=preference)
+    best = min(found, key=_preference)
     if asked.method != "auto" and len(chain) == 1:
         return best
     if len(found) > 1 and best.status not in PLANS and all(s.method == "collocation" for s in found):
         best = best.told(message=f"{best.message}; from none of {len(found)} first guesses was a plan found")
     return best.told(options=best.options | {"chain": chain})
+
+
+def _restarted(task: _Task, asked: Attempt, first: Solution, count: int) -> Solution:
+    """The cheapest verified of a solution and of `count` more by the same method, with all optima that were found.
+
+    Ctrl-C and the time limit end it; an attempt that fails is told in the chain.
+    """
+    told = {"method": first.method, "reason": asked.reason, "ended": first.status.value}
+    chain = list(first.options.get("chain", (told,)))
+    used = sum(OTHER_GUESS in link["reason"] for link in chain)
+    solver = asked.solver if first.method == asked.method else None
+    base = dataclasses.replace(asked, method=first.method, solver=solver, continuation=None)
+    found = [(first, f"that of {len(chain)} in the chain" if len(chain) > 1 else "the first")]
+    for number in range(1, count + 1):
+        if found[-1][0].status in (Status.INTERRUPTED, Status.TIME_LIMIT):
+            break
+        which = f"{OTHER_GUESS}, number {used + number} of seed {asked.seed}"
+        attempt = dataclasses.replace(base, reason=f"restart {number} of {count}: {which}")
+        begun = another_guess(task.problem, asked.seed, used + number)
+        if first.method != "collocation":
+            begun = begun[0], begun[1][:-1]
+        try:
+            found.append((task.prepare(attempt, begun)(), which))
+            ended = found[-1][0].status.value
+        except DrakeDiffError as error:
+            ended = f"not possible: {error}"
+        task.report.say(f"{first.method} ({attempt.reason}): {ended}")
+        chain.append({"method": first.method, "reason": attempt.reason, "ended": ended})
+    best = min((solution for solution, _ in found), key=_preference)
+    optima = distinct(found)
+    options = best.options | {"chain": chain, "optima": [optimum.to_dict() for optimum in optima]}
+    best = best.told(options=options, optima=tuple(optimum.solution for optimum in optima))
+    if len(found) > 1 and found[-1][0].status in (Status.INTERRUPTED, Status.TIME_LIMIT):
+        best = best.told(message=f"{best.message}; the restarts were ended: {found[-1][0].status.sentence}")
+    if not optima:
+        return best
+    costs = ", ".join(f"{optimum.solution.cost:.4g} ({optimum.count})" for optimum in optima)
+    verified = sum(optimum.count for optimum in optima)
+    message = f"{verified} of {len(found)} first guesses were verified, at cost (how many): {costs}"
+    return best.told(message=f"{best.message}; {message}")
+
+
+def _preference(solution: Solution) -> tuple[int, float, float]:
+    """The order of solutions, the best first: how they ended, how wrong they are where that is no plan, the cost."""
+    rank = PREFERENCE.index(solution.status) if solution.status in PREFERENCE else len(PREFERENCE)
+    return rank, 0.0 if solution.success else solution.defect + solution.goal_error, solution.cost
 
 
 def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution]) -> Iterator[tuple[Attempt, Any]]:
@@ -419,7 +478,7 @@ def _other_guesses(
     for number in range(1, OTHER_GUESSES + 1):
         if found[-1].status not in NOT_FOUND:
             return
-        reason = f"no motion was found: another first guess ({number} of {OTHER_GUESSES})"
+        reason = f"no motion was found: {OTHER_GUESS} ({number} of {OTHER_GUESSES})"
         begun = another_guess(problem, attempt.seed, number)
         yield dataclasses.replace(attempt, reason=reason, max_iterations=OTHER_ITERATIONS), begun
 

@@ -110,12 +110,17 @@ class Plan(ShowsItsRepr):
             f"audit     {', '.join(sorted({f'{f.severity} {f.code}' for f in severe})) or 'nothing to warn of'}",
             f"goal      {self._goal(far)}",
             f"guesses   {'; '.join(self.tried)}",
-            f"solved    {s.method}, {len(s.us)} intervals in {s.horizon:.3g} s, cost {s.cost:.4g}",
+            f"solved    {s.method}, {len(s.us)} intervals in {s.horizon:.3g} s, cost {s.cost:.4g}{self._optima}",
             f"gradients {agreeing}",
             f"plan      {s.status.value}: {s.message.split(';')[0]}",
             f"verified  {self.verification.verdict}: {self.verification.sentence[:200]}",
             f"wrote     {path}: {', '.join(sorted(self.record.files))}",
         )
+
+    @property
+    def _optima(self) -> str:
+        costs = [optimum["cost"] for optimum in self.solution.options.get("optima", ())]
+        return f"; optima at cost {', '.join(f'{cost:.4g}' for cost in costs)}" if len(costs) > 1 else ""
 
     def _goal(self, far: float) -> str:
         told = [f"a state {far:.2g} away (rad or m), at the end of {self.solution.horizon:.3g} s"]
@@ -136,6 +141,7 @@ def plan(
     time: str | None = None,
     out: str | Path | None = None,
     seed: int = 0,
+    restarts: int = 0,
     report: Report | None = None,
 ) -> Plan:
     """Load a robot file, mend what it leaves out, plan a motion to a goal, write the run and verify it.
@@ -148,6 +154,7 @@ def plan(
         time: "least" for the shortest time; None for the least effort (of large robots: any smooth motion).
         out: The directory to write; `artifacts/plan_<robot>` where not given.
         seed: Of what is drawn; the same seed gives the same plan.
+        restarts: How many more first guesses each search is given, to list other optima and to keep the cheapest.
         report: Gets a stage and a sentence now and then.
 
     Returns:
@@ -179,7 +186,8 @@ def plan(
             clock.begin("guess", f"{len(findings)} finding{'s' * (len(findings) != 1)}")
             task = asked(ready.model, goals or {}, avoid)
             try:
-                tried, found, apart = _first_that_holds(_attempts(ready, task, time, seed), clock)
+                attempts = (attempt.restarted(restarts) for attempt in _attempts(ready, task, time, seed))
+                tried, found, apart = _first_that_holds(attempts, clock)
             except ModelError as error:
                 if ready.standing is None:
                     raise
@@ -214,6 +222,10 @@ class _Attempt:
     guess: Guess | None
     options: Mapping[str, Any]
     instead: "_Attempt | None" = None
+
+    def restarted(self, restarts: int) -> "_Attempt":
+        """The same with as many more first guesses."""
+        return replace(self, options={**self.options, "restarts": restarts})
 
     def solved(self, progress: Callable[[str], None]) -> Solution:
         begun = None if self.guess is None else (self.guess.xs, self.guess.us)
