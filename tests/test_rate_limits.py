@@ -90,8 +90,8 @@ def test_an_arm_moves_without_jerks_and_its_motion_is_smooth_between_its_knots()
     times = np.linspace(0, solution.horizon, 2001)
     knots = np.hstack([state.vector_values(times).T, given.vector_values(times).T])
     accelerations = problem.dynamics.values(knots)[:, 2:]
-    # By differences of the plant's accelerations; the verdict allows 1e-3 of a range of 120
-    assert np.max(np.abs(np.diff(accelerations, axis=0))) / times[1] <= 60.2
+    # By differences of the plant's accelerations; the verdict allows 1 % of the limit
+    assert np.max(np.abs(np.diff(accelerations, axis=0))) / times[1] <= 60.6
 
 
 def test_whatever_breaks_a_limit_is_seen():

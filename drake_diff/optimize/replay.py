@@ -303,13 +303,17 @@ def track(plan: Plan, model: Model, xs: Array, us: Array) -> Policy:
 
 
 def regulator_weights(plan: Plan, us: Array) -> tuple[Array, Array, Array]:
-    """Q (nt, nt), R (nu, nu) and Qf by Bryson's rule, one over the square of each range; a rotation's is a radian."""
+    """Q (nt, nt), R (nu, nu) and Qf by Bryson's rule, one over the square of each range; a rotation's is a radian.
+
+    Where jerks are limited, the end has no weight of its own: the last steps would pull at it.
+    """
     model = plan.problem.model
     space = tangent_space(model)
     scale = space.scale(plan.scale)
     effort = np.maximum(np.max(np.abs(us), axis=0), SMALLEST_RANGE)
     Q = np.diag(1 / scale**2)
-    return Q, EFFORT_WEIGHT * np.diag(1 / effort**2), FINAL_WEIGHT * Q
+    smooth = any(not limit.of_inputs for limit in plan.problem.rate_limits)
+    return Q, EFFORT_WEIGHT * np.diag(1 / effort**2), (1.0 if smooth else FINAL_WEIGHT) * Q
 
 
 def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, known: Rollout | None) -> Replay:

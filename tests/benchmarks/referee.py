@@ -2,7 +2,7 @@
 
 A plan is true if the plant, under its inputs or with feedback about them, cut off at their limits, ends at the goal
 and stays within the bounds, to `tolerance` of each state's range (at least a fifth of the largest of its kind). What
-else is asked of it are its `asks`: (name, function of the times and states, most allowed).
+else is asked of it are its `asks`: (name, function of the times and states, most allowed), and its inputs' `rate`.
 """
 
 import numpy as np
@@ -71,6 +71,12 @@ def judge(plan, step, tolerance):
     beyond = np.max(np.maximum(plan["u_lower"] - applied, applied - plan["u_upper"]) / np.maximum(us, 1e-2))
     if beyond > 1e-3:
         return f"input beyond its bound by {beyond:.2g} of its range", np.inf
+    if "rate" in plan:  # of inputs, per s, over a while that a held one takes to change
+        most, while_ = plan["rate"]
+        starts = np.linspace(0, plan["T"] - while_, 999)
+        changes = [np.abs(plan["u"](t + while_) - plan["u"](t)).max() / while_ for t in starts + 1e-9]
+        if max(changes) > 1.01 * most:
+            return f"an input changes by {max(changes):.4g} per s, {most:g} allowed", np.inf
     best = np.inf, "no motion"
     for control in ("open loop", "TVLQR"):
         at, xs = simulate(plan, step, times, None if control == "open loop" else regulator(plan, step, times, scale))

@@ -4,6 +4,7 @@ Each takes a random generator and gives a `Case`. Constants are drawn such that 
 (the block's 4 m d / T^2), they leave room.
 """
 
+import dataclasses
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -23,7 +24,10 @@ from pydrake.multibody.plant import (
     Propeller,
     PropellerInfo,
 )
-from pydrake.systems.framework import DiagramBuilder, InputPortIndex
+from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
+from pydrake.systems.framework import DiagramBuilder, InputPortIndex, OutputPortSelection
+from pydrake.systems.primitives import FirstOrderTaylorApproximation
+from referee import state_of
 from task_formulas import bicycle, dubins, planar
 from trust_solve import FOLDER, FREE, arm_file, block_file, effort, formula, loaded, plant_of, touching
 
@@ -42,7 +46,7 @@ class Case:
     """`asks` are what a referee measures besides the goal and the bounds; `peer` is x' = f(x, u, math), by hand.
 
     `file` is the model's, for peers that read it; `disks` are what they are told to keep off. `optimum` is the least
-    cost, in closed form.
+    cost, in closed form. `rate` [per s] is how fast inputs may change.
     """
 
     problem: dd.Problem
@@ -53,6 +57,7 @@ class Case:
     file: Path | None = None
     disks: tuple[tuple[float, float, float], ...] = ()  # x, y, radius
     optimum: float | None = None  # in closed form
+    rate: float | None = None
 
 
 TWO_LINKS = {
@@ -731,6 +736,165 @@ def ur5_hand_follows_a_circle(random):
     return Case(problem, plant_of(path), (("hand off the circle [m]", miss, 0.3 * radius),))
 
 
+# ------------------------------------------------------------------------------ orbits, slow motors, stays
+
+
+def repeats(offset=0.0):
+    """How far the last state is from the first, moved on by `offset`."""
+    return "repeats", lambda _, xs: float(np.max(np.abs(xs[-1] - xs[0] - offset)))
+
+
+def periodic_orbit_of_a_driven_pendulum(random):
+    """To and fro between two angles, at another rate than its own: 4.4 rad/s where it swings little."""
+    size, count = random.uniform(0.3, 1.2), 2 * int(random.integers(12, 30))
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
+    problem = dd.Problem(
+        model,
+        x0=[-size, 0],
+        num_steps=count,
+        running_cost=effort(1),
+        waypoints={count // 2: [size, np.nan]},
+        optimize=("controls", "initial_state"),
+        initial_state_mask=[False, True],
+        couplings=dd.optimize.Periodic(),
+        bounds=bounded(model, 20.0),
+    )
+    half = 0.05 * count / 2
+    other_side = "other side", lambda at, xs: float(abs(np.interp(half, at, xs[:, 0]) - size)), 0.05 * 2 * size
+    return Case(problem, plant_of(MODELS / "pendulum.urdf"), ((*repeats(), 0.1 * size * 5), other_side))
+
+
+def pendulum_turns_over_and_over(random):
+    """One turn after the other, each of the same time."""
+    count = int(random.integers(15, 40))
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
+    problem = dd.Problem(
+        model,
+        x0=[0, 2 * np.pi / (0.05 * count)],
+        num_steps=count,
+        running_cost=effort(1),
+        optimize=("controls", "initial_state"),
+        initial_state_mask=[False, True],
+        couplings=dd.optimize.Periodic(offset=[2 * np.pi, 0]),
+        bounds=bounded(model, random.uniform(5, 10)),
+    )
+    return Case(problem, plant_of(MODELS / "pendulum.urdf"), ((*repeats([2 * np.pi, 0]), 0.35),))
+
+
+def pendulum_slow_motor(random):
+    """A swing-up in which the torque cannot jump."""
+    rate = random.uniform(6, 15)
+    case = swing(MODELS / "pendulum.urdf", near_rest(random, 1), [np.pi, 0], random.uniform(2.5, 4), 0.05, 80)
+    problem = dataclasses.replace(case.problem, couplings=dd.optimize.InputRate(rate))
+    return Case(problem, case.build, rate=rate)
+
+
+def cart_pole_slow_motor(random):
+    rate = random.uniform(60, 150)
+    goal = [random.uniform(-0.5, 0.5), np.pi, 0, 0]
+    case = swing(MODELS / "cart_pole.urdf", near_rest(random, 2, 0.1), goal, 20.0, 0.04, 60)
+    problem = dataclasses.replace(case.problem, couplings=dd.optimize.InputRate(rate))
+    return Case(problem, case.build, rate=rate)
+
+
+def jerks(nq, limit):
+    """The largest change of an acceleration [per s^3], by second differences of speeds, as a part of `limit`."""
+
+    def largest(times, xs):
+        w = 6 * times[-1] / 200  # six of the largest steps that the referee takes
+        starts = np.linspace(0, times[-1] - 2 * w, 500)
+        v = [np.array([np.interp(starts + i * w, times, column) for column in xs.T[nq:]]) for i in range(3)]
+        return float(np.max(np.abs(v[2] - 2 * v[1] + v[0])) / w**2 / limit)
+
+    return "jerk, as a part of its limit", largest, 1.1
+
+
+def two_rods_without_jerks(random):
+    path, limit = MODELS / "double_pendulum.urdf", random.uniform(60, 150)
+    problem = dd.Problem(
+        dd.load_model(path, time_step=0.05),
+        x0=[*random.uniform(-0.5, 0.5, 2), 0, 0],
+        x_goal=[*random.uniform(-1.5, 1.5, 2), 0, 0],
+        num_steps=30,
+        running_cost=effort(2),
+        couplings=dd.optimize.Jerk(limit),
+    )
+    return Case(problem, plant_of(path), (jerks(2, limit),))
+
+
+def ur5_without_jerks(random):
+    path, limit = arm_file("ur5_robot.urdf"), random.uniform(30, 80)
+    start = np.array([0, -1.2, 1.5, -0.5, 0.5, 0]) + random.uniform(-0.3, 0.3, 6)
+    problem = dd.Problem(
+        loaded(path, 0.05),
+        x0=[*start, *np.zeros(6)],
+        x_goal=[*(start + random.uniform(-0.8, 0.8, 6)), *np.zeros(6)],
+        num_steps=40,
+        running_cost=effort(6, 1e-3),
+        couplings=dd.optimize.Jerk(limit),
+    )
+    return Case(problem, plant_of(path), (jerks(6, limit),))
+
+
+def crane_stays(random):
+    """The load hangs still over its place for a while, and not at the end alone."""
+    seconds, near = random.uniform(0.4, 1.0), 0.02
+    way = random.uniform(0.3, 1.0)
+    stay = dd.optimize.Dwell(dd.JointGoal({"slide_x": way, "hinge_q": 0.0}, tolerance=near), seconds)
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.05)
+    problem = dd.Problem(
+        model,
+        x0=[-way, random.uniform(-0.2, 0.2), 0, 0],
+        num_steps=60,
+        running_cost=effort(1),
+        goals=[stay],
+        bounds=bounded(model, random.uniform(4, 15)),
+    )
+
+    def leaves(times, xs):
+        return float(np.max(np.abs(xs[times >= 3.0 - seconds, :2] - [way, 0])))
+
+    return Case(problem, plant_of(MODELS / "cart_pole.urdf"), (("leaves its place", leaves, 1.2 * near),))
+
+
+def regulated(path, goal, limit, h):
+    """How far from `goal` the plant is after 20 s more under Drake's own regulator, cut off at its limits."""
+
+    def left(_, xs):
+        system, port, _ = plant_of(path)(h)
+        context = system.CreateDefaultContext()
+        system.get_input_port(port).FixValue(context, np.zeros(1))
+
+        def step(x, u):
+            state_of(context).SetFromVector(x)
+            system.get_input_port(port).FixValue(context, u)
+            return np.array(system.EvalUniquePeriodicDiscreteUpdate(context).value())
+
+        state_of(context).SetFromVector(goal)
+        found = FirstOrderTaylorApproximation(system, context, port, OutputPortSelection.kNoOutput)
+        A, B, x = found.A(), found.B(), xs[-1]
+        gain, _ = DiscreteTimeLinearQuadraticRegulator(A, B, np.eye(len(goal)), np.eye(1))
+        for _ in range(round(20 / h)):
+            x = step(x, np.clip(-gain @ (x - goal), -limit, limit))
+        return float(np.max(np.abs(x - goal)))
+
+    return "20 s later, from its goal", left, 0.05
+
+
+def into_a_set(random, path, goal, limit, h, count):
+    case = swing(path, near_rest(random, len(goal) // 2, 0.2), None, limit, h, count)
+    problem = dataclasses.replace(case.problem, goals=[dd.optimize.TerminalSet(goal)])
+    return Case(problem, case.build, (regulated(path, np.array(goal), limit, h),))
+
+
+def pendulum_to_where_it_is_caught(random):
+    return into_a_set(random, MODELS / "pendulum.urdf", [np.pi, 0], random.uniform(2, 4), 0.05, 80)
+
+
+def cart_pole_to_where_it_is_caught(random):
+    return into_a_set(random, MODELS / "cart_pole.urdf", [0, np.pi, 0, 0], random.uniform(12, 20), 0.04, 60)
+
+
 # ------------------------------------------------------------------------------ co-design
 
 
@@ -776,13 +940,17 @@ FAMILIES: dict[str, list[Callable[[np.random.Generator], Case]]] = {
         parallel_parking, car_turns_around, bicycle_around_disks, dubins_least_time, planar_quadrotor_least_time,
         planar_quadrotor_flip, planar_quadrotor_among_disks, quadrotor_to_a_place, quadrotor_gates,
     ],
+    "orbits, slow motors and stays": [
+        periodic_orbit_of_a_driven_pendulum, pendulum_turns_over_and_over, pendulum_slow_motor, cart_pole_slow_motor,
+        two_rods_without_jerks, ur5_without_jerks, crane_stays, pendulum_to_where_it_is_caught,
+        cart_pole_to_where_it_is_caught,
+    ],
     "references": [pendulum_follows_a_sine, car_follows_an_eight, ur5_hand_follows_a_circle],
     "co-design": [pendulum_and_its_mass],
 }  # fmt: skip
 
 # What a practitioner asks and a Problem cannot say. Each counts as a task that is not solved.
 NOT_EXPRESSED = {
-    "periodic_orbit_of_a_driven_pendulum": ("periodic orbits", "no constraint couples the last state with the first"),
     "gait_of_a_compass_walker": ("periodic orbits", "a Problem has no phases with reset events"),
     "length_of_a_pendulum_in_least_time": ("co-design", "collocation takes no parameters, shooting no free horizon"),
     "tip_spring_of_a_jumping_leg_in_least_time": ("co-design", "parameters and a free horizon exclude each other"),

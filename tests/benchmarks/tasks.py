@@ -68,6 +68,8 @@ def attempt(name: str, seed: int, number: int, wall_limit: float) -> Row:
     if solution.success:
         plan, h = plan_of(solution, case.model_file(solution) if case.model_file else case.build), solution.time_step
         plan["asks"] = case.asks
+        if case.rate is not None:
+            plan["rate"] = case.rate, h if solution.scheme == "step" else plan["T"] / 500
         found = [judge(plan, step, NAMED) for step in ((0.0,) if solution.scheme != "step" else (h, h / 2, h / 8))]
         why, miss = next((why for why, _ in found if why), ""), max(miss for _, miss in found)
     chain = solution.options.get("chain", [])

@@ -19,6 +19,9 @@ DENSE = np.linspace(0, 1, 41)[1:-1]  # where the input is looked at between two 
 # Of a number's range along the motion: how far beyond its bound it may be between nodes. The solver keeps the scheme's
 # polynomials of states and inputs within; what the dynamics do in between differs from these by the integration error.
 EXCESS_TOLERANCE = 1e-3
+# Of a limit of jerks: the slopes of a scheme's polynomials differ from those of what the dynamics do by an order of an
+# interval's length more than the polynomials do.
+JERK_TOLERANCE = 1e-2
 DEPTH_TOLERANCE = 1e-3  # of the ranges of states and inputs: how far away a constraint that does not hold may hold
 SOLVED = 1e-8  # of max(1, |bound|): what the solver may leave of a constraint that it keeps
 CLOSER, CLOSER_ROUNDS = 9, 2  # places about a constraint's nearest approach to its bound, and how often
@@ -85,7 +88,8 @@ def violation_between_nodes(motion: Collocated) -> Excess:
     for limit in task.problem.rate_limits:
         _, most = limit.entries(task.problem.system)
         rates, when = motion.rates_of(limit)
-        found.append(_beyond("constraint", (limit.label,) * len(most), rates, -most, most, _extent(rates), when))
+        extent = _extent(rates) if limit.of_inputs else JERK_TOLERANCE / EXCESS_TOLERANCE * most
+        found.append(_beyond("constraint", (limit.label,) * len(most), rates, -most, most, extent, when))
     k, tau = np.repeat(np.arange(count), len(DENSE)), np.tile(DENSE, count)
     us = motion.between(k, tau)[1]
     found.append(_beyond("input", inputs, us, b.u_lower, b.u_upper, _extent(us), motion.times(k, tau)))

@@ -27,6 +27,7 @@ SUBSTEPS = 10  # of the Runge-Kutta method that measures an interval
 EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in TVLQR, over that of the states
 CLEARANCE_ROUNDS, MOST_INTERVALS = 5, 1000  # where a plan comes too near to an obstacle between its knots
 ROUNDED = 1e-9  # of an interval: so near to its end is the end
+ACCURATE = 1e-4  # of an interval, in the states' units
 SMALLEST_ERROR = 1e-12  # of an interval: rounding, which no finer mesh makes less
 MOST_PIECES = 4  # of one interval in one round of refinement
 FOUND = (Outcome.SOLVED, Outcome.INACCURATE)
@@ -500,11 +501,15 @@ class Transcription:
 def finer_mesh(motion: Transcribed, exceeded: Sequence[int], most: int) -> Array | None:
     """The mesh of `motion` with its coarsest intervals split, those `exceeded` among them.
 
-    None where that has more than `most` intervals, or no other ones.
+    Where a jerk is limited and the motion is accurate, those `exceeded` alone: the jerk is beyond its limit where it
+    switches, and elsewhere nothing is gained. None where that has more than `most` intervals, or no other ones.
     """
     lacking = np.zeros(len(motion.mesh) - 1)
     lacking[list(exceeded)] = 1.0
     tolerance = motion.largest_error / 2 ** (motion.task.scheme.order + 1)  # what halving all would bring
+    smooth = any(not limit.of_inputs for limit in motion.task.problem.rate_limits)
+    if smooth and len(exceeded) and motion.largest_error <= ACCURATE:
+        tolerance = np.inf
     mesh = _split(motion, max(tolerance, SMALLEST_ERROR), lacking)
     return None if len(mesh) - 1 > most or len(mesh) == len(motion.mesh) else mesh
 
