@@ -922,6 +922,127 @@ def pendulum_and_its_mass(random):
     return Case(problem, plant_of(MODELS / "pendulum.urdf"), model_file=chosen)
 
 
+def designed(f, nx, nu, parameters, bounds, *, limits, price=None, **asked):
+    """x' = f(x, u, p, math) in plain formulas, with the parameters p among what is searched for."""
+    (xl, xu), (ul, uu) = limits
+    dynamics = dd.Dynamics(
+        lambda x, u, p: f(x, u, p, np),
+        nx,
+        nu,
+        x_lower=xl,
+        x_upper=xu,
+        u_lower=ul,
+        u_upper=uu,
+        parameters=parameters,
+    )
+    names = tuple(parameters)
+    problem = dd.Problem(
+        dynamics,
+        optimize=("controls", "parameters"),
+        parameters=names,
+        parameter_bounds=dict(zip(names, bounds, strict=True)),
+        parameter_cost=price,
+        **asked,
+    )
+
+    def chosen(solution):
+        values = [float(value) for value in solution.parameters]
+        return formula(lambda x, u, math: f(x, u, values, math), nx, nu)
+
+    return Case(
+        problem, formula(lambda x, u, math: f(x, u, list(parameters.values()), math), nx, nu), model_file=chosen
+    )
+
+
+def gear_ratio_of_a_motor_in_least_time(random):
+    """Of a limited motor that turns a load: the best ratio is the root of the inertias' (the referee does not ask)."""
+    load, rotor, torque = random.uniform(0.5, 4), 10 ** random.uniform(-3, -1.5), random.uniform(0.2, 1)
+    best = np.sqrt(load / rotor)
+
+    def rates(x, u, p, math):
+        return [x[1], p[0] * u[0] / (load + p[0] ** 2 * rotor)]
+
+    case = designed(
+        rates, 2, 1, {"ratio": best * random.uniform(0.3, 3)}, [(1, 10 * best)],
+        limits=(([-ANY] * 2, [ANY] * 2), ([-torque], [torque])),
+        x0=[0, 0], x_goal=[random.uniform(0.5, 3), 0], num_steps=40, horizon=(0.05, 50), running_cost=1.0,
+    )  # fmt: skip
+    return case
+
+
+def length_of_a_pendulum_in_least_time(random):
+    """A bob on a rod under a weak motor: a short one turns fast, and gravity, which has to be overcome, is less."""
+    mass, torque, damping = random.uniform(0.5, 1.5), random.uniform(2, 5), random.uniform(0.0, 0.2)
+
+    def rates(x, u, p, math):
+        inertia = mass * p[0] * p[0]
+        return [x[1], (u[0] - damping * x[1] - mass * 9.81 * p[0] * math.sin(x[0])) / inertia]
+
+    return designed(
+        rates, 2, 1, {"length": 0.5}, [(random.uniform(0.2, 0.4), 1.0)],
+        limits=(([-ANY] * 2, [ANY] * 2), ([-torque], [torque])),
+        x0=near_rest(random, 1), x_goal=[np.pi, 0], num_steps=40, horizon=(0.2, 10), running_cost=1.0,
+    )  # fmt: skip
+
+
+def cart_pole_and_the_length_of_its_pole(random):
+    """Swung up by least effort, where what a pole weighs is for the designer to choose its length by."""
+    cart, density = random.uniform(0.8, 1.5), random.uniform(0.2, 0.5)  # [kg], [kg/m]
+
+    def rates(x, u, p, math):
+        half, mass = p[0] / 2, density * p[0]
+        s, c = math.sin(x[1]), math.cos(x[1])
+        inertia = mass * p[0] * p[0] / 3
+        det = (cart + mass) * inertia - (mass * half * c) ** 2
+        push, turn = u[0] + mass * half * s * x[3] ** 2, -mass * 9.81 * half * s
+        return [
+            x[2],
+            x[3],
+            (inertia * push - mass * half * c * turn) / det,
+            ((cart + mass) * turn - mass * half * c * push) / det,
+        ]
+
+    return designed(
+        rates, 4, 1, {"length": 1.0}, [(0.4, 2.0)], limits=(([-2, *[-ANY] * 3], [2, *[ANY] * 3]), ([-20], [20])),
+        x0=near_rest(random, 2, 0.1), x_goal=[random.uniform(-0.5, 0.5), np.pi, 0, 0], num_steps=50, horizon=2.0,
+        running_cost=effort(1),
+    )  # fmt: skip
+
+
+def masses_of_a_double_pendulum(random):
+    """1.7 kg may be spread otherwise over the two links, at a price of leaving what is."""
+    path, price = MODELS / "double_pendulum.urdf", random.uniform(20, 60)
+    problem = dd.Problem(
+        dd.load_model(path, time_step=0.04),
+        x0=near_rest(random, 2),
+        x_goal=[np.pi, 0, 0, 0],
+        num_steps=60,
+        running_cost=effort(2),
+        bounds=dd.Bounds(u_lower=[-15, -8], u_upper=[15, 8]),
+        optimize=("controls", "parameters"),
+        parameters=("upper.mass", "lower.mass"),
+        parameter_bounds={"upper.mass": (0.5, 1.5), "lower.mass": (0.35, 1.2)},
+        parameter_cost=lambda p: price * (p[0] + p[1] - 1.7) ** 2,
+    )
+
+    def chosen(solution):
+        found, text = solution.vector.to_dict(), path.read_text()
+        for link, mass in (("upper", 1.0), ("lower", 0.7)):
+            now = float(found[f"{link}.mass"][0])
+            head, tail = text.split(f'<link name="{link}">')
+            inertial, rest = tail.split("</inertial>", 1)
+            inertial = inertial.replace(f'mass value="{mass:g}"', f'mass value="{now!r}"')
+            inertial = re.sub(
+                r'(i..)="([^"]+)"', lambda m, part=now / mass: f'{m[1]}="{float(m[2]) * part!r}"', inertial
+            )
+            text = f'{head}<link name="{link}">{inertial}</inertial>{rest}'
+        own = Path(FOLDER.name) / f"double_pendulum_{now:.10f}.urdf"
+        own.write_text(text)
+        return plant_of(own)
+
+    return Case(problem, plant_of(path), model_file=chosen)
+
+
 FAMILIES: dict[str, list[Callable[[np.random.Generator], Case]]] = {
     "swing-ups": [
         pendulum_least_effort, pendulum_weak_motor, pendulum_least_time, cart_pole_least_effort,
@@ -946,12 +1067,14 @@ FAMILIES: dict[str, list[Callable[[np.random.Generator], Case]]] = {
         cart_pole_to_where_it_is_caught,
     ],
     "references": [pendulum_follows_a_sine, car_follows_an_eight, ur5_hand_follows_a_circle],
-    "co-design": [pendulum_and_its_mass],
+    "co-design": [
+        pendulum_and_its_mass, gear_ratio_of_a_motor_in_least_time, length_of_a_pendulum_in_least_time,
+        cart_pole_and_the_length_of_its_pole, masses_of_a_double_pendulum,
+    ],
 }  # fmt: skip
 
 # What a practitioner asks and a Problem cannot say. Each counts as a task that is not solved.
 NOT_EXPRESSED = {
     "gait_of_a_compass_walker": ("periodic orbits", "a Problem has no phases with reset events"),
-    "length_of_a_pendulum_in_least_time": ("co-design", "collocation takes no parameters, shooting no free horizon"),
     "tip_spring_of_a_jumping_leg_in_least_time": ("co-design", "parameters and a free horizon exclude each other"),
 }
