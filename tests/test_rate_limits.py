@@ -78,6 +78,19 @@ def test_a_pendulum_swings_up_with_a_slow_motor(method):
         assert np.max(np.abs(np.diff(replay.motion.us[:, 0]))) <= 10 * 0.05 * 1.05
 
 
+def test_steps_of_another_length_have_their_own_rates():
+    """A horizon of 2 s in 40 steps of a model of 0.02 s: inputs change from one 0.05 s to the next."""
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
+    problem = dd.Problem(
+        model, x0=[0, 0], x_goal=[1, 0], num_steps=40, horizon=2.0, running_cost=EFFORT, couplings=InputRate(4.0)
+    )
+    solution = dd.solve(problem, method="shooting")
+    assert solution.success, solution.message
+    assert 0.9 * 4.0 * 0.05 < np.max(np.abs(np.diff(solution.us[:, 0]))) <= 4.0 * 0.05 + 1e-6
+    with pytest.raises(InputError, match=r"a horizon that is given.*collocation"):
+        dd.solve(replace(problem, horizon=(1.0, 3.0)), method="shooting")
+
+
 def test_an_arm_moves_without_jerks_and_its_motion_is_smooth_between_its_knots():
     model = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.05)
     problem = dd.Problem(

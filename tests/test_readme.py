@@ -140,9 +140,13 @@ SOURCES = {
         "0.5": "drake_diff.model.repairs:GROUND_FRICTION",
         **dict.fromkeys(("0", "1"), "tests/test_audit_model.py::test_a_trap_is_named_and_its_remedy_mends_it"),
     },
-    "docs/tasks.md": dict.fromkeys(
-        ("5", "0.01", "0.05"), "tests/test_goals.py::test_the_default_tolerances_are_those_of_the_documents"
-    ),
+    "docs/tasks.md": {
+        **dict.fromkeys(
+            ("5", "0.01", "0.05"), "tests/test_goals.py::test_the_default_tolerances_are_those_of_the_documents"
+        ),
+        "1": "drake_diff.optimize.transcription.between:JERK_TOLERANCE",
+        "200": "tests/test_stays.py::test_a_pendulum_swings_up_to_where_a_regulator_takes_over",
+    },
     "docs/panels.md": {
         "95": "tests/test_robustness.py::test_intervals_are_the_published_ones",
         "20": "tests/test_readme.py::test_the_reference_run_steps_by_20_ms",

@@ -357,7 +357,8 @@ class Solution(ShowsItsRepr):
         Collocation keeps constraints of all knots at its midpoints too, which count to the knot before them.
         """
         if self.transcribed is None or self.problem.is_map:
-            return self.problem.constraint_excess(self.xs, self.inputs_at_knots)
+            coupled = self.problem.coupled_steps(self.time_step)
+            return self.problem.constraint_excess(self.xs, self.inputs_at_knots, coupled=coupled)
         nodes, every = self.transcribed.nodes, self.transcribed.task.scheme.nodes
         xs, us = np.split(nodes, [self.problem.nx], axis=1)
         found = self.problem.constraint_excess(xs, us, every * self.knots, self.transcribed.task.couplings)

@@ -535,6 +535,9 @@ def _check_attempt(problem: Problem, attempt: Attempt) -> str:
     _check_timed_cost(problem)
     if attempt.refine:
         raise InputError("refine", got=True, expected=f'None or False for method="{method}": {takes}')
+    if problem.rate_limits and problem.horizon is not None and problem.horizon[0] < problem.horizon[1]:
+        expected = f'a horizon that is given for method="{method}": {takes}'
+        raise InputError("couplings", got=f"{problem.rate_limits[0]!r} and a free horizon", expected=expected)
     if method == "ilqr":
         check_problem(problem)
     return "step"

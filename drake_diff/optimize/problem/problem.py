@@ -345,8 +345,8 @@ class Problem(ShowsItsRepr):
         return tuple(c for c in self.couplings if isinstance(c, RateLimit))
 
     def coupled_steps(self, time_step: float | None = None) -> tuple[BoundCoupling, ...]:
-        """All couplings of a motion in steps of `time_step` [s], the problem's own where None."""
-        h = self.time_step if time_step is None else time_step
+        """All couplings of a motion in steps of `time_step` [s], those that a search begins with where None."""
+        h = self.start_horizon / self.num_steps if time_step is None else time_step
         rates = [rate.of_steps(self.system, self.num_steps, h) for rate in self.rate_limits]
         return (*self.coupled(input_at_end=False), *rates)
 
