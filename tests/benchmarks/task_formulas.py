@@ -54,3 +54,95 @@ def two_links(x, u, math, first, second, damping, motors):
     r2 = torque[1] - damping * v2 - h * v1**2 - low
     determinant = a * c - b * b
     return [v1, v2, (c * r1 - b * r2) / determinant, (a * r2 - b * r1) / determinant]
+
+
+# ------------------------------------------------------------------------------ of the textbooks
+
+
+def sliding_bead(x, u, math):
+    """The brachistochrone: place, depth, speed; the angle from the vertical."""
+    return [x[2] * math.sin(u[0]), x[2] * math.cos(u[0]), GRAVITY * math.cos(u[0])]
+
+
+def goddard(x, u, math):
+    """A rocket that goes straight up, in units of its own: height from the centre, speed, mass; thrust."""
+    drag = 310 * x[1] ** 2 * math.exp(-500 * (x[0] - 1))
+    return [x[1], (u[0] - drag) / x[2] - 1 / x[0] ** 2, -u[0] / 0.5]
+
+
+def sailing_orbit(x, u, math):
+    """Bryson and Ho's transfer between circles: radius, both speeds, mass; the angle of a thrust that is constant."""
+    push = 0.1405 / x[3]
+    radial = x[2] ** 2 / x[0] - 1 / x[0] ** 2 + push * math.sin(u[0])
+    return [x[1], radial, -x[1] * x[2] / x[0] + push * math.cos(u[0]), -0.0749]
+
+
+def chain(x, u, math):
+    """A chain that hangs, along the ground: height, its moment, its length; the slope."""
+    along = math.sqrt(1 + u[0] ** 2)
+    return [u[0], x[0] * along, along]
+
+
+def van_der_pol(x, u, math):
+    return [(1 - x[1] ** 2) * x[0] - x[1] + u[0], x[0]]
+
+
+def lander(x, u, math):
+    """Place, height, speeds, mass; thrust and its angle from the vertical. 3000 m/s exhaust on the Moon."""
+    push = u[0] / x[4]
+    return [x[2], x[3], push * math.sin(u[1]), push * math.cos(u[1]) - 1.62, -u[0] / 3000]
+
+
+def ball_on_beam(x, u, math):
+    """Place, angle of the beam and their rates; the beam's angular acceleration. A ball that rolls."""
+    return [x[2], x[3], 5 / 7 * (x[0] * x[3] ** 2 - GRAVITY * math.sin(x[1])), u[0]]
+
+
+def trailer(x, u, math, length):
+    """A unicycle and its trailer: place, heading, the trailer's heading; speed and turning rate."""
+    v = u[0]
+    return [v * math.cos(x[2]), v * math.sin(x[2]), u[1], v / length * math.sin(x[2] - x[3])]
+
+
+def hovercraft(x, u, math):
+    """Place, heading and their rates; two fans that only push, 0.3 m to either side. 1 kg, drag 0.2."""
+    push = u[0] + u[1]
+    return [
+        x[3],
+        x[4],
+        x[5],
+        push * math.cos(x[2]) - 0.2 * x[3],
+        push * math.sin(x[2]) - 0.2 * x[4],
+        (0.3 * (u[1] - u[0]) - 0.02 * x[5]) / 0.05,
+    ]
+
+
+def slung_load(x, u, math):
+    """A planar quadrotor, 0.5 kg, with a load of 0.2 kg on a rod of 0.6 m: the load's place, the rod's and the body's
+
+    angle and their rates; two rotors.
+    """
+    m, load, length, arm, inertia = 0.5, 0.2, 0.6, 0.25, 0.004
+    force = u[0] + u[1]
+    along = -force * math.cos(x[2] - x[3]) - m * length * x[6] ** 2
+    rod = -force * math.sin(x[2] - x[3]) / (m * length)
+    return [
+        x[4],
+        x[5],
+        x[6],
+        x[7],
+        along * math.sin(x[2]) / (m + load),
+        -along * math.cos(x[2]) / (m + load) - GRAVITY,
+        rod,
+        arm * (u[0] - u[1]) / inertia,
+    ]
+
+
+def hang_glider(x, u, math):
+    """COPS: place, height, speeds; the lift coefficient. An updraft about 250 m."""
+    r = (x[0] / 100 - 2.5) ** 2
+    rise = x[3] - 2.5 * (1 - r) * math.exp(-r)
+    speed = math.sqrt(x[2] ** 2 + rise**2)
+    q = 0.5 * 1.13 * 14 * speed
+    drag, lift = (0.034 + 0.069662 * u[0] ** 2) * q, u[0] * q
+    return [x[2], x[3], (-lift * rise - drag * x[2]) / 100, (lift * x[2] - drag * rise) / 100 - 9.80665]

@@ -35,6 +35,7 @@ import numpy as np  # noqa: E402
 import task_peers  # noqa: E402
 from referee import judge  # noqa: E402
 from task_cases import FAMILIES, NOT_EXPRESSED, Case  # noqa: E402
+from task_cases_more import MORE  # noqa: E402
 from trust_solve import NAMED, plan_of  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
@@ -42,7 +43,8 @@ from drake_diff._base.statistics import success_rate  # noqa: E402
 from drake_diff.exceptions import DrakeDiffError, ModelWarning  # noqa: E402
 
 TIME_LIMIT, AIM = 60.0, 0.95
-TASKS = {task.__name__: (family, task) for family, tasks in FAMILIES.items() for task in tasks}
+EVERY = {family: [*FAMILIES.get(family, []), *MORE.get(family, [])] for family in dict.fromkeys([*FAMILIES, *MORE])}
+TASKS = {task.__name__: (family, task) for family, tasks in EVERY.items() for task in tasks}
 Row = dict[str, Any]
 
 
