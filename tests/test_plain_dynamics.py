@@ -168,8 +168,8 @@ def test_where_a_finer_mesh_fails_the_last_motion_is_kept(monkeypatch, refine):
     honest = Transcription.solve_on
 
     def fails_later(outcome):
-        def solve_on(self, mesh, *arguments):
-            found = honest(self, mesh, *arguments)
+        def solve_on(self, mesh, *arguments, **named):
+            found = honest(self, mesh, *arguments, **named)
             if len(mesh) == 5:
                 return found
             return dataclasses.replace(found, result=dataclasses.replace(found.result, outcome=outcome))

@@ -420,8 +420,8 @@ class Transcription:
         """
         start, mesh = time.monotonic(), self.mesh
         first = float(np.clip(self.problem.start_horizon if horizon is None else horizon, *self.task.horizon))
-        begun = self.nodes_at(mesh, guess)
-        motion = self.solve_on(mesh, begun, first, limits, report, parameters)
+        begun, far = self.nodes_at(mesh, guess), not isinstance(guess, Collocated)
+        motion = self.solve_on(mesh, begun, first, limits, report, parameters, far=far)
         tolerance, most = (np.inf, MOST_INTERVALS) if refinement is None else (refinement.tolerance, refinement.most)
         rounds, near = [(len(mesh) - 1, motion.largest_error)], [_nearer(motion)]
         while motion.result.outcome in FOUND:
@@ -430,8 +430,8 @@ class Transcription:
                 break
             entered = bool(np.max(lacking) > _largest_margin(self.problem))
             mesh = _split(motion, tolerance, np.ones_like(lacking) if entered else lacking)
-            far = f"{in_words(float(np.max(lacking)), 'm')} too near to an obstacle"
-            told = f"error {error:.2g}" if error > tolerance else far
+            missing = f"{in_words(float(np.max(lacking)), 'm')} too near to an obstacle"
+            told = f"error {error:.2g}" if error > tolerance else missing
             if len(mesh) - 1 > most:
                 told = f"{told} still, with {count} intervals: raise max_num_steps"
                 motion = replace(motion, result=replace(motion.result, note=told))
@@ -442,7 +442,7 @@ class Transcription:
             if entered:  # what goes through an obstacle is no place to go on from
                 now, then = (self.task.scheme.node_fractions(each) for each in (mesh, self.mesh))
                 nodes = np.array([np.interp(now, then, column) for column in begun.T]).T
-                motion = self.solve_on(mesh, nodes, first, left, report, parameters)
+                motion = self.solve_on(mesh, nodes, first, left, report, parameters, far=far)
             else:
                 values = motion.task.parameters
                 motion = self.solve_on(mesh, self.nodes_at(mesh, motion), motion.horizon, left, report, values)
@@ -477,17 +477,23 @@ class Transcription:
         limits: Limits,
         report: Report | None,
         parameters: Array | None = None,
+        *,
+        far: bool = False,
     ) -> Transcribed:
-        """IPOPT on one mesh, from `nodes` (K, nx + nu), `horizon` [s] and `parameters` (np,), the problem's if None."""
-        from drake_diff.optimize.transcription.program import NOT_FINITE, TranscribedProgram, solve_ipopt
+        """IPOPT on one mesh, from `nodes` (K, nx + nu), `horizon` [s] and `parameters` (np,), the problem's if None.
+
+        These are `far` from a motion where nothing has moved them: a line.
+        """
+        from drake_diff.optimize.transcription.program import FAR, NOT_FINITE, TranscribedProgram, solve_ipopt
 
         program, why = TranscribedProgram(self.task, mesh, self.functions), self.functions.why_not
         moved = None if parameters is None else self.task.at(self._inside(parameters)).coordinates
         guess = program.pack(nodes, horizon, moved)
         told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
-        result = solve_ipopt(program, guess, limits, report, exact=not why)
+        more = FAR if far and program.free else None
+        result = solve_ipopt(program, guess, limits, report, exact=not why, more=more)
         if not why and result.message == NOT_FINITE:
-            again = solve_ipopt(program, guess, limits, report, exact=False)
+            again = solve_ipopt(program, guess, limits, report, exact=False, more=more)
             if again.message != NOT_FINITE:  # then it was the Hessian
                 told, result = "symbolic, limited-memory Hessian: the exact one is not finite at an iterate", again
         found, horizon = program.unpack(result.z)
