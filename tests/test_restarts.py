@@ -4,6 +4,7 @@ import signal
 
 import numpy as np
 import pytest
+from helpers.models import MODELS
 from helpers.table import each_row
 
 import drake_diff as dd
@@ -51,6 +52,17 @@ def test_the_ways_around_a_disk_are_listed():
     assert "first guesses were verified" in solution.message
     sides = [np.sign(each.xs[len(each.xs) // 2, 1] - 0.1) for each in solution.optima[:2]]
     assert sorted(sides) == [-1, 1]
+
+
+@pytest.mark.slow
+def test_both_swing_ups_of_kellys_cart_pole_are_listed():
+    """58.8077 and 57.9448, as in test_transcription, where a guess leads to each; 50 intervals here."""
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04)
+    limits = dd.Bounds(u_lower=[-20], u_upper=[20])
+    effort = dd.QuadraticCost(R=[[1.0]])
+    problem = dd.Problem(model, x0=[0] * 4, x_goal=[1, np.pi, 0, 0], num_steps=50, running_cost=effort, bounds=limits)
+    solution = dd.solve(problem, restarts=8)
+    assert [each["cost"] for each in solution.options["optima"]] == pytest.approx([57.9448, 58.8077], rel=1e-3)
 
 
 def test_restarts_come_out_the_same_and_none_leaves_all_as_it_is():

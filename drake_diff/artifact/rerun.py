@@ -25,6 +25,7 @@ from drake_diff.model.load_file import FORMATS
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.soft_contact import SoftContact
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.program import Multipliers
 from drake_diff.optimize.solution import Search, Solution, Status
 from drake_diff.optimize.solve import solve
 from drake_diff.record.parts import ModelInput
@@ -36,7 +37,7 @@ TRACE = "trace.mcap"
 REQUIRED, OPTIONAL = ("xs", "us", "parameters"), ("us_mid", "u_final", "mesh", "free_horizon")  # of a Solution
 START = "start_us"  # the first guess of the inputs that the problem has
 GUESS = "guess_"  # before the name of an array of the guess that `solve` was given
-GUESSED = ("xs", "us", "us_mid", "u_final", "mesh", "horizon", "num_steps")
+GUESSED = ("xs", "us", "us_mid", "u_final", "mesh", "horizon", "num_steps", "multipliers", "row_multipliers")
 
 
 def write_plan(path: Path, solution: Solution) -> None:
@@ -49,6 +50,8 @@ def write_plan(path: Path, solution: Solution) -> None:
     if isinstance(guess, Solution):
         found = {name: getattr(guess, name) for name in ("xs", "us", "us_mid", "u_final", "mesh", "horizon")}
         found["num_steps"] = guess.problem.num_steps
+        if guess.multipliers is not None:
+            found |= {"multipliers": guess.multipliers.variables, "row_multipliers": guess.multipliers.rows}
     else:
         found = {} if guess is None else dict(zip(("xs", "us", "horizon"), guess, strict=False))
     given |= {GUESS + name: value for name, value in found.items()}
@@ -185,6 +188,8 @@ def _rebuild_guess(problem: Problem, kind: Any, plan: dict[str, Array]) -> Any:
         problem, num_steps=int(given["num_steps"]), us=None, waypoints={}, constraints=(), couplings=(), goals=()
     )
     horizon = float(given["horizon"])
+    if {"multipliers", "row_multipliers"} <= set(given):
+        fields["multipliers"] = Multipliers(given["multipliers"], given["row_multipliers"])
     return Solution(
         problem=like,
         method="",

@@ -16,6 +16,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.timed import TimedCost
+from drake_diff.optimize.program import Multipliers
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.transcription.collocation import Collocated
 
@@ -40,6 +41,7 @@ class Guess:
     horizon: float | None = None  # [s]
     motion: Collocated | None = None
     parameters: Array | None = None
+    multipliers: Multipliers | None = None  # of the motion on its mesh
 
 
 def first_guess(problem: Problem, method: str, given: Any, seed: int) -> Guess:
@@ -77,7 +79,7 @@ def _of_solution(problem: Problem, given: Solution, continuous: bool) -> Guess:
         return Guess(xs, _means(given.us, knots))
     if continuous:
         xs, us = motion.at(np.linspace(0, motion.horizon, count + 1))
-        return Guess(xs, us[:-1], us[-1], motion.horizon, motion)
+        return Guess(xs, us[:-1], us[-1], motion.horizon, motion, multipliers=given.multipliers)
     if len(given.knots) == count + 1:
         return Guess(given.xs[given.knots], given.inputs_at_knots[given.knots][:-1])
     return Guess(motion.at(np.linspace(0, motion.horizon, count + 1))[0], motion.means(np.arange(count + 1) / count))

@@ -88,6 +88,11 @@ class Multipliers:
     variables: Array
     rows: Array
 
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """(n, m)"""
+        return len(self.variables), len(self.rows)
+
 
 @dataclass(frozen=True, eq=False)
 class NlpResult:

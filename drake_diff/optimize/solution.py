@@ -23,7 +23,7 @@ from drake_diff.model.step import advance
 from drake_diff.motion.rollout import Rollout, roll_states
 from drake_diff.optimize.optimality import Optimality, final_state_norms, optimality
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import Iteration
+from drake_diff.optimize.program import Iteration, Multipliers
 from drake_diff.optimize.replay import Plan, Replay, held, judged_replay, replays
 from drake_diff.optimize.shooting import ShootingVariables
 from drake_diff.optimize.transcription.collocation import Collocated, collocated
@@ -114,6 +114,7 @@ class Solution(ShowsItsRepr):
         certificates: of the derivatives that the solver used, at some knots of the guess and of the result.
         options: what was asked of the solver, and what it chose.
         wall_time: [s] what the solve took.
+        multipliers: of the bounds and rows of what collocation solved, with which a search from here begins.
         optima: with `restarts`, the verified solutions that differ in cost or motion, the cheapest first.
         search: the arguments of `solve`, None of a solution that it did not make.
 
@@ -145,6 +146,7 @@ class Solution(ShowsItsRepr):
     solver_message: str = ""
     wall_time: float = 0.0
     search: Search | None = None
+    multipliers: Multipliers | None = None
     optima: tuple["Solution", ...] = ()
 
     def __str__(self) -> str:

@@ -644,9 +644,14 @@ class Run:
             return refused(self._draft(guess.xs, guess.us), error)
         us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
         begun = guess.motion or (guess.xs, np.vstack([guess.us, us_end]))
-        asked = refinement if refine else None
         motion = transcription.solve(
-            begun, horizon=guess.horizon, limits=limits, report=report, refinement=asked, parameters=guess.parameters
+            begun,
+            horizon=guess.horizon,
+            limits=limits,
+            report=report,
+            refinement=refinement if refine else None,
+            parameters=guess.parameters,
+            **self._known(transcription, guess, finer=refine is not False),
         )
         if refine:
             self.options["refinements"] = [list(each) for each in motion.refinements]
@@ -660,6 +665,16 @@ class Run:
         if refine is not None or refinement is None:
             return solution
         return self._refined(transcription, motion, solution, refinement, judged)
+
+    def _known(self, transcription: Transcription, guess: Guess, *, finer: bool) -> dict[str, Any]:
+        """The mesh and the multipliers of a guess by the same scheme and in as many steps; `finer` may it be."""
+        motion = guess.motion
+        if motion is None or motion.task.scheme is not transcription.task.scheme:
+            return {}
+        same = motion.task.problem.num_steps == self.problem.num_steps
+        if not same or (len(motion.mesh) > self.problem.num_steps + 1 and not finer):
+            return {}
+        return {"mesh": np.asarray(motion.mesh), "multipliers": guess.multipliers}
 
     def _refined(
         self,
@@ -725,6 +740,7 @@ class Run:
             free_horizon=motion.horizon if self.problem.horizon else None,
             mesh=motion.mesh if len(us) > self.problem.num_steps else None,
             parameters=frozen(motion.task.parameters),
+            multipliers=motion.result.multipliers,
             certificates=certificates,
         )
         return self._judge(draft, motion.result)

@@ -19,7 +19,7 @@ from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, clearances
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.problem.rates import RateLimit
-from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report
+from drake_diff.optimize.program import Limits, Multipliers, NlpResult, Outcome, Report
 from drake_diff.optimize.transcription.task import OptimalControl
 
 SLOPED = np.linspace(0, 1, 11)  # where slopes are looked at within an interval, its ends among them
@@ -410,18 +410,22 @@ class Transcription:
         report: Report | None,
         refinement: MeshRefinement | None = None,
         parameters: Array | None = None,
+        mesh: Array | None = None,
+        multipliers: Multipliers | None = None,
     ) -> Transcribed:
         """From a guess that `nodes_at` takes, and of `horizon` [s]; `limits.max_iterations` hold for each round.
 
-        Parameters that are optimized start at `parameters` (np,), at the problem's own where None.
+        Parameters that are optimized start at `parameters` (np,), at the problem's own where None. The first mesh is
+        the problem's own where none is given; `multipliers` are those of the guess on it.
 
         A refinement splits the intervals whose error is above its tolerance and solves again from what was found.
         Intervals that come nearer to an obstacle than a plan may are split in any case, up to CLEARANCE_ROUNDS times.
         """
-        start, mesh = time.monotonic(), self.mesh
+        start, mesh = time.monotonic(), self.mesh if mesh is None else mesh
+        coarse = mesh
         first = float(np.clip(self.problem.start_horizon if horizon is None else horizon, *self.task.horizon))
         begun, far = self.nodes_at(mesh, guess), not isinstance(guess, Collocated)
-        motion = self.solve_on(mesh, begun, first, limits, report, parameters, far=far)
+        motion = self.solve_on(mesh, begun, first, limits, report, parameters, multipliers, far=far)
         tolerance, most = (np.inf, MOST_INTERVALS) if refinement is None else (refinement.tolerance, refinement.most)
         rounds, near = [(len(mesh) - 1, motion.largest_error)], [_nearer(motion)]
         while motion.result.outcome in FOUND:
@@ -440,7 +444,7 @@ class Transcription:
                 report.say(f"{told} with {count} intervals: refined to {len(mesh) - 1}")
             left, last = _left(limits, start), motion
             if entered:  # what goes through an obstacle is no place to go on from
-                now, then = (self.task.scheme.node_fractions(each) for each in (mesh, self.mesh))
+                now, then = (self.task.scheme.node_fractions(each) for each in (mesh, coarse))
                 nodes = np.array([np.interp(now, then, column) for column in begun.T]).T
                 motion = self.solve_on(mesh, nodes, first, left, report, parameters, far=far)
             else:
@@ -477,12 +481,14 @@ class Transcription:
         limits: Limits,
         report: Report | None,
         parameters: Array | None = None,
+        multipliers: Multipliers | None = None,
         *,
         far: bool = False,
     ) -> Transcribed:
         """IPOPT on one mesh, from `nodes` (K, nx + nu), `horizon` [s] and `parameters` (np,), the problem's if None.
 
-        These are `far` from a motion where nothing has moved them: a line.
+        These are `far` from a motion where nothing has moved them: a line. Where `multipliers` are as many as the
+        program's they begin the search; where that fails, it begins without.
         """
         from drake_diff.optimize.transcription.program import FAR, NOT_FINITE, TranscribedProgram, solve_ipopt
 
@@ -490,8 +496,14 @@ class Transcription:
         moved = None if parameters is None else self.task.at(self._inside(parameters)).coordinates
         guess = program.pack(nodes, horizon, moved)
         told = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
-        more = FAR if far and program.free else None
-        result = solve_ipopt(program, guess, limits, report, exact=not why, more=more)
+        more, start = FAR if far and program.free else None, time.monotonic()
+        sizes = len(program.lower), len(program.sides[0])
+        begun = multipliers if multipliers and multipliers.sizes == sizes else None
+        result = solve_ipopt(program, guess, limits, report, exact=not why, begun=begun, more=more)
+        if begun and result.outcome not in (*FOUND, Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
+            result = solve_ipopt(program, guess, _left(limits, start), report, exact=not why, more=more)
+        elif begun:
+            result = replace(result, message=f"{result.message}, from the guess's multipliers")
         if not why and result.message == NOT_FINITE:
             again = solve_ipopt(program, guess, limits, report, exact=False, more=more)
             if again.message != NOT_FINITE:  # then it was the Hessian
