@@ -224,8 +224,9 @@ def solve(
         "refine": refine,
         "error_tolerance": refinement.tolerance,
         "max_num_steps": refinement.most,
-        "restarts": _count("restarts", restarts),
     }
+    if _count("restarts", restarts):
+        arguments["restarts"] = int(restarts)
     if isinstance(problem, PhasedProblem):
         if restarts:
             raise InputError("restarts", got=restarts, expected="0 for a PhasedProblem")
