@@ -448,7 +448,8 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
     first = dataclasses.replace(asked, method=method, reason=reason, solver=None if method == "ilqr" else asked.solver)
     told = "nothing touches at first, and every coordinate is driven"
     free = dataclasses.replace(asked, method="collocation", reason=told)
-    if method == "ilqr" and _is_free_at_first(problem) and _is_possible(problem, free):
+    by_steps = method == "ilqr" or (method == "shooting" and problem.couplings)
+    if by_steps and _is_free_at_first(problem) and _is_possible(problem, free):
         yield free, given
         yield from _kept_apart(problem, free, found)
     yield first, given
