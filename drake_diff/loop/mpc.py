@@ -115,6 +115,7 @@ class MPC:
         xs, us = _first_plan(problem, plan)
         self._rolling = Rolling(problem, _staying(problem, xs, us), xs, us)
         self._reference = self._plan_the_whole(xs, us)
+        self._get_ready()
         self.start(problem.x0)
 
     def start(self, x0: Array) -> None:
@@ -227,6 +228,16 @@ class MPC:
             label, far, knot = step.given_way
             said.append(f"{label} gives way by {far:.3g} at {(k + knot) * self._problem.model.time_step:.4g} s")
         return "; ".join(said) or OK
+
+    def _get_ready(self) -> None:
+        """Do once what each length of a plan needs once, so that no call has to."""
+        counts = {self._rolling.count(k, self.horizon) for k in range(self._problem.num_steps + 1)}
+        for count in counts:
+            xs, us = self._reference.xs[-count - 1 :], self._reference.us[-count:]
+            if len(us) == count:
+                take_step(self._rolling.stretch(self._problem.num_steps - count, count), Motion(xs, us, xs[1:]))
+            else:
+                self._rolling.stretch(0, count)
 
     def _row(self, k: int, i: int) -> Array:
         """State (i = 0) or input (1) `k` of the last plan, else of the first, and after its end what stays there."""

@@ -21,10 +21,12 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.steps import Flags
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic
 
-OPTIONS = {"error_on_fail": False, "piqp": {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100}}
+ACCURATE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 50}
+# The second is slower and solves what the first may not, whose numbers differ widely.
+OPTIONS = (ACCURATE, ACCURATE | {"iterative_refinement_always_enabled": True})
 FREE = 1e30  # what PIQP takes for no limit
 FAR = 1e3  # ranges: a limit there is as good as none
-DEAREST = 1e3  # price: dearer ones cost PIQP its digits, so that the cost is taken in another unit
+DEAREST = 1e4  # price: dearer ones cost PIQP its digits, so that the cost is taken in another unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +100,8 @@ class SoftProgram:
         self._order = np.lexsort((at[0][self._inside], at[1][self._inside]))
         a = _sparsity(at[:, self._inside][:, self._order], (sides, self.size))
         h = self._set_hessian(n)
-        self._solver = ca.conic("step", "piqp", {"h": h, "a": a}, OPTIONS)
+        shapes = {"h": h, "a": a}
+        self._solvers = [ca.conic("step", "piqp", shapes, {"error_on_fail": False, "piqp": o}) for o in OPTIONS]
         self._a, self._h = a, h
         self._free = np.full(self.size - moves, FREE)
 
@@ -160,10 +163,13 @@ class SoftProgram:
         least[:, :nu], most[:, :nu] = model.lower, model.upper
         sides = {"lba": np.concatenate(lower), "uba": np.concatenate(upper)}
         sides |= {"lbx": np.append(least.ravel(), 0.0 * self._free), "ubx": np.append(most.ravel(), self._free)}
-        found = self._solver(h=ca.DM(self._h, unit * h), g=unit * g, a=ca.DM(self._a, a), **sides)
-        stats = self._solver.stats()
-        z = np.asarray(found["x"]).ravel()
-        if not stats["success"] or not np.all(np.isfinite(z)):
+        given = {"h": ca.DM(self._h, unit * h), "g": unit * g, "a": ca.DM(self._a, a), **sides}
+        for solver in self._solvers:
+            found, stats = solver(**given), solver.stats()
+            z = np.asarray(found["x"]).ravel()
+            if stats["success"] and np.all(np.isfinite(z)):
+                break
+        else:
             return Refusal(f"PIQP: {stats['return_status']}")
         return self._unpacked(z, *(np.asarray(found[name]).ravel() / unit for name in ("lam_a", "lam_x")))
 
