@@ -342,8 +342,8 @@ HEAD = """# MPC in real time, under blows
 
 Three tasks by `dd.loop.MPC` with default options: one step of sequential quadratic programming a tick. Written by
 `python tests/benchmarks/mpc_realtime.py --markdown docs/mpc_realtime.md`, seed {seed}, {count} runs each: problems
-drawn by seed, and three blows in each run. The plant is pydrake's alone in steps of 1 ms and goes on under the old input
-for as long as the controller computes. Limits are judged at each of these steps by the referee's own formulas. They are
+drawn by seed, and three blows in each run. The plant is that of pydrake alone in steps of 1 ms, under the old input
+while the controller computes. Limits are judged at each of these steps by the referee's own formulas. They are
 those of the task; the problem plans with a part of them (sway and tilt 70 and 80 %, speeds 75 %, 2 cm beside the ball).
 Latencies are {clock} on the machine that wrote this page, with other work on it.
 
