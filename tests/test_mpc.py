@@ -168,7 +168,7 @@ def test_a_loop_logs_the_steps_whose_solve_failed(swung, monkeypatch):
         ({}, {"plan": "a plan"}, "plan"),
         ({}, {"plan": (np.zeros((5, 2)), np.zeros((20, 1)))}, "plan xs"),
         ({}, {"budget": 0.0}, "budget"),
-        ({"us": np.zeros((20, 1)), "optimize": ("initial_state",)}, {}, "fixed controls"),
+        ({"us": np.zeros((20, 1)), "optimize": ("initial_state",)}, {}, "optimize"),
         ({"parameters": ["block_0.mass"]}, {}, "parameters"),
         ({"trajectory_cost": lambda xs, us: xs[0, 0]}, {}, "trajectory_cost"),
         ({"couplings": dd.optimize.InputRate(5.0)}, {}, "couplings"),

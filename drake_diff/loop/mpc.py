@@ -20,7 +20,6 @@ from drake_diff.loop.run import LATE, OK
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import LQR
-from drake_diff.optimize.ilqr.ilqr import check_problem
 from drake_diff.optimize.problem.cost import CostToGo, QuadraticCost
 from drake_diff.optimize.problem.goals import LAST
 from drake_diff.optimize.problem.problem import Problem
@@ -98,15 +97,7 @@ class MPC:
         replan_every: int = 1,
         clock: Callable[[], float] = perf_counter,
     ):
-        if not isinstance(problem, Problem):
-            raise InputError("problem", got=type(problem).__name__, expected="a Problem")
-        if not problem.has_model:
-            raise InputError("system", got="plain dynamics", expected="a Model: MPC steps its plant")
-        check_problem(problem)
-        if problem.horizon:
-            raise InputError("horizon", got="given", expected="none: the steps of MPC are the model's")
-        if not problem.initial_state_is_given:
-            raise InputError("optimize", got=list(problem.optimize), expected='("controls",) for MPC')
+        _check(problem)
         self.horizon = positive_int("horizon", horizon)
         self.replan_every = positive_int("replan_every", replan_every)
         self.iterations = positive_int("iterations", iterations)
@@ -271,6 +262,25 @@ class MPC:
             raise InputError("running_cost", got="no positive curvature by the inputs", expected="one with a minimum")
         rolling.tails = step.tails
         return motion
+
+
+def _check(problem: Problem) -> None:
+    """Refuse by name what MPC cannot keep."""
+    if not isinstance(problem, Problem):
+        raise InputError("problem", got=type(problem).__name__, expected="a Problem")
+    if not problem.has_model:
+        raise InputError("system", got="plain dynamics", expected="a Model: MPC steps its plant")
+    if not problem.optimizes_controls or not problem.initial_state_is_given or problem.optimizes_parameters:
+        raise InputError("optimize", got=list(problem.optimize), expected='("controls",) for MPC')
+    given = {
+        "horizon": problem.horizon is not None,
+        "parameters": bool(problem.parameters.parameters),
+        "couplings": bool(problem.couplings),
+        "trajectory_cost": problem.trajectory_cost is not None,
+        "parameter_cost": problem.parameter_cost is not None,
+    }
+    for subject in (name for name, is_given in given.items() if is_given):
+        raise InputError(subject, got="given", expected="none: MPC cannot keep it, and steps the model as it is")
 
 
 def _staying(problem: Problem, xs: Array, us: Array) -> Staying | None:
