@@ -7,7 +7,7 @@ Each takes a random generator and gives a `Case`. Constants are drawn such that 
 import dataclasses
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
@@ -562,11 +562,47 @@ def bicycle_around_disks(random):
     return Case(case.problem, case.build, asks, case.peer, disks=tuple(disks))
 
 
+def shortest_dubins(x, y, heading):
+    """[s] the shortest of the six words of Dubins from the origin, with unit speed and radius."""
+
+    def turned(angle):
+        return angle % (2 * np.pi)
+
+    def tangents(side, other):  # an arc to a line to an arc; sides are 1 to the left, -1 to the right
+        ends = np.array([0, side]), np.array([x - other * np.sin(heading), y + other * np.cos(heading)])
+        way = ends[1] - ends[0]
+        across, distance = (0.0 if side == other else 2.0), np.hypot(*way)
+        if distance < across:
+            return np.inf
+        along = np.arctan2(way[1], way[0]) + (0 if side == other else side * np.arcsin(across / distance))
+        return turned(side * along) + np.sqrt(distance**2 - across**2) + turned(other * (heading - along))
+
+    def three_arcs(side):
+        ends = np.array([0, side]), np.array([x - side * np.sin(heading), y + side * np.cos(heading)])
+        way = ends[1] - ends[0]
+        distance = np.hypot(*way)
+        if distance > 4:
+            return np.inf
+        between = np.arccos(distance / 4)
+        found = []
+        for bend in (1, -1):
+            middle = np.arctan2(way[1], way[0]) + bend * between  # from the first centre to the middle one
+            back = np.arctan2(way[1], way[0]) + np.pi - bend * between
+            first = turned(side * (middle - np.arctan2(-side, 0)))
+            last = turned(side * (heading - side * np.pi / 2 - back))
+            found.append(first + turned(-side * (back - middle - np.pi)) + last)
+        return min(found)
+
+    words = [tangents(side, other) for side in (1, -1) for other in (1, -1)]
+    return float(min([*words, *(three_arcs(side) for side in (1, -1))]))
+
+
 def dubins_least_time(random):
     """Unit speed, unit radius: the shortest way between two poses."""
     limits = ([-ANY] * 3, [ANY] * 3), ([-1], [1])
     goal = [*random.uniform(-5, 5, 2), random.uniform(-np.pi, np.pi)]
-    return plain(dubins, 3, 1, limits=limits, x0=np.zeros(3), goal=goal, count=40, horizon=(0.3, 25), cost=1.0)
+    case = plain(dubins, 3, 1, limits=limits, x0=np.zeros(3), goal=goal, count=40, horizon=(0.3, 25), cost=1.0)
+    return replace(case, optimum=shortest_dubins(*goal))
 
 
 def planar_limits(random):

@@ -212,9 +212,8 @@ def ours(case: Case, time_limit: float) -> Row:
 
 def beside(
     peer: str, python: str, draw: Callable[[str, int], Case], names: list[str], count: int, time_limit: float
-) -> list[Row]:
+) -> Iterator[Row]:
     """A row for each solve of both, and one with a reason for each task that the peer is not told."""
-    rows: list[Row] = []
     script, warm = Peer(peer, python), False
     for name in names:
         for number in range(count):
@@ -222,7 +221,7 @@ def beside(
             task = asked(case)
             why = task if isinstance(task, str) else not_said(peer, task)
             if why:
-                rows.append({"peer": peer, "name": name, "left out": why})
+                yield {"peer": peer, "name": name, "left out": why}
                 break
             if not warm:  # what is loaded at the first call is not counted
                 ours(case, time_limit)
@@ -233,7 +232,7 @@ def beside(
                 script, warm = Peer(peer, python), False
             false = judged(answer, case) if answer["solved"] else ""
             theirs = {key: answer.get(key) for key in ("solved", "told", "cost", "build", "solve")} | {"false": false}
-            rows.append({"peer": peer, "name": name, "number": number, "ours": mine, "theirs": theirs})
+            yield {"peer": peer, "name": name, "number": number, "ours": mine, "theirs": theirs}
             word = f"FALSE: {false}" if false else answer["told"]
             ratio = mine["seconds"] / max(answer["build"] + answer["solve"], 1e-9)
             print(
@@ -241,7 +240,6 @@ def beside(
                 flush=True,
             )
     script.end()
-    return rows
 
 
 # ------------------------------------------------------------------------------ what is told

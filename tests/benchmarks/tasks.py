@@ -62,9 +62,10 @@ def attempt(name: str, seed: int, number: int, wall_limit: float) -> Row:
     case, begun, clock = drawn(name, seed, number), time.process_time(), time.perf_counter()
     try:
         solution = dd.solve(case.problem, time_limit=wall_limit)
-    except DrakeDiffError as error:
-        refused = f"refused: {error}"
-        return {"claimed": False, "false": "", "miss": 0.0, "status": "refused", "message": refused, "seconds": 0.0}
+    except Exception as error:  # an end that no user may meet: it counts as not solved, and the run goes on
+        told = "refused" if isinstance(error, DrakeDiffError) else f"crashed with {type(error).__name__}"
+        row = {"claimed": False, "false": "", "miss": 0.0, "status": told, "message": f"{told}: {error}"}
+        return row | {"seconds": round(time.process_time() - begun, 2)}
     seconds, wall = time.process_time() - begun, time.perf_counter() - clock
     why, miss = "", 0.0
     if solution.success:
@@ -205,20 +206,17 @@ def marked() -> Row:
 
 def compared(given: argparse.Namespace, names: list[str]) -> None:
     """Our solves beside those of a peer; in --peers the rows of other tasks and other peers stay."""
-    mark = marked()
-    rows = task_peers.beside(
-        given.beside,
-        given.python,
-        lambda name, number: drawn(name, given.seed, number),
-        names,
-        given.count,
-        TIME_LIMIT,
-    )
-    rows = [row | mark for row in rows]
-    if given.peers:
-        old = json.loads(given.peers.read_text()) if given.peers.is_file() else []
-        kept = [row for row in old if row["peer"] != given.beside or row["name"] not in names]
-        given.peers.write_text(json.dumps(kept + rows, indent=1))
+    rows: list[Row] = []
+    mark, old = marked(), json.loads(given.peers.read_text()) if given.peers and given.peers.is_file() else []
+    kept = [row for row in old if row["peer"] != given.beside or row["name"] not in names]
+
+    def draw(name: str, number: int) -> Case:
+        return drawn(name, given.seed, number)
+
+    for row in task_peers.beside(given.beside, given.python, draw, names, given.count, TIME_LIMIT):
+        rows.append(row | mark)
+        if given.peers:
+            given.peers.write_text(json.dumps(kept + rows, indent=1))
     print("\n".join(task_peers.told(rows)))
 
 
