@@ -40,6 +40,7 @@ class Guess:
     u_final: Array | None = None
     horizon: float | None = None  # [s]
     motion: Collocated | None = None
+    line: bool = False
     parameters: Array | None = None
     multipliers: Multipliers | None = None  # of the motion on its mesh
 
@@ -134,7 +135,7 @@ def _line(problem: Problem, method: str, seed: int) -> Guess:
         size = np.where(np.isfinite(limit), np.minimum(limit, 100.0), 1.0)
         us = NOISE * size * np.random.default_rng(seed).standard_normal(us.shape)
     inside = np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
-    return Guess(xs, inside if problem.optimizes_controls else us)
+    return Guess(xs, inside if problem.optimizes_controls else us, line=True)
 
 
 def _way(problem: Problem) -> tuple[Array, Array | None]:

@@ -653,6 +653,7 @@ class Run:
             report=report,
             refinement=refinement if refine else None,
             parameters=guess.parameters,
+            far=guess.line,
             **self._known(transcription, guess, finer=refine is not False),
         )
         if refine:

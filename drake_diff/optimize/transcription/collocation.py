@@ -412,11 +412,13 @@ class Transcription:
         parameters: Array | None = None,
         mesh: Array | None = None,
         multipliers: Multipliers | None = None,
+        far: bool = False,
     ) -> Transcribed:
         """From a guess that `nodes_at` takes, and of `horizon` [s]; `limits.max_iterations` hold for each round.
 
         Parameters that are optimized start at `parameters` (np,), at the problem's own where None. The first mesh is
-        the problem's own where none is given; `multipliers` are those of the guess on it.
+        the problem's own where none is given; `multipliers` are those of the guess on it. A guess that is a line is
+        `far` from a motion.
 
         A refinement splits the intervals whose error is above its tolerance and solves again from what was found.
         Intervals that come nearer to an obstacle than a plan may are split in any case, up to CLEARANCE_ROUNDS times.
@@ -424,7 +426,7 @@ class Transcription:
         start, mesh = time.monotonic(), self.mesh if mesh is None else mesh
         coarse = mesh
         first = float(np.clip(self.problem.start_horizon if horizon is None else horizon, *self.task.horizon))
-        begun, far = self.nodes_at(mesh, guess), not isinstance(guess, Collocated)
+        begun = self.nodes_at(mesh, guess)
         motion = self.solve_on(mesh, begun, first, limits, report, parameters, multipliers, far=far)
         tolerance, most = (np.inf, MOST_INTERVALS) if refinement is None else (refinement.tolerance, refinement.most)
         rounds, near = [(len(mesh) - 1, motion.largest_error)], [_nearer(motion)]
@@ -487,8 +489,8 @@ class Transcription:
     ) -> Transcribed:
         """IPOPT on one mesh, from `nodes` (K, nx + nu), `horizon` [s] and `parameters` (np,), the problem's if None.
 
-        These are `far` from a motion where nothing has moved them: a line. Where `multipliers` are as many as the
-        program's they begin the search; where that fails, it begins without.
+        These may be `far` from a motion: a line. Where `multipliers` are as many as the program's they begin the
+        search; where that fails, it begins without.
         """
         from drake_diff.optimize.transcription.program import FAR, NOT_FINITE, TranscribedProgram, solve_ipopt
 
