@@ -161,8 +161,11 @@ def test_what_is_no_limit_is_refused_at_once(couplings, error, told):
         least_time(1.0, 1.0, 1.0, couplings())
 
 
-def test_a_sensitivity_counts_them():
-    """d cost / d goal of the least time of the S-curve with a plateau: T = A/J + sqrt((A/J)^2 + 4 d/A)."""
-    solution = dd.solve(least_time(1.0, 1.0, 2.0, InputRate(2.0), horizon=3.0, running_cost=EFFORT))
-    found = dd.sensitivity(solution, "goal")
+@each_row("limit, by", [(InputRate(8.0), "goal"), (Jerk(40.0), ["pole.mass"])])
+def test_a_sensitivity_counts_them(limit, by):
+    """Also those of jerks, whose rows change with the parameters of the model."""
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=EFFORT, couplings=limit)
+    found = dd.sensitivity(dd.solve(problem), by)
     assert found.verdict == "agree", found
+    assert found.active > 0

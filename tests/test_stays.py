@@ -179,6 +179,13 @@ def test_a_quadrotor_has_quaternions_and_no_set():
         )  # fmt: skip
 
 
+def test_a_set_is_one_of_the_model_as_it_is():
+    solution = dd.solve(swung_up())
+    assert dd.sensitivity(solution).verdict == "agree"
+    with pytest.raises(InputError, match=r"as it is"):
+        dd.sensitivity(solution, ["pole.mass"])
+
+
 def test_records_of_both_are_verified(tmp_path):
     for name, problem in (("stay", crane(goals=[stay()])), ("set", swung_up())):
         solution = dd.solve(problem)

@@ -18,6 +18,7 @@ from drake_diff.model.parameters import applied, select
 from drake_diff.model.step import advance
 from drake_diff.optimize.problem.obstacles import swept
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.terminal import TerminalSet
 from drake_diff.optimize.program import Limits, Multipliers
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.transcription.collocation import FOUND
@@ -224,6 +225,8 @@ def _change(solution: Solution, by: Any) -> Change:
     if problem.parameters.parameters and solution.transcribed is not None:
         expected = '"x0" or "goal", as the problem has parameters of its own'
         raise InputError("by", got=repr(by), expected=expected)
+    if any(isinstance(goal, TerminalSet) for goal in problem.goals):
+        raise InputError("by", got=repr(by), expected='"x0": a TerminalSet is one of the model as it is')
     chosen = {p.name for p in problem.parameters.parameters} & {p.name for p in vector.parameters}
     if chosen and problem.optimizes_parameters:
         raise InputError("by", got=sorted(chosen), expected="parameters that the plan does not choose itself")

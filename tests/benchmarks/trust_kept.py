@@ -130,6 +130,7 @@ def terminal(random):
     )
     region = caught.region(model, weaker.bounds)
     end = region.x_goal + (region.random_state(random) - region.x_goal) * random.uniform(0.5, 8)
+    end = np.clip(end, weaker.bounds.x_lower + 0.01, weaker.bounds.x_upper - 0.01)
     weaker = dataclasses.replace(weaker, x_goal=end, running_cost=dd.QuadraticCost(R=[[1.0]]))
 
     def broken(solution):
