@@ -75,7 +75,7 @@ def _of_solution(problem: Problem, given: Solution, continuous: bool) -> Guess:
     if motion is None:
         knots = np.linspace(0.0, len(given.us), count + 1)
         if len(given.us) == count:
-            return Guess(np.asarray(given.xs), np.asarray(given.us))
+            return Guess(np.asarray(given.xs), np.asarray(given.us), multipliers=given.multipliers)
         xs = np.array([np.interp(knots, np.arange(len(given.xs)), column) for column in given.xs.T]).T
         return Guess(xs, _means(given.us, knots))
     if continuous:

@@ -114,7 +114,7 @@ class Solution(ShowsItsRepr):
         certificates: of the derivatives that the solver used, at some knots of the guess and of the result.
         options: what was asked of the solver, and what it chose.
         wall_time: [s] what the solve took.
-        multipliers: of the bounds and rows of what collocation solved, with which a search from here begins.
+        multipliers: of the bounds and rows of what collocation or iLQR solved, with which a search from here begins.
         optima: with `restarts`, the verified solutions that differ in cost or motion, the cheapest first.
         search: the arguments of `solve`, None of a solution that it did not make.
 

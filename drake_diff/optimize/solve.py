@@ -762,8 +762,11 @@ class Run:
                 self.options["continuation"] = [asdict(log) for log in logs]
                 return result, xs_found, us
             touches = problem.model.contract.contact.collision_pairs and not moves_shapes(problem)
-            solve_method = solve_through_jumps if touches else solve_ilqr
-            return solve_method(problem, next(first, rolled), us, limits=limits, report=report, values=values)
+            begin = next(first, rolled)
+            if touches:
+                return solve_through_jumps(problem, begin, us, limits=limits, report=report, values=values)
+            known = guess.multipliers
+            return solve_ilqr(problem, begin, us, limits=limits, report=report, values=values, begun=known)
 
         return self._through_steps(xs, us, search, guess, may_be_blind=bool(stages))
 
@@ -824,7 +827,7 @@ class Run:
         if self.problem.horizon is not None:
             horizon = float(np.clip(design.time_step(values) * self.problem.num_steps, *self.problem.horizon))
         found = {"certificates": before + after, "parameters": frozen(design.own(values)), "free_horizon": horizon}
-        solution = self._judge(self._draft(xs, us, **found), result)
+        solution = self._judge(self._draft(xs, us, multipliers=result.multipliers, **found), result)
         return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
 
     def _first_values(self, guess: Guess) -> Array:

@@ -43,6 +43,15 @@ class AugmentedLagrangian:
         self.penalty = FIRST_PENALTIES[0]
         self.any = bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
 
+    @property
+    def forces(self) -> Array:
+        """(m,) the multipliers of the rows in their own units, whatever their scales are."""
+        return self.multipliers * self.scale
+
+    @forces.setter
+    def forces(self, forces: Array) -> None:
+        self.multipliers = forces / self.scale
+
     def start(self, xs: Array, us: Array, cost: float, gaps: float) -> None:
         """Choose scales, and a first penalty that makes the guess as wrong as it is expensive: a good one is not left.
 
@@ -92,7 +101,7 @@ class AugmentedLagrangian:
         """Take over the multipliers that the minimum xs, us of the augmented cost tells, and look at the scales."""
         forces = self._pushes(xs, us) * self.scale
         self._choose_scales(xs, us)
-        self.multipliers = forces / self.scale
+        self.forces = forces
 
     def _choose_scales(self, xs: Array, us: Array) -> None:
         for group, rows in zip(self.groups, self.slices, strict=True):

@@ -26,7 +26,16 @@ from drake_diff.optimize.ilqr.expansion import DynamicsCurvature, Motion, curvat
 from drake_diff.optimize.ilqr.riccati import AffinePolicy, LinearQuadratic, slope_along, solve_riccati
 from drake_diff.optimize.problem.cost import CostToGo
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Outcome, Report, ctrl_c
+from drake_diff.optimize.program import (
+    FEASIBILITY_TOLERANCE,
+    Iteration,
+    Limits,
+    Multipliers,
+    NlpResult,
+    Outcome,
+    Report,
+    ctrl_c,
+)
 
 SMALLEST_REGULARIZATION, LARGEST_REGULARIZATION = 1e-8, 1e8
 SUFFICIENT_DECREASE = 1e-4
@@ -74,23 +83,28 @@ def solve_ilqr(
     patience: float = math.inf,
     least_penalty: float = 0.0,
     values: Array | None = None,
+    begun: Multipliers | None = None,
 ) -> tuple[NlpResult, Array, Array]:
     """Solve `problem` from xs (N+1, nx), us (N, nu), a rollout or not; gives (result, xs, us), result.z being us flat.
 
     After `patience` steps in a row that are shorter than SHORT the search ends as inaccurate: it crawls along a jump.
     Before that it regularizes where steps are short, as the model reaches too far. `least_penalty` is what constraints
-    weigh from the start, `values` (np,) are those of the problem's `design` to begin with, its own where None. A motion
+    weigh from the start, `values` (np,) are those of the problem's `design` to begin with, its own where None;
+    `begun` are the multipliers of a search like this one. A motion
     on the way that cannot be stepped or differentiated is a step that is too long, which the message counts; raises
     GradientError or SimulationError if the guess is such a motion.
     """
     search = _Search(problem, xs, us, limits, report, patience, values)
     search.constraints.penalty = max(search.constraints.penalty, least_penalty)
+    if begun is not None and begun.sizes == (0, len(search.constraints.forces)):
+        search.constraints.forces = begun.rows
     with ctrl_c() as interrupted:
         outcome = search.run(interrupted)
     message = f"iLQR: {outcome.value} after {len(search.rows) - 1} steps{search.told_of_refusals}"
     motion, found = search.motion, problem.design.values(search.motion.c)
     result = NlpResult(motion.us.ravel(), outcome, message, tuple(search.rows), parameters=found)
-    return result, motion.xs, motion.us
+    multipliers = Multipliers(np.zeros(0), search.constraints.forces)
+    return replace(result, multipliers=multipliers), motion.xs, motion.us
 
 
 def costs_to_go(problem: Problem, xs: Array, us: Array) -> tuple[CostToGo, ...]:
