@@ -258,27 +258,27 @@ BLOCK = """<robot name="block"><link name="rail"/><link name="block"><inertial><
 
 
 @pytest.mark.slow
-@each_row("method, solver", [("ilqr", None), ("shooting", "ipopt")])
-def test_a_block_in_least_time_by_discrete_steps(method, solver, tmp_path):
+@each_row("method, solver, steps", [("ilqr", None, 20), ("shooting", "ipopt", 6)])
+def test_a_block_in_least_time_by_discrete_steps(method, solver, steps, tmp_path):
     """T = 2 sqrt(m d / F): with an even number of held inputs the switch is at a knot, and the steps are exact.
 
     x_N of N semi-implicit steps differs from the time-continuous one by h v: over a way from rest to rest by nothing.
     """
     mass, force, way = 1.3, 2.0, 1.0
     problem = dd.Problem(
-        sliding(mass, force, tmp_path), x0=[0, 0], x_goal=[way, 0], num_steps=20, horizon=(0.2, 10), running_cost=1.0
+        sliding(mass, force, tmp_path), x0=[0, 0], x_goal=[way, 0], num_steps=steps, horizon=(0.2, 10), running_cost=1.0
     )
     solution = dd.solve(problem, method=method, solver=solver)
     assert solution.success, solution.message
     assert solution.horizon == pytest.approx(2 * np.sqrt(way * mass / force), rel=1e-6)
-    assert solution.time_step == pytest.approx(solution.horizon / 20, rel=1e-12)
+    assert solution.time_step == pytest.approx(solution.horizon / steps, rel=1e-12)
     assert solution.cost == pytest.approx(solution.horizon, rel=1e-12)
     assert solution.replays[0].time_step == pytest.approx(solution.time_step, rel=1e-12)
     assert any("time_step" in column for column in solution.certificates[-1].columns)
 
 
-@each_row("method", ["ilqr", "shooting"])
-def test_a_time_that_is_weighed_against_effort(method, tmp_path):
+@each_row("method, segments", [("ilqr", 1), ("shooting", 1), ("shooting", 3)])
+def test_a_time_that_is_weighed_against_effort(method, segments, tmp_path):
     """w T + c 12 m^2 d^2 / T^3 is least at T = (36 c m^2 d^2 / w)^(1/4); of N steps c = 1 / (1 - 1/N^2)."""
     mass, way, weight, steps = 1.3, 1.0, 3.0, 20
     problem = dd.Problem(
@@ -289,7 +289,7 @@ def test_a_time_that_is_weighed_against_effort(method, tmp_path):
         horizon=(0.5, 10),
         running_cost=lambda x, u: weight + u[0] ** 2,
     )
-    solution = dd.solve(problem, method=method)
+    solution = dd.solve(problem, method=method, segments=segments)
     assert solution.success, solution.message
     effort = 36 * mass**2 * way**2 / (1 - 1 / steps**2)
     assert solution.horizon == pytest.approx((effort / weight) ** 0.25, rel=1e-5)
@@ -315,6 +315,30 @@ def test_mass_and_time_by_sweeps_through_discrete_steps(tmp_path):
     effort = 12 * way**2 / (1 - 1 / steps**2)
     assert weight == pytest.approx(3 * effort * mass**2 / time**4, rel=1e-4)
     assert mass == pytest.approx(price * heaviest / (price + effort / time**3), rel=1e-4)
+
+
+@pytest.mark.slow
+def test_a_mass_that_pushes_through_contact_is_where_its_price_meets_what_it_saves():
+    """The slope of the least effort by the mass, from plans with masses on both sides, against that of the price."""
+    model = dd.load_model(MODELS / "two_spheres.sdf", time_step=0.01)
+    price, first, asked = 0.05, 0.5, {"num_steps": 40, "running_cost": dd.QuadraticCost(R=[[1e-3]])}
+    asked |= {"x0": [0, 0.2, 0, 0], "x_goal": [np.nan, 0.6, np.nan, np.nan]}
+    problem = dd.Problem(
+        model,
+        optimize=BOTH,
+        parameters=("ball.mass",),
+        parameter_bounds={"ball.mass": (0.1, 2.5)},
+        parameter_cost=lambda p: price * (p[0] - first) ** 2,
+        **asked,
+    )
+    solution = dd.solve(problem, method="ilqr")
+    mass, costs = solution.parameters[0], []
+    assert solution.goal_error < 1e-6
+    assert 0.2 < mass < 0.45
+    for side in (-0.02, 0.02):
+        other = dd.Problem(model, parameters={"ball.mass": mass * (1 + side)}, **asked)
+        costs.append(dd.solve(other, method="ilqr", initial_guess=solution).cost)
+    assert (costs[1] - costs[0]) / (0.04 * mass) == pytest.approx(-2 * price * (mass - first), rel=1e-4)
 
 
 def test_a_diagram_has_one_length_of_a_step():

@@ -40,6 +40,7 @@ PARITY_TOLERANCE = 1e-9
 DIFFERENCE_STEP = 1e-5
 # Friction turns within 1e-4 m/s, so that it is smaller where impulses act; 1e-5 was up to 20 times off there.
 POLISHED_STEP = 3e-7
+TIME_STEP_DIFFERENCE = 4e-4  # of a step's length, which a step depends on smoothly where contact lasts
 # Two ways to the same smooth Jacobian differ by rounding, which the inverse of a mass matrix may magnify.
 SAME_JACOBIAN = 1e-10
 # Below so many degrees of freedom AutoDiffXd takes a step with contact in less time than NumPy's calls for one take:
@@ -151,9 +152,10 @@ def _parameter_differences(steps: Steps, k: int, entries: NDArray[np.int64]) -> 
             def led(d: Array, own: Array = own) -> Array:
                 return ends(np.hstack([np.zeros((len(d), width)), d @ own]))
 
-            if which is timed:  # each size of a difference needs models of its own
-                sweep = sweep_of(led, count, (step,))
-                found[:, which] = (sweep.forward + sweep.backward)[0] / 2
+            if which is timed:  # each size of a difference needs models of its own: two, extrapolated, and no plateau
+                sweep = sweep_of(led, count, (TIME_STEP_DIFFERENCE, TIME_STEP_DIFFERENCE / 2))
+                coarse, fine = (sweep.forward + sweep.backward) / 2
+                found[:, which] = fine + (fine - coarse) / 3
             else:
                 found[:, which] = plateau(led, count)
         return found / scale

@@ -236,7 +236,7 @@ def plain_parameters(values: Mapping[str, Any]) -> ParameterVector:
             raise InputError("parameters", got=repr(name), expected="names with their values")
         kind = Kind("", AUTODIFF, lambda model: {}, "", lambda element: None, lambda twin, label, value: None)
         value = finite_array(f"parameter {name}", np.atleast_1d(value), (1,))
-        found.append(Parameter(name, "", value, -np.inf, np.inf, AUTODIFF, kind))
+        found.append(Parameter(name, "unknown", value, -np.inf, np.inf, AUTODIFF, kind))
     return ParameterVector(cast(Model, None), tuple(found), frozen([p.value[0] for p in found]))
 
 

@@ -158,7 +158,8 @@ class Dynamics:
 
     def __repr__(self) -> str:
         states, inputs = ", ".join(self.state_names), ", ".join(self.input_names)
-        return f"Dynamics of the states {states} under the inputs {inputs}"
+        named = f" with the parameters {', '.join(self.parameters.names)}" if self.parameters.names else ""
+        return f"Dynamics of the states {states} under the inputs {inputs}{named}"
 
     def __call__(self, x: Any, u: Any) -> Array:
         """(nx,) the rates at `x` (nx,), `u` (nu,)."""
