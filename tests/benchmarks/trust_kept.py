@@ -90,7 +90,7 @@ def rate(random):
     free = dd.solve(dd.Problem(model, **given), method="collocation", refine=False)
     jerk = bool(random.random() < 0.5)
     times, xs, us = dense(free)
-    limit = float(random.uniform(0.4, 0.8) * steepest(times, accelerations(path, xs, us) if jerk else us).max())
+    limit = float(random.uniform(0.75, 0.98) * steepest(times, accelerations(path, xs, us) if jerk else us).max())
     more, kind = 1 + 10 ** random.uniform(-2.5, -0.3), Jerk if jerk else InputRate
 
     def broken(solution):
@@ -139,15 +139,16 @@ def terminal(random):
         port.FixValue(context, [0.0])
         plant.SetPositionsAndVelocities(context, upright)
         found = FirstOrderTaylorApproximation(plant, context, port.get_index(), OutputPortSelection.kNoOutput)
-        gain, _ = DiscreteTimeLinearQuadraticRegulator(found.A(), found.B(), np.array(caught.Q), np.eye(1))
+        gain, S = DiscreteTimeLinearQuadraticRegulator(found.A(), found.B(), np.array(caught.Q), np.eye(1))
         x = np.array(solution.xs[-1])
+        outside = (x - upright) @ S @ (x - upright) / region.level - 1
         for _ in range(round(60 / h)):
             plant.SetPositionsAndVelocities(context, x)
             port.FixValue(context, np.clip(-gain @ (x - upright), -limit, limit))
             x = np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())
             if np.max(np.abs(x)) > 1e6:
                 return np.inf
-        return float(np.max(np.abs(x - upright)))
+        return max(float(np.max(np.abs(x - upright))), float(outside))
 
     return weaker, dataclasses.replace(weaker, x_goal=None, goals=[caught]), broken
 

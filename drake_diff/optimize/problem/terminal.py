@@ -18,6 +18,7 @@ from drake_diff._base.arrays import Array, finite_array, positive_int
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import InputError, ModelError, SimulationError
 from drake_diff.model.model import Model
+from drake_diff.model.parameters import Parameters, applied, select
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import LQR
@@ -146,18 +147,23 @@ class TerminalSet(Goal):
         samples = positive_int("TerminalSet.samples", self.samples)
         self._set(x_goal=tuple(x_goal.tolist()), samples=samples, seed=int(self.seed), **weights)
 
-    def region(self, model: Model, bounds: Bounds) -> Region:
-        """The set on a `model` within resolved `bounds`, as a `Problem` has them; looked for once."""
-        key = (self, *(np.asarray(side).tobytes() for side in vars(bounds).values()))
-        known = _KNOWN.setdefault(model, {})
+    def region(self, model: Model, bounds: Bounds, parameters: Parameters = ()) -> Region:
+        """The set on a `model` within resolved `bounds`, as a `Problem` has them; looked for once.
+
+        With `parameters` of the model, names and values, it is that of the model with these.
+        """
+        vector = select(model, parameters)
+        sides = (np.asarray(side).tobytes() for side in vars(bounds).values())
+        key, known = (self, vector.names, vector.values.tobytes(), *sides), _KNOWN.setdefault(model, {})
         if key not in known:
-            known[key] = _found(self, model, bounds)
+            with applied(vector) as set_model:
+                known[key] = _found(self, set_model, bounds)
         return known[key]
 
     def bind_to(self, problem: Any) -> tuple[GoalConstraint, ...]:
         if problem.optimizes_parameters:
             raise InputError("TerminalSet", got='"parameters" in optimize', expected="a model that does not change")
-        region = self.region(problem.model, problem.bounds)
+        region = self.region(problem.model, problem.bounds, problem.parameters)
         evidence = f"{region.level:.4g} from which {region.samples} of {region.samples} random states converged"
         return (
             TerminalConstraint(
