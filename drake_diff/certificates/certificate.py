@@ -20,6 +20,7 @@ from drake_diff.exceptions import CertificateError, GradientError, ShapeError
 from drake_diff.model.contact import Pair
 
 JITTER = 1e-9
+ROUNDED_POINT = 4 * np.finfo(float).eps  # of a point's entries: what displacing them rounds, to both sides
 
 
 @dataclass(frozen=True)
@@ -222,8 +223,11 @@ def certify_jacobian(
         beside = np.asarray(jacobian(x + jitter(scale)), dtype=float) * scale
     many = f if batched else one_by_one(lambda at: np.asarray(f(at), dtype=float))
     unsolved: Array | float = 0.0
+    if np.all(np.isfinite(at_x)) and at_x.ndim == 2 and at_x.shape[1] == len(x):
+        unsolved = ROUNDED_POINT * np.abs(at_x) @ np.abs(x)  # of 50 (a - b) that is far more than the value's own
     if solver_tolerance:
-        unsolved = solver_tolerance * np.maximum(1.0, np.abs(np.asarray(many(x[None]), dtype=float)[0]))
+        solved = solver_tolerance * np.maximum(1.0, np.abs(np.asarray(many(x[None]), dtype=float)[0]))
+        unsolved = np.maximum(unsolved, solved)
     return certify_displacement(
         lambda d: many(x + scale * d),
         at_x * scale,

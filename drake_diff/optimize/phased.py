@@ -20,6 +20,7 @@ from drake_diff.optimize.certified import certify_equations
 from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
 from drake_diff.optimize.judge import judged, may_be_too_coarse, status_of
 from drake_diff.optimize.problem.phases import PhasedProblem
+from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Report
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Search, Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
@@ -263,15 +264,31 @@ def _first_guesses(problem: PhasedProblem, given: Any, seed: int) -> list[Guess]
     if len(parts) != len(problem.phases):
         expected = f"None, a PhasedSolution, or {len(problem.phases)} guesses, one for each phase"
         raise InputError("initial_guess", got=f"{len(parts)} guesses", expected=expected)
-    pairs = zip(problem.phases, parts, strict=True)
+    pairs = zip(_aimed(problem), parts, strict=True)
     return [first_guess(phase, "collocation", sampled(phase, "collocation", part), seed) for phase, part in pairs]
+
+
+def _aimed(problem: PhasedProblem) -> list[Problem]:
+    """The phases, for guesses alone: one that has no goal ends where the next one's first guess begins.
+
+    That is its state before a linear reset; before another it is the same state, where there are as many.
+    """
+    found = list(problem.phases)
+    for switch in problem.switches:
+        one, other = found[switch.before], problem.phases[switch.after]
+        if switch.after == 0 or (switch.matrix is None and one.nx != other.nx):
+            continue
+        end = other.x0 if switch.matrix is None else np.linalg.lstsq(switch.matrix, other.x0, rcond=None)[0]
+        end = np.clip(end, one.bounds.x_lower, one.bounds.x_upper)
+        found[switch.before] = replace(one, x_goal=np.where(np.isnan(one.goal), end, one.goal))
+    return found
 
 
 def _guesses(problem: PhasedProblem, first: list[Guess], given: Any, seed: int) -> Iterator[list[Guess]]:
     """The first guesses, and where they are not given others, by `seed`."""
     yield first
     for number in range(1, OTHER_GUESSES + 1) if given is None else ():
-        every = enumerate(problem.phases)
+        every = enumerate(_aimed(problem))
         others = [another_guess(phase, seed * len(problem.phases) + i, number) for i, phase in every]
         pairs = zip(problem.phases, others, strict=True)
         yield [first_guess(phase, "collocation", other, seed) for phase, other in pairs]
@@ -379,7 +396,8 @@ class _PhasedRun:
         return found
 
     def _judged(self, result: NlpResult, motions: list[Transcribed], derivatives: str) -> PhasedSolution:
-        drafts, error = [], None
+        drafts: list[Solution] = []
+        error: Exception | None = None
         options = {"derivatives": derivatives, "initial_guess": "default" if self.by_default else "given"}
         for t, motion in zip(self.transcriptions, motions, strict=True):
             xs, us = motion.xs, motion.us[:-1]
@@ -393,36 +411,45 @@ class _PhasedRun:
             found |= {"scheme": self.scheme, "certificates": certificates, "options": dict(options)}
             by = t.problem, "collocation", "ipopt", Status.FAILED, ""
             drafts.append(Solution(*by, frozen(xs), frozen(us), **found))
-        phases = tuple(judged(draft, result) for draft in drafts)
+        phases, links = tuple(judged(draft, result) for draft in drafts), tuple[Certificate, ...]()
+        try:
+            links = self._certified_links(motions)
+        except (GradientError, SimulationError) as refusal:
+            error = refusal
         draft = PhasedSolution(
             self.problem,
             Status.FAILED,
             "",
             phases,
             iterations=result.iterations,
-            link_certificates=self._certified_links(motions),
+            link_certificates=links,
             options=options | {"seed": self.asked["seed"]},
             solver_message=result.message,
             wall_time=time.monotonic() - self.start,
         )
-        return judged_phases(draft, result) if error is None else _ended(draft, Status.NO_GRADIENT, [str(error)])
+        solution = judged_phases(draft, result)
+        if error is not None and solution.status in PLANS:
+            return _ended(solution, Status.NO_GRADIENT, [str(error)])
+        return solution
 
     def _certified_links(self, motions: list[Transcribed]) -> tuple[Certificate, ...]:
+        """GradientError where a derivative is refused."""
         found = []
         for s, function in zip(self.problem.switches, self.links, strict=True):
             at, count = np.concatenate([motions[s.before].xs[-1], motions[s.after].xs[0]]), len(s.columns)
-            if np.all(np.isfinite(at)):
-                found.append(
-                    certify_jacobian(
-                        lambda x, s=s, count=count: s.link(x[:count], x[count:]),
-                        at,
-                        function.jacobian_of,
-                        rows=s.rows,
-                        columns=[*(f"last {name}" for name in s.columns), *(f"first {name}" for name in s.rows)],
-                        method="reset",
-                        subject=s.label,
-                    )
+            if not np.all(np.isfinite(at)):
+                continue
+            with np.errstate(all="ignore"):
+                certificate = certify_jacobian(
+                    lambda x, s=s, count=count: s.link(x[:count], x[count:]),
+                    at,
+                    function.jacobian_of,
+                    rows=s.rows,
+                    columns=[*(f"last {name}" for name in s.columns), *(f"first {name}" for name in s.rows)],
+                    method="reset",
+                    subject=s.label,
                 )
+            found.append(certificate)
         return tuple(found)
 
 

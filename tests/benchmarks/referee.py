@@ -32,7 +32,7 @@ def state_of(context):
 
 
 def simulate(
-    plan, step, times, gains
+    plan, step, times, gains, start=None
 ):  # (S,) [s], (S, nx): what the plant with `step` [s] (0: continuous) goes through
     builder, seen, (system, port_in, port_out) = DiagramBuilder(), [], plan["build"](step)
     system, control = builder.AddSystem(system), builder.AddSystem(Control(plan, times, gains))
@@ -40,7 +40,7 @@ def simulate(
     builder.Connect(system.get_output_port(port_out), control.get_input_port())
     simulator = Simulator(builder.Build())
     own = system.GetMyContextFromRoot(simulator.get_mutable_context())
-    state_of(own).SetFromVector(plan["x"](0.0))
+    state_of(own).SetFromVector(plan["x"](0.0) if start is None else start)
     ResetIntegratorFromFlags(simulator, "runge_kutta3", times[1]).set_target_accuracy(1e-7)
     simulator.set_monitor(lambda root: seen.append([root.get_time(), *state_of(own).CopyToVector()]) and None)
     simulator.AdvanceTo(times[-1] - step / 2)  # a step begins at each multiple of it
@@ -62,14 +62,33 @@ def regulator(plan, step, times, scale):  # gains at `times` by Riccati's recurs
     return gains[::-1]
 
 
-def judge(plan, step, tolerance):
-    """(why the plan is false, "" if it is true; the worst miss as a part of the range) in the plant with `step` [s]."""
-    nq, times = plan["nq"], np.linspace(0, plan["T"], round(plan["T"] / step) + 1 if step else 201)
+def scale_of(plan, times):  # (nx,) what a miss of each state is a part of, and (nu,) the inputs' ranges
+    nq = plan["nq"]
     ranges, us = (np.ptp([plan[name](t) for t in times], axis=0) for name in ("x", "u"))
     least = np.repeat([ranges[:nq].max(initial=0), ranges[nq:].max(initial=0)], [nq, len(ranges) - nq]) / 5
-    scale, applied = np.maximum(np.maximum(ranges, least), 1e-3), [plan["u"](t) for t in np.linspace(0, plan["T"], 999)]
-    beyond = np.max(np.maximum(plan["u_lower"] - applied, applied - plan["u_upper"]) / np.maximum(us, 1e-2))
-    if beyond > 1e-3:
+    return np.maximum(np.maximum(ranges, least), 1e-3), us
+
+
+def input_excess(plan, us):  # by how much of its range an input is beyond its bound
+    applied = [plan["u"](t) for t in np.linspace(0, plan["T"], 999)]
+    return np.max(np.maximum(plan["u_lower"] - applied, applied - plan["u_upper"]) / np.maximum(us, 1e-2))
+
+
+def misses(plan, at, xs, scale, tolerance):  # (the worst miss, what is told of it, "" where nothing is missed)
+    excess = np.maximum(plan["x_lower"] - xs, xs - plan["x_upper"])[1:].max(axis=0)
+    missed = np.where(np.isnan(plan["goal"]), 0, np.abs(xs[-1] - plan["goal"]))
+    worst = float(np.nan_to_num(np.maximum(missed, excess) / scale, nan=np.inf).max())
+    found = [(name, miss(at, xs), allowed) for name, miss, allowed in plan.get("asks", ())]
+    lacking = [f"{name}: {miss:.4g}, {allowed:g} allowed" for name, miss, allowed in found if not miss <= allowed]
+    told = [f"{missed.round(4)} off, {excess.round(4)} beyond bounds"] * (not worst <= tolerance) + lacking
+    return max(worst, bool(lacking) * 1.0), "; ".join(told)
+
+
+def judge(plan, step, tolerance):
+    """(why the plan is false, "" if it is true; the worst miss as a part of the range) in the plant with `step` [s]."""
+    times = np.linspace(0, plan["T"], round(plan["T"] / step) + 1 if step else 201)
+    scale, us = scale_of(plan, times)
+    if (beyond := input_excess(plan, us)) > 1e-3:
         return f"input beyond its bound by {beyond:.2g} of its range", np.inf
     if "rate" in plan:  # of inputs, per s, over a while that a held one takes to change
         most, while_ = plan["rate"]
@@ -80,13 +99,40 @@ def judge(plan, step, tolerance):
     best = np.inf, "no motion"
     for control in ("open loop", "TVLQR"):
         at, xs = simulate(plan, step, times, None if control == "open loop" else regulator(plan, step, times, scale))
-        excess = np.maximum(plan["x_lower"] - xs, xs - plan["x_upper"])[1:].max(axis=0)
-        missed = np.where(np.isnan(plan["goal"]), 0, np.abs(xs[-1] - plan["goal"]))
-        worst = float(np.nan_to_num(np.maximum(missed, excess) / scale, nan=np.inf).max())
-        found = [(name, miss(at, xs), allowed) for name, miss, allowed in plan.get("asks", ())]
-        lacking = [f"{name}: {miss:.4g}, {allowed:g} allowed" for name, miss, allowed in found if not miss <= allowed]
-        if worst <= tolerance and not lacking:
+        worst, told = misses(plan, at, xs, scale, tolerance)
+        if not told:
             return "", worst
-        told = [f"{missed.round(4)} off, {excess.round(4)} beyond bounds"] * (worst > tolerance) + lacking
-        best = min(best, (max(worst, bool(lacking) * 1.0), f"{control}, {step:g} s: {'; '.join(told)}"))
+        best = min(best, (worst, f"{control}, {step:g} s: {told}"))
+    return best[1], best[0]
+
+
+def judge_phases(plans, resets, closes, tolerance):
+    """The same of phases one after the other, each from where the one before leads, through `resets` of its own.
+
+    Where it `closes`, the last reset leads back to the first state. A plant that Drake cannot linearize has no TVLQR.
+    """
+    parts = []
+    for plan in plans:
+        times = np.linspace(0, plan["T"], 201)
+        scale, us = scale_of(plan, times)
+        if (beyond := input_excess(plan, us)) > 1e-3:
+            return f"input beyond its bound by {beyond:.2g} of its range", np.inf
+        parts.append((plan, times, scale))
+    best = np.inf, "no motion"
+    for control in ("open loop", "TVLQR"):
+        x, worst, told = parts[0][0]["x"](0.0), 0.0, []
+        for i, ((plan, times, scale), reset) in enumerate(zip(parts, resets, strict=True)):
+            linear = plan["build"](0.0)[0].ToAutoDiffXdMaybe() is not None
+            gains = regulator(plan, 0.0, times, scale) if control == "TVLQR" and linear else None
+            at, xs = simulate(plan, 0.0, times, gains, x)
+            off, why = misses(plan, at, xs, scale, tolerance)
+            worst, x = max(worst, off), reset(xs[-1])
+            told += [f"phase {i}: {why}"] * bool(why)
+        if closes:
+            off = float((np.abs(x - parts[0][0]["x"](0.0)) / parts[0][2]).max())
+            worst = max(worst, off)
+            told += [f"it comes back {off:.2g} of its range away"] * (not off <= tolerance)
+        if not told:
+            return "", worst
+        best = min(best, (worst, f"{control}: {'; '.join(told)}"))
     return best[1], best[0]

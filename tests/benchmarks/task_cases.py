@@ -1131,6 +1131,4 @@ FAMILIES: dict[str, list[Callable[[np.random.Generator], Case]]] = {
 }  # fmt: skip
 
 # What a practitioner asks and a Problem cannot say. Each counts as a task that is not solved.
-NOT_EXPRESSED = {
-    "gait_of_a_compass_walker": ("periodic orbits", "a Problem has no phases with reset events"),
-}
+NOT_EXPRESSED: dict[str, tuple[str, str]] = {}

@@ -33,9 +33,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
 import numpy as np  # noqa: E402
 import task_peers  # noqa: E402
-from referee import judge  # noqa: E402
+from referee import judge, judge_phases  # noqa: E402
 from task_cases import FAMILIES, NOT_EXPRESSED, Case  # noqa: E402
 from task_cases_more import MORE  # noqa: E402
+from task_phases import PHASES, PhasedCase  # noqa: E402
 from trust_solve import NAMED, plan_of  # noqa: E402
 
 import drake_diff as dd  # noqa: E402
@@ -44,6 +45,7 @@ from drake_diff.exceptions import DrakeDiffError, ModelWarning  # noqa: E402
 
 TIME_LIMIT, AIM = 60.0, 0.95
 EVERY = {family: [*FAMILIES.get(family, []), *MORE.get(family, [])] for family in dict.fromkeys([*FAMILIES, *MORE])}
+EVERY["phases"] = PHASES
 TASKS = {task.__name__: (family, task) for family, tasks in EVERY.items() for task in tasks}
 Row = dict[str, Any]
 
@@ -52,7 +54,7 @@ def chosen(name: str, only: str) -> bool:
     return any(fnmatch.fnmatch(name, pattern) for pattern in only.split(","))
 
 
-def drawn(name: str, seed: int, number: int) -> Case:
+def drawn(name: str, seed: int, number: int) -> Case | PhasedCase:
     """The case of a task: its number, and not that of the task in the list, decides."""
     return TASKS[name][1](np.random.default_rng([seed, zlib.crc32(name.encode()), number]))
 
@@ -68,14 +70,18 @@ def attempt(name: str, seed: int, number: int, wall_limit: float) -> Row:
         return row | {"seconds": round(time.process_time() - begun, 2)}
     seconds, wall = time.process_time() - begun, time.perf_counter() - clock
     why, miss = "", 0.0
-    if solution.success:
+    in_phases = isinstance(case, PhasedCase)
+    if solution.success and in_phases:
+        closes = case.problem.periodic is not False
+        why, miss = judge_phases(case.plans(solution), case.resets, closes, NAMED)
+    elif solution.success:
         plan, h = plan_of(solution, case.model_file(solution) if case.model_file else case.build), solution.time_step
         plan["asks"] = case.asks
         if case.rate is not None:
             plan["rate"] = case.rate, h if solution.scheme == "step" else plan["T"] / 500
         found = [judge(plan, step, NAMED) for step in ((0.0,) if solution.scheme != "step" else (h, h / 2, h / 8))]
         why, miss = next((why for why, _ in found if why), ""), max(miss for _, miss in found)
-    chain = solution.options.get("chain", [])
+    chain, parts = solution.options.get("chain", []), solution.phases if in_phases else (solution,)
     return {
         "claimed": solution.success,
         "late": seconds > TIME_LIMIT,
@@ -84,9 +90,9 @@ def attempt(name: str, seed: int, number: int, wall_limit: float) -> Row:
         "status": solution.status.value,
         "message": solution.message,
         "cost": solution.cost,
-        "method": f"{solution.method} {solution.scheme}",
+        "method": "; ".join(dict.fromkeys(f"{part.method} {part.scheme}" for part in parts)),
         "attempts": max(1, len(chain)),
-        "intervals": [case.problem.num_steps, len(solution.us)],
+        "intervals": [sum(part.problem.num_steps for part in parts), sum(len(part.us) for part in parts)],
         "optimum": case.optimum,
         "seconds": round(seconds, 2),
         "wall": round(wall, 2),
