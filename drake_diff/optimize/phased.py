@@ -216,13 +216,21 @@ def solve_phased(
         reason = "a straight line" if given is None else "given"
         chain.append({"guess": reason if number == 0 else f"random {number}", "ended": found[-1].status.value})
         report.say(f"from the guess {chain[-1]['guess']}: {found[-1].status.value}")
-        if found[-1].status not in NOT_FOUND:
+        if not _may_mend(found[-1], arguments["refine"]):
             break
     best = min(found, key=_preference)
     told = best.message
     if len(found) > 1 and best.status not in PLANS:
         told += f"; from none of {len(found)} first guesses was a plan found"
     return replace(best, message=told, options={**best.options, "chain": chain}, search=Search(arguments, given))
+
+
+def _may_mend(solution: PhasedSolution, refine: bool | None) -> bool:
+    """Whether another first guess may do better: nothing was found, or a plan that no mesh made hold."""
+    if solution.status is not Status.CONVERGED_NOT_VERIFIED or refine is False:
+        return solution.status in NOT_FOUND
+    agree = all(c.verdict == "agree" for phase in solution.phases for c in phase.certificates)
+    return agree and all(c.verdict == "agree" for c in solution.link_certificates)
 
 
 def _preference(solution: PhasedSolution) -> tuple[int, float]:
@@ -337,10 +345,12 @@ class _PhasedRun:
             nodes = [t.nodes_at(mesh, m) for t, mesh, m in zip(self.transcriptions, finer, motions, strict=True)]
             again = self._solve_on(finer, nodes, [motion.horizon for motion in motions], most)
             if again[0].outcome not in FOUND:
-                note = (
+                counts = (
                     f"on {rounds[-1]} intervals no motion was found ({again[0].message}): that on {rounds[-2]} is kept"
                 )
-                return replace(solution, message=f"{solution.message}; {note}")
+                solution = replace(solution, message=f"{solution.message}; {counts}")
+                del rounds[-1]
+                break
             result, motions, told = again
             solution = self._judged(result, motions, told)
         return replace(solution, options={**solution.options, "refinements": rounds}) if len(rounds) > 1 else solution
