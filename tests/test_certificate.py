@@ -302,6 +302,20 @@ def test_stairs_are_discontinuous_whatever_is_claimed_and_the_jumps_are_told(nam
         assert "it jumps by" in str(certificate)
 
 
+def test_a_difference_of_nearly_equal_numbers_is_no_staircase():
+    """Two thrusts at their limit turn nothing: what rounding moves them by is more than the rounding of the turn."""
+    slope = np.zeros((2, 8))
+    slope[0, 0], slope[1, 6], slope[1, 7] = 1, 50, -50
+    for seed in (*range(10), 51, 293):  # the last two were called staircases once
+        random = np.random.default_rng(seed)
+        x = random.standard_normal(8)
+        x[6:] = 5.54382 + random.standard_normal(2) * 10 ** random.uniform(-8, -6)
+        certificate = dd.certificates.certify_jacobian(lambda z: [z[0], 50 * (z[6] - z[7])], x, slope)
+        assert certificate.verdict == "agree", (seed, str(certificate))
+        wrong = dd.certificates.certify_jacobian(lambda z: [z[0], 50 * (z[6] - z[7])], x, 1.001 * slope)
+        assert wrong.verdict == "disagree"
+
+
 @each_row(
     "f, reason",
     [

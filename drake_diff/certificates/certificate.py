@@ -20,7 +20,6 @@ from drake_diff.exceptions import CertificateError, GradientError, ShapeError
 from drake_diff.model.contact import Pair
 
 JITTER = 1e-9
-ROUNDED_POINT = 4 * np.finfo(float).eps  # of a point's entries: what displacing them rounds, to both sides
 
 
 @dataclass(frozen=True)
@@ -223,11 +222,8 @@ def certify_jacobian(
         beside = np.asarray(jacobian(x + jitter(scale)), dtype=float) * scale
     many = f if batched else one_by_one(lambda at: np.asarray(f(at), dtype=float))
     unsolved: Array | float = 0.0
-    if np.all(np.isfinite(at_x)) and at_x.ndim == 2 and at_x.shape[1] == len(x):
-        unsolved = ROUNDED_POINT * np.abs(at_x) @ np.abs(x)  # of 50 (a - b) that is far more than the value's own
     if solver_tolerance:
-        solved = solver_tolerance * np.maximum(1.0, np.abs(np.asarray(many(x[None]), dtype=float)[0]))
-        unsolved = np.maximum(unsolved, solved)
+        unsolved = solver_tolerance * np.maximum(1.0, np.abs(np.asarray(many(x[None]), dtype=float)[0]))
     return certify_displacement(
         lambda d: many(x + scale * d),
         at_x * scale,
@@ -237,6 +233,7 @@ def certify_jacobian(
         columns=tuple(columns or (f"x[{i}]" for i in range(len(x)))),
         unsolved=unsolved,
         stopped=solver_tolerance,
+        point=x / scale,
         method=method,
         subject=subject,
     )
@@ -253,6 +250,7 @@ def certify_displacement(
     minus: Difference = np.subtract,
     unsolved: Array | float = 0.0,
     stopped: float = 0.0,
+    point: Array | None = None,
     told: str = "",
     method: str = "given",
     subject: str = "the derivative",
@@ -261,14 +259,14 @@ def certify_displacement(
 
     `beside` is the derivative at a point 1e-9 away; `scale` (n,) takes the scaling out of what is reported;
     `minus` subtracts two values of `f`, on a tangent space if need be; `unsolved` (m,) is how wrong a value of `f` may
-    be because a solver stopped early, and `stopped` is how early, relative: see `judge`; `told` says whose differences
-    these are.
+    be because a solver stopped early, and `stopped` is how early, relative: see `judge`; `point` (n,) is what is
+    displaced, in the same units, if it is numbers that are rounded; `told` says whose differences these are.
     """
     if derivative.shape != (len(rows), len(columns)):
         raise ShapeError("derivative", got=derivative.shape, expected=(len(rows), len(columns)))
     if not np.all(np.isfinite(derivative)):
         raise GradientError(f"{subject} is not finite: {derivative}")
-    around = look_around(f, len(columns), minus, unsolved)
+    around = look_around(f, len(columns), minus, unsolved, point)
     named: dict[str, Any] = {"rows": rows, "columns": columns, "method": method, "subject": subject, "told": told}
     return certificate_of(around, derivative, beside, scale=scale, stopped=stopped, **named)
 

@@ -21,6 +21,7 @@ from drake_diff._base.differences import RATIO_SQUARED, Difference, Many
 
 STEPS = tuple(10.0 ** (-k / 2) for k in range(4, 17))  # 1e-2 ... 1e-8
 SPACINGS = (1e-9, 1e-7, 1e-5, 1e-3)  # of the values along a line
+ROUNDED_POINT = 4 * np.finfo(float).eps  # of a point's entries: what displacing them to both sides rounds
 VALUES = 8  # at each spacing, to each side
 ORDERS = (4, 5, 6)  # of the differences that tell scatter
 TINY = 1e-300  # no number that means anything is smaller
@@ -72,10 +73,13 @@ class Neighbourhood:
         return np.asarray(np.where(shrinks, 0.0, gap[1:] / 2))
 
 
-def look_around(f: Many, n: int, minus: Difference = np.subtract, unsolved: Array | float = 0.0) -> Neighbourhood:
+def look_around(
+    f: Many, n: int, minus: Difference = np.subtract, unsolved: Array | float = 0.0, point: Array | None = None
+) -> Neighbourhood:
     """Take `f`, a function of displacements (K, n) with values (K, m), around 0.
 
-    `unsolved` (m,) is how wrong a value may be at most because a solver stopped early: such jumps are no stairs.
+    `unsolved` (m,) is how wrong a value may be at most because a solver stopped early: such jumps are no stairs. Nor is
+    what comes of rounding the displaced `point` (n,), which is more than the value's own rounding where terms cancel.
     """
     steps = np.array(STEPS)[:, None, None]
     sides = np.stack([steps * np.eye(n), -steps * np.eye(n)]).reshape(-1, n)
@@ -93,10 +97,12 @@ def look_around(f: Many, n: int, minus: Difference = np.subtract, unsolved: Arra
     along = changes[len(sides) :].reshape(2, len(SPACINGS), VALUES, rows)
     rounding = LAST_PLACE * (size + np.abs(along).max(axis=2))
     by_spacing = np.maximum(_scatter(along), rounding)  # (2, spacings, m)
-    unsolved = np.broadcast_to(unsolved, rows)
-    scatter = np.maximum(by_spacing[:, :NEAR].max(axis=(0, 1)), unsolved / SAFETY)
-    finest = np.maximum(by_spacing[:, 0].max(axis=0), unsolved / SAFETY)
-    stairs = _stairs(lambda t: apart(f(np.multiply.outer(t, direction))), along, by_spacing, rounding, unsolved)
+    unknown = np.array(np.broadcast_to(unsolved, rows), dtype=float)
+    if point is not None:
+        unknown = np.maximum(unknown, ROUNDED_POINT * np.nan_to_num(np.abs(ahead[0])) @ np.abs(point))
+    scatter = np.maximum(by_spacing[:, :NEAR].max(axis=(0, 1)), unknown / SAFETY)
+    finest = np.maximum(by_spacing[:, 0].max(axis=0), unknown / SAFETY)
+    stairs = _stairs(lambda t: apart(f(np.multiply.outer(t, direction))), along, by_spacing, rounding, unknown)
     return Neighbourhood(centre, size, ahead, -behind, scatter, finest, stairs)
 
 
