@@ -244,6 +244,27 @@ def test_a_mass_that_the_plan_chooses_moves_with_the_goal(write_urdf):
 
 
 @pytest.mark.slow
+@each_row("method", ["ilqr", "shooting"])
+def test_the_length_of_steps_moves_with_the_goal(write_urdf, method):
+    """Effort k d^2 / T^3 in N steps of any length, and T: T grows with the root of d, so that dT/dd = T / 2 d."""
+    problem = dd.Problem(
+        write_urdf(mass=1.0, time_step=0.1),
+        x0=[0, 0],
+        x_goal=[1, 0],
+        num_steps=12,
+        horizon=(0.5, 10.0),
+        running_cost=lambda x, u: u[0] ** 2 + 1.0,
+    )
+    solution = dd.solve(problem, method=method)
+    found = dd.sensitivity(solution, "goal")
+    assert found.verdict == "agree", found
+    assert found.horizon[0] == pytest.approx(solution.horizon / 2, rel=1e-6)
+    assert found.cost[0] == pytest.approx(2 * (solution.cost - solution.horizon), rel=1e-6)
+    with pytest.raises(InputError, match="a length of their own"):
+        dd.sensitivity(solution, ["block.mass"])
+
+
+@pytest.mark.slow
 def test_a_contact_that_is_about_to_begin_is_a_corner():
     """A ball is driven to 4 um before or behind where it touches another; 0.1 mm away it is none, on either side."""
     model = dd.load_model(MODELS / "two_spheres.sdf", time_step=0.01)

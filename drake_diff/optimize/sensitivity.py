@@ -131,9 +131,6 @@ def sensitivity(solution: Solution, by: Any = "x0", *, certified: bool = True) -
         raise InputError(
             "solution", got='scheme="drake"', expected="one by hermite_simpson, trapezoid, iLQR or shooting"
         )
-    if solution.scheme == "step" and solution.problem.design.has_step:
-        expected = 'one by method="collocation", or without a horizon'
-        raise InputError("solution", got="a plan by discrete steps with a horizon", expected=expected)
     change = _change(solution, by)
     plan = _plan(solution)
     plan_held = _held(plan)
@@ -145,7 +142,9 @@ def sensitivity(solution: Solution, by: Any = "x0", *, certified: bool = True) -
         xs=frozen(dz[program.states_at]),
         us=frozen(dz[program.inputs_at[:knots]]),
         u_final=frozen(dz[program.inputs_at[-1]]),
-        horizon=frozen(np.zeros(dz.shape[1]) if program.horizon_at is None else dz[program.horizon_at]),
+        horizon=frozen(
+            np.zeros(dz.shape[1]) if program.horizon_at is None else program.horizon_unit * dz[program.horizon_at]
+        ),
         cost=frozen(found.cost),
         active=found.active,
         weak=(*found.weak, *_changes_of_contact(plan, plan_held, change, dz)),
@@ -189,9 +188,10 @@ def _plan(solution: Solution) -> _Plan:
         return _Plan(problem, collocated, z, False)
     rounds = solution.options.get("clearance_rounds", ())
     if rounds:  # what it was searched with besides
-        more = swept(problem.kept, problem.time_step, int(rounds[-1][0]))
+        more = swept(problem.kept, solution.time_step, int(rounds[-1][0]))
         problem = replace(problem, constraints=(*problem.constraints, *more))
-    z = StepProgram(problem).pack(np.asarray(solution.xs), np.asarray(solution.us), solution.vector.values)
+    values = problem.design.whole(solution.vector.values, solution.time_step)
+    z = StepProgram(problem).pack(np.asarray(solution.xs), np.asarray(solution.us), values)
     return _Plan(problem, StepProgram, z, True)
 
 
@@ -227,6 +227,10 @@ def _change(solution: Solution, by: Any) -> Change:
         raise InputError("by", got=repr(by), expected=expected)
     if any(isinstance(goal, TerminalSet) for goal in problem.goals):
         raise InputError("by", got=repr(by), expected='"x0": a TerminalSet is one of the model as it is')
+    if problem.horizon is not None and solution.transcribed is None:
+        raise InputError(
+            "by", got=repr(by), expected='"x0" or "goal", as steps of a horizon have a length of their own'
+        )
     chosen = {p.name for p in problem.parameters.parameters} & {p.name for p in vector.parameters}
     if chosen and problem.optimizes_parameters:
         raise InputError("by", got=sorted(chosen), expected="parameters that the plan does not choose itself")
@@ -253,7 +257,7 @@ def _changes_of_contact(plan: _Plan, held: HeldPlan, change: Change, dz: Array) 
 def _modes(problem: Problem, program: KnotProgram, z: Array) -> list[dict[tuple[str, str], str]]:
     """(N,) the modes of the pairs that push each other in each step; one that cannot be taken has a mode of its own."""
     found: list[dict[tuple[str, str], str]] = []
-    with applied(problem.parameters) as model:
+    with applied(StepProgram(problem).vector(z)) as model:
         for x, u in zip(z[program.states_at[:-1]], z[program.inputs_at], strict=True):
             try:
                 advance(model.double, x, u)

@@ -65,10 +65,11 @@ class Change:
 class KnotProgram(Program, Protocol):
     """A program whose variables have names; the knots' states (N+1, nx) and inputs (M, nu) are at these places in it.
 
-    `horizon_at` is where a free horizon is.
+    `horizon_at` is where a free horizon is, in `horizon_unit`s [s].
     """
 
     horizon_at: int | None
+    horizon_unit: float
 
     @property
     def names(self) -> tuple[str, ...]: ...

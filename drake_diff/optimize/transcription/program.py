@@ -100,7 +100,7 @@ class TranscribedProgram:
         self.rates, self.costs = functions.dynamics.values(self.moved), self.rate.values(self.knots)
         self.rate_rows, self.cost_rows = functions.dynamics.jacobian(self.moved), self.rate.jacobian(self.knots)
         self._set_links()
-        self.horizon_at = len(self.lower) - 1 if self.free else None
+        self.horizon_at, self.horizon_unit = len(self.lower) - 1 if self.free else None, 1.0
 
     @property
     def states_at(self) -> Indices:

@@ -18,7 +18,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import GradientError, InputError, SimulationError
-from drake_diff.model.parameters import ParameterCoordinates, ParameterVector, applied
+from drake_diff.model.parameters import ParameterVector, applied
 from drake_diff.optimize.ilqr.expansion import expand_running_cost
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import differentiate_final_cost, final_cost_hessian
@@ -49,14 +49,15 @@ class StepProgram:
         if problem.trajectory_cost is not None:
             raise InputError("trajectory_cost", got="given", expected="none: it joins all states, and no step does")
         self.problem = problem
-        self.horizon_at: int | None = None
         nx, nu, count = problem.nx, problem.nu, problem.num_steps
-        self.coordinates = ParameterCoordinates(problem.parameters) if problem.optimizes_parameters else None
-        width, free = nx + nu, len(problem.parameters.values) if problem.optimizes_parameters else 0
+        self.design = problem.design
+        width, free = nx + nu, self.design.count
         self.states_at = np.arange(count + 1)[:, None] * width + np.arange(nx)
         self.inputs_at = np.arange(count)[:, None] * width + nx + np.arange(nu)
         self.parameters_at = count * width + nx + np.arange(free)
         self.size = count * width + nx + free
+        self.horizon_at: int | None = self.size - 1 if self.design.moves_step else None
+        self.horizon_unit = count * float(self._by_step(self.design.start)[-1]) if self.design.moves_step else 1.0
         single = [(c, np.array([k])) for c in problem.kept for k in problem.knots_of(c, input_at_end=False)]
         several = [(c.rows, at) for c in problem.coupled_steps() for at in c.knots]
         self.paths = [_Path(self, rows, at) for rows, at in (*single, *several)]
@@ -76,24 +77,21 @@ class StepProgram:
         for at, own in ((self.states_at, self.problem.state_names), (self.inputs_at, self.problem.input_names)):
             for k, row in enumerate(at):
                 names[row] = [f"{name} at knot {k}" for name in own]
-        if len(self.parameters_at):
-            names[self.parameters_at] = self.problem.parameters.names
+        names[self.parameters_at] = self.design.coordinates.start.names
         return tuple(names)
 
-    def pack(self, xs: Array, us: Array, parameters: Array | None = None) -> Array:
-        """z (n,) of xs (N+1, nx), us (N, nu) and parameter values (np,), the problem's where None."""
+    def pack(self, xs: Array, us: Array, values: Array | None = None) -> Array:
+        """z (n,) of xs (N+1, nx), us (N, nu) and the values of the problem's `design`, its own where None."""
         z = np.empty(self.size)
         z[self.states_at], z[self.inputs_at] = xs, us
-        if self.coordinates is not None:
-            values = self.problem.parameters.values if parameters is None else parameters
-            z[self.parameters_at] = self.coordinates.from_values(np.array(values))
+        z[self.parameters_at] = self.design.of_values(self.design.vector.values if values is None else values)
         return z
 
     def _bounds(self, side: int) -> Array:
         problem, b = self.problem, self.problem.bounds
         inputs = np.tile((b.u_lower, b.u_upper)[side], (problem.num_steps, 1))
         inputs = inputs if problem.optimizes_controls else np.asarray(problem.us)
-        return self.pack(problem.state_limits()[side], inputs, problem.bounds_of_parameters()[side])
+        return self.pack(problem.state_limits()[side], inputs, (self.design.lower, self.design.upper)[side])
 
     @cached_property
     def sides(self) -> tuple[Array, Array]:
@@ -154,22 +152,30 @@ class StepProgram:
 
     # ------------------------------------------------------------------------------ what it evaluates
 
-    def _read(self, z: Array) -> tuple[Array, Array, ParameterVector]:
-        """xs (N+1, nx), us (N, nu) and the parameters; inputs are taken inside their bounds by rounding.
+    def vector(self, z: Array) -> ParameterVector:
+        """The parameters of the steps at z (n,)."""
+        return self.design.at(z[self.parameters_at])
+
+    def _read(self, z: Array) -> tuple[Array, Array, float]:
+        """xs (N+1, nx), us (N, nu) and the length of a step [s]; inputs are taken inside their bounds by rounding.
 
         A bound is often an actuator's limit, beyond which the plant cuts an input off.
         """
-        b, vector = self.problem.bounds, self.problem.parameters
-        us = z[self.inputs_at]
+        b, us = self.problem.bounds, z[self.inputs_at]
         us = np.where(us >= b.u_upper, np.nextafter(b.u_upper, b.u_lower), us)
         us = np.where(us <= b.u_lower, np.nextafter(b.u_lower, b.u_upper), us)
-        if self.coordinates is not None:
-            vector = vector.at(self.coordinates.to_values(z[self.parameters_at]))
-        return z[self.states_at], us, vector
+        return z[self.states_at], us, self.design.time_step(self.design.values(z[self.parameters_at]))
+
+    def _by_step(self, at: Array) -> Array:
+        """(nc,) the derivative of the length of a step by the coordinates."""
+        by_values = np.zeros(len(self.design.vector.values))
+        if self.design.moves_step:
+            by_values[self.design.own_count] = 1.0
+        return self.design.pull_back(at, by_values)
 
     def _steps(self, z: Array) -> list[StepDerivatives]:
         if self._kept[0] != z.tobytes():
-            xs, us, vector = self._read(z)
+            (xs, us, _), vector = self._read(z), self.vector(z)
             with applied(vector) as model:
                 found = derivatives_along(model, xs[0], us, vector=vector, xs=xs[:-1])
             self.methods |= {d.method for d in found}
@@ -184,33 +190,33 @@ class StepProgram:
             return [self._cost(z), np.concatenate([(xs[1:] - ends).ravel(), *paths])]
 
     def _cost(self, z: Array) -> float:
-        xs, us, vector = self._read(z)
-        return self.problem.objective(xs, us) + self.problem.cost_of_parameters(np.array(vector.values))
+        own = self.design.own(self.design.values(z[self.parameters_at]))
+        return self.problem.objective(*self._read(z)) + self.problem.cost_of_parameters(own)
 
     def _gradient(self, z: Array, _: Array) -> list[Any]:
-        xs, us = self._read(z)[:2]
-        gradient = np.zeros(self.size)
-        by_nodes = expand_running_cost(self.problem, xs, us)[0]
+        xs, us, h = self._read(z)
+        gradient, at, final, paid = np.zeros(self.size), z[self.parameters_at], self.problem.total_final_cost, 0.0
+        by_nodes = expand_running_cost(self.problem, xs, us, h)[0]
         gradient[np.hstack([self.states_at[:-1], self.inputs_at])] = by_nodes
-        if self.problem.total_final_cost is not None:
-            gradient[self.states_at[-1]] += differentiate_final_cost(self.problem.total_final_cost, xs[-1])[1]
-        gradient[self.parameters_at] = self._by_coordinates(z[self.parameters_at])
+        if final is not None:
+            paid, by_end = differentiate_final_cost(final, xs[-1])
+            gradient[self.states_at[-1]] += by_end
+        rates = (self.problem.objective(xs, us, h) - paid) / h  # of a running cost, whose steps are all of one length
+        gradient[self.parameters_at] = self._by_coordinates(at) + rates * self._by_step(at)
         return [self._cost(z), gradient]
 
     def _by_coordinates(self, at: Array) -> Array:
-        """(np,) the gradient of `parameter_cost` by the coordinates."""
-        cost = self.problem.parameter_cost
-        if cost is None or self.coordinates is None:
-            return np.zeros(len(at))
-        return self.coordinates.pull_back(at, differentiate_final_cost(cost, self.coordinates.to_values(at))[1])
+        """(nc,) the gradient of `parameter_cost` by the coordinates."""
+        cost, values = self.problem.parameter_cost, self.design.values(at)
+        by_values = np.zeros(len(values))
+        if cost is not None:
+            by_values[: self.design.own_count] = differentiate_final_cost(cost, np.array(self.design.own(values)))[1]
+        return self.design.pull_back(at, by_values)
 
     def _jacobians(self, z: Array) -> Array:
         """(N, nx, nx + nu + np) of the steps."""
-        found = [np.hstack([d.A, d.B, d.C]) for d in self._steps(z)]
-        if self.coordinates is None:
-            return np.array(found)
-        width, at = self.problem.nx + self.problem.nu, z[self.parameters_at]
-        return np.array([np.hstack([j[:, :width], self.coordinates.pull_back(at, j[:, width:])]) for j in found])
+        at = z[self.parameters_at]
+        return np.array([np.hstack([d.A, d.B, self.design.pull_back(at, d.C)]) for d in self._steps(z)])
 
     def _jacobian(self, z: Array, _: Array) -> list[Any]:
         xs, us = self._read(z)[:2]
@@ -221,18 +227,20 @@ class StepProgram:
         return [self._values(z)[1], self._rows_at.matrix(values)]
 
     def _hessian(self, z: Array, _: Array, sigma: Array, multipliers: Array) -> list[Any]:
-        xs, us = self._read(z)[:2]
+        xs, us, h = self._read(z)
         count, nx, nu = self.problem.num_steps, self.problem.nx, self.problem.nu
         blocks = list(-self._curvature(z, multipliers[: count * nx].reshape(count, nx)))
         blocks.append(np.zeros((nx, nx)))
-        for block, cost in zip(blocks, expand_running_cost(self.problem, xs, us)[1], strict=False):
-            block[: nx + nu, : nx + nu] += sigma[0] * cost
+        at, width = z[self.parameters_at], nx + nu
+        by_step = self._by_step(at)
+        for block, slope, cost in zip(blocks, *expand_running_cost(self.problem, xs, us, h), strict=False):
+            block[:width, :width] += sigma[0] * cost
+            block[:width, width:] += sigma[0] * np.outer(slope / h, by_step)
         if self.problem.total_final_cost is not None:
             blocks[-1] += sigma[0] * final_cost_hessian(self.problem.total_final_cost, xs[-1])
-        at = z[self.parameters_at]
         for j, step in enumerate(np.diag(DIFFERENCE * np.maximum(1.0, np.abs(at)))):
             apart = self._by_coordinates(at + step) - self._by_coordinates(at - step)
-            blocks[0][nx + nu :, nx + nu + j] += sigma[0] * apart / (2 * step[j])
+            blocks[0][width:, width + j] += sigma[0] * apart / (2 * step[j])
         first = count * nx
         for path in self.paths:
             blocks.append(path.curvature(*path.packed(xs, us), multipliers[first : first + path.count]))
