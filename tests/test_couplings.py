@@ -44,6 +44,15 @@ def test_a_forced_oscillator_finds_its_own_steady_state():
     assert solution.constraint_violation < 1e-9
 
 
+def test_a_spring_that_repeats_at_no_effort_does_so_in_its_own_period():
+    spring = dd.Dynamics(lambda x, u: [x[1], u[0] - 4.0 * x[0]], nx=2, nu=1)
+    problem = dd.Problem(spring, x0=[0.5, 0], num_steps=30, horizon=(1, 5), couplings=Periodic(), running_cost=EFFORT)
+    solution = dd.solve(problem)
+    assert solution.success, solution.message
+    assert solution.horizon == pytest.approx(np.pi, abs=2e-5)  # of order 4 in 30 intervals: (0.2)^4 / 180 * pi / 2
+    assert solution.cost < 1e-10
+
+
 @pytest.mark.parametrize("horizon", [1.0, (0.5, 2.0)])
 @pytest.mark.parametrize("scheme", ["hermite_simpson", "trapezoid"])
 def test_its_jacobian_and_hessian_are_those_of_casadi(scheme, horizon):
@@ -119,7 +128,7 @@ def test_what_takes_no_couplings_says_so():
     with pytest.raises(InputError, match=r"couplings"):
         dd.solve(problem, method="collocation", scheme="drake", solver="snopt")
     with pytest.raises(InputError, match=r"couplings"):
-        dd.loop.MPC(problem, horizon=5)
+        dd.loop.MPC(swing(waypoints=None, optimize="controls", initial_state_mask=None), horizon=5)
 
 
 @pytest.mark.parametrize(
