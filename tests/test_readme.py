@@ -94,6 +94,7 @@ SOURCES = {
         "0.3": "tests/test_certificate.py::",
     },
     "docs/mimic.md": {},
+    "docs/mpc.md": {},
     "docs/plan.md": {
         "0": CODES["0"],
         "7": "drake_diff.planning.planner:SMALL",
@@ -163,7 +164,7 @@ def prose(path):
     return NAMES.sub(" ", text)
 
 
-FIGURES = ("trust.md", "zoo.md", "tasks_solved.md")  # pages that a benchmark writes
+FIGURES = ("trust.md", "zoo.md", "tasks_solved.md", "mpc_realtime.md")  # pages that a benchmark writes
 
 
 @each_row("path", [path for path in DOCUMENTS if path.name not in FIGURES], ids=lambda path: path.name)

@@ -274,7 +274,7 @@ def drive(task, problem, plan, seed, clock, iterations, steps_beside):
     u, statuses, cpu, wall, beside = np.array(plan[1][0]), [], [], [], []
     limits = [np.where(np.isfinite(side), side, np.nan) for side in (problem.bounds.u_lower, problem.bounds.u_upper)]
     wide = limits[1] - limits[0]
-    wide = np.where(np.isfinite(wide), wide, np.ptp(plan[1], axis=0))
+    wide, lost = np.where(np.isfinite(wide), wide, np.ptp(plan[1], axis=0)), False
     for k in range(round(task.duration / h)):
         now = k * per_tick
         for at, impulse in pushes:
@@ -290,14 +290,20 @@ def drive(task, problem, plan, seed, clock, iterations, steps_beside):
             beside.append(np.max(np.abs(slow(x, k * h) - new) / wide))
         taken = (cpu if clock == "cpu" else wall)[-1]
         late = min(int(np.ceil(taken / FINE)), per_tick)
-        plant.go_on(u, now + late)
-        if taken <= h:
-            u = new
-        plant.go_on(u, now + per_tick)
+        try:
+            plant.go_on(u, now + late)
+            if taken <= h:
+                u = new
+            plant.go_on(u, now + per_tick)
+        except RuntimeError:  # Drake takes no step more: it is out of control
+            lost = True
+            break
     xs = np.array(plant.xs)
-    excess = {ask.name: float(max(0.0, np.max(ask.excess(xs)))) for ask in task.asks}
-    missed = {ask.name: float(ask.excess(xs[[round(at / FINE)]])[0]) for at, ask in task.passes}
-    ended = float(task.ends.excess(xs[-1:])[0])
+    if lost:
+        excess, missed = ({ask.name: np.inf for ask in asks} for asks in (task.asks, [a for _, a in task.passes]))
+        ended = np.inf
+    else:
+        excess, missed, ended = _judged(task, xs)
     return Run(
         seed=seed,
         excess=excess | missed,
@@ -312,6 +318,13 @@ def drive(task, problem, plan, seed, clock, iterations, steps_beside):
         statuses=statuses,
         beside=np.array(beside),
     )
+
+
+def _judged(task, xs):
+    """(excess over each limit, distance from each gate, distance from the goal)"""
+    excess = {ask.name: float(max(0.0, np.max(ask.excess(xs)))) for ask in task.asks}
+    missed = {ask.name: float(ask.excess(xs[[round(at / FINE)]])[0]) for at, ask in task.passes}
+    return excess, missed, float(task.ends.excess(xs[-1:])[0])
 
 
 @cache
