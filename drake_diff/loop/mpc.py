@@ -22,7 +22,7 @@ from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import LQR
 from drake_diff.optimize.problem.cost import CostToGo, QuadraticCost
 from drake_diff.optimize.problem.goals import LAST
-from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.realtime.rolling import Rolling, Staying
 from drake_diff.optimize.realtime.step import Motion, Step, take_step
 from drake_diff.optimize.replay import Plan, held, regulator_weights
@@ -30,6 +30,7 @@ from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
 
 PLAN_STEPS = 300  # of the first plan, made once
+DAMPED = 1e-3  # of the cost of a step, for a move by a whole range: the least damping
 PLENTY, NEAR = 100, 1e-6  # after so many, with limits that hold, a plan will do of which a step promises no more
 FOLLOWED = "the last plan is followed further"
 FIXED_POINT_STEPS, AT_REST = 20, 1e-10
@@ -246,14 +247,22 @@ class MPC:
         xs, us = np.array(xs), np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
         xs[0] = problem.x0
         motion, ranges = Motion(xs, us, stretch.ends(xs[:-1], us)), problem.ranges(xs)
+        efforts = np.maximum(np.ptp(us, axis=0), SMALLEST_RANGE)
+        unit = abs(stretch.cost(xs, us)) / problem.num_steps / np.concatenate([ranges, efforts]) ** 2
+        damping = 0.0
         for i in range(PLAN_STEPS):
-            found = take_step(stretch, motion)
+            found = take_step(stretch, motion, damping * unit if damping else None)
             if isinstance(found, Refusal):
                 raise InputError("plan", got=found.reason, expected="a plan near which a minimum is found")
             step, motion = found, found.motion
             is_near = i >= PLENTY and not step.whole and step.promised <= NEAR * (1 + abs(step.merit))
-            if step.is_reached or not step.size or is_near:
+            if damping <= DAMPED and (step.is_reached or not step.size or is_near):
                 break
+            less = damping / 8 if damping > DAMPED else 0.0
+            damping = max(8 * damping, DAMPED) if step.size < 1.0 else less
+        if damping:  # gains and costs-to-go are those of the problem itself
+            found = take_step(stretch, motion)
+            step = step if isinstance(found, Refusal) else found
         apart = float(np.max(np.abs(motion.gaps) / ranges))
         if apart > GAP or step.given_way is not None:
             got = f"steps that are {apart:.2g} of a range off" if apart > GAP else self._told(step, 0)

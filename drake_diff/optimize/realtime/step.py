@@ -177,12 +177,16 @@ class Step:
         return found
 
 
-def take_step(stretch: Stretch, motion: Motion) -> Step | Refusal:
+def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) -> Step | Refusal:
     """One step from `motion`, whose first state is given; a Refusal where the quadratic program is not solved.
+
+    `damping` (nx + nu,) is added to the curvature of each knot, for shorter steps (Levenberg and Marquardt).
 
     Raises GradientError or SimulationError where a derivative is refused.
     """
     expansion = expand(stretch, motion)
+    if damping is not None:
+        expansion = replace(expansion, quadratic=_damped(expansion.quadratic, damping))
     free = _free_moves(expansion.quadratic)
     found = free if free is not None and _is_kept(stretch, expansion, free) else None
     whole = found is not None
@@ -224,6 +228,11 @@ def take_step(stretch: Stretch, motion: Motion) -> Step | Refusal:
             step = Step(stretch, tried, size, promised, after, expansion, found, whole)
             return replace(step, is_doubtful=_is_doubtful(step, motion))
     return Step(stretch, motion, 0.0, promised, before, expansion, found, whole, is_doubtful=True)
+
+
+def _damped(quadratic: LinearQuadratic, damping: Array) -> LinearQuadratic:
+    final = quadratic.final_hessian + np.diag(damping[: quadratic.num_states])
+    return replace(quadratic, hessians=quadratic.hessians + np.diag(damping), final_hessian=final)
 
 
 def _is_doubtful(step: Step, before: Motion) -> bool:
