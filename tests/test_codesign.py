@@ -488,3 +488,24 @@ def test_a_plans_derivative_with_a_parameter_that_follows_it():
     assert found.cost[0] == pytest.approx(24 * mass**2 * way / time**3, rel=1e-5)  # d cost / d way at the best mass
     with pytest.raises(UnknownNameError, match="goal, x0"):
         dd.sensitivity(solution, ("mass",))
+
+
+@each_row(
+    "name, parameters",
+    [
+        ("pendulum.urdf", {"model.gravity": [0, 0, -1.6]}),
+        ("mass_spring_damper.sdf", {"slide.spring_stiffness": 10.0, "block.mass": 3.0}),
+        ("double_pendulum.urdf", {"elbow.offset": [0, 0, -0.4], "lower.mass": 0.2}),
+    ],
+)
+def test_what_is_linearized_has_the_parameters_that_are_applied(name, parameters):
+    """By AutoDiffXd too, whose plant has a gravity and springs of its own: feedback about a plan rests on it."""
+    model = named(name)
+    xs, us = np.full((2, model.nx), 0.3), np.full((2, model.nu), 0.2)
+    wanted = dd.differentiate_step(model, xs[0], us[0], parameters=parameters, method="finite_difference").A
+    for method in ("autodiff", "auto"):
+        with applied(select(model, parameters)) as set_model:
+            found = dd.linearize(set_model, xs, us, method)[0][0]
+        assert found == pytest.approx(wanted, abs=1e-8)
+    own = dd.linearize(model, xs, us, "autodiff")[0][0]
+    assert own == pytest.approx(dd.differentiate_step(model, xs[0], us[0]).A, abs=1e-12)

@@ -106,6 +106,7 @@ class Model(ShowsItsRepr):
         self.held = 0 if coupling is None else len(coupling.mimics)  # constraints that the reduced state keeps to
         # What parameters in its contexts are, for the time being, not the model's own: see `parameters.applied`.
         self.other_quantities: frozenset[str] = frozenset()
+        self.applied: Any = None  # the ParameterVector that is applied, if one is
         self.path = path_to_the_plant(diagram)
         self.plant: MultibodyPlant = follow(diagram, self.path)
         _check_plant(self)

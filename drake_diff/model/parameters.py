@@ -261,9 +261,10 @@ def applied(vector: ParameterVector) -> Iterator[Model]:
     try:
         vector.write(model.double, vector.values)
         model.other_quantities = frozenset(p.kind.quantity for p in vector.parameters if p.name != TIME_STEP)
+        model.applied = vector
         yield model
     finally:
-        model.other_quantities = frozenset()
+        model.other_quantities, model.applied = frozenset(), None
         vector.restore(model.double)
         if "autodiff" in vars(model):  # made on the way, or before
             vector.restore(model.autodiff)
@@ -273,6 +274,8 @@ def write_autodiff(vector: ParameterVector, model: Model, variables: Any) -> Non
     """Set the AutoDiffXd twin of a model that the vector is applied to: `variables` (np,) AutoDiffXd."""
     if model.has_other_parameters:
         model.autodiff.root_context.SetTimeStateAndParametersFrom(model.double.root_context)
+        if model.applied is not None and len(model.applied.values) > len(vector.values):
+            model.applied.write(model.autodiff, model.applied.values)  # what is no part of a context, such as gravity
         vector.write(model.autodiff, variables)
 
 

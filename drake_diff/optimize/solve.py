@@ -612,7 +612,7 @@ def choose_method(problem: Problem) -> tuple[str, str]:
     if not smooth:
         return "ilqr", "the model has constraints or PD control, which collocation leaves out"
     if problem.optimizes_parameters:
-        return "collocation", f"the model is smooth, and {', '.join(problem.parameters.names[:3])} are variables of it"
+        return "collocation", f"the model is smooth, with {', '.join(problem.parameters.names[:3])} among its variables"
     return "collocation", "the model is smooth"
 
 
