@@ -90,3 +90,7 @@ class ArtifactError(DrakeDiffError):
 
 class ModelWarning(UserWarning):
     """Something of a model file was left out; the model is used all the same."""
+
+
+class GradientWarning(UserWarning):
+    """A derivative at a point that says nothing of what is a little away from it."""

@@ -1,14 +1,15 @@
 """The motion in continuous time that a model's discrete steps stand for, integrated with error control.
 
-    M(q) dv/dt = B u + forces(q, v) - C(q, v) v + sum over contacts J' (f n - mu f v_t / sqrt(|v_t|^2 + v_s^2))
+    M(q) dv/dt = B u + forces(q, v) - C(q, v) v + sum over contacts J' (f n - mu step5(|v_t| / v_s) f v_t / |v_t|)
 
 with the normal force of the model's own contact approximation at depth x and its rate x',
 
     f = k (x + tau x')+ of `sap`,    f = k x (1 + d x')+ of `similar` and `lagged`,
 
-and Drake's rules for the two sides of a contact. It is written out from these formulas: of Drake it takes the mass
-matrix, the forces without contact and where geometries overlap, and nothing of a discrete step. The force of `sap`
-jumps by k tau x' where two geometries touch; error control makes the steps there as short as they have to be.
+step5(r) = r^3 (10 - 15 r + 6 r^2) up to 1, and Drake's rules for the two sides of a contact. It is written out from
+these formulas: of Drake it takes the mass matrix, the forces without contact and where geometries overlap, and nothing
+of a discrete step. The force of `sap` jumps by k tau x' where two geometries touch; error control makes the steps there
+as short as they have to be.
 """
 
 from collections.abc import Callable
@@ -26,8 +27,8 @@ from drake_diff.model.step import set_state
 
 TOLERANCE = 1e-9  # of each step, relative to max(1, |x|)
 EVALUATIONS = 40_000  # of the equations of motion at most, about a second
-# v_s [m/s]: below it friction is a damper, above it Coulomb's. In Drake's steps it is 1e-4 or less, which no explicit
-# method can follow while anything sticks.
+# v_s [m/s]: below it friction is a damper, above it Coulomb's, as in Drake's continuous plants. In Drake's steps it is
+# 1e-4 or less, which no explicit method can follow while anything sticks.
 SLIP = 1e-3
 SAFETY, LEAST, MOST = 0.9, 0.1, 5.0  # of the factor by which a step's length changes
 # Dormand and Prince, "A family of embedded Runge-Kutta formulae", 1980: stages, and fifth less fourth order.
@@ -124,7 +125,9 @@ class ContinuousMotion:
             rate = -float(normal @ relative)
             push = k * (pair.depth + tau * rate) if self.is_sap else k * pair.depth * max(0.0, 1 + d * rate)
             slip = relative + rate * normal
-            drag = mu / np.sqrt(slip @ slip + SLIP**2)
+            speed = float(np.linalg.norm(slip))
+            r = min(speed / SLIP, 1.0)
+            drag = mu * r**3 * (10 - 15 * r + 6 * r * r) / speed if speed > 0 else 0.0
             total += max(0.0, push) * (jacobian.T @ (normal - drag * slip))
         return total
 

@@ -1,6 +1,7 @@
 """The gradient of a scalar back through the steps of a rollout, with its norm at every step."""
 
 import inspect
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,10 +14,11 @@ from drake_diff._base.autodiff import gradient_of
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.derivatives.sources import check_method
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import GradientWarning, InputError, SimulationError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameters, ParameterVector, applied, select
 from drake_diff.model.step import advance
+from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import active_parameters, differentiate_policy, policy_parameters
 from drake_diff.motion.rollout import Policy, check_inputs
 
@@ -24,6 +26,9 @@ Loss = Callable[..., Any]
 # A policy's derivatives (nu, nx) by the state and (nu, n) by those of its parameters that act, and which they are.
 Feedback = tuple[Array, Array, slice]
 EXPLODED, VANISHED = 1e6, 1e-6
+CONTINUOUS = "continuous"  # the method that takes no steps of Drake's
+# Widths, of a state's unit, and by what part of the derivative the slope of a loss that is but curved may differ there.
+WIDTHS, SAME_SLOPE = (1e-2, 1e-3, 1e-4), (np.inf, 0.1, 0.01)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +124,11 @@ def differentiate_rollout(
         policy: u = policy(x, t), written likewise (see `drake_diff.motion.policy`), in place of `us`.
         parameters: Names of the model's parameters to differentiate by, or a mapping of the names to values.
         num_steps: N, where `us` does not say it.
-        method: Where the step Jacobians come from, see `differentiate_step`.
+        method: Where the step Jacobians come from, see `differentiate_step`; or "continuous": the motion in continuous
+            time that the steps stand for, contact included, integrated with error control, and its own derivative by
+            the state, the inputs, the policy and contact's parameters. A `GradientWarning` says where the loss does not
+            follow it along its own direction, to 10 % over +-1e-3 and to 1 % over +-1e-4: after many bounces, or one
+            that barely touches, it is that of a point alone.
 
     Returns:
         The loss; `by_x0` (nx,), `by_us` (N, nu), `by_parameters` (np,), `by_policy` (n,); the motion, and the norm of
@@ -136,14 +145,17 @@ def differentiate_rollout(
         >>> g.by_x0.shape, g.by_us.shape, g.loss > 0.09
         ((4,), (10, 1), True)
     """
-    check_method(method)
+    if method != CONTINUOUS:
+        check_method(method)
     x0 = finite_array("x0", x0, (model.nx,))
     if us is not None and policy is not None:
         raise InputError("differentiate_rollout", got="us and policy", expected="one of them")
     vector = select(model, parameters)
     feedback: list[Feedback] = []
     with applied(vector) as set_model:
-        if policy is None:
+        if method == CONTINUOUS:
+            linearization, feedback, inputs = _along_the_flow(set_model, x0, us, policy, num_steps, vector)
+        elif policy is None:
             inputs = check_inputs(model, us, num_steps)
             linearization = derivatives_along(set_model, x0, inputs, vector=vector, method=method)
         else:
@@ -152,6 +164,8 @@ def differentiate_rollout(
     xs = np.vstack([x0, [d.x_next for d in linearization]])
     value, by_xs, by_us = differentiate_loss(loss, xs, inputs)
     totals = accumulate(linearization, by_xs, by_us, feedback, len(policy_parameters(policy)))
+    if method == CONTINUOUS:
+        _warn_where_it_is_no_slope(model, x0, inputs, policy, loss, vector, totals.states[0])
     closed = [d.A for d in linearization]
     if feedback:
         closed = [d.A + d.B @ by_x for d, (by_x, _, _) in zip(linearization, feedback, strict=True)]
@@ -184,6 +198,62 @@ def _close_the_loop(
         feedback.append((by_x, by_parameters[:, active].copy(), active))
         x = advance(model.double, x, inputs[k])
     return derivatives_along(model, x0, inputs, vector=vector, method=method, xs=xs), feedback, inputs
+
+
+def _along_the_flow(
+    model: Model, x0: Array, us: ArrayLike | None, policy: Policy | None, num_steps: int | None, vector: ParameterVector
+) -> tuple[list[StepDerivatives], list[Feedback], Array]:
+    """The motion in continuous time first, then the derivatives of its intervals."""
+    from drake_diff.motion.flow.steps import FlowSteps  # loads CasADi
+
+    steps, feedback = FlowSteps(model, vector), list[Feedback]()
+    if policy is None:
+        inputs = check_inputs(model, us, num_steps)
+        _, _, flow = steps.roll(x0, lambda x, k: inputs[k], len(inputs))
+        return steps.derivatives(flow), feedback, inputs
+
+    def choose(x: Array, k: int) -> Array:
+        t = k * model.time_step
+        u, by_x, by_parameters = differentiate_policy(policy, x, t, model.nu)
+        active = active_parameters(policy, t)
+        feedback.append((by_x, by_parameters[:, active].copy(), active))
+        return u
+
+    _, inputs, flow = steps.roll(x0, choose, positive_int("num_steps", num_steps))
+    return steps.derivatives(flow), feedback, inputs
+
+
+def _warn_where_it_is_no_slope(
+    model: Model, x0: Array, us: Array, policy: Policy | None, loss: Loss, vector: ParameterVector, by_x0: Array
+) -> None:
+    """Compare the derivative by the first state with slopes of the loss over `WIDTHS`, along its own direction."""
+    from drake_diff.motion.flow.steps import FlowSteps  # loads CasADi
+
+    space = tangent_space(model)
+    by_motion = space.derivative_of_plus(x0).T @ by_x0
+    size = float(np.linalg.norm(by_motion))
+    if not size > 0:
+        return
+    with applied(vector) as set_model:
+        steps = FlowSteps(set_model, vector)
+
+        def choose(x: Array, k: int) -> Array:
+            return us[k] if policy is None else np.asarray(policy(x, k * model.time_step), dtype=float)
+
+        def at(width: float) -> float:
+            xs, inputs, _ = steps.roll(space.plus(x0, width / size * by_motion), choose, len(us))
+            return evaluate_loss(loss, xs, inputs)
+
+        try:
+            slopes = [(at(w) - at(-w)) / (2 * w) for w in WIDTHS]
+        except SimulationError as error:
+            told = f"a little away from the first state there is no motion: {error}"
+        else:
+            if all(abs(slope - size) <= part * size for slope, part in zip(slopes, SAME_SLOPE, strict=True)):
+                return
+            over = ", ".join(f"{slope:.5g} over +-{w:g}" for w, slope in zip(WIDTHS, slopes, strict=True))
+            told = f"along its own direction the derivative is {size:.5g}, and the loss rises by {over}"
+    warnings.warn(f"the derivative by the first state is that of a point alone: {told}", GradientWarning, stacklevel=3)
 
 
 @dataclass(frozen=True, eq=False)

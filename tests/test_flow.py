@@ -1,0 +1,279 @@
+"""The motion in continuous time through contact, and its derivative: closed forms, and Drake's continuous plant."""
+
+import warnings
+
+import numpy as np
+import pytest
+from helpers.bounces import Bounce
+from helpers.models import Plant, contact_properties
+from helpers.robots import example_robot, state_in_contact
+from pydrake.geometry import Box, HalfSpace, Sphere
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
+from pydrake.systems.framework import DiagramBuilder
+
+import drake_diff as dd
+from drake_diff.exceptions import GradientWarning, ModelError, SimulationError
+from drake_diff.model.equations import EquationsOfMotion
+from drake_diff.motion.continuous import ContinuousMotion
+from drake_diff.motion.flow.integrate import pushing_of
+from drake_diff.motion.flow.plant import flow_plant, material_of, numbers_of
+
+
+def ball_on_rails(*, stiffness, dissipation=0.0, friction=0.0, gravity=0.0, approximation="lagged", relaxation=0.0):
+    """1 kg, radius 0.1 m, on rails along x and z above the ground; `stiffness` is that of the pair."""
+    plant = Plant(0.01, approximation)
+    properties = contact_properties(2 * stiffness, dissipation, friction, relaxation / 2)
+    plant.ball("ball", 1.0, 0.1, properties, "x", "z")
+    plant.ground(properties)
+    plant.plant.mutable_gravity_field().set_gravity_vector([0, 0, -gravity])
+    return plant.model()
+
+
+def height(x):
+    return x[1]
+
+
+@pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e6])
+def test_an_elastic_bounce_has_the_slopes_of_its_closed_form(stiffness):
+    """Half a period pi / omega in contact: the end is at r + V (T - pi / omega) - (y0 - r)."""
+    model, speed, duration = ball_on_rails(stiffness=stiffness), 2.0, 1.0
+    x0 = [0, 1.0, 0, -speed]
+    motion = dd.differentiate_rollout(
+        model, x0, None, height, num_steps=100, method="continuous", parameters=("world.stiffness",)
+    )
+    touching = np.pi / np.sqrt(stiffness)
+    assert motion.loss == pytest.approx(0.1 + speed * (duration - touching) - 0.9, abs=1e-7)
+    assert motion.by_x0[1] == pytest.approx(-1.0, abs=1e-6)
+    assert motion.by_x0[3] == pytest.approx(-(duration - touching), abs=1e-6)
+    by_pair = speed * touching / (2 * stiffness)  # and the pair's stiffness by the ground's own is a fourth
+    assert motion.by_parameters[0] == pytest.approx(by_pair / 4, rel=1e-4)
+    assert set(motion.methods) == {"continuous"}
+
+
+@pytest.mark.parametrize("relaxation", [0.001, 0.012, 0.03])
+def test_a_bounce_whose_force_jumps_at_touch_has_the_slopes_of_its_closed_form(relaxation):
+    """k (x + tau x')+ of `sap`: without gravity the way out is slower by a factor, whatever the speed.
+
+    From x'' = -omega^2 (x + tau x'), x(0) = 0, x'(0) = V the force ends at t_c with x_c = V a, x'_c = -V e, and the
+    ball leaves at that speed: y = r - V a + V e (T - t_0 - t_c), t_0 = (y0 - r) / V.
+    """
+    k, speed, duration = 1e4, 2.0, 1.0
+    model = ball_on_rails(stiffness=k, approximation="sap", relaxation=relaxation)
+    omega, zeta = np.sqrt(k), relaxation * np.sqrt(k) / 2
+    times = np.linspace(0, 0.1, 2_000_001)
+    if zeta < 1:
+        damped = omega * np.sqrt(1 - zeta**2)
+        x = np.exp(-zeta * omega * times) * np.sin(damped * times) / damped
+    else:
+        growth = omega * np.sqrt(zeta**2 - 1)
+        x = np.exp(-zeta * omega * times) * np.sinh(growth * times) / growth
+    rate = np.gradient(x, times, edge_order=2)
+    end = int(np.argmax((x + relaxation * rate < 0) & (times > 1e-5)))
+    a, e, touching = x[end], -rate[end], times[end]
+    motion = dd.differentiate_rollout(model, [0, 1.0, 0, -speed], None, height, num_steps=100, method="continuous")
+    t_0 = 0.9 / speed
+    assert motion.loss == pytest.approx(0.1 - speed * a + speed * e * (duration - t_0 - touching), abs=1e-6)
+    assert motion.by_x0[1] == pytest.approx(-e, abs=1e-5)
+    assert motion.by_x0[3] == pytest.approx(-(-a + e * (duration - touching)), abs=1e-5)  # by the velocity, down
+
+
+def test_a_slide_stops_where_coulomb_says():
+    """v0^2 / (2 mu g), and its slopes v0 / (mu g) and -v0^2 / (2 mu^2 g), but for the stiction speed of 1e-3 m/s."""
+    mu, g, v0 = 0.5, 9.81, 1.0
+    model = ball_on_rails(stiffness=1e4, dissipation=10, friction=mu, gravity=g)
+    rest = [0, 0.1 - g / 1e4, v0, 0]
+    names = ("ball.friction", "world.friction")
+    motion = dd.differentiate_rollout(
+        model, rest, None, lambda x: x[0], num_steps=60, method="continuous", parameters=names
+    )
+    assert motion.loss == pytest.approx(v0**2 / (2 * mu * g), rel=2e-3)
+    assert motion.by_x0[2] == pytest.approx(v0 / (mu * g), rel=2e-3)
+    assert motion.by_parameters.sum() == pytest.approx(-(v0**2) / (2 * mu**2 * g), rel=2e-3)
+
+
+def cube(time_step, *, gravity, side=0.1, mass=0.1, radius=1e-3, stiffness=2e3, dissipation=0.5, friction=0.5):
+    """(plant, diagram) of a cube with a sphere in each corner, over the ground."""
+    builder = DiagramBuilder()
+    config = MultibodyPlantConfig(
+        time_step=time_step,
+        contact_model="point",
+        stiction_tolerance=1e-3,
+        discrete_contact_approximation="lagged",
+        use_sampled_output_ports=False,
+    )
+    plant, _ = AddMultibodyPlant(config, builder)
+    properties = contact_properties(2 * stiffness, dissipation, friction)
+    body = plant.AddRigidBody("cube", SpatialInertia.SolidBoxWithMass(mass, side, side, side))
+    for i in range(8):
+        corner = (side / 2 - radius) * (2 * np.array([i & 1, i >> 1 & 1, i >> 2]) - 1)
+        plant.RegisterCollisionGeometry(body, RigidTransform(corner), Sphere(radius), f"corner_{i}", properties)
+    plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", properties)
+    plant.mutable_gravity_field().set_gravity_vector([0, 0, -gravity])
+    plant.Finalize()
+    return plant, builder.Build()
+
+
+TOSSED = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0, 0, 0, 0, 0.2, 0, 0, 0, 0, -0.1, -2.0])
+
+
+def test_the_rates_are_those_of_drakes_continuous_plant():
+    """At 40 states in contact, some of which slip by less than the stiction speed."""
+    model = dd.model_from_diagram(cube(1e-3, gravity=9.81)[1])
+    plant, diagram = cube(0.0, gravity=9.81)
+    context = plant.GetMyContextFromRoot(diagram.CreateDefaultContext())
+    ours, random, most = flow_plant(model), np.random.default_rng(0), 0
+    materials = numbers_of(ours, material_of(ours))
+    for k in range(40):
+        turn = random.standard_normal(4)
+        speed = 10.0 ** random.uniform(-5, 0.5) if k % 2 else 1.0
+        v = speed * random.standard_normal(6)
+        x = np.concatenate([turn / np.linalg.norm(turn), [0.3, -0.2, random.uniform(0.03, 0.06)], v])
+        modes = (np.asarray(ours.switches(x, [], materials)).ravel() > 0).astype(float)
+        pushing = pushing_of(modes)
+        most = max(most, len(pushing))
+        found = np.asarray(ours.part(pushing).rates(x, [], materials)).ravel()
+        plant.SetPositionsAndVelocities(context, x)
+        wanted = plant.EvalTimeDerivatives(context).CopyToVector()
+        assert np.max(np.abs(found - wanted)) <= 1e-12 * max(1.0, np.max(np.abs(wanted)))
+    assert most >= 2
+
+
+@pytest.mark.parametrize("name", ["bolt.urdf", "solo12.urdf", "go2.urdf"])
+def test_the_rates_of_robots_are_those_of_drakes_terms(name):
+    """Without friction, whose law in continuous time the other form has otherwise."""
+    model = example_robot(name, feet=True, friction=0.0)
+    random = np.random.default_rng(1)
+    ours, other = flow_plant(model), ContinuousMotion(model)
+    x = state_in_contact(model, random)
+    ours.check(x)
+    materials, u = numbers_of(ours, material_of(ours)), 0.1 * random.standard_normal(model.nu)
+    model.double.set_input(u)
+    wanted = other.rates(model.actuation @ u, x)
+    modes = (np.asarray(ours.switches(x, u, materials)).ravel() > 0).astype(float)
+    found = np.asarray(ours.part(pushing_of(modes)).rates(x, u, materials)).ravel()
+    assert pushing_of(modes)
+    assert np.max(np.abs(found - wanted)) <= 1e-9 * np.max(np.abs(wanted))
+
+
+def test_a_tossed_cube_has_the_slope_of_drakes_error_controlled_motion():
+    """Runge-Kutta 3 of accuracy 1e-8 and central differences of three widths, which agree."""
+    plant, diagram = cube(0.0, gravity=2.0)
+    simulator = Simulator(diagram)
+    config = SimulatorConfig(
+        integration_scheme="runge_kutta3", max_step_size=0.01, accuracy=1e-8, use_error_control=True
+    )
+    ApplySimulatorConfig(config, simulator)
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+
+    def end(vz):
+        simulator.get_mutable_context().SetTime(0.0)
+        plant.SetPositionsAndVelocities(context, np.append(TOSSED[:-1], vz))
+        simulator.Initialize()
+        simulator.AdvanceTo(1.0)
+        return plant.GetPositions(context)[5]
+
+    slopes = [(end(-2.0 + w) - end(-2.0 - w)) / (2 * w) for w in (1e-2, 1e-3, 1e-4)]
+    assert np.ptp(slopes) < 1e-3 * abs(slopes[0])
+    model = dd.model_from_diagram(cube(0.01, gravity=2.0)[1])
+    motion = dd.differentiate_rollout(model, TOSSED, None, lambda x: x[5], num_steps=100, method="continuous")
+    assert motion.loss == pytest.approx(end(-2.0), abs=1e-7)
+    assert motion.by_x0[12] == pytest.approx(slopes[1], rel=1e-3)
+
+
+def test_a_policy_is_differentiated_along_the_flow():
+    """A motor on the ball's rail that pushes it up by a gain: differences of the flow itself, at its tolerance."""
+    plant = Plant(0.01, "lagged")
+    properties = contact_properties(2e4, 0.5, 0.3)
+    plant.ball("ball", 1.0, 0.1, properties, "x", "z")
+    plant.ground(properties)
+    plant.plant.AddJointActuator("lift", plant.plant.GetJointByName("ball_z"))
+    model, gain = plant.model(), np.array([0.0, 0.0, 0.0, 0.3])
+
+    def along(x0):
+        return dd.differentiate_rollout(
+            model, x0, None, height, policy=lambda x, t: [gain @ x], num_steps=80, method="continuous"
+        )
+
+    x0, w = np.array([0, 0.6, 0.5, -1.0]), 1e-4
+    motion = along(x0)
+    slope = (along(x0 + w * np.eye(4)[3]).loss - along(x0 - w * np.eye(4)[3]).loss) / (2 * w)
+    assert motion.by_x0[3] == pytest.approx(slope, rel=1e-4)
+
+
+def test_what_has_no_continuous_motion_is_refused_by_name():
+    model = ball_on_rails(stiffness=1e4)
+    with pytest.raises(ModelError, match=r'method="continuous" has no derivative by ball\.mass'):
+        dd.differentiate_rollout(
+            model, [0, 1, 0, -1], None, height, num_steps=5, method="continuous", parameters=("ball.mass",)
+        )
+    cart_pole = dd.load_model("models/cart_pole.urdf", time_step=0.01)
+    with pytest.raises(SimulationError, match="slide_x reaches a joint limit"):
+        dd.differentiate_rollout(cart_pole, [1.99, 0, 5, 0], np.zeros((20, 1)), lambda x: x[0], method="continuous")
+
+
+def test_a_smooth_motion_has_the_slopes_of_its_closed_form():
+    """A mass on a spring, exp(A t) of its linear equations."""
+    model = dd.load_model("models/mass_spring_damper.sdf", time_step=0.01)
+    x0 = np.array([0.3, -0.2])
+    motion = dd.differentiate_rollout(model, x0, np.zeros((100, model.nu)), lambda x: x[0], method="continuous")
+    equations, at_zero = EquationsOfMotion(model), np.zeros(2 + model.nu)
+    A, b = equations.jacobian(at_zero)[:, :2], equations.values(at_zero[None])[0]
+    values, vectors = np.linalg.eig(A)
+    flow = np.real(vectors @ np.diag(np.exp(values)) @ np.linalg.inv(vectors))
+    end = flow @ x0 + np.linalg.solve(A, (flow - np.eye(2)) @ b)
+    assert motion.loss == pytest.approx(end[0], abs=1e-8)
+    assert np.allclose(motion.by_x0, flow[0], atol=1e-7)
+
+
+def test_shapes_that_touch_without_a_law_end_the_flow():
+    """Two boxes: a quadruped's shapes are known by its feet alone, and its trunk on the ground is refused by name."""
+    plant = Plant(0.01, "lagged")
+    properties = contact_properties(2e4, 0.5, 0.3)
+    body = plant.plant.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(1, 0.2, 0.2, 0.2))
+    plant.shape(body, Box(0.2, 0.2, 0.2), properties)
+    plant.ground(properties)
+    model = plant.model()
+    falling = np.array(model.default_state)
+    falling[6] = 0.3
+    with pytest.raises(SimulationError, match=r"ground.* touch, and are no sphere"):
+        dd.differentiate_rollout(model, falling, None, lambda x: x[6], num_steps=100, method="continuous")
+    soon = dd.differentiate_rollout(model, falling, None, lambda x: x[6], num_steps=10, method="continuous")
+    assert soon.by_x0[12] == pytest.approx(0.1, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_a_derivative_of_a_point_alone_is_told():
+    """The same toss under Earth's gravity tumbles many times; a little away it ends elsewhere."""
+    tumbling = dd.model_from_diagram(cube(0.01, gravity=9.81)[1])
+    with pytest.warns(GradientWarning, match="along its own direction the derivative is"):
+        dd.differentiate_rollout(tumbling, TOSSED, None, lambda x: x[5], num_steps=100, method="continuous")
+    model = ball_on_rails(stiffness=1e4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", GradientWarning)
+        dd.differentiate_rollout(model, [0, 1.0, 0, -2.0], None, height, num_steps=100, method="continuous")
+    grazing = [0, 0.1 + 1e-3, 1.0, -1e-3]  # it touches just before the end, or not at all
+    with pytest.warns(GradientWarning):
+        dd.differentiate_rollout(model, grazing, None, lambda x: x[3], num_steps=101, method="continuous")
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_random_bounces_have_the_slopes_of_another_integration(tmp_path, seed):
+    """Both laws, by seed: up to a dozen bounces, piece by piece between events, and its differences."""
+    random = np.random.default_rng(seed)
+    approximation = ("sap", "lagged")[seed % 2]
+    ball = Bounce(
+        10 ** random.uniform(3, 5),
+        relaxation_time=random.uniform(0, 5e-3) if approximation == "sap" else 0.0,
+        dissipation=random.uniform(0, 0.8) if approximation == "lagged" else 0.0,
+        mass=random.uniform(0.3, 3),
+    )
+    start, duration = np.array([random.uniform(0.2, 0.6), random.uniform(-1.5, 1.0)]), 0.6
+    model, w = ball.model(tmp_path / "ball.sdf", approximation, 0.01), 1e-5
+    motion = dd.differentiate_rollout(model, start, np.zeros((60, 0)), lambda x: x[0], method="continuous")
+    assert motion.loss == pytest.approx(ball.end(approximation, start, duration)[0], abs=1e-6)
+    for i, unit in enumerate(np.eye(2)):
+        ends = [ball.end(approximation, start + s * w * unit, duration)[0] for s in (1, -1)]
+        assert motion.by_x0[i] == pytest.approx((ends[0] - ends[1]) / (2 * w), rel=1e-3, abs=1e-4)
