@@ -483,3 +483,25 @@ def test_what_does_not_agree_at_a_joint_limit_says_so(tmp_path):
     assert "joint limits act: hinge_q is 0, at its limits [0, 2]" in found.told
     inside = dd.certify(model, [1.0, 0.0], []).require()
     assert "limits" not in inside.told
+
+
+def test_terms_that_cancel_do_not_jump():
+    """f = a z0 - a z1 where z0 and z1 are nearly the same: what their last places round to is a staircase of 1e-13."""
+    random = np.random.default_rng(0)
+    for _ in range(200):
+        a, z = random.uniform(-100, 100), random.uniform(-10, 10)
+        x = np.array([z, z + random.choice([0, 1e-9, 1e-7, 1e-5])])
+        certificate = dd.certificates.certify_jacobian(
+            lambda z, a=a: np.array([a * (z[0] - z[1])]), x, lambda z, a=a: [[a, -a]]
+        )
+        assert certificate.verdict == "agree", certificate
+
+
+def test_a_derivative_that_jumps_where_terms_cancel_is_caught():
+    """The same with steps of 1e-5, which are no rounding."""
+    x = np.array([4.3, 4.3 + 1e-7])
+
+    def steps(z):
+        return np.array([np.round(65 * (z[0] - z[1]), 5)])
+
+    assert dd.certificates.certify_jacobian(steps, x, [[65.0, -65.0]]).verdict == "discontinuous"

@@ -164,3 +164,23 @@ def test_a_plan_whose_derivative_is_wrong_exactly_at_the_limit_is_not_verified(w
     solution = dd.solve(problem, method="ilqr")
     assert not solution.success
     assert "disagree" in {certificate.verdict for certificate in solution.certificates}
+
+
+def test_a_bead_takes_the_cycloid_though_its_first_time_is_far_off():
+    """r (a - sin a) = 2.28, r (1 - cos a) = 2.017 in a sqrt(r / g); a search once ended in a way of twice the time."""
+    a = 2.5
+    for _ in range(50):  # Newton on the quotient of both
+        value, slope = (2.28 * (1 - math.cos(a)) - 2.017 * (a - math.sin(a)) for a in (a, a + 1e-6))
+        a -= 1e-6 * value / (slope - value)
+    least = a * math.sqrt(2.017 / (1 - math.cos(a)) / 9.81)
+
+    def slides(x, u):
+        return [x[2] * np.sin(u[0]), x[2] * np.cos(u[0]), 9.81 * np.cos(u[0])]
+
+    bead = dd.Dynamics(slides, 3, 1, u_lower=[0], u_upper=[np.pi])
+    problem = dd.Problem(
+        bead, x0=[0, 0, 0], x_goal=[2.28, 2.017, math.nan], num_steps=40, running_cost=1.0, horizon=(0.05, 10)
+    )
+    solution = dd.solve(problem)
+    assert solution.success, solution.message
+    assert solution.cost == pytest.approx(least, rel=1e-6)
