@@ -23,6 +23,7 @@ COUNT = 200
 ROBOTS = ("ur5_robot.urdf", "panda.urdf", "z1.urdf", "kinova.urdf", "xarm7.urdf", "finger_edu.urdf", "so100.urdf")
 OWN = ("pendulum.urdf", "cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "mass_spring_damper.sdf")
 TOUCHING = ("hopper.sdf", "two_spheres.sdf", "sliding_block.sdf")
+SMOOTH = ("ur5_robot.urdf", "z1.urdf", "kinova.urdf", *OWN)  # no couplers, in the middle of their joints' ranges
 MOVABLE = ("mass", "center_of_mass", "offset", "damping", "spring_stiffness", "gear_ratio", "rotor_inertia")
 MATTERS, SAME = 1e-6, 0.02
 
@@ -66,13 +67,18 @@ def of_equations(random):
 
 def of_steps(random, touching):
     """The same of one discrete step by a parameter and by the length of the step."""
-    name = str(random.choice(TOUCHING if touching else [*ROBOTS[:3], *OWN]))
+    name = str(random.choice(TOUCHING if touching else SMOOTH))
     model = load(name, random)
     kinds = ("mass", "stiffness", "friction") if touching else MOVABLE
     own = {parameter.name: parameter.value for parameter in dd.list_parameters(model)}
     vector = {name: own[name] for name in some(model, random, 1, kinds)}
     vector["model.time_step"] = model.time_step * random.uniform(0.7, 1.4)
-    x = model.default_state + random.uniform(-0.3, 0.3, model.nx) * (0.1 if touching else 1.0)
+    if touching:
+        x = model.default_state + random.uniform(-0.03, 0.03, model.nx)
+    else:
+        lower, upper = (np.clip(side, -2.5, 2.5) for side in model.position_limits)
+        q = (lower + upper) / 2 + (upper - lower) * random.uniform(-0.3, 0.3, model.nq)
+        x = np.concatenate([q, random.uniform(-0.3, 0.3, model.nv)])
     found = certify_inside(model, x, random.uniform(-1, 1, model.nu), parameters=vector)
     return found, sum(len(np.atleast_1d(value)) for value in vector.values())
 
