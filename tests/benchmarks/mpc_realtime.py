@@ -161,7 +161,7 @@ def quadrotor(random):
         return lambda xs: np.linalg.norm(xs[:, 4:7] - where, axis=1)
 
     return Task(
-        problem(dd.KeepLevel("body", tolerance=0.8 * tilt)), problem(), 25, 4.0, lambda h: flying(h)[0], "body",
+        problem(dd.KeepLevel("body", tolerance=0.8 * tilt)), problem(), 25, 5.0, lambda h: flying(h)[0], "body",
         (np.full(3, 0.3), np.zeros(3)), (Ask("tilt", tilted, "rad", 0.0),),
         tuple((0.02 * k, Ask(f"gate at {0.02 * k:g} s", off(g), "m", opening)) for k, g in gates.items()),
         Ask("place", off(place), "m", 0.05),

@@ -19,6 +19,7 @@ from drake_diff.optimize.realtime.step import DEAR, NO_SLOPE, Limits, Motion, St
 # costs of the plan for a whole range of what is limited: ten times what staying costs that is off by as much. Elsewhere
 # they are so many times what the cost-to-go says that a unit is worth.
 DEAR_BESIDE_STAYING = 1e5
+HALF = 0.5  # of a goal's tolerance
 PERTURBED, SPREAD = 8, 0.3  # motions at which slopes are looked at, in ranges of the states beside the plan
 
 
@@ -118,8 +119,8 @@ class Rolling:
                 continue  # the plan keeps it, and its end is stayed at
             at = None if c.knots is None else frozenset(problem.knots_of(c, input_at_end=False))
             function = knot_function(c, self.nx, self.nu, probe)
-            ones = np.ones(len(c.lower))
-            found.append(_Group(_labels(c), function, c.takes_input, c.lower, c.upper, at, {}, ones, ones))
+            ones, (lower, upper) = np.ones(len(c.lower)), _wide(c)
+            found.append(_Group(_labels(c), function, c.takes_input, lower, upper, at, {}, ones, ones))
         return found
 
     def _limits(self, group: _Group, begin: int, count: int) -> Limits:
@@ -182,6 +183,19 @@ def _priced(group: _Group, knots: Array, worth: Array, spans: Array, unit: float
         return replace(group, prices=DEAR_BESIDE_STAYING * unit / ranges, ranges=ranges)
     prices = np.where(flat, np.sum(worth), steepest @ worth / np.where(flat, 1.0, squared))
     return replace(group, prices=DEAR * prices, ranges=ranges)
+
+
+def _wide(c: Constraint) -> tuple[Array, Array]:
+    """Its limits; of a goal that is met from both sides half of its tolerance, of which a plan uses less.
+
+    What a push has spent is not to be won back at any price.
+    """
+    if not isinstance(c, GoalConstraint):
+        return c.lower, c.upper
+    met, middle = ~np.isnan(c.wanted), np.nan_to_num(c.wanted)
+    half = HALF * c.tolerance / max(int(np.count_nonzero(met)), 1) ** (1 / c.norm)
+    lower = np.where(met, np.minimum(c.lower, middle - half), c.lower)
+    return lower, np.where(met, np.maximum(c.upper, middle + half), c.upper)
 
 
 def _labels(c: Constraint) -> tuple[str, ...]:
