@@ -350,3 +350,17 @@ def test_a_plan_that_cannot_keep_what_is_asked_for_is_refused():
                          constraints=[wall], bounds=dd.Bounds(u_lower=[-0.6], u_upper=[0.6]))  # fmt: skip
     with pytest.raises(InputError, match="wall gives way by"):
         MPC(problem, horizon=5, plan=straight(problem))
+
+
+def test_goals_at_gates_are_kept_to_half_their_tolerance_and_no_further():
+    """A push just before the gate costs that much; |x - 1| <= 0.1 of 0.2, all that is kept being linear."""
+    gate = dd.JointGoal({"x": 1.0}, tolerance=0.2, knots=[15])
+    model = block(time_step=0.1)
+    gate = replace(gate, values={model.state_names[0]: 1.0})
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=30, running_cost=EFFORT, goals=[gate])
+    mpc = MPC(problem, horizon=10)
+    (limits,) = mpc._rolling.stretch(10, 10).limits
+    met = np.isfinite(limits.lower[:, 0])
+    assert np.flatnonzero(met).tolist() == [4]  # knots 11 ... 20, the gate at 15
+    assert limits.lower[4, 0] == pytest.approx(0.9)
+    assert limits.upper[4, 0] == pytest.approx(1.1)
