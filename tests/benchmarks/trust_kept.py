@@ -125,13 +125,13 @@ def terminal(random):
     upright[model.nq - 1] = np.pi
     caught = TerminalSet(upright, np.diag(10 ** random.uniform(-1, 1, model.nx)))
     bounds = dd.Bounds(u_lower=[-limit], u_upper=[limit])
-    weaker = dd.Problem(
-        model, x0=upright + random.normal(0, 0.05, model.nx), num_steps=30, x_goal=upright, bounds=bounds
-    )
+    weaker = dd.Problem(model, x0=upright, num_steps=5, x_goal=upright, bounds=bounds)
     region = caught.region(model, weaker.bounds)
-    end = region.x_goal + (region.random_state(random) - region.x_goal) * random.uniform(0.5, 8)
-    end = np.clip(end, weaker.bounds.x_lower + 0.01, weaker.bounds.x_upper - 0.01)
-    weaker = dataclasses.replace(weaker, x_goal=end, running_cost=dd.QuadraticCost(R=[[1.0]]))
+    inside = np.clip(weaker.bounds.x_lower + 0.1, -1e3, 1e3), np.clip(weaker.bounds.x_upper - 0.1, -1e3, 1e3)
+    start = np.clip(upright + (region.random_state(random) - upright) * random.uniform(0.2, 1.2), *inside)
+    pushed = np.full((5, 1), random.uniform(-0.3, 0.3) * limit)  # what it can be brought to
+    end = np.clip(dd.rollout(model, start, pushed).xs[-1], *inside)
+    weaker = dataclasses.replace(weaker, x0=start, x_goal=end, running_cost=dd.QuadraticCost(R=[[1.0]]))
 
     def broken(solution):
         plant, context = plant_of(path, h)
