@@ -47,6 +47,22 @@ def simulate(
     return np.array(seen)[:, 0], np.array(seen)[:, 1:]
 
 
+def slopes(system, context, port_in):  # A and B where the context is; by differences of what Drake cannot linearize
+    if system.ToAutoDiffXdMaybe() is not None:
+        found = FirstOrderTaylorApproximation(system, context, port_in, OutputPortSelection.kNoOutput)
+        return found.A(), found.B()
+    x, u, h = state_of(context).CopyToVector(), system.get_input_port(port_in).Eval(context), 1e-6
+
+    def rates(at):
+        state_of(context).SetFromVector(at[: len(x)])
+        system.get_input_port(port_in).FixValue(context, at[len(x) :])
+        return system.EvalTimeDerivatives(context).CopyToVector()
+
+    at = np.concatenate([x, u])
+    found = np.array([(rates(at + h * e) - rates(at - h * e)) / (2 * h) for e in np.eye(len(at))]).T
+    return found[:, : len(x)], found[:, len(x) :]
+
+
 def regulator(plan, step, times, scale):  # gains at `times` by Riccati's recursion, from the plant's linearizations
     system, port_in, _ = plan["build"](step)
     context, h, Q, gains = system.CreateDefaultContext(), times[1], np.diag(1 / scale**2), []
@@ -54,8 +70,7 @@ def regulator(plan, step, times, scale):  # gains at `times` by Riccati's recurs
     for t in times[-2::-1]:
         state_of(context).SetFromVector(plan["x"](t))
         system.get_input_port(port_in).FixValue(context, plan["u"](t + 1e-9))
-        found = FirstOrderTaylorApproximation(system, context, port_in, OutputPortSelection.kNoOutput)
-        A, B = found.A(), found.B()
+        A, B = slopes(system, context, port_in)
         A, B = (A, B) if step else (np.eye(len(A)) + h * A + h * h / 2 * A @ A, h * (B + h / 2 * A @ B))
         gains.append(np.linalg.solve(h * R + B.T @ P @ B, B.T @ P @ A))
         P = h * Q + A.T @ P @ (A - B @ gains[-1])
@@ -109,7 +124,7 @@ def judge(plan, step, tolerance):
 def judge_phases(plans, resets, closes, tolerance):
     """The same of phases one after the other, each from where the one before leads, through `resets` of its own.
 
-    Where it `closes`, the last reset leads back to the first state. A plant that Drake cannot linearize has no TVLQR.
+    Where it `closes`, the last reset leads back to the first state.
     """
     parts = []
     for plan in plans:
@@ -122,8 +137,7 @@ def judge_phases(plans, resets, closes, tolerance):
     for control in ("open loop", "TVLQR"):
         x, worst, told = parts[0][0]["x"](0.0), 0.0, []
         for i, ((plan, times, scale), reset) in enumerate(zip(parts, resets, strict=True)):
-            linear = plan["build"](0.0)[0].ToAutoDiffXdMaybe() is not None
-            gains = regulator(plan, 0.0, times, scale) if control == "TVLQR" and linear else None
+            gains = regulator(plan, 0.0, times, scale) if control == "TVLQR" else None
             at, xs = simulate(plan, 0.0, times, gains, x)
             off, why = misses(plan, at, xs, scale, tolerance)
             worst, x = max(worst, off), reset(xs[-1])
