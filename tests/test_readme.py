@@ -108,6 +108,7 @@ SOURCES = {
         "1": "tests/test_contact_table.py::test_values_by_hand_and_by_drake_alone",
         "1e4": "tests/test_contact_table.py::test_values_by_hand_and_by_drake_alone",
         "1e-6": SAP,
+        "1e-3": "drake_diff.motion.flow.plant:STICTION_SPEED",
         **dict.fromkeys(("0.42", "0.29", "-0.13"), TABLE),
         **dict.fromkeys(("0.5", "76", "0.02"), FORWARD),
         "30": BLEND,
@@ -147,6 +148,13 @@ SOURCES = {
         ),
         "1": "drake_diff.optimize.transcription.between:JERK_TOLERANCE",
         "200": "tests/test_stays.py::test_a_pendulum_swings_up_to_where_a_regulator_takes_over",
+        "1e-3": "drake_diff.optimize.problem.problem:SMALLEST_PART",
+        "1e-12": "drake_diff.optimize.sensitivity:EXACT_TOLERANCE",
+        "1e-4": "drake_diff.optimize.sensitivity:SAME",
+        "1e-5": "drake_diff.optimize.transcription.kkt:NEAREST",
+        **dict.fromkeys(
+            ("57.94", "58.81"), "tests/test_restarts.py::test_both_swing_ups_of_kellys_cart_pole_are_listed"
+        ),
     },
     "docs/panels.md": {
         "95": "tests/test_robustness.py::test_intervals_are_the_published_ones",
@@ -157,9 +165,9 @@ SOURCES = {
 
 
 def prose(path):
-    """The text without code, links, and the tables of docs/contact.md, which have tests or a command of their own."""
+    """The text without code, links, and tables of figures, which have tests or a command of their own."""
     text = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", " ", path.read_text(), flags=re.DOTALL)
-    if path.name == "contact.md":
+    if path.name in ("contact.md", "tasks.md"):
         text = "\n".join(line for line in text.splitlines() if not line.startswith("|"))
     return NAMES.sub(" ", text)
 
