@@ -451,6 +451,7 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
     by_steps = method == "ilqr" or (method == "shooting" and problem.couplings)
     if by_steps and _is_free_at_first(problem) and _is_possible(problem, free):
         yield free, given
+        yield from _other_guesses(problem, free, given, found)
         yield from _kept_apart(problem, free, found)
     yield first, given
     if method == "collocation":
