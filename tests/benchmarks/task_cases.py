@@ -430,9 +430,12 @@ def ball_distance(radius, center):
 def panda_past_a_ball(random):
     """Across its front, a ball on the way."""
     model, problem, _, _ = panda(random)
-    start, goal = HOME + random.uniform(-0.1, 0.1, 7), HOME + random.uniform(-0.1, 0.1, 7)
-    start[0], goal[0] = -random.uniform(0.5, 0.8), random.uniform(0.5, 0.8)
-    center = places(PANDA, (start + goal) / 2, ["panda_hand"])[0] + random.uniform(-0.03, 0.03, 3)
+    while True:  # until the ball is clear of both ends
+        start, goal = HOME + random.uniform(-0.1, 0.1, 7), HOME + random.uniform(-0.1, 0.1, 7)
+        start[0], goal[0] = -random.uniform(0.5, 0.8), random.uniform(0.5, 0.8)
+        center = places(PANDA, (start + goal) / 2, ["panda_hand"])[0] + random.uniform(-0.03, 0.03, 3)
+        if ball_distance(0.06, center)(None, np.array([start, goal])) < -0.05:
+            break
     target = places(PANDA, goal, ["panda_hand"])[0]
     problem |= {"x0": [*start, *np.zeros(7)]}
     goals = [dd.FrameGoal("panda_hand", position=target), dd.SphereObstacle(center, 0.06)]
