@@ -107,7 +107,10 @@ def test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact(tm
         (("pendulum.urdf", "projectile.sdf"), "expected"),
         (("x0=[0, 0]", "x0=[99, 0]"), "expected within [-50, 50]"),
         (("def problem", "def another"), "problem()"),
-        (("return dd.Problem", "return lambda *_, **__: dd.Problem"), "problem(): expected a Problem, got function"),
+        (
+            ("return dd.Problem", "return lambda *_, **__: dd.Problem"),
+            "problem(): expected a Problem or a PhasedProblem, got function",
+        ),
         (("{'method'", "{'metod'"), "solve_options: expected one of"),
     ],
 )

@@ -226,6 +226,6 @@ def test_a_motion_that_breaks_a_constraint_is_told(knot):
 
 
 @pytest.mark.parametrize("method", ["ilqr", "shooting"])
-def test_a_free_horizon_is_for_collocation(method):
-    with pytest.raises(InputError, match="horizon: expected none for discrete steps"):
+def test_steps_of_a_diagram_have_one_length(method):
+    with pytest.raises(InputError, match="horizon: expected none for steps of a diagram, which are of one length"):
         dd.solve(move(horizon=(0.5, 2)), method=method)

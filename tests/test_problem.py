@@ -115,7 +115,7 @@ def test_a_nan_goal_is_free(load):
         ({"running_cost": 3.0}, "a function or a QuadraticCost, got float"),
         ({"running_cost": dd.QuadraticCost(R=np.eye(2))}, r"running_cost.R: expected shape \(1, 1\)"),
         ({"running_cost": dd.QuadraticCost(Q=np.eye(3))}, r"running_cost.Q: expected shape \(4, 4\)"),
-        ({"running_cost": None, "x_goal": None}, "a cost, an x_goal or goals"),
+        ({"running_cost": None, "x_goal": None}, "a cost, an x_goal, goals or constraints"),
         ({"us": np.zeros((3, 1))}, r"us: expected shape \(10, 1\)"),
         ({"us": np.full((10, 1), math.nan)}, r"us\[0, 0\]: expected a finite number, got nan"),
         (

@@ -7,7 +7,6 @@ import pytest
 
 import drake_diff as dd
 from drake_diff.derivatives.smooth_step import SmoothStep
-from drake_diff.exceptions import InputError
 from drake_diff.optimize.solution import Status
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
@@ -46,13 +45,6 @@ def test_auto_takes_collocation_where_the_horizon_is_free(load):
     assert 0.5 <= solution.horizon <= 2.0 + 1e-6  # IPOPT keeps a bound to its tolerance
     fixed = dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=60, running_cost=EFFORT, horizon=(2.0, 2.0))
     assert solution.cost <= dd.solve(fixed).cost + 1e-6
-
-
-@pytest.mark.parametrize("method", ["shooting", "ilqr"])
-def test_discrete_methods_refuse_a_free_horizon(load, method):
-    problem = dd.Problem(load("pendulum.urdf"), x0=[0, 0], x_goal=[1, 0], num_steps=10, horizon=(1, 2))
-    with pytest.raises(InputError, match='horizon: expected none for discrete steps: method="collocation" takes it'):
-        dd.solve(problem, method=method)
 
 
 def test_a_waypoint_is_passed_at_the_cost_of_the_closed_form(write_urdf):

@@ -408,7 +408,7 @@ def test_a_guess_of_another_length_is_named(load):
 
 
 def test_only_a_problem_can_be_solved():
-    with pytest.raises(InputError, match="problem: expected a Problem, got NoneType"):
+    with pytest.raises(InputError, match="problem: expected a Problem or a PhasedProblem, got NoneType"):
         dd.solve(None)
 
 

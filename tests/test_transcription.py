@@ -782,7 +782,7 @@ def test_bad_dynamics_are_named(options, message):
         ({"running_cost": dd.QuadraticCost(R=np.eye(2))}, r"running_cost.R: expected shape \(1, 1\)"),
         ({"final_cost": dd.QuadraticCost(Q=np.eye(3))}, r"final_cost.Q: expected shape \(2, 2\)"),
         ({"final_cost": 3}, "final_cost: expected a function"),
-        ({"running_cost": None, "x_goal": None}, "problem: expected a cost, an x_goal or goals"),
+        ({"running_cost": None, "x_goal": None}, "problem: expected a cost, an x_goal, goals or constraints"),
         ({"refine": True, "error_tolerance": 0}, "error_tolerance: expected a finite number above 0"),
         ({"max_num_steps": 0}, "max_num_steps: expected a whole number"),
     ],

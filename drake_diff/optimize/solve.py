@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from hashlib import sha256
@@ -220,7 +220,7 @@ def solve(
         "tolerance": limits.tolerance,
         "seed": int(seed),
         "segments": int(segments),
-        "continuation": continuation if continuation is None or continuation == "auto" else _plain_stages(continuation),
+        "continuation": _plain_stages(continuation),
         "refine": refine,
         "error_tolerance": refinement.tolerance,
         "max_num_steps": refinement.most,
@@ -281,8 +281,11 @@ def _is_possible(problem: Problem, attempt: "Attempt") -> bool:
     return True
 
 
-def _plain_stages(stages: Sequence[SoftContact]) -> list[dict[str, float]]:
-    return [asdict(stage) for stage in stages]
+def _plain_stages(stages: Any) -> Any:
+    """Stages of a continuation as plain numbers; what is none stays as it is, and is refused where it is checked."""
+    if not isinstance(stages, (list, tuple)):
+        return stages
+    return [asdict(stage) if isinstance(stage, SoftContact) else stage for stage in stages]
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ number of cases of a part; without it each part takes as many as its figures in 
 import argparse
 import importlib
 import json
+import logging
 import os
 import platform
 import sys
@@ -76,6 +77,7 @@ def main() -> int:
     for name in parts:
         if name not in PARTS:
             parser.error(f"unknown part {name!r}, expected some of {', '.join(PARTS)}")
+    logging.getLogger("drake").setLevel(logging.ERROR)  # tags of robots' files that Drake does not know
     found = run(parts, options.seed, options.count)
     if options.out:
         figures = {name: [vars(figure) | {"holds": figure.holds} for figure in ones] for name, ones in found.items()}

@@ -1,6 +1,5 @@
 """Claims of `converged` on 20 tasks with random starts and goals, by every method, each judged by `referee.py`."""
 
-import logging
 import tempfile
 import warnings
 import xml.etree.ElementTree as ET
@@ -33,7 +32,6 @@ BLOCK = """<robot name="block"><link name="world"/><link name="block"><inertial>
 <transmission name="push"><type>transmission_interface/SimpleTransmission</type><joint name="slide"/>
 <actuator name="push"/></transmission></robot>"""
 FREE = np.nan
-logging.getLogger("drake").setLevel(logging.ERROR)  # tags of robots' files that Drake does not know
 FOLDER = tempfile.TemporaryDirectory()
 
 
