@@ -484,6 +484,7 @@ def test_the_table_in_the_documents_is_this_table(found):
     assert [float(number) for number in told] == pytest.approx(laws, abs=0.0051)
 
 
+@pytest.mark.slow
 def test_what_the_documents_say_of_physx_and_newton():
     needs("mujoco")
     for module in ("sapien", "newton"):
