@@ -509,3 +509,25 @@ def test_what_is_linearized_has_the_parameters_that_are_applied(name, parameters
         assert found == pytest.approx(wanted, abs=1e-8)
     own = dd.linearize(model, xs, us, "autodiff")[0][0]
     assert own == pytest.approx(dd.differentiate_step(model, xs[0], us[0]).A, abs=1e-12)
+
+
+def test_the_parameters_of_plain_dynamics_need_not_be_named():
+    """The lightest of masses between 0.5 and 2 kg is the quickest: T = 2 sqrt(m d / F)."""
+    block = dd.Dynamics(
+        lambda x, u, p: [x[1], u[0] / p[0]], nx=2, nu=1, parameters={"mass": 1.0}, u_lower=[-1], u_upper=[1]
+    )
+    problem = dd.Problem(
+        block,
+        x0=[0, 0],
+        x_goal=[1, 0],
+        num_steps=30,
+        horizon=(0.1, 10),
+        running_cost=1.0,
+        optimize=("controls", "parameters"),
+        parameter_bounds={"mass": (0.5, 2)},
+    )
+    assert problem.parameters.names == ("mass",)
+    solution = dd.solve(problem)
+    assert solution.success, solution.message
+    assert solution.parameters[0] == pytest.approx(0.5, rel=1e-6)
+    assert solution.horizon == pytest.approx(2 * 0.5**0.5, rel=2e-3)  # the switch lies within an interval

@@ -65,7 +65,8 @@ class Problem(ShowsItsRepr):
         initial_state_mask: (nx,) booleans, True where "initial_state" may change; x0 is its first guess there.
         us: (N, nu) inputs where they are not optimized, their first guess where they are; 0 if not given.
         parameters: names of model parameters (see `list_parameters`) or of those of the `Dynamics`, or a mapping from
-            names to values. They hold at all times; with "parameters" in `optimize` the search starts from them.
+            names to values. They hold at all times; with "parameters" in `optimize` the search starts from them, and
+            those of the `Dynamics` need not be named.
         parameter_bounds: mapping from names to (lower, upper). What cannot be negative stays above 1e-3 of its start
             where no bound is given, and an inertia stays one that a body can have.
         trajectory_cost: a function (xs, us) -> scalar that is added to the cost, such as the distance from a
@@ -123,7 +124,11 @@ class Problem(ShowsItsRepr):
             self._set("parameters", select(system, given))
             own = plant_limits(system)
         else:
-            self._set("parameters", system.with_parameters(self.parameters).parameters)
+            all_of_them = (
+                self.optimizes_parameters and isinstance(self.parameters, (tuple, list)) and not self.parameters
+            )
+            asked = system.parameters if all_of_them else self.parameters
+            self._set("parameters", system.with_parameters(asked).parameters)
             own = vars(system.bounds)
         self._check_parameters()
         bounds = resolve_bounds(bounds_of(system, self.bounds), own, self.state_names, self.input_names)
@@ -464,7 +469,10 @@ class Problem(ShowsItsRepr):
         given = self.constraints if isinstance(self.constraints, (tuple, list)) else (self.constraints,)
         for constraint in given:
             if not isinstance(constraint, Constraint):
-                raise InputError("constraints", got=type(constraint).__name__, expected="a Constraint or several")
+                where = "; couplings= takes it" if isinstance(constraint, Couples) else ""
+                raise InputError(
+                    "constraints", got=type(constraint).__name__, expected=f"a Constraint or several{where}"
+                )
         return tuple(constraint.resolved(self.x0, np.zeros(self.nu)) for constraint in given)
 
     def _check_couplings(self) -> tuple[Couples, ...]:
