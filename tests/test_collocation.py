@@ -159,7 +159,7 @@ def test_a_collocation_solver_that_lies_is_not_believed(monkeypatch):
     def liar(problem, xs, us, **options):
         return NlpResult(us.ravel(), Outcome.SOLVED, "all is well", ()), xs, us, us[-1]
 
-    monkeypatch.setattr("drake_diff.optimize.solve.solve_collocation", liar)
+    monkeypatch.setattr("drake_diff.optimize.run.solve_collocation", liar)
     solution = collocate(swing_up(), solver="snopt")
     assert solution.status is Status.CONVERGED_NOT_VERIFIED
     assert "defect" in solution.message

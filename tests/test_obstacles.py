@@ -13,7 +13,7 @@ from helpers.table import each_row
 from pydrake.math import RigidTransform
 
 import drake_diff as dd
-import drake_diff.optimize.solve as solve_module
+import drake_diff.optimize.run as run_module
 import drake_diff.optimize.transcription.collocation as collocation_module
 from drake_diff.exceptions import InputError, ModelWarning, UnknownNameError
 from drake_diff.optimize.judge import complaints_about, judged
@@ -149,7 +149,7 @@ def test_steps_are_looked_at_as_closely_and_a_motion_too_wild_to_be_seen_is_none
 @pytest.mark.slow
 def test_where_steps_jump_through_they_are_looked_at_within(monkeypatch):
     problem = arm([BALL])
-    monkeypatch.setattr(solve_module, "CLEARANCE_PARTS", ())
+    monkeypatch.setattr(run_module, "CLEARANCE_PARTS", ())
     through = dd.solve(problem, method="ilqr", max_iterations=200)
     assert not through.success
     assert through.constraint_violation <= 1e-5  # every knot is clear

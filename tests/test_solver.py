@@ -17,8 +17,8 @@ import drake_diff as dd
 from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import GradientError, InputError, ModelError, ShapeError, SimulationError
 from drake_diff.optimize.program import NlpResult, Outcome
+from drake_diff.optimize.run import Run
 from drake_diff.optimize.solution import Status
-from drake_diff.optimize.solve import Run
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
@@ -235,7 +235,7 @@ def test_a_solver_that_lies_is_not_believed(load, monkeypatch):
     def liar(problem, xs, us, **options):
         return NlpResult(us.ravel(), Outcome.SOLVED, "all is well", ()), xs, us
 
-    monkeypatch.setattr("drake_diff.optimize.solve.solve_shooting", liar)
+    monkeypatch.setattr("drake_diff.optimize.run.solve_shooting", liar)
     solution = dd.solve(swing_up(load, 20), method="shooting")
     assert solution.status is Status.CONVERGED_NOT_VERIFIED
     assert "goal error" in solution.message

@@ -1,0 +1,337 @@
+"""One solve by one method: certify at the guess, search, certify at the result, measure, judge."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, frozen
+from drake_diff.certificates.certificate import Certificate
+from drake_diff.certificates.certify import certify_inside
+from drake_diff.exceptions import GradientError, SimulationError
+from drake_diff.model.equations import EquationsOfMotion
+from drake_diff.model.parameters import TIME_STEP
+from drake_diff.model.soft_contact import SoftContact
+from drake_diff.optimize.certified import certified_knots, certify_equations
+from drake_diff.optimize.guess import Guess
+from drake_diff.optimize.ilqr.ilqr import solve_ilqr
+from drake_diff.optimize.ilqr.through_contact import (
+    moves_shapes,
+    solve_continuation,
+    solve_through_jumps,
+)
+from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, refused
+from drake_diff.optimize.problem.goals import in_words
+from drake_diff.optimize.problem.obstacles import lacking_between, swept
+from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report
+from drake_diff.optimize.reach import out_of_reach, why_blind
+from drake_diff.optimize.shooting import ShootingVariables, roll_segments, solve_shooting
+from drake_diff.optimize.solution import Solution, Status
+from drake_diff.optimize.transcription.between import violation_between_nodes
+from drake_diff.optimize.transcription.collocation import (
+    FOUND,
+    MeshRefinement,
+    Transcribed,
+    Transcription,
+    kept,
+)
+from drake_diff.optimize.transcription.drake import solve_collocation
+
+CLEARANCE_PARTS = (4, 8, 16)  # of a step: looked at where a discrete plan comes too near to an obstacle in between
+FINER_ROUNDS = 6  # of a mesh whose plan does not hold
+PLANS = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
+
+Searcher = Callable[[Problem, Array, Array, Array], tuple[NlpResult, Array, Array]]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One solve by one method: certify at the guess, search, certify at the result, measure, judge."""
+
+    problem: Problem
+    method: str
+    scheme: str
+    solver: str
+    limits: Limits
+    options: dict[str, Any]
+    report: Report | None
+    searched: Problem | None = None  # what is solved where that is more than what is asked
+    start: float = field(default_factory=time.monotonic)
+    certified: dict[bytes, Certificate] = field(default_factory=dict)  # by state, input and parameters
+
+    def collocate(self, guess: Guess, refinement: MeshRefinement | None, *, refine: bool | None) -> Solution:
+        """In CasADi; SNOPT, which that does not carry, in Drake's own DirectCollocation.
+
+        The mesh is refined where `refine` is True; where it is None, for as long as the plan does not hold.
+        """
+        if self.solver == "snopt":
+            return self._collocate_in_drake(guess)
+        problem, limits, report = self.problem, self.limits, self.report
+        transcription = Transcription(self.searched or problem, self.scheme)
+        try:
+            before = certify_equations(self.problem, transcription.jacobian, guess.xs, guess.us, transcription.task)
+        except (GradientError, SimulationError) as error:
+            return refused(self._draft(guess.xs, guess.us), error)
+        us_end = guess.us[-1:] if guess.u_final is None else guess.u_final
+        begun = guess.motion or (guess.xs, np.vstack([guess.us, us_end]))
+        motion = transcription.solve(
+            begun,
+            horizon=guess.horizon,
+            limits=limits,
+            report=report,
+            refinement=refinement if refine else None,
+            parameters=guess.parameters,
+            far=guess.line,
+            **self._known(transcription, guess, finer=refine is not False),
+        )
+        if refine:
+            self.options["refinements"] = [list(each) for each in motion.refinements]
+        if motion.cleared:
+            self.options["clearance_rounds"] = [list(each) for each in motion.cleared]
+
+        def judged(motion: Transcribed) -> Solution:
+            return self._judge_collocated(transcription, motion, before)
+
+        solution = judged(motion)
+        if refine is not None or refinement is None:
+            return solution
+        return self._refined(transcription, motion, solution, refinement, judged)
+
+    def _known(self, transcription: Transcription, guess: Guess, *, finer: bool) -> dict[str, Any]:
+        """The mesh and the multipliers of a guess by the same scheme and in as many steps; `finer` may it be."""
+        motion = guess.motion
+        if motion is None or motion.task.scheme is not transcription.task.scheme:
+            return {}
+        same = motion.task.problem.num_steps == self.problem.num_steps
+        if not same or (len(motion.mesh) > self.problem.num_steps + 1 and not finer):
+            return {}
+        return {"mesh": np.asarray(motion.mesh), "multipliers": guess.multipliers}
+
+    def _refined(
+        self,
+        transcription: Transcription,
+        motion: Transcribed,
+        solution: Solution,
+        until: MeshRefinement,
+        judged: Callable[[Transcribed], Solution],
+    ) -> Solution:
+        """`solution`, or that on a mesh which is made finer for as long as the plan does not hold."""
+        rounds = list(motion.refinements)
+        for _ in range(FINER_ROUNDS):
+            if not may_be_too_coarse(solution):
+                break
+            exceeded = violation_between_nodes(motion).intervals
+            if motion.largest_error <= until.tolerance and not exceeded:
+                break  # what does not hold is not the mesh's
+            left = self.limits.time_limit - (time.monotonic() - self.start)
+            limits = dataclasses.replace(self.limits, time_limit=max(left, 0.0))
+            finer = transcription.finer(motion, exceeded, until.most, limits, self.report)
+            if finer is None:
+                break
+            if finer.result.outcome not in FOUND:
+                last = kept(motion, finer).result
+                if last.outcome not in FOUND:
+                    return self._judge(solution, last)
+                return solution.told(message=f"{solution.message}; {last.note}")
+            motion = finer
+            rounds.append((len(finer.mesh) - 1, finer.largest_error))
+            self.options["refinements"] = [list(each) for each in rounds]
+            solution = judged(motion)
+        if len(rounds) > 1:
+            told = f"the mesh was refined from {rounds[0][0]} to {rounds[-1][0]} intervals"
+            solution = solution.told(message=f"{solution.message}; {told}")
+        return solution
+
+    def _collocate_in_drake(self, guess: Guess) -> Solution:
+        """By Drake's own DirectCollocation."""
+        jacobian = EquationsOfMotion(self.problem.model).jacobian
+        try:
+            certificates = certify_equations(self.problem, jacobian, guess.xs, guess.us)
+        except (GradientError, SimulationError) as error:
+            return refused(self._draft(guess.xs, guess.us), error)
+        result, xs, us, u_final = solve_collocation(
+            self.problem, guess.xs, guess.us, solver=self.solver, limits=self.limits, report=self.report
+        )
+        if np.all(np.isfinite(xs)):
+            certificates += certify_equations(self.problem, jacobian, xs, us)
+        return self._judge(self._draft(xs, us, u_final=u_final, certificates=certificates), result)
+
+    def _judge_collocated(
+        self, transcription: Transcription, motion: Transcribed, certificates: tuple[Certificate, ...]
+    ) -> Solution:
+        xs, us = motion.xs, motion.us[:-1]
+        self.options["derivatives"] = motion.derivatives
+        if np.all(np.isfinite(xs)):
+            certificates += certify_equations(self.problem, transcription.jacobian, xs, us, motion.task)
+        draft = self._draft(
+            xs,
+            us,
+            u_final=None if self.problem.is_map else motion.us[-1],
+            us_mid=None if self.scheme == "drake" else motion.us_mid,
+            free_horizon=motion.horizon if self.problem.horizon else None,
+            mesh=motion.mesh if len(us) > self.problem.num_steps else None,
+            parameters=frozen(motion.task.parameters),
+            multipliers=motion.result.multipliers,
+            certificates=certificates,
+        )
+        return self._judge(draft, motion.result)
+
+    def sweep(self, guess: Guess, *, given: bool, stages: tuple[SoftContact, ...]) -> Solution:
+        """iLQR; from the states of a `given` guess, which need not be a rollout, else from the rollout of `us`.
+
+        With `stages`, which take the inputs of the guess alone, it need not have a gradient.
+        """
+        xs, us = guess.xs, guess.us
+        limits, report, first = self.limits, self.report, iter([xs] if given else [])
+
+        def search(problem: Problem, rolled: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
+            if stages:
+                result, xs_found, us, logs = solve_continuation(problem, us, stages, limits=limits, report=report)
+                self.options["continuation"] = [asdict(log) for log in logs]
+                return result, xs_found, us
+            touches = problem.model.contract.contact.collision_pairs and not moves_shapes(problem)
+            begin = next(first, rolled)
+            if touches:
+                return solve_through_jumps(problem, begin, us, limits=limits, report=report, values=values)
+            known = guess.multipliers
+            return solve_ilqr(problem, begin, us, limits=limits, report=report, values=values, begun=known)
+
+        return self._through_steps(xs, us, search, guess, may_be_blind=bool(stages))
+
+    def shoot(self, guess: Guess, segments: int, *, improve: bool) -> Solution:
+        """Shooting; `improve` the guess by iLQR, which gets out of curved valleys that shooting crawls along.
+
+        Several `segments` are looked at around their own states, which defects part.
+        """
+        limits, report, xs, us = self.limits, self.report, guess.xs, guess.us
+        if segments > 1:
+            try:
+                xs = roll_segments(self.problem, xs, us, segments)
+            except SimulationError as error:
+                return refused(self._draft(xs, us), error)
+
+        def search(problem: Problem, xs: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
+            if improve:
+                result, xs, us = solve_ilqr(problem, xs, us, limits=limits, report=report)
+                self.options["initial_guess"] = f"default, then {result.message}"
+                if result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
+                    return result, xs, us
+            options: dict[str, Any] = {"solver": self.solver, "segments": segments, "values": values}
+            return solve_shooting(problem, xs, us, limits=limits, report=report, **options)
+
+        return self._through_steps(xs, us, search, guess, segmented=segments > 1)
+
+    def _through_steps(
+        self,
+        xs: Array,
+        us: Array,
+        search: Searcher,
+        guess: Guess,
+        *,
+        segmented: bool = False,
+        may_be_blind: bool = False,
+    ) -> Solution:
+        """Certify, search, certify again, on Drake's own steps; at rollouts, or at the states as they are."""
+        variables, values = ShootingVariables(self.problem, around=xs if segmented else None), self._first_values(guess)
+        try:
+            xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us, values))
+        except (GradientError, SimulationError) as error:
+            return refused(self._draft(xs, us), error)
+        if blindness and not may_be_blind:
+            return ended(self._draft(xs, us, certificates=before), Status.NO_GRADIENT, blindness)
+        try:
+            result, xs, us = self._keeping_clear(search, xs, us, values)
+            variables = ShootingVariables(self.problem, around=xs if segmented else None)
+            z = variables.pack(xs[0], us, result.parameters)
+            if self.method == "shooting" and len(result.z) == variables.size:
+                z = np.clip(result.z, *variables.limits())  # which solvers keep within their tolerance
+            xs, us, after, blindness = self._look_at(variables, z)
+        except (GradientError, SimulationError) as error:
+            return refused(self._draft(xs, us, certificates=before), error)
+        values = variables.parameters(z).values
+        if result.note:
+            self.options["contact_sequence"] = result.note
+        design, horizon = self.problem.design, None
+        if self.problem.horizon is not None:
+            horizon = float(np.clip(design.time_step(values) * self.problem.num_steps, *self.problem.horizon))
+        found = {"certificates": before + after, "parameters": frozen(design.own(values)), "free_horizon": horizon}
+        solution = self._judge(self._draft(xs, us, multipliers=result.multipliers, **found), result)
+        return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
+
+    def _first_values(self, guess: Guess) -> Array:
+        """(np,) those of the problem's `design` where a search begins."""
+        problem, design = self.problem, self.problem.design
+        own = problem.parameters.values if guess.parameters is None else guess.parameters
+        first = problem.start_horizon if guess.horizon is None else guess.horizon
+        h = (first if problem.horizon is None else float(np.clip(first, *problem.horizon))) / problem.num_steps
+        return np.clip(design.whole(own, h), design.lower, design.upper)
+
+    def _keeping_clear(self, search: Searcher, xs: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
+        """What `search` finds; where it comes too near to an obstacle between two states, again with these in view."""
+        problem, rounds, guess = self.problem, list[list[float]](), (xs, us)
+        result, xs, us = search(problem, xs, us, values)
+        for parts in CLEARANCE_PARTS:
+            lacking, enters = lacking_between(problem.kept, xs)
+            if not lacking or result.outcome not in (Outcome.SOLVED, Outcome.INACCURATE, Outcome.ITERATION_LIMIT):
+                break
+            if self.report is not None:
+                self.report.say(f"{in_words(lacking, 'm')} too near to an obstacle within a step: {parts} parts")
+            last = self._values_of(result, values)
+            more = swept(self.problem.kept, problem.design.time_step(last), parts)
+            wider = dataclasses.replace(problem, constraints=(*problem.constraints, *more))
+            result, xs, us = search(wider, *((*guess, values) if enters else (xs, us, last)))
+            rounds.append([parts, lacking])
+        if rounds:
+            self.options["clearance_rounds"] = rounds
+        return result, xs, us
+
+    def _values_of(self, result: NlpResult, first: Array) -> Array:
+        """(np,) what a search found, that began at `first`."""
+        if result.parameters is not None:
+            return result.parameters
+        variables = ShootingVariables(self.problem)
+        return variables.parameters(result.z).values if len(result.z) == variables.size else first
+
+    def _judge(self, draft: Solution, result: NlpResult) -> Solution:
+        """`judged`, and no success where the cost asks for a motion that nothing here could have begun."""
+        solution, problem = judged(draft, result), self.problem
+        if solution.status not in PLANS or not problem.has_model:
+            return solution
+        xs, us = solution.plan.sample(1)
+        variables = ShootingVariables(problem, around=xs)
+        try:
+            found = out_of_reach(problem, variables, variables.pack(xs[0], us, solution.step_vector.values))
+        except (GradientError, SimulationError) as error:
+            detail = f"whether the cost asks for what nothing moves cannot be told: {error}"
+            return ended(solution, Status.CONVERGED_NOT_VERIFIED, detail)
+        if found.silent:
+            return ended(solution, Status.NO_GRADIENT, found.silent)
+        return solution.told(message=f"{solution.message}; {found.constant}") if found.constant else solution
+
+    def _draft(self, xs: Array, us: Array, **found: Any) -> Solution:
+        arrays = ("u_final", "us_mid", "mesh")
+        found |= {name: frozen(found[name]) for name in arrays if found.get(name) is not None}
+        found |= {"scheme": self.scheme, "options": self.options, "wall_time": time.monotonic() - self.start}
+        return Solution(self.problem, self.method, self.solver, Status.FAILED, "", frozen(xs), frozen(us), **found)
+
+    def _look_at(self, variables: ShootingVariables, z: Array) -> tuple[Array, Array, tuple[Certificate, ...], str]:
+        """xs and us of z, certificates of some of its steps, and why the goal or cost is out of its reach."""
+        us = variables.unpack(z)[1]
+        xs, parameters = variables.states(z), variables.parameters(z).to_dict()
+        model, design = self.problem.model, self.problem.design
+        if design.has_step and not design.moves_step:
+            model = model.at_time_step(float(parameters.pop(TIME_STEP)[0]))
+
+        def certificate(x: Array, u: Array) -> Certificate:
+            """That of a search which ends where it began is known: it costs as much as the search."""
+            at = x.tobytes() + u.tobytes() + repr(parameters).encode()
+            if at not in self.certified:
+                self.certified[at] = certify_inside(model, x, u, parameters=parameters)
+            return self.certified[at]
+
+        certificates = tuple(certificate(xs[k], us[k]) for k in certified_knots(us))
+        return xs, us, certificates, why_blind(self.problem, variables, z)
