@@ -277,3 +277,10 @@ def test_random_bounces_have_the_slopes_of_another_integration(tmp_path, seed):
     for i, unit in enumerate(np.eye(2)):
         ends = [ball.end(approximation, start + s * w * unit, duration)[0] for s in (1, -1)]
         assert motion.by_x0[i] == pytest.approx((ends[0] - ends[1]) / (2 * w), rel=1e-3, abs=1e-4)
+
+
+def test_a_limit_that_is_passed_within_an_interval_is_seen():
+    """The cart is out of its rail for 0.2 s and back again at the end of the interval."""
+    model = dd.load_model("models/cart_pole.urdf", time_step=0.4)
+    with pytest.raises(SimulationError, match="slide_x reaches a joint limit"):
+        dd.differentiate_rollout(model, [1.99, 0, 0.5, 0], [[-5.0]], lambda x: x[0], method="continuous")

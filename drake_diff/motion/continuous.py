@@ -24,23 +24,13 @@ from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators, proximity_property
 from drake_diff.model.step import set_state
+from drake_diff.motion.dormand_prince import ERROR, STAGES, factor
 
 TOLERANCE = 1e-9  # of each step, relative to max(1, |x|)
 EVALUATIONS = 40_000  # of the equations of motion at most, about a second
 # v_s [m/s]: below it friction is a damper, above it Coulomb's, as in Drake's continuous plants. In Drake's steps it is
 # 1e-4 or less, which no explicit method can follow while anything sticks.
 SLIP = 1e-3
-SAFETY, LEAST, MOST = 0.9, 0.1, 5.0  # of the factor by which a step's length changes
-# Dormand and Prince, "A family of embedded Runge-Kutta formulae", 1980: stages, and fifth less fourth order.
-STAGES = (
-    (1 / 5,),
-    (3 / 40, 9 / 40),
-    (44 / 45, -56 / 15, 32 / 9),
-    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
-    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
-    (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
-)
-ERROR = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
 Rates = Callable[[Array], Array]
 
 
@@ -168,7 +158,7 @@ def integrate(rates: Rates, x: Array, duration: float, dt: float, most: int) -> 
         error = float(np.sqrt(np.mean((step * (ERROR @ np.array(slopes)) / size) ** 2)))
         if error <= 1:
             time, x, first = (duration if step == duration - time else time + step), ahead, slopes[-1]
-        change = MOST if error == 0 else min(MOST, max(LEAST, SAFETY * error**-0.2))
+        change = factor(error)
         # A step that was cut off at the end says nothing against a longer one.
         dt = max(dt, step * change) if error <= 1 and step < dt else step * change
     return x, dt, used

@@ -14,20 +14,11 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.exceptions import SimulationError
+from drake_diff.motion.dormand_prince import ERROR, LEAST, STAGES, factor
 from drake_diff.motion.flow.plant import FlowPlant
 
 TOLERANCE = 1e-9  # of each step, relative to max(1, |x|)
 BUDGET = 30.0  # [s] of wall time
-SAFETY, LEAST, MOST = 0.9, 0.1, 5.0  # of the factor by which a step's length changes
-STAGES = (
-    (1 / 5,),
-    (3 / 40, 9 / 40),
-    (44 / 45, -56 / 15, 32 / 9),
-    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
-    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
-    (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
-)
-ERROR = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
 ROOT = 1e-13  # of a step: how near to its event it ends
 NEARER = 1e-3  # of what is left of a step: at least so far from both ends it is looked for
 SHORTEST = 1e-14  # [s] a step that is shorter does not move time
@@ -106,20 +97,13 @@ class Integrator:
         found.ends.append(len(found.hs))
         return found.xs[-1]
 
-    def flow(self, x0: Array, us: Array, interval: float, *, budget: float = BUDGET) -> Flow:
-        """From `x0` (nx,) under inputs us (N, nu), each held for `interval` [s]."""
-        found = self.begin(x0)
-        for u in us:
-            self.advance(found, u, interval, budget)
-        return found
-
     def _advance(self, found: Flow, now: float, length: float, wanted: float) -> float:
         """One accepted step of at most `length` [s] from `now`; the length that would do next."""
         is_cut = length < wanted
         while True:
             ratio = self._try(length)
             found.tried += 1
-            change = MOST if ratio == 0 else min(MOST, max(LEAST, SAFETY * ratio**-0.2))
+            change = factor(ratio)
             if ratio <= 1:
                 break
             length, is_cut = length * (change if np.isfinite(ratio) else LEAST), False

@@ -56,7 +56,6 @@ class FlowPlant:
             raise ModelError(f"{contact.model} contact has no motion in continuous time here: point contact has one")
         self.model, self.pairs, self.is_sap = model, read_pairs(model), contact.approximation == "sap"
         count = len(self.pairs.ids)
-        self.labels = _labels(model, self.pairs)
         self.is_whole = count == contact.collision_pairs  # whether all that may touch are pairs here
         self.x, self.u, self.materials = (
             ca.SX.sym(name, size) for name, size in (("x", model.nx), ("u", model.nu), ("materials", 4 * count))
@@ -73,7 +72,7 @@ class FlowPlant:
 
     @property
     def num_pairs(self) -> int:
-        return len(self.labels)
+        return len(self.pairs.ids)
 
     def switch_slope(self, switch: int) -> Any:
         """(x, u, materials) -> (1, nx + nu + 4 P) of one of the switches."""
@@ -130,11 +129,6 @@ class FlowPlant:
 def flow_plant(model: Model) -> FlowPlant:
     """That of a model, made once."""
     return model.cache("flow plant", lambda: FlowPlant(model))
-
-
-def _labels(model: Model, pairs: ContactPairs) -> tuple[str, ...]:
-    inspector = model.double.inspector
-    return tuple(" and ".join(inspector.GetName(i) for i in ids) for ids in pairs.ids)
 
 
 def material_of(plant: FlowPlant) -> Material:

@@ -39,14 +39,15 @@ class FlowSteps:
         xs[0] = x0
         for k in range(count):
             us[k] = choose(xs[k], k)
+            begin = len(flow.hs)
             xs[k + 1] = self.integrator.advance(flow, us[k], model.time_step)
-            self._check_limits(xs[k + 1])
+            self._check_limits(np.array(flow.xs[begin:]))
         return xs, us, flow
 
-    def _check_limits(self, x: Array) -> None:
+    def _check_limits(self, xs: Array) -> None:
         lower, upper = self.model.position_limits
-        q = x[: self.model.nq]
-        beyond = np.flatnonzero((q < lower) | (q > upper))
+        qs = xs[:, : self.model.nq]
+        beyond = np.flatnonzero(np.any((qs < lower) | (qs > upper), axis=0))
         if len(beyond):
             name = self.model.state_names[beyond[0]]
             raise SimulationError(f"{name} reaches a joint limit, whose motion in continuous time is not known here")

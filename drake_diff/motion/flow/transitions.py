@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff.motion.flow.integrate import STAGES, Flow, FlowEvent, on_arrays, pushing_of
+from drake_diff.motion.dormand_prince import STAGES
+from drake_diff.motion.flow.integrate import Flow, FlowEvent, on_arrays, pushing_of
 from drake_diff.motion.flow.plant import FlowPart, FlowPlant
 
 STABLE = 2.0  # of a step's length times the largest rate of decay; the method is stable up to 3.3
@@ -29,7 +30,6 @@ class Transitions:
     by_x: Array
     by_u: Array
     by_materials: Array
-    crossing: Array  # (E,) of each event, how steeply the motion goes through it: sine of the angle to the switch
 
 
 def transitions(plant: FlowPlant, flow: Flow, materials: Array, *, by_materials: bool = False) -> Transitions:
@@ -42,13 +42,12 @@ def transitions(plant: FlowPlant, flow: Flow, materials: Array, *, by_materials:
         sets.setdefault(pushing_of(modes), []).append(i)
     for pushing, rows in sets.items():
         found[rows] = _Steps(plant.part(pushing), us[rows], materials, nx + nu + nm).changes(xs[rows], hs[rows])
-    crossing = np.ones(len(flow.events))
     modes_now: dict[int, Array] = {}
-    for i, event in enumerate(flow.events):
+    for event in flow.events:
         if event.step:  # one that it begins with is none on the way
             now = modes_now.setdefault(event.step, flow.modes[event.step - 1].copy())
-            crossing[i] = _jump(plant, event, flow.us[event.step - 1], now, materials, found[event.step - 1])
-    return Transitions(found[:, :, :nx], found[:, :, nx : nx + nu], found[:, :, nx + nu :], crossing)
+            _jump(plant, event, flow.us[event.step - 1], now, materials, found[event.step - 1])
+    return Transitions(found[:, :, :nx], found[:, :, nx : nx + nu], found[:, :, nx + nu :])
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,10 +118,10 @@ class _Steps:
         return found.transpose(0, 2, 1)
 
 
-def _jump(plant: FlowPlant, event: FlowEvent, u: Array, modes: Array, materials: Array, step: Array) -> float:
+def _jump(plant: FlowPlant, event: FlowEvent, u: Array, modes: Array, materials: Array, step: Array) -> None:
     """Put the jump at an event onto the derivative of the `step` that ended there, and turn its switch in `modes`.
 
-    Several at once are taken one after the other. Gives how steep the crossing is, 1 at a right angle.
+    Several at once are taken one after the other.
     """
     nx = len(event.x)
     before = np.asarray(plant.part(pushing_of(modes)).rates(event.x, u, materials)).ravel()
@@ -136,4 +135,3 @@ def _jump(plant: FlowPlant, event: FlowEvent, u: Array, modes: Array, materials:
         by = row[:nx] @ step
         by[nx:] += row[nx : step.shape[1]]
         step += np.outer(jump / rate, by)
-    return steep
