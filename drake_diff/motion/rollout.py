@@ -9,20 +9,23 @@ from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
 from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.model.contact import ContactPoint, contacts_of_the_step, penetration
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import applied, select
+from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.model.plant import instances, joints
 from drake_diff.model.step import advance, set_state
 from drake_diff.model.tangent import tangent_space
 
 Policy = Callable[[Array, float], ArrayLike]
+STEPS, CONTINUOUS = MOTIONS = "steps", "continuous"  # of Drake's, or in the continuous time that they stand for
 
 
 @dataclass(frozen=True, eq=False)
 class Rollout(ShowsItsRepr):
     """N steps of the double plant and what was measured along them; `rollout` makes one. Arrays are read-only.
+
+    With method="continuous" it is the motion in continuous time at the ends of N intervals.
 
     The energy balance of the discrete plant is `energy_error` = energy - energy[0] - work + dissipation
     - contact_work - limit_work: the work of a force f in a step is h f (v + v') / 2, which is exact where M is
@@ -98,6 +101,7 @@ def rollout(
     policy: Policy | None = None,
     num_steps: int | None = None,
     parameters: Mapping[str, Any] | None = None,
+    method: str = STEPS,
 ) -> Rollout:
     """Many steps of the double plant, with energy, contact, penetration and constraint violation along them.
 
@@ -108,25 +112,39 @@ def rollout(
         policy: `policy(x, t)` (nu,) of the state and the time [s], in place of `us`.
         num_steps: N, where `us` does not say it.
         parameters: Names (see `list_parameters`) and values that replace the model's own.
+        method: "steps", or "continuous": the motion in continuous time that the steps stand for, contact included,
+            integrated with error control, at the ends of the same intervals (of parameters it takes contact's). Then
+            work is integrated along the motion, `penetration` is the largest since the end before, and `contacts` are
+            those at the end of each interval.
 
     Returns:
         The states `xs` (N+1, nx), and what was measured at each.
 
     Raises:
         ShapeError, NonFiniteError, InputError: Of what was given, or of what the policy returned.
-        SimulationError: Drake cannot take a step.
+        ModelError: The model has no motion in continuous time here.
+        SimulationError: Drake cannot take a step, or the motion in continuous time has no end.
 
     Example:
         >>> model = dd.load_model("models/projectile.sdf", time_step=0.01)
         >>> motion = dd.rollout(model, model.default_state, num_steps=100)
         >>> float(motion.times[-1]), motion.xs.shape
         (1.0, (101, 13))
+        >>> ball = dd.load_model("models/sphere_on_ground.sdf", time_step=0.01)
+        >>> dd.rollout(ball, ball.default_state, np.zeros((50, ball.nu)), method="continuous")
+        Rollout of 50 steps, 0.5 s: energy ... to ... J, of which ... J are unaccounted for
+          deepest penetration ... m, largest constraint violation 0, ... steps with contact
     """
+    if method not in MOTIONS:
+        raise UnknownNameError("method", got=method, known=MOTIONS)
     if us is not None and policy is not None:
         raise InputError("rollout", got="us and policy", expected="one of them")
     inputs = check_inputs(model, us, num_steps) if policy is None else policy
     count = len(inputs) if policy is None else positive_int("num_steps", num_steps)  # type: ignore[arg-type]
-    with applied(select(model, parameters or ())) as set_model:
+    vector = select(model, parameters or ())
+    with applied(vector) as set_model:
+        if method == CONTINUOUS:
+            return _in_continuous_time(set_model, vector, finite_array("x0", x0, (model.nx,)), inputs, count)
         h, meter = set_model.time_step, Meter(set_model)
         xs, us = np.empty((count + 1, model.nx)), np.empty((count, model.nu))
         xs[0] = finite_array("x0", x0, (model.nx,))
@@ -137,6 +155,39 @@ def rollout(
         set_state(set_model.double, xs[-1])
         meter.measure_state(xs[-1])
         return meter.result(xs, us)
+
+
+def _in_continuous_time(
+    model: Model, vector: ParameterVector, x0: Array, inputs: Array | Policy, count: int
+) -> Rollout:
+    """`rollout` of a model, to which the vector is applied, by its flow."""
+    from drake_diff.motion.flow.measured import measured_flow  # loads CasADi
+
+    h, meter = model.time_step, Meter(model)
+
+    def choose(x: Array, k: int) -> Array:
+        return finite_array("u", inputs(x.copy(), k * h), (model.nu,)) if callable(inputs) else inputs[k]
+
+    found = measured_flow(model, vector, x0, choose, count)
+    for x in found.xs:
+        set_state(model.double, x)
+        meter.measure_state(x)
+    _, kinetic, potential, at_ends = (np.array(column) for column in zip(*meter.states, strict=True))
+    return Rollout(
+        times=frozen(h * np.arange(count + 1)),
+        xs=frozen(found.xs),
+        us=frozen(found.us),
+        efforts=frozen(found.efforts),
+        kinetic_energy=frozen(kinetic),
+        potential_energy=frozen(potential),
+        work=frozen(found.work),
+        dissipation=frozen(found.dissipation),
+        contact_work=frozen(found.contact_work),
+        limit_work=frozen(np.zeros(count + 1)),  # a motion that reaches one is refused
+        penetration=frozen(np.maximum(at_ends, found.penetration)),
+        constraint_violation=frozen(meter.violations(found.xs[:, : model.nq])),
+        contacts=found.contacts,
+    )
 
 
 def check_inputs(model: Model, us: ArrayLike | None, num_steps: int | None = None) -> Array:
@@ -249,11 +300,11 @@ class Meter:
             contact_work=frozen(np.append(0.0, np.cumsum(by_contact))),
             limit_work=frozen(np.append(0.0, np.cumsum(by_limits))),
             penetration=frozen(deepest),
-            constraint_violation=frozen(self._violations(at[:, :nq])),
+            constraint_violation=frozen(self.violations(at[:, :nq])),
             contacts=tuple(self.contacts),
         )
 
-    def _violations(self, qs: Array) -> Array:
+    def violations(self, qs: Array) -> Array:
         """(N+1,) at the positions qs (N+1, nq)."""
         if self.model.num_constraints:
             return np.full(len(qs), np.inf)  # pydrake does not tell where a coupler, ball, weld or distance should be

@@ -156,6 +156,10 @@ class _Touch:
     depth: Any  # -phi [m]
     bracket: Any  # 1 + d x', or x + tau x' [m]
     force: Any  # (nv,) where it pushes
+    point: Any  # (3,) [m] in world, where it acts
+    normal: Any  # (3,) from the other shape to the sphere
+    push: Any  # (3,) [N] on the sphere where it pushes
+    speed: Any  # [m/s] of the slip
 
 
 class _Tree:
@@ -316,7 +320,8 @@ class _Tree:
         drag = mu * r**3 * (10 - 15 * r + 6 * r**2) / speed
         bracket = -phi + damping * rate if is_sap else 1 + damping * rate
         push = k * bracket if is_sap else -k * phi * bracket
-        return _Touch(-phi, bracket, J.T @ (push * (normal - drag * slip)))
+        on_sphere = push * (normal - drag * slip)
+        return _Touch(-phi, bracket, J.T @ on_sphere, point, normal, on_sphere, speed)
 
 
 def _from_box(local: Any, lower: Array, upper: Array) -> tuple[Any, Any]:

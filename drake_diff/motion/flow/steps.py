@@ -25,7 +25,7 @@ class FlowSteps:
         for parameter in vector.parameters:
             if parameter.kind.quantity not in QUANTITIES:
                 raise ModelError(
-                    f'method="continuous" has no derivative by {parameter.name}: it has those by contact\'s '
+                    f'method="continuous" takes no {parameter.name}: of parameters it takes contact\'s '
                     f"{', '.join(QUANTITIES)}"
                 )
         self.model, self.vector, self.plant = model, vector, flow_plant(model)

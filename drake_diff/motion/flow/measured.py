@@ -1,0 +1,112 @@
+"""What `rollout` measures along a flow: energies and contacts at the ends of the intervals, work along its steps.
+
+Work is integrated with the motion itself: the power at the stages of each step, by the weights that the state has.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from drake_diff._base.arrays import Array, frozen
+from drake_diff.model.contact import ContactPoint
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import ParameterVector
+from drake_diff.motion.dormand_prince import STAGES
+from drake_diff.motion.flow.integrate import Flow, pushing_of
+from drake_diff.motion.flow.plant import FlowPlant
+from drake_diff.motion.flow.steps import Chooser, FlowSteps
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A flow at the ends of N intervals, and what is read along its steps."""
+
+    xs: Array  # (N+1, nx)
+    us: Array  # (N, nu)
+    efforts: Array  # (N, actuators)
+    work: Array  # (N+1,) [J] of actuators, since the start
+    dissipation: Array  # (N+1,) [J]
+    contact_work: Array  # (N+1,) [J]
+    penetration: Array  # (N+1,) [m] the largest since the end before
+    contacts: tuple[tuple[ContactPoint, ...], ...]  # N tuples: those at the end of each interval
+
+
+def measured_flow(model: Model, vector: ParameterVector, x0: Array, choose: Chooser, count: int) -> Measured:
+    """The flow of a model, to which the vector is applied, over `count` of its intervals."""
+    steps = FlowSteps(model, vector)
+    xs, us, flow = steps.roll(x0, choose, count)
+    materials, at = steps.integrator.materials, [0, *flow.ends]
+    depths = _depths(steps.plant, flow, materials)
+    deepest = [depths[0], *(np.max(depths[begin : end + 1]) for begin, end in pairwise(at))]
+    limits = steps.plant.description.effort_limits
+    work, dissipation, by_contact = _work(steps.plant, flow, materials)[at].T
+    contacts = _contacts(steps.plant, model, xs[1:], materials)
+    return Measured(xs, us, np.clip(us, -limits, limits), work, dissipation, by_contact, np.array(deepest), contacts)
+
+
+def _depths(plant: FlowPlant, flow: Flow, materials: Array) -> Array:
+    """(M+1,) [m] how deep the pairs overlap at the ends of the steps, at most; 0 where none does."""
+    if not plant.num_pairs:
+        return np.zeros(len(flow.xs))
+    nothing = np.zeros(plant.model.nu)
+    found = [np.asarray(plant.switches(x, nothing, materials)).ravel()[::2] for x in flow.xs]
+    return np.maximum(np.max(found, axis=1), 0.0)
+
+
+def _work(plant: FlowPlant, flow: Flow, materials: Array) -> Array:
+    """(M+1, 3) [J] what actuators did, what damping took and what contact did since the start."""
+    done, functions = np.zeros((len(flow.hs) + 1, 3)), dict[tuple[int, ...], Any]()
+    for m, h in enumerate(flow.hs):
+        pushing = pushing_of(flow.modes[m])
+        if pushing not in functions:
+            functions[pushing] = _work_function(plant, pushing)
+        done[m + 1] = done[m] + np.asarray(functions[pushing](flow.xs[m], flow.us[m], materials, h)).ravel()
+    return done
+
+
+def _work_function(plant: FlowPlant, pushing: tuple[int, ...]) -> Any:
+    """(x, u, materials, h) -> (3,) [J] the work of a step by actuators, damping and contact."""
+    description, tree = plant.description, plant.tree
+    limits = ca.DM(description.effort_limits)
+    effort = ca.fmin(ca.fmax(plant.u, -limits), limits) if plant.u.numel() else plant.u
+    driven = ca.DM(description.actuation) @ effort
+    push = ca.SX.zeros(plant.model.nv)
+    for i in pushing:
+        push += plant.touches[i].force
+    damping = ca.DM(description.by_velocity("damping"))
+    power = ca.vertcat(ca.dot(tree.v, driven), ca.dot(damping * tree.v, tree.v), ca.dot(tree.v, push))
+    powers, rates = ca.Function("powers", [plant.x, plant.u, plant.materials], [power]), plant.part(pushing).rates
+    h, u, materials = ca.SX.sym("h"), *(ca.SX.sym(name, *rates.size_in(i)) for i, name in ((1, "u"), (2, "m")))
+    x = at = ca.SX.sym("x", *rates.size_in(0))
+    slopes, work = [], ca.SX.zeros(3)
+    for k, weights in enumerate(STAGES):
+        slopes.append(rates(at, u, materials))
+        if STAGES[-1][k]:
+            work += h * STAGES[-1][k] * powers(at, u, materials)
+        at = x + h * sum(w * s for w, s in zip(weights, slopes, strict=True))
+    return ca.Function("work", [x, u, materials, h], [ca.densify(work)])
+
+
+def _contacts(plant: FlowPlant, model: Model, xs: Array, materials: Array) -> tuple[tuple[ContactPoint, ...], ...]:
+    """The pairs that push at each of the states."""
+    if not plant.num_pairs:
+        return ((),) * len(xs)
+    of_all = [ca.horzcat(t.point, t.normal, t.push, ca.vertcat(t.depth, t.speed, 0)) for t in plant.touches]
+    read = ca.Function("contacts", [plant.x, plant.u, plant.materials], [ca.horzcat(*of_all)])
+    pairs, nothing, found = plant.pairs, np.zeros(model.nu), []
+    for x in xs:
+        pushing = pushing_of((np.asarray(plant.switches(x, nothing, materials)).ravel() > 0).astype(float))
+        values = np.asarray(read(x, nothing, materials)).reshape(3, plant.num_pairs, 4) if pushing else np.zeros(0)
+        now = []
+        for i in pushing:
+            point, normal, force, sizes = values[:, i].T
+            a, b = pairs.bodies[pairs.sphere_body[i]], pairs.bodies[pairs.other_body[i]]
+            if model.plant.IsAnchored(a):  # the force is the one on what can move
+                a, b, normal, force = b, a, -normal, -force
+            where = frozen(point), frozen(normal), frozen(force)
+            now.append(ContactPoint(a.name(), b.name(), *where, float(sizes[0]), float(sizes[1])))
+        found.append(tuple(now))
+    return tuple(found)
