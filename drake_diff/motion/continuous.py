@@ -4,44 +4,74 @@
 
 with the normal force of the model's own contact approximation at depth x and its rate x',
 
-    f = k (x + tau x')+ of `sap`,    f = k x (1 + d x')+ of `similar` and `lagged`,
+    f = k (x + tau x')+   of `sap` (Kelvin and Voigt),    f = k x (1 + d x')+   of `similar` and `lagged` (Hunt and
+    Crossley),
 
 step5(r) = r^3 (10 - 15 r + 6 r^2) up to 1, and Drake's rules for the two sides of a contact. It is written out from
 these formulas: of Drake it takes the mass matrix, the forces without contact and where geometries overlap, and nothing
-of a discrete step. The force of `sap` jumps by k tau x' where two geometries touch; error control makes the steps there
-as short as they have to be.
+of a discrete step.
+
+In the air steps are explicit. What touches is stiff, as friction that holds is a damper of mu f / v_s: steps there are
+linearly implicit, of `rodas`. Where two geometries touch or let go the force has a corner, and that of Kelvin and Voigt
+jumps by k tau x': a step ends there, and no pair pushes within a step that did not at its start.
 """
 
+import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
-from pydrake.multibody.tree import JacobianWrtVariable
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.tree import BodyIndex, MultibodyForces
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators, proximity_property
 from drake_diff.model.step import set_state
-from drake_diff.motion.dormand_prince import ERROR, STAGES, factor
+from drake_diff.motion.dormand_prince import ERROR, LEAST, STAGES, factor
+from drake_diff.motion.rodas import ImplicitSteps
 
 TOLERANCE = 1e-9  # of each step, relative to max(1, |x|)
 EVALUATIONS = 40_000  # of the equations of motion at most, about a second
 # v_s [m/s]: below it friction is a damper, above it Coulomb's, as in Drake's continuous plants. In Drake's steps it is
-# 1e-4 or less, which no explicit method can follow while anything sticks.
+# 1e-4 or less.
 SLIP = 1e-3
+SHORTEST = 1e-14  # [s] a step that is shorter does not move time
+ROOT = 1e-13  # [s] how near to a touch, or to the end of one, the step before it ends
+LOOKS = tuple(i / 8 for i in range(1, 9))  # of a step in the air: where it is looked at for what touches
+KELVIN_VOIGT, HUNT_CROSSLEY = "Kelvin-Voigt", "Hunt-Crossley"  # the laws of contact
+DAMPING = {KELVIN_VOIGT: "relaxation_time", HUNT_CROSSLEY: "dissipation"}  # the quantity each needs beside stiffness
 Rates = Callable[[Array], Array]
+Pairs = frozenset[Any]  # of geometries' identifiers
+
+
+def own_law(model: Model) -> str:
+    """The law of contact that a model's steps tend to as they become short."""
+    return KELVIN_VOIGT if model.contract.contact.approximation == "sap" else HUNT_CROSSLEY
+
+
+@dataclass(frozen=True, eq=False)
+class _Touch:
+    """What two geometries are when they touch: mu, k [N/m], d [s/m] or tau [s], the part of A's own point in it."""
+
+    friction: float
+    stiffness: float
+    damping: float
+    part: float
+    bodies: tuple[tuple[float, int, Any], ...]  # +1 for A and -1 for B, its index, itself; the world left out
 
 
 class ContinuousMotion:
     """The continuous motion of a model, as it is now: parameters that are applied act.
 
-    Raises ModelError, which says why, where it has none: contact that is no point contact or states no stiffness, PD
-    controllers, constraints.
+    `law` is that of contact, the model's own where it is not given. Raises ModelError, which says why, where it has
+    none: contact that is no point contact or states no stiffness, PD controllers, constraints.
     """
 
-    def __init__(self, model: Model):
+    def __init__(self, model: Model, law: str | None = None):
         plant, contract = model.plant, model.contract
         contact = contract.contact
         if contact.collision_pairs and contact.model != "point":
@@ -53,112 +83,220 @@ class ContinuousMotion:
         self.model, self.twin = model, model.double
         self.used = 0  # evaluations of the equations of motion by the last call of `states`
         self.touches = bool(contact.collision_pairs)
-        self.is_sap = contact.approximation == "sap"
+        self.law = law or own_law(model)
         self.actuation = model.actuation
         self.limits = model.inputs.of_actuators([actuator.effort_limit() for actuator in actuators(plant)])
         self.plain_rates = plant.IsVelocityEqualToQDot()
         self.still = np.zeros(model.nv)
         self.lower, self.upper = model.position_limits
-        self.materials: dict[tuple[Any, Any], tuple[float, ...]] = {}
+        self.forces = MultibodyForces(plant)
+        self._found: dict[Any, _Touch] = {}
 
-    def states(self, x0: Array, us: Array) -> Array:
+    def states(self, x0: Array, us: Array, *, tolerance: float | None = None, deadline: float = np.inf) -> Array:
         """(N+1, nx) at the ends of the model's steps, over which us (N, nu) is held.
 
-        SimulationError where it has no end: it reaches a joint limit, or is too stiff for `EVALUATIONS`.
+        SimulationError where it has no end: it reaches a joint limit, or is too stiff for `EVALUATIONS`. TimeoutError
+        where the clock (`time.monotonic`) is past `deadline` [s].
         """
         xs, dt = np.empty((len(us) + 1, self.model.nx)), self.model.time_step
         xs[0], self.used = x0, 0
+        allowed = TOLERANCE if tolerance is None else tolerance
         for k, u in enumerate(us):
             self.twin.set_input(u)
             force = self.actuation @ np.clip(u, -self.limits, self.limits)
-            xs[k + 1], dt, used = integrate(
-                partial(self.rates, force), xs[k], self.model.time_step, dt, EVALUATIONS - self.used
-            )
-            self.used += used
-            q = xs[k + 1, : self.model.nq]
-            if np.any(q < self.lower) or np.any(q > self.upper):
-                raise SimulationError("it reaches a joint limit, which has none")
+            xs[k + 1], dt = self._advance(partial(self.rates, force), xs[k], dt, allowed, deadline)
         return xs
 
-    def rates(self, force: Array, x: Array) -> Array:
-        """(nx,) dx/dt at `x` (nx,) under the actuators' generalized `force` (nv,)."""
+    def rates(self, force: Array, x: Array, only: Pairs | None = None) -> Array:
+        """(nx,) dx/dt at `x` (nx,) under the actuators' generalized `force` (nv,); of contacts `only` some push."""
+        self.used += 1
         twin, nq = self.twin, self.model.nq
         set_state(twin, x)
-        v = x[nq:]
         total = force - twin.inverse_dynamics(self.still)
-        if self.touches:
-            total = total + self.contact_force(v)
+        if self.touches and (only is None or only):
+            total = total + self.contact_force(only)
+        v = x[nq:]
         q_dot = v if self.plain_rates else twin.rates(v)
         return np.concatenate([q_dot, np.linalg.solve(twin.mass_matrix(), total)])
 
-    def contact_force(self, v: Array) -> Array:
-        """(nv,) of all contacts in the context's state, whose velocity is `v` (nv,)."""
-        plant, context, total = self.twin.plant, self.twin.context, np.zeros(self.model.nv)
-        world, by_v = plant.world_frame(), JacobianWrtVariable.kV
-        query = plant.get_geometry_query_input_port().Eval(context)
+    def pushing(self, x: Array) -> Pairs:
+        """The pairs of geometries that push each other at `x` (nx,)."""
+        if not self.touches:
+            return frozenset()
+        set_state(self.twin, x)
+        return self._contacts(None)[1]
+
+    def contact_force(self, only: Pairs | None = None) -> Array:
+        """(nv,) of all contacts in the context's state, or of some pairs `only`."""
+        plant, context = self.twin.plant, self.twin.context
+        self.forces.SetZero()
+        for i, wrench in self._contacts(only)[0].items():
+            force = SpatialForce(np.array(wrench))
+            plant.get_body(BodyIndex(i)).AddInForceInWorld(context, force, self.forces)
+        return np.asarray(self.twin.own_force(plant.CalcGeneralizedForces(context, self.forces)))
+
+    def _contacts(self, only: Pairs | None) -> tuple[dict[int, list[float]], Pairs]:
+        """(the wrench on each body about its origin, the pairs that push) in the context's state."""
+        plant, context = self.twin.plant, self.twin.context
+        inspector, pairs = self._penetrations()
+        motions: dict[int, list[float]] = {}  # of each body's origin: where it is, how it turns, how it moves
+        wrenches: dict[int, list[float]] = {}
+        pushing = []
+        for pair in pairs:
+            key = pair.id_A, pair.id_B
+            if only is not None and key not in only:
+                continue
+            touch = self._found.get(key) or self._touch(inspector, *key)
+            a, b = touch.part, 1 - touch.part
+            x, y, z = (a * p + b * q for p, q in zip(pair.p_WCa.tolist(), pair.p_WCb.tolist(), strict=True))
+            ux = uy = uz = 0.0
+            for sign, i, body in touch.bodies:
+                if i not in motions:
+                    place = plant.EvalBodyPoseInWorld(context, body).translation().tolist()
+                    motions[i] = place + plant.EvalBodySpatialVelocityInWorld(context, body).get_coeffs().tolist()
+                    wrenches[i] = [0.0] * 6
+                px, py, pz, wx, wy, wz, vx, vy, vz = motions[i]
+                rx, ry, rz = x - px, y - py, z - pz
+                ux += sign * (vx + wy * rz - wz * ry)
+                uy += sign * (vy + wz * rx - wx * rz)
+                uz += sign * (vz + wx * ry - wy * rx)
+            fx, fy, fz, push = self._force(touch, pair.depth, pair.nhat_BA_W.tolist(), (ux, uy, uz))
+            if push > 0:
+                pushing.append(key)
+            for sign, i, _ in touch.bodies:
+                px, py, pz, *_ = motions[i]
+                rx, ry, rz = x - px, y - py, z - pz
+                w = wrenches[i]
+                w[0] += sign * (ry * fz - rz * fy)
+                w[1] += sign * (rz * fx - rx * fz)
+                w[2] += sign * (rx * fy - ry * fx)
+                w[3] += sign * fx
+                w[4] += sign * fy
+                w[5] += sign * fz
+        return wrenches, frozenset(pushing)
+
+    def _force(self, touch: _Touch, depth: float, normal: Any, relative: Any) -> tuple[float, ...]:
+        """[N] on A, and how much of it is along the normal. A's point moves `relative` to B's; `normal` is out of B."""
+        (nx, ny, nz), (vx, vy, vz) = normal, relative
+        rate = -(nx * vx + ny * vy + nz * vz)
+        if self.law == KELVIN_VOIGT:
+            push = max(0.0, touch.stiffness * (depth + touch.damping * rate))
+        else:
+            push = touch.stiffness * depth * max(0.0, 1 + touch.damping * rate)
+        sx, sy, sz = vx + rate * nx, vy + rate * ny, vz + rate * nz
+        speed = (sx * sx + sy * sy + sz * sz) ** 0.5
+        r = min(speed / SLIP, 1.0)
+        drag = touch.friction * r**3 * (10 - 15 * r + 6 * r * r) / speed if speed > 0 else 0.0
+        return push * (nx - drag * sx), push * (ny - drag * sy), push * (nz - drag * sz), push
+
+    def _penetrations(self) -> tuple[Any, Any]:
+        """(inspector, pairs that overlap) in the context's state."""
+        query = self.twin.plant.get_geometry_query_input_port().Eval(self.twin.context)
         try:
-            pairs = query.ComputePointPairPenetration()
+            return query.inspector(), query.ComputePointPairPenetration()
         except RuntimeError as error:
             raise SimulationError(f"Drake cannot tell how deep geometries overlap: {error}") from error
-        for pair in pairs:
-            mu, k, d, tau, part = self.material(query.inspector(), pair.id_A, pair.id_B)
-            point = part * np.asarray(pair.p_WCa) + (1 - part) * np.asarray(pair.p_WCb)
-            jacobian = np.zeros((3, plant.num_velocities()))
-            for sign, geometry in ((1, pair.id_A), (-1, pair.id_B)):
-                body = plant.GetBodyFromFrameId(query.inspector().GetFrameId(geometry))
-                p_BC = plant.CalcPointsPositions(context, world, point.reshape(3, 1), body.body_frame())
-                J = plant.CalcJacobianTranslationalVelocity(context, by_v, body.body_frame(), p_BC, world, world)
-                jacobian += sign * J
-            if self.model.coupling is not None:
-                jacobian = jacobian @ self.model.coupling.spread
-            normal, relative = np.asarray(pair.nhat_BA_W), jacobian @ v
-            rate = -float(normal @ relative)
-            push = k * (pair.depth + tau * rate) if self.is_sap else k * pair.depth * max(0.0, 1 + d * rate)
-            slip = relative + rate * normal
-            speed = float(np.linalg.norm(slip))
-            r = min(speed / SLIP, 1.0)
-            drag = mu * r**3 * (10 - 15 * r + 6 * r * r) / speed if speed > 0 else 0.0
-            total += max(0.0, push) * (jacobian.T @ (normal - drag * slip))
-        return total
 
-    def material(self, inspector: Any, a: Any, b: Any) -> tuple[float, ...]:
-        """mu, k [N/m], d [s/m] and tau [s] of a contact of two geometries, and the part of a's own point in it."""
-        if (a, b) not in self.materials:
-            sides = []
-            for geometry in (a, b):
-                names = ("friction", "stiffness", "dissipation", "relaxation_time")
-                found = {name: proximity_property(inspector, geometry, name) for name in names}
-                needed = names[:2] + names[3 if self.is_sap else 2 :][:1]
-                if missing := [name for name in needed if found[name] is None]:
-                    raise SimulationError(f"{inspector.GetName(geometry)} states no {missing[0]}")
-                sides.append([found[name] or 0.0 for name in names])
-            (mu_a, k_a, d_a, tau_a), (mu_b, k_b, d_b, tau_b) = sides
-            mu, part = 2 * mu_a * mu_b / (mu_a + mu_b or 1.0), k_a / (k_a + k_b)
-            d = (1 - part) * d_a + part * d_b
-            self.materials[a, b] = mu, k_a * k_b / (k_a + k_b), d, tau_a + tau_b, part
-        return self.materials[a, b]
+    def _touch(self, inspector: Any, a: Any, b: Any) -> _Touch:
+        plant, names, sides, bodies = self.twin.plant, ("friction", "stiffness", DAMPING[self.law]), [], []
+        for sign, geometry in ((1.0, a), (-1.0, b)):
+            values = []
+            for name in names:
+                value = proximity_property(inspector, geometry, name)
+                if value is None:
+                    raise SimulationError(f"{inspector.GetName(geometry)} states no {name}")
+                values.append(value)
+            sides.append(values)
+            body = plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
+            if body.index() != plant.world_body().index():
+                bodies.append((sign, int(body.index()), body))
+        (mu_a, k_a, d_a), (mu_b, k_b, d_b) = sides
+        part = k_a / (k_a + k_b)
+        both = d_a + d_b if self.law == KELVIN_VOIGT else (1 - part) * d_a + part * d_b
+        friction, stiffness = 2 * mu_a * mu_b / (mu_a + mu_b or 1.0), k_a * k_b / (k_a + k_b)
+        self._found[a, b] = _Touch(friction, stiffness, both, part, tuple(bodies))
+        return self._found[a, b]
+
+    def _advance(
+        self, rates: Callable[..., Array], x: Array, dt: float, tolerance: float, deadline: float
+    ) -> tuple[Array, float]:
+        """(the state one of the model's steps after `x`, a length of step [s] that would do next)."""
+        duration, now, pushing = self.model.time_step, 0.0, self.pushing(x)
+        while now < duration:
+            f = partial(rates, only=pushing)
+            steps = ImplicitSteps(f, x) if pushing else ExplicitSteps(f, x)
+            while True:
+                if self.used > EVALUATIONS:
+                    raise SimulationError(f"it is too stiff: {EVALUATIONS} evaluations do not reach its end")
+                if time.monotonic() > deadline:
+                    raise TimeoutError
+                step = min(dt, duration - now)
+                ahead, error = steps.take(step)
+                ratio = _ratio(x, ahead, error, tolerance)
+                change = factor(ratio) if np.isfinite(ratio) else LEAST
+                if ratio <= 1:
+                    break
+                dt = step * change
+                if dt < SHORTEST:
+                    raise SimulationError("it cannot go on: its rates are not finite, or jump")
+            # A step that was cut off at the end says nothing against a longer one.
+            dt = max(dt, step * change) if step < dt else step * change
+            taken, x, pushing = self._until_change(steps, step, ahead, pushing)
+            now = duration if taken == duration - now else now + taken
+            if np.any(x[: self.model.nq] < self.lower) or np.any(x[: self.model.nq] > self.upper):
+                raise SimulationError("it reaches a joint limit, which has none")
+        return x, dt
+
+    def _until_change(
+        self, steps: "ExplicitSteps | ImplicitSteps", step: float, ahead: Array, pushing: Pairs
+    ) -> tuple[float, Array, Pairs]:
+        """(length, end, pairs that push there) of the step, or of its part until other pairs push than at its start."""
+        if not self.touches:
+            return step, ahead, pushing
+        low, high, now = 0.0, step, self.pushing(ahead)
+        if isinstance(steps, ExplicitSteps):
+            seen = next((part for part in LOOKS if self.pushing(steps.within(part, ahead))), 1.0)
+            low, high = (seen - LOOKS[0]) * step, seen * step
+            if seen < 1:
+                ahead, _ = steps.take(high)
+                now = self.pushing(ahead)
+        while now != pushing and high - low > ROOT:
+            middle = (low + high) / 2
+            state, _ = steps.take(middle)
+            there = self.pushing(state)
+            if there == pushing:
+                low = middle
+            else:
+                high, ahead, now = middle, state, there
+        return high, ahead, now
 
 
-def integrate(rates: Rates, x: Array, duration: float, dt: float, most: int) -> tuple[Array, float, int]:
-    """(the state `duration` [s] after `x`, a length of step [s] that would do next, evaluations of `rates` taken).
+class ExplicitSteps:
+    """Steps of any length from one state, of Dormand and Prince's orders 5 and 4."""
 
-    Dormand and Prince's pair of orders 5 and 4, from a first step of `dt`.
-    """
-    time, used, first = 0.0, 1, rates(x)
-    while time < duration:
-        if used > most:
-            raise SimulationError(f"it is too stiff: {EVALUATIONS} evaluations do not reach its end")
-        step = min(dt, duration - time)
-        slopes = [first]
+    def __init__(self, rates: Rates, x: Array):
+        self.rates, self.x, self.first = rates, x, rates(x)
+        self.last, self.length = self.first, 0.0  # the slope at the end of the last step, and how long it was
+
+    def take(self, h: float) -> tuple[Array, Array]:
+        """The state after a step of `h` [s], and its error."""
+        slopes, at = [self.first], self.x
         for weights in STAGES:
-            ahead = x + step * (np.array(weights) @ np.array(slopes))
-            slopes.append(rates(ahead))
-        used += len(STAGES)
-        size = TOLERANCE * np.maximum(1.0, np.maximum(np.abs(x), np.abs(ahead)))
-        error = float(np.sqrt(np.mean((step * (ERROR @ np.array(slopes)) / size) ** 2)))
-        if error <= 1:
-            time, x, first = (duration if step == duration - time else time + step), ahead, slopes[-1]
-        change = factor(error)
-        # A step that was cut off at the end says nothing against a longer one.
-        dt = max(dt, step * change) if error <= 1 and step < dt else step * change
-    return x, dt, used
+            at = self.x + h * (np.array(weights) @ np.array(slopes))
+            slopes.append(self.rates(at))
+        self.last, self.length = slopes[-1], h
+        return at, h * (ERROR @ np.array(slopes))
+
+    def within(self, part: float, ahead: Array) -> Array:
+        """The state at `part` of the last step, which led to `ahead`: by the cubic of both ends' slopes."""
+        s, h = part, self.length
+        ends = (1 + 2 * s) * (1 - s) ** 2 * self.x + s * s * (3 - 2 * s) * ahead
+        return np.asarray(ends + h * s * (1 - s) * ((1 - s) * self.first - s * self.last))
+
+
+def _ratio(x: Array, ahead: Array, error: Array, tolerance: float) -> float:
+    """The error of a step from `x` to `ahead`, as a part of what is allowed."""
+    size = tolerance * np.maximum(1.0, np.maximum(np.abs(x), np.abs(ahead)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        ratio = float(np.sqrt(np.mean((error / size) ** 2)))
+    return ratio if np.isfinite(ratio) else float("inf")
