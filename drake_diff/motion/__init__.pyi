@@ -4,3 +4,4 @@ from .rollout import Rollout as Rollout
 from .smoothing import Barrier as Barrier
 from .smoothing import Gaussian as Gaussian
 from .smoothing import Smoothed as Smoothed
+from .undefined import Undefined as Undefined

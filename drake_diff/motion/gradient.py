@@ -3,8 +3,8 @@
 import inspect
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,21 +14,24 @@ from drake_diff._base.autodiff import gradient_of
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.derivatives.sources import check_method
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
-from drake_diff.exceptions import GradientWarning, InputError, SimulationError
+from drake_diff.exceptions import GradientWarning, InputError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameters, ParameterVector, applied, select
 from drake_diff.model.step import advance
-from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import active_parameters, differentiate_policy, policy_parameters
 from drake_diff.motion.rollout import Policy, check_inputs
+
+if TYPE_CHECKING:
+    from drake_diff.motion.flow.steps import FlowSteps
+    from drake_diff.motion.undefined import Undefined
 
 Loss = Callable[..., Any]
 # A policy's derivatives (nu, nx) by the state and (nu, n) by those of its parameters that act, and which they are.
 Feedback = tuple[Array, Array, slice]
 EXPLODED, VANISHED = 1e6, 1e-6
 CONTINUOUS = "continuous"  # the method that takes no steps of Drake's
-# Widths, of a state's unit, and by what part of the derivative the slope of a loss that is but curved may differ there.
-WIDTHS, SAME_SLOPE = (1e-2, 1e-3, 1e-4), (np.inf, 0.1, 0.01)
+FINER = 1e-2  # of its tolerance: of a motion whose derivative is not the slope that there is
+NAMED = 3  # columns of which a warning tells the numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +62,8 @@ class RolloutGradient(ShowsItsRepr):
     xs: Array  # (N+1, nx) the motion
     us: Array  # (N, nu) the inputs that were applied
     methods: tuple[str, ...]  # where the step Jacobians came from: one name, or more where a fallback was taken
+    # Of method="continuous": the columns in which the loss has no slope, the derivative being that of a point alone.
+    undefined: "tuple[Undefined, ...]" = ()
 
     def __repr__(self) -> str:
         sizes = [f"|by x0| {np.linalg.norm(self.by_x0):.3g}", f"|by us| {np.linalg.norm(self.by_us):.3g}"]
@@ -71,6 +76,7 @@ class RolloutGradient(ShowsItsRepr):
             f"  {', '.join(sizes[:6])}{', ...' if len(sizes) > 6 else ''}\n"
             f"  |d loss / d x_k| from {first:.3g} at the start to {last:.3g} at the end, a factor of "
             f"{self.growth_rate:.3g} a step"
+            + (f"\n  undefined by {', '.join(one.column for one in self.undefined)}" if self.undefined else "")
         )
 
     @property
@@ -126,9 +132,9 @@ def differentiate_rollout(
         num_steps: N, where `us` does not say it.
         method: Where the step Jacobians come from, see `differentiate_step`; or "continuous": the motion in continuous
             time that the steps stand for, contact included, integrated with error control, and its own derivative by
-            the state, the inputs, the policy and contact's parameters. A `GradientWarning` says where the loss does not
-            follow it along its own direction, to 10 % over +-1e-3 and to 1 % over +-1e-4: after many bounces, or one
-            that barely touches, it is that of a point alone.
+            the state, the inputs, the policy and contact's parameters. Columns in which the loss has no slope, after
+            many bounces or where a body barely touches, are in `undefined`, and a `GradientWarning` names them: what
+            the gradient has there is the derivative of that point alone (`drake_diff.motion.undefined` says when).
 
     Returns:
         The loss; `by_x0` (nx,), `by_us` (N, nu), `by_parameters` (np,), `by_policy` (n,); the motion, and the norm of
@@ -151,21 +157,31 @@ def differentiate_rollout(
     if us is not None and policy is not None:
         raise InputError("differentiate_rollout", got="us and policy", expected="one of them")
     vector = select(model, parameters)
+    if method == CONTINUOUS:
+        return _in_continuous_time(model, x0, us, policy, loss, vector, num_steps)
     feedback: list[Feedback] = []
     with applied(vector) as set_model:
-        if method == CONTINUOUS:
-            linearization, feedback, inputs = _along_the_flow(set_model, x0, us, policy, num_steps, vector)
-        elif policy is None:
+        if policy is None:
             inputs = check_inputs(model, us, num_steps)
             linearization = derivatives_along(set_model, x0, inputs, vector=vector, method=method)
         else:
             steps = positive_int("num_steps", num_steps)
             linearization, feedback, inputs = _close_the_loop(set_model, x0, policy, steps, vector, method)
+    return _collected(x0, inputs, policy, loss, linearization, feedback)
+
+
+def _collected(
+    x0: Array,
+    inputs: Array,
+    policy: Policy | None,
+    loss: Loss,
+    linearization: Sequence[StepDerivatives],
+    feedback: Sequence[Feedback],
+) -> RolloutGradient:
+    """What the steps of a motion make of its loss."""
     xs = np.vstack([x0, [d.x_next for d in linearization]])
     value, by_xs, by_us = differentiate_loss(loss, xs, inputs)
     totals = accumulate(linearization, by_xs, by_us, feedback, len(policy_parameters(policy)))
-    if method == CONTINUOUS:
-        _warn_where_it_is_no_slope(model, x0, inputs, policy, loss, vector, totals.states[0])
     closed = [d.A for d in linearization]
     if feedback:
         closed = [d.A + d.B @ by_x for d, (by_x, _, _) in zip(linearization, feedback, strict=True)]
@@ -185,6 +201,44 @@ def differentiate_rollout(
     )
 
 
+def _in_continuous_time(
+    model: Model,
+    x0: Array,
+    us: ArrayLike | None,
+    policy: Policy | None,
+    loss: Loss,
+    vector: ParameterVector,
+    num_steps: int | None,
+) -> RolloutGradient:
+    """The gradient along the flow, and a warning where the loss has no slope; see `drake_diff.motion.undefined`."""
+    from drake_diff.motion.flow.integrate import TOLERANCE  # loads CasADi
+    from drake_diff.motion.flow.steps import FlowSteps
+    from drake_diff.motion.undefined import Beside, undefined_columns
+
+    if policy is None:
+        given = check_inputs(model, us, num_steps)
+    else:
+        given = np.zeros((positive_int("num_steps", num_steps), model.nu))
+    for tolerance in (TOLERANCE, FINER * TOLERANCE):
+        with applied(vector) as set_model:
+            steps = FlowSteps(set_model, vector, tolerance)
+            linearization, feedback, inputs = along_the_flow(steps, x0, given, policy)
+        gradient = _collected(x0, inputs, policy, loss, linearization, feedback)
+        undefined = undefined_columns(Beside(model, x0, inputs, policy, loss, vector, steps), gradient)
+        if not any(one.missed for one in undefined):
+            break
+    if undefined:
+        more = f", and {len(undefined) - NAMED} more" if len(undefined) > NAMED else ""
+        told = "; ".join(str(one) for one in undefined[:NAMED])
+        warnings.warn(
+            f"the loss has no slope in {len(undefined)} of its columns, the derivative there is that of a point alone: "
+            f"{told}{more}",
+            GradientWarning,
+            stacklevel=3,
+        )
+    return replace(gradient, undefined=undefined)
+
+
 def _close_the_loop(
     model: Model, x0: Array, policy: Policy, count: int, vector: ParameterVector, method: str
 ) -> tuple[list[StepDerivatives], list[Feedback], Array]:
@@ -200,60 +254,23 @@ def _close_the_loop(
     return derivatives_along(model, x0, inputs, vector=vector, method=method, xs=xs), feedback, inputs
 
 
-def _along_the_flow(
-    model: Model, x0: Array, us: ArrayLike | None, policy: Policy | None, num_steps: int | None, vector: ParameterVector
+def along_the_flow(
+    steps: "FlowSteps", x0: Array, us: Array, policy: Policy | None
 ) -> tuple[list[StepDerivatives], list[Feedback], Array]:
-    """The motion in continuous time first, then the derivatives of its intervals."""
-    from drake_diff.motion.flow.steps import FlowSteps  # loads CasADi
-
-    steps, feedback = FlowSteps(model, vector), list[Feedback]()
-    if policy is None:
-        inputs = check_inputs(model, us, num_steps)
-        _, _, flow = steps.roll(x0, lambda x, k: inputs[k], len(inputs))
-        return steps.derivatives(flow), feedback, inputs
+    """The motion in continuous time first, then the derivatives of its intervals; a policy takes the length of `us`."""
+    feedback, nu = list[Feedback](), steps.model.nu
 
     def choose(x: Array, k: int) -> Array:
-        t = k * model.time_step
-        u, by_x, by_parameters = differentiate_policy(policy, x, t, model.nu)
+        if policy is None:
+            return us[k]
+        t = k * steps.model.time_step
+        u, by_x, by_parameters = differentiate_policy(policy, x, t, nu)
         active = active_parameters(policy, t)
         feedback.append((by_x, by_parameters[:, active].copy(), active))
         return u
 
-    _, inputs, flow = steps.roll(x0, choose, positive_int("num_steps", num_steps))
+    _, inputs, flow = steps.roll(x0, choose, len(us))
     return steps.derivatives(flow), feedback, inputs
-
-
-def _warn_where_it_is_no_slope(
-    model: Model, x0: Array, us: Array, policy: Policy | None, loss: Loss, vector: ParameterVector, by_x0: Array
-) -> None:
-    """Compare the derivative by the first state with slopes of the loss over `WIDTHS`, along its own direction."""
-    from drake_diff.motion.flow.steps import FlowSteps  # loads CasADi
-
-    space = tangent_space(model)
-    by_motion = space.derivative_of_plus(x0).T @ by_x0
-    size = float(np.linalg.norm(by_motion))
-    if not size > 0:
-        return
-    with applied(vector) as set_model:
-        steps = FlowSteps(set_model, vector)
-
-        def choose(x: Array, k: int) -> Array:
-            return us[k] if policy is None else np.asarray(policy(x, k * model.time_step), dtype=float)
-
-        def at(width: float) -> float:
-            xs, inputs, _ = steps.roll(space.plus(x0, width / size * by_motion), choose, len(us))
-            return evaluate_loss(loss, xs, inputs)
-
-        try:
-            slopes = [(at(w) - at(-w)) / (2 * w) for w in WIDTHS]
-        except SimulationError as error:
-            told = f"a little away from the first state there is no motion: {error}"
-        else:
-            if all(abs(slope - size) <= part * size for slope, part in zip(slopes, SAME_SLOPE, strict=True)):
-                return
-            over = ", ".join(f"{slope:.5g} over +-{w:g}" for w, slope in zip(WIDTHS, slopes, strict=True))
-            told = f"along its own direction the derivative is {size:.5g}, and the loss rises by {over}"
-    warnings.warn(f"the derivative by the first state is that of a point alone: {told}", GradientWarning, stacklevel=3)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,333 @@
+"""Where the loss of a motion in continuous time has no slope: its columns, by motions a little beside it.
+
+The derivative along a motion that touches is that of a point. A body that barely touches or tumbles ends elsewhere a
+little away, and then it is no slope of anything that can be measured or descended. A column has a slope where
+
+    1. the slopes over +-1e-3 and +-1e-4 of its unit agree to 0.1 %, and the derivative is within 1 % of them;
+    2. the slope over +-1e-2 agrees with them to 0.1 % too, or differs from them as a smooth curve does: by the square
+       of the width, which the slope over +-5e-3 shows,
+
+all of it but for what the integration's own error makes of a slope. It is `Undefined` otherwise. A graze within 1e-2
+is undefined so, also where the derivative at the point is right over a thousandth of that; a curve is not. Where
+nothing touches, here or beside, a hundredth of these widths will do: a double pendulum is smooth, and yet bent.
+
+Rollouts are spared where all is well. Columns are moved together in three groups, those with the largest derivatives
+first, each by 1e-2 and all so that the loss rises. Where the loss follows the sum of their derivatives to 0.5 % of the
+largest, they have slopes; else, and where a group is but one column, the same is asked of each on its own, and the
+narrower widths of those that fail. Slopes over 1e-2 need no more than a tolerance of 1e-7.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff.exceptions import GradientError, SimulationError
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import ParameterVector, applied
+from drake_diff.model.tangent import tangent_space
+from drake_diff.motion.flow.integrate import TOLERANCE
+from drake_diff.motion.flow.steps import FlowSteps
+from drake_diff.motion.gradient import (
+    Loss,
+    RolloutGradient,
+    accumulate,
+    along_the_flow,
+    differentiate_loss,
+    evaluate_loss,
+)
+from drake_diff.motion.policy import ParametricPolicy, policy_parameters
+from drake_diff.motion.smoothing import Gaussian, Smoothed, smooth
+
+WIDE, BETWEEN, MIDDLE, NARROW = 1e-2, 5e-3, 1e-3, 1e-4  # of a column's unit, to both sides
+CURVE = (WIDE**2 - MIDDLE**2) / (BETWEEN**2 - MIDDLE**2)  # how slopes over these differ on a smooth curve
+SMOOTH = 1e-2  # part of the widths where nothing touches
+COARSE = 1e-7  # the tolerance of what moves by 1e-2
+SETTLED, FOLLOWS, RIGHT = 1e-3, 5e-3, 1e-2
+BENT = 0.1  # of a curve's difference: what its fourth derivative may add
+NEGLIGIBLE = 1e-3  # of the largest column: what is smaller is judged as if it were that large
+NOISE = 0.1  # of the tolerance, times how much of an error comes through to the loss: its change between two motions
+GROUPS = 3
+MANY = 24  # parameters of a policy: more are one column, along their own gradient
+SMOOTHED = tuple(float(f"{width:.2g}") for width in 10 ** np.arange(-3.0, 0.25, 0.5))  # widths that are tried
+KNOWN = 0.2  # of a smoothed slope: its standard error at most
+
+
+@dataclass(frozen=True, eq=False)
+class Undefined(ShowsItsRepr):
+    """A column of a gradient in which the loss has no slope: the derivative at the point is that of the point alone.
+
+    `slopes` are measured over `widths` to both sides, in the column's unit; they may be fewer than the widths that
+    `differentiate_rollout` names, for it stops where the answer is clear. `reason` says what is not as it should be.
+
+    Example:
+        >>> import warnings
+        >>> model = dd.load_model("models/sphere_on_ground.sdf", time_step=0.01)
+        >>> x0 = np.array([1.0, 0, 0, 0, 0, 0, 0.2964, 0, 0, 0, 0, 0, 0])  # it touches just at the end, or not
+        >>> with warnings.catch_warnings(action="ignore"):
+        ...     g = dd.differentiate_rollout(model, x0, None, lambda x: x[12], num_steps=20, method="continuous")
+        >>> [one.column for one in g.undefined]
+        ['ball_z[0]', 'ball_vz[0]']
+    """
+
+    column: str
+    derivative: float
+    widths: tuple[float, ...]
+    slopes: tuple[float, ...]
+    reason: str
+    _along: "Line" = field(repr=False)
+
+    def __repr__(self) -> str:
+        over = ", ".join(f"{s:.5g} over +-{w:.3g}" for w, s in zip(self.widths, self.slopes, strict=True))
+        return f"{self.column}: {self.derivative:.5g} at the point, {over or 'nothing'} measured; {self.reason}"
+
+    @property
+    def missed(self) -> bool:
+        """Whether there is a slope, and the derivative is not it."""
+        return self.reason == MISSED
+
+    def smooth(self, samples: int = 100, seed: int = 0) -> Smoothed:
+        """The slope of the loss's mean under normal noise in this column, of the smallest width that has one.
+
+        Widths (standard deviations) go from 1e-3 to 1 of the column's unit by factors of 3. The first at which the
+        blend of first and zeroth order (see `drake_diff.smooth`) is known to 20 %, by its standard error, is taken.
+        Each costs `samples` rollouts with their derivatives.
+
+        Args:
+            samples: How many at each width.
+            seed: The same gives the same.
+
+        Returns:
+            Value and Jacobian (1, 1) with their variance, `noise` with the width in the column's unit, and `bias`: by
+            how much the mean of the derivatives alone would be wrong, with its error.
+
+        Raises:
+            GradientError: No width up to 1 has a slope that so many samples show.
+            InputError: Fewer than 2 samples.
+            SimulationError: A motion beside this one has no end.
+        """
+        line, error = self._along, float("nan")
+        for width in SMOOTHED:
+            noise = Gaussian(width * line.unit)
+            found = smooth(line.value, [0.0], line.derivative, noise=noise, samples=samples, seed=seed)
+            value, error = float(found.jacobian[0, 0]), float(np.sqrt(found.variance[0, 0]))
+            if error <= KNOWN * abs(value):
+                return found
+        raise GradientError(
+            f"no width up to {SMOOTHED[-1] * line.unit:g} has a smoothed slope by {self.column} that {samples} samples "
+            f"show: there it is {value:.3g} with a standard error of {error:.2g}; take more samples"
+        )
+
+
+UNSETTLED = "the slopes do not settle"
+MISSED = "the slopes settle, and the derivative is not what they settle at"
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """Motions in continuous time beside one, by displacements (n,): of the first state on the tangent space, of the
+
+    inputs (N, nu) or the policy's parameters, and of the model's parameters.
+    """
+
+    model: Model
+    x0: Array
+    us: Array  # (N, nu)
+    policy: Any
+    loss: Loss
+    vector: ParameterVector
+    steps: FlowSteps  # of the motion itself, whose equations are made
+
+    @cached_property
+    def space(self) -> Any:
+        return tangent_space(self.model)
+
+    @cached_property
+    def _given(self) -> Array:
+        return self.us.ravel() if self.policy is None else policy_parameters(self.policy)
+
+    def _moved(self, displacement: Array) -> tuple[Array, Array, Any, ParameterVector]:
+        size, given = self.space.size, len(self._given)
+        x0 = self.space.plus(self.x0, displacement[:size])
+        values = self._given + displacement[size : size + given]
+        vector = self.vector.at(self.vector.values + displacement[size + given :])
+        if self.policy is None:
+            return x0, values.reshape(self.us.shape), None, vector
+        return x0, self.us, ParametricPolicy(self.policy, values) if given else self.policy, vector
+
+    def _steps(self, model: Model, vector: ParameterVector, tolerance: float) -> FlowSteps:
+        """Those of the motion itself, unless parameters are moved."""
+        if not np.array_equal(vector.values, self.vector.values):
+            return FlowSteps(model, vector, tolerance)
+        self.steps.integrator.tolerance = tolerance
+        return self.steps
+
+    def value(self, displacement: Array, tolerance: float) -> tuple[float, bool]:
+        """The loss at a displacement (n,), and whether anything touches on the way."""
+        x0, us, policy, vector = self._moved(displacement)
+
+        def choose(x: Array, k: int) -> Array:
+            return us[k] if policy is None else np.asarray(policy(x, k * self.model.time_step), dtype=float)
+
+        with applied(vector) as model:
+            xs, inputs, flow = self._steps(model, vector, tolerance).roll(x0, choose, len(us))
+        return evaluate_loss(self.loss, xs, inputs), bool(flow.events)
+
+    def gradient(self, displacement: Array) -> tuple[float, Array]:
+        """The loss, and its derivative (n,) by the displacement."""
+        x0, us, policy, vector = self._moved(displacement)
+        with applied(vector) as model:
+            steps = self._steps(model, vector, TOLERANCE)
+            linearization, feedback, inputs = along_the_flow(steps, x0, us, policy)
+        xs = np.vstack([x0, [d.x_next for d in linearization]])
+        value, by_xs, by_us = differentiate_loss(self.loss, xs, inputs)
+        totals = accumulate(linearization, by_xs, by_us, feedback, len(policy_parameters(policy)))
+        given = totals.inputs.ravel() if policy is None else totals.policy
+        by_start = totals.states[0] @ self._derivative_of_start(displacement[: self.space.size])
+        return value, np.concatenate([by_start, given, totals.parameters])
+
+    def _derivative_of_start(self, d: Array, step: float = 1e-5) -> Array:
+        """(nx, size): of x0 moved by d (size,), which is linear but for a turn; to 1e-10."""
+        ends = [[self.space.plus(self.x0, d + sign * step * e) for e in np.eye(len(d))] for sign in (1, -1)]
+        return np.asarray((np.array(ends[0]) - np.array(ends[1])).T / (2 * step))
+
+    def lines(self, gradient: RolloutGradient) -> "Iterator[Line]":
+        """A line for each column."""
+        size, given, (count, nu) = self.space.size, len(self._given), self.us.shape
+        by_start = gradient.by_x0 @ self.space.derivative_of_plus(self.x0)
+        by_given = gradient.by_us.ravel() if self.policy is None else gradient.by_policy
+        flat = np.concatenate([by_start, by_given, gradient.by_parameters])
+        eye = np.eye(len(flat))
+        for j, name in enumerate(self.space.names):
+            yield Line(self, f"{name}[0]", eye[j], 1.0, flat[j])
+        if self.policy is None:
+            for j, name in enumerate(self.model.input_names):
+                rows = slice(size + j, size + count * nu, nu)
+                unit = max(1.0, float(np.max(np.abs(self.us[:, j]))))
+                yield Line(self, f"{name} at all times", eye[rows].sum(axis=0), unit, flat[rows].sum())
+        elif given > MANY:
+            along = np.zeros(len(flat))
+            along[size : size + given] = by_given / (np.linalg.norm(by_given) or 1.0)
+            yield Line(self, f"the policy's {given} parameters, along their gradient", along, 1.0, float(flat @ along))
+        else:
+            for i in range(given):
+                unit = max(1.0, abs(float(self._given[i])))
+                yield Line(self, f"policy[{i}]", eye[size + i], unit, flat[size + i])
+        if self.vector.parameters:
+            for i, (name, unit) in enumerate(zip(self.vector.names, self.vector.difference_scale(), strict=True)):
+                yield Line(self, name, eye[size + given + i], float(unit), flat[size + given + i])
+
+
+@dataclass(eq=False)
+class Line:
+    """The loss along one column; `unit` is what widths are parts of, `slope` the derivative at the point."""
+
+    beside: Beside
+    column: str
+    vector: Array  # (n,) a displacement of 1 in the column
+    unit: float
+    slope: float
+    touches: bool = field(default=False, init=False)  # whether anything does in a motion along it
+    _last: tuple[float, Array] = field(default=(float("nan"), np.zeros(0)), init=False)
+
+    @property
+    def change(self) -> float:
+        """How much the loss rises over one unit, by the derivative."""
+        return self.slope * self.unit
+
+    def over(self, width: float, tolerance: float) -> float:
+        """The slope over +- so many units."""
+        way = width * self.unit
+        (ahead, touches), (behind, also) = (self.beside.value(s * way * self.vector, tolerance) for s in (1, -1))
+        self.touches |= touches or also
+        return (ahead - behind) / (2 * way)
+
+    def value(self, z: Array) -> float:
+        """The loss at z (1,); keeps its derivative, for which it is asked next."""
+        value, gradient = self.beside.gradient(z[0] * self.vector)
+        self._last = float(z[0]), gradient
+        return value
+
+    def derivative(self, z: Array) -> Array:
+        """(1,) the derivative at z (1,)."""
+        if self._last[0] != z[0]:
+            self.value(z)
+        return np.array([self._last[1] @ self.vector])
+
+
+def undefined_columns(beside: Beside, gradient: RolloutGradient) -> tuple[Undefined, ...]:
+    """The columns of `gradient` in which the loss has no slope."""
+    lines = list(beside.lines(gradient))
+    judge = _Judge(
+        NEGLIGIBLE * max(abs(line.change) for line in lines),
+        NOISE * max(1.0, float(np.max(gradient.state_gradient_norms))),
+    )
+    order = sorted(range(len(lines)), key=lambda j: -abs(lines[j].change))
+    suspects: list[int] = []
+    for group in np.array_split(order, min(GROUPS, len(lines))):
+        if len(group) == 1 or not judge.follow(beside, [lines[j] for j in group]):
+            suspects += group.tolist()
+    found = (judge.column(lines[j]) for j in sorted(suspects))
+    return tuple(one for one in found if one is not None)
+
+
+@dataclass(frozen=True)
+class _Judge:
+    least: float  # [of the loss by one unit of a column] what is smaller is judged as if it were that large
+    noise: float  # of the loss, by the tolerance
+
+    def follow(self, beside: Beside, lines: Sequence[Line]) -> bool:
+        """Whether the loss follows several columns that are moved together."""
+        vector = sum((line.unit * (-1 if line.slope < 0 else 1) * line.vector for line in lines), np.zeros(1))
+        together = Line(beside, "", np.asarray(vector), 1.0, sum(abs(line.change) for line in lines))
+        try:
+            wide = together.over(WIDE, COARSE)
+        except SimulationError:
+            return False
+        largest = max(abs(line.change) for line in lines)
+        return abs(wide - together.slope) <= FOLLOWS * max(largest, self.least) + self.noise * COARSE / WIDE
+
+    def column(self, line: Line) -> Undefined | None:
+        """What is said of one column; None where it has a slope."""
+        found: dict[float, float] = {}
+        try:
+            reason = self._reason(line, found)
+            if reason == UNSETTLED and not line.touches:
+                reason = self._reason(line, found, SMOOTH)
+                reason = UNSETTLED if line.touches else reason
+        except SimulationError as error:
+            reason = f"a little away there is no motion: {error}"
+        if not reason:
+            return None
+        widths, slopes = tuple(w * line.unit for w in found), tuple(found.values())
+        return Undefined(line.column, line.slope, widths, slopes, reason, line)
+
+    def _reason(self, line: Line, found: dict[float, float], part: float = 1.0) -> str:
+        """Why the column has no slope over `part` of the widths, or nothing. Slopes are put into `found`."""
+        widest, tolerance = part * WIDE, COARSE if part == 1 else TOLERANCE
+
+        def same(a: float, b: float, share: float, width: float, tolerance: float = TOLERANCE) -> bool:
+            size = max(abs(a), abs(b), self.least / line.unit)
+            return abs(a - b) <= share * size + self.noise * tolerance / (part * width * line.unit)
+
+        wide = found[widest] = line.over(widest, tolerance)
+        if same(wide, line.slope, FOLLOWS, WIDE, tolerance):
+            return ""
+        middle = found[part * MIDDLE] = line.over(part * MIDDLE, TOLERANCE)
+        is_right = same(middle, line.slope, RIGHT, MIDDLE)
+        if not is_right and not same(wide, middle, RIGHT, MIDDLE):
+            return UNSETTLED
+        narrow = found[part * NARROW] = line.over(part * NARROW, TOLERANCE)
+        if not same(middle, narrow, SETTLED, NARROW):
+            return UNSETTLED
+        if not same(wide, middle, SETTLED, MIDDLE):
+            expected = middle + CURVE * (line.over(part * BETWEEN, TOLERANCE) - middle)
+            size = max(abs(middle), self.least / line.unit)
+            allowed = SETTLED * size + BENT * abs(wide - middle) + self.noise * TOLERANCE / (part * MIDDLE * line.unit)
+            if abs(wide - expected) > allowed:
+                return UNSETTLED
+        return "" if is_right else MISSED

@@ -1,0 +1,153 @@
+"""Columns in which a motion's loss has no slope: told where there is none, and nowhere else."""
+
+import warnings
+
+import numpy as np
+import pytest
+from helpers.models import Plant, contact_properties
+from pydrake.geometry import Sphere
+
+import drake_diff as dd
+from drake_diff.exceptions import GradientWarning
+from drake_diff.motion import undefined as verdict
+from drake_diff.motion.flow.steps import FlowSteps
+from drake_diff.motion.undefined import Undefined
+
+
+def ball(
+    *, gravity=0.0, stiffness=1e4, dissipation=0.2, friction=0.3, approximation="lagged", relaxation=0.0, motor=False
+):
+    """1 kg, radius 0.1 m, on rails along x and z over the ground."""
+    plant = Plant(0.01, approximation, gravity=gravity)
+    properties = contact_properties(2 * stiffness, dissipation, friction, relaxation / 2)
+    plant.ball("ball", 1.0, 0.1, properties, "x", "z")
+    plant.ground(properties)
+    if motor:
+        plant.plant.AddJointActuator("lift", plant.plant.GetJointByName("ball_z"))
+    return plant.model()
+
+
+def gradient(model, x0, loss, steps, **more):
+    """It, and the names of the columns that are undefined; which are warned of, or nothing is."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", GradientWarning)
+        g = dd.differentiate_rollout(model, x0, None, loss, num_steps=steps, method="continuous", **more)
+    told = [str(one.message) for one in caught if one.category is GradientWarning]
+    assert len(told) == bool(g.undefined)
+    return g, [one.column for one in g.undefined]
+
+
+def test_a_clean_bounce_and_a_pendulum_are_defined():
+    g, undefined = gradient(ball(), [0, 1.0, 0, -2.0], lambda x: x[1], 100)
+    assert undefined == []
+    assert "undefined" not in repr(g)
+    pendulum = dd.load_model("models/double_pendulum.urdf", time_step=0.01)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", GradientWarning)
+        dd.differentiate_rollout(
+            pendulum, [2.5, 1.0, 0, 0], np.zeros((200, pendulum.nu)), lambda x: x[0], method="continuous"
+        )
+
+
+def test_a_curve_that_is_steep_is_defined():
+    """Thrice around: sin of 30 times the angle differs by 1.5 % over +-1e-2, by the square of the width."""
+    model = ball(gravity=9.81)
+    _, undefined = gradient(model, [0.3, 1.0, 0.5, 0], lambda x: np.sin(30 * x[0]), 20)
+    assert undefined == []
+
+
+@pytest.mark.parametrize(
+    ("gap", "is_smooth"), [(-1e-4, False), (1e-4, False), (-3e-3, False), (3e-3, False), (3e-2, True)]
+)
+def test_a_ball_that_passes_another_has_a_slope_only_far_from_touching(gap, is_smooth):
+    """The way of the ball is by `gap` [m] too far aside to touch, or not far enough."""
+    plant = Plant(0.01, "lagged", gravity=0.0)
+    properties = contact_properties(2e4, 0.2, 0.3)
+    plant.ball("ball", 1.0, 0.1, properties, "x", "z")
+    plant.shape(plant.plant.world_body(), Sphere(0.1), properties)
+    _, undefined = gradient(plant.model(), [-0.5, 0.2 + gap, 1.5, 0], lambda x: x[3], 80)
+    assert ("ball_z_x[0]" in undefined) == (not is_smooth)
+    assert ("ball_z_v[0]" in undefined) == (not is_smooth)
+    assert "ball_x_x[0]" not in undefined  # only when, not how
+
+
+def test_what_the_entry_says_is_what_the_loss_does():
+    """Slopes of the closed form: in free flight z - v t, after touching at the same speed the other way."""
+    model, speed, gap = ball(stiffness=1e6, dissipation=0.0), 1.0, 2e-4
+    x0 = [0, 0.1 + 0.2 * speed + gap, 0, -speed]
+    g, undefined = gradient(model, x0, lambda x: x[3], 20)
+    assert undefined == ["ball_z_x[0]", "ball_z_v[0]"]
+    entry = g.undefined[0]
+    assert entry.derivative == pytest.approx(0.0, abs=1e-9)
+    assert entry.widths[0] == 1e-2
+    assert entry.slopes[0] == pytest.approx(-speed * 2 / 2e-2, rel=1e-3)  # -v on one side, v on the other
+    assert "undefined by ball_z_x[0], ball_z_v[0]" in repr(g)
+    assert "over +-0.01" in repr(entry)
+
+
+def test_columns_of_parameters_inputs_and_policies_are_judged():
+    """The motor holds the ball so that it touches at the end, or not."""
+    model = ball(gravity=9.81, motor=True)
+    fall = 0.1 + 1e-5 + 9.81 * 0.2**2 / 4
+    x0, half = [0, fall, 0, 0], [[9.81 / 2]] * 20
+    with pytest.warns(GradientWarning, match="lift at all times"):
+        g = dd.differentiate_rollout(
+            model, x0, half, lambda x: x[3], method="continuous", parameters=("ball.stiffness",)
+        )
+    names = [one.column for one in g.undefined]
+    assert "lift at all times" in names
+    assert "ball.stiffness" not in names  # it does not touch
+    policy = dd.motion.ParametricPolicy(lambda x, t, p: [p[0] + p[1] * x[1]], [9.81 / 2, 0.0])
+    _, undefined = gradient(model, x0, lambda x: x[3], 20, policy=policy)
+    assert {"policy[0]", "policy[1]"} <= set(undefined)
+    touching = [0, 0.1 - 1e-5, 0, 1e-4]  # a touch that is hardly one: of stiffness nothing depends smoothly
+    g, undefined = gradient(ball(), touching, lambda x: x[3], 20, parameters=("ball.stiffness",))
+    assert "ball_z_x[0]" in undefined
+
+
+def test_a_loss_that_jumps_is_undefined_where_it_may_jump():
+    model = ball(gravity=9.81)
+    _, undefined = gradient(model, [0, 1.0, 1.0, 0], lambda x: x[0] + (1.0 if x[0] > 0.2 else 0.0), 20)
+    assert undefined == ["ball_x_x[0]", "ball_x_v[0]"]
+
+
+def test_where_a_motion_a_little_away_has_no_end_is_told():
+    """The cart comes within 5e-3 m of its limit."""
+    model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
+    with pytest.warns(GradientWarning, match="a little away there is no motion: slide_x reaches a joint limit"):
+        g = dd.differentiate_rollout(model, [1.895, 0, 0.5, 0], np.zeros((20, 1)), lambda x: x[0], method="continuous")
+    assert "slide_x[0]" in [one.column for one in g.undefined]
+
+
+def test_a_derivative_that_is_not_the_slope_that_there_is_is_not_called_undefined(monkeypatch):
+    """Steps that are too long for the derivative: taken again at a hundredth of the tolerance; then it is named."""
+    model, x0 = ball(gravity=9.81), [0, 0.5, 0.3, 0]
+    right = gradient(model, x0, lambda x: x[1], 60)[0]
+    real = FlowSteps.derivatives
+
+    def wrong(only_first):
+        def derivatives(self, flow):
+            found = real(self, flow)
+            if self.integrator.tolerance > 1e-10 or not only_first:
+                found[0] = type(found[0])(**{**vars(found[0]), "A": 1.05 * found[0].A})
+            return found
+
+        return derivatives
+
+    monkeypatch.setattr(FlowSteps, "derivatives", wrong(only_first=True))
+    again, undefined = gradient(model, x0, lambda x: x[1], 60)
+    assert undefined == []
+    assert np.allclose(again.by_x0, right.by_x0, rtol=1e-4, atol=1e-6)
+    monkeypatch.setattr(FlowSteps, "derivatives", wrong(only_first=False))
+    g, undefined = gradient(model, x0, lambda x: x[1], 60)
+    assert {"ball_z_x[0]", "ball_z_v[0]"} <= set(undefined)
+    assert all(isinstance(one, Undefined) and one.missed for one in g.undefined)
+
+
+def test_where_all_is_well_it_takes_six_rollouts(monkeypatch):
+    taken = []
+    real = verdict.Beside.value
+    monkeypatch.setattr(verdict.Beside, "value", lambda self, *args: taken.append(args) or real(self, *args))
+    _, undefined = gradient(ball(), [0, 1.0, 0, -2.0], lambda x: x[1], 100)
+    assert undefined == []
+    assert len(taken) == 6
