@@ -15,7 +15,8 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import TangentSpace, tangent_space
-from drake_diff.motion.gradient import Loss, RolloutGradient, differentiate_rollout, evaluate_loss
+from drake_diff.motion.gradient import RolloutGradient, differentiate_rollout
+from drake_diff.motion.loss import Loss, evaluate_loss
 from drake_diff.motion.policy import policy_parameters
 
 MANY = 256  # rollouts whose steps are solved at once

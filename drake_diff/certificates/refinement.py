@@ -23,7 +23,8 @@ from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, list_parameters, select
 from drake_diff.model.tangent import TangentSpace, tangent_space
-from drake_diff.motion.gradient import Loss, RolloutGradient, differentiate_rollout, takes_one_argument
+from drake_diff.motion.gradient import RolloutGradient, differentiate_rollout
+from drake_diff.motion.loss import Loss, takes_one_argument
 
 REFINEMENTS = (1, 2, 4)
 STIFFENING = (1, 4, 16)

@@ -20,7 +20,8 @@ from drake_diff.derivatives.sources import check_method
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameters, select
-from drake_diff.motion.gradient import Loss, RolloutGradient
+from drake_diff.motion.gradient import RolloutGradient
+from drake_diff.motion.loss import Loss
 from drake_diff.motion.rollout import Policy, check_inputs
 
 ELSEWHERE = 1e-3  # of the scale: how far from the motion a policy is led before it is asked again

@@ -21,7 +21,7 @@ from drake_diff.model.plant import actuators
 from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.continuous import ContinuousMotion
-from drake_diff.motion.gradient import Loss, evaluate_loss
+from drake_diff.motion.loss import Loss, evaluate_loss
 from drake_diff.motion.rollout import roll_states
 
 FRACTIONS = np.array([0.25, 0.5, 0.75, 1.0])  # of the width: where the loss is taken, on both sides, whole teeth apart

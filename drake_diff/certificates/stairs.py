@@ -12,7 +12,8 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.certificates.feedback import fresh
 from drake_diff.model.tangent import TangentSpace
-from drake_diff.motion.gradient import Loss, RolloutGradient, evaluate_loss
+from drake_diff.motion.gradient import RolloutGradient
+from drake_diff.motion.loss import Loss, evaluate_loss
 
 LENGTHS = tuple(10.0**k for k in range(-4, 2))  # of the line, to each side
 CELLS = 16  # both sides together

@@ -1,16 +1,14 @@
 """The gradient of a scalar back through the steps of a rollout, with its norm at every step."""
 
-import inspect
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
-from drake_diff._base.autodiff import gradient_of
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.derivatives.sources import check_method
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
@@ -18,16 +16,13 @@ from drake_diff.exceptions import GradientWarning, InputError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameters, ParameterVector, applied, select
 from drake_diff.model.step import advance
-from drake_diff.motion.policy import active_parameters, differentiate_policy, policy_parameters
+from drake_diff.motion.loss import Feedback, Loss, Totals, total_gradients
+from drake_diff.motion.policy import active_parameters, differentiate_policy
 from drake_diff.motion.rollout import Policy, check_inputs
 
 if TYPE_CHECKING:
-    from drake_diff.motion.flow.steps import FlowSteps
     from drake_diff.motion.undefined import Undefined
 
-Loss = Callable[..., Any]
-# A policy's derivatives (nu, nx) by the state and (nu, n) by those of its parameters that act, and which they are.
-Feedback = tuple[Array, Array, slice]
 EXPLODED, VANISHED = 1e6, 1e-6
 CONTINUOUS = "continuous"  # the method that takes no steps of Drake's
 FINER = 1e-2  # of its tolerance: of a motion whose derivative is not the slope that there is
@@ -167,21 +162,19 @@ def differentiate_rollout(
         else:
             steps = positive_int("num_steps", num_steps)
             linearization, feedback, inputs = _close_the_loop(set_model, x0, policy, steps, vector, method)
-    return _collected(x0, inputs, policy, loss, linearization, feedback)
+    value, totals = total_gradients(loss, x0, inputs, policy, linearization, feedback)
+    return _collected(value, totals, x0, inputs, linearization, feedback)
 
 
 def _collected(
+    value: float,
+    totals: Totals,
     x0: Array,
     inputs: Array,
-    policy: Policy | None,
-    loss: Loss,
     linearization: Sequence[StepDerivatives],
     feedback: Sequence[Feedback],
 ) -> RolloutGradient:
     """What the steps of a motion make of its loss."""
-    xs = np.vstack([x0, [d.x_next for d in linearization]])
-    value, by_xs, by_us = differentiate_loss(loss, xs, inputs)
-    totals = accumulate(linearization, by_xs, by_us, feedback, len(policy_parameters(policy)))
     closed = [d.A for d in linearization]
     if feedback:
         closed = [d.A + d.B @ by_x for d, (by_x, _, _) in zip(linearization, feedback, strict=True)]
@@ -195,7 +188,7 @@ def _collected(
         by_policy=frozen(totals.policy),
         state_gradient_norms=frozen(np.linalg.norm(totals.states, axis=1)),
         spectral_radii=frozen(np.abs(np.linalg.eigvals(np.array(closed))).max(axis=1)),
-        xs=frozen(xs),
+        xs=frozen(np.vstack([x0, [d.x_next for d in linearization]])),
         us=frozen(inputs),
         methods=tuple(sorted({d.method for d in linearization})),
     )
@@ -213,7 +206,7 @@ def _in_continuous_time(
     """The gradient along the flow, and a warning where the loss has no slope; see `drake_diff.motion.undefined`."""
     from drake_diff.motion.flow.integrate import TOLERANCE  # loads CasADi
     from drake_diff.motion.flow.steps import FlowSteps
-    from drake_diff.motion.undefined import Beside, undefined_columns
+    from drake_diff.motion.undefined import Beside, along_the_flow, undefined_columns
 
     if policy is None:
         given = check_inputs(model, us, num_steps)
@@ -223,8 +216,8 @@ def _in_continuous_time(
         with applied(vector) as set_model:
             steps = FlowSteps(set_model, vector, tolerance)
             linearization, feedback, inputs = along_the_flow(steps, x0, given, policy)
-        gradient = _collected(x0, inputs, policy, loss, linearization, feedback)
-        undefined = undefined_columns(Beside(model, x0, inputs, policy, loss, vector, steps), gradient)
+        value, totals = total_gradients(loss, x0, inputs, policy, linearization, feedback)
+        undefined = undefined_columns(Beside(model, x0, inputs, policy, loss, vector, steps), totals)
         if not any(one.missed for one in undefined):
             break
     if undefined:
@@ -236,6 +229,7 @@ def _in_continuous_time(
             GradientWarning,
             stacklevel=3,
         )
+    gradient = _collected(value, totals, x0, inputs, linearization, feedback)
     return replace(gradient, undefined=undefined)
 
 
@@ -254,86 +248,6 @@ def _close_the_loop(
     return derivatives_along(model, x0, inputs, vector=vector, method=method, xs=xs), feedback, inputs
 
 
-def along_the_flow(
-    steps: "FlowSteps", x0: Array, us: Array, policy: Policy | None
-) -> tuple[list[StepDerivatives], list[Feedback], Array]:
-    """The motion in continuous time first, then the derivatives of its intervals; a policy takes the length of `us`."""
-    feedback, nu = list[Feedback](), steps.model.nu
-
-    def choose(x: Array, k: int) -> Array:
-        if policy is None:
-            return us[k]
-        t = k * steps.model.time_step
-        u, by_x, by_parameters = differentiate_policy(policy, x, t, nu)
-        active = active_parameters(policy, t)
-        feedback.append((by_x, by_parameters[:, active].copy(), active))
-        return u
-
-    _, inputs, flow = steps.roll(x0, choose, len(us))
-    return steps.derivatives(flow), feedback, inputs
-
-
-@dataclass(frozen=True, eq=False)
-class Totals:
-    """A loss's total gradients: by states (N+1, nx), inputs (N, nu), parameters (np,), policy parameters (n,)."""
-
-    states: Array
-    inputs: Array
-    parameters: Array
-    policy: Array
-
-
-def accumulate(
-    linearization: Sequence[StepDerivatives],
-    by_xs: Array,
-    by_us: Array,
-    feedback: Sequence[Feedback] = (),
-    num_policy_parameters: int = 0,
-) -> Totals:
-    """From a loss's partial gradients by xs (N+1, nx) and us (N, nu) to its total ones."""
-    state, inputs = np.array(by_xs), np.array(by_us)
-    parameters = np.zeros(linearization[0].C.shape[1])
-    policy = np.zeros(num_policy_parameters)
-    for k in reversed(range(len(linearization))):
-        d = linearization[k]
-        inputs[k] += d.B.T @ state[k + 1]
-        parameters += d.C.T @ state[k + 1]
-        state[k] += d.A.T @ state[k + 1]
-        if feedback:
-            by_x, by_parameters, active = feedback[k]
-            state[k] += by_x.T @ inputs[k]
-            policy[active] += by_parameters.T @ inputs[k]
-    return Totals(state, inputs, parameters, policy)
-
-
 def _last(where: NDArray[np.bool_]) -> int | None:
     found = np.flatnonzero(where)
     return int(found[-1]) if len(found) else None
-
-
-def evaluate_loss(loss: Loss, xs: Array, us: Array) -> float:
-    """`loss` at a rollout of plain numbers."""
-    return float(loss(xs[-1]) if takes_one_argument(loss) else loss(xs, us))
-
-
-def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, Array]:
-    """(value, gradient by xs (N+1, nx), gradient by us (N, nu)) of `loss` on its own, the steps apart."""
-    if takes_one_argument(loss):
-        value, gradient = gradient_of(loss, xs[-1])
-        return value, np.vstack([np.zeros_like(xs[:-1]), gradient]), np.zeros_like(us)
-    split = xs.size
-
-    def flat(z: Any) -> Any:
-        return loss(z[:split].reshape(xs.shape), z[split:].reshape(us.shape))
-
-    value, gradient = gradient_of(flat, np.concatenate([xs.ravel(), us.ravel()]))
-    return value, gradient[:split].reshape(xs.shape), gradient[split:].reshape(us.shape)
-
-
-def takes_one_argument(loss: Loss) -> bool:
-    """Whether `loss` is a function of the final state alone."""
-    arguments = [p for p in inspect.signature(loss).parameters.values() if p.default is p.empty]
-    required = [p for p in arguments if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    if len(required) not in (1, 2):
-        raise InputError("loss", got=f"{len(required)} arguments", expected="loss(xs, us) or loss(x_final)")
-    return len(required) == 1

@@ -26,21 +26,20 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.flow.integrate import TOLERANCE
 from drake_diff.motion.flow.steps import FlowSteps
-from drake_diff.motion.gradient import (
-    Loss,
-    RolloutGradient,
-    accumulate,
-    along_the_flow,
-    differentiate_loss,
-    evaluate_loss,
+from drake_diff.motion.loss import Feedback, Loss, Totals, evaluate_loss, total_gradients
+from drake_diff.motion.policy import (
+    ParametricPolicy,
+    active_parameters,
+    differentiate_policy,
+    policy_parameters,
 )
-from drake_diff.motion.policy import ParametricPolicy, policy_parameters
 from drake_diff.motion.smoothing import Gaussian, Smoothed, smooth
 
 WIDE, BETWEEN, MIDDLE, NARROW = 1e-2, 5e-3, 1e-3, 1e-4  # of a column's unit, to both sides
@@ -183,24 +182,23 @@ class Beside:
         with applied(vector) as model:
             steps = self._steps(model, vector, TOLERANCE)
             linearization, feedback, inputs = along_the_flow(steps, x0, us, policy)
-        xs = np.vstack([x0, [d.x_next for d in linearization]])
-        value, by_xs, by_us = differentiate_loss(self.loss, xs, inputs)
-        totals = accumulate(linearization, by_xs, by_us, feedback, len(policy_parameters(policy)))
-        given = totals.inputs.ravel() if policy is None else totals.policy
-        by_start = totals.states[0] @ self._derivative_of_start(displacement[: self.space.size])
-        return value, np.concatenate([by_start, given, totals.parameters])
+        value, totals = total_gradients(self.loss, x0, inputs, policy, linearization, feedback)
+        return value, self._flat(totals, self._derivative_of_start(displacement[: self.space.size]))
+
+    def _flat(self, totals: Totals, by_displacement: Array) -> Array:
+        """(n,) by displacements, of which those of the start move x0 by (nx, size)."""
+        given = totals.inputs.ravel() if self.policy is None else totals.policy
+        return np.concatenate([totals.states[0] @ by_displacement, given, totals.parameters])
 
     def _derivative_of_start(self, d: Array, step: float = 1e-5) -> Array:
         """(nx, size): of x0 moved by d (size,), which is linear but for a turn; to 1e-10."""
         ends = [[self.space.plus(self.x0, d + sign * step * e) for e in np.eye(len(d))] for sign in (1, -1)]
         return np.asarray((np.array(ends[0]) - np.array(ends[1])).T / (2 * step))
 
-    def lines(self, gradient: RolloutGradient) -> "Iterator[Line]":
+    def lines(self, totals: Totals) -> "Iterator[Line]":
         """A line for each column."""
         size, given, (count, nu) = self.space.size, len(self._given), self.us.shape
-        by_start = gradient.by_x0 @ self.space.derivative_of_plus(self.x0)
-        by_given = gradient.by_us.ravel() if self.policy is None else gradient.by_policy
-        flat = np.concatenate([by_start, by_given, gradient.by_parameters])
+        flat = self._flat(totals, self.space.derivative_of_plus(self.x0))
         eye = np.eye(len(flat))
         for j, name in enumerate(self.space.names):
             yield Line(self, f"{name}[0]", eye[j], 1.0, flat[j])
@@ -211,7 +209,7 @@ class Beside:
                 yield Line(self, f"{name} at all times", eye[rows].sum(axis=0), unit, flat[rows].sum())
         elif given > MANY:
             along = np.zeros(len(flat))
-            along[size : size + given] = by_given / (np.linalg.norm(by_given) or 1.0)
+            along[size : size + given] = totals.policy / (np.linalg.norm(totals.policy) or 1.0)
             yield Line(self, f"the policy's {given} parameters, along their gradient", along, 1.0, float(flat @ along))
         else:
             for i in range(given):
@@ -259,12 +257,31 @@ class Line:
         return np.array([self._last[1] @ self.vector])
 
 
-def undefined_columns(beside: Beside, gradient: RolloutGradient) -> tuple[Undefined, ...]:
-    """The columns of `gradient` in which the loss has no slope."""
-    lines = list(beside.lines(gradient))
+def along_the_flow(
+    steps: FlowSteps, x0: Array, us: Array, policy: Any
+) -> tuple[list[StepDerivatives], list[Feedback], Array]:
+    """The motion in continuous time first, then the derivatives of its intervals; a policy takes the length of `us`."""
+    feedback, nu = list[Feedback](), steps.model.nu
+
+    def choose(x: Array, k: int) -> Array:
+        if policy is None:
+            return us[k]
+        t = k * steps.model.time_step
+        u, by_x, by_parameters = differentiate_policy(policy, x, t, nu)
+        active = active_parameters(policy, t)
+        feedback.append((by_x, by_parameters[:, active].copy(), active))
+        return u
+
+    _, inputs, flow = steps.roll(x0, choose, len(us))
+    return steps.derivatives(flow), feedback, inputs
+
+
+def undefined_columns(beside: Beside, totals: Totals) -> tuple[Undefined, ...]:
+    """The columns of a gradient in which the loss has no slope."""
+    lines = list(beside.lines(totals))
     judge = _Judge(
         NEGLIGIBLE * max(abs(line.change) for line in lines),
-        NOISE * max(1.0, float(np.max(gradient.state_gradient_norms))),
+        NOISE * max(1.0, float(np.max(np.linalg.norm(totals.states, axis=1)))),
     )
     order = sorted(range(len(lines)), key=lambda j: -abs(lines[j].change))
     suspects: list[int] = []

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff.derivatives.step import StepDerivatives
-from drake_diff.motion.gradient import Totals, accumulate
+from drake_diff.motion.loss import Totals, accumulate
 from drake_diff.optimize.ilqr.riccati import minimize_in_box
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.problem import Problem

@@ -22,7 +22,7 @@ from drake_diff._base.autodiff import chain, chain_rows
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.parameters import ParameterVector, applied
-from drake_diff.motion.gradient import Totals, accumulate, differentiate_loss
+from drake_diff.motion.loss import Totals, accumulate, differentiate_loss
 from drake_diff.motion.rollout import roll_states
 from drake_diff.optimize.drake_program import solve_program
 from drake_diff.optimize.problem.cost import differentiate_cost, differentiate_final_cost

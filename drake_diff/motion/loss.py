@@ -1,0 +1,93 @@
+"""A loss of a motion, and its gradient back through the derivatives of the steps."""
+
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.autodiff import gradient_of
+from drake_diff.derivatives.step import StepDerivatives
+from drake_diff.exceptions import InputError
+from drake_diff.motion.policy import policy_parameters
+
+Loss = Callable[..., Any]
+# A policy's derivatives (nu, nx) by the state and (nu, n) by those of its parameters that act, and which they are.
+Feedback = tuple[Array, Array, slice]
+
+
+@dataclass(frozen=True, eq=False)
+class Totals:
+    """A loss's total gradients: by states (N+1, nx), inputs (N, nu), parameters (np,), policy parameters (n,)."""
+
+    states: Array
+    inputs: Array
+    parameters: Array
+    policy: Array
+
+
+def accumulate(
+    linearization: Sequence[StepDerivatives],
+    by_xs: Array,
+    by_us: Array,
+    feedback: Sequence[Feedback] = (),
+    num_policy_parameters: int = 0,
+) -> Totals:
+    """From a loss's partial gradients by xs (N+1, nx) and us (N, nu) to its total ones."""
+    state, inputs = np.array(by_xs), np.array(by_us)
+    parameters = np.zeros(linearization[0].C.shape[1])
+    policy = np.zeros(num_policy_parameters)
+    for k in reversed(range(len(linearization))):
+        d = linearization[k]
+        inputs[k] += d.B.T @ state[k + 1]
+        parameters += d.C.T @ state[k + 1]
+        state[k] += d.A.T @ state[k + 1]
+        if feedback:
+            by_x, by_parameters, active = feedback[k]
+            state[k] += by_x.T @ inputs[k]
+            policy[active] += by_parameters.T @ inputs[k]
+    return Totals(state, inputs, parameters, policy)
+
+
+def total_gradients(
+    loss: Loss,
+    x0: Array,
+    us: Array,
+    policy: Any,
+    linearization: Sequence[StepDerivatives],
+    feedback: Sequence[Feedback],
+) -> tuple[float, Totals]:
+    """The value of a loss of the steps from `x0` (nx,) under `us` (N, nu), and its total gradients."""
+    xs = np.vstack([x0, [d.x_next for d in linearization]])
+    value, by_xs, by_us = differentiate_loss(loss, xs, us)
+    return value, accumulate(linearization, by_xs, by_us, feedback, len(policy_parameters(policy)))
+
+
+def evaluate_loss(loss: Loss, xs: Array, us: Array) -> float:
+    """`loss` at a rollout of plain numbers."""
+    return float(loss(xs[-1]) if takes_one_argument(loss) else loss(xs, us))
+
+
+def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, Array]:
+    """(value, gradient by xs (N+1, nx), gradient by us (N, nu)) of `loss` on its own, the steps apart."""
+    if takes_one_argument(loss):
+        value, gradient = gradient_of(loss, xs[-1])
+        return value, np.vstack([np.zeros_like(xs[:-1]), gradient]), np.zeros_like(us)
+    split = xs.size
+
+    def flat(z: Any) -> Any:
+        return loss(z[:split].reshape(xs.shape), z[split:].reshape(us.shape))
+
+    value, gradient = gradient_of(flat, np.concatenate([xs.ravel(), us.ravel()]))
+    return value, gradient[:split].reshape(xs.shape), gradient[split:].reshape(us.shape)
+
+
+def takes_one_argument(loss: Loss) -> bool:
+    """Whether `loss` is a function of the final state alone."""
+    arguments = [p for p in inspect.signature(loss).parameters.values() if p.default is p.empty]
+    required = [p for p in arguments if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    if len(required) not in (1, 2):
+        raise InputError("loss", got=f"{len(required)} arguments", expected="loss(xs, us) or loss(x_final)")
+    return len(required) == 1
