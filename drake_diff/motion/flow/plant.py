@@ -228,8 +228,11 @@ class _Tree:
         for link in description.moving:
             if link.stiffness:
                 total[link.v_start] -= stiffness[link.v_start] * (self.q[link.q_start] - link.rest)
-        mass = self._mass() + ca.diag(ca.DM(description.by_velocity("armature")))
-        return ca.ldl_solve(total, *ca.ldl(mass)) if n else total
+        return ca.ldl_solve(total, *ca.ldl(self.mass())) if n else total
+
+    def mass(self) -> Any:
+        """(nv, nv) the mass matrix, reflected inertia included."""
+        return self._mass() + ca.diag(ca.DM(self.description.by_velocity("armature")))
 
     def _inertias(self) -> list[Any]:
         """(6, 6) of each link about the world's origin."""
@@ -304,7 +307,7 @@ class _Tree:
         center = p + R @ ca.DM(pairs.center[i])
         R, p, moves_other = self.body(pairs.bodies[pairs.other_body[i]].index())
         turn, origin = R @ ca.DM(pairs.rotation[i]), p + R @ ca.DM(pairs.position[i])
-        distance, normal = _from_box(turn.T @ (center - origin), pairs.lower[i], pairs.upper[i])
+        distance, normal = from_box(turn.T @ (center - origin), pairs.lower[i], pairs.upper[i])
         normal = turn @ normal
         phi = distance - pairs.rounding[i] - pairs.radius[i]
         point = center - (pairs.radius[i] + part * phi) * normal
@@ -324,7 +327,7 @@ class _Tree:
         return _Touch(-phi, bracket, J.T @ on_sphere, point, normal, on_sphere, speed)
 
 
-def _from_box(local: Any, lower: Array, upper: Array) -> tuple[Any, Any]:
+def from_box(local: Any, lower: Array, upper: Array) -> tuple[Any, Any]:
     """The signed distance of a point from a box, and its gradient: inside, to the nearest face."""
     outside = local - ca.fmin(ca.fmax(local, ca.DM(lower)), ca.DM(upper))
     is_point, is_plane = bool(np.all(lower == upper)), bool(np.isinf(lower).any())

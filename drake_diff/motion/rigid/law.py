@@ -1,0 +1,248 @@
+"""Laws of rigid impact: which impulses a set of contacts gives, by Newton's or Poisson's restitution and Coulomb.
+
+An impact takes no time, moves nothing, and changes the velocities by M (v+ - v-) = J' P. With the contacts' velocities
+w = J v and their parts along the normals w_n,
+
+    Newton:    0 <= P_n          complementary to   w_n+ + e w_n- >= 0     (0 in place of e w_n- where w_n- >= 0)
+    Poisson:   first the inelastic impact, e = 0, whose impulse is P_c, then another with
+               0 <= P_n - e P_c  complementary to   w_n+ >= 0
+    Coulomb:   |P_t| <= mu P_n, and where the contact slides on, P_t = -mu P_n w_t+ / |w_t+|
+
+of each, and of each of Poisson's two parts (Glocker and Pfeiffer, "Multiple impacts with friction in rigid multibody
+systems", 1995). All ways in which contacts may open, stick and slide are tried; where two of them lead to different
+velocities the law has no unique answer.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from scipy.optimize import minimize
+
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import SimulationError
+
+OPENS, STICKS, SLIDES, FRICTIONLESS = "opens", "sticks", "slides", "frictionless"
+MOST_FRICTIONAL, MOST = 5, 8  # contacts at once: 3 and 2 ways of each
+SAME = 1e-8  # of the largest velocity: the same motion
+ROUNDED = 1e-10  # of the largest velocity: as good as 0
+SINGULAR = 1e-11  # of the largest singular value
+ROUNDS = 200  # of the direction of a slide
+DIRECTIONS = 8  # a slide's direction is sought from
+Ways = tuple[tuple[bool, str], ...]  # of each contact: whether it is closed, and OPENS, STICKS, SLIDES or FRICTIONLESS
+
+
+@dataclass(frozen=True, eq=False)
+class Impulses:
+    """What m contacts give: P (m, 3) [N s] in world, the velocities (m, 3) after, and what each does."""
+
+    values: Array
+    after: Array
+    ways: Ways
+    others: tuple[Ways, ...]  # that give the same: a change of the motion may lead to any of them
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What a part of a law asks of m contacts: velocities along the normals, and impulses, are at least these."""
+
+    W: Array  # (3 m, 3 m) J M^-1 J'
+    before: Array  # (m, 3) velocities
+    normals: Array  # (m, 3)
+    speeds: Array  # (m,) along the normals
+    least: Array  # (m,) impulses
+    friction: Array  # (m,)
+
+    def __len__(self) -> int:
+        return len(self.normals)
+
+
+def solve(asked: Asked, name: str) -> Impulses:
+    """The impulses; SimulationError where there are none, or where they lead to different motions."""
+    count = len(asked)
+    most = MOST_FRICTIONAL if np.any((asked.friction > 0) & np.isfinite(asked.friction)) else MOST
+    if count > most:
+        raise SimulationError(f"{count} contacts strike at once at {name}: expected at most {most}")
+    size = max(float(np.max(np.abs(asked.before))), float(np.max(np.abs(asked.speeds))), 1e-300)
+    found: list[Impulses] = []
+    for ways in product(*[_ways(asked, i) for i in range(count)]):
+        for values, after in _of_ways(asked, ways, size):
+            found.append(Impulses(values, after, ways, ()))
+    if not found:
+        raise SimulationError(f"no impulses of restitution and friction satisfy the impact of {name}")
+    apart = [float(np.max(np.abs(each.after - found[0].after))) for each in found]
+    if max(apart) > SAME * size:
+        ends = sorted({", ".join(way for _, way in each.ways) for each in found})
+        raise SimulationError(
+            f"the impact of {name} has no unique answer: its contacts may end as {' or '.join(ends)}, with "
+            f"velocities up to {max(apart):.3g} m/s apart"
+        )
+    best = min(found, key=_rank)
+    others = tuple(sorted({each.ways for each in found} - {best.ways}))
+    return Impulses(best.values, best.after, best.ways, others)
+
+
+def _rank(found: Impulses) -> tuple[int, int]:
+    """Closed before open, sticking before sliding, where both are the same motion."""
+    return sum(not closed for closed, _ in found.ways), sum(way == SLIDES for _, way in found.ways)
+
+
+def _ways(asked: Asked, i: int) -> list[tuple[bool, str]]:
+    """What contact i may do: (closed, how its tangents behave)."""
+    mu = asked.friction[i]
+    along = [FRICTIONLESS] if mu == 0 else [STICKS] if np.isinf(mu) else [STICKS, SLIDES]
+    if asked.least[i] > 0:  # of Poisson's second part: it pushes at least so much
+        return [(closed, way) for closed in (True, False) for way in along]
+    return [*((True, way) for way in along), (False, OPENS)]
+
+
+def _of_ways(asked: Asked, ways: Ways, size: float) -> Iterator[tuple[Array, Array]]:
+    """The impulses (m, 3) and velocities (m, 3) in which every contact does what `ways` says."""
+    sliding = [i for i, (_, way) in enumerate(ways) if way == SLIDES]
+    starts = _starts(asked, sliding)
+    for directions in starts:
+        found = _iterated(asked, ways, directions, sliding, size)
+        if found is None:
+            continue
+        values, spare = found
+        after = asked.before + (asked.W @ values.ravel()).reshape(-1, 3)
+        if _keeps(asked, ways, values, after, size):
+            yield values, after
+        elif len(spare) and _fits(asked, ways, after, size):
+            other = _within(asked, ways, values, spare, size)
+            if other is not None:
+                yield other, after
+
+
+def _starts(asked: Asked, sliding: list[int]) -> list[Array]:
+    """Directions (m, 3) to begin with: the velocities before, and around the normals."""
+    base = np.zeros((len(asked), 3))
+    if not sliding:
+        return [base]
+    found = []
+    for turn in range(DIRECTIONS):
+        angle = 2 * np.pi * turn / DIRECTIONS
+        directions = base.copy()
+        for i in sliding:
+            n = asked.normals[i]
+            t = asked.before[i] - n * (n @ asked.before[i])
+            if np.linalg.norm(t) <= ROUNDED:
+                t = np.cross(n, np.eye(3)[int(np.argmin(np.abs(n)))])
+            t = t / np.linalg.norm(t)
+            directions[i] = np.cos(angle) * t + np.sin(angle) * np.cross(n, t)
+        found.append(directions)
+    return found
+
+
+def _iterated(
+    asked: Asked, ways: Ways, directions: Array, sliding: list[int], size: float
+) -> tuple[Array, Array] | None:
+    """The impulses (m, 3) once the directions of slides have settled, and which (k, 3 m) add nothing; None if never."""
+    for round_ in range(ROUNDS):
+        found = _linear(asked, ways, directions)
+        if found is None:
+            return None
+        values, spare = found
+        if not sliding:
+            return values, spare
+        after = asked.before + (asked.W @ values.ravel()).reshape(-1, 3)
+        new, change = directions.copy(), 0.0
+        for i in sliding:
+            n = asked.normals[i]
+            t = after[i] - n * (n @ after[i])
+            speed = float(np.linalg.norm(t))
+            if speed <= ROUNDED * size:
+                return None
+            new[i] = t / speed
+            change = max(change, float(np.linalg.norm(new[i] - directions[i])))
+        if change <= 1e-13:
+            return values, spare
+        if change > 1.99 and round_ > 2:  # it turns back and forth
+            return None
+        directions = new
+    return (values, spare) if change <= 1e-9 else None
+
+
+def _linear(asked: Asked, ways: Ways, directions: Array) -> tuple[Array, Array] | None:
+    """The impulses (m, 3) for given directions of slides, and those (k, 3 m) that change no equation; None if none."""
+    m = len(asked)
+    scale = float(np.trace(asked.W)) / max(3 * m, 1)
+    W = asked.W / scale
+    A, b = np.zeros((3 * m, 3 * m)), np.zeros(3 * m)
+    for i, (closed, way) in enumerate(ways):
+        rows, n = slice(3 * i, 3 * i + 3), asked.normals[i]
+        onto, own = np.outer(n, n), np.zeros((3, 3 * m))
+        own[:, rows] = np.eye(3)
+        along = np.eye(3) - onto
+        if closed:
+            A[rows] += onto @ W[rows]
+            b[rows] += n * (asked.speeds[i] - n @ asked.before[i])
+        else:
+            A[rows] += onto @ own
+            b[rows] += n * asked.least[i] * scale
+        if way == STICKS:
+            A[rows] += along @ W[rows]
+            b[rows] -= along @ asked.before[i]
+        else:
+            A[rows] += along @ own
+            if way == SLIDES:
+                A[rows] += asked.friction[i] * np.outer(directions[i], n) @ own
+    U, s, Vt = np.linalg.svd(A)
+    rank = int(np.count_nonzero(s > SINGULAR * s[0]))
+    values = Vt[:rank].T @ ((U[:, :rank].T @ b) / s[:rank])
+    if np.max(np.abs(A @ values - b), initial=0.0) > 1e-9 * max(float(np.max(np.abs(b))), 1e-300):
+        return None
+    return (values / scale).reshape(m, 3), Vt[rank:]
+
+
+def _keeps(asked: Asked, ways: Ways, values: Array, after: Array, size: float) -> bool:
+    """Whether the impulses and velocities are within what the law allows."""
+    return _fits(asked, ways, after, size) and _excess(asked, ways, values) <= ROUNDED * size / _scale(asked)
+
+
+def _scale(asked: Asked) -> float:
+    return float(np.trace(asked.W)) / max(3 * len(asked), 1)
+
+
+def _fits(asked: Asked, ways: Ways, after: Array, size: float) -> bool:
+    """Whether contacts that open do, and slides slide."""
+    along = np.einsum("ij,ij->i", asked.normals, after)
+    opened = [i for i, (closed, _) in enumerate(ways) if not closed]
+    return all(along[i] >= asked.speeds[i] - ROUNDED * size for i in opened)
+
+
+def _excess(asked: Asked, ways: Ways, values: Array) -> float:
+    """By how much [N s] impulses are beyond what the law allows, at most."""
+    worst = 0.0
+    for i, (closed, way) in enumerate(ways):
+        n = asked.normals[i]
+        push = float(n @ values[i])
+        if closed:
+            worst = max(worst, asked.least[i] - push)
+        if way == STICKS and np.isfinite(asked.friction[i]):
+            worst = max(worst, float(np.linalg.norm(values[i] - push * n)) - asked.friction[i] * push)
+    return worst
+
+
+def _within(
+    asked: Asked, ways: Ways, values: Array, spare: Array, size: float
+) -> Array | None:
+    """Impulses (m, 3) that the law allows and that add to the same motion, if there are any: a convex search."""
+    scale = 1.0 / max(float(np.max(np.abs(values))), 1e-300)
+
+    def beyond(z: Array) -> float:
+        p, total = values + (spare.T @ z).reshape(-1, 3) / scale, 0.0
+        for i, (closed, way) in enumerate(ways):
+            n = asked.normals[i]
+            push = float(n @ p[i])
+            if closed:
+                total += max(asked.least[i] - push, 0.0) ** 2
+            if way == STICKS and np.isfinite(asked.friction[i]):
+                total += max(float(np.linalg.norm(p[i] - push * n)) - asked.friction[i] * push, 0.0) ** 2
+        return total * scale**2
+
+    result = minimize(beyond, np.zeros(len(spare)), method="BFGS", options={"gtol": 1e-14})
+    found = values + (spare.T @ result.x).reshape(-1, 3) / scale
+    allowed = max(ROUNDED * size / _scale(asked), 1e-7 / scale)
+    return found if _excess(asked, ways, found) <= allowed else None
