@@ -1,16 +1,10 @@
-"""Hard contact as a user states it: restitution, friction and the law of impact; its impacts and motions."""
+"""Hard contact as a user states it: restitution, friction, the law of impact, and contacts without geometry."""
 
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike
-
-from drake_diff._base.arrays import Array, finite_array
+from drake_diff._base.arrays import finite_array
 from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.model.model import Model
-from drake_diff.motion.rigid.impact import Impact, strike
-from drake_diff.motion.rigid.plant import PointOnPlane, RigidPlant
+from drake_diff.motion.rigid.points import PointOnPlane
 
 NEWTON, POISSON = "newton", "poisson"
 TOUCHES = 1e-6  # [m]
@@ -41,9 +35,9 @@ class RigidContact:
         >>> x0 = np.array(model.default_state)
         >>> x0[6] = 0.6  # dropped from 0.5 m above the ground
         >>> hard = dd.motion.RigidContact(restitution=0.8, friction=0)
-        >>> g = dd.differentiate_rollout(model, x0, None, lambda x: x[6], num_steps=50, method=hard)
-        >>> round(g.loss, 6), g.by_x0[[6, 12]].round(4).tolist()  # of the height at 0.5 s, by height and speed
-        (0.450283, [0.3057, -0.0456])
+        >>> motion = dd.motion.rigid_motion(model, x0, hard, num_steps=50)
+        >>> motion.by_x0[6, [6, 12]].round(4).tolist()  # of the height at 0.5 s, by the first height and speed
+        [0.2189, -0.0747]
     """
 
     restitution: float = 0.0
@@ -66,59 +60,3 @@ class RigidContact:
             raise InputError("points", got=repr(self.points)[:80], expected="PointOnPlanes")
         for name, value in (("restitution", e), ("points", points)):
             object.__setattr__(self, name, value)
-
-    def plant(self, model: Model) -> RigidPlant:
-        """The contacts of `model`, made once; ModelError where it has none that are known."""
-        return model.cache(("rigid plant", self.points), lambda: RigidPlant(model, self.points))
-
-    def impact(self, model: Model, x: ArrayLike, contacts: Any = None) -> Impact:
-        """The impact at a state.
-
-        Args:
-            model: The model.
-            x: (nx,) the state before.
-            contacts: Names of those that take part; if not given, those whose gap is at most 1e-6 m.
-
-        Returns:
-            The state after, impulses, and derivatives.
-
-        Raises:
-            SimulationError: No impulses satisfy the law, they are not unique, or they add energy.
-            UnknownNameError: There is no such contact.
-            InputError: No contact touches.
-
-        Example:
-            >>> model = dd.load_model("models/two_spheres.sdf", time_step=0.01)  # of the same mass, on a line
-            >>> hit = dd.motion.RigidContact(restitution=1.0, friction=0.0).impact(model, [0, 0.2, 3, 0])
-            >>> hit.x_after[2:].tolist()
-            [0.0, 3.0]
-        """
-        plant, state = self.plant(model), finite_array("x", x, (model.nx,))
-        if contacts is None:
-            chosen = tuple(np.flatnonzero(plant.gaps(state) <= TOUCHES).tolist())
-        else:
-            named = (contacts,) if isinstance(contacts, str) else tuple(contacts)
-            for name in named:
-                if name not in plant.names:
-                    raise UnknownNameError("contact", got=name, known=plant.names)
-            chosen = tuple(plant.names.index(name) for name in named)
-        if not chosen:
-            least = float(np.min(plant.gaps(state), initial=np.inf))
-            raise InputError("x", got=f"gaps of at least {least:.3g} m", expected="contacts that touch")
-        return self.struck(plant, np.asarray(state), chosen)
-
-    def struck(
-        self, plant: RigidPlant, x: Array, contacts: tuple[int, ...], held: tuple[int, ...] = (), time: float = 0.0
-    ) -> Impact:
-        """The impact of `contacts` at `x` (nx,), of which those that are `held` were closed before."""
-        return strike(
-            plant,
-            x,
-            contacts,
-            np.array([i not in held for i in contacts]) & (plant.gap_rates(x)[list(contacts)] < 0),
-            self.restitution,
-            plant.frictions(self.friction),
-            is_poisson=self.law == POISSON,
-            friction_is_given=self.friction is not None,
-            time=time,
-        )

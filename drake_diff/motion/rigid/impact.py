@@ -7,13 +7,17 @@ of an implicit function: by positions, velocities, restitution and friction.
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from drake_diff._base.arrays import Array, frozen
+from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.jupyter import ShowsItsRepr
-from drake_diff.exceptions import GradientError, SimulationError
-from drake_diff.motion.rigid.law import FRICTIONLESS, OPENS, STICKS, Asked, Impulses, Ways, solve
+from drake_diff.exceptions import GradientError, InputError, SimulationError, UnknownNameError
+from drake_diff.model.model import Model
+from drake_diff.motion.rigid.contact import POISSON, TOUCHES, RigidContact
+from drake_diff.motion.rigid.law import FRICTIONLESS, OPENS, STICKS, Asked, Impulses, solve
 from drake_diff.motion.rigid.plant import Kinetics, RigidPlant
 
 STRIKES = 1e-9  # [m/s] a contact that closes more slowly does not strike
@@ -40,7 +44,7 @@ class Impact(ShowsItsRepr):
         >>> model = dd.load_model("models/sphere_on_ground.sdf", time_step=0.01)
         >>> x = np.array(model.default_state)
         >>> x[[6, 12]] = 0.1, -2.0  # the ball's radius, 2 m/s down
-        >>> dd.motion.RigidContact(restitution=0.5, friction=0.0).impact(model, x)
+        >>> dd.motion.rigid_impact(model, x, dd.motion.RigidContact(restitution=0.5, friction=0))
         Impact of ball and ground: frictionless, 1.5 J lost
     """
 
@@ -93,7 +97,7 @@ class Struck:
     plant: RigidPlant
     q: Array
     contacts: tuple[int, ...]
-    strikes: Array  # (m,) whether each closes before it
+    strikes: NDArray[np.bool_]  # (m,) whether each closes before it
     restitution: float
     friction_is_given: bool
     kinetics: Kinetics
@@ -179,7 +183,14 @@ class _Equations:
         self.P = slice(nv + 3 * i, nv + 3 * i + 3)
 
     def normal(
-        self, closed: bool, e: float | None, J: Array, by_q: tuple[Array, ...], n: Array, w: tuple[Array, Array], P: Array
+        self,
+        closed: bool,
+        e: float | None,
+        J: Array,
+        by_q: tuple[Array, ...],
+        n: Array,
+        w: tuple[Array, Array],
+        P: Array,
     ) -> None:
         """n . w+ + e n . w- = 0 where it is closed, without the second where e is None; else n . P = least."""
         before, after, dn = by_q
@@ -236,20 +247,62 @@ def _solved(K: Array, right: Array, nv: int) -> tuple[Array | None, Array]:
     return found, spare
 
 
+def plant_of(model: Model, contact: RigidContact) -> RigidPlant:
+    """The hard contacts of `model`, made once; ModelError where it has no such motion."""
+    return model.cache(("rigid plant", contact.points), lambda: RigidPlant(model, contact.points))
+
+
+def rigid_impact(model: Model, x: ArrayLike, contact: RigidContact, *, contacts: Any = None) -> Impact:
+    """The impact of hard contacts at a state: the state after it, the impulses, and the derivatives.
+
+    Args:
+        model: The model.
+        x: (nx,) the state before.
+        contact: Restitution, friction and the law.
+        contacts: Names of those that take part; if not given, those whose gap is at most 1e-6 m.
+
+    Returns:
+        The `Impact`.
+
+    Raises:
+        SimulationError: No impulses satisfy the law, they are not unique, or they add energy.
+        UnknownNameError: There is no such contact.
+        InputError: No contact touches.
+        ModelError: The model has no such motion.
+
+    Example:
+        >>> model = dd.load_model("models/two_spheres.sdf", time_step=0.01)  # of 1 kg and 0.5 kg, on a line
+        >>> hit = dd.motion.rigid_impact(model, [0, 0.2, 3, 0], dd.motion.RigidContact(1.0, friction=0))
+        >>> hit.x_after[2:].round(9).tolist()
+        [1.0, 4.0]
+    """
+    plant, state = plant_of(model, contact), np.asarray(finite_array("x", x, (model.nx,)))
+    if contacts is None:
+        chosen = tuple(np.flatnonzero(plant.gaps(state) <= TOUCHES).tolist())
+    else:
+        named = (contacts,) if isinstance(contacts, str) else tuple(contacts)
+        for name in named:
+            if name not in plant.names:
+                raise UnknownNameError("contact", got=name, known=plant.names)
+        chosen = tuple(plant.names.index(name) for name in named)
+    if not chosen:
+        least = float(np.min(plant.gaps(state), initial=np.inf))
+        raise InputError("x", got=f"gaps of at least {least:.3g} m", expected="contacts that touch")
+    return strike(plant, state, contact, chosen)
+
+
 def strike(
     plant: RigidPlant,
     x: Array,
+    contact: RigidContact,
     contacts: tuple[int, ...],
-    strikes: Array,
-    restitution: float,
-    friction: Array,
-    *,
-    is_poisson: bool,
-    friction_is_given: bool,
+    held: tuple[int, ...] = (),
     time: float = 0.0,
 ) -> Impact:
-    """The impact of `contacts` at the state `x` (nx,), of which those strike that `strikes` (m,) says."""
+    """The impact of `contacts` at the state `x` (nx,), of which those that are `held` were closed before."""
     q, v = x[: plant.nq], x[plant.nq :]
+    strikes = np.array([i not in held for i in contacts]) & (plant.gap_rates(x)[list(contacts)] < 0)
+    restitution, is_poisson, friction = contact.restitution, contact.law == POISSON, plant.frictions(contact.friction)
     kinetics = plant.kinetics(q, contacts)
     names = ", ".join(plant.names[i] for i in contacts)
     J, M, m = kinetics.J, kinetics.mass, len(contacts)
@@ -276,7 +329,8 @@ def strike(
             f"{law} restitution of {restitution:g} with friction adds {energy - before_energy:.4g} J to the "
             f"{before_energy:.4g} J before the impact of {names}{other}"
         )
-    record = Struck(plant, q, contacts, strikes, restitution, friction_is_given, kinetics, tuple(parts))
+    is_given = contact.friction is not None
+    record = Struck(plant, q, contacts, strikes, restitution, is_given, kinetics, tuple(parts))
     return Impact(
         time=time,
         x_before=frozen(x),
@@ -287,4 +341,3 @@ def strike(
         energy_lost=before_energy - energy,
         record=record,
     )
-

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from scipy.optimize import minimize
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import SimulationError
@@ -225,24 +224,33 @@ def _excess(asked: Asked, ways: Ways, values: Array) -> float:
     return worst
 
 
-def _within(
-    asked: Asked, ways: Ways, values: Array, spare: Array, size: float
-) -> Array | None:
+def _within(asked: Asked, ways: Ways, values: Array, spare: Array, size: float) -> Array | None:
     """Impulses (m, 3) that the law allows and that add to the same motion, if there are any: a convex search."""
-    scale = 1.0 / max(float(np.max(np.abs(values))), 1e-300)
+    size_of_impulse, z = max(float(np.max(np.abs(values))), 1e-300), np.zeros(len(spare))
+    allowed = max(ROUNDED * size / _scale(asked), 1e-9 * size_of_impulse)
+    parts = spare.reshape(len(spare), -1, 3)
+    for _ in range(ROUNDS):
+        p = values + np.einsum("k,kij->ij", z, parts)
+        if _excess(asked, ways, p) <= allowed:
+            return p
+        left, slopes = _beyond(asked, ways, p, parts, 1e-2 * allowed)
+        z = z - np.linalg.lstsq(slopes, left, rcond=1e-10)[0]
+    return None
 
-    def beyond(z: Array) -> float:
-        p, total = values + (spare.T @ z).reshape(-1, 3) / scale, 0.0
-        for i, (closed, way) in enumerate(ways):
-            n = asked.normals[i]
-            push = float(n @ p[i])
-            if closed:
-                total += max(asked.least[i] - push, 0.0) ** 2
-            if way == STICKS and np.isfinite(asked.friction[i]):
-                total += max(float(np.linalg.norm(p[i] - push * n)) - asked.friction[i] * push, 0.0) ** 2
-        return total * scale**2
 
-    result = minimize(beyond, np.zeros(len(spare)), method="BFGS", options={"gtol": 1e-14})
-    found = values + (spare.T @ result.x).reshape(-1, 3) / scale
-    allowed = max(ROUNDED * size / _scale(asked), 1e-7 / scale)
-    return found if _excess(asked, ways, found) <= allowed else None
+def _beyond(asked: Asked, ways: Ways, p: Array, parts: Array, margin: float) -> tuple[Array, Array]:
+    """By how much the impulses p (m, 3) are beyond each bound, and the slopes by the multiples of `parts` (k, m, 3)."""
+    left, slopes = [], []
+    for i, (closed, way) in enumerate(ways):
+        n, own = asked.normals[i], parts[:, i]
+        push = float(n @ p[i])
+        if closed and asked.least[i] - push > 0:
+            left.append(asked.least[i] - push + margin)
+            slopes.append(-own @ n)
+        if way == STICKS and np.isfinite(asked.friction[i]):
+            t = p[i] - push * n
+            along = float(np.linalg.norm(t))
+            if along - asked.friction[i] * push > 0:
+                left.append(along - asked.friction[i] * push + margin)
+                slopes.append(own @ (t / max(along, 1e-300) - asked.friction[i] * n))
+    return np.array(left), np.array(slopes).reshape(len(left), len(parts))

@@ -13,52 +13,16 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from drake_diff._base.arrays import Array, finite_array
-from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff._base.arrays import Array
+from drake_diff.exceptions import ModelError, UnknownNameError
 from drake_diff.mechanics.description import names_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import proximity_property
-from drake_diff.motion.flow.integrate import step_function
+from drake_diff.motion.dormand_prince import ERROR, STAGES
 from drake_diff.motion.flow.plant import FlowPlant, flow_plant, from_box
+from drake_diff.motion.rigid.points import PointOnPlane
 
 Closed = tuple[tuple[int, bool], ...]  # contacts that are closed, and whether each sticks
-
-
-@dataclass(frozen=True, eq=False)
-class PointOnPlane:
-    """A point of a body that may strike a plane of another body: a contact without collision geometry.
-
-    Args:
-        body: The body, by its name in `Model.plant`.
-        point: (3,) [m] the point in the body's frame.
-        other: The body that has the plane; the world if not given.
-        origin: (3,) [m] a point of the plane in the other body's frame.
-        normal: (3,) the plane's normal in that frame, to the side where the point is free.
-
-    Example:
-        >>> toe = dd.motion.PointOnPlane("foot", [0, 0, -0.05])
-        >>> toe.name
-        'foot on world'
-    """
-
-    body: str
-    point: Any = (0.0, 0.0, 0.0)
-    other: str = "world"
-    origin: Any = (0.0, 0.0, 0.0)
-    normal: Any = (0.0, 0.0, 1.0)
-
-    def __post_init__(self) -> None:
-        for name in ("point", "origin", "normal"):
-            object.__setattr__(self, name, finite_array(f"{name} of {self.body}", getattr(self, name), (3,)))
-        size = float(np.linalg.norm(self.normal))
-        if not size > 0:
-            raise InputError(f"normal of {self.body}", got="zeros", expected="a direction")
-        object.__setattr__(self, "normal", self.normal / size)
-
-    @property
-    def name(self) -> str:
-        """Of the contact, for messages."""
-        return f"{self.body} on {self.other}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +61,7 @@ class RigidPlant:
         self.flow: FlowPlant = flow_plant(model)
         tree, pairs, inspector = self.flow.tree, self.flow.pairs, model.double.inspector
         self.nq, self.nv = model.nq, model.nv
+        self.mass, self.free = tree.mass(), tree.acceleration(self.flow.u, ca.SX.zeros(model.nv))
         self._places = [self._of_pair(i) for i in range(self.flow.num_pairs)] + [self._of_point(p) for p in points]
         names = [" and ".join(inspector.GetName(i) for i in ids) for ids in pairs.ids]
         self.names = (*names, *(point.name for point in points))
@@ -147,7 +112,7 @@ class RigidPlant:
         if contacts not in self._kinetics:
             J, normals = self._stacked(contacts)
             self._kinetics[contacts] = ca.Function(
-                "kinetics", [self.flow.x], [ca.densify(a) for a in (self.flow.tree.mass(), J, normals)]
+                "kinetics", [self.flow.x], [ca.densify(a) for a in (self.mass, J, normals)]
             )
         found = [np.asarray(a) for a in self._kinetics[contacts](self._at(q))]
         return Kinetics(found[0], found[1], found[2].reshape(-1, 3))
@@ -158,9 +123,11 @@ class RigidPlant:
         """By `q` (nq,), of M change - J' impulses (3 m,), J before, J after and the normals."""
         if contacts not in self._slopes:
             J, normals = self._stacked(contacts)
-            a, p, b, c = (ca.SX.sym(s, n) for s, n in (("a", self.nv), ("p", J.shape[0]), ("b", self.nv), ("c", self.nv)))
+            a, p, b, c = (
+                ca.SX.sym(s, n) for s, n in (("a", self.nv), ("p", J.shape[0]), ("b", self.nv), ("c", self.nv))
+            )
             by = self.flow.tree.q
-            found = [self.flow.tree.mass() @ a - J.T @ p, J @ b, J @ c, normals]
+            found = [self.mass @ a - J.T @ p, J @ b, J @ c, normals]
             given = [self.flow.x, a, p, b, c]
             jacobians = [ca.densify(ca.jacobian(each, by)) for each in found]
             self._slopes[contacts] = ca.Function("slopes", given, jacobians)
@@ -237,12 +204,12 @@ class Smooth:
     """The motion while given contacts are closed: steps, rates and the forces that hold them, with their slopes."""
 
     def __init__(self, plant: RigidPlant, closed: Closed):
-        flow, n = plant.flow, plant.nv
+        flow = plant.flow
         tree, self.plant, self.closed = flow.tree, plant, closed
         self.model = flow.model
-        free, rows = tree.acceleration(flow.u, ca.SX.zeros(n)), plant.held_rows(closed)
+        free, rows = plant.free, plant.held_rows(closed)
         if closed:
-            pushed = ca.ldl_solve(ca.densify(rows.T), *ca.ldl(tree.mass()))
+            pushed = ca.ldl_solve(ca.densify(rows.T), *ca.ldl(plant.mass))
             speeds = rows @ tree.v
             needed = -(ca.jacobian(speeds, tree.q) @ tree.position_rates + rows @ free)
             inner = ca.densify(rows @ pushed)
@@ -262,11 +229,7 @@ class Smooth:
         normals = ca.densify(ca.vertcat(*[normal for _, normal in worlds])) if worlds else ca.SX(0, 1)
         self._forces = ca.Function("forces", given, [pushes, normals])
         self._normal_slopes = ca.Function("normal_slopes", given, [ca.densify(ca.jacobian(normals, by))])
-        self.step = step_function(self, ())
-
-    def part(self, pushing: tuple[int, ...]) -> "Smooth":
-        """Itself: what `step_function` asks for the rates."""
-        return self
+        self.step = _step(self.rates)
 
     def _rows(self) -> list[tuple[int, tuple[int, bool]]]:
         """Where the rows of each closed contact begin."""
@@ -309,3 +272,15 @@ class Smooth:
     def _unused(self) -> Array:
         """The materials of compliant contact, which have no part in it."""
         return np.zeros(4 * self.plant.flow.num_pairs)
+
+
+def _step(rates: Any) -> Any:
+    """(x, u, materials, h) -> the state after a step of Dormand and Prince, and its error."""
+    h = ca.SX.sym("h")
+    x, u, materials = (ca.SX.sym(name, *rates.size_in(i)) for i, name in enumerate("xum"))
+    slopes, ahead = [rates(x, u, materials)], x
+    for weights in STAGES:
+        ahead = x + h * sum(w * s for w, s in zip(weights, slopes, strict=True))
+        slopes.append(rates(ahead, u, materials))
+    error = h * sum(w * s for w, s in zip(ERROR, slopes, strict=True))
+    return ca.Function("step", [x, u, materials, h], [ca.densify(ahead), ca.densify(error)])

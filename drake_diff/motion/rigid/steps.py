@@ -10,21 +10,25 @@ and where a closed contact lets go, as its force falls through 0, R is the ident
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
-from scipy.optimize import brentq
+from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, frozen
+from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.exceptions import GradientError, ModelError, SimulationError
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import ParameterVector
+from drake_diff.model.parameters import ParameterVector, select
 from drake_diff.motion.dormand_prince import LEAST, STAGES, factor
 from drake_diff.motion.flow.steps import Chooser
 from drake_diff.motion.rigid.contact import TOUCHES, RigidContact
-from drake_diff.motion.rigid.impact import STRIKES, Impact
-from drake_diff.motion.rigid.plant import Closed, RigidPlant, Smooth
+from drake_diff.motion.rigid.impact import STRIKES, Impact, plant_of, strike
+from drake_diff.motion.rigid.plant import Closed, Smooth
+from drake_diff.motion.rollout import check_inputs
 
 METHOD = "rigid"
 TOLERANCE = 1e-11  # of each step, relative to max(1, |x|)
@@ -32,7 +36,7 @@ BUDGET = 30.0  # [s] of wall time
 SHORTEST = 1e-13  # [s]
 ENDLESS = 1e-5  # [s] between two impacts of a contact: they have no end
 GRAZES = 1e-9  # of the sizes of a gap's slope and of the rates: less is no crossing
-MOST_HALVES = 30
+MOST_HALVES, MOST_ROUNDS = 30, 100
 LOOKED = 8  # places in a step at which gaps are looked at
 TOGETHER = 1e-9  # [m] gaps that close at once
 PARTS = 1e-9  # [N] relative to the largest force of a contact: one that pulls
@@ -86,6 +90,73 @@ class RigidFlow:
         return tuple(part.impact for part in self.parts if isinstance(part, Struck))
 
 
+@dataclass(frozen=True, eq=False)
+class RigidMotion(ShowsItsRepr):
+    """A motion with hard contact; `rigid_motion` makes one. Arrays are read-only.
+
+    Attributes:
+        times: (N+1,) [s].
+        xs: (N+1, nx) the states.
+        us: (N, nu) the inputs.
+        impacts: `Impact`s in order.
+        by_x0: (nx, nx) the derivative of the last state by the first.
+        by_restitution, by_friction: (nx,) of the last state.
+
+    Example:
+        >>> model = dd.load_model("models/sphere_on_ground.sdf", time_step=0.01)
+        >>> x0 = np.array(model.default_state)
+        >>> x0[6] = 0.6
+        >>> dd.motion.rigid_motion(model, x0, dd.motion.RigidContact(0.8, friction=0), num_steps=100)
+        RigidMotion of 1 s with 2 impacts, at 0.319275, 0.830116 s
+    """
+
+    times: Array
+    xs: Array
+    us: Array
+    impacts: tuple[Impact, ...]
+    _steps: "RigidSteps"
+    _flow: RigidFlow
+
+    def __repr__(self) -> str:
+        count = len(self.impacts)
+        at = ", ".join(f"{impact.time:.6g}" for impact in self.impacts[:8])
+        more = ", ..." if count > 8 else ""
+        told = f", at {at}{more} s" if count else ""
+        return f"RigidMotion of {self.times[-1]:g} s with {count} impact{'s' * (count != 1)}{told}"
+
+    @cached_property
+    def derivatives(self) -> tuple[StepDerivatives, ...]:
+        """Of each interval, by the state, the input, restitution and friction; GradientError where one has none."""
+        return tuple(self._steps.derivatives(self._flow))
+
+    @cached_property
+    def _by_start(self) -> Array:
+        """(nx, nx + np)."""
+        nx = self.xs.shape[1]
+        total = np.hstack([np.eye(nx), np.zeros((nx, len(self._steps.names)))])
+        for step in self.derivatives:
+            total = step.A @ total
+            total[:, nx:] += step.C
+        return total
+
+    @property
+    def by_x0(self) -> Array:
+        """(nx, nx)."""
+        return frozen(self._by_start[:, : self.xs.shape[1]])
+
+    @property
+    def by_restitution(self) -> Array:
+        """(nx,)."""
+        return frozen(self._by_start[:, self.xs.shape[1]])
+
+    @property
+    def by_friction(self) -> Array:
+        """(nx,)."""
+        if len(self._steps.names) < 2:
+            raise GradientError("friction is the model's own: give RigidContact(friction=...) for a derivative by it")
+        return frozen(self._by_start[:, self.xs.shape[1] + 1])
+
+
 class RigidSteps:
     """The motion of a model's hard contacts; ModelError where it has none."""
 
@@ -95,7 +166,7 @@ class RigidSteps:
                 f"hard contact has no derivative by {vector.parameters[0].name}: it has those by its own restitution "
                 "and friction, which need not be asked for"
             )
-        self.model, self.law, self.plant = model, law, law.plant(model)
+        self.model, self.law, self.plant = model, law, plant_of(model, law)
         self.friction = self.plant.frictions(law.friction)
         self.names = ("restitution", "friction") if law.friction is not None else ("restitution",)
 
@@ -108,6 +179,12 @@ class RigidSteps:
             us[k] = choose(xs[k], k)
             xs[k + 1] = runner.advance(us[k], k * h, (k + 1) * h)
         return xs, us, runner.found
+
+    def motion(self, x0: Array, us: Array) -> RigidMotion:
+        """Under the inputs `us` (N, nu)."""
+        xs, _, flow = self.roll(x0, lambda x, k: us[k], len(us))
+        times = frozen(self.model.time_step * np.arange(len(xs)))
+        return RigidMotion(times, frozen(xs), frozen(us), flow.impacts, self, flow)
 
     def derivatives(self, flow: RigidFlow) -> list[StepDerivatives]:
         """Of the intervals of a motion; GradientError where an event has none."""
@@ -182,6 +259,64 @@ class RigidSteps:
         return found
 
 
+def rigid_motion(
+    model: Model,
+    x0: ArrayLike,
+    contact: RigidContact,
+    us: ArrayLike | None = None,
+    *,
+    num_steps: int | None = None,
+) -> RigidMotion:
+    """The motion of a model whose contacts are hard, impact by impact, and its derivatives.
+
+    Args:
+        model: The model, in whose intervals the inputs are held.
+        x0: (nx,) the first state.
+        contact: Restitution, friction and the law.
+        us: (N, nu) the inputs [N or N m]; may be left out where the model has no actuators.
+        num_steps: N, where `us` does not say it.
+
+    Returns:
+        States, impacts and derivatives.
+
+    Raises:
+        SimulationError: An impact has no unique answer; a contact slides on with friction, or bounces infinitely
+            often; shapes touch that have no law here, or a joint limit is reached.
+        ModelError: The model has no such motion.
+
+    Example:
+        >>> model = dd.load_model("models/sphere_on_ground.sdf", time_step=0.01)
+        >>> x0 = np.array(model.default_state)
+        >>> x0[6] = 0.2
+        >>> landed = dd.motion.rigid_motion(model, x0, dd.motion.RigidContact(friction=0), num_steps=30)
+        >>> landed.impacts[0], landed.xs[-1, [6, 12]].round(6).tolist()  # where it stays
+        (Impact of ball and ground: frictionless, 0.981 J lost at 0.142784 s, [0.1, 0.0])
+    """
+    first, inputs = finite_array("x0", x0, (model.nx,)), check_inputs(model, us, num_steps)
+    return RigidSteps(model, select(model, ()), contact).motion(np.asarray(first), inputs)
+
+
+def first_zero(function: Callable[[float], float], low: float, high: float) -> float:
+    """Where a function that is above 0 at `low` and not at `high` is 0, to rounding: the Illinois rule, and halves."""
+    f_low, f_high, side = function(low), function(high), 0
+    for _ in range(MOST_ROUNDS):
+        if high - low <= 4e-16 * max(high, 1e-3) or f_high == 0:
+            break
+        middle = high - f_high * (high - low) / (f_high - f_low)
+        if not low < middle < high:
+            middle = (low + high) / 2
+        value = function(middle)
+        if value > 0:
+            low, f_low = middle, value
+            f_high = f_high / 2 if side > 0 else f_high
+            side = 1
+        else:
+            high, f_high = middle, value
+            f_low = f_low / 2 if side < 0 else f_low
+            side = -1
+    return high
+
+
 def saltation(impact: Impact, rates: Array, rates_after: Array) -> Array:
     """(nx, nx) the saltation matrix of an impact of one contact, of the rates (nx,) before and after it."""
     plant, contacts = impact.record.plant, impact.record.contacts
@@ -202,7 +337,7 @@ class _Runner:
         gaps, rates = self.plant.gaps(self.x), self.plant.gap_rates(self.x)
         if np.any(gaps < -TOUCHES):
             i = int(np.argmin(gaps))
-            raise SimulationError(f"{self.plant.names[i]} overlap by {-gaps[i]:.3g} m at the start: hard contact does not")
+            raise SimulationError(f"{self.plant.names[i]} overlap by {-gaps[i]:.3g} m at the start")
         rests = np.flatnonzero((np.abs(gaps) <= TOUCHES) & (np.abs(rates) <= TOUCHES))
         self.resting = tuple((int(i), self._sticks(int(i))) for i in rests)
         self.striking_first = tuple(np.flatnonzero((gaps <= 0) & (rates < -TOUCHES)).tolist())
@@ -270,7 +405,7 @@ class _Runner:
             def gap(h: float, i: int = i) -> float:
                 return float(self.plant.gaps(smooth.step_from(self.x, u, h)[0])[i])
 
-            found.append((brentq(gap, low, places[k], xtol=1e-16, rtol=1e-15), "closes", i))
+            found.append((first_zero(gap, low, float(places[k])), "closes", i))
         if self.closed:
             found += self._lets_go(smooth, u, places, states)
         return min(found) if found else None
@@ -301,13 +436,13 @@ class _Runner:
             if len(below):
                 k = int(below[0]) + 1
                 if pushes[k - 1, j] > 0:
-                    found.append((brentq(push, places[k - 1], places[k], xtol=1e-15), "lets go", i))
+                    found.append((first_zero(push, places[k - 1], places[k]), "lets go", i))
             elif sticks and np.isfinite(self.steps.friction[i]):
                 grips = np.array([self._grip(i, f[j], along[j]) for f, along in forces])
                 lost = np.flatnonzero(grips[1:] < -PARTS * max(size, 1.0))
                 if len(lost):
                     k = int(lost[0]) + 1
-                    at = brentq(grip, places[k - 1], places[k], xtol=1e-12) if grips[k - 1] > 0 else places[k - 1]
+                    at = first_zero(grip, places[k - 1], places[k]) if grips[k - 1] > 0 else places[k - 1]
                     found.append((at, "slips", i))
         return found
 
@@ -333,15 +468,15 @@ class _Runner:
 
     def _slips(self, contact: int, now: float) -> None:
         raise SimulationError(
-            f"{self.plant.names[contact]} slides on with friction from {now:.6g} s on, which hard contact does not follow: "
-            'take friction=0 or numpy.inf, or method="continuous"'
+            f"{self.plant.names[contact]} slides on with friction from {now:.6g} s on, which hard contact does not "
+            'follow: take friction=0 or numpy.inf, or method="continuous"'
         )
 
     def _strike(self, striking: tuple[int, ...], u: Array, now: float) -> None:
         self._check_end(striking, now)
         held = tuple(i for i, _ in self.closed)
         contacts = (*held, *(i for i in striking if i not in held))
-        impact = self.law.struck(self.plant, self.x, contacts, held, now)
+        impact = strike(self.plant, self.x, self.law, contacts, held, now)
         before, self.x = self.closed, np.array(impact.x_after)
         rates = self.plant.gap_rates(self.x)
         stays = []
@@ -406,4 +541,3 @@ class _Runner:
         if len(beyond):
             name = self.model.state_names[beyond[0]]
             raise SimulationError(f"{name} reaches a joint limit at {now:.6g} s, whose motion is not known here")
-
