@@ -45,7 +45,7 @@ class Impact(ShowsItsRepr):
         >>> x = np.array(model.default_state)
         >>> x[[6, 12]] = 0.1, -2.0  # the ball's radius, 2 m/s down
         >>> dd.motion.rigid_impact(model, x, dd.motion.RigidContact(restitution=0.5, friction=0))
-        Impact of ball and ground: frictionless, 1.5 J lost
+        Impact of sphere::ball and ground::ground: frictionless, 1.5 J lost
     """
 
     time: float

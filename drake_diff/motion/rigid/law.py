@@ -28,7 +28,7 @@ SAME = 1e-8  # of the largest velocity: the same motion
 ROUNDED = 1e-10  # of the largest velocity: as good as 0
 SINGULAR = 1e-11  # of the largest singular value
 ROUNDS = 200  # of the direction of a slide
-DIRECTIONS = 8  # a slide's direction is sought from
+STARTS, AROUND = 8, 36  # directions from which several slides are sought, and one is
 Ways = tuple[tuple[bool, str], ...]  # of each contact: whether it is closed, and OPENS, STICKS, SLIDES or FRICTIONLESS
 
 
@@ -99,13 +99,12 @@ def _ways(asked: Asked, i: int) -> list[tuple[bool, str]]:
 def _of_ways(asked: Asked, ways: Ways, size: float) -> Iterator[tuple[Array, Array]]:
     """The impulses (m, 3) and velocities (m, 3) in which every contact does what `ways` says."""
     sliding = [i for i, (_, way) in enumerate(ways) if way == SLIDES]
-    starts = _starts(asked, sliding)
-    for directions in starts:
-        found = _iterated(asked, ways, directions, sliding, size)
+    for directions in _directions(asked, ways, sliding, size):
+        found = _linear(asked, ways, directions)
         if found is None:
             continue
         values, spare = found
-        after = asked.before + (asked.W @ values.ravel()).reshape(-1, 3)
+        after = _after(asked, values)
         if _keeps(asked, ways, values, after, size):
             yield values, after
         elif len(spare) and _fits(asked, ways, after, size):
@@ -114,39 +113,77 @@ def _of_ways(asked: Asked, ways: Ways, size: float) -> Iterator[tuple[Array, Arr
                 yield other, after
 
 
-def _starts(asked: Asked, sliding: list[int]) -> list[Array]:
-    """Directions (m, 3) to begin with: the velocities before, and around the normals."""
+def _after(asked: Asked, values: Array) -> Array:
+    return asked.before + (asked.W @ values.ravel()).reshape(-1, 3)
+
+
+def _directions(asked: Asked, ways: Ways, sliding: list[int], size: float) -> Iterator[Array]:
+    """Directions (m, 3) of slides that are those of the velocities to which their friction leads."""
     base = np.zeros((len(asked), 3))
     if not sliding:
-        return [base]
-    found = []
-    for turn in range(DIRECTIONS):
-        angle = 2 * np.pi * turn / DIRECTIONS
-        directions = base.copy()
-        for i in sliding:
-            n = asked.normals[i]
-            t = asked.before[i] - n * (n @ asked.before[i])
-            if np.linalg.norm(t) <= ROUNDED:
-                t = np.cross(n, np.eye(3)[int(np.argmin(np.abs(n)))])
-            t = t / np.linalg.norm(t)
-            directions[i] = np.cos(angle) * t + np.sin(angle) * np.cross(n, t)
-        found.append(directions)
-    return found
+        yield base
+    elif len(sliding) == 1:
+        yield from _all_round(asked, ways, sliding[0], size)
+    else:
+        for turn in range(STARTS):
+            directions = base.copy()
+            for i in sliding:
+                directions[i] = _turned(asked, i, 2 * np.pi * turn / STARTS)
+            found = _settled(asked, ways, directions, sliding, size)
+            if found is not None:
+                yield found
 
 
-def _iterated(
-    asked: Asked, ways: Ways, directions: Array, sliding: list[int], size: float
-) -> tuple[Array, Array] | None:
-    """The impulses (m, 3) once the directions of slides have settled, and which (k, 3 m) add nothing; None if never."""
-    for round_ in range(ROUNDS):
+def _turned(asked: Asked, i: int, angle: float) -> Array:
+    """(3,) along the plane of contact i, by an angle from its velocity before."""
+    n = asked.normals[i]
+    t = asked.before[i] - n * (n @ asked.before[i])
+    if np.linalg.norm(t) <= ROUNDED:
+        t = np.cross(n, np.eye(3)[int(np.argmin(np.abs(n)))])
+    t = t / np.linalg.norm(t)
+    return np.asarray(np.cos(angle) * t + np.sin(angle) * np.cross(n, t))
+
+
+def _all_round(asked: Asked, ways: Ways, i: int, size: float) -> Iterator[Array]:
+    """Every direction of the one contact that slides, by looking all round."""
+    n, directions = asked.normals[i], np.zeros((len(asked), 3))
+
+    def slide(angle: float) -> tuple[float, float]:
+        """The velocity's part across the direction, and along it."""
+        directions[i] = d = _turned(asked, i, angle)
+        found = _linear(asked, ways, directions)
+        if found is None:
+            return np.nan, np.nan
+        after = _after(asked, found[0])[i]
+        return float(np.cross(n, d) @ after), float(d @ after)
+
+    angles = np.linspace(-np.pi / AROUND, 2 * np.pi - np.pi / AROUND, AROUND + 1)
+    across = [slide(angle)[0] for angle in angles]
+    still = ROUNDED * size
+    for k, angle in enumerate(angles[:-1]):
+        if not across[k] * across[k + 1] <= 0:
+            continue
+        low, high, f_low = angle, angles[k + 1], across[k]  # across may be 0, or beyond all bounds, in between
+        for _ in range(60):
+            middle = (low + high) / 2
+            value = slide(middle)[0]
+            if value * f_low > 0:
+                low, f_low = middle, value
+            else:
+                high = middle
+        value, along = slide(high)
+        if abs(value) <= 1e-9 * max(along, 0.0) and along > still:
+            yield directions.copy()
+
+
+def _settled(asked: Asked, ways: Ways, directions: Array, sliding: list[int], size: float) -> Array | None:
+    """The directions (m, 3) in which several slides settle, each to that of the velocity; None if they never do."""
+    change = np.inf
+    for _ in range(ROUNDS):
         found = _linear(asked, ways, directions)
         if found is None:
             return None
-        values, spare = found
-        if not sliding:
-            return values, spare
-        after = asked.before + (asked.W @ values.ravel()).reshape(-1, 3)
-        new, change = directions.copy(), 0.0
+        after, new = _after(asked, found[0]), directions.copy()
         for i in sliding:
             n = asked.normals[i]
             t = after[i] - n * (n @ after[i])
@@ -154,13 +191,11 @@ def _iterated(
             if speed <= ROUNDED * size:
                 return None
             new[i] = t / speed
-            change = max(change, float(np.linalg.norm(new[i] - directions[i])))
-        if change <= 1e-13:
-            return values, spare
-        if change > 1.99 and round_ > 2:  # it turns back and forth
-            return None
+        before, change = change, float(np.max(np.abs(new - directions)))
+        if change <= 1e-14 or (change <= 1e-11 and change >= before):
+            return new
         directions = new
-    return (values, spare) if change <= 1e-9 else None
+    return directions if change <= 1e-9 else None
 
 
 def _linear(asked: Asked, ways: Ways, directions: Array) -> tuple[Array, Array] | None:

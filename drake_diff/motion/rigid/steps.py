@@ -290,7 +290,7 @@ def rigid_motion(
         >>> x0[6] = 0.2
         >>> landed = dd.motion.rigid_motion(model, x0, dd.motion.RigidContact(friction=0), num_steps=30)
         >>> landed.impacts[0], landed.xs[-1, [6, 12]].round(6).tolist()  # where it stays
-        (Impact of ball and ground: frictionless, 0.981 J lost at 0.142784 s, [0.1, 0.0])
+        (Impact of sphere::ball and ground::ground: frictionless, 0.981 J lost at 0.142784 s, [0.1, 0.0])
     """
     first, inputs = finite_array("x0", x0, (model.nx,)), check_inputs(model, us, num_steps)
     return RigidSteps(model, select(model, ()), contact).motion(np.asarray(first), inputs)
