@@ -13,11 +13,13 @@ from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
+from scipy.integrate import solve_ivp
 
 import drake_diff as dd
 from drake_diff.exceptions import GradientWarning, ModelError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.motion.continuous import ContinuousMotion
+from drake_diff.motion.flow import rosenbrock
 from drake_diff.motion.flow.integrate import pushing_of
 from drake_diff.motion.flow.plant import flow_plant, material_of, numbers_of
 
@@ -156,6 +158,62 @@ def test_the_rates_of_robots_are_those_of_drakes_terms(name):
     found = np.asarray(ours.part(pushing_of(modes)).rates(x, u, materials)).ravel()
     assert pushing_of(modes)
     assert np.max(np.abs(found - wanted)) <= 1e-9 * np.max(np.abs(wanted))
+
+
+@pytest.mark.parametrize("name", ["bolt.urdf", "finger_edu.urdf"])
+def test_the_slopes_of_the_rates_are_those_of_casadi(name):
+    """The closed form beside algorithmic differentiation of the rates, one foot on the ground."""
+    model, random = example_robot(name, feet=True), np.random.default_rng(2)
+    x = state_in_contact(model, random) if model.nq > model.nv else random.standard_normal(model.nx)
+    ours, u = flow_plant(model), random.standard_normal(model.nu)
+    materials, part = numbers_of(ours, material_of(ours)), ours.part((0,))
+    found = np.asarray(part.slopes(x, u, materials)[1])
+    by_x, by_u, by_materials = part.rates.jacobian()(x, u, materials, np.zeros(model.nx))
+    wanted, of_materials = np.column_stack([np.asarray(by_x), np.asarray(by_u)]), np.asarray(by_materials)[:, :4]
+    assert np.max(np.abs(found - wanted)) <= 1e-11 * np.max(np.abs(wanted))
+    found = np.asarray(part.material_slopes(x, u, materials))
+    assert np.max(np.abs(found - of_materials)) <= 1e-11 * np.max(np.abs(of_materials))
+
+
+def test_the_rosenbrock_method_has_order_5():
+    """A pendulum with cubic drag, beside Dormand and Prince's eighth order at 1e-13."""
+
+    def rates(x):
+        return np.array([x[1], -3 * np.sin(x[0]) - 0.2 * x[1] ** 3])
+
+    def after(count):
+        x, h = np.array([1.0, 0.5]), 1 / count
+        for _ in range(count):
+            slope = np.array([[0, 1], [-3 * np.cos(x[0]), -0.6 * x[1] ** 2]])
+            W, changes = np.eye(2) / (h * rosenbrock.GAMMA) - slope, np.zeros((8, 2))
+            for i, (a, c) in enumerate(zip(rosenbrock.STAGES, rosenbrock.COUPLINGS, strict=True)):
+                changes[i] = np.linalg.solve(W, rates(x + a @ changes[:i]) + c @ changes[:i] / h)
+            x = x + rosenbrock.STAGES[7] @ changes[:7] + changes[7]
+        return x
+
+    exact = solve_ivp(lambda _, x: rates(x), (0, 1), [1, 0.5], method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+    errors = [np.max(np.abs(after(count) - exact)) for count in (8, 16, 32)]
+    orders = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert np.all(orders > 4.7)
+
+
+@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.GradientWarning")  # a little aside it flies past
+@pytest.mark.parametrize("depth", [3e-3, 1e-4, 1e-6])
+def test_a_touch_that_begins_and_ends_within_a_step_is_met(depth):
+    """A ball flies past another, both ends of the interval of 0.1 s far from it: as by intervals of 0.1 ms."""
+
+    def past(time_step, count):
+        plant = Plant(time_step, "lagged", gravity=0.0)
+        properties = contact_properties(2e4, 0.2, 0.0)
+        plant.ball("ball", 1.0, 0.01, properties, "x", "z")
+        plant.shape(plant.plant.world_body(), Sphere(0.02), properties)
+        x0 = [-0.52, 0.03 - depth, 10.0, 0.0]
+        return dd.differentiate_rollout(plant.model(), x0, None, height, num_steps=count, method="continuous")
+
+    once, often = past(0.1, 1), past(1e-4, 1000)
+    assert often.loss > 0.03 - depth + 1e-9  # it is thrown aside
+    assert once.loss == pytest.approx(often.loss, abs=1e-9)
+    assert once.by_x0 == pytest.approx(often.by_x0, rel=1e-5, abs=1e-7)
 
 
 def test_a_tossed_cube_has_the_slope_of_drakes_error_controlled_motion():

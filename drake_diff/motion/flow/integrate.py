@@ -1,27 +1,28 @@
 """Error-controlled integration of a `FlowPlant`, which ends a step where a contact's switch turns.
 
 Between two events the modes are fixed and the equations smooth, so that the method keeps its order, and so does the
-derivative of what it does. The steps are Dormand and Prince's of orders 5 and 4 ("A family of embedded Runge-Kutta
-formulae", 1980).
+derivative of what it does. A switch that turns twice within a step has turned at neither end of it: where it comes
+nearer to 0 at the start and goes away from it at the end, what is between them is looked at.
 """
 
 import time
 from dataclasses import dataclass, field
-from typing import Any
 
-import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.exceptions import SimulationError
-from drake_diff.motion.dormand_prince import ERROR, LEAST, STAGES, factor
+from drake_diff.motion.dormand_prince import LEAST, factor
 from drake_diff.motion.flow.plant import FlowPlant
+from drake_diff.motion.flow.stepping import Stepper, on_arrays
 
 TOLERANCE = 1e-9  # of each step, relative to max(1, |x|)
 BUDGET = 30.0  # [s] of wall time
 ROOT = 1e-13  # of a step: how near to its event it ends
-NEARER = 1e-3  # of what is left of a step: at least so far from both ends it is looked for
 SHORTEST = 1e-14  # [s] a step that is shorter does not move time
+BEYOND = 1e-4  # of the way to where a switch is expected to be 0: how far beyond it the next look is
+SHALLOW = 1e-13  # [m] overlap that begins and ends within a step and is not looked for
 
 
 @dataclass(frozen=True)
@@ -49,48 +50,52 @@ class Flow:
     tried: int = 0
 
 
+@dataclass(frozen=True, eq=False)
+class _Switches:
+    """(2 P,) of the switches and their rates."""
+
+    values: Array
+    rates: Array
+
+
 class Integrator:
-    """Steps of a plant under fixed modes, with their error estimate."""
+    """The flow of a plant from a state, with contacts of given materials."""
 
     def __init__(self, plant: FlowPlant, materials: Array, tolerance: float = TOLERANCE):
-        model = plant.model
+        model, count = plant.model, 2 * plant.num_pairs
         self.plant, self.tolerance, self.materials = plant, tolerance, np.array(materials, dtype=float)
+        self.stepper = Stepper(plant, self.materials)
         self.h_next, self.began = model.time_step, 0.0
-        self._steps: dict[tuple[int, ...], Any] = {}
-        self.x, self.u, self.h = np.zeros(model.nx), np.zeros(model.nu), np.zeros(1)
-        self.modes = np.zeros(2 * plant.num_pairs)
-        self.ahead, self.error = np.zeros(model.nx), np.zeros(model.nx)
-        self._at, self._values = np.zeros(model.nx), np.zeros(2 * plant.num_pairs)
-        self._switch_buffer, self._switch = on_arrays(
-            plant.switches, (self._at, self.u, self.materials), (self._values,)
-        )
-        self._set_modes(np.zeros(2 * plant.num_pairs))
-
-    def _set_modes(self, modes: Array) -> None:
-        """Take the equations where the pairs push whose two modes are 1."""
-        self.modes[:] = modes
-        pushing = pushing_of(modes)
-        if pushing not in self._steps:
-            arguments = self.x, self.u, self.materials, self.h
-            self._steps[pushing] = on_arrays(step_function(self.plant, pushing), arguments, (self.ahead, self.error))
-        self._buffer, self._run = self._steps[pushing]
+        self.modes = np.zeros(count)
+        self._start = _Switches(np.zeros(count), np.zeros(count))  # where the step begins
+        self._x, self._rates = np.zeros(model.nx), np.zeros(model.nx)
+        self._values, self._changes = np.zeros(count), np.zeros(count)
+        arguments = self._x, self.stepper.u, self.materials, self._rates
+        self._buffer, self._run = on_arrays(plant.moving_switches, arguments, (self._values, self._changes))
 
     def begin(self, x0: Array) -> Flow:
         """A flow that stands at `x0` (nx,)."""
-        self.x[:], self.h_next = x0, self.plant.model.time_step
-        self._set_modes(np.zeros_like(self.modes))
+        self.stepper.x[:], self.h_next = x0, self.plant.model.time_step
+        self.modes[:] = 0.0
+        self.stepper.push(())
         self.began = time.monotonic()
         return Flow([0.0], [np.array(x0, dtype=float)])
 
     def advance(self, found: Flow, u: Array, interval: float, budget: float = BUDGET) -> Array:
         """(nx,) where a flow leads in `interval` [s] more under `u` (nu,); SimulationError where it has no end."""
-        self.u[:] = u
+        if not found.hs or not np.array_equal(u, self.stepper.u):
+            self.stepper.u[:] = u
+            self.stepper.moved()
+            self._look()
         self._settle(found)
         now, end = found.times[-1], (len(found.ends) + 1) * interval
         near = SHORTEST * max(1.0, end)
         while end - now > near:
             if time.monotonic() - self.began > budget:
-                raise SimulationError(f"the flow is too stiff: {budget:g} s of work did not reach {end:.4g} s")
+                raise SimulationError(
+                    f"the flow is too stiff: {budget:g} s of work reached {now:.4g} s by {len(found.hs)} steps, not "
+                    f"{end:.4g} s"
+                )
             self.h_next = self._advance(found, now, min(self.h_next, end - now), self.h_next)
             now = found.times[-1]
         found.times[-1] = end
@@ -101,7 +106,7 @@ class Integrator:
         """One accepted step of at most `length` [s] from `now`; the length that would do next."""
         is_cut = length < wanted
         while True:
-            ratio = self._try(length)
+            ratio = self.stepper.attempt(length) / self.tolerance
             found.tried += 1
             change = factor(ratio)
             if ratio <= 1:
@@ -110,78 +115,95 @@ class Integrator:
             if length < SHORTEST:
                 raise SimulationError(f"the flow cannot go on at {now:.6g} s: its rates are not finite or jump")
         after = max(wanted, length * change) if is_cut else length * change  # a step that is cut says nothing
-        turned = self._turned()
-        if len(turned):
-            length = self._find(length, turned)
-        self._accept(found, now + length, length)
+        end = self._switches_ahead()
+        while True:
+            if len(self._turned(end)):
+                length, end = self._find(length, end)
+            dip = self._dip(length, end)
+            if dip is None:
+                break
+            length, end = dip
+        self._accept(found, now + length, length, end)
         return after
 
-    def _try(self, length: float) -> float:
-        """A step of `length` [s] into `ahead`; its error as a part of what is allowed."""
-        self.h[0] = length
+    def _switches_ahead(self) -> _Switches:
+        """Where the last attempt led."""
+        self._x[:], self._rates[:] = self.stepper.ahead, self.stepper.after
         self._run()
-        if not np.all(np.isfinite(self.ahead)):
-            return float("inf")
-        size = self.tolerance * np.maximum(1.0, np.maximum(np.abs(self.x), np.abs(self.ahead)))
-        with np.errstate(over="ignore"):
-            return float(np.sqrt(np.mean((self.error / size) ** 2)))
+        return _Switches(self._values.copy(), self._changes.copy())
 
-    def _switches(self, x: Array) -> Array:
-        """(2 P,) at `x` (nx,)."""
-        self._at[:] = x
-        self._switch()
-        return self._values.copy()
+    def _after(self, length: float) -> _Switches:
+        """After a step of another `length` [s]."""
+        self.stepper.attempt(length)
+        return self._switches_ahead()
 
-    def _turned(self) -> Indices:
-        """The switches that differ from the modes at the step's end; a bracket matters where its pair overlapped."""
-        on, was = self._switches(self.ahead) > 0, self.modes > 0.5
-        matters = np.repeat(was[::2], 2)
+    def _matters(self) -> NDArray[np.bool_]:
+        """(2 P,) a bracket matters where its pair overlapped."""
+        matters = np.repeat(self.modes[::2] > 0.5, 2)
         matters[::2] = True
-        return np.flatnonzero((on != was) & matters)
+        return matters
 
-    def _find(self, length: float, turned: Indices) -> float:
-        """The length of the step at whose end the first of the switches that `turned` is 0, just past it."""
-        low, high, halve = 0.0, length, False
-        while high - low > max(ROOT * length, SHORTEST):
-            first = 0.5 if halve else self._first(self._values_at(low), self._values_at(high), turned)
+    def _turned(self, end: _Switches) -> Indices:
+        """The switches that differ from the modes at the step's end."""
+        return np.flatnonzero(((end.values > 0) != (self.modes > 0.5)) & self._matters())
+
+    def _find(self, length: float, end: _Switches) -> tuple[float, _Switches]:
+        """The length of the step at whose end the first of the switches that turned is 0, just past it."""
+        low, high, first, last = 0.0, length, self._start, end
+        near, slow = max(ROOT * length, SHORTEST), 0
+        while high - low > near:
             before = high - low
-            middle = low + before * min(max(first, NEARER), 1 - NEARER)
-            self._try(middle)
-            crossed = self._turned()
-            if len(crossed):
-                high, turned = middle, crossed
+            at = 0.5 * before if slow > 1 else _crossing(before, first, last, self._turned(last), near)
+            found = self._after(low + at)
+            if len(self._turned(found)):
+                high, last = low + at, found
             else:
-                low = middle
-            halve = high - low > before / 2
-        self._try(high)
-        return high
+                low, first = low + at, found
+            slow = slow + 1 if high - low > before / 2 and slow <= 1 else 0
+        return high, self._after(high)
 
-    def _values_at(self, length: float) -> Array:
-        if length == 0.0:
-            return self._switches(self.x)
-        self._try(length)
-        return self._switches(self.ahead)
+    def _dip(self, length: float, end: _Switches) -> tuple[float, _Switches] | None:
+        """The length of a step within this one at whose end a switch has turned that is back at its end, or None."""
+        side = np.where(self.modes > 0.5, 1.0, -1.0)
+        falls = self._matters() & (side * end.values > 0) & (side * self._start.rates < 0) & (side * end.rates > 0)
+        looked = False
+        for i in np.flatnonzero(falls).tolist():
+            low, high, first, last = 0.0, length, self._start, end
+            while high - low > SHORTEST:
+                at, least = _meeting(high - low, side[i], first, last, i)
+                if least > -SHALLOW:
+                    break
+                looked, found = True, self._after(low + at)
+                if len(self._turned(found)):
+                    return low + at, found
+                if side[i] * found.rates[i] < 0:
+                    low, first = low + at, found
+                else:
+                    high, last = low + at, found
+        if looked:
+            self.stepper.attempt(length)
+        return None
 
-    def _first(self, start: Array, end: Array, turned: Indices) -> float:
-        """Where between the two, from 0 to 1, the first of the switches is 0 if they are straight lines."""
-        gap = start[turned] - end[turned]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            at = np.where(gap != 0, start[turned] / gap, 0.5)
-        return float(np.min(np.clip(at, 0.0, 1.0)))
-
-    def _accept(self, found: Flow, now: float, length: float) -> None:
+    def _accept(self, found: Flow, now: float, length: float, end: _Switches) -> None:
         found.times.append(now)
         found.hs.append(length)
-        found.us.append(self.u.copy())
+        found.us.append(self.stepper.u.copy())
         found.modes.append(self.modes.copy())
-        self.x[:] = self.ahead
-        found.xs.append(self.x.copy())
-        self.plant.check(self.x)
+        self.stepper.accept(length)
+        found.xs.append(self.stepper.x.copy())
+        self.plant.check(self.stepper.x)
+        self._start = end
         self._settle(found)
+
+    def _look(self) -> None:
+        """Where the step begins."""
+        self._x[:], self._rates[:] = self.stepper.x, self.stepper.rates()
+        self._run()
+        self._start = _Switches(self._values.copy(), self._changes.copy())
 
     def _settle(self, found: Flow) -> None:
         """Set the modes to what the switches say at the state, and note what turns; of a pair apart nothing pushes."""
-        on, modes = self._switches(self.x) > 0, self.modes.copy()
+        on, modes = self._start.values > 0, self.modes.copy()
         if np.array_equal(on, modes > 0.5):
             return
         for i in range(self.plant.num_pairs):
@@ -190,20 +212,11 @@ class Integrator:
             switch = 2 * i + int(was[0] == now[0])
             if was[0] != now[0] or (now[0] and was[1] != now[1]):
                 both = float(now[0]), float(now[1])
-                found.events.append(FlowEvent(found.times[-1], len(found.hs), switch, both, self.x.copy()))
-        self._set_modes(modes)
-
-
-def on_arrays(function: Any, arguments: tuple[Array, ...], results: tuple[Array, ...]) -> tuple[Any, Any]:
-    """A function of CasADi's on arrays that stay where they are: (what has to be kept, what runs it)."""
-    buffer, run = function.buffer()
-    for i, a in enumerate(arguments):
-        if a.size:
-            buffer.set_arg(i, a.data)
-    for i, a in enumerate(results):
-        if a.size:
-            buffer.set_res(i, a.data)
-    return buffer, run
+                found.events.append(FlowEvent(found.times[-1], len(found.hs), switch, both, self.stepper.x.copy()))
+        pushed, self.modes[:] = pushing_of(self.modes), modes
+        if pushing_of(modes) != pushed:
+            self.stepper.push(pushing_of(modes))
+            self._look()
 
 
 def pushing_of(modes: Array) -> tuple[int, ...]:
@@ -211,14 +224,26 @@ def pushing_of(modes: Array) -> tuple[int, ...]:
     return tuple(np.flatnonzero((modes[::2] > 0.5) & (modes[1::2] > 0.5)).tolist())
 
 
-def step_function(plant: FlowPlant, pushing: tuple[int, ...]) -> Any:
-    """(x, u, materials, h) -> the state after a step, and its error."""
-    rates, h = plant.part(pushing).rates, ca.SX.sym("h")
-    x, u, materials = (ca.SX.sym(name, *rates.size_in(i)) for i, name in enumerate("xum"))
-    slopes = [rates(x, u, materials)]
-    ahead = x
-    for weights in STAGES:
-        ahead = x + h * sum(w * s for w, s in zip(weights, slopes, strict=True))
-        slopes.append(rates(ahead, u, materials))
-    error = h * sum(w * s for w, s in zip(ERROR, slopes, strict=True))
-    return ca.Function("step", [x, u, materials, h], [ca.densify(ahead), ca.densify(error)])
+def _crossing(length: float, first: _Switches, last: _Switches, turned: Indices, near: float) -> float:
+    """Where the first of the switches that turned is 0 by cubics through both ends, a little beyond the nearer end."""
+    at = length
+    for i in turned:
+        a, b, ra, rb = first.values[i], last.values[i], length * first.rates[i], length * last.rates[i]
+        t = a / (a - b) if a != b else 0.5
+        for _ in range(4):
+            value = a + t * (ra + t * (3 * (b - a) - 2 * ra - rb + t * (2 * (a - b) + ra + rb)))
+            slope = ra + t * (2 * (3 * (b - a) - 2 * ra - rb) + t * 3 * (2 * (a - b) + ra + rb))
+            t = min(max(t - value / slope, 0.0), 1.0) if slope else 0.5
+        at = min(at, t * length)
+    beyond = max(0.4 * near, BEYOND * min(at, length - at))
+    at += beyond if 2 * at < length else -beyond
+    return min(max(at, 0.4 * near), length - 0.4 * near)
+
+
+def _meeting(length: float, side: float, first: _Switches, last: _Switches, i: int) -> tuple[float, float]:
+    """Where the tangents at both ends of a switch meet, and how far from 0: below all between, where it is convex."""
+    a, b = side * first.values[i], side * last.values[i]
+    ra, rb = side * first.rates[i], side * last.rates[i]
+    at = (b - a - rb * length) / (ra - rb)
+    at = min(max(at, 0.0), length)
+    return min(max(at, 0.01 * length), 0.99 * length), min(a + ra * at, b)

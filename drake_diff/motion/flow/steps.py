@@ -56,11 +56,11 @@ class FlowSteps:
         """Of the intervals of a flow."""
         nu, names = self.model.nu, self.vector.names
         material = self.integrator.materials
-        found = transitions(self.plant, flow, material, by_materials=bool(names))
-        by_parameters = np.zeros((len(material), 0))
+        by_parameters = np.zeros((len(material), len(names)))
         if names:
             change = material_change(self.plant.pairs, self.material, self.vector, self.model.double)
             by_parameters = numbers_of(self.plant, change)
+        found = transitions(self.plant, flow, material, by_parameters)
         steps, begin = [], 0
         for end in flow.ends:
             A, B = np.eye(self.model.nx), np.zeros((self.model.nx, nu))
@@ -68,7 +68,7 @@ class FlowSteps:
             for m in range(begin, end):
                 by_x = found.by_x[m]
                 A, B = by_x @ A, by_x @ B + found.by_u[m]
-                C = by_x @ C + (found.by_materials[m] @ by_parameters if names else 0.0)
+                C = by_x @ C + found.by_parameters[m]
             x_next = frozen(flow.xs[end])
             told = f"the flow by {end - begin} steps"
             steps.append(

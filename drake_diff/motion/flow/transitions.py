@@ -1,7 +1,12 @@
 """How a flow's end changes with its start: the derivative of each accepted step, and the jump at each event.
 
-The derivative of a step is that of its stages, at the step's length and modes. Where a switch turns at an event that
-the motion meets under way, the time of the event moves with the state, and where the rates jump there from f- to f+,
+In a step the change Phi of the motion follows Phi' = A(t) Phi + B(t), A and B being the slopes of the rates on the way,
+by the collocation method of three points of order 5 (Radau IIA; Hairer and Wanner, "Solving Ordinary Differential
+Equations II", 1996, IV.5). It is stable at any length of step: a motion that rests does not show how stiff the friction
+is that holds it, and small changes of it do.
+
+Where a switch turns at an event that the motion meets under way, the time of the event moves with the state, and where
+the rates jump there from f- to f+,
 
     dx+ = (1 + (f+ - f-) g' / (g' f-)) dx-,
 
@@ -10,120 +15,81 @@ Mechanical Systems", 2004). The step before it ends at the event, so that its ow
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, Indices
-from drake_diff.motion.dormand_prince import STAGES
-from drake_diff.motion.flow.integrate import Flow, FlowEvent, on_arrays, pushing_of
-from drake_diff.motion.flow.plant import FlowPart, FlowPlant
+from drake_diff._base.arrays import Array
+from drake_diff.motion.flow.integrate import Flow, FlowEvent, pushing_of
+from drake_diff.motion.flow.plant import FlowPlant
+from drake_diff.motion.flow.within import Slopes, between
 
-STABLE = 2.0  # of a step's length times the largest rate of decay; the method is stable up to 3.3
+ROOT_6 = np.sqrt(6.0)
+NODES = (4 - ROOT_6) / 10, (4 + ROOT_6) / 10  # and the end
+WEIGHTS = np.array(
+    [
+        [(88 - 7 * ROOT_6) / 360, (296 - 169 * ROOT_6) / 1800, (-2 + 3 * ROOT_6) / 225],
+        [(296 + 169 * ROOT_6) / 1800, (88 + 7 * ROOT_6) / 360, (-2 - 3 * ROOT_6) / 225],
+        [(16 - ROOT_6) / 36, (16 + ROOT_6) / 36, 1 / 9],
+    ]
+)
 ALONG = 1e-9  # of the sizes of a switch's slope and of the rates: less is no crossing
+AT_ONCE = 256  # steps whose equations are solved in one call
 
 
 @dataclass(frozen=True, eq=False)
 class Transitions:
-    """Of M steps: (M, nx, nx), (M, nx, nu) and (M, nx, 4 P) by state, input and materials, jumps at events included."""
+    """Of M steps: (M, nx, nx), (M, nx, nu) and (M, nx, n) by state, input and parameters, jumps at events included."""
 
     by_x: Array
     by_u: Array
-    by_materials: Array
+    by_parameters: Array
 
 
-def transitions(plant: FlowPlant, flow: Flow, materials: Array, *, by_materials: bool = False) -> Transitions:
-    """The derivatives of the steps of `flow`; those by materials have no columns where they are not asked for."""
-    xs, us, hs = np.array(flow.xs[:-1]), np.array(flow.us), np.array(flow.hs)
-    nx, nu, nm = xs.shape[1], us.shape[1], len(materials) * by_materials
-    found = np.empty((len(hs), nx, nx + nu + nm))
+def transitions(plant: FlowPlant, flow: Flow, materials: Array, by_parameters: Array) -> Transitions:
+    """The derivatives of the steps of `flow`, those of the materials by n parameters being `by_parameters` (4 P, n)."""
+    xs, us, hs = np.array(flow.xs), np.array(flow.us), np.array(flow.hs)
+    nx, nu = xs.shape[1], us.shape[1]
+    found = np.empty((len(hs), nx, nx + nu + by_parameters.shape[1]))
     sets: dict[tuple[int, ...], list[int]] = {}
     for i, modes in enumerate(flow.modes):
         sets.setdefault(pushing_of(modes), []).append(i)
-    for pushing, rows in sets.items():
-        found[rows] = _Steps(plant.part(pushing), us[rows], materials, nx + nu + nm).changes(xs[rows], hs[rows])
+    for pushing, chosen in sets.items():
+        own = [4 * i + j for i in pushing for j in range(4)]
+        slopes = Slopes(plant.part(pushing), materials, by_parameters[own])
+        for first in range(0, len(chosen), AT_ONCE):
+            rows = np.array(chosen[first : first + AT_ONCE])
+            found[rows] = _changes(slopes, xs[rows], xs[rows + 1], us[rows], hs[rows])
     modes_now: dict[int, Array] = {}
     for event in flow.events:
         if event.step:  # one that it begins with is none on the way
             now = modes_now.setdefault(event.step, flow.modes[event.step - 1].copy())
-            _jump(plant, event, flow.us[event.step - 1], now, materials, found[event.step - 1])
+            _jump(plant, event, flow.us[event.step - 1], now, materials, by_parameters, found[event.step - 1])
     return Transitions(found[:, :, :nx], found[:, :, nx : nx + nu], found[:, :, nx + nu :])
 
 
-@dataclass(frozen=True, eq=False)
-class _Steps:
-    """M steps under given inputs, and their derivatives by `width` numbers: state, input and materials."""
-
-    part: FlowPart
-    us: Array  # (M, nu)
-    materials: Array  # (4 P,)
-    width: int
-
-    def changes(self, xs: Array, hs: Array) -> Array:
-        """(M, nx, width) of steps from xs (M, nx) of lengths hs (M,).
-
-        The method is stable for the motion where its error says so, and yet not for small changes of it: friction that
-        holds is a stiff damper, which a motion that rests does not show. Such a step is taken in several for them.
-        """
-        nx = xs.shape[1]
-        slopes = self._values(self.part.slopes, xs, self.us)[:, :, :nx]
-        radius = np.max(np.abs(np.linalg.eigvals(slopes)), axis=1)
-        parts = np.maximum(np.ceil(hs * radius / STABLE), 1).astype(int)
-        change = np.zeros((len(xs), nx, self.width))
-        change[:, :, :nx] = np.eye(nx)
-        at = xs.copy()
-        for j in range(int(np.max(parts))):
-            rows = np.flatnonzero(parts > j)
-            step, ahead = self._step(at[rows], (hs / parts)[rows], rows)
-            total = step[:, :, :nx] @ change[rows]
-            total[:, :, nx:] += step[:, :, nx:]
-            change[rows], at[rows] = total, ahead
-        return change
-
-    def _step(self, xs: Array, hs: Array, rows: Indices) -> tuple[Array, Array]:
-        """(M, nx, width) by differentiation of the stages, and (M, nx) where the step ends."""
-        nx, us = xs.shape[1], self.us[rows]
-        identity = np.zeros((len(xs), nx, self.width))
-        identity[:, :, :nx] = np.eye(nx)
-        values: list[Array] = []
-        changes: list[Array] = []
-        at, change = xs, identity
-        for weights in STAGES:
-            values.append(self._values(self.part.rates, at, us)[:, :, 0])
-            slope = self._slopes(at, us)
-            total = slope[:, :, :nx] @ change
-            total[:, :, nx:] += slope[:, :, nx:]
-            changes.append(total)
-            at = xs + hs[:, None] * np.tensordot(weights, values, axes=1)
-            change = identity + hs[:, None, None] * np.tensordot(weights, changes, axes=1)
-        return change, at
-
-    def _slopes(self, xs: Array, us: Array) -> Array:
-        """(M, nx, width) of the rates."""
-        found = [self._values(self.part.slopes, xs, us)]
-        if self.width > xs.shape[1] + us.shape[1]:
-            found.append(self._values(self.part.material_slopes, xs, us))
-        return np.concatenate(found, axis=2)
-
-    def _values(self, function: Any, xs: Array, us: Array) -> Array:
-        """(M, rows, columns) of a function of the part."""
-        rows, columns = function.size_out(0)
-        x, u, result = np.empty(xs.shape[1]), np.empty(us.shape[1]), np.empty((columns, rows))
-        found = np.empty((len(xs), columns, rows))
-        _kept, run = on_arrays(function, (x, u, self.materials), (result,))
-        for k in range(len(xs)):
-            x[:], u[:] = xs[k], us[k]
-            run()
-            found[k] = result
-        return found.transpose(0, 2, 1)
+def _changes(slopes: Slopes, starts: Array, ends: Array, us: Array, hs: Array) -> Array:
+    """(M, nx, nx + nu + n) of steps of lengths hs (M,) from `starts` (M, nx) to `ends`."""
+    count, nx = starts.shape
+    at_start, at_end = slopes.at_ends(starts, ends, us)
+    inner = [slopes(between(c, starts, ends, hs, at_start, at_end), us)[1] for c in NODES]
+    on_the_way = np.stack([*inner, at_end[1]], axis=1)  # (M, 3, nx, width)
+    parts = hs[:, None, None, None, None] * WEIGHTS[None, :, :, None, None] * on_the_way[:, None]
+    left = -parts[..., :nx].transpose(0, 1, 3, 2, 4).reshape(count, 3 * nx, 3 * nx)
+    diagonal = np.arange(3 * nx)
+    left[:, diagonal, diagonal] += 1.0
+    right = np.sum(parts, axis=2)
+    right[..., :nx] = np.eye(nx)
+    return np.asarray(np.linalg.solve(left, right.reshape(count, 3 * nx, -1))[:, 2 * nx :])
 
 
-def _jump(plant: FlowPlant, event: FlowEvent, u: Array, modes: Array, materials: Array, step: Array) -> None:
+def _jump(
+    plant: FlowPlant, event: FlowEvent, u: Array, modes: Array, materials: Array, by_parameters: Array, step: Array
+) -> None:
     """Put the jump at an event onto the derivative of the `step` that ended there, and turn its switch in `modes`.
 
     Several at once are taken one after the other.
     """
-    nx = len(event.x)
+    nx, nu = len(event.x), len(u)
     before = np.asarray(plant.part(pushing_of(modes)).rates(event.x, u, materials)).ravel()
     pair = event.switch // 2
     modes[2 * pair : 2 * pair + 2] = event.modes
@@ -133,5 +99,6 @@ def _jump(plant: FlowPlant, event: FlowEvent, u: Array, modes: Array, materials:
     steep = abs(rate) / max(float(np.linalg.norm(row[:nx]) * np.linalg.norm(before)), 1e-300)
     if np.any(jump) and steep > ALONG:
         by = row[:nx] @ step
-        by[nx:] += row[nx : step.shape[1]]
+        by[nx : nx + nu] += row[nx : nx + nu]
+        by[nx + nu :] += row[nx + nu :] @ by_parameters
         step += np.outer(jump / rate, by)
