@@ -2,11 +2,22 @@
 
 import numpy as np
 import pytest
+from helpers.impacts import Floor
 from helpers.models import Plant, add_slide, contact_properties
+from helpers.robots import FOOT, example_robot, state_in_contact
 from pydrake.multibody.tree import RevoluteJoint, SpatialInertia, UnitInertia
 
 import drake_diff as dd
+from drake_diff.exceptions import (
+    GradientError,
+    GradientWarning,
+    InputError,
+    ModelError,
+    SimulationError,
+    UnknownNameError,
+)
 from drake_diff.motion import PointOnPlane, RigidContact, rigid_impact, rigid_motion
+from drake_diff.motion.rigid.impact import plant_of
 from drake_diff.motion.rigid.steps import saltation
 
 G = 9.81
@@ -48,15 +59,6 @@ def falling_rod(mass=2.0, length=1.2):
 
 def end_of_rod(length=1.2):
     return PointOnPlane("rod", [length / 2, 0, 0])
-
-
-def differences(model, x, contact, contacts=None, width=1e-6):
-    """(nx, nx) central ones of the impact itself."""
-    ends = [
-        [rigid_impact(model, x + s * width * e, contact, contacts=contacts).x_after for e in np.eye(model.nx)]
-        for s in (1, -1)
-    ]
-    return (np.array(ends[0]) - np.array(ends[1])).T / (2 * width)
 
 
 def test_the_saltation_matrix_of_a_bounce():
@@ -111,7 +113,9 @@ def test_the_bounce_of_zhong_han_and_brikis():
     motion = rigid_motion(plant.model(), [-1, 1, 2, -2], RigidContact(1.0, friction=0), np.zeros((480, 1)))
     assert motion.xs[-1][1] == pytest.approx(1.2, abs=1e-10)
     assert motion.by_x0[1] == pytest.approx([0, -1, 0, -1], abs=1e-9)
-    by_first = np.linalg.multi_dot([d.A for d in reversed(motion.derivatives[1:])]) @ motion.derivatives[0].B
+    by_first = motion.derivatives[0].B
+    for step in motion.derivatives[1:]:
+        by_first = step.A @ by_first
     assert by_first[1, 0] == pytest.approx(-h * (1 - h / 2), rel=1e-9)
 
 
@@ -176,14 +180,203 @@ def test_a_pendulum_hits_a_wall():
     angle = np.arcsin(0.4)
     contact = RigidContact(0.7, friction=np.inf, points=(wall,))
     x = np.array([angle, 0.0])
-    assert abs(rigid_gap(model, contact, x)) < 1e-12
-    x[1] = 2.0 if rigid_gap(model, contact, np.array([angle + 1e-3, 0])) < 0 else -2.0
+    assert abs(plant_of(model, contact).gaps(x)[0]) < 1e-12
+    x[1] = 2.0 if plant_of(model, contact).gaps(np.array([angle + 1e-3, 0]))[0] < 0 else -2.0
     hit = rigid_impact(model, x, RigidContact(0.7, friction=0, points=(wall,)))
     np.testing.assert_allclose(hit.x_after, [angle, -0.7 * x[1]], atol=1e-12)
     np.testing.assert_allclose(hit.by_x, [[1, 0], [0, -0.7]], atol=1e-9)
 
 
-def rigid_gap(model, contact, x):
-    from drake_diff.motion.rigid.impact import plant_of
+CONTACTS = [
+    RigidContact(0.0, friction=0),
+    RigidContact(0.3, friction=0.6),
+    RigidContact(0.4, friction=0.6, law="poisson"),
+    RigidContact(0.2, friction=0.1),
+    RigidContact(0.2, friction=1e6),
+]
 
-    return plant_of(model, contact).gaps(x)[0]
+
+@pytest.mark.parametrize("name", ["solo12.urdf", "bolt.urdf"])
+def test_the_impacts_of_robots_are_those_of_drakes_terms(name):
+    """Values and derivatives of a foot that strikes, beside impulses by another method and their differences."""
+    model, random, seen = example_robot(name, feet=True), np.random.default_rng(3), set()
+    for contact in CONTACTS * 2:
+        x = state_in_contact(model, random, depth=0.0, speed=1.0)
+        plant = plant_of(model, contact)
+        i = int(np.argmin(plant.gaps(x)))
+        if plant.gap_rates(x)[i] > 0:
+            x[model.nq :] *= -1
+        floor = Floor(model.plant, plant.names[i].split(" and ")[0].split("::")[1].removesuffix("_foot"), FOOT)
+        given = contact.restitution, contact.friction
+        wanted = floor.after(x, *given, poisson=contact.law == "poisson")
+        if not np.all(np.isfinite(wanted)):
+            continue
+        hit = rigid_impact(model, x, contact, contacts=plant.names[i])
+        np.testing.assert_allclose(hit.x_after, wanted, atol=1e-9 * max(1.0, np.max(np.abs(wanted))))
+        slopes = floor.slopes(x, *given, poisson=contact.law == "poisson")
+        apart = np.max(np.abs(hit.by_x - slopes)) / np.max(np.abs(slopes))
+        assert apart <= 1e-6, (contact, hit, apart)
+        seen.add(hit.ways[0])
+    assert seen == {"frictionless", "sticks", "slides"}
+
+
+def wheel(time_step, slope=0.08, spokes=8, friction=1.0, gyration=0.1):
+    """A rimless wheel of 2 kg and spokes of 1 m that walks down: x = [x, z, turn, ...] along the slope."""
+    plant = Plant(time_step, "lagged")
+    one, two = (plant.plant.AddRigidBody(name, SpatialInertia.Zero()) for name in ("one", "two"))
+    inertia = SpatialInertia(2.0, np.zeros(3), UnitInertia(*[gyration] * 3))
+    hub = plant.plant.AddRigidBody("hub", inertia)
+    add_slide(plant.plant, "x", plant.plant.world_frame(), one, "x")
+    add_slide(plant.plant, "z", one.body_frame(), two, "z")
+    plant.plant.AddJoint(RevoluteJoint("turn", two.body_frame(), hub.body_frame(), [0, 1, 0]))
+    plant.plant.mutable_gravity_field().set_gravity_vector(G * np.array([np.sin(slope), 0, -np.cos(slope)]))
+    angles = 2 * np.pi * np.arange(spokes) / spokes
+    feet = tuple(PointOnPlane("hub", [-np.sin(angle), 0, -np.cos(angle)]) for angle in angles)
+    return plant.model(), RigidContact(0.0, friction=friction, points=feet)
+
+
+def test_a_rimless_wheel_walks_its_limit_cycle():
+    """omega+ = eta omega-, eta = (k^2 + l^2 cos 2a) / (k^2 + l^2); its multiplier is eta^2 (cos^2 2a of a point mass).
+
+    With V = g cos(turn + slope) a step begins at omega^2 = eta^2 c / (1 - eta^2), c = 4 g sin a sin(slope) / (1 + k^2).
+    """
+    k2, a, slope = 0.1, np.pi / 8, 0.08
+    eta = (k2 + np.cos(2 * a)) / (k2 + 1)
+    begins = eta**2 * 4 * G * np.sin(a) * np.sin(slope) / (1 + k2) / (1 - eta**2)
+
+    def omega(angle):
+        return np.sqrt(begins + 2 * G * (np.cos(slope - a) - np.cos(angle + slope)) / (1 + k2))
+
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    period = float(a * np.sum(weights / omega(a * nodes)))
+    model, contact = wheel(period, slope)
+    w = omega(0.0)
+    x0 = np.array([0, 1, 0, w, 0, w])
+    motion = rigid_motion(model, x0, contact, num_steps=2)
+    assert len(motion.impacts) == 2
+    assert {hit.ways for hit in motion.impacts} <= {("opens", "sticks"), ("sticks", "opens")}
+    assert np.diff([hit.time for hit in motion.impacts])[0] == pytest.approx(period, abs=1e-9)
+    np.testing.assert_allclose(motion.xs[1] - x0, [2 * np.sin(a), 0, 2 * a, 0, 0, 0], atol=1e-9)
+    held = np.array([[1, 0, 1, 0, -w, 0], [0, 0, 0, 1, 0, 1.0]]).T  # turn and rate, with the foot in its place
+    once = np.linalg.multi_dot([motion.derivatives[0].A, held])[[2, 5]]
+    np.testing.assert_allclose(np.sort(np.linalg.eigvals(once)), [eta**2, 1.0], atol=1e-8)
+
+
+def test_a_wheel_whose_feet_never_slip_has_two_answers():
+    """With friction without bound both feet may hold it, as well as the new one alone."""
+    model, contact = wheel(0.5, friction=np.inf)
+    with pytest.raises(
+        SimulationError, match="no unique answer: its contacts may end as opens, sticks or sticks, stick"
+    ):
+        rigid_motion(model, [0, 1, 0, 1.5, 0, 1.5], contact, num_steps=2)
+
+
+def test_newtons_restitution_with_friction_may_add_energy_and_is_told():
+    """Kane's paradox: a rod at an angle that slides back. Poisson's law takes energy from the same impact."""
+    model, angle = falling_rod(), 0.9
+    turned = np.array([np.cos(angle), -np.sin(angle)]) * 0.6
+    random, found = np.random.default_rng(0), 0
+    newton = RigidContact(0.9, friction=0.8, points=(end_of_rod(),))
+    poisson = RigidContact(0.9, 0.8, "poisson", newton.points)
+    for _ in range(80):
+        x = np.array([0, -turned[1], angle, *(random.standard_normal(3) * [3, 1, 3])])
+        if plant_of(model, newton).gap_rates(x)[0] > 0:
+            x[3:] *= -1
+        floor = Floor(model.plant, "rod", at=[0.6, 0, 0])
+        after, M = floor.after(x, 0.9, 0.8), floor.terms(x)[0]
+        if after[3:] @ M @ after[3:] > x[3:] @ M @ x[3:] * (1 + 1e-6):
+            with pytest.raises(SimulationError, match=r"Newton's restitution of 0.9 with friction adds"):
+                rigid_impact(model, x, newton)
+            found += 1
+        else:
+            assert rigid_impact(model, x, newton).energy_lost > 0
+        assert rigid_impact(model, x, poisson).energy_lost > 0
+    assert 3 <= found <= 40
+
+
+def test_bounces_without_end_are_told_with_their_time():
+    """sqrt(2 H / g) (1 + e) / (1 - e)."""
+    e, height = 0.5, 0.4
+    with pytest.raises(SimulationError, match="bounces infinitely often: the bounces end at") as told:
+        rigid_motion(ball_on_rails(), [0, 0.1 + height, 0, 0], RigidContact(e, friction=0), num_steps=100)
+    at = float(str(told.value).split("end at ")[1].split(" s")[0])
+    assert at == pytest.approx(np.sqrt(2 * height / G) * (1 + e) / (1 - e), abs=2e-6)
+
+
+def test_a_ball_that_landed_is_lifted_off_again():
+    """A motor on its rail: it lets go where the motor carries the weight, and the slopes are those of the force."""
+    plant = Plant(0.1, "lagged")
+    plant.ball("ball", 1.0, 0.1, contact_properties(2e4), "x", "z")
+    plant.ground(contact_properties(2e4))
+    plant.plant.AddJointActuator("lift", plant.plant.GetJointByName("ball_z"))
+    us = np.array([0, 0, 0, 5.0, 15.0, 15.0])[:, None]
+    motion = rigid_motion(plant.model(), [0, 0.15, 0.7, 0], RigidContact(0.0, friction=0), us)
+    np.testing.assert_allclose(motion.xs[4], [0.28, 0.1, 0.7, 0], atol=1e-11)
+    rise = 15.0 - G
+    np.testing.assert_allclose(motion.xs[6], [0.42, 0.1 + rise * 0.02, 0.7, rise * 0.2], atol=1e-11)
+    np.testing.assert_allclose(motion.by_x0, [[1, 0, 0.6, 0], [0, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 0]], atol=1e-11)
+
+
+def test_the_gradient_of_a_rollout_takes_hard_contact_as_its_method():
+    model = ball_on_rails()
+    hard = RigidContact(0.8, friction=0)
+    found = dd.differentiate_rollout(model, [0, 0.6, 0.3, 0], None, lambda x: x[1], num_steps=50, method=hard)
+    v, t = np.sqrt(2 * G * 0.5), 0.5 - np.sqrt(1.0 / G)
+    assert found.loss == pytest.approx(0.1 + 0.8 * v * t - G * t**2 / 2, abs=1e-9)
+    dz = 0.8 * G / v * t - (0.8 * v - G * t) / v  # dv / dH = g / v = dt1 / dH g
+    assert found.by_x0[1] == pytest.approx(dz, rel=1e-7)
+    assert found.parameter_names == ("restitution", "friction")
+    assert found.by_parameters[0] == pytest.approx(v * t, rel=1e-8)
+    assert found.undefined == ()
+    assert found.methods == ("rigid",)
+
+
+def test_a_grazing_bounce_is_undefined():
+    with pytest.warns(GradientWarning, match="no slope"):
+        found = dd.differentiate_rollout(
+            ball_on_rails(0.0), [0, 0.1 + 1e-3, 1.0, -1e-3], None, lambda x: x[3], num_steps=101,
+            method=RigidContact(1.0, friction=0),
+        )  # fmt: skip
+    assert any(one.column.startswith("ball_z") for one in found.undefined)
+
+
+def test_what_hard_contact_cannot_do_is_refused_by_name():
+    model = ball_on_rails(friction=0.4)
+    for wrong, told in (
+        ({"restitution": 1.2}, "restitution: expected a number from 0 to 1"),
+        ({"law": "stronge"}, "law: expected one of newton, poisson"),
+        ({"law": "poisson"}, '"newton", which is then the same'),
+        ({"friction": -1}, "friction: expected a number of at least 0"),
+        ({"points": ("foot",)}, "points: expected PointOnPlanes"),
+    ):
+        with pytest.raises(InputError, match=told):
+            RigidContact(**wrong)
+    hard = RigidContact(0.5, friction=0)
+    with pytest.raises(InputError, match=r"x: expected contacts that touch, got gaps of at least 0\.5 m"):
+        rigid_impact(model, [0, 0.6, 0, 0], hard)
+    with pytest.raises(UnknownNameError, match="contact: expected one of ball and ground"):
+        rigid_impact(model, [0, 0.1, 0, -1], hard, contacts="foot")
+    with pytest.raises(UnknownNameError, match="body: expected one of"):
+        rigid_impact(model, [0, 0.1, 0, -1], RigidContact(points=(PointOnPlane("foot"),)))
+    with pytest.raises(SimulationError, match=r"overlap by 0\.01 m at the start"):
+        rigid_motion(model, [0, 0.09, 0, 0], hard, num_steps=2)
+    with pytest.raises(SimulationError, match="slides on with friction from"):
+        rigid_motion(model, [0, 0.2, 1.0, 0], RigidContact(0.0), num_steps=30)
+    with pytest.raises(ModelError, match=r"no derivative by ball\.mass"):
+        dd.differentiate_rollout(model, [0, 1, 0, -1], None, lambda x: x[1], num_steps=5, method=hard,
+                                 parameters=("ball.mass",))  # fmt: skip
+
+
+def test_an_impact_on_the_edge_has_no_derivative():
+    """A ball whose slip stops just as the impact ends, and two contacts that strike at once."""
+    mu, r, v = 0.3, 0.1, 2.0
+    slip = 7 / 2 * mu * v  # 2 m s / 7 = mu (1 + e) m v
+    hit = rigid_impact(free_ball(), np.array([1.0, 0, 0, 0, 0, 0, r, 0, 0, 0, slip, 0, -v]), RigidContact(friction=mu))
+    with pytest.raises(GradientError, match="on the edge of two motions"):
+        _ = hit.by_x
+    model = falling_rod()
+    both = (end_of_rod(), PointOnPlane("rod", [-0.6, 0, 0]))
+    motion = rigid_motion(model, [0, 0.1, 0, 0, -1, 0], RigidContact(0.5, friction=0, points=both), num_steps=20)
+    assert motion.xs[-1][4] == pytest.approx(0.5, abs=1e-12)
+    with pytest.raises(GradientError, match="strike at once"):
+        _ = motion.by_x0

@@ -40,6 +40,7 @@ from drake_diff.motion.policy import (
     differentiate_policy,
     policy_parameters,
 )
+from drake_diff.motion.rigid.steps import RigidSteps
 from drake_diff.motion.smoothing import Gaussian, Smoothed, smooth
 
 WIDE, BETWEEN, MIDDLE, NARROW = 1e-2, 5e-3, 1e-3, 1e-4  # of a column's unit, to both sides
@@ -139,7 +140,7 @@ class Beside:
     policy: Any
     loss: Loss
     vector: ParameterVector
-    steps: FlowSteps  # of the motion itself, whose equations are made
+    steps: FlowSteps | RigidSteps  # of the motion itself, whose equations are made
 
     @cached_property
     def space(self) -> Any:
@@ -158,8 +159,11 @@ class Beside:
             return x0, values.reshape(self.us.shape), None, vector
         return x0, self.us, ParametricPolicy(self.policy, values) if given else self.policy, vector
 
-    def _steps(self, model: Model, vector: ParameterVector, tolerance: float) -> FlowSteps:
+    def _steps(self, model: Model, vector: ParameterVector, tolerance: float) -> FlowSteps | RigidSteps:
         """Those of the motion itself, unless parameters are moved."""
+        if isinstance(self.steps, RigidSteps):
+            self.steps.tolerance = tolerance
+            return self.steps
         if not np.array_equal(vector.values, self.vector.values):
             return FlowSteps(model, vector, tolerance)
         self.steps.integrator.tolerance = tolerance
@@ -188,7 +192,8 @@ class Beside:
     def _flat(self, totals: Totals, by_displacement: Array) -> Array:
         """(n,) by displacements, of which those of the start move x0 by (nx, size)."""
         given = totals.inputs.ravel() if self.policy is None else totals.policy
-        return np.concatenate([totals.states[0] @ by_displacement, given, totals.parameters])
+        own = totals.parameters[: len(self.vector.values)]  # restitution and friction are none of the model's
+        return np.concatenate([totals.states[0] @ by_displacement, given, own])
 
     def _derivative_of_start(self, d: Array, step: float = 1e-5) -> Array:
         """(nx, size): of x0 moved by d (size,), which is linear but for a turn; to 1e-10."""
@@ -258,7 +263,7 @@ class Line:
 
 
 def along_the_flow(
-    steps: FlowSteps, x0: Array, us: Array, policy: Any
+    steps: FlowSteps | RigidSteps, x0: Array, us: Array, policy: Any
 ) -> tuple[list[StepDerivatives], list[Feedback], Array]:
     """The motion in continuous time first, then the derivatives of its intervals; a policy takes the length of `us`."""
     feedback, nu = list[Feedback](), steps.model.nu
@@ -272,6 +277,9 @@ def along_the_flow(
         feedback.append((by_x, by_parameters[:, active].copy(), active))
         return u
 
+    if isinstance(steps, RigidSteps):
+        _, inputs, motion = steps.roll(x0, choose, len(us))
+        return steps.derivatives(motion), feedback, inputs
     _, inputs, flow = steps.roll(x0, choose, len(us))
     return steps.derivatives(flow), feedback, inputs
 

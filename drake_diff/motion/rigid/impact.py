@@ -118,10 +118,9 @@ class Struck:
         """(nv, nq + nv + 2) of the velocities after by positions, velocities before, restitution and friction."""
         nq, nv, m = self.plant.nq, self.plant.nv, len(self.contacts)
         for part in self.parts:
-            for other in part.given.others:
-                differ = [i for i in range(m) if self.strikes[i] and other[i] != part.given.ways[i]]
-                if differ:
-                    where = self.plant.names[self.contacts[differ[0]]]
+            for i in part.given.edges:
+                if self.strikes[i]:
+                    where = self.plant.names[self.contacts[i]]
                     raise GradientError(f"the impact of {where} has no derivative: it is on the edge of two motions")
         total = np.zeros((nv, nq + nv + 2))
         total[:, nq : nq + nv] = np.eye(nv)

@@ -13,18 +13,19 @@ systems", 1995). All ways in which contacts may open, stick and slide are tried;
 velocities the law has no unique answer.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, cross
 from drake_diff.exceptions import SimulationError
 
 OPENS, STICKS, SLIDES, FRICTIONLESS = "opens", "sticks", "slides", "frictionless"
 MOST_FRICTIONAL, MOST = 5, 8  # contacts at once: 3 and 2 ways of each
 SAME = 1e-8  # of the largest velocity: the same motion
+EDGE = 1e-7  # of the largest velocity: the edge between two ways
 ROUNDED = 1e-10  # of the largest velocity: as good as 0
 SINGULAR = 1e-11  # of the largest singular value
 ROUNDS = 200  # of the direction of a slide
@@ -39,7 +40,7 @@ class Impulses:
     values: Array
     after: Array
     ways: Ways
-    others: tuple[Ways, ...]  # that give the same: a change of the motion may lead to any of them
+    edges: tuple[int, ...]  # contacts that do so only just: a change of the motion may lead to another way
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +68,7 @@ def solve(asked: Asked, name: str) -> Impulses:
     found: list[Impulses] = []
     for ways in product(*[_ways(asked, i) for i in range(count)]):
         for values, after in _of_ways(asked, ways, size):
-            found.append(Impulses(values, after, ways, ()))
+            found.append(Impulses(values, after, ways, _edges(asked, ways, values, after, size)))
     if not found:
         raise SimulationError(f"no impulses of restitution and friction satisfy the impact of {name}")
     apart = [float(np.max(np.abs(each.after - found[0].after))) for each in found]
@@ -77,9 +78,24 @@ def solve(asked: Asked, name: str) -> Impulses:
             f"the impact of {name} has no unique answer: its contacts may end as {' or '.join(ends)}, with "
             f"velocities up to {max(apart):.3g} m/s apart"
         )
-    best = min(found, key=_rank)
-    others = tuple(sorted({each.ways for each in found} - {best.ways}))
-    return Impulses(best.values, best.after, best.ways, others)
+    return min(found, key=_rank)
+
+
+def _edges(asked: Asked, ways: Ways, values: Array, after: Array, size: float) -> tuple[int, ...]:
+    """The contacts whose impulse or velocity is at the end of what their way allows."""
+    found, little = [], EDGE * size
+    impulse = little / _scale(asked)
+    for i, (closed, way) in enumerate(ways):
+        n, mu = asked.normals[i], asked.friction[i]
+        push, speed = float(n @ values[i]), float(n @ after[i])
+        slack = push - asked.least[i] if closed else (speed - asked.speeds[i]) / _scale(asked)
+        if way == STICKS and np.isfinite(mu):
+            slack = min(slack, mu * push - float(np.linalg.norm(values[i] - push * n)))
+        if way == SLIDES:
+            slack = min(slack, float(np.linalg.norm(after[i] - speed * n)) / _scale(asked))
+        if slack <= impulse:
+            found.append(i)
+    return tuple(found)
 
 
 def _rank(found: Impulses) -> tuple[int, int]:
@@ -128,52 +144,70 @@ def _directions(asked: Asked, ways: Ways, sliding: list[int], size: float) -> It
         for turn in range(STARTS):
             directions = base.copy()
             for i in sliding:
-                directions[i] = _turned(asked, i, 2 * np.pi * turn / STARTS)
+                one, other = _plane(asked, i)
+                angle = 2 * np.pi * turn / STARTS
+                directions[i] = np.cos(angle) * one + np.sin(angle) * other
             found = _settled(asked, ways, directions, sliding, size)
             if found is not None:
                 yield found
 
 
-def _turned(asked: Asked, i: int, angle: float) -> Array:
-    """(3,) along the plane of contact i, by an angle from its velocity before."""
+def _plane(asked: Asked, i: int) -> tuple[Array, Array]:
+    """Two directions (3,) along the plane of contact i, the first that of its velocity before."""
     n = asked.normals[i]
     t = asked.before[i] - n * (n @ asked.before[i])
     if np.linalg.norm(t) <= ROUNDED:
-        t = np.cross(n, np.eye(3)[int(np.argmin(np.abs(n)))])
+        t = np.eye(3)[int(np.argmin(np.abs(n)))]
+        t = t - n * (n @ t)
     t = t / np.linalg.norm(t)
-    return np.asarray(np.cos(angle) * t + np.sin(angle) * np.cross(n, t))
+    return t, cross(n, t)
 
 
 def _all_round(asked: Asked, ways: Ways, i: int, size: float) -> Iterator[Array]:
     """Every direction of the one contact that slides, by looking all round."""
-    n, directions = asked.normals[i], np.zeros((len(asked), 3))
+    directions, (one, other) = np.zeros((len(asked), 3)), _plane(asked, i)
 
     def slide(angle: float) -> tuple[float, float]:
         """The velocity's part across the direction, and along it."""
-        directions[i] = d = _turned(asked, i, angle)
+        c, s = np.cos(angle), np.sin(angle)
+        directions[i] = c * one + s * other
         found = _linear(asked, ways, directions)
         if found is None:
             return np.nan, np.nan
         after = _after(asked, found[0])[i]
-        return float(np.cross(n, d) @ after), float(d @ after)
+        return float((c * other - s * one) @ after), float(directions[i] @ after)
 
     angles = np.linspace(-np.pi / AROUND, 2 * np.pi - np.pi / AROUND, AROUND + 1)
-    across = [slide(angle)[0] for angle in angles]
-    still = ROUNDED * size
-    for k, angle in enumerate(angles[:-1]):
-        if not across[k] * across[k + 1] <= 0:
+    seen, still = [slide(angle) for angle in angles], ROUNDED * size
+    for k in range(AROUND):
+        (f_low, along), (f_high, also) = seen[k], seen[k + 1]
+        if not f_low * f_high <= 0 or max(along, also) <= 0:
             continue
-        low, high, f_low = angle, angles[k + 1], across[k]  # across may be 0, or beyond all bounds, in between
-        for _ in range(60):
-            middle = (low + high) / 2
-            value = slide(middle)[0]
-            if value * f_low > 0:
-                low, f_low = middle, value
-            else:
-                high = middle
-        value, along = slide(high)
-        if abs(value) <= 1e-9 * max(along, 0.0) and along > still:
+        value, along = slide(_zero(lambda angle: slide(angle)[0], angles[k], angles[k + 1], f_low, f_high))
+        if abs(value) <= 1e-9 * max(along, 0.0) and along > still:  # it may be beyond all bounds in between
             yield directions.copy()
+
+
+def _zero(function: Callable[[float], float], low: float, high: float, f_low: float, f_high: float) -> float:
+    """Where a function is 0 between two places of different sign, to rounding: the Illinois rule, and halves."""
+    side, best = 0, (low, f_low)
+    for _ in range(ROUNDS):
+        if high - low <= 1e-15 * max(abs(low), abs(high)):
+            break
+        middle = high - f_high * (high - low) / (f_high - f_low) if f_high != f_low else (low + high) / 2
+        if not low < middle < high:
+            middle = (low + high) / 2
+        value = function(middle)
+        best = (middle, value)
+        if value == 0:
+            break
+        if value * f_low > 0:
+            f_high = f_high / 2 if side > 0 else f_high
+            low, f_low, side = middle, value, 1
+        else:
+            f_low = f_low / 2 if side < 0 else f_low
+            high, f_high, side = middle, value, -1
+    return best[0]
 
 
 def _settled(asked: Asked, ways: Ways, directions: Array, sliding: list[int], size: float) -> Array | None:

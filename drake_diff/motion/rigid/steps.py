@@ -85,6 +85,11 @@ class RigidFlow:
     xs: list[Array] = field(default_factory=list)  # (nx,) at the end of each interval
 
     @property
+    def events(self) -> list[Struck | Release]:
+        """In order."""
+        return [part for part in self.parts if not isinstance(part, Piece)]
+
+    @property
     def impacts(self) -> tuple[Impact, ...]:
         """In order."""
         return tuple(part.impact for part in self.parts if isinstance(part, Struck))
@@ -160,13 +165,13 @@ class RigidMotion(ShowsItsRepr):
 class RigidSteps:
     """The motion of a model's hard contacts; ModelError where it has none."""
 
-    def __init__(self, model: Model, vector: ParameterVector, law: RigidContact):
+    def __init__(self, model: Model, vector: ParameterVector, law: RigidContact, tolerance: float = TOLERANCE):
         if vector.parameters:
             raise ModelError(
                 f"hard contact has no derivative by {vector.parameters[0].name}: it has those by its own restitution "
                 "and friction, which need not be asked for"
             )
-        self.model, self.law, self.plant = model, law, plant_of(model, law)
+        self.model, self.law, self.plant, self.tolerance = model, law, plant_of(model, law), tolerance
         self.friction = self.plant.frictions(law.friction)
         self.names = ("restitution", "friction") if law.friction is not None else ("restitution",)
 
@@ -366,7 +371,7 @@ class _Runner:
         smooth, wanted = self.plant.smooth(self.closed), length
         while True:
             ahead, error = smooth.step_from(self.x, u, length)
-            size = TOLERANCE * np.maximum(1.0, np.maximum(np.abs(self.x), np.abs(ahead)))
+            size = self.steps.tolerance * np.maximum(1.0, np.maximum(np.abs(self.x), np.abs(ahead)))
             with np.errstate(all="ignore"):
                 ratio = float(np.sqrt(np.mean((error / size) ** 2))) if np.all(np.isfinite(ahead)) else float("inf")
             if ratio <= 1:
