@@ -7,8 +7,9 @@ import pytest
 from helpers.bounces import Bounce
 from helpers.models import Plant, contact_properties
 from helpers.robots import example_robot, state_in_contact
-from pydrake.geometry import Box, HalfSpace, Sphere
-from pydrake.math import RigidTransform
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.geometry import Box, Cylinder, HalfSpace, Sphere
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
@@ -141,6 +142,66 @@ def test_the_rates_are_those_of_drakes_continuous_plant():
         wanted = plant.EvalTimeDerivatives(context).CopyToVector()
         assert np.max(np.abs(found - wanted)) <= 1e-12 * max(1.0, np.max(np.abs(wanted)))
     assert most >= 2
+
+
+def can_and_ball(time_step, approximation="lagged"):
+    """(plant, diagram) of a free ball and a free can, which is turned in its body."""
+    builder = DiagramBuilder()
+    config = MultibodyPlantConfig(
+        time_step=time_step, contact_model="point", stiction_tolerance=1e-3, use_sampled_output_ports=False
+    )
+    config.discrete_contact_approximation = approximation
+    plant, _ = AddMultibodyPlant(config, builder)
+    properties = contact_properties(2e4, 0.3, 0.5)
+    ball = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(0.5, 0.05))
+    can = plant.AddRigidBody("can", SpatialInertia.SolidBoxWithMass(1, 0.2, 0.3, 0.4))
+    plant.RegisterCollisionGeometry(ball, RigidTransform(), Sphere(0.05), "ball", properties)
+    turned = RigidTransform(RotationMatrix.MakeXRotation(0.4), [0.02, 0.01, -0.03])
+    plant.RegisterCollisionGeometry(can, turned, Cylinder(*CAN), "can", properties)
+    plant.Finalize()
+    return plant, builder.Build(), turned
+
+
+CAN = 0.2, 0.5  # [m] radius and length
+
+
+def test_a_ball_at_a_can_has_the_rates_of_drakes_continuous_plant_and_their_slopes():
+    """At 200 random places: over its side, its caps and their edge, from near and from within."""
+    model = dd.model_from_diagram(can_and_ball(1e-3)[1])
+    plant, diagram, turned = can_and_ball(0.0)
+    context = plant.GetMyContextFromRoot(diagram.CreateDefaultContext())
+    ours, random, met = flow_plant(model), np.random.default_rng(0), []
+    materials, part = numbers_of(ours, material_of(ours)), ours.part((0,))
+    radius, half = CAN[0], CAN[1] / 2
+    while len(met) < 200:
+        angle, away = random.uniform(0, 2 * np.pi), radius + random.uniform(-0.15, 0.05)
+        local = np.array([away * np.cos(angle), away * np.sin(angle), random.uniform(-half - 0.05, half + 0.05)])
+        turn = random.standard_normal(4)
+        pose = RigidTransform(Quaternion(turn / np.linalg.norm(turn)), 0.1 * random.standard_normal(3))
+        v = 10.0 ** random.uniform(-4, 0.5) * random.standard_normal(12)
+        ball, can = pose @ turned @ local, [*pose.rotation().ToQuaternion().wxyz(), *pose.translation()]
+        x = np.concatenate([[1, 0, 0, 0], ball, can, v])
+        switches = np.asarray(ours.switches(x, [], materials)).ravel()
+        plant.SetPositionsAndVelocities(context, x)
+        query = plant.get_geometry_query_input_port().Eval(context)
+        found = query.ComputePointPairPenetration()
+        assert (switches[0] > 0) == bool(found)
+        if not found or switches[1] <= 0:
+            continue
+        assert switches[0] == pytest.approx(found[0].depth, abs=1e-12)
+        wanted = plant.EvalTimeDerivatives(context).CopyToVector()
+        rates, slopes = (np.asarray(a) for a in part.slopes(x, [], materials))
+        assert np.max(np.abs(rates.ravel() - wanted)) <= 1e-12 * max(1.0, np.max(np.abs(wanted)))
+        met.append((away > radius, abs(local[2]) > half))
+        if len(met) % 20 == 0:  # Drake's differences
+            way = random.standard_normal(model.nx)
+            ends = []
+            for width in (1e-7, -1e-7):
+                plant.SetPositionsAndVelocities(context, x + width * way)
+                ends.append(plant.EvalTimeDerivatives(context).CopyToVector())
+            slope = (ends[0] - ends[1]) / 2e-7
+            assert np.max(np.abs(slopes @ way - slope)) <= 1e-5 * np.max(np.abs(slope))
+    assert {(True, False), (False, True), (True, True), (False, False)} == set(met)
 
 
 @pytest.mark.parametrize("name", ["bolt.urdf", "solo12.urdf", "go2.urdf"])

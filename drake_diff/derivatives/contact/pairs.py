@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Box, Capsule, HalfSpace, Shape, Sphere
+from pydrake.geometry import Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
 
 from drake_diff._base.arrays import Array
 from drake_diff.model.model import Model
@@ -46,6 +46,7 @@ class ContactPairs:
     lower: Array  # (P, 3) the corners of the other shape's box
     upper: Array
     rounding: Array  # (P,) R
+    is_round: NDArray[np.bool_]  # (P,) whether the other shape is the cylinder along z within its box
 
     def touching(self, poses: Array) -> Touches:
         """The pairs that overlap where the bodies are at `poses` (N, bodies, 3, 4)."""
@@ -87,20 +88,22 @@ def _curvature(normal: Array, outside: Array, length: Array) -> Array:
     return np.asarray((across - normal[:, :, None] * normal[:, None, :]) / length[:, None, None])
 
 
-def read_pairs(model: Model) -> ContactPairs:
-    """The pairs of spheres of `model`, none where there are none."""
+def read_pairs(model: Model, *, cylinders: bool = False) -> ContactPairs:
+    """The pairs of spheres of `model`, none where there are none; with cylinders, which `touching` does not know."""
     plant, inspector = model.plant, model.double.inspector
-    ids, at, radius, boxes = [], [], [], []
+    ids, at, radius, boxes, rounds = [], [], [], [], []
     bodies: dict[Any, tuple[int, Any]] = {}
     for pair in sorted(inspector.GetCollisionCandidates()) if inspector is not None else ():
         shapes = [inspector.GetShape(i) for i in pair]
         first = 0 if isinstance(shapes[0], Sphere) else 1
-        box = _rounded_box(shapes[1 - first])
+        other = shapes[1 - first]
+        box = _box_around(other) if cylinders and isinstance(other, Cylinder) else _rounded_box(other)
         if not isinstance(shapes[first], Sphere) or box is None:
             continue
         ids.append((pair[first], pair[1 - first]))
         radius.append(shapes[first].radius())
         boxes.append(box)
+        rounds.append(isinstance(other, Cylinder))
         own = [plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in ids[-1]]
         at.append([bodies.setdefault(body.index(), (len(bodies), body))[0] for body in own])
     poses = [[inspector.GetPoseInFrame(i) for i in pair] for pair in ids]
@@ -117,7 +120,13 @@ def read_pairs(model: Model) -> ContactPairs:
         lower=np.array([lower for lower, _, _ in boxes]).reshape(count, 3),
         upper=np.array([upper for _, upper, _ in boxes]).reshape(count, 3),
         rounding=np.array([rounding for _, _, rounding in boxes], dtype=float),
+        is_round=np.array(rounds, dtype=bool),
     )
+
+
+def _box_around(shape: Cylinder) -> tuple[Array, Array, float]:
+    half = np.array([shape.radius(), shape.radius(), shape.length() / 2])
+    return -half, half, 0.0
 
 
 def _rounded_box(shape: Shape) -> tuple[Array, Array, float] | None:

@@ -29,6 +29,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.plant import proximity_property
 from drake_diff.model.step import set_state
 from drake_diff.motion.dormand_prince import ERROR, STAGES
+from drake_diff.motion.flow.shapes import distance_of
 from drake_diff.motion.flow.tree import Tree
 
 STICTION_SPEED = 1e-3  # v_s [m/s], Drake's default in continuous time
@@ -57,7 +58,7 @@ class FlowPlant:
         contact, self.description = model.contract.contact, describe(model)
         if contact.collision_pairs and contact.model != "point":
             raise ModelError(f"{contact.model} contact has no motion in continuous time here: point contact has one")
-        self.model, self.pairs, self.is_sap = model, read_pairs(model), contact.approximation == "sap"
+        self.model, self.pairs, self.is_sap = model, read_pairs(model, cylinders=True), contact.approximation == "sap"
         count = len(self.pairs.ids)
         self.is_whole = count == contact.collision_pairs  # whether all that may touch are pairs here
         self.x, self.u, self.materials = (
@@ -110,8 +111,8 @@ class FlowPlant:
             if frozenset((each.id_A, each.id_B)) not in known:
                 names = " and ".join(query.inspector().GetName(i) for i in (each.id_A, each.id_B))
                 raise SimulationError(
-                    f"{names} touch, and are no sphere beside a sphere, box, capsule or half space: their motion in "
-                    "continuous time is not known here; see contact_geometry of load_model"
+                    f"{names} touch, and are no sphere beside a sphere, box, capsule, cylinder or half space: their "
+                    "motion in continuous time is not known here; see contact_geometry of load_model"
                 )
 
     def part(self, pushing: tuple[int, ...]) -> FlowPart:
@@ -197,9 +198,8 @@ def _touch(tree: Tree, pairs: ContactPairs, i: int, material: Any, is_sap: bool)
     center = p + R @ ca.DM(pairs.center[i])
     R, p, moves_other = tree.body(pairs.bodies[pairs.other_body[i]].index())
     turn, origin = R @ ca.DM(pairs.rotation[i]), p + R @ ca.DM(pairs.position[i])
-    distance, normal = from_box(turn.T @ (center - origin), pairs.lower[i], pairs.upper[i])
-    normal = turn @ normal
-    phi = distance - pairs.rounding[i] - pairs.radius[i]
+    distance, normal = distance_of(pairs, i, turn.T @ (center - origin))
+    normal, phi = turn @ normal, distance - pairs.radius[i]
     point = center - (pairs.radius[i] + part * phi) * normal
     J = ca.SX.zeros(3, tree.nv)
     for sign, moves in ((1, moves_sphere), (-1, moves_other)):
@@ -215,28 +215,6 @@ def _touch(tree: Tree, pairs: ContactPairs, i: int, material: Any, is_sap: bool)
     push = k * bracket if is_sap else -k * phi * bracket
     on_sphere = push * (normal - drag * slip)
     return _Touch(-phi, bracket, J.T @ on_sphere, point, normal, on_sphere, speed)
-
-
-def from_box(local: Any, lower: Array, upper: Array) -> tuple[Any, Any]:
-    """The signed distance of a point from a box, and its gradient: inside, to the nearest face."""
-    outside = local - ca.fmin(ca.fmax(local, ca.DM(lower)), ca.DM(upper))
-    is_point, is_plane = bool(np.all(lower == upper)), bool(np.isinf(lower).any())
-    if is_plane:  # a half space, below 0
-        return local[2] - float(upper[2]), ca.DM([0, 0, 1])
-    square = ca.sumsqr(outside)
-    beyond = square > 0
-    length = ca.sqrt(ca.if_else(beyond, square, 1.0))
-    if is_point:
-        return length, outside / length
-    ways = ca.vertcat(ca.DM(upper) - local, local - ca.DM(lower))
-    least = ca.mmin(ways)
-    signed = np.concatenate([np.eye(3), -np.eye(3)])
-    face, found = ca.SX.zeros(3), ca.SX(0)
-    for j in range(6):
-        nearest = ca.logic_and(ways[j] <= least, found < 0.5)
-        face += ca.if_else(nearest, ca.DM(signed[j]), ca.DM.zeros(3))
-        found += ca.if_else(nearest, 1.0, 0.0)
-    return ca.if_else(beyond, length, -least), ca.if_else(beyond, outside / length, face)
 
 
 def _step_function(rates: Any) -> Any:

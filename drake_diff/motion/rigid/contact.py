@@ -14,10 +14,10 @@ TOUCHES = 1e-6  # [m]
 class RigidContact:
     """Hard contact: bodies that touch do not enter each other, and an impact changes velocities at once.
 
-    The contacts are those of the model's spheres with spheres, boxes, capsules and half spaces, and `points`. Between
-    impacts a contact is open, or closed where an impact did not part it: then it sticks, or glides where it is
-    frictionless. A contact that would slide on with friction ends the motion with an error, and so does one that
-    bounces infinitely often.
+    The contacts are those of the model's spheres with spheres, boxes, capsules, cylinders and half spaces, and
+    `points`. Between impacts a contact is open, or closed where an impact did not part it: then it sticks, or glides
+    where it is frictionless. A contact that would slide on with friction ends the motion with an error, and so does one
+    that bounces infinitely often.
 
     Args:
         restitution: e from 0 to 1. The speed at which a contact opens is e times that at which it closed (Newton), or

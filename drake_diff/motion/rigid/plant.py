@@ -19,7 +19,8 @@ from drake_diff.mechanics.description import names_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import proximity_property
 from drake_diff.motion.dormand_prince import ERROR, STAGES
-from drake_diff.motion.flow.plant import FlowPlant, flow_plant, from_box
+from drake_diff.motion.flow.plant import FlowPlant, flow_plant
+from drake_diff.motion.flow.shapes import distance_of
 from drake_diff.motion.rigid.points import PointOnPlane
 
 Closed = tuple[tuple[int, bool], ...]  # contacts that are closed, and whether each sticks
@@ -164,10 +165,10 @@ class RigidPlant:
         center = p + R @ ca.DM(pairs.center[i])
         R, p, moves_other = tree.body(pairs.bodies[pairs.other_body[i]].index())
         turn, origin = R @ ca.DM(pairs.rotation[i]), p + R @ ca.DM(pairs.position[i])
-        distance, normal = from_box(turn.T @ (center - origin), pairs.lower[i], pairs.upper[i])
+        distance, normal = distance_of(pairs, i, turn.T @ (center - origin))
         normal = turn @ normal
         point = center - pairs.radius[i] * normal
-        gap = distance - pairs.rounding[i] - pairs.radius[i]
+        gap = distance - pairs.radius[i]
         return _Place(gap, normal, self._relative(point, moves_sphere, moves_other))
 
     def _of_point(self, given: PointOnPlane) -> _Place:
