@@ -5,6 +5,8 @@ import pytest
 from helpers.impacts import Floor
 from helpers.models import Plant, add_slide, contact_properties
 from helpers.robots import FOOT, example_robot, state_in_contact
+from pydrake.geometry import Sphere
+from pydrake.math import RigidTransform
 from pydrake.multibody.tree import RevoluteJoint, SpatialInertia, UnitInertia
 
 import drake_diff as dd
@@ -43,9 +45,12 @@ def free_ball(gravity=G, friction=0.3, mass=1.0, radius=0.1):
     return plant.model()
 
 
-def falling_rod(mass=2.0, length=1.2):
-    """A slender rod in the plane x, z that turns about y: x = [x, z, angle, x_v, z_v, angle_v]; no geometry."""
-    plant = Plant(0.01, "lagged", gravity=0.0)
+def falling_rod(mass=2.0, length=1.2, tips=None, time_step=0.01):
+    """A slender rod in the plane x, z that turns about y: x = [x, z, angle, x_v, z_v, angle_v], without gravity.
+
+    With `tips`, their contact, it has balls of 1 mm at its ends, and ground below.
+    """
+    plant = Plant(time_step, "lagged", gravity=0.0)
     world = plant.plant.world_frame()
 
     one, two = (plant.plant.AddRigidBody(name, SpatialInertia.Zero()) for name in ("one", "two"))
@@ -54,6 +59,11 @@ def falling_rod(mass=2.0, length=1.2):
     add_slide(plant.plant, "x", world, one, "x")
     add_slide(plant.plant, "z", one.body_frame(), two, "z")
     plant.plant.AddJoint(RevoluteJoint("angle", two.body_frame(), rod.body_frame(), [0, 1, 0]))
+    if tips is not None:
+        plant.ground(tips)
+        for side in (1, -1):
+            place = RigidTransform(np.array([side * length / 2, 0, 0]))
+            plant.plant.RegisterCollisionGeometry(rod, place, Sphere(1e-3), f"tip_{side}", tips)
     return plant.model()
 
 
@@ -380,3 +390,58 @@ def test_an_impact_on_the_edge_has_no_derivative():
     assert motion.xs[-1][4] == pytest.approx(0.5, abs=1e-12)
     with pytest.raises(GradientError, match="strike at once"):
         _ = motion.by_x0
+
+
+def ball_of(stiffness, ratio=0.0, friction=0.0):
+    """1 kg that may spin, on compliant ground; its force is k x, or k (x + tau x') of that damping ratio."""
+    relaxation = 2 * ratio / np.sqrt(stiffness)
+    plant = Plant(0.02, "sap" if ratio else "lagged")
+    properties = contact_properties(2 * stiffness, friction=friction, relaxation_time=relaxation / 2)
+    plant.ball("ball", 1.0, 0.1, properties)
+    plant.ground(properties)
+    return plant.model()
+
+
+def restitution_of(ratio):
+    """-x'(t) / x'(0) where the force k (x + tau x') ends: exp(-zeta (pi - 2 asin zeta) / sqrt(1 - zeta^2))."""
+    return np.exp(-ratio * (np.pi - 2 * np.arcsin(ratio)) / np.sqrt(1 - ratio**2))
+
+
+def rod_of(stiffness):
+    """The falling rod with small balls at its ends, above compliant ground without damping."""
+    return falling_rod(tips=contact_properties(2 * stiffness), time_step=0.02)
+
+
+def ball_case(ratio, friction, spin):
+    x0 = np.array([1.0, 0, 0, 0, 0, 0, 0.5, 0.3, spin, 0, 1.0, 0, -1.0])
+    rigid = RigidContact(restitution_of(ratio), friction=friction)
+    return (lambda k: ball_of(k, ratio, friction)), rigid, x0, lambda x: x[4] + 2 * x[6] + 0.1 * x[8]
+
+
+LIMITS = {
+    "elastic": ball_case(0.0, 0.0, 0.0),
+    "damped": ball_case(0.15, 0.0, 0.0),
+    "damped and sliding": ball_case(0.3, 0.2, -60.0),
+    "rod": (
+        rod_of,
+        RigidContact(1.0, friction=0),
+        np.array([0, 0.5, 0.6, 0.2, -2.0, 0.5]),
+        lambda x: x[1] + 0.3 * x[2],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", LIMITS)
+def test_hard_contact_is_the_limit_of_the_compliant_one(case):
+    """Values and slopes differ by k^(-1/2), the time in contact, as the stiffness grows at the same damping ratio."""
+    make, contact, x0, loss = LIMITS[case]
+    hard = dd.differentiate_rollout(make(1e4), x0, None, loss, num_steps=20, method=contact)
+    assert hard.undefined == ()
+    errors = []
+    for stiffness in (1e4, 1e6, 1e8):
+        soft = dd.differentiate_rollout(make(stiffness), x0, None, loss, num_steps=20, method="continuous")
+        apart = np.max(np.abs(soft.by_x0 - hard.by_x0)) / np.max(np.abs(hard.by_x0))
+        errors.append([abs(soft.loss - hard.loss), apart])
+    orders = np.log10(np.array(errors[:-1]) / np.array(errors[1:])) / 2
+    assert np.all(np.abs(orders[-1] - 0.5) < 0.03), (errors, orders)
+    assert np.all(np.array(errors[-1]) < 5e-3)
