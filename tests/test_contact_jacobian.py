@@ -12,6 +12,8 @@ from drake_diff.derivatives.contact import laws as friction_cone
 from drake_diff.derivatives.contact.laws import Cone, HuntCrossley, Impulse, StateChange
 from drake_diff.derivatives.contact.material import MaterialChange
 from drake_diff.derivatives.contact.pairs import read_pairs
+from drake_diff.derivatives.joint_impulses import JointImpulses
+from drake_diff.exceptions import SimulationError
 from drake_diff.model.step import set_state
 
 pytest.importorskip("pinocchio")
@@ -392,7 +394,7 @@ def test_another_law_is_found_out(tmp_path, monkeypatch):
     assert analytic.SAME_JACOBIAN == 1e-9
 
 
-def test_a_joint_limit_beside_contact_is_refused(tmp_path):
+def test_a_joint_limit_beside_contact_is_known(tmp_path):
     links = _link("x", mass=0.3) + _link("z", _sphere("tip", "0 0 0", 0.1), 0.2)
     joints = _joint("along", "prismatic", "world", "x", "1 0 0", limit=0.01) + _joint(
         "up", "prismatic", "x", "z", "0 0 1"
@@ -400,9 +402,38 @@ def test_a_joint_limit_beside_contact_is_refused(tmp_path):
     model = _load(tmp_path, _collision("ground", SHAPES["ground"]), links + joints)
     free = dd.differentiate_step(model, [0.0, 0.099, 0.5, 0.0], method="analytic")
     assert free.method == "analytic", free.reason
-    held = dd.differentiate_step(model, [0.0095, 0.099, 0.5, 0.0], method="analytic")
-    assert held.method == "autodiff"
-    assert "something else acts beside contact" in held.reason
+    point = [0.0095, 0.099, 0.5, 0.0]
+    held = dd.differentiate_step(model, point, method="analytic")
+    assert held.method == "analytic", held.reason
+    other = dd.differentiate_step(model, point, method="autodiff")
+    assert np.abs(held.A - other.A).max() <= 1e-11 * np.abs(other.A).max()
+    assert np.abs(held.A - free.A).max() > 1e-3
+
+
+def test_what_autodiff_does_not_step_is_certified_by_differences(tmp_path, monkeypatch):
+    """A slide at its stop, beside whose tilted cylinder another stands, near enough that AutoDiffXd asks for both."""
+    tilted = _collision("rod", SHAPES["cylinder"], "0.22 0 0.22 0 0.7854 0")
+    moving = _link("x", tilted) + _joint("along", "prismatic", "world", "x", "1 0 0", limit=0.01)
+    moving += _link("pole", com="0 0 0.3") + _joint("hinge", "revolute", "x", "pole", "0 1 0")
+    post, x = _collision("post", SHAPES["cylinder"], "0 0 0 0 0.7854 0"), np.array([0.0099, 0.4, 0.5, -0.3])
+
+    def found():
+        model = _load(tmp_path, post, moving)
+        with pytest.raises(SimulationError, match="Cylinder"):
+            dd.differentiate_step(model, x, method="autodiff")
+        return dd.differentiate_step(model, x, method="analytic"), dd.differentiate_step(
+            model, x, method="finite_difference"
+        )
+
+    d, by_differences = found()
+    assert d.method == "analytic", d.reason
+    assert "equal to the differences of the step solved to rounding, as AutoDiffXd takes no such step" in d.reason
+    assert np.abs(d.A - by_differences.A).max() <= 1e-6 * np.abs(d.A).max()
+    right = JointImpulses.by_motion
+    monkeypatch.setattr(JointImpulses, "by_motion", lambda *a: 1.001 * right(*a))
+    d, _ = found()
+    assert d.method == "finite_difference"
+    assert "differs from the differences of the step solved to rounding" in d.reason
 
 
 def test_what_the_form_does_not_describe_is_differentiated_otherwise(tmp_path):

@@ -9,13 +9,15 @@ import pytest
 from helpers.engines import ROBOTS, G, free_state
 from helpers.models import MODELS, random_state, robot, robot_file
 from helpers.plants import POINT, floating, in_the_air, limited_pendulum, springs_and_motors
-from helpers.robots import state_in_range
+from helpers.robots import ROBOTS as ROBOTS_STAND
+from helpers.robots import example_robot, state_in_contact, state_in_range
 from helpers.table import each_row
 from pydrake.multibody.tree import RpyFloatingJoint
 
 import drake_diff as dd
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of, build_analytic, certified
+from drake_diff.derivatives.joint_impulses import NEAR_RIGID, JointImpulses
 from drake_diff.derivatives.polish import polished_step
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
 from drake_diff.model.parameters import applied, select
@@ -145,13 +147,25 @@ def test_steps_with_other_contact_are_taken_by_others_and_named(load):
     assert "not analytic: the contact model is hydroelastic_with_fallback, not point" in reasons["autodiff"]
 
 
-def test_a_joint_limit_that_acts_is_no_smooth_step():
+def test_a_joint_limit_that_acts_is_in_the_derivative():
     model = limited_pendulum()
     xs, us = np.array([[0.3, 0.2], [0.999, 2.0]]), np.array([[0.1], [0.1]])
-    _, _, methods = equal(model, xs, us, expected=("analytic", "autodiff"))
-    assert methods[0] == "analytic"
+    A, _, _ = equal(model, xs, us)
+    assert A[1, 1, 1] < 0.1 < A[0, 1, 1]
     free = np.array([dd.step(model, xs[0], us[0]), xs[1] + 0.01])  # the second is not where the step leads
-    assert equal(model, xs, us, expected=methods, x_next=free)[2] == methods
+    equal(model, xs, us, x_next=free)
+
+
+def test_a_limits_impulse_has_its_closed_form():
+    """One joint of inertia I: v' = (v* + v_hat / b) / (1 + 1 / b) at a limit, v_hat = d / 2h from a distance d."""
+    model, x, h = limited_pendulum(), np.array([0.999, 2.0]), 0.01
+    A, B, (method,) = dd.linearize(model, x[None], np.array([[0.1]]))
+    free = dd.linearize(model, np.array([[0.3, 2.0]]), np.array([[0.1]]))
+    assert method == "analytic"
+    stiff = 1 / NEAR_RIGID
+    by_q = np.cos(x[0]) / np.cos(0.3) * free[0][0, 1, 0] - stiff / (2 * h)
+    np.testing.assert_allclose(A[0, 1], [by_q / (1 + stiff), free[0][0, 1, 1] / (1 + stiff)], rtol=1e-9)
+    np.testing.assert_allclose(B[0, 1], free[1][0, 1] / (1 + stiff), rtol=1e-9)
 
 
 def test_a_controller_at_its_limit_is_no_smooth_step():
@@ -161,8 +175,7 @@ def test_a_controller_at_its_limit_is_no_smooth_step():
     _, _, methods = equal(model, xs, us, expected=("analytic", "implicit"))
     assert methods[0] == "analytic"
     hardly_ever_free = springs_and_motors(limit=1e-3, kp=(20.0, 5.0, 8.0))
-    why = analytic_of(hardly_ever_free).reason
-    assert "in all but 0 geometries touch, or joints or controllers are at their limits" in why
+    assert "in all but 0 controllers are at their limits" in analytic_of(hardly_ever_free).reason
 
 
 def test_x_next_that_is_wrong_is_found(load):
@@ -181,7 +194,7 @@ def test_a_doctored_inertia_is_caught(load):
     analytic = build_analytic(model)
     assert certified(model, analytic) is analytic
     analytic.pinocchio.inertias[2].mass *= 1 + 1e-6
-    assert "its step differs from Drake's" in certified(model, analytic).reason
+    assert "of the forces in Drake's equation" in certified(model, analytic).reason
 
 
 @pytest.mark.parametrize("part", ["ddq_dq", "ddq_dv", "Minv"])
@@ -256,7 +269,7 @@ def same_where_autodiff_works(model, x, u):
     try:
         exact = dd.differentiate_step(model, x, u, method="autodiff")
     except (ModelError, SimulationError):
-        assert "not " in found.reason
+        assert found.method == "analytic" or "not " in found.reason
         return False
     for ours, theirs in ((found.A, exact.A), (found.B, exact.B)):
         # Masses of 1e-6 kg beside 10 kg, as some of these robots have, magnify rounding.
@@ -338,3 +351,45 @@ def test_tvlqr_is_the_same_with_and_without(load):
 
     ours, theirs = with_and_without(load, gains)
     np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
+
+
+# ---- joint limits, couplers and shapes that AutoDiffXd does not know ----------------------------------------------
+
+
+@each_row("name", ["solo12.urdf", "go2.urdf", "ur5_robot.urdf", "bolt.urdf"])
+@pytest.mark.parametrize("time_step", [0.005, 0.02, 0.05])
+def test_robots_at_their_limits_are_linearized_at_once(name, time_step):
+    """Three joints at their stops, some beyond; those with feet stand on them too."""
+    model, random = example_robot(name, time_step, feet=ROBOTS_STAND[name]), np.random.default_rng(3)
+    lower, upper = model.position_limits
+    limited = np.flatnonzero(np.isfinite(lower) & np.isfinite(upper))
+    for _ in range(3):
+        x = state_in_contact(model, random) if ROBOTS_STAND[name] else state_in_range(model, random)
+        for k in random.choice(limited, 3):
+            x[k] = random.choice([lower[k] - 1e-3, lower[k] + 2e-3, upper[k] + 1e-3, upper[k] - 2e-3])
+        us = random.uniform(-0.1, 0.1, (1, model.nu))
+        equal(model, x[None], us)
+        by_differences = dd.differentiate_step(model, x, us[0], method="finite_difference").A
+        A, _, _ = dd.linearize(model, x[None], us)
+        assert np.abs(A[0] - by_differences).max() <= 1e-6 * np.abs(A[0]).max()  # differences over 3e-7
+
+
+def test_joints_that_are_coupled_are_linearized_at_once():
+    """A Panda whose second finger follows the first by Drake's coupler, in flight and closing onto its stop."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        model = dd.load_model(robot_file("panda.urdf"), time_step=0.01, base="weld", actuators="all", contact=False)
+    random = np.random.default_rng(2)
+    assert model.num_constraints == 1
+    for finger in (0.03, 1e-4):
+        x = np.concatenate([state_in_range(model, random)[:7], [finger, finger], 0.1 * random.standard_normal(9)])
+        equal(model, x[None], 0.1 * random.standard_normal((1, model.nu)))
+
+
+def test_a_wrong_derivative_at_a_limit_is_refused_on_the_model(monkeypatch):
+    right = JointImpulses.by_motion
+    monkeypatch.setattr(JointImpulses, "by_motion", lambda *a: 1.001 * right(*a))
+    model = limited_pendulum()
+    found = dd.differentiate_step(model, [0.999, 2.0], [0.1], method="analytic")
+    assert found.method == "autodiff"
+    assert "its Jacobian with impulses differs from AutoDiffXd's" in found.reason

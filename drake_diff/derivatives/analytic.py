@@ -5,19 +5,20 @@ of its steps with contact (`contact.jacobian`) at the first of them that are met
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
+from numpy.typing import NDArray
+from pydrake.autodiffutils import InitializeAutoDiff
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.contact.jacobian import contact_form, contact_jacobians, material_of, place
 from drake_diff.derivatives.contact.material import QUANTITIES, material_change
-from drake_diff.derivatives.implicit import form_of
+from drake_diff.derivatives.implicit import RESIDUAL_TOLERANCE, differentiate_equation, form_of
+from drake_diff.derivatives.polish import polished_steps
 from drake_diff.derivatives.smooth_step import SmoothStep, build_analytic
-from drake_diff.derivatives.steps import Flags, Jacobians, NotSmoothError, Steps, take_step
+from drake_diff.derivatives.steps import FREE, Flags, Jacobians, NotSmoothError, Steps
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, ModelError, SimulationError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.model.model import Model
@@ -26,11 +27,10 @@ from drake_diff.model.step import advance, set_state
 
 # Of the largest entry: two derivatives of one smooth step differ by rounding, which a mass matrix may magnify.
 SAME_JACOBIAN = 1e-9
-# Of the largest entry of x' (or 1): the same equation solved in another order; more where the mass matrix magnifies
-# rounding by more, as that of a robot with light fingers on a heavy trunk does.
-SAME_STEP = 1e-12
+# Differences over DIFFERENCE of a step solved to rounding, whose friction turns within 1e-4 m/s.
+SAME_DIFFERENCES, DIFFERENCE = 1e-5, 3e-7
+SAME_STEP = 1e-12  # of the largest entry of x' (or 1): the same positions, summed in another order
 CERTIFIED_STATES, STATES_TRIED = 3, 60
-AS_STRONG, WEAKER = 20, 0.1  # after so many states inputs are a tenth: they throw light fingers to their limits at once
 FAR = 4.0  # [m or rad]
 
 
@@ -50,27 +50,26 @@ class Analytic:
         smooth = analytic_of(steps.model)
         if isinstance(smooth, Refusal):
             return smooth
-        if not parameters and not steps.some_touch:
+        impulsive = steps.touching | (steps.model.num_constraints > 0)
+        free = np.flatnonzero(~impulsive)
+        if len(free) == len(steps) and not parameters:
             values, known = smooth(steps)
-            return Jacobians(values, _refusals(known, "contact, a limit or a constraint acts"))
-        values, known = np.zeros((len(steps), steps.model.nx, steps.width)), np.zeros(len(steps), dtype=bool)
-        free, touching = np.flatnonzero(~steps.touching), np.flatnonzero(steps.touching)
-        if len(free):
-            values[free, :, : steps.model.nx + steps.model.nu], known[free] = smooth(steps.part(free))
-        refused = _refusals(known | steps.touching, "contact, a limit or a constraint acts")
-        if len(touching):
-            found = _with_contact(smooth, steps.part(touching))
-            why = found.reason if isinstance(found, Refusal) else "something else acts beside contact"
-            if not isinstance(found, Refusal):
-                values[touching], known[touching] = found
-            refused |= _refusals(known | ~steps.touching, why)
-        return Jacobians(values, refused)
+        else:
+            values, known = np.zeros((len(steps), steps.model.nx, steps.width)), np.zeros(len(steps), dtype=bool)
+            if len(free):
+                values[free, :, : steps.model.nx + steps.model.nu], known[free] = smooth(steps.part(free))
+        refused = _refusals(known, free, "contact, a limit or a constraint acts")
+        notes: dict[int, str] = {}
+        left = np.flatnonzero(~known & (impulsive | smooth.at_a_limit(steps)))
+        if len(left):
+            why = _with_impulses(smooth, steps, left, values, known, notes)
+            why = why or "something else acts beside contact, joint limits and couplers"
+            refused = {k: e for k, e in refused.items() if not known[k]} | _refusals(known, left, why)
+        return Jacobians(values, refused, notes)
 
 
-def _refusals(known: Flags, why: str) -> dict[int, DrakeDiffError]:
-    if np.count_nonzero(known) == len(known):
-        return {}
-    return {int(k): NotSmoothError(why) for k in np.flatnonzero(~known)}
+def _refusals(known: Flags, of: NDArray[np.intp], why: str) -> dict[int, DrakeDiffError]:
+    return {int(k): NotSmoothError(why) for k in of[~known[of]]}
 
 
 def analytic_of(model: Model) -> SmoothStep | Refusal:
@@ -88,7 +87,10 @@ def analytic_of(model: Model) -> SmoothStep | Refusal:
 
 
 def certified(model: Model, smooth: SmoothStep) -> SmoothStep | Refusal:
-    """`smooth` where it is Drake's step and AutoDiffXd's derivative at three random states, else why not."""
+    """`smooth` where it has the derivative, by AutoDiffXd, of Drake's equation at three random states; else why not.
+
+    Whether a step solves that equation is seen at its end; here nothing has to be apart, nor within its limits.
+    """
     here = model.double.state()
     try:
         why = _first_difference(model, smooth)
@@ -98,47 +100,31 @@ def certified(model: Model, smooth: SmoothStep) -> SmoothStep | Refusal:
 
 
 def _first_difference(model: Model, smooth: SmoothStep) -> str:
-    random, left = np.random.default_rng(0), CERTIFIED_STATES
-    for i in range(STATES_TRIED):
+    """How one of the steps, or its Jacobian, is another than by Drake's equation; empty where none is."""
+    random, left, exact = np.random.default_rng(0), CERTIFIED_STATES, np.empty((model.nx, model.nx + model.nu))
+    for _ in range(STATES_TRIED):
         x, u = _random_point(model, smooth.coordinates, random)
-        u = WEAKER ** (i // AS_STRONG) * u
+        jacobians, ends = smooth.differentiate(x[None], u[None])
+        v_next = ends[0, model.nq :]
+        if not np.all(smooth.form.effort(x[: model.nq], v_next, u, model.time_step)[1][np.isinf(smooth.limit)]):
+            continue  # a controller is at its limit
+        steps = Steps(model, select(model, ()), x[None], u[None], ends, FREE, taken=False)
         try:
-            steps = take_step(model, select(model, ()), x, u)
-            if steps.touching[0] or smooth.at_a_limit(steps)[0]:
-                continue
-            _, free, _ = smooth.form.effort(x[: model.nq], steps.x_next[0, model.nq :], u, model.time_step)
-            if not np.all(free[np.isinf(smooth.limit)]):
-                continue  # a controller is at its limit
-            variables = InitializeAutoDiff(np.concatenate([x, u])).ravel()
-            exact = advance(model.autodiff, variables[: model.nx], variables[model.nx :])
+            missing = differentiate_equation(smooth.form, steps, 0, exact)
         except (SimulationError, ModelError) as error:
             return f"AutoDiffXd, to certify it by, is refused: {error}"
-        why = _difference(smooth, steps, exact)
-        if why:
-            return why
+        if not missing <= RESIDUAL_TOLERANCE:
+            return f"its step leaves {missing:.2g} of the forces in Drake's equation"
+        moved = x[: model.nq] + model.time_step * np.asarray(model.double.rates(v_next)) - ends[0, : model.nq]
+        if not np.abs(moved).max() <= SAME_STEP * max(1.0, float(np.abs(ends).max())):
+            return f"its positions differ from Drake's by {np.abs(moved).max():.2g}"
+        gap = float(np.abs(jacobians[0] - exact).max())
+        if not gap <= SAME_JACOBIAN * float(np.abs(exact).max()):
+            return f"its Jacobian differs from AutoDiffXd's by {gap:.2g}"
         left -= 1
         if not left:
             return ""
-    smooth_ones = CERTIFIED_STATES - left
-    at_limits = "geometries touch, or joints or controllers are at their limits"
-    return f"of {STATES_TRIED} random states in all but {smooth_ones} {at_limits}"
-
-
-def _difference(smooth: SmoothStep, steps: Steps, exact: Any) -> str:
-    """How the one step, or its Jacobian, is another than Drake's; empty where it is not."""
-    end, rows = steps.x_next[0], gradient_rows(exact, steps.width)
-    jacobians, ends = smooth.differentiate(steps.xs, steps.us)
-    gap, size = float(np.abs(ends[0] - end).max()), max(1.0, float(np.abs(end).max()))
-    set_state(steps.model.double, steps.xs[0])
-    rounding = np.finfo(float).eps * float(np.linalg.cond(steps.model.double.mass_matrix()))
-    if not gap <= max(SAME_STEP, rounding) * size:
-        return f"its step differs from Drake's by {gap:.2g}"
-    if not np.abs(ExtractValue(exact.reshape(-1, 1)).ravel() - end).max() <= SAME_JACOBIAN * size:
-        return "the AutoDiffXd step is not the double step"
-    gap = float(np.abs(jacobians[0] - rows).max())
-    if not gap <= SAME_JACOBIAN * float(np.abs(rows).max()):
-        return f"its Jacobian differs from AutoDiffXd's by {gap:.2g}"
-    return ""
+    return f"of {STATES_TRIED} random states in all but {CERTIFIED_STATES - left} controllers are at their limits"
 
 
 def _random_point(model: Model, coordinates: Coordinates, random: np.random.Generator) -> tuple[Array, Array]:
@@ -159,43 +145,86 @@ def _random_point(model: Model, coordinates: Coordinates, random: np.random.Gene
 
 @dataclass
 class _ContactTrial:
-    """How many steps with contact are still to be certified, or why the model's contact is not differentiated so."""
+    """How many steps with contact, or at joint limits alone, are still to be certified, or why none is known so."""
 
     left: int = CERTIFIED_STATES
     refusal: str = ""
+    note: str = ""  # by what they were certified where AutoDiffXd takes no such step
 
 
-def _with_contact(smooth: SmoothStep, steps: Steps) -> tuple[Array, Flags] | Refusal:
-    """(N, nx, nx + nu + np) of steps with contact, and which (N,) are known."""
+def _with_impulses(
+    smooth: SmoothStep, steps: Steps, which: NDArray[np.intp], values: Array, known: Flags, notes: dict[int, str]
+) -> str:
+    """Put the Jacobians of `which` (K,) of the N steps, in which impulses act, into `values`, and which are `known`.
+
+    Steps with contact and those at joint limits alone are certified apart. The answer is why those are not known that
+    are not, empty where the steps themselves say it.
+    """
+    whys = []
+    for name, touch in (("contact", True), ("joint limits", False)):
+        part = which[steps.touching[which] == touch]
+        if len(part):
+            found = _certified_impulses(smooth, steps.part(part), name)
+            if isinstance(found, Refusal):
+                whys.append(found.reason)
+            else:
+                values[part], known[part], note = found
+                notes |= {int(k): note for k in part if note}
+    return "; ".join(dict.fromkeys(whys))
+
+
+def _certified_impulses(smooth: SmoothStep, steps: Steps, name: str) -> tuple[Array, Flags, str] | Refusal:
+    """(N, nx, nx + nu + np) of steps, all with contact or all without, which (N,) are known, and what to note."""
     model, vector = steps.model, steps.vector
     form = contact_form(model, smooth)
     if isinstance(form, Refusal):
         return form
-    trial = model.cache("contact trial", _ContactTrial, of_structure=True)
+    if form.unknown and name == "contact":
+        return Refusal(form.unknown)
+    trial = model.cache(f"{name} trial", _ContactTrial, of_structure=True)
     if trial.refusal:
         return Refusal(trial.refusal)
     material = material_of(model, form)
     change = material_change(form.pairs, material, vector, model.double) if vector.parameters else None
     jacobians, known = contact_jacobians(form, smooth, steps, place(form, steps), material, change)
     for k in np.flatnonzero(known)[: trial.left]:
-        try:
-            trial.refusal = _other_jacobian(steps, k, jacobians[k])
-        except (SimulationError, ModelError) as error:  # of this step, as where contacts exert nothing
-            return Refusal(f"AutoDiffXd, to certify contact by, is refused: {error}")
+        trial.refusal, trial.note = _other_jacobian(steps, k, jacobians[k])
         if trial.refusal:
             return Refusal(trial.refusal)
         trial.left -= 1
-    return jacobians, known
+    return jacobians, known, trial.note
 
 
-def _other_jacobian(steps: Steps, k: int, jacobian: Array) -> str:
-    """How a step's Jacobian with contact differs from AutoDiffXd's, empty where it does not."""
+def _other_jacobian(steps: Steps, k: int, jacobian: Array) -> tuple[str, str]:
+    """How a step's Jacobian with impulses differs from AutoDiffXd's, empty where it does not; and a note if not its.
+
+    Where Drake takes no AutoDiffXd step, as beside shapes that it does not differentiate, it is compared with
+    differences of the step solved to rounding.
+    """
     model, vector = steps.model, steps.vector
     write_autodiff(vector, model, vector.values)
     variables = InitializeAutoDiff(np.concatenate([steps.xs[k], steps.us[k]])).ravel()
-    exact = advance(model.autodiff, variables[: model.nx], variables[model.nx :])
-    rows = gradient_rows(exact, model.nx + model.nu)
-    gap = float(np.abs(jacobian[:, : rows.shape[1]] - rows).max())
-    if not gap <= SAME_JACOBIAN * float(np.abs(rows).max()):
-        return f"its Jacobian with contact differs from AutoDiffXd's by {gap:.2g}"
-    return ""
+    try:
+        exact = advance(model.autodiff, variables[: model.nx], variables[model.nx :])
+    except (SimulationError, ModelError):
+        other, same, whose = _differences(steps, k), SAME_DIFFERENCES, "the differences of the step solved to rounding"
+        if isinstance(other, Refusal):
+            return f"neither AutoDiffXd nor differences are had to certify it by: {other}", ""
+    else:
+        other, same, whose = gradient_rows(exact, model.nx + model.nu), SAME_JACOBIAN, "AutoDiffXd's"
+    gap = float(np.abs(jacobian[:, : other.shape[1]] - other).max())
+    if not gap <= same * float(np.abs(other).max()):
+        return f"its Jacobian with impulses differs from {whose} by {gap:.2g}", ""
+    return "", "" if whose == "AutoDiffXd's" else f"with impulses equal to {whose}, as AutoDiffXd takes no such step"
+
+
+def _differences(steps: Steps, k: int) -> Array | Refusal:
+    """(nx, nx + nu) central differences of the step solved to rounding."""
+    model, width = steps.model, steps.model.nx + steps.model.nu
+    point = np.concatenate([steps.xs[k], steps.us[k]])
+    size = DIFFERENCE * np.maximum(1.0, np.abs(point))
+    points = np.concatenate([point + np.diag(size), point - np.diag(size)])
+    found = polished_steps(model, steps.vector, points[:, : model.nx], points[:, model.nx :])
+    for why in found.refused.values():
+        return why
+    return np.asarray(((found.x_next[:width] - found.x_next[width:]) / (2 * size[:, None])).T)

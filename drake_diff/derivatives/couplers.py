@@ -38,7 +38,7 @@ class Couplers:
         infinite = np.full(count * rows, np.inf)
         direction = np.broadcast_to(self.direction, (count, rows, nv)).reshape(-1, nv)
         problem = np.repeat(np.arange(count), rows)
-        return JointImpulses(problem, direction, -off / (2 * h), NEAR_RIGID * w, -infinite, infinite)
+        return JointImpulses(problem, direction, -off / (2 * h), NEAR_RIGID * w, -infinite, infinite, infinite > 0)
 
 
 def couplers_of(model: Model) -> Couplers | Refusal:

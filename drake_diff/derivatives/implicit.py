@@ -59,7 +59,7 @@ class Implicit:
         else:
             values, missing = np.empty((len(steps), model.nx, steps.width)), np.zeros(len(steps))
             for k, touches in enumerate(steps.touching.tolist()):
-                missing[k] = 0.0 if touches else _by_autodiff(form, steps, k, values[k])
+                missing[k] = 0.0 if touches else differentiate_equation(form, steps, k, values[k])
         refused: dict[int, DrakeDiffError] = {}
         if not steps.some_touch and np.count_nonzero(missing <= RESIDUAL_TOLERANCE) == len(missing):
             return Jacobians(values, refused, timed=True)
@@ -109,7 +109,7 @@ def _by_tree(form: "Form", tree: TreeDynamics, steps: Steps) -> tuple[Array, Arr
     return np.concatenate([positions, velocities], axis=1), _missing(d.tau, rest)
 
 
-def _by_autodiff(form: "Form", steps: Steps, k: int, jacobian: Array) -> float:
+def differentiate_equation(form: "Form", steps: Steps, k: int, jacobian: Array) -> float:
     """Step k's derivative into `jacobian` (nx, nx + nu + np); returns the force that is not accounted for.
 
     Where some is missing nothing is written: the equation is not the step's.

@@ -39,11 +39,14 @@ class JointImpulses:
     compliance: Array  # (S,) R [1/kg or 1/(kg m^2)]
     lower: Array  # (S,) [N s or N m s]
     upper: Array
+    near_rigid: NDArray[np.bool_]  # (S,) whether R is b w
 
     def part(self, which: NDArray[np.intp], position: NDArray[np.intp]) -> "JointImpulses":
         """Some of them, in the problems that `position` says."""
-        fields = (self.direction, self.target, self.compliance, self.lower, self.upper)
-        return JointImpulses(position, *(field[which] for field in fields))
+        target, compliance = self.target[which], self.compliance[which]
+        bounds = self.lower[which], self.upper[which]
+        direction, near_rigid = self.direction[which], self.near_rigid[which]
+        return JointImpulses(position, direction, target, compliance, *bounds, near_rigid)
 
     def at(self, v: Array) -> tuple[Array, Array]:
         """The impulses (S,) at the velocities v (N, nv), and their derivatives (S,) by -j . v', none at a bound."""
@@ -51,13 +54,25 @@ class JointImpulses:
         free = (wanted > self.lower) & (wanted < self.upper)
         return np.clip(wanted, self.lower, self.upper), np.where(free, 1 / self.compliance, 0.0)
 
+    def by_motion(self, v: Array, diagonal: Array, diagonal_slope: Array, h: float) -> Array:
+        """(S, nv) how the impulses of limits and couplers change with the degrees of freedom, v' (N, nv) being fixed.
+
+        Through v_hat, which falls by j / 2h, and through R where it is b w; `diagonal_slope` (N, nv, nv) has the
+        derivatives of the diagonal (N, nv) of A.
+        """
+        impulse, slope = self.at(v)
+        softer = np.where(self.near_rigid, NEAR_RIGID * impulse * slope, 0.0)[:, None]
+        of_weight = (self.direction / diagonal[self.problem]) ** 2
+        by_weight = (of_weight[:, None, :] @ diagonal_slope[self.problem])[:, 0]
+        return np.asarray(softer * by_weight - slope[:, None] * self.direction / (2 * h))
+
 
 def gather(parts: Sequence[JointImpulses], nv: int) -> JointImpulses:
     """All of some parts as one."""
     if not parts:
         none = np.zeros(0)
-        return JointImpulses(np.zeros(0, dtype=np.intp), np.zeros((0, nv)), none, none, none, none)
-    names = ("problem", "direction", "target", "compliance", "lower", "upper")
+        return JointImpulses(np.zeros(0, dtype=np.intp), np.zeros((0, nv)), none, none, none, none, none > 0)
+    names = ("problem", "direction", "target", "compliance", "lower", "upper", "near_rigid")
     return JointImpulses(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
@@ -77,10 +92,11 @@ def limit_impulses(limits: Array, q: Array, v: Array, free: Array, diagonal: Arr
         w = 1 / diagonal[problem, dof]
         direction = np.zeros((len(problem), q.shape[1]))
         direction[np.arange(len(problem)), dof] = sign
-        compliance = np.maximum(NEAR_RIGID * w, 1 / (2 * h * h * LIMIT_STIFFNESS))
+        stiffest = 1 / (2 * h * h * LIMIT_STIFFNESS)
+        compliance = np.maximum(NEAR_RIGID * w, stiffest)
         none, all_ = np.zeros(len(problem)), np.full(len(problem), np.inf)
         target = -distance[problem, dof] / (2 * h)
-        found.append(JointImpulses(problem, direction, target, compliance, none, all_))
+        found.append(JointImpulses(problem, direction, target, compliance, none, all_, compliance > stiffest))
     return found
 
 
@@ -105,4 +121,5 @@ class Controllers:
         direction[np.arange(len(problem)), dof] = 1.0
         effort = us.ravel() - kp * (q[problem, dof] - self.reference[0, which]) + kd * self.reference[1, which]
         total, bound = h * kp + kd, h * self.limit[which]
-        return JointImpulses(problem, direction, effort / total, 1 / (h * total), -bound, bound)
+        near_rigid = (lowered < 1).ravel()
+        return JointImpulses(problem, direction, effort / total, 1 / (h * total), -bound, bound, near_rigid)

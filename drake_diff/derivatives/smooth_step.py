@@ -198,8 +198,8 @@ class SmoothStep:
 def build_analytic(model: Model) -> SmoothStep:
     """Not certified. Raises ModelError where the plant is no such tree, MissingDependencyError without Pinocchio."""
     form = form_of(model)
-    if form.excluded:
-        raise ModelError(form.excluded)
+    if form.driven or model.systems_act:
+        raise ModelError(form.driven or model.systems_act)
     description = describe_tree(model)
     from drake_diff.mechanics.pinocchio_tree import acceleration_derivatives, build  # here, as Pinocchio is an extra
 

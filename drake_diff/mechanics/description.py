@@ -164,14 +164,19 @@ def coordinates_of(model: Model) -> Coordinates:
 
 def describe(model: Model) -> Description:
     """The description of `model`; ModelError, naming the element, where the plant has what no other engine is given."""
-    controlled = [f"actuator {a.name()} has PD gains" for a in actuators(model.plant) if a.has_controller()]
-    if controlled:
-        raise ModelError("this model cannot be given to another engine: " + "; ".join(controlled))
+    found = [f"actuator {a.name()} has PD gains" for a in actuators(model.plant) if a.has_controller()]
+    if model.num_constraints:
+        found.append(
+            f"{model.num_constraints} constraints (mimic joints, for which see mimic= of load_model, couplers, balls, "
+            "welds, distances)"
+        )
+    if found:
+        raise ModelError("this model cannot be given to another engine: " + "; ".join(found))
     return describe_tree(model)
 
 
 def describe_tree(model: Model) -> Description:
-    """As `describe`, PD control of the actuators left out."""
+    """As `describe`, PD control of the actuators and constraints left out."""
     plant = model.plant
     found = [
         f"joint {j.name()} is of type {j.type_name()}" for j in joints(plant) if j.type_name() not in ("weld", *MOVING)
@@ -181,11 +186,6 @@ def describe_tree(model: Model) -> Description:
     found += [f"the free body of joint {j.name()} is damped" for j in damped if j.type_name() == "quaternion_floating"]
     if model.coupling is not None:
         found.append('its mimic joints are reduced (mimic="fix" holds them)')
-    if model.num_constraints:
-        found.append(
-            f"{model.num_constraints} constraints (mimic joints, for which see mimic= of load_model, couplers, balls, "
-            "welds, distances)"
-        )
     if model.forces:
         found.append("forces are added to Drake's")
     found += [model.systems_act] if model.systems_act else []

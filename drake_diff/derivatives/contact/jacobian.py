@@ -1,13 +1,14 @@
-"""The Jacobian of a step with contact from its own equation, without differentiating Drake's solver.
+"""The Jacobian of a step with contact or at joint limits from its own equation, without differentiating Drake's solver.
 
-Drake's step solves A (v' - v*) = sum_c J_c' g_c(J_c v'), with A = M + h D, v* the velocity without contact and g_c the
-impulse of contact c (see `laws`). At Drake's own v' it is a smooth step under a known force
-A (v' - v*) / h, which Pinocchio differentiates (see `smooth_step`); what the impulses change is solved for:
+Drake's step solves A (v' - v*) = sum_c J_c' g_c(J_c v'), with A = M + h D, v* the velocity without impulses and g_c the
+impulse of contact c (see `laws`), of a joint's limit or of a coupler (see `joint_impulses`). At Drake's own v' it is a
+smooth step under a known force A (v' - v*) / h, which Pinocchio differentiates (see `smooth_step`); what the impulses
+change is solved for:
 
     (A + sum_c J_c' G_c J_c) dv' = A dv'|_g + sum_c d(J_c' g_c)|_v',   G_c = -dg_c / d(J_c v').
 
-That v' solves the equation is checked, in the norm and to the tolerance of Drake's solver, and that no joint limit
-acts. What is left out here, as a shape that is not known, shows there.
+That v' solves the equation is checked, in the norm and to the tolerance of Drake's solver. What is left out here, as a
+shape that is not known, shows there.
 """
 
 from dataclasses import dataclass
@@ -27,6 +28,8 @@ from drake_diff.derivatives.contact.kinematics import (
 from drake_diff.derivatives.contact.laws import Cone, HuntCrossley, HuntCrossleyImpulse, Impulse, StateChange
 from drake_diff.derivatives.contact.material import Material, MaterialChange, read_material
 from drake_diff.derivatives.contact.pairs import ContactPairs, Indices, Touches, read_pairs
+from drake_diff.derivatives.couplers import Couplers, couplers_of
+from drake_diff.derivatives.joint_impulses import JointImpulses, gather, limit_impulses
 from drake_diff.derivatives.smooth_step import Native, SmoothStep
 from drake_diff.derivatives.steps import Flags, Steps
 from drake_diff.mechanics.description import describe_tree
@@ -42,41 +45,50 @@ STICTION_TOLERANCE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class ContactForm:
-    """What of a model with contact does not change from step to step."""
+    """What of a model with contact or joint limits does not change from step to step."""
 
     pairs: ContactPairs
+    unknown: str  # why no contact of the model is known here; empty where some is
     topology: Topology
     by_body: Array  # (bodies, nv) 1 where a degree of freedom moves the body
     armature: Array  # (nv, nv) of reflected inertia and h D, a diagonal
     approximation: str
     time_step: float
     near_rigid: float
+    couplers: Couplers
 
 
 def contact_form(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
-    """Read once; else why the form describes no step of the model with contact."""
+    """Read once; else why the form describes no step of the model in which impulses act."""
     return model.cache("contact form", lambda: _read(model, smooth), of_structure=True)
 
 
 def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
     contact = model.contract.contact
-    if contact.model != "point":
-        return Refusal(f"the contact model is {contact.model}, not point")
     if smooth.form.pd:
         return Refusal("PD controllers act beside contact")
-    pairs = read_pairs(model)
-    if not pairs.ids:
-        return Refusal("no sphere may touch a sphere, box, capsule or half space")
+    couplers = couplers_of(model)
+    if isinstance(couplers, Refusal):
+        return couplers
+    pairs, unknown = read_pairs(model), ""
+    if contact.model != "point":
+        unknown = f"the contact model is {contact.model}, not point"
+    elif not pairs.ids:
+        unknown = "no sphere may touch a sphere, box, capsule or half space"
     topology = topology_of(describe_tree(model))
     labels = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
     return ContactForm(
         pairs=pairs,
+        unknown=unknown,
         topology=topology,
-        by_body=np.array([topology.bodies[labels.get(body.index(), "world")] for body in pairs.bodies]),
+        by_body=np.array([topology.bodies[labels.get(body.index(), "world")] for body in pairs.bodies]).reshape(
+            -1, model.nv
+        ),
         armature=np.diag(smooth.pinocchio.armature),
         approximation=contact.approximation,
         time_step=model.time_step,
         near_rigid=float(model.plant.get_sap_near_rigid_threshold()),
+        couplers=couplers,
     )
 
 
@@ -100,17 +112,18 @@ def place(form: ContactForm, steps: Steps) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """N steps with M contacts at Drake's own solution."""
+    """N steps with M contacts, and impulses on joints, at Drake's own solution."""
 
     native: Native
     v_next: Array  # (N, nv)
     A: Array  # (N, nv, nv)
     contacts: Contacts
     speeds: tuple[Array, Array]  # v and v' (M, nv) of each contact's state
-    diagonal: Array  # (M, nv) of A
-    diagonal_slope: Array  # (M, nv, nv)
+    diagonal: Array  # (N, nv) of A
+    diagonal_slope: Array  # (N, nv, nv)
     weight: Weight
     impulse: Impulse | HuntCrossleyImpulse
+    joints: JointImpulses
     push: Array  # (N, nv) sum_c J_c' g_c
     gained: Array  # (N, nv) A (v' - v*)
 
@@ -134,13 +147,19 @@ def contact_jacobians(
         right = np.concatenate([right, at.total(_by_material(at, change.part(at.contacts.touch.pair)))], axis=2)
     J = at.contacts.jacobian
     left = at.A - at.total(J @ at.impulse.by_velocity() @ J.swapaxes(-1, -2))
+    joints = at.joints
+    if len(joints.problem):
+        slope = joints.at(at.v_next)[1]
+        by_motion = joints.by_motion(at.v_next, at.diagonal, at.diagonal_slope, smooth.time_step)
+        right[:, :, :nv] += _sum(joints.problem, joints.direction[:, :, None] * by_motion[:, None, :], len(steps))
+        stiff = (slope[:, None] * joints.direction)[:, :, None] * joints.direction[:, None, :]
+        left += _sum(joints.problem, stiff, len(steps))
     velocities = np.asarray(np.linalg.solve(left, right), dtype=float)
     jacobians, _ = smooth.assemble(at.native, velocities, at.v_next)
     # What is missing is the impulse that Drake's solver leaves, in the norm that it ends by.
-    diagonal, momentum = np.einsum("kii->ki", at.A), (at.A @ at.v_next[..., None])[..., 0]
-    missing, had, given = (np.sqrt((p * p / diagonal).sum(axis=1)) for p in (at.gained - at.push, momentum, at.push))
-    solved = missing <= OPTIMALITY * np.maximum(had, given) + ROUNDING
-    return jacobians, solved & ~smooth.at_a_limit(steps)
+    momentum = (at.A @ at.v_next[..., None])[..., 0]
+    missing, had, given = (np.sqrt((p * p / at.diagonal).sum(axis=1)) for p in (at.gained - at.push, momentum, at.push))
+    return jacobians, missing <= OPTIMALITY * np.maximum(had, given) + ROUNDING
 
 
 def _at_the_solution(form: ContactForm, smooth: SmoothStep, steps: Steps, poses: Array, material: Material) -> Solved:
@@ -150,9 +169,16 @@ def _at_the_solution(form: ContactForm, smooth: SmoothStep, steps: Steps, poses:
     A = mass_matrix(S, inertia, form.topology) + form.armature
     contacts = _contacts(form, form.pairs.touching(poses), S, material)
     state = contacts.touch.state
-    diagonal, speeds = np.einsum("kii->ki", A)[state], (native.v[state], v_next[state])
-    weight = contacts.weight(diagonal)
+    diagonal, speeds = np.einsum("kii->ki", A), (native.v[state], v_next[state])
+    weight = contacts.weight(diagonal[state])
     impulse = _law(form, contacts, material, weight, *speeds).solve()
+    q = steps.xs[:, smooth.positions]
+    joints = limit_impulses(smooth.limits, q, native.v, v_star, diagonal, smooth.time_step)
+    if len(form.couplers.offset):
+        joints.append(form.couplers.impulses(q, diagonal, smooth.time_step))
+    on_joints = gather(joints, v_next.shape[1])
+    push = _sum(state, (contacts.jacobian @ impulse.impulse[..., None])[..., 0], len(v_next))
+    push += _sum(on_joints.problem, on_joints.direction * on_joints.at(v_next)[0][:, None], len(v_next))
     return Solved(
         native=native,
         v_next=v_next,
@@ -160,10 +186,11 @@ def _at_the_solution(form: ContactForm, smooth: SmoothStep, steps: Steps, poses:
         contacts=contacts,
         speeds=speeds,
         diagonal=diagonal,
-        diagonal_slope=diagonal_slope(S, inertia, form.topology)[state],
+        diagonal_slope=diagonal_slope(S, inertia, form.topology),
         weight=weight,
         impulse=impulse,
-        push=_sum(state, (contacts.jacobian @ impulse.impulse[..., None])[..., 0], len(v_next)),
+        joints=on_joints,
+        push=push,
         gained=(A @ (v_next - v_star)[..., None])[..., 0],
     )
 
@@ -173,7 +200,8 @@ def _by_motion(at: Solved) -> Array:
     contacts, (v, v_next) = at.contacts, at.speeds
     point, normal, phi = contacts.displacement()
     velocity = contacts.velocity_change(v_next, point)
-    weight = contacts.weight_change(at.weight, at.diagonal, at.diagonal_slope, point)
+    state = contacts.touch.state
+    weight = contacts.weight_change(at.weight, at.diagonal[state], at.diagonal_slope[state], point)
     before = np.zeros(v.shape)
     if isinstance(at.impulse, HuntCrossleyImpulse):  # the only law that knows the normal velocity before the step
         along = contacts.velocity_change(v, point) @ contacts.touch.normal[:, :, None]
@@ -187,7 +215,7 @@ def _by_material(at: Solved, change: MaterialChange) -> Array:
     contacts, touch, nothing = at.contacts, at.contacts.touch, np.zeros((*change.friction.shape, 3))
     point = -(touch.phi[:, None] * change.other_part)[..., None] * touch.normal[:, None]
     before, after = (contacts.velocity_change(v, point, moves=False) for v in at.speeds)
-    weight = contacts.weight_change(at.weight, at.diagonal, None, point)
+    weight = contacts.weight_change(at.weight, at.diagonal[touch.state], None, point)
     moved = StateChange(after, nothing, nothing[..., 0], weight, (before @ touch.normal[:, :, None])[..., 0])
     changed = np.swapaxes(at.impulse.by_material(change) + at.impulse.by_state(moved), -1, -2)
     return np.asarray(contacts.force_change(at.impulse.impulse, point, moves=False) + contacts.jacobian @ changed)
