@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from helpers.bounces import Bounce
 
-from drake_diff.motion.continuous import ContinuousMotion
-from drake_diff.motion.rodas import ImplicitSteps
+from drake_diff.motion.continuous import ContinuousMotion, ImplicitSteps
 
 
 def test_the_implicit_step_is_of_order_five_and_follows_what_is_stiff():
