@@ -4,8 +4,9 @@ The motion is integrated with error control from the contact law itself (`motion
 the steps nor with `differentiate_rollout(method="continuous")`. A slope is measured by central differences over three
 widths, 1e-2, 1e-3 and 1e-4 of a column's scale (a tenth of that where nothing touches), each with an integration as
 much more accurate as it is narrower. It exists where the two narrow ones agree to 0.1 %, and the wide one agrees as
-well or differs from them as a smooth curve does: by the square of the width, which half the wide one shows. It is
-unknown, and nothing else, where the time is up first or the integration's own error hides it.
+well or differs from them as a smooth curve does: by the square of the width, which half the wide one shows; and where
+it is the same ahead as behind. It is unknown, and nothing else, where the time is up first or the integration's own
+error hides it.
 """
 
 import time
@@ -33,6 +34,7 @@ WIDTHS = (1e-2, 1e-3, 1e-4)  # of a column's scale, to both sides
 BETWEEN = 5e-3  # a fourth, where the first is another slope than the rest
 CURVE = (WIDTHS[0] ** 2 - WIDTHS[1] ** 2) / (BETWEEN**2 - WIDTHS[1] ** 2)  # how the slopes of a smooth curve differ
 BENT = 0.1  # of that: what its next derivative may add
+SHRINKS = 0.3  # of a smooth curve's corner a tenth is left over a tenth of the width, of a real one all
 SMOOTH = 0.1  # part of the widths where nothing touches
 TOLERANCE = 1e-5  # of an integration's step, as a part of the width
 SETTLED = 1e-3  # how far apart slopes may be, of their size
@@ -42,6 +44,7 @@ CLOSE = 3e-3  # the same, for a yes
 KNOWN = 1e-2  # of a slope: the integration's own error at most
 SURE = 3.0  # times what the integration's error is found to be
 ROUNDED = 1e-15  # of a loss: its rounding
+UNKNOWN = 1e6  # of its size: what would have been noticed where nothing is measured
 SECONDS = 10.0  # of work
 FORMULAS = {KELVIN_VOIGT: "k (x + tau x')+", HUNT_CROSSLEY: "k x (1 + d x')+"}
 
@@ -59,6 +62,7 @@ class TrueSlope(ShowsItsRepr):
     ours: float
     widths: tuple[float, ...] = ()  # to both sides, in the column's unit
     slopes: tuple[float, ...] = ()  # over them
+    corners: tuple[float, ...] = ()  # the slope ahead less the slope behind, over them
     value: float = float("nan")
     error: float = float("nan")
     exists: bool | None = None
@@ -171,6 +175,7 @@ class _Measurement:
     seconds: float
     deadline: float = field(init=False)
     touches: bool = False
+    losses: list[float] = field(default_factory=list)  # here: one for each of the widths, and one that is better
 
     def __post_init__(self) -> None:
         self.deadline = time.monotonic() + self.seconds
@@ -178,7 +183,7 @@ class _Measurement:
     def truth(self) -> Truth:
         with applied(self.moved.vector) as model:
             law = ContinuousMotion(model).law
-        losses: list[float] = []
+        losses = self.losses
         with suppress(TimeoutError):  # every slope says so below
             losses.extend(self._losses())
         order = sorted(self.lines, key=lambda x: -abs(self._ours(x)) * x.scale)
@@ -244,11 +249,12 @@ class _Measurement:
             yield self._loss(still, TOLERANCE * width)
         yield self._loss(still, TOLERANCE * self._widths()[-1] / 10)
 
-    def _slope(self, line: _Line, width: float, law: str | None = None) -> float:
-        """Over `width` times the scale to both sides."""
+    def _slope(self, line: _Line, width: float, law: str | None = None) -> tuple[float, float]:
+        """Over `width` times the scale to both sides; and by how much it is another one ahead than behind."""
         w = width * line.scale
-        ends = [self._loss(s * w * line.vector, TOLERANCE * width, law) for s in (1, -1)]
-        return (ends[0] - ends[1]) / (2 * w)
+        ahead, behind = (self._loss(s * w * line.vector, TOLERANCE * width, law) for s in (1, -1))
+        nearest = int(np.argmin(np.abs(np.log(np.array(self._widths()) / width))))
+        return (ahead - behind) / (2 * w), (ahead - 2 * self.losses[nearest] + behind) / w
 
     def _measured(self, line: _Line) -> TrueSlope:
         """The slopes along a line, from wide to narrow; not judged."""
@@ -257,15 +263,16 @@ class _Measurement:
         if widths[0] * line.scale > line.room:
             return replace(found, reason=f"not measured: moved by {widths[0] * line.scale:.2g} it is cut off")
         try:
-            slopes = [self._slope(line, w) for w in widths]
-            if not abs(slopes[0] - slopes[1]) <= SETTLED * max(map(abs, slopes)):
+            over = [self._slope(line, w) for w in widths]
+            if not abs(over[0][0] - over[1][0]) <= SETTLED * max(abs(slope) for slope, _ in over):
                 widths.insert(1, widths[0] * BETWEEN / WIDTHS[0])
-                slopes.insert(1, self._slope(line, widths[1]))
+                over.insert(1, self._slope(line, widths[1]))
         except TimeoutError:
             return replace(found, reason=self._beyond())
         except DrakeDiffError as error:
             return replace(found, reason=f"not measured: a little away there is no motion: {error}")
-        return replace(found, widths=tuple(w * line.scale for w in widths), slopes=tuple(slopes))
+        slopes, corners = zip(*over, strict=True)
+        return replace(found, widths=tuple(w * line.scale for w in widths), slopes=slopes, corners=corners)
 
     def _beside_other_law(self, found: Truth) -> Truth:
         """With what Drake's continuous plant would do, which has Hunt and Crossley's law whatever the steps have."""
@@ -281,7 +288,7 @@ class _Measurement:
             if not one.exists:
                 continue
             try:
-                slopes[i] = replace(one, by_other_law=self._slope(line, WIDTHS[1], HUNT_CROSSLEY) - one.value)
+                slopes[i] = replace(one, by_other_law=self._slope(line, WIDTHS[1], HUNT_CROSSLEY)[0] - one.value)
             except (TimeoutError, DrakeDiffError):
                 break  # NaN: not measured
         return replace(found, slopes=tuple(slopes), by_other_law=loss - found.loss)
@@ -300,6 +307,10 @@ def judged(one: TrueSlope, noise: Array, least: float) -> TrueSlope:
     narrows = abs(narrow - middle) <= SETTLED * size + hidden[1] + hidden[2]
     gap, slack = wide - middle, SETTLED * size + hidden[0] + hidden[1]
     bends = bool(between) and abs(gap - CURVE * (between[0] - middle)) <= BENT * abs(gap) + CURVE * slack
+    corner, before = abs(one.corners[-1]), abs(one.corners[-2])
+    if corner > SETTLED * size + 4 * hidden[2] and corner > SHRINKS * before:
+        ahead, behind = (narrow + s * one.corners[-1] / 2 for s in (1, -1))
+        return replace(found, exists=False, reason=f"it has a corner here, {ahead:.4g} ahead and {behind:.4g} behind")
     if narrows and (abs(gap) <= slack or bends):
         return replace(found, exists=True, value=narrow, error=abs(narrow - middle) + hidden[2])
     return replace(found, exists=False, reason="the slopes do not settle")
@@ -312,6 +323,7 @@ def by_truth(truth: Truth, subject: str) -> dict[str, Any]:
         np.array([getattr(one, name) for one in slopes], dtype=float).reshape(shape)
         for name in ("ours", "value", "error", "size")
     )
+    size = np.maximum(size, TINY)
     known = np.array([bool(one.exists) for one in slopes]).reshape(shape)
     gap, tolerance = np.abs(ours - value), CLOSE * size + error
     codes = np.full(shape, VERDICTS.index("undecided"))
@@ -321,11 +333,11 @@ def by_truth(truth: Truth, subject: str) -> dict[str, Any]:
     for j, one in enumerate(slopes):
         if one.exists is False:
             codes[0, j], reasons[0, j] = VERDICTS.index("discontinuous"), repr(one)
+    unknown = UNKNOWN * size
     return {
         "rows": ("loss",), "columns": tuple(one.column for one in slopes), "derivative": frozen(ours),
-        "difference": frozen(np.where(known, value, np.nan)), "tolerance": frozen(np.where(known, tolerance, np.inf)),
-        "noticeable": frozen(np.where(known, gap + tolerance, np.inf)), "size": frozen(np.maximum(size, TINY)),
-        "codes": codes, "reasons": reasons, "method": CONTINUOUS, "subject": subject, "around": None,
-        "scale": frozen(np.ones(len(slopes))), "stopped": 0.0, "second": None,
-        "told": "differences are of another integration of the same motion",
+        "difference": frozen(np.where(known, value, np.nan)), "tolerance": frozen(np.where(known, tolerance, unknown)),
+        "noticeable": frozen(np.where(known, gap + tolerance, unknown)), "size": frozen(size), "codes": codes,
+        "reasons": reasons, "method": CONTINUOUS, "subject": subject, "around": None, "stopped": 0.0, "second": None,
+        "scale": frozen(np.ones(len(slopes))), "told": "differences are of another integration of the same motion",
     }  # fmt: skip

@@ -12,8 +12,8 @@ these formulas: of Drake it takes the mass matrix, the forces without contact an
 of a discrete step.
 
 In the air steps are explicit. What touches is stiff, as friction that holds is a damper of mu f / v_s: steps there are
-linearly implicit, of `rosenbrock`. Where two geometries touch or let go the force has a corner, and that of Kelvin and Voigt
-jumps by k tau x': a step ends there, and no pair pushes within a step that did not at its start.
+linearly implicit, of `rosenbrock`. Where two geometries touch or let go the force has a corner, and that of Kelvin and
+Voigt jumps by k tau x': a step ends there, and no pair pushes within a step that did not at its start.
 """
 
 import time
@@ -42,7 +42,7 @@ SLIP = 1e-3
 NUDGE = 1e-9  # of a state's entries, which the slopes of the rates are differences over: a millionth of v_s
 SHORTEST = 1e-14  # [s] a step that is shorter does not move time
 ROOT = 1e-13  # [s] how near to a touch, or to the end of one, the step before it ends
-LOOKS = tuple(i / 8 for i in range(1, 9))  # of a step in the air: where it is looked at for what touches
+LOOK, LOOKS = 1e-3, 8  # [s] how often a step in the air is looked at for what touches, and how many times at most
 KELVIN_VOIGT, HUNT_CROSSLEY = "Kelvin-Voigt", "Hunt-Crossley"  # the laws of contact
 DAMPING = {KELVIN_VOIGT: "relaxation_time", HUNT_CROSSLEY: "dissipation"}  # the quantity each needs beside stiffness
 Rates = Callable[[Array], Array]
@@ -264,8 +264,10 @@ class ContinuousMotion:
             return step, ahead, pushing
         low, high, now = 0.0, step, self.pushing(ahead)
         if isinstance(steps, ExplicitSteps):
-            seen = next((part for part in LOOKS if self.pushing(steps.within(part, ahead))), 1.0)
-            low, high = (seen - LOOKS[0]) * step, seen * step
+            looks = min(LOOKS, 1 + int(step / LOOK))
+            parts = (i / looks for i in range(1, looks))
+            seen = next((part for part in parts if self.pushing(steps.within(part, ahead))), 1.0)
+            low, high = (seen - 1 / looks) * step, seen * step
             if seen < 1:
                 ahead, _ = steps.take(high)
                 now = self.pushing(ahead)
