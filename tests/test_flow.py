@@ -8,7 +8,7 @@ from helpers.bounces import Bounce
 from helpers.models import Plant, contact_properties
 from helpers.robots import example_robot, state_in_contact
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.geometry import Box, Cylinder, HalfSpace, Sphere
+from pydrake.geometry import Box, Capsule, Cylinder, HalfSpace, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import SpatialInertia
@@ -17,12 +17,14 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
 
 import drake_diff as dd
-from drake_diff.exceptions import GradientWarning, ModelError, SimulationError
+from drake_diff.exceptions import GradientError, GradientWarning, ModelError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
+from drake_diff.model.parameters import select
+from drake_diff.motion import rosenbrock
 from drake_diff.motion.continuous import ContinuousMotion
-from drake_diff.motion.flow import rosenbrock
-from drake_diff.motion.flow.integrate import pushing_of
+from drake_diff.motion.flow.integrate import Integrator, pushing_of
 from drake_diff.motion.flow.plant import flow_plant, material_of, numbers_of
+from drake_diff.motion.flow.steps import FlowSteps
 
 
 def ball_on_rails(*, stiffness, dissipation=0.0, friction=0.0, gravity=0.0, approximation="lagged", relaxation=0.0):
@@ -403,3 +405,57 @@ def test_a_limit_that_is_passed_within_an_interval_is_seen():
     model = dd.load_model("models/cart_pole.urdf", time_step=0.4)
     with pytest.raises(SimulationError, match="slide_x reaches a joint limit"):
         dd.differentiate_rollout(model, [1.99, 0, 0.5, 0], [[-5.0]], lambda x: x[0], method="continuous")
+
+
+def along(model, x0, count, tolerance=1e-9):
+    """(nx,) where a flow ends, and its derivative by the start."""
+    steps = FlowSteps(model, select(model, ()), tolerance)
+    xs, _, flow = steps.roll(np.array(x0, dtype=float), lambda x, k: np.zeros(model.nu), count)
+    found = np.eye(model.nx)
+    for step in steps.derivatives(flow):
+        found = step.A @ found
+    return xs[-1], found
+
+
+def ball_at(shape, *, stiffness, radius=0.02, time_step=0.05, gravity=9.81, dissipation=0.1, friction=0.3):
+    """A ball on rails along x and z at a shape that stands still at the origin."""
+    plant = Plant(time_step, "lagged", gravity=gravity)
+    properties = contact_properties(2 * stiffness, dissipation, friction)
+    plant.ball("ball", 1.0, radius, properties, "x", "z")
+    plant.shape(plant.plant.world_body(), shape, properties)
+    return plant.model()
+
+
+@pytest.mark.parametrize(
+    "shape", [Capsule(0.1, 0.2), Box(0.2, 1, 0.2), Cylinder(0.1, 0.2)], ids=lambda s: type(s).__name__
+)
+def test_a_ball_that_rolls_over_an_edge_has_the_slopes_of_differences(shape):
+    """Where it passes from a face to the edge its normal begins to turn: a step ends there."""
+    model = ball_at(shape, stiffness=1e3)
+    x0 = [0.115, 0.12, -0.2, 0.0] if isinstance(shape, Capsule) else [-0.115, 0.15, 0.3, 0.0]
+    _, found = along(model, x0, 8)
+    w = 1e-5
+    ends = [[along(model, x0 + s * w * e, 8, 1e-11)[0] for s in (1, -1)] for e in np.eye(4)]
+    wanted = np.column_stack([(a - b) / (2 * w) for a, b in ends])
+    assert np.max(np.abs(found - wanted)) < 5e-5 * np.max(np.abs(found))
+
+
+def test_a_ball_that_goes_through_the_middle_of_a_shape_has_no_derivative():
+    """Its push turns round at once where its centre is in the middle of a soft box."""
+    model = ball_at(Box(0.1, 1, 0.1), stiffness=50, gravity=0.0)
+    with pytest.raises(
+        GradientError, match=r"ball and .* overlap so deep that they push each other out by another way"
+    ):
+        along(model, [-0.2, 0.01, 5.0, 0.0], 4)
+    stiff = ball_at(Box(0.1, 1, 0.1), stiffness=5e4, gravity=0.0)
+    assert np.all(np.isfinite(along(stiff, [-0.2, 0.01, 5.0, 0.0], 4)[1]))
+
+
+def test_a_flow_that_takes_too_long_says_how_far_it_came():
+    model = ball_on_rails(stiffness=1e6, friction=1.0, gravity=9.81)
+    plant = flow_plant(model)
+    integrator = Integrator(plant, numbers_of(plant, material_of(plant)))
+    flow = integrator.begin(np.array([0, 0.1, 1.0, 0]))
+    integrator.advance(flow, np.zeros(0), 0.01)
+    with pytest.raises(SimulationError, match=r"too stiff: 0 s of work reached 0\.01 s by \d+ steps, not 0\.02 s"):
+        integrator.advance(flow, np.zeros(0), 0.01, budget=0.0)

@@ -2,7 +2,8 @@
 
 Between two events the modes are fixed and the equations smooth, so that the method keeps its order, and so does the
 derivative of what it does. A switch that turns twice within a step has turned at neither end of it: where it comes
-nearer to 0 at the start and goes away from it at the end, what is between them is looked at.
+nearer to 0 at the start and goes away from it at the end, what is between them is looked at. A step ends, too, where a
+sphere passes from a face of a shape to its edge: how the normal turns jumps there.
 """
 
 import time
@@ -22,6 +23,7 @@ BUDGET = 30.0  # [s] of wall time
 ROOT = 1e-13  # of a step: how near to its event it ends
 SHORTEST = 1e-14  # [s] a step that is shorter does not move time
 BEYOND = 1e-4  # of the way to where a switch is expected to be 0: how far beyond it the next look is
+EDGE = 1e-9  # [m] a body that moves along an edge passes it all the time by less
 SHALLOW = 1e-13  # [m] overlap that begins and ends within a step and is not looked for
 
 
@@ -47,12 +49,13 @@ class Flow:
     modes: list[Array] = field(default_factory=list)
     events: list[FlowEvent] = field(default_factory=list)
     ends: list[int] = field(default_factory=list)  # after how many steps each interval of the inputs ended
+    deep: list[int] = field(default_factory=list)  # steps at whose end a sphere's centre is within another shape
     tried: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class _Switches:
-    """(2 P,) of the switches and their rates."""
+    """(2 P + edges,) of what is watched, and its rates."""
 
     values: Array
     rates: Array
@@ -62,16 +65,17 @@ class Integrator:
     """The flow of a plant from a state, with contacts of given materials."""
 
     def __init__(self, plant: FlowPlant, materials: Array, tolerance: float = TOLERANCE):
-        model, count = plant.model, 2 * plant.num_pairs
+        model, self.count = plant.model, 2 * plant.num_pairs
+        watched = self.count + len(plant.edge_pairs)
         self.plant, self.tolerance, self.materials = plant, tolerance, np.array(materials, dtype=float)
         self.stepper = Stepper(plant, self.materials)
         self.h_next, self.began = model.time_step, 0.0
-        self.modes = np.zeros(count)
-        self._start = _Switches(np.zeros(count), np.zeros(count))  # where the step begins
+        self.modes = np.zeros(self.count)
+        self._start = _Switches(np.zeros(watched), np.zeros(watched))  # where the step begins
         self._x, self._rates = np.zeros(model.nx), np.zeros(model.nx)
-        self._values, self._changes = np.zeros(count), np.zeros(count)
+        self._values, self._changes = np.zeros(watched), np.zeros(watched)
         arguments = self._x, self.stepper.u, self.materials, self._rates
-        self._buffer, self._run = on_arrays(plant.moving_switches, arguments, (self._values, self._changes))
+        self._buffer, self._run = on_arrays(plant.watched, arguments, (self._values, self._changes))
 
     def begin(self, x0: Array) -> Flow:
         """A flow that stands at `x0` (nx,)."""
@@ -144,8 +148,14 @@ class Integrator:
         return matters
 
     def _turned(self, end: _Switches) -> Indices:
-        """The switches that differ from the modes at the step's end."""
-        return np.flatnonzero(((end.values > 0) != (self.modes > 0.5)) & self._matters())
+        """The switches that differ from the modes at the step's end, and the edges that a pair that pushes passed."""
+        n, values, was = self.count, end.values, self._start.values
+        turned = np.flatnonzero(((values[:n] > 0) != (self.modes > 0.5)) & self._matters())
+        if not len(self.plant.edge_pairs):
+            return turned
+        pushes = (self.modes[::2] * self.modes[1::2])[self.plant.edge_pairs] > 0.5
+        passed = ((values[n:] > 0) != (was[n:] > 0)) & (np.abs(values[n:] - was[n:]) > EDGE)
+        return np.concatenate([turned, n + np.flatnonzero(pushes & passed)])
 
     def _find(self, length: float, end: _Switches) -> tuple[float, _Switches]:
         """The length of the step at whose end the first of the switches that turned is 0, just past it."""
@@ -165,7 +175,8 @@ class Integrator:
     def _dip(self, length: float, end: _Switches) -> tuple[float, _Switches] | None:
         """The length of a step within this one at whose end a switch has turned that is back at its end, or None."""
         side = np.where(self.modes > 0.5, 1.0, -1.0)
-        falls = self._matters() & (side * end.values > 0) & (side * self._start.rates < 0) & (side * end.rates > 0)
+        now, before, after = (a[: self.count] for a in (end.values, self._start.rates, end.rates))
+        falls = self._matters() & (side * now > 0) & (side * before < 0) & (side * after > 0)
         looked = False
         for i in np.flatnonzero(falls).tolist():
             low, high, first, last = 0.0, length, self._start, end
@@ -192,6 +203,8 @@ class Integrator:
         self.stepper.accept(length)
         found.xs.append(self.stepper.x.copy())
         self.plant.check(self.stepper.x)
+        if np.any(end.values[: self.count : 2] > self.plant.pairs.radius):
+            found.deep.append(len(found.hs) - 1)
         self._start = end
         self._settle(found)
 
@@ -203,7 +216,7 @@ class Integrator:
 
     def _settle(self, found: Flow) -> None:
         """Set the modes to what the switches say at the state, and note what turns; of a pair apart nothing pushes."""
-        on, modes = self._start.values > 0, self.modes.copy()
+        on, modes = self._start.values[: self.count] > 0, self.modes.copy()
         if np.array_equal(on, modes > 0.5):
             return
         for i in range(self.plant.num_pairs):

@@ -23,17 +23,18 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.derivatives.contact.material import QUANTITIES, Material, MaterialChange, combine
 from drake_diff.derivatives.contact.pairs import ContactPairs, read_pairs
-from drake_diff.exceptions import ModelError, SimulationError
+from drake_diff.exceptions import GradientError, ModelError, SimulationError
 from drake_diff.mechanics.description import describe
 from drake_diff.model.model import Model
 from drake_diff.model.plant import proximity_property
 from drake_diff.model.step import set_state
 from drake_diff.motion.dormand_prince import ERROR, STAGES
-from drake_diff.motion.flow.shapes import distance_of
+from drake_diff.motion.flow.shapes import distance_of, edges_of
 from drake_diff.motion.flow.tree import Tree
 
 STICTION_SPEED = 1e-3  # v_s [m/s], Drake's default in continuous time
 MOST_PARTS = 200  # sets of contacts whose equations are kept
+SAME_WAY = 0.5  # the cosine of a normal's turn within a step: a step's error keeps it near 1 where it does not jump
 TINY = 1e-24  # [m^2/s^2] keeps the length of a slip of 0 differentiable
 
 
@@ -51,7 +52,7 @@ class FlowPlant:
     """A model's motion in continuous time; ModelError, which says why, where it has none.
 
     `switches` (x, u, materials) -> (2 P,) are of each of P pairs -phi, above 0 where it overlaps, and the bracket;
-    `moving_switches` (x, u, materials, x') -> those and their rates.
+    `watched` (x, u, materials, x') -> those, edges of the shapes of `edge_pairs`, and the rates of all.
     """
 
     def __init__(self, model: Model):
@@ -77,12 +78,15 @@ class FlowPlant:
         ]
         switches = ca.vertcat(*[ca.vertcat(t.depth, t.bracket) for t in self.touches]) if count else ca.SX(0, 1)
         ahead = ca.SX.sym("rates", model.nx)
-        both = [ca.densify(switches), ca.densify(ca.jtimes(switches, self.x, ahead))]
+        self.edge_pairs = np.array([i for i, t in enumerate(self.touches) for _ in t.edges], dtype=int)
+        watched = ca.vertcat(switches, *[edge for t in self.touches for edge in t.edges])
+        both = [ca.densify(watched), ca.densify(ca.jtimes(watched, self.x, ahead))]
         self.switches = self._function("switches", switches)
-        self.moving_switches = ca.Function("moving_switches", [self.x, self.u, self.materials, ahead], both)
+        self.watched = ca.Function("watched", [self.x, self.u, self.materials, ahead], both)
         self._switches = switches
         self._switch_slopes: dict[int, Any] = {}
         self._parts: dict[tuple[int, ...], FlowPart] = {}
+        self._normals: Any = None
 
     @property
     def num_pairs(self) -> int:
@@ -94,6 +98,20 @@ class FlowPlant:
             by = ca.vertcat(self.x, self.u, self.materials)
             self._switch_slopes[switch] = self._function("switch_slope", ca.jacobian(self._switches[switch], by))
         return self._switch_slopes[switch]
+
+    def check_normals(self, before: Array, after: Array, pushing: tuple[int, ...]) -> None:
+        """GradientError where the normal of one of the pairs `pushing` jumps between two states (nx,)."""
+        if self._normals is None:
+            normals = ca.horzcat(*[t.normal for t in self.touches])
+            self._normals = ca.Function("normals", [self.x], [ca.densify(normals)])
+        ends = [np.asarray(self._normals(x))[:, list(pushing)] for x in (before, after)]
+        for i in np.flatnonzero(np.sum(ends[0] * ends[1], axis=0) < SAME_WAY):
+            inspector = self.model.double.inspector
+            names = " and ".join(inspector.GetName(j) for j in self.pairs.ids[pushing[i]])
+            raise GradientError(
+                f"{names} overlap so deep that they push each other out by another way: the derivative of that motion "
+                "is not known here; stiffer contact does not let them"
+            )
 
     def check(self, x: Array) -> None:
         """SimulationError where shapes overlap at `x` (nx,) that are no pair here."""
@@ -189,6 +207,7 @@ class _Touch:
     normal: Any  # (3,) from the other shape to the sphere
     push: Any  # (3,) [N] on the sphere where it pushes
     speed: Any  # [m/s] of the slip
+    edges: list[Any]  # [m] where the nearest face of the other shape becomes another one
 
 
 def _touch(tree: Tree, pairs: ContactPairs, i: int, material: Any, is_sap: bool) -> _Touch:
@@ -198,7 +217,8 @@ def _touch(tree: Tree, pairs: ContactPairs, i: int, material: Any, is_sap: bool)
     center = p + R @ ca.DM(pairs.center[i])
     R, p, moves_other = tree.body(pairs.bodies[pairs.other_body[i]].index())
     turn, origin = R @ ca.DM(pairs.rotation[i]), p + R @ ca.DM(pairs.position[i])
-    distance, normal = distance_of(pairs, i, turn.T @ (center - origin))
+    local = turn.T @ (center - origin)
+    distance, normal = distance_of(pairs, i, local)
     normal, phi = turn @ normal, distance - pairs.radius[i]
     point = center - (pairs.radius[i] + part * phi) * normal
     J = ca.SX.zeros(3, tree.nv)
@@ -214,7 +234,7 @@ def _touch(tree: Tree, pairs: ContactPairs, i: int, material: Any, is_sap: bool)
     bracket = -phi + damping * rate if is_sap else 1 + damping * rate
     push = k * bracket if is_sap else -k * phi * bracket
     on_sphere = push * (normal - drag * slip)
-    return _Touch(-phi, bracket, J.T @ on_sphere, point, normal, on_sphere, speed)
+    return _Touch(-phi, bracket, J.T @ on_sphere, point, normal, on_sphere, speed, edges_of(pairs, i, local))
 
 
 def _step_function(rates: Any) -> Any:

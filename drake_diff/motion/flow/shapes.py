@@ -26,6 +26,21 @@ def distance_of(pairs: ContactPairs, i: int, local: Any) -> tuple[Any, Any]:
     return distance - pairs.rounding[i], gradient
 
 
+def edges_of(pairs: ContactPairs, i: int, local: Any) -> list[Any]:
+    """Where the nearest point of the other shape goes from one of its faces to the next, how the normal turns jumps.
+
+    Each is above 0 beyond a face, at `local` (3,) as in `distance_of`.
+    """
+    lower, upper = pairs.lower[i], pairs.upper[i]
+    if np.isinf(lower).any():
+        return []
+    if pairs.is_round[i]:
+        half = float(upper[2])
+        return [ca.sqrt(ca.sumsqr(local[:2]) + TINY) - float(upper[0]), local[2] - half, -half - local[2]]
+    wide = np.flatnonzero(upper > lower).tolist()
+    return [side for j in wide for side in (local[j] - float(upper[j]), float(lower[j]) - local[j])]
+
+
 def _from_box(local: Any, lower: Array, upper: Array) -> tuple[Any, Any]:
     outside = local - ca.fmin(ca.fmax(local, ca.DM(lower)), ca.DM(upper))
     ways = ca.vertcat(ca.DM(upper) - local, local - ca.DM(lower))

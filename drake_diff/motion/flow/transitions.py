@@ -59,6 +59,8 @@ def transitions(plant: FlowPlant, flow: Flow, materials: Array, by_parameters: A
         for first in range(0, len(chosen), AT_ONCE):
             rows = np.array(chosen[first : first + AT_ONCE])
             found[rows] = _changes(slopes, xs[rows], xs[rows + 1], us[rows], hs[rows])
+    for m in flow.deep:
+        plant.check_normals(xs[m], xs[m + 1], pushing_of(flow.modes[m]))
     modes_now: dict[int, Array] = {}
     for event in flow.events:
         if event.step:  # one that it begins with is none on the way
