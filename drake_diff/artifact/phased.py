@@ -10,6 +10,7 @@ import numpy as np
 from drake_diff.optimize.phased import Chain, PhasedSolution
 from drake_diff.optimize.problem.held import Impact
 from drake_diff.optimize.problem.phases import PhasedProblem, Switch
+from drake_diff.optimize.problem.rigid import RigidReset
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.parts import ModelInput
@@ -18,10 +19,14 @@ from drake_diff.record.provenance import gradient_evidence, provenance_of, writt
 from drake_diff.record.sealed import Passed, WallClock
 from drake_diff.record.solve import Claim, EvidenceRecord, Solver
 
-LIMITATIONS = [
-    "of the model in simulation only: nothing here was measured on a robot",
-    "resets happen at the times of the plan, also in the chain of all phases: an event that comes early is not tried",
-]
+LIMITATIONS = ["of the model in simulation only: nothing here was measured on a robot"]
+AT_THEIR_TIMES = (
+    "resets happen at the times of the plan, also in the chain of all phases: an event that comes early is not tried"
+)
+WHERE_GAPS_CLOSE = (
+    "rigid impacts come where their own gaps close, also in the chain of all phases: other contacts on the way are not "
+    "tried"
+)
 
 
 def directory_of(i: int) -> str:
@@ -61,6 +66,8 @@ def phases_record(folder: Path, problem: PhasedProblem, verdict: Passed, sentenc
 def _asked(problem: PhasedProblem) -> dict[str, Any]:
     names = ", then ".join(problem.names)
     repeated = " and again from the start" if problem.periodic is not False else ""
+    rigid = [isinstance(switch.reset, RigidReset) for switch in problem.switches]
+    limitations = [*LIMITATIONS, *([] if all(rigid) else [AT_THEIR_TIMES]), *([WHERE_GAPS_CLOSE] if any(rigid) else [])]
     statement = (
         f"{problem.name} in {len(problem.phases)} phases ({names}{repeated}), linked by resets, each as its record"
     )
@@ -68,7 +75,7 @@ def _asked(problem: PhasedProblem) -> dict[str, Any]:
         "model": ModelInput(file=None, options=None),  # each phase has its own
         "provenance": provenance_of(),
         "wall_clock": WallClock(written_utc=written_now()),
-        "claim": Claim(statement=f"{statement} says", limitations=LIMITATIONS),
+        "claim": Claim(statement=f"{statement} says", limitations=limitations),
         "horizon_s": None if problem.horizon is None else list(problem.horizon),
         "counts_steps": problem.is_map,
     }
@@ -132,7 +139,7 @@ def _reset(switch: Switch, problem: PhasedProblem) -> dict[str, Any] | None:
     held = problem.phases[switch.after].system
     if isinstance(switch.reset, Impact) and switch.reset.held is held:
         return {"impact": {}}
-    return None
+    return {"rigid": switch.reset.to_dict()} if isinstance(switch.reset, RigidReset) else None
 
 
 def chain_evidence(chain: Chain) -> ChainEvidence:

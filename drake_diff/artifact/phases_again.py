@@ -1,7 +1,7 @@
 """What in the directory of a solve in phases does not come out when it is made again.
 
-Phases of models without user's functions, linked by nothing, matrices and impacts, are solved again as one problem. A
-user's function is in no artifact: then what the numbers say of each other is checked alone.
+Phases of models without user's functions, linked by nothing, matrices and impacts of both kinds, are solved again as
+one problem. A user's function is in no artifact: then what the numbers say of each other is checked alone.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,6 +20,7 @@ from drake_diff.exceptions import ArtifactError, DrakeDiffError, ModelError
 from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.held import HeldContacts
 from drake_diff.optimize.problem.phases import PhasedProblem
+from drake_diff.optimize.problem.rigid import RigidReset
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
@@ -133,7 +134,7 @@ def _check_links(found: PhasesAgain, record: PhasesRecord, plans: list[dict[str,
     for i, link in enumerate(record.links):
         before, after = plans[link.before]["xs"][-1], plans[link.after]["xs"][0]
         reset = link.reset or {}
-        if "impact" in reset:
+        if "impact" in reset or "rigid" in reset:
             continue  # with the model: see `_solve_again`
         if not reset:
             found.undecided.append(
@@ -214,6 +215,13 @@ def _problem_of(record: PhasesRecord, solutions: list[Solution]) -> PhasedProble
             if not isinstance(system, HeldContacts):
                 raise ArtifactError(f"{record.FILE}: an impact into phase {link.after}, which holds no points")
             resets.append(system.impact)
+        elif "rigid" in reset:
+            before = solutions[link.before].problem.system
+            model: Any = before.model if isinstance(before, HeldContacts) else before
+            try:
+                resets.append(RigidReset.from_dict(reset["rigid"], model))
+            except DrakeDiffError as error:
+                raise ArtifactError(f"{record.FILE}: its rigid impact cannot be rebuilt: {error}") from error
         else:
             resets.append(None if "identity" in reset else np.array(reset["matrix"]["rows"], dtype=float))
     closing: Any = False

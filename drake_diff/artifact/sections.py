@@ -24,6 +24,7 @@ from drake_diff.optimize.problem.held import QUANTITIES, HeldContacts, HeldQuant
 from drake_diff.optimize.problem.obstacles import BoxObstacle, SelfCollision, SphereObstacle
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.rates import InputRate, Jerk
+from drake_diff.optimize.problem.rigid import RIGID_QUANTITIES, RigidQuantity, rigid_quantity
 from drake_diff.optimize.problem.terminal import TerminalSet
 from drake_diff.optimize.problem.timed import SumOfCosts, TrackingCost
 from drake_diff.optimize.solution import Solution
@@ -297,7 +298,8 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
 
 def _quantity(function: Any) -> dict[str, Any] | None:
     """What made a constraint's function; None of a user's own."""
-    return function.to_dict() if isinstance(function, HeldQuantity) else description_of(function)
+    is_told = isinstance(function, (HeldQuantity, RigidQuantity))
+    return function.to_dict() if is_told else description_of(function)
 
 
 def finite_list(values: Any) -> list[float | None]:
@@ -383,13 +385,14 @@ def rebuild_problem(record: EvidenceRecord, model: Model, us: Array, start_us: A
 
 
 def _rebuild_constraint(c: dict[str, Any], system: Model | HeldContacts) -> Constraint:
-    told = c["quantity"]
-    if isinstance(system, Model):
-        function: Any = made_from(system, told)
+    told, model = c["quantity"], system if isinstance(system, Model) else system.plant.model
+    kind = next(iter(told))
+    if kind in RIGID_QUANTITIES:
+        function: Any = rigid_quantity(model, told)
+    elif kind in QUANTITIES and isinstance(system, HeldContacts):
+        function = held_quantity(system, told)
     else:
-        function = (
-            held_quantity(system, told) if next(iter(told)) in QUANTITIES else made_from(system.plant.model, told)
-        )
+        function = made_from(model, told)
     lower, upper = (_numbers(c[side], gap) for side, gap in GAPS.items())
     knots = None if c["every_knot"] else c["knots"]
     return Constraint(function, lower=lower, upper=upper, knots=knots, name=c["name"])

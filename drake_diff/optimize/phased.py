@@ -1,7 +1,8 @@
 """Problems in phases: solved as one program, each phase judged as a solution, and their links and their chain as well.
 
 A chain is the motion that the dynamics make from the first state of all, through the resets at the times of the plan,
-open loop or under TVLQR whose cost to go is led back through the resets too.
+open loop or under TVLQR whose cost to go is led back through the resets too. A `RigidReset` comes where its gap closes,
+by the law of impact itself, and the cost to go is led back through its saltation matrix.
 """
 
 import time
@@ -19,8 +20,9 @@ from drake_diff.exceptions import GradientError, InputError, SimulationError, Un
 from drake_diff.optimize.certified import certify_equations
 from drake_diff.optimize.guess import Guess, another_guess, first_guess, sampled
 from drake_diff.optimize.judge import judged, may_be_too_coarse, status_of
-from drake_diff.optimize.problem.phases import PhasedProblem
+from drake_diff.optimize.problem.phases import PhasedProblem, Switch
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.problem.rigid import RigidReset
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE, Iteration, Limits, NlpResult, Report
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Search, Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
@@ -37,6 +39,8 @@ from drake_diff.optimize.transcription.task import MAP, SCHEMES, default_scheme
 OTHER_GUESSES = 8  # where no motion is found from the first
 FINER_ROUNDS = 6  # of meshes whose plan does not hold
 NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
+LATE = 0.1  # of a phase's time: so long after it an impact is waited for
+HALVES = 50  # of a step in which a gap closes
 PLANS = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
 
 
@@ -163,17 +167,27 @@ def _led_through(solution: PhasedSolution, motions: Sequence[Collocated], contro
     x, worst, where = np.asarray(motions[0].xs[0]), -1.0, ""
     for i, (name, motion) in enumerate(zip(problem.names, motions, strict=True)):
         b, ranges, names = motion.task.bounds, motion.task.problem.ranges(motion.xs), motion.task.dynamics.state_names
-        xs = motion.led_from(x, gains[i])
+        xs, wanted = motion.led_from(x, gains[i]), motion.xs
+        switch = next((s for s in problem.switches if s.before == i), None)
+        impact = None if switch is None or not isinstance(switch.reset, RigidReset) else switch.reset
+        if impact is not None:
+            late = _until_it_touches(motion, xs, gains[i], impact)
+            if late is None:
+                return float("inf"), f"{', '.join(impact.contacts)} do not touch at the end of {name}"
+            xs, wanted = late, np.vstack([wanted[: (len(late) - 2) // SUBSTEPS + 1], wanted[-1:]])
         beyond = np.max(np.maximum(np.maximum(b.x_lower - xs, xs - b.x_upper), 0.0)[1:], axis=0)
-        apart = np.max(np.abs(xs[::SUBSTEPS] - motion.xs), axis=0)
+        at_knots = xs[::SUBSTEPS] if impact is None else np.vstack([xs[:-1:SUBSTEPS][: len(wanted) - 1], xs[-1:]])
+        apart = np.max(np.abs(at_knots - wanted), axis=0)
         found = [(f"at most {{:.2g}} from the plan in {name}", apart), (f"{{:.2g}} beyond its bound in {name}", beyond)]
-        for switch in problem.switches:
-            if switch.before == i:
-                with np.errstate(all="ignore"):
-                    x = switch(xs[-1])
-                if switch.after == 0:
-                    found.append((f"{{:.2g}} from its first value after {name}", np.abs(x - motions[0].xs[0])))
-                    ranges = np.concatenate([ranges, motions[0].task.problem.ranges(motions[0].xs)])
+        if switch is not None:
+            with np.errstate(all="ignore"):
+                try:
+                    x = switch(xs[-1]) if impact is None else impact.law(xs[-1])
+                except SimulationError as error:
+                    return float("inf"), f"the impact after {name} has no end: {error}"
+            if switch.after == 0:
+                found.append((f"{{:.2g}} from its first value after {name}", np.abs(x - motions[0].xs[0])))
+                ranges = np.concatenate([ranges, motions[0].task.problem.ranges(motions[0].xs)])
         for k, (told, values) in enumerate(found):
             scale = ranges[-len(values) :] if k == 2 else ranges[: len(values)]
             part = np.nan_to_num(values / scale, nan=np.inf)
@@ -184,6 +198,54 @@ def _led_through(solution: PhasedSolution, motions: Sequence[Collocated], contro
     return worst, where
 
 
+def _until_it_touches(motion: Collocated, xs: Array, gains: Array | None, impact: RigidReset) -> Array | None:
+    """(S, nx) where a motion leads, ten steps an interval, until the gap closes that closes at the end of the plan.
+
+    `xs` is where it leads to the end; from there it goes on for a tenth of its time. A gap that the plan itself closes
+    earlier, such as of a foot that swings through, does not count. None where none closes.
+    """
+    per, count, T = SUBSTEPS, len(motion.mesh) - 1, motion.horizon
+    parts = np.linspace(0, 1, per + 1)[:-1]
+    times = T * np.append((motion.mesh[:-1, None] + parts * np.diff(motion.mesh)[:, None]).ravel(), 1.0)
+    planned = np.array([impact.first_gap(x) for x in motion.at(times)[0]])
+    early = np.flatnonzero(planned[: (count - 1) * per] <= 0)
+    k = 1 + (int(early[-1]) + 1 if len(early) else 0)
+    step = times[-1] - times[-2]
+
+    def rate(x: Array, t: float) -> Array:
+        at = np.array([min(t, T)])
+        plan, u = (a[0] for a in motion.at(at))
+        j = min(int(np.searchsorted(T * motion.mesh, at[0], side="right")) - 1, count - 1)
+        if gains is not None:
+            b = motion.task.bounds
+            u = np.clip(u + gains[j] @ (plan - x), b.u_lower, b.u_upper)
+        limits = motion.task.dynamics.bounds
+        knot = np.concatenate([x, np.clip(u, limits.u_lower, limits.u_upper)])[None]
+        return np.asarray(motion.task.moved(knot, np.array([j]))[0])
+
+    def ahead(x: Array, t: float, h: float) -> Array:
+        k1 = rate(x, t)
+        k2 = rate(x + h / 2 * k1, t + h / 2)
+        k3 = rate(x + h / 2 * k2, t + h / 2)
+        return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + h * k3, t + h))
+
+    found = list(xs[:k])
+    while True:
+        t = times[k - 1] if k <= len(times) else T + (k - len(times)) * step
+        h = times[k] - t if k < len(times) else step
+        if t > T * (1 + LATE):
+            return None
+        x = xs[k] if k < len(xs) else ahead(found[-1], t, h)
+        if impact.first_gap(x) <= 0 < impact.first_gap(found[-1]):
+            low, high = 0.0, h
+            for _ in range(HALVES):
+                middle = (low + high) / 2
+                low, high = (middle, high) if impact.first_gap(ahead(found[-1], t, middle)) > 0 else (low, middle)
+            return np.array([*found, ahead(found[-1], t, high)])
+        found.append(x)
+        k += 1
+
+
 def _gains(problem: PhasedProblem, motions: Sequence[Collocated]) -> list[Array | None]:
     """TVLQR's gains of each phase, whose cost to go at its end is that of the next phase through the reset."""
     found: list[Array | None] = [None] * len(motions)
@@ -192,9 +254,19 @@ def _gains(problem: PhasedProblem, motions: Sequence[Collocated]) -> list[Array 
         found[i], P = motions[i].gains(at_end)
         for switch in problem.switches:
             if switch.after == i and switch.before == i - 1:
-                slope = switch.jacobian(motions[i - 1].xs[-1])
+                slope = _across(switch, motions[i - 1], motions[i])
                 at_end = slope.T @ P @ slope
     return found
+
+
+def _across(switch: Switch, before: Collocated, after: Collocated) -> Array:
+    """(n, m) the derivative of a first state by the last one before; of a rigid impact the saltation matrix."""
+    x = before.xs[-1]
+    if not isinstance(switch.reset, RigidReset):
+        return switch.jacobian(x)
+    last, first = (np.concatenate([m.xs[k], m.us[k]])[None] for m, k in ((before, -1), (after, 0)))
+    rates = before.task.moved(last, np.array([len(before.mesh) - 2]))[0]
+    return switch.reset.saltation(x, rates, after.task.moved(first, np.array([0]))[0])
 
 
 def solve_phased(
@@ -504,6 +576,8 @@ def _broken_links(draft: PhasedSolution) -> Iterator[str]:
         i = int(np.argmax(errors))
         if not errors[i] <= FEASIBILITY_TOLERANCE:
             yield f"{s.label} is missed by {errors[i]:.3g} in {s.rows[i]}, above {FEASIBILITY_TOLERANCE:g}"
+        if isinstance(s.reset, RigidReset):
+            yield from _broken_law(draft, s, s.reset)
     if draft.problem.horizon is not None:
         lower, upper = draft.problem.horizon
         beyond = max(lower - draft.horizon, draft.horizon - upper)
@@ -512,6 +586,22 @@ def _broken_links(draft: PhasedSolution) -> Iterator[str]:
     for certificate in draft.link_certificates:
         if certificate.verdict != "agree":
             yield f"the certificate of {certificate.subject} says {certificate.verdict}: {certificate.worst}"
+
+
+def _broken_law(draft: PhasedSolution, s: Switch, impact: RigidReset) -> Iterator[str]:
+    """Where the law of impact does not lead to the first state after it, or the gap is not closed."""
+    before, after = draft.phases[s.before].xs[-1], draft.phases[s.after].xs[0]
+    gap = impact.first_gap(before)
+    if not abs(gap) <= FEASIBILITY_TOLERANCE:
+        yield f"{s.label}: {', '.join(impact.contacts)} are {gap:.3g} m apart, above {FEASIBILITY_TOLERANCE:g}"
+    try:
+        off = np.abs(impact.law(before) - after)
+    except SimulationError as error:
+        yield f"{s.label}: {error}"
+        return
+    i = int(np.argmax(off))
+    if not off[i] <= FEASIBILITY_TOLERANCE:
+        yield f"{s.label}: the law of impact leads elsewhere, by {off[i]:.3g} in {s.rows[i]}: a contact opens or slides"
 
 
 def _ended(draft: PhasedSolution, status: Status, details: Sequence[str]) -> PhasedSolution:

@@ -12,6 +12,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError, UnknownNameError
@@ -23,6 +24,9 @@ from drake_diff.motion.flow.plant import FlowPlant, flow_plant
 from drake_diff.motion.flow.shapes import distance_of
 from drake_diff.motion.rigid.points import PointOnPlane
 
+NO_WAY = 1e-9  # of the largest: a direction in which no joint moves a point
+DEPENDENT = 1e-6  # of the largest singular value: what cannot be stopped one by one
+TRIED = 3  # states
 Closed = tuple[tuple[int, bool], ...]  # contacts that are closed, and whether each sticks
 
 
@@ -65,7 +69,7 @@ class RigidPlant:
         self.mass, self.free = tree.mass(), tree.acceleration(self.flow.u, ca.SX.zeros(model.nv))
         self._places = [self._of_pair(i) for i in range(self.flow.num_pairs)] + [self._of_point(p) for p in points]
         names = [" and ".join(inspector.GetName(i) for i in ids) for ids in pairs.ids]
-        self.names = (*names, *(point.name for point in points))
+        self.names = _different([*names, *(point.name for point in points)])
         self._frictions = [self._friction(ids) for ids in pairs.ids] + [None] * len(points)
         gaps = ca.vertcat(*[place.gap for place in self._places]) if self._places else ca.SX(0, 1)
         rate = tree.position_rates
@@ -155,6 +159,60 @@ class RigidPlant:
         rows = [self._places[i].J if sticks else self._places[i].normal.T @ self._places[i].J for i, sticks in closed]
         return ca.vertcat(*rows) if rows else ca.SX(0, self.nv)
 
+    def moved(self, rows: Any) -> NDArray[np.bool_]:
+        """(m,) which of the `rows` (m, nv) some joint moves: not the y of a planar leg."""
+        probe, random = ca.Function("rows", [self.flow.x], [ca.densify(rows)]), np.random.default_rng(2)
+        found = [np.asarray(probe(0.5 * random.standard_normal(self.model.nx))) for _ in range(TRIED)]
+        largest = np.max(np.abs(found), axis=(0, 2))
+        return np.asarray(largest > NO_WAY * max(1.0, float(np.max(largest, initial=0.0))))
+
+    def after(self, contacts: tuple[int, ...], restitution: float, *, sticks: bool) -> list[tuple[Any, Any]]:
+        """Of an impact in which all of `contacts` act: x (nx,) -> the state after it, and the impulses of each.
+
+        The latter are (n . P, P - n (n . P)) of each contact (4,). All are SX functions with their Jacobians. The
+        velocities along the normals are returned, the others stopped where it `sticks`. ModelError where the contacts
+        depend on each other.
+        """
+        closed = tuple((i, sticks) for i in contacts)
+        rows, tree = self.held_rows(closed), self.flow.tree
+        speeds = rows @ tree.v
+        if sticks:
+            places = [self._places[i] for i in contacts]
+            returned = [p.normal * ca.dot(p.normal, p.J @ tree.v) for p in places]
+            speeds = speeds + restitution * ca.vertcat(*returned)
+        else:
+            speeds = (1 + restitution) * speeds
+        held = np.flatnonzero(self.moved(rows)).tolist()
+        rows, speeds = rows[held, :], speeds[held]
+        probe, random = ca.Function("rows", [self.flow.x], [ca.densify(rows)]), np.random.default_rng(3)
+        x = 0.5 * random.standard_normal(self.model.nx)
+        singular = np.linalg.svd(np.asarray(probe(x)), compute_uv=False)
+        if len(held) > self.nv or singular[-1] < DEPENDENT * singular[0]:
+            names = ", ".join(self.names[i] for i in contacts)
+            raise ModelError(f"an impact of {names}: what it stops depends on each other, name fewer contacts")
+        pushed = ca.ldl_solve(ca.densify(rows.T), *ca.ldl(self.mass))
+        impulses = ca.ldl_solve(ca.densify(speeds), *ca.ldl(ca.densify(rows @ pushed)))
+        every = ca.SX.zeros(len(contacts) * (3 if sticks else 1))
+        every[held] = -impulses
+        found = [ca.vertcat(tree.q, tree.v - pushed @ impulses)]
+        for k, i in enumerate(contacts):
+            normal = self._places[i].normal
+            P = every[3 * k : 3 * k + 3] if sticks else every[k] * normal
+            push = ca.dot(normal, P)
+            found.append(ca.vertcat(push, P - push * normal))
+        return [self._with_slopes(each) for each in found]
+
+    def gap_functions(self, contact: int) -> tuple[Any, Any]:
+        """x (nx,) -> the gap (1,) of a contact, and its slopes (1, nx), as SX functions."""
+        return self._with_slopes(self._places[contact].gap)
+
+    def _with_slopes(self, value: Any) -> tuple[Any, Any]:
+        x = self.flow.x
+        return (
+            ca.Function("value", [x], [ca.densify(value)]),
+            ca.Function("slopes", [x], [ca.densify(ca.jacobian(value, x))]),
+        )
+
     def normal_of(self, contact: int) -> Any:
         """(3,) an expression of the state."""
         return self._places[contact].normal
@@ -214,8 +272,7 @@ class Smooth:
             speeds = rows @ tree.v
             needed = -(ca.jacobian(speeds, tree.q) @ tree.position_rates + rows @ free)
             inner = ca.densify(rows @ pushed)
-            # What no joint moves is not held: a row of zeros has a 1 on its diagonal, and needs no force.
-            still = ca.DM([float(rows[i, :].nnz() == 0 or bool(rows[i, :].is_zero())) for i in range(rows.shape[0])])
+            still = ca.DM((~plant.moved(rows)).astype(float))  # a row that no joint moves gets a 1, and needs no force
             forces = ca.ldl_solve(needed, *ca.ldl(inner + ca.diag(still)))
             free = free + pushed @ forces
         else:
@@ -273,6 +330,16 @@ class Smooth:
     def _unused(self) -> Array:
         """The materials of compliant contact, which have no part in it."""
         return np.zeros(4 * self.plant.flow.num_pairs)
+
+
+def _different(names: list[str]) -> tuple[str, ...]:
+    """The names, those that several have with a number: "hub on world 2"."""
+    seen: dict[str, int] = {}
+    found = []
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        found.append(f"{name} {seen[name]}" if names.count(name) > 1 else name)
+    return tuple(found)
 
 
 def _step(rates: Any) -> Any:

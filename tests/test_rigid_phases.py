@@ -1,0 +1,212 @@
+"""Plans in phases through rigid impacts, replayed by SciPy with events, and planted errors that must be refused."""
+
+import json
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.models import Plant, contact_properties
+from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
+from scipy.integrate import solve_ivp
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError, ModelWarning, UnknownNameError
+from drake_diff.motion import PointOnPlane, RigidContact
+from drake_diff.optimize import HeldContacts, PhasedProblem, RigidReset
+from drake_diff.optimize.phased import _across, judged_phases
+from drake_diff.optimize.program import NlpResult, Outcome
+from drake_diff.record.sealed import canonical, own_sha256
+
+G, RESTITUTION = 9.81, 0.7
+FOOT = [0, 0, -0.05]
+
+
+@pytest.fixture(scope="module")
+def thrown():
+    """A ball with two motors is to bounce into a target, least effort."""
+    plant, properties = Plant(0.01, "lagged"), contact_properties(2e4)
+    plant.ball("ball", 1.0, 0.1, properties, "x", "z")
+    plant.ground(properties)
+    for axis in "xz":
+        plant.plant.AddJointActuator(f"push_{axis}", plant.plant.GetJointByName(f"ball_{axis}"))
+    model = plant.model()
+    reset = RigidReset(model, RigidContact(RESTITUTION, friction=0))
+    way = {"num_steps": 12, "horizon": (0.1, 1.5), "running_cost": dd.QuadraticCost(R=np.eye(2))}
+    down = dd.Problem(model, x0=[0, 0.8, 0, 0], constraints=reset.kept(), **way)
+    up = dd.Problem(model, x0=[0.5, 0.1, 1, 1], x_goal=[1.2, 0.9, np.nan, np.nan], **way)
+    return dd.solve(PhasedProblem([down, up], resets=[reset], names=["down", "up"]))
+
+
+@pytest.fixture(scope="module")
+def landed():
+    """The hopper falls from 0.3 m with 0.4 m/s forwards, lands on its foot and comes to rest."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        model = dd.load_model("models/hopper.sdf", time_step=0.01, contact=False)
+    landing = RigidReset(model, RigidContact(0.0, friction=0.8, points=PointOnPlane("foot", FOOT)))
+    stance, effort = HeldContacts(model, {"foot": FOOT}), dd.QuadraticCost(R=1e-2 * np.eye(2))
+    x0, begins = np.array([0, 0.35, 0, 0, 0.4, 0, 0, 0]), np.array([0.1, 0.05, 0, 0, 0, 0, 0, 0])
+    fly = dd.Problem(model, x0=x0, num_steps=15, horizon=(0.1, 0.8), running_cost=effort, constraints=landing.kept())
+    stand = dd.Problem(
+        stance, x0=begins, num_steps=20, horizon=(0.1, 1.0), running_cost=effort,
+        x_goal={"x_v": 0.0, "z_v": 0.0, "z": 0.0}, constraints=stance.kept(friction=0.8)[1:],
+    )  # fmt: skip
+    return dd.solve(PhasedProblem([fly, stand], resets=[landing], names=["flight", "landing"]))
+
+
+def inputs(phase):
+    """u(t) of a plan, its last value from its end on."""
+    return lambda t: phase.transcribed.applied_at(np.array([min(t, phase.horizon)]))[0]
+
+
+def test_a_ball_bounces_into_its_target(thrown):
+    """Free flight and z' -> -e z' at z = r, by SciPy: the floor is met where it is, and not when the plan says."""
+    assert thrown.success, thrown.message
+    down, up = (inputs(phase) for phase in thrown.phases)
+
+    def rates(x, u):
+        return [x[2], x[3], u[0], u[1] - G]
+
+    def floor(t, x):
+        return x[1] - 0.1
+
+    floor.terminal, floor.direction = True, -1
+    tight = {"rtol": 1e-11, "atol": 1e-12, "max_step": 0.01}
+    fall = solve_ivp(lambda t, x: rates(x, down(t)), (0, 2), [0, 0.8, 0, 0], events=floor, **tight)
+    assert fall.t[-1] == pytest.approx(thrown.phases[0].horizon, abs=1e-6)
+    begins = fall.y[:, -1] * [1, 1, 1, -RESTITUTION]
+    rise = solve_ivp(lambda t, x: rates(x, up(t)), (0, thrown.phases[1].horizon), begins, **tight)
+    np.testing.assert_allclose(rise.y[:2, -1], [1.2, 0.9], atol=1e-5)
+    assert np.min(rise.y[1]) > 0.0999
+    assert "open loop through all phases" in thrown.message
+    assert [c.verdict for c in thrown.link_certificates] == ["agree"]
+
+
+class HopperByHand:
+    """The hopper by Drake's mass matrix, bias and Jacobian; its own impact and its own foot."""
+
+    def __init__(self, model):
+        self.plant, self.context = model.plant, model.plant.CreateDefaultContext()
+        self.foot, self.B = model.plant.GetBodyByName("foot"), model.actuation
+
+    def terms(self, x):
+        plant, world = self.plant, self.plant.world_frame()
+        plant.SetPositionsAndVelocities(self.context, x)
+        forces = MultibodyForces(plant)
+        plant.CalcForceElementsContribution(self.context, forces)
+        bias = plant.CalcInverseDynamics(self.context, np.zeros(4), forces)
+        frame, at = self.foot.body_frame(), np.array(FOOT, dtype=float)
+        J = plant.CalcJacobianTranslationalVelocity(self.context, JacobianWrtVariable.kV, frame, at, world, world)
+        own = plant.CalcBiasTranslationalAcceleration(self.context, JacobianWrtVariable.kV, frame, at, world, world)
+        height = plant.CalcPointsPositions(self.context, frame, at, world)[2, 0]
+        return plant.CalcMassMatrix(self.context), bias, J[[0, 2]], np.asarray(own).ravel()[[0, 2]], height
+
+    def rates(self, x, u, held):
+        M, bias, J, own, _ = self.terms(x)
+        free = np.linalg.solve(M, self.B @ u - bias)
+        if held:
+            pushed = np.linalg.solve(M, J.T)
+            free = free - pushed @ np.linalg.solve(J @ pushed, own + J @ free)
+        return np.concatenate([x[4:], free])
+
+    def impact(self, x):
+        M, _, J, _, _ = self.terms(x)
+        pushed = np.linalg.solve(M, J.T)
+        P = -np.linalg.solve(J @ pushed, J @ x[4:])
+        return np.concatenate([x[:4], x[4:] + pushed @ P]), P
+
+
+def test_a_hopper_lands_where_another_simulation_lands(landed):
+    assert landed.success, landed.message
+    hopper = HopperByHand(landed.problem.phases[0].system)
+    fly, stand = (inputs(phase) for phase in landed.phases)
+
+    def foot(t, x):
+        return hopper.terms(x)[4]
+
+    foot.terminal, foot.direction = True, -1
+    tight = {"rtol": 1e-9, "atol": 1e-10, "max_step": 0.02}
+    x0 = landed.phases[0].xs[0]
+    fall = solve_ivp(lambda t, x: hopper.rates(x, fly(t), False), (0, 1), x0, events=foot, **tight)
+    assert fall.t[-1] == pytest.approx(landed.phases[0].horizon, abs=1e-5)
+    begins, P = hopper.impact(fall.y[:, -1])
+    assert P[1] > 0
+    assert abs(P[0]) <= 0.8 * P[1] * (1 + 1e-6)
+    np.testing.assert_allclose(begins, landed.phases[1].xs[0], atol=1e-5)
+    end = solve_ivp(lambda t, x: hopper.rates(x, stand(t), True), (0, landed.phases[1].horizon), begins, **tight)
+    np.testing.assert_allclose(end.y[[1, 4, 5], -1], 0.0, atol=1e-4)
+
+
+def test_feedback_is_led_back_through_the_saltation_matrix(thrown):
+    """[[-e, 0], [-(1 + e) z'' / z', -e]] of height and speed, where both phases have their own push at the impact."""
+    motions = [phase.transcribed for phase in thrown.phases]
+    xi = _across(thrown.problem.switches[0], *motions)
+    v, e = thrown.phases[0].xs[-1, 3], RESTITUTION
+    push, after = motions[0].us[-1], motions[1].us[0]
+    wanted = np.diag([1.0, -e, 1.0, -e])
+    wanted[2, 1] = (after[0] - push[0]) / v
+    wanted[3, 1] = (after[1] - G + e * (push[1] - G)) / v
+    np.testing.assert_allclose(xi, wanted, atol=1e-9)
+
+
+def rejudged(solution, **fields):
+    result = NlpResult(np.zeros(0), Outcome.SOLVED, "IPOPT: Solve Succeeded", ())
+    return judged_phases(replace(solution, **fields), result)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_plan_that_the_law_of_impact_does_not_have_is_refused(landed, seed):
+    """The landing said to be on a floor of less friction than its impulse needs, and by another restitution."""
+    assert rejudged(landed).success
+    random, problem = np.random.default_rng(seed), landed.problem
+    reset = problem.switches[0].reset
+    P = HopperByHand(problem.phases[0].system).impact(landed.phases[0].xs[-1])[1]
+    needed = abs(P[0]) / P[1]
+    less = RigidContact(0.0, friction=needed * random.uniform(0.1, 0.9), points=reset.contact.points)
+    bouncy = RigidContact(10 ** random.uniform(-4, -1), friction=0.8, points=reset.contact.points)
+    for contact, told in ((less, "a contact opens or slides"), (bouncy, "is missed by")):
+        other = PhasedProblem(problem.phases, resets=[RigidReset(reset.model, contact)], names=problem.names)
+        again = rejudged(landed, problem=other)
+        assert again.status is dd.Status.CONVERGED_NOT_VERIFIED
+        assert told in again.message
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_plan_whose_impact_comes_at_another_time_is_refused(thrown, seed):
+    """Its last stretch is another motion of the same equations: the floor is met earlier or later than it says."""
+    shift = np.random.default_rng(seed).choice([-1, 1]) * 10 ** np.random.default_rng(seed).uniform(-3, -1)
+    phases = list(thrown.phases)
+    xs = np.array(phases[0].xs)
+    xs[:, 1] += shift
+    phases[0] = replace(phases[0], xs=xs)
+    again = rejudged(thrown, phases=tuple(phases))
+    assert again.status is dd.Status.CONVERGED_NOT_VERIFIED
+    assert "apart, above 1e-05" in again.message
+
+
+def test_what_is_no_impact_is_refused_early(landed):
+    model = landed.problem.phases[0].system
+    foot = PointOnPlane("foot", FOOT)
+    two = RigidContact(points=(foot, PointOnPlane("body")), friction=0)
+    with pytest.raises(InputError, match="contacts: expected some of foot on world, body on world"):
+        RigidReset(model, two)
+    with pytest.raises(UnknownNameError, match="contact: expected one of"):
+        RigidReset(model, two, "leg on world")
+    assert repr(RigidReset(model, two, "foot on world")) == "RigidReset of foot on world: restitution 0, friction 0"
+
+
+@pytest.mark.slow
+def test_a_landing_is_made_again_and_a_forged_one_is_not(landed, tmp_path):
+    """Its impact is in the record: restitution, friction, point and law."""
+    record = dd.save(landed, tmp_path / "run")
+    assert record.verdict == "pass", record.sentence
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        assert dd.verify(tmp_path / "run").verdict == "holds"
+        fields = json.loads((tmp_path / "run" / "phases.json").read_text())
+        assert fields["links"][0]["reset"]["rigid"]["points"][0]["point"] == FOOT
+        fields["links"][0]["reset"]["rigid"]["restitution"] = 0.01
+        fields["record_sha256"] = own_sha256(fields)
+        (tmp_path / "run" / "phases.json").write_text(canonical(fields))
+        assert dd.verify(tmp_path / "run").verdict == "broken"
