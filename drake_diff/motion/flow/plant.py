@@ -174,8 +174,10 @@ class FlowPlant:
 
 
 def flow_plant(model: Model) -> FlowPlant:
-    """That of a model, made once."""
-    return model.cache("flow plant", lambda: FlowPlant(model))
+    """That of a model, made once: contact's parameters are not in it, which are its functions' arguments."""
+    if model.other_quantities <= set(QUANTITIES):
+        return model.cache("flow plant", lambda: FlowPlant(model), of_structure=True)
+    return FlowPlant(model)
 
 
 def material_of(plant: FlowPlant) -> Material:
