@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 EXPLODED, VANISHED = 1e6, 1e-6
 CONTINUOUS = "continuous"  # the method that takes no steps of Drake's
-FINER = 1e-2  # of its tolerance: of a motion whose derivative is not the slope that there is
+FINER = 1e-3  # of its tolerance: of a motion whose derivative is not the slope that there is
 NAMED = 3  # columns of which a warning tells the numbers
 
 

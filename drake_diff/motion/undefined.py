@@ -49,7 +49,7 @@ SMOOTH = 1e-2  # part of the widths where nothing touches
 COARSE = 1e-7  # the tolerance of what moves by 1e-2
 SETTLED, FOLLOWS, RIGHT = 1e-3, 5e-3, 1e-2
 BENT = 0.1  # of a curve's difference: what its fourth derivative may add
-NEGLIGIBLE = 1e-3  # of the largest column: what is smaller is judged as if it were that large
+NEGLIGIBLE = 1e-2  # of the largest column: what is smaller is judged as if it were that large
 NOISE = 0.1  # of the tolerance, times how much of an error comes through to the loss: its change between two motions
 GROUPS = 3
 MANY = 24  # parameters of a policy: more are one column, along their own gradient
@@ -95,8 +95,8 @@ class Undefined(ShowsItsRepr):
 
         Widths (standard deviations) go from 1e-3 to 1 of the column's unit by factors of 3. The first is taken at which
         half of `samples` say that all of them will know the blend of first and zeroth order (see `drake_diff.smooth`)
-        to 20 %, by its standard error; then they are drawn afresh, so that the choice does not bend the answer. A sample
-        is a rollout with its derivative.
+        to 20 %, by its standard error; then they are drawn afresh, so that the choice does not bend the answer. A
+        sample is a rollout with its derivative.
 
         Args:
             samples: How many; half as many at each width that is tried.

@@ -27,7 +27,19 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 from drake_diff._base.statistics import success_rate  # noqa: E402
 
 # Each is a module trust_NAME beside this file, with `measure(seed, count)` and its usual COUNT.
-PARTS = ("certificate", "rollout", "refinement", "solve", "avoid", "reach", "verify", "compare", "design", "kept")
+PARTS = (
+    "certificate",
+    "rollout",
+    "refinement",
+    "solve",
+    "avoid",
+    "reach",
+    "verify",
+    "compare",
+    "design",
+    "kept",
+    "undefined",
+)
 
 
 @dataclass(frozen=True)
