@@ -4,11 +4,12 @@ import warnings
 
 import numpy as np
 import pytest
+from helpers.bounces import RADIUS, Bounce
 from helpers.models import Plant, contact_properties
 from pydrake.geometry import Sphere
 
 import drake_diff as dd
-from drake_diff.exceptions import GradientWarning
+from drake_diff.exceptions import GradientError, GradientWarning, InputError
 from drake_diff.motion import undefined as verdict
 from drake_diff.motion.flow.steps import FlowSteps
 from drake_diff.motion.undefined import Undefined
@@ -151,3 +152,73 @@ def test_where_all_is_well_it_takes_six_rollouts(monkeypatch):
     _, undefined = gradient(ball(), [0, 1.0, 0, -2.0], lambda x: x[1], 100)
     assert undefined == []
     assert len(taken) == 6
+
+
+def test_a_smoothed_step_has_the_slope_of_its_closed_form_where_first_order_has_none():
+    """Whether the ball has turned by the end: half a period after it touches. Derivatives are 0 on both sides.
+
+    E[1(z + w < z1)] changes by z at -density(z1 - z) of the noise.
+    """
+    model, speed, duration, stiffness = ball(stiffness=1e6, dissipation=0.0), 1.0, 0.05, 1e6
+    turns = 0.1 + speed * (duration - np.pi / 2 / np.sqrt(stiffness))
+    g, undefined = gradient(model, [0, turns + 5e-4, 0, -speed], lambda x: 0 * x[1] + (1.0 if x[3] > 0 else 0.0), 5)
+    assert undefined[0] == "ball_z_x[0]"
+    found = g.undefined[0].smooth(150, seed=1)
+    width = float(found.noise.sigma)
+    exact = -np.exp(-((5e-4 / width) ** 2) / 2) / (width * np.sqrt(2 * np.pi))
+    assert width == 1e-3
+    assert found.first.item() == 0
+    assert found.biased.item()
+    assert found.jacobian.item() == pytest.approx(exact, abs=3 * np.sqrt(found.variance.item()))
+    assert np.sqrt(found.variance.item()) < 0.2 * abs(exact)
+    again = g.undefined[0].smooth(150, seed=1)
+    assert again.jacobian.item() == found.jacobian.item()
+
+
+def test_where_no_width_has_a_slope_there_is_no_number():
+    """|x - 0.3| at 0.3: it falls as often as it rises."""
+    g, undefined = gradient(ball(), [0.3, 1.0, 0, 0], lambda x: abs(x[0] - 0.3), 5)
+    assert undefined == ["ball_x_x[0]", "ball_x_v[0]"]
+    with pytest.raises(
+        GradientError, match=r"no width up to 1 has a smoothed slope by ball_x_x\[0\] that 30 samples show"
+    ):
+        g.undefined[0].smooth(30)
+    with pytest.raises(InputError, match="at least 4"):
+        g.undefined[0].smooth(3)
+
+
+def smoothed_truth(ball, approximation, start, column, width, duration):
+    """E[f(x + w) w] / width^2 of the last rate, by the trapezoid rule on motions event by event."""
+    nodes = np.linspace(-6, 6, 801)
+    moved = [np.array(start) + width * z * np.eye(2)[column] for z in nodes]
+    ends = np.array([ball.end(approximation, one, duration)[1] for one in moved])
+    return np.trapezoid(ends * nodes * np.exp(-(nodes**2) / 2) / np.sqrt(2 * np.pi), nodes) / width
+
+
+@pytest.mark.slow
+def test_intervals_of_smoothed_slopes_cover_those_of_an_integration_event_by_event(tmp_path):
+    """By seed, both laws: a ball that touches the ground at the end, or not. That 3 of 10 miss has a chance of 1 %."""
+    random, inside, of, duration = np.random.default_rng(5), 0, 0, 0.3
+    for i in range(10):
+        approximation = ("lagged", "sap")[i % 2]
+        ball = Bounce(
+            10 ** random.uniform(3, 4),
+            relaxation_time=random.uniform(0, 5e-3) if approximation == "sap" else 0.0,
+            dissipation=random.uniform(0, 0.5) if approximation == "lagged" else 0.0,
+        )
+        v = random.uniform(-1, 0.5)
+        gap = random.choice([-1, 1]) * 10 ** random.uniform(-5, -2.5)
+        start = [RADIUS + gap - v * duration + 9.81 * duration**2 / 2, v]
+        model = ball.model(tmp_path / "ball.sdf", approximation, 0.01)
+        g, _ = gradient(model, start, lambda x: x[1], 30)
+        for one in g.undefined[:1]:
+            try:
+                found = one.smooth(60, seed=i)
+            except GradientError:
+                continue
+            column = [f"{name}[0]" for name in model.state_names].index(one.column)
+            exact = smoothed_truth(ball, approximation, start, column, float(found.noise.sigma), duration)
+            inside += abs(found.jacobian.item() - exact) <= 1.96 * np.sqrt(found.variance.item())
+            of += 1
+    assert of >= 6
+    assert inside >= of - 2

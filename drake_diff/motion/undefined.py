@@ -50,6 +50,7 @@ COARSE = 1e-7  # the tolerance of what moves by 1e-2
 SETTLED, FOLLOWS, RIGHT = 1e-3, 5e-3, 1e-2
 BENT = 0.1  # of a curve's difference: what its fourth derivative may add
 NEGLIGIBLE = 1e-2  # of the largest column: what is smaller is judged as if it were that large
+FORGOTTEN = 2e-3  # of the loss's own derivative by the last state: likewise, of a start that the motion forgets
 NOISE = 0.1  # of the tolerance, times how much of an error comes through to the loss: its change between two motions
 GROUPS = 3
 MANY = 24  # parameters of a policy: more are one column, along their own gradient
@@ -295,10 +296,9 @@ def along_the_flow(
 def undefined_columns(beside: Beside, totals: Totals) -> tuple[Undefined, ...]:
     """The columns of a gradient in which the loss has no slope."""
     lines = list(beside.lines(totals))
-    judge = _Judge(
-        NEGLIGIBLE * max(abs(line.change) for line in lines),
-        NOISE * max(1.0, float(np.max(np.linalg.norm(totals.states, axis=1)))),
-    )
+    norms = np.linalg.norm(totals.states, axis=1)
+    least = max(NEGLIGIBLE * max(abs(line.change) for line in lines), FORGOTTEN * float(norms[-1]))
+    judge = _Judge(least, NOISE * max(1.0, float(np.max(norms))))
     order = sorted(range(len(lines)), key=lambda j: -abs(lines[j].change))
     suspects: list[int] = []
     for group in np.array_split(order, min(GROUPS, len(lines))):
