@@ -11,6 +11,8 @@ from helpers.table import each_row
 
 sys.path.insert(0, str(ROOT / "tests" / "benchmarks"))
 
+import impact_orders
+import impact_peers
 import impacts
 from impact_cases import FAMILIES, Material, Mover, Obstacle, case
 from impact_truth import Motion, Slopes, truth
@@ -107,3 +109,28 @@ def test_a_wrong_gradient_and_a_wrong_verdict_are_counted(monkeypatch):
 def test_a_seed_is_its_cases():
     assert case(5, 3) == case(5, 3) != case(6, 3)
     assert [case(5, n).family for n in range(len(FAMILIES))] == list(FAMILIES)
+
+
+@pytest.mark.slow
+def test_the_readmes_table_of_a_bounce_and_a_toss():
+    """Through Drake's steps by AutoDiffXd in Drake alone, and ours; the last line is another integration, or exact."""
+    text = (ROOT / "README.md").read_text()
+    table = text[text.index("| One second, d end") :].split("\n\n")[0]
+    printed = [[cell.strip() for cell in row.split("|")[2:4]] for row in table.splitlines()[2:]]
+    motions = impact_orders.BALL, impact_orders.CUBE
+    found = [
+        [impact_peers.drake(one, one.columns[0], 1e-3)[1] for one in motions],
+        [impact_peers.drake(one, one.columns[0], 2e-4)[1] for one in motions],
+        [impacts.ours(one, one.model(), np.zeros((one.num_steps, 0)))[1][one.columns[0]] for one in motions],
+        [impact_orders.reference(one)[1] for one in motions],
+    ]
+    for row, values in zip(printed, found, strict=True):
+        assert row == [f"{value:.4g}" for value in values]
+
+
+def test_value_and_slope_of_a_bounce_converge_by_the_order_of_the_method():
+    """A step's error is held to a tolerance: both fall in proportion to it, and by order 5 in the steps that push."""
+    found = impact_orders.measure(impact_orders.BALL, None)
+    for what in ("value", "slope"):
+        assert impact_orders.order(found["tolerance"], found[what]) == pytest.approx(1.0, abs=0.2)
+        assert -impact_orders.order(found["steps"], found[what]) > 4.5

@@ -70,6 +70,7 @@ TABLE = "tests/test_contact_table.py::test_the_table_in_the_documents_is_this_ta
 TURN = "tests/test_engines.py::test_mujoco_differs_on_free_bodies_by_the_quaternions_exponential_alone"
 RESTING = "tests/test_contact_contract.py::test_the_stiffness_that_is_read_is_that_on_which_a_weight_rests_in_mujoco"
 FORWARD = "tests/test_contact_table.py::test_what_the_documents_say_of_physx_and_newton"
+BOUNCES = "tests/test_impact_cases.py::test_the_readmes_table_of_a_bounce_and_a_toss"
 BLEND = "tests/test_smoothing.py::test_what_the_blend_keeps_of_the_bias_shrinks_with_more_samples"
 CODES = {
     "0": "tests/test_cli.py::test_a_run_that_holds_prints_its_checks_and_exits_with_0",
@@ -80,7 +81,12 @@ CODES = {
 }
 # Of each number the constant that it is ("module:NAME", of 5 % as a part), or the test that fails without it.
 SOURCES = {
-    "README.md": {**CODES, "97": "tests/test_readme.py::test_the_network_of_the_example_has_97_weights", "1e-6": SAP},
+    "README.md": {
+        **CODES,
+        **dict.fromkeys(("1", "0.2", "-1.867", "-13.18", "-1.437", "0.3739", "-0.9686", "0.2648"), BOUNCES),
+        "97": "tests/test_readme.py::test_the_network_of_the_example_has_97_weights",
+        "1e-6": SAP,
+    },
     "CONTRIBUTING.md": {},
     "docs/benchmarks.md": {},
     "docs/certificates.md": {
@@ -172,7 +178,7 @@ def prose(path):
     return NAMES.sub(" ", text)
 
 
-FIGURES = ("trust.md", "zoo.md", "tasks_solved.md", "mpc_realtime.md")  # pages that a benchmark writes
+FIGURES = ("trust.md", "zoo.md", "impacts.md", "tasks_solved.md", "mpc_realtime.md")  # pages that a benchmark writes
 
 
 @each_row("path", [path for path in DOCUMENTS if path.name not in FIGURES], ids=lambda path: path.name)

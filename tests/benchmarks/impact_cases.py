@@ -287,7 +287,7 @@ def _case(
 
 
 def _bounce(random: Any) -> Case:
-    """A ball on rails that falls on the ground, once or a dozen times."""
+    """A ball on rails that falls on the ground, once or a dozen times, or at its last moment."""
     draw = _Draw(random)
     mass, radius, g = draw.scale(0.05, 5), draw.between(0.03, 0.2), draw.between(1, 15)
     axes = draw.one_of("z", "xz")
@@ -295,30 +295,35 @@ def _bounce(random: Any) -> Case:
     z, vz = radius + draw.between(0.02, 0.6), draw.between(-3, 1)
     fall = (vz + sqrt(vz * vz + 2 * g * (z - radius))) / g
     duration = min(fall * draw.between(1.1, 3) + 0.05, 1.5)
+    if draw.chance(0.2):  # it touches some ms before the end or just does not
+        duration = max(round(fall, 2), 0.05)
+        touch = duration + draw.between(-4e-3, 4e-3)
+        vz = min(vz, 0.0)
+        z = radius - vz * touch + g * touch**2 / 2
     x0 = (z, vz) if axes == "z" else (0.0, z, draw.between(-2, 2), vz)
     of = draw.one_of(0, 1) if axes == "z" else draw.one_of(0, 1, 2)
     columns = (1, 0, STIFFNESS) if axes == "z" else (3, 1, "ball.friction")
     return _case(draw, draw.law(), (ball,), x0, duration, of, columns, gravity=(0, 0, -g))
 
 
-def _corners(sides: tuple[float, ...], radius: float) -> tuple[tuple[float, float, float], ...]:
+def corners(sides: tuple[float, ...], radius: float) -> tuple[tuple[float, float, float], ...]:
     half = np.array(sides) / 2 - radius
     return tuple(tuple((half * (2 * np.array([i & 1, i >> 1 & 1, i >> 2]) - 1)).tolist()) for i in range(8))
 
 
 def _toss(random: Any) -> Case:
-    """A box with a sphere in each corner, thrown down with or without spin."""
+    """A box with a sphere in each corner, thrown down with or without spin: from one strike to a long tumble."""
     draw = _Draw(random)
     mass, side, g = draw.scale(0.05, 2), draw.between(0.06, 0.2), draw.between(1, 10)
     sides = (side,) * 3 if draw.chance(0.5) else tuple(side * draw.between(0.6, 1.5) for _ in range(3))
     radius = draw.between(0.01, 0.1) * min(sides)
-    box = Mover("box", mass, sides, radius, _corners(sides, radius), draw.material(mass, min(sides) / 5, mass * g))
+    box = Mover("box", mass, sides, radius, corners(sides, radius), draw.material(mass, min(sides) / 5, mass * g))
     reach = float(np.linalg.norm(sides)) / 2
     z, vz = reach + draw.between(0, 0.15), draw.between(-2.5, -0.2)
     spin = draw.vector(4.0) if draw.chance(0.6) else (0.0, 0.0, 0.0)
     x0 = (*draw.quaternion(), 0.0, 0.0, z, *spin, *draw.vector(0.7)[:2], vz)
     fall = (vz + sqrt(vz * vz + 2 * g * (z - reach / 2))) / g
-    duration = fall + draw.scale(0.03, 0.6)
+    duration = fall + draw.scale(0.03, 1.5)
     columns = (12, 7, STIFFNESS)
     return _case(draw, draw.law(0.15), (box,), x0, duration, draw.one_of(4, 5, 6, 12), columns, gravity=(0, 0, -g))
 
@@ -416,7 +421,7 @@ def _two(random: Any) -> Case:
 
 
 def _wall(random: Any) -> Case:
-    """A ball thrown at a box, capsule, cylinder or sphere that is fixed in the world; Hunt and Crossley's law."""
+    """A ball thrown at what is fixed in the world, also so that it barely touches; Hunt and Crossley's law."""
     draw = _Draw(random)
     mass, radius, g = draw.scale(0.05, 3), draw.between(0.03, 0.12), draw.between(0, 10)
     kind = draw.one_of("box", "capsule", "cylinder", "sphere")
@@ -432,6 +437,8 @@ def _wall(random: Any) -> Case:
     turn = draw.vector(0.4) if kind != "box" else draw.vector(0.2)
     speed, far = draw.between(1, 4), 2 * thick + radius + draw.between(0.05, 0.3)
     aside = draw.between(-0.08, 0.08)
+    if kind == "sphere" and draw.chance(0.5):  # it barely touches or just does not
+        aside = thick + radius - draw.between(-2e-3, 6e-3)
     place = Obstacle(kind, sizes, (far, 0.0, 0.0), turn, material)
     reach = (far - thick - radius) / speed
     x0 = (*draw.quaternion(), 0.0, aside, draw.between(-0.05, 0.05), *draw.vector(10.0), speed, 0.0, g * reach / 2)

@@ -1,12 +1,15 @@
 """The gradient through random impacts beside the truth, and beside what other simulators make of it.
 
     pip install -e '.[test]'
-    python tests/benchmarks/impacts.py [--seed 0] [--count 100] [--only toss,rod] [--out FILE.json]
+    python tests/benchmarks/impacts.py [--seed 0] [--count 100] [--only toss,rod] [--no-peers] [--out FILE.json]
+    python tests/benchmarks/impacts.py --page FILE.json [--mjx FILE.json] [--newton FILE.json] [--nosnoc FILE.json]
 
 Of each case (impact_cases.py) some columns of the gradient are judged: by the first state, contact's parameters, an
 input. The truth is Drake's own continuous plant by error-controlled Runge-Kutta 3 and central differences of three
 widths (impact_truth.py); where those agree to 0.1 % ours is to be within 1 %, elsewhere it is to be `undefined`. What
-it costs is processor time beside that of the rollout alone, medians of three in turns.
+it costs is processor time beside that of the rollout alone, medians of three in turns. Other simulators are asked for
+the first column (impact_peers.py). --page writes docs/impacts.md from runs of before; those of MJX, Newton and nosnoc
+have scripts of their own.
 """
 
 import argparse
@@ -24,6 +27,7 @@ from pathlib import Path
 for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(threads, "1")  # read when NumPy is imported: small matrices are slower on threads
 
+import impact_page  # noqa: E402
 import numpy as np  # noqa: E402
 from impact_cases import FAMILIES, Case, case  # noqa: E402
 from impact_truth import Slopes, truth  # noqa: E402
@@ -44,7 +48,8 @@ def known_truth(one: Case, file: Path | None) -> tuple[float, list[Slopes]]:
     """The truth of a case, read from a file where it was found before, by the same case and the same referee."""
     if file is None:
         return truth(one)
-    text = repr(one) + (HERE / "impact_truth.py").read_text() + (HERE / "impact_cases.py").read_text()
+    referee, cases = ((HERE / f"impact_{name}.py").read_text() for name in ("truth", "cases"))
+    text = repr(one) + referee + cases.split("def case(")[0]
     key = hashlib.sha256(text.encode()).hexdigest()
     found = json.loads(file.read_text()) if file.exists() else {}
     if key not in found:
@@ -58,15 +63,19 @@ def known_truth(one: Case, file: Path | None) -> tuple[float, list[Slopes]]:
 def ours(one: Case, model, us):
     """(loss, {column: derivative by its unit}, columns told to be undefined)."""
     names = tuple(name for column in one.columns for name in one.parameters(column))
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always", GradientWarning)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GradientWarning)  # `undefined` has what it says
         found = differentiate_rollout(model, one.x0, us, one.loss, method="continuous", parameters=names)
     by = {column: float(found.by_x0[column]) for column in one.columns if isinstance(column, int)}
     columns = dict(zip(names, found.by_parameters, strict=True))
     by |= {c: float(sum(columns[name] for name in one.parameters(c))) for c in one.columns if one.parameters(c)}
     if "input" in one.columns:
         by["input"] = float(np.sum(found.by_us))
-    undefined = set(one.columns) if any(issubclass(w.category, GradientWarning) for w in told) else set()
+    without = {each.column for each in found.undefined}
+    called = {c: {f"{model.state_names[c]}[0]"} if isinstance(c, int) else set(one.parameters(c)) for c in one.columns}
+    if "input" in called:
+        called["input"] = {f"{name} at all times" for name in model.input_names}
+    undefined = {column for column, names in called.items() if names & without}
     return found.loss, {column: one.unit(column) * slope for column, slope in by.items()}, undefined
 
 
@@ -93,7 +102,7 @@ def cost(one: Case, model, us) -> float:
 def judge(one: Case, truths: Path | None, *, costs: bool = True) -> dict:
     """One case: each column's kind of truth, our number, its error and whether it was told to be undefined."""
     value, slopes = known_truth(one, truths)
-    found = {"name": one.name, "law": one.law, "value": value, "columns": []}
+    found = {"name": one.name, "family": one.family, "law": one.law, "value": value, "columns": []}
     try:
         model = one.model()
         us = np.full((one.num_steps, model.nu), one.input)
@@ -116,6 +125,23 @@ def judge(one: Case, truths: Path | None, *, costs: bool = True) -> dict:
                 "right": off <= RIGHT * abs(each.best) + each.doubt,
             }
         )
+    return found
+
+
+def judge_peers(one: Case, judged: dict) -> dict:
+    """What other simulators make of the first column: their slope, and what it should be; or why there is none."""
+    import impact_peers
+
+    column, first, found = one.columns[0], judged["columns"][0], {}
+    if first["kind"] == "none":
+        return {}
+    for name, ask in impact_peers.PEERS.items():
+        try:
+            slope, own = ask(one, column)
+        except (DrakeDiffError, RuntimeError, ValueError) as error:
+            found[name] = {"error": f"{type(error).__name__}: {error}"}
+            continue
+        found[name] = {"slope": slope, "wanted": first["slopes"][1] if own is impact_peers.TRUTH else own}
     return found
 
 
@@ -167,9 +193,19 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--begin", type=int, default=0, help="the number of the first case")
     parser.add_argument("--only", default=",".join(FAMILIES), help="families, with commas between them")
+    parser.add_argument("--no-peers", action="store_true", help="leave out the other simulators")
+    parser.add_argument("--page", type=Path, help="write docs/impacts.md from what --out wrote before")
+    for name in impact_page.MORE:
+        parser.add_argument(f"--{name}", type=Path, help=f"what impact_{name}.py wrote, for --page")
     parser.add_argument("--truths", type=Path, help="where truths are kept for another run")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
+    if options.page:
+        more = {name: getattr(options, name) for name in impact_page.MORE}
+        found = {name: json.loads(file.read_text()) for name, file in more.items() if file}
+        text = impact_page.page(json.loads(options.page.read_text()), found)
+        (HERE.parents[1] / "docs" / "impacts.md").write_text(text)
+        return 0
     logging.getLogger("drake").setLevel(logging.ERROR)  # what it tells of every half space
     only, cases = options.only.split(","), []
     for family in only:
@@ -179,11 +215,15 @@ def main() -> int:
         one = case(options.seed, number)
         if one.family in only:
             cases.append(judge(one, options.truths))
+            if not options.no_peers and cases[-1]["columns"]:
+                cases[-1]["peers"] = judge_peers(one, cases[-1])
             print(line(cases[-1]), flush=True)
     for each in figures(cases):
         print(told(*each))
     if options.out:
-        options.out.write_text(json.dumps({"seed": options.seed, "cases": cases}, indent=1) + "\n")
+        options.out.write_text(
+            json.dumps({"seed": options.seed, "count": options.count, "cases": cases}, indent=1) + "\n"
+        )
     return 0
 
 
