@@ -16,7 +16,7 @@ from drake_diff._base.differences import Difference, Function, Many, one_by_one
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.certificates.judgement import VERDICTS, Scales, judge
 from drake_diff.certificates.neighbourhood import Neighbourhood, look_around
-from drake_diff.exceptions import CertificateError, GradientError, ShapeError
+from drake_diff.exceptions import CertificateError, GradientError, InputError, ShapeError
 from drake_diff.model.contact import Pair
 
 JITTER = 1e-9
@@ -98,7 +98,8 @@ class Certificate(ShowsItsRepr):
     reasons: dict[tuple[int, int], str]  # of the entries that are discontinuous
     method: str
     subject: str
-    around: Neighbourhood  # in displacements of which one changes a column by its `scale`
+    # In displacements of which one changes a column by its `scale`; None where the differences are of another motion.
+    around: Neighbourhood | None
     scale: Array  # (n,)
     stopped: float  # how early the solver stopped where the derivative was taken, as a part of the momentum
     second: Scales | None  # units of rows and columns by which entries are weighed as well
@@ -138,6 +139,8 @@ class Certificate(ShowsItsRepr):
 
     def of(self, derivative: ArrayLike) -> "Certificate":
         """The certificate of another `derivative` (m, n) at this point, by the same differences."""
+        if self.around is None:
+            raise InputError("of", got="a certificate by the motion in continuous time", expected="certify_rollout")
         a = finite_array("derivative", derivative, self.derivative.shape) * self.scale
         named = {
             name: getattr(self, name) for name in ("rows", "columns", "method", "subject", "told", "stopped", "second")

@@ -103,7 +103,7 @@ class Displaced:
 
     def _roll(self, displacement: Array, policy: Any) -> float:
         x0, us, parameters, values = self.at(displacement)
-        ask = self._inputs(us, parameters, policy)
+        ask = self.inputs(us, parameters, policy)
         xs, inputs = np.empty((len(us) + 1, self.model.nx)), np.empty((len(us), self.model.nu))
         xs[0] = x0
         with applied(values) as model:
@@ -135,7 +135,7 @@ class Displaced:
     def _solved(self, left: Array, displacements: Array) -> Array:
         count, size = len(self.us), len(displacements)
         points = [self.at(d) for d in displacements]
-        asks = [self._inputs(us, parameters, None) for _, us, parameters, _ in points]
+        asks = [self.inputs(us, parameters, None) for _, us, parameters, _ in points]
         values = np.array([vector.values for *_, vector in points])
         times = [self.vector.time_step(row) for row in values]
         xs, inputs = np.empty((size, count + 1, self.model.nx)), np.empty((size, count, self.model.nu))
@@ -153,7 +153,7 @@ class Displaced:
         with applied(self.vector) as model:
             return max(solver_tolerance(model, x, u) for x, u in zip(g.xs[:-1], g.us, strict=True))
 
-    def _inputs(self, us: Array, parameters: Array, policy: Any) -> Callable[[Array, int, float], Array]:
+    def inputs(self, us: Array, parameters: Array, policy: Any) -> Callable[[Array, int, float], Array]:
         """The input (nu,) at a state, a step and a time step [s]."""
         if self.policy is None:
             return lambda x, k, h: us[k]

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff.certificates.slopes import Motions, Slope, directions
+from drake_diff.certificates.truth import Truth
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, list_parameters, select
@@ -131,13 +132,25 @@ def in_stiffer_contact(
 
 
 def refine_by_time_step(
-    model: Model, x0: Array, us: Array, loss: Loss, vector: ParameterVector, method: str, first: Array, columns: Columns
+    model: Model,
+    x0: Array,
+    us: Array,
+    loss: Loss,
+    vector: ParameterVector,
+    method: str,
+    first: Array,
+    columns: Columns,
+    truth: Truth | None,
+    no_truth: str,
 ) -> Refinement:
-    """The gradient `first` (n,) at h, at h/2 and h/4, beside the slopes of the loss itself."""
+    """The gradient `first` (n,) at h, at h/2 and h/4, beside the slopes of the loss itself and the `truth`.
+
+    `no_truth` says why there is none.
+    """
     values = np.array([first, *at_finer_steps(model, x0, us, loss, vector, method)])
     levels = tuple(model.time_step / m for m in REFINEMENTS)
     found = judge_levels("time step", levels, columns, values, kinds_of(model, len(us), vector))
-    motions = Motions(model, x0, us, loss, vector, REFINEMENTS[-1])
+    motions = Motions(model, x0, us, loss, vector, REFINEMENTS[-1], truth, no_truth)
     compared = [motions.slope(direction) for direction in directions(model, x0, us, vector)]
     return beside_slopes(found, compared)
 

@@ -1,7 +1,10 @@
 """Certify the gradient of a whole rollout before it is used."""
 
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,11 +19,12 @@ from drake_diff.certificates.judgement import VERDICTS
 from drake_diff.certificates.refinement import Refinement, refine_by_stiffness, refine_by_time_step
 from drake_diff.certificates.sampled import SampledCertificate, certify_sampled
 from drake_diff.certificates.stairs import stairs_of_loss, stairs_of_policy
+from drake_diff.certificates.truth import SECONDS, Truth, by_truth, truth_of
 from drake_diff.derivatives.sources import check_method
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import GradientWarning, InputError, ModelError, SimulationError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameters, select
-from drake_diff.motion.gradient import RolloutGradient
+from drake_diff.motion.gradient import CONTINUOUS, RolloutGradient
 from drake_diff.motion.loss import Loss
 from drake_diff.motion.rollout import Policy, check_inputs
 
@@ -41,9 +45,12 @@ class RolloutCertificate(Certificate):
     gradient: RolloutGradient = field(kw_only=True)
     refinements: tuple[Refinement, ...] = ()
     cause: str = ""  # why entries disagree, where that is known
+    truth: Truth | None = None  # the motion in continuous time, where it was asked for and there is one
+    no_truth: str = ""  # why there is none
 
     def _lines(self) -> list[str]:
-        return [*super()._lines(), *map(str, self.refinements), *([self.cause] if self.cause else [])]
+        truth = [repr(self.truth)] if self.truth else [f"no truth: {self.no_truth}"] if self.no_truth else []
+        return [*super()._lines(), *map(str, self.refinements), *truth, *([self.cause] if self.cause else [])]
 
 
 def certify_rollout(
@@ -57,6 +64,7 @@ def certify_rollout(
     num_steps: int | None = None,
     refine: bool = False,
     refine_stiffness: bool = False,
+    seconds: float = SECONDS,
     method: str = "auto",
     gradient: RolloutGradient | None = None,
     sampled: bool = False,
@@ -77,22 +85,27 @@ def certify_rollout(
         num_steps: N, where `us` is None.
         refine: take the gradient again at h/2 and h/4, under the same inputs, and compare it with the slopes of the
             loss over the way of many steps and of the motion in continuous time, along each state, each input by as
-            much at all times, and each parameter.
+            much at all times, and each parameter. The latter is the certificate's `truth`.
+        seconds: of work at most for the motion in continuous time [s]; columns that are not measured by then say so.
         refine_stiffness: take it again at 4 and 16 times every contact stiffness that the model states.
-        method: as in `differentiate_step`.
-        gradient: what to certify, instead of what `differentiate_rollout` gives.
+        method: as in `differentiate_step`; or "continuous": the gradient of the motion in continuous time, beside the
+            slopes of another integration of it. A column has no slope where those do not settle, which is
+            "discontinuous", and is "undecided" where they were not measured in time.
+        gradient: what to certify, instead of what `differentiate_rollout` gives; one by "continuous" is judged so.
         sampled: take at most 20 rollouts, along random directions, whatever the number of columns.
         seed: of these directions.
 
     Returns:
         The certificate of one row, the loss; its columns are x0 (on the tangent space), u[k] step by step or the
-        policy's parameters, and the model's. Entries that agree and do not converge are "not_converged". Where
+        policy's parameters, and the model's; in continuous time each input is one column, by as much at all times.
+        Entries that agree and do not converge are "not_converged". Where
         `sampled`, a certificate of all columns together, which says how small an error it would have noticed.
 
     Raises:
         InputError: both `us` and `policy` are given; what is sampled, or under a policy, is to be refined; the time
             step or a stiffness is refined and a parameter at once, or no stiffness is stated.
-        ModelError: `refine` of a model that has but one time step.
+        ModelError: the motion in continuous time is asked for and there is none; `refine` of a model from a diagram,
+            which has but one time step, where that is so.
         GradientError: the rollout has no gradient, or the policy remembers what it was asked before.
         SimulationError: Drake cannot take a step.
 
@@ -105,11 +118,10 @@ def certify_rollout(
         >>> certificate.verdict, certificate.columns
         ('agree', ('hinge_q[0]', 'hinge_w[0]', 'motor[0]', 'motor[1]'))
     """
-    check_method(method)
-    if us is not None and policy is not None:
-        raise InputError("certify_rollout", got="us and policy", expected="one of them")
-    if (policy is not None or sampled) and (refine or refine_stiffness):
-        raise InputError("refine", got="refinement of a closed loop or of a sample", expected="it of given inputs")
+    is_continuous = method == CONTINUOUS or (gradient is not None and CONTINUOUS in gradient.methods)
+    _check_arguments(us, policy, refine, refine_stiffness, sampled, is_continuous)
+    if not is_continuous:
+        check_method(method)
     x0, vector = finite_array("x0", x0, (model.nx,)), select(model, parameters)
     if policy is None:
         inputs = check_inputs(model, us, num_steps)
@@ -117,6 +129,8 @@ def certify_rollout(
         inputs = np.empty((positive_int("num_steps", num_steps), 0))
     moved = Displaced(model, x0, inputs, loss, fresh(policy), vector, method)
     columns, subject = moved.columns, f"the rollout of {model.name}"
+    if is_continuous:
+        return _certify_continuous(moved, gradient, seconds, subject)
     here, beside = np.zeros(len(columns)), None
     if gradient is None:
         gradient = moved.gradient(here)
@@ -124,32 +138,78 @@ def certify_rollout(
             beside = moved.flat(moved.gradient(jitter(here + 1)))[None] * moved.scale
     stairs = _checked(moved, gradient)
     if sampled:
-        sample = certify_sampled(moved, gradient, seed, 0 if policy is None else 1, subject)
-        if stairs:
-            return replace(sample, verdict="discontinuous", reason=stairs)
-        cause = _cause(moved, gradient, "")  # which few rollouts may not tell: it is asked for whatever they say
-        return replace(
-            sample, cause=cause, verdict="disagree" if cause and sample.verdict == "agree" else sample.verdict
-        )
-    refinements = [
-        refined(model, x0, inputs, loss, vector, method, moved.flat(gradient), columns)
-        for wanted, refined in ((refine, refine_by_time_step), (refine_stiffness, refine_by_stiffness))
-        if wanted
-    ]
+        return _sampled(moved, gradient, stairs, seed, subject)
+    flat, (truth, no_truth) = moved.flat(gradient), (None, "")
+    if refine:
+        truth, no_truth = _truth(moved, gradient, seconds)
+    refinements = []
+    if refine and (model.can_rebuild or truth is None):
+        found = refine_by_time_step(model, x0, inputs, loss, vector, method, flat, columns, truth, no_truth)
+        refinements.append(found)
+    if refine_stiffness:
+        refinements.append(refine_by_stiffness(model, x0, inputs, loss, vector, method, flat, columns))
     method = " + ".join(dict.fromkeys((*gradient.methods, *gradient.parameter_sources)))
     certificate = _certified(moved, gradient, beside, method, subject)
-    codes = np.array(certificate.codes)
-    for found in refinements:
-        codes[0] = np.where(found.converged, codes[0], np.maximum(codes[0], VERDICTS.index("not_converged")))
-    reasons = dict(certificate.reasons)
-    if stairs:
-        codes[:] = VERDICTS.index("discontinuous")
-        reasons = {(0, j): stairs for j in range(len(columns))}
-    parts = {name: getattr(certificate, name) for name in Certificate.__dataclass_fields__}
-    parts |= {"codes": codes, "reasons": reasons}
     return RolloutCertificate(
-        **parts, gradient=gradient, refinements=tuple(refinements), cause=_cause(moved, gradient, certificate.verdict)
+        **_with_refinements(certificate, refinements, None if model.can_rebuild else truth, stairs),
+        gradient=gradient,
+        refinements=tuple(refinements),
+        cause=_cause(moved, gradient, certificate.verdict),
+        truth=truth,
+        no_truth=no_truth,
     )
+
+
+def _check_arguments(
+    us: ArrayLike | None,
+    policy: Policy | None,
+    refine: bool,
+    refine_stiffness: bool,
+    sampled: bool,
+    is_continuous: bool,
+) -> None:
+    """Raise InputError where two of them do not go together."""
+    if us is not None and policy is not None:
+        raise InputError("certify_rollout", got="us and policy", expected="one of them")
+    if is_continuous and (sampled or refine or refine_stiffness):
+        raise InputError("certify_rollout", got="refinement or a sample in continuous time", expected="neither there")
+    if (policy is not None or sampled) and (refine or refine_stiffness):
+        raise InputError("refine", got="refinement of a closed loop or of a sample", expected="it of given inputs")
+
+
+def _sampled(moved: Displaced, gradient: RolloutGradient, stairs: str, seed: int, subject: str) -> SampledCertificate:
+    """The certificate by few rollouts along random directions."""
+    sample = certify_sampled(moved, gradient, seed, 0 if moved.policy is None else 1, subject)
+    if stairs:
+        return replace(sample, verdict="discontinuous", reason=stairs)
+    cause = _cause(moved, gradient, "")  # which few rollouts may not tell: it is asked for whatever they say
+    return replace(sample, cause=cause, verdict="disagree" if cause and sample.verdict == "agree" else sample.verdict)
+
+
+def _certify_continuous(
+    moved: Displaced, gradient: RolloutGradient | None, seconds: float, subject: str
+) -> RolloutCertificate:
+    """The certificate of a gradient in continuous time: one column for each slope that is measured."""
+    if gradient is None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", GradientWarning)  # the certificate says it, and more
+            gradient = moved.gradient(np.zeros(len(moved.scale)))
+    stairs = stairs_of_loss(moved.loss, gradient, moved.space)
+    if moved.policy is not None:
+        stairs = stairs or stairs_of_policy(moved.policy, gradient, moved.space, moved.model.time_step)
+    truth = truth_of(moved, moved.flat(gradient), gradient.loss, seconds)
+    parts = by_truth(truth, subject)
+    return RolloutCertificate(
+        **_with_refinements(Certificate(**parts), (), None, stairs), gradient=gradient, truth=truth
+    )
+
+
+def _truth(moved: Displaced, gradient: RolloutGradient, seconds: float) -> tuple[Truth | None, str]:
+    """The motion in continuous time beside a gradient, or why there is none."""
+    try:
+        return truth_of(moved, moved.flat(gradient), gradient.loss, seconds), ""
+    except (ModelError, SimulationError) as error:
+        return None, str(error)
 
 
 def _checked(moved: Displaced, gradient: RolloutGradient) -> str:
@@ -182,6 +242,24 @@ def _certified(
         return by(partial(moved.solved_losses, left), differences_of_solved(worst), 0.0, worst)
     except NotSolvedError as why:
         return by(moved.losses, differences_of_drake(str(why)), tolerance * abs(gradient.loss), tolerance)
+
+
+def _with_refinements(
+    certificate: Certificate, refinements: Sequence[Refinement], truth: Truth | None, stairs: str
+) -> dict[str, Any]:
+    """The parts of a certificate whose entries that do not converge, are not the truth, or on stairs, do not agree."""
+    codes, reasons = np.array(certificate.codes), dict(certificate.reasons)
+    wrong = np.zeros(codes.shape[1], dtype=bool)
+    for found in refinements:
+        wrong |= ~found.converged
+    for slope in truth.slopes if truth is not None else ():
+        wrong[list(slope.columns)] |= slope.agrees is not True
+    codes[0, wrong] = np.maximum(codes[0, wrong], VERDICTS.index("not_converged"))
+    if stairs:
+        codes[:] = VERDICTS.index("discontinuous")
+        reasons = {(0, j): stairs for j in range(codes.shape[1])}
+    parts = {name: getattr(certificate, name) for name in Certificate.__dataclass_fields__}
+    return parts | {"codes": codes, "reasons": reasons}
 
 
 def _cause(moved: Displaced, gradient: RolloutGradient, verdict: str) -> str:

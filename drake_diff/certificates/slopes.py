@@ -3,7 +3,7 @@
 1. A line through the loss of the discrete motion over a width of many teeth (see `refinement`). Two geometries touch
    one step later where a direction moves them apart by the way v h by which they approach each other in a step: that is
    the width of a tooth, and it is measured where they touch.
-2. Central differences of the loss of the motion in continuous time, where there is one.
+2. Central differences of the loss of the motion in continuous time, where there is one (see `truth`).
 """
 
 from collections.abc import Iterator
@@ -14,13 +14,13 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.certificates.certify import move, state_scale
+from drake_diff.certificates.truth import Truth
 from drake_diff.exceptions import DrakeDiffError, SimulationError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.model.plant import actuators
 from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
-from drake_diff.motion.continuous import ContinuousMotion
 from drake_diff.motion.loss import Loss, evaluate_loss
 from drake_diff.motion.rollout import roll_states
 
@@ -28,8 +28,7 @@ FRACTIONS = np.array([0.25, 0.5, 0.75, 1.0])  # of the width: where the loss is 
 TEETH = 8.0  # to each side
 ALIKE = 30.0  # what needs so many times the narrowest tooth's width is hardly moved by the direction
 WIDEST = 0.25  # of a state's or a parameter's own scale
-WIDTH, NARROW = 1e-3, 1e-4  # of the scale, where no tooth is known: of the line, and of the continuous motion
-ALL_EVALUATIONS = 2_000_000  # of the equations of motion in continuous time for all directions, about a minute
+WIDTH = 1e-3  # of the scale, where no tooth is known
 PILOT = 1e-6  # of the scale: how far a direction is followed to see what it moves
 
 
@@ -52,7 +51,7 @@ class Slope:
     secant: float
     width: float  # to both sides, in the unit of the direction
     continuous: float
-    spread: float  # of the continuous motion's over two widths
+    spread: float  # by how much that may be off; infinite where there is none
     missing: tuple[str, ...]
 
     def __str__(self) -> str:
@@ -60,7 +59,12 @@ class Slope:
         if np.isfinite(self.secant):
             found.append(f"over +-{self.width:.2g} the loss itself rises by {self.secant:.4g}")
         if np.isfinite(self.continuous):
-            found.append(f"the continuous motion's slope is {self.continuous:.4g} (+-{self.spread:.1g})")
+            sure = (
+                f"(+-{self.spread:.1g})"
+                if np.isfinite(self.spread)
+                else "over its narrowest width, and does not settle"
+            )
+            found.append(f"the continuous motion's slope is {self.continuous:.4g} {sure}")
         return ", ".join((*found, *self.missing))
 
 
@@ -91,6 +95,8 @@ class Motions:
     loss: Loss
     vector: ParameterVector
     parts: int
+    truth: Truth | None
+    no_truth: str = ""
 
     def slope(self, direction: Direction) -> Slope:
         """The loss's, along one direction."""
@@ -101,13 +107,14 @@ class Motions:
             secant = self._secant(direction, width)
         except DrakeDiffError as error:
             missing.append(f"no line through the loss: {error}")
-        try:
-            self._check_continuous()
-            widths = np.array([WIDTH, NARROW]) * direction.scale
-            over = [(self._continuous(direction, w) - self._continuous(direction, -w)) / (2 * w) for w in widths]
-            continuous, spread = over[1], abs(over[1] - over[0])
-        except DrakeDiffError as error:
-            missing.append(f"no slope of the continuous motion: {error}")
+        if self.truth is None:
+            missing.append(f"no slope of the continuous motion: {self.no_truth}")
+        else:
+            true = self.truth.slope(direction.name)
+            if true.exists is None:
+                missing.append(f"no slope of the continuous motion: {true.reason}")
+            else:
+                continuous, spread = (true.value, true.error) if true.exists else (true.slopes[-1], np.inf)
         return Slope(direction, secant, width, continuous, spread, tuple(missing))
 
     def _at(self, direction: Direction, s: float) -> tuple[Array, Array, ParameterVector]:
@@ -121,28 +128,6 @@ class Motions:
         x0, us, values = self._at(direction, s)
         with applied(select(self._finer, values.to_dict())) as finer:
             return roll_states(finer, x0, np.repeat(us, self.parts, axis=0)), us
-
-    def _continuous(self, direction: Direction, s: float) -> float:
-        x0, us, values = self._at(direction, s)
-        with applied(values) as model:
-            return evaluate_loss(self.loss, ContinuousMotion(model).states(x0, us), us)
-
-    def _check_continuous(self) -> None:
-        """Raise SimulationError or ModelError where the motion itself has no continuous form, or a too long one."""
-        if self._why_not_continuous:
-            raise SimulationError(self._why_not_continuous)
-
-    @cached_property
-    def _why_not_continuous(self) -> str:
-        count = 4 * (tangent_space(self.model).size + self.us.shape[1] + len(self.vector.values))
-        try:
-            with applied(self.vector) as model:
-                motion = ContinuousMotion(model)
-                motion.states(self.x0, self.us)
-        except DrakeDiffError as error:
-            return str(error)
-        taken = count * motion.used
-        return "" if taken <= ALL_EVALUATIONS else f"{taken:.2g} evaluations are more than {ALL_EVALUATIONS:.0e}"
 
     def _secant(self, direction: Direction, width: float) -> float:
         """By least squares of an odd cubic through the loss at `FRACTIONS` of the width."""

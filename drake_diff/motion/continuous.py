@@ -12,8 +12,8 @@ these formulas: of Drake it takes the mass matrix, the forces without contact an
 of a discrete step.
 
 In the air steps are explicit. What touches is stiff, as friction that holds is a damper of mu f / v_s: steps there are
-linearly implicit, of `rodas`. Where two geometries touch or let go the force has a corner, and that of Kelvin and Voigt
-jumps by k tau x': a step ends there, and no pair pushes within a step that did not at its start.
+linearly implicit, of `rosenbrock`. Where two geometries touch or let go the force has a corner, and that of Kelvin and
+Voigt jumps by k tau x': a step ends there, and no pair pushes within a step that did not at its start.
 """
 
 import time
@@ -31,20 +31,22 @@ from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators, proximity_property
 from drake_diff.model.step import set_state
+from drake_diff.motion import rosenbrock
 from drake_diff.motion.dormand_prince import ERROR, LEAST, STAGES, factor
-from drake_diff.motion.rodas import ImplicitSteps
 
 TOLERANCE = 1e-9  # of each step, relative to max(1, |x|)
-EVALUATIONS = 40_000  # of the equations of motion at most, about a second
+EVALUATIONS = 1_000_000  # of the equations of motion at most, about half a minute
 # v_s [m/s]: below it friction is a damper, above it Coulomb's, as in Drake's continuous plants. In Drake's steps it is
 # 1e-4 or less.
 SLIP = 1e-3
+NUDGE = 1e-9  # of a state's entries, which the slopes of the rates are differences over: a millionth of v_s
 SHORTEST = 1e-14  # [s] a step that is shorter does not move time
 ROOT = 1e-13  # [s] how near to a touch, or to the end of one, the step before it ends
-LOOKS = tuple(i / 8 for i in range(1, 9))  # of a step in the air: where it is looked at for what touches
+LOOK, LOOKS = 1e-3, 8  # [s] how often a step in the air is looked at for what touches, and how many times at most
 KELVIN_VOIGT, HUNT_CROSSLEY = "Kelvin-Voigt", "Hunt-Crossley"  # the laws of contact
 DAMPING = {KELVIN_VOIGT: "relaxation_time", HUNT_CROSSLEY: "dissipation"}  # the quantity each needs beside stiffness
 Rates = Callable[[Array], Array]
+Chooser = Callable[[Array, int], Array]  # the state (nx,) and the number of the step -> the input (nu,)
 Pairs = frozenset[Any]  # of geometries' identifiers
 
 
@@ -81,7 +83,7 @@ class ContinuousMotion:
         if model.num_constraints:
             raise ModelError("constraints have none")
         self.model, self.twin = model, model.double
-        self.used = 0  # evaluations of the equations of motion by the last call of `states`
+        self.used, self.touched = 0, False  # evaluations of the rates, and whether anything touched, in the last call
         self.touches = bool(contact.collision_pairs)
         self.law = law or own_law(model)
         self.actuation = model.actuation
@@ -92,20 +94,26 @@ class ContinuousMotion:
         self.forces = MultibodyForces(plant)
         self._found: dict[Any, _Touch] = {}
 
-    def states(self, x0: Array, us: Array, *, tolerance: float | None = None, deadline: float = np.inf) -> Array:
-        """(N+1, nx) at the ends of the model's steps, over which us (N, nu) is held.
+    def states(self, x0: Array, us: Array) -> Array:
+        """(N+1, nx) at the ends of the model's steps, over which us (N, nu) is held; raises as `roll`."""
+        return self.roll(x0, lambda x, k: us[k], len(us))[0]
+
+    def roll(
+        self, x0: Array, choose: Chooser, count: int, *, tolerance: float = TOLERANCE, deadline: float = np.inf
+    ) -> tuple[Array, Array]:
+        """xs (N+1, nx) at the ends of the model's steps, and us (N, nu), each chosen at the start of one and held.
 
         SimulationError where it has no end: it reaches a joint limit, or is too stiff for `EVALUATIONS`. TimeoutError
         where the clock (`time.monotonic`) is past `deadline` [s].
         """
-        xs, dt = np.empty((len(us) + 1, self.model.nx)), self.model.time_step
-        xs[0], self.used = x0, 0
-        allowed = TOLERANCE if tolerance is None else tolerance
-        for k, u in enumerate(us):
-            self.twin.set_input(u)
-            force = self.actuation @ np.clip(u, -self.limits, self.limits)
-            xs[k + 1], dt = self._advance(partial(self.rates, force), xs[k], dt, allowed, deadline)
-        return xs
+        xs, us, dt = np.empty((count + 1, self.model.nx)), np.empty((count, self.model.nu)), self.model.time_step
+        xs[0], self.used, self.touched = x0, 0, False
+        for k in range(count):
+            us[k] = choose(xs[k], k)
+            self.twin.set_input(us[k])
+            force = self.actuation @ np.clip(us[k], -self.limits, self.limits)
+            xs[k + 1], dt = self._advance(partial(self.rates, force), xs[k], dt, tolerance, deadline)
+        return xs, us
 
     def rates(self, force: Array, x: Array, only: Pairs | None = None) -> Array:
         """(nx,) dx/dt at `x` (nx,) under the actuators' generalized `force` (nv,); of contacts `only` some push."""
@@ -223,6 +231,7 @@ class ContinuousMotion:
         """(the state one of the model's steps after `x`, a length of step [s] that would do next)."""
         duration, now, pushing = self.model.time_step, 0.0, self.pushing(x)
         while now < duration:
+            self.touched |= bool(pushing)
             f = partial(rates, only=pushing)
             steps = ImplicitSteps(f, x) if pushing else ExplicitSteps(f, x)
             while True:
@@ -255,8 +264,10 @@ class ContinuousMotion:
             return step, ahead, pushing
         low, high, now = 0.0, step, self.pushing(ahead)
         if isinstance(steps, ExplicitSteps):
-            seen = next((part for part in LOOKS if self.pushing(steps.within(part, ahead))), 1.0)
-            low, high = (seen - LOOKS[0]) * step, seen * step
+            looks = min(LOOKS, 1 + int(step / LOOK))
+            parts = (i / looks for i in range(1, looks))
+            seen = next((part for part in parts if self.pushing(steps.within(part, ahead))), 1.0)
+            low, high = (seen - 1 / looks) * step, seen * step
             if seen < 1:
                 ahead, _ = steps.take(high)
                 now = self.pushing(ahead)
@@ -292,6 +303,28 @@ class ExplicitSteps:
         s, h = part, self.length
         ends = (1 + 2 * s) * (1 - s) ** 2 * self.x + s * s * (3 - 2 * s) * ahead
         return np.asarray(ends + h * s * (1 - s) * ((1 - s) * self.first - s * self.last))
+
+
+class ImplicitSteps:
+    """Steps of any length from one state, of Rodas5P, which share the slopes of the rates there."""
+
+    def __init__(self, rates: Callable[[Array], Array], x: Array):
+        self.rates, self.x, self.first = rates, x, rates(x)
+        self.slopes = np.empty((len(x), len(x)))
+        for j, size in enumerate(np.maximum(1.0, np.abs(x)).tolist()):
+            beside = x.copy()
+            beside[j] += NUDGE * size
+            self.slopes[:, j] = (rates(beside) - self.first) / (beside[j] - x[j])
+
+    def take(self, h: float) -> tuple[Array, Array]:
+        """The state after a step of `h` [s], and its error."""
+        inverse = np.linalg.inv(np.eye(len(self.x)) / (rosenbrock.GAMMA * h) - self.slopes)
+        stages, at = np.empty((len(rosenbrock.STAGES), len(self.x))), self.x
+        for i, (weights, couplings) in enumerate(zip(rosenbrock.STAGES, rosenbrock.COUPLINGS, strict=True)):
+            at = self.x + weights @ stages[:i]
+            value = self.first if i == 0 else self.rates(at)
+            stages[i] = inverse @ (value + couplings @ stages[:i] / h)
+        return at + stages[-1], stages[-1]
 
 
 def _ratio(x: Array, ahead: Array, error: Array, tolerance: float) -> float:

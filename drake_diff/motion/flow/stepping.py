@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff.motion.flow import rosenbrock
+from drake_diff.motion import rosenbrock
 from drake_diff.motion.flow.plant import FlowPlant
 
 STABLE = 1.0  # of a step's length times the rate at which its stages move apart; the explicit method is stable to 3.3

@@ -1,0 +1,343 @@
+"""What a rollout's gradient is beside the truth: the motion in continuous time that the discrete steps stand for.
+
+The motion is integrated with error control from the contact law itself (`motion.continuous`), which shares nothing with
+the steps nor with `differentiate_rollout(method="continuous")`. A slope is measured by central differences over three
+widths, 1e-2, 1e-3 and 1e-4 of a column's scale (a tenth of that where nothing touches), each with an integration as
+much more accurate as it is narrower. It exists where the two narrow ones agree to 0.1 %, and the wide one agrees as
+well or differs from them as a smooth curve does: by the square of the width, which half the wide one shows; and where
+it is the same ahead as behind. It is unknown, and nothing else, where the time is up first or the integration's own
+error hides it.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from drake_diff._base.arrays import Array, Indices, frozen
+from drake_diff._base.jupyter import ShowsItsRepr
+from drake_diff.certificates.displaced import Displaced
+from drake_diff.certificates.judgement import VERDICTS
+from drake_diff.certificates.neighbourhood import TINY
+from drake_diff.exceptions import DrakeDiffError
+from drake_diff.model.parameters import applied
+from drake_diff.model.plant import actuators
+from drake_diff.motion.continuous import HUNT_CROSSLEY, KELVIN_VOIGT, ContinuousMotion
+from drake_diff.motion.gradient import CONTINUOUS
+from drake_diff.motion.loss import evaluate_loss
+
+WIDTHS = (1e-2, 1e-3, 1e-4)  # of a column's scale, to both sides
+BETWEEN = 5e-3  # a fourth, where the first is another slope than the rest
+CURVE = (WIDTHS[0] ** 2 - WIDTHS[1] ** 2) / (BETWEEN**2 - WIDTHS[1] ** 2)  # how the slopes of a smooth curve differ
+BENT = 0.1  # of that: what its next derivative may add
+SHRINKS = 0.3  # of a smooth curve's corner a tenth is left over a tenth of the width, of a real one all
+SMOOTH = 0.1  # part of the widths where nothing touches
+TOLERANCE = 1e-5  # of an integration's step, as a part of the width
+SETTLED = 1e-3  # how far apart slopes may be, of their size
+RIGHT = 1e-2  # how far from the truth a gradient may be, of its size
+NEGLIGIBLE = 1e-3  # of the largest column, each moved by its scale: a smaller one is judged as if it were that large
+CLOSE = 3e-3  # the same, for a yes
+KNOWN = 1e-2  # of a slope: the integration's own error at most
+SURE = 3.0  # times what the integration's error is found to be
+ROUNDED = 1e-15  # of a loss: its rounding
+UNKNOWN = 1e6  # of its size: what would have been noticed where nothing is measured
+SECONDS = 10.0  # of work
+FORMULAS = {KELVIN_VOIGT: "k (x + tau x')+", HUNT_CROSSLEY: "k x (1 + d x')+"}
+
+
+@dataclass(frozen=True, eq=False)
+class TrueSlope(ShowsItsRepr):
+    """One column of a gradient, or an input's at all times together, beside the slope of the motion in continuous time.
+
+    `exists` is None where it is not known whether there is one; `reason` then says why, and where there is none. Value
+    and error are NaN unless it exists.
+    """
+
+    column: str
+    columns: tuple[int, ...]  # of the gradient, which add up to it
+    ours: float
+    widths: tuple[float, ...] = ()  # to both sides, in the column's unit
+    slopes: tuple[float, ...] = ()  # over them
+    corners: tuple[float, ...] = ()  # the slope ahead less the slope behind, over them
+    value: float = float("nan")
+    error: float = float("nan")
+    exists: bool | None = None
+    reason: str = ""
+    size: float = float("nan")  # what an error of it is measured by
+    by_other_law: float = float("nan")  # the slope under `Truth.other_law`, less this one
+
+    @property
+    def sign_agrees(self) -> bool | None:
+        """Whether ours has the sign of the truth; None where that has none that is known."""
+        if not self.exists or not abs(self.value) > self.error:
+            return None
+        return bool(np.sign(self.ours) == np.sign(self.value))
+
+    @property
+    def agrees(self) -> bool | None:
+        """Whether ours is the truth, to 1 % and its error; None where the truth is not known, or there is none."""
+        return bool(abs(self.ours - self.value) <= RIGHT * self.size + self.error) if self.exists else None
+
+    def __repr__(self) -> str:
+        if not self.exists:
+            over = ", ".join(f"{s:.4g} over +-{w:.2g}" for w, s in zip(self.widths, self.slopes, strict=True))
+            return f"by {self.column} ours is {self.ours:.4g}, {self.reason}{f': {over}' if over else ''}"
+        sign = {True: "", False: ", of the other sign", None: ""}[self.sign_agrees]
+        law = f", {self.by_other_law:+.4g} by the other law" if np.isfinite(self.by_other_law) else ""
+        return f"by {self.column} the slope is {self.value:.6g} (+-{self.error:.1g}), ours {self.ours:.6g}{sign}{law}"
+
+
+@dataclass(frozen=True, eq=False)
+class Truth(ShowsItsRepr):
+    """A rollout's loss and the slopes of it in continuous time, beside what the rollout and its gradient say.
+
+    Example:
+        >>> model = dd.load_model("models/sphere_on_ground.sdf", time_step=0.01)
+        >>> x0 = np.array([1.0, 0, 0, 0, 0, 0, 0.4, 0, 0, 0, 0, 0, -1.0])
+        >>> certificate = dd.certify_rollout(model, x0, None, lambda x: x[12], num_steps=20, refine=True)
+        >>> certificate.truth.law
+        'Kelvin-Voigt'
+    """
+
+    law: str
+    loss: float
+    error: float  # of the loss, by the integration
+    ours: float  # the rollout's
+    slopes: tuple[TrueSlope, ...]
+    seconds: float  # that it was given
+    touches: bool  # whether anything touches on the way
+    other_law: str = ""  # that of Drake's own continuous plant, where it is another one
+    by_other_law: float = float("nan")  # the loss under it, less this one
+    other_reason: str = ""  # why that is not known
+    notes: tuple[str, ...] = ()  # what else the steps have that is not the law
+
+    def slope(self, column: str) -> TrueSlope:
+        """That of a column; KeyError where there is none of that name."""
+        return {one.column: one for one in self.slopes}[column]
+
+    @property
+    def wrong(self) -> tuple[TrueSlope, ...]:
+        """Those that ours is not."""
+        return tuple(one for one in self.slopes if one.agrees is False)
+
+    def __repr__(self) -> str:
+        formula = f" ({self.law}, {FORMULAS[self.law]})" if self.touches else ""
+        lines = [
+            f"in continuous time{formula} the loss is {self.loss:.6g} (+-{self.error:.1g}); ours is {self.ours:.6g}, "
+            f"error of the step {self.ours - self.loss:.3g}"
+        ]
+        if self.other_law:
+            told = self.other_reason or f"the loss changes by {self.by_other_law:.3g}"
+            lines.append(f"difference of the laws, to {self.other_law} of Drake's continuous plant: {told}")
+        groups: dict[str, list[TrueSlope]] = {"wrong": [], "none": [], "unknown": [], "right": []}
+        for one in self.slopes:
+            key = {None: "unknown", False: "none", True: "right" if one.agrees else "wrong"}[one.exists]
+            groups[key].append(one)
+        for key, said in (
+            ("wrong", "not ours"),
+            ("none", "without a slope"),
+            ("unknown", "not known"),
+            ("right", "ours"),
+        ):
+            if ones := groups[key]:
+                lines.append(f"{len(ones)} of {len(self.slopes)} {said}, first {ones[0]!r}")
+        return "; ".join([*lines, *self.notes])
+
+
+def truth_of(moved: Displaced, gradient: Array, ours: float, seconds: float = SECONDS) -> Truth:
+    """The truth beside a `gradient` (n,) by all that `moved` moves, and the rollout's loss `ours`.
+
+    Raises ModelError or SimulationError, which say why, where the motion has no continuous form.
+    """
+    return _Measurement(moved, gradient, ours, seconds).truth()
+
+
+@dataclass(frozen=True)
+class _Line:
+    """One direction: which columns add up to it, and a unit of it as a displacement (n,)."""
+
+    name: str
+    columns: Indices
+    scale: float
+    vector: Array
+    room: float  # how far it may be moved, in its unit
+
+
+@dataclass(eq=False)
+class _Measurement:
+    moved: Displaced
+    gradient: Array
+    ours: float
+    seconds: float
+    deadline: float = field(init=False)
+    touches: bool = False
+    losses: list[float] = field(default_factory=list)  # here: one for each of the widths, and one that is better
+
+    def __post_init__(self) -> None:
+        self.deadline = time.monotonic() + self.seconds
+
+    def truth(self) -> Truth:
+        with applied(self.moved.vector) as model:
+            law = ContinuousMotion(model).law
+        losses = self.losses
+        with suppress(TimeoutError):  # every slope says so below
+            losses.extend(self._losses())
+        order = sorted(self.lines, key=lambda x: -abs(self._ours(x)) * x.scale)
+        measured = {x.name: self._measured(x) for x in order}
+        sizes = [abs(s) * x.scale for x in order for s in (*measured[x.name].slopes[-1:], self._ours(x))]
+        least = NEGLIGIBLE * max(sizes, default=0.0)
+        noise = np.abs(np.array(losses[:3]) - losses[-1]) + ROUNDED * max(map(abs, losses)) if losses else np.zeros(3)
+        slopes = tuple(judged(measured[x.name], noise, least / x.scale) for x in self.lines)
+        loss, error = losses[-1] if losses else np.nan, abs(losses[-1] - losses[-2]) if losses[1:] else np.nan
+        found = Truth(law, loss, error, self.ours, slopes, self.seconds, self.touches)
+        return self._beside_other_law(found) if law == KELVIN_VOIGT and self.touches else found
+
+    def _beyond(self) -> str:
+        return f"not measured within the budget of {self.seconds:g} s"
+
+    def _ours(self, line: _Line) -> float:
+        return float(self.gradient[line.columns].sum())
+
+    @cached_property
+    def lines(self) -> list[_Line]:
+        """Each state, each input by as much at all times or each parameter of the policy, and each of the model."""
+        moved, (count, nu) = self.moved, self.moved.us.shape
+        of_x0, given = moved.space.size, count * nu if moved.policy is None else 0
+        single = [*range(of_x0), *range(of_x0 + given, len(moved.scale))]
+        found = []
+        for j in single:
+            unit = np.zeros(len(moved.scale))
+            unit[j] = 1 / moved.scale[j]
+            found.append(_Line(moved.columns[j], np.array([j]), float(moved.scale[j]), unit, np.inf))
+        if moved.policy is not None:
+            return found
+        limits = moved.model.inputs.of_actuators([a.effort_limit() for a in actuators(moved.model.plant)])
+        cut = np.where(moved.model.inputs.actuator >= 0, limits, np.inf)
+        for j in range(nu):
+            columns = of_x0 + j + nu * np.arange(count)
+            unit = np.zeros(len(moved.scale))
+            unit[columns] = 1 / moved.scale[columns]
+            sizes = np.abs(moved.us[:, j])
+            name, room = f"{moved.model.input_names[j]} at all times", float(np.abs(cut[j] - sizes).min())
+            found.insert(of_x0 + j, _Line(name, columns, max(1.0, float(sizes.max())), unit, room))
+        return found
+
+    def _loss(self, displacement: Array, tolerance: float, law: str | None = None) -> float:
+        x0, us, parameters, values = self.moved.at(displacement)
+        ask = self.moved.inputs(us, parameters, None)
+        with applied(values) as model:
+            motion = ContinuousMotion(model, law)
+            xs, inputs = motion.roll(
+                x0, lambda x, k: ask(x, k, model.time_step), len(us), tolerance=tolerance, deadline=self.deadline
+            )
+            self.touches |= motion.touched
+        return evaluate_loss(self.moved.loss, xs, inputs)
+
+    def _widths(self) -> tuple[float, ...]:
+        return tuple(w if self.touches else SMOOTH * w for w in WIDTHS)
+
+    def _losses(self) -> Iterator[float]:
+        """The loss by an integration for each width, and by one that is better than the last."""
+        still = np.zeros(len(self.moved.scale))
+        first = self._loss(still, TOLERANCE * WIDTHS[0])  # and what touches
+        yield first if self.touches else self._loss(still, TOLERANCE * self._widths()[0])
+        for width in self._widths()[1:]:
+            yield self._loss(still, TOLERANCE * width)
+        yield self._loss(still, TOLERANCE * self._widths()[-1] / 10)
+
+    def _slope(self, line: _Line, width: float, law: str | None = None) -> tuple[float, float]:
+        """Over `width` times the scale to both sides; and by how much it is another one ahead than behind."""
+        w = width * line.scale
+        ahead, behind = (self._loss(s * w * line.vector, TOLERANCE * width, law) for s in (1, -1))
+        nearest = int(np.argmin(np.abs(np.log(np.array(self._widths()) / width))))
+        return (ahead - behind) / (2 * w), (ahead - 2 * self.losses[nearest] + behind) / w
+
+    def _measured(self, line: _Line) -> TrueSlope:
+        """The slopes along a line, from wide to narrow; not judged."""
+        widths = list(self._widths())
+        found = TrueSlope(line.name, tuple(line.columns.tolist()), self._ours(line))
+        if widths[0] * line.scale > line.room:
+            return replace(found, reason=f"not measured: moved by {widths[0] * line.scale:.2g} it is cut off")
+        try:
+            over = [self._slope(line, w) for w in widths]
+            if not abs(over[0][0] - over[1][0]) <= SETTLED * max(abs(slope) for slope, _ in over):
+                widths.insert(1, widths[0] * BETWEEN / WIDTHS[0])
+                over.insert(1, self._slope(line, widths[1]))
+        except TimeoutError:
+            return replace(found, reason=self._beyond())
+        except DrakeDiffError as error:
+            return replace(found, reason=f"not measured: a little away there is no motion: {error}")
+        slopes, corners = zip(*over, strict=True)
+        return replace(found, widths=tuple(w * line.scale for w in widths), slopes=slopes, corners=corners)
+
+    def _beside_other_law(self, found: Truth) -> Truth:
+        """With what Drake's continuous plant would do, which has Hunt and Crossley's law whatever the steps have."""
+        still, slopes, tolerance = np.zeros(len(self.moved.scale)), list(found.slopes), TOLERANCE * WIDTHS[1]
+        found = replace(found, other_law=HUNT_CROSSLEY)
+        try:
+            loss = self._loss(still, tolerance, HUNT_CROSSLEY)
+        except TimeoutError:
+            return replace(found, other_reason=self._beyond())
+        except DrakeDiffError as error:
+            return replace(found, other_reason=f"not measured: {error}")
+        for i, (one, line) in enumerate(zip(slopes, self.lines, strict=True)):
+            if not one.exists:
+                continue
+            try:
+                slopes[i] = replace(one, by_other_law=self._slope(line, WIDTHS[1], HUNT_CROSSLEY)[0] - one.value)
+            except (TimeoutError, DrakeDiffError):
+                break  # NaN: not measured
+        return replace(found, slopes=tuple(slopes), by_other_law=loss - found.loss)
+
+
+def judged(one: TrueSlope, noise: Array, least: float) -> TrueSlope:
+    """Whether the slope exists, and its value; `noise` (3,) is how wrong a loss is at each of three widths."""
+    if not one.slopes:
+        return replace(one, size=max(abs(one.ours), least))
+    (wide, *between, middle, narrow), w = one.slopes, np.array([*one.widths[:1], *one.widths[-2:]])
+    hidden = SURE * noise / w  # of each slope
+    size = max(abs(narrow), abs(middle), least)
+    found = replace(one, size=max(size, abs(one.ours)) if size > 0 else abs(one.ours))
+    if least > 0 and hidden[-1] > KNOWN * size and hidden[-1] > abs(narrow - middle):
+        return replace(found, reason=f"not known: the integration's error is {hidden[-1]:.1g} of it")
+    narrows = abs(narrow - middle) <= SETTLED * size + hidden[1] + hidden[2]
+    gap, slack = wide - middle, SETTLED * size + hidden[0] + hidden[1]
+    bends = bool(between) and abs(gap - CURVE * (between[0] - middle)) <= BENT * abs(gap) + CURVE * slack
+    corner, before = abs(one.corners[-1]), abs(one.corners[-2])
+    if corner > SETTLED * size + 4 * hidden[2] and corner > SHRINKS * before:
+        ahead, behind = (narrow + s * one.corners[-1] / 2 for s in (1, -1))
+        return replace(found, exists=False, reason=f"it has a corner here, {ahead:.4g} ahead and {behind:.4g} behind")
+    if narrows and (abs(gap) <= slack or bends):
+        return replace(found, exists=True, value=narrow, error=abs(narrow - middle) + hidden[2])
+    return replace(found, exists=False, reason="the slopes do not settle")
+
+
+def by_truth(truth: Truth, subject: str) -> dict[str, Any]:
+    """The parts of a certificate of one row, the loss, and a column for each of the slopes."""
+    slopes, shape = truth.slopes, (1, len(truth.slopes))
+    ours, value, error, size = (
+        np.array([getattr(one, name) for one in slopes], dtype=float).reshape(shape)
+        for name in ("ours", "value", "error", "size")
+    )
+    size = np.maximum(size, TINY)
+    known = np.array([bool(one.exists) for one in slopes]).reshape(shape)
+    gap, tolerance = np.abs(ours - value), CLOSE * size + error
+    codes = np.full(shape, VERDICTS.index("undecided"))
+    codes[known & (gap <= tolerance) & (gap + tolerance <= RIGHT * size)] = VERDICTS.index("agree")
+    codes[known & (gap > RIGHT * size + error)] = VERDICTS.index("disagree")
+    reasons = {}
+    for j, one in enumerate(slopes):
+        if one.exists is False:
+            codes[0, j], reasons[0, j] = VERDICTS.index("discontinuous"), repr(one)
+    unknown = UNKNOWN * size
+    return {
+        "rows": ("loss",), "columns": tuple(one.column for one in slopes), "derivative": frozen(ours),
+        "difference": frozen(np.where(known, value, np.nan)), "tolerance": frozen(np.where(known, tolerance, unknown)),
+        "noticeable": frozen(np.where(known, gap + tolerance, unknown)), "size": frozen(size), "codes": codes,
+        "reasons": reasons, "method": CONTINUOUS, "subject": subject, "around": None, "stopped": 0.0, "second": None,
+        "scale": frozen(np.ones(len(slopes))), "told": "differences are of another integration of the same motion",
+    }  # fmt: skip
