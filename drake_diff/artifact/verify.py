@@ -49,7 +49,11 @@ OF_FUNCTIONS = (
     "all that rests on the functions: only the plan's first and last state and its bounds were compared with the "
     "metrics, and the plan with the trace"
 )
-NOT_RERUN = {"comparison": "the engines were not run again", "robustness": "the trials were not run again"}
+NOT_RERUN = {
+    "comparison": "the engines were not run again",
+    "robustness": "the trials were not run again",
+    "rollout": "a loss is a function, and was not asked again",
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -153,12 +157,13 @@ def verify(directory: str | Path) -> Verification:
     again. So whoever changes a value and all hashes with it is found, and the message names the value. A record of an
     easier task is as true as any: `claimed` says what was asked.
 
-    Comparisons and robustness trials are not run again: their verdict is at best "intact". What cannot be run again (a
-    model that came from a diagram, a user's functions, a search that a time limit ended) makes the verdict "undecided",
-    and so does another version of Drake where numbers differ. It takes as long as the solve did.
+    Comparisons, robustness trials and rollouts' certificates are not run again: their verdict is at best "intact". What
+    cannot be run again (a model that came from a diagram, a user's functions, a search that a time limit ended) makes
+    the verdict "undecided", and so does another version of Drake where numbers differ. It takes as long as the solve
+    did.
 
     Args:
-        directory: What `save`, `save_comparison`, `save_robustness` or `certify_model` wrote.
+        directory: What `save`, `save_comparison`, `save_robustness`, `certify_model` or `save_rollout` wrote.
 
     Returns:
         A `Verification`: the verdict, what was claimed, what was not checked, and what does not hold.

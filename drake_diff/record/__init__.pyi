@@ -3,5 +3,7 @@ from .certification import certify_model as certify_model
 from .comparison import ComparisonRecord as ComparisonRecord
 from .phases import PhasesRecord as PhasesRecord
 from .robustness import RobustnessRecord as RobustnessRecord
+from .rollout import RolloutRecord as RolloutRecord
+from .rollout import save_rollout as save_rollout
 from .sealed import SealedRecord as SealedRecord
 from .solve import EvidenceRecord as EvidenceRecord

@@ -7,6 +7,7 @@ from drake_diff.record.certification import CertificationRecord
 from drake_diff.record.comparison import ComparisonRecord
 from drake_diff.record.phases import PhasesRecord
 from drake_diff.record.robustness import RobustnessRecord
+from drake_diff.record.rollout import RolloutRecord
 from drake_diff.record.sealed import SealedRecord
 from drake_diff.record.solve import EvidenceRecord
 
@@ -16,6 +17,7 @@ KINDS: tuple[type[SealedRecord], ...] = (
     RobustnessRecord,
     CertificationRecord,
     PhasesRecord,
+    RolloutRecord,
 )
 
 
@@ -25,16 +27,17 @@ def kind_of(directory: str | Path) -> type[SealedRecord] | None:
 
 
 def load_record(directory: str | Path) -> SealedRecord:
-    """Read the record in a directory that a solve, a comparison, robustness trials or a certification wrote.
+    """Read the record in a directory that a solve, a comparison, trials, a certification or `save_rollout` wrote.
 
     It is read, not verified: see `verify`.
 
     Args:
-        directory: The directory that holds record.json, phases.json, comparison.json, robustness.json or
-            certification.json.
+        directory: The directory that holds record.json, phases.json, comparison.json, robustness.json,
+            certification.json or rollout.json.
 
     Returns:
-        An `EvidenceRecord`, `PhasesRecord`, `ComparisonRecord`, `RobustnessRecord` or `CertificationRecord`.
+        An `EvidenceRecord`, `PhasesRecord`, `ComparisonRecord`, `RobustnessRecord`, `CertificationRecord` or
+        `RolloutRecord`.
 
     Raises:
         ArtifactError: There is no such record, or it does not follow its schema.
