@@ -76,7 +76,7 @@ def test_a_gradient_that_converges_to_the_slope_of_the_teeth_is_refused(tmp_path
     """The force of `sap` jumps by k tau v at the touch: the loss is a sawtooth, the gradient the slope of a tooth."""
     ball = Bounce(stiffness, relaxation_time=tau)
     model = ball.model(tmp_path / "bouncer.sdf", "sap", h)
-    certificate = dd.certify_rollout(model, DROP, None, height, num_steps=round(FALL / h), refine=True)
+    certificate = dd.certify_rollout(model, DROP, None, height, num_steps=round(FALL / h), refine=True, seconds=60)
     refinement, (truth, uncertain) = certificate.refinements[0], ball.slopes("sap", DROP, FALL)
     assert uncertain < 1e-4
     assert np.ptp(refinement.values[:, 0]) < 0.08 * abs(refinement.values[0, 0])  # it converges, to something else

@@ -86,7 +86,8 @@ def certify_rollout(
         refine: take the gradient again at h/2 and h/4, under the same inputs, and compare it with the slopes of the
             loss over the way of many steps and of the motion in continuous time, along each state, each input by as
             much at all times, and each parameter. The latter is the certificate's `truth`.
-        seconds: of work at most for the motion in continuous time [s]; columns that are not measured by then say so.
+        seconds: of this thread's work at most for the motion in continuous time [s]; columns that are not measured by
+            then say so.
         refine_stiffness: take it again at 4 and 16 times every contact stiffness that the model states.
         method: as in `differentiate_step`; or "continuous": the gradient of the motion in continuous time, beside the
             slopes of another integration of it. A column has no slope where those do not settle, which is

@@ -45,7 +45,7 @@ KNOWN = 1e-2  # of a slope: the integration's own error at most
 SURE = 3.0  # times what the integration's error is found to be
 ROUNDED = 1e-15  # of a loss: its rounding
 UNKNOWN = 1e6  # of its size: what would have been noticed where nothing is measured
-SECONDS = 10.0  # of work
+SECONDS = 10.0  # of this thread's work
 FORMULAS = {KELVIN_VOIGT: "k (x + tau x')+", HUNT_CROSSLEY: "k x (1 + d x')+"}
 
 
@@ -178,7 +178,7 @@ class _Measurement:
     losses: list[float] = field(default_factory=list)  # here: one for each of the widths, and one that is better
 
     def __post_init__(self) -> None:
-        self.deadline = time.monotonic() + self.seconds
+        self.deadline = time.thread_time() + self.seconds
 
     def truth(self) -> Truth:
         with applied(self.moved.vector) as model:

@@ -104,7 +104,7 @@ class ContinuousMotion:
         """xs (N+1, nx) at the ends of the model's steps, and us (N, nu), each chosen at the start of one and held.
 
         SimulationError where it has no end: it reaches a joint limit, or is too stiff for `EVALUATIONS`. TimeoutError
-        where the clock (`time.monotonic`) is past `deadline` [s].
+        where this thread has worked (`time.thread_time`) until `deadline` [s].
         """
         xs, us, dt = np.empty((count + 1, self.model.nx)), np.empty((count, self.model.nu)), self.model.time_step
         xs[0], self.used, self.touched = x0, 0, False
@@ -237,7 +237,7 @@ class ContinuousMotion:
             while True:
                 if self.used > EVALUATIONS:
                     raise SimulationError(f"it is too stiff: {EVALUATIONS} evaluations do not reach its end")
-                if time.monotonic() > deadline:
+                if time.thread_time() > deadline:
                     raise TimeoutError
                 step = min(dt, duration - now)
                 ahead, error = steps.take(step)
