@@ -10,7 +10,6 @@ import time
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.exceptions import SimulationError
@@ -24,6 +23,7 @@ ROOT = 1e-13  # of a step: how near to its event it ends
 SHORTEST = 1e-14  # [s] a step that is shorter does not move time
 BEYOND = 1e-4  # of the way to where a switch is expected to be 0: how far beyond it the next look is
 EDGE = 1e-9  # [m] a body that moves along an edge passes it all the time by less
+NOTHING = np.zeros(0, dtype=np.intp)
 SHALLOW = 1e-13  # [m] overlap that begins and ends within a step and is not looked for
 
 
@@ -71,6 +71,7 @@ class Integrator:
         self.stepper = Stepper(plant, self.materials)
         self.h_next, self.began = model.time_step, 0.0
         self.modes = np.zeros(self.count)
+        self._on, self._matters = (np.zeros(watched, dtype=bool) for _ in range(2))
         self._start = _Switches(np.zeros(watched), np.zeros(watched))  # where the step begins
         self._x, self._rates = np.zeros(model.nx), np.zeros(model.nx)
         self._values, self._changes = np.zeros(watched), np.zeros(watched)
@@ -80,7 +81,7 @@ class Integrator:
     def begin(self, x0: Array) -> Flow:
         """A flow that stands at `x0` (nx,)."""
         self.stepper.x[:], self.h_next = x0, self.plant.model.time_step
-        self.modes[:] = 0.0
+        self._set(np.zeros(self.count))
         self.stepper.push(())
         self.began = time.monotonic()
         return Flow([0.0], [np.array(x0, dtype=float)])
@@ -141,21 +142,22 @@ class Integrator:
         self.stepper.attempt(length)
         return self._switches_ahead()
 
-    def _matters(self) -> NDArray[np.bool_]:
-        """(2 P,) a bracket matters where its pair overlapped."""
-        matters = np.repeat(self.modes[::2] > 0.5, 2)
-        matters[::2] = True
-        return matters
+    def _set(self, modes: Array) -> None:
+        """Take new modes: a bracket matters where its pair overlapped, and an edge where its pair pushes."""
+        self.modes[:] = modes
+        overlaps, pushes = modes[::2] > 0.5, modes[::2] * modes[1::2] > 0.5
+        self._on[: self.count] = modes > 0.5
+        self._matters[: self.count : 2], self._matters[1 : self.count : 2] = True, overlaps
+        self._matters[self.count :] = pushes[self.plant.edge_pairs]
 
     def _turned(self, end: _Switches) -> Indices:
         """The switches that differ from the modes at the step's end, and the edges that a pair that pushes passed."""
-        n, values, was = self.count, end.values, self._start.values
-        turned = np.flatnonzero(((values[:n] > 0) != (self.modes > 0.5)) & self._matters())
-        if not len(self.plant.edge_pairs):
-            return turned
-        pushes = (self.modes[::2] * self.modes[1::2])[self.plant.edge_pairs] > 0.5
-        passed = ((values[n:] > 0) != (was[n:] > 0)) & (np.abs(values[n:] - was[n:]) > EDGE)
-        return np.concatenate([turned, n + np.flatnonzero(pushes & passed)])
+        turned = ((end.values > 0) != self._on) & self._matters
+        if not turned.any():
+            return NOTHING
+        n, moved = self.count, np.abs(end.values - self._start.values)
+        turned[n:] &= moved[n:] > EDGE
+        return np.flatnonzero(turned)
 
     def _find(self, length: float, end: _Switches) -> tuple[float, _Switches]:
         """The length of the step at whose end the first of the switches that turned is 0, just past it."""
@@ -174,9 +176,12 @@ class Integrator:
 
     def _dip(self, length: float, end: _Switches) -> tuple[float, _Switches] | None:
         """The length of a step within this one at whose end a switch has turned that is back at its end, or None."""
-        side = np.where(self.modes > 0.5, 1.0, -1.0)
-        now, before, after = (a[: self.count] for a in (end.values, self._start.rates, end.rates))
-        falls = self._matters() & (side * now > 0) & (side * before < 0) & (side * after > 0)
+        n, on = self.count, self._on[: self.count]
+        toward, away = self._start.rates[:n] > 0, end.rates[:n] > 0
+        falls = (toward != on) & (away == on) & ((end.values[:n] > 0) == on) & self._matters[:n]
+        if not falls.any():
+            return None
+        side = np.where(on, 1.0, -1.0)
         looked = False
         for i in np.flatnonzero(falls).tolist():
             low, high, first, last = 0.0, length, self._start, end
@@ -203,9 +208,10 @@ class Integrator:
         self.stepper.accept(length)
         found.xs.append(self.stepper.x.copy())
         self.plant.check(self.stepper.x)
-        if np.any(end.values[: self.count : 2] > self.plant.pairs.radius):
+        if (end.values[: self.count : 2] > self.plant.pairs.radius).any():
             found.deep.append(len(found.hs) - 1)
         self._start = end
+        self._on[self.count :] = end.values[self.count :] > 0
         self._settle(found)
 
     def _look(self) -> None:
@@ -213,12 +219,14 @@ class Integrator:
         self._x[:], self._rates[:] = self.stepper.x, self.stepper.rates()
         self._run()
         self._start = _Switches(self._values.copy(), self._changes.copy())
+        self._on[self.count :] = self._values[self.count :] > 0
 
     def _settle(self, found: Flow) -> None:
         """Set the modes to what the switches say at the state, and note what turns; of a pair apart nothing pushes."""
-        on, modes = self._start.values[: self.count] > 0, self.modes.copy()
-        if np.array_equal(on, modes > 0.5):
+        on = self._start.values[: self.count] > 0
+        if not (on != self._on[: self.count]).any():
             return
+        modes = self.modes.copy()
         for i in range(self.plant.num_pairs):
             was, now = modes[2 * i : 2 * i + 2] > 0.5, on[2 * i : 2 * i + 2]
             modes[2 * i : 2 * i + 2] = now
@@ -226,7 +234,8 @@ class Integrator:
             if was[0] != now[0] or (now[0] and was[1] != now[1]):
                 both = float(now[0]), float(now[1])
                 found.events.append(FlowEvent(found.times[-1], len(found.hs), switch, both, self.stepper.x.copy()))
-        pushed, self.modes[:] = pushing_of(self.modes), modes
+        pushed = pushing_of(self.modes)
+        self._set(modes)
         if pushing_of(modes) != pushed:
             self.stepper.push(pushing_of(modes))
             self._look()

@@ -29,7 +29,7 @@ class FlowSteps:
                     f"{', '.join(QUANTITIES)}"
                 )
         self.model, self.vector, self.plant = model, vector, flow_plant(model)
-        self.material = material_of(self.plant)
+        self.material, self._limits = material_of(self.plant), model.position_limits
         self.integrator = Integrator(self.plant, numbers_of(self.plant, self.material), tolerance)
 
     def roll(self, x0: Array, choose: Chooser, count: int) -> tuple[Array, Array, Flow]:
@@ -45,7 +45,7 @@ class FlowSteps:
         return xs, us, flow
 
     def _check_limits(self, xs: Array) -> None:
-        lower, upper = self.model.position_limits
+        lower, upper = self._limits
         qs = xs[:, : self.model.nq]
         beyond = np.flatnonzero(np.any((qs < lower) | (qs > upper), axis=0))
         if len(beyond):

@@ -33,7 +33,7 @@ WEIGHTS = np.array(
     ]
 )
 ALONG = 1e-9  # of the sizes of a switch's slope and of the rates: less is no crossing
-AT_ONCE = 256  # steps whose equations are solved in one call
+AT_ONCE = 1_000_000  # numbers of the equations that are solved in one call
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +56,9 @@ def transitions(plant: FlowPlant, flow: Flow, materials: Array, by_parameters: A
     for pushing, chosen in sets.items():
         own = [4 * i + j for i in pushing for j in range(4)]
         slopes = Slopes(plant.part(pushing), materials, by_parameters[own])
-        for first in range(0, len(chosen), AT_ONCE):
-            rows = np.array(chosen[first : first + AT_ONCE])
+        at_once = max(1, AT_ONCE // (9 * nx * found.shape[2]))
+        for first in range(0, len(chosen), at_once):
+            rows = np.array(chosen[first : first + at_once])
             found[rows] = _changes(slopes, xs[rows], xs[rows + 1], us[rows], hs[rows])
     for m in flow.deep:
         plant.check_normals(xs[m], xs[m + 1], pushing_of(flow.modes[m]))
