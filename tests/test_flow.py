@@ -20,8 +20,8 @@ import drake_diff as dd
 from drake_diff.exceptions import GradientError, GradientWarning, ModelError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.parameters import select
-from drake_diff.motion import rosenbrock
 from drake_diff.motion.continuous import ContinuousMotion
+from drake_diff.motion.flow import rosenbrock
 from drake_diff.motion.flow.integrate import Integrator, pushing_of
 from drake_diff.motion.flow.plant import flow_plant, material_of, numbers_of
 from drake_diff.motion.flow.steps import FlowSteps

@@ -213,23 +213,25 @@ def _in_continuous_time(
     """
     from drake_diff.motion.flow.integrate import TOLERANCE  # loads CasADi
     from drake_diff.motion.flow.steps import FlowSteps
+    from drake_diff.motion.rigid.steps import TOLERANCE as RIGID
     from drake_diff.motion.rigid.steps import RigidSteps
-    from drake_diff.motion.undefined import Beside, along_the_flow, undefined_columns
+    from drake_diff.motion.undefined import Beside, undefined_columns
 
     if policy is None:
         given = check_inputs(model, us, num_steps)
     else:
         given = np.zeros((positive_int("num_steps", num_steps), model.nu))
-    for tolerance in (TOLERANCE, FINER * TOLERANCE):
-        with applied(vector) as set_model:
-            steps: FlowSteps | RigidSteps = (
-                RigidSteps(set_model, vector, method, FINER * tolerance)
-                if isinstance(method, RigidContact)
-                else FlowSteps(set_model, vector, tolerance)
-            )
-            linearization, feedback, inputs = along_the_flow(steps, x0, given, policy)
+    with applied(vector) as set_model:
+        if isinstance(method, RigidContact):
+            beside = Beside(model, x0, given, policy, loss, vector, RigidSteps(set_model, vector, method))
+            tolerances: tuple[float, ...] = (RIGID,)
+        else:
+            beside = Beside(model, x0, given, policy, loss, vector, FlowSteps(set_model, vector))
+            tolerances = TOLERANCE, FINER * TOLERANCE
+    for tolerance in tolerances:
+        linearization, feedback, inputs = beside.linearize(tolerance)
         value, totals = total_gradients(loss, x0, inputs, policy, linearization, feedback)
-        undefined = undefined_columns(Beside(model, x0, inputs, policy, loss, vector, steps), totals)
+        undefined = undefined_columns(beside, totals)
         if not any(one.missed for one in undefined):
             break
     if undefined:

@@ -145,11 +145,12 @@ class Beside:
 
     model: Model
     x0: Array
-    us: Array  # (N, nu)
+    us: Array  # (N, nu); under a policy of that length alone
     policy: Any
     loss: Loss
     vector: ParameterVector
     steps: FlowSteps | RigidSteps  # of the motion itself, whose equations are made
+    known: dict[tuple[bytes, float], tuple[float, bool]] = field(default_factory=dict)  # losses beside
 
     @cached_property
     def space(self) -> Any:
@@ -178,8 +179,19 @@ class Beside:
         self.steps.integrator.tolerance = tolerance
         return self.steps
 
+    def linearize(self, tolerance: float) -> tuple[list[StepDerivatives], list[Feedback], Array]:
+        """The motion itself and the derivatives of its intervals; see `along_the_flow`."""
+        with applied(self.vector) as model:
+            return along_the_flow(self._steps(model, self.vector, tolerance), self.x0, self.us, self.policy)
+
     def value(self, displacement: Array, tolerance: float) -> tuple[float, bool]:
         """The loss at a displacement (n,), and whether anything touches on the way."""
+        key = displacement.tobytes(), tolerance
+        if key not in self.known:
+            self.known[key] = self._value(displacement, tolerance)
+        return self.known[key]
+
+    def _value(self, displacement: Array, tolerance: float) -> tuple[float, bool]:
         x0, us, policy, vector = self._moved(displacement)
 
         def choose(x: Array, k: int) -> Array:
