@@ -16,7 +16,7 @@ from pydrake.multibody.tree import RpyFloatingJoint
 
 import drake_diff as dd
 from drake_diff._base.refusal import Refusal
-from drake_diff.derivatives.analytic import analytic_of, build_analytic, certified
+from drake_diff.derivatives.analytic import analytic_of, build_analytic, certified, is_own
 from drake_diff.derivatives.joint_impulses import NEAR_RIGID, JointImpulses
 from drake_diff.derivatives.polish import polished_step
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
@@ -193,7 +193,7 @@ def test_a_doctored_inertia_is_caught(load):
     model = load("acrobot.xml")
     analytic = build_analytic(model)
     assert certified(model, analytic) is analytic
-    analytic.pinocchio.inertias[2].mass *= 1 + 1e-6
+    analytic.dynamics.model.inertias[2].mass *= 1 + 1e-6
     assert "of the forces in Drake's equation" in certified(model, analytic).reason
 
 
@@ -203,11 +203,14 @@ def test_a_derivative_that_is_not_its_steps_is_caught(load, part):
     analytic = build_analytic(model)
 
     def wrong(pinocchio, data, *point):
-        analytic.derivatives(pinocchio, data, *point)
+        analytic.dynamics.derivatives(pinocchio, data, *point)
         matrix = getattr(data, part)  # a view
         matrix[:] *= 1 + 1e-4
 
-    assert "its Jacobian differs from AutoDiffXd's" in certified(model, replace(analytic, derivatives=wrong)).reason
+    assert (
+        "its Jacobian differs from AutoDiffXd's"
+        in certified(model, replace(analytic, dynamics=replace(analytic.dynamics, derivatives=wrong))).reason
+    )
 
 
 def test_other_parameters_are_never_answered_by_the_models_own(load):
@@ -278,12 +281,14 @@ def same_where_autodiff_works(model, x, u):
 
 
 @each_row("name", ["icub.urdf", "icub_reduced.urdf"])
-def test_an_inertia_that_pinocchio_does_not_take_is_named_and_the_next_source_taken(name):
+def test_an_inertia_that_pinocchio_does_not_take_is_had_by_our_own_dynamics(name):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         model = dd.load_model(robot_file(name), time_step=0.002)
-    assert "Pinocchio does not take the inertia of r_hip_2" in analytic_of(model).reason
-    assert same_where_autodiff_works(model, state_in_range(model, np.random.default_rng(0)), np.zeros(0))
+    assert is_own(model)
+    x = state_in_range(model, np.random.default_rng(0))
+    assert same_where_autodiff_works(model, x, np.zeros(0))
+    equal(model, x[None], np.zeros((1, 0)))
 
 
 @pytest.mark.slow
@@ -296,12 +301,26 @@ def test_auto_serves_wherever_autodiff_does_and_every_step_is_had_to_rounding():
     assert served.count(True) >= 30
 
 
-def test_without_pinocchio_the_others_serve(load, without_pinocchio):
+def test_without_pinocchio_our_own_dynamics_serve(load, without_pinocchio):
     model = load("double_pendulum.urdf")
     xs, us = np.array([[0.4, -0.9, 1.3, -0.6]] * 2), np.array([[0.25, -0.15]] * 2)
-    _, _, methods = dd.linearize(model, xs, us)
-    assert set(methods) <= {"implicit", "autodiff"}
-    assert "pip install 'drake-diff" in dd.differentiate_step(model, xs[0], us[0], method="analytic").reason
+    equal(model, xs, us)
+    assert is_own(model)
+    assert dd.differentiate_step(model, xs[0], us[0]).method == "implicit"  # of one state in less time
+
+
+@each_row("name", ["solo12.urdf", "go2.urdf", "bolt.urdf"])
+def test_our_own_dynamics_are_pinocchios(name, without_pinocchio):
+    """In flight and on their feet, at their stops too, as AutoDiffXd has them; a wrong inertia is found out."""
+    model, random = example_robot(name, 0.01, feet=True), np.random.default_rng(4)
+    xs = np.array([state_in_contact(model, random), state_in_range(model, random)])
+    xs[1, :4] *= 1.1  # of any norm
+    xs[1, model.nq - 1] = model.position_limits[0][-1] + 1e-3
+    equal(model, xs, 0.1 * random.standard_normal((2, model.nu)))
+    smooth = analytic_of(model)
+    wrong = replace(smooth.dynamics.tree, inertia=1.001 * smooth.dynamics.tree.inertia)
+    doctored = replace(smooth, dynamics=replace(smooth.dynamics, tree=wrong))
+    assert "of the forces in Drake's equation" in certified(model, doctored).reason
 
 
 @each_row(

@@ -1,4 +1,4 @@
-"""Jacobians by Pinocchio, certified equal to AutoDiffXd's before they are used: of smooth steps, and with contact.
+"""Jacobians from steps' own equations, certified equal to AutoDiffXd's first: of smooth steps, and with impulses.
 
 The equation of a model's smooth steps (`smooth_step`) is certified when it is first asked for, at random states; that
 of its steps with contact (`contact.jacobian`) at the first of them that are met.
@@ -19,8 +19,9 @@ from drake_diff.derivatives.implicit import RESIDUAL_TOLERANCE, differentiate_eq
 from drake_diff.derivatives.polish import polished_steps
 from drake_diff.derivatives.smooth_step import SmoothStep, build_analytic
 from drake_diff.derivatives.steps import FREE, Flags, Jacobians, NotSmoothError, Steps
-from drake_diff.exceptions import DrakeDiffError, MissingDependencyError, ModelError, SimulationError
+from drake_diff.exceptions import DrakeDiffError, ModelError, SimulationError
 from drake_diff.mechanics.coordinates import Coordinates
+from drake_diff.mechanics.tree import OwnDynamics
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import select, write_autodiff
 from drake_diff.model.step import advance, set_state
@@ -80,10 +81,16 @@ def analytic_of(model: Model) -> SmoothStep | Refusal:
     def make() -> SmoothStep | Refusal:
         try:
             return certified(model, build_analytic(model))
-        except (ModelError, MissingDependencyError) as error:
+        except ModelError as error:
             return Refusal(str(error))
 
     return model.cache("analytic", make, of_structure=True)  # parameters of contact alone may be applied
+
+
+def is_own(model: Model) -> bool:
+    """Whether the model's smooth step is by our own dynamics, which take longer than Pinocchio's for a single state."""
+    smooth = analytic_of(model)
+    return isinstance(smooth, SmoothStep) and isinstance(smooth.dynamics, OwnDynamics)
 
 
 def certified(model: Model, smooth: SmoothStep) -> SmoothStep | Refusal:

@@ -1,4 +1,4 @@
-"""Smooth steps by Pinocchio's derivatives of forward dynamics.
+"""Smooth steps by the derivatives of a tree's accelerations: Pinocchio's, and without it our own.
 
 Where nothing touches and no limit acts, Drake's step of a tree is (see `implicit`)
 
@@ -6,23 +6,26 @@ Where nothing touches and no limit acts, Drake's step of a tree is (see `implici
 
 with M the mass matrix and reflected inertia, K the stiffness of springs and of PD control (kp), D joint damping and
 what PD control adds (kd + h kp), and c what their rest positions add. As h D stands beside the reflected inertia, the
-whole step is Pinocchio's articulated-body algorithm with h D as additional armature, and its derivatives are those of
-`computeABADerivatives`. Inputs are clipped at their effort limits as Drake does; a PD controller at its limit, as
-anything that this form leaves out, shows in Drake's own step, which is not this one then.
+whole step is forward dynamics with h D as additional armature: Pinocchio's `computeABADerivatives`, or, where it is not
+installed or does not take the tree's inertias, `mechanics.tree`. Inputs are clipped at their effort limits as Drake
+does; a PD controller at its limit, as anything that this form leaves out, shows in Drake's own step, which is not this
+one then.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.implicit import Form, form_of
 from drake_diff.derivatives.steps import Steps
-from drake_diff.exceptions import ModelError
+from drake_diff.exceptions import MissingDependencyError, ModelError
 from drake_diff.mechanics.coordinates import Coordinates, native_positions, turn, turn_change, turn_derivatives, turning
-from drake_diff.mechanics.description import describe_tree
+from drake_diff.mechanics.description import Description, describe_tree
+from drake_diff.mechanics.tree import OwnDynamics, tree_of
 from drake_diff.model.model import Model
 
 # What a limit or a controller at its limit changes in x' is larger; x' known to rounding alone, as x + gap, is not.
@@ -31,7 +34,7 @@ STEP_TOLERANCE = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Native:
-    """N states in Drake's coordinates and in Pinocchio's, Q (N, nv, nv) turning the velocities."""
+    """N states in Drake's coordinates and in those of the dynamics, Q (N, nv, nv) turning the velocities."""
 
     q: Array  # (N, nq)
     v: Array  # (N, nv)
@@ -40,14 +43,29 @@ class Native:
     v_native: Array
 
 
+class Dynamics(Protocol):
+    """The accelerations of a tree in coordinates of its own."""
+
+    @property
+    def armature(self) -> Array:
+        """(nv,) what stands beside the tree's own inertia."""
+        ...
+
+    def accelerate(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array, Array]:
+        """da/dq, da/dv, da/dforce (each (N, nv, nv)) and a (N, nv) under generalized forces (N, nv)."""
+        ...
+
+    def motions(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array]:
+        """(N, nv, 6) of each degree of freedom, (N, nv, 6, 6) of what it carries, and a (N, nv)."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class SmoothStep:
     """What of a model does not change from step to step."""
 
-    pinocchio: Any  # pin.Model, with h D in its armature
-    data: Any
-    derivatives: Any  # pin.computeABADerivatives
-    outputs: list[memoryview]  # where in data it leaves da/dq, da/dv, da/dforce and a: four joined are one copy
+    dynamics: Dynamics  # of what has h D in its armature
+    turned: Coordinates  # the free bodies that the dynamics holds in other coordinates than Drake
     coordinates: Coordinates
     form: Form
     time_step: float
@@ -58,7 +76,6 @@ class SmoothStep:
     positions: NDArray[np.intp]  # (nv,) the index in q of hinges and slides; 0 for free bodies, where K is 0
     limits: Array  # (2, nv) lower and upper positions of hinges and slides; infinite of free bodies
     sprung: bool  # whether any K is not 0
-    joint_of: NDArray[np.intp]  # (nv,) of each degree of freedom, less 1
 
     def __call__(self, steps: Steps) -> tuple[Array, NDArray[np.bool_]]:
         """(N, nx, nx + nu) of the steps, and which (N,) are smooth: those that lead where Drake's do."""
@@ -74,7 +91,7 @@ class SmoothStep:
         q, v = xs[:, : c.nq], xs[:, c.nq :]
         force, clipped = self._force(q, v, us)
         native = self.into_native(q, v)
-        solved = self._accelerate(native.q_native, native.v_native, force)
+        solved = self.dynamics.accelerate(native.q_native, native.v_native, force)
         return self.assemble(native, *self._velocities(native, solved, clipped))
 
     def _fixed(self, xs: Array, us: Array) -> tuple[Array, Array]:
@@ -83,7 +100,7 @@ class SmoothStep:
         nx, nu = 2 * n, us.shape[1]
         q, v = xs[:, :n], xs[:, n:]
         force, clipped = self._force(q, v, us)
-        by_q, by_v, inverse, a = self._accelerate(q, v, force)
+        by_q, by_v, inverse, a = self.dynamics.accelerate(q, v, force)
         jacobians = np.empty((len(xs), nx, nx + nu))
         upper, lower = jacobians[:, :n], jacobians[:, n:]
         np.multiply(by_q - inverse * self.stiffness if self.sprung else by_q, h, out=lower[:, :, :n])
@@ -101,18 +118,6 @@ class SmoothStep:
         v_next = steps.x_next[:, self.coordinates.nq :]
         ahead = steps.xs[:, self.positions] + 2 * self.time_step * v_next
         return np.asarray(((ahead <= self.limits[0]) | (ahead >= self.limits[1])).any(axis=1))
-
-    def _accelerate(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array, Array]:
-        """Pinocchio's da/dq, da/dv, da/dforce (each (N, nv, nv)) and a (N, nv)."""
-        model, data, derivatives, outputs = self.pinocchio, self.data, self.derivatives, self.outputs
-        rows = []
-        for q_k, v_k, force_k in zip(q, v, force, strict=True):
-            derivatives(model, data, q_k, v_k, force_k)
-            rows.append(b"".join(outputs))
-        n = v.shape[1]
-        found = np.frombuffer(b"".join(rows)).reshape(len(q), 3 * n * n + n)
-        by_q, by_v, inverse = (found[:, k * n * n : (k + 1) * n * n].reshape(len(q), n, n) for k in range(3))
-        return by_q, by_v, inverse, found[:, 3 * n * n :]
 
     def _force(self, q: Array, v: Array, us: Array) -> tuple[Array, NDArray[np.bool_] | None]:
         """(N, nv) B u + c - K q - D v, and which inputs (N, nu) are clipped, None where none is."""
@@ -132,8 +137,8 @@ class SmoothStep:
 
     def into_native(self, q: Array, v: Array) -> Native:
         """The states q (N, nq), v (N, nv) in Pinocchio's coordinates."""
-        Q = turn(self.coordinates, q)
-        return Native(q, v, Q, native_positions(self.coordinates, q), (Q @ v[..., None])[..., 0])
+        Q = turn(self.turned, q)
+        return Native(q, v, Q, native_positions(self.turned, q), (Q @ v[..., None])[..., 0])
 
     def _velocities(
         self, at: Native, solved: tuple[Array, ...], clipped: NDArray[np.bool_] | None
@@ -141,7 +146,7 @@ class SmoothStep:
         """(N, nv, 2 nv + nu) the derivative of v' by small motion, v and u, and v' (N, nv)."""
         c, h, Q = self.coordinates, self.time_step, at.Q
         by_q, by_v, inverse, native = solved
-        into, out, out_v = turn_derivatives(c, at.Q, at.v, native)
+        into, out, out_v = turn_derivatives(self.turned, at.Q, at.v, native)
         Q_t = Q.swapaxes(-1, -2)
         by_motion = Q_t @ (by_q @ Q + by_v @ into - inverse * self.stiffness) + out
         by_velocity = Q_t @ (by_v @ Q - inverse * self.damping) + out_v
@@ -165,22 +170,12 @@ class SmoothStep:
         And (N, nv, 6, 6) the spatial inertia of what it carries, and v' (N, nv) were the step smooth.
         """
         force, _ = self._force(at.q, at.v, us)
-        data, joints = self.data, range(1, self.pinocchio.njoints)
-        motion = memoryview(data.J.T).cast("B")
-        motions, inertias, accelerations = [], [], []
-        for q, v, f in zip(at.q_native, at.v_native, force, strict=True):
-            self.derivatives(self.pinocchio, data, q, v, f)
-            motions.append(motion.tobytes())
-            carried = data.oYcrb
-            inertias.append([carried[j].matrix() for j in joints])
-            accelerations.append(np.array(data.ddq))
-        S = np.frombuffer(b"".join(motions)).reshape(*at.v.shape, 6)
-        Q_t, native = at.Q.swapaxes(-1, -2), np.array(accelerations)
-        return Q_t @ S, np.array(inertias)[:, self.joint_of], self._v_next(at, native)
+        S, inertia, native = self.dynamics.motions(at.q_native, at.v_native, force)
+        return at.Q.swapaxes(-1, -2) @ S, inertia, self._v_next(at, native)
 
     def _v_next(self, at: Native, native: Array) -> Array:
-        """(N, nv) v' by Pinocchio's accelerations (N, nv)."""
-        a = (at.Q.swapaxes(-1, -2) @ native[..., None])[..., 0] + turning(self.coordinates, at.v)
+        """(N, nv) v' by the accelerations (N, nv)."""
+        a = (at.Q.swapaxes(-1, -2) @ native[..., None])[..., 0] + turning(self.turned, at.v)
         return np.asarray(at.v + self.time_step * a)
 
     def pushed(self, at: Native, us: Array, push: Array) -> Array:
@@ -188,39 +183,33 @@ class SmoothStep:
         c = self.coordinates
         force, clipped = self._force(at.q, at.v, us)
         force = force + push
-        solved = self._accelerate(at.q_native, at.v_native, (at.Q @ force[..., None])[..., 0])
+        solved = self.dynamics.accelerate(at.q_native, at.v_native, (at.Q @ force[..., None])[..., 0])
         velocities, _ = self._velocities(at, solved, clipped)
-        by_turn = solved[2] @ turn_change(c, at.Q, force)  # a fixed force is another one in Pinocchio's frames
+        by_turn = solved[2] @ turn_change(self.turned, at.Q, force)  # a fixed force is another one in other frames
         velocities[:, :, : c.nv] += self.time_step * at.Q.swapaxes(-1, -2) @ by_turn
         return velocities
 
 
 def build_analytic(model: Model) -> SmoothStep:
-    """Not certified. Raises ModelError where the plant is no such tree, MissingDependencyError without Pinocchio."""
+    """Not certified. Raises ModelError where the plant is no such tree."""
     form = form_of(model)
     if form.driven or model.systems_act:
         raise ModelError(form.driven or model.systems_act)
     description = describe_tree(model)
-    from drake_diff.mechanics.pinocchio_tree import acceleration_derivatives, build  # here, as Pinocchio is an extra
-
-    built, _ = build(description.links, description.gravity)
     kp, kd = form.gains()
     stiffness, damping = description.by_velocity("stiffness"), description.by_velocity("damping")
     rest = stiffness * description.by_velocity("rest")
     np.add.at(stiffness, form.velocity, kp)
     np.add.at(damping, form.velocity, kd + model.time_step * kp)
     np.add.at(rest, form.velocity, kp * form.reference[0] + kd * form.reference[1])
-    data = built.createData()
-    built.armature = description.by_velocity("armature") + model.time_step * damping
     positions, limits = np.zeros(model.nv, dtype=int), np.array([[-np.inf], [np.inf]]) * np.ones(model.nv)
     for i, j in description.coordinates.single:
         positions[j] = i
         limits[:, j] = model.plant.GetPositionLowerLimits()[i], model.plant.GetPositionUpperLimits()[i]
+    dynamics, turned = _dynamics(model, description, model.time_step * damping)
     return SmoothStep(
-        pinocchio=built,
-        data=data,
-        derivatives=acceleration_derivatives,
-        outputs=[memoryview(x).cast("B") for x in (data.ddq_dq, data.ddq_dv, data.Minv, data.ddq)],
+        dynamics=dynamics,
+        turned=turned,
         coordinates=description.coordinates,
         form=form,
         time_step=model.time_step,
@@ -231,5 +220,18 @@ def build_analytic(model: Model) -> SmoothStep:
         positions=positions,
         limits=limits,
         sprung=bool(stiffness.any()),
-        joint_of=np.repeat(np.arange(built.njoints - 1), list(built.nvs)[1:]),
     )
+
+
+def _dynamics(model: Model, description: Description, added: Array) -> tuple[Dynamics, Coordinates]:
+    """With an armature of `added` (nv,) and the joints' own; and which free bodies it holds otherwise than Drake."""
+    armature = description.by_velocity("armature") + added
+    try:
+        from drake_diff.mechanics.pinocchio_tree import PinocchioDynamics  # here, as Pinocchio is an extra
+
+        return PinocchioDynamics.of(description.links, description.gravity, armature), description.coordinates
+    except (MissingDependencyError, ModelError) as error:
+        tree = tree_of(model, free=True)
+        if isinstance(tree, Refusal):
+            raise ModelError(f"{error}; our own equations: {tree}") from error
+        return OwnDynamics(tree, model, armature), Coordinates((), tuple((0, j) for j in range(model.nv)))

@@ -23,7 +23,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.differences import Many, plateau, sweep_of
 from drake_diff._base.refusal import Refusal
-from drake_diff.derivatives.analytic import Analytic
+from drake_diff.derivatives.analytic import Analytic, is_own
 from drake_diff.derivatives.implicit import Implicit, form_of
 from drake_diff.derivatives.methods import METHODS
 from drake_diff.derivatives.polish import polished_steps, solves_the_step
@@ -273,6 +273,8 @@ def order_of(steps: Steps, method: str, single: bool) -> tuple[Source, ...]:
         return _ORDERS[method]
     if single and steps.model.nv < CONTACT_SIZE and not steps.vector.parameters and steps.some_touch:
         return SMALL_IN_CONTACT
+    if single and is_own(steps.model):
+        return (IMPLICIT, ANALYTIC, AUTODIFF, DIFFERENCES)
     return _ORDERS["analytic"]
 
 

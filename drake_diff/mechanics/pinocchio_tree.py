@@ -1,11 +1,12 @@
 """A Pinocchio model built joint by joint from Drake's plant; `body_frame` has its coordinates."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, Indices
 from drake_diff.exceptions import MissingDependencyError, ModelError
 from drake_diff.mechanics.description import Link
 
@@ -16,7 +17,60 @@ except ImportError as error:
         "Pinocchio is not installed: pip install 'drake-diff[engines]', or 'drake-diff[fast]' alone"
     ) from error
 
-acceleration_derivatives = pin.computeABADerivatives
+
+@dataclass(frozen=True, eq=False)
+class PinocchioDynamics:
+    """Accelerations of a Pinocchio model, whose armature is part of its inertia, in its own coordinates."""
+
+    model: Any  # pin.Model
+    data: Any
+    derivatives: Any  # pin.computeABADerivatives
+    outputs: list[memoryview]  # where in data it leaves da/dq, da/dv, da/dforce and a: four joined are one copy
+    joint_of: Indices  # (nv,) of each degree of freedom, less 1
+
+    @classmethod
+    def of(cls, links: tuple[Link, ...], gravity: Array, armature: Array) -> "PinocchioDynamics":
+        """Of the links, with an armature (nv,); raises ModelError as `build`."""
+        model, _ = build(links, gravity)
+        data = model.createData()
+        model.armature = armature
+        outputs = [memoryview(x).cast("B") for x in (data.ddq_dq, data.ddq_dv, data.Minv, data.ddq)]
+        joint_of = np.repeat(np.arange(model.njoints - 1), list(model.nvs)[1:])
+        return cls(model, data, pin.computeABADerivatives, outputs, joint_of)
+
+    @property
+    def armature(self) -> Array:
+        """(nv,)."""
+        return np.array(self.model.armature)
+
+    def accelerate(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array, Array]:
+        """da/dq, da/dv, da/dforce (each (N, nv, nv)) and a (N, nv) under generalized forces (N, nv)."""
+        model, data, derivatives, outputs = self.model, self.data, self.derivatives, self.outputs
+        rows = []
+        for q_k, v_k, force_k in zip(q, v, force, strict=True):
+            derivatives(model, data, q_k, v_k, force_k)
+            rows.append(b"".join(outputs))
+        n = v.shape[1]
+        found = np.frombuffer(b"".join(rows)).reshape(len(q), 3 * n * n + n)
+        by_q, by_v, inverse = (found[:, k * n * n : (k + 1) * n * n].reshape(len(q), n, n) for k in range(3))
+        return by_q, by_v, inverse, found[:, 3 * n * n :]
+
+    def motions(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array]:
+        """(N, nv, 6) the motion [linear; angular] of each degree of freedom in world, about its origin, at unit speed.
+
+        And (N, nv, 6, 6) the spatial inertia of what it carries, and a (N, nv).
+        """
+        data, joints = self.data, range(1, self.model.njoints)
+        motion = memoryview(data.J.T).cast("B")
+        motions, inertias, accelerations = [], [], []
+        for q_k, v_k, force_k in zip(q, v, force, strict=True):
+            self.derivatives(self.model, data, q_k, v_k, force_k)
+            motions.append(motion.tobytes())
+            carried = data.oYcrb
+            inertias.append([carried[j].matrix() for j in joints])
+            accelerations.append(np.array(data.ddq))
+        S = np.frombuffer(b"".join(motions)).reshape(*v.shape, 6)
+        return S, np.array(inertias)[:, self.joint_of], np.array(accelerations)
 
 
 def build(links: tuple[Link, ...], gravity: Array) -> tuple[Any, float]:

@@ -84,7 +84,7 @@ def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
         by_body=np.array([topology.bodies[labels.get(body.index(), "world")] for body in pairs.bodies]).reshape(
             -1, model.nv
         ),
-        armature=np.diag(smooth.pinocchio.armature),
+        armature=np.diag(smooth.dynamics.armature),
         approximation=contact.approximation,
         time_step=model.time_step,
         near_rigid=float(model.plant.get_sap_near_rigid_threshold()),
