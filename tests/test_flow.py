@@ -20,8 +20,8 @@ import drake_diff as dd
 from drake_diff.exceptions import GradientError, GradientWarning, ModelError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.parameters import select
+from drake_diff.motion import rosenbrock
 from drake_diff.motion.continuous import ContinuousMotion
-from drake_diff.motion.flow import rosenbrock
 from drake_diff.motion.flow.integrate import Integrator, pushing_of
 from drake_diff.motion.flow.plant import flow_plant, material_of, numbers_of
 from drake_diff.motion.flow.steps import FlowSteps
@@ -459,3 +459,46 @@ def test_a_flow_that_takes_too_long_says_how_far_it_came():
     integrator.advance(flow, np.zeros(0), 0.01)
     with pytest.raises(SimulationError, match=r"too stiff: 0 s of work reached 0\.01 s by \d+ steps, not 0\.02 s"):
         integrator.advance(flow, np.zeros(0), 0.01, budget=0.0)
+
+
+# What a contact may begin with, by the height of the ball's centre less its radius [m] and its velocity [m/s].
+STARTS = {
+    "at rest in balance": (-9.81 / 1e4, 0.0, 0.0),
+    "in exact touch, at rest": (0.0, 0.0, 0.0),
+    "in exact touch, falling": (0.0, 0.3, -1.0),
+    "in exact touch, rising": (0.0, 0.3, 1.0),
+    "deep in the ground": (-0.02, 0.5, 0.0),
+    "slower than the stiction speed": (-9.81 / 1e4, 5e-4, 0.0),
+}
+
+
+@pytest.mark.parametrize("approximation", ["lagged", "sap"])
+@pytest.mark.parametrize("start", STARTS)
+def test_a_contact_that_is_there_from_the_start_goes_on_as_by_another_integration(start, approximation):
+    """Without events, by Drake's own terms; a little deeper at the start the end moves as the derivative says."""
+    above, vx, vz = STARTS[start]
+    given = {"dissipation": 0.5} if approximation == "lagged" else {"relaxation": 0.01}
+    model = ball_on_rails(stiffness=1e4, friction=0.5, gravity=9.81, approximation=approximation, **given)
+    x0 = np.array([0, 0.1 + above, vx, vz])
+    ours, found = along(model, x0, 40)
+    assert np.max(np.abs(ours - ContinuousMotion(model).states(x0, np.zeros((40, 0)))[-1])) < 1e-6
+    if above < 0:
+        deeper = x0 + np.array([0, -1e-6, 0, 0])
+        change = (along(model, deeper, 40, 1e-11)[0] - along(model, x0, 40, 1e-11)[0]) / -1e-6
+        assert np.max(np.abs(change - found[:, 1])) < 1e-2 * max(1.0, np.max(np.abs(found[:, 1])))
+
+
+def test_contacts_that_begin_at_once_are_all_met():
+    """A cube that falls flat: four corners touch in one instant, and it bounces without a turn."""
+    model = dd.model_from_diagram(cube(0.05, gravity=9.81, dissipation=0.0)[1])
+    x0 = np.array([1, 0, 0, 0, 0, 0, 0.15, *np.zeros(5), -1.0])
+    ours, found = along(model, x0, 4)
+    falls = (np.sqrt(1 + 2 * 9.81 * 0.1) - 1) / 9.81  # [s] until it touches, at 0.05 m
+    speed = 1 + 9.81 * falls
+    # Then a spring of 4 k about its balance: x'' = g - omega^2 x.
+    omega, rest = np.sqrt(4 * 2e3 / 0.1), 9.81 * 0.1 / (4 * 2e3)
+    touching = (2 * np.pi - 2 * np.arctan2(speed / omega, rest)) / omega
+    left = 0.2 - falls - touching
+    assert ours[6] == pytest.approx(0.05 + speed * left - 9.81 * left**2 / 2, abs=1e-7)
+    assert ours[:4] == pytest.approx([1, 0, 0, 0], abs=1e-9)
+    assert found[6, 4] == pytest.approx(0.0, abs=1e-9)
