@@ -6,9 +6,10 @@ import json
 import numpy as np
 import pytest
 from helpers.bounces import Bounce
+from helpers.models import Plant, contact_properties
 
 import drake_diff as dd
-from drake_diff.certificates.truth import TrueSlope, judged
+from drake_diff.certificates.truth import TrueSlope, judged, softest_contact
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.motion.continuous import ContinuousMotion, ImplicitSteps
 from drake_diff.record.rollout import SlopeEvidence
@@ -228,3 +229,22 @@ def test_the_truth_goes_into_a_record_and_back(dropped, tmp_path):
         dd.record.save_rollout(
             dd.certify_rollout(model, (0.2, -2.0), None, height, num_steps=15, sampled=True), model, tmp_path
         )
+
+
+@pytest.mark.parametrize("stiffness", [1e4, 1e7])
+def test_contact_that_the_steps_soften_is_named_by_as_much_as_it_sinks_in(stiffness):
+    """A ball at rest sinks in by m g / k, and in steps of 10 ms by `factor` times that where it is near-rigid."""
+    plant, properties = Plant(0.01, "sap"), contact_properties(2 * stiffness, 0.0, 0.5, 0.0)
+    plant.ball("ball", 1.0, 0.1, properties)
+    plant.ground(properties)
+    model = plant.model()
+    x0 = np.array([1.0, 0, 0, 0, 0, 0, 0.1, *np.zeros(6)])
+    xs = dd.rollout(model, x0, None, num_steps=400).xs
+    told = softest_contact(model, xs[-1:])
+    softer = (0.1 - xs[-1][6]) / (9.81 / stiffness)
+    if stiffness == 1e4:
+        assert softer == pytest.approx(1.0, rel=1e-3)
+        assert told is None
+    else:
+        assert "times softer than it is stated: near-rigid at h = 0.01 s" in told
+        assert float(told.split(" times")[0].split()[-1]) == pytest.approx(softer, rel=1e-2)

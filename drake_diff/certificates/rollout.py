@@ -198,7 +198,7 @@ def _certify_continuous(
     stairs = stairs_of_loss(moved.loss, gradient, moved.space)
     if moved.policy is not None:
         stairs = stairs or stairs_of_policy(moved.policy, gradient, moved.space, moved.model.time_step)
-    truth = truth_of(moved, moved.flat(gradient), gradient.loss, seconds)
+    truth = truth_of(moved, gradient, seconds)
     parts = by_truth(truth, subject)
     return RolloutCertificate(
         **_with_refinements(Certificate(**parts), (), None, stairs), gradient=gradient, truth=truth
@@ -208,7 +208,7 @@ def _certify_continuous(
 def _truth(moved: Displaced, gradient: RolloutGradient, seconds: float) -> tuple[Truth | None, str]:
     """The motion in continuous time beside a gradient, or why there is none."""
     try:
-        return truth_of(moved, moved.flat(gradient), gradient.loss, seconds), ""
+        return truth_of(moved, gradient, seconds), ""
     except (ModelError, SimulationError) as error:
         return None, str(error)
 

@@ -10,7 +10,7 @@ error hides it.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -24,10 +24,11 @@ from drake_diff.certificates.displaced import Displaced
 from drake_diff.certificates.judgement import VERDICTS
 from drake_diff.certificates.neighbourhood import TINY
 from drake_diff.exceptions import DrakeDiffError
+from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied
 from drake_diff.model.plant import actuators
 from drake_diff.motion.continuous import HUNT_CROSSLEY, KELVIN_VOIGT, ContinuousMotion
-from drake_diff.motion.gradient import CONTINUOUS
+from drake_diff.motion.gradient import CONTINUOUS, RolloutGradient
 from drake_diff.motion.loss import evaluate_loss
 
 WIDTHS = (1e-2, 1e-3, 1e-4)  # of a column's scale, to both sides
@@ -41,6 +42,7 @@ SETTLED = 1e-3  # how far apart slopes may be, of their size
 RIGHT = 1e-2  # how far from the truth a gradient may be, of its size
 NEGLIGIBLE = 1e-3  # of the largest column, each moved by its scale: a smaller one is judged as if it were that large
 CLOSE = 3e-3  # the same, for a yes
+NOTHING = 1e-7  # of the loss: a change by a whole scale that is none
 KNOWN = 1e-2  # of a slope: the integration's own error at most
 SURE = 3.0  # times what the integration's error is found to be
 ROUNDED = 1e-15  # of a loss: its rounding
@@ -148,12 +150,38 @@ class Truth(ShowsItsRepr):
         return "; ".join([*lines, *self.notes])
 
 
-def truth_of(moved: Displaced, gradient: Array, ours: float, seconds: float = SECONDS) -> Truth:
-    """The truth beside a `gradient` (n,) by all that `moved` moves, and the rollout's loss `ours`.
+def truth_of(
+    moved: Displaced, gradient: RolloutGradient, seconds: float = SECONDS, columns: Sequence[str] | None = None
+) -> Truth:
+    """The truth beside a gradient by all that `moved` moves, or some `columns`, and the rollout's loss.
 
     Raises ModelError or SimulationError, which say why, where the motion has no continuous form.
     """
-    return _Measurement(moved, gradient, ours, seconds).truth()
+    found = _Measurement(moved, moved.flat(gradient), gradient.loss, seconds, columns).truth()
+    if CONTINUOUS in gradient.methods or found.law != KELVIN_VOIGT:
+        return found
+    with applied(moved.vector) as model:
+        softer = softest_contact(model, gradient.xs)
+    return found if softer is None else replace(found, notes=(softer,))
+
+
+def softest_contact(model: Model, xs: Array) -> str | None:
+    """Which contact of `sap` the steps make softer than it is stated, and by how much; None where they do not.
+
+    An impulse of the step is g = (x + ...) / (R (h + tau)), R = max(beta^2 w / (4 pi^2), 1 / (h (h + tau) k)), where
+    beta is Drake's near-rigid threshold and w a third of the norm of the inverse of the mass at the contact (Castro,
+    Permenter and Han, "An unconstrained convex formulation of compliant contact", 2022).
+    """
+    motion, h, beta = ContinuousMotion(model), model.time_step, model.plant.get_sap_near_rigid_threshold()
+    worst, told = 1.0, None
+    for x in xs:
+        for name, k, tau, inverse in motion.touches_at(x):
+            stated = 1 / (h * (h + tau) * k)
+            factor = beta**2 * float(np.linalg.norm(inverse)) / 3 / (4 * np.pi**2) / stated
+            if factor > worst:
+                worst = factor
+                told = f"the steps make {name} {factor:.3g} times softer than it is stated: near-rigid at h = {h:g} s"
+    return told
 
 
 @dataclass(frozen=True)
@@ -173,6 +201,7 @@ class _Measurement:
     gradient: Array
     ours: float
     seconds: float
+    columns: Sequence[str] | None
     deadline: float = field(init=False)
     touches: bool = False
     losses: list[float] = field(default_factory=list)  # here: one for each of the widths, and one that is better
@@ -189,7 +218,8 @@ class _Measurement:
         order = sorted(self.lines, key=lambda x: -abs(self._ours(x)) * x.scale)
         measured = {x.name: self._measured(x) for x in order}
         sizes = [abs(s) * x.scale for x in order for s in (*measured[x.name].slopes[-1:], self._ours(x))]
-        least = NEGLIGIBLE * max(sizes, default=0.0)
+        # and what changes the loss by no part of it that matters, moved by a whole scale
+        least = max(NEGLIGIBLE * max(sizes, default=0.0), NOTHING * max(map(abs, losses), default=0.0))
         noise = np.abs(np.array(losses[:3]) - losses[-1]) + ROUNDED * max(map(abs, losses)) if losses else np.zeros(3)
         slopes = tuple(judged(measured[x.name], noise, least / x.scale) for x in self.lines)
         loss, error = losses[-1] if losses else np.nan, abs(losses[-1] - losses[-2]) if losses[1:] else np.nan
@@ -204,6 +234,10 @@ class _Measurement:
 
     @cached_property
     def lines(self) -> list[_Line]:
+        """Those that are asked for."""
+        return [line for line in self._all_lines() if self.columns is None or line.name in self.columns]
+
+    def _all_lines(self) -> list[_Line]:
         """Each state, each input by as much at all times or each parameter of the policy, and each of the model."""
         moved, (count, nu) = self.moved, self.moved.us.shape
         of_x0, given = moved.space.size, count * nu if moved.policy is None else 0

@@ -17,14 +17,14 @@ Voigt jumps by k tau x': a step ends there, and no pair pushes within a step tha
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 from pydrake.multibody.math import SpatialForce
-from pydrake.multibody.tree import BodyIndex, MultibodyForces
+from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, MultibodyForces
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError, SimulationError
@@ -143,6 +143,25 @@ class ContinuousMotion:
             plant.get_body(BodyIndex(i)).AddInForceInWorld(context, force, self.forces)
         return np.asarray(self.twin.own_force(plant.CalcGeneralizedForces(context, self.forces)))
 
+    def touches_at(self, x: Array) -> Iterator[tuple[str, float, float, Array]]:
+        """(names, k [N/m], d [s/m] or tau [s], the inverse mass (3, 3) at the contact) of each that overlaps at `x`."""
+        if not self.touches:
+            return
+        set_state(self.twin, x)
+        plant, context, by_v = self.twin.plant, self.twin.context, JacobianWrtVariable.kV
+        inspector, pairs = self._penetrations()
+        world, mass = plant.world_frame(), self.twin.mass_matrix()
+        for pair in pairs:
+            touch = self._found.get((pair.id_A, pair.id_B)) or self._touch(inspector, pair.id_A, pair.id_B)
+            point = touch.part * np.asarray(pair.p_WCa) + (1 - touch.part) * np.asarray(pair.p_WCb)
+            jacobian = np.zeros((3, self.model.nv))
+            for sign, _, body in touch.bodies:
+                place = plant.CalcPointsPositions(context, world, point.reshape(3, 1), body.body_frame())
+                J = plant.CalcJacobianTranslationalVelocity(context, by_v, body.body_frame(), place, world, world)
+                jacobian += sign * (J if self.model.coupling is None else J @ self.model.coupling.spread)
+            names = " and ".join(inspector.GetName(geometry) for geometry in (pair.id_A, pair.id_B))
+            yield names, touch.stiffness, touch.damping, jacobian @ np.linalg.solve(mass, jacobian.T)
+
     def _contacts(self, only: Pairs | None) -> tuple[dict[int, list[float]], Pairs]:
         """(the wrench on each body about its origin, the pairs that push) in the context's state."""
         plant, context = self.twin.plant, self.twin.context
@@ -222,7 +241,8 @@ class ContinuousMotion:
         part = k_a / (k_a + k_b)
         both = d_a + d_b if self.law == KELVIN_VOIGT else (1 - part) * d_a + part * d_b
         friction, stiffness = 2 * mu_a * mu_b / (mu_a + mu_b or 1.0), k_a * k_b / (k_a + k_b)
-        self._found[a, b] = _Touch(friction, stiffness, both, part, tuple(bodies))
+        place = part if self.law == own_law(self.model) else 0.5  # Drake's continuous plant pushes in the middle
+        self._found[a, b] = _Touch(friction, stiffness, both, place, tuple(bodies))
         return self._found[a, b]
 
     def _advance(

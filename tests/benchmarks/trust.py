@@ -39,6 +39,7 @@ PARTS = (
     "design",
     "kept",
     "undefined",
+    "truth",
 )
 
 
