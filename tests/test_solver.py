@@ -484,7 +484,7 @@ def test_a_step_refused_in_the_middle_of_a_solve_is_named(load, monkeypatch, sol
             raise error("this far and no further")
         return original(*args, **options)
 
-    monkeypatch.setattr("drake_diff.optimize.shooting.derivatives_along", refusing)
+    monkeypatch.setattr("drake_diff.motion.intervals.derivatives_along", refusing)
     monkeypatch.setattr(
         "drake_diff.optimize.shooting.ShootingVariables.attempt", lambda self, evaluate, failed: evaluate()
     )

@@ -20,7 +20,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameter, ParameterVector, applied
 from drake_diff.model.plant import FLOATING, bodies, joints
 from drake_diff.model.step import set_state
-from drake_diff.motion.rollout import Rollout, drift, smooth_mean
+from drake_diff.motion.rollout import CONTINUOUS, STEPS, Rollout, drift, smooth_mean
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.replay import PENETRATION_PART, Replay, energy_tolerance
 from drake_diff.optimize.solution import INTEGRATION_TOLERANCE, Solution, Status
@@ -29,8 +29,12 @@ from drake_diff.record.parts import Event, Failure, Label, Metric
 from drake_diff.record.solve import ReplayEvidence
 
 AT_LIMIT = 1e-3  # of a limit: so close to it an input counts as there; interior points never quite reach it
-ON_THE_PLANT = "in the open-loop replay on the discrete plant"
-NO_REPLAY = "the discrete plant could not be stepped along these inputs"
+ON_THE_PLANT = {  # by the problem's motion
+    STEPS: "in the open-loop replay on the discrete plant",
+    CONTINUOUS: "in the open-loop replay in continuous time, integrated apart",
+}
+NO_REPLAY = "the plant could not be stepped along these inputs"
+HALF_STEP = "half-step end error"
 NEVER_FREE = "there is contact, or a limit, from the first step on"
 INVARIANTS = {
     "free-motion energy drift": "J",
@@ -159,7 +163,7 @@ def measure(solution: Solution) -> Measurement:
     limit, thinnest = math.inf, ""
     if problem.has_model:
         metrics += _metrics_of_the_replay(solution, motion, states, positions)
-        invariants += _invariants(solution.vector, motion, _unit(positions))
+        invariants += _invariants(solution.vector, motion, _unit(positions), ON_THE_PLANT[problem.motion])
         limit, thinnest = thinnest_geometry(problem.model)
     failures = tuple(_failures(solution, metrics))
     return Measurement(
@@ -222,10 +226,10 @@ def _metrics_of_the_plan(s: Solution, states: Sequence[Column], inputs: Sequence
 def _metrics_of_the_replay(
     solution: Solution, motion: Rollout | None, states: Sequence[Column], positions: Sequence[Column]
 ) -> Iterator[Metric]:
-    here, x, position = ON_THE_PLANT, _unit(states), _unit(positions)
+    here, x, position = ON_THE_PLANT[solution.problem.motion], _unit(states), _unit(positions)
     measures = (
         ("replay end error", f"largest distance of the final state {here} from the plan's", x),
-        ("half-step end error", "the same, in steps half as long", x),
+        (HALF_STEP, "the same, in steps half as long", x),
         ("energy drift", f"lasting energy that no force explains (actuators, damping, contact, limits), {here}", "J"),
         ("energy oscillation", f"largest oscillation of that energy about its drift, {here}", "J"),
         ("energy scale", f"range of kinetic plus potential energy {here}", "J"),
@@ -250,6 +254,8 @@ def _metrics_of_the_replay(
     if motion is not None and rests_on_it and np.all(np.isfinite(motion.constraint_violation)):  # which may take some
         bounds["energy drift"] = energy_tolerance(motion)
     for (name, definition, unit), value in zip(measures, values, strict=True):
+        if name == HALF_STEP and solution.problem.motion != STEPS:
+            continue  # it has no steps
         yield measured(name, definition, value, unit, bounds.get(name), reason=reason)
 
 
@@ -377,27 +383,27 @@ def measured(
     )
 
 
-def _invariants(vector: ParameterVector, motion: Rollout | None, unit: str) -> Iterator[Metric]:
+def _invariants(vector: ParameterVector, motion: Rollout | None, unit: str, here: str) -> Iterator[Metric]:
     """Each invariant along the replay; null with a reason where it does not apply.
 
-    `vector` has the parameters' values that the motion is of, `unit` is that of the positions.
+    `vector` has the parameters' values that the motion is of, `unit` is that of the positions, `here` says which it is.
     """
     if motion is None:
         for name, own in INVARIANTS.items():
-            yield measured(name, ON_THE_PLANT, np.inf, own or unit, reason=NO_REPLAY)
+            yield measured(name, here, np.inf, own or unit, reason=NO_REPLAY)
         return
     positions, (lower, upper) = motion.xs[:, : vector.model.nq], vector.model.position_limits
     limits = (positions <= lower) | (positions >= upper)
     # A limit is implicit: it acts in the step before it is met.
     held = np.array([bool(c) for c in motion.contacts]) | np.any(limits, axis=1)[1:]
     free = int(np.argmax(held)) if held.any() else len(held)  # steps from the start with nothing in the way
-    yield from _energy(motion, free)
+    yield from _energy(motion, free, here)
     yield from _momentum(vector, motion, free)
-    yield _worst("penetration", f"largest overlap of two geometries {ON_THE_PLANT}", "m", motion, motion.penetration)
-    definition = f"largest excess over a joint limit, or of a quaternion's norm over 1, {ON_THE_PLANT}"
+    yield _worst("penetration", f"largest overlap of two geometries {here}", "m", motion, motion.penetration)
+    definition = f"largest excess over a joint limit, or of a quaternion's norm over 1, {here}"
     untold = "the plant has constraints (couplers, balls, welds), whose violation pydrake does not tell"
     yield _worst("limit violation", definition, unit, motion, motion.constraint_violation, untold)
-    yield _friction_cone(vector, motion)
+    yield _friction_cone(vector, motion, here)
 
 
 def _worst(name: str, definition: str, unit: str, motion: Rollout, values: Array, reason: str = "not finite") -> Metric:
@@ -405,10 +411,10 @@ def _worst(name: str, definition: str, unit: str, motion: Rollout, values: Array
     return measured(name, definition, float(values[k]), unit, reason=reason, t_s=float(motion.times[k]))
 
 
-def _energy(motion: Rollout, free: int) -> Iterator[Metric]:
+def _energy(motion: Rollout, free: int, here: str) -> Iterator[Metric]:
     """Of the first, free part: what neither actuators nor damping explain, drift apart from oscillation."""
     error = motion.energy_error[: free + 1]
-    part = f"over the {free} steps from the start without contact, {ON_THE_PLANT}"
+    part = f"over the {free} steps from the start without contact, {here}"
     lasting = swing = math.inf
     if free > 0:
         lasting = drift(error)
@@ -461,9 +467,9 @@ def _momentum_errors(model: Model, motion: Rollout, free: int) -> tuple[float, f
     return float(np.abs(change).max()), float(np.abs(np.array(angular) - angular[0]).max())
 
 
-def _friction_cone(vector: ParameterVector, motion: Rollout) -> Metric:
+def _friction_cone(vector: ParameterVector, motion: Rollout, here: str) -> Metric:
     """By how much a tangential contact force is larger than friction allows."""
-    name, definition = "friction-cone excess", f"largest |f_t| - mu f_n of a contact's force {ON_THE_PLANT}"
+    name, definition = "friction-cone excess", f"largest |f_t| - mu f_n of a contact's force {here}"
     if any(parameter.name.endswith(".friction") for parameter in vector.parameters):
         return measured(name, definition, np.inf, "N", reason="friction is a parameter here, not the contract's")
     coefficients: dict[str, set[Any]] = {}

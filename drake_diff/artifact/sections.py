@@ -15,6 +15,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import select
 from drake_diff.model.plant import FLOATING, joints
 from drake_diff.model.quantities import description_of, made_from
+from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.problem.constraint import Bounds, Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost
 from drake_diff.optimize.problem.coupling import Couples, Periodic
@@ -110,6 +111,8 @@ def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
     goal = "" if np.all(np.isnan(problem.goal)) else " and ends in x_goal"
     goals = (", goals" if problem.goals else "") + (", couplings" if problem.couplings else "")
     equations = "the given equations" if problem.moved is None else "Drake's equations"
+    if problem.motion != STEPS:
+        equations += " in continuous time, contact included"
     statement = (
         f"{problem.name}, by {equations}, starts in x0{goal} after {problem.num_steps} intervals, and "
         f"keeps bounds{goals} and constraints at every knot; optimized: {', '.join(problem.optimize)}"
@@ -237,6 +240,8 @@ def _gradient(solution: Solution) -> GradientEvidence:
         reason = "relative, of Drake's contact solver"
         tolerance = Quantity(value=contact.solver_relative_tolerance, unit="1", reason=reason)
     methods = "; ".join(dict.fromkeys(c.method for c in solution.certificates)) or "no certificate was reached"
+    if problem.motion != STEPS:
+        methods = "continuous: saltation along the accepted steps of the integration"
     names = (*problem.state_names, *problem.input_names, *vector.names)
     units = (*units_of(problem), *(p.unit for p in vector.parameters for _ in p.value))
     sources = (*[methods] * (problem.nx + problem.nu), *vector.sources)
@@ -292,6 +297,7 @@ def describe_problem(problem: Problem) -> dict[str, Any]:
         "parameters": [p.name for p in problem.parameters.parameters],
         **{name: _cost(getattr(problem, name)) for name in COSTS},
         "initial_state_free": [bool(free) for free in problem.initial_state_mask],
+        **({} if problem.motion == STEPS else {"motion": problem.motion}),
         **({"held": problem.system.to_dict()} if isinstance(problem.system, HeldContacts) else {}),
     }
 
@@ -373,6 +379,7 @@ def rebuild_problem(record: EvidenceRecord, model: Model, us: Array, start_us: A
         couplings=couplings,
         goals=goals,
         horizon=p["free_horizon_s"],
+        motion=p.get("motion", STEPS),
         bounds=Bounds(**bounds),
         optimize=p["optimize"],
         initial_state_mask=mask if mask.any() else None,

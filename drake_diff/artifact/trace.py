@@ -21,6 +21,7 @@ from drake_diff.logs.channels import Shown, input_channel, motion_channels, nano
 from drake_diff.logs.mcap_file import Channel, McapLog, read_mcap, write_mcap
 from drake_diff.logs.messages import TYPES, MessageType
 from drake_diff.model.parameters import applied
+from drake_diff.motion.rollout import CONTINUOUS
 from drake_diff.record.sealed import canonical
 
 ROW_PERIOD = 1_000_000  # [ns] of log time per row of a table
@@ -56,7 +57,7 @@ def write_trace(path: Path, m: Measurement, attachments: Mapping[str, tuple[str,
         "method": solution.method,
         "model": problem.name,
         "time_axis": "simulated; tables: 1 ms per row",
-        "motion": "missing: it could not be stepped" if m.motion is None else "the discrete plant, open loop",
+        "motion": _told_of_motion(m),
         "verdict_rests_on": m.shown[1],
     }
     shown = Shown(problem.model, solution.time_step, m.xs, m.motion) if problem.has_model else None
@@ -64,6 +65,13 @@ def write_trace(path: Path, m: Measurement, attachments: Mapping[str, tuple[str,
     channels = [*_solver_channels(m), *_plan_channels(m), _event_channel(m)]
     with applied(solution.vector) if shown else nullcontext():
         write_mcap(path, [*(motion_channels(shown) if shown else _no_motion(m)), *channels], metadata, files)
+
+
+def _told_of_motion(m: Measurement) -> str:
+    if m.motion is None:
+        return "missing: it could not be stepped"
+    continuous = m.solution.problem.motion == CONTINUOUS
+    return "in continuous time, integrated apart, open loop" if continuous else "the discrete plant, open loop"
 
 
 def _no_motion(m: Measurement) -> Iterator[Channel]:

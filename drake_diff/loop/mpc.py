@@ -20,6 +20,7 @@ from drake_diff.loop.run import LATE, OK
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.policy import LQR
+from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.problem.cost import CostToGo, QuadraticCost
 from drake_diff.optimize.problem.goals import LAST
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
@@ -283,6 +284,7 @@ def _check(problem: Problem) -> None:
         raise InputError("optimize", got=list(problem.optimize), expected='("controls",) for MPC')
     given = {
         "horizon": problem.horizon is not None,
+        "motion": problem.motion != STEPS,
         "parameters": bool(problem.parameters.parameters),
         "couplings": bool(problem.couplings),
         "trajectory_cost": problem.trajectory_cost is not None,

@@ -179,6 +179,7 @@ class TVLQR:
         Q: (nt, nt) symmetric and positive semidefinite.
         R: (nu, nu) symmetric and positive definite.
         Qf: (nt, nt) the weight of the end; Q where left out.
+        jacobians: (N, nx, nx + nu) of what leads from state to state where these are no steps of the model.
 
     Raises:
         InputError: The arrays do not fit one another or the model, or a weight is not as said.
@@ -192,7 +193,15 @@ class TVLQR:
     """
 
     def __init__(
-        self, model: Model, xs: ArrayLike, us: ArrayLike, Q: ArrayLike, R: ArrayLike, Qf: ArrayLike | None = None
+        self,
+        model: Model,
+        xs: ArrayLike,
+        us: ArrayLike,
+        Q: ArrayLike,
+        R: ArrayLike,
+        Qf: ArrayLike | None = None,
+        *,
+        jacobians: Array | None = None,
     ):
         self.us = finite_array("us", us, ("N", model.nu))
         if not len(self.us):
@@ -201,7 +210,10 @@ class TVLQR:
         self.time_step = model.time_step
         self._space = tangent_space(model)
         Q, R = _weight("Q", Q, self._space.size), _weight("R", R, model.nu, definite=True)
-        A, B, _ = linearize(model, self.xs, self.us)
+        if jacobians is None:
+            A, B, _ = linearize(model, self.xs, self.us)
+        else:
+            A, B = np.split(jacobians, [model.nx], axis=2)
         gains, cost_to_go = [], [Q if Qf is None else _weight("Qf", Qf, self._space.size)]
         for point in reversed(list(zip(self.xs[:-1], self.xs[1:], A, B, strict=True))):
             A_k, B_k = np.hsplit(self._space.jacobian(*point), [self._space.size])

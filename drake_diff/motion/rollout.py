@@ -115,7 +115,7 @@ def rollout(
         method: "steps", or "continuous": the motion in continuous time that the steps stand for, contact included,
             integrated with error control, at the ends of the same intervals (of parameters it takes contact's). Then
             work is integrated along the motion, `penetration` is the largest since the end before, and `contacts` are
-            those at the end of each interval.
+            those of each interval where they are deepest.
 
     Returns:
         The states `xs` (N+1, nx), and what was measured at each.

@@ -20,12 +20,10 @@ from pydrake.multibody.tree import (
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError, SimulationError
-from drake_diff.model.contact import contacts_of_the_step
 from drake_diff.model.model import Model
-from drake_diff.model.parameters import applied
 from drake_diff.model.plant import bodies, joints
 from drake_diff.model.soft_contact import distances
-from drake_diff.model.step import advance, set_state
+from drake_diff.model.step import set_state
 from drake_diff.optimize.problem.cost import final_cost_hessian, running_cost_hessian
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.timed import cost_at
@@ -139,11 +137,9 @@ class _Plan:
         if self.linked or not self.model.contract.contact.collision_pairs:
             return []
         found = []
-        with applied(self.variables.parameters(self.z)) as model:
+        with self.problem.intervals(self.variables.parameters(self.z)) as intervals:
             for x, u in zip(self.xs, self.us, strict=False):
-                advance(model.double, x, u)
-                named = ((c.body_a, c.body_b) for c in contacts_of_the_step(model))
-                found.append(tuple(pair for a, b in named for pair in self.trees.pairs(a, b)))
+                found.append(tuple(pair for a, b in intervals.touching(x, u) for pair in self.trees.pairs(a, b)))
         return found
 
     def asked(self) -> Iterator[tuple[int, tuple[float, int]]]:

@@ -5,6 +5,8 @@ of the plant holds if the inputs, open loop or with TVLQR feedback about the pla
 an unstable motion diverges open loop however right it is, and feedback through contact can do harm. A discrete plan has
 to hold at h, h/2 and h/8; a collocated one, whose interval need not be a step that the simulator can take, at two
 successive ones of h, h/2, ... h/64. Under feedback less is allowed, since the end then depends on its weights too.
+A plan in continuous time, whose law of contact is one, has to hold in another integration of that law: its equations
+are Drake's terms and the contact written out, and share nothing with those that the plan was made by.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -22,8 +24,10 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
+from drake_diff.motion.intervals import intervals_of
 from drake_diff.motion.policy import TVLQR
-from drake_diff.motion.rollout import Policy, Rollout, rollout
+from drake_diff.motion.replayed import replayed
+from drake_diff.motion.rollout import CONTINUOUS, Policy, Rollout, rollout
 from drake_diff.optimize.problem.goals import GoalConstraint, in_words
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, along_steps, clearances
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
@@ -43,6 +47,7 @@ OTHER_APPROXIMATION = {"sap": "lagged", "similar": "sap", "lagged": "sap", "tams
 FINE = 8  # parts of a step: what is left of an error of O(h) from there on is a seventh of what is seen up to there
 # Intervals are cut into at most that many steps: a hand that is to be within 5 mm at 1 m/s needs those of 5 ms.
 FINER, FINEST = 16, 64
+APART = "by another integration in continuous time"
 MOST_STEPS = 4000  # of a replay in more than FINER parts of an interval
 
 
@@ -96,7 +101,8 @@ class Plan:
         """The plant's own motion under the inputs at the plan's own step; None if it cannot be taken."""
         try:
             xs, us = self.sample(1)
-            return rollout(self.model_at(1), xs[0], us, parameters=self.vector.to_dict())
+            with applied(select(self.model_at(1), self.vector.to_dict())) as model:
+                return _rolled(self.problem, model, xs[0], us, len(us))
         except (SimulationError, ModelError, ValueError):
             return None  # not finite, or beyond what Drake can step: recorded as missing, never as zero
 
@@ -119,7 +125,10 @@ def held(xs: Array, us: Array) -> Callable[[int], tuple[Array, Array]]:
 
 def replays(plan: Plan) -> tuple[Replay, ...]:
     """`plan` in the variants of the plant, open loop and, if there are inputs, under TVLQR."""
-    model, found = plan.problem.model, list(_replay_step(plan, 1))
+    model = plan.problem.model
+    if plan.problem.motion == CONTINUOUS:
+        return tuple(_replay_in(plan, APART, lambda: model, 1, plan.open_loop))
+    found = list(_replay_step(plan, 1))
     if model.can_rebuild:  # a user's diagram is one plant: there are no variants of it to try
         parts = 2
         found += _replay_step(plan, parts)
@@ -244,7 +253,7 @@ def told_of_tolerance(plan: Plan, found: Sequence[Replay]) -> str:
                 f"{plan.problem.state_names[i]} ends {off[i] * plan.scale[i]:.2g} from its goal {variant}, {off[i]:.1%}"
             )
             worst = max(worst, (float(off[i]), told))
-    only = "" if len(decides) > 1 else ", and a diagram allows no other step"
+    only = "" if len(decides) > 1 or plan.problem.motion == CONTINUOUS else ", and a diagram allows no other step"
     allowed = f"{STATE_TOLERANCE:.0%} of each state's range in the plan ({FEEDBACK_TOLERANCE:.0%} under TVLQR)"
     return f"at worst {worst[1]} of its range, of {allowed} allowed{only}"
 
@@ -284,7 +293,10 @@ def track(plan: Plan, model: Model, xs: Array, us: Array) -> Policy:
     bounds = plan.problem.bounds
     Q, R, final = regulator_weights(plan, us)
     part = model.time_step / plan.time_step  # a running cost is summed over more steps where they are finer
-    policy = TVLQR(model, xs, us, part * Q, part * R, final)
+    jacobians = None
+    if plan.problem.motion == CONTINUOUS:
+        jacobians = intervals_of(model, select(model, ()), CONTINUOUS).jacobians(xs, us)
+    policy = TVLQR(model, xs, us, part * Q, part * R, final, jacobians=jacobians)
     slew, last = np.full(model.nu, np.inf), list[Array]()
     period = model.time_step if plan.continuous else plan.time_step  # a held input jumps at the plan's own knots
     for limit in plan.problem.rate_limits:
@@ -322,9 +334,9 @@ def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, kn
         if known is not None:
             motion = known
         elif control == "open loop":
-            motion = rollout(model, xs[0], us)
+            motion = _rolled(plan.problem, model, xs[0], us, len(us))
         else:
-            motion = rollout(model, xs[0], policy=track(plan, model, xs, us), num_steps=len(us))
+            motion = _rolled(plan.problem, model, xs[0], track(plan, model, xs, us), len(us))
     except (SimulationError, ModelError, GradientError, ValueError) as error:
         return _missing(plan, variant, control, str(error))
     bounds = plan.problem.bounds
@@ -352,6 +364,15 @@ def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, kn
             *too_deep(model, motion),
         ),
     )
+
+
+def _rolled(problem: Problem, model: Model, x0: Array, inputs: Array | Policy, count: int) -> Rollout:
+    """The plant's motion by its own steps, or in continuous time by another integration than a plan is made by."""
+    if problem.motion == CONTINUOUS:
+        return replayed(model, x0, inputs, count)
+    if callable(inputs):
+        return rollout(model, x0, policy=inputs, num_steps=count)
+    return rollout(model, x0, inputs)
 
 
 def _missing(plan: Plan, variant: str, control: str, why: str) -> Replay:

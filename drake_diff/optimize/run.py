@@ -15,6 +15,7 @@ from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.parameters import TIME_STEP
 from drake_diff.model.soft_contact import SoftContact
+from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.certified import certified_knots, certify_equations
 from drake_diff.optimize.guess import Guess
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
@@ -30,6 +31,7 @@ from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, NlpResult, Outcome, Report
 from drake_diff.optimize.reach import out_of_reach, why_blind
 from drake_diff.optimize.shooting import ShootingVariables, roll_segments, solve_shooting
+from drake_diff.optimize.slope import HOLDS, doubt_of_the_slope
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.optimize.transcription.between import violation_between_nodes
 from drake_diff.optimize.transcription.collocation import (
@@ -194,6 +196,7 @@ class Run:
                 self.options["continuation"] = [asdict(log) for log in logs]
                 return result, xs_found, us
             touches = problem.model.contract.contact.collision_pairs and not moves_shapes(problem)
+            touches = touches and problem.motion == STEPS  # in continuous time a touch is no jump
             begin = next(first, rolled)
             if touches:
                 return solve_through_jumps(problem, begin, us, limits=limits, report=report, values=values)
@@ -301,6 +304,11 @@ class Run:
         solution, problem = judged(draft, result), self.problem
         if solution.status not in PLANS or not problem.has_model:
             return solution
+        if problem.motion != STEPS and solution.success:
+            doubt = doubt_of_the_slope(solution)
+            if doubt is not None:
+                return ended(solution, *doubt)
+            solution = solution.told(message=f"{solution.message}; {HOLDS}")
         xs, us = solution.plan.sample(1)
         variables = ShootingVariables(problem, around=xs)
         try:
@@ -333,5 +341,6 @@ class Run:
                 self.certified[at] = certify_inside(model, x, u, parameters=parameters)
             return self.certified[at]
 
-        certificates = tuple(certificate(xs[k], us[k]) for k in certified_knots(us))
+        certified = certified_knots(us) if self.problem.motion == STEPS else ()  # else see `slope`, of the whole plan
+        certificates = tuple(certificate(xs[k], us[k]) for k in certified)
         return xs, us, certificates, why_blind(self.problem, variables, z)

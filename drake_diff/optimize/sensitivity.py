@@ -16,6 +16,7 @@ from drake_diff.exceptions import GradientError, InputError, ModelError, Simulat
 from drake_diff.model.contact import active_modes
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.step import advance
+from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.problem.obstacles import swept
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.terminal import TerminalSet
@@ -175,6 +176,8 @@ class _Plan:
 
 def _plan(solution: Solution) -> _Plan:
     motion, problem = solution.transcribed, solution.problem
+    if problem.motion != STEPS:
+        raise ModelError('a plan with motion="continuous" has no second derivatives here: motion="steps" has them')
     if motion is not None:
         scheme, mesh = solution.scheme, motion.mesh
 

@@ -19,11 +19,11 @@ from pydrake.solvers import MathematicalProgram
 
 from drake_diff._base.arrays import Array, positive_int
 from drake_diff._base.autodiff import chain, chain_rows
-from drake_diff.derivatives.step import StepDerivatives, derivatives_along
+from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.exceptions import GradientError, InputError, SimulationError
-from drake_diff.model.parameters import ParameterVector, applied
+from drake_diff.model.parameters import ParameterVector
+from drake_diff.motion.intervals import roll
 from drake_diff.motion.loss import Totals, accumulate, differentiate_loss
-from drake_diff.motion.rollout import roll_states
 from drake_diff.optimize.drake_program import solve_program
 from drake_diff.optimize.problem.cost import differentiate_cost, differentiate_final_cost
 from drake_diff.optimize.problem.coupling import BoundCoupling
@@ -275,9 +275,9 @@ class ShootingVariables:
         """The step derivatives along the states of z."""
         if z.tobytes() != self._at:
             (x0, us), vector = self.unpack(z), self.parameters(z)
-            with applied(vector) as model:
+            with self.problem.intervals(vector) as intervals:
                 given = None if self.around is None else self.around[:-1]
-                self._linearization = derivatives_along(model, x0, us, vector=vector, xs=given)
+                self._linearization = intervals.derivatives(x0, us, given)
             self._at = z.tobytes()
         return self._linearization
 
@@ -300,8 +300,8 @@ class ShootingVariables:
         x0, us = self.unpack(z)
         if z.tobytes() == self._at:
             return np.vstack([x0, [d.x_next for d in self._linearization]])
-        with applied(self.parameters(z)) as model:
-            return roll_states(model, x0, us)
+        with self.problem.intervals(self.parameters(z)) as intervals:
+            return roll(intervals, x0, us)
 
 
 def state_sensitivities(variables: ShootingVariables, z: Array) -> Array:

@@ -16,11 +16,10 @@ from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff._base.refusal import Refusal
 from drake_diff.certificates.certificate import Certificate
-from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import GradientError, ModelError, SimulationError, UnknownNameError
 from drake_diff.model.parameters import ParameterVector, applied, select
-from drake_diff.model.step import advance
-from drake_diff.motion.rollout import Rollout, roll_states
+from drake_diff.motion.intervals import intervals_of
+from drake_diff.motion.rollout import STEPS, Rollout, roll_states
 from drake_diff.optimize.optimality import Optimality, final_state_norms, optimality
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Multipliers
@@ -280,17 +279,18 @@ class Solution(ShowsItsRepr):
     def defects(self) -> Array:
         """(N,) how far each interval is from the dynamics, as a state change, in the worst coordinate's unit.
 
-        Discrete: |x_(k+1) - step(x_k, u_k)|. Collocation: the scheme's own equations.
+        Discrete: |x_(k+1) - step(x_k, u_k)|, the step being that of the problem's `motion`. Collocation: the scheme's
+        own equations.
         """
         if not self._is_whole:
             return np.full(self._num_intervals, np.inf)
         if self.transcribed is not None:
             return np.nan_to_num(self.transcribed.defects, nan=np.inf)
         found = np.full(len(self.us), np.inf)
-        with applied(self.step_vector) as model:
+        with self.problem.intervals(self.step_vector) as intervals:
             for k, u in enumerate(self.us):
                 with suppress(SimulationError):
-                    found[k] = _largest(np.abs(self.xs[k + 1] - advance(model.double, self.xs[k], u)))
+                    found[k] = _largest(np.abs(self.xs[k + 1] - intervals.end(self.xs[k], u)))
         return found
 
     @property
@@ -394,8 +394,10 @@ class Solution(ShowsItsRepr):
             return Refusal("the plan is not finite")
         try:
             xs, us = self.plan.sample(1)
-            with applied(select(self.plan.model_at(1), self.vector.to_dict())) as model:
-                return final_state_norms(derivatives_along(model, xs[0], us, xs=xs[:-1]))
+            vector = select(self.plan.model_at(1), self.vector.to_dict())
+            with applied(vector) as model:
+                intervals = intervals_of(model, vector, self.problem.motion)
+                return final_state_norms(intervals.derivatives(xs[0], us, xs[:-1]))
         except (GradientError, ModelError, SimulationError) as error:
             return Refusal(f"a step or its derivative is refused: {error}")
 
@@ -424,16 +426,19 @@ class Solution(ShowsItsRepr):
 
     @cached_property
     def replay(self) -> Rollout | None:
-        """The discrete plant's own open-loop motion from xs[0]; None where it cannot be taken.
+        """The plant's own open-loop motion from xs[0]; None where it cannot be taken.
 
-        An input that changes between knots is held at its mean over each step. Plain dynamics have no plant to step:
-        see `integrated`.
+        It is the discrete plant's; of a problem whose motion is continuous, another integration than the plan's. An
+        input that changes between knots is held at its mean over each step. Plain dynamics have no plant to step: see
+        `integrated`.
         """
         return self.plan.open_loop if self.problem.has_model else None
 
     @cached_property
     def replays(self) -> tuple[Replay, ...]:
         """The plan in every variant of the plant (step, half step, other contact), open loop and under TVLQR.
+
+        Of a plan in continuous time there is one, by another integration than that which made it.
 
         None of plain dynamics, which have no such variants.
         """
@@ -448,8 +453,11 @@ class Solution(ShowsItsRepr):
     def half_step_error(self) -> float:
         """How far from xs[-1] the same held inputs lead at half the time step: what a step size decided.
 
-        inf where the model cannot be built again (it came from a diagram) or stepped.
+        inf where the model cannot be built again (it came from a diagram) or stepped, NaN of a motion in
+        continuous time, which has no steps.
         """
+        if self.problem.motion != STEPS:
+            return float("nan")
         if self.replay is None:
             return float("inf")
         try:

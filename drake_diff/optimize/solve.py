@@ -3,6 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from hashlib import sha256
@@ -11,11 +12,13 @@ from typing import Any, overload
 import numpy as np
 
 from drake_diff._base.arrays import positive_float, positive_int
-from drake_diff.exceptions import DrakeDiffError, InputError, UnknownNameError
+from drake_diff.exceptions import DrakeDiffError, InputError, SimulationError, UnknownNameError
 from drake_diff.model.contact import penetration
 from drake_diff.model.parameters import applied
 from drake_diff.model.soft_contact import SoftContact
 from drake_diff.model.step import set_state
+from drake_diff.motion.intervals import roll
+from drake_diff.motion.rollout import CONTINUOUS
 from drake_diff.optimize.advice import advice
 from drake_diff.optimize.apart import is_kept_apart, kept_apart
 from drake_diff.optimize.drake_program import SOLVERS
@@ -47,6 +50,7 @@ OTHER_ITERATIONS = 200  # of each
 OTHER_GUESS = "another first guess"
 NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
 GUESS_ITERATIONS = 100  # of an attempt that is to find a guess for the next one
+BLIND = (Status.NO_GRADIENT, Status.DIVERGED)
 ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
 # The order in which a chain that ends without a verified motion prefers what it has.
 PREFERENCE = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED, Status.INTERRUPTED, Status.TIME_LIMIT)
@@ -391,9 +395,10 @@ def _restarted(task: _Task, asked: Attempt, first: Solution, count: int) -> Solu
             break
         which = f"{OTHER_GUESS}, number {used + number} of seed {asked.seed}"
         attempt = dataclasses.replace(base, reason=f"restart {number} of {count}: {which}")
-        begun = another_guess(task.problem, asked.seed, used + number)
-        if first.method != "collocation":
-            begun = begun[0], begun[1][:-1]
+        if first.method == "collocation":
+            begun = another_guess(task.problem, asked.seed, used + number)
+        else:
+            begun = _rolled_guess(task.problem, asked.seed, used + number)
         try:
             found.append((task.prepare(attempt, begun)(), which))
             ended = found[-1][0].status.value
@@ -429,6 +434,9 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
         yield from _kept_apart(problem, asked, found)
         return
     method, reason = choose_method(problem)
+    if problem.motion == CONTINUOUS:
+        yield from _in_continuous_time(problem, dataclasses.replace(asked, method=method, reason=reason), given, found)
+        return
     first = dataclasses.replace(asked, method=method, reason=reason, solver=None if method == "ilqr" else asked.solver)
     told = "nothing touches at first, and every coordinate is driven"
     free = dataclasses.replace(asked, method="collocation", reason=told)
@@ -454,6 +462,36 @@ def _attempts(problem: Problem, asked: Attempt, given: Any, found: list[Solution
             begun = found[-1]
         after = "collocation" if method == "collocation" else "shooting"
         yield dataclasses.replace(asked, method=after, reason="from the motion that iLQR found"), begun
+
+
+def _in_continuous_time(
+    problem: Problem, first: Attempt, given: Any, found: list[Solution]
+) -> Iterator[tuple[Attempt, Any]]:
+    """One method, shooting from what iLQR found, and other first guesses: one that touches nothing has no slope."""
+    first = dataclasses.replace(first, solver=None) if first.method == "ilqr" else first
+    yield first, given
+    for number in range(OTHER_GUESSES + 1):
+        if number:
+            reason = f"no plan was found: {OTHER_GUESS} ({number} of {OTHER_GUESSES})"
+            yield dataclasses.replace(first, reason=reason), _rolled_guess(problem, first.seed, number)
+        last = found[-1]
+        if (
+            first.method == "ilqr"
+            and last.method == "ilqr"
+            and last.status not in BLIND
+            and np.all(np.isfinite(last.xs))
+        ):
+            yield dataclasses.replace(first, method="shooting", reason="from the motion that iLQR found"), last
+
+
+def _rolled_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
+    """Another first guess for steps; of a motion in continuous time the motion itself, where its states have one."""
+    xs, us = another_guess(problem, seed, number)[:2]
+    us = us[:-1]
+    if problem.motion == CONTINUOUS:
+        with suppress(SimulationError), problem.intervals(problem.parameters) as intervals:
+            xs = roll(intervals, np.where(problem.initial_state_mask, xs[0], problem.x0), us)
+    return xs, us
 
 
 def _other_guesses(
@@ -507,6 +545,8 @@ def _is_free_at_first(problem: Problem) -> bool:
 def _check_attempt(problem: Problem, attempt: Attempt) -> str:
     """The scheme, "step" of the discrete methods; refuses what the method cannot take, and what is another's."""
     method, scheme = attempt.method, attempt.scheme
+    if problem.motion == CONTINUOUS:
+        _check_motion(attempt)
     if method == "collocation":
         return _check_collocation(problem, attempt)
     takes = 'method="collocation" takes it'
@@ -528,6 +568,16 @@ def _check_attempt(problem: Problem, attempt: Attempt) -> str:
     if method == "ilqr":
         check_problem(problem)
     return "step"
+
+
+def _check_motion(attempt: Attempt) -> None:
+    """What does not go along the motion in continuous time."""
+    if attempt.method == "collocation":
+        expected = 'method="ilqr" or "shooting" for motion="continuous": collocation leaves contact out'
+        raise InputError("method", got='"collocation"', expected=expected)
+    if attempt.continuation is not None:
+        expected = 'none for motion="continuous": restarts try other first guesses'
+        raise InputError("continuation", got="given", expected=expected)
 
 
 def _check_collocation(problem: Problem, attempt: Attempt) -> str:
@@ -583,6 +633,9 @@ def choose_method(problem: Problem) -> tuple[str, str]:
         told = "a discrete map is one sparse program" if problem.is_map else "plain dynamics have no discrete step"
         return "collocation", told
     contract = problem.model.contract
+    if problem.motion == CONTINUOUS:
+        by_sweeps = problem.optimizes_controls and problem.trajectory_cost is None and not problem.couplings
+        return "ilqr" if by_sweeps else "shooting", "the motion is in continuous time, which collocation does not take"
     if problem.horizon is not None and not _touches_at_first(problem):
         return "collocation", "the horizon is " + ("free" if problem.horizon[0] < problem.horizon[1] else "given")
     if not problem.optimizes_controls:

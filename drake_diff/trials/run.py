@@ -22,6 +22,7 @@ from drake_diff.loop.parts import Hold
 from drake_diff.loop.run import Loop
 from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space
+from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.solution import Solution
 from drake_diff.record.parts import Label
 from drake_diff.trials.perturbation import PERTURBATIONS, parameters_of, perturbation_named
@@ -80,6 +81,8 @@ def robustness(
         {'mass': 0.05}
     """
     trials, seed = positive_int("trials", trials), count("seed", seed, 0)
+    if solution.problem.motion != STEPS:
+        raise InputError("solution", got='one with motion="continuous"', expected='motion="steps": trials are stepped')
     task = Task(solution.plan, controller, loop)
     levels, sensitivity = levels_of(task, perturbations), Sensitivity(task)
     cells = []

@@ -1,4 +1,4 @@
-"""What `rollout` measures along a flow: energies and contacts at the ends of the intervals, work along its steps.
+"""What `rollout` measures along a flow: its ends of the intervals, and contacts and work along its steps.
 
 Work is the power at three points of each step by Gauss' quadrature of order 6.
 """
@@ -34,7 +34,7 @@ class Measured:
     dissipation: Array  # (N+1,) [J]
     contact_work: Array  # (N+1,) [J]
     penetration: Array  # (N+1,) [m] the largest since the end before
-    contacts: tuple[tuple[ContactPoint, ...], ...]  # N tuples: those at the end of each interval
+    contacts: tuple[tuple[ContactPoint, ...], ...]  # N tuples: those of each interval, where they are deepest
 
 
 def measured_flow(model: Model, vector: ParameterVector, x0: Array, choose: Chooser, count: int) -> Measured:
@@ -46,7 +46,7 @@ def measured_flow(model: Model, vector: ParameterVector, x0: Array, choose: Choo
     deepest = [depths[0], *(np.max(depths[begin : end + 1]) for begin, end in pairwise(at))]
     limits = steps.plant.description.effort_limits
     work, dissipation, by_contact = _work(steps.plant, flow, materials)[at].T
-    contacts = _contacts(steps.plant, model, xs[1:], materials)
+    contacts = _contacts(steps.plant, flow, materials)
     return Measured(xs, us, np.clip(us, -limits, limits), work, dissipation, by_contact, np.array(deepest), contacts)
 
 
@@ -92,23 +92,32 @@ def _powers(plant: FlowPlant, pushing: tuple[int, ...]) -> Any:
     return ca.Function("powers", [plant.x, plant.u, plant.materials], [ca.densify(power)])
 
 
-def _contacts(plant: FlowPlant, model: Model, xs: Array, materials: Array) -> tuple[tuple[ContactPoint, ...], ...]:
-    """The pairs that push at each of the states."""
+def _contacts(plant: FlowPlant, flow: Flow, materials: Array) -> tuple[tuple[ContactPoint, ...], ...]:
+    """Of each interval the pairs that push in it, at that end of a step where they are deepest."""
     if not plant.num_pairs:
-        return ((),) * len(xs)
+        return ((),) * len(flow.ends)
     of_all = [ca.horzcat(t.point, t.normal, t.push, ca.vertcat(t.depth, t.speed, 0)) for t in plant.touches]
     read = ca.Function("contacts", [plant.x, plant.u, plant.materials], [ca.horzcat(*of_all)])
-    pairs, nothing, found = plant.pairs, np.zeros(model.nu), []
-    for x in xs:
-        pushing = pushing_of((np.asarray(plant.switches(x, nothing, materials)).ravel() > 0).astype(float))
-        values = np.asarray(read(x, nothing, materials)).reshape(3, plant.num_pairs, 4) if pushing else np.zeros(0)
-        now = []
-        for i in pushing:
-            point, normal, force, sizes = values[:, i].T
-            a, b = pairs.bodies[pairs.sphere_body[i]], pairs.bodies[pairs.other_body[i]]
-            if model.plant.IsAnchored(a):  # the force is the one on what can move
-                a, b, normal, force = b, a, -normal, -force
-            where = frozen(point), frozen(normal), frozen(force)
-            now.append(ContactPoint(a.name(), b.name(), *where, float(sizes[0]), float(sizes[1])))
-        found.append(tuple(now))
+    nothing, found = np.zeros(plant.model.nu), []
+    for begin, end in pairwise([0, *flow.ends]):
+        deepest: dict[int, tuple[float, Array]] = {}
+        for m in range(begin, end):
+            pushing = pushing_of(flow.modes[m])
+            for x in flow.xs[m : m + 2] if pushing else ():
+                values = np.asarray(read(x, nothing, materials)).reshape(3, -1, 4)
+                for i in pushing:
+                    depth = float(values[0, i, 3])
+                    if depth > deepest.get(i, (0.0,))[0]:
+                        deepest[i] = depth, values[:, i]
+        found.append(tuple(_contact(plant, i, values) for i, (_, values) in sorted(deepest.items())))
     return tuple(found)
+
+
+def _contact(plant: FlowPlant, i: int, values: Array) -> ContactPoint:
+    """Of pair `i`, from its point, its normal, the force on the sphere, and (depth, speed of slip, 0)."""
+    point, normal, force, sizes = values.T
+    a, b = plant.pairs.bodies[plant.pairs.sphere_body[i]], plant.pairs.bodies[plant.pairs.other_body[i]]
+    if plant.model.plant.IsAnchored(a):  # the force is the one on what can move
+        a, b, normal, force = b, a, -normal, -force
+    where = frozen(point), frozen(normal), frozen(force)
+    return ContactPoint(a.name(), b.name(), *where, float(sizes[0]), float(sizes[1]))

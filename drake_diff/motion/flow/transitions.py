@@ -32,6 +32,7 @@ WEIGHTS = np.array(
         [(16 - ROOT_6) / 36, (16 + ROOT_6) / 36, 1 / 9],
     ]
 )
+SWING = 0.5  # of a part's length times the frequency that its stiffest entry would swing at
 ALONG = 1e-9  # of the sizes of a switch's slope and of the rates: less is no crossing
 AT_ONCE = 1_000_000  # numbers of the equations that are solved in one call
 
@@ -59,7 +60,7 @@ def transitions(plant: FlowPlant, flow: Flow, materials: Array, by_parameters: A
         at_once = max(1, AT_ONCE // (9 * nx * found.shape[2]))
         for first in range(0, len(chosen), at_once):
             rows = np.array(chosen[first : first + at_once])
-            found[rows] = _changes(slopes, xs[rows], xs[rows + 1], us[rows], hs[rows])
+            found[rows] = _changes(slopes, plant.model.nq, xs[rows], xs[rows + 1], us[rows], hs[rows])
     for m in flow.deep:
         plant.check_normals(xs[m], xs[m + 1], pushing_of(flow.modes[m]))
     modes_now: dict[int, Array] = {}
@@ -70,13 +71,37 @@ def transitions(plant: FlowPlant, flow: Flow, materials: Array, by_parameters: A
     return Transitions(found[:, :, :nx], found[:, :, nx : nx + nu], found[:, :, nx + nu :])
 
 
-def _changes(slopes: Slopes, starts: Array, ends: Array, us: Array, hs: Array) -> Array:
-    """(M, nx, nx + nu + n) of steps of lengths hs (M,) from `starts` (M, nx) to `ends`."""
+def _changes(slopes: Slopes, nq: int, starts: Array, ends: Array, us: Array, hs: Array) -> Array:
+    """(M, nx, width) of steps of lengths hs (M,) from `starts` (M, nx) to `ends`.
+
+    A motion that rests does not show how fast it would swing either: steps that are long for that are taken in parts.
+    """
     count, nx = starts.shape
     at_start, at_end = slopes.at_ends(starts, ends, us)
-    inner = [slopes(between(c, starts, ends, hs, at_start, at_end), us)[1] for c in NODES]
-    on_the_way = np.stack([*inner, at_end[1]], axis=1)  # (M, 3, nx, width)
-    parts = hs[:, None, None, None, None] * WEIGHTS[None, :, :, None, None] * on_the_way[:, None]
+    stiffness = np.max(np.abs(at_start[1][:, nq:, :nq]), axis=(1, 2), initial=0.0)
+    parts = np.ceil(np.maximum(hs * np.sqrt(stiffness) / SWING, 1.0)).astype(int)
+    found = np.empty((count, nx, at_end[1].shape[2]))
+    for number in np.unique(parts).tolist():
+        rows = np.flatnonzero(parts == number)
+        here = starts[rows], ends[rows], hs[rows]
+        near = [(rates[rows], by_all[rows]) for rates, by_all in (at_start, at_end)]
+        for j in range(number):
+            points = [(j + c) / number for c in NODES] + [(j + 1) / number] * (j + 1 < number)
+            on_the_way = [slopes(between(point, *here, *near), us[rows])[1] for point in points]
+            on_the_way += [near[1][1]] * (j + 1 == number)
+            change = _collocated(np.stack(on_the_way, axis=1), hs[rows] / number)
+            if j:
+                total = change[:, :, :nx] @ found[rows]
+                total[:, :, nx:] += change[:, :, nx:]
+                change = total
+            found[rows] = change
+    return found
+
+
+def _collocated(slopes: Array, hs: Array) -> Array:
+    """(M, nx, width) from the slopes (M, 3, nx, width) at the three points of steps of lengths hs (M,)."""
+    count, _, nx, _ = slopes.shape
+    parts = hs[:, None, None, None, None] * WEIGHTS[None, :, :, None, None] * slopes[:, None]
     left = -parts[..., :nx].transpose(0, 1, 3, 2, 4).reshape(count, 3 * nx, 3 * nx)
     diagonal = np.arange(3 * nx)
     left[:, diagonal, diagonal] += 1.0

@@ -12,8 +12,8 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of
-from drake_diff.derivatives.step import derivatives_along, linearize, smooth_jacobians
-from drake_diff.model.parameters import applied
+from drake_diff.derivatives.step import smooth_jacobians
+from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic
 from drake_diff.optimize.problem.cost import (
@@ -173,11 +173,10 @@ def jacobians_along(problem: Problem, motion: Motion) -> Array:
     """
     design, us = problem.design, _off_bounds(problem, motion.us)
     vector = design.at(motion.c)
-    with applied(vector) as model:
+    with problem.intervals(vector) as intervals:
         if not design.count:
-            A, B, _ = linearize(model, motion.xs, us, x_next=motion.ends)
-            return np.concatenate([A, B], axis=2)
-        found = derivatives_along(model, motion.xs[0], us, vector=vector, xs=motion.xs[:-1])
+            return intervals.jacobians(motion.xs, us, motion.ends)
+        found = intervals.derivatives(motion.xs[0], us, motion.xs[:-1])
     return np.array([np.hstack([d.A, design.pull_back(motion.c, d.C), d.B]) for d in found])
 
 
@@ -188,13 +187,14 @@ def _off_bounds(problem: Problem, us: Array) -> Array:
 
 
 def curvature_along(problem: Problem, motion: Motion, v: Array) -> Array | None:
-    """(N, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx); None if contact or a limit acts.
+    """(N, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx); None if contact or a limit acts,
+    or the motion is in continuous time.
 
     By differences of the Jacobians along every state: in its inputs alone a smooth step is linear. None also if
     Jacobians are not to be had in one call. Raises what `linearize` raises.
     """
     model, xs, us = problem.model, motion.xs[:-1], _off_bounds(problem, motion.us)
-    if problem.design.vector.parameters:
+    if problem.design.vector.parameters or problem.motion != STEPS:
         return None  # what is learned has the parameters in it
     here = smooth_jacobians(model, xs, us, motion.ends)
     if here is None:

@@ -18,8 +18,6 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import GradientError, InputError, SimulationError
-from drake_diff.model.parameters import applied
-from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.ilqr.constraints import GROWTH, LARGEST_PENALTY, AugmentedLagrangian
 from drake_diff.optimize.ilqr.expansion import DynamicsCurvature, Motion, curvature_along, expand, jacobians_along
@@ -298,10 +296,10 @@ class _Search:
         wanted = old.us + size * policy.feedforward
         if len(c):
             wanted = wanted + policy.feedback[:, :, nx:] @ (c - old.c)
-        with applied(self.design.at(c)) as model:
+        with self.problem.intervals(self.design.at(c)) as intervals:
             for k, feedback in enumerate(policy.feedback[:, :, :nx]):
                 us[k] = self._inside(wanted[k] + feedback.dot(xs[k] - old.xs[k]))
-                xs[k + 1] = advance(model.double, xs[k], us[k]) - gaps[k]
+                xs[k + 1] = intervals.end(xs[k], us[k]) - gaps[k]
         return Motion(xs, us, gaps, c)
 
     def _objective(self, motion: Motion) -> float:
@@ -316,9 +314,9 @@ class _Search:
         xs[0] = self._inside_start(np.where(free, xs[0], self.problem.x0))
         gaps = np.empty_like(xs[1:])
         quaternions = tangent_space(self.problem.model).quaternions
-        with applied(self.design.at(c)) as model:
+        with self.problem.intervals(self.design.at(c)) as intervals:
             for k, u in enumerate(us):
-                x_next = advance(model.double, xs[k], u)
+                x_next = intervals.end(xs[k], u)
                 for part in (slice(start, start + 4) for start in quaternions):
                     if x_next[part] @ xs[k + 1, part] < 0:  # the same rotation, further off
                         xs[k + 1, part] *= -1

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import Any, cast
@@ -13,6 +14,8 @@ from drake_diff._base.jupyter import ShowsItsRepr
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, ShapeError, UnknownNameError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, select
+from drake_diff.motion.intervals import Intervals, intervals_of
+from drake_diff.motion.rollout import MOTIONS, STEPS
 from drake_diff.optimize.problem.constraint import Constraint, check_inside, plant_limits, resolve_bounds, short
 from drake_diff.optimize.problem.cost import ConstantCost, FinalCost, QuadraticCost, differentiate_final_cost
 from drake_diff.optimize.problem.coupling import BoundCoupling, Couples, Joins, checked_couplings, excess_of
@@ -73,6 +76,9 @@ class Problem(ShowsItsRepr):
             measured motion.
         parameter_cost: a function (p) -> scalar of the values (np,) of `parameters` that is added to the cost, such as
             what a stronger motor costs.
+        motion: how a model gets from knot to knot. "steps": by Drake's own. "continuous": as they do as time steps
+            vanish, contact included (see `rollout`), so that the derivative through an impact is the impact's own; for
+            iLQR and shooting. Such a plan has to hold where another integration replays it.
 
     Raises:
         InputError: something does not fit; also ShapeError, NonFiniteError and UnknownNameError, all with what was
@@ -108,6 +114,7 @@ class Problem(ShowsItsRepr):
     parameter_bounds: Mapping[str, tuple[Any, Any]] | None = None
     trajectory_cost: Callable[[Any, Any], Any] | None = None
     parameter_cost: Callable[[Any], Any] | None = None
+    motion: str = STEPS
 
     def __post_init__(self) -> None:
         system = self.system
@@ -155,6 +162,7 @@ class Problem(ShowsItsRepr):
             raise InputError("horizon", got="none", expected="a number of seconds, or (lower, upper)")
         self._check_costs()
         self._check_quantities()
+        self._check_motion()
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -568,6 +576,25 @@ class Problem(ShowsItsRepr):
         except (GradientError, TypeError, ValueError, IndexError, AttributeError) as error:
             expected = "a function of the parameters' values (np,) in ordinary arithmetic, without float()"
             raise InputError("parameter_cost", got=f"{type(error).__name__}: {error}", expected=expected) from error
+
+    def _check_motion(self) -> None:
+        if self.motion not in MOTIONS:
+            raise UnknownNameError("motion", got=self.motion, known=MOTIONS)
+        if self.motion == STEPS:
+            return
+        if not self.has_model:
+            raise InputError("motion", got=repr(self.motion), expected=f'"{STEPS}" for plain dynamics: a model has it')
+        if self.horizon is not None:
+            expected = "none: a motion in continuous time lasts num_steps * model.time_step"
+            raise InputError("horizon", got="given", expected=expected)
+        with self.intervals(self.parameters):
+            pass  # what has none says why
+
+    @contextmanager
+    def intervals(self, vector: ParameterVector) -> Iterator[Intervals]:
+        """How the model gets from knot to knot with the parameters applied, for as long as the block runs."""
+        with applied(vector) as model:
+            yield intervals_of(model, vector, self.motion)
 
     def _check_quantities(self) -> None:
         """Call each function once with the parameters applied: what depends on the model's own refuses them."""

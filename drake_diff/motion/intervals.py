@@ -1,0 +1,73 @@
+"""How a model gets from one knot to the next: by Drake's own step, or by the motion in continuous time it stands for.
+
+Either is a function of the state and the input alone, with derivatives, so that a search need not know which it is.
+"""
+
+from typing import Protocol
+
+import numpy as np
+
+from drake_diff._base.arrays import Array
+from drake_diff.derivatives.step import StepDerivatives, derivatives_along, linearize
+from drake_diff.model.contact import contacts_of_the_step
+from drake_diff.model.model import Model
+from drake_diff.model.parameters import ParameterVector
+from drake_diff.model.step import advance
+from drake_diff.motion.rollout import CONTINUOUS
+
+BodyPair = tuple[str, str]
+
+
+class Intervals(Protocol):
+    """Those of a model to which a vector of parameters is applied, for as long as it is."""
+
+    def end(self, x: Array, u: Array) -> Array:
+        """(nx,) where an interval leads from `x` (nx,) under `u` (nu,)."""
+
+    def derivatives(self, x0: Array, us: Array, xs: Array | None = None) -> list[StepDerivatives]:
+        """Along the motion from `x0` under `us` (N, nu); given xs (N, nx), of the intervals from each of them."""
+
+    def jacobians(self, xs: Array, us: Array, ends: Array | None = None) -> Array:
+        """(N, nx, nx + nu) of the intervals from xs (N or N+1, nx), which may be known to lead to `ends` (N, nx)."""
+
+    def touching(self, x: Array, u: Array) -> tuple[BodyPair, ...]:
+        """The bodies that push each other in the interval from `x` under `u`."""
+
+
+def intervals_of(model: Model, vector: ParameterVector, motion: str) -> Intervals:
+    """By the name of the motion; ModelError where the model has none in continuous time."""
+    if motion == CONTINUOUS:
+        from drake_diff.motion.flow.intervals import FlowIntervals  # loads CasADi
+
+        return FlowIntervals(model, vector)
+    return DrakeSteps(model, vector)
+
+
+def roll(intervals: Intervals, x0: Array, us: Array) -> Array:
+    """(N+1, nx) the states at the ends of the intervals from `x0` (nx,) under `us` (N, nu)."""
+    xs = np.empty((len(us) + 1, len(x0)))
+    xs[0] = x0
+    for k, u in enumerate(us):
+        xs[k + 1] = intervals.end(xs[k], u)
+    return xs
+
+
+class DrakeSteps:
+    """Drake's own discrete steps."""
+
+    def __init__(self, model: Model, vector: ParameterVector):
+        self.model, self.vector = model, vector
+
+    def end(self, x: Array, u: Array) -> Array:
+        return np.asarray(advance(self.model.double, x, u))
+
+    def derivatives(self, x0: Array, us: Array, xs: Array | None = None) -> list[StepDerivatives]:
+        return derivatives_along(self.model, x0, us, vector=self.vector, xs=xs)
+
+    def jacobians(self, xs: Array, us: Array, ends: Array | None = None) -> Array:
+        A, B, _ = linearize(self.model, xs, us, x_next=ends)
+        return np.concatenate([A, B], axis=2)
+
+    def touching(self, x: Array, u: Array) -> tuple[BodyPair, ...]:
+        advance(self.model.double, x, u)
+        return tuple((c.body_a, c.body_b) for c in contacts_of_the_step(self.model))
