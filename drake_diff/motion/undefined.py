@@ -12,9 +12,10 @@ is undefined so, also where the derivative at the point is right over a thousand
 nothing touches, here or beside, a hundredth of these widths will do: a double pendulum is smooth, and yet bent.
 
 Rollouts are spared where all is well. Columns are moved together in three groups, those with the largest derivatives
-first, each by 1e-2 and all so that the loss rises. Where the loss follows the sum of their derivatives to 0.5 % of the
-largest, they have slopes; else, and where a group is but one column, the same is asked of each on its own, and the
-narrower widths of those that fail. Slopes over 1e-2 need no more than a tolerance of 1e-7.
+first, each by 1e-2 and all so that the loss rises. Where the loss follows the sum of their derivatives to 1 % of the
+largest, or bends away from it as a smooth curve does, they have slopes; else, and where a group is but one column, it
+is asked of each on its own whether the loss follows to 1 %, and of those that fail the narrower widths, unless they are
+off by a half already. Slopes over 1e-2 need no more than a tolerance of 1e-7.
 """
 
 from collections.abc import Iterator, Sequence
@@ -45,10 +46,13 @@ from drake_diff.motion.smoothing import Gaussian, Smoothed, smooth
 
 WIDE, BETWEEN, MIDDLE, NARROW = 1e-2, 5e-3, 1e-3, 1e-4  # of a column's unit, to both sides
 CURVE = (WIDE**2 - MIDDLE**2) / (BETWEEN**2 - MIDDLE**2)  # how slopes over these differ on a smooth curve
+QUARTER = (WIDE / BETWEEN) ** 2
 SMOOTH = 1e-2  # part of the widths where nothing touches
 COARSE = 1e-7  # the tolerance of what moves by 1e-2
-SETTLED, FOLLOWS, RIGHT = 1e-3, 5e-3, 1e-2
+SETTLED, RIGHT = 1e-3, 1e-2
+FAR = 0.5  # a derivative that is so far off over +-1e-2 is no slope, whatever there is over less
 BENT = 0.1  # of a curve's difference: what its fourth derivative may add
+BENDS = 0.2  # of the largest: by so much columns that are moved together may
 NEGLIGIBLE = 1e-2  # of the largest column: what is smaller is judged as if it were that large
 FORGOTTEN = 2e-3  # of the loss's own derivative by the last state: likewise, of a start that the motion forgets
 NOISE = 0.1  # of the tolerance, times how much of an error comes through to the loss: its change between two motions
@@ -169,20 +173,21 @@ class Beside:
             return x0, values.reshape(self.us.shape), None, vector
         return x0, self.us, ParametricPolicy(self.policy, values) if given else self.policy, vector
 
-    def _steps(self, model: Model, vector: ParameterVector, tolerance: float) -> FlowSteps | RigidSteps:
-        """Those of the motion itself, unless parameters are moved."""
+    def _steps(self, vector: ParameterVector, tolerance: float) -> FlowSteps | RigidSteps:
+        """Those of the motion itself, which have its materials, unless parameters are moved."""
         if isinstance(self.steps, RigidSteps):
             self.steps.tolerance = tolerance
-            return self.steps
-        if not np.array_equal(vector.values, self.vector.values):
-            return FlowSteps(model, vector, tolerance)
-        self.steps.integrator.tolerance = tolerance
+        elif not np.array_equal(vector.values, self.vector.values):
+            with applied(vector) as model:
+                return FlowSteps(model, vector, tolerance)
+        else:
+            self.steps.integrator.tolerance = tolerance
         return self.steps
 
     def linearize(self, tolerance: float) -> tuple[list[StepDerivatives], list[Feedback], Array]:
         """The motion itself and the derivatives of its intervals; see `along_the_flow`."""
-        with applied(self.vector) as model:
-            return along_the_flow(self._steps(model, self.vector, tolerance), self.x0, self.us, self.policy)
+        with applied(self.vector):
+            return along_the_flow(self._steps(self.vector, tolerance), self.x0, self.us, self.policy)
 
     def value(self, displacement: Array, tolerance: float) -> tuple[float, bool]:
         """The loss at a displacement (n,), and whether anything touches on the way."""
@@ -197,15 +202,14 @@ class Beside:
         def choose(x: Array, k: int) -> Array:
             return us[k] if policy is None else np.asarray(policy(x, k * self.model.time_step), dtype=float)
 
-        with applied(vector) as model:
-            xs, inputs, flow = self._steps(model, vector, tolerance).roll(x0, choose, len(us))
+        xs, inputs, flow = self._steps(vector, tolerance).roll(x0, choose, len(us))
         return evaluate_loss(self.loss, xs, inputs), bool(flow.events)
 
     def gradient(self, displacement: Array) -> tuple[float, Array]:
         """The loss, and its derivative (n,) by the displacement."""
         x0, us, policy, vector = self._moved(displacement)
-        with applied(vector) as model:
-            steps = self._steps(model, vector, TOLERANCE)
+        steps = self._steps(vector, TOLERANCE)
+        with applied(vector):
             linearization, feedback, inputs = along_the_flow(steps, x0, us, policy)
         value, totals = total_gradients(self.loss, x0, inputs, policy, linearization, feedback)
         return value, self._flat(totals, self._derivative_of_start(displacement[: self.space.size]))
@@ -329,12 +333,14 @@ class _Judge:
         """Whether the loss follows several columns that are moved together."""
         vector = sum((line.unit * (-1 if line.slope < 0 else 1) * line.vector for line in lines), np.zeros(1))
         together = Line(beside, "", np.asarray(vector), 1.0, sum(abs(line.change) for line in lines))
+        largest = max(self.least, *(abs(line.change) for line in lines))
         try:
-            wide = together.over(WIDE, COARSE)
+            off = together.over(WIDE, COARSE) - together.slope
+            if RIGHT * largest + self.noise * COARSE / WIDE < abs(off) < BENDS * largest:
+                off -= QUARTER * (together.over(BETWEEN, COARSE) - together.slope)
         except SimulationError:
             return False
-        largest = max(abs(line.change) for line in lines)
-        return abs(wide - together.slope) <= FOLLOWS * max(largest, self.least) + self.noise * COARSE / WIDE
+        return abs(off) <= RIGHT * largest + self.noise * COARSE / WIDE
 
     def column(self, line: Line) -> Undefined | None:
         """What is said of one column; None where it has a slope."""
@@ -360,8 +366,10 @@ class _Judge:
             return abs(a - b) <= share * size + self.noise * tolerance / (part * width * line.unit)
 
         wide = found[widest] = line.over(widest, tolerance)
-        if same(wide, line.slope, FOLLOWS, WIDE, tolerance):
+        if same(wide, line.slope, RIGHT, WIDE, tolerance):
             return ""
+        if not same(wide, line.slope, FAR, WIDE, tolerance):
+            return UNSETTLED
         middle = found[part * MIDDLE] = line.over(part * MIDDLE, TOLERANCE)
         is_right = same(middle, line.slope, RIGHT, MIDDLE)
         if not is_right and not same(wide, middle, RIGHT, MIDDLE):

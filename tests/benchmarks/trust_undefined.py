@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from helpers.bounces import RADIUS, Bounce
-from impact_cases import INTERVAL, Case, Material, Mover, Obstacle, _corners
+from impact_cases import INTERVAL, Case, Material, Mover, Obstacle
 from impact_truth import FINER, NEARLY, WIDTHS, Motion, Slopes, slope
 from pydrake.math import RollPitchYaw
 from trust import Figure
@@ -126,7 +126,9 @@ def tumble(random):
     """The box of ORACLES D01 and others, under gravity of the moon to the earth."""
     mass, side = 10 ** random.uniform(-1, 0), random.uniform(0.08, 0.15)
     own = material(random, mass, friction=0.5)
-    box = Mover("box", mass, (side,) * 3, 0.01 * side, _corners((side,) * 3, 0.01 * side), own)
+    far = 0.49 * side
+    corners = tuple((x, y, z) for x in (-far, far) for y in (-far, far) for z in (-far, far))
+    box = Mover("box", mass, (side,) * 3, 0.01 * side, corners, own)
     angle = random.uniform(0, pi)
     spin = 3 * random.standard_normal(3) if random.random() < 0.5 else np.zeros(3)
     start = (0, 0, random.uniform(0.12, 0.25), *spin, 0, random.uniform(-0.5, 0.5), random.uniform(-2, 0))
