@@ -98,6 +98,8 @@ SOURCES = {
         "0.4": "drake_diff.certificates.judgement:STOPPED",
         "0.9": "drake_diff.certificates.judgement:DOUBTFUL",
         "0.3": "tests/test_certificate.py::",
+        "1e-3": "drake_diff.certificates.truth:WIDTHS",
+        "0.1": "drake_diff.certificates.truth:SETTLED",
     },
     "docs/mimic.md": {},
     "docs/mpc.md": {},
