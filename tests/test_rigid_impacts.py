@@ -272,6 +272,41 @@ def test_a_rimless_wheel_walks_its_limit_cycle():
     np.testing.assert_allclose(np.sort(np.linalg.eigvals(once)), [eta**2, 1.0], atol=1e-8)
 
 
+def compass(hip=10.0, leg=5.0, a=0.5, b=0.5):
+    """The compass-gait walker in the air: x = [x, z, leg, leg, ...], masses at the hip and b below it in each leg."""
+    plant = Plant(0.01, "lagged", gravity=0.0)
+    one = plant.plant.AddRigidBody("one", SpatialInertia.Zero())
+    body = plant.plant.AddRigidBody("hip", SpatialInertia(hip, np.zeros(3), UnitInertia(0, 0, 0)))
+    add_slide(plant.plant, "x", plant.plant.world_frame(), one, "x")
+    add_slide(plant.plant, "z", one.body_frame(), body, "z")
+    for name in ("left", "right"):
+        inertia = SpatialInertia(leg, np.array([0, 0, -b]), UnitInertia.PointMass(np.array([0, 0, -b])))
+        link = plant.plant.AddRigidBody(name, inertia)
+        plant.plant.AddJoint(RevoluteJoint(name, body.body_frame(), link.body_frame(), [0, 1, 0]))
+    feet = tuple(PointOnPlane(name, [0, 0, -a - b]) for name in ("left", "right"))
+    return plant.model(), RigidContact(0.0, friction=1.0, points=feet)
+
+
+@pytest.mark.parametrize("alpha", [0.15, 0.3])
+def test_the_heel_strike_of_the_compass_walker(alpha):
+    """Goswami, Thuilot and Espiau, 1998: Q+ (ns', s')+ = Q- (ns', s')-, the legs' angular momenta before and after."""
+    m_h, m, a, b = 10.0, 5.0, 0.5, 0.5
+    length, c = a + b, np.cos(2 * alpha)
+    model, contact = compass(m_h, m, a, b)
+    stance, swing = 1.1, 0.4  # rates about +y, walking towards +x: the left foot is behind
+    x = np.array([0, length * np.cos(alpha), alpha, -alpha, 0, 0, stance, swing])
+    x[4:6] = length * stance * np.array([np.cos(alpha), -np.sin(alpha)])  # about the left foot
+    hit = rigid_impact(model, x, contact)
+    assert hit.ways == ("opens", "sticks")
+    before = [[-m * a * b, -m * a * b + (m_h * length**2 + 2 * m * a * length) * c], [0, -m * a * b]]
+    after = [
+        [m * b * (b - length * c), m * length * (length - b * c) + m * a**2 + m_h * length**2],
+        [m * b**2, -m * b * length * c],
+    ]
+    wanted = np.linalg.solve(after, np.array(before) @ [swing, stance])  # the left leg swings now
+    np.testing.assert_allclose(hit.x_after[6:], wanted, atol=1e-12)
+
+
 def test_a_wheel_whose_feet_never_slip_has_two_answers():
     """With friction without bound both feet may hold it, as well as the new one alone."""
     model, contact = wheel(0.5, friction=np.inf)

@@ -40,6 +40,7 @@ PARTS = (
     "kept",
     "undefined",
     "truth",
+    "impact",
 )
 
 

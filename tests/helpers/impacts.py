@@ -1,10 +1,11 @@
 """Rigid impacts of a point of a robot with a floor, from Drake's mass matrix and Jacobian alone: a referee.
 
-Impulses by proximal iteration on Coulomb's cone (Alart and Curnier, 1991): nothing of the toolkit is in it.
+Impulses of one contact by the angle along which it slides: nothing of the toolkit is in it.
 """
 
 import numpy as np
 from pydrake.multibody.tree import JacobianWrtVariable
+from scipy.optimize import brentq
 
 FLOOR = np.array([0.0, 0.0, 1.0])
 
@@ -51,16 +52,43 @@ class Floor:
 
 
 def impulse(W, w, speed, least, friction):
-    """(3,) of the cone |P_t| <= friction P_n that makes the normal velocity `speed`, at least `least` along z."""
-    P, step = np.zeros(3), 1.0 / np.max(np.linalg.eigvalsh(W))
-    for _ in range(200_000):
-        u = w + W @ P
-        new = P.copy()
-        new[2] = max(least, P[2] - step * (u[2] - speed))
-        along = P[:2] - step * u[:2]
-        most, size = friction * new[2], np.linalg.norm(along)
-        new[:2] = along if size <= most else along * (most / size)
-        if np.max(np.abs(new - P)) <= 1e-17 + 1e-15 * np.max(np.abs(P)):
-            return new
-        P = new
+    """(3,) of the cone |P_t| <= friction P_n that makes the normal velocity `speed`, or is `least` if it parts them.
+
+    It sticks where the cone has what that needs. Else it slides along an angle at which the slip has no part across.
+    """
+    for parts in (False, True):  # the contact is left at `speed`, or faster by what it is pushed at least
+        P = _sticking(W, w, speed, least, parts)
+        if np.hypot(*P[:2]) > friction * P[2] + 1e-14 or P[2] < 0:
+            P = _sliding(W, w, speed, least, friction, parts)
+        if P is not None and P[2] >= least - 1e-14 and (w + W @ P)[2] >= speed - 1e-12:
+            return P
     return np.full(3, np.nan)
+
+
+def _sticking(W, w, speed, least, parts):
+    A, b = W.copy(), np.array([-w[0], -w[1], speed - w[2]])
+    if parts:
+        A[2], b[2] = [0, 0, 1], least
+    return np.linalg.lstsq(A, b, rcond=1e-12)[0]  # of a planar body nothing moves across its plane
+
+
+def _sliding(W, w, speed, least, friction, parts):
+    def at(angle):
+        """Across and along the direction the slip, times the size that P is to be divided by; and P times it."""
+        d = np.array([np.cos(angle), np.sin(angle), 0.0])
+        way = FLOOR - friction * d
+        push, size = (least, 1.0) if parts else (speed - w[2], W[2] @ way)
+        u = size * w + push * (W @ way)
+        return d[0] * u[1] - d[1] * u[0], d @ u, push * way, size
+
+    if friction == 0:
+        return at(0.0)[2] / at(0.0)[3]
+    angles = np.linspace(-0.123, 2 * np.pi - 0.123, 25)
+    across = [at(angle)[0] for angle in angles]
+    for low, high, one, other in zip(angles[:-1], angles[1:], across[:-1], across[1:], strict=True):
+        if one * other <= 0:
+            _, along, P, size = at(brentq(lambda angle: at(angle)[0], low, high, xtol=1e-15))
+            is_known = abs(size) > 1e-9 * (1.0 if parts else np.trace(W))  # else nothing is divided by nothing
+            if is_known and along * size > 0 and P[2] * size >= 0:
+                return P / size
+    return None
