@@ -12,6 +12,7 @@ from helpers.table import each_row
 sys.path.insert(0, str(ROOT / "tests" / "benchmarks"))
 
 import impact_orders
+import impact_page
 import impact_peers
 import impacts
 from impact_cases import FAMILIES, Material, Mover, Obstacle, case
@@ -134,3 +135,31 @@ def test_value_and_slope_of_a_bounce_converge_by_the_order_of_the_method():
     for what in ("value", "slope"):
         assert impact_orders.order(found["tolerance"], found[what]) == pytest.approx(1.0, abs=0.2)
         assert -impact_orders.order(found["steps"], found[what]) > 4.5
+
+
+def test_the_page_names_every_column_that_is_not_as_it_should_be():
+    column = {"column": 1, "slopes": (1.0, 1.0, 1.0), "doubt": 0.0, "ours": 1.0, "error": 0.0, "right": True}
+    kinds = [
+        column | {"kind": "exists", "undefined": False},
+        column | {"kind": "exists", "undefined": True},
+        column | {"kind": "exists", "undefined": False, "right": False},
+        column | {"kind": "none", "undefined": False, "right": False},
+        column | {"kind": "none", "undefined": True, "right": False},
+        column | {"kind": "narrow", "undefined": False, "right": False},
+        column | {"kind": "narrow", "undefined": True, "right": False},
+    ]
+    told = impact_page.failures([{"name": "toss 0.1", "law": "sap", "columns": kinds}])
+    ends = [line.rsplit(", ", 1)[1] for line in told.splitlines() if line.startswith("-")]
+    assert ends == ["called undefined", "off", "not called undefined", "off and not called undefined"]
+
+
+def test_a_wrong_derivative_of_a_peer_is_counted_as_wrong():
+    answers = [
+        {"slope": 1.005, "wanted": 1.0},
+        {"slope": 1.09, "wanted": 1.0},
+        {"slope": -1.0, "wanted": 1.0},
+        {"slope": float("nan"), "wanted": 1.0},
+        {"slope": 3.0, "wanted": None},
+        {"error": "no such shape"},
+    ]
+    assert impact_page.row("drake", answers)[1:] == ["3", "1", "2", "1", "9 %", "2"]

@@ -194,7 +194,7 @@ def main() -> int:
     parser.add_argument("--begin", type=int, default=0, help="the number of the first case")
     parser.add_argument("--only", default=",".join(FAMILIES), help="families, with commas between them")
     parser.add_argument("--no-peers", action="store_true", help="leave out the other simulators")
-    parser.add_argument("--page", type=Path, help="write docs/impacts.md from what --out wrote before")
+    parser.add_argument("--page", type=Path, help="write docs/impacts.md from what --out wrote before", nargs="+")
     for name in impact_page.MORE:
         parser.add_argument(f"--{name}", type=Path, help=f"what impact_{name}.py wrote, for --page")
     parser.add_argument("--truths", type=Path, help="where truths are kept for another run")
@@ -203,7 +203,9 @@ def main() -> int:
     if options.page:
         more = {name: getattr(options, name) for name in impact_page.MORE}
         found = {name: json.loads(file.read_text()) for name, file in more.items() if file}
-        text = impact_page.page(json.loads(options.page.read_text()), found)
+        runs = [json.loads(file.read_text()) for file in options.page]  # of one seed, one part after the other
+        whole = runs[-1] | {"cases": [one for run in runs for one in run["cases"]]}
+        text = impact_page.page(whole, found)
         (HERE.parents[1] / "docs" / "impacts.md").write_text(text)
         return 0
     logging.getLogger("drake").setLevel(logging.ERROR)  # what it tells of every half space
@@ -218,12 +220,11 @@ def main() -> int:
             if not options.no_peers and cases[-1]["columns"]:
                 cases[-1]["peers"] = judge_peers(one, cases[-1])
             print(line(cases[-1]), flush=True)
+            if options.out:
+                whole = {"seed": options.seed, "count": options.begin + options.count, "cases": cases}
+                options.out.write_text(json.dumps(whole, indent=1) + "\n")
     for each in figures(cases):
         print(told(*each))
-    if options.out:
-        options.out.write_text(
-            json.dumps({"seed": options.seed, "count": options.count, "cases": cases}, indent=1) + "\n"
-        )
     return 0
 
 
