@@ -100,17 +100,30 @@ def limit(one: Case, x0) -> float:
     k, m, r = ball.material.stiffness / 2, ball.mass, ball.radius
     z, v = x0[n - 1], x0[-1]
 
-    def rate(z, v):
-        depth = r - z
-        return g + (k * depth - 1e-3 * k * min(v, 0.0)) / m if depth > 0 else g
+    def mode(z, v):
+        return z < r, v < 0
 
-    for _ in range(round(one.duration / FINE)):
-        h = FINE
+    def ahead(z, v, h, touches, closes):
+        def rate(z, v):
+            return g + k * ((r - z) - 1e-3 * v * closes) / m * touches
+
         a = rate(z, v)
         b = rate(z + h / 2 * v, v + h / 2 * a)
         c = rate(z + h / 2 * (v + h / 2 * a), v + h / 2 * b)
         d = rate(z + h * (v + h / 2 * b), v + h * c)
-        z, v = z + h * v + h * h / 6 * (a + b + c), v + h / 6 * (a + 2 * b + 2 * c + d)
+        return z + h * v + h * h / 6 * (a + b + c), v + h / 6 * (a + 2 * b + 2 * c + d)
+
+    left, on = one.duration, mode(z, v)
+    while left > 0:
+        h = min(FINE, left)
+        if mode(*ahead(z, v, h, *on)) != on:  # up to just past where the force has a kink
+            low, high = 0.0, h
+            for _ in range(50):
+                middle = (low + high) / 2
+                low, high = (middle, high) if mode(*ahead(z, v, middle, *on)) == on else (low, middle)
+            h = high
+        z, v = ahead(z, v, h, *on)
+        left, on = left - h, mode(z, v)
     x = np.zeros(len(x0))
     x[n - 1], x[-1] = z, v
     return float(one.loss(x))
