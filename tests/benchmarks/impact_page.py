@@ -41,6 +41,11 @@ def page(run: dict, more: dict) -> str:
         "written by\n",
         f"```sh\npython tests/benchmarks/impacts.py --seed {run['seed']} --count {run['count']} --out run.json\n"
         "python tests/benchmarks/impacts.py --page run.json\n```\n",
+        *(
+            [f"This run was cut short: it has {len(cases)} of them, {reached(cases)}.\n"]
+            if len(cases) < run["count"]
+            else []
+        ),
         INTRODUCTION,
         table(["", "columns or cases (95 % Wilson interval)"], [[n, told(f, o)] for n, f, o in impacts.figures(cases)]),
         "\n## By family\n",
@@ -56,6 +61,14 @@ def page(run: dict, more: dict) -> str:
         *(["\n## A second referee\n", nosnoc(more["nosnoc"])] if "nosnoc" in more else []),
     ]
     return "\n".join(part.strip("\n") + "\n" for part in parts)
+
+
+def reached(cases: list[dict]) -> str:
+    """Their numbers, as ranges."""
+    numbers = sorted(int(one["name"].rsplit(".", 1)[1]) for one in cases)
+    begins = [n for n in numbers if n - 1 not in numbers]
+    ends = [n for n in numbers if n + 1 not in numbers]
+    return ", ".join(f"{a} to {b}" if a != b else str(a) for a, b in zip(begins, ends, strict=True))
 
 
 INTRODUCTION = """
@@ -77,9 +90,9 @@ PEERS = """
 The first column of each case that exists or is narrow; of some cases only, since they are dear. Drake's steps have the
 case's own law, and their error is that from the truth above. MuJoCo and MJX have another law of contact (stiffness and
 friction are matched, damping is their own): their error is that from MuJoCo's own motion in steps of 10 us, where its
-slopes over +-1e-2 and +-3e-3 agree to 5 %. Elsewhere what it should be is not known, and it is not counted. MJX is asked
-for the cases of the table below. Newton has the bounces whose loss is in the height, as a particle (its tape holds
-contacts of rigid bodies fixed), and its error is that from its own law, a spring and a damper, in small steps.
+slopes over +-1e-2 and +-3e-3 agree to 5 %. Elsewhere what it should be is not known, and it is not counted. MJX is
+asked for the cases of the table below. Newton has the bounces whose loss is in the height, as a particle (its tape
+holds contacts of rigid bodies fixed), and its error is that from its own law, a spring and a damper, in small steps.
 """
 
 CONVERGENCE = """
