@@ -17,7 +17,6 @@ from drake_diff.optimize.solution import Solution, Status
 
 WIDTHS = (1e-4, 1e-5)  # of a variable's unit, over the derivative's own size where that is more
 SAME, SETTLED = 0.01, 0.1  # of the derivative: how far a slope may be from it, and slopes from each other
-TOLERANCE = 1e-11  # of the integration
 HOLDS = f"the derivative of its end is the slope of that integration, to {SAME:.0%}"
 
 
@@ -62,7 +61,7 @@ def _slope(solution: Solution, variables: ShootingVariables, z: Array, direction
     ahead, behind = (variables.unpack(z + sign * width * direction) for sign in (1, -1))
     with applied(solution.step_vector) as model:
         motion = ContinuousMotion(model)
-        ends = [motion.roll(x0, partial(_input, us), len(us), tolerance=TOLERANCE)[0][-1] for x0, us in (ahead, behind)]
+        ends = [motion.roll(x0, partial(_input, us), len(us))[0][-1] for x0, us in (ahead, behind)]
     return np.asarray((ends[0] - ends[1]) / (2 * width))
 
 
