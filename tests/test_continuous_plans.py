@@ -1,5 +1,7 @@
 """Rollouts and plans in continuous time: closed forms, and another integration of the same law."""
 
+import shutil
+
 import numpy as np
 import pytest
 from helpers.models import MODELS, Plant, contact_properties
@@ -175,3 +177,57 @@ def test_a_plan_in_continuous_time_is_refused_what_it_has_not():
         dd.sensitivity(solution)
     with pytest.raises(InputError, match="motion"):
         dd.loop.MPC(problem, horizon=3)
+
+
+def thrown_from_a_file(**more):
+    """The throw of a model that a run can name."""
+    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.02, contact_approximation="lagged")
+    x0, goal, free = np.array(model.default_state), np.full(13, np.nan), np.zeros(13, dtype=bool)
+    x0[[4, 6, 10, 12]], goal[[4, 6]], free[[10, 12]] = [0.0, 1.0, 1.2, -0.8], [1.0, 0.5], True
+    asked = {"x0": x0, "x_goal": goal, "num_steps": 40, "optimize": ("initial_state",), "initial_state_mask": free}
+    parameters = dict.fromkeys(("ball.dissipation", "ground.dissipation"), 0.05)
+    return dd.Problem(model, parameters=parameters, motion="continuous", **asked | more)
+
+
+@pytest.fixture(scope="module")
+def thrown_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("thrown") / "run"
+    assert dd.save(dd.solve(thrown_from_a_file()), folder).verdict == "pass"
+    return folder
+
+
+def test_a_run_in_continuous_time_comes_out_again_and_its_page_says_what_was_checked(thrown_run):
+    assert dd.load_record(thrown_run).problem["motion"] == "continuous"
+    found = dd.verify(thrown_run)
+    assert found.holds, found.complaints
+    assert "that of the end is a slope of another integration" in (thrown_run / "report.html").read_text()
+
+
+def moved(folder):
+    """Thrown by another 1 mm/s."""
+    with np.load(folder / "plan.npz") as plan:
+        parts = dict(plan)
+    parts["xs"] = parts["xs"].copy()
+    parts["xs"][0, 12] += 1e-3
+    np.savez(folder / "plan.npz", **parts)
+    return {}
+
+
+def of_the_steps(folder):
+    """As if Drake's steps had been planned."""
+    return {"problem": {k: v for k, v in dd.load_record(folder).problem.items() if k != "motion"}}
+
+
+def of_less_penetration(folder):
+    found = dd.load_record(folder).invariants
+    of = {"penetration": 0.5}
+    return {"invariants": tuple(m.model_copy(update={"value": of.get(m.name, 1.0) * m.value}) for m in found)}
+
+
+@pytest.mark.parametrize("forge", [moved, of_the_steps, of_less_penetration])
+def test_a_forged_run_in_continuous_time_is_refused(thrown_run, tmp_path, forge):
+    """All hashes are right."""
+    folder = tmp_path / "forged"
+    shutil.copytree(thrown_run, folder)
+    dd.load_record(folder).model_copy(update=forge(folder)).write(folder)
+    assert dd.verify(folder).verdict == "broken"

@@ -158,3 +158,11 @@ def test_a_quadrotor_flies_through_its_gates_and_its_record_holds(tmp_path):
         solution.problem.input_names
     )
     assert dd.verify(tmp_path / "run").verdict == "holds"
+
+
+def test_the_ball_bounces_into_its_target(capsys):
+    module = example("bounce_into_target")
+    module.main()
+    text = capsys.readouterr().out
+    assert text.startswith("converged")
+    assert "on the ground from 0.60 to 0.62 s" in text  # once

@@ -80,6 +80,8 @@ CODES = {
     "4": "tests/test_cli.py::test_a_bug_in_the_script_exits_with_4_and_its_traceback",
 }
 # Of each number the constant that it is ("module:NAME", of 5 % as a part), or the test that fails without it.
+UNDEFINED = "tests/test_undefined.py::test_what_the_entry_says_is_what_the_loss_does"
+LIMIT = "tests/test_rigid_impacts.py::test_hard_contact_is_the_limit_of_the_compliant_one"
 SOURCES = {
     "README.md": {
         **CODES,
@@ -119,6 +121,11 @@ SOURCES = {
         "1e-3": "drake_diff.motion.flow.plant:STICTION_SPEED",
         **dict.fromkeys(("0.42", "0.29", "-0.13"), TABLE),
         **dict.fromkeys(("0.5", "76", "0.02"), FORWARD),
+        **dict.fromkeys(("-1e-2", "-1e-3", "-1e-4", "0.1", "1e-2"), UNDEFINED),  # "+-1e-2" reads as a sign
+        "5": "tests/test_undefined.py::test_a_ball_that_passes_another_has_a_slope_only_far_from_touching",
+        "24": "drake_diff.motion.undefined:MANY",
+        "0": "tests/test_undefined.py::test_a_smoothed_step_has_the_slope_of_its_closed_form",
+        **dict.fromkeys(("0.03", "1e6", "1e8", "-1", "2"), LIMIT),
         "30": BLEND,
         "0.01": "tests/test_gradient_panel.py::test_on_stiff_ground_the_jumps_of_the_step_turn_the_sign_of_first_order",
     },
@@ -137,6 +144,7 @@ SOURCES = {
         "0.01": "tests/test_bounce_oracles.py::test_a_resolved_collision_has_the_compliant_gradient",
         "1": "tests/test_rollout_certificate.py::",
         "1e-6": SAP,
+        "-1e-2": UNDEFINED,
         "8": TURN,
         "3": "drake_diff.optimize.replay:FEEDBACK_TOLERANCE",
         "5": "drake_diff.optimize.replay:STATE_TOLERANCE",
