@@ -271,7 +271,7 @@ def test_a_certificates_repr_is_short_and_its_html_is_escaped(load):
     assert "&lt;i&gt;" in certificate._repr_html_()
     assert "<i>" not in certificate._repr_html_()
     rollout = dd.certify_rollout(load("pendulum.urdf"), [0.5, 0], np.zeros((2, 1)), lambda x: x[0], refine=True)
-    assert len(repr(rollout).splitlines()) == 3  # the verdict, the worst entry, the refinement
+    assert len(repr(rollout).splitlines()) == 4  # the verdict, the worst entry, the refinement, the continuous truth
     assert repr(rollout).startswith("RolloutCertificate of the rollout of ")
 
 
