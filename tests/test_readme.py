@@ -188,7 +188,14 @@ def prose(path):
     return NAMES.sub(" ", text)
 
 
-FIGURES = ("trust.md", "zoo.md", "impacts.md", "tasks_solved.md", "mpc_realtime.md")  # pages that a benchmark writes
+FIGURES = (
+    "trust.md",
+    "zoo.md",
+    "impacts.md",
+    "continuous_plans.md",
+    "tasks_solved.md",
+    "mpc_realtime.md",
+)  # pages that a benchmark writes
 
 
 @each_row("path", [path for path in DOCUMENTS if path.name not in FIGURES], ids=lambda path: path.name)
