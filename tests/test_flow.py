@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 from helpers.bounces import Bounce
+from helpers.continuous import error_controlled_end
 from helpers.models import Plant, contact_properties
 from helpers.robots import example_robot, state_in_contact
 from pydrake.common.eigen_geometry import Quaternion
@@ -12,7 +13,6 @@ from pydrake.geometry import Box, Capsule, Cylinder, HalfSpace, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import SpatialInertia
-from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
 
@@ -282,19 +282,10 @@ def test_a_touch_that_begins_and_ends_within_a_step_is_met(depth):
 def test_a_tossed_cube_has_the_slope_of_drakes_error_controlled_motion():
     """Runge-Kutta 3 of accuracy 1e-8 and central differences of three widths, which agree."""
     plant, diagram = cube(0.0, gravity=2.0)
-    simulator = Simulator(diagram)
-    config = SimulatorConfig(
-        integration_scheme="runge_kutta3", max_step_size=0.01, accuracy=1e-8, use_error_control=True
-    )
-    ApplySimulatorConfig(config, simulator)
-    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    from_start = error_controlled_end(plant, diagram, 1.0)
 
     def end(vz):
-        simulator.get_mutable_context().SetTime(0.0)
-        plant.SetPositionsAndVelocities(context, np.append(TOSSED[:-1], vz))
-        simulator.Initialize()
-        simulator.AdvanceTo(1.0)
-        return plant.GetPositions(context)[5]
+        return from_start(np.append(TOSSED[:-1], vz))[5]
 
     slopes = [(end(-2.0 + w) - end(-2.0 - w)) / (2 * w) for w in (1e-2, 1e-3, 1e-4)]
     assert np.ptp(slopes) < 1e-3 * abs(slopes[0])

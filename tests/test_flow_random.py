@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from helpers.continuous import error_controlled_end
 from helpers.models import contact_properties
 from pydrake.geometry import (
     Box,
@@ -21,7 +22,6 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import FixedOffsetFrame, PrismaticJoint, RevoluteJoint, SpatialInertia
-from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
 
 import drake_diff as dd
@@ -136,21 +136,7 @@ def other_end(seed, model, approximation, count):
         motion = ContinuousMotion(model)
         return lambda x: motion.states(x, np.zeros((count, model.nu)))[-1]
     given = Random(seed, 0.0)
-    simulator, plant = Simulator(given.diagram), given.plant
-    config = SimulatorConfig(
-        integration_scheme="runge_kutta3", max_step_size=0.01, accuracy=1e-8, use_error_control=True
-    )
-    ApplySimulatorConfig(config, simulator)
-    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-
-    def end(x):
-        simulator.get_mutable_context().SetTime(0.0)
-        plant.SetPositionsAndVelocities(context, x)
-        simulator.Initialize()
-        simulator.AdvanceTo(DURATION)
-        return plant.GetPositionsAndVelocities(context).copy()
-
-    return end
+    return error_controlled_end(given.plant, given.diagram, DURATION)
 
 
 @dataclass

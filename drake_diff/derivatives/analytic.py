@@ -61,6 +61,8 @@ class Analytic:
                 values[free, :, : steps.model.nx + steps.model.nu], known[free] = smooth(steps.part(free))
         refused = _refusals(known, free, "contact, a limit or a constraint acts")
         notes: dict[int, str] = {}
+        if np.count_nonzero(known) == len(known):
+            return Jacobians(values, refused, notes)
         left = np.flatnonzero(~known & (impulsive | smooth.at_a_limit(steps)))
         if len(left):
             why = _with_impulses(smooth, steps, left, values, known, notes)

@@ -17,9 +17,6 @@ from drake_diff.optimize.solution import Solution, Status
 
 WIDTHS = (1e-4, 1e-5, 1e-6)  # of a variable's unit, over the derivative's own size where that is more
 SAME, SETTLED = 0.01, 0.1  # of the derivative: how far a slope may be from it, and slopes from each other
-# Where friction turns within 1e-3 m/s the motion bends so much that slopes only come nearer as widths shrink: how near
-# the last one has to be, and by what part of the one before.
-NEAR, NEARER = 0.05, 0.5
 HOLDS = f"the derivative of its end is the slope of that integration, to {SAME:.0%}"
 
 
@@ -49,7 +46,7 @@ def doubt_of_the_slope(solution: Solution) -> tuple[Status, str] | None:
                 off.append(float(np.linalg.norm(slopes[-1] - wanted)) / size)
                 if off[-1] <= SAME:
                     break
-            if off[-1] <= SAME or (off[-1] <= NEAR and off[-1] <= NEARER * off[-2]):
+            if off[-1] <= SAME:
                 continue
             apart = float(np.linalg.norm(slopes[-2] - slopes[-1])) / size
             if apart > SETTLED:

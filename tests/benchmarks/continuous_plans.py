@@ -202,21 +202,7 @@ def hopper(random) -> Task:
     h, steps = 0.01, 60
     lands = bool(random.integers(2))
 
-    def build(step):
-        builder = DiagramBuilder()
-        config = MultibodyPlantConfig(
-            time_step=step,
-            contact_model="point",
-            stiction_tolerance=1e-3,
-            discrete_contact_approximation="lagged",
-            use_sampled_output_ports=False,
-        )
-        plant, _ = AddMultibodyPlant(config, builder)
-        Parser(plant).AddModels(str(MODELS / "hopper.sdf"))
-        plant.Finalize()
-        builder.ExportInput(plant.get_actuation_input_port(), "u")
-        return plant, builder.Build()
-
+    build = plant_of(lambda plant: Parser(plant).AddModels(str(MODELS / "hopper.sdf")))
     leg, weight = 0.3, 1.202 * 9.81
     stands = 0.05 + leg - weight / 1e4
     fall = random.uniform(0.05, 0.3) if lands else 0.0
