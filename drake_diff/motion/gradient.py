@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -54,7 +55,7 @@ class RolloutGradient(ShowsItsRepr):
     # (N+1,) |d loss / d x_k|, the later steps being functions of x_k: where it grows without bound going back the
     # gradient explodes, where it dies out the early inputs cannot be learned.
     state_gradient_norms: Array
-    spectral_radii: Array  # (N,) the largest |eigenvalue| of each step's Jacobian by the state, policy included
+    step_jacobians: tuple[Array, ...]  # N of (nx, nx), each step's derivative by its state, policy included
     xs: Array  # (N+1, nx) the motion
     us: Array  # (N, nu) the inputs that were applied
     methods: tuple[str, ...]  # where the step Jacobians came from: one name, or more where a fallback was taken
@@ -85,6 +86,14 @@ class RolloutGradient(ShowsItsRepr):
         if first == 0 or last == 0:
             return float("nan")
         return float((first / last) ** (1 / (len(self.state_gradient_norms) - 1)))
+
+    @cached_property
+    def spectral_radii(self) -> Array:
+        """(N,) the largest |eigenvalue| of each step's Jacobian by the state, policy included.
+
+        Found when first asked for: eigenvalues take longer than the steps.
+        """
+        return frozen(np.abs(np.linalg.eigvals(np.array(self.step_jacobians))).max(axis=1))
 
     @property
     def explodes_at(self) -> int | None:
@@ -190,7 +199,7 @@ def _collected(
         parameter_sources=linearization[0].sources,
         by_policy=frozen(totals.policy),
         state_gradient_norms=frozen(np.linalg.norm(totals.states, axis=1)),
-        spectral_radii=frozen(np.abs(np.linalg.eigvals(np.array(closed))).max(axis=1)),
+        step_jacobians=tuple(closed),
         xs=frozen(np.vstack([x0, [d.x_next for d in linearization]])),
         us=frozen(inputs),
         methods=tuple(sorted({d.method for d in linearization})),
