@@ -1,0 +1,35 @@
+"""One task with contact, as `contact_plans.py` runs it: `legged_tasks.py` and `manipulation_tasks.py` build them.
+
+Each of these modules has `TASKS`, a name -> a function of a random generator that gives a Task: the start is drawn,
+and the guess is none or a naive one.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+import drake_diff as dd
+
+Ask = tuple[str, Callable[[np.ndarray, np.ndarray], float], float]  # name, (xs, us) -> miss, allowed
+
+
+@dataclass(frozen=True)
+class Task:
+    """`options` are keywords of `dd.solve`; `asks` are what a referee measures besides the goal and the bounds.
+
+    `schedule` is what Crocoddyl needs to be told, None where it cannot express the task; `build` gives Drake's
+    (plant, diagram) at a time step, 0 for continuous, None where the model's own file gives it.
+    """
+
+    name: str
+    problem: dd.Problem
+    goal_text: str
+    options: dict[str, Any] = field(default_factory=dict)
+    asks: tuple[Ask, ...] = ()
+    schedule: Any = None
+    build: Callable[[float], Any] | None = None
+
+
+Tasks = dict[str, Callable[[np.random.Generator], Task]]
