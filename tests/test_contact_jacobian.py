@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.robots import example_robot, state_in_contact
 from helpers.table import each_row
 
 import drake_diff as dd
@@ -408,6 +409,19 @@ def test_a_joint_limit_beside_contact_is_known(tmp_path):
     other = dd.differentiate_step(model, point, method="autodiff")
     assert np.abs(held.A - other.A).max() <= 1e-11 * np.abs(other.A).max()
     assert np.abs(held.A - free.A).max() > 1e-3
+
+
+@pytest.mark.parametrize("approximation", ["sap", "lagged"])
+def test_controllers_beside_contact_are_known_within_their_effort_limits(approximation):
+    """A robot on PD controllers on its feet, at 20 ms; with a limit that they reach the step goes to AutoDiffXd."""
+    model = example_robot("go2.urdf", 0.02, approximation=approximation, feet=True, gains=(60.0, 3.0))
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        x = state_in_contact(model, random)
+        x[7 : model.nq] *= 0.2  # near the targets, which are 0
+        _agree(model, x, random.uniform(-2.0, 2.0, model.nu))
+    beyond = np.full(model.nu, 200.0)  # of 23.7 and 45 N m
+    assert dd.linearize(model, x[None], beyond[None])[2] == ("autodiff",)
 
 
 def test_what_autodiff_does_not_step_is_certified_by_differences(tmp_path, monkeypatch):

@@ -1,7 +1,8 @@
 """The Jacobian of a step with contact or at joint limits from its own equation, without differentiating Drake's solver.
 
 Drake's step solves A (v' - v*) = sum_c J_c' g_c(J_c v'), with A = M + h D, v* the velocity without impulses and g_c the
-impulse of contact c (see `laws`), of a joint's limit or of a coupler (see `joint_impulses`). At Drake's own v' it is a
+impulse of contact c (see `laws`), of a joint's limit or of a coupler (see `joint_impulses`). PD controllers
+within their effort limits are part of D. At Drake's own v' it is a
 smooth step under a known force A (v' - v*) / h, which Pinocchio differentiates (see `smooth_step`); what the impulses
 change is solved for:
 
@@ -51,7 +52,8 @@ class ContactForm:
     unknown: str  # why no contact of the model is known here; empty where some is
     topology: Topology
     by_body: Array  # (bodies, nv) 1 where a degree of freedom moves the body
-    armature: Array  # (nv, nv) of reflected inertia and h D, a diagonal
+    armature: Array  # (nv, nv) of reflected inertia and h D, a diagonal; D is of PD controllers too
+    controlled: Array  # (nv,) what of it is of PD controllers, which Drake counts among the impulses
     approximation: str
     time_step: float
     near_rigid: float
@@ -65,8 +67,6 @@ def contact_form(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
 
 def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
     contact = model.contract.contact
-    if smooth.form.pd:
-        return Refusal("PD controllers act beside contact")
     couplers = couplers_of(model)
     if isinstance(couplers, Refusal):
         return couplers
@@ -85,11 +85,19 @@ def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
             -1, model.nv
         ),
         armature=np.diag(smooth.dynamics.armature),
+        controlled=_of_controllers(smooth),
         approximation=contact.approximation,
         time_step=model.time_step,
         near_rigid=float(model.plant.get_sap_near_rigid_threshold()),
         couplers=couplers,
     )
+
+
+def _of_controllers(smooth: SmoothStep) -> Array:
+    """(nv,) h (kd + h kp): a controller within its effort limit is a spring and a damper that act on v'."""
+    (kp, kd), h, found = smooth.form.gains(), smooth.time_step, np.zeros(smooth.coordinates.nv)
+    np.add.at(found, smooth.form.velocity, h * (kd + h * kp))
+    return found
 
 
 def material_of(model: Model, form: ContactForm) -> Material:
@@ -119,7 +127,7 @@ class Solved:
     A: Array  # (N, nv, nv)
     contacts: Contacts
     speeds: tuple[Array, Array]  # v and v' (M, nv) of each contact's state
-    diagonal: Array  # (N, nv) of A
+    diagonal: Array  # (N, nv) of A, but for controllers
     diagonal_slope: Array  # (N, nv, nv)
     weight: Weight
     impulse: Impulse | HuntCrossleyImpulse
@@ -169,7 +177,7 @@ def _at_the_solution(form: ContactForm, smooth: SmoothStep, steps: Steps, poses:
     A = mass_matrix(S, inertia, form.topology) + form.armature
     contacts = _contacts(form, form.pairs.touching(poses), S, material)
     state = contacts.touch.state
-    diagonal, speeds = np.einsum("kii->ki", A), (native.v[state], v_next[state])
+    diagonal, speeds = np.einsum("kii->ki", A) - form.controlled, (native.v[state], v_next[state])
     weight = contacts.weight(diagonal[state])
     impulse = _law(form, contacts, material, weight, *speeds).solve()
     q = steps.xs[:, smooth.positions]
