@@ -245,10 +245,8 @@ def _law(
 
 
 def _contacts(form: ContactForm, touch: Touches, S: Array, material: Material) -> Contacts:
-    own, part = S[touch.state], material.other_part[touch.pair]
+    own, (point, change) = S[touch.state], touch.at(material.other_part[touch.pair])
     linear, angular = own[..., :3], own[..., 3:]
-    reach = form.pairs.radius[touch.pair] + part * touch.phi
-    point = touch.center - reach[:, None] * touch.normal
     return Contacts(
         touch=touch,
         moves=form.topology.moves,
@@ -257,8 +255,7 @@ def _contacts(form: ContactForm, touch: Touches, S: Array, material: Material) -
         angular=angular,
         point=point,
         at_point=linear + cross(angular, point[:, None, :]),
-        reach=reach,
-        other_part=part,
+        change=change,
     )
 
 

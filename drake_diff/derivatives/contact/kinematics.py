@@ -90,8 +90,7 @@ class Contacts:
     angular: Array  # (M, nv, 3) a
     point: Array  # (M, 3) p
     at_point: Array  # (M, nv, 3) L
-    reach: Array  # (M,) from the centre to p
-    other_part: Array  # (M,) b, see `pairs`
+    change: Array  # (M, 7, 6) of p, the normal and phi by the twist there: see `pairs.Touches`
 
     @property
     def side(self) -> Array:
@@ -109,14 +108,11 @@ class Contacts:
 
     def displacement(self) -> tuple[Array, Array, Array]:
         """How p (M, nv, 3), the normal (M, nv, 3) and phi (M, nv) move with each degree of freedom."""
-        n, reach = self.touch.normal[:, None, :], self.reach[:, None, None]
-        by_turn = cross(self.angular, n)
-        center = self.at_point + reach * by_turn
-        apart = self.side[..., None] * center
-        phi = (apart * n).sum(axis=-1)
-        normal = self.other[..., None] * by_turn + apart @ self.touch.curvature
-        point = self.sphere[..., None] * center - (self.other_part[:, None] * phi)[..., None] * n - reach * normal
-        return point, normal, phi
+        twist = np.concatenate([self.at_point, self.angular], axis=-1)
+        found = (self.side[..., None] * twist) @ self.change.swapaxes(-1, -2)
+        other = self.other[..., None]
+        normal = found[..., 3:6] + other * cross(self.angular, self.touch.normal[:, None, :])
+        return found[..., :3] + other * self.at_point, normal, found[..., 6]
 
     def velocity_change(self, v: Array, point: Array, moves: bool = True) -> Array:
         """(M, K, 3) the change of J v for fixed v (M, nv), of K changes of p (M, K, 3).

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, skew
 from drake_diff.model.model import Model
 
 Indices = NDArray[np.intp]
@@ -25,10 +25,23 @@ class Touches:
 
     state: Indices  # (M,)
     pair: Indices
-    center: Array  # (M, 3) of the sphere [m]
+    middle: Array  # (M, 3) half way between the deepest points of the two [m]
     phi: Array  # (M,) the signed distance, below 0 [m]
     normal: Array  # (M, 3) from the other shape to the sphere
-    curvature: Array  # (M, 3, 3) the derivative of the normal by where the centre is in the other shape's frame
+    change: Array  # (M, 7, 6) of [middle; normal; phi], as moved with the other shape, by the sphere's twist in it
+
+    def at(self, part: Array) -> tuple[Array, Array]:
+        """Where the contacts act (M, 3), and (M, 7, 6) as `change`, of that point and by the twist there.
+
+        `part` (M,) is the other shape's of the two stiffnesses.
+        """
+        n, share = self.normal, (part - 0.5)[:, None]
+        back = share * self.phi[:, None] * n  # from the point to the middle
+        change = np.array(self.change)
+        change[:, :, 3:] -= self.change[:, :, :3] @ skew(back)
+        along = n[:, :, None] * change[:, 6:] + self.phi[:, None, None] * change[:, 3:6]
+        change[:, :3] -= share[..., None] * along
+        return self.middle - back, change
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +80,9 @@ class ContactPairs:
         phi = length - self.rounding[pair] - self.radius[pair]
         normal = (turned @ normal[:, :, None])[..., 0]
         curvature = turned @ curvature @ turned.swapaxes(-1, -2)
-        return Touches(state, pair, center[state, pair], phi, normal, curvature)
+        reach = (self.radius[pair] + phi / 2)[:, None]  # from the middle to the centre
+        middle = center[state, pair] - reach * normal
+        return Touches(state, pair, middle, phi, normal, _change(normal, curvature, reach[..., None]))
 
     def _with_inside(self, local: Array, outside: Array, length: Array, pair: Indices) -> tuple[Array, Array, Array]:
         """Distance from the box, normal and curvature, for centres that may be inside it, where the last is 0."""
@@ -86,6 +101,17 @@ def _curvature(normal: Array, outside: Array, length: Array) -> Array:
     """(M, 3, 3) (P - n n') / |e|, P onto the axes along which e is not 0."""
     across = (outside != 0.0)[:, :, None] * np.eye(3)
     return np.asarray((across - normal[:, :, None] * normal[:, None, :]) / length[:, None, None])
+
+
+def _change(normal: Array, curvature: Array, reach: Array) -> Array:
+    """(M, 7, 6) of Touches, of the derivative of the normal by where the centre is in the other shape's frame."""
+    change, of_center = np.zeros((len(normal), 7, 6)), np.empty((len(normal), 3, 6))
+    of_center[..., :3], of_center[..., 3:] = np.eye(3), -reach * skew(normal)
+    change[:, 3:6] = curvature @ of_center
+    change[:, :3] = of_center - reach * change[:, 3:6]
+    change[:, :3, :3] -= normal[:, :, None] * normal[:, None, :] / 2
+    change[:, 6, :3] = normal
+    return change
 
 
 def read_pairs(model: Model, *, cylinders: bool = False) -> ContactPairs:
