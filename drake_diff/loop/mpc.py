@@ -15,7 +15,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_float, positive_int
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.step import differentiate_step
-from drake_diff.exceptions import DrakeDiffError, InputError
+from drake_diff.exceptions import DrakeDiffError, InputError, SimulationError
 from drake_diff.loop.run import LATE, OK
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
@@ -25,7 +25,7 @@ from drake_diff.optimize.problem.cost import CostToGo, QuadraticCost
 from drake_diff.optimize.problem.goals import LAST
 from drake_diff.optimize.problem.problem import SMALLEST_RANGE, Problem
 from drake_diff.optimize.realtime.rolling import Rolling, Staying
-from drake_diff.optimize.realtime.step import Motion, Step, take_step
+from drake_diff.optimize.realtime.step import Motion, Step, Stretch, roll, take_step
 from drake_diff.optimize.replay import Plan, held, regulator_weights
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
@@ -34,6 +34,7 @@ PLAN_STEPS = 300  # of the first plan, made once
 DAMPED = 1e-3  # of the cost of a step, for a move by a whole range: the least damping
 PLENTY, NEAR = 100, 1e-6  # after so many, with limits that hold, a plan will do of which a step promises no more
 FOLLOWED = "the last plan is followed further"
+FAR_MORE = 2.0  # than was planned: what the last gains may cost from where the plant is before others are tried
 FIXED_POINT_STEPS, AT_REST = 20, 1e-10
 RANK = 1e-9  # positions follow velocities: what their rows say beside those is rounding
 GAP = 1e-3  # of a state's range: what a plan's steps may be off, which a call closes
@@ -47,6 +48,7 @@ class MPC:
 
     Each call shifts the last plan by the time that has passed, puts the state measured in its place, and takes
     `iterations` steps towards the best plan. `t` is rounded to a step of the problem, which is the model's time step.
+    Where shapes touch along the plan, that and every step is a motion of the plant, rolled out under feedback.
 
     Inputs keep their bounds. All else that the problem asks for (bounds of states, constraints, waypoints, goals and
     obstacles) is kept wherever it can be; where it cannot, it gives way at a high price, and `status` says what, by how
@@ -172,8 +174,9 @@ class MPC:
         motion = Motion(xs, us, xs[1:])
         self.status = OK
         try:
-            motion = self._measured(finite_array("x", x, (self._problem.nx,)), k, xs, us)
-            stretch = self._rolling.stretch(k, count)
+            x = self._same_sign(finite_array("x", x, (self._problem.nx,)), xs[0])
+            stretch = self._rolling.stretch(k, count).along(np.vstack([x, xs[1:]]))
+            motion = self._followed(x, k, xs, us, stretch) if stretch.rolls else self._measured(x, k, xs, us)
             for _ in range(self.iterations):
                 begin = self._clock()
                 step = take_step(stretch, motion)
@@ -193,11 +196,35 @@ class MPC:
     def _measured(self, x: Array, k: int, xs: Array, us: Array) -> Motion:
         """The plan xs, us from step `k` on, from the state measured."""
         twin, last = self._problem.model.double, self._last
-        xs[0] = self._same_sign(x, xs[0])
+        xs[0] = x
         known = range(self._begin + (k == self._begin), self._begin + len(last.us))
         ends = [last.ends[k + j - self._begin] if j and k + j in known else advance(twin, xs[j], us[j])
                 for j in range(len(us))]  # fmt: skip
         return Motion(xs, us, np.array(ends))
+
+    def _followed(self, x: Array, k: int, xs: Array, us: Array, stretch: Stretch) -> Motion:
+        """The plant's own motion from x under the last gains; under those of the first plan where it costs less.
+
+        That is looked at where the last ones cost far more than was planned.
+        """
+        steps, found = np.arange(k, k + len(us)), list[tuple[float, Motion]]()
+        last, first = self._step, self._first_step
+        for step, begin in ((last, self._solved_at), (first, 0)):
+            if step is None:
+                continue
+            rows = step.feedback[np.clip(steps - begin, 0, len(step.feedback) - 1)]
+            try:
+                motion = roll(stretch, x, xs, us, rows)
+                paid = stretch.paid(motion)
+            except SimulationError:
+                continue
+            if np.isfinite(paid):
+                found.append((paid, motion))
+                if paid <= FAR_MORE * step.merit:
+                    break
+        if not found:
+            raise SimulationError("the last plan cannot be followed on the plant from where it is")
+        return min(found, key=lambda each: each[0])[1]
 
     def _same_sign(self, x: Array, planned: Array) -> Array:
         """`x` with its quaternions as near to those of `planned` as they can be: either sign is the same rotation."""
@@ -244,7 +271,7 @@ class MPC:
     def _plan_the_whole(self, xs: Array, us: Array) -> Motion:
         """A minimum near the given plan, whose costs-to-go are the tails."""
         problem, rolling = self._problem, self._rolling
-        stretch = rolling.stretch(0, problem.num_steps)
+        stretch = rolling.stretch(0, problem.num_steps).along(xs)
         xs, us = np.array(xs), np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
         xs[0] = problem.x0
         motion, ranges = Motion(xs, us, stretch.ends(xs[:-1], us)), problem.ranges(xs)
@@ -271,6 +298,7 @@ class MPC:
         if step.tails is None:
             raise InputError("running_cost", got="no positive curvature by the inputs", expected="one with a minimum")
         rolling.tails = step.tails
+        self._first_step = step
         return motion
 
 

@@ -48,8 +48,12 @@ def example_robot(
     dissipation=0.5,
     friction=0.6,
     gains=None,
+    leg=None,
 ):
-    """The robot of that file; `gains` (kp, kd) gives every motor a PD controller inside the plant."""
+    """The robot of that file; `gains` (kp, kd) gives every motor a PD controller inside the plant.
+
+    With `leg`, the joints of each leg in turn, its default state stands on its feet; controllers hold that posture.
+    """
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
         time_step=time_step,
@@ -83,7 +87,26 @@ def example_robot(
                 plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(FOOT), f"{body.name()}_foot", properties)
         plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", properties)
     plant.Finalize()
+    if leg is not None:
+        _stand(plant, leg)
     return dd.model_from_diagram(builder.Build())
+
+
+def _stand(plant, leg):
+    """Let the default posture be that of `leg`, the lowest foot on the ground."""
+    jointed = [plant.get_joint(JointIndex(i)) for i in range(plant.num_joints())]
+    for i, joint in enumerate(joint for joint in jointed if joint.num_velocities() == 1):
+        joint.set_default_positions([leg[i % len(leg)]])
+    (base,) = (plant.get_body(b) for b in plant.GetFloatingBaseBodies())
+    plant.SetDefaultFloatingBaseBodyPose(base, RigidTransform())
+    context = plant.CreateDefaultContext()
+    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
+    lowest = min(
+        plant.EvalBodyPoseInWorld(context, body).translation()[2]
+        for body in bodies
+        if plant.GetCollisionGeometriesForBody(body)
+    )
+    plant.SetDefaultFloatingBaseBodyPose(base, RigidTransform([0, 0, FOOT - lowest]))
 
 
 def state_in_range(model, random, speed=0.5):

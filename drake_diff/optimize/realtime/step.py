@@ -3,6 +3,10 @@
 The merit is an exact one: the cost, the prices of what is beyond limits, and of the gaps between the steps. Gauss and
 Newton's curvature alone is used, that of the dynamics is left out. Diehl, Bock and Schloeder, "A real-time iteration
 scheme for nonlinear optimization in optimal feedback control", 2005.
+
+Where shapes touch, a state beside the motion is in another contact: so each step is rolled out on the plant, under
+the feedback of the quadratic program, and there are no gaps. Tassa, Erez and Todorov, "Synthesis and stabilization of
+complex behaviors through online trajectory optimization", 2012.
 """
 
 import math
@@ -17,7 +21,7 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.step import linearize
 from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.model import Model
-from drake_diff.model.step import advance
+from drake_diff.model.step import advance, set_state
 from drake_diff.optimize.ilqr.riccati import AffinePolicy, LinearQuadratic, solve_riccati
 from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.cost import CostToGo
@@ -25,6 +29,7 @@ from drake_diff.optimize.realtime.knots import KnotCost, KnotFunction
 from drake_diff.optimize.realtime.qp import Limited, Moves, Rows, SoftProgram
 
 STEP_SIZES = (1.0, 0.5, 0.25, 0.125, 1 / 16, 1 / 32)
+ROLLED_SIZES = (1.0, 0.4, 0.1)  # each costs a rollout
 SUFFICIENT_DECREASE = 1e-4
 GAP_PRICE = 2.0  # over the largest multiplier of the dynamics
 SMALLEST_REGULARIZATION = 1e-8
@@ -84,6 +89,18 @@ class Stretch:
     final: Sequence[Stage]
     limits: Sequence[Limits]
     program: SoftProgram
+    rolls: bool = False  # whether each motion is rolled out on the plant, see `along`
+
+    def along(self, xs: Array) -> "Stretch":
+        """The same for motions near xs (N+1, nx): rolled out where shapes touch in one of its states."""
+        twin = self.model.double
+        if not self.model.contract.contact.collision_pairs:
+            return self
+        for x in xs:
+            set_state(twin, x)
+            if twin.overlaps():
+                return replace(self, rolls=True)
+        return self
 
     def cost(self, xs: Array, us: Array) -> float:
         """That of a motion xs (N+1, nx), us (N, nu)."""
@@ -94,6 +111,12 @@ class Stretch:
     def beyond(self, xs: Array, us: Array) -> list[Array]:
         """How far each limit is passed, (K, m) each."""
         return [limit.beyond(limit.function.values(limit.at(xs, us))) for limit in self.limits]
+
+    def paid(self, motion: "Motion") -> float:
+        """The cost of the plant's own motion, and the prices of what is beyond limits."""
+        with np.errstate(all="ignore"):
+            far = zip(self.limits, self.beyond(motion.xs, motion.us), strict=True)
+            return self.cost(motion.xs, motion.us) + sum(float(np.sum(one.prices * beyond)) for one, beyond in far)
 
     def ends(self, xs: Array, us: Array) -> Array:
         """(N, nx) where the plant's steps from xs (N, nx) under us (N, nu) lead."""
@@ -112,6 +135,11 @@ class Motion:
     def gaps(self) -> Array:
         """(N, nx)"""
         return self.ends - self.xs[1:]
+
+    @property
+    def is_rollout(self) -> bool:
+        """Whether there are no gaps."""
+        return bool(np.all(self.ends == self.xs[1:]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +167,7 @@ class Step:
     moves: Moves
     whole: bool  # whether no limit pushed
     is_doubtful: bool = False  # whether the derivatives seem not to be those of the plant's steps
+    swept: Array | None = None  # (N, nu, nx) the gains of the sweep that solved it, if one did
 
     @cached_property
     def policy(self) -> AffinePolicy | None:
@@ -147,6 +176,14 @@ class Step:
         Rows and bounds that hold the solution go on to hold it, and those that give way give way.
         """
         return _solved(_held(self.expansion, self.moves, self.stretch, one_sided=True))
+
+    @cached_property
+    def feedback(self) -> Array:
+        """(N, nu, nx) the gains by which it is rolled out; 0 where there are none."""
+        if self.swept is not None:
+            return self.swept
+        none = np.zeros((*self.motion.us.shape, self.motion.xs.shape[1]))
+        return none if self.policy is None else self.policy.feedback
 
     @cached_property
     def tails(self) -> tuple[CostToGo, ...] | None:
@@ -187,47 +224,108 @@ def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) ->
     expansion = expand(stretch, motion)
     if damping is not None:
         expansion = replace(expansion, quadratic=_damped(expansion.quadratic, damping))
-    free = _free_moves(expansion.quadratic)
-    found = free if free is not None and _is_kept(stretch, expansion, free) else None
-    whole = found is not None
-    if found is None:
-        if free is not None:
-            expansion = replace(expansion, limited=_dear_enough(expansion.limited, free.dynamics))
-        solved = stretch.program.solve(expansion.quadratic, expansion.limited)
-        if isinstance(solved, Refusal):
-            return solved
-        found = solved
-    else:
-        nothing = tuple(np.zeros_like(one.lower) for one in expansion.limited)
-        found = replace(found, slacks=nothing, multipliers=nothing)
+    solved = _solve(stretch, expansion)
+    if isinstance(solved, Refusal):
+        return solved
+    expansion, found = solved.expansion, solved.moves
     gap_prices = GAP_PRICE * np.max(np.abs(found.dynamics), axis=0)
-
-    def merit(m: Motion) -> float:
-        with np.errstate(all="ignore"):
-            paid = sum(
-                float(np.sum(one.prices * beyond))
-                for one, beyond in zip(expansion.limited, stretch.beyond(m.xs, m.us), strict=True)
-            )
-            return stretch.cost(m.xs, m.us) + paid + float(np.sum(gap_prices * np.abs(m.gaps)))
-
-    before = merit(motion)
+    before = merit(stretch, expansion, motion, gap_prices)
     saved = [one.prices * (one.beyond - slack) for one, slack in zip(expansion.limited, found.slacks, strict=True)]
     slope, curvature = _along(expansion.quadratic, found)
     slope -= sum(float(np.sum(one)) for one in saved) + float(np.sum(gap_prices * np.abs(motion.gaps)))
     promised = -(slope + curvature / 2)
     rounding = ROUNDING * (1 + abs(before))
-    for size in STEP_SIZES:
-        xs, us = motion.xs + size * found.dxs, motion.us + size * found.dus
-        us = np.clip(us, stretch.bounds.u_lower, stretch.bounds.u_upper)
+    step = Step(stretch, motion, 0.0, promised, before, expansion, found, solved.whole, True, solved.feedback)
+    if stretch.rolls and not motion.is_rollout:
+        return _first_rollout(step)
+    for size in ROLLED_SIZES if stretch.rolls else STEP_SIZES:
         try:
-            tried = Motion(xs, us, stretch.ends(xs[:-1], us))
-            after = merit(tried)
+            tried = _moved(step, size)
+            after = merit(stretch, expansion, tried, gap_prices)
         except SimulationError:
             continue
         if after <= before + SUFFICIENT_DECREASE * size * min(slope, 0.0) + rounding:
-            step = Step(stretch, tried, size, promised, after, expansion, found, whole)
-            return replace(step, is_doubtful=_is_doubtful(step, motion))
-    return Step(stretch, motion, 0.0, promised, before, expansion, found, whole, is_doubtful=True)
+            step = replace(step, motion=tried, size=size, merit=after)
+            # The plant's own motion costs less: whatever the derivatives are, they led there.
+            return replace(step, is_doubtful=not stretch.rolls and _is_doubtful(step, motion))
+    return step
+
+
+def merit(stretch: Stretch, expansion: Expansion, motion: Motion, gap_prices: Array) -> float:
+    """What a motion costs, with the prices of what is beyond limits and of gaps, `gap_prices` (nx,)."""
+    with np.errstate(all="ignore"):
+        paid = sum(
+            float(np.sum(one.prices * beyond))
+            for one, beyond in zip(expansion.limited, stretch.beyond(motion.xs, motion.us), strict=True)
+        )
+        return stretch.cost(motion.xs, motion.us) + paid + float(np.sum(gap_prices * np.abs(motion.gaps)))
+
+
+def _moved(step: Step, size: float) -> Motion:
+    """A part of the step from its motion: rolled out where shapes touch."""
+    motion, stretch = step.motion, step.stretch
+    xs, us = motion.xs + size * step.moves.dxs, motion.us + size * step.moves.dus
+    if stretch.rolls:
+        return roll(stretch, motion.xs[0], xs, us, step.feedback)
+    us = np.clip(us, stretch.bounds.u_lower, stretch.bounds.u_upper)
+    return Motion(xs, us, stretch.ends(xs[:-1], us))
+
+
+def roll(stretch: Stretch, x: Array, xs: Array, us: Array, feedback: Array) -> Motion:
+    """The plant's motion from x (nx,) under the `feedback` (N, nu, nx) about xs (N+1, nx) and us (N, nu)."""
+    bounds, twin = stretch.bounds, stretch.model.double
+    states, inputs = np.empty_like(xs), np.empty_like(us)
+    states[0] = x
+    for k, u in enumerate(us):
+        inputs[k] = np.clip(u + feedback[k].dot(states[k] - xs[k]), bounds.u_lower, bounds.u_upper)
+        states[k + 1] = advance(twin, states[k], inputs[k])
+    return Motion(states, inputs, states[1:])
+
+
+def _first_rollout(step: Step) -> Step:
+    """From a motion with gaps: the plant's own, the whole step or none of it, whichever costs less."""
+    best = None
+    for size in (1.0, 0.0):
+        try:
+            tried = _moved(step, size)
+        except SimulationError:
+            continue
+        after = merit(step.stretch, step.expansion, tried, np.zeros(len(tried.xs[0])))
+        if np.isfinite(after) and (best is None or after < best[1]):
+            best = tried, after
+    if best is None:
+        return step
+    return replace(step, motion=best[0], size=1.0, merit=best[1], is_doubtful=False)
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """The program with prices that are dear enough, its solution, whether no limit pushes, and gains (N, nu, nx)."""
+
+    expansion: Expansion
+    moves: Moves
+    whole: bool
+    feedback: Array | None
+
+
+def _solve(stretch: Stretch, expansion: Expansion) -> _Solved | Refusal:
+    """The quadratic program; where motions are rolled out and bounds of inputs alone push, by Riccati's sweep."""
+    quadratic = expansion.quadratic
+    nothing = tuple(np.zeros_like(one.lower) for one in expansion.limited)
+    free, policy = _swept(_unbounded(quadratic)), None
+    if free is not None:
+        moves, policy = free
+        within = _within_bounds(quadratic, moves)
+        if within and _is_kept(stretch, expansion, moves):
+            return _Solved(expansion, replace(moves, slacks=nothing, multipliers=nothing), True, policy.feedback)
+        if stretch.rolls and not within:
+            boxed = _swept(quadratic)
+            if boxed is not None and _is_kept(stretch, expansion, boxed[0]):
+                found = replace(boxed[0], slacks=nothing, multipliers=nothing)
+                return _Solved(expansion, found, False, boxed[1].feedback)
+        expansion = replace(expansion, limited=_dear_enough(expansion.limited, moves.dynamics))
+    found_by_piqp = stretch.program.solve(quadratic, expansion.limited)
+    return found_by_piqp if isinstance(found_by_piqp, Refusal) else _Solved(expansion, found_by_piqp, False, None)
 
 
 def _damped(quadratic: LinearQuadratic, damping: Array) -> LinearQuadratic:
@@ -240,19 +338,18 @@ def _is_doubtful(step: Step, before: Motion) -> bool:
 
     It is looked at again, over a short part of the step, where the error is large.
     """
-    d = np.hstack([step.moves.dxs[:-1], step.moves.dus])
-    linear = np.einsum("kij,kj->ki", step.expansion.quadratic.F, d)
-    change = float(np.max(np.abs(linear - step.moves.dxs[:-1])))  # beside what a state moves by anyway
+    dxs, dus = step.motion.xs - before.xs, step.motion.us - before.us
+    linear = np.einsum("kij,kj->ki", step.expansion.quadratic.F, np.hstack([dxs[:-1], dus]))
+    change = float(np.max(np.abs(linear - dxs[:-1])))  # beside what a state moves by anyway
 
-    def error(motion: Motion, size: float) -> float:
-        return float(np.max(np.abs(motion.ends - before.ends - size * linear)))
+    def error(motion: Motion, part: float) -> float:
+        return float(np.max(np.abs(motion.ends - before.ends - part * linear)))
 
-    large = error(step.motion, step.size)
-    if large <= max(SUSPECT * step.size * change, UNSEEN * (1 + float(np.max(np.abs(before.ends))))):
+    large = error(step.motion, 1.0)
+    if large <= max(SUSPECT * change, UNSEEN * (1 + float(np.max(np.abs(before.ends))))):
         return False
-    size = SHORT_PART * step.size
-    xs, us = before.xs + size * step.moves.dxs, before.us + size * step.moves.dus
-    return error(Motion(xs, us, step.stretch.ends(xs[:-1], us)), size) > STILL * SHORT_PART * large
+    xs, us = before.xs + SHORT_PART * dxs, before.us + SHORT_PART * dus
+    return error(Motion(xs, us, step.stretch.ends(xs[:-1], us)), SHORT_PART) > STILL * SHORT_PART * large
 
 
 def expand(stretch: Stretch, motion: Motion) -> Expansion:
@@ -301,21 +398,25 @@ def _limited(limit: Limits, xs: Array, us: Array) -> Limited:
     return Limited(jacobians, limit.lower - values, limit.upper - values, limit.prices, limit.ranges)
 
 
-def _free_moves(quadratic: LinearQuadratic) -> Moves | None:
-    """The solution without limits; None where the cost has no minimum."""
-    policy = solve_riccati(_unbounded(quadratic), 0.0)
+def _swept(quadratic: LinearQuadratic) -> tuple[Moves, AffinePolicy] | None:
+    """The solution by Riccati's sweep, its inputs within their bounds; None where the cost has no minimum."""
+    policy = solve_riccati(quadratic, 0.0)
     if policy is None:
         return None
     dxs, dus = _roll(quadratic, policy)
     dynamics = policy.value_gradients[1:] + np.einsum("kij,kj->ki", policy.value_hessians[1:], dxs[1:])
-    return Moves(dxs, dus, (), (), np.zeros_like(dus), dynamics)
+    by_input = quadratic.gradients + np.einsum("kij,kj->ki", quadratic.hessians, np.hstack([dxs[:-1], dus]))
+    by_input += np.einsum("kij,ki->kj", quadratic.F, dynamics)
+    bounds = -by_input[:, quadratic.num_states :]
+    return Moves(dxs, dus, (), (), bounds, dynamics), policy
+
+
+def _within_bounds(quadratic: LinearQuadratic, moves: Moves) -> bool:
+    return not (np.any(moves.dus < quadratic.lower) or np.any(moves.dus > quadratic.upper))
 
 
 def _is_kept(stretch: Stretch, expansion: Expansion, moves: Moves) -> bool:
-    """Whether moves leave no limit."""
-    quadratic = expansion.quadratic
-    if np.any(moves.dus < quadratic.lower) or np.any(moves.dus > quadratic.upper):
-        return False
+    """Whether moves leave no limit of states."""
     for limit, one in zip(stretch.limits, expansion.limited, strict=True):
         moved = np.einsum("kri,ki->kr", one.jacobians, limit.at(moves.dxs, moves.dus))
         if np.any(moved < one.lower) or np.any(moved > one.upper):
@@ -351,7 +452,8 @@ def _unbounded(quadratic: LinearQuadratic) -> LinearQuadratic:
 def _roll(quadratic: LinearQuadratic, policy: AffinePolicy) -> tuple[Array, Array]:
     dxs, dus = np.zeros((len(quadratic.gaps) + 1, quadratic.num_states)), np.empty_like(policy.feedforward)
     for k, F in enumerate(quadratic.F):
-        dus[k] = policy.feedforward[k] + policy.feedback[k].dot(dxs[k])
+        wanted = policy.feedforward[k] + policy.feedback[k].dot(dxs[k])
+        dus[k] = np.clip(wanted, quadratic.lower[k], quadratic.upper[k])
         dxs[k + 1] = F.dot(np.concatenate([dxs[k], dus[k]])) + quadratic.gaps[k]
     return dxs, dus
 

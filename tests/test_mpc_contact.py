@@ -1,0 +1,128 @@
+"""MPC of models that touch: sliding friction in closed form, a quadruped under a blow, derivatives that are wrong."""
+
+import numpy as np
+import pytest
+from helpers.models import contact_properties
+from helpers.plants import Plant
+from helpers.problems import riccati
+from helpers.robots import example_robot
+
+import drake_diff as dd
+from drake_diff.model.step import advance
+from drake_diff.optimize.realtime import step as realtime
+
+G, FRICTION = 9.81, 0.5
+
+
+def sliding(h, count, Q, R, Qf):
+    """A block of 1 kg is to slide at 1 m/s over a ground of friction 0.5; states x, z and their speeds."""
+    plant = Plant(h, "lagged")
+    plant.ball("ball", 1.0, 0.1, contact_properties(2e4, 10, FRICTION), "x", "z")
+    plant.ground(contact_properties(2e4, 10, FRICTION))
+    plant.plant.AddJointActuator("push", plant.plant.GetJointByName("ball_x"))
+    model = plant.model()
+    times = h * np.arange(count + 1)
+    rest = model.default_state
+    rest[1] = 0.1 - G / 1e4  # the stiffness of two like shapes is half of each
+    xs = np.tile(rest, (count + 1, 1))
+    xs[:, 0], xs[:, 2] = times, 1.0
+    us = np.full((count, 1), FRICTION * G)
+    weight, last = np.zeros((4, 4)), np.zeros((4, 4))
+    weight[np.ix_([0, 2], [0, 2])], last[np.ix_([0, 2], [0, 2])] = Q / h, Qf
+    follow = dd.optimize.TrackingCost((times, xs, np.vstack([us, us[-1:]])), Q=weight, R=[[R / h]])
+    ends = dd.QuadraticCost(Q=last, x_ref=xs[-1])
+    problem = dd.Problem(model, x0=xs[0], num_steps=count, running_cost=follow, final_cost=ends)
+    return problem, xs, us
+
+
+@pytest.mark.parametrize("horizon", [3, 20])
+def test_against_sliding_friction_it_is_lqr_beside_what_friction_takes(horizon):
+    """u = mu m g - K (x - x_ref); 1e-4: Drake's friction at 0.5 m/s lacks 2e-8, its normal force settles to 1e-5."""
+    case = 0.02, 20, np.diag([5.0, 1.0]), 0.1, 10 * np.eye(2)
+    problem, xs, us = sliding(*case)
+    gains = riccati(*case)[1]
+    mpc = dd.loop.MPC(problem, horizon=horizon, plan=(xs, us))
+    planned, random = mpc.plan[0], np.random.default_rng(0)
+    for k, K in enumerate(gains):
+        off = random.uniform(-0.1, 0.1, 2)
+        x = np.array(planned[k])
+        x[[0, 2]] = xs[k, [0, 2]] + off
+        assert mpc(x, k * case[0]) == pytest.approx(FRICTION * G - K @ off, abs=1e-4)
+        assert mpc.status == "ok"
+
+
+@pytest.fixture(scope="module")
+def solo():
+    """Solo12 on PD controllers that hold its stance, at 20 ms for the plan and at 1 ms to be driven, and its rest."""
+    options = {"feet": True, "gains": (5.0, 0.2), "leg": (0.0, 0.8, -1.6)}
+    model, fine = (example_robot("solo12.urdf", h, **options) for h in (0.02, 0.001))
+    x = model.default_state
+    for _ in range(100):
+        x = advance(model.double, x, np.zeros(model.nu))
+    x[model.nq :] = 0.0
+    return model, fine, x
+
+
+def standing(model, rest, steps=60):
+    weights = [*[100.0] * 4, 50, 50, 400, *[2.0] * 12, *[1.0] * 3, *[4.0] * 3, *[0.02] * 12]
+    idle, most = np.zeros(model.nu), np.full(model.nu, 2.7)
+    cost = dd.QuadraticCost(Q=np.diag(weights), R=np.eye(model.nu), x_ref=rest, u_ref=idle)
+    ends = dd.QuadraticCost(Q=np.diag(weights), x_ref=rest)
+    bounds = dd.Bounds(u_lower=-most, u_upper=most)
+    problem = dd.Problem(model, x0=rest, num_steps=steps, running_cost=cost, final_cost=ends, bounds=bounds)
+    return problem, (np.tile(rest, (steps + 1, 1)), np.tile(idle, (steps, 1)))
+
+
+def struck(model, rest, speed):
+    x = np.array(rest)
+    x[model.nq + 4] += speed
+    return x
+
+
+def test_a_quadruped_stays_on_its_feet_where_its_controllers_alone_fall(solo):
+    """The trunk is struck sideways to 1.4 m/s, and driven in steps of 1 ms: it is upright, as high as it was, still."""
+    model, fine, rest = solo
+    problem, plan = standing(model, rest)
+    mpc = dd.loop.MPC(problem, horizon=10, plan=plan)
+    ends = []
+    for controller in (lambda x, t: np.zeros(model.nu), mpc):
+        x = struck(model, rest, 1.4)
+        for k in range(50):
+            u = controller(x, 0.02 * k)
+            assert np.all(np.abs(u) <= 2.7)
+            for _ in range(20):
+                x = advance(fine.double, x, u)
+        ends.append(x)
+    fallen, stood = ends
+    assert fallen[6] < 0.0
+    assert stood[6] == pytest.approx(rest[6], abs=0.02)
+    assert abs(stood[0]) > 0.99
+    assert np.max(np.abs(stood[model.nq :])) < 0.5
+
+
+def test_its_plan_is_the_plants_own_motion(solo):
+    """What touches is rolled out: no gap is left between the steps, exactly."""
+    model, _, rest = solo
+    problem, plan = standing(model, rest)
+    mpc = dd.loop.MPC(problem, horizon=10, plan=plan)
+    mpc(struck(model, rest, 0.6), 0.0)
+    xs, us = mpc.plan
+    assert xs[0] == pytest.approx(struck(model, rest, 0.6), abs=0.0)
+    for x, u, after in zip(xs[:-1], us, xs[1:], strict=True):
+        np.testing.assert_array_equal(advance(model.double, x, u), after)
+
+
+def test_where_derivatives_are_wrong_the_last_plan_is_followed(solo, monkeypatch):
+    """Their sign is turned: no step is taken that costs more, and it is told."""
+    model, _, rest = solo
+    problem, plan = standing(model, rest)
+    mpc = dd.loop.MPC(problem, horizon=10, plan=plan)
+    right = realtime.linearize
+
+    def turned(*args, **options):
+        A, B, methods = right(*args, **options)
+        return A, -B, methods
+
+    monkeypatch.setattr(realtime, "linearize", turned)
+    mpc(struck(model, rest, 0.6), 0.0)
+    assert "followed further: no step lowers what is paid" in mpc.status
