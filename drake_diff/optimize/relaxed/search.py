@@ -1,0 +1,297 @@
+"""Gauss-Newton over positions: the least cost of a motion under inverse dynamics with relaxed contact.
+
+The unknowns are q_1 ... q_N. Velocities are v_k = (q_k - q_(k-1)) / h, forces are those of `plant`, inputs what of them
+the motors give, and what they cannot give has to vanish. That, bounds, goals and constraints are an augmented
+Lagrangian. As each knot's cost knows three positions, the Hessian is a band, which one Cholesky factor solves
+(Kurtz and Lin, "Inverse dynamics trajectory optimization for contact-implicit model predictive control", 2023; there
+the forces that no motor gives cost a penalty). No motion is ever rolled out, so that any guess will do.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
+
+from drake_diff._base.arrays import Array, skew
+from drake_diff.mechanics.coordinates import Coordinates, unit
+from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
+from drake_diff.optimize.ilqr.expansion import Motion, expand
+from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.relaxed.plant import Forces, RelaxedPlant, Softness
+
+PENALTY, GROWTH, LARGEST_PENALTY = 1.0, 5.0, 1e8
+SUFFICIENT = 1e-3  # of the decrease that the model promises
+LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
+ENOUGH = 1e-3  # of the merit: less than that is no gain
+INNER = 12  # steps between two looks at the multipliers
+
+
+@dataclass(frozen=True, eq=False)
+class RelaxedMotion:
+    """q (N+1, nq), and what it comes to."""
+
+    q: Array
+    xs: Array  # (N+1, nx)
+    us: Array  # (N, nu)
+    tau: Array  # (N, nv)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The motion, its cost and how far it is from one: what no motor gives as a speed [m/s or rad/s], in N steps."""
+
+    motion: RelaxedMotion
+    iterations: int
+    cost: float
+    gap: float
+    violation: float
+    ended: str
+
+
+class RelaxedSearch:
+    """The search of one problem; each stage begins where the one before ended."""
+
+    def __init__(self, problem: Problem, plant: RelaxedPlant):
+        self.problem, self.plant, self.h = problem, plant, problem.model.time_step
+        model = problem.model
+        self.nv, self.count = model.nv, problem.num_steps
+        self.constraints = AugmentedLagrangian(problem)
+        self.undriven = plant.undriven
+        self.lower, self.upper = problem.bounds.u_lower, problem.bounds.u_upper
+        self.rest_multipliers = np.zeros((self.count, self.undriven.shape[1]))
+        self.input_multipliers = np.zeros((self.count, problem.nu))
+        self.rest_penalty, self.input_penalty = PENALTY, 0.0
+        self.rest_scale, self.input_scale = self._scales()
+        self.started = False
+
+    def _scales(self) -> tuple[Array, Array]:
+        """What a force of 1 along each undriven direction and each input changes in a step, in sqrt(J)."""
+        x0, model, plant = self.problem.x0, self.problem.model, self.plant
+        v = x0[None, model.nq :]
+        poses, _ = plant.place(x0[None, : model.nq])
+        mass = plant.tree.moving(poses, v).mass[0] + np.diag(plant.tree.reflected)
+        inverse = np.linalg.inv(mass)
+        of_rest = np.sqrt(np.einsum("ir,ij,jr->r", self.undriven, inverse, self.undriven))
+        of_inputs = np.sqrt(np.einsum("ir,ij,jr->r", plant.actuation, inverse, plant.actuation))
+        return self.h * of_rest, self.h * of_inputs
+
+    def run(self, q: Array, soft: Softness, most: int, is_over: Callable[[], bool], tell: Any = None) -> Found:
+        """At most `most` steps from q (N+1, nq), of which the first is given."""
+        motion = self.motion(q, soft)
+        if not self.started:
+            self._start(motion)
+        merit, damping, since, ended = self._merit(motion), 1e-3, 0, "iteration limit"
+        number = 0
+        while number < most:
+            if is_over():
+                ended = "time limit"
+                break
+            gradient, band = self._expand(motion, soft)
+            moved, gained = None, 0.0
+            while damping <= MOST_DAMPING and moved is None:
+                step = self._step(gradient, band, damping)
+                if step is not None:
+                    trial = self.motion(self._moved(motion.q, step), soft)
+                    found = self._merit(trial)
+                    promised = -float(gradient @ step) / 2
+                    if np.isfinite(found) and merit - found > SUFFICIENT * promised:
+                        gained = merit - found
+                        moved, merit = trial, found
+                        damping = max(damping / (5 if gained > 0.5 * promised else 1.5), LEAST_DAMPING)
+                        break
+                damping *= 4
+            number += 1
+            if moved is None:
+                damping = 1e-3
+            else:
+                motion = moved
+            since += 1
+            if moved is None or gained < ENOUGH * (1 + abs(merit)) or since >= INNER:
+                gap, violation = self._gap(motion), self._violation(motion)
+                if tell:
+                    tell(f"{number} cost {self.problem.objective(motion.xs, motion.us):.4g} merit {merit:.4g} "
+                         f"gap {gap:.2g} violation {violation:.2g} penalty {self.rest_penalty:.2g} damping {damping:.1g}")
+                if gap < 1e-3 and violation < 1e-3 and gained < ENOUGH * (1 + abs(merit)):
+                    ended = "solved"
+                    break
+                self._update(motion)
+                merit, since = self._merit(motion), 0
+        cost = self.problem.objective(motion.xs, motion.us)
+        return Found(motion, number, cost, self._gap(motion), self._violation(motion), ended)
+
+    def motion(self, q: Array, soft: Softness) -> RelaxedMotion:
+        v = self._velocities(q)
+        forces = self.plant.forces(q[:-1], v[:-1], v[1:], soft, slopes=False)
+        return RelaxedMotion(q, np.hstack([q, v]), forces.tau @ self.plant.inverse_actuation.T, forces.tau)
+
+    def _velocities(self, q: Array) -> Array:
+        v = np.empty((len(q), self.nv))
+        v[0] = self.problem.x0[self.problem.model.nq :]
+        v[1:] = between(self.plant.coordinates, q[:-1], q[1:])[0] / self.h
+        return v
+
+    # ------------------------------------------------------------------ the augmented cost
+
+    def _start(self, motion: RelaxedMotion) -> None:
+        self.started = True
+        cost = self.problem.objective(motion.xs, motion.us)
+        wrong = float(np.sum(self._rest(motion) ** 2)) / 2
+        size = abs(cost) / wrong if wrong > 0 else 0.0
+        self.rest_penalty = float(np.clip(size, 1.0, 1e4))
+        self.input_penalty = self.rest_penalty
+        self.constraints.start(motion.xs, motion.us, cost, float(np.sum(self._rest(motion) ** 2)))
+
+    def _rest(self, motion: RelaxedMotion) -> Array:
+        return (motion.tau @ self.undriven) * self.rest_scale
+
+    def _input_pushes(self, motion: RelaxedMotion) -> Array:
+        p, s = self.input_penalty, self.input_scale
+        above = self.input_multipliers + p * s * (motion.us - self.upper)
+        below = self.input_multipliers + p * s * (motion.us - self.lower)
+        return np.maximum(above, 0.0) + np.minimum(below, 0.0)
+
+    def _merit(self, motion: RelaxedMotion) -> float:
+        rest, p = self._rest(motion), self.rest_penalty
+        with np.errstate(all="ignore"):
+            total = self.problem.objective(motion.xs, motion.us) + self.constraints.value(motion.xs, motion.us)
+        total += float(np.sum(self.rest_multipliers * rest + p * rest**2 / 2))
+        pushes = self._input_pushes(motion)
+        return total + float(np.sum(pushes**2 - self.input_multipliers**2)) / (2 * self.input_penalty)
+
+    def _update(self, motion: RelaxedMotion) -> None:
+        self.rest_multipliers = self.rest_multipliers + self.rest_penalty * self._rest(motion)
+        self.input_multipliers = self._input_pushes(motion)
+        self.constraints.update(motion.xs, motion.us)
+        if self._gap(motion) > 1e-3:
+            self.rest_penalty = min(GROWTH * self.rest_penalty, LARGEST_PENALTY)
+        self.input_penalty = min(GROWTH * self.input_penalty, LARGEST_PENALTY)
+        if self.constraints.any and self.constraints.violation(motion.xs, motion.us) > 1e-4:
+            self.constraints.penalty = min(GROWTH * self.constraints.penalty, LARGEST_PENALTY)
+
+    def _gap(self, motion: RelaxedMotion) -> float:
+        return float(np.max(np.abs(self._rest(motion)), initial=0.0))
+
+    def _violation(self, motion: RelaxedMotion) -> float:
+        beyond = np.maximum(np.maximum(self.lower - motion.us, motion.us - self.upper), 0.0) * self.input_scale
+        return max(self.constraints.violation(motion.xs, motion.us), float(np.max(beyond, initial=0.0)))
+
+    # ------------------------------------------------------------------ its expansion
+
+    def _expand(self, motion: RelaxedMotion, soft: Softness) -> tuple[Array, Array]:
+        """The gradient (N nv,) and the Hessian's lower band (3 nv, N nv) by small motions of q_1 ... q_N."""
+        nv, n, N, h = self.nv, self.problem.model.nq, self.count, self.h
+        q, v = motion.q, motion.xs[:, n:]
+        forces = self.plant.forces(q[:-1], v[:-1], v[1:], soft, slopes=True)
+        gaps = np.zeros((N, self.problem.nx))
+        model = expand(self.problem, Motion(motion.xs, motion.us, gaps), np.empty(0), self.constraints)
+        g, H = self._of_knots(motion, model, forces)  # by [dq_k, v_k, tau_k]
+        first, second = slopes_of(self.plant.coordinates, q[:-1], q[1:])
+        first, second = first / h, second / h
+        # Z_k = d [dq_k, v_k, tau_k] / d [dq_(k-1), dq_k, dq_(k+1)]
+        Z = np.zeros((N + 1, 3 * nv, 3 * nv))
+        a, b, c = slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, 3 * nv)
+        Z[:, a, b] = np.eye(nv)
+        Z[1:, b, a], Z[1:, b, b] = first, second
+        Z[:-1, c, b] = forces.by_motion + forces.by_next @ first
+        Z[1:-1, c, b] += forces.by_v[1:] @ second[:-1]
+        Z[1:-1, c, a] = forces.by_v[1:] @ first[:-1]
+        Z[:-1, c, c] = forces.by_next @ second
+        small = (Z.swapaxes(1, 2) @ g[..., None])[..., 0]
+        full = Z.swapaxes(1, 2) @ H @ Z
+        gradient = np.zeros((N + 3, nv))
+        for i in range(3):
+            gradient[i : i + N + 1] += small[:, i * nv : (i + 1) * nv]
+        diagonal, below, beneath = np.zeros((3, N + 3, nv, nv))
+        parts = full.reshape(N + 1, 3, nv, 3, nv)
+        for i in range(3):
+            diagonal[i : i + N + 1] += parts[:, i, :, i]
+        for i in range(2):
+            below[i : i + N + 1] += parts[:, i + 1, :, i]
+        beneath[: N + 1] += parts[:, 2, :, 0]
+        keep = slice(2, N + 2)  # q_1 ... q_N; that of index 0 is before the first, 1 is the first
+        return gradient[keep].ravel(), _banded(diagonal[keep], below[keep], beneath[keep])
+
+    def _of_knots(self, motion: RelaxedMotion, model: Any, forces: Forces) -> tuple[Array, Array]:
+        """The gradients (N+1, 3 nv) and Hessians (N+1, 3 nv, 3 nv) of the augmented cost by [dq, v, tau]."""
+        nv, nq, nx, N = self.nv, self.problem.model.nq, self.problem.nx, self.count
+        rate = self.plant.coordinates.rate(motion.q)
+        T = np.zeros((N + 1, nx + self.problem.nu, 3 * nv))
+        T[:, :nq, :nv] = rate
+        T[:, nq:nx, nv : 2 * nv] = np.eye(nv)
+        T[:, nx:, 2 * nv :] = self.plant.inverse_actuation
+        gradients, hessians = np.zeros((N + 1, T.shape[1])), np.zeros((N + 1, T.shape[1], T.shape[1]))
+        gradients[:-1], hessians[:-1] = model.gradients, model.hessians
+        gradients[-1, :nx], hessians[-1, :nx, :nx] = model.final_gradient, model.final_hessian
+        pushes = self._input_pushes(motion)
+        gradients[:-1, nx:] += self.input_scale * pushes
+        inputs = np.arange(nx, T.shape[1])
+        hessians[:-1, inputs, inputs] += np.where(pushes != 0, self.input_penalty, 0.0) * self.input_scale**2
+        g = (T.swapaxes(1, 2) @ gradients[..., None])[..., 0]
+        H = T.swapaxes(1, 2) @ hessians @ T
+        U = self.undriven * self.rest_scale
+        g[:-1, 2 * nv :] += (self.rest_multipliers + self.rest_penalty * (motion.tau @ U)) @ U.T
+        H[:-1, 2 * nv :, 2 * nv :] += self.rest_penalty * U @ U.T
+        return g, H
+
+    def _step(self, gradient: Array, band: Array, damping: float) -> Array | None:
+        damped = np.array(band)
+        damped[0] += damping * np.maximum(band[0], 1e-8 * np.max(band[0])) + 1e-12
+        try:
+            factor = cholesky_banded(damped, lower=True, check_finite=True)
+        except (LinAlgError, ValueError):
+            return None
+        return np.asarray(cho_solve_banded((factor, True), -gradient))
+
+    def _moved(self, q: Array, step: Array) -> Array:
+        d = step.reshape(self.count, self.nv)
+        moved = np.array(q)
+        coordinates = self.plant.coordinates
+        moved[1:] += (coordinates.rate(q[1:]) @ d[..., None])[..., 0]
+        for i, _ in coordinates.free:
+            moved[1:, i : i + 4] /= np.linalg.norm(moved[1:, i : i + 4], axis=1, keepdims=True)
+        return moved
+
+
+def _conjugate_product(p: Array, q: Array) -> Array:
+    """(..., 4) p * conj(q) of quaternions w x y z."""
+    w = (p * q).sum(axis=-1)
+    vector = q[..., :1] * p[..., 1:] - p[..., :1] * q[..., 1:] - np.cross(p[..., 1:], q[..., 1:])
+    return np.concatenate([w[..., None], vector], axis=-1)
+
+
+def between(coordinates: Coordinates, q: Array, q_next: Array) -> tuple[Array, list[Array]]:
+    """(N, nv) the small motion from q to q_next (each (N, nq)), h v' of Drake's step; and the turns (N, 3) in it."""
+    found, turns = np.empty((len(q), coordinates.nv)), []
+    for i, j in coordinates.single:
+        found[:, j] = q_next[:, i] - q[:, i]
+    for i, j in coordinates.free:
+        turn = _conjugate_product(q_next[:, i : i + 4], q[:, i : i + 4])
+        found[:, j : j + 3] = 2 * turn[:, 1:] / turn[:, :1]
+        found[:, j + 3 : j + 6] = q_next[:, i + 4 : i + 7] - q[:, i + 4 : i + 7]
+        turns.append(found[:, j : j + 3])
+    return found, turns
+
+
+def slopes_of(coordinates: Coordinates, q: Array, q_next: Array) -> tuple[Array, Array]:
+    """(N, nv, nv) the derivatives of `between` by small motions of q and of q_next."""
+    _, turns = between(coordinates, q, q_next)
+    first = np.repeat(-np.eye(coordinates.nv)[None], len(q), axis=0)
+    second = -first
+    for (_, j), r in zip(coordinates.free, turns, strict=True):
+        part, across, outer = slice(j, j + 3), skew(r) / 2, r[:, :, None] * r[:, None, :] / 4
+        first[:, part, part] = -np.eye(3) - across - outer
+        second[:, part, part] = np.eye(3) - across + outer
+    return first, second
+
+
+def _banded(diagonal: Array, below: Array, beneath: Array) -> Array:
+    """The lower band (3 n, N n) of a matrix of blocks (N, n, n): its diagonal and the two below it."""
+    N, n, _ = diagonal.shape
+    column = np.concatenate([diagonal, below, beneath], axis=1)  # (N, 3 n, n) of each column of blocks
+    band = np.zeros((3 * n, N, n))
+    for j in range(n):
+        band[: 3 * n - j, :, j] = column[:, j:, j].T
+    return band.reshape(3 * n, N * n)
