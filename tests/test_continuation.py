@@ -10,7 +10,8 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
-from drake_diff.optimize.ilqr.through_contact import default_schedule, restore_goal
+from drake_diff.optimize.continuation import default_schedule
+from drake_diff.optimize.ilqr.through_contact import restore_goal
 from drake_diff.optimize.solution import Status
 
 

@@ -14,16 +14,12 @@ from drake_diff.certificates.certify import certify_inside
 from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.parameters import TIME_STEP
-from drake_diff.model.soft_contact import SoftContact
 from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.certified import certified_knots, certify_equations
+from drake_diff.optimize.continuation import Stages, solve_continuation
 from drake_diff.optimize.guess import Guess
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
-from drake_diff.optimize.ilqr.through_contact import (
-    moves_shapes,
-    solve_continuation,
-    solve_through_jumps,
-)
+from drake_diff.optimize.ilqr.through_contact import moves_shapes, solve_through_jumps
 from drake_diff.optimize.judge import ended, judged, may_be_too_coarse, refused
 from drake_diff.optimize.problem.goals import in_words
 from drake_diff.optimize.problem.obstacles import lacking_between, swept
@@ -182,17 +178,17 @@ class Run:
         )
         return self._judge(draft, motion.result)
 
-    def sweep(self, guess: Guess, *, given: bool, stages: tuple[SoftContact, ...]) -> Solution:
+    def sweep(self, guess: Guess, *, given: bool, stages: Stages) -> Solution:
         """iLQR; from the states of a `given` guess, which need not be a rollout, else from the rollout of `us`.
 
-        With `stages`, which take the inputs of the guess alone, it need not have a gradient.
+        With `stages` it need not have a gradient.
         """
         xs, us = guess.xs, guess.us
         limits, report, first = self.limits, self.report, iter([xs] if given else [])
 
         def search(problem: Problem, rolled: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
             if stages:
-                result, xs_found, us, logs = solve_continuation(problem, us, stages, limits=limits, report=report)
+                result, xs_found, us, logs = solve_continuation(problem, xs, us, stages, limits=limits, report=report)
                 self.options["continuation"] = [asdict(log) for log in logs]
                 return result, xs_found, us
             touches = problem.model.contract.contact.collision_pairs and not moves_shapes(problem)

@@ -21,12 +21,10 @@ from drake_diff.motion.intervals import roll
 from drake_diff.motion.rollout import CONTINUOUS
 from drake_diff.optimize.advice import advice
 from drake_diff.optimize.apart import is_kept_apart, kept_apart
+from drake_diff.optimize.continuation import check_schedule
 from drake_diff.optimize.drake_program import SOLVERS
 from drake_diff.optimize.guess import another_guess, first_guess, sampled
 from drake_diff.optimize.ilqr.ilqr import check_problem, is_unconstrained
-from drake_diff.optimize.ilqr.through_contact import (
-    check_schedule,
-)
 from drake_diff.optimize.judge import overlaps
 from drake_diff.optimize.optima import distinct
 from drake_diff.optimize.phased import PhasedSolution, solve_phased
@@ -146,7 +144,9 @@ def solve(
         seed: of the noise in a default guess, and of the other first guesses.
         segments: of multiple shooting, whose first states are variables too; 1 is single shooting.
         continuation: finds contact that the guess does not make, by stages of a force at a distance before the true
-            plant: "auto" or a sequence of SoftContacts, with method="ilqr". `Solution.options` has the stages' log.
+            plant: "auto" or a sequence of SoftContacts, with method="ilqr"; or "relaxed": by inverse dynamics over the
+            positions of the guess, with contact and friction at a distance, of hinges, slides and free bodies that
+            spheres touch. `Solution.options` has the stages' log.
         refine: with collocation, whether coarse intervals are split and the problem is solved again. None: where the
             plan does not hold between its knots or in a replay, until it does or every error is at most
             `error_tolerance`. True: until every error is. False: never.

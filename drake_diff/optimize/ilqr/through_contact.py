@@ -1,17 +1,14 @@
-"""Trajectory optimization through contact by iLQR: stages of softer contact, then the true plant, whose step jumps.
+"""Trajectory optimization through contact by iLQR on the true plant, whose step jumps.
 
-What does not touch has no gradient. So `solve_continuation` first solves the same plant with a force at a distance
-added (`soft_contact`), of a shorter reach in each stage. A stage only warms up the next: the schedule goes on if it
-fails. The true plant's step jumps where two bodies just touch, and the least cost often lies at such a jump, where no
-gradient tells a minimum. So `solve_through_jumps` holds every beginning of a touch at its knot, by rows phi >= m before
-it and phi <= -m at it, phi being the signed distance and m a margin: under these the problem is smooth. A minimum that
-presses against a row is compared with that of the sequence beyond it, where the touch begins a knot earlier or later.
+It jumps where two bodies just touch, and the least cost often lies at such a jump, where no gradient tells a minimum.
+So `solve_through_jumps` holds every beginning of a touch at its knot, by rows phi >= m before it and phi <= -m at it,
+phi being the signed distance and m a margin: under these the problem is smooth. A minimum that presses against a row is
+compared with that of the sequence beyond it, where the touch begins a knot earlier or later.
 """
 
-import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,10 +17,9 @@ from pydrake.autodiffutils import ExtractValue
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import chain
-from drake_diff.exceptions import GradientError, InputError, ModelError, SimulationError
-from drake_diff.model.contact import thinnest_geometry
+from drake_diff.exceptions import GradientError, ModelError, SimulationError
 from drake_diff.model.model import Model
-from drake_diff.model.soft_contact import Separation, SoftContact, distances, separations, softened
+from drake_diff.model.soft_contact import Separation, distances, separations
 from drake_diff.model.step import advance, set_state
 from drake_diff.motion.rollout import roll_states
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
@@ -39,141 +35,13 @@ HOLDING = 1e6  # the least penalty of held rows: a search that may cross them se
 BEYOND_ITERATIONS = 50  # for the minimum beyond a row, which the note then says was not found
 MOST_SEQUENCES = 30  # that are tried: beyond them the result claims its own sequence alone
 MOST_STEPS, SHORTENINGS = 20, 10  # of Newton's method towards the goal
-STAGE_ITERATIONS, STAGE_TOLERANCE = 30, 1e-4  # a stage is a guess for the next: no more than that is asked of it
-REACH = 3.0  # the first distance is this part of the gap, where the force is e^-3 = 5 % of that at touching
-SHORTER = 3.0  # each distance is this part of the one before
-# No distance is shorter than what crosses the gap L at 4 L / T moves in a step: it would be met only by chance.
-FASTEST = 4.0
-# h^2 k / m of the stiffest stage: at 4 the explicit force is unstable; where it is weak, true contact, which jumps,
-# does the work, and the stage is as rough as the true plant.
-LARGEST_STIFFNESS = 0.4
 JUST_TOUCHING = 2e-5  # [m], beyond MARGIN; what rests on something presses further into it
-NUDGE = 10.0  # how many gaps the force at x0 alone would move what it acts on, were it to last
 
 OF_SHAPES = ("offset", "radius")  # parameters that change where shapes are, or what they are
-Found = tuple[NlpResult, Array, Array]  # as from `solve_ilqr`
+Minimum = tuple[NlpResult, Array, Array]  # as from `solve_ilqr`
 
 
-@dataclass(frozen=True)
-class StageLog:
-    """What one stage did; `distance` [m] and `stiffness` [N/m] are None for the true plant.
-
-    `status` is an outcome of iLQR or "refused: ..."; `goal_error` is the stage's own and `gradient` that of
-    its last step.
-    """
-
-    number: int
-    distance: float | None
-    stiffness: float | None
-    status: str
-    iterations: int
-    cost: float | None
-    goal_error: float | None
-    gradient: float | None
-
-    def __str__(self) -> str:
-        contact = "the true plant"
-        if self.distance is not None:
-            contact = f"distance {self.distance:.3g} m, stiffness {self.stiffness:.3g} N/m"
-        numbers = "" if self.cost is None else f", cost {self.cost:.6g}, goal error {self.goal_error:.2g}"
-        return f"stage {self.number}: {contact}: {self.status} after {self.iterations} steps{numbers}"
-
-
-def solve_continuation(
-    problem: Problem, us: Array, stages: Sequence[SoftContact], *, limits: Limits, report: Report | None
-) -> tuple[NlpResult, Array, Array, tuple[StageLog, ...]]:
-    """Solve `problem` by iLQR through the `stages` and then on the true plant, from us (N, nu).
-
-    Gives what `solve_ilqr` gives, of the true plant, and a log for each stage. `limits.time_limit` is that of all
-    stages together; if it or Ctrl-C ends one, the rest are left out and the motion is the true plant's rollout. A
-    search that ends short of a minimum is taken to the goal by `restore_goal`, which its message says.
-    Raises GradientError or SimulationError if the true plant refuses.
-    """
-    deadline, logs, x0 = time.monotonic() + limits.time_limit, list[StageLog](), np.array(problem.x0)
-
-    def log(*entries: Any) -> None:
-        logs.append(StageLog(len(logs) + 1, *entries))
-        if report:
-            report.say(str(logs[-1]))
-
-    with ctrl_c() as interrupted:
-        for contact in stages:
-            softer = replace(problem, system=softened(problem.model, contact))
-            iterations, tolerance = min(STAGE_ITERATIONS, limits.max_iterations), max(STAGE_TOLERANCE, limits.tolerance)
-            short = Limits(iterations, deadline - time.monotonic(), tolerance)
-            try:
-                xs = roll_states(softer.model, x0, us)
-                result, xs, us = solve_ilqr(softer, xs, us, limits=short, report=report, patience=PATIENCE)
-                x0, outcome = xs[0], result.outcome
-                log(contact.distance, contact.stiffness, *_told(softer, result, xs, us))
-            except (GradientError, SimulationError) as error:
-                outcome = Outcome.NO_GRADIENT
-                log(contact.distance, contact.stiffness, f"refused: {error}", 0, None, None, None)
-            if interrupted.is_set() or outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
-                outcome = Outcome.TIME_LIMIT if outcome is Outcome.TIME_LIMIT else Outcome.INTERRUPTED
-                xs, message = roll_states(problem.model, x0, us), f"iLQR: {outcome.value} in stage {len(logs)}"
-                return NlpResult(us.ravel(), outcome, message, ()), xs, us, tuple(logs)
-        left = replace(limits, time_limit=deadline - time.monotonic())
-        xs = roll_states(problem.model, x0, us)
-        try:
-            result, xs, us = solve_through_jumps(problem, xs, us, limits=left, report=report)
-        except (GradientError, SimulationError) as error:
-            log(None, None, f"refused: {error}", 0, None, None, None)
-            outcome = Outcome.NO_GRADIENT if isinstance(error, GradientError) else Outcome.DIVERGED
-            message = f"iLQR: the motion that the stages lead to is refused on the true plant: {error}"
-            return NlpResult(us.ravel(), outcome, message, ()), xs, us, tuple(logs)
-        log(None, None, *_told(problem, result, xs, us))
-        if result.outcome in (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.INFEASIBLE):
-            xs, us, done = restore_goal(
-                problem, xs, us, limits.tolerance, lambda: interrupted.is_set() or time.monotonic() > deadline
-            )
-            message, outcome = result.message + _where_it_jumps(problem, xs) + done, result.outcome
-            if outcome is Outcome.INFEASIBLE and _miss(problem, xs) <= limits.tolerance:
-                outcome = Outcome.INACCURATE  # state bounds are measured again by the verdict
-            result = replace(result, z=us.ravel(), outcome=outcome, message=message)
-            if done and report:
-                report.say(done.removeprefix("; "))
-    return result, xs, us, tuple(logs)
-
-
-def check_schedule(problem: Problem, continuation: Any) -> tuple[SoftContact, ...]:
-    """The stages before the true plant, from "auto" or a sequence of SoftContacts; refuses what cannot be softened."""
-    if isinstance(continuation, str) and continuation == "auto":
-        return default_schedule(problem)
-    given = tuple(continuation) if isinstance(continuation, Sequence) else ()
-    if not given or not all(isinstance(stage, SoftContact) for stage in given):
-        raise InputError("continuation", got=repr(continuation), expected='None, "auto" or SoftContacts, one a stage')
-    softened(problem.model, given[0])
-    return given
-
-
-def default_schedule(problem: Problem) -> tuple[SoftContact, ...]:
-    """Stages from the model's sizes and masses, the problem's start and duration.
-
-    The reach L is the largest gap at x0 between two bodies that may collide, or the smallest half width of what
-    collides if that is more. The distances are L/3, L/9, ..., down to 4 L / num_steps, what moves at
-    4 L / T passes in a step. The stiffness is such that the force at L alone would move the lightest of what can
-    approach each other, its mass m, by 10 L in the whole time T; but no more than 0.4 m / h^2, h being the time step.
-    """
-    model = problem.model
-    softened(model, SoftContact(1.0, 1.0))  # refuses what cannot be
-    set_state(model.double, problem.x0)
-    mass = min((1 / pair.mobility for pair in separations(model.double) if pair.mobility > 0), default=math.inf)
-    if not math.isfinite(mass):
-        raise InputError("x0", got="nothing that may collide can approach", expected="a pair that can")
-    reach = max(*distances(model.double).values(), thinnest_geometry(model)[0] / 2)
-    duration, stiffest = problem.num_steps * model.time_step, LARGEST_STIFFNESS * mass / model.time_step**2
-    stages: list[SoftContact] = []
-    sigma = reach / REACH
-    while not stages or sigma >= FASTEST * reach / problem.num_steps:
-        unit = SoftContact(float(sigma), 1.0)
-        nudge = NUDGE * 2 * mass * reach / duration**2 / unit.normal_force(reach)
-        stages.append(replace(unit, stiffness=float(min(stiffest, nudge))))
-        sigma /= SHORTER
-    return tuple(stages)
-
-
-def _cost(problem: Problem, result: NlpResult, xs: Array, us: Array) -> float:
+def cost_of(problem: Problem, result: NlpResult, xs: Array, us: Array) -> float:
     """What xs (N+1, nx) under us (N, nu) cost with the parameters of `result`."""
     design = problem.design
     values = design.vector.values if result.parameters is None else result.parameters
@@ -181,17 +49,7 @@ def _cost(problem: Problem, result: NlpResult, xs: Array, us: Array) -> float:
     return cost + problem.cost_of_parameters(design.own(values))
 
 
-def _told(
-    problem: Problem, result: NlpResult, xs: Array, us: Array
-) -> tuple[str, int, float | None, float | None, float | None]:
-    """Status, iterations, cost, goal error and gradient of a stage, for its log."""
-    last = result.iterations[-1]
-    numbers = _cost(problem, result, xs, us), _miss(problem, xs), last.dual_infeasibility
-    cost, error, gradient = (value if math.isfinite(value) else None for value in numbers)
-    return result.outcome.value, last.iteration, cost, error, gradient
-
-
-def _where_it_jumps(problem: Problem, xs: Array) -> str:
+def where_it_jumps(problem: Problem, xs: Array) -> str:
     """Where along xs (N+1, nx) two bodies are just touching, and what that means; empty if none are."""
     for k, x in enumerate(xs[:-1]):
         set_state(problem.model.double, x)
@@ -244,7 +102,7 @@ def moves_shapes(problem: Problem) -> bool:
 
 def solve_through_jumps(
     problem: Problem, xs: Array, us: Array, *, limits: Limits, report: Report | None, values: Array | None = None
-) -> Found:
+) -> Minimum:
     """What `solve_ilqr` gives, from a search that holds beginnings of touches where it stalls at one.
 
     Where they press, the result's note says which, and what the sequences beyond them cost. `limits` are those of all
@@ -264,7 +122,7 @@ class _Sequences:
         self.costs = dict[tuple[ContactHold, ...], float]()  # of each sequence's minimum; infinite if none was found
         self.ended = False  # by Ctrl-C or the clock
 
-    def run(self, xs: Array, us: Array, interrupted: threading.Event) -> Found:
+    def run(self, xs: Array, us: Array, interrupted: threading.Event) -> Minimum:
         """Let the search go free until it stalls, then from sequence to cheaper sequence."""
         found, holds, stuck = self._minimize(xs, us, (), PATIENCE), tuple[ContactHold, ...](), False
         while found[0].outcome is Outcome.INACCURATE and not stuck and len(self.costs) < MOST_SEQUENCES:
@@ -279,19 +137,19 @@ class _Sequences:
             return self._improve(found, interrupted)
         return found
 
-    def _improve(self, best: Found, interrupted: threading.Event) -> Found:
+    def _improve(self, best: Minimum, interrupted: threading.Event) -> Minimum:
         """Cross what holds the motion while that is cheaper."""
         told, left = list[str](), self._pressing(best[1])
         while left and len(self.costs) < MOST_SEQUENCES and not interrupted.is_set():
             if time.monotonic() > self.deadline or len(self.rows) > self.limits.max_iterations:
                 break
             hold, self.values = left.pop(), best[0].parameters
-            cost = _cost(self.problem, *best)
+            cost = cost_of(self.problem, *best)
             other = self._beyond(hold, *best[1:])
             if self.ended:
                 left.append(hold)
                 break
-            new = _cost(self.problem, *other) if isinstance(other, tuple) else other
+            new = cost_of(self.problem, *other) if isinstance(other, tuple) else other
             if isinstance(other, tuple) and new < cost:
                 best, told, left = other, [], self._pressing(other[1])
             else:
@@ -299,11 +157,11 @@ class _Sequences:
         told += [f"{hold} (beyond: not tried)" for hold in left]
         if not told:
             return best
-        cost = _cost(self.problem, *best)
+        cost = cost_of(self.problem, *best)
         note = f"a minimum for its own sequence of contacts, cost {cost:.6g}, held by " + "; ".join(told)
         return replace(best[0], note=note), *best[1:]
 
-    def _beyond(self, hold: ContactHold, xs: Array, us: Array) -> Found | float:
+    def _beyond(self, hold: ContactHold, xs: Array, us: Array) -> Minimum | float:
         """The minimum of the sequence beyond `hold`; its cost alone if it is known, infinite if there is none."""
         beyond = np.array(xs)
         beyond[hold.knot] = hold.moved_beyond(self.problem.model, xs[hold.knot])
@@ -325,7 +183,7 @@ class _Sequences:
 
     def _minimize(
         self, xs: Array, us: Array, holds: tuple[ContactHold, ...], patience: int, most: float = np.inf
-    ) -> Found:
+    ) -> Minimum:
         """One search under `holds`, of `most` iterations, within what is left of the limits."""
         more = int(min(most, max(self.limits.max_iterations - max(len(self.rows) - 1, 0), 1)))
         limits = replace(self.limits, time_limit=self.deadline - time.monotonic(), max_iterations=more)
@@ -341,7 +199,7 @@ class _Sequences:
         first = len(self.rows) - 1 if self.rows else 0
         self.rows += [replace(r, iteration=first + r.iteration) for r in result.iterations[bool(self.rows) :]]
         self.values = result.parameters
-        self.costs[holds] = _cost(self.problem, result, xs, us) if result.outcome is Outcome.SOLVED else np.inf
+        self.costs[holds] = cost_of(self.problem, result, xs, us) if result.outcome is Outcome.SOLVED else np.inf
         return found
 
     def _say(self, text: str) -> None:
@@ -388,7 +246,7 @@ def restore_goal(
             first = k
             break
     for number in range(1, MOST_STEPS + 1):
-        if is_over() or _miss(problem, xs) <= tolerance:
+        if is_over() or miss_of(problem, xs) <= tolerance:
             break
         try:
             nearer = _newton_step(problem, xs, us, first)
@@ -425,5 +283,5 @@ def _excess(problem: Problem, xs: Array, us: Array) -> float:
     return max(beyond, *(excess for excess, _ in problem.constraint_excess(xs, us).values()), 0.0)
 
 
-def _miss(problem: Problem, xs: Array) -> float:
+def miss_of(problem: Problem, xs: Array) -> float:
     return float(np.abs(problem.goal_error(xs[-1])).max())

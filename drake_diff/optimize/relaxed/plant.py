@@ -15,14 +15,15 @@ then 0. Inverse dynamics need no contact solver, and everything here has a close
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.arrays import Array, cross, skew
 from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.contact.kinematics import Contacts, Topology, topology_of
 from drake_diff.derivatives.contact.material import Material, read_material
-from drake_diff.derivatives.contact.pairs import ContactPairs, read_pairs
+from drake_diff.derivatives.contact.pairs import ContactPairs, Touches, read_pairs
 from drake_diff.derivatives.implicit import form_of
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import describe_tree
@@ -30,7 +31,7 @@ from drake_diff.mechanics.tree import TreeDynamics, tree_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
 
-FAR = 30.0  # reaches: beyond it the force is less than rounding of that of what touches
+FAR = 12.0  # reaches: beyond it the force is 1e-5 of that of what touches, and left out
 SWAP = np.r_[3:6, 0:3]  # [angular; linear] to [linear; angular]
 
 
@@ -66,6 +67,7 @@ class RelaxedPlant:
     by_body: Array  # (bodies of pairs, nv)
     material: Material
     actuation: Array  # (nv, nu)
+    labels: dict[Any, str]  # of Drake's bodies, by their index, as in the topology
 
     @cached_property
     def inverse_actuation(self) -> Array:
@@ -79,6 +81,10 @@ class RelaxedPlant:
         rank = int(np.count_nonzero(size > 1e-9 * np.max(size, initial=0.0)))
         return np.asarray(left[:, rank:])
 
+    def moving(self, body: Any) -> Array:
+        """(nv,) 1 for the degrees of freedom that move one of Drake's bodies."""
+        return self.topology.bodies[self.labels[body.index()]]
+
     def place(self, q: Array) -> tuple[Array, Array]:
         """The poses (N, n, 3, 4) of the tree's bodies and (N, bodies, 3, 4) of the pairs' at q (N, nq)."""
         plant, context = self.model.plant, self.model.double.context
@@ -89,8 +95,8 @@ class RelaxedPlant:
             plant.SetPositions(context, positions)
             for i, body in enumerate(own.values()):
                 poses[k, i] = plant.EvalBodyPoseInWorld(context, body).GetAsMatrix34()
-        of_tree, of_pairs = ([at[body.index()] for body in some] for some in (self.tree.bodies, self.pairs.bodies))
-        return poses[:, of_tree], poses[:, of_pairs]
+        tree, pairs = ([at[body.index()] for body in some] for some in (self.tree.bodies, self.pairs.bodies))
+        return np.take(poses, tree, axis=1), np.take(poses, pairs, axis=1)
 
     def forces(self, q: Array, v: Array, v_next: Array, soft: Softness, *, slopes: bool) -> Forces:
         """At q (N, nq), v and v_next (N, nv); without `slopes` the derivatives are empty."""
@@ -120,7 +126,7 @@ class RelaxedPlant:
         np.subtract.at(by_next, state, J @ law.by_velocity() @ J.swapaxes(-1, -2))
         return Forces(tau + added - push, by_q, by_v, by_next)
 
-    def distances(self, q: Array) -> tuple[Array, Array]:
+    def distances(self, q: Array) -> Array:
         """(N, P) the signed distance of each pair at q (N, nq), infinite where it is further than 1e3 m."""
         touch = _within(self.pairs, self.place(q)[1], 1e3)
         found = np.full((len(q), len(self.pairs.ids)), np.inf)
@@ -129,11 +135,8 @@ class RelaxedPlant:
 
     def _contacts(self, poses: Array, S: Array, v_next: Array, soft: Softness) -> tuple[Contacts, "Law"]:
         touch = _within(self.pairs, poses, FAR * soft.reach)
-        own, part = S[touch.state], self.material.other_part[touch.pair]
+        own, (point, change) = S[touch.state], touch.at(np.full(len(touch.pair), 0.5))
         linear, angular = own[..., :3], own[..., 3:]
-        reach = self.pairs.radius[touch.pair] + part * np.minimum(touch.phi, 0.0)
-        point = touch.center - reach[:, None] * touch.normal
-        cross = np.cross(angular, point[:, None, :])
         contacts = Contacts(
             touch=touch,
             moves=self.topology.moves,
@@ -141,9 +144,8 @@ class RelaxedPlant:
             other=self.by_body[self.pairs.other_body[touch.pair]],
             angular=angular,
             point=point,
-            at_point=linear + cross,
-            reach=reach,
-            other_part=np.where(touch.phi < 0, part, 0.0),
+            at_point=linear + cross(angular, point[:, None, :]),
+            change=change,
         )
         velocity = (v_next[touch.state][:, None, :] @ contacts.jacobian)[:, 0]
         friction, force = self.material.friction[touch.pair], soft.force[touch.pair]
@@ -223,10 +225,13 @@ class Law:
         return np.swapaxes(self.change(along, 0 * along, np.zeros((len(self.phi), 3))), -1, -2)
 
 
-def _within(pairs: ContactPairs, poses: Array, far: float):
-    """The pairs that are no further apart than `far` [m]."""
+def _within(pairs: ContactPairs, poses: Array, far: float) -> Touches:
+    """The pairs that are no further apart than `far` [m]: they overlap where the spheres are larger by that."""
     touch = replace(pairs, radius=pairs.radius + far).touching(poses)
-    return replace(touch, phi=touch.phi + far)
+    further, change = far / 2 * touch.normal, np.array(touch.change)  # from the larger sphere's middle to the pair's
+    change[:, :, 3:] += change[:, :, :3] @ skew(further)
+    change[:, :3] += far / 2 * change[:, 3:6]
+    return replace(touch, middle=touch.middle + further, phi=touch.phi + far, change=change)
 
 
 def relaxed_plant(model: Model) -> RelaxedPlant | Refusal:
@@ -236,15 +241,16 @@ def relaxed_plant(model: Model) -> RelaxedPlant | Refusal:
     if contact.model != "point":
         return Refusal(f"the contact model is {contact.model}, not point")
     why = form.driven or model.systems_act
-    if why or form.pd or not model.inputs.plain or model.coupling is not None:
-        return Refusal(why or "PD control, thrusters or couplers act")
+    if why or form.pd or not model.inputs.plain or model.coupling is not None or model.num_constraints:
+        return Refusal(why or "PD control, thrusters, constraints or couplers act")
     tree = tree_of(model, free=True)
     if isinstance(tree, Refusal):
         return tree
     description, pairs = describe_tree(model), read_pairs(model)
     topology = topology_of(description)
     labels = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
-    rows = [topology.bodies[labels.get(body.index(), "world")] for body in pairs.bodies]
+    labels[model.plant.world_body().index()] = "world"
+    rows = [topology.bodies[labels[body.index()]] for body in pairs.bodies]
     return RelaxedPlant(
         model=model,
         tree=tree,
@@ -254,4 +260,5 @@ def relaxed_plant(model: Model) -> RelaxedPlant | Refusal:
         by_body=np.array(rows).reshape(-1, model.nv),
         material=read_material(model.double, pairs),
         actuation=np.asarray(form.actuation),
+        labels=labels,
     )

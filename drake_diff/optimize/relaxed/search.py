@@ -7,26 +7,29 @@ Lagrangian. As each knot's cost knows three positions, the Hessian is a band, wh
 the forces that no motor gives cost a penalty). No motion is ever rolled out, so that any guess will do.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
 from drake_diff._base.arrays import Array, skew
-from drake_diff.mechanics.coordinates import Coordinates, unit
+from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.optimize.ilqr.constraints import AugmentedLagrangian
 from drake_diff.optimize.ilqr.expansion import Motion, expand
 from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.relaxed.band import Band
 from drake_diff.optimize.relaxed.plant import Forces, RelaxedPlant, Softness
 
 PENALTY, GROWTH, LARGEST_PENALTY = 1.0, 5.0, 1e8
 SUFFICIENT = 1e-3  # of the decrease that the model promises
+SMALLEST = 1e-8  # of the Hessian's largest entry: what counts as its smallest
 LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
 ENOUGH = 1e-3  # of the merit: less than that is no gain
-INNER = 12  # steps between two looks at the multipliers
+RELENT = 25.0
+INNER = 20  # steps between two looks at the multipliers
+CLOSED = 1e-3  # [sqrt(J)], and in the units of bounds and goals: what a stage leaves is for the true plant to close
+STALLED, PATIENCE = 0.7, 3  # of what was open: so often in a row no more than that was closed
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,49 +81,57 @@ class RelaxedSearch:
         of_inputs = np.sqrt(np.einsum("ir,ij,jr->r", plant.actuation, inverse, plant.actuation))
         return self.h * of_rest, self.h * of_inputs
 
-    def run(self, q: Array, soft: Softness, most: int, is_over: Callable[[], bool], tell: Any = None) -> Found:
+    def run(
+        self, q: Array, soft: Softness, most: int, is_over: Callable[[], bool], tell: Callable[[str], None]
+    ) -> Found:
         """At most `most` steps from q (N+1, nq), of which the first is given."""
         motion = self.motion(q, soft)
-        if not self.started:
+        if self.started:
+            self._relent()
+        else:
             self._start(motion)
-        merit, damping, since, ended = self._merit(motion), 1e-3, 0, "iteration limit"
-        number = 0
+        merit, damping, since, ended, stuck = self._merit(motion), 1e-3, 0, "iteration_limit", 0
+        number, before = 0, (self._gap(motion), self._violation(motion))
         while number < most:
             if is_over():
-                ended = "time limit"
+                ended = "time_limit"
                 break
-            gradient, band = self._expand(motion, soft)
-            moved, gained = None, 0.0
-            while damping <= MOST_DAMPING and moved is None:
-                step = self._step(gradient, band, damping)
-                if step is not None:
-                    trial = self.motion(self._moved(motion.q, step), soft)
-                    found = self._merit(trial)
-                    promised = -float(gradient @ step) / 2
-                    if np.isfinite(found) and merit - found > SUFFICIENT * promised:
-                        gained = merit - found
-                        moved, merit = trial, found
-                        damping = max(damping / (5 if gained > 0.5 * promised else 1.5), LEAST_DAMPING)
-                        break
-                damping *= 4
-            number += 1
-            if moved is None:
-                damping = 1e-3
-            else:
-                motion = moved
-            since += 1
-            if moved is None or gained < ENOUGH * (1 + abs(merit)) or since >= INNER:
-                gap, violation = self._gap(motion), self._violation(motion)
-                if tell:
-                    tell(f"{number} cost {self.problem.objective(motion.xs, motion.us):.4g} merit {merit:.4g} "
-                         f"gap {gap:.2g} violation {violation:.2g} penalty {self.rest_penalty:.2g} damping {damping:.1g}")
-                if gap < 1e-3 and violation < 1e-3 and gained < ENOUGH * (1 + abs(merit)):
-                    ended = "solved"
-                    break
-                self._update(motion)
-                merit, since = self._merit(motion), 0
+            moved, gained, damping = self._improved(motion, merit, soft, damping)
+            number, since = number + 1, since + 1
+            little = moved is None or gained < ENOUGH * (abs(merit) + self._size(motion))
+            if moved is not None:
+                motion, merit = moved, merit - gained
+            if not little and since < INNER:
+                continue
+            now = self._gap(motion), self._violation(motion)
+            cost = self.problem.objective(motion.xs, motion.us)
+            tell(f"relaxed step {number}: cost {cost:.6g}, gap {now[0]:.2g}, violation {now[1]:.2g}")
+            if max(now) < CLOSED and little:
+                ended = "solved"
+                break
+            stuck = stuck + 1 if max(now) > STALLED * max(before) else 0
+            if stuck >= PATIENCE:
+                ended = "inaccurate"
+                break
+            self._update(motion, before, now, grow=little)
+            merit, since, before, damping = self._merit(motion), 0, now, min(damping, 1e-3)
         cost = self.problem.objective(motion.xs, motion.us)
         return Found(motion, number, cost, self._gap(motion), self._violation(motion), ended)
+
+    def _improved(
+        self, motion: RelaxedMotion, merit: float, soft: Softness, damping: float
+    ) -> tuple[RelaxedMotion | None, float, float]:
+        """The motion after a step that lowers the merit, None where there is none; by how much; and the damping."""
+        gradient, band = self._expand(motion, soft)
+        while damping <= MOST_DAMPING:
+            step = self._step(gradient, band, damping)
+            if step is not None:
+                trial = self.motion(self._moved(motion.q, step), soft)
+                gained, promised = merit - self._merit(trial), -float(gradient @ step) / 2
+                if np.isfinite(gained) and gained > SUFFICIENT * promised:
+                    return trial, gained, max(damping / (5 if gained > 0.5 * promised else 1.5), LEAST_DAMPING)
+            damping *= 4
+        return None, 0.0, damping
 
     def motion(self, q: Array, soft: Softness) -> RelaxedMotion:
         v = self._velocities(q)
@@ -143,6 +154,13 @@ class RelaxedSearch:
         self.rest_penalty = float(np.clip(size, 1.0, 1e4))
         self.input_penalty = self.rest_penalty
         self.constraints.start(motion.xs, motion.us, cost, float(np.sum(self._rest(motion) ** 2)))
+        self.first_penalty, self.first_weight = self.rest_penalty, self.constraints.penalty
+
+    def _relent(self) -> None:
+        """Penalties no higher than a few times the first: those of the stage before are too stiff for another law."""
+        most = RELENT * self.first_penalty
+        self.rest_penalty, self.input_penalty = min(self.rest_penalty, most), min(self.input_penalty, most)
+        self.constraints.penalty = min(self.constraints.penalty, RELENT * self.first_weight)
 
     def _rest(self, motion: RelaxedMotion) -> Array:
         return (motion.tau @ self.undriven) * self.rest_scale
@@ -161,14 +179,25 @@ class RelaxedSearch:
         pushes = self._input_pushes(motion)
         return total + float(np.sum(pushes**2 - self.input_multipliers**2)) / (2 * self.input_penalty)
 
-    def _update(self, motion: RelaxedMotion) -> None:
+    def _size(self, motion: RelaxedMotion) -> float:
+        """What the merit's parts come to, which may cancel in it."""
+        return abs(self.problem.objective(motion.xs, motion.us)) + self.rest_penalty / 2 * float(
+            np.sum(self._rest(motion) ** 2)
+        )
+
+    def _update(
+        self, motion: RelaxedMotion, before: tuple[float, float], now: tuple[float, float], *, grow: bool
+    ) -> None:
+        """Better multipliers, and where the last ones did not help, higher penalties."""
         self.rest_multipliers = self.rest_multipliers + self.rest_penalty * self._rest(motion)
         self.input_multipliers = self._input_pushes(motion)
         self.constraints.update(motion.xs, motion.us)
-        if self._gap(motion) > 1e-3:
+        if not grow:
+            return
+        if now[0] > max(CLOSED, before[0] / GROWTH):
             self.rest_penalty = min(GROWTH * self.rest_penalty, LARGEST_PENALTY)
-        self.input_penalty = min(GROWTH * self.input_penalty, LARGEST_PENALTY)
-        if self.constraints.any and self.constraints.violation(motion.xs, motion.us) > 1e-4:
+        if now[1] > max(CLOSED, before[1] / GROWTH):
+            self.input_penalty = min(GROWTH * self.input_penalty, LARGEST_PENALTY)
             self.constraints.penalty = min(GROWTH * self.constraints.penalty, LARGEST_PENALTY)
 
     def _gap(self, motion: RelaxedMotion) -> float:
@@ -180,8 +209,8 @@ class RelaxedSearch:
 
     # ------------------------------------------------------------------ its expansion
 
-    def _expand(self, motion: RelaxedMotion, soft: Softness) -> tuple[Array, Array]:
-        """The gradient (N nv,) and the Hessian's lower band (3 nv, N nv) by small motions of q_1 ... q_N."""
+    def _expand(self, motion: RelaxedMotion, soft: Softness) -> tuple[Array, Band]:
+        """The gradient (N nv,) and the Hessian by small motions of q_1 ... q_N."""
         nv, n, N, h = self.nv, self.problem.model.nq, self.count, self.h
         q, v = motion.q, motion.xs[:, n:]
         forces = self.plant.forces(q[:-1], v[:-1], v[1:], soft, slopes=True)
@@ -212,7 +241,7 @@ class RelaxedSearch:
             below[i : i + N + 1] += parts[:, i + 1, :, i]
         beneath[: N + 1] += parts[:, 2, :, 0]
         keep = slice(2, N + 2)  # q_1 ... q_N; that of index 0 is before the first, 1 is the first
-        return gradient[keep].ravel(), _banded(diagonal[keep], below[keep], beneath[keep])
+        return gradient[keep].ravel(), Band(diagonal[keep], below[keep], beneath[keep])
 
     def _of_knots(self, motion: RelaxedMotion, model: Any, forces: Forces) -> tuple[Array, Array]:
         """The gradients (N+1, 3 nv) and Hessians (N+1, 3 nv, 3 nv) of the augmented cost by [dq, v, tau]."""
@@ -236,14 +265,10 @@ class RelaxedSearch:
         H[:-1, 2 * nv :, 2 * nv :] += self.rest_penalty * U @ U.T
         return g, H
 
-    def _step(self, gradient: Array, band: Array, damping: float) -> Array | None:
-        damped = np.array(band)
-        damped[0] += damping * np.maximum(band[0], 1e-8 * np.max(band[0])) + 1e-12
-        try:
-            factor = cholesky_banded(damped, lower=True, check_finite=True)
-        except (LinAlgError, ValueError):
-            return None
-        return np.asarray(cho_solve_banded((factor, True), -gradient))
+    def _step(self, gradient: Array, band: Band, damping: float) -> Array | None:
+        size = np.einsum("kii->ki", band.diagonal)
+        added = damping * np.maximum(size, SMALLEST * np.max(size)) + np.finfo(float).tiny
+        return band.plus(added).solve(-gradient.reshape(size.shape))
 
     def _moved(self, q: Array, step: Array) -> Array:
         d = step.reshape(self.count, self.nv)
@@ -285,13 +310,3 @@ def slopes_of(coordinates: Coordinates, q: Array, q_next: Array) -> tuple[Array,
         first[:, part, part] = -np.eye(3) - across - outer
         second[:, part, part] = np.eye(3) - across + outer
     return first, second
-
-
-def _banded(diagonal: Array, below: Array, beneath: Array) -> Array:
-    """The lower band (3 n, N n) of a matrix of blocks (N, n, n): its diagonal and the two below it."""
-    N, n, _ = diagonal.shape
-    column = np.concatenate([diagonal, below, beneath], axis=1)  # (N, 3 n, n) of each column of blocks
-    band = np.zeros((3 * n, N, n))
-    for j in range(n):
-        band[: 3 * n - j, :, j] = column[:, j:, j].T
-    return band.reshape(3 * n, N * n)
