@@ -19,7 +19,7 @@ from drake_diff._base.refusal import Refusal
 from drake_diff.derivatives.analytic import analytic_of, build_analytic, certified, is_own
 from drake_diff.derivatives.joint_impulses import NEAR_RIGID, JointImpulses
 from drake_diff.derivatives.polish import polished_step
-from drake_diff.exceptions import InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
+from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
 from drake_diff.model.parameters import applied, select
 
 NAMES = sorted(path.name for path in MODELS.iterdir())
@@ -142,8 +142,8 @@ def test_steps_with_other_contact_are_taken_by_others_and_named(load):
     _, _, methods = equal(model, xs, us, expected=("analytic", "autodiff"))
     assert [m != "analytic" for m in methods] == touches
     assert equal(model, xs, us, expected=set(methods), x_next=xs[1:])[2] == methods  # without Drake's steps
-    reasons = {d.method: d.reason for d in (dd.differentiate_step(model, xs[k], method="analytic") for k in (0, -1))}
-    assert reasons["analytic"] == "asked for"
+    reasons = {d.method: d.reason for d in (dd.differentiate_step(model, xs[k]) for k in (0, -1))}
+    assert reasons["analytic"] == "equal to autodiff, as certified on this model"
     assert "not analytic: the contact model is hydroelastic_with_fallback, not point" in reasons["autodiff"]
 
 
@@ -222,7 +222,7 @@ def test_other_parameters_are_never_answered_by_the_models_own(load):
     vector = select(model, {name: 2 * next(p.value for p in dd.list_parameters(model) if p.name == name)})
     with applied(vector) as heavier:
         assert isinstance(analytic_of(heavier), Refusal)
-        A, _, methods = dd.linearize(heavier, x[None], u[None], "analytic")
+        A, _, methods = dd.linearize(heavier, x[None], u[None])
         exact = dd.differentiate_step(model, x, u, parameters=vector.to_dict(), method="autodiff")
     assert "analytic" not in methods
     assert np.abs(A[0] - exact.A).max() <= SAME * np.abs(exact.A).max()
@@ -409,6 +409,8 @@ def test_a_wrong_derivative_at_a_limit_is_refused_on_the_model(monkeypatch):
     right = JointImpulses.by_motion
     monkeypatch.setattr(JointImpulses, "by_motion", lambda *a: 1.001 * right(*a))
     model = limited_pendulum()
-    found = dd.differentiate_step(model, [0.999, 2.0], [0.1], method="analytic")
+    found = dd.differentiate_step(model, [0.999, 2.0], [0.1])
     assert found.method == "autodiff"
     assert "its Jacobian with impulses differs from AutoDiffXd's" in found.reason
+    with pytest.raises(GradientError, match="its Jacobian with impulses differs from AutoDiffXd's"):
+        dd.differentiate_step(model, [0.999, 2.0], [0.1], method="analytic")

@@ -239,7 +239,7 @@ def test_a_step_derivative_that_is_one_percent_off_is_named(row, column, monkeyp
         jacobian[row, column] *= 1.01
         return jacobian
 
-    monkeypatch.setitem(module._ORDERS, "analytic", (module.AUTODIFF, module.DIFFERENCES))
+    monkeypatch.setitem(module._ORDERS, "auto", (module.AUTODIFF, module.DIFFERENCES))
     monkeypatch.setattr(module, "_by_autodiff", one_percent_off)
     solution = shoot(pendulum(num_steps=20, x_goal=[0.3, 0]), max_iterations=50)
     assert not solution.success
@@ -254,7 +254,7 @@ def test_an_honest_derivative_lets_the_same_solve_succeed():
 def test_a_wrong_derivative_is_not_believed_by_ilqr(monkeypatch):
     module = sys.modules["drake_diff.derivatives.sources"]
     honest = module._by_autodiff
-    monkeypatch.setitem(module._ORDERS, "analytic", (module.AUTODIFF, module.DIFFERENCES))
+    monkeypatch.setitem(module._ORDERS, "auto", (module.AUTODIFF, module.DIFFERENCES))
     monkeypatch.setattr(module, "_by_autodiff", lambda *args: honest(*args) * [[1, 1, 1], [1, 1, 1.01]])
     problem = pendulum(x_goal=None, num_steps=20, final_cost=dd.QuadraticCost(Q=np.eye(2), x_ref=[1, 0]))
     solution = dd.solve(problem, method="ilqr")

@@ -13,7 +13,7 @@ from pydrake.autodiffutils import InitializeAutoDiff
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.refusal import Refusal
-from drake_diff.derivatives.contact.jacobian import contact_form, contact_jacobians, material_of, place
+from drake_diff.derivatives.contact.jacobian import contact_form, contact_jacobians, material_of
 from drake_diff.derivatives.contact.material import QUANTITIES, material_change
 from drake_diff.derivatives.implicit import RESIDUAL_TOLERANCE, differentiate_equation, form_of
 from drake_diff.derivatives.polish import polished_steps
@@ -65,9 +65,10 @@ class Analytic:
             return Jacobians(values, refused, notes)
         left = np.flatnonzero(~known & (impulsive | smooth.at_a_limit(steps)))
         if len(left):
-            why = _with_impulses(smooth, steps, left, values, known, notes)
+            why, of_steps = _with_impulses(smooth, steps, left, values, known, notes)
             why = why or "something else acts beside contact, joint limits and couplers"
             refused = {k: e for k, e in refused.items() if not known[k]} | _refusals(known, left, why)
+            refused |= {k: NotSmoothError(of_step) for k, of_step in of_steps.items() if not known[k]}
         return Jacobians(values, refused, notes)
 
 
@@ -153,55 +154,80 @@ def _random_point(model: Model, coordinates: Coordinates, random: np.random.Gene
 
 
 @dataclass
-class _ContactTrial:
-    """How many steps with contact, or at joint limits alone, are still to be certified, or why none is known so."""
+class _Trial:
+    """How many steps with one kind of impulses are still to be certified, or why none is known so."""
 
     left: int = CERTIFIED_STATES
     refusal: str = ""
     note: str = ""  # by what they were certified where AutoDiffXd takes no such step
 
 
+@dataclass
+class _WithImpulses:
+    """Of the steps of a part of N in which impulses act."""
+
+    values: Array  # (N, nx, nx + nu + np)
+    known: Flags  # (N,)
+    notes: dict[int, str]
+    refused: dict[int, str]
+
+
 def _with_impulses(
     smooth: SmoothStep, steps: Steps, which: NDArray[np.intp], values: Array, known: Flags, notes: dict[int, str]
-) -> str:
+) -> tuple[str, dict[int, str]]:
     """Put the Jacobians of `which` (K,) of the N steps, in which impulses act, into `values`, and which are `known`.
 
-    Steps with contact and those at joint limits alone are certified apart. The answer is why those are not known that
-    are not, empty where the steps themselves say it.
+    The answer is why none with contact, or none at joint limits alone, is known, empty where the steps themselves say
+    it; and of single steps why.
     """
-    whys = []
-    for name, touch in (("contact", True), ("joint limits", False)):
+    whys: list[str] = []
+    refused: dict[int, str] = {}
+    for touch in (True, False):
         part = which[steps.touching[which] == touch]
         if len(part):
-            found = _certified_impulses(smooth, steps.part(part), name)
+            found = _certified_impulses(smooth, steps.part(part), touch)
             if isinstance(found, Refusal):
                 whys.append(found.reason)
             else:
-                values[part], known[part], note = found
-                notes |= {int(k): note for k in part if note}
-    return "; ".join(dict.fromkeys(whys))
+                values[part], known[part] = found.values, found.known
+                notes |= {int(part[k]): note for k, note in found.notes.items()}
+                refused |= {int(part[k]): why for k, why in found.refused.items()}
+    return "; ".join(dict.fromkeys(whys)), refused
 
 
-def _certified_impulses(smooth: SmoothStep, steps: Steps, name: str) -> tuple[Array, Flags, str] | Refusal:
-    """(N, nx, nx + nu + np) of steps, all with contact or all without, which (N,) are known, and what to note."""
+def _certified_impulses(smooth: SmoothStep, steps: Steps, touch: bool) -> _WithImpulses | Refusal:
+    """Of N steps, all with contact or all without."""
     model, vector = steps.model, steps.vector
     form = contact_form(model, smooth)
     if isinstance(form, Refusal):
         return form
-    if form.unknown and name == "contact":
+    if form.unknown and touch:
         return Refusal(form.unknown)
-    trial = model.cache(f"{name} trial", _ContactTrial, of_structure=True)
-    if trial.refusal:
-        return Refusal(trial.refusal)
-    material = material_of(model, form)
+    material, placed = material_of(model, form), form.pairs.place(steps)
     change = material_change(form.pairs, material, vector, model.double) if vector.parameters else None
-    jacobians, known = contact_jacobians(form, smooth, steps, place(form, steps), material, change)
-    for k in np.flatnonzero(known)[: trial.left]:
-        trial.refusal, trial.note = _other_jacobian(steps, k, jacobians[k])
-        if trial.refusal:
-            return Refusal(trial.refusal)
-        trial.left -= 1
-    return jacobians, known, trial.note
+    values, known, refused = contact_jacobians(form, smooth, steps, placed, material, change)
+    found = _WithImpulses(values, known, {}, refused)
+    trials: dict[str, _Trial] = model.cache("impulse trials", dict, of_structure=True)
+    own = form.pairs.kinds(placed, len(steps)) if touch else [{"joint limits"}] * len(steps)
+    for k in np.flatnonzero(found.known):
+        of_step = [trials.setdefault(kind, _Trial()) for kind in sorted(own[k])]
+        _certify(steps, int(k), found.values[k], [trial for trial in of_step if trial.left and not trial.refusal])
+        why, note = (
+            "; ".join(dict.fromkeys(filter(None, (getattr(t, of) for t in of_step)))) for of in ("refusal", "note")
+        )
+        if why:
+            found.known[k], found.refused[int(k)] = False, why
+        elif note:
+            found.notes[int(k)] = note
+    return found
+
+
+def _certify(steps: Steps, k: int, jacobian: Array, trials: list[_Trial]) -> None:
+    """Compare a step's Jacobian for the trials that are still open."""
+    if trials:
+        refusal, note = _other_jacobian(steps, k, jacobian)
+        for trial in trials:
+            trial.refusal, trial.note, trial.left = refusal, note, trial.left - 1
 
 
 def _other_jacobian(steps: Steps, k: int, jacobian: Array) -> tuple[str, str]:

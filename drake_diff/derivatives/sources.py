@@ -253,12 +253,13 @@ def _compare(trial: _Trial, steps: Steps, k: int, jacobian: Array) -> None:
 
 ANALYTIC, AUTODIFF, DIFFERENCES, IMPLICIT = Analytic(), Autodiff(), Differences(), CertifiedImplicit()
 _ORDERS: dict[str, tuple[Source, ...]] = {
-    "analytic": (ANALYTIC, IMPLICIT, AUTODIFF, DIFFERENCES),
+    "auto": (ANALYTIC, IMPLICIT, AUTODIFF, DIFFERENCES),
+    "analytic": (ANALYTIC,),
     "autodiff": (AUTODIFF,),
     "implicit": (Implicit(), AUTODIFF),
     "finite_difference": (DIFFERENCES,),
 }
-SMALL_IN_CONTACT: tuple[Source, ...] = (AUTODIFF, DIFFERENCES)
+SMALL_IN_CONTACT: tuple[Source, ...] = (AUTODIFF, ANALYTIC, DIFFERENCES)
 
 
 def check_method(method: str) -> None:
@@ -275,7 +276,7 @@ def order_of(steps: Steps, method: str, single: bool) -> tuple[Source, ...]:
         return SMALL_IN_CONTACT
     if single and is_own(steps.model):
         return (IMPLICIT, ANALYTIC, AUTODIFF, DIFFERENCES)
-    return _ORDERS["analytic"]
+    return _ORDERS["auto"]
 
 
 @dataclass(eq=False, slots=True)
@@ -302,7 +303,9 @@ def choose(steps: Steps, method: str, *, single: bool = False) -> Chosen:
 def _ask(order: tuple[Source, ...], steps: Steps, method: str, whys: list[str], error: DrakeDiffError | None) -> Chosen:
     """`whys` (N,) is what the sources before had against each step, `error` the last of it."""
     if not order:
-        if error is not None and steps.taken:
+        if steps.taken and method == ANALYTIC.name:
+            raise GradientError(f"asked for by name, the analytic derivative is not known of a step: {whys[0][:-2]}")
+        if steps.taken and error is not None:
             raise error
         return choose(take_steps(steps.model, steps.vector, steps.xs[0], steps.us, steps.xs), method)
     source = order[0]

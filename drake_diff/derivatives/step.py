@@ -61,9 +61,9 @@ def differentiate_step(
         method: Where the Jacobians come from:
 
             - "autodiff": AutoDiffXd through Drake's own step;
-            - "analytic": Pinocchio's derivatives, for smooth steps and for point contact of spheres, on a model on
-              which they were certified equal to autodiff. What they do not cover goes on as by "auto", and so do
-              derivatives by parameters other than friction, stiffness, dissipation and relaxation time;
+            - "analytic": the step's own equation, with point contact, joint limits and couplers, on a model on which it
+              was certified equal to Drake's; by parameters, friction, stiffness, dissipation and relaxation time. What
+              it does not cover is a GradientError that says why;
             - "implicit": from the equation of a smooth step; autodiff where contact or a limit acts;
             - "finite_difference": central differences of the double step, solved to rounding where contact, joint
               limits, PD controllers or couplers act and their equation is known, which the reason says;
@@ -75,7 +75,8 @@ def differentiate_step(
         `x_next` (nx,), `A` (nx, nx), `B` (nx, nu) and `C` (nx, np), with the `method` that gave them and the `reason`.
 
     Raises:
-        GradientError: The AutoDiffXd step is not the double step, or a derivative is not finite or beyond 1e8.
+        GradientError: The AutoDiffXd step is not the double step, a derivative is not finite or beyond 1e8, or there is
+            no "analytic" one, which was asked for by name.
         SimulationError: Drake cannot take the step.
         UnknownNameError: There is no such method or parameter.
         ShapeError, NonFiniteError: x or u is not the model's.
@@ -105,7 +106,7 @@ def linearize(
         model: The discrete model.
         xs: (N, nx) where the steps start, or (N+1, nx) with a last state from which no step is taken.
         us: (N, nu) the inputs [N or N m].
-        method: As of `differentiate_step`; a step that one method cannot take goes where it goes there.
+        method: As of `differentiate_step`, by "auto" of each step apart.
         x_next: (N, nx) where the steps are known to lead, which spares Drake's own. A step that is found to lead
             elsewhere is taken.
 

@@ -28,7 +28,8 @@ from drake_diff.derivatives.contact.kinematics import (
 )
 from drake_diff.derivatives.contact.laws import Cone, HuntCrossley, HuntCrossleyImpulse, Impulse, StateChange
 from drake_diff.derivatives.contact.material import Material, MaterialChange, read_material
-from drake_diff.derivatives.contact.pairs import ContactPairs, Indices, Touches, read_pairs
+from drake_diff.derivatives.contact.pairs import Indices
+from drake_diff.derivatives.contact.touching import AllPairs, Placed, read_all_pairs
 from drake_diff.derivatives.couplers import Couplers, couplers_of
 from drake_diff.derivatives.joint_impulses import JointImpulses, gather, limit_impulses
 from drake_diff.derivatives.smooth_step import Native, SmoothStep
@@ -48,7 +49,7 @@ STICTION_TOLERANCE = 1e-4
 class ContactForm:
     """What of a model with contact or joint limits does not change from step to step."""
 
-    pairs: ContactPairs
+    pairs: AllPairs
     unknown: str  # why no contact of the model is known here; empty where some is
     topology: Topology
     by_body: Array  # (bodies, nv) 1 where a degree of freedom moves the body
@@ -70,11 +71,11 @@ def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
     couplers = couplers_of(model)
     if isinstance(couplers, Refusal):
         return couplers
-    pairs, unknown = read_pairs(model), ""
+    pairs, unknown = read_all_pairs(model), ""
     if contact.model != "point":
         unknown = f"the contact model is {contact.model}, not point"
     elif not pairs.ids:
-        unknown = "no sphere may touch a sphere, box, capsule or half space"
+        unknown = "nothing of it may touch"
     topology = topology_of(describe_tree(model))
     labels = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
     return ContactForm(
@@ -107,17 +108,6 @@ def material_of(model: Model, form: ContactForm) -> Material:
     return model.cache("contact material", lambda: read_material(model.double, form.pairs))
 
 
-def place(form: ContactForm, steps: Steps) -> Array:
-    """(N, bodies, 3, 4) the poses of the bodies of the pairs at the steps' states; the context is left at the last."""
-    plant, context = steps.model.plant, steps.model.double.context
-    poses = np.empty((len(steps), len(form.pairs.bodies), 3, 4))
-    for k in range(len(steps)):
-        steps.stand_at(k)
-        for i, body in enumerate(form.pairs.bodies):
-            poses[k, i] = plant.EvalBodyPoseInWorld(context, body).GetAsMatrix34()
-    return poses
-
-
 @dataclass(frozen=True, eq=False)
 class Solved:
     """N steps with M contacts, and impulses on joints, at Drake's own solution."""
@@ -141,10 +131,18 @@ class Solved:
 
 
 def contact_jacobians(
-    form: ContactForm, smooth: SmoothStep, steps: Steps, poses: Array, material: Material, change: MaterialChange | None
-) -> tuple[Array, Flags]:
-    """(N, nx, nx + nu + np) of steps from states with the bodies at `poses`, and which (N,) are as Drake took them."""
-    at, nv = _at_the_solution(form, smooth, steps, poses, material), smooth.coordinates.nv
+    form: ContactForm,
+    smooth: SmoothStep,
+    steps: Steps,
+    placed: Placed,
+    material: Material,
+    change: MaterialChange | None,
+) -> tuple[Array, Flags, dict[int, str]]:
+    """(N, nx, nx + nu + np) of steps with the bodies `placed`, which (N,) are as Drake took them, and why some are not.
+
+    Where nothing is said of one that is not, its equation is not Drake's.
+    """
+    at, nv = _at_the_solution(form, smooth, steps, placed, material), smooth.coordinates.nv
     right = at.A @ smooth.pushed(at.native, steps.us, at.gained / smooth.time_step)
     right[:, :, :nv] += at.total(_by_motion(at))
     if isinstance(at.impulse, HuntCrossleyImpulse):
@@ -167,15 +165,17 @@ def contact_jacobians(
     # What is missing is the impulse that Drake's solver leaves, in the norm that it ends by.
     momentum = (at.A @ at.v_next[..., None])[..., 0]
     missing, had, given = (np.sqrt((p * p / at.diagonal).sum(axis=1)) for p in (at.gained - at.push, momentum, at.push))
-    return jacobians, missing <= OPTIMALITY * np.maximum(had, given) + ROUNDING
+    known = missing <= OPTIMALITY * np.maximum(had, given) + ROUNDING
+    known[list(at.contacts.unknown)] = False
+    return jacobians, known, at.contacts.unknown
 
 
-def _at_the_solution(form: ContactForm, smooth: SmoothStep, steps: Steps, poses: Array, material: Material) -> Solved:
+def _at_the_solution(form: ContactForm, smooth: SmoothStep, steps: Steps, placed: Placed, material: Material) -> Solved:
     nq = smooth.coordinates.nq
     native, v_next = smooth.into_native(steps.xs[:, :nq], steps.xs[:, nq:]), steps.x_next[:, nq:]
     S, inertia, v_star = smooth.motions(native, steps.us)
     A = mass_matrix(S, inertia, form.topology) + form.armature
-    contacts = _contacts(form, form.pairs.touching(poses), S, material)
+    contacts = _contacts(form, placed, S, material)
     state = contacts.touch.state
     diagonal, speeds = np.einsum("kii->ki", A) - form.controlled, (native.v[state], v_next[state])
     weight = contacts.weight(diagonal[state])
@@ -244,18 +244,24 @@ def _law(
     return HuntCrossley(after, approach, n, phi, w, *material_and_step)
 
 
-def _contacts(form: ContactForm, touch: Touches, S: Array, material: Material) -> Contacts:
-    own, (point, change) = S[touch.state], touch.at(material.other_part[touch.pair])
+def _contacts(form: ContactForm, placed: Placed, S: Array, material: Material) -> Contacts:
+    pairs = form.pairs
+    touch = pairs.touching(placed)
+    own, (first, second) = S[touch.state], form.by_body[pairs.sides[touch.pair].T]
     linear, angular = own[..., :3], own[..., 3:]
+    side, twists = (first - second)[..., None], linear + cross(angular, touch.middle[:, None, :])
+    unknown = pairs.complete(touch, placed, side * np.concatenate([twists, angular], axis=-1))
+    point, change = touch.at(material.other_part[touch.pair])
     return Contacts(
         touch=touch,
         moves=form.topology.moves,
-        sphere=form.by_body[form.pairs.sphere_body[touch.pair]],
-        other=form.by_body[form.pairs.other_body[touch.pair]],
+        sphere=first,
+        other=second,
         angular=angular,
         point=point,
         at_point=linear + cross(angular, point[:, None, :]),
         change=change,
+        unknown=unknown,
     )
 
 

@@ -91,6 +91,7 @@ class Contacts:
     point: Array  # (M, 3) p
     at_point: Array  # (M, nv, 3) L
     change: Array  # (M, 7, 6) of p, the normal and phi by the twist there: see `pairs.Touches`
+    unknown: dict[int, str]  # the states in which that is not known of one of them, and why
 
     @property
     def side(self) -> Array:

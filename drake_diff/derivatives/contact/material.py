@@ -13,6 +13,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.derivatives.contact.pairs import ContactPairs, Indices
+from drake_diff.derivatives.contact.touching import AllPairs
 from drake_diff.model.parameter_kinds import geometries_of
 from drake_diff.model.parameters import ParameterVector
 from drake_diff.model.plant import proximity_property
@@ -48,7 +49,7 @@ class MaterialChange:
         return MaterialChange(*(getattr(self, f.name)[pairs] for f in fields(self)))
 
 
-def read_material(twin: Twin, pairs: ContactPairs) -> Material:
+def read_material(twin: Twin, pairs: AllPairs | ContactPairs) -> Material:
     """What the context has for the pairs, parameters that are applied included; Drake fills in its defaults there."""
     inspector, geometries = twin.inspector, {i for ids in pairs.ids for i in ids}
     read = {i: [proximity_property(inspector, i, quantity) for quantity in QUANTITIES] for i in geometries}
@@ -69,7 +70,9 @@ def _harmonic(sides: Array) -> Array:
     return np.asarray(sides.prod(axis=1) / np.where(total > 0, total, 1.0))
 
 
-def material_change(pairs: ContactPairs, material: Material, vector: ParameterVector, twin: Twin) -> MaterialChange:
+def material_change(
+    pairs: AllPairs | ContactPairs, material: Material, vector: ParameterVector, twin: Twin
+) -> MaterialChange:
     """By the entries of a vector all of whose quantities are QUANTITIES."""
     by_sides = np.zeros((len(vector.values), *material.sides.shape))
     of_label = geometries_of(twin)

@@ -6,7 +6,7 @@ b = k_o / (k_s + k_o), the other shape's part of the two stiffnesses. Spheres, b
 shape: what is within R of a box, d = |e| - R where e leads from the box to c, and inside the way to the nearest face.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,11 @@ class Touches:
     phi: Array  # (M,) the signed distance, below 0 [m]
     normal: Array  # (M, 3) from the other shape to the sphere
     change: Array  # (M, 7, 6) of [middle; normal; phi], as moved with the other shape, by the sphere's twist in it
+
+    def joined(self, other: "Touches") -> "Touches":
+        """These and others."""
+        parts = ([getattr(of, f.name) for of in (self, other)] for f in fields(self))
+        return Touches(*(np.concatenate(both) for both in parts))
 
     def at(self, part: Array) -> tuple[Array, Array]:
         """Where the contacts act (M, 3), and (M, 7, 6) as `change`, of that point and by the twist there.
@@ -124,7 +129,7 @@ def read_pairs(model: Model, *, cylinders: bool = False) -> ContactPairs:
         first = 0 if isinstance(shapes[0], Sphere) else 1
         other = shapes[1 - first]
         box = _box_around(other) if cylinders and isinstance(other, Cylinder) else _rounded_box(other)
-        if not isinstance(shapes[first], Sphere) or box is None:
+        if not isinstance(shapes[first], Sphere) or box is None or not move_apart(model, pair):
             continue
         ids.append((pair[first], pair[1 - first]))
         radius.append(shapes[first].radius())
@@ -148,6 +153,13 @@ def read_pairs(model: Model, *, cylinders: bool = False) -> ContactPairs:
         rounding=np.array([rounding for _, _, rounding in boxes], dtype=float),
         is_round=np.array(rounds, dtype=bool),
     )
+
+
+def move_apart(model: Model, pair: tuple[Any, Any]) -> bool:
+    """Whether two geometries are on bodies that are not welded together, on which contact would do nothing."""
+    plant, inspector = model.plant, model.double.inspector
+    body, other = (plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in pair)
+    return all(welded.index() != body.index() for welded in plant.GetBodiesWeldedTo(other))
 
 
 def _box_around(shape: Cylinder) -> tuple[Array, Array, float]:

@@ -1,0 +1,386 @@
+"""Pairs without a sphere, as SceneGraph finds them in the double plant, and how their points of contact move.
+
+There are two ways to the derivative of what SceneGraph finds. Where it finds the deepest points themselves, it has a
+closed form. Where it does not, as between boxes and cylinders, whose contact point is that of an iteration, and where
+shapes lie flat on each other as long as only the joints between them move, SceneGraph itself is differenced along the
+motions that these joints have. Where what it finds jumps, as beside the rim of a cylinder where its iteration ends at a
+tolerance, there is no derivative, and the contact is not known.
+
+Of two shapes that overlap, A and B, with support functions s_A and s_B, Drake's normal n from B to A is where the
+overlap s_B(n) + s_A(-n) is smallest, and is -phi there. Near its deepest point p_A a shape is known by the directions F
+in which it is flat, so that the normal keeps square to them in the shape's frame and the point may slide along them,
+and by C = d p / d m, m being its outward normal: 0 at corners and edges, r of a sphere, r / sin of the rim of a
+cylinder whose axis the normal leaves by that angle. With the twist of A in B and dn the change of the normal,
+
+    d p_A = v(p_A) - C_A (dn - w x n) + F_A a,   d p_B = C_B dn + F_B b,   d p_A - d p_B = d(phi n)
+    F_A . (dn - w x n) = 0,   F_B . dn = 0,
+
+which are as many equations as there are unknowns where the smallest overlap is a proper one.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    Convex,
+    Cylinder,
+    Ellipsoid,
+    FramePoseVector,
+    GeometryFrame,
+    GeometryInstance,
+    HalfSpace,
+    Mesh,
+    ProximityProperties,
+    SceneGraph,
+    Sphere,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+
+from drake_diff._base.arrays import Array, skew
+from drake_diff.derivatives.contact.pairs import move_apart
+from drake_diff.model.model import Model
+
+Flags = NDArray[np.bool_]
+
+KINDS = (Sphere, HalfSpace, Box, Cylinder, Capsule, Ellipsoid, Convex, Mesh)
+FLAT = 1e-8  # what of a normal, a unit vector, is rounding
+SAME_POINT = 1e-9  # [m] how far the closed form's points may be from those that are found
+DIFFERENCE = 1e-5  # [m or rad] SceneGraph's iterations leave 1e-10 where they end by themselves
+SAME_SLOPE = 1e-4  # of the largest: over DIFFERENCE and twice that
+PROPER = 1e-6  # [m] the least curvature of the overlap at its smallest, and the least sine between two flat directions
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A convex shape at a pose (3, 4) in its body."""
+
+    kind: int  # in KINDS
+    size: Array  # (3,) [m] radius, half sizes, semi-axes; radius and half the length
+    vertices: Array  # (V, 3) of a mesh's hull; else none
+    pose: Array
+
+    @classmethod
+    def of(cls, inspector: Any, geometry: Any) -> "Shape | None":
+        """That of a geometry, None where it is none of KINDS."""
+        shape, size, vertices = inspector.GetShape(geometry), np.zeros(3), np.zeros((0, 3))
+        if isinstance(shape, Sphere):
+            size[0] = shape.radius()
+        elif isinstance(shape, Box):
+            size[:] = np.array(shape.size()) / 2
+        elif isinstance(shape, Cylinder | Capsule):
+            size[:2] = shape.radius(), shape.length() / 2
+        elif isinstance(shape, Ellipsoid):
+            size[:] = shape.a(), shape.b(), shape.c()
+        elif isinstance(shape, Convex | Mesh):
+            hull = inspector.GetConvexHull(geometry)
+            vertices = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
+        elif not isinstance(shape, HalfSpace):
+            return None
+        return cls(KINDS.index(type(shape)), size, vertices, inspector.GetPoseInFrame(geometry).GetAsMatrix34())
+
+    def at(self, normal: Array, flat: float) -> "Feature":
+        """What is outermost along `normal` (M, 3), in the shape's frame; what of it is below `flat` counts as 0."""
+        return _FEATURES[self.kind](self, normal, flat)
+
+
+@dataclass(frozen=True, eq=False)
+class Feature:
+    """What of a shape is outermost along M normals."""
+
+    point: Array  # (M, 3) one that is
+    flat: Array  # (M, 3, 2) unit vectors, or 0
+    curve: Array  # (M, 3, 3) C
+
+
+def _feature(normal: Array) -> Feature:
+    count = len(normal)
+    return Feature(np.zeros((count, 3)), np.zeros((count, 3, 2)), np.zeros((count, 3, 3)))
+
+
+def _round(normal: Array) -> Array:
+    """(M, 3, 3) 1 - n n'."""
+    return np.eye(3) - normal[:, :, None] * normal[:, None, :]
+
+
+def _sphere(shape: Shape, normal: Array, flat: float) -> Feature:
+    radius = shape.size[0]
+    return Feature(radius * normal, np.zeros((len(normal), 3, 2)), radius * _round(normal))
+
+
+def _half_space(shape: Shape, normal: Array, flat: float) -> Feature:
+    found = _feature(normal)
+    found.flat[:] = np.eye(3)[:, :2]
+    return found
+
+
+def _box(shape: Shape, normal: Array, flat: float) -> Feature:
+    found, zero = _feature(normal), np.abs(normal) < flat
+    found.point[:] = np.where(zero, 0.0, np.sign(normal) * shape.size)
+    which, axis = np.nonzero(zero)
+    found.flat[which, axis, np.cumsum(zero, axis=1)[which, axis] - 1] = 1.0
+    return found
+
+
+def _cylinder(shape: Shape, normal: Array, flat: float) -> Feature:
+    found, (radius, half, _) = _feature(normal), shape.size
+    across = np.sqrt((normal[:, :2] ** 2).sum(axis=1))
+    cap, side = across < flat, np.abs(normal[:, 2]) < flat
+    out = normal[:, :2] / np.where(cap, 1.0, across)[:, None]
+    found.point[:, :2] = np.where(cap[:, None], 0.0, radius * out)
+    found.point[:, 2] = np.where(side, 0.0, np.sign(normal[:, 2]) * half)
+    found.flat[cap] = np.eye(3)[:, :2]
+    found.flat[side, 2, 0] = 1.0
+    along = np.stack([-out[:, 1], out[:, 0], np.zeros(len(out))], axis=1)
+    found.curve[:] = (
+        along[:, :, None] * along[:, None, :] * np.where(cap, 0.0, radius / np.where(cap, 1.0, across))[:, None, None]
+    )
+    return found
+
+
+def _capsule(shape: Shape, normal: Array, flat: float) -> Feature:
+    found, (radius, half, _) = _feature(normal), shape.size
+    side = np.abs(normal[:, 2]) < flat
+    found.point[:] = radius * normal
+    found.point[:, 2] += np.where(side, 0.0, np.sign(normal[:, 2]) * half)
+    found.flat[side, 2, 0] = 1.0
+    found.curve[:] = radius * _round(normal)
+    found.curve[side, 2] = found.curve[side, :, 2] = 0.0
+    return found
+
+
+def _ellipsoid(shape: Shape, normal: Array, flat: float) -> Feature:
+    found, square = _feature(normal), shape.size**2
+    size = np.sqrt((square * normal**2).sum(axis=1))
+    found.point[:] = square * normal / size[:, None]
+    found.curve[:] = (np.diag(square) - found.point[:, :, None] * found.point[:, None, :]) / size[:, None, None]
+    return found
+
+
+def _mesh(shape: Shape, normal: Array, flat: float) -> Feature:
+    found = _feature(normal)
+    heights = normal @ shape.vertices.T
+    extent = float(np.ptp(shape.vertices, axis=0).max())
+    for i, row in enumerate(heights):
+        top = shape.vertices[row >= row.max() - flat * extent]
+        found.point[i] = top.mean(axis=0)
+        edges = top[1:] - top[0]
+        if len(edges):
+            first = edges[np.argmax((edges**2).sum(axis=1))]
+            first = first / np.linalg.norm(first)
+            rest = edges - np.outer(edges @ first, first)
+            second = rest[np.argmax((rest**2).sum(axis=1))]
+            size = float(np.linalg.norm(second))
+            found.flat[i, :, 0] = first
+            if size > PROPER * extent:
+                found.flat[i, :, 1] = second / size
+    return found
+
+
+_FEATURES = (_sphere, _half_space, _box, _cylinder, _capsule, _ellipsoid, _mesh, _mesh)
+
+
+@dataclass(frozen=True, eq=False)
+class WitnessPairs:
+    """Q pairs of which SceneGraph says where they touch."""
+
+    ids: tuple[tuple[Any, Any], ...]
+    bodies: tuple[tuple[Any, Any], ...]  # Drake's
+    shapes: tuple[tuple[Any, Any], ...]  # Drake's
+    known: tuple[tuple[Shape | None, Shape | None], ...]
+    scenes: dict[int, "PairScene"]  # made when they are first asked
+
+    def find(self, model: Model) -> list[tuple[int, Array]]:
+        """Those that overlap in the state of the double twin, and the middle, the normal and phi (7,) of each."""
+        order = {pair: (i, 1.0) for i, pair in enumerate(self.ids)}
+        order |= {(b, a): (i, -1.0) for (a, b), (i, _) in order.items()}
+        query = model.plant.get_geometry_query_input_port().Eval(model.double.context)
+        found = []
+        for of in query.ComputePointPairPenetration():
+            if (of.id_A, of.id_B) in order:
+                i, sign = order[of.id_A, of.id_B]
+                middle = (of.p_WCa + of.p_WCb) / 2
+                found.append((i, np.concatenate([middle, sign * of.nhat_BA_W, [-of.depth]])))
+        return found
+
+    def change(self, pair: int, poses: tuple[Array, Array], of: Array, twists: Array) -> tuple[Array, Flags]:
+        """(M, 7, 6) of `pairs.Touches`, and which (M,) are known, of M overlaps `of` (M, 7) of one pair.
+
+        With the bodies at `poses` (M, 3, 4) each, and the twists (M, nv, 6) of the first in the second at the middle.
+        """
+        a, b = self.known[pair]
+        if a is None or b is None:
+            return np.zeros((len(of), 7, 6)), np.zeros(len(of), dtype=bool)
+        placed = _times(poses[0], a.pose), _times(poses[1], b.pose)
+        change, known = overlap_change(a, b, Overlaps(placed, of[:, :3], of[:, 3:6], of[:, 6]))
+        for k in np.flatnonzero(~known):
+            if pair not in self.scenes:
+                self.scenes[pair] = PairScene(*self.shapes[pair])
+            R, X_a, X_b = placed[1][k, :, :3], RigidTransform(placed[0][k]), RigidTransform(placed[1][k])
+            own = np.concatenate([twists[k, :, :3] @ R, twists[k, :, 3:] @ R], axis=1)
+            local = self.scenes[pair].change(X_b.inverse() @ X_a, own[np.abs(own).max(axis=1) > FLAT])
+            if local is not None:
+                known[k] = True
+                turned = np.concatenate([local[:, :3] @ R.T, local[:, 3:] @ R.T], axis=1)
+                change[k] = np.concatenate([R @ turned[:3], R @ turned[3:6], turned[6:]])
+        return change, known
+
+
+def _times(pose: Array, other: Array) -> Array:
+    """(M, 3, 4) of poses (M, 3, 4) and a pose (3, 4) in them."""
+    R = pose[:, :, :3]
+    at = (R @ other[:, 3])[..., None] + pose[:, :, 3:]
+    return np.concatenate([R @ other[:, :3], at], axis=2)
+
+
+def read_witness_pairs(model: Model, without: set[tuple[Any, Any]]) -> WitnessPairs:
+    """The pairs of `model` that may move against each other and are not among `without`."""
+    inspector, plant = model.double.inspector, model.plant
+    ids = []
+    for pair in sorted(inspector.GetCollisionCandidates()) if inspector is not None else ():
+        if not {pair, pair[::-1]} & without and move_apart(model, pair):
+            ids.append(pair)
+    bodies = tuple(tuple(plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in pair) for pair in ids)
+    shapes = tuple((inspector.GetShape(a), inspector.GetShape(b)) for a, b in ids)
+    known = tuple((Shape.of(inspector, a), Shape.of(inspector, b)) for a, b in ids)
+    return WitnessPairs(tuple(ids), bodies, shapes, known, {})
+
+
+@dataclass(frozen=True, eq=False)
+class Overlaps:
+    """M overlaps of two shapes, as Drake found them, in world."""
+
+    poses: tuple[Array, Array]  # (M, 3, 4) of the shapes A and B
+    middle: Array  # (M, 3) half way between their deepest points
+    normal: Array  # (M, 3) from B to A
+    phi: Array  # (M,)
+
+
+def overlap_change(a: Shape, b: Shape, of: Overlaps) -> tuple[Array, Flags]:
+    """(M, 7, 6) of `pairs.Touches`, and which (M,) are known: those at whose points the overlap is the smallest."""
+    n = of.normal
+    sides = []
+    for shape, pose, out, sign in ((a, of.poses[0], -n, 0.5), (b, of.poses[1], n, -0.5)):
+        R = pose[:, :, :3]
+        local = (out[:, None, :] @ R)[:, 0]
+        feature = shape.at(local, FLAT)
+        point = (R @ feature.point[:, :, None])[..., 0] + pose[:, :, 3]
+        flat, curve = R @ feature.flat, R @ feature.curve @ R.swapaxes(-1, -2)
+        touching = of.middle + sign * of.phi[:, None] * n
+        sides.append((point - touching, flat, curve))
+    (off_a, F_a, C_a), (off_b, F_b, C_b) = sides
+    tangent = _tangent(n)
+    T_t = tangent.swapaxes(-1, -2)
+    f_a, f_b = T_t @ F_a, T_t @ F_b
+    H = T_t @ (C_a + C_b) @ tangent + of.phi[:, None, None] * np.eye(2)
+    left, known = _system(H, f_a, f_b)
+    for off, F in ((off_a, F_a), (off_b, F_b)):
+        beside = off - (F @ (F.swapaxes(-1, -2) @ off[:, :, None]))[..., 0]
+        known &= (np.abs(beside) <= SAME_POINT).all(axis=1)
+    turn = -skew(n)  # w x n
+    at_a = np.zeros((len(n), 3, 6))
+    at_a[..., :3], at_a[..., 3:] = np.eye(3), -skew(of.phi[:, None] / 2 * n)
+    at_a[..., 3:] += C_a @ turn
+    right = np.zeros((len(n), 6, 6))
+    right[:, :2] = T_t @ at_a
+    right[:, 2:4, 3:] = f_a.swapaxes(-1, -2) @ T_t @ turn
+    left[~known] = np.eye(6)
+    found = np.linalg.solve(left, right)
+    normal = tangent @ found[:, :2]
+    point_a = at_a - C_a @ normal + F_a @ found[:, 2:4]
+    point_b = C_b @ normal + F_b @ found[:, 4:]
+    change = np.concatenate([(point_a + point_b) / 2, normal, np.zeros((len(n), 1, 6))], axis=1)
+    change[:, 6, :3] = n
+    return change, known
+
+
+def _system(H: Array, f_a: Array, f_b: Array) -> tuple[Array, Flags]:
+    """(M, 6, 6) of dn in the tangent plane, a and b, and where (M,) it belongs to a smallest overlap."""
+    count = len(H)
+    left = np.zeros((count, 6, 6))
+    left[:, :2, :2] = H
+    left[:, :2, 2:4], left[:, :2, 4:] = -f_a, f_b
+    left[:, 2:4, :2], left[:, 4:, :2] = f_a.swapaxes(-1, -2), f_b.swapaxes(-1, -2)
+    flats = np.concatenate([f_a, f_b], axis=2)
+    used = np.abs(flats).max(axis=1) > 0
+    which, column = np.nonzero(~used)
+    left[which, 2 + column, 2 + column] = 1.0
+    number = used.sum(axis=1)
+    gram = flats @ flats.swapaxes(-1, -2)  # (M, 2, 2) of the flat directions
+    size, axes = np.linalg.eigh(gram)
+    proper = np.zeros(count, dtype=bool)
+    proper[number == 0] = np.linalg.eigvalsh(H[number == 0])[:, 0] > PROPER
+    free = axes[:, :, 0]  # square to the one flat direction
+    along = (free[:, None, :] @ H @ free[:, :, None])[:, 0, 0]
+    proper[number == 1] = along[number == 1] > PROPER
+    proper[number == 2] = size[number == 2, 0] > PROPER
+    return left, proper
+
+
+def _tangent(normal: Array) -> Array:
+    """(M, 3, 2) two unit vectors square to each normal (M, 3) and to each other."""
+    other = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
+    first = np.cross(normal, other)
+    first /= np.sqrt((first**2).sum(axis=1))[:, None]
+    return np.stack([first, np.cross(normal, first)], axis=2)
+
+
+class PairScene:
+    """Two shapes alone, of which SceneGraph is asked what it finds of them."""
+
+    def __init__(self, a: Any, b: Any) -> None:
+        """Of Drake's shapes."""
+        scene_graph = SceneGraph()
+        source = scene_graph.RegisterSource("pair")
+        self._frame = scene_graph.RegisterFrame(source, GeometryFrame("a"))
+        moving = GeometryInstance(RigidTransform(), a, "a")
+        self._a = scene_graph.RegisterGeometry(source, self._frame, moving)
+        b = scene_graph.RegisterAnchoredGeometry(source, GeometryInstance(RigidTransform(), b, "b"))
+        for geometry in (self._a, b):
+            scene_graph.AssignRole(source, geometry, ProximityProperties())
+        self._scene_graph, self._context = scene_graph, scene_graph.CreateDefaultContext()
+        self._poses, self._port = FramePoseVector(), scene_graph.get_source_pose_port(source)
+
+    def find(self, pose: RigidTransform) -> Array:
+        """(7,) the middle, the normal and phi in b's frame with a at `pose` in it; NaN where they do not overlap."""
+        self._poses.set_value(self._frame, pose)
+        self._port.FixValue(self._context, self._poses)
+        found = self._scene_graph.get_query_output_port().Eval(self._context).ComputePointPairPenetration()
+        if not found:
+            return np.full(7, np.nan)
+        sign = 1.0 if found[0].id_A == self._a else -1.0
+        middle = (found[0].p_WCa + found[0].p_WCb) / 2
+        return np.concatenate([middle, sign * found[0].nhat_BA_W, [-found[0].depth]])
+
+    def change(self, pose: RigidTransform, twists: Array) -> Array | None:
+        """(7, 6) the derivative along the span of `twists` (K, 6) of a at the middle, 0 across it; None where none is.
+
+        All in b's frame. Where the shapes turn about one direction alone it does not matter where along it they touch:
+        that of the middle is 0 there, also where SceneGraph leaves it to rounding, as between a face and a cylinder.
+        """
+        here = self.find(pose)
+        _, sizes, directions = np.linalg.svd(twists, full_matrices=False)
+        change, matters = np.zeros((7, 6)), np.eye(7)
+        _, turns, axes = np.linalg.svd(twists[:, 3:], full_matrices=True)
+        if not (turns[1:] > FLAT * max(1.0, float(turns[0]))).any():
+            matters[:3, :3] -= np.outer(axes[0], axes[0])
+        for direction in directions[sizes > SAME_SLOPE * max(1.0, float(sizes[0]))]:
+            near, far = (
+                matters @ (self._moved(pose, here, d * direction) - self._moved(pose, here, -d * direction)) / (2 * d)
+                for d in (DIFFERENCE, 2 * DIFFERENCE)
+            )
+            if not np.abs(near - far).max() <= SAME_SLOPE * max(1.0, float(np.abs(near).max())):
+                return None
+            change += near[:, None] * direction
+        return change
+
+    def _moved(self, pose: RigidTransform, here: Array, motion: Array) -> Array:
+        """What is found after a small motion (6,) of a, about the middle."""
+        angle = float(np.linalg.norm(motion[3:]))
+        R = RotationMatrix(AngleAxis(angle, motion[3:] / angle)) if angle else RotationMatrix()
+        at = R @ (pose.translation() - here[:3]) + here[:3] + motion[:3]
+        return self.find(RigidTransform(R @ pose.rotation(), at))
