@@ -9,7 +9,7 @@ dq being the small motion that a velocity makes. Drake weighs friction by w = |W
 A the mass matrix with what joint damping adds in a step.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -91,7 +91,7 @@ class Contacts:
     point: Array  # (M, 3) p
     at_point: Array  # (M, nv, 3) L
     change: Array  # (M, 7, 6) of p, the normal and phi by the twist there: see `pairs.Touches`
-    unknown: dict[int, str]  # the states in which that is not known of one of them, and why
+    unknown: dict[int, str] = field(default_factory=dict)  # the states in which that is not known of one of them, and why
 
     @property
     def side(self) -> Array:
