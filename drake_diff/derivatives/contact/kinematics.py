@@ -91,7 +91,7 @@ class Contacts:
     point: Array  # (M, 3) p
     at_point: Array  # (M, nv, 3) L
     change: Array  # (M, 7, 6) of p, the normal and phi by the twist there: see `pairs.Touches`
-    unknown: dict[int, str] = field(default_factory=dict)  # the states in which that is not known of one of them, and why
+    unknown: dict[int, str] = field(default_factory=dict)  # the states of which that is not known
 
     @property
     def side(self) -> Array:
