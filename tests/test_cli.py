@@ -14,6 +14,7 @@ from helpers.models import ROOT
 from helpers.table import each_row
 
 import drake_diff as dd
+from drake_diff._base.compiled import has_numba
 from drake_diff.cli import main as cli
 from drake_diff.cli.text import as_options
 from drake_diff.derivatives.methods import METHODS
@@ -326,7 +327,10 @@ def test_arguments_are_typed_as_options():
 
 def test_the_version_is_that_of_the_installation(tmp_path):
     done = drake_diff("--version", cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (0, f"drake-diff {metadata.version('drake-diff')}\n")
+    version, computes = done.stdout.splitlines()
+    assert (done.returncode, version) == (0, f"drake-diff {metadata.version('drake-diff')}")
+    assert computes.startswith("Steps with contact are differentiated by ")
+    assert ("compiled functions (Numba " in computes) == has_numba()
 
 
 def test_without_an_installation_there_is_no_version(monkeypatch, capsys):

@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.forms import both_forms
 from helpers.robots import example_robot, state_in_contact
 from helpers.table import each_row
 
 import drake_diff as dd
+from drake_diff._base import compiled as of_numba
 from drake_diff.derivatives import analytic
 from drake_diff.derivatives.contact import laws as friction_cone
 from drake_diff.derivatives.contact import witness
@@ -19,6 +21,7 @@ from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.step import set_state
 
 pytest.importorskip("pinocchio")
+pytest.importorskip("numba")
 
 MATERIAL = (
     "<drake:proximity_properties><drake:point_contact_stiffness>{k}</drake:point_contact_stiffness>"
@@ -101,6 +104,9 @@ def _agree(model, x, u):
     assert ours.method == "analytic", ours.reason
     # Both are right to rounding, which near-rigid contact and the inverse of a mass matrix magnify.
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-9 * np.abs(exact).max())
+    for jacobians, known in both_forms(model, x, u):
+        assert known.all()
+        np.testing.assert_allclose(jacobians[0], exact, rtol=0, atol=1e-9 * np.abs(exact).max())
 
 
 def _contacts(model):
@@ -506,6 +512,7 @@ def test_what_autodiff_does_not_step_is_certified_by_differences(tmp_path, monke
     assert d.method == "analytic", d.reason
     assert "equal to the differences of the step solved to rounding, as AutoDiffXd takes no such step" in d.reason
     assert np.abs(d.A - by_differences.A).max() <= 1e-6 * np.abs(d.A).max()
+    monkeypatch.setattr(of_numba, "has_numba", lambda: False)
     right = JointImpulses.by_motion
     monkeypatch.setattr(JointImpulses, "by_motion", lambda *a: 1.001 * right(*a))
     with pytest.raises(GradientError, match="differs from the differences of the step solved to rounding"):

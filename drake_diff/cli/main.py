@@ -26,10 +26,21 @@ def _print_version(asked: bool) -> None:
     if not asked:
         return
     try:
-        typer.echo(f"drake-diff {version('drake-diff')}")
+        typer.echo(f"drake-diff {version('drake-diff')}\n{_what_computes()}")
     except PackageNotFoundError as error:
         raise MissingDependencyError("drake-diff runs from a folder and is not installed: pip install -e .") from error
     raise typer.Exit
+
+
+def _what_computes() -> str:
+    """Whether the derivatives of steps with contact are compiled."""
+    from importlib.metadata import version
+
+    from drake_diff._base.compiled import has_numba
+
+    if has_numba():
+        return f"Steps with contact are differentiated by compiled functions (Numba {version('numba')})"
+    return "Steps with contact are differentiated by NumPy; the extra `fast` compiles them"
 
 
 @app.callback()

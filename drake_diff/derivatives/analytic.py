@@ -203,9 +203,9 @@ def _certified_impulses(smooth: SmoothStep, steps: Steps, touch: bool) -> _WithI
         return form
     if form.unknown and touch:
         return Refusal(form.unknown)
-    material, placed = material_of(model, form), form.pairs.place(steps)
+    material = material_of(model, form)
     change = material_change(form.pairs, material, vector, model.double) if vector.parameters else None
-    values, known, refused = contact_jacobians(form, smooth, steps, placed, material, change)
+    values, known, refused, placed = contact_jacobians(form, smooth, steps, material, change)
     found = _WithImpulses(values, known, {}, refused)
     trials: dict[str, _Trial] = model.cache("impulse trials", dict, of_structure=True)
     own = form.pairs.kinds(placed, len(steps)) if touch else [{"joint limits"}] * len(steps)

@@ -89,7 +89,7 @@ class SmoothStep:
         if not c.free:
             return self._fixed(xs, us)
         q, v = xs[:, : c.nq], xs[:, c.nq :]
-        force, clipped = self._force(q, v, us)
+        force, clipped = self.force_of(q, v, us)
         native = self.into_native(q, v)
         solved = self.dynamics.accelerate(native.q_native, native.v_native, force)
         return self.assemble(native, *self._velocities(native, solved, clipped))
@@ -99,7 +99,7 @@ class SmoothStep:
         n, h = self.coordinates.nv, self.time_step
         nx, nu = 2 * n, us.shape[1]
         q, v = xs[:, :n], xs[:, n:]
-        force, clipped = self._force(q, v, us)
+        force, clipped = self.force_of(q, v, us)
         by_q, by_v, inverse, a = self.dynamics.accelerate(q, v, force)
         jacobians = np.empty((len(xs), nx, nx + nu))
         upper, lower = jacobians[:, :n], jacobians[:, n:]
@@ -119,7 +119,7 @@ class SmoothStep:
         ahead = steps.xs[:, self.positions] + 2 * self.time_step * v_next
         return np.asarray(((ahead <= self.limits[0]) | (ahead >= self.limits[1])).any(axis=1))
 
-    def _force(self, q: Array, v: Array, us: Array) -> tuple[Array, NDArray[np.bool_] | None]:
+    def force_of(self, q: Array, v: Array, us: Array) -> tuple[Array, NDArray[np.bool_] | None]:
         """(N, nv) B u + c - K q - D v, and which inputs (N, nu) are clipped, None where none is."""
         clipped = np.abs(us) > self.limit
         some = bool(clipped.any())
@@ -169,7 +169,7 @@ class SmoothStep:
 
         And (N, nv, 6, 6) the spatial inertia of what it carries, and v' (N, nv) were the step smooth.
         """
-        force, _ = self._force(at.q, at.v, us)
+        force, _ = self.force_of(at.q, at.v, us)
         S, inertia, native = self.dynamics.motions(at.q_native, at.v_native, force)
         return at.Q.swapaxes(-1, -2) @ S, inertia, self._v_next(at, native)
 
@@ -181,7 +181,7 @@ class SmoothStep:
     def pushed(self, at: Native, us: Array, push: Array) -> Array:
         """The derivative of v' as `assemble` takes it, of steps under further generalized forces `push` (N, nv)."""
         c = self.coordinates
-        force, clipped = self._force(at.q, at.v, us)
+        force, clipped = self.force_of(at.q, at.v, us)
         force = force + push
         solved = self.dynamics.accelerate(at.q_native, at.v_native, (at.Q @ force[..., None])[..., 0])
         velocities, _ = self._velocities(at, solved, clipped)

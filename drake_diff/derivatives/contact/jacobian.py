@@ -18,6 +18,8 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, cross
 from drake_diff._base.refusal import Refusal
+from drake_diff.derivatives.contact import laws
+from drake_diff.derivatives.contact.compiled import CompiledForm, compiled_form
 from drake_diff.derivatives.contact.kinematics import (
     Contacts,
     Topology,
@@ -41,8 +43,6 @@ from drake_diff.model.plant import bodies, labelled
 # Of the momentum: Drake's solver ends at 1e-6 of it, in the same norm.
 OPTIMALITY = 2e-6
 ROUNDING = 1e-12
-# Drake's default [m/s], which it does not give back: another one shows in what it leaves unsolved.
-STICTION_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +59,7 @@ class ContactForm:
     time_step: float
     near_rigid: float
     couplers: Couplers
+    compiled: CompiledForm | None  # the same for compiled functions; None where there are none of the model
 
 
 def contact_form(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
@@ -76,21 +77,34 @@ def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
         unknown = f"the contact model is {contact.model}, not point"
     elif not pairs.ids:
         unknown = "nothing of it may touch"
-    topology = topology_of(describe_tree(model))
+    description = describe_tree(model)
+    topology = topology_of(description)
     labels = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
+    found = [topology.bodies[labels.get(body.index(), "world")] for body in pairs.bodies]
+    by_body, controlled = np.array(found).reshape(-1, model.nv), _of_controllers(smooth)
+    near_rigid = float(model.plant.get_sap_near_rigid_threshold())
     return ContactForm(
         pairs=pairs,
         unknown=unknown,
         topology=topology,
-        by_body=np.array([topology.bodies[labels.get(body.index(), "world")] for body in pairs.bodies]).reshape(
-            -1, model.nv
-        ),
+        by_body=by_body,
         armature=np.diag(smooth.dynamics.armature),
-        controlled=_of_controllers(smooth),
+        controlled=controlled,
         approximation=contact.approximation,
         time_step=model.time_step,
-        near_rigid=float(model.plant.get_sap_near_rigid_threshold()),
+        near_rigid=near_rigid,
         couplers=couplers,
+        compiled=compiled_form(
+            model,
+            smooth,
+            description,
+            pairs=pairs,
+            by_body=by_body,
+            moves=topology.moves,
+            controlled=controlled,
+            couplers=couplers,
+            near_rigid=near_rigid,
+        ),
     )
 
 
@@ -131,17 +145,30 @@ class Solved:
 
 
 def contact_jacobians(
-    form: ContactForm,
-    smooth: SmoothStep,
-    steps: Steps,
-    placed: Placed,
-    material: Material,
-    change: MaterialChange | None,
-) -> tuple[Array, Flags, dict[int, str]]:
-    """(N, nx, nx + nu + np) of steps with the bodies `placed`, which (N,) are as Drake took them, and why some are not.
+    form: ContactForm, smooth: SmoothStep, steps: Steps, material: Material, change: MaterialChange | None
+) -> tuple[Array, Flags, dict[int, str], Placed]:
+    """(N, nx, nx + nu + np) of steps, which (N,) are as Drake took them, why some are not, and where the bodies are.
 
     Where nothing is said of one that is not, its equation is not Drake's.
     """
+    if form.compiled is None or change is not None:
+        return numpy_jacobians(form, smooth, steps, material, change)
+    jacobians, sizes, unknown, placed = form.compiled(smooth, steps, form.pairs, material)
+    known = _is_solved(*sizes.T) & np.isfinite(jacobians).all(axis=(1, 2))
+    known[list(unknown)] = False
+    return jacobians, known, unknown, placed
+
+
+def _is_solved(missing: Array, had: Array, given: Array) -> Flags:
+    """Whether the momentum that the impulses do not account for is what Drake's solver leaves, in its norm."""
+    return np.asarray(missing <= OPTIMALITY * np.maximum(had, given) + ROUNDING)
+
+
+def numpy_jacobians(
+    form: ContactForm, smooth: SmoothStep, steps: Steps, material: Material, change: MaterialChange | None
+) -> tuple[Array, Flags, dict[int, str], Placed]:
+    """`contact_jacobians` without compiled functions; the context is left at the last state."""
+    placed = form.pairs.place(steps)
     at, nv = _at_the_solution(form, smooth, steps, placed, material), smooth.coordinates.nv
     right = at.A @ smooth.pushed(at.native, steps.us, at.gained / smooth.time_step)
     right[:, :, :nv] += at.total(_by_motion(at))
@@ -162,12 +189,10 @@ def contact_jacobians(
         left += _sum(joints.problem, stiff, len(steps))
     velocities = np.asarray(np.linalg.solve(left, right), dtype=float)
     jacobians, _ = smooth.assemble(at.native, velocities, at.v_next)
-    # What is missing is the impulse that Drake's solver leaves, in the norm that it ends by.
     momentum = (at.A @ at.v_next[..., None])[..., 0]
-    missing, had, given = (np.sqrt((p * p / at.diagonal).sum(axis=1)) for p in (at.gained - at.push, momentum, at.push))
-    known = missing <= OPTIMALITY * np.maximum(had, given) + ROUNDING
+    known = _is_solved(*(np.sqrt((p * p / at.diagonal).sum(axis=1)) for p in (at.gained - at.push, momentum, at.push)))
     known[list(at.contacts.unknown)] = False
-    return jacobians, known, at.contacts.unknown
+    return jacobians, known, at.contacts.unknown, placed
 
 
 def _at_the_solution(form: ContactForm, smooth: SmoothStep, steps: Steps, placed: Placed, material: Material) -> Solved:
@@ -240,7 +265,7 @@ def _law(
         return Cone(after, touch.normal, touch.phi, weight.value, friction, stiffness, time, h, form.near_rigid)
     approach, n, phi, w = (before * touch.normal).sum(axis=-1), touch.normal, touch.phi, weight.value
     dissipation, lagged = material.dissipation[pair], form.approximation == "lagged"
-    material_and_step = friction, stiffness, dissipation, h, STICTION_TOLERANCE, lagged
+    material_and_step = friction, stiffness, dissipation, h, laws.STICTION_TOLERANCE, lagged
     return HuntCrossley(after, approach, n, phi, w, *material_and_step)
 
 

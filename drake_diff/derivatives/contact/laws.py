@@ -31,6 +31,8 @@ from drake_diff._base.arrays import Array
 from drake_diff.derivatives.contact.material import MaterialChange
 
 SIGMA = 1e-3  # Drake's, of both papers: regularizes friction so that a contact sticks up to a creep
+# Drake's default [m/s], which it does not give back: another one shows in what it leaves unsolved.
+STICTION_TOLERANCE = 1e-4
 SOFT_NORM = 1e-7  # s [N s], Drake's: keeps the norm of an impulse of 0 differentiable
 
 

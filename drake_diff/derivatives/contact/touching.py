@@ -32,20 +32,24 @@ class AllPairs:
     spheres: ContactPairs
     others: WitnessPairs
 
-    def place(self, steps: Steps) -> Placed:
-        """At the steps' states; the context is left at the last."""
-        model = steps.model
-        plant, context = model.plant, model.double.context
-        poses = np.empty((len(steps), len(self.bodies), 3, 4))
+    def place(self, steps: Steps, poses: Array | None = None) -> Placed:
+        """At the steps' states, where the bodies are at `poses` (N, bodies, 3, 4) if that is known."""
+        asks = steps.touching & bool(self.others.ids)
         found: list[tuple[int, int, Array]] = []
-        for k in range(len(steps)):
+        poses, read = (np.empty((len(steps), len(self.bodies), 3, 4)), True) if poses is None else (poses, False)
+        for k in range(len(steps)) if read else np.flatnonzero(asks).tolist():
             steps.stand_at(k)
-            for i, body in enumerate(self.bodies):
-                poses[k, i] = plant.EvalBodyPoseInWorld(context, body).GetAsMatrix34()
-            if self.others.ids and steps.touching[k]:
-                found += [(k, len(self.spheres.ids) + i, of) for i, of in self.others.find(model)]
+            if read:
+                self._read_poses(steps.model, poses[k])
+            if asks[k]:
+                found += [(k, len(self.spheres.ids) + i, of) for i, of in self.others.find(steps.model)]
         state, pair = (np.array([row[i] for row in found], dtype=np.intp) for i in (0, 1))
         return Placed(poses, state, pair, np.array([of for *_, of in found]).reshape(-1, 7))
+
+    def _read_poses(self, model: Model, poses: Array) -> None:
+        """The bodies' (bodies, 3, 4), from Drake, where the double twin stands."""
+        for i, body in enumerate(self.bodies):
+            poses[i] = model.plant.EvalBodyPoseInWorld(model.double.context, body).GetAsMatrix34()
 
     def kinds(self, placed: Placed, count: int) -> list[set[str]]:
         """Of each of `count` states with contact what kinds of shapes touch: spheres, or two others by their names."""

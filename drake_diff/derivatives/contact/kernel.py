@@ -1,0 +1,561 @@
+"""What contacts, joint limits and couplers change of a step's Jacobian, state by state: compiled.
+
+The formulas are those of `jacobian`, `kinematics`, `laws` and `joint_impulses`, which say what they are. What is of one
+contact is done in one pass, where NumPy goes through memory once for each sum. Kept apart as Numba compiles what is in
+here.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_diff._base.compiled import compiled
+
+Array = NDArray[np.float64]
+Whole = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+SAP, SIMILAR, LAGGED = 0, 1, 2
+
+
+class Touching(NamedTuple):
+    """M contacts, those of state k from first[k] to first[k + 1]; see `kinematics.Contacts`."""
+
+    first: Whole  # (N + 1,)
+    sphere: Array  # (M, nv)
+    other: Array  # (M, nv)
+    point: Array  # (M, 3)
+    normal: Array  # (M, 3)
+    phi: Array  # (M,)
+    change: Array  # (M, 7, 6)
+    friction: Array  # (M,)
+    stiffness: Array  # (M,)
+    time: Array  # (M,)
+    dissipation: Array  # (M,)
+
+
+class Plant(NamedTuple):
+    """What of a model does not change from step to step."""
+
+    time_step: float
+    law: int
+    near_rigid: float
+    constants: tuple[float, float, float]  # SIGMA, SOFT_NORM and STICTION_TOLERANCE
+    joint_constants: tuple[float, float, float]  # NEAR_RIGID, LIMIT_STIFFNESS and LIMIT_WINDOW
+    moves: Array  # (nv, nv) j the axis of k
+    armature: Array  # (nv,)
+    controlled: Array  # (nv,) what of it is of controllers
+    stiffness: Array  # (nv,) of springs
+    damping: Array  # (nv,)
+    actuation: Array  # (nv, nu)
+    limits: Array  # (2, nv)
+    couplers: Array  # (K, nv)
+    offsets: Array  # (K,)
+    free: Whole  # (bodies, 2) where free bodies begin in q and in v
+    single: Whole  # (joints, 2) the places of the others in q and in v
+
+
+@compiled
+def _law(
+    law: int,
+    h: float,
+    beta: float,
+    constants: tuple[float, float, float],
+    n: Array,
+    phi: float,
+    mu: float,
+    k: float,
+    tau: float,
+    d: float,
+    w: float,
+    u: Array,
+    u_0: float,
+    at: Array,
+) -> None:
+    """Solve the law of a contact with the velocity u (3,) after the step and u_0 along the normal before it.
+
+    `at` keeps what its derivatives are made of, from at[0:3] the impulse on.
+    """
+    sigma, soft_norm, stiction_tolerance = constants
+    vn = u[0] * n[0] + u[1] * n[1] + u[2] * n[2]
+    if law == SAP:
+        soft = h + tau
+        rigid, compliant = (beta / (2 * np.pi)) ** 2 * w, 1.0 / (h * k * soft)
+        R_n, R_t = max(rigid, compliant), sigma * w
+        y_n = (-phi / soft - vn) / R_n
+        squared = soft_norm**2
+        for i in range(3):
+            at[3 + i] = (vn * n[i] - u[i]) / R_t  # y_t
+            squared += at[3 + i] * at[3 + i]
+        y_r, ratio = np.sqrt(squared), R_t / R_n
+        sticks = y_r <= mu * y_n
+        pushes = sticks or -mu * ratio * y_r < y_n
+        g_n = 0.0
+        if sticks:
+            g_n = y_n
+        elif pushes:
+            g_n = (y_n + mu * ratio * y_r) / (1 + mu * mu * ratio)
+        for i in range(3):
+            at[6 + i] = at[3 + i] / y_r  # the tangent
+            at[i] = (at[3 + i] if sticks else mu * g_n * at[6 + i]) + g_n * n[i]
+        at[9], at[10], at[11], at[12], at[13], at[14] = soft, R_n, R_t, vn, y_n, y_r
+        at[15], at[16], at[17] = 1.0 if sticks else 0.0, 1.0 if pushes else 0.0, g_n
+        at[18] = 1.0 if rigid > compliant else 0.0
+        return
+    elastic, slowed = h * max(-k * phi, 0.0), max(1 - d * u_0, 0.0)
+    soft = mu * sigma * w * elastic * slowed
+    e = max(stiction_tolerance, soft)
+    squared = e * e
+    for i in range(3):
+        at[3 + i] = u[i] - vn * n[i]
+        squared += at[3 + i] * at[3 + i]
+    s = np.sqrt(squared)
+    z = vn if law == LAGGED else vn - mu * (s - e)
+    force, left = -k * phi - h * k * z, 1 - d * z
+    pushes = force > 0 and left > 0
+    g_n = h * force * left if pushes else 0.0
+    n_f = elastic * slowed if law == LAGGED else g_n
+    for i in range(3):
+        at[6 + i] = at[3 + i] / s
+        at[i] = g_n * n[i] - mu * n_f * at[6 + i]
+    at[9], at[10], at[11], at[12], at[13], at[14] = elastic, slowed, e, vn, s, z
+    at[15], at[16], at[17], at[18], at[19] = force, left, g_n, n_f, w
+    at[20], at[21], at[22] = u_0, 1.0 if pushes else 0.0, 1.0 if soft > stiction_tolerance else 0.0
+
+
+@compiled
+def _law_change(
+    law: int,
+    h: float,
+    sigma: float,
+    n: Array,
+    mu: float,
+    k: float,
+    d: float,
+    w: float,
+    u: Array,
+    at: Array,
+    du: Array,
+    dn: Array,
+    d_phi: float,
+    d_w: float,
+    d_before: float,
+    out: Array,
+) -> None:
+    """out (3,) the change of the impulse by those of u, of the normal, phi, w and u_0."""
+    d_vn = du[0] * n[0] + du[1] * n[1] + du[2] * n[2] + u[0] * dn[0] + u[1] * dn[1] + u[2] * dn[2]
+    if law == SAP:
+        soft, R_n, R_t, vn, y_n, y_r = at[9], at[10], at[11], at[12], at[13], at[14]
+        sticks, pushes, g_n = at[15] != 0, at[16] != 0, at[17]
+        if not pushes:
+            out[0], out[1], out[2] = 0.0, 0.0, 0.0
+            return
+        d_Rt = d_w / w
+        d_Rn = d_Rt if at[18] != 0 else 0.0
+        d_yn = -(d_vn + d_phi / soft) / R_n - y_n * d_Rn
+        ratio, d_yr = R_t / R_n, 0.0
+        for i in range(3):
+            out[i] = -(du[i] - d_vn * n[i] - vn * dn[i]) / R_t - at[3 + i] * d_Rt  # d y_t
+            d_yr += at[6 + i] * out[i]
+        if sticks:
+            for i in range(3):
+                out[i] += d_yn * n[i] + g_n * dn[i]
+            return
+        slide = d_yn + mu * ratio * (d_yr + (y_r - mu * g_n) * (d_Rt - d_Rn))
+        slide /= 1 + mu * mu * ratio
+        for i in range(3):
+            turned = (out[i] - at[6 + i] * d_yr) / y_r
+            out[i] = mu * (slide * at[6 + i] + g_n * turned) + slide * n[i] + g_n * dn[i]
+        return
+    elastic, slowed, e, vn, s = at[9], at[10], at[11], at[12], at[13]
+    force, left, g_n, n_f = at[15], at[16], at[17], at[18]
+    pushes, is_soft = at[21] != 0, at[22] != 0
+    d_force, n_0 = -k * d_phi, elastic * slowed
+    d_n0 = h * slowed * d_force + (elastic * -d * d_before if slowed > 0 else 0.0)
+    d_e = sigma * mu * (d_w * n_0 + w * d_n0) if is_soft else 0.0
+    d_s = e / s * d_e
+    for i in range(3):
+        out[i] = du[i] - d_vn * n[i] - vn * dn[i]  # d v_t
+        d_s += at[6 + i] * out[i]
+    d_z = d_vn if law == LAGGED else d_vn - mu * (d_s - d_e)
+    d_push = d_force - h * k * d_z
+    d_gn = h * (left * d_push - force * d * d_z) if pushes else 0.0
+    d_nf = d_n0 if law == LAGGED else d_gn
+    for i in range(3):
+        turned = (out[i] - at[6 + i] * d_s) / s
+        out[i] = d_gn * n[i] + g_n * dn[i] - mu * (d_nf * at[6 + i] + n_f * turned)
+
+
+@compiled
+def _add_contact(
+    p: Plant,
+    c: Touching,
+    m: int,
+    S: Array,
+    diagonal: Array,
+    slope: Array,
+    v: Array,
+    v_next: Array,
+    right: Array,
+    left: Array,
+    push: Array,
+    L: Array,
+    point: Array,
+    across: Array,
+    y: Array,
+) -> None:
+    """Add what contact m changes to right (nv, 2 nv + nu), left (nv, nv) and push (nv,); from L on is scratch."""
+    nv, n, here, change = len(v), c.normal[m], c.point[m], c.change[m]
+    sphere, other, moves = c.sphere[m], c.other[m], p.moves
+    law, h, mu, k_c, d = p.law, p.time_step, c.friction[m], c.stiffness[m], c.dissipation[m]
+    sigma = p.constants[0]
+    at, u, du, dn, g = np.zeros(23), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    W, G, turned_sum, zero = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3), np.zeros(3)
+    u_0 = 0.0
+    for j in range(nv):  # the velocities L of all degrees of freedom at p, and J's W
+        a0, a1, a2 = S[j, 0], S[j, 1], S[j, 2]
+        L[j, 0] = S[j, 3] + a1 * here[2] - a2 * here[1]
+        L[j, 1] = S[j, 4] + a2 * here[0] - a0 * here[2]
+        L[j, 2] = S[j, 5] + a0 * here[1] - a1 * here[0]
+        s = sphere[j] - other[j]
+        if s != 0:
+            for a in range(3):
+                u[a] += s * L[j, a] * v_next[j]
+                u_0 += s * L[j, a] * v[j] * n[a]
+                for b in range(3):
+                    W[a, b] += s * s * L[j, a] * L[j, b] / diagonal[j]
+    size = 0.0
+    for a in range(3):
+        for b in range(3):
+            size += W[a, b] * W[a, b]
+    size = np.sqrt(size)
+    w = size / 3
+    _law(law, h, p.near_rigid, p.constants, n, c.phi[m], mu, k_c, c.time[m], d, w, u, u_0, at)
+    f0, f1, f2 = at[0], at[1], at[2]
+    for j in range(nv):  # how p, the normal and phi move, f x a, and what the weight's change is made of
+        s = sphere[j] - other[j]
+        a0, a1, a2 = S[j, 0], S[j, 1], S[j, 2]
+        across[j, 0], across[j, 1], across[j, 2] = f1 * a2 - f2 * a1, f2 * a0 - f0 * a2, f0 * a1 - f1 * a0
+        for a in range(7):
+            point[j, a] = 0.0
+            if s != 0:
+                moved = change[a, 0] * L[j, 0] + change[a, 1] * L[j, 1] + change[a, 2] * L[j, 2]
+                point[j, a] = s * (moved + change[a, 3] * a0 + change[a, 4] * a1 + change[a, 5] * a2)
+        for a in range(3):
+            point[j, a] += other[j] * L[j, a]
+            y[j, a] = 0.0
+            if s != 0:
+                along = W[a, 0] * L[j, 0] + W[a, 1] * L[j, 1] + W[a, 2] * L[j, 2]
+                y[j, a] = s * s * along / (3 * size) / diagonal[j]
+        point[j, 3] += other[j] * (a1 * n[2] - a2 * n[1])
+        point[j, 4] += other[j] * (a2 * n[0] - a0 * n[2])
+        point[j, 5] += other[j] * (a0 * n[1] - a1 * n[0])
+        y[j, 3] = a1 * y[j, 2] - a2 * y[j, 1]  # a x y
+        y[j, 4] = a2 * y[j, 0] - a0 * y[j, 2]
+        y[j, 5] = a0 * y[j, 1] - a1 * y[j, 0]
+        y[j, 6] = (L[j, 0] * y[j, 0] + L[j, 1] * y[j, 1] + L[j, 2] * y[j, 2]) / diagonal[j]
+        for a in range(3):
+            turned_sum[a] += y[j, 3 + a]
+    ua0, ua1, ua2 = 0.0, 0.0, 0.0  # the angular velocity of the sphere's side less the other's, after the step
+    va0, va1, va2 = 0.0, 0.0, 0.0  # and before it
+    for j in range(nv):
+        s = sphere[j] - other[j]
+        if s != 0:
+            ua0 += s * v_next[j] * S[j, 0]
+            ua1 += s * v_next[j] * S[j, 1]
+            ua2 += s * v_next[j] * S[j, 2]
+            va0 += s * v[j] * S[j, 0]
+            va1 += s * v[j] * S[j, 1]
+            va2 += s * v[j] * S[j, 2]
+    for a in range(3):  # the impulse's slope by the velocity
+        du[a] = 1.0
+        _law_change(law, h, sigma, n, mu, k_c, d, w, u, at, du, zero, 0.0, 0.0, 0.0, g)
+        for b in range(3):
+            G[b, a] = g[b]
+        du[a] = 0.0
+    g_0 = np.zeros(3)
+    if law != SAP:
+        _law_change(law, h, sigma, n, mu, k_c, d, w, u, at, zero, zero, 0.0, 0.0, 1.0, g_0)
+    for j in range(nv):
+        a0, a1, a2, l0, l1, l2 = S[j, 0], S[j, 1], S[j, 2], L[j, 0], L[j, 1], L[j, 2]
+        p0, p1, p2 = point[j, 0], point[j, 1], point[j, 2]
+        # Sums over the k whose axes j moves: of u_k [L_k; a_k] after and before the step, and of the weight's change.
+        b0, b1, b2, b3, b4, b5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        e0, e1, e2, e3, e4, e5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        w0, w1, w2, w3, w4, w5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        by_slope = 0.0
+        for k in range(nv):
+            s = sphere[k] - other[k]
+            if s == 0:
+                continue
+            by_slope += y[k, 6] * slope[k, j]
+            if moves[j, k] == 0:
+                continue
+            r, r_0 = s * v_next[k], s * v[k]
+            b0, b1, b2 = b0 + r * L[k, 0], b1 + r * L[k, 1], b2 + r * L[k, 2]
+            b3, b4, b5 = b3 + r * S[k, 0], b4 + r * S[k, 1], b5 + r * S[k, 2]
+            e0, e1, e2 = e0 + r_0 * L[k, 0], e1 + r_0 * L[k, 1], e2 + r_0 * L[k, 2]
+            e3, e4, e5 = e3 + r_0 * S[k, 0], e4 + r_0 * S[k, 1], e5 + r_0 * S[k, 2]
+            w0 += L[k, 1] * y[k, 2] - L[k, 2] * y[k, 1]
+            w1 += L[k, 2] * y[k, 0] - L[k, 0] * y[k, 2]
+            w2 += L[k, 0] * y[k, 1] - L[k, 1] * y[k, 0]
+            w3, w4, w5 = w3 + y[k, 3], w4 + y[k, 4], w5 + y[k, 5]
+        du[0] = ua1 * p2 - ua2 * p1 + a1 * b2 - a2 * b1 + l1 * b5 - l2 * b4
+        du[1] = ua2 * p0 - ua0 * p2 + a2 * b0 - a0 * b2 + l2 * b3 - l0 * b5
+        du[2] = ua0 * p1 - ua1 * p0 + a0 * b1 - a1 * b0 + l0 * b4 - l1 * b3
+        d_before = 0.0
+        if law != SAP:
+            d_before = n[0] * (va1 * p2 - va2 * p1 + a1 * e2 - a2 * e1 + l1 * e5 - l2 * e4)
+            d_before += n[1] * (va2 * p0 - va0 * p2 + a2 * e0 - a0 * e2 + l2 * e3 - l0 * e5)
+            d_before += n[2] * (va0 * p1 - va1 * p0 + a0 * e1 - a1 * e0 + l0 * e4 - l1 * e3)
+            for k in range(nv):
+                s = sphere[k] - other[k]
+                if s != 0:
+                    along = L[k, 0] * point[j, 3] + L[k, 1] * point[j, 4] + L[k, 2] * point[j, 5]
+                    d_before += s * v[k] * along
+        d_w = -(p0 * turned_sum[0] + p1 * turned_sum[1] + p2 * turned_sum[2])
+        d_w += a0 * w0 + a1 * w1 + a2 * w2 + l0 * w3 + l1 * w4 + l2 * w5
+        d_w = 2 * d_w - by_slope
+        dn[0], dn[1], dn[2] = point[j, 3], point[j, 4], point[j, 5]
+        _law_change(law, h, sigma, n, mu, k_c, d, w, u, at, du, dn, point[j, 6], d_w, d_before, g)
+        for i in range(nv):
+            s = sphere[i] - other[i]
+            if s == 0:
+                continue
+            found = L[i, 0] * g[0] + L[i, 1] * g[1] + L[i, 2] * g[2]
+            found += across[i, 0] * p0 + across[i, 1] * p1 + across[i, 2] * p2
+            if moves[j, i] != 0:
+                found += across[j, 0] * L[i, 0] + across[j, 1] * L[i, 1] + across[j, 2] * L[i, 2]
+                found -= across[i, 0] * l0 + across[i, 1] * l1 + across[i, 2] * l2
+            right[i, j] += s * found
+    for i in range(nv):
+        s = sphere[i] - other[i]
+        if s == 0:
+            continue
+        push[i] += s * (L[i, 0] * f0 + L[i, 1] * f1 + L[i, 2] * f2)
+        for a in range(3):
+            g[a] = L[i, 0] * G[0, a] + L[i, 1] * G[1, a] + L[i, 2] * G[2, a]
+        early = L[i, 0] * g_0[0] + L[i, 1] * g_0[1] + L[i, 2] * g_0[2]
+        for k in range(nv):
+            s_k = sphere[k] - other[k]
+            if s_k != 0:
+                left[i, k] -= s * s_k * (g[0] * L[k, 0] + g[1] * L[k, 1] + g[2] * L[k, 2])
+                if early != 0:
+                    right[i, nv + k] += s * s_k * early * (L[k, 0] * n[0] + L[k, 1] * n[1] + L[k, 2] * n[2])
+
+
+@compiled
+def _add_joint(
+    j: Array,
+    target: float,
+    R: float,
+    near_rigid: float,
+    one_sided: bool,
+    h: float,
+    v_next: Array,
+    diagonal: Array,
+    slope: Array,
+    right: Array,
+    left: Array,
+    push: Array,
+) -> None:
+    """Add what an impulse along j (nv,) changes: (target - j . v') / R, of a limit at least 0.
+
+    `near_rigid` is R / w where R goes with the effective inverse mass w, else 0.
+    """
+    nv, along = len(j), 0.0
+    for i in range(nv):
+        along += j[i] * v_next[i]
+    impulse = (target - along) / R
+    if one_sided and not impulse > 0:
+        return
+    for i in range(nv):
+        if j[i] == 0:
+            continue
+        push[i] += j[i] * impulse
+        for k in range(nv):
+            by_weight = 0.0
+            if near_rigid != 0:
+                for b in range(nv):
+                    if j[b] != 0:
+                        by_weight += (j[b] / diagonal[b]) ** 2 * slope[b, k]
+            right[i, k] += j[i] * (near_rigid * impulse / R * by_weight - j[k] / (2 * h * R))
+            left[i, k] += j[i] * j[k] / R
+
+
+@compiled
+def _factor(A: Array, L: Array) -> None:
+    """L L' = A, of which the lower half is read; NaN where A is not positive definite."""
+    n = len(A)
+    for i in range(n):
+        for j in range(i + 1):
+            total = A[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
+
+
+@compiled
+def _solve(L: Array, B: Array) -> None:
+    """B (n, m) becomes (L L')^-1 B, row by row as they lie in memory."""
+    n, m = B.shape
+    for i in range(n):
+        for k in range(i):
+            part = L[i, k]
+            for j in range(m):
+                B[i, j] -= part * B[k, j]
+        inverse = 1.0 / L[i, i]
+        for j in range(m):
+            B[i, j] *= inverse
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            part = L[k, i]
+            for j in range(m):
+                B[i, j] -= part * B[k, j]
+        inverse = 1.0 / L[i, i]
+        for j in range(m):
+            B[i, j] *= inverse
+
+
+@compiled
+def _assemble(p: Plant, q: Array, v_next: Array, by: Array, nq: int, out: Array) -> None:
+    """out (nx, nx + nu) from the derivative of v' by small motion, v and u: by (nv, 2 nv + nu)."""
+    nv, width, h = len(v_next), by.shape[1], p.time_step
+    shift = nq - nv
+    out[:] = 0.0
+    for i in range(nv):
+        row = nq + i
+        for b in range(len(p.single)):
+            out[row, p.single[b, 0]] = by[i, p.single[b, 1]]
+        for b in range(len(p.free)):
+            s, d = p.free[b, 0], p.free[b, 1]
+            w, x, y, z = q[s], q[s + 1], q[s + 2], q[s + 3]
+            f = 2.0 / (w * w + x * x + y * y + z * z)
+            b0, b1, b2 = f * by[i, d], f * by[i, d + 1], f * by[i, d + 2]
+            out[row, s] = -(b0 * x + b1 * y + b2 * z)
+            out[row, s + 1] = b0 * w + b1 * z - b2 * y
+            out[row, s + 2] = -b0 * z + b1 * w + b2 * x
+            out[row, s + 3] = b0 * y - b1 * x + b2 * w
+            for a in range(3):
+                out[row, s + 4 + a] = by[i, d + 3 + a]
+        for j in range(nv, width):
+            out[row, shift + j] = by[i, j]
+    total = out.shape[1]
+    for b in range(len(p.single)):
+        s, row = p.single[b, 0], nq + p.single[b, 1]
+        for j in range(total):
+            out[s, j] = h * out[row, j]
+        out[s, s] += 1.0
+    for b in range(len(p.free)):
+        s, d = p.free[b, 0], p.free[b, 1]
+        w, x, y, z = q[s], q[s + 1], q[s + 2], q[s + 3]
+        for j in range(total):
+            r0, r1, r2 = out[nq + d, j], out[nq + d + 1, j], out[nq + d + 2, j]
+            out[s, j] = -0.5 * h * (x * r0 + y * r1 + z * r2)
+            out[s + 1, j] = 0.5 * h * (w * r0 + z * r1 - y * r2)
+            out[s + 2, j] = 0.5 * h * (-z * r0 + w * r1 + x * r2)
+            out[s + 3, j] = 0.5 * h * (y * r0 - x * r1 + w * r2)
+            for a in range(3):
+                out[s + 4 + a, j] = h * out[nq + d + 3 + a, j]
+        for a in range(7):
+            out[s + a, s + a] += 1.0
+        w0, w1, w2 = 0.5 * h * v_next[d], 0.5 * h * v_next[d + 1], 0.5 * h * v_next[d + 2]
+        out[s, s + 1] -= w0
+        out[s, s + 2] -= w1
+        out[s, s + 3] -= w2
+        out[s + 1, s] += w0
+        out[s + 1, s + 2] -= w2
+        out[s + 1, s + 3] += w1
+        out[s + 2, s] += w1
+        out[s + 2, s + 1] += w2
+        out[s + 2, s + 3] -= w0
+        out[s + 3, s] += w2
+        out[s + 3, s + 1] -= w1
+        out[s + 3, s + 2] += w0
+
+
+@compiled
+def step_jacobians(
+    p: Plant,
+    c: Touching,
+    q: Array,
+    v: Array,
+    v_next: Array,
+    at_joints: Array,
+    force: Array,
+    clipped: Flags,
+    S: Array,
+    mass: Array,
+    slope: Array,
+    tau: Array,
+    by_q: Array,
+    by_v: Array,
+    out: Array,
+    sizes: Array,
+) -> None:
+    """(N, nx, nx + nu) of N steps from q and v to v', `at_joints` (N, nv) being the positions of hinges and slides.
+
+    `force` (N, nv) are those beside inverse dynamics, which was differentiated at (v' - v) / h. In `sizes` (N, 3) are
+    the momentum that the impulses do not account for, that which v' has, and the impulses', each in Drake's norm.
+    """
+    N, nv = v.shape
+    nq, nu, h = q.shape[1], p.actuation.shape[1], p.time_step
+    right, left, factor = np.empty((nv, 2 * nv + nu)), np.empty((nv, nv)), np.zeros((nv, nv))
+    A, diagonal, push, gained = np.empty((nv, nv)), np.empty(nv), np.empty(nv), np.empty((nv, 1))
+    free, j = np.empty((nv, 1)), np.zeros(nv)
+    L, point, across, y = np.empty((nv, 3)), np.empty((nv, 7)), np.empty((nv, 3)), np.empty((nv, 7))
+    joint_near_rigid, limit_stiffness, limit_window = p.joint_constants
+    stiffest = 1 / (2 * h * h * limit_stiffness)
+    for n in range(N):
+        for i in range(nv):
+            push[i] = 0.0
+            for k in range(nv):
+                A[i, k] = mass[n, i, k]
+            A[i, i] += p.armature[i]
+            diagonal[i] = A[i, i] - p.controlled[i]
+            for k in range(nv):
+                right[i, k] = -h * by_q[n, i, k]
+                right[i, nv + k] = A[i, k] - h * by_v[n, i, k]
+                left[i, k] = A[i, k]
+            right[i, i] -= h * p.stiffness[i]
+            right[i, nv + i] -= h * p.damping[i]
+            for k in range(nu):
+                right[i, 2 * nv + k] = 0.0 if clipped[n, k] else h * p.actuation[i, k]
+            gained[i, 0] = h * (tau[n, i] - force[n, i]) + p.armature[i] * (v_next[n, i] - v[n, i])
+            free[i, 0] = gained[i, 0]
+        _factor(A, factor)
+        _solve(factor, free)
+        for m in range(c.first[n], c.first[n + 1]):
+            _add_contact(p, c, m, S[n], diagonal, slope[n], v[n], v_next[n], right, left, push, L, point, across, y)
+        for i in range(nv):
+            window = limit_window * h * max(abs(v[n, i]), abs(v_next[n, i] - free[i, 0]))
+            for side in range(2):
+                sign = 1.0 - 2.0 * side
+                distance = sign * (at_joints[n, i] - p.limits[side, i])
+                if distance <= window:
+                    R = max(joint_near_rigid / diagonal[i], stiffest)
+                    soft = joint_near_rigid if stiffest < R else 0.0
+                    j[i] = sign
+                    target = -distance / (2 * h)
+                    _add_joint(j, target, R, soft, True, h, v_next[n], diagonal, slope[n], right, left, push)
+                    j[i] = 0.0
+        for b in range(len(p.offsets)):
+            off, weight = -p.offsets[b], 0.0
+            for i in range(nv):
+                off += p.couplers[b, i] * at_joints[n, i]
+                weight += p.couplers[b, i] ** 2 / diagonal[i]
+            R, target, soft = joint_near_rigid * weight, off / (-2 * h), joint_near_rigid
+            _add_joint(p.couplers[b], target, R, soft, False, h, v_next[n], diagonal, slope[n], right, left, push)
+        missing, had, given = 0.0, 0.0, 0.0
+        for i in range(nv):
+            momentum = 0.0
+            for k in range(nv):
+                momentum += A[i, k] * v_next[n, k]
+            missing += (gained[i, 0] - push[i]) ** 2 / diagonal[i]
+            had += momentum * momentum / diagonal[i]
+            given += push[i] * push[i] / diagonal[i]
+        sizes[n, 0], sizes[n, 1], sizes[n, 2] = np.sqrt(missing), np.sqrt(had), np.sqrt(given)
+        _factor(left, factor)
+        _solve(factor, right)
+        _assemble(p, q[n], v_next[n], right, nq, out[n])

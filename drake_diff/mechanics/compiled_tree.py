@@ -1,0 +1,93 @@
+"""The tables of a tree of hinges, slides and free bodies for `tree_kernel`, and what it makes of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.compiled import kernel
+from drake_diff.mechanics.description import Description
+
+KERNEL = "drake_diff.mechanics.tree_kernel"
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """A tree at N states and accelerations; S is [angular; linear] in world about its origin."""
+
+    poses: Array  # (N, L, 3, 4) of the links
+    S: Array  # (N, nv, 6) the motion of each degree of freedom at unit speed
+    mass: Array  # (N, nv, nv) M, without reflected inertia
+    slope: Array  # (N, nv, nv) d M_kk / d q_j by k and j
+    tau: Array  # (N, nv) M a + bias - gravity
+    by_q: Array  # (N, nv, nv) its derivative by small motion
+    by_v: Array  # (N, nv, nv)
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledTree:
+    """A tree whose kernel is compiled."""
+
+    tables: tuple[Array, ...]
+    links: dict[str, int]  # by their bodies' names
+    nv: int
+
+    def __call__(self, q: Array, v: Array, a: Array) -> Moved:
+        """At q (N, nq), v and a (each (N, nv)), in Drake's coordinates."""
+        N, n, compiled = len(q), self.nv, kernel(KERNEL)
+        poses, S, tau = np.empty((N, len(self.links), 3, 4)), np.empty((N, n, 6)), np.empty((N, n))
+        mass, slope, by_q, by_v = np.empty((4, N, n, n))
+        compiled.differentiate_tree(compiled.Tree(*self.tables), q, v, a, poses, S, mass, slope, tau, by_q, by_v)
+        return Moved(poses, S, mass, slope, tau, by_q, by_v)
+
+
+def compiled_tree(description: Description) -> CompiledTree | None:
+    """None where Numba is not installed, or a free body is not joined to the world by its own frame."""
+    links, compiled = description.links, kernel(KERNEL)
+    identity = RigidTransform()
+    for link in links:
+        own = link.on_parent.IsExactlyEqualTo(identity) and link.on_child.IsExactlyEqualTo(identity)
+        if link.kind == "quaternion_floating" and (link.parent != "world" or not own):
+            return None
+    if compiled is None:
+        return None
+    kinds = {
+        "weld": compiled.WELD,
+        "revolute": compiled.HINGE,
+        "prismatic": compiled.SLIDE,
+        "quaternion_floating": compiled.FREE,
+    }
+    number = {link.body: i for i, link in enumerate(links)}
+    joint_of, parents, first, count = {"world": -1}, [], [], []
+    for link in links:
+        joint_of[link.body] = joint_of[link.parent]
+        starts = {"weld": (), "quaternion_floating": (3, 0)}.get(link.kind, (0,))
+        for start in starts:
+            parents.append(joint_of[link.body])
+            first.append(link.v_start + start)
+            count.append(3 if len(starts) == 2 else 1)
+            joint_of[link.body] = len(parents) - 1
+    axes = [link.axis / (np.linalg.norm(link.axis) if link.kind in ("revolute", "prismatic") else 1) for link in links]
+    tables = (
+        _whole([number.get(link.parent, -1) for link in links]),
+        _whole([kinds[link.kind] for link in links]),
+        _whole([joint_of[link.body] for link in links]),
+        _whole([link.q_start for link in links]),
+        _whole([link.v_start for link in links]),
+        np.array(axes, dtype=float).reshape(-1, 3),
+        np.array([link.on_parent.GetAsMatrix34() for link in links]).reshape(-1, 3, 4),
+        np.array([link.on_child.inverse().GetAsMatrix34() for link in links]).reshape(-1, 3, 4),
+        np.array([link.mass for link in links], dtype=float),
+        np.array([link.center_of_mass for link in links], dtype=float).reshape(-1, 3),
+        np.array([link.inertia for link in links], dtype=float).reshape(-1, 3, 3),
+        _whole(parents),
+        _whole(first),
+        _whole(count),
+        np.array(description.gravity, dtype=float),
+    )
+    return CompiledTree(tuple(map(np.ascontiguousarray, tables)), number, description.coordinates.nv)
+
+
+def _whole(numbers: list[int]) -> Array:
+    return np.array(numbers, dtype=np.int64)

@@ -1,0 +1,110 @@
+"""Compiled functions against the NumPy form of the same; and that form where there are none."""
+
+import numpy as np
+import pytest
+from helpers.forms import both_forms
+from helpers.robots import example_robot, state_in_contact, state_in_range
+from helpers.table import each_row
+
+import drake_diff as dd
+from drake_diff._base import compiled as of_numba
+from drake_diff.derivatives.analytic import analytic_of
+from drake_diff.derivatives.contact import compiled as of_contact
+from drake_diff.derivatives.contact.jacobian import contact_form
+from drake_diff.mechanics import compiled_tree as of_trees
+from drake_diff.mechanics.compiled_tree import compiled_tree
+from drake_diff.mechanics.description import describe_tree
+from drake_diff.mechanics.tree import tree_of
+
+pytest.importorskip("numba")
+pytest.importorskip("pinocchio")
+
+
+@pytest.fixture
+def without_numba(monkeypatch):
+    """As where Numba is not installed."""
+    monkeypatch.setattr(of_numba, "has_numba", lambda: False)
+
+
+def _largest(a, b):
+    return float(np.abs(a - b).max() / np.abs(b).max())
+
+
+@each_row("name", ["go2.urdf", "simple_humanoid.urdf", "panda.urdf", "allegro_left_hand.urdf"])
+def test_a_compiled_tree_is_numpys(name):
+    model, random = example_robot(name), np.random.default_rng(1)
+    xs, a = np.array([state_in_range(model, random) for _ in range(5)]), random.standard_normal((5, model.nv))
+    q, v = xs[:, : model.nq], xs[:, model.nq :]
+    q[:, :4] *= 1.3 if model.nq > model.nv else 1.0  # a quaternion's norm means nothing
+    ours, tree = compiled_tree(describe_tree(model))(q, v, a), tree_of(model, free=True)
+    moving = tree.moving(tree.place_all(model, q), v)
+    tau, by_q, by_v = moving.derivatives(a)
+    # Sums in another order, of terms up to a hundred times as large as what they amount to.
+    found = ((ours.S, moving.S), (ours.mass, moving.mass), (ours.tau, tau), (ours.by_q, by_q), (ours.by_v, by_v))
+    assert all(_largest(*pair) < 1e-12 for pair in found)
+
+
+def test_the_slope_of_a_trees_inertia_is_its_difference():
+    model, random = example_robot("panda.urdf"), np.random.default_rng(2)
+    tree, q = compiled_tree(describe_tree(model)), state_in_range(model, random)[None, : model.nq]
+    still = np.zeros((1, model.nv))
+    slope = tree(q, still, still).slope[0]
+    for j in range(model.nv):
+        move = 1e-5 * np.eye(model.nv)[j]
+        ahead, behind = (np.diag(tree(q + m, still, still).mass[0]) for m in (move, -move))
+        assert slope[:, j] == pytest.approx((ahead - behind) / 2e-5, abs=1e-9)  # of second differences of 1e-10
+
+
+@pytest.mark.parametrize("approximation", ["sap", "similar", "lagged"])
+@pytest.mark.parametrize("time_step", [0.005, 0.05])
+def test_steps_with_impulses_are_numpys(approximation, time_step):
+    """In contact, on controllers, and thrown at stops by the speed."""
+    model, random = (
+        example_robot("go2.urdf", time_step, approximation=approximation, feet=True),
+        np.random.default_rng(3),
+    )
+    xs = np.array([state_in_contact(model, random, speed=speed) for speed in (0.0, 0.2, 0.2, 2.0, 2.0)])
+    (ours, known), (other, same) = both_forms(model, xs, random.uniform(-2, 2, (5, model.nu)))
+    assert known.tolist() == same.tolist()
+    assert np.count_nonzero(known) >= 3
+    # The equation's matrix may be a thousand times stiffer along a contact than across.
+    assert _largest(ours[known], other[known]) < 1e-10
+
+
+def test_without_numba_numpy_answers_the_same(without_numba):
+    assert of_numba.kernel("drake_diff.derivatives.contact.kernel") is None
+    model, random = example_robot("solo12.urdf", feet=True), np.random.default_rng(4)
+    x, u = state_in_contact(model, random), random.uniform(-1, 1, model.nu)
+    d = dd.differentiate_step(model, x, u)
+    assert d.method == "analytic", d.reason
+    assert contact_form(model, analytic_of(model)).compiled is None
+    exact = dd.differentiate_step(model, x, u, method="autodiff")
+    assert _largest(d.A, exact.A) < 1e-9
+
+
+@each_row("table", ["mass", "center", "moves"])
+def test_a_wrong_number_in_the_tables_is_found_out(table, monkeypatch):
+    """By Drake's solution, which does not solve such a step, or by AutoDiffXd's Jacobian."""
+    module, kind = (of_trees, "Tree") if table in ("mass", "center") else (of_contact, "Plant")
+    right = module.kernel
+
+    def planted(name):
+        module = right(name)
+        plain = getattr(module, kind)
+
+        class Patched:
+            def __getattr__(self, wanted):
+                return (lambda *a: _off(plain(*a), table)) if wanted == kind else getattr(module, wanted)
+
+        return Patched()
+
+    model, random = example_robot("solo12.urdf", feet=True), np.random.default_rng(4)
+    x, u = state_in_contact(model, random), random.uniform(-1, 1, model.nu)
+    monkeypatch.setattr(module, "kernel", planted)
+    assert dd.differentiate_step(model, x, u).method != "analytic"
+
+
+def _off(tables, name):
+    """With a thousandth more of one table, or, of what moves what, without it."""
+    wrong = 0.0 if name == "moves" else 1.001
+    return tables._replace(**{name: wrong * getattr(tables, name)})
