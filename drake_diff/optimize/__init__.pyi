@@ -9,6 +9,7 @@ from .problem.phases import PhasedProblem as PhasedProblem
 from .problem.rates import InputRate as InputRate
 from .problem.rates import Jerk as Jerk
 from .problem.rigid import RigidReset as RigidReset
+from .problem.schedule import ContactSchedule as ContactSchedule
 from .problem.terminal import TerminalSet as TerminalSet
 from .problem.timed import TrackingCost as TrackingCost
 from .transcription.between import violation_between_nodes as violation_between_nodes

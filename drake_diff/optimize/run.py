@@ -199,7 +199,8 @@ class Run:
             known = guess.multipliers
             return solve_ilqr(problem, begin, us, limits=limits, report=report, values=values, begun=known)
 
-        return self._through_steps(xs, us, search, guess, may_be_blind=bool(stages))
+        around = given and not stages  # a robot that falls open loop says nothing of the motion that was given
+        return self._through_steps(xs, us, search, guess, may_be_blind=bool(stages), around=around)
 
     def shoot(self, guess: Guess, segments: int, *, improve: bool) -> Solution:
         """Shooting; `improve` the guess by iLQR, which gets out of curved valleys that shooting crawls along.
@@ -233,9 +234,14 @@ class Run:
         *,
         segmented: bool = False,
         may_be_blind: bool = False,
+        around: bool = False,
     ) -> Solution:
-        """Certify, search, certify again, on Drake's own steps; at rollouts, or at the states as they are."""
-        variables, values = ShootingVariables(self.problem, around=xs if segmented else None), self._first_values(guess)
+        """Certify, search, certify again, on Drake's own steps; at rollouts, or at the states as they are.
+
+        The latter if the motion is `segmented`; `around` its first states the guess alone.
+        """
+        given, values = xs if segmented or around else None, self._first_values(guess)
+        variables = ShootingVariables(self.problem, around=given)
         try:
             xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us, values))
         except (GradientError, SimulationError) as error:

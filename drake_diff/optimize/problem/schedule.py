@@ -1,0 +1,249 @@
+"""Which foot stands when: a goal that a plan keeps, and the guess that it begins with."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import KW_ONLY, dataclass
+from typing import Any
+
+import numpy as np
+from pydrake.autodiffutils import ExtractValue
+
+from drake_diff._base.arrays import Array, Indices, finite_array, positive_float
+from drake_diff._base.autodiff import chain_rows
+from drake_diff.exceptions import InputError
+from drake_diff.model.model import Model
+from drake_diff.optimize.problem.cost import QuadraticCost
+from drake_diff.optimize.problem.goals import USED, Goal, GoalConstraint, name_of
+from drake_diff.optimize.problem.timed import TrackingCost
+from drake_diff.optimize.scheduled.legs import Legs
+from drake_diff.optimize.scheduled.motion import scheduled_motion, swings, touching
+
+MIDDLE = 0.25  # of a swing at either end is left out where its clearance is looked at
+OF_FRICTION = 0.7  # of the friction that is possible: what a guess uses
+Phases = tuple[tuple[int, tuple[str, ...]], ...]
+# What counts as 1 of what a plan is off its guess: of a quaternion, [m], [rad], [rad/s or m/s] of the base, [rad/s];
+# of the largest input of the guess; and how much more the last state counts than a second on the way.
+TURN, PLACE, JOINT, BASE_SPEED, JOINT_SPEED, EFFORT, LAST_STATE = 0.3, 0.2, 1.0, 3.0, 10.0, 1.5, 10.0
+
+
+@dataclass(frozen=True, repr=False)
+class ContactSchedule(Goal):
+    """Which foot stands in which steps, on a ground at z = 0; a foot that does not stand swings.
+
+    As a goal of a `Problem` it is kept: a standing foot touches the ground and does not slip, a swinging one is above.
+    `guess` makes a motion to begin with, and `follow` the cost that stays near it. The plan itself is of the model's
+    own steps.
+
+    Args:
+        phases: For each phase the number of its steps, and the feet that stand in it.
+        feet: The feet; those of all phases where not given. A foot is a body with spheres or boxes fixed to it.
+        clearance: [m] how high a swinging foot is at least in the middle half of its way.
+        slip: [m/s] how fast a standing foot may slide.
+        touch: [m] how high over the ground a foot may be that stands, in a replay; in the plan it is on it.
+
+    Raises:
+        InputError: Values that are none; or, by the Problem, another number of steps, or a foot that has no shape.
+        UnknownNameError: By the Problem: its model has no such foot; the message lists its bodies.
+
+    Example:
+        >>> hop = dd.optimize.ContactSchedule([(20, ["left", "right"]), (12, []), (20, ["left", "right"])])
+        >>> hop.num_steps, hop.feet
+        (52, ('left', 'right'))
+    """
+
+    phases: Any  # becomes Phases
+    _: KW_ONLY
+    feet: Any = None  # becomes names
+    clearance: float = 5e-3
+    slip: float = 0.2
+    touch: float = 5e-3
+
+    weight = None
+    knots = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.phases, (list, tuple)) or not self.phases:
+            raise InputError("ContactSchedule.phases", got=repr(self.phases)[:80], expected="(steps, feet) of each")
+        phases = tuple(_phase(phase) for phase in self.phases)
+        named = tuple(dict.fromkeys(foot for _, standing in phases for foot in standing))
+        feet = named if self.feet is None else tuple(name_of("ContactSchedule.feet", foot) for foot in self.feet)
+        if not feet or set(named) - set(feet):
+            got = f"phases of {', '.join(named) or 'none'}"
+            raise InputError("ContactSchedule.feet", got=got, expected=f"some of {', '.join(feet) or 'the feet'}")
+        self._set(
+            phases=phases,
+            feet=feet,
+            clearance=positive_float("ContactSchedule.clearance [m]", self.clearance),
+            slip=positive_float("ContactSchedule.slip [m/s]", self.slip),
+            touch=positive_float("ContactSchedule.touch [m]", self.touch),
+        )
+
+    @property
+    def num_steps(self) -> int:
+        """Of all phases."""
+        return sum(steps for steps, _ in self.phases)
+
+    @property
+    def stands(self) -> Any:
+        """(N, feet) whether a foot stands in a step."""
+        rows = [[foot in standing for foot in self.feet] for steps, standing in self.phases for _ in range(steps)]
+        return np.array(rows, dtype=bool)
+
+    def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
+        return self._bound(model, np.asarray(model.default_state))
+
+    def bind_to(self, problem: Any) -> tuple[GoalConstraint, ...]:
+        if problem.num_steps != self.num_steps:
+            raise InputError("ContactSchedule.phases", got=f"{self.num_steps} steps", expected=str(problem.num_steps))
+        return self._bound(problem.model, np.asarray(problem.x0))
+
+    def _bound(self, model: Model, x0: Array) -> tuple[GoalConstraint, ...]:
+        soles = _Soles(Legs(model, self.feet, x0[: model.nq]))
+        stands, on = self.stands, touching(self.stands)
+        alike = dict[bytes, list[int]]()
+        for foot in range(len(self.feet)):
+            alike.setdefault(stands[:, foot].tobytes(), []).append(foot)
+        found, most = list[GoalConstraint](), USED * self.slip
+        for those in alike.values():
+            name, down = " and ".join(self.feet[i] for i in those), on[:, those[0]]
+            heights, slides = soles.of("heights", those), soles.of("slides", those)
+            carries = stands[:, those[0]]
+            standing = np.flatnonzero(carries) + 1  # not where it lands: longer steps fly a little longer
+            still = np.flatnonzero(carries & np.concatenate([carries[:1], carries[:-1]])) + 1
+            swung = np.array([k for a, b in swings(down) for k in _middle(a, b, self.num_steps)], dtype=int)
+            found += _rows(heights, standing, name, "over the ground where it stands", self.touch, upper=0.0)
+            clear = self.clearance
+            found += _rows(heights, swung, name, "short of its clearance where it swings", clear, lower=clear)
+            found += _rows(slides, still, name, "of slip where it stands", self.slip, lower=-most, upper=most)
+        return tuple(found)
+
+    def guess(self, model: Model, x0: Any, end: Any = None, *, swing: float = 0.04) -> tuple[Array, Array]:
+        """A motion by the schedule: forces at the standing feet bring the centre of mass to where it is to be.
+
+        It nearly obeys the steps of the model, and is an `initial_guess` of `solve`; what is told is what the search
+        makes of it.
+
+        Args:
+            model: The model.
+            x0: (nx,) the first state, its feet on the ground where they stand at first.
+            end: (nq,) the posture that it comes to, at rest: its feet are where they are to stand at last. The first
+                one where not given.
+            swing: [m] how high a foot is swung.
+
+        Returns:
+            States xs (N+1, nx) and inputs us (N, nu).
+
+        Raises:
+            InputError: No forces of the feet within friction make such a motion.
+        """
+        x0 = np.array(finite_array("x0", x0, (model.nx,)))
+        last = x0[: model.nq] if end is None else np.array(finite_array("end", end, (model.nq,)))
+        legs = Legs(model, self.feet, x0[: model.nq])
+        height, friction = positive_float("swing [m]", swing), OF_FRICTION * legs.friction()
+        return scheduled_motion(model, legs, x0, last, self.stands, height, friction)
+
+    def follow(self, model: Model, guess: tuple[Array, Array]) -> dict[str, Any]:
+        """The `running_cost` and `final_cost` of a Problem that stays near a guess and ends at rest where it ends.
+
+        Args:
+            model: The model.
+            guess: What `guess` gave, or another motion xs (N+1, nx), us (N, nu).
+
+        Returns:
+            Both by name, so that `Problem(model, ..., **schedule.follow(model, guess))` has them.
+        """
+        xs, us = guess
+        base = Legs(model, self.feet, xs[0, : model.nq]).base_q
+        unit = np.concatenate([np.full(model.nq, JOINT), np.full(model.nv, JOINT_SPEED)])
+        unit[base : base + 4], unit[base + 4 : base + 7] = TURN, PLACE
+        unit[model.nq + base : model.nq + base + 6] = BASE_SPEED
+        effort = EFFORT * max(float(np.max(np.abs(us))), 1e-9)
+        Q, times = np.diag(unit**-2.0), model.time_step * np.arange(len(xs))
+        table = times, xs, np.vstack([us, us[-1:]])
+        end = np.concatenate([xs[-1, : model.nq], np.zeros(model.nv)])
+        return {
+            "running_cost": TrackingCost(table, Q=Q, R=np.eye(model.nu) / effort**2),
+            "final_cost": QuadraticCost(Q=LAST_STATE * Q, x_ref=end),
+        }
+
+
+class _Soles:
+    """What a schedule asks of the points that feet stand on, all of one state at once: the last one's are kept."""
+
+    def __init__(self, legs: Legs):
+        self.legs, self.key = legs, b""
+        self.known = dict[str, Array]()
+
+    def of(self, what: str, feet: Sequence[int]) -> Callable[[Any], Any]:
+        """x (nx,) -> "heights" (n,) [m] of these feet's points over the ground; or "slides" (2 n,) [m/s] along it."""
+        points = np.flatnonzero(np.isin(self.legs.owners, feet))
+        rows = points if what == "heights" else np.concatenate([2 * points, 2 * points + 1])
+
+        def function(x: Any) -> Any:
+            if x.dtype == float:
+                return self._at(x, what)[rows]
+            at = ExtractValue(x.reshape(-1, 1)).ravel()
+            return chain_rows(self._at(at, what)[rows], self._at(at, f"{what} by x")[rows], x)
+
+        return function
+
+    def _at(self, x: Array, what: str) -> Array:
+        if x.tobytes() != self.key:
+            self.key, self.known = x.tobytes(), {}
+        if what not in self.known:
+            self.legs.put(x[: self.legs.model.nq], x[self.legs.model.nq :])
+            self.known[what] = getattr(self, "_" + what.replace(" ", "_"))(x)
+        return self.known[what]
+
+    def _heights(self, x: Array) -> Array:
+        return self.legs.points()[:, 2]
+
+    def _heights_by_x(self, x: Array) -> Array:
+        by_q = self.legs.jacobians()[0][:, 2]
+        return self._by_x(x, by_q, np.zeros_like(by_q))
+
+    def _slides(self, x: Array) -> Array:
+        v = x[self.legs.model.nq :]
+        return np.asarray(self.legs.jacobians()[0][:, :2] @ v).ravel()
+
+    def _slides_by_x(self, x: Array) -> Array:
+        nv = self.legs.model.nv
+        by_q = self.legs.velocities(x[self.legs.model.nq :])[1][:, :2]
+        return self._by_x(x, by_q.reshape(-1, nv), self.legs.jacobians()[0][:, :2].reshape(-1, nv))
+
+    def _by_x(self, x: Array, by_q: Array, by_v: Array) -> Array:
+        return np.asarray(np.hstack([by_q, by_v]) @ self.legs.space.derivative_of_minus(x))
+
+
+def _rows(
+    function: Callable[[Any], Any], knots: Indices, name: str, off: str, tolerance: float, **sides: Any
+) -> Iterator[GoalConstraint]:
+    """`function` within `sides` at `knots`, if there are any; in `off` a clause says what is missed."""
+    if not len(knots):
+        return
+    unit = "m/s" if off.startswith("of slip") else "m"
+    at = tuple(int(k) for k in knots)
+
+    def words(distance: str) -> str:
+        return f"{name} is at most {distance} {off}"
+
+    label = f"{name}: {off}"
+    yield GoalConstraint(
+        function, knots=at, name=label, tolerance=tolerance, unit=unit, words=words, norm=np.inf, **sides
+    )
+
+
+def _phase(given: Any) -> tuple[int, tuple[str, ...]]:
+    expected = "(number of steps, names of the feet that stand)"
+    if not (isinstance(given, (list, tuple)) and len(given) == 2) or isinstance(given[1], str):
+        raise InputError("ContactSchedule.phases", got=repr(given)[:80], expected=expected)
+    steps, standing = given
+    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
+        raise InputError("ContactSchedule.phases", got=repr(given)[:80], expected=expected)
+    return int(steps), tuple(name_of("ContactSchedule.phases", foot) for foot in standing)
+
+
+def _middle(a: int, b: int, last: int) -> range:
+    """The knots of a swing from a to b without its first and last part; up to where it begins or ends the motion."""
+    part = MIDDLE * (b - a)
+    return range(math.ceil(a + part) if a > 0 else 1, (math.floor(b - part) if b < last else last) + 1)

@@ -1,0 +1,1 @@
+"""First guesses of a robot's motion where it is known which foot stands when."""

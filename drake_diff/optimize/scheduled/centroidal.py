@@ -1,0 +1,131 @@
+"""The way of a robot's centre of mass, and the forces at its feet, where it is known which of them stand when.
+
+A quadratic program in the positions of the centre of mass at the knots and the forces at the standing points in each
+step. Newton's law holds exactly; forces are in a pyramid of friction, alike, and change little from step to step; their
+moment about the centre of mass is small, so that the robot keeps its turn. That moment is bilinear, so it is taken
+about the way of the program before, and there are a few of them.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.solvers import ClarabelSolver, MathematicalProgram
+
+from drake_diff._base.arrays import Array
+from drake_diff._base.refusal import Refusal
+
+ROUNDS = 3
+ALIKE, CHANGE, MOMENT, NEAR = 1e-2, 1.0, 1.0, 1.0  # weights, of forces in weights of the robot and lengths in its size
+STEP = 0.02  # [s] of which these weights are; they are rates, so that they say the same in steps of another length
+SHARE = 0.02  # of an even share of the weight: what a standing point carries at least
+
+
+def plan_forces(
+    mass: float,
+    gravity: Array,
+    time_step: float,
+    start: tuple[Array, Array],
+    way: Array,
+    places: Array,
+    stands: NDArray[np.bool_],
+    friction: float,
+) -> tuple[Array, Array] | Refusal:
+    """Positions (N+1, 3) [m] of the centre of mass, and forces (N, n, 3) [N]; or why there are none.
+
+    Args:
+        mass: [kg]
+        gravity: (3,) [m/s^2]
+        time_step: [s]
+        start: Place and velocity (3,) of the centre of mass at first.
+        way: (N+1, 3) [m] what it is to be near; it ends there, at rest.
+        places: (N+1, n, 3) [m] of the points.
+        stands: (N, n) whether a point carries in a step.
+        friction: The largest sideways force, as a part of the upright one.
+    """
+    size = max(float(np.max(np.ptp(places[0], axis=0))) / 2, 1e-3)
+    found = np.array(way)
+    for _ in range(ROUNDS):
+        program = _Program(mass, gravity, time_step, size, stands)
+        program.follow(start, way)
+        program.share(friction)
+        program.keep_turn(places, found)
+        solved = program.solve()
+        if isinstance(solved, Refusal):
+            return solved
+        found, forces = solved
+    return found, forces
+
+
+class _Program:
+    def __init__(self, mass: float, gravity: Array, time_step: float, size: float, stands: NDArray[np.bool_]):
+        self.gravity, self.h, self.size, self.stands = gravity, time_step, size, stands
+        self.pull = float(np.linalg.norm(gravity)) or 1.0
+        self.weight = mass * self.pull
+        self.part = time_step / STEP
+        self.program = MathematicalProgram()
+        self.at = self.program.NewContinuousVariables(len(stands) + 1, 3)
+        self.carries = np.argwhere(stands)  # (m, 2): step and point
+        self.forces = self.program.NewContinuousVariables(max(len(self.carries), 1), 3)  # in weights
+        self.of_step = [np.flatnonzero(self.carries[:, 0] == k) for k in range(len(stands))]
+
+    def follow(self, start: tuple[Array, Array], way: Array) -> None:
+        """Newton's law by the step's own rule, the given first state, and rest at the end of the way."""
+        program, at, h = self.program, self.at, self.h
+        first, speed = start
+        program.AddBoundingBoxConstraint(first, first, at[0])
+        program.AddBoundingBoxConstraint(way[-1], way[-1], at[-1])
+        program.AddLinearEqualityConstraint(
+            np.hstack([np.eye(3), -np.eye(3)]), np.zeros(3), np.concatenate([at[-1], at[-2]])
+        )
+        push = -(h**2) * self.pull * np.eye(3)
+        for k, carrying in enumerate(self.of_step):
+            blocks, known = [np.eye(3)], h**2 * self.gravity
+            variables = [at[k + 1]]
+            if k == 0:
+                known = known + first + h * speed
+            else:
+                blocks += [-2 * np.eye(3), np.eye(3)]
+                variables += [at[k], at[k - 1]]
+            blocks += [push] * len(carrying)
+            variables += [self.forces[j] for j in carrying]
+            program.AddLinearEqualityConstraint(np.hstack(blocks), known, np.concatenate(variables))
+        near = np.sqrt(NEAR * self.part) / self.size * np.eye(at.size)
+        program.Add2NormSquaredCost(near, near @ way.ravel(), at.ravel())
+
+    def share(self, friction: float) -> None:
+        """Forces within friction, upwards, alike among the points, and alike from step to step."""
+        program, steps = self.program, {(int(k), int(i)): j for j, (k, i) in enumerate(self.carries)}
+        sides = np.array([[1, 0, -friction], [-1, 0, -friction], [0, 1, -friction], [0, -1, -friction]])
+        up, alike = -self.gravity / self.pull, np.sqrt(ALIKE * self.part) * np.eye(3)
+        change = np.sqrt(CHANGE / self.part) * np.hstack([np.eye(3), -np.eye(3)])
+        for (k, i), j in steps.items():
+            force, share = self.forces[j], 1 / len(self.of_step[k])
+            program.AddLinearConstraint(sides, np.full(4, -np.inf), np.zeros(4), force)
+            program.AddBoundingBoxConstraint(SHARE * share, np.inf, force[2])
+            program.Add2NormSquaredCost(alike, alike @ (share * up), force)
+            before = steps.get((k - 1, i))
+            if before is not None:
+                program.Add2NormSquaredCost(change, np.zeros(3), np.concatenate([force, self.forces[before]]))
+
+    def keep_turn(self, places: Array, way: Array) -> None:
+        """No moment about the way (N+1, 3) of the centre of mass, as nearly as may be."""
+        for k, carrying in enumerate(self.of_step):
+            if len(carrying):
+                arms = (places[k, self.carries[carrying, 1]] - way[k]) / self.size
+                moment = np.sqrt(MOMENT * self.part) * np.hstack([_cross(arm) for arm in arms])
+                self.program.Add2NormSquaredCost(moment, np.zeros(3), self.forces[carrying].ravel())
+
+    def solve(self) -> tuple[Array, Array] | Refusal:
+        if not len(self.carries):
+            self.program.AddBoundingBoxConstraint(0.0, 0.0, self.forces)
+        result = ClarabelSolver().Solve(self.program)
+        if not result.is_success():
+            return Refusal("no forces of its feet, within friction, bring its centre of mass to where it is to end")
+        forces = np.zeros((*self.stands.shape, 3))
+        forces[self.stands] = self.weight * np.asarray(result.GetSolution(self.forces))[: len(self.carries)]
+        return np.asarray(result.GetSolution(self.at)), forces
+
+
+def _cross(arm: Array) -> Array:
+    """(3, 3): arm x."""
+    x, y, z = arm
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

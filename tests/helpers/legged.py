@@ -1,0 +1,118 @@
+"""Robots of example-robot-data that stand on spheres: their feet, as soft as their weight asks for."""
+
+import tempfile
+import warnings
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+import drake_diff as dd
+from drake_diff.exceptions import ModelWarning
+from drake_diff.model.step import advance
+
+from .models import robot_file
+
+SINK = 1.25e-3  # [m] of a foot under an even share of the weight: what plans of 10 to 20 ms are found with
+RELAXATION, DISSIPATION, FRICTION = 0.05, 0.5, 0.7  # [s], [s/m]
+SETTLES, SETTLE_STEP = 0.6, 0.002  # [s] of a PD controller that brings a posture to rest
+
+
+@dataclass(frozen=True)
+class Legged:
+    """What its file does not tell: which bodies are feet, of which radius [m], its postures and its weight [N].
+
+    Postures are those of the joints in the order of the model, gains those of a PD controller that holds them.
+    """
+
+    file: str
+    feet: tuple[str, ...]
+    radius: float
+    high: tuple[float, ...]
+    low: tuple[float, ...]
+    weight: float
+    gains: tuple[float, float]
+    folder: str = ""
+    base: str = "base_link"
+
+
+def _legs(hip, knee, back=1, times=4):
+    """Hips and knees of so many legs; those behind the first two are bent `back` times as much."""
+    return tuple(v for leg in range(times) for v in (0.0, *(np.array([hip, knee]) * (back if leg >= 2 else 1))))
+
+
+SOLO_FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
+LEGGED = {
+    "solo12": Legged("solo12.urdf", SOLO_FEET, 0.016, _legs(0.8, -1.6, -1), _legs(1.2, -2.4, -1), 24.5, (5.0, 0.1)),
+}
+
+
+@cache
+def robot_on_feet(name):
+    """A file of that robot in which its feet are spheres of the stiffness that lets them sink by SINK, and all else
+    is left out that can touch."""
+    robot = LEGGED[name]
+    tree = ElementTree.parse(robot_file(f"{robot.folder}{robot.file}"))
+    root = tree.getroot()
+    root.set("xmlns:drake", "http://drake.mit.edu")
+    for link in root.findall("link"):
+        for kind in ("collision", "visual"):
+            for old in link.findall(kind):
+                link.remove(old)
+        if link.get("name") in robot.feet:
+            collision = ElementTree.SubElement(link, "collision")
+            ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), "sphere", radius=str(robot.radius))
+            properties = ElementTree.SubElement(collision, "drake:proximity_properties")
+            for quantity, value in (
+                ("point_contact_stiffness", robot.weight / len(robot.feet) / SINK),
+                ("hunt_crossley_dissipation", DISSIPATION),
+                ("relaxation_time", RELAXATION),
+                ("mu_dynamic", FRICTION),
+                ("mu_static", FRICTION),
+            ):
+                ElementTree.SubElement(properties, f"drake:{quantity}", value=str(value))
+    path = Path(tempfile.mkdtemp(prefix="drake_diff_legged_")) / robot.file
+    tree.write(path)
+    return path
+
+
+@cache
+def legged_model(name, time_step=0.02):
+    """The robot on its feet on a ground, a motor in each joint."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        return dd.load_model(
+            robot_on_feet(name),
+            time_step=time_step,
+            base="free",
+            actuators="all",
+            ground=FRICTION,
+            contact="ground",
+            near_rigid=0.1,
+        )
+
+
+def rest(name, model, joints, turn=(0.0, 0.0, 0.0)):
+    """(nx,) a state at rest, the joints held at about `joints` by a PD controller, with the base turned [rad] first."""
+    robot, fine = LEGGED[name], model.at_time_step(SETTLE_STEP)
+    nq, count = model.nq, len(joints)
+    x = np.array(model.default_state)
+    x[:nq] = 0.0
+    quaternion = np.concatenate([[1.0], np.array(turn) / 2])
+    x[:4], x[nq - count : nq] = quaternion / np.linalg.norm(quaternion), joints
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, x[:nq])
+    bottoms = [
+        model.plant.EvalBodyPoseInWorld(context, model.plant.GetBodyByName(foot)).translation()[2] - robot.radius
+        for foot in robot.feet
+    ]
+    x[6] -= min(bottoms) + SINK
+    kp, kd = robot.gains
+    drive = model.actuation[-count:]
+    for _ in range(round(SETTLES / SETTLE_STEP)):
+        torque = kp * (joints - x[nq - count : nq]) - kd * x[-count:]
+        x = np.array(advance(fine.double, x, np.linalg.solve(drive, torque)))
+    x[nq:] = 0.0
+    return x

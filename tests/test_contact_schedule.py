@@ -1,0 +1,180 @@
+"""Which foot stands when: the soles, the forces and the guess by closed form, what a schedule refuses, and plans."""
+
+import numpy as np
+import pytest
+from helpers.legged import LEGGED, SOLO_FEET, legged_model, rest
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.model.step import advance
+from drake_diff.model.tangent import tangent_space
+from drake_diff.optimize.scheduled.centroidal import plan_forces
+from drake_diff.optimize.scheduled.legs import Legs
+from drake_diff.optimize.scheduled.motion import swings, touching
+
+H, G = 0.02, np.array([0.0, 0.0, -9.81])
+SQUARE = np.array([[0.2, 0.1, 0.0], [0.2, -0.1, 0.0], [-0.2, 0.1, 0.0], [-0.2, -0.1, 0.0]])
+HOP = [(20, SOLO_FEET), (8, ()), (20, SOLO_FEET)]
+
+
+@pytest.fixture(scope="module")
+def solo():
+    return legged_model("solo12")
+
+
+@pytest.fixture(scope="module")
+def standing(solo):
+    return rest("solo12", solo, np.array(LEGGED["solo12"].high))
+
+
+def posed(model, seed):
+    """A posture at random, the base turned any way."""
+    random = np.random.default_rng(seed)
+    x = np.array(model.default_state)
+    x[:4] = random.standard_normal(4)
+    x[:4] /= np.linalg.norm(x[:4])
+    x[4 : model.nq] = random.uniform(-1, 1, model.nq - 4)
+    x[model.nq :] = random.standard_normal(model.nv)
+    return x
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_soles_move_as_differences_say(solo, seed):
+    x, nq, nv = posed(solo, seed), solo.nq, solo.nv
+    legs, space, step = Legs(solo, SOLO_FEET, np.array(solo.default_state[:nq])), tangent_space(solo), 1e-6
+
+    def at(d):
+        moved = space.plus(x, np.concatenate([d, np.zeros(nv)]))
+        legs.put(moved[:nq], x[nq:])
+        return legs.points(), legs.velocities(x[nq:])[0]
+
+    units = step * np.eye(nv)
+    slopes = [[(a - b) / (2 * step) for a, b in zip(at(d), at(-d), strict=True)] for d in units]
+    legs.put(x[:nq], x[nq:])
+    moves, turns = legs.jacobians()
+    velocities, by_posture = legs.velocities(x[nq:])
+    assert np.allclose(velocities, moves @ x[nq:], atol=1e-12)
+    assert np.allclose(by_posture, np.moveaxis([s[1] for s in slopes], 0, -1), atol=1e-7)  # of differences of 1e-6
+    height = np.moveaxis([s[0] for s in slopes], 0, -1)[:, 2]
+    assert np.allclose(moves[:, 2], height, atol=1e-7)
+    assert np.allclose(turns[:, :, :3], np.eye(3), atol=1e-12)  # a turn of the base turns every foot
+
+
+def test_where_no_foot_stands_the_centre_of_mass_flies():
+    stands = np.repeat([[True], [False], [True]], [20, 10, 20], axis=0) & np.ones((1, 4), bool)
+    way = np.tile([0.0, 0.0, 0.3], (51, 1))
+    way[:, 0] = np.linspace(0, 0.1, 51)
+    places = np.tile(SQUARE, (51, 1, 1))
+    at, forces = plan_forces(3.0, G, H, (way[0], np.zeros(3)), way, places, stands, 0.5)
+    velocity = np.diff(at, axis=0) / H
+    before = np.vstack([np.zeros(3), velocity[:-1]])
+    assert np.allclose((velocity - before) / H, forces.sum(axis=1) / 3.0 + G, atol=1e-4)  # [m/s^2] Newton's law
+    assert np.all(forces[20:30] == 0)
+    # From its last step on the ground to its first it falls as a stone does, by the steps' own rule.
+    assert np.allclose(
+        at[20:31, 2] - at[20, 2], H * velocity[19, 2] * np.arange(11) - 9.81 * H**2 * np.cumsum(range(11)), atol=1e-6
+    )
+    assert np.all(np.abs(forces[..., :2]) <= 0.5 * forces[..., 2:] + 1e-5)
+    assert np.allclose(at[[0, -1]], way[[0, -1]], atol=1e-7)
+
+
+def test_without_a_foot_that_stands_there_are_no_forces():
+    refused = plan_forces(
+        3.0, G, H, (np.zeros(3), np.zeros(3)), np.zeros((11, 3)), np.zeros((11, 4, 3)), np.zeros((10, 4), bool), 0.5
+    )
+    assert "no forces" in str(refused)
+
+
+def test_a_foot_is_on_the_ground_before_and_after_each_step_it_stands_in():
+    stands = np.array([[1, 1, 0, 0, 0, 1, 1]], bool).T
+    on = touching(stands)
+    assert on.ravel().tolist() == [True, True, True, False, False, True, True, True]
+    assert swings(on[:, 0]) == [(2, 5)]
+    assert swings(touching(~stands)[:, 0]) == [(0, 2), (5, 7)]
+
+
+def test_a_guess_keeps_its_schedule_and_nearly_the_steps(solo, standing):
+    schedule = dd.optimize.ContactSchedule(HOP)
+    xs, us = schedule.guess(solo, standing)
+    problem = dd.Problem(solo, x0=standing, num_steps=48, goals=[schedule], **schedule.follow(solo, (xs, us)))
+    for constraint in problem.kept_goals:
+        knots = problem.knots_of(constraint, input_at_end=False)
+        assert max(constraint.miss(xs[k]) for k in knots) <= constraint.tolerance
+    ends = np.array([advance(solo.double, x, u) for x, u in zip(xs[:-1], us, strict=True)])
+    gaps = np.array([tangent_space(solo).minus(a, b) for a, b in zip(ends, xs[1:], strict=True)])
+    base = gaps[:, [0, 1, 2, 3, 4, 5, 18, 19, 20, 21, 22, 23]]
+    assert np.max(np.abs(base)) < 0.05  # rad, m and their rates, where the robot flies at 0.8 m/s
+    assert np.max(xs[:, 6]) > standing[6] + 0.02  # g T^2 / 8 = 0.03 m
+
+
+def test_what_does_not_keep_the_schedule_is_told(solo, standing):
+    schedule = dd.optimize.ContactSchedule(HOP)
+    xs, us = schedule.guess(solo, standing)
+    problem = dd.Problem(solo, x0=standing, num_steps=48, goals=[schedule], **schedule.follow(solo, (xs, us)))
+    lifted, low, dragged = np.array(xs[10]), np.array(xs[24]), np.array(xs[10])
+    lifted[6] += 0.02
+    low[6] -= 0.08
+    dragged[solo.nq + 3] += 0.5
+    stands, clear, slips = problem.kept_goals
+    assert stands.miss(lifted) == pytest.approx(0.02 - 1.25e-3, abs=5e-4)  # it sinks by 1.25 mm as it stands
+    assert clear.miss(low) > clear.tolerance
+    assert slips.miss(dragged) > slips.tolerance
+    assert slips.miss(xs[10]) < slips.tolerance
+    assert "over the ground" in stands.told(0.02)
+
+
+def test_rows_of_a_schedule_have_the_derivative_of_differences(solo, standing):
+    schedule = dd.optimize.ContactSchedule(HOP)
+    problem = dd.Problem(solo, x0=standing, num_steps=48, goals=[schedule])
+    x, u, step = posed(solo, 5), np.zeros(solo.nu), 1e-6
+    for constraint in problem.kept_goals:
+        found = constraint.differentiate(x, u)[1][:, : solo.nx]
+        assert np.allclose(found[:, :4] @ x[:4], 0.0, atol=1e-9)  # of a quaternion's length nothing depends
+        units = step * np.eye(solo.nx)
+        along = np.array([(constraint(x + d, u) - constraint(x - d, u)) / (2 * step) for d in units]).T
+        assert np.allclose(found, along, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("phases", "named"),
+    [
+        ([], "phases"),
+        ([(0, SOLO_FEET)], "phases"),
+        ([(4, "FL_FOOT")], "phases"),
+        ([(4, ())], "feet"),
+        ([(2.5, SOLO_FEET)], "phases"),
+    ],
+)
+def test_what_is_no_schedule_is_refused(phases, named):
+    with pytest.raises(InputError, match=named):
+        dd.optimize.ContactSchedule(phases)
+
+
+def test_a_schedule_that_does_not_fit_the_problem_is_refused(solo, standing):
+    hop = dd.optimize.ContactSchedule(HOP)
+    with pytest.raises(InputError, match="48 steps"):
+        dd.Problem(solo, x0=standing, num_steps=50, goals=[hop])
+    with pytest.raises(UnknownNameError, match="FL_FOOT"):
+        dd.Problem(solo, x0=standing, num_steps=4, goals=[dd.optimize.ContactSchedule([(4, ["left"])])])
+    with pytest.raises(InputError, match="none to stand on"):
+        dd.optimize.ContactSchedule([(4, ["base_link"])]).guess(solo, standing)
+    far = np.array(standing[: solo.nq])
+    far[4] += 50.0
+    with pytest.raises(InputError, match="no forces"):
+        hop.guess(solo, standing, far)
+
+
+@pytest.mark.slow
+def test_solo_hops_and_lands(solo, standing):
+    schedule = dd.optimize.ContactSchedule(HOP)
+    guess = schedule.guess(solo, standing)
+    place = dd.FrameGoal("base_link", position=standing[4:7], tolerance=0.05)
+    problem = dd.Problem(solo, x0=standing, num_steps=48, goals=[schedule, place], **schedule.follow(solo, guess))
+    solution = dd.solve(problem, method="ilqr", initial_guess=guess, tolerance=1e-4)
+    assert solution.success, solution.message
+    # A referee of its own: every foot is in the air in the middle of the flight, by Drake's own numbers.
+    context = solo.plant.CreateDefaultContext()
+    solo.plant.SetPositions(context, solution.xs[24, : solo.nq])
+    feet = [solo.plant.GetBodyByName(foot) for foot in SOLO_FEET]
+    heights = [solo.plant.EvalBodyPoseInWorld(context, foot).translation()[2] - 0.016 for foot in feet]
+    assert min(heights) > 0.02
