@@ -429,7 +429,7 @@ def test_steps_that_are_not_known_to_rounding_are_said_to_be_drakes_own_and_hide
     def refused(model, vector, xs, us, values):
         n = len(xs)
         refusals = dict.fromkeys(range(n), Refusal("not today"))
-        return Polished(xs, xs, np.ones(n, dtype=bool), np.full(n, np.nan), refusals)
+        return Polished(xs, xs, np.ones(n, dtype=bool), np.full(n, np.nan), np.full((n, model.nv), np.nan), refusals)
 
     monkeypatch.setattr("drake_diff.certificates.certify.polished_steps", refused)
     model = sliding("lagged")

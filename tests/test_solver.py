@@ -242,14 +242,14 @@ def test_a_solver_that_lies_is_not_believed(load, monkeypatch):
 
 
 def test_a_wrong_derivative_is_named_and_keeps_a_solve_from_success(load, monkeypatch):
-    module = sys.modules["drake_diff.certificates.certify"]
-    original = module.step_jacobians
+    module = sys.modules["drake_diff.certificates.steps"]
+    original = module.derivatives_along
 
-    def one_percent_off(*args):
-        d = original(*args)
-        return dataclasses.replace(d, A=d.A * np.array([[1, 1], [1.01, 1]]))
+    def one_percent_off(*args, **options):
+        found = original(*args, **options)
+        return [dataclasses.replace(d, A=d.A * np.array([[1, 1], [1.01, 1]])) for d in found]
 
-    monkeypatch.setattr(module, "step_jacobians", one_percent_off)
+    monkeypatch.setattr(module, "derivatives_along", one_percent_off)
     solution = dd.solve(pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0]), method="shooting")
     assert solution.status is Status.CONVERGED_NOT_VERIFIED
     assert "d hinge_w / d hinge_q" in solution.message

@@ -98,7 +98,8 @@ class Certificate(ShowsItsRepr):
     reasons: dict[tuple[int, int], str]  # of the entries that are discontinuous
     method: str
     subject: str
-    # In displacements of which one changes a column by its `scale`; None where the differences are of another motion.
+    # In displacements of which one changes a column by its `scale`; None where the differences are of another motion,
+    # or along directions alone: `difference` then is the matrix nearest to the derivative that has their slopes.
     around: Neighbourhood | None
     scale: Array  # (n,)
     stopped: float  # how early the solver stopped where the derivative was taken, as a part of the momentum
@@ -140,7 +141,7 @@ class Certificate(ShowsItsRepr):
     def of(self, derivative: ArrayLike) -> "Certificate":
         """The certificate of another `derivative` (m, n) at this point, by the same differences."""
         if self.around is None:
-            raise InputError("of", got="a certificate by the motion in continuous time", expected="certify_rollout")
+            raise InputError("of", got="a certificate without differences of each entry", expected="one by `certify`")
         a = finite_array("derivative", derivative, self.derivative.shape) * self.scale
         named = {
             name: getattr(self, name) for name in ("rows", "columns", "method", "subject", "told", "stopped", "second")

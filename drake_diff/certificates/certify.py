@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.differences import one_by_one
@@ -67,8 +67,19 @@ def certify(
         ('agree', (2, 3))
     """
     check_method(method)
-    x, u = check_point(model, x, u)
-    vector = select(model, parameters)
+    return _certified(model, *check_point(model, x, u), select(model, parameters), method, derivatives, not derivatives)
+
+
+def _certified(
+    model: Model,
+    x: Array,
+    u: Array,
+    vector: ParameterVector,
+    method: str,
+    derivatives: StepDerivatives | None,
+    look_beside: bool,
+) -> Certificate:
+    """`certify`; `look_beside` the point too, at the derivative 1e-9 away by `method`."""
     with applied(vector) as model:
         space = tangent_space(model)
         point = np.concatenate([x, u, vector.values])
@@ -80,7 +91,7 @@ def certify(
             return space.jacobian(at[: model.nx], d.x_next, d.A, d.B, d.C) * scale
 
         d, beside = derivatives or step_jacobians(model, vector, x, u, method), None
-        if derivatives is None and not vector.parameters:
+        if look_beside and not vector.parameters:
             jittered = move(space, model.nx, point, jitter(scale))
             d_beside = step_jacobians(model, vector, jittered[: model.nx], jittered[model.nx :], method)
             beside = on_tangent(jittered, d_beside)
@@ -120,29 +131,41 @@ def _at_limits(model: Model, x: Array) -> str:
     return f"joint limits act: {', '.join(found)}" if found else ""
 
 
-def certify_inside(model: Model, x: Array, u: Array, *, parameters: Parameters = ()) -> Certificate:
+def certify_inside(
+    model: Model, x: Array, u: Array, *, parameters: Parameters = (), derivatives: StepDerivatives | None = None
+) -> Certificate:
     """`certify`, on the inner side of effort limits: a plan's inputs end up exactly at them, and never go beyond.
 
     Drake cuts inputs off at the limit, which is a corner: differences are taken beside it, where they have room. By
-    what the derivative exactly at the limit differs from the one just inside, what is certified is off.
+    what the derivative exactly at the limit differs from the one just inside, what is certified is off. `derivatives`
+    are those on the inner side, where they are known.
     """
-    limits = form_of(model).cut
-    room = np.minimum(EFFORT_ROOM * np.maximum(1.0, np.abs(u)), EFFORT_PART * limits)
-    inside = np.minimum(np.maximum(u, room - limits), limits - room)
-    found = certify(model, x, inside, parameters=parameters)
+    inside = with_room(model, u)
+    found = _certified(model, x, inside, select(model, parameters), "auto", derivatives, look_beside=True)
     moved = inside != u
     if not moved.any():
         return found
-    names = ", ".join(np.array(model.input_names)[moved])
-    told = "; ".join(text for text in (found.told, f"{names} certified beside the limit of its effort") if text)
-    leap = _leap(model, x, u, np.where(moved, np.sign(inside - u), 0.0), parameters)
+    told = "; ".join(text for text in (found.told, beside_limits(model, moved)) if text)
+    leap = leap_at_limits(model, x, u, np.sign(inside - u), parameters)
     if np.any(np.abs(leap) > LEAP * found.size):
         told += f", at which the derivative is another one, by up to {np.max(np.abs(leap)):.3g}"
         found = replace(found.of(found.derivative + leap), mode_changes=found.mode_changes)
     return replace(found, told=told)
 
 
-def _leap(model: Model, x: Array, u: Array, inward: Array, parameters: Parameters) -> Array:
+def beside_limits(model: Model, at_limit: NDArray[np.bool_]) -> str:
+    """What a certificate says of inputs that are at the limit of their effort."""
+    return f"{', '.join(np.array(model.input_names)[at_limit])} certified beside the limit of its effort"
+
+
+def with_room(model: Model, us: Array) -> Array:
+    """Inputs (..., nu) that leave differences room to effort limits."""
+    limits = form_of(model).cut
+    room = np.minimum(EFFORT_ROOM * np.maximum(1.0, np.abs(us)), EFFORT_PART * limits)
+    return np.minimum(np.maximum(us, room - limits), limits - room)
+
+
+def leap_at_limits(model: Model, x: Array, u: Array, inward: Array, parameters: Parameters) -> Array:
     """The derivative at u (nu,) less that 1e-9 of u away, to the side that the signs `inward` (nu,) say."""
     vector, both = select(model, parameters), []
     with applied(vector) as model:
@@ -167,12 +190,13 @@ class StepAround:
     point: Array
     scale: Array
 
-    def _moved(self, displacement: Array) -> Array:
+    def moved(self, displacement: Array) -> Array:
+        """(nx + nu + np,) the point at a displacement (n,)."""
         return move(self.space, self.model.nx, self.point, self.scale * displacement)
 
     def drake(self, displacement: Array) -> Array:
         """(nx,) where Drake's own step leads, on the double twin, which is left there."""
-        moved, nx, end = self._moved(displacement), self.model.nx, self.model.nx + self.model.nu
+        moved, nx, end = self.moved(displacement), self.model.nx, self.model.nx + self.model.nu
         return step_at(self.model, self.vector, moved[:nx], moved[nx:end], moved[end:])
 
     def look_around(self) -> tuple[Neighbourhood, str, float]:
@@ -185,7 +209,7 @@ class StepAround:
         left = []
 
         def solved(displacements: Array) -> Array:
-            moved, nx, end = np.array([self._moved(d) for d in displacements]), model.nx, model.nx + model.nu
+            moved, nx, end = np.array([self.moved(d) for d in displacements]), model.nx, model.nx + model.nu
             found = polished_steps(model, self.vector, moved[:, :nx], moved[:, nx:end], moved[:, end:])
             for refusal in found.refused.values():
                 raise _RefusedError(str(refusal))

@@ -118,16 +118,27 @@ def _matters(around: Neighbourhood, a: Array, difference: Array, second: Scales 
       of the largest entry of the row.
     """
     found = np.abs(difference)
-    small = _small(found)
-    if second is not None:
-        unit = second[0][:, None] / second[1]
-        small = np.minimum(small, unit * _small(found / unit))
-    small = np.maximum(small, UNSEEN * found.max(axis=1, keepdims=True, initial=0))
+    small = _negligible(found, second)
     rounding = (TOLD * around.finest / STEPS[3] / POWER)[:, None]
     rounding = np.minimum(rounding, ROUNDED * found.max(axis=1, keepdims=True, initial=0))
     widest = VANISHING * np.maximum(np.abs(around.forward[0]), np.abs(around.backward[0]))
     least = np.maximum(np.maximum(small, widest), rounding) + EPS * found.max(initial=0) + TINY
     return np.maximum(np.maximum(np.abs(a), found), least), least
+
+
+def weighed(a: Array, second: Scales | None) -> Array:
+    """(m, n) what an error of each entry of `a` is measured by: see `_matters`; nothing is excused by rounding."""
+    found = np.abs(a)
+    return np.maximum(found, _negligible(found, second) + EPS * found.max(initial=0) + TINY)
+
+
+def _negligible(found: Array, second: Scales | None) -> Array:
+    """(m, n) the least that matters of entries of these magnitudes."""
+    small = _small(found)
+    if second is not None:
+        unit = second[0][:, None] / second[1]
+        small = np.minimum(small, unit * _small(found / unit))
+    return np.maximum(small, UNSEEN * found.max(axis=1, keepdims=True, initial=0))
 
 
 def _small(found: Array) -> Array:

@@ -11,7 +11,7 @@ Where Drake's does not, the problem is not Drake's and a Refusal says by how muc
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,7 @@ class Polished:
     drake: Array  # (N, nx) where Drake's own steps lead
     acts: NDArray[np.bool_]  # (N,) whether an impulse may act, so that Drake's solver has something to solve
     left: Array  # (N,) what Drake's own leaves of the momentum, which is to be at most 1e-6; NaN where not known
+    missing: Array  # (N, nv) that, as a momentum, of the whole plant
     refused: Mapping[int, Refusal]
 
 
@@ -61,32 +62,41 @@ def polished_step(model: Model, vector: ParameterVector, x: Array, u: Array) -> 
 
 
 def polished_steps(
-    model: Model, vector: ParameterVector, xs: Array, us: Array, values: Array | None = None
+    model: Model,
+    vector: ParameterVector,
+    xs: Array,
+    us: Array,
+    values: Array | None = None,
+    held: Array | None = None,
 ) -> Polished:
     """The steps from each of xs (N, nx) under each of us (N, nu); many in one call cost far less than one by one.
 
-    `values` (N, np) are the parameters of each step, those of `vector`, which is applied, where it is None.
+    `values` (N, np) are the parameters of each step, those of `vector`, which is applied, where it is None. `held`
+    (N, nv) is a momentum that is left in the balance of each step: with what Drake's solver left at a point, steps
+    around it begin at Drake's own, and their slopes are those of the equation there, where a derivative is taken.
 
     Raises SimulationError where Drake cannot take a step.
     """
     if values is None or not vector.parameters:
-        return _polish(model, vector, xs, us, None)
+        return _polish(model, vector, xs, us, None, held)
     times = np.array([vector.time_step(row) for row in values])
     if np.all(times == model.time_step):
-        return _polish(model, vector, xs, us, values)
+        return _polish(model, vector, xs, us, values, held)
     x_next, drake, left, acts = np.empty_like(xs), np.empty_like(xs), np.empty(len(xs)), np.zeros(len(xs), dtype=bool)
+    missing = np.empty((len(xs), model.whole.nv))
     refused: dict[int, Refusal] = {}
     for h in np.unique(times):
         which = np.flatnonzero(times == h)
-        points = xs[which], us[which], values[which]
+        points = xs[which], us[which], values[which], None if held is None else held[which]
         if h == model.time_step:
             part = _polish(model, vector, *points)
         else:
             with applied(vector.at(points[2][0])) as other:
                 part = _polish(other, vector.at(points[2][0]), *points)
         x_next[which], drake[which], left[which], acts[which] = part.x_next, part.drake, part.left, part.acts
+        missing[which] = part.missing
         refused |= {int(which[k]): why for k, why in part.refused.items()}
-    return Polished(x_next, drake, acts, left, refused)
+    return Polished(x_next, drake, acts, left, missing, refused)
 
 
 def solves_the_step(model: Model, x: Array, u: Array, end: Array) -> bool:
@@ -103,16 +113,18 @@ def solves_the_step(model: Model, x: Array, u: Array, end: Array) -> bool:
         return False
     v_next = np.array([drake[model.nq :], end[model.nq :]])
     problems = _problems(model, form, [read, read], np.array([x, x]), np.array([u, u]), couplers)
-    _, _, refused = _solved(problems, np.array([x, x])[:, model.nq :], v_next)
+    _, _, _, refused = _solved(problems, np.array([x, x])[:, model.nq :], v_next)
     moved = _states(model, x[None], v_next[1:])[0] - end
     return not refused and bool(np.all(np.abs(moved) <= FREE_STEP * np.maximum(1.0, np.abs(end))))
 
 
-def _polish(model: Model, vector: ParameterVector, xs: Array, us: Array, values: Array | None) -> Polished:
+def _polish(
+    model: Model, vector: ParameterVector, xs: Array, us: Array, values: Array | None, held: Array | None
+) -> Polished:
     """Of one time step. Reduced coordinates are read from the step of the whole plant, as in `advance`."""
     if model.coupling is None:
-        return _polish_whole(model, vector, xs, us, values, couplers_of(model))
-    whole = _polish_whole(model.whole, vector, model.coupling.state(xs), us, values, couplers_of(model))
+        return _polish_whole(model, vector, xs, us, values, held, couplers_of(model))
+    whole = _polish_whole(model.whole, vector, model.coupling.state(xs), us, values, held, couplers_of(model))
     drake, x_next = np.empty_like(xs), np.full_like(xs, np.nan)
     try:
         for k, x in enumerate(xs):
@@ -125,7 +137,7 @@ def _polish(model: Model, vector: ParameterVector, xs: Array, us: Array, values:
     finally:
         if values is not None:
             vector.write(model.double, vector.values)
-    return Polished(x_next, drake, whole.acts, whole.left, whole.refused)
+    return Polished(x_next, drake, whole.acts, whole.left, whole.missing, whole.refused)
 
 
 def _polish_whole(
@@ -134,6 +146,7 @@ def _polish_whole(
     xs: Array,
     us: Array,
     values: Array | None,
+    held: Array | None,
     couplers: Couplers | Refusal,
 ) -> Polished:
     """With all coordinates of the plant."""
@@ -159,18 +172,21 @@ def _polish_whole(
         if values is not None:
             vector.write(model.double, vector.values)
     x_next, left = np.full_like(xs, np.nan), np.full(len(xs), np.nan)
-    acts = np.zeros(len(xs), dtype=bool)
+    acts, missing = np.zeros(len(xs), dtype=bool), np.full((len(xs), model.nv), np.nan)
     if why:
-        return Polished(x_next, drake, acts, left, {k: Refusal(why) for k in range(len(xs))})
+        return Polished(x_next, drake, acts, left, missing, {k: Refusal(why) for k in range(len(xs))})
     if read:
         which = np.array([r.step for r in read], dtype=np.intp)
         problems = _problems(model, form, read, xs[which], us[which], couplers)
         acts[which] = problems.taking_part().any(axis=1)
-        v_next, left[which], whys = _solved(problems, xs[which, model.nq :], drake[which, model.nq :])
+        own = None if held is None else held[which]
+        v_next, missing[which], left[which], whys = _solved(
+            problems, xs[which, model.nq :], drake[which, model.nq :], own
+        )
         refused |= {int(which[i]): Refusal(why) for i, why in whys.items()}
         x_next[which] = _states(model, xs[which], v_next)
     x_next[list(refused)] = np.nan
-    return Polished(x_next, drake, acts, left, refused)
+    return Polished(x_next, drake, acts, left, missing, refused)
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,8 +377,11 @@ def _at_point(motions: Array, from_origin: Array) -> Array:
     return np.asarray(moves[..., 3:] + cross(moves[..., :3], from_origin[:, None, :]))
 
 
-def _solved(problems: ConvexSteps, before: Array, drake: Array) -> tuple[Array, Array, dict[int, str]]:
-    """v' (N, nv) to rounding, what Drake's v' (N, nv) leaves of the momentum (N,), and those that are refused.
+def _solved(
+    problems: ConvexSteps, before: Array, drake: Array, held: Array | None = None
+) -> tuple[Array, Array, Array, dict[int, str]]:
+    """v' (N, nv) to rounding, what Drake's v' (N, nv) leaves, as a momentum (N, nv) and as a part of it (N,), and those
+    that are refused; `held` (N, nv) is left in the balance.
 
     Without impulses the step is a sum, rounded by its larger terms: from `before` (N, nv) it may end at rest.
     """
@@ -371,7 +390,11 @@ def _solved(problems: ConvexSteps, before: Array, drake: Array) -> tuple[Array, 
     moving = np.maximum(problems.scale(before, at.given), problems.scale(drake, at.given))
     had = problems.scale(drake * solved, at.given) + AT_REST, moving
     left, elsewhere = (np.divide(m, p, out=np.zeros_like(m), where=m > 0) for m, p in zip(missing, had, strict=True))
-    v_next, reached = problems.solve(drake, at)
+    if held is None:
+        v_next, reached = problems.solve(drake, at)
+    else:
+        problems_held = replace(problems, momentum=problems.momentum + held)
+        v_next, reached = problems_held.solve(drake, replace(at, missing=at.missing - held))
     whys = {}
     for i in np.flatnonzero(~(left <= DRAKES_STOP)):
         whys[int(i)] = (
@@ -382,7 +405,7 @@ def _solved(problems: ConvexSteps, before: Array, drake: Array) -> tuple[Array, 
         whys[int(i)] = f"Drake's step without impulses differs by {elsewhere[i]:.2g} of the momentum"
     for i in np.flatnonzero(~reached):
         whys.setdefault(int(i), "Newton's method does not solve the step to rounding")
-    return v_next, left, whys
+    return v_next, at.missing, left, whys
 
 
 def _states(model: Model, xs: Array, v_next: Array) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff.certificates.certificate import Certificate
-from drake_diff.certificates.certify import certify_inside
+from drake_diff.certificates.steps import certify_steps
 from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.parameters import TIME_STEP
@@ -336,13 +336,12 @@ class Run:
         if design.has_step and not design.moves_step:
             model = model.at_time_step(float(parameters.pop(TIME_STEP)[0]))
 
-        def certificate(x: Array, u: Array) -> Certificate:
-            """That of a search which ends where it began is known: it costs as much as the search."""
-            at = x.tobytes() + u.tobytes() + repr(parameters).encode()
-            if at not in self.certified:
-                self.certified[at] = certify_inside(model, x, u, parameters=parameters)
-            return self.certified[at]
-
-        certified = certified_knots(us) if self.problem.motion == STEPS else ()  # else see `slope`, of the whole plan
-        certificates = tuple(certificate(xs[k], us[k]) for k in certified)
+        knots = certified_knots(us) if self.problem.motion == STEPS else ()  # else see `slope`, of the whole plan
+        keys = {int(k): xs[k].tobytes() + us[k].tobytes() + repr(parameters).encode() for k in knots}
+        # That of a search which ends where it began is known.
+        new = [k for k, key in keys.items() if key not in self.certified]
+        if new:
+            found = certify_steps(model, xs[new], us[new], parameters=parameters)
+            self.certified.update(zip([keys[k] for k in new], found, strict=True))
+        certificates = tuple(self.certified[key] for key in keys.values())
         return xs, us, certificates, why_blind(self.problem, variables, z)

@@ -3,7 +3,8 @@
 States of robots of example-robot-data and of the models here, at random step sizes: free, within 0.05 rad of joint
 limits, under PD control, and in contact by the three approximations. Each derivative, by parameters too, is certified
 as it is, and then with errors planted: one entry that matters 1 % off, blocks negated, zeroed or transposed, columns
-swapped. An entry matters from a millionth of the largest entry of its row or of its column on, the columns being moved
+swapped. What `dd.solve` asks, a look along a few directions and at the entries where that leaves a doubt, gets the same
+errors. An entry matters from a millionth of the largest entry of its row or of its column on, the columns being moved
 by 1 SI unit, or by the variable's magnitude where that is more.
 """
 
@@ -19,7 +20,12 @@ from pydrake.multibody.tree import JointIndex
 from trust import Figure
 
 import drake_diff as dd
+from drake_diff.certificates.certify import StepAround, in_steps, state_scale
+from drake_diff.certificates.first_look import LookAt
+from drake_diff.certificates.steps import ends_around
 from drake_diff.exceptions import GradientError, SimulationError
+from drake_diff.model.parameters import applied, select
+from drake_diff.model.tangent import tangent_space
 
 COUNT = 1000
 FLOATING = ("solo12.urdf", "go2.urdf", "bolt.urdf", "simple_humanoid.urdf")
@@ -150,6 +156,20 @@ def certified(case):
     return dd.certify(case.model, case.x, case.u, parameters=case.parameters, method=method)
 
 
+def first_look(case, derivative):
+    """Whether a look along a few directions passes a derivative: what `dd.solve` asks before anything else."""
+    vector = select(case.model, case.parameters)
+    with applied(vector) as model:
+        space = tangent_space(model)
+        point = np.concatenate([case.x, case.u, vector.values])
+        scale = np.concatenate([state_scale(space, case.x), np.maximum(1.0, np.abs(case.u)), vector.difference_scale()])
+        step = StepAround(model, vector, space, point, scale)
+        plan = LookAt(derivative * scale, in_steps(model, space, len(scale)))
+        points = np.array([step.moved(d) for d in plan.displacements])
+        ((ends, _, why),) = ends_around(model, vector, case.x[None], case.u[None], [points])
+        return not why and not plan.taken(ends, space.minus).doubt()
+
+
 def plant_entries(case, certificate, random, tally, report):
     """Single entries 1 % off."""
     entries = mattering(certificate)
@@ -159,6 +179,11 @@ def plant_entries(case, certificate, random, tally, report):
         found = certificate.of(wrong)
         tally["entries"] += 1
         tally["found"] += found.verdict != "agree"
+        seen = not first_look(case, wrong)
+        tally["seen"] += seen
+        tally["found by both"] += seen and found.verdict != "agree"
+        if not seen:
+            report(case, found, f"a first look passes {found.rows[i]}, {found.columns[j]}: {found.entry(i, j)}")
         if certificate.verdict == "agree":
             tally["of certified"] += 1
             tally["named"] += (found.worst.row, found.worst.column) == (found.rows[i], found.columns[j])
@@ -189,11 +214,15 @@ def measure(seed, count, report=silent):
             tally["exact"] += 1
             tally["alarms"] += certificate.verdict in {"disagree", "discontinuous"}
             tally["undecided"] += certificate.verdict == "undecided"
+            at_once = first_look(case, certificate.derivative)
+            tally["at once"] += at_once
+            tally["solve's alarms"] += not at_once and certificate.verdict in {"disagree", "discontinuous"}
         plant_entries(case, certificate, random, tally, report)
         for how, wrong in corrupted(case, certificate, random):
             tally["blocks"] += 1
             found = certificate.of(wrong)
             tally["blocks found"] += found.verdict != "agree"
+            tally["blocks by both"] += found.verdict != "agree" and not first_look(case, wrong)
             if found.verdict == "agree":
                 report(case, found, how)
     return [
@@ -204,4 +233,8 @@ def measure(seed, count, report=silent):
         Figure("an exact derivative is called wrong or discontinuous", tally["alarms"], tally["exact"], 0.01, False),
         Figure("an exact derivative is undecided", tally["undecided"], tally["exact"], 0.03, False),
         Figure("a derivative is refused", tally["refused"], count, 0.05, False),
+        Figure("an entry 1 % off is found in a solve", tally["found by both"], tally["entries"], 0.99, True),
+        Figure("a wrong block is found in a solve", tally["blocks by both"], tally["blocks"], 1.0, True),
+        Figure("an exact derivative is called wrong in a solve", tally["solve's alarms"], tally["exact"], 0.01, False),
+        Figure("a first look passes an exact derivative", tally["at once"], tally["exact"], 0.8, True),
     ]

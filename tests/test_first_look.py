@@ -1,0 +1,124 @@
+"""A look along a few random directions: what it passes is right, and what is wrong, or no slope, is left in doubt."""
+
+import numpy as np
+import pytest
+from helpers.models import MODELS
+from helpers.robots import example_robot, state_in_contact, state_in_range
+from helpers.table import each_row
+
+import drake_diff as dd
+from drake_diff.certificates.certify import certify_inside
+from drake_diff.certificates.first_look import LookAt
+from drake_diff.certificates.steps import certify_steps, first_looks
+
+RANDOM = np.random.default_rng(3)
+WEIGHT = RANDOM.standard_normal((5, 8)) * 10.0 ** RANDOM.uniform(-3, 3, (5, 1)) * 10.0 ** RANDOM.uniform(-3, 0, 8)
+
+
+def bent(x):
+    """(K, 5) of (K, 8), whose Jacobian at 0 is WEIGHT; entries differ by nine orders of magnitude."""
+    return np.sin(x) @ WEIGHT.T + np.cos(x[:, :1] * x[:, 1:2])
+
+
+def doubt(f, derivative):
+    look = LookAt(np.asarray(derivative, dtype=float))
+    return look.taken(f(look.displacements)).doubt()
+
+
+def test_the_jacobian_of_a_formula_passes_and_each_entry_a_percent_off_does_not():
+    assert doubt(bent, WEIGHT) == ""
+    for i, j in np.ndindex(WEIGHT.shape):
+        wrong = WEIGHT.copy()
+        wrong[i, j] *= 1.0101
+        assert "another one" in doubt(bent, wrong), (i, j)
+
+
+def test_what_would_have_been_noticed_is_noticed():
+    look = LookAt(WEIGHT)
+    taken = look.taken(bent(look.displacements))
+    assert np.all(taken.noticeable <= 0.01 * taken.size)
+    random, seen = np.random.default_rng(5), 0
+    for _ in range(200):  # errors of all entries together, the size of each what matters
+        error = 0.0101 * taken.size * random.choice([-1.0, 1.0], WEIGHT.shape)
+        seen += taken.of(WEIGHT + error).doubt() != ""
+    assert seen == 200
+
+
+def test_the_difference_of_one_wrong_entry_has_the_slopes_that_were_measured():
+    wrong = WEIGHT.copy()
+    wrong[2, 3] *= 2
+    look = LookAt(wrong)
+    taken = look.taken(bent(look.displacements))
+    # 1e-9 of the largest slope: the differences' own error
+    assert taken.difference @ taken.directions.T == pytest.approx(WEIGHT @ taken.directions.T, abs=1e-9 * 1e3)
+
+
+@each_row(
+    "f, slope",
+    [
+        (lambda x: np.abs(x), 0.0),  # a corner
+        (lambda x: x + 0.02 * np.abs(x), 1.0),  # a small one
+        (lambda x: x + 1e-9 * (x > 0), 1.0),  # a jump
+        (lambda x: np.floor(x / 1e-7) * 1e-7, 1.0),  # stairs, by the slope over many
+        (lambda x: np.floor(x / 1e-7 + 0.5) * 1e-7, 0.0),  # by the slope of one
+        (lambda x: x + 1e-6 * np.floor(x / 1e-5 + 0.5), 1.0),  # the slope of stairs that rise more
+        (lambda x: np.floor(x / 1e-3 + 0.5) * 1e-3, 0.0),  # wide ones
+        (lambda x: x + np.maximum(x - 1e-6, 0.0), 1.0),  # a corner a millionth beside the point
+        (
+            lambda x: 1e-3 * x + np.maximum(np.abs(x) - 1e-4, 0) * np.sign(x),
+            1e-3,
+        ),  # flat beside far more, to both sides
+    ],
+)
+def test_what_has_no_slope_at_the_point_is_in_doubt(f, slope):
+    def both(x):
+        return np.hstack([f(x[:, :1]), x[:, 1:] * 3])
+
+    assert doubt(both, [[slope, 0.0], [0.0, 3.0]]) != ""
+
+
+def test_a_column_of_zeros_is_zero():
+    assert doubt(lambda x: x[:, :1], [[1.0, 0.0]]) == ""
+    assert "no effect" in doubt(lambda x: x[:, :1] + 1e-9 * x[:, 1:], [[1.0, 0.0]])
+
+
+def test_a_wide_bend_and_a_far_corner_are_no_doubt():
+    assert doubt(lambda x: x + 100 * x**2, [[1.0]]) == ""
+    assert doubt(lambda x: x + np.maximum(x - 1e-3, 0.0), [[1.0]]) == ""  # a contact that begins farther away
+
+
+@pytest.mark.parametrize("name", ["go2.urdf", "solo12.urdf"])
+@pytest.mark.parametrize("approximation", ["sap", "lagged", "similar"])
+def test_robots_on_their_feet_pass_at_once_and_a_wrong_entry_is_named(name, approximation):
+    model, random = example_robot(name, 0.005, approximation=approximation, feet=True), np.random.default_rng(1)
+    xs = np.array([state_in_contact(model, random, depth=3e-4) for _ in range(2)])
+    us = random.standard_normal((2, model.nu))
+    for look in first_looks(model, xs, us, ()):
+        assert look.doubt == ""
+        assert look.certificate.verdict == "agree"
+        assert look.certificate.power <= 0.01
+        a, scale = look.look.derivative, look.step.scale
+        for i, j in random.permutation(np.argwhere(np.abs(a) >= look.look.size * (1 - 1e-12)))[:100]:
+            wrong = a.copy()
+            wrong[i, j] *= 1.0101
+            assert look.look.of(wrong).doubt() != "", (i, j)
+        assert look.certificate.derivative * scale == pytest.approx(a)
+
+
+def test_where_a_ball_just_touches_every_entry_is_looked_at():
+    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.001)
+    x = model.default_state
+    x[:4], x[4:] = [1, 0, 0, 0], 0
+    x[6], x[12] = 0.1 + 1e-7, -0.1
+    (found,) = certify_steps(model, x[None], np.zeros((1, 0)))
+    assert found.around is not None
+    assert found.verdict == certify_inside(model, x, np.zeros(0)).verdict != "agree"
+
+
+def test_many_steps_agree_as_each_does():
+    model, random = example_robot("ur5_robot.urdf", 0.01), np.random.default_rng(2)
+    xs, us = np.array([state_in_range(model, random) for _ in range(3)]), random.standard_normal((3, model.nu))
+    together = certify_steps(model, xs, us)
+    for x, u, found in zip(xs, us, together, strict=True):
+        assert found.verdict == certify_inside(model, x, u).verdict == "agree"
+        assert "random directions" in found.told
