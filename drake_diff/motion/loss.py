@@ -9,8 +9,9 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import gradient_of
+from drake_diff._base.reverse import traced_gradient
 from drake_diff.derivatives.step import StepDerivatives
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import GradientError, InputError
 from drake_diff.motion.policy import policy_parameters
 
 Loss = Callable[..., Any]
@@ -41,9 +42,10 @@ def accumulate(
     policy = np.zeros(num_policy_parameters)
     for k in reversed(range(len(linearization))):
         d = linearization[k]
-        inputs[k] += d.B.T @ state[k + 1]
-        parameters += d.C.T @ state[k + 1]
-        state[k] += d.A.T @ state[k + 1]
+        inputs[k] += state[k + 1].dot(d.B)
+        if parameters.size:
+            parameters += state[k + 1].dot(d.C)
+        state[k] += state[k + 1].dot(d.A)
         if feedback:
             by_x, by_parameters, active = feedback[k]
             state[k] += by_x.T @ inputs[k]
@@ -75,6 +77,17 @@ def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, 
     if takes_one_argument(loss):
         value, gradient = gradient_of(loss, xs[-1])
         return value, np.vstack([np.zeros_like(xs[:-1]), gradient]), np.zeros_like(us)
+    try:
+        value, (by_xs, by_us) = traced_gradient(loss, (xs, us))
+    except Exception:  # it does what is not known there, or is wrong itself, which shows here
+        return _by_autodiff(loss, xs, us)
+    if not (np.isfinite(value) and np.all(np.isfinite(by_xs)) and np.all(np.isfinite(by_us))):
+        raise GradientError(f"the loss or its gradient is not finite: value {value}")
+    return value, by_xs, by_us
+
+
+def _by_autodiff(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, Array]:
+    """`differentiate_loss` in a time that grows with the square of the motion's length."""
     split = xs.size
 
     def flat(z: Any) -> Any:

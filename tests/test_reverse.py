@@ -1,0 +1,125 @@
+"""Gradients of functions of whole arrays: each operation against AutoDiffXd, and what must be refused."""
+
+import math
+
+import numpy as np
+import pytest
+from helpers.table import each_row
+
+import drake_diff as dd
+from drake_diff._base.reverse import UntraceableError, traced_gradient
+from drake_diff.exceptions import GradientError
+from drake_diff.motion.loss import _by_autodiff, differentiate_loss
+
+Q = np.random.default_rng(0).standard_normal((3, 3))
+OTHER = np.random.default_rng(1).standard_normal((4, 3))
+LOSSES = {
+    "squares": lambda xs, us: (xs * xs).sum() + 0.5 * (us**2).sum(),
+    "a constant beside": lambda xs, us: 2.0 - (3.0 - xs).sum() / 7 + (xs - OTHER).sum() * 1.5,
+    "quotients": lambda xs, us: (xs / (2 + us[0, 0])).sum() + (1 / (3 + xs)).sum() + (OTHER / (5 + xs)).sum(),
+    "powers": lambda xs, us: ((2 + xs) ** 1.5).sum() + (us**3).sum(),
+    "sines": lambda xs, us: (np.sin(xs) * np.cos(xs) + np.tan(0.3 * xs)).sum() + np.sin(us).mean(),
+    "arcs": lambda xs, us: (np.arcsin(0.2 * xs) + np.arccos(0.2 * xs) + np.arctan(xs) + np.arctan2(xs, 2 + xs)).sum(),
+    "exponentials": lambda xs, us: (np.exp(xs) + np.log(9 + xs) + np.sqrt(9 + xs)).sum(),
+    "hyperbolas": lambda xs, us: (np.sinh(xs) + np.cosh(xs) + np.tanh(xs)).sum(),
+    "corners": lambda xs, us: (np.abs(xs) + np.maximum(xs, 0.1) + np.minimum(0.2, xs) - np.maximum(xs, OTHER)).sum(),
+    "at a corner": lambda xs, us: np.abs(0 * us).sum() + np.maximum(us, us).sum() + np.maximum(0 * us, 0.0).sum(),
+    "a choice": lambda xs, us: np.where(np.asarray(OTHER) > 0, xs, xs * xs).sum(),
+    "a branch": lambda xs, us: xs[0].sum() if xs[0, 0] > xs[1, 0] else xs[1].sum(),
+    "forms": lambda xs, us: xs[-1] @ Q @ xs[-1] + xs[-1].dot(Q.dot(xs[0])) + np.dot(xs[2], OTHER[1]),
+    "products": lambda xs, us: (xs @ Q @ xs.T).sum() + (OTHER @ xs.T).sum() + (xs.T @ us[[0, 1, 2, 0]]).sum(),
+    "steps": lambda xs, us: sum((x - OTHER[0]) @ Q @ (x - OTHER[1]) for x in xs) + sum(u @ u for u in us),
+    "broadcast": lambda xs, us: ((xs - xs[0]) * us[0, 0] * xs[:, :1]).sum(),
+    "rows": lambda xs, us: (xs[[0, 0, 2]] ** 2).sum() + xs[1:, 0][::2].sum() + xs[..., None].sum(),
+    "a mask": lambda xs, us: (xs[OTHER > 0] ** 3).sum(),
+    "axes": lambda xs, us: (xs.sum(axis=0) ** 2).sum() + (np.sum(xs, axis=1) ** 3).sum() + (xs.mean(axis=1) ** 2).sum(),
+    "shapes": lambda xs, us: (xs.reshape(2, 6) ** 2)[0].sum() + xs.ravel()[3] ** 2 + (np.transpose(xs)[1] ** 2).sum(),
+    "joined": lambda xs, us: (np.concatenate([xs[:2], xs[1:3]]) ** 2).sum() + (np.hstack([xs[0], us[0]]) ** 3).sum(),
+    "differences": lambda xs, us: (np.diff(xs, axis=0) ** 2).sum() + (np.diff(us, axis=0) ** 2).sum(),
+    "lengths": lambda xs, us: np.linalg.norm(xs[-1]) + np.linalg.norm(us[0]) ** 3,
+    "one number": lambda xs, us: np.array([xs[0, 0] * us[0, 0]]).sum(),
+}
+
+
+@each_row("name", list(LOSSES))
+def test_a_gradient_is_autodiffs(name):
+    random = np.random.default_rng(2)
+    xs, us = random.uniform(-1, 1, (4, 3)), random.uniform(-1, 1, (3, 2))
+    if name == "at a corner":
+        us[0] = 0.0
+    value, by_xs, by_us = differentiate_loss(LOSSES[name], xs, us)
+    exact, of_xs, of_us = _by_autodiff(LOSSES[name], xs, us)
+    assert value == pytest.approx(exact, rel=1e-14)
+    np.testing.assert_allclose(by_xs, of_xs, rtol=0, atol=1e-13)  # the same sums in another order
+    np.testing.assert_allclose(by_us, of_us, rtol=0, atol=1e-13)
+
+
+def test_what_autodiff_has_not_is_its_closed_form():
+    xs, us = np.random.default_rng(4).standard_normal((4, 3)), np.zeros((3, 2))
+    _, by_xs, _ = differentiate_loss(lambda xs, us: np.linalg.norm(xs, axis=1).sum(), xs, us)
+    np.testing.assert_allclose(by_xs, xs / np.sqrt((xs**2).sum(axis=1))[:, None], rtol=1e-14)
+
+
+def _assigned(xs, us):
+    xs[0] = 0.0
+    return xs.sum()
+
+
+def _moved(xs, us):
+    moved = xs
+    moved -= 1.0
+    return (xs * xs).sum()
+
+
+@each_row(
+    "loss",
+    [
+        _assigned,
+        _moved,
+        lambda xs, us: math.sin(xs[0, 0]),
+        lambda xs, us: float(xs[0, 0]),
+        lambda xs, us: np.asarray(xs, dtype=float).sum(),
+        lambda xs, us: np.linalg.inv(xs[:3]).sum(),
+        lambda xs, us: np.floor(xs).sum(),
+        lambda xs, us: np.add(xs, 1.0, out=np.zeros((4, 3))).sum(),
+        lambda xs, us: xs.sum() if xs[0, 0] else 0.0,
+        lambda xs, us: 3.0,
+        lambda xs, us: xs[0],
+    ],
+)
+def test_what_is_not_known_is_not_answered(loss):
+    """NumPy's own answer would lose the derivative, or be another."""
+    with pytest.raises((UntraceableError, TypeError, AttributeError)):
+        traced_gradient(loss, (np.ones((4, 3)), np.ones((3, 2))))
+
+
+def test_what_is_not_known_goes_to_autodiff():
+    xs, us = np.random.default_rng(3).standard_normal((4, 3)), np.zeros((3, 2))
+
+    def moved(xs, us):
+        xs = np.array(xs)
+        xs -= 1.0
+        return (xs * xs).sum()
+
+    value, by_xs, _ = differentiate_loss(moved, xs, us)
+    assert value == pytest.approx(((xs - 1) ** 2).sum())
+    np.testing.assert_allclose(by_xs, 2 * (xs - 1), rtol=1e-14)
+    with pytest.raises(GradientError, match="lost its derivatives"):
+        differentiate_loss(lambda xs, us: float(us[0, 0].value()) if hasattr(us[0, 0], "value") else 0.0, xs, us)
+    with pytest.raises(GradientError, match="not finite"):
+        differentiate_loss(lambda xs, us: np.sqrt((us * us).sum()), xs, us)
+
+
+def test_a_long_motions_loss_is_differentiated_in_time_that_grows_with_it(load):
+    """By AutoDiffXd the 20,000 numbers of this motion would take minutes."""
+    model, count = load("pendulum.urdf"), 10_000
+    us = 0.1 * np.sin(0.01 * np.arange(count))[:, None]
+    found = dd.differentiate_rollout(model, [0.1, 0.0], us, lambda xs, us: 1e-4 * ((xs * xs).sum() + (us * us).sum()))
+    assert found.by_us.shape == (count, 1)
+    move = np.zeros((count, 1))
+    move[-200:, 0] = 1e-5
+    ends = [
+        1e-4 * ((m.xs**2).sum() + (m.us**2).sum())
+        for m in (dd.rollout(model, [0.1, 0.0], us + s * move) for s in (1, -1))
+    ]
+    assert (ends[0] - ends[1]) / 2 == pytest.approx((found.by_us * move).sum(), rel=1e-4)  # of two sums of 20,000
