@@ -13,7 +13,7 @@ from drake_diff.exceptions import InputError, ModelError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.step import advance, set_state
 from drake_diff.motion.rollout import Meter, drift
-from drake_diff.optimize.replay import _broken_balance
+from drake_diff.optimize.replay import broken_balance
 
 
 @pytest.fixture
@@ -103,13 +103,13 @@ def test_what_slides_to_a_stop_loses_mu_m_g_d_to_contact_and_no_energy_is_unexpl
     assert motion.contact_work[-1] == pytest.approx(-1.0, abs=2e-4)  # it creeps on by the regularization's 1e-4 m/s
     assert motion.contact_work[-1] == pytest.approx(-0.4 * 2 * 9.81 * way, rel=0.01)  # Euler: v h / 2 of the way
     assert abs(motion.energy_drift) < 1e-4
-    assert not list(_broken_balance(motion))
+    assert not list(broken_balance(motion))
     # Without the contact's own work a joule would be missing, and told of.
     unexplained = replace(motion, contact_work=np.zeros(601))
-    (said,) = _broken_balance(unexplained)
+    (said,) = broken_balance(unexplained)
     assert "go nowhere" in said
     doubled = replace(motion, contact_work=2 * motion.contact_work)
-    (said,) = _broken_balance(doubled)
+    (said,) = broken_balance(doubled)
     assert "come from nowhere" in said
 
 
@@ -121,7 +121,7 @@ def test_what_a_joint_limit_takes_is_the_limits_work(load):
     assert motion.limit_work[-1] < -1.0
     lost = motion.energy[0] - motion.energy[-1]
     assert -motion.limit_work[-1] == pytest.approx(lost, abs=0.1 * motion.energy_exchanged)
-    assert not list(_broken_balance(motion))
+    assert not list(broken_balance(motion))
     untold = replace(motion, limit_work=np.zeros(101))
     assert np.abs(untold.energy_error).max() > 10 * np.abs(motion.energy_error).max()
 

@@ -4,5 +4,6 @@ from .listing import compare_runs as compare_runs
 from .listing import list_runs as list_runs
 from .measurement import Measurement as Measurement
 from .measurement import measure as measure
+from .other_plants import elsewhere as elsewhere
 from .trace import Trace as Trace
 from .verify import Verification as Verification

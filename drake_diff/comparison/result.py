@@ -11,7 +11,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, frozen
 from drake_diff._base.jupyter import preformatted
 from drake_diff.comparison.attribution import NOT_TOLD, Attribution
-from drake_diff.engines.contract_line import ContractLine
+from drake_diff.engines.contract_line import LAWS, ContractLine, is_another_model
 from drake_diff.engines.interface import Precision
 from drake_diff.engines.motion import AGREES, BROKE_OFF, EngineMotion, JacobianAt
 from drake_diff.model.model import Model
@@ -26,8 +26,6 @@ JACOBIAN_TOLERANCE: dict[Precision, float] = {"float64": 1e-8, "float32": 1e-2}
 OF_CONTACT = (
     "shapes", "poses", "contact pairs", "friction", "stiffness", "dissipation", "contact margin", "other contact terms",
 )  # fmt: skip
-# Of these what an engine must have: where it lacks them and they are at work, it simulates another model.
-MUST_HAVE = ("shapes", "poses", "contact pairs")
 # By term of a step: the lines of a contract that can explain it.
 TELLS: Mapping[str, tuple[str, ...]] = {
     "inertia": ("mass", "center of mass", "inertia", "frames", "armature", "joint types", "joint order and names"),
@@ -39,10 +37,6 @@ TELLS: Mapping[str, tuple[str, ...]] = {
     "contact law": ("contact law", *OF_CONTACT, "solver tolerance"),
     "limit law": ("limit law", "position limits"),
 }
-# What is the engine's own whatever the model: the form of its laws.
-LAWS = (
-    "integrator", "scalar type", "derivative convention", "limit law", "contact law", "solver tolerance", "reset",
-)  # fmt: skip
 
 
 class Probe(NamedTuple):
@@ -275,8 +269,7 @@ class Comparison:
 
 def _breaks(line: ContractLine, touched: bool) -> bool:
     """Whether a line that is different makes another model, where contact is at work or not."""
-    lacking = touched and line.quantity in MUST_HAVE and line.reason != NOT_TOLD
-    return lacking or (not line.reason and line.quantity not in LAWS)
+    return line.reason != NOT_TOLD and is_another_model(line, touched)
 
 
 def first_above(gaps: Array, precision: Precision) -> int | None:

@@ -13,9 +13,9 @@ from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.refusal import Refusal
 from drake_diff.comparison import attribution
 from drake_diff.comparison.recordings import Recording, check_recording, steps_between
-from drake_diff.comparison.result import MUST_HAVE, STEP_TOLERANCE, Compared, Comparison, Probe, Refused, first_above
+from drake_diff.comparison.result import STEP_TOLERANCE, Compared, Comparison, Probe, Refused, first_above
 from drake_diff.engines.contact_match import contact_lines
-from drake_diff.engines.contract_line import Match
+from drake_diff.engines.contract_line import MUST_HAVE, Match
 from drake_diff.engines.contract_match import match_contracts
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.interface import Engine

@@ -13,6 +13,13 @@ SAME_NUMBER: dict[Precision, float] = {"float64": 1e-9, "float32": 1e-5}
 # Below any inertia that matters: what MuJoCo gives a point mass, 2e-15 kg m^2, and rounding of zeros.
 NOTHING: dict[Precision, float] = {"float64": 1e-12, "float32": 1e-6}
 
+# What an engine must have of contact: where it lacks them and they are at work, it simulates another model.
+MUST_HAVE = ("shapes", "poses", "contact pairs")
+# What is the engine's own whatever the model: the form of its laws.
+LAWS = (
+    "integrator", "scalar type", "derivative convention", "limit law", "contact law", "solver tolerance", "reset",
+)  # fmt: skip
+
 
 @dataclass(frozen=True, repr=False)
 class ContractLine:
@@ -36,6 +43,11 @@ class ContractLine:
 
     def __repr__(self) -> str:
         return f"{self.verdict:9} {self.quantity}: {self.detail}"
+
+
+def is_another_model(line: ContractLine, touched: bool) -> bool:
+    """Whether a line that is different makes another model, where contact is at work (`touched`) or not."""
+    return (touched and line.quantity in MUST_HAVE) or (not line.reason and line.quantity not in LAWS)
 
 
 class Match:

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_diff.comparison.result import LAWS
 from drake_diff.engines.closed_form import NumpyEngine
+from drake_diff.engines.contract_line import LAWS
 from drake_diff.engines.contract_match import match_contracts
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.interface import EngineContract, limit

@@ -83,6 +83,7 @@ class ContinuousMotion:
         if model.num_constraints:
             raise ModelError("constraints have none")
         self.model, self.twin = model, model.double
+        self.most = EVALUATIONS
         self.used, self.touched = 0, False  # evaluations of the rates, and whether anything touched, in the last call
         self.touches = bool(contact.collision_pairs)
         self.law = law or own_law(model)
@@ -255,8 +256,8 @@ class ContinuousMotion:
             f = partial(rates, only=pushing)
             steps = ImplicitSteps(f, x) if pushing else ExplicitSteps(f, x)
             while True:
-                if self.used > EVALUATIONS:
-                    raise SimulationError(f"it is too stiff: {EVALUATIONS} evaluations do not reach its end")
+                if self.used > self.most:
+                    raise SimulationError(f"it is too stiff: {self.most} evaluations do not reach its end")
                 if time.thread_time() > deadline:
                     raise TimeoutError
                 step = min(dt, duration - now)

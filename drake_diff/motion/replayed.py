@@ -17,12 +17,22 @@ from drake_diff.motion.continuous import TOLERANCE, ContinuousMotion, Pairs
 from drake_diff.motion.rollout import Meter, Policy, Rollout
 
 
-def replayed(model: Model, x0: Array, inputs: Array | Policy, count: int) -> Rollout:
+def replayed(
+    model: Model,
+    x0: Array,
+    inputs: Array | Policy,
+    count: int,
+    *,
+    tolerance: float = TOLERANCE,
+    evaluations: int | None = None,
+) -> Rollout:
     """The motion over `count` of the model's steps under us (N, nu) or a policy; raises what `ContinuousMotion` does.
 
+    It is too stiff where it takes more than `evaluations` of the equations of motion to the `tolerance` of each step.
     The states have work with them while they are integrated: of actuators, of what damping took, and of contact [J].
     """
-    motion, meter, nx, h = _WithWork(model), Meter(model), model.nx, model.time_step
+    motion, meter, nx, h = _WithWork(model, tolerance), Meter(model), model.nx, model.time_step
+    motion.most = evaluations or motion.most
     states, us = np.zeros((count + 1, nx + 3)), np.empty((count, model.nu))
     states[0, :nx] = x0
     deepest, contacts, dt = np.zeros(count + 1), list[tuple[ContactPoint, ...]](), h
@@ -58,8 +68,9 @@ def replayed(model: Model, x0: Array, inputs: Array | Policy, count: int) -> Rol
 class _WithWork(ContinuousMotion):
     """Of states (nx + 3,), the last three being work."""
 
-    def __init__(self, model: Model):
+    def __init__(self, model: Model, tolerance: float):
         super().__init__(model)
+        self.tolerance = tolerance
         self.damping, self.push, self.seen = model.double.damping(), np.zeros(model.nv), list[Array]()
 
     def follow(self, state: Array, u: Array, dt: float) -> tuple[Array, float]:
@@ -67,7 +78,7 @@ class _WithWork(ContinuousMotion):
         self.twin.set_input(u)
         self.seen = [state]
         force = self.actuation @ np.clip(u, -self.limits, self.limits)
-        return self._advance(partial(self.rates, force), state, dt, TOLERANCE, np.inf)
+        return self._advance(partial(self.rates, force), state, dt, self.tolerance, np.inf)
 
     def rates(self, force: Array, x: Array, only: Pairs | None = None) -> Array:
         self.push, v = self.still, x[self.model.nq : self.model.nx]

@@ -12,7 +12,7 @@ are Drake's terms and the contact written out, and share nothing with those that
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -49,6 +49,19 @@ FINE = 8  # parts of a step: what is left of an error of O(h) from there on is a
 FINER, FINEST = 16, 64
 APART = "by another integration in continuous time"
 MOST_STEPS = 4000  # of a replay in more than FINER parts of an interval
+
+
+class Motion(Protocol):
+    """What is judged of a motion: times (n+1,) [s], xs (n+1, nx), us (n, nu) and penetration (n+1,) [m]."""
+
+    @property
+    def times(self) -> Array: ...
+    @property
+    def xs(self) -> Array: ...
+    @property
+    def us(self) -> Array: ...
+    @property
+    def penetration(self) -> Array: ...
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -160,7 +173,7 @@ def _holds(found: Sequence[Replay]) -> bool:
     return any(r.holds for r in found)
 
 
-def _deciding(plan: Plan, found: Sequence[Replay]) -> list[str]:
+def deciding(plan: Plan, found: Sequence[Replay]) -> list[str]:
     """The variants in which the plan has to hold."""
     variants = list(dict.fromkeys(r.variant for r in found))
     if plan.continuous:
@@ -170,7 +183,7 @@ def _deciding(plan: Plan, found: Sequence[Replay]) -> list[str]:
 
 def broken_variants(plan: Plan, found: Sequence[Replay]) -> Iterator[str]:
     """A clause for each variant of the plant in which the plan does not hold, whatever the control."""
-    for variant in _deciding(plan, found):
+    for variant in deciding(plan, found):
         tried = [r for r in found if r.variant == variant]
         if not _holds(tried):
             yield f"replayed {variant} it does not hold: " + "; ".join(f"{r.control}, {r.failures[0]}" for r in tried)
@@ -180,7 +193,7 @@ def told_of_controls(plan: Plan, found: Sequence[Replay]) -> str:
     """Under which control a plan that holds does so, and under which it does not; empty where nothing was replayed."""
     if not found:
         return ""
-    decides = _deciding(plan, found)
+    decides = deciding(plan, found)
     if not decides:
         return "on the plant nothing was replayed in finer steps, which a diagram does not allow"
     controls = list(dict.fromkeys(r.control for r in found))
@@ -203,7 +216,7 @@ def told_of_goals(plan: Plan, found: Sequence[Replay]) -> str:
     told = []
     for c in plan.problem.kept_goals:
         misses = []
-        for variant in _deciding(plan, found):
+        for variant in deciding(plan, found):
             kept = [r.motion for r in found if r.variant == variant and r.holds and r.motion is not None]
             misses += [min(_miss(c, motion, plan) for motion in kept)] * bool(kept)
         if misses:
@@ -211,7 +224,7 @@ def told_of_goals(plan: Plan, found: Sequence[Replay]) -> str:
     return "; ".join(told)
 
 
-def _miss(c: GoalConstraint, motion: Rollout, plan: Plan) -> float:
+def _miss(c: GoalConstraint, motion: Motion, plan: Plan) -> float:
     """The largest distance of a replay from a goal at the knots of the plan."""
     parts = (len(motion.xs) - 1) // plan.problem.num_steps
     knots = plan.problem.knots_of(c, input_at_end=False)
@@ -220,17 +233,17 @@ def _miss(c: GoalConstraint, motion: Rollout, plan: Plan) -> float:
     return max(c.miss(motion.xs[parts * k]) for k in knots)
 
 
-def _missed_goals(plan: Plan, motion: Rollout) -> Iterator[str]:
+def _missed_goals(plan: Plan, motion: Motion, wider: float) -> Iterator[str]:
     """The goals that a replay is further from than their tolerance."""
     for c in plan.problem.kept_goals:
         if isinstance(c, ClearanceConstraint):  # see `came_too_near`
             continue
-        miss = _miss(c, motion, plan)
-        if not miss <= c.tolerance:
-            yield f"{c.told(miss)}, tolerance {in_words(c.tolerance, c.unit)}"
+        miss, tolerance = _miss(c, motion, plan), wider * c.tolerance
+        if not miss <= tolerance:
+            yield f"{c.told(miss)}, tolerance {in_words(tolerance, c.unit)}"
 
 
-def _left_alone(plan: Plan, model: Model, motion: Rollout) -> Iterator[str]:
+def _left_alone(plan: Plan, model: Model, motion: Motion) -> Iterator[str]:
     """The terminal sets whose regulator, followed from the end of a replay, does not bring the plant to rest."""
     for c in plan.problem.kept_goals:
         if isinstance(c, TerminalConstraint) and not c.region.converges(model, motion.xs[-1]):
@@ -239,7 +252,7 @@ def _left_alone(plan: Plan, model: Model, motion: Rollout) -> Iterator[str]:
 
 def told_of_tolerance(plan: Plan, found: Sequence[Replay]) -> str:
     """How far from its goal a plan ends where it has to hold, and what is allowed; empty where nothing has to."""
-    decides = _deciding(plan, found)
+    decides = deciding(plan, found)
     if not decides or np.all(np.isnan(plan.problem.goal)):
         return f"bounds are kept to {STATE_TOLERANCE:.0%} of each state's range in the plan" if decides else ""
     worst: tuple[float, str] = (-1.0, "")
@@ -260,7 +273,7 @@ def told_of_tolerance(plan: Plan, found: Sequence[Replay]) -> str:
 
 def judged_replay(plan: Plan, found: Sequence[Replay]) -> Replay | None:
     """The motion that a verdict rests on: open loop where that holds, else under TVLQR; None where neither does."""
-    decides = _deciding(plan, found)
+    decides = deciding(plan, found)
     for control in dict.fromkeys(r.control for r in found):
         tried = [r for r in found if r.control == control]
         if all(r.holds for r in tried if r.variant in decides):
@@ -354,16 +367,24 @@ def _replay(plan: Plan, variant: str, control: str, model: Model, parts: int, kn
         energy_error=motion.energy_drift,
         penetration=float(np.max(motion.penetration)),
         failures=(
-            *missed_goal(plan, plan.problem.goal_error(motion.xs[-1]), goal_tolerance(control, law_is_another)),
-            *left_bounds(plan, motion),
-            *_missed_goals(plan, motion),
-            *_left_alone(plan, model, motion),
-            *_broken_constraints(plan, motion.xs[::parts], motion.us[::parts]),
-            *came_too_near(plan, motion),
-            *_broken_balance(motion),
-            *too_deep(model, motion),
+            *failures_of(plan, model, motion, parts, goal_tolerance(control, law_is_another)),
+            *broken_balance(motion),
         ),
     )
+
+
+def failures_of(plan: Plan, model: Model, motion: Motion, parts: int, part: float, wider: float = 1.0) -> Iterator[str]:
+    """What `motion`, of which `parts` steps make one of the plan's, does not keep of what was asked; energy apart.
+
+    It may end `part` of each state's range from x_goal; every other tolerance is `wider` than a replay's.
+    """
+    yield from missed_goal(plan, plan.problem.goal_error(motion.xs[-1]), part)
+    yield from left_bounds(plan, motion, wider)
+    yield from _missed_goals(plan, motion, wider)
+    yield from _left_alone(plan, model, motion)
+    yield from _broken_constraints(plan, motion.xs[::parts], motion.us[::parts], wider)
+    yield from came_too_near(plan, motion)
+    yield from too_deep(model, motion)
 
 
 def _rolled(problem: Problem, model: Model, x0: Array, inputs: Array | Policy, count: int) -> Rollout:
@@ -398,9 +419,9 @@ def missed_goal(plan: Plan, distance: Array, part: float = STATE_TOLERANCE) -> I
         yield f"{name} ends {missed[worst]:.3g} from its goal, tolerance {tolerance[worst]:.3g}"
 
 
-def left_bounds(plan: Plan, motion: Rollout) -> Iterator[str]:
+def left_bounds(plan: Plan, motion: Motion, wider: float = 1.0) -> Iterator[str]:
     """Where a state of the motion, but the first, is beyond a bound by more than the tolerance."""
-    bounds, scale, tolerance = plan.problem.bounds, plan.scale, STATE_TOLERANCE * plan.scale
+    bounds, scale, tolerance = plan.problem.bounds, plan.scale, wider * STATE_TOLERANCE * plan.scale
     excess = np.maximum(np.maximum(bounds.x_lower - motion.xs, motion.xs - bounds.x_upper), 0.0)[1:]
     if np.any(excess > tolerance):
         k, i = divmod(int(np.argmax(excess / scale)), excess.shape[1])
@@ -408,13 +429,13 @@ def left_bounds(plan: Plan, motion: Rollout) -> Iterator[str]:
         yield f"{name} is {excess[k, i]:.3g} beyond its bound at {when:.3g} s, tolerance {tolerance[i]:.3g}"
 
 
-def came_too_near(plan: Plan, motion: Rollout) -> Iterator[str]:
+def came_too_near(plan: Plan, motion: Motion) -> Iterator[str]:
     """Where the motion enters an obstacle, at its states or between them: it may use the margin up."""
     for c in clearances(plan.problem.kept):
         yield from c.too_near(*along_steps(motion.times, motion.xs), c.tolerance)
 
 
-def too_deep(model: Model, motion: Rollout) -> Iterator[str]:
+def too_deep(model: Model, motion: Motion) -> Iterator[str]:
     """Where geometries overlap by more than a quarter of the thinner of them."""
     least, _ = thinnest_geometry(model)
     worst = 0.0, ""
@@ -429,7 +450,7 @@ def too_deep(model: Model, motion: Rollout) -> Iterator[str]:
         yield worst[1]
 
 
-def _broken_constraints(plan: Plan, xs: Array, us: Array) -> Iterator[str]:
+def _broken_constraints(plan: Plan, xs: Array, us: Array, wider: float) -> Iterator[str]:
     """Of constraints, couplings and waypoints, by a replay's states xs (N+1, nx) and us (N, nu) at the plan's knots."""
     problem, tolerances = plan.problem, dict[str, float]()
     planned_xs, planned_us = plan.sample(1)
@@ -444,12 +465,12 @@ def _broken_constraints(plan: Plan, xs: Array, us: Array) -> Iterator[str]:
         tolerances[coupling.label] = max(STATE_TOLERANCE * reach, tolerances.get(coupling.label, 0.0))
     goals = {c.label for c in problem.kept_goals}.difference(tolerances)  # they say themselves how near is near enough
     for name, (excess, knot) in problem.constraint_excess(xs, us, coupled=couplings).items():
-        tolerance = tolerances.get(name, STATE_TOLERANCE * float(np.max(plan.scale)))
+        tolerance = wider * tolerances.get(name, STATE_TOLERANCE * float(np.max(plan.scale)))
         if not (name in goals or excess <= tolerance):
             yield f"{name} is broken by {excess:.3g} at knot {knot}, tolerance {tolerance:.3g}"
 
 
-def _broken_balance(motion: Rollout) -> Iterator[str]:
+def broken_balance(motion: Rollout) -> Iterator[str]:
     """Energy out of nothing, or gone; what constraints (couplers, balls, welds) take is not told."""
     gained, tolerance = motion.energy_drift, energy_tolerance(motion)
     if gained > tolerance or (gained < -tolerance and np.all(np.isfinite(motion.constraint_violation))):

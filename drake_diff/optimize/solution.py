@@ -20,6 +20,7 @@ from drake_diff.exceptions import GradientError, ModelError, SimulationError, Un
 from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.motion.intervals import intervals_of
 from drake_diff.motion.rollout import STEPS, Rollout, roll_states
+from drake_diff.optimize.elsewhere import Elsewhere
 from drake_diff.optimize.optimality import Optimality, final_state_norms, optimality
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Multipliers
@@ -38,6 +39,7 @@ TOLD = (
     "options",
     "search",
     "optima",
+    "elsewhere",
 )  # fields that no measure depends on
 
 
@@ -116,6 +118,7 @@ class Solution(ShowsItsRepr):
         multipliers: of the bounds and rows of what collocation or iLQR solved, with which a search from here begins.
         optima: with `restarts`, the verified solutions that differ in cost or motion, the cheapest first.
         search: the arguments of `solve`, None of a solution that it did not make.
+        elsewhere: where else it holds, of a solution that `artifact.elsewhere` returned.
 
     Example:
         >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
@@ -147,6 +150,7 @@ class Solution(ShowsItsRepr):
     search: Search | None = None
     multipliers: Multipliers | None = None
     optima: tuple["Solution", ...] = ()
+    elsewhere: Elsewhere | None = None
 
     def __str__(self) -> str:
         measures = f"cost {self.cost:.6g}, defect {self.defect:.2g}, goal error {self.goal_error:.2g}"
@@ -171,6 +175,8 @@ class Solution(ShowsItsRepr):
         ]
         if "replays" in vars(self) and self.replays:  # they take time: a printed line starts none
             lines.append(f"replays: {sum(r.holds for r in self.replays)} of {len(self.replays)} hold")
+        if self.elsewhere is not None:
+            lines.append(f"elsewhere: {self.elsewhere}")
         return "\n  ".join(lines)
 
     def told(self, **fields: Any) -> "Solution":

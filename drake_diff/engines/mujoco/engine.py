@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, frozen
+from drake_diff._base.arrays import Array, frozen, positive_float
 from drake_diff.engines.common import PlantEngine
 from drake_diff.engines.interface import EngineContract, StepJacobian
 from drake_diff.engines.mujoco.contract import check_known, read_contract
 from drake_diff.engines.mujoco.coordinates import MujocoCoordinates
 from drake_diff.engines.mujoco.mjcf import mjcf
-from drake_diff.exceptions import MissingDependencyError, ModelError, SimulationError
+from drake_diff.exceptions import InputError, MissingDependencyError, ModelError, SimulationError
 from drake_diff.mechanics.description import Description
 from drake_diff.model.model import Model
 
@@ -37,14 +37,17 @@ SAME_JACOBIAN = 1e-7
 class MujocoEngine(PlantEngine):
     """`path` is the user's own MJCF, with joints and actuators of the names that Drake's plant has.
 
-    `mjcf` is the text that was generated or read.
+    `time_step` [s] is another than the model's, for a generated MJCF. `mjcf` is the text that was generated or read.
     """
 
     name, version = "mujoco", str(mujoco.__version__)
 
-    def __init__(self, model: Model, *, path: str | Path | None = None):
+    def __init__(self, model: Model, *, path: str | Path | None = None, time_step: float | None = None):
         super().__init__(model)
-        self.mjcf, self.model = mujoco_model(self.description, model.time_step, path)
+        if path is not None and time_step is not None:
+            raise InputError("time_step [s]", got=time_step, expected="none beside an MJCF of your own, which has one")
+        self.time_step = model.time_step if time_step is None else positive_float("time_step [s]", time_step)
+        self.mjcf, self.model = mujoco_model(self.description, self.time_step, path)
         self.data = mujoco.MjData(self.model)
         self.native = MujocoCoordinates(self.description, self.model)
 
