@@ -11,6 +11,7 @@ import drake_diff as dd
 
 sys.path.insert(0, str(ROOT / "tests" / "benchmarks"))
 realtime = pytest.importorskip("mpc_realtime")
+contact = pytest.importorskip("mpc_contact")
 
 
 @pytest.fixture(scope="module")
@@ -68,3 +69,47 @@ def test_a_controller_that_does_nothing_does_not_pass(crane, monkeypatch):
     monkeypatch.setattr("drake_diff.loop.MPC", Idle)
     run = realtime.drive(replace(crane, duration=0.4), problem, plan, 0, "cpu", 1, 0)
     assert not run.arrived
+
+
+@pytest.fixture(scope="module")
+def solo():
+    return contact.Plant(contact.SOLO), contact.rest_of(contact.SOLO, contact.FINE)
+
+
+def test_a_quadrupeds_plant_takes_the_models_steps(solo):
+    plant, rest = solo
+    model = contact.model_of(contact.SOLO, contact.FINE)
+    us = np.repeat(0.3 * np.random.default_rng(0).standard_normal((2, model.nu)), [10, 15], axis=0)
+    plant.start(rest)
+    plant.go_on(us[0], 10)
+    plant.go_on(us[-1], 25)
+    np.testing.assert_allclose(plant.x, dd.rollout(model, rest, us).xs[-1], atol=1e-12)
+
+
+def test_a_blow_gives_the_robot_its_momentum(solo):
+    """p of the whole in free motion: the mass matrix's rows of the base are the momentum."""
+    plant, rest = solo
+    plant.start(rest)
+    plant.push(np.array([1.0, 0.5, 0.0]))
+    momentum = plant.plant.CalcSpatialMomentumInWorldAboutPoint(plant.context, np.zeros(3)).translational()
+    assert momentum == pytest.approx([1.0, 0.5, 0.0], abs=1e-9)
+
+
+def test_what_fell_or_still_moves_is_no_recovery(solo):
+    rest = solo[1]
+    turned, low, fast = np.array(rest), np.array(rest), np.array(rest)
+    turned[:4], low[6], fast[22] = [0.9, 0.43, 0, 0], rest[6] - 0.1, 1.0
+    for x, is_one in ((rest, True), (turned, False), (low, False), (fast, False)):
+        assert contact.recovered(contact.Run(xs=[x]), rest) == is_one
+    assert not contact.recovered(contact.Run(xs=[rest], lost=True), rest)
+
+
+def test_a_missed_tick_holds_the_old_input(solo, monkeypatch):
+    """A clock by which each answer takes 30 ms: no answer is ever used, and all are counted."""
+    plant, rest = solo
+    times = iter(0.03 * np.arange(1000))
+    monkeypatch.setattr(contact.time, "thread_time", lambda: next(times))
+    run = contact.drive(plant, lambda x, t: np.full(12, 2.0), rest, 5)
+    assert run.missed == 5
+    idle = dd.rollout(contact.model_of(contact.SOLO, contact.FINE), rest, np.zeros((100, 12))).xs[-1]
+    np.testing.assert_allclose(run.xs[-1], idle, atol=1e-12)
