@@ -108,3 +108,18 @@ def _off(tables, name):
     """With a thousandth more of one table, or, of what moves what, without it."""
     wrong = 0.0 if name == "moves" else 1.001
     return tables._replace(**{name: wrong * getattr(tables, name)})
+
+
+def test_nothing_is_compiled_for_more_than_one_kind_of_arguments():
+    """As of read-only arrays, which states may be, or of those that are not contiguous: each takes seconds."""
+    model, random = example_robot("solo12.urdf", feet=True), np.random.default_rng(6)
+    xs = np.array([state_in_contact(model, random) for _ in range(3)])
+    us = np.zeros((3, model.nu))
+    xs.setflags(write=False)
+    dd.linearize(model, xs, us)
+    dd.linearize(model, xs[:1], us[:1])
+    dd.linearize(model, np.asfortranarray(xs), us)
+    dd.differentiate_step(model, xs[0], us[0])
+    for module, names in ((of_trees, ["differentiate_tree"]), (of_contact, ["overlapping", "touch", "step_jacobians"])):
+        functions = [getattr(module.kernel(module.KERNEL), name) for name in names]
+        assert [len(function.signatures) for function in functions] == [1] * len(names)

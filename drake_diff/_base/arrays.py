@@ -81,6 +81,11 @@ def scale(subject: str, value: ArrayLike, size: int) -> Array:
     return finite_array(subject, value, (size,))
 
 
+def own_array(array: Any) -> Any:
+    """A copy that is contiguous and may be written: for other arrays what is compiled would be compiled once more."""
+    return np.array(array, order="C")
+
+
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 _SKEW = np.zeros((3, 9))  # w -> skew(w), flattened
 for _row, _column, _entry, _sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 2, 0, -1)):

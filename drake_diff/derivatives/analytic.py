@@ -161,6 +161,11 @@ class _Trial:
     refusal: str = ""
     note: str = ""  # by what they were certified where AutoDiffXd takes no such step
 
+    @property
+    def is_settled(self) -> bool:
+        """Whether nothing is left to do or to say."""
+        return not (self.left or self.refusal or self.note)
+
 
 @dataclass
 class _WithImpulses:
@@ -211,6 +216,8 @@ def _certified_impulses(smooth: SmoothStep, steps: Steps, touch: bool) -> _WithI
     own = form.pairs.kinds(placed, len(steps)) if touch else [{"joint limits"}] * len(steps)
     for k in np.flatnonzero(found.known):
         of_step = [trials.setdefault(kind, _Trial()) for kind in sorted(own[k])]
+        if all(trial.is_settled for trial in of_step):
+            continue
         _certify(steps, int(k), found.values[k], [trial for trial in of_step if trial.left and not trial.refusal])
         why, note = (
             "; ".join(dict.fromkeys(filter(None, (getattr(t, of) for t in of_step)))) for of in ("refusal", "note")

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.math import RigidTransform
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, own_array
 from drake_diff._base.compiled import kernel
 from drake_diff.mechanics.description import Description
 
@@ -36,9 +36,10 @@ class CompiledTree:
     def __call__(self, q: Array, v: Array, a: Array) -> Moved:
         """At q (N, nq), v and a (each (N, nv)), in Drake's coordinates."""
         N, n, compiled = len(q), self.nv, kernel(KERNEL)
+        point = own_array(q), own_array(v), own_array(a)
         poses, S, tau = np.empty((N, len(self.links), 3, 4)), np.empty((N, n, 6)), np.empty((N, n))
         mass, slope, by_q, by_v = np.empty((4, N, n, n))
-        compiled.differentiate_tree(compiled.Tree(*self.tables), q, v, a, poses, S, mass, slope, tau, by_q, by_v)
+        compiled.differentiate_tree(compiled.Tree(*self.tables), *point, poses, S, mass, slope, tau, by_q, by_v)
         return Moved(poses, S, mass, slope, tau, by_q, by_v)
 
 
@@ -86,7 +87,7 @@ def compiled_tree(description: Description) -> CompiledTree | None:
         _whole(count),
         np.array(description.gravity, dtype=float),
     )
-    return CompiledTree(tuple(map(np.ascontiguousarray, tables)), number, description.coordinates.nv)
+    return CompiledTree(tuple(map(own_array, tables)), number, description.coordinates.nv)
 
 
 def _whole(numbers: list[int]) -> Array:

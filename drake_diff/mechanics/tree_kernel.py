@@ -162,62 +162,69 @@ def _rotated(X: Array, inertia: Array, a: int, b: int) -> float:
     return total
 
 
+# Of rows of matrices, and not of vectors: a view of a row costs more than what is done with it.
 @compiled
-def _times(I: Array, s: Array, out: Array) -> None:  # noqa: E741
-    """out = I s: the momentum [about the origin; linear] of an inertia (10,) that moves at s (6,)."""
-    m, x, y, z = I[0], I[1], I[2], I[3]
-    out[0] = I[4] * s[0] + I[7] * s[1] + I[8] * s[2] + y * s[5] - z * s[4]
-    out[1] = I[7] * s[0] + I[5] * s[1] + I[9] * s[2] + z * s[3] - x * s[5]
-    out[2] = I[8] * s[0] + I[9] * s[1] + I[6] * s[2] + x * s[4] - y * s[3]
-    out[3] = m * s[3] - (y * s[2] - z * s[1])
-    out[4] = m * s[4] - (z * s[0] - x * s[2])
-    out[5] = m * s[5] - (x * s[1] - y * s[0])
-
-
-@compiled
-def _cross(m: Array, s: Array, out: Array) -> None:
-    """out = m x s of motions (6,)."""
-    out[0] = m[1] * s[2] - m[2] * s[1]
-    out[1] = m[2] * s[0] - m[0] * s[2]
-    out[2] = m[0] * s[1] - m[1] * s[0]
-    out[3] = m[1] * s[5] - m[2] * s[4] + m[4] * s[2] - m[5] * s[1]
-    out[4] = m[2] * s[3] - m[0] * s[5] + m[5] * s[0] - m[3] * s[2]
-    out[5] = m[0] * s[4] - m[1] * s[3] + m[3] * s[1] - m[4] * s[0]
+def _times(I: Array, i: int, S: Array, s: int, out: Array, o: int) -> None:  # noqa: E741
+    """out[o] = I[i] S[s]: the momentum [about the origin; linear] of an inertia (10,) that moves at S[s] (6,)."""
+    m, x, y, z = I[i, 0], I[i, 1], I[i, 2], I[i, 3]
+    w0, w1, w2, l0, l1, l2 = S[s, 0], S[s, 1], S[s, 2], S[s, 3], S[s, 4], S[s, 5]
+    out[o, 0] = I[i, 4] * w0 + I[i, 7] * w1 + I[i, 8] * w2 + y * l2 - z * l1
+    out[o, 1] = I[i, 7] * w0 + I[i, 5] * w1 + I[i, 9] * w2 + z * l0 - x * l2
+    out[o, 2] = I[i, 8] * w0 + I[i, 9] * w1 + I[i, 6] * w2 + x * l1 - y * l0
+    out[o, 3] = m * l0 - (y * w2 - z * w1)
+    out[o, 4] = m * l1 - (z * w0 - x * w2)
+    out[o, 5] = m * l2 - (x * w1 - y * w0)
 
 
 @compiled
-def _add_cross_force(m: Array, f: Array, out: Array) -> None:
-    """out += m x* f of a motion and a force (6,)."""
-    out[0] += m[1] * f[2] - m[2] * f[1] + m[4] * f[5] - m[5] * f[4]
-    out[1] += m[2] * f[0] - m[0] * f[2] + m[5] * f[3] - m[3] * f[5]
-    out[2] += m[0] * f[1] - m[1] * f[0] + m[3] * f[4] - m[4] * f[3]
-    out[3] += m[1] * f[5] - m[2] * f[4]
-    out[4] += m[2] * f[3] - m[0] * f[5]
-    out[5] += m[0] * f[4] - m[1] * f[3]
+def _add_cross(M: Array, m: int, S: Array, s: int, out: Array, o: int) -> None:
+    """out[o] += M[m] x S[s] of motions (6,)."""
+    a0, a1, a2, b0, b1, b2 = M[m, 0], M[m, 1], M[m, 2], M[m, 3], M[m, 4], M[m, 5]
+    w0, w1, w2, l0, l1, l2 = S[s, 0], S[s, 1], S[s, 2], S[s, 3], S[s, 4], S[s, 5]
+    out[o, 0] += a1 * w2 - a2 * w1
+    out[o, 1] += a2 * w0 - a0 * w2
+    out[o, 2] += a0 * w1 - a1 * w0
+    out[o, 3] += a1 * l2 - a2 * l1 + b1 * w2 - b2 * w1
+    out[o, 4] += a2 * l0 - a0 * l2 + b2 * w0 - b0 * w2
+    out[o, 5] += a0 * l1 - a1 * l0 + b0 * w1 - b1 * w0
 
 
 @compiled
-def _dot(a: Array, b: Array) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5]
+def _add_cross_force(M: Array, m: int, F: Array, f: int, out: Array, o: int) -> None:
+    """out[o] += M[m] x* F[f] of a motion and a force (6,)."""
+    a0, a1, a2, b0, b1, b2 = M[m, 0], M[m, 1], M[m, 2], M[m, 3], M[m, 4], M[m, 5]
+    n0, n1, n2, f0, f1, f2 = F[f, 0], F[f, 1], F[f, 2], F[f, 3], F[f, 4], F[f, 5]
+    out[o, 0] += a1 * n2 - a2 * n1 + b1 * f2 - b2 * f1
+    out[o, 1] += a2 * n0 - a0 * n2 + b2 * f0 - b0 * f2
+    out[o, 2] += a0 * n1 - a1 * n0 + b0 * f1 - b1 * f0
+    out[o, 3] += a1 * f2 - a2 * f1
+    out[o, 4] += a2 * f0 - a0 * f2
+    out[o, 5] += a0 * f1 - a1 * f0
 
 
 @compiled
-def _force_rates(I: Array, V: Array, B: Array) -> None:  # noqa: E741
-    """B (6, 6) = (V x*) I - I (V x) + (I V) x* of an inertia (10,) that moves at V (6,), column by column."""
-    e, momentum, turned, out = np.zeros(6), np.empty(6), np.empty(6), np.empty(6)
-    own = np.empty(6)
-    _times(I, V, own)
+def _dot(A: Array, a: int, B: Array, b: int) -> float:
+    total = 0.0
+    for i in range(6):
+        total += A[a, i] * B[b, i]
+    return total
+
+
+@compiled
+def _force_rates(I: Array, j: int, V: Array, momentum: Array, B: Array, work: Array) -> None:  # noqa: E741
+    """B[j] (6, 6) = (V x*) I - I (V x) + (I V) x* of the inertia I[j] that moves at V[j] with `momentum` (1, 6)."""
     for k in range(6):
-        e[k] = 1.0
-        _cross(V, e, turned)
-        _times(I, turned, out)
+        for r in range(3):
+            for i in range(6):
+                work[r, i] = 0.0
+        work[0, k] = 1.0
+        _add_cross(V, j, work, 0, work, 1)
+        _times(I, j, work, 1, work, 3)
+        _times(I, j, work, 0, work, 1)
+        _add_cross_force(V, j, work, 1, work, 2)
+        _add_cross_force(work, 0, momentum, 0, work, 2)
         for i in range(6):
-            out[i] = -out[i]
-        _times(I, e, momentum)
-        _add_cross_force(V, momentum, out)
-        _add_cross_force(e, own, out)
-        B[:, k] = out
-        e[k] = 0.0
+            B[j, i, k] = work[2, i] - work[3, i]
 
 
 @compiled
@@ -238,36 +245,37 @@ def differentiate_tree(
 
     And the inverse dynamics (N, nv) at the accelerations a (N, nv), with its derivatives by small motion and by v.
     """
-    N, nv, J = len(q), v.shape[1], len(t.parent)
-    own, carried = np.empty((J, 10)), np.empty((J, 10))
-    V, A, F, B = np.empty((J, 6)), np.empty((J, 6)), np.empty((J, 6)), np.empty((J, 6, 6))
+    nv, J = v.shape[1], len(t.parent)
+    parent, first, size = t.parent, t.first, t.size
+    own, carried, work = np.empty((J, 10)), np.empty((J, 10)), np.empty((4, 6))
+    V, A, F, B = np.empty((J + 1, 6)), np.empty((J + 1, 6)), np.empty((J, 6)), np.empty((J, 6, 6))
     before, P, Q, T = np.empty((nv, 6)), np.empty((nv, 6)), np.empty((nv, 6)), np.empty((nv, 6))
-    rest, still, one, other = np.zeros(6), np.zeros(6), np.empty(6), np.empty(6)
-    S_I, S_B, of_q, of_v = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
+    S_I, S_B, of_q, of_v = np.empty((1, 6)), np.empty(6), np.empty((1, 6)), np.empty((1, 6))
+    V[J], A[J] = 0.0, 0.0  # the world's, which -1 finds
     for i in range(3):
-        rest[3 + i] = -t.gravity[i]
-    for n in range(N):
+        A[J, 3 + i] = -t.gravity[i]
+    for n in range(len(q)):
         S = motions[n]
         _place(t, q[n], poses[n], S, own)
         for j in range(J):
-            up = t.parent[j]
-            V_P = V[up] if up >= 0 else still
-            A_P = A[up] if up >= 0 else rest
+            up = parent[j] if parent[j] >= 0 else J
             for i in range(6):
-                V[j, i], A[j, i] = V_P[i], A_P[i]
-            for s in range(t.first[j], t.first[j] + t.size[j]):
-                _cross(V_P, S[s], before[s])
+                V[j, i], A[j, i], F[j, i] = V[up, i], A[up, i], 0.0
+            for s in range(first[j], first[j] + size[j]):
+                for i in range(6):
+                    before[s, i] = 0.0
+                _add_cross(V, up, S, s, before, s)
                 for i in range(6):
                     V[j, i] += S[s, i] * v[n, s]
                     A[j, i] += S[s, i] * a[n, s] + before[s, i] * v[n, s]
             for i in range(10):
                 carried[j, i] = own[j, i]
-            _times(own[j], A[j], F[j])
-            _times(own[j], V[j], one)
-            _add_cross_force(V[j], one, F[j])
-            _force_rates(own[j], V[j], B[j])
+            _times(own, j, A, j, F, j)
+            _times(own, j, V, j, S_I, 0)
+            _add_cross_force(V, j, S_I, 0, F, j)
+            _force_rates(own, j, V, S_I, B, work)
         for j in range(J - 1, -1, -1):
-            up = t.parent[j]
+            up = parent[j]
             if up >= 0:
                 for i in range(10):
                     carried[up, i] += carried[j, i]
@@ -276,44 +284,44 @@ def differentiate_tree(
                     for k in range(6):
                         B[up, i, k] += B[j, i, k]
         for j in range(J):
-            for s in range(t.first[j], t.first[j] + t.size[j]):
-                _cross(V[j], S[s], P[s])
-                _cross(A[j], S[s], Q[s])
-                _cross(V[j], P[s], one)
+            for s in range(first[j], first[j] + size[j]):
                 for i in range(6):
-                    Q[s, i] += one[i]
+                    P[s, i] = Q[s, i] = 0.0
+                _add_cross(V, j, S, s, P, s)
+                _add_cross(A, j, S, s, Q, s)
+                _add_cross(V, j, P, s, Q, s)
+                for i in range(6):
                     T[s, i] = before[s, i] + P[s, i]
         mass[n], slope[n], by_q[n], by_v[n] = 0.0, 0.0, 0.0, 0.0
         for j in range(J):
-            I_c, B_c = carried[j], B[j]
-            for s in range(t.first[j], t.first[j] + t.size[j]):
-                tau[n, s] = _dot(S[s], F[j])
-                _times(I_c, S[s], S_I)
-                _times(I_c, Q[s], of_q)
-                _times(I_c, T[s], of_v)
-                _add_cross_force(S[s], F[j], of_q)
+            for s in range(first[j], first[j] + size[j]):
+                tau[n, s] = _dot(S, s, F, j)
+                _times(carried, j, S, s, S_I, 0)
+                _times(carried, j, Q, s, of_q, 0)
+                _times(carried, j, T, s, of_v, 0)
+                _add_cross_force(S, s, F, j, of_q, 0)
                 for i in range(6):
                     total = 0.0
                     for k in range(6):
-                        of_q[i] += B_c[i, k] * P[s, k]
-                        of_v[i] += B_c[i, k] * S[s, k]
-                        total += B_c[k, i] * S[s, k]
+                        of_q[0, i] += B[j, i, k] * P[s, k]
+                        of_v[0, i] += B[j, i, k] * S[s, k]
+                        total += B[j, k, i] * S[s, k]
                     S_B[i] = total
-                turns = S[s, 0] != 0.0 or S[s, 1] != 0.0 or S[s, 2] != 0.0
-                turns = turns or t.size[j] == 1
+                turns = size[j] == 1 or S[s, 0] != 0 or S[s, 1] != 0 or S[s, 2] != 0
                 up = j
                 while up >= 0:
-                    for k in range(t.first[up], t.first[up] + t.size[up]):
-                        by_q[n, k, s] += _dot(of_q, S[k])
-                        by_v[n, k, s] += _dot(of_v, S[k])
-                        m = _dot(S_I, S[k])
-                        mass[n, s, k] = m
-                        mass[n, k, s] = m
+                    for k in range(first[up], first[up] + size[up]):
+                        by_q[n, k, s] += _dot(of_q, 0, S, k)
+                        by_v[n, k, s] += _dot(of_v, 0, S, k)
+                        mass[n, s, k] = mass[n, k, s] = _dot(S_I, 0, S, k)
                         if up != j:
-                            by_q[n, s, k] += _dot(S_B, P[k]) + _dot(S_I, Q[k])
-                            by_v[n, s, k] += _dot(S_B, S[k]) + _dot(S_I, T[k])
-                        if turns:
-                            _cross(S[s], S[k], one)
-                            _times(I_c, S[k], other)
-                            slope[n, k, s] = -2.0 * _dot(one, other)
-                    up = t.parent[up]
+                            for i in range(6):
+                                by_q[n, s, k] += S_B[i] * P[k, i] + S_I[0, i] * Q[k, i]
+                                by_v[n, s, k] += S_B[i] * S[k, i] + S_I[0, i] * T[k, i]
+                        if turns:  # turning what is carried is turning back the motion before it
+                            for i in range(6):
+                                work[0, i] = 0.0
+                            _add_cross(S, s, S, k, work, 0)
+                            _times(carried, j, S, k, work, 1)
+                            slope[n, k, s] = -2.0 * _dot(work, 0, work, 1)
+                    up = parent[up]

@@ -1,11 +1,12 @@
 """The Jacobians of `jacobian` by compiled functions: the same equation, for steps without parameters."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_diff._base.arrays import Array, cross
+from drake_diff._base.arrays import Array, cross, own_array
 from drake_diff._base.compiled import kernel
 from drake_diff.derivatives import joint_impulses
 from drake_diff.derivatives.contact import laws
@@ -29,8 +30,10 @@ class CompiledForm:
 
     tree: CompiledTree
     plant: tuple[object, ...]  # of kernel.Plant
-    carriers: NDArray[np.intp]  # (bodies,) the link of each body of the pairs, -1 of the world
+    spheres: tuple[Array, ...]  # of kernel.Spheres
+    sides: NDArray[np.int64]  # (P, 2)
     by_body: Array  # (bodies, nv)
+    carriers: NDArray[np.intp]  # (bodies,) the link of each body of the pairs, -1 of the world
 
     def __call__(
         self, smooth: SmoothStep, steps: Steps, pairs: AllPairs, material: Material
@@ -38,22 +41,27 @@ class CompiledForm:
         """(N, nx, nx + nu), sizes (N, 3) of `kernel.step_jacobians`, and as `jacobian.contact_jacobians`."""
         nq, compiled, N = smooth.coordinates.nq, kernel(KERNEL), len(steps)
         parts = steps.xs[:, :nq], steps.xs[:, nq:], steps.x_next[:, nq:]
-        q, v, v_next = (np.ascontiguousarray(part) for part in parts)
+        q, v, v_next = (own_array(part) for part in parts)
         moved = self.tree(q, v, (v_next - v) / smooth.time_step)
         placed = pairs.place(steps, self._poses(moved.poses))
-        contacts, unknown = self._contacts(pairs, placed, moved.S, material)
+        of = (material.friction, material.stiffness, material.time, material.dissipation, material.other_part)
+        of_pairs = compiled.Pairs(self.sides, self.by_body, *(own_array(part) for part in of))
+        contacts, unknown = self._of_spheres(of_pairs, placed.poses), dict[int, str]()
+        if len(placed.found):
+            contacts, unknown = self._with_others(contacts, pairs, placed, moved.S, material)
         force, clipped = smooth.force_of(q, v, steps.us)
         if clipped is None:
             clipped = np.zeros(steps.us.shape, dtype=bool)
         jacobians, sizes = np.empty((N, steps.model.nx, steps.model.nx + steps.model.nu)), np.empty((N, 3))
         compiled.step_jacobians(
             compiled.Plant(*self.plant),
-            compiled.Touching(*contacts),
+            of_pairs,
+            contacts,
             q,
             v,
             v_next,
-            steps.xs[:, smooth.positions],
-            force,
+            own_array(steps.xs[:, smooth.positions]),
+            own_array(force),
             clipped,
             moved.S,
             moved.mass,
@@ -66,30 +74,36 @@ class CompiledForm:
         )
         return jacobians, sizes, unknown, placed
 
-    def _contacts(
-        self, pairs: AllPairs, placed: Placed, S: Array, material: Material
-    ) -> tuple[tuple[Array, ...], dict[int, str]]:
-        """What kernel.Touching has, and the states with contacts of which it is not known how they change, and why."""
-        touch = pairs.touching(placed)
+    def _of_spheres(self, of_pairs: Any, poses: Array) -> Any:
+        """The kernel.Touching of the pairs with a sphere."""
+        compiled, N = kernel(KERNEL), len(poses)
+        spheres, first = compiled.Spheres(*self.spheres), np.empty(N + 1, dtype=np.int64)
+        pair = np.empty(N * len(spheres.radius), dtype=np.int64)
+        M = compiled.overlapping(spheres, self.sides, poses, first, pair)
+        parts = np.empty((M, 3)), np.empty((M, 3)), np.empty(M), np.empty((M, 7, 6))
+        contacts = compiled.Touching(first, pair[:M], *parts)
+        compiled.touch(spheres, of_pairs, poses, contacts)
+        return contacts
+
+    def _with_others(
+        self, spheres: Any, pairs: AllPairs, placed: Placed, S: Array, material: Material
+    ) -> tuple[Any, dict[int, str]]:
+        """The contacts of spheres and those that SceneGraph found; in which states it is not known how these change."""
+        touch = pairs.found(placed)
         first, second = self.by_body[pairs.sides[touch.pair].T]
-        unknown: dict[int, str] = {}
-        if len(placed.found):
-            angular, linear = S[touch.state, :, :3], S[touch.state, :, 3:]
-            twists = np.concatenate([linear + cross(angular, touch.middle[:, None, :]), angular], axis=-1)
-            unknown = pairs.complete(touch, placed, (first - second)[..., None] * twists)
-        pair = touch.pair
-        point, change = touch.at(material.other_part[pair])
-        of_material = (material.friction, material.stiffness, material.time, material.dissipation)
-        parts = [first, second, point, touch.normal, touch.phi, change, *(of[pair] for of in of_material)]
-        if len(placed.found):  # which come after those of spheres
-            order = np.argsort(touch.state, kind="stable")
-            parts = [part[order] for part in parts]
-        begins = np.searchsorted(np.sort(touch.state), np.arange(len(S) + 1))
-        return (begins, *parts), unknown
+        angular, linear = S[touch.state, :, :3], S[touch.state, :, 3:]
+        twists = np.concatenate([linear + cross(angular, touch.middle[:, None, :]), angular], axis=-1)
+        unknown = pairs.complete(touch, placed, (first - second)[..., None] * twists)
+        point, change = touch.at(material.other_part[touch.pair])
+        state = np.concatenate([np.repeat(np.arange(len(S)), np.diff(spheres.first)), touch.state])
+        order = np.argsort(state, kind="stable")
+        parts = zip(spheres[1:], (touch.pair, point, touch.normal, touch.phi, change), strict=True)
+        begins = np.searchsorted(state[order], np.arange(len(S) + 1))
+        return type(spheres)(own_array(begins), *(own_array(np.concatenate(part)[order]) for part in parts)), unknown
 
     def _poses(self, links: Array) -> Array:
         """(N, bodies, 3, 4) of the bodies of the pairs."""
-        poses = links[:, self.carriers]
+        poses = own_array(links[:, self.carriers])
         poses[:, self.carriers < 0] = np.eye(3, 4)
         return poses
 
@@ -131,5 +145,22 @@ def compiled_form(
         couplers.offset,
         *places,
     )
-    whole = tuple(np.ascontiguousarray(part) if isinstance(part, np.ndarray) else part for part in plant)
-    return CompiledForm(tree, whole, np.array(carriers, dtype=np.intp), np.ascontiguousarray(by_body))
+    whole = tuple(own_array(part) if isinstance(part, np.ndarray) else part for part in plant)
+    of_spheres = pairs.spheres
+    spheres = (
+        of_spheres.center,
+        of_spheres.radius,
+        of_spheres.rotation,
+        of_spheres.position,
+        of_spheres.lower,
+        of_spheres.upper,
+        of_spheres.rounding,
+    )
+    return CompiledForm(
+        tree=tree,
+        plant=whole,
+        spheres=tuple(own_array(part) for part in spheres),
+        sides=own_array(pairs.sides),
+        by_body=own_array(by_body),
+        carriers=np.array(carriers, dtype=np.intp),
+    )

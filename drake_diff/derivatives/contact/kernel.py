@@ -23,16 +23,35 @@ class Touching(NamedTuple):
     """M contacts, those of state k from first[k] to first[k + 1]; see `kinematics.Contacts`."""
 
     first: Whole  # (N + 1,)
-    sphere: Array  # (M, nv)
-    other: Array  # (M, nv)
+    pair: Whole  # (M,)
     point: Array  # (M, 3)
     normal: Array  # (M, 3)
     phi: Array  # (M,)
     change: Array  # (M, 7, 6)
-    friction: Array  # (M,)
-    stiffness: Array  # (M,)
-    time: Array  # (M,)
-    dissipation: Array  # (M,)
+
+
+class Pairs(NamedTuple):
+    """P pairs; see `touching.AllPairs` and `material.Material`."""
+
+    sides: Whole  # (P, 2) in the bodies
+    by_body: Array  # (bodies, nv) 1 where a degree of freedom moves the body
+    friction: Array  # (P,)
+    stiffness: Array  # (P,)
+    time: Array  # (P,)
+    dissipation: Array  # (P,)
+    other_part: Array  # (P,)
+
+
+class Spheres(NamedTuple):
+    """The first K of the pairs, a sphere and another shape each; see `pairs.ContactPairs`."""
+
+    center: Array  # (K, 3)
+    radius: Array  # (K,)
+    rotation: Array  # (K, 3, 3)
+    position: Array  # (K, 3)
+    lower: Array  # (K, 3)
+    upper: Array  # (K, 3)
+    rounding: Array  # (K,)
 
 
 class Plant(NamedTuple):
@@ -54,6 +73,129 @@ class Plant(NamedTuple):
     offsets: Array  # (K,)
     free: Whole  # (bodies, 2) where free bodies begin in q and in v
     single: Whole  # (joints, 2) the places of the others in q and in v
+
+
+@compiled
+def _center_in(X: Array, center: Array, Y: Array, rotation: Array, position: Array, own: Array, local: Array) -> None:
+    """A sphere's centre in world (own) and in the other shape's frame (local), its bodies being at X and Y (3, 4)."""
+    d, in_body = np.empty(3), np.empty(3)
+    for a in range(3):
+        own[a] = X[a, 0] * center[0] + X[a, 1] * center[1] + X[a, 2] * center[2] + X[a, 3]
+        d[a] = own[a] - Y[a, 3]
+    for a in range(3):
+        in_body[a] = Y[0, a] * d[0] + Y[1, a] * d[1] + Y[2, a] * d[2] - position[a]
+    for a in range(3):
+        local[a] = rotation[0, a] * in_body[0] + rotation[1, a] * in_body[1] + rotation[2, a] * in_body[2]
+
+
+@compiled
+def overlapping(s: Spheres, sides: Whole, poses: Array, first: Whole, pair: Whole) -> int:
+    """Which pairs overlap where the bodies are at `poses` (N, bodies, 3, 4): how many, in `pair`, from first[k] on."""
+    count, R, p, d = 0, s.rotation, s.position, s.center
+    for k in range(len(poses)):
+        first[k] = count
+        for i in range(len(s.radius)):
+            X, Y = sides[i, 0], sides[i, 1]  # as in _center_in, but without views, of which each has its cost
+            x = poses[k, X, 0, 0] * d[i, 0] + poses[k, X, 0, 1] * d[i, 1] + poses[k, X, 0, 2] * d[i, 2]
+            y = poses[k, X, 1, 0] * d[i, 0] + poses[k, X, 1, 1] * d[i, 1] + poses[k, X, 1, 2] * d[i, 2]
+            z = poses[k, X, 2, 0] * d[i, 0] + poses[k, X, 2, 1] * d[i, 1] + poses[k, X, 2, 2] * d[i, 2]
+            x += poses[k, X, 0, 3] - poses[k, Y, 0, 3]
+            y += poses[k, X, 1, 3] - poses[k, Y, 1, 3]
+            z += poses[k, X, 2, 3] - poses[k, Y, 2, 3]
+            e = poses[k, Y, 0, 0] * x + poses[k, Y, 1, 0] * y + poses[k, Y, 2, 0] * z - p[i, 0]
+            f = poses[k, Y, 0, 1] * x + poses[k, Y, 1, 1] * y + poses[k, Y, 2, 1] * z - p[i, 1]
+            g = poses[k, Y, 0, 2] * x + poses[k, Y, 1, 2] * y + poses[k, Y, 2, 2] * z - p[i, 2]
+            squared = 0.0
+            for a in range(3):
+                local = R[i, 0, a] * e + R[i, 1, a] * f + R[i, 2, a] * g
+                outside = local - min(max(local, s.lower[i, a]), s.upper[i, a])
+                squared += outside * outside
+            if np.sqrt(squared) < s.radius[i] + s.rounding[i]:
+                pair[count] = i
+                count += 1
+    first[len(poses)] = count
+    return count
+
+
+@compiled
+def _nearest(local: Array, lower: Array, upper: Array, normal: Array, across: Array) -> float:
+    """How far a point is from a box, below 0 inside; the normal there and the derivative of it by the point (3, 3)."""
+    squared = 0.0
+    for a in range(3):
+        normal[a] = local[a] - min(max(local[a], lower[a]), upper[a])
+        squared += normal[a] * normal[a]
+    across[:] = 0.0
+    if squared > 0:
+        length = np.sqrt(squared)
+        for a in range(3):
+            if normal[a] != 0:
+                across[a, a] = 1 / length
+            normal[a] /= length
+        for a in range(3):
+            for b in range(3):
+                across[a, b] -= normal[a] * normal[b] / length
+        return length
+    way, axis, sign = np.inf, 0, 1.0  # of equal ways the upper faces' come first
+    for a in range(3):
+        if upper[a] - local[a] < way:
+            way, axis, sign = upper[a] - local[a], a, 1.0
+    for a in range(3):
+        if local[a] - lower[a] < way:
+            way, axis, sign = local[a] - lower[a], a, -1.0
+    normal[axis] = sign
+    return -way
+
+
+@compiled
+def touch(s: Spheres, p: Pairs, poses: Array, c: Touching) -> None:
+    """Fill in where the contacts of spheres act, and how that changes."""
+    own, local, flat, across, R = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    half, skew, back = np.empty((3, 3)), np.zeros((3, 3)), np.empty(3)
+    for k in range(len(poses)):
+        for m in range(c.first[k], c.first[k + 1]):
+            i, n, change = c.pair[m], c.normal[m], c.change[m]
+            Y, radius = poses[k, p.sides[i, 1]], s.radius[i]
+            _center_in(poses[k, p.sides[i, 0]], s.center[i], Y, s.rotation[i], s.position[i], own, local)
+            phi = _nearest(local, s.lower[i], s.upper[i], flat, across) - s.rounding[i] - radius
+            for a in range(3):
+                for b in range(3):
+                    R[a, b] = 0.0
+                    for d in range(3):
+                        R[a, b] += Y[a, d] * s.rotation[i, d, b]
+            for a in range(3):
+                n[a] = R[a, 0] * flat[0] + R[a, 1] * flat[1] + R[a, 2] * flat[2]
+                for b in range(3):
+                    half[a, b] = R[a, 0] * across[0, b] + R[a, 1] * across[1, b] + R[a, 2] * across[2, b]
+            reach, share = radius + phi / 2, p.other_part[i] - 0.5
+            for a in range(3):
+                back[a] = share * phi * n[a]
+                c.point[m, a] = own[a] - reach * n[a] - back[a]
+            c.phi[m] = phi
+            # By the twist at the middle, where the centre moves by [1, -reach n^]; then at the point.
+            skew[0, 1], skew[0, 2], skew[1, 2] = -n[2], n[1], -n[0]
+            skew[1, 0], skew[2, 0], skew[2, 1] = n[2], -n[1], n[0]
+            for a in range(3):
+                for b in range(3):
+                    curved = half[a, 0] * R[b, 0] + half[a, 1] * R[b, 1] + half[a, 2] * R[b, 2]
+                    change[3 + a, b] = curved
+                    change[a, b] = (1.0 if a == b else 0.0) - reach * curved - n[a] * n[b] / 2
+                change[6, a] = n[a]
+                change[6, 3 + a] = 0.0
+            for a in range(3):
+                for b in range(3):
+                    turned = (
+                        change[3 + a, 0] * skew[0, b] + change[3 + a, 1] * skew[1, b] + change[3 + a, 2] * skew[2, b]
+                    )
+                    change[3 + a, 3 + b] = -reach * turned
+                    change[a, 3 + b] = -reach * (skew[a, b] - reach * turned)
+            for a in range(7):
+                x, y, z = change[a, 0], change[a, 1], change[a, 2]
+                change[a, 3] -= y * back[2] - z * back[1]
+                change[a, 4] -= z * back[0] - x * back[2]
+                change[a, 5] -= x * back[1] - y * back[0]
+            for a in range(3):
+                for b in range(6):
+                    change[a, b] -= share * (n[a] * change[6, b] + phi * change[3 + a, b])
 
 
 @compiled
@@ -190,6 +332,7 @@ def _law_change(
 @compiled
 def _add_contact(
     p: Plant,
+    pairs: Pairs,
     c: Touching,
     m: int,
     S: Array,
@@ -207,8 +350,9 @@ def _add_contact(
 ) -> None:
     """Add what contact m changes to right (nv, 2 nv + nu), left (nv, nv) and push (nv,); from L on is scratch."""
     nv, n, here, change = len(v), c.normal[m], c.point[m], c.change[m]
-    sphere, other, moves = c.sphere[m], c.other[m], p.moves
-    law, h, mu, k_c, d = p.law, p.time_step, c.friction[m], c.stiffness[m], c.dissipation[m]
+    i_pair, moves, law, h = c.pair[m], p.moves, p.law, p.time_step
+    sphere, other = pairs.by_body[pairs.sides[i_pair, 0]], pairs.by_body[pairs.sides[i_pair, 1]]
+    mu, k_c, d, tau = pairs.friction[i_pair], pairs.stiffness[i_pair], pairs.dissipation[i_pair], pairs.time[i_pair]
     sigma = p.constants[0]
     at, u, du, dn, g = np.zeros(23), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     W, G, turned_sum, zero = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3), np.zeros(3)
@@ -231,7 +375,7 @@ def _add_contact(
             size += W[a, b] * W[a, b]
     size = np.sqrt(size)
     w = size / 3
-    _law(law, h, p.near_rigid, p.constants, n, c.phi[m], mu, k_c, c.time[m], d, w, u, u_0, at)
+    _law(law, h, p.near_rigid, p.constants, n, c.phi[m], mu, k_c, tau, d, w, u, u_0, at)
     f0, f1, f2 = at[0], at[1], at[2]
     for j in range(nv):  # how p, the normal and phi move, f x a, and what the weight's change is made of
         s = sphere[j] - other[j]
@@ -478,6 +622,7 @@ def _assemble(p: Plant, q: Array, v_next: Array, by: Array, nq: int, out: Array)
 @compiled
 def step_jacobians(
     p: Plant,
+    pairs: Pairs,
     c: Touching,
     q: Array,
     v: Array,
@@ -527,7 +672,9 @@ def step_jacobians(
         _factor(A, factor)
         _solve(factor, free)
         for m in range(c.first[n], c.first[n + 1]):
-            _add_contact(p, c, m, S[n], diagonal, slope[n], v[n], v_next[n], right, left, push, L, point, across, y)
+            _add_contact(
+                p, pairs, c, m, S[n], diagonal, slope[n], v[n], v_next[n], right, left, push, L, point, across, y
+            )
         for i in range(nv):
             window = limit_window * h * max(abs(v[n, i]), abs(v_next[n, i] - free[i, 0]))
             for side in range(2):

@@ -61,12 +61,14 @@ class AllPairs:
 
     def touching(self, placed: Placed) -> Touches:
         """What overlaps; how what SceneGraph found changes is not in it yet: see `complete`."""
-        touch, found = self.spheres.touching(placed.poses), placed.found
-        if not len(found):
-            return touch
+        touch = self.spheres.touching(placed.poses)
+        return touch.joined(self.found(placed)) if len(placed.found) else touch
+
+    def found(self, placed: Placed) -> Touches:
+        """What SceneGraph found."""
+        found = placed.found
         nothing = np.full((len(found), 7, 6), np.nan)
-        others = Touches(placed.state, placed.pair, found[:, :3], found[:, 6], found[:, 3:6], nothing)
-        return touch.joined(others)
+        return Touches(placed.state, placed.pair, found[:, :3], found[:, 6], found[:, 3:6], nothing)
 
     def complete(self, touch: Touches, placed: Placed, twists: Array) -> dict[int, str]:
         """Say of what SceneGraph found how it changes; the states of those of which it is not known, and why.
